@@ -1,0 +1,1 @@
+"""The companion process: configuration, camera feeds, wiring, health, recording, CLI."""

@@ -1,0 +1,43 @@
+"""Named errors of the localizer: each says what is wrong, where, and what to do."""
+
+from __future__ import annotations
+
+
+class LocalizerError(Exception):
+    """Base of every error that the localizer raises on purpose."""
+
+
+class GeoreferenceError(LocalizerError):
+    """A datum, CRS or coordinate that is missing, unknown or out of range."""
+
+
+class CameraError(LocalizerError):
+    """A camera model that is not physical, or that contradicts the images it is used with."""
+
+
+class PoseFileError(LocalizerError):
+    """A pose file that cannot be read; names file and line."""
+
+
+class MapError(LocalizerError):
+    """Base of everything that can be wrong with a map or its tile cache."""
+
+
+class MapSourceError(MapError):
+    """A map source (tileset, mesh, raster) that cannot be imported."""
+
+
+class MapCacheError(MapError):
+    """A tile cache that is missing, incomplete, corrupt or of another format version."""
+
+
+class OutsideMapError(MapError):
+    """A pose whose view does not meet the map."""
+
+
+class ModelError(LocalizerError):
+    """A feature network that is missing, corrupt or of the wrong shape."""
+
+
+class SequenceError(LocalizerError):
+    """An evaluation sequence that lacks a part or contradicts itself."""

@@ -1,0 +1,147 @@
+"""The small frozen messages that travel between threads and packages.
+
+World means the map's ENU frame (`localizer.geo.LocalFrame` about the map's origin), float64
+metres. Camera means OpenCV axes (x right, y down, z forward). Times are CLOCK_MONOTONIC
+nanoseconds of the exposure's middle.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from enum import Enum
+
+import numpy as np
+from numpy.typing import NDArray
+
+from localizer.camera import Camera
+from localizer.pose import Array, Pose
+
+Float32 = NDArray[np.float32]
+Image = NDArray[np.uint8]
+
+
+@dataclass(frozen=True)
+class Frame:
+    """One video frame. image: (height, width, 3) uint8 RGB, as the (distorted) camera saw it."""
+
+    image: Image
+    exposure_time_ns: int
+    camera: Camera
+    sequence: int
+
+
+@dataclass(frozen=True)
+class RenderedView:
+    """What a `MapRenderer` returns. rgb: (H, W, 3) uint8. depth: (H, W) float32, z in metres along
+    the optical axis at pixel centres, 0 where no surface was hit.
+    """
+
+    rgb: Image
+    depth: Float32
+    world_from_camera: Pose
+    camera: Camera
+
+
+@dataclass(frozen=True)
+class FeatureLevel:
+    """One pyramid level. features: (h, w, C) float32, channels last, C-contiguous, unit length per
+    pixel; confidence: (h, w) float32 in (0, 1), the complement of the paper's uncertainty;
+    stride: image pixels per feature pixel.
+    """
+
+    features: Float32
+    confidence: Float32
+    stride: int
+
+
+@dataclass(frozen=True)
+class FeaturePyramid:
+    """Feature levels from coarse to fine of one image of size (width, height)."""
+
+    levels: tuple[FeatureLevel, ...]
+    width: int
+    height: int
+
+
+@dataclass(frozen=True)
+class Anchors:
+    """The N geo-anchors of a reference view (paper, Eq. 1).
+
+    points_world: (N, 3) float64; pixels: (N, 2) float32 in the reference image; per level, coarse to
+    fine, the reference features (N, C) float32 and confidences (N,) float32 at those pixels.
+    """
+
+    points_world: Array
+    pixels: Float32
+    features: tuple[Float32, ...]
+    confidence: tuple[Float32, ...]
+
+
+@dataclass(frozen=True)
+class ReferenceBundle:
+    """The rendered reference view and its geo-anchors (paper, Eq. 2)."""
+
+    view: RenderedView
+    anchors: Anchors
+    time_ns: int
+
+
+@dataclass(frozen=True)
+class PosePrior:
+    """A predicted camera pose. covariance: (6, 6) over (position in world axes, m; rotation as a
+    left-multiplied small rotation vector in world axes, rad).
+    """
+
+    world_from_camera: Pose
+    covariance: Array
+    time_ns: int
+
+
+class RegistrationStatus(Enum):
+    """Why a registration did or did not give a pose."""
+
+    OK = "ok"
+    NO_OVERLAP = "no overlap: too few anchors project into the image"
+    NO_TEXTURE = "no texture: the normal equations are singular"
+    BAD_FEATURES = "features are not finite"
+    TOO_FEW_ANCHORS = "too few anchors in the reference view"
+
+
+class TrackingState(Enum):
+    """State of the tracking state machine (`localizer.integrity`)."""
+
+    INITIALIZING = "initializing"
+    TRACKING = "tracking"
+    DEGRADED = "degraded"
+    LOST = "lost"
+
+
+@dataclass(frozen=True)
+class PoseEstimate:
+    """The localizer's answer for one frame.
+
+    covariance: (6, 6) as in `PosePrior`. quality: 0 to 1. accepted: whether integrity lets it be
+    used. stage_ms: latency of each stage in milliseconds.
+    """
+
+    world_from_camera: Pose
+    covariance: Array
+    quality: float
+    state: TrackingState
+    status: RegistrationStatus
+    accepted: bool
+    exposure_time_ns: int
+    sequence: int
+    camera: Camera
+    stage_ms: dict[str, float] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class TargetFix:
+    """A pixel's place on Earth. position_world: (3,) metres; covariance: (3, 3) m², world axes."""
+
+    target_id: str
+    position_world: Array
+    covariance: Array
+    pixel: tuple[float, float]
+    exposure_time_ns: int

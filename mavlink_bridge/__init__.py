@@ -1,0 +1,1 @@
+"""Everything that speaks MAVLink, and nothing that sees images."""

@@ -1,0 +1,1 @@
+"""Simulation in the loop: vehicles, world camera, flights and their reports."""
