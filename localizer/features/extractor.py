@@ -1,0 +1,159 @@
+"""Feature extractors: the shipped network through onnxruntime, or the labelled fallback.
+
+A model is two files: ``NAME.onnx`` and ``NAME.json``. The graph takes ``image`` (1, H, W, 3) uint8
+RGB with H and W divisible by the coarsest stride, and gives for each level, coarse to fine,
+``features_K`` (1, h, w, C) float32 of unit length per pixel and ``confidence_K`` (1, h, w) float32
+in (0, 1). The JSON file names the levels and carries the SHA-256 of the graph.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import logging
+from pathlib import Path
+from typing import Protocol
+
+import numpy as np
+import onnxruntime as ort
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
+
+from localizer.errors import ModelError
+from localizer.features.gradient import GradientExtractor
+from localizer.features.image import check_image
+from localizer.types import FeatureLevel, FeaturePyramid, Image
+
+logger = logging.getLogger(__name__)
+
+SHIPPED_MODEL = Path(__file__).parent / "weights" / "tiny.onnx"
+_PROVIDERS = ("TensorrtExecutionProvider", "CUDAExecutionProvider", "CPUExecutionProvider")
+
+
+class FeatureExtractor(Protocol):
+    """Turns an image into the feature pyramid of the paper's Sec. 3.3.1."""
+
+    @property
+    def name(self) -> str:
+        """What computes the features, for reports, e.g. ``tiny (onnxruntime, CPU)``."""
+
+    def extract(self, rgb: Image) -> FeaturePyramid:
+        """Pyramid of an (H, W, 3) uint8 RGB image, H and W divisible by 8."""
+
+
+class LevelInfo(BaseModel):
+    """One pyramid level of a model: image pixels per feature pixel, and feature channels."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+    stride: int = Field(gt=0)
+    channels: int = Field(gt=0)
+
+
+class ModelInfo(BaseModel):
+    """Content of the JSON file beside a model."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+    name: str
+    sha256: str = Field(pattern="^[0-9a-f]{64}$")
+    levels: tuple[LevelInfo, ...] = Field(min_length=1)
+    parameters: int = Field(gt=0)
+    training: dict[str, object] = {}
+
+
+def read_model_info(model: Path) -> ModelInfo:
+    """Metadata of `model`, with the graph's hash verified against it."""
+    path = model.with_suffix(".json")
+    try:
+        info = ModelInfo.model_validate_json(path.read_text())
+    except OSError as error:
+        raise ModelError(
+            f"{path}: cannot be read ({error.strerror}); every model needs its JSON file beside it"
+        ) from error
+    except (ValidationError, ValueError) as error:
+        raise ModelError(f"{path}: not a valid model description: {error}") from error
+    try:
+        digest = hashlib.sha256(model.read_bytes()).hexdigest()
+    except OSError as error:
+        raise ModelError(f"{model}: cannot be read: {error.strerror}") from error
+    if digest != info.sha256:
+        raise ModelError(
+            f"{model}: SHA-256 is {digest}, {path.name} says {info.sha256}; the file is corrupt or "
+            "of another version: fetch both files again"
+        )
+    return info
+
+
+class OnnxExtractor:
+    """A network in onnxruntime, on the best execution provider that starts."""
+
+    def __init__(self, model: Path, *, threads: int = 2) -> None:
+        self.info = read_model_info(model)
+        options = ort.SessionOptions()
+        options.intra_op_num_threads = threads
+        options.log_severity_level = 3
+        # Spinning worker threads would starve the optimizer and the renderer on a small computer.
+        options.add_session_config_entry("session.intra_op.allow_spinning", "0")
+        available = ort.get_available_providers()
+        try:
+            self._session = ort.InferenceSession(
+                str(model), options, providers=[p for p in _PROVIDERS if p in available]
+            )
+        except Exception as error:  # onnxruntime raises its own untyped exceptions
+            raise ModelError(f"{model}: onnxruntime cannot load it: {error}") from error
+        self._multiple = max(level.stride for level in self.info.levels)
+        self._outputs = [
+            f"{kind}_{k}"
+            for k in range(len(self.info.levels))
+            for kind in ("features", "confidence")
+        ]
+        self._check_graph(model)
+
+    @property
+    def provider(self) -> str:
+        """Short name of the execution provider in use: TensorRT, CUDA or CPU."""
+        name = str(self._session.get_providers()[0]).removesuffix("ExecutionProvider")
+        return "TensorRT" if name == "Tensorrt" else name
+
+    @property
+    def name(self) -> str:
+        """Model and provider, for reports."""
+        return f"{self.info.name} (onnxruntime, {self.provider})"
+
+    def extract(self, rgb: Image) -> FeaturePyramid:
+        """Pyramid of an (H, W, 3) uint8 RGB image, H and W divisible by the coarsest stride."""
+        check_image(rgb, self._multiple)
+        arrays = self._session.run(self._outputs, {"image": np.ascontiguousarray(rgb)[None]})
+        levels = tuple(
+            FeatureLevel(arrays[2 * k][0], arrays[2 * k + 1][0], level.stride)
+            for k, level in enumerate(self.info.levels)
+        )
+        return FeaturePyramid(levels, rgb.shape[1], rgb.shape[0])
+
+    def _check_graph(self, model: Path) -> None:
+        """Run once on a small image: it warms up, and a wrong graph fails here, not in flight."""
+        side = 4 * self._multiple
+        try:
+            pyramid = self.extract(np.zeros((side, side, 3), np.uint8))
+        except Exception as error:
+            raise ModelError(f"{model}: does not run on a {side}x{side} image: {error}") from error
+        for level, expected in zip(pyramid.levels, self.info.levels, strict=True):
+            shape = (side // expected.stride, side // expected.stride, expected.channels)
+            if level.features.shape != shape or level.confidence.shape != shape[:2]:
+                raise ModelError(
+                    f"{model}: level of stride {expected.stride} gives {level.features.shape}, "
+                    f"its description says {shape}"
+                )
+
+
+def load_extractor(model: Path | None = None, *, threads: int = 2) -> FeatureExtractor:
+    """The extractor for `model`; None takes the shipped weights.
+
+    Without shipped weights it is the gradient fallback, which says so in its name and in a warning.
+    A model that was asked for by path and is missing or corrupt raises `ModelError`.
+    """
+    if model is None:
+        if not SHIPPED_MODEL.exists():
+            logger.warning("no model file at %s: using gradient features", SHIPPED_MODEL)
+            return GradientExtractor()
+        model = SHIPPED_MODEL
+    if not model.exists():
+        raise ModelError(f"{model}: no such model file; leave it out to use the shipped weights")
+    return OnnxExtractor(model, threads=threads)
