@@ -1,0 +1,26 @@
+"""Settings of the localizer: one frozen model, unknown keys are errors."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from pydantic import BaseModel, ConfigDict, Field
+
+from localizer.integrity import IntegrityConfig
+from localizer.motion import MotionConfig
+
+
+class LocalizerConfig(BaseModel):
+    """What the dual-thread engine needs to know."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    width: int = Field(320, ge=64, le=2048, description="width of query and reference, pixels")
+    model: Path | None = Field(None, description="ONNX feature network; none: the shipped one")
+    anchors: int = Field(500, ge=50, le=5000, description="geo-anchors per reference (N)")
+    threads: int = Field(2, ge=1, description="CPU threads of rendering and optimization")
+    feature_threads: int = Field(1, ge=1, description="CPU threads of each feature extraction")
+    cache_mib: int = Field(384, ge=16, description="resident tiles, MiB")
+    seed: int = Field(0, ge=0, description="seed of anchors and hypotheses")
+    motion: MotionConfig = MotionConfig()
+    integrity: IntegrityConfig = IntegrityConfig()

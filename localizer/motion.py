@@ -1,0 +1,134 @@
+"""Constant-velocity motion model of the camera pose (paper, Sec. 3.2), on filterpy.
+
+The state is an error state about a nominal rotation: ``x = (p, phi, v, omega)``, shape (12,), in
+world axes: position (m), small left rotation (rad), velocity (m/s), angular rate (rad/s).
+`MotionState` is immutable and the functions are pure, so the render thread may predict from the
+same state that the localization thread is about to replace.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from filterpy.common import Q_discrete_white_noise
+from filterpy.kalman import predict as kalman_predict
+from filterpy.kalman import update as kalman_update
+from pydantic import BaseModel, ConfigDict, Field
+
+from localizer.pose import Array, Pose, so3_exp, so3_log
+from localizer.types import PosePrior
+
+_H = np.hstack([np.eye(6), np.zeros((6, 6))])
+
+
+class MotionConfig(BaseModel):
+    """Process noise of the constant-velocity model, as white accelerations."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    acceleration_sigma: float = Field(2.0, gt=0, description="m/s²")
+    angular_acceleration_sigma: float = Field(0.6, gt=0, description="rad/s²")
+    initial_velocity_sigma: float = Field(8.0, gt=0, description="m/s")
+    initial_angular_rate_sigma: float = Field(0.3, gt=0, description="rad/s")
+
+
+@dataclass(frozen=True)
+class MotionState:
+    """Filter state at `time_ns`: error-state mean (12,), covariance (12, 12), nominal rotation."""
+
+    mean: Array
+    covariance: Array
+    rotation: Array
+    time_ns: int
+
+    @property
+    def velocity(self) -> Array:
+        """Velocity (3,) in world axes, m/s."""
+        return self.mean[6:9]
+
+    @property
+    def prior(self) -> PosePrior:
+        """The pose and its covariance (6, 6)."""
+        pose = Pose(self.rotation, self.mean[:3].copy())
+        return PosePrior(pose, self.covariance[:6, :6].copy(), self.time_ns)
+
+
+def start(prior: PosePrior, config: MotionConfig, velocity: Array | None = None) -> MotionState:
+    """A filter that knows `prior` and, if given, the velocity (3,) in m/s."""
+    mean = np.zeros(12)
+    mean[:3] = prior.world_from_camera.translation
+    mean[6:9] = 0.0 if velocity is None else velocity
+    P = np.zeros((12, 12))
+    P[:6, :6] = prior.covariance
+    velocity_sigma = config.initial_velocity_sigma if velocity is None else 1.0
+    P[6:9, 6:9] = np.eye(3) * velocity_sigma**2
+    P[9:, 9:] = np.eye(3) * config.initial_angular_rate_sigma**2
+    return MotionState(mean, P, prior.world_from_camera.rotation, prior.time_ns)
+
+
+def predict(state: MotionState, time_ns: int, config: MotionConfig) -> MotionState:
+    """The state moved to `time_ns`; a time before the state's own moves it back the same way."""
+    dt = (time_ns - state.time_ns) * 1e-9
+    if dt == 0.0:
+        return state
+    F = np.eye(12)
+    F[:6, 6:] = np.eye(6) * dt
+    mean, P = kalman_predict(state.mean, state.covariance, F, _process_noise(abs(dt), config))
+    return _fold_rotation(mean, P, state.rotation, time_ns)
+
+
+def update(
+    state: MotionState, pose: Pose, covariance: Array, time_ns: int, config: MotionConfig
+) -> MotionState:
+    """Fuse a measured pose with covariance (6, 6) at `time_ns`."""
+    ahead = predict(state, time_ns, config)
+    z = np.concatenate([pose.translation, so3_log(pose.rotation @ ahead.rotation.T)])
+    mean, P = kalman_update(ahead.mean, ahead.covariance, z, covariance, _H)
+    return _fold_rotation(mean, P, ahead.rotation, time_ns)
+
+
+def shifted(state: MotionState, pose: Pose) -> MotionState:
+    """The same motion about another pose: after a relocalization the velocity stays known."""
+    mean = state.mean.copy()
+    mean[:3] = pose.translation
+    return replace(state, mean=mean, rotation=pose.rotation)
+
+
+def mahalanobis_squared(prior: PosePrior, pose: Pose, extra: Array | float = 0.0) -> float:
+    """Squared Mahalanobis distance of `pose` from `prior`, 6 degrees of freedom.
+
+    extra: covariance (6, 6) of the pose itself, added to the prior's.
+    """
+    delta = pose_difference(prior.world_from_camera, pose)
+    S = prior.covariance + extra
+    return float(delta @ np.linalg.solve(S, delta))
+
+
+def pose_difference(a: Pose, b: Pose) -> Array:
+    """``b - a`` as (position, left rotation vector), shape (6,), world axes."""
+    return np.concatenate([b.translation - a.translation, so3_log(b.rotation @ a.rotation.T)])
+
+
+def _fold_rotation(mean: Array, P: Array, rotation: Array, time_ns: int) -> MotionState:
+    """Move the rotation error into the nominal rotation, so that it stays small."""
+    mean = np.asarray(mean, dtype=np.float64).reshape(12).copy()
+    folded = so3_exp(mean[3:6]) @ rotation
+    mean[3:6] = 0.0
+    P = np.asarray(P, dtype=np.float64)
+    return MotionState(mean, 0.5 * (P + P.T), folded, time_ns)
+
+
+def _process_noise(dt: float, config: MotionConfig) -> Array:
+    """Discrete white-noise acceleration, (12, 12)."""
+    Q = np.zeros((12, 12))
+    for start_index, sigma in (
+        (0, config.acceleration_sigma),
+        (3, config.angular_acceleration_sigma),
+    ):
+        q = Q_discrete_white_noise(2, dt, sigma**2)
+        for axis in range(start_index, start_index + 3):
+            for i in range(2):
+                for j in range(2):
+                    Q[axis + 6 * i, axis + 6 * j] = q[i, j]
+    return Q

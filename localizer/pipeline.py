@@ -1,0 +1,233 @@
+"""One frame's way through the algorithm, without threads: the two halves that the engine runs.
+
+`Localizer.make_reference` is the render thread's half (predict, render, extract, anchors),
+`Localizer.localize` the localization thread's (extract, register, judge, filter).
+"""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+
+from localizer import motion
+from localizer.camera import Camera
+from localizer.config import LocalizerConfig
+from localizer.errors import CameraError, OutsideMapError
+from localizer.features.extractor import FeatureExtractor
+from localizer.integrity import Integrity, is_acceptable, judge
+from localizer.motion import MotionState
+from localizer.pose import Array
+from localizer.registration.anchors import select_anchors
+from localizer.registration.jngo import JNGO, Registration
+from localizer.render.base import MapRenderer
+from localizer.types import (
+    Anchors,
+    FeaturePyramid,
+    Frame,
+    Image,
+    PoseEstimate,
+    PosePrior,
+    ReferenceBundle,
+    RegistrationStatus,
+    TrackingState,
+)
+
+# A reference view with less of the map in it than this has nothing to register against.
+_MIN_MAP_SHARE = 0.1
+
+
+@dataclass(frozen=True)
+class TrackerState:
+    """What the two halves share; replaced as a whole, never changed."""
+
+    motion: MotionState | None = None
+    integrity: Integrity = Integrity()
+
+
+def working_camera(camera: Camera, width: int) -> Camera:
+    """The ideal pinhole at the network's input size: `width` wide, both sides divisible by 8."""
+    w = max(8, round(width / 8) * 8)
+    h = max(8, round(w * camera.height / camera.width / 8) * 8)
+    return camera.without_distortion().resized(w, h)
+
+
+class Undistorter:
+    """Turns frames of a (distorted) camera into the working pinhole's images."""
+
+    def __init__(self, source: Camera, target: Camera) -> None:
+        self._source, self._target = source, target
+        # Shrinking by more than 2 under bilinear sampling aliases: average down to twice the
+        # target first, undistort there, and average again.
+        double = (2 * target.width, 2 * target.height)
+        shrinks = source.width > double[0]
+        self._middle = source.resized(*double) if shrinks else source
+        pinhole = target.resized(self._middle.width, self._middle.height)
+        self._maps = self._middle.undistortion_maps(pinhole) if source.is_distorted else None
+
+    def __call__(self, frame: Frame) -> Image:
+        """The frame's image (height, width, 3) uint8 at the target's size."""
+        height, width = frame.image.shape[:2]
+        if (width, height) != (self._source.width, self._source.height):
+            raise CameraError(
+                f"frame {frame.sequence} is {width}x{height}, the camera model says "
+                f"{self._source.width}x{self._source.height}: give this stream's calibration"
+            )
+        image = _shrink(frame.image, self._middle)
+        if self._maps is not None:
+            image = cv2.remap(image, *self._maps, cv2.INTER_LINEAR).astype(np.uint8, copy=False)
+        return _shrink(image, self._target)
+
+
+def _shrink(image: Image, camera: Camera) -> Image:
+    if image.shape[:2] == (camera.height, camera.width):
+        return image
+    resized = cv2.resize(image, (camera.width, camera.height), interpolation=cv2.INTER_AREA)
+    return resized.astype(np.uint8, copy=False)
+
+
+class Localizer:
+    """The algorithm for one camera. Each half may run on its own thread."""
+
+    def __init__(
+        self,
+        renderer: MapRenderer,
+        extractor: FeatureExtractor,
+        optimizer: JNGO,
+        camera: Camera,
+        config: LocalizerConfig,
+    ) -> None:
+        self._renderer = renderer
+        self._extractor = extractor
+        self._optimizer = optimizer
+        self._config = config
+        self.camera = working_camera(camera, config.width)
+        self._undistorter = Undistorter(camera, self.camera)
+        self._lock = threading.Lock()
+        self._tracker = TrackerState()
+
+    @property
+    def tracker(self) -> TrackerState:
+        """The current motion state and integrity."""
+        with self._lock:
+            return self._tracker
+
+    def set_prior(self, prior: PosePrior, velocity: Array | None = None) -> None:
+        """Begin (again) from a pose known from outside, e.g. the autopilot's."""
+        state = motion.start(prior, self._config.motion, velocity)
+        with self._lock:
+            self._tracker = TrackerState(state, Integrity())
+
+    def predict(self, time_ns: int) -> PosePrior | None:
+        """The constant-velocity prediction at `time_ns`; None before the first prior."""
+        state = self.tracker.motion
+        return motion.predict(state, time_ns, self._config.motion).prior if state else None
+
+    def make_reference(self, prior: PosePrior, *, wait: bool = False) -> ReferenceBundle:
+        """Render the view at the prior's pose and select its geo-anchors (paper, Eq. 1 and 2)."""
+        view = self._renderer.render(prior.world_from_camera, self.camera, wait=wait)
+        if np.count_nonzero(view.depth) < _MIN_MAP_SHARE * view.depth.size:
+            e, n, u = prior.world_from_camera.translation
+            raise OutsideMapError(
+                f"the view from east {e:.1f} north {n:.1f} up {u:.1f} m (map frame) does not meet "
+                "the map: check the prior, the map's extent and the camera's direction"
+            )
+        features = self._extractor.extract(view.rgb)
+        anchors = select_anchors(view, features, self._config.anchors, self._config.seed)
+        return ReferenceBundle(view, anchors, prior.time_ns)
+
+    def extract_query(self, frame: Frame) -> FeaturePyramid:
+        """Features of the frame (does not need the reference, so it may run beside it)."""
+        return self._extractor.extract(self._undistorter(frame))
+
+    def localize(
+        self, frame: Frame, query: FeaturePyramid, anchors: Anchors
+    ) -> PoseEstimate:
+        """Register the frame against the anchors, judge the result and update the filter."""
+        tracker = self.tracker
+        if tracker.motion is None:
+            raise OutsideMapError("no pose prior yet: call set_prior before localizing")
+        config = self._config
+        ahead = motion.predict(tracker.motion, frame.exposure_time_ns, config.motion)
+        started = time.perf_counter()
+        result = self._optimizer.register(
+            query,
+            self.camera,
+            anchors,
+            ahead.prior,
+            motion=ahead.prior if tracker.integrity.trusts_prediction else None,
+            seed=config.seed + frame.sequence,
+        )
+        elapsed_ms = (time.perf_counter() - started) * 1e3
+        acceptable = self._acceptable(tracker.integrity, result, ahead.prior)
+        integrity = judge(tracker.integrity, config.integrity, acceptable)
+        self._store(tracker, self._next_motion(ahead, result, frame, acceptable), integrity)
+        return _estimate(frame, result, integrity, acceptable, {"register": elapsed_ms})
+
+    def _acceptable(self, integrity: Integrity, result: Registration, prior: PosePrior) -> bool:
+        # Also before tracking: the gate is against the prior's own covariance, which is wide then.
+        distance = motion.mahalanobis_squared(prior, result.world_from_camera, result.covariance)
+        return is_acceptable(
+            integrity,
+            self._config.integrity,
+            result.status,
+            result.overlap,
+            result.quality,
+            distance,
+        )
+
+    def _next_motion(
+        self, ahead: MotionState, result: Registration, frame: Frame, acceptable: bool
+    ) -> MotionState:
+        if not acceptable:
+            return ahead
+        return motion.update(
+            ahead,
+            result.world_from_camera,
+            result.covariance,
+            frame.exposure_time_ns,
+            self._config.motion,
+        )
+
+    def _store(self, seen: TrackerState, state: MotionState, integrity: Integrity) -> None:
+        """Keep the new state unless a prior from outside replaced it meanwhile."""
+        with self._lock:
+            if self._tracker is seen:
+                self._tracker = TrackerState(state, integrity)
+
+
+def _estimate(
+    frame: Frame,
+    result: Registration,
+    integrity: Integrity,
+    acceptable: bool,
+    stage_ms: dict[str, float],
+) -> PoseEstimate:
+    usable = acceptable and integrity.state is not TrackingState.LOST
+    return PoseEstimate(
+        world_from_camera=result.world_from_camera,
+        covariance=result.covariance,
+        quality=result.quality if result.status is RegistrationStatus.OK else 0.0,
+        state=integrity.state,
+        status=result.status,
+        accepted=usable,
+        exposure_time_ns=frame.exposure_time_ns,
+        sequence=frame.sequence,
+        camera=frame.camera,
+        stage_ms=stage_ms,
+    )
+
+
+@contextmanager
+def stopwatch(stage_ms: dict[str, float], stage: str) -> Iterator[None]:
+    """Add the milliseconds spent inside to ``stage_ms[stage]``."""
+    started = time.perf_counter()
+    try:
+        yield
+    finally:
+        stage_ms[stage] = stage_ms.get(stage, 0.0) + (time.perf_counter() - started) * 1e3
