@@ -1,0 +1,132 @@
+"""The deployment's configuration: one YAML file, checked as a whole before anything starts."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import yaml
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
+
+from companion.errors import ConfigError
+from localizer.camera import Camera
+from localizer.config import LocalizerConfig
+from localizer.errors import CameraError
+from mavlink_bridge.config import BridgeConfig
+
+
+class _Model(BaseModel):
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+
+class CameraModel(_Model):
+    """Intrinsics in pixels of the stream as it arrives (pixel centres at + 0.5)."""
+
+    width: int = Field(ge=8, le=8192)
+    height: int = Field(ge=8, le=8192)
+    fx: float = Field(gt=0)
+    fy: float = Field(gt=0)
+    cx: float
+    cy: float
+    distortion: tuple[float, float, float, float, float] = Field(
+        (0.0, 0.0, 0.0, 0.0, 0.0), description="Brown: k1 k2 p1 p2 k3"
+    )
+
+    def camera(self) -> Camera:
+        """As the geometry type."""
+        return Camera(
+            self.width, self.height, self.fx, self.fy, self.cx, self.cy, self.distortion
+        )
+
+
+class MountConfig(_Model):
+    """How the camera sits on its gimbal (or, for a fixed camera, on the body)."""
+
+    roll_deg: float = Field(0.0, ge=-180, le=180)
+    pitch_deg: float = Field(0.0, ge=-180, le=180)
+    yaw_deg: float = Field(0.0, ge=-180, le=180)
+    lever_arm_m: tuple[float, float, float] = Field(
+        (0.0, 0.0, 0.0), description="camera from the autopilot, body axes: forward right down"
+    )
+
+
+class FeedConfig(_Model):
+    """Where the video comes from."""
+
+    source: str = Field(description="udp://, rtsp://, /dev/videoN, a video file or a folder")
+    model: CameraModel
+    mount: MountConfig = MountConfig()
+    latency_ms: float = Field(0.0, ge=0, le=2000, description="exposure to arrival, if unstamped")
+    stall_timeout_s: float = Field(2.0, gt=0, description="silence after which the feed reopens")
+
+
+class TargetConfig(_Model):
+    """Target geo-localization."""
+
+    detections: str | None = Field(None, description="host:port where pixel detections arrive")
+    rate_hz: float = Field(5.0, gt=0, le=30, description="reports per second and target")
+    pixel_sigma: float = Field(1.5, gt=0, description="error of a detection, pixels")
+    map_sigma_m: float = Field(0.3, gt=0, description="error of the map's surface, metres")
+
+
+class PriorConfig(_Model):
+    """How well the autopilot's own position is believed when tracking (re)starts from it."""
+
+    position_sigma_m: float = Field(5.0, gt=0)
+    rotation_sigma_deg: float = Field(4.0, gt=0)
+
+
+class CompanionConfig(_Model):
+    """One deployment."""
+
+    map: Path = Field(description="tile cache made by `companion map build`")
+    camera: FeedConfig
+    localizer: LocalizerConfig = LocalizerConfig()
+    bridge: BridgeConfig = BridgeConfig()
+    targets: TargetConfig = TargetConfig()
+    prior: PriorConfig = PriorConfig()
+    record: Path | None = Field(None, description="folder of the flight's records")
+
+
+def load_config(path: Path) -> CompanionConfig:
+    """Read and check a configuration file; relative paths are relative to that file."""
+    try:
+        data = yaml.safe_load(path.read_text(encoding="utf-8"))
+    except OSError as error:
+        raise ConfigError(f"{path}: cannot be read: {error.strerror}") from error
+    except (yaml.YAMLError, UnicodeDecodeError) as error:
+        raise ConfigError(f"{path}: not valid YAML: {error}") from error
+    if not isinstance(data, dict):
+        raise ConfigError(f"{path}: expected a mapping of settings at the top")
+    config = parse_config(data, str(path))
+    return _resolve(config, path.parent)
+
+
+def parse_config(data: dict[str, Any], where: str) -> CompanionConfig:
+    """Check a configuration given as plain data; `where` names it in errors."""
+    try:
+        config = CompanionConfig.model_validate(data)
+        config.camera.model.camera()
+    except ValidationError as error:
+        lines = [
+            f"  {'.'.join(str(p) for p in e['loc'])}: {e['msg']} (got {_short(e['input'])})"
+            for e in error.errors()
+        ]
+        raise ConfigError(f"{where}: {len(lines)} problem(s)\n" + "\n".join(lines)) from error
+    except CameraError as error:
+        raise ConfigError(f"{where}: camera.model: {error}") from error
+    return config
+
+
+def _short(value: object) -> str:
+    text = repr(value)
+    return text if len(text) <= 60 else text[:57] + "..."
+
+
+def _resolve(config: CompanionConfig, folder: Path) -> CompanionConfig:
+    localizer = config.localizer
+    if localizer.model is not None:
+        localizer = localizer.model_copy(update={"model": folder / localizer.model})
+    record = None if config.record is None else folder / config.record
+    update = {"map": folder / config.map, "localizer": localizer, "record": record}
+    return config.model_copy(update=update)

@@ -1,0 +1,124 @@
+"""The flight's record: estimates, targets and events as CSV, written on a thread of its own."""
+
+from __future__ import annotations
+
+import csv
+import queue
+import threading
+import time
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Any, TextIO
+
+from localizer.geo import LocalFrame
+from localizer.pose import quaternion_from_matrix
+from localizer.types import PoseEstimate, TargetFix
+
+_QUEUE_SIZE = 4096
+_FLUSH_S = 1.0
+
+ESTIMATE_COLUMNS = (
+    "exposure_time_ns", "sequence", "east_m", "north_m", "up_m", "qw", "qx", "qy", "qz",
+    "latitude_deg", "longitude_deg", "height_m", "sigma_east_m", "sigma_north_m", "sigma_up_m",
+    "sigma_rotation_rad", "quality", "state", "status", "accepted",
+    "reference_ms", "extract_ms", "register_ms", "latency_ms",
+)  # fmt: skip
+TARGET_COLUMNS = (
+    "exposure_time_ns", "target_id", "east_m", "north_m", "up_m",
+    "latitude_deg", "longitude_deg", "height_m", "sigma_horizontal_m", "sigma_up_m",
+    "velocity_east", "velocity_north", "velocity_up", "u", "v",
+)  # fmt: skip
+EVENT_COLUMNS = ("time_ns", "level", "text")
+
+
+class Recorder:
+    """Writes ``estimates.csv``, ``targets.csv`` and ``events.csv`` in a folder.
+
+    Nothing here blocks its callers: rows beyond a bounded queue are dropped and counted.
+    """
+
+    def __init__(self, folder: Path, frame: LocalFrame) -> None:
+        folder.mkdir(parents=True, exist_ok=True)
+        self._frame = frame
+        self._rows: queue.Queue[tuple[str, Iterable[Any]] | None] = queue.Queue(_QUEUE_SIZE)
+        self.dropped = 0
+        self._files: dict[str, TextIO] = {}
+        self._writers = {
+            "estimates": self._open(folder / "estimates.csv", ESTIMATE_COLUMNS),
+            "targets": self._open(folder / "targets.csv", TARGET_COLUMNS),
+            "events": self._open(folder / "events.csv", EVENT_COLUMNS),
+        }
+        self._thread = threading.Thread(target=self._run, name="recorder")
+        self._thread.start()
+
+    def estimate(self, estimate: PoseEstimate) -> None:
+        """Record one estimate (accepted or not)."""
+        pose = estimate.world_from_camera
+        position = self._frame.position(pose.translation)
+        sigma = estimate.covariance.diagonal() ** 0.5
+        stages = (estimate.stage_ms.get(k, 0.0) for k in ("reference", "extract", "register"))
+        row = (
+            estimate.exposure_time_ns, estimate.sequence,
+            *(f"{x:.4f}" for x in pose.translation),
+            *(f"{x:.8f}" for x in quaternion_from_matrix(pose.rotation)),
+            f"{position.latitude_deg:.9f}", f"{position.longitude_deg:.9f}",
+            f"{position.height_m:.4f}",
+            *(f"{x:.4f}" for x in sigma[:3]), f"{sigma[3:].max():.6f}",
+            f"{estimate.quality:.4f}", estimate.state.value, estimate.status.name,
+            int(estimate.accepted), *(f"{x:.2f}" for x in stages),
+            f"{estimate.stage_ms.get('latency', 0.0):.2f}",
+        )  # fmt: skip
+        self._put("estimates", row)
+
+    def target(self, fix: TargetFix, velocity: Iterable[float]) -> None:
+        """Record one target fix with its filtered velocity (3,) in world axes."""
+        position = self._frame.position(fix.position_world)
+        horizontal = (fix.covariance[0, 0] + fix.covariance[1, 1]) ** 0.5
+        row = (
+            fix.exposure_time_ns, fix.target_id, *(f"{x:.4f}" for x in fix.position_world),
+            f"{position.latitude_deg:.9f}", f"{position.longitude_deg:.9f}",
+            f"{position.height_m:.4f}", f"{horizontal:.3f}", f"{fix.covariance[2, 2] ** 0.5:.3f}",
+            *(f"{x:.3f}" for x in velocity), *(f"{x:.2f}" for x in fix.pixel),
+        )  # fmt: skip
+        self._put("targets", row)
+
+    def event(self, level: str, text: str) -> None:
+        """Record something that happened, at the current time."""
+        self._put("events", (time.monotonic_ns(), level, text))
+
+    def close(self) -> None:
+        """Write what is queued and close the files."""
+        self._rows.put(None)
+        self._thread.join()
+        for file in self._files.values():
+            file.close()
+
+    def _open(self, path: Path, columns: tuple[str, ...]) -> Any:
+        file = path.open("w", newline="", encoding="utf-8")
+        self._files[path.stem] = file
+        writer = csv.writer(file)
+        writer.writerow(columns)
+        return writer
+
+    def _put(self, name: str, row: Iterable[Any]) -> None:
+        try:
+            self._rows.put_nowait((name, row))
+        except queue.Full:
+            self.dropped += 1
+
+    def _run(self) -> None:
+        flushed = time.monotonic()
+        while True:
+            try:
+                item = self._rows.get(timeout=_FLUSH_S)
+            except queue.Empty:
+                item = ("", ())
+            if item is None:
+                return
+            name, row = item
+            if name:
+                self._writers[name].writerow(row)
+            if time.monotonic() - flushed > _FLUSH_S:
+                flushed = time.monotonic()
+                for file in self._files.values():
+                    file.flush()
