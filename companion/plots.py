@@ -1,0 +1,105 @@
+"""Pictures for reports: checkerboard overlays, tracks on the map, errors over time."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import cv2
+import matplotlib as mpl
+import numpy as np
+from matplotlib.figure import Figure
+
+from localizer.pose import Array
+from localizer.types import Image
+
+mpl.use("Agg")
+
+
+def checkerboard(video: Image, render: Image, cells: int = 8) -> Image:
+    """Video and render, both (H, W, 3), in alternating cells: edges run on where poses are right.
+
+    cells: across the width.
+    """
+    height, width = video.shape[:2]
+    side = max(1, width // cells)
+    rows, columns = np.arange(height) // side, np.arange(width) // side
+    from_video = ((rows[:, None] + columns[None, :]) % 2 == 0)[..., None]
+    return np.where(from_video, video, render).astype(np.uint8)
+
+
+def overlay_sheet(video: Image, render: Image, caption: str) -> Image:
+    """Video, render and their checkerboard side by side under a caption."""
+    sheet = np.hstack([video, render, checkerboard(video, render)])
+    bar = np.zeros((22, sheet.shape[1], 3), np.uint8)
+    cv2.putText(bar, caption, (6, 16), cv2.FONT_HERSHEY_SIMPLEX, 0.45, (255, 255, 255), 1)
+    return np.vstack([bar, sheet])
+
+
+def save_image(path: Path, rgb: Image) -> None:
+    """Write an RGB image as PNG or JPEG, by suffix."""
+    cv2.imwrite(str(path), cv2.cvtColor(rgb, cv2.COLOR_RGB2BGR))
+
+
+@dataclass(frozen=True)
+class MapPicture:
+    """A north-up picture of the map and the ENU rectangle it covers (m)."""
+
+    rgb: Image
+    west: float
+    east: float
+    south: float
+    north: float
+
+
+def plot_tracks(
+    path: Path, tracks: Mapping[str, Array], background: MapPicture | None, marks: Mapping[str, Array]
+) -> None:
+    """Tracks (N, 2+) in ENU metres and named marks (2+,) over the map."""
+    figure = Figure(figsize=(9, 9), layout="constrained")
+    axes = figure.add_subplot()
+    if background is not None:
+        b = background
+        axes.imshow(b.rgb, extent=(b.west, b.east, b.south, b.north), alpha=0.75)
+    styles = ("-", "--", ":", "-.")
+    for (name, track), style in zip(tracks.items(), styles, strict=False):
+        axes.plot(track[:, 0], track[:, 1], style, linewidth=1.8, label=name)
+    for name, mark in marks.items():
+        axes.plot(mark[0], mark[1], "k+", markersize=9)
+        axes.annotate(name, (mark[0], mark[1]), textcoords="offset points", xytext=(5, 5))
+    points = np.vstack([t[:, :2] for t in tracks.values()])
+    low, high = points.min(axis=0) - 80, points.max(axis=0) + 80
+    axes.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]), xlabel="east, m", ylabel="north, m")
+    axes.set_aspect("equal")
+    axes.legend(loc="upper right")
+    figure.savefig(path, dpi=110)
+
+
+@dataclass(frozen=True)
+class ErrorSeries:
+    """One curve of `plot_errors`: time in s, error in `unit`."""
+
+    label: str
+    time_s: Array
+    error: Array
+    unit: str
+
+
+def plot_errors(
+    path: Path, series: Sequence[ErrorSeries], shaded: Sequence[tuple[float, float, str]] = ()
+) -> None:
+    """Errors over time, one row per unit; `shaded` marks spans (begin, end, name)."""
+    units = list(dict.fromkeys(s.unit for s in series))
+    figure = Figure(figsize=(10, 2.6 * len(units)), layout="constrained")
+    for row, unit in enumerate(units, start=1):
+        axes = figure.add_subplot(len(units), 1, row)
+        for s in (s for s in series if s.unit == unit):
+            axes.plot(s.time_s, s.error, linewidth=0.9, label=s.label)
+        for begin, end, name in shaded:
+            axes.axvspan(begin, end, color="tab:orange", alpha=0.12, label=name)
+        axes.set(xlabel="time, s", ylabel=f"error, {unit}")
+        axes.set_ylim(bottom=0)
+        axes.grid(alpha=0.3)
+        axes.legend(loc="upper right", fontsize="small")
+    figure.savefig(path, dpi=110)

@@ -1,0 +1,36 @@
+"""Fixtures for every test: the real data sets and the autopilot binary, or a printed skip."""
+
+from __future__ import annotations
+
+import os
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).resolve().parent.parent
+
+
+@pytest.fixture(scope="session")
+def real_data() -> Callable[[str], Path]:
+    """``real_data("quito")``: the folder of a real data set, or a skip that says where it is not."""
+    base = Path(os.environ.get("PILOT_DATA", ROOT.parent / "shared" / "data"))
+
+    def folder(name: str) -> Path:
+        if not (base / name).is_dir():
+            pytest.skip(f"real data set {name!r} is not in {base} (set PILOT_DATA)")
+        return base / name
+
+    return folder
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Skip what needs a missing part, with the reason."""
+    home = os.environ.get("ARDUPILOT_HOME")
+    path = os.pathsep.join(p for p in (home, os.environ.get("PATH")) if p)
+    if shutil.which("arducopter", path=path) is None:
+        reason = pytest.mark.skip(reason="no arducopter on PATH or in ARDUPILOT_HOME")
+        for item in items:
+            if item.get_closest_marker("sitl"):
+                item.add_marker(reason)
