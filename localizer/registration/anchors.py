@@ -1,0 +1,120 @@
+"""Selection of the geo-anchors of a reference view (paper, Eq. 1; docs/registration.md, section 2)."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from localizer.pose import Array
+from localizer.registration.backend import sample_bilinear
+from localizer.types import Anchors, FeatureLevel, FeaturePyramid, Float32, RenderedView
+
+_CANDIDATE_STEP = 2  # px; one candidate per 2 x 2 pixels is finer than the finest feature level
+_BORDER_SHARE = 0.02  # of the image's shorter side, where features see the padding
+_MAX_CURVATURE = 0.01  # second difference of 1/depth relative to 1/depth; 0 on any plane
+_EDGE_RADIUS = 2  # px around a depth edge or hole
+_GRADIENT_FLOOR = 0.05  # of the view's largest gradient: flat pixels stay possible
+
+
+def select_anchors(
+    view: RenderedView, features: FeaturePyramid, count: int = 500, seed: int = 0
+) -> Anchors:
+    """At most `count` anchors: confident, textured, spread over the image, off depth edges.
+
+    They are drawn by importance (confidence times feature gradient) within equal cells, so that
+    every part of the view is represented, and come in Morton order, so that neighbours in the list
+    are neighbours in every feature map. The same seed gives the same anchors. A view without
+    usable depth gives fewer or none; `JNGO` then says TOO_FEW_ANCHORS.
+    """
+    rows, columns = _candidates(view.depth)
+    importance = _importance(features, view.depth.shape)[rows, columns]
+    usable = np.isfinite(importance) & (importance > 0)
+    rows, columns, importance = rows[usable], columns[usable], importance[usable]
+    picked = _stratified(rows, columns, importance, view.depth.shape, count, seed)
+    rows, columns = rows[picked], columns[picked]
+    order = np.argsort(_morton(columns, rows), kind="stable")
+    rows, columns = rows[order], columns[order]
+    pixels = np.stack([columns + 0.5, rows + 0.5], axis=1)
+    points = view.world_from_camera.apply(
+        view.camera.rays(pixels) * view.depth[rows, columns, None].astype(np.float64)
+    )
+    return Anchors(
+        points,
+        pixels.astype(np.float32),
+        tuple(_sample(level, level.features, pixels) for level in features.levels),
+        tuple(_sample(level, level.confidence, pixels) for level in features.levels),
+    )
+
+
+def _candidates(depth: Float32) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Rows and columns of a pixel grid where the surface is smooth and present."""
+    hole = ~(np.isfinite(depth) & (depth > 0))
+    inverse = np.where(hole, 0.0, 1.0 / np.maximum(depth, 1e-3)).astype(np.float32)
+    edge = np.zeros(depth.shape, dtype=bool)
+    # On a plane, 1/depth is linear in the pixel whatever the slant, so a grazing road is no edge.
+    limit = _MAX_CURVATURE * inverse
+    edge[:, 1:-1] |= (
+        np.abs(inverse[:, 2:] - 2 * inverse[:, 1:-1] + inverse[:, :-2]) > limit[:, 1:-1]
+    )
+    edge[1:-1] |= np.abs(inverse[2:] - 2 * inverse[1:-1] + inverse[:-2]) > limit[1:-1]
+    size = 2 * _EDGE_RADIUS + 1
+    bad = cv2.dilate((edge | hole).astype(np.uint8), np.ones((size, size), np.uint8)) > 0
+    border = max(2, round(_BORDER_SHARE * min(depth.shape)))
+    bad[:border], bad[-border:], bad[:, :border], bad[:, -border:] = True, True, True, True
+    rows, columns = np.nonzero(~bad[::_CANDIDATE_STEP, ::_CANDIDATE_STEP])
+    return rows * _CANDIDATE_STEP, columns * _CANDIDATE_STEP
+
+
+def _importance(features: FeaturePyramid, shape: tuple[int, ...]) -> Array:
+    """Product over levels of confidence and gradient norm, geometric mean, at every pixel."""
+    total = np.zeros(shape, dtype=np.float32)
+    for level in features.levels:
+        f = level.features
+        dx, dy = f[:, 2:] - f[:, :-2], f[2:] - f[:-2]
+        norm2 = np.zeros(f.shape[:2], dtype=np.float32)
+        norm2[:, 1:-1] += np.einsum("hwc,hwc->hw", dx, dx)
+        norm2[1:-1] += np.einsum("hwc,hwc->hw", dy, dy)
+        gradient = np.sqrt(norm2)
+        value = level.confidence * (gradient + _GRADIENT_FLOOR * gradient.max())
+        log = np.log(np.maximum(value, 1e-12)).astype(np.float32)
+        total += cv2.resize(log, (shape[1], shape[0]), interpolation=cv2.INTER_LINEAR)
+    importance: Array = np.exp(total / len(features.levels))
+    return importance
+
+
+def _stratified(
+    rows: NDArray[np.int64],
+    columns: NDArray[np.int64],
+    importance: Array,
+    shape: tuple[int, ...],
+    count: int,
+    seed: int,
+) -> NDArray[np.int64]:
+    """Indices of `count` candidates: the cells' first draws, then their second, and so on."""
+    rng = np.random.default_rng(seed)
+    # Gumbel noise on the logarithm turns sorting into sampling in proportion to importance.
+    key = np.log(importance) + rng.gumbel(size=len(importance))
+    side = np.sqrt(shape[0] * shape[1] / max(count, 1))
+    across = int(np.ceil(shape[1] / side))
+    cell = (rows // side).astype(np.int64) * across + (columns // side).astype(np.int64)
+    order = np.lexsort((-key, cell))
+    first = np.r_[True, np.diff(cell[order]) != 0] if len(order) else np.zeros(0, bool)
+    start = np.maximum.accumulate(np.where(first, np.arange(len(order)), 0))
+    rank = np.arange(len(order)) - start
+    chosen: NDArray[np.int64] = order[np.lexsort((-key[order], rank))[:count]]
+    return chosen
+
+
+def _morton(x: NDArray[np.int64], y: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Z-order code: the bits of x and y interleaved."""
+    code = np.zeros(len(x), dtype=np.int64)
+    for bit in range(16):
+        code |= ((x >> bit) & 1) << (2 * bit) | ((y >> bit) & 1) << (2 * bit + 1)
+    return code
+
+
+def _sample(level: FeatureLevel, values: Float32, pixels: Array) -> Float32:
+    uv = pixels / level.stride - 0.5
+    sampled = sample_bilinear(values, uv[:, 0], uv[:, 1])
+    return np.ascontiguousarray(sampled, dtype=np.float32)

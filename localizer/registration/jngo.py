@@ -1,0 +1,297 @@
+"""JNGO: registers a query image against one reference view (paper, section 3.3.2 and A.2).
+
+Hypotheses about the prior are refined coarse to fine by Levenberg-Marquardt, pruned between levels
+by successive halving, scored after the last step, and selected with the motion term of Eq. 10.
+docs/registration.md is the specification.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import BaseModel, ConfigDict, Field
+
+from localizer.camera import Camera
+from localizer.pose import Array, Pose
+from localizer.registration.backend import (
+    Backend,
+    LevelProblem,
+    LMSettings,
+    QuadraticPrior,
+    camera_from_local,
+    level_problems,
+    local_origin,
+    world_from_camera,
+)
+from localizer.registration.covariance import (
+    mode_spread,
+    pose_covariance,
+    pose_difference,
+    tangent_covariance,
+)
+from localizer.registration.hypotheses import generate_hypotheses
+from localizer.registration.kernel_numba import NumbaBackend
+from localizer.registration.reference import Linearization, ReferenceBackend, linearize
+from localizer.types import Anchors, FeaturePyramid, PosePrior, RegistrationStatus
+
+_PROBES = 12  # anchors whose projections tell hypotheses apart
+
+
+class JNGOConfig(BaseModel):
+    """The optimizer's settings; the defaults are the paper's where it gives them."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    hypotheses: int = Field(144, ge=1, description="size M of the swarm")
+    box_deg: float = Field(11.0, gt=0, description="largest pitch and yaw perturbation")
+    translation_sigma_m: float = Field(1.0, ge=0, description="largest sigma of the perturbation")
+    spread_sigmas: float = Field(2.2, gt=0, description="grid half-width in prior sigmas")
+    iterations: tuple[int, ...] = Field((2, 3, 4), description="LM steps per level, coarse to fine")
+    keep: tuple[int, ...] = Field((32, 8), description="survivors after each level but the last")
+    polish: int = Field(6, ge=0, description="further finest-level LM steps on the best hypothesis")
+    distinct_px: float = Field(0.25, ge=0, description="least rms distance of survivors, level px")
+    huber: float = Field(0.5, gt=0, description="Huber threshold on the residual norm")
+    damping: float = Field(0.03, gt=0, description="first Marquardt factor")
+    min_overlap: float = Field(0.25, gt=0, le=1, description="least share of anchors in view")
+    min_anchors: int = Field(50, ge=6, description="anchors below which nothing is tried")
+    motion_weight: float = Field(0.04, ge=0, description="lambda of Eq. 10, in best costs per d²")
+    prior_weight: float = Field(0.04, ge=0, description="weight of priors given as residuals")
+    correlation: float = Field(8.0, gt=0, description="covariance factor for correlated features")
+    covariance_floor: float = Field(0.05, ge=0, description="least share of the isotropic model")
+    max_sigma_m: float = Field(50.0, gt=0, description="position sigma that counts as no texture")
+
+    @property
+    def settings(self) -> LMSettings:
+        """What the backends need of it."""
+        return LMSettings(self.huber, self.damping, min_overlap=self.min_overlap)
+
+
+@dataclass(frozen=True)
+class Registration:
+    """A registered pose, or the prior's with the reason why not.
+
+    covariance: (6, 6) as `PosePrior`'s. score: mean robust cost, lower is better, inf on failure.
+    overlap: share of the anchors in view. quality: 0 (no better than chance) to 1. modes: distinct
+    surviving poses. evaluations: cost evaluations spent.
+    """
+
+    world_from_camera: Pose
+    covariance: Array
+    score: float
+    overlap: float
+    quality: float
+    status: RegistrationStatus
+    modes: int
+    evaluations: int
+
+
+class JNGO:
+    """The optimizer. Keeps its worker threads and scratch memory between frames."""
+
+    def __init__(
+        self, config: JNGOConfig | None = None, backend: str = "numba", threads: int = 2
+    ) -> None:
+        self.config = config or JNGOConfig()
+        self.backend = make_backend(backend, threads)
+
+    def register(
+        self,
+        query: FeaturePyramid,
+        camera: Camera,
+        anchors: Anchors,
+        prior: PosePrior,
+        *,
+        motion: PosePrior | None = None,
+        constraint: QuadraticPrior | None = None,
+        seed: int = 0,
+    ) -> Registration:
+        """Pose of the query's camera, a pinhole of the query image's size.
+
+        prior: centre and spread of the swarm. motion: the Kalman prediction of Eq. 10, None before
+        there is one. constraint: attitude, height or position knowledge (`priors`). Deterministic
+        for a seed.
+        """
+        status = _input_status(query, anchors, self.config)
+        if status is not RegistrationStatus.OK:
+            return _failure(prior, status)
+        origin = local_origin(anchors, prior.world_from_camera)
+        problems = level_problems(query, camera, anchors, origin, constraint)
+        swarm = self._refine(problems, origin, prior, motion, seed)
+        if not np.isfinite(swarm.scores[0]):
+            return _failure(prior, RegistrationStatus.NO_OVERLAP, swarm.evaluations)
+        return self._result(problems[-1], origin, prior, swarm)
+
+    def _refine(
+        self,
+        problems: tuple[LevelProblem, ...],
+        origin: Array,
+        prior: PosePrior,
+        motion: PosePrior | None,
+        seed: int,
+    ) -> _Swarm:
+        c = self.config
+        poses = generate_hypotheses(
+            prior, c.hypotheses, c.box_deg, c.translation_sigma_m, c.spread_sigmas, seed
+        )
+        R, t = camera_from_local(poses, origin)
+        keep = (*c.keep[: len(problems) - 1], c.hypotheses)
+        evaluations = 0
+        for problem, iterations, survivors in zip(problems, c.iterations, keep, strict=True):
+            result = self.backend.refine(problem, R, t, iterations, c.settings)
+            evaluations += result.evaluations
+            totals = self._totals(
+                result.rotations, result.translations, result.scores, origin, motion
+            )
+            order = _distinct(problem, result.rotations, result.translations, totals, c.distinct_px)
+            order = order[:survivors]
+            R, t = result.rotations[order], result.translations[order]
+            scores, overlaps = result.scores[order], result.overlaps[order]
+        if c.polish and np.isfinite(scores[0]):
+            result = self.backend.refine(problems[-1], R[:1], t[:1], c.polish, c.settings)
+            evaluations += result.evaluations
+            R[:1], t[:1] = result.rotations, result.translations
+            scores[:1], overlaps[:1] = result.scores, result.overlaps
+        return _Swarm(R, t, scores, overlaps, evaluations)
+
+    def _totals(
+        self, R: Array, t: Array, scores: Array, origin: Array, motion: PosePrior | None
+    ) -> Array:
+        """Eq. 10: photometric cost plus the squared Mahalanobis distance to the prediction."""
+        best = scores.min()
+        if motion is None or not np.isfinite(best) or self.config.motion_weight == 0:
+            return scores
+        information = np.linalg.pinv(motion.covariance, hermitian=True)
+        totals = scores.copy()
+        for m in np.flatnonzero(np.isfinite(scores)):
+            d = pose_difference(world_from_camera(R[m], t[m], origin), motion.world_from_camera)
+            totals[m] += self.config.motion_weight * best * (d @ information @ d)
+        return totals
+
+    def _result(
+        self, problem: LevelProblem, origin: Array, prior: PosePrior, swarm: _Swarm
+    ) -> Registration:
+        c = self.config
+        R, t = swarm.rotations[0], swarm.translations[0]
+        model = linearize(problem, R, t, c.settings)
+        tangent = tangent_covariance(model, c.correlation, c.covariance_floor)
+        if tangent is None:
+            return _failure(prior, RegistrationStatus.NO_TEXTURE, swarm.evaluations)
+        poses = [
+            world_from_camera(r, s, origin)
+            for r, s in zip(swarm.rotations, swarm.translations, strict=True)
+        ]
+        probabilities = self._mode_probabilities(swarm, problem.points.shape[1])
+        covariance = pose_covariance(tangent, R, t) + mode_spread(
+            poses[0], poses[1:], probabilities[1:]
+        )
+        if np.sqrt(np.linalg.eigvalsh(covariance[:3, :3])[-1]) > c.max_sigma_m:
+            return _failure(prior, RegistrationStatus.NO_TEXTURE, swarm.evaluations)
+        return Registration(
+            poses[0],
+            covariance,
+            float(swarm.scores[0]),
+            float(swarm.overlaps[0]),
+            _quality(problem, model, c.settings),
+            RegistrationStatus.OK,
+            int(np.isfinite(swarm.scores).sum()),
+            swarm.evaluations,
+        )
+
+    def _mode_probabilities(self, swarm: _Swarm, anchors: int) -> Array:
+        """Posterior weight (M,) of each surviving mode under independent feature noise."""
+        effective = anchors * swarm.overlaps[0] / self.config.correlation
+        best = max(swarm.scores[0], 1e-6)
+        excess = np.maximum(swarm.scores - swarm.scores[0], 0.0) / best
+        likelihood = np.exp(-0.5 * effective * excess)
+        probabilities: Array = likelihood / likelihood.sum()
+        return probabilities
+
+
+@dataclass(frozen=True)
+class _Swarm:
+    """Survivors of the last level, best first."""
+
+    rotations: Array
+    translations: Array
+    scores: Array
+    overlaps: Array
+    evaluations: int
+
+
+def make_backend(name: str, threads: int = 2) -> Backend:
+    """The backend called `name`: "numba" or "reference"."""
+    if name == "numba":
+        return NumbaBackend(threads)
+    if name == "reference":
+        return ReferenceBackend()
+    raise ValueError(f"no registration backend {name!r}: choose numba or reference")
+
+
+def _input_status(
+    query: FeaturePyramid, anchors: Anchors, config: JNGOConfig
+) -> RegistrationStatus:
+    levels = len(config.iterations)
+    if len(query.levels) != levels or len(anchors.features) != levels:
+        raise ValueError(
+            f"iterations {config.iterations} need {levels} feature levels, "
+            f"query has {len(query.levels)}, anchors have {len(anchors.features)}"
+        )
+    if len(anchors.points_world) < config.min_anchors:
+        return RegistrationStatus.TOO_FEW_ANCHORS
+    arrays = [anchors.points_world, *anchors.features, *anchors.confidence]
+    for level in query.levels:
+        arrays += [level.features, level.confidence]
+    # A sum is not finite when any term is not, and costs a tenth of isfinite().all().
+    if not all(np.isfinite(a.sum(dtype=np.float32)) for a in arrays):
+        return RegistrationStatus.BAD_FEATURES
+    return RegistrationStatus.OK
+
+
+def _failure(prior: PosePrior, status: RegistrationStatus, evaluations: int = 0) -> Registration:
+    return Registration(
+        prior.world_from_camera, prior.covariance, np.inf, 0.0, 0.0, status, 0, evaluations
+    )
+
+
+def _distinct(
+    problem: LevelProblem, R: Array, t: Array, totals: Array, distance_px: float
+) -> NDArray[np.int64]:
+    """Indices of finite hypotheses, best first, without those that repeat a better one.
+
+    Distance: rms over probe anchors of the distance between projections, in pixels of the level.
+    Without this the survivors would be many copies of one mode.
+    """
+    order = np.argsort(totals, kind="stable")
+    finite = order[np.isfinite(totals[order])]
+    if len(finite) < 2:
+        return order[:1]
+    probes = problem.points[:, :: max(1, problem.points.shape[1] // _PROBES)].astype(np.float64)
+    x = R[finite] @ probes + t[finite, :, None]
+    z = np.maximum(x[:, 2], 0.1)
+    uv = np.concatenate([problem.focal[0] * x[:, 0] / z, problem.focal[1] * x[:, 1] / z], axis=1)
+    kept: list[int] = []
+    limit = distance_px**2 * uv.shape[1] / 2
+    alive = np.ones(len(finite), dtype=bool)
+    for i in range(len(finite)):
+        if alive[i]:
+            kept.append(i)
+            alive &= ((uv - uv[i]) ** 2).sum(axis=1) > limit
+    return finite[kept]
+
+
+def _quality(problem: LevelProblem, model: Linearization, settings: LMSettings) -> float:
+    """1 - score / score of chance, where chance pairs each anchor with another's query feature."""
+    visible = np.flatnonzero(model.visible)
+    sampled = model.residuals[visible] + problem.anchor_features[visible]
+    others = np.roll(problem.anchor_features[visible], len(visible) // 2, axis=0)
+    weights = model.weights[visible]
+    norms = np.linalg.norm(sampled - others, axis=1)
+    delta = settings.huber
+    chance = weights @ np.where(norms <= delta, norms**2, 2 * delta * norms - delta**2)
+    chance /= max(weights.sum(), 1e-12)
+    norms = np.linalg.norm(model.residuals[visible], axis=1)
+    score = weights @ np.where(norms <= delta, norms**2, 2 * delta * norms - delta**2)
+    score /= max(weights.sum(), 1e-12)
+    return float(np.clip(1.0 - score / max(chance, 1e-12), 0.0, 1.0))
