@@ -1,15 +1,23 @@
-"""Named errors of the companion process."""
+"""Named errors of the companion: each says what is wrong, where, and what to do."""
 
 from __future__ import annotations
 
 
 class CompanionError(Exception):
-    """Base of every error that the companion process raises on purpose."""
+    """Base of every error that the companion raises on purpose."""
 
 
-class ConfigError(CompanionError):
-    """A configuration that cannot be read or does not hold; names file and key."""
+class StreamError(CompanionError):
+    """Base of everything that can be wrong with a camera feed."""
 
 
-class DetectionError(CompanionError):
-    """A datagram that is not a pixel detection."""
+class StreamOpenError(StreamError):
+    """A source that does not exist, cannot be opened, or is of an unknown kind."""
+
+
+class StreamSizeError(StreamError):
+    """A stream whose frames are of another size than the camera model says."""
+
+
+class StreamDecodeError(StreamError):
+    """An image or a video that is there but cannot be decoded."""

@@ -1,0 +1,45 @@
+"""The command line: ``companion run | eval | map | world | doctor``. Thin; the work is elsewhere."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+from typing import Annotated
+
+import typer
+from rich.console import Console
+
+from companion.errors import CompanionError
+from companion.eval_cli import evaluate_command
+from companion.map_cli import app as map_app
+from companion.run_cli import run_command
+from companion.world_cli import app as world_app
+from localizer.errors import LocalizerError
+from mavlink_bridge.errors import BridgeError
+
+app = typer.Typer(
+    no_args_is_help=True,
+    pretty_exceptions_enable=False,
+    help="GNSS-denied navigation from video and a geo-referenced 3D map.",
+)
+app.command("run")(run_command)
+app.command("eval")(evaluate_command)
+app.add_typer(map_app, name="map", help="Build and inspect tile caches.")
+app.add_typer(world_app, name="world", help="Generated worlds for tests and demos.")
+
+
+@app.command("doctor")
+def doctor_command(config: Annotated[Path, typer.Argument(help="deployment YAML")]) -> None:
+    """Check a deployment against the connected vehicle (parameters, clock, link, map)."""
+    from companion.doctor import doctor
+
+    raise typer.Exit(doctor(config))
+
+
+def main() -> None:
+    """Entry point: named errors become one clear line and exit code 2."""
+    try:
+        app()
+    except (CompanionError, LocalizerError, BridgeError) as error:
+        Console(stderr=True).print(f"[bold red]{type(error).__name__}[/]: {error}", soft_wrap=True)
+        sys.exit(2)

@@ -1,0 +1,137 @@
+"""``companion eval``: localize a recorded sequence and print the paper's Table 2 columns."""
+
+from __future__ import annotations
+
+import csv
+import json
+from pathlib import Path
+from typing import Annotated
+
+import typer
+from rich.console import Console
+from rich.progress import track
+from rich.table import Table
+
+from companion.build import MapStack, build_localizer
+from companion.errors import ConfigError
+from companion.plots import ErrorSeries, overlay_sheet, plot_errors, save_image
+from companion.versions import versions
+from localizer.config import LocalizerConfig
+from localizer.evaluation import (
+    EvaluatedFrame,
+    Perturbation,
+    PriorMode,
+    Sequence,
+    csv_rows,
+    evaluate,
+    load_sequence,
+)
+from localizer.features.extractor import load_extractor
+from localizer.geo import LocalFrame
+from localizer.metrics import LocalizationMetrics
+from localizer.pipeline import Undistorter
+
+_OVERLAYS = 4
+
+
+def evaluate_command(
+    sequence: Annotated[Path, typer.Argument(help="folder: images/, poses.txt, camera.json")],
+    map_cache: Annotated[Path, typer.Option("--map", help="tile cache")],
+    report: Annotated[Path, typer.Option(help="folder of the report")] = Path("report/eval"),
+    name: Annotated[str | None, typer.Option(help="which sequence of a PiLoT data set")] = None,
+    prior: Annotated[str, typer.Option(help="first: one prior; each: one per frame")] = "first",
+    seed: Annotated[int, typer.Option(min=0, help="seed of the prior's noise")] = 0,
+    noise_m: Annotated[float, typer.Option(min=0, help="prior noise up to, m")] = 10.0,
+    noise_deg: Annotated[float, typer.Option(min=0, help="prior noise up to, degrees")] = 10.0,
+    width: Annotated[int, typer.Option(min=64, max=2048, help="working width, pixels")] = 320,
+    model: Annotated[Path | None, typer.Option(help="ONNX feature network")] = None,
+    limit: Annotated[int | None, typer.Option(min=1, help="only the first N frames")] = None,
+) -> None:
+    """Localize every frame of a recorded sequence from a perturbed prior and measure it."""
+    if prior not in ("first", "each"):
+        raise ConfigError(f"--prior is first or each, not {prior!r}")
+    mode: PriorMode = "first" if prior == "first" else "each"
+    config = LocalizerConfig(width=width, model=model, seed=seed, feature_threads=2)
+    stack = MapStack(map_cache, config)
+    try:
+        data = _limited(load_sequence(sequence, stack.cache.frame, name), limit)
+        localizer = build_localizer(stack, data.camera, config)
+        bar = iter(track(range(len(data.images)), description="localizing"))
+        frames, metrics = evaluate(
+            localizer,
+            data,
+            Perturbation(noise_m, noise_deg, seed),
+            mode,
+            progress=lambda _: next(bar, None),
+        )
+        next(bar, None)
+        settings = {
+            "sequence": str(sequence), "map": str(map_cache), "prior": prior, "seed": seed,
+            "noise_m": noise_m, "noise_deg": noise_deg, "width": localizer.camera.width,
+            "height": localizer.camera.height, "features": load_extractor(model).name,
+        }  # fmt: skip
+        _write_report(report, frames, metrics, settings, stack.cache.frame)
+        _write_overlays(report, frames, data, localizer.camera.width)
+    finally:
+        stack.close()
+    print_metrics(metrics, str(sequence))
+
+
+def _limited(data: Sequence, limit: int | None) -> Sequence:
+    return data if limit is None else Sequence(data.images[:limit], data.truth[:limit], data.camera)
+
+
+def print_metrics(metrics: LocalizationMetrics, title: str) -> None:
+    """The columns of the paper's Table 2."""
+    table = Table(title=title)
+    for column in ("frames", "Med m", "Med °", "R@1", "R@3", "R@5", "Comp. %", "FPS"):
+        table.add_column(column, justify="right")
+    m = metrics
+    table.add_row(
+        str(m.frames), f"{m.median_translation_m:.2f}", f"{m.median_rotation_deg:.3f}",
+        f"{m.recall_1:.1f}", f"{m.recall_3:.1f}", f"{m.recall_5:.1f}",
+        f"{m.completeness:.1f}", f"{m.fps:.1f}",
+    )  # fmt: skip
+    Console().print(table)
+
+
+def _write_report(
+    folder: Path,
+    frames: list[EvaluatedFrame],
+    metrics: LocalizationMetrics,
+    settings: dict[str, object],
+    local: LocalFrame,
+) -> None:
+    folder.mkdir(parents=True, exist_ok=True)
+    report = metrics.to_dict() | {"settings": settings, "versions": versions()}
+    (folder / "report.json").write_text(json.dumps(report, indent=2))
+    rows = list(csv_rows(frames, local))
+    with (folder / "frames.csv").open("w", newline="", encoding="utf-8") as file:
+        writer = csv.DictWriter(file, rows[0].keys())
+        writer.writeheader()
+        writer.writerows(rows)
+
+
+def _write_overlays(
+    folder: Path, frames: list[EvaluatedFrame], data: Sequence, width: int
+) -> None:
+    import numpy as np
+
+    index = np.unique(np.linspace(0, len(frames) - 1, _OVERLAYS).astype(int))
+    for i in index:
+        frame = data.frame(int(i))
+        view = frames[i].bundle.view
+        video = Undistorter(data.camera, view.camera)(frame)
+        caption = (
+            f"{frames[i].name}: {frames[i].translation_error_m:.2f} m "
+            f"{frames[i].rotation_error_deg:.2f} deg, reference at the prediction"
+        )
+        save_image(folder / f"overlay-{i:04d}.png", overlay_sheet(video, view.rgb, caption))
+    number = np.arange(len(frames), dtype=np.float64)
+    plot_errors(
+        folder / "errors.png",
+        [
+            ErrorSeries("position", number, np.array([f.translation_error_m for f in frames]), "m"),
+            ErrorSeries("rotation", number, np.array([f.rotation_error_deg for f in frames]), "°"),
+        ],
+    )

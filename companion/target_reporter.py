@@ -1,0 +1,129 @@
+"""Detections and estimates of the same frame become target coordinates, on a thread of its own."""
+
+from __future__ import annotations
+
+import logging
+import threading
+from collections import deque
+from collections.abc import Callable
+from dataclasses import dataclass
+
+from companion.config import TargetConfig
+from companion.detections import Detection
+from localizer.pose import Array
+from localizer.targets import SurfacePoint, TargetFilter, ray_in_world, target_covariance
+from localizer.types import PoseEstimate, TargetFix
+
+_log = logging.getLogger(__name__)
+_KEPT = 64
+_MATCH_NS = 5_000_000  # detection and estimate must be of the same frame
+
+RayCaster = Callable[[Array, Array], "SurfacePoint | None"]
+
+
+@dataclass(frozen=True)
+class Target:
+    """A filtered fix. velocity: (3,) m/s, world axes."""
+
+    fix: TargetFix
+    velocity: Array
+    estimate: PoseEstimate
+
+
+class TargetReporter:
+    """Pairs detections with accepted estimates, casts the ray, filters, and hands the target on.
+
+    cast: origin (3,), unit direction (3,) in the map frame to the surface point, or None.
+    """
+
+    def __init__(
+        self, config: TargetConfig, cast: RayCaster, on_target: Callable[[Target], None]
+    ) -> None:
+        self._config = config
+        self._cast = cast
+        self._on_target = on_target
+        self._estimates: deque[PoseEstimate] = deque(maxlen=_KEPT)
+        self._detections: deque[Detection] = deque(maxlen=_KEPT)
+        self._filters: dict[str, TargetFilter] = {}
+        self._reported_ns: dict[str, int] = {}
+        self._condition = threading.Condition()
+        self._stopping = False
+        self.missed = 0
+        self._thread = threading.Thread(target=self._run, name="targets")
+
+    def start(self) -> None:
+        """Start the thread."""
+        self._thread.start()
+
+    def stop(self) -> None:
+        """Stop the thread."""
+        with self._condition:
+            self._stopping = True
+            self._condition.notify()
+        self._thread.join()
+
+    def add_estimate(self, estimate: PoseEstimate) -> None:
+        """Offer an estimate; only accepted ones are used. Never blocks."""
+        if estimate.accepted:
+            with self._condition:
+                self._estimates.append(estimate)
+                self._condition.notify()
+
+    def add_detection(self, detection: Detection) -> None:
+        """Offer a detection; it waits for its frame's estimate. Never blocks."""
+        with self._condition:
+            self._detections.append(detection)
+            self._condition.notify()
+
+    def _run(self) -> None:
+        while True:
+            with self._condition:
+                pairs = self._take_pairs()
+                if not pairs and not self._stopping:
+                    self._condition.wait(0.5)
+                    pairs = self._take_pairs()
+                if self._stopping:
+                    return
+            for detection, estimate in pairs:
+                try:
+                    self._locate(detection, estimate)
+                except Exception:  # a target must not end the flight
+                    _log.exception("target %s could not be located", detection.target_id)
+
+    def _take_pairs(self) -> list[tuple[Detection, PoseEstimate]]:
+        """Detections whose frame has an estimate; the rest wait until newer frames pass them."""
+        pairs, waiting = [], []
+        newest = self._estimates[-1].exposure_time_ns if self._estimates else 0
+        for detection in self._detections:
+            estimate = self._match(detection)
+            if estimate is not None:
+                pairs.append((detection, estimate))
+            elif detection.time_ns > newest - _MATCH_NS:
+                waiting.append(detection)
+        self._detections = deque(waiting, maxlen=_KEPT)
+        return pairs
+
+    def _match(self, detection: Detection) -> PoseEstimate | None:
+        for estimate in reversed(self._estimates):
+            if abs(estimate.exposure_time_ns - detection.time_ns) <= _MATCH_NS:
+                return estimate
+        return None
+
+    def _locate(self, detection: Detection, estimate: PoseEstimate) -> None:
+        last = self._reported_ns.get(detection.target_id, 0)
+        if estimate.exposure_time_ns - last < 0.9e9 / self._config.rate_hz:
+            return
+        pixel = (detection.u, detection.v)
+        hit = self._cast(*ray_in_world(estimate, pixel))
+        if hit is None:
+            self.missed += 1
+            return
+        self._reported_ns[detection.target_id] = estimate.exposure_time_ns
+        covariance = target_covariance(
+            estimate, hit, self._config.pixel_sigma, self._config.map_sigma_m
+        )
+        time_ns = estimate.exposure_time_ns
+        raw = TargetFix(detection.target_id, hit.position, covariance, pixel, time_ns)
+        target_filter = self._filters.setdefault(detection.target_id, TargetFilter())
+        fix = target_filter.update(raw)
+        self._on_target(Target(fix, target_filter.velocity, estimate))

@@ -1,0 +1,36 @@
+"""``companion world build``: generated worlds."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated, Literal
+
+import typer
+from rich.console import Console
+
+app = typer.Typer(no_args_is_help=True)
+
+
+@app.callback()
+def _group() -> None:
+    """Keep ``build`` a subcommand although it is the only one."""
+
+
+@app.command("build")
+def build(
+    out: Annotated[Path, typer.Option(help="folder of the tileset")],
+    seed: Annotated[int, typer.Option(min=0, help="which world")] = 0,
+    variant: Annotated[
+        str, typer.Option(help="survey: as a map shows it; live: another day and season")
+    ] = "survey",
+    size: Annotated[float, typer.Option(min=200, max=4000, help="side length, m")] = 1600.0,
+) -> None:
+    """Generate a world and write it as a 3D Tiles 1.1 tileset."""
+    from localizer.synth.world import build_world
+
+    if variant not in ("survey", "live"):
+        raise typer.BadParameter(f"variant is survey or live, not {variant!r}")
+    chosen: Literal["survey", "live"] = "survey" if variant == "survey" else "live"
+    with Console().status(f"building world {seed} ({variant})"):
+        info = build_world(seed, out, variant=chosen, size_m=size)
+    Console().print(f"[green]{out}/tileset.json[/]: world {seed}, {info.size_m:.0f} m a side")

@@ -1,0 +1,63 @@
+import socket
+import time
+
+import pytest
+
+from companion.detections import (
+    Detection,
+    DetectionListener,
+    encode_detection,
+    parse_detection,
+    parse_host_port,
+)
+from companion.errors import ConfigError, DetectionError
+
+
+def test_round_trip():
+    detection = Detection("car", 123456789, 320.5, 200.25)
+    assert parse_detection(encode_detection(detection)) == detection
+
+
+@pytest.mark.parametrize(
+    "data",
+    [
+        b"",
+        b"{",
+        b"[]",
+        b"\xff\xfe",
+        b'{"target_id": "a", "time_ns": 1, "u": 1}',
+        b'{"target_id": "a", "time_ns": "x", "u": 1, "v": 2}',
+        b'{"target_id": "a", "time_ns": 1, "u": NaN, "v": 2}',
+        b'{"target_id": "", "time_ns": 1, "u": 1, "v": 2}',
+        b'{"target_id": "' + b"a" * 100 + b'", "time_ns": 1, "u": 1, "v": 2}',
+        b"[" * 1500,
+    ],
+)
+def test_bad_datagrams_are_named(data):
+    with pytest.raises(DetectionError):
+        parse_detection(data)
+
+
+@pytest.mark.parametrize("text", ["", "5600", "host", "host:", "host:0", "host:99999", ":1"])
+def test_bad_addresses_are_named(text):
+    with pytest.raises(ConfigError):
+        parse_host_port(text)
+
+
+def test_listener_survives_garbage():
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
+        probe.bind(("127.0.0.1", 0))
+        port = probe.getsockname()[1]
+    got: list[Detection] = []
+    listener = DetectionListener(f"127.0.0.1:{port}", got.append)
+    try:
+        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sender:
+            sender.sendto(b"garbage", ("127.0.0.1", port))
+            sender.sendto(encode_detection(Detection("a", 1, 2.0, 3.0)), ("127.0.0.1", port))
+        deadline = time.monotonic() + 5
+        while not got and time.monotonic() < deadline:
+            time.sleep(0.01)
+    finally:
+        listener.close()
+    assert got == [Detection("a", 1, 2.0, 3.0)]
+    assert listener.rejected == 1

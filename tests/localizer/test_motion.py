@@ -1,0 +1,64 @@
+import numpy as np
+import pytest
+
+from localizer import motion
+from localizer.motion import MotionConfig
+from localizer.pose import Pose, so3_exp
+from localizer.types import PosePrior
+
+CONFIG = MotionConfig()
+SECOND = 1_000_000_000
+
+
+def _prior(sigma: float = 1.0) -> PosePrior:
+    return PosePrior(Pose.identity(), np.eye(6) * sigma**2, 0)
+
+
+def test_filter_learns_a_constant_velocity_and_turn_rate():
+    velocity, rate = np.array([8.0, -3.0, 1.0]), np.array([0.0, 0.1, 0.3])
+    state = motion.start(_prior(), CONFIG)
+    for k in range(1, 31):
+        t = 0.1 * k
+        pose = Pose(so3_exp(rate * t), velocity * t)
+        state = motion.update(state, pose, np.eye(6) * 1e-4, round(t * SECOND), CONFIG)
+    ahead = motion.predict(state, round(3.5 * SECOND), CONFIG)
+    truth = Pose(so3_exp(rate * 3.5), velocity * 3.5)
+    translation, rotation = truth.distance_to(ahead.prior.world_from_camera)
+    assert translation < 0.05
+    assert rotation < 0.1
+    np.testing.assert_allclose(state.velocity, velocity, atol=0.05)
+
+
+def test_prediction_grows_the_covariance_and_leaves_the_state_alone():
+    state = motion.start(_prior(), CONFIG)
+    before = state.covariance.copy()
+    ahead = motion.predict(state, SECOND, CONFIG)
+    assert np.trace(ahead.covariance) > np.trace(before)
+    np.testing.assert_array_equal(state.covariance, before)
+    assert np.linalg.eigvalsh(ahead.covariance).min() > 0
+
+
+def test_filtered_errors_match_the_filters_own_covariance():
+    """NEES over many runs: the mean of chi² with 6 degrees of freedom is 6."""
+    rng = np.random.default_rng(1)
+    nees = []
+    for _ in range(60):
+        velocity = rng.normal(0, 5, 3)
+        state = motion.start(_prior(3.0), CONFIG)
+        truth = Pose.identity()
+        for k in range(1, 40):
+            dt = 0.1
+            velocity = velocity + rng.normal(0, CONFIG.acceleration_sigma, 3) * dt
+            truth = Pose(truth.rotation, truth.translation + velocity * dt)
+            noise = rng.normal(0, [0.3] * 3 + [0.005] * 3)
+            seen = Pose(so3_exp(noise[3:]) @ truth.rotation, truth.translation + noise[:3])
+            R = np.diag([0.09] * 3 + [0.005**2] * 3)
+            state = motion.update(state, seen, R, round(k * dt * SECOND), CONFIG)
+        nees.append(motion.mahalanobis_squared(state.prior, truth))
+    # The rotation never accelerates here, so its part is conservative.
+    assert 2.0 < np.mean(nees) < 8.0
+
+
+def test_mahalanobis_counts_sigmas():
+    moved = Pose(np.eye(3), np.array([3.0, 0.0, 0.0]))
+    assert motion.mahalanobis_squared(_prior(), moved) == pytest.approx(9.0)
