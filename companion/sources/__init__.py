@@ -1,0 +1,57 @@
+"""Camera feeds: UDP MPEG-TS, RTSP, V4L2 devices, video files and image folders."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from companion.errors import StreamOpenError
+from companion.sources.av_source import LiveVideoSource, VideoFileSource
+from companion.sources.base import (
+    FrameSource,
+    SourceCounters,
+    SourceSettings,
+    StateCallback,
+    StreamState,
+)
+from companion.sources.folder_source import FolderSource
+from localizer.camera import Camera
+
+__all__ = [
+    "FolderSource",
+    "FrameSource",
+    "LiveVideoSource",
+    "SourceCounters",
+    "SourceSettings",
+    "StateCallback",
+    "StreamState",
+    "VideoFileSource",
+    "open_source",
+]
+
+_LIVE = ("udp://", "rtsp://", "v4l2://", "/dev/")
+
+
+def open_source(
+    location: str | Path,
+    camera: Camera,
+    settings: SourceSettings | None = None,
+    on_state: StateCallback | None = None,
+) -> FrameSource:
+    """The feed at `location`: ``udp://host:port``, ``rtsp://...``, ``/dev/videoN`` (or
+    ``v4l2:///dev/videoN``), a video file, or a folder of images.
+
+    Raises `StreamOpenError` for what is not there. A live stream may come later.
+    """
+    text = str(location)
+    if text.startswith(_LIVE):
+        return LiveVideoSource(text, camera, settings, on_state)
+    if "://" in text:
+        raise StreamOpenError(
+            f"{text}: unknown kind of source; use udp://, rtsp://, /dev/videoN, a file or a folder"
+        )
+    path = Path(location)
+    if path.is_dir():
+        return FolderSource(path, camera, settings, on_state)
+    if path.is_file():
+        return VideoFileSource(path, camera, settings, on_state)
+    raise StreamOpenError(f"{path}: no such file or folder")

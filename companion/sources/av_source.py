@@ -1,0 +1,369 @@
+"""Video through PyAV: files, UDP MPEG-TS, RTSP and V4L2 devices."""
+
+from __future__ import annotations
+
+import logging
+import threading
+import time
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import av
+import numpy as np
+from av.sidedata.sidedata import Type as SideDataType
+
+from companion.errors import StreamDecodeError, StreamError, StreamOpenError
+from companion.sources.base import (
+    SourceCounters,
+    SourceSettings,
+    StateCallback,
+    StreamState,
+    check_size,
+)
+from companion.sources.misp import MispTime, parse_message
+from companion.sources.slot import NewestSlot
+from companion.sources.timing import ExposureClock, Stamps
+from localizer.camera import Camera
+from localizer.types import Frame, Image
+
+_log = logging.getLogger(__name__)
+
+_RETRY_FIRST_S = 0.25
+_OPEN_TIMEOUT_S = 3.0  # a joining receiver has to see one key frame with its headers
+_LOW_DELAY = 0x80000  # AV_CODEC_FLAG_LOW_DELAY: hand a picture out at once, not in display order
+
+
+@dataclass(frozen=True)
+class _Input:
+    """How FFmpeg opens a location."""
+
+    url: str
+    options: dict[str, str]
+    format: str | None = None
+    device: bool = False
+
+
+class _Decoder:
+    """One open container: packets in, pictures out. Single-threaded, because FFmpeg's frame threads
+    add a frame of delay each.
+    """
+
+    def __init__(self, source: _Input, read_timeout_s: float | None) -> None:
+        timeout = None if read_timeout_s is None else (_OPEN_TIMEOUT_S, read_timeout_s)
+        self._container = av.open(
+            source.url, format=source.format, options=source.options, timeout=timeout
+        )
+        if not self._container.streams.video:
+            self._container.close()
+            raise StreamOpenError(f"{source.url}: has no video stream; give a video")
+        self.stream = self._container.streams.video[0]
+        context = self.stream.codec_context
+        context.thread_count = 1
+        if read_timeout_s is not None:
+            context.flags |= _LOW_DELAY
+
+    def pictures(self) -> Iterator[tuple[av.VideoFrame | None, int]]:
+        """(picture, arrival time in ns) per picture, (None, time) per packet that gave none."""
+        for packet in self._container.demux(self.stream):
+            arrival_ns = time.monotonic_ns()
+            try:
+                pictures = packet.decode()
+            except av.error.InvalidDataError:
+                pictures = []
+            whole = [p for p in pictures if not p.is_corrupt]
+            for picture in whole:
+                yield picture, arrival_ns
+            if not whole and packet.size:
+                yield None, arrival_ns
+
+    def close(self) -> None:
+        self._container.close()
+
+
+class VideoFileSource:
+    """Every picture of a video file, in order; exposure times are now plus presentation time."""
+
+    def __init__(
+        self,
+        path: Path,
+        camera: Camera,
+        settings: SourceSettings | None = None,
+        on_state: StateCallback | None = None,
+    ) -> None:
+        if not path.is_file():
+            raise StreamOpenError(f"{path}: no such video file")
+        self._path = path
+        self._camera = camera
+        self._settings = settings or SourceSettings()
+        self._on_state = on_state
+        self._closed = threading.Event()
+        self._counters = SourceCounters()
+        self._state = StreamState.IDLE
+        self._to_rgb = av.video.reformatter.VideoReformatter()
+
+    @property
+    def counters(self) -> SourceCounters:
+        """Received is delivered here: nothing is dropped."""
+        return self._counters
+
+    @property
+    def state(self) -> StreamState:
+        """Idle, live, ended, failed or closed."""
+        return self._state
+
+    def frames(self) -> Iterator[Frame]:
+        """Every picture; raises `StreamDecodeError` when the file holds none."""
+        try:
+            decoder = _Decoder(_Input(str(self._path), {}), None)
+        except av.error.FFmpegError as error:
+            raise StreamOpenError(
+                f"{self._path}: not a video, or damaged from the start: {error}"
+            ) from error
+        self._report(StreamState.LIVE, f"{self._path}: playing")
+        try:
+            yield from self._play(decoder)
+        except StreamError as error:
+            self._report(StreamState.FAILED, str(error))
+            raise
+        finally:
+            decoder.close()
+
+    def close(self) -> None:
+        """Ends `frames` after the present picture."""
+        self._closed.set()
+        self._report(StreamState.CLOSED, f"{self._path}: closed")
+
+    def _play(self, decoder: _Decoder) -> Iterator[Frame]:
+        start = time.monotonic_ns()
+        first: int | None = None
+        for picture in self._readable(decoder):
+            check_size(picture.width, picture.height, self._camera, str(self._path))
+            pts = self._pts_ns(picture, decoder)
+            first = pts if first is None else first
+            offset = pts - first
+            if self._settings.realtime:
+                self._closed.wait((start + offset - time.monotonic_ns()) / 1e9)
+            if self._closed.is_set():
+                return
+            n = self._counters.delivered
+            frame = Frame(_rgb(picture, self._to_rgb), start + offset, self._camera, n)
+            self._counters = replace(self._counters, received=n + 1, delivered=n + 1)
+            yield frame
+        if not self._counters.delivered:
+            raise StreamDecodeError(f"{self._path}: no picture in it can be decoded; replace it")
+        self._report(StreamState.ENDED, f"{self._path}: end of file, {self._counters}")
+
+    def _readable(self, decoder: _Decoder) -> Iterator[av.VideoFrame]:
+        try:
+            for picture, _ in decoder.pictures():
+                if picture is None:
+                    self._count_undecodable()
+                else:
+                    yield picture
+        except av.error.FFmpegError as error:
+            # A damaged rest ends the file as its end would: what was before it is still good.
+            self._count_undecodable()
+            _log.warning("%s: damaged after %d pictures: %s", self._path, self._delivered, error)
+
+    @property
+    def _delivered(self) -> int:
+        return self._counters.delivered
+
+    def _count_undecodable(self) -> None:
+        n = self._counters.undecodable + 1
+        self._counters = replace(self._counters, undecodable=n)
+
+    def _pts_ns(self, picture: av.VideoFrame, decoder: _Decoder) -> int:
+        stamp = _pts_ns(picture)
+        if stamp is not None:
+            return stamp
+        rate = float(decoder.stream.average_rate or self._settings.rate_hz)
+        return round(self._delivered * 1e9 / rate)
+
+    def _report(self, state: StreamState, text: str) -> None:
+        self._state = state
+        if self._on_state is not None:
+            self._on_state(state, text)
+
+
+class LiveVideoSource:
+    """A live stream. A reader thread decodes; the newest picture wins; a stream that stops is
+    reported and connected to again, waiting longer after each failure.
+    """
+
+    def __init__(
+        self,
+        location: str,
+        camera: Camera,
+        settings: SourceSettings | None = None,
+        on_state: StateCallback | None = None,
+    ) -> None:
+        self._location = location
+        self._camera = camera
+        self._settings = settings or SourceSettings()
+        self._input = live_input(location, camera, self._settings)
+        self._on_state = on_state
+        self._slot: NewestSlot[tuple[av.VideoFrame, int, int]] = NewestSlot()
+        self._closing = threading.Event()
+        self._reader: threading.Thread | None = None
+        self._lock = threading.Lock()
+        self._counters = SourceCounters()
+        self._state = StreamState.IDLE
+        self._last_picture_ns = 0
+        self._to_rgb = av.video.reformatter.VideoReformatter()
+
+    @property
+    def counters(self) -> SourceCounters:
+        """Live counters; `dropped` are the pictures that a newer one overtook."""
+        with self._lock:
+            return replace(self._counters, dropped=self._slot.dropped)
+
+    @property
+    def state(self) -> StreamState:
+        """Where the stream stands."""
+        return self._state
+
+    def frames(self) -> Iterator[Frame]:
+        """The newest picture each time; raises `StreamSizeError`, ends only when closed."""
+        self._start()
+        while (item := self._slot.get()) is not None:
+            picture, exposure_ns, sequence = item
+            # Converted here and not in the reader: pictures that are dropped cost no conversion.
+            image = _rgb(picture, self._to_rgb)
+            self._count(delivered=1)
+            yield Frame(image, exposure_ns, self._camera, sequence)
+
+    def close(self) -> None:
+        """Ends `frames`; waits for the reader, at most about the open time-out."""
+        self._closing.set()
+        self._slot.close()
+        reader = self._reader
+        if reader is not None and reader is not threading.current_thread():
+            reader.join(_OPEN_TIMEOUT_S + self._settings.stall_timeout_s + 1.0)
+        if self._state is not StreamState.CLOSED:
+            self._report(StreamState.CLOSED, f"{self._location}: closed")
+
+    def _start(self) -> None:
+        with self._lock:
+            if self._reader is None and not self._closing.is_set():
+                self._reader = threading.Thread(target=self._run, name="video", daemon=True)
+                self._reader.start()
+
+    def _run(self) -> None:
+        wait_s = _RETRY_FIRST_S
+        connections = 0
+        while not self._closing.is_set():
+            if self._state is not StreamState.STALLED:
+                self._report(StreamState.CONNECTING, f"{self._location}: connecting")
+            received = self._counters.received
+            try:
+                reason = self._receive_once(reconnect=connections > 0)
+                connections += 1
+            except StreamError as error:
+                self._report(StreamState.FAILED, str(error))
+                self._slot.close(error)
+                return
+            except av.error.FFmpegError as error:
+                reason = f"cannot connect: {error}"
+            if self._closing.is_set():
+                return
+            wait_s = _RETRY_FIRST_S if self._counters.received > received else wait_s
+            self._report_stall(f"{reason}; trying again every {wait_s:.2g} s")
+            self._closing.wait(wait_s)
+            wait_s = min(2 * wait_s, self._settings.retry_max_s)
+
+    def _receive_once(self, *, reconnect: bool) -> str:
+        """Receives until the connection ends; returns why it did."""
+        decoder = _Decoder(self._input, self._settings.stall_timeout_s)
+        if reconnect:
+            self._count(reconnects=1)
+        clock = ExposureClock(
+            round(self._settings.latency_ms * 1e6),
+            self._settings.timing,
+            device=self._input.device,
+        )
+        self._last_picture_ns = time.monotonic_ns()
+        try:
+            for picture, arrival_ns in decoder.pictures():
+                if self._closing.is_set():
+                    return "closed"
+                self._take(picture, arrival_ns, clock)
+            return "the sender ended the stream"
+        except av.error.FFmpegError as error:
+            silence = (time.monotonic_ns() - self._last_picture_ns) / 1e9
+            return f"no picture for {silence:.1f} s ({error.strerror})"
+        finally:
+            decoder.close()
+
+    def _take(self, picture: av.VideoFrame | None, arrival_ns: int, clock: ExposureClock) -> None:
+        if picture is None:
+            self._count(undecodable=1)
+            if arrival_ns - self._last_picture_ns > self._settings.stall_timeout_s * 1e9:
+                self._report_stall("data arrives but no picture can be decoded (no key frame yet?)")
+            return
+        check_size(picture.width, picture.height, self._camera, self._location)
+        self._last_picture_ns = arrival_ns
+        stamps = Stamps(_pts_ns(picture), _misp_time(picture))
+        exposure_ns = clock.exposure_time(stamps, arrival_ns)
+        self._slot.put((picture, exposure_ns, self._counters.received))
+        self._count(received=1)
+        if self._state is not StreamState.LIVE:
+            self._report(
+                StreamState.LIVE, f"{self._location}: live, {picture.width}x{picture.height}"
+            )
+
+    def _count(self, **more: int) -> None:
+        with self._lock:
+            c = self._counters
+            self._counters = replace(c, **{k: getattr(c, k) + n for k, n in more.items()})
+
+    def _report_stall(self, reason: str) -> None:
+        if self._state is not StreamState.STALLED:
+            self._report(StreamState.STALLED, f"{self._location}: {reason}")
+
+    def _report(self, state: StreamState, text: str) -> None:
+        self._state = state
+        if self._on_state is not None:
+            self._on_state(state, text)
+
+
+def live_input(location: str, camera: Camera, settings: SourceSettings) -> _Input:
+    """FFmpeg's options for a live location, chosen for low delay."""
+    timeout_us = str(round(settings.stall_timeout_s * 1e6))
+    common = {"probesize": "65536", "analyzeduration": "200000", "flags": "low_delay"}
+    if location.startswith("udp://"):
+        # Without noparse FFmpeg's H.264 parser holds each picture until the next one begins: one
+        # frame period. MPEG-TS carries one picture per PES packet, so the parser is not needed.
+        flags = {"fflags": "nobuffer+noparse+nofillin"}
+        udp = {"buffer_size": "2000000", "fifo_size": "32768", "overrun_nonfatal": "1"}
+        return _Input(location, common | flags | udp, format="mpegts")
+    if location.startswith("rtsp://"):
+        rtsp = {"fflags": "nobuffer", "rtsp_transport": "tcp", "timeout": timeout_us}
+        return _Input(location, common | rtsp)
+    device = Path(location.removeprefix("v4l2://"))
+    if not device.exists():
+        raise StreamOpenError(
+            f"{device}: no such video device; is the camera plugged in (v4l2-ctl --list-devices)?"
+        )
+    size = {"video_size": f"{camera.width}x{camera.height}", "fflags": "nobuffer"}
+    return _Input(str(device), size, format="v4l2", device=True)
+
+
+def _rgb(picture: av.VideoFrame, reformatter: av.video.reformatter.VideoReformatter) -> Image:
+    return np.ascontiguousarray(reformatter.reformat(picture, format="rgb24").to_ndarray())
+
+
+def _pts_ns(picture: av.VideoFrame) -> int | None:
+    if picture.pts is None or picture.time_base is None:
+        return None
+    return round(picture.pts * picture.time_base * 1_000_000_000)
+
+
+def _misp_time(picture: av.VideoFrame) -> MispTime | None:
+    for data in picture.side_data:
+        if data.type == SideDataType.SEI_UNREGISTERED:
+            stamp = parse_message(bytes(data))
+            if stamp is not None:
+                return stamp
+    return None

@@ -1,0 +1,115 @@
+"""What every camera feed offers, whatever it comes from."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from enum import Enum
+from typing import Protocol
+
+from pydantic import BaseModel, ConfigDict, Field
+
+from companion.errors import StreamSizeError
+from companion.sources.timing import Timing
+from localizer.camera import Camera
+from localizer.types import Frame
+
+
+class StreamState(Enum):
+    """Where a feed stands; `SourceSettings` says when a live one counts as stalled."""
+
+    IDLE = "not started"
+    CONNECTING = "connecting"
+    LIVE = "live"
+    STALLED = "stalled"
+    ENDED = "ended"
+    FAILED = "failed"
+    CLOSED = "closed"
+
+
+StateCallback = Callable[[StreamState, str], None]
+
+
+@dataclass(frozen=True)
+class SourceCounters:
+    """received: pictures decoded; delivered: handed out by `frames`; dropped: overwritten by a
+    newer one before they were fetched; undecodable: packets or pictures that were damaged;
+    reconnects: connections after the first.
+    """
+
+    received: int = 0
+    delivered: int = 0
+    dropped: int = 0
+    undecodable: int = 0
+    reconnects: int = 0
+
+
+class SourceSettings(BaseModel):
+    """The keys of a camera feed in a deployment's configuration."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    latency_ms: float = Field(
+        default=0.0,
+        ge=0,
+        le=1000,
+        description="fixed glass-to-glass latency, taken off where the stream has no exact times",
+    )
+    timing: Timing = Field(
+        default="auto",
+        description="auto: MISP time stamps where the stream has them; pts: never use them",
+    )
+    stall_timeout_s: float = Field(
+        default=1.0,
+        gt=0,
+        le=60,
+        description="a live stream without a picture for so long is stalled",
+    )
+    retry_max_s: float = Field(
+        default=4.0, gt=0, le=600, description="longest wait between two attempts to connect"
+    )
+    rate_hz: float = Field(
+        default=10.0,
+        gt=0,
+        le=1000,
+        description="frame rate of an image folder without timestamps.txt",
+    )
+    realtime: bool = Field(
+        default=False,
+        description="play files and folders at their own pace instead of as fast as possible",
+    )
+
+
+class FrameSource(Protocol):
+    """A camera feed. One consumer iterates `frames`; `close` may be called from any thread."""
+
+    def frames(self) -> Iterator[Frame]:
+        """Frames in order of exposure. Ends when a file ends or the source is closed.
+
+        A live stream that stops does not end it: it reports its state and connects again.
+        """
+        ...
+
+    def close(self) -> None:
+        """Ends `frames` and frees the device or socket; harmless when called again."""
+        ...
+
+    @property
+    def counters(self) -> SourceCounters:
+        """What was received, delivered and lost so far."""
+        ...
+
+    @property
+    def state(self) -> StreamState:
+        """Where the feed stands."""
+        ...
+
+
+def check_size(width: int, height: int, camera: Camera, where: str) -> None:
+    """Raises `StreamSizeError` when a picture is not of the camera model's size."""
+    if (width, height) != (camera.width, camera.height):
+        raise StreamSizeError(
+            f"{where} delivers {width}x{height} but the camera model is "
+            f"{camera.width}x{camera.height}: set the stream to the calibrated size, or give the "
+            f"camera model of {width}x{height} (intrinsics do not carry over to a cropped size)"
+        )

@@ -1,0 +1,160 @@
+"""A folder of images as a camera feed: every image is delivered, in order of name."""
+
+from __future__ import annotations
+
+import re
+import threading
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from companion.errors import StreamDecodeError, StreamOpenError
+from companion.sources.base import (
+    SourceCounters,
+    SourceSettings,
+    StateCallback,
+    StreamState,
+    check_size,
+)
+from localizer.camera import Camera
+from localizer.types import Frame, Image
+
+IMAGE_SUFFIXES = frozenset({".jpg", ".jpeg", ".png", ".bmp", ".tif", ".tiff"})
+TIMESTAMPS_NAME = "timestamps.txt"
+
+
+def list_images(folder: Path) -> list[Path]:
+    """The folder's images by name, numbers in names counted as numbers (img2 before img10)."""
+    if not folder.is_dir():
+        raise StreamOpenError(f"{folder}: no such folder; give a folder of images")
+    images = [p for p in folder.iterdir() if p.suffix.lower() in IMAGE_SUFFIXES]
+    if not images:
+        raise StreamOpenError(
+            f"{folder}: holds no images ({', '.join(sorted(IMAGE_SUFFIXES))}); "
+            "give the folder that directly contains them"
+        )
+    return sorted(images, key=_natural_key)
+
+
+def read_image(path: Path) -> Image:
+    """RGB image (H, W, 3) uint8 in the sensor's own orientation (EXIF rotation is not applied)."""
+    flags = cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION
+    try:
+        # imdecode, because imread prints a warning for what becomes a named error here.
+        bgr = cv2.imdecode(np.frombuffer(path.read_bytes(), np.uint8), flags)
+    except (OSError, cv2.error) as error:
+        raise StreamDecodeError(f"{path}: cannot be read: {error}") from error
+    if bgr is None:
+        raise StreamDecodeError(f"{path}: not an image, or damaged; remove or replace it")
+    return np.asarray(cv2.cvtColor(bgr, cv2.COLOR_BGR2RGB))
+
+
+def read_timestamps(path: Path) -> dict[str, int]:
+    """Image name to exposure time in ns, from lines ``name time_ns`` (blank or comma between)."""
+    times: dict[str, int] = {}
+    for number, line in enumerate(path.read_text().splitlines(), start=1):
+        text = line.split("#", 1)[0].replace(",", " ").split()
+        if not text:
+            continue
+        try:
+            name, value = text
+            times[name] = int(value)
+        except ValueError as error:
+            raise StreamDecodeError(
+                f"{path}, line {number}: expected 'name time_ns', got {line!r}"
+            ) from error
+    return times
+
+
+class FolderSource:
+    """Frames from a folder. Times come from ``timestamps.txt`` in it, else from a fixed rate that
+    starts now.
+    """
+
+    def __init__(
+        self,
+        folder: Path,
+        camera: Camera,
+        settings: SourceSettings | None = None,
+        on_state: StateCallback | None = None,
+    ) -> None:
+        self._folder = folder
+        self._camera = camera
+        self._settings = settings or SourceSettings()
+        self._on_state = on_state
+        self._images = list_images(folder)
+        self._times = self._read_times()
+        self._closed = threading.Event()
+        self._state = StreamState.IDLE
+        self._delivered = 0
+
+    @property
+    def counters(self) -> SourceCounters:
+        """Received is delivered here: nothing is dropped."""
+        return SourceCounters(received=self._delivered, delivered=self._delivered)
+
+    @property
+    def state(self) -> StreamState:
+        """Idle, live, ended, failed or closed."""
+        return self._state
+
+    def frames(self) -> Iterator[Frame]:
+        """Every image; raises `StreamDecodeError` or `StreamSizeError` naming the file."""
+        start = time.monotonic_ns()
+        first = self._times[0] if self._times else 0
+        self._report(StreamState.LIVE, f"{self._folder}: {len(self._images)} images")
+        for sequence, path in enumerate(self._images):
+            offset = self._offset_ns(sequence, first)
+            if self._settings.realtime:
+                self._closed.wait((start + offset - time.monotonic_ns()) / 1e9)
+            if self._closed.is_set():
+                return
+            frame = self._load(path, (first if self._times else start) + offset, sequence)
+            self._delivered += 1
+            yield frame
+        self._report(StreamState.ENDED, f"{self._folder}: all {len(self._images)} images delivered")
+
+    def close(self) -> None:
+        """Ends `frames` after the present image."""
+        self._closed.set()
+        self._report(StreamState.CLOSED, f"{self._folder}: closed")
+
+    def _load(self, path: Path, time_ns: int, sequence: int) -> Frame:
+        try:
+            image = read_image(path)
+            check_size(image.shape[1], image.shape[0], self._camera, str(path))
+        except Exception as error:
+            self._report(StreamState.FAILED, str(error))
+            raise
+        return Frame(image, time_ns, self._camera, sequence)
+
+    def _offset_ns(self, sequence: int, first: int) -> int:
+        if self._times:
+            return self._times[sequence] - first
+        return round(sequence * 1e9 / self._settings.rate_hz)
+
+    def _read_times(self) -> list[int]:
+        path = self._folder / TIMESTAMPS_NAME
+        if not path.exists():
+            return []
+        by_name = read_timestamps(path)
+        missing = [p.name for p in self._images if p.name not in by_name]
+        if missing:
+            raise StreamOpenError(
+                f"{path}: has no time for {len(missing)} of {len(self._images)} images, "
+                f"first {missing[0]}; add them or remove the file"
+            )
+        return [by_name[p.name] for p in self._images]
+
+    def _report(self, state: StreamState, text: str) -> None:
+        self._state = state
+        if self._on_state is not None:
+            self._on_state(state, text)
+
+
+def _natural_key(path: Path) -> list[tuple[int, str]]:
+    parts = re.split(r"(\d+)", path.name)
+    return [(int(part), "") if part.isdigit() else (-1, part) for part in parts]

@@ -1,0 +1,112 @@
+"""From what a stream says about time to the exposure time on CLOCK_MONOTONIC.
+
+Three sources, best first:
+
+1. A device's own monotonic stamp (V4L2 on Linux): it is the time already.
+2. MISP stamps of a camera whose clock is locked to the companion's (NTP, PTP): exact.
+3. Presentation times, or MISP stamps of a free-running clock: only their differences mean anything.
+   The sender's clock is laid under ours by the smallest lag seen (as ArduPilot's JitterCorrection
+   does for MAVLink), less a fixed latency that has to be measured glass to glass once per camera.
+"""
+
+from __future__ import annotations
+
+import logging
+import time
+from dataclasses import dataclass, field
+from typing import Literal
+
+from companion.sources.misp import MispTime
+
+_log = logging.getLogger(__name__)
+
+Timing = Literal["auto", "pts"]
+
+_WINDOW_NS = 10_000_000_000  # the smallest lag is forgotten after one to two windows: clocks drift
+_DISCONTINUITY_NS = 2_000_000_000
+_MAX_AGE_NS = 500_000_000  # no absolute stamp is believed that makes a frame older than this
+_MAX_AHEAD_NS = 5_000_000  # nor one this far in the future
+
+
+@dataclass
+class MinimumLag:
+    """Maps a sender's clock of unknown epoch to CLOCK_MONOTONIC by the smallest lag seen.
+
+    The results never run backwards while arrival times do not: a new smallest lag gives the arrival
+    time itself. latency_ns: the part of the lag that every frame has.
+    """
+
+    latency_ns: int = 0
+    _current: int | None = None
+    _previous: int | None = None
+    _window_start: int = 0
+    _last_sender: int = field(default=-(2**63))
+
+    def map(self, sender_ns: int, arrival_ns: int) -> int:
+        """CLOCK_MONOTONIC nanoseconds of `sender_ns`, of a message that arrived at `arrival_ns`."""
+        lag = arrival_ns - sender_ns
+        if self._is_discontinuity(lag, sender_ns):
+            self._current = self._previous = None
+        self._last_sender = sender_ns
+        if self._current is None:
+            self._current, self._window_start = lag, arrival_ns
+        elif arrival_ns - self._window_start > _WINDOW_NS:
+            self._previous, self._current = self._current, lag
+            self._window_start = arrival_ns
+        self._current = min(self._current, lag)
+        smallest = self._current if self._previous is None else min(self._current, self._previous)
+        return sender_ns + smallest - self.latency_ns
+
+    def _is_discontinuity(self, lag: int, sender_ns: int) -> bool:
+        known = self._current if self._current is not None else lag
+        return sender_ns < self._last_sender or abs(lag - known) > _DISCONTINUITY_NS
+
+
+@dataclass(frozen=True)
+class Stamps:
+    """What a decoded picture says about time. pts_ns: presentation time, epoch unknown."""
+
+    pts_ns: int | None
+    misp: MispTime | None
+
+
+class ExposureClock:
+    """Gives each frame of one stream its exposure time; start a new one for each connection."""
+
+    def __init__(self, latency_ns: int, timing: Timing = "auto", *, device: bool = False) -> None:
+        self._timing = timing
+        self._device = device
+        self._by_pts = MinimumLag(latency_ns)
+        self._by_misp = MinimumLag(latency_ns)
+        self._warned = False
+
+    def exposure_time(self, stamps: Stamps, arrival_ns: int) -> int:
+        """CLOCK_MONOTONIC nanoseconds of the exposure of a frame that arrived at `arrival_ns`."""
+        if self._device and stamps.pts_ns is not None and _plausible(stamps.pts_ns, arrival_ns):
+            return stamps.pts_ns
+        if stamps.misp is not None and self._timing == "auto":
+            return self._from_misp(stamps.misp, arrival_ns)
+        if stamps.pts_ns is not None:
+            return self._by_pts.map(stamps.pts_ns, arrival_ns)
+        return arrival_ns - self._by_pts.latency_ns
+
+    def _from_misp(self, misp: MispTime, arrival_ns: int) -> int:
+        # Both clocks are read anew for each frame, because NTP may step the system's clock.
+        system_minus_monotonic = time.time_ns() - time.monotonic_ns()
+        monotonic = misp.time_us * 1000 - system_minus_monotonic
+        relative = self._by_misp.map(misp.time_us * 1000, arrival_ns)
+        if misp.locked and _plausible(monotonic, arrival_ns):
+            return monotonic
+        if not self._warned:
+            self._warned = True
+            _log.warning(
+                "the camera's MISP clock is not the companion's (locked: %s, age %.3f s): using "
+                "the smallest lag instead; synchronise the camera by NTP or PTP for exact times",
+                misp.locked,
+                (arrival_ns - monotonic) / 1e9,
+            )
+        return relative
+
+
+def _plausible(stamp_ns: int, arrival_ns: int) -> bool:
+    return -_MAX_AHEAD_NS <= arrival_ns - stamp_ns <= _MAX_AGE_NS

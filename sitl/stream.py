@@ -1,0 +1,101 @@
+"""H.264 in MPEG-TS over UDP, as a gimbal camera sends it."""
+
+from __future__ import annotations
+
+import time
+from fractions import Fraction
+
+import av
+import numpy as np
+
+from companion.sources.misp import MispTime, sei_nal
+from localizer.types import Image
+
+_CLOCK = Fraction(1, 90_000)  # MPEG-TS presentation clock, Hz
+_NS_PER_TICK = Fraction(1_000_000_000) * _CLOCK
+
+
+class VideoSender:
+    """Encodes and sends frames as they come.
+
+    misp: stamp each picture with its exposure time (MISB ST 0604); without it the presentation
+    times are all that a receiver has. Every key frame (one a second) carries the headers, so that a
+    receiver may join at any time.
+    """
+
+    def __init__(
+        self,
+        url: str,
+        width: int,
+        height: int,
+        rate_hz: float,
+        *,
+        bit_rate: int = 4_000_000,
+        misp: bool = True,
+    ) -> None:
+        self._misp = misp
+        self._encoder = _encoder(width, height, rate_hz, bit_rate)
+        # The PES length lets a receiver end a picture with its last byte, not at the next one's
+        # first. 1316 bytes are seven TS packets, what fits an Ethernet frame.
+        separator = "&" if "?" in url else "?"
+        self._container = av.open(
+            f"{url}{separator}pkt_size=1316",
+            "w",
+            format="mpegts",
+            options={
+                "omit_video_pes_length": "0",
+                "mpegts_flags": "resend_headers",
+                "flush_packets": "1",
+            },
+        )
+        self._stream = self._container.add_stream("libx264", rate=round(rate_hz))
+        self._stream.width, self._stream.height = width, height
+        self._stream.pix_fmt = "yuv420p"
+        self._bytes = 0
+
+    @property
+    def sent_bytes(self) -> int:
+        """Size of all pictures sent, without the transport's overhead."""
+        return self._bytes
+
+    def send(self, image: Image, exposure_ns: int) -> None:
+        """Sends an RGB image (H, W, 3) uint8 exposed at `exposure_ns` on CLOCK_MONOTONIC."""
+        picture = av.VideoFrame.from_ndarray(np.ascontiguousarray(image), format="rgb24")
+        picture = picture.reformat(format="yuv420p")
+        picture.pts = round(exposure_ns / _NS_PER_TICK)
+        picture.time_base = _CLOCK
+        stamp = self._stamp(exposure_ns) if self._misp else b""
+        for encoded in self._encoder.encode(picture):
+            packet = av.Packet(stamp + bytes(encoded))
+            packet.pts, packet.dts, packet.time_base = encoded.pts, encoded.dts, _CLOCK
+            packet.is_keyframe = encoded.is_keyframe
+            packet.stream = self._stream
+            self._container.mux(packet)
+            self._bytes += packet.size
+
+    def close(self) -> None:
+        """Ends the stream."""
+        self._container.close()
+
+    @staticmethod
+    def _stamp(exposure_ns: int) -> bytes:
+        system_ns = exposure_ns + time.time_ns() - time.monotonic_ns()
+        return sei_nal(MispTime(system_ns // 1000, locked=True))
+
+
+def _encoder(width: int, height: int, rate_hz: float, bit_rate: int) -> av.VideoCodecContext:
+    encoder = av.CodecContext.create("libx264", "w")
+    encoder.width, encoder.height, encoder.pix_fmt = width, height, "yuv420p"
+    encoder.time_base = _CLOCK
+    encoder.framerate = Fraction(rate_hz).limit_denominator(1000)
+    encoder.bit_rate = bit_rate
+    # A PES packet with a length holds at most 65,535 bytes: the rate control's buffer keeps every
+    # picture below 60 kB.
+    rate_control = f"vbv-maxrate={bit_rate // 1000}:vbv-bufsize=480"
+    encoder.options = {
+        "preset": "ultrafast",
+        "tune": "zerolatency",
+        "g": str(max(1, round(rate_hz))),
+        "x264-params": f"repeat-headers=1:scenecut=0:threads=1:{rate_control}",
+    }
+    return encoder
