@@ -21,3 +21,11 @@ class StreamSizeError(StreamError):
 
 class StreamDecodeError(StreamError):
     """An image or a video that is there but cannot be decoded."""
+
+
+class ConfigError(CompanionError):
+    """A configuration that cannot be read or does not hold; names file and key."""
+
+
+class DetectionError(CompanionError):
+    """A datagram that is not a pixel detection."""
