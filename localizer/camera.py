@@ -154,8 +154,8 @@ class Camera:
         if self.is_distorted:
             flat = np.stack([x, y], axis=-1).reshape(-1, 1, 2)
             criteria = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 40, 1e-12)
-            flat = cv2.undistortPointsIter(
-                flat, np.eye(3), np.asarray(self.distortion), None, None, criteria
+            flat = cv2.undistortPoints(
+                flat, np.eye(3), np.asarray(self.distortion), criteria=criteria
             )
             x, y = flat[:, 0, 0].reshape(x.shape), flat[:, 0, 1].reshape(y.shape)
         return np.stack([x, y, np.ones_like(x)], axis=-1)
