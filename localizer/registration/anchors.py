@@ -1,4 +1,4 @@
-"""Selection of the geo-anchors of a reference view (paper, Eq. 1; docs/registration.md, section 2)."""
+"""Selection of the geo-anchors of a reference view (paper, Eq. 1; docs/registration.md)."""
 
 from __future__ import annotations
 
@@ -31,7 +31,11 @@ def select_anchors(
     importance = _importance(features, view.depth.shape)[rows, columns]
     usable = np.isfinite(importance) & (importance > 0)
     rows, columns, importance = rows[usable], columns[usable], importance[usable]
-    picked = _stratified(rows, columns, importance, view.depth.shape, count, seed)
+    side = np.sqrt(view.depth.size / max(count, 1))
+    cell = (rows // side).astype(np.int64) * view.depth.shape[1] + (columns // side).astype(
+        np.int64
+    )
+    picked = _stratified(cell, importance, count, seed)
     rows, columns = rows[picked], columns[picked]
     order = np.argsort(_morton(columns, rows), kind="stable")
     rows, columns = rows[order], columns[order]
@@ -84,25 +88,21 @@ def _importance(features: FeaturePyramid, shape: tuple[int, ...]) -> Array:
 
 
 def _stratified(
-    rows: NDArray[np.int64],
-    columns: NDArray[np.int64],
-    importance: Array,
-    shape: tuple[int, ...],
-    count: int,
-    seed: int,
+    cell: NDArray[np.int64], importance: Array, count: int, seed: int
 ) -> NDArray[np.int64]:
-    """Indices of `count` candidates: the cells' first draws, then their second, and so on."""
-    rng = np.random.default_rng(seed)
-    # Gumbel noise on the logarithm turns sorting into sampling in proportion to importance.
-    key = np.log(importance) + rng.gumbel(size=len(importance))
-    side = np.sqrt(shape[0] * shape[1] / max(count, 1))
-    across = int(np.ceil(shape[1] / side))
-    cell = (rows // side).astype(np.int64) * across + (columns // side).astype(np.int64)
-    order = np.lexsort((-key, cell))
-    first = np.r_[True, np.diff(cell[order]) != 0] if len(order) else np.zeros(0, bool)
-    start = np.maximum.accumulate(np.where(first, np.arange(len(order)), 0))
-    rank = np.arange(len(order)) - start
-    chosen: NDArray[np.int64] = order[np.lexsort((-key[order], rank))[:count]]
+    """Indices of `count` candidates: every cell's first draw, then every cell's second, and so on.
+
+    Within a cell the draws are an exponential race: without replacement, in proportion to
+    importance (Efraimidis and Spirakis 2006).
+    """
+    time = np.random.default_rng(seed).exponential(size=len(importance)) / importance
+    place = time / (time + np.median(time)) if len(time) else time  # order kept, below 1
+    order = np.argsort(cell + np.minimum(place, 0.999999))
+    cells = cell[order]
+    first = np.r_[0, np.flatnonzero(np.diff(cells)) + 1] if len(cells) else np.zeros(0, np.int64)
+    lengths = np.diff(np.r_[first, len(cells)])
+    rank = np.arange(len(cells)) - np.repeat(first, lengths)
+    chosen: NDArray[np.int64] = order[np.argsort(rank + place[order], kind="stable")[:count]]
     return chosen
 
 

@@ -7,7 +7,6 @@ centroid, so that float32 points are exact to micrometres and translation and ro
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Protocol
 
@@ -54,9 +53,9 @@ class QuadraticPrior:
 class LevelProblem:
     """One pyramid level, ready for a backend.
 
-    features: (h, w, C), confidence: (h, w) of the query; focal (fx, fy) and centre (cx, cy) in array
-    index units of this level; points: (3, N) float32 in the local frame; anchor_features: (N, C);
-    anchor_confidence: (N,).
+    features: (h, w, C), confidence: (h, w) of the query; focal (fx, fy) and centre (cx, cy) in
+    array index units of this level; points: (3, N) float32 in the local frame; anchor_features:
+    (N, C); anchor_confidence: (N,).
     """
 
     features: Float32
@@ -164,13 +163,13 @@ def sample_bilinear(image: NDArray[np.float32], x: Array, y: Array) -> Array:
     return values
 
 
-def camera_from_local(poses: Sequence[Pose], origin: Array) -> tuple[Array, Array]:
-    """Rotations (M, 3, 3) and translations (M, 3) of M poses `world_from_camera`."""
-    rotations = np.stack([p.rotation.T for p in poses])
-    centres = np.stack([p.translation for p in poses])
-    return rotations, np.einsum("mij,mj->mi", rotations, origin - centres)
+def camera_from_local(rotations: Array, centres: Array, origin: Array) -> tuple[Array, Array]:
+    """Rotations (M, 3, 3) and translations (M, 3) of M poses world_from_camera, given likewise."""
+    inverse = np.ascontiguousarray(np.swapaxes(rotations, 1, 2))
+    return inverse, np.einsum("mij,mj->mi", inverse, origin - centres)
 
 
-def world_from_camera(rotation: Array, translation: Array, origin: Array) -> Pose:
-    """Inverse of `camera_from_local` for one pose."""
-    return Pose(rotation.T.copy(), origin - rotation.T @ translation)
+def world_from_camera(rotations: Array, translations: Array, origin: Array) -> tuple[Array, Array]:
+    """Rotations (M, 3, 3) and centres (M, 3): the inverse of `camera_from_local`."""
+    inverse = np.ascontiguousarray(np.swapaxes(rotations, 1, 2))
+    return inverse, origin - np.einsum("mij,mj->mi", inverse, translations)

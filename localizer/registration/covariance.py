@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
-from localizer.pose import Array, Pose, so3_log
+from localizer.pose import Array, Pose
 from localizer.registration.reference import Linearization, pose_tangent_map
 
 
@@ -43,15 +44,19 @@ def pose_covariance(tangent: Array, rotation: Array, translation: Array) -> Arra
     return 0.5 * (covariance + covariance.T)
 
 
-def pose_difference(a: Pose, b: Pose) -> Array:
-    """(6,) position a - b and rotation vector of ``a b^-1`` in world axes: equation 13."""
-    return np.concatenate([a.translation - b.translation, so3_log(a.rotation @ b.rotation.T)])
+def pose_differences(rotations: Array, centres: Array, other: Pose) -> Array:
+    """(M, 6) differences of M poses world_from_camera to another (equation 13).
+
+    Position, and rotation vector of ``R R_other'``, in world axes.
+    """
+    turn = Rotation.from_matrix(rotations @ other.rotation.T).as_rotvec()
+    return np.concatenate([centres - other.translation, turn], axis=1)
 
 
-def mode_spread(best: Pose, others: list[Pose], probabilities: Array) -> Array:
-    """(6, 6) second moment of the competing modes about the chosen pose (equation 15)."""
-    spread = np.zeros((6, 6))
-    for pose, probability in zip(others, probabilities, strict=True):
-        d = pose_difference(pose, best)
-        spread += probability * np.outer(d, d)
+def mode_spread(differences: Array, probabilities: Array) -> Array:
+    """(6, 6) second moment of competing modes about the chosen pose (equation 15).
+
+    differences: (M, 6) of the modes to the chosen pose.
+    """
+    spread: Array = np.einsum("m,mi,mj->ij", probabilities, differences, differences)
     return spread

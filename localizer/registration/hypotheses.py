@@ -3,41 +3,42 @@
 from __future__ import annotations
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
-from localizer.pose import Array, Pose, so3_exp
+from localizer.pose import Array
 from localizer.types import PosePrior
 
 
 def generate_hypotheses(
     prior: PosePrior,
     count: int = 144,
+    *,
     box_deg: float = 11.0,
     translation_limit_m: float = 1.0,
     reach: float = 2.2,
     seed: int = 0,
-) -> list[Pose]:
-    """`count` poses world_from_camera about the prior, the unperturbed prior first.
+) -> tuple[Array, Array]:
+    """Rotations (M, 3, 3) and centres (M, 3) of M = `count` poses world_from_camera.
 
-    Rotation: a square grid over the two axes that move the image most, the camera's x (pitch) and
-    y (yaw). Its half-width per axis is `reach` standard deviations of the prior and at most
-    `box_deg`; with the paper's 144 and 11 degrees the step is 2 degrees. Translation, and the
-    rotation about the optical axis: normal with the prior's covariance, at most
-    `translation_limit_m` standard deviation per axis. The grid's farthest corner gives its place to
-    the zero perturbation.
+    The unperturbed prior is the first. Rotation: a square grid over the two axes that move the
+    whole image, the camera's x (pitch) and y (yaw). Its half-width per axis is `reach` standard
+    deviations of the prior and at most `box_deg`; with the paper's 144 and 11 degrees the step is
+    2 degrees. Rotation about the optical axis, and translation: normal with the prior's
+    covariance, the deviation cut to ``box_deg / reach`` and `translation_limit_m` per axis. The
+    grid's farthest corner gives its place to the zero perturbation.
     """
     R = prior.world_from_camera.rotation
-    rotation_camera = R.T @ prior.covariance[3:, 3:] @ R
-    sigma = np.sqrt(np.maximum(np.diag(rotation_camera), 0.0))
-    half = np.minimum(np.radians(box_deg), reach * sigma[:2])
+    sigma = np.sqrt(np.maximum(np.diag(R.T @ prior.covariance[3:, 3:] @ R), 0.0))
+    box = np.radians(box_deg)
     rng = np.random.default_rng(seed)
     offsets = np.zeros((count, 3))
-    offsets[1:, :2] = _grid(count - 1) * half
-    offsets[1:, 2] = rng.normal(0.0, 1.0, count - 1) * min(sigma[2], np.radians(box_deg) / reach)
-    position = _limited_square_root(prior.covariance[:3, :3], translation_limit_m)
-    shifts = rng.normal(0.0, 1.0, (count, 3)) @ position.T
+    offsets[1:, :2] = _grid(count - 1) * np.minimum(box, reach * sigma[:2])
+    offsets[1:, 2] = rng.normal(0.0, min(sigma[2], box / reach), count - 1)
+    root = _limited_square_root(prior.covariance[:3, :3], translation_limit_m)
+    shifts = rng.normal(0.0, 1.0, (count, 3)) @ root.T
     shifts[0] = 0.0
-    centre = prior.world_from_camera.translation
-    return [Pose(R @ so3_exp(o), centre + s) for o, s in zip(offsets, shifts, strict=True)]
+    rotations: Array = R @ Rotation.from_rotvec(offsets).as_matrix()
+    return rotations, prior.world_from_camera.translation + shifts
 
 
 def _grid(count: int) -> Array:

@@ -28,7 +28,7 @@ from localizer.registration.backend import (
 from localizer.registration.covariance import (
     mode_spread,
     pose_covariance,
-    pose_difference,
+    pose_differences,
     tangent_covariance,
 )
 from localizer.registration.hypotheses import generate_hypotheses
@@ -44,23 +44,45 @@ class JNGOConfig(BaseModel):
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
-    hypotheses: int = Field(144, ge=1, description="size M of the swarm")
-    box_deg: float = Field(11.0, gt=0, description="largest pitch and yaw perturbation")
-    translation_sigma_m: float = Field(1.0, ge=0, description="largest sigma of the perturbation")
-    spread_sigmas: float = Field(2.2, gt=0, description="grid half-width in prior sigmas")
-    iterations: tuple[int, ...] = Field((2, 3, 4), description="LM steps per level, coarse to fine")
-    keep: tuple[int, ...] = Field((32, 8), description="survivors after each level but the last")
-    polish: int = Field(6, ge=0, description="further finest-level LM steps on the best hypothesis")
-    distinct_px: float = Field(0.25, ge=0, description="least rms distance of survivors, level px")
-    huber: float = Field(0.5, gt=0, description="Huber threshold on the residual norm")
-    damping: float = Field(0.03, gt=0, description="first Marquardt factor")
-    min_overlap: float = Field(0.25, gt=0, le=1, description="least share of anchors in view")
-    min_anchors: int = Field(50, ge=6, description="anchors below which nothing is tried")
-    motion_weight: float = Field(0.04, ge=0, description="lambda of Eq. 10, in best costs per d²")
-    prior_weight: float = Field(0.04, ge=0, description="weight of priors given as residuals")
-    correlation: float = Field(8.0, gt=0, description="covariance factor for correlated features")
-    covariance_floor: float = Field(0.05, ge=0, description="least share of the isotropic model")
-    max_sigma_m: float = Field(50.0, gt=0, description="position sigma that counts as no texture")
+    hypotheses: int = Field(default=144, ge=1, description="size M of the swarm")
+    box_deg: float = Field(default=11.0, gt=0, description="largest pitch and yaw perturbation")
+    translation_sigma_m: float = Field(
+        default=1.0, ge=0, description="largest sigma of the perturbation"
+    )
+    spread_sigmas: float = Field(default=2.2, gt=0, description="grid half-width in prior sigmas")
+    iterations: tuple[int, ...] = Field(
+        default=(2, 3, 4), description="LM steps per level, coarse to fine"
+    )
+    keep: tuple[int, ...] = Field(
+        default=(32, 8), description="survivors after each level but the last"
+    )
+    polish: int = Field(
+        default=6, ge=0, description="further finest-level LM steps on the best hypothesis"
+    )
+    distinct_px: float = Field(
+        default=0.25, ge=0, description="least rms distance of survivors, level px"
+    )
+    huber: float = Field(default=0.5, gt=0, description="Huber threshold on the residual norm")
+    damping: float = Field(default=0.03, gt=0, description="first Marquardt factor")
+    min_overlap: float = Field(
+        default=0.25, gt=0, le=1, description="least share of anchors in view"
+    )
+    min_anchors: int = Field(default=50, ge=6, description="anchors below which nothing is tried")
+    motion_weight: float = Field(
+        default=0.04, ge=0, description="lambda of Eq. 10, in best costs per d²"
+    )
+    prior_weight: float = Field(
+        default=0.04, ge=0, description="weight of priors given as residuals"
+    )
+    correlation: float = Field(
+        default=8.0, gt=0, description="covariance factor for correlated features"
+    )
+    covariance_floor: float = Field(
+        default=0.05, ge=0, description="least share of the isotropic model"
+    )
+    max_sigma_m: float = Field(
+        default=50.0, gt=0, description="position sigma that counts as no texture"
+    )
 
     @property
     def settings(self) -> LMSettings:
@@ -132,10 +154,15 @@ class JNGO:
         seed: int,
     ) -> _Swarm:
         c = self.config
-        poses = generate_hypotheses(
-            prior, c.hypotheses, c.box_deg, c.translation_sigma_m, c.spread_sigmas, seed
+        rotations, centres = generate_hypotheses(
+            prior,
+            c.hypotheses,
+            box_deg=c.box_deg,
+            translation_limit_m=c.translation_sigma_m,
+            reach=c.spread_sigmas,
+            seed=seed,
         )
-        R, t = camera_from_local(poses, origin)
+        R, t = camera_from_local(rotations, centres, origin)
         keep = (*c.keep[: len(problems) - 1], c.hypotheses)
         evaluations = 0
         for problem, iterations, survivors in zip(problems, c.iterations, keep, strict=True):
@@ -163,10 +190,10 @@ class JNGO:
         if motion is None or not np.isfinite(best) or self.config.motion_weight == 0:
             return scores
         information = np.linalg.pinv(motion.covariance, hermitian=True)
-        totals = scores.copy()
-        for m in np.flatnonzero(np.isfinite(scores)):
-            d = pose_difference(world_from_camera(R[m], t[m], origin), motion.world_from_camera)
-            totals[m] += self.config.motion_weight * best * (d @ information @ d)
+        rotations, centres = world_from_camera(R, t, origin)
+        d = pose_differences(rotations, centres, motion.world_from_camera)
+        squared = np.einsum("mi,ij,mj->m", d, information, d)
+        totals: Array = scores + self.config.motion_weight * best * squared
         return totals
 
     def _result(
@@ -178,18 +205,15 @@ class JNGO:
         tangent = tangent_covariance(model, c.correlation, c.covariance_floor)
         if tangent is None:
             return _failure(prior, RegistrationStatus.NO_TEXTURE, swarm.evaluations)
-        poses = [
-            world_from_camera(r, s, origin)
-            for r, s in zip(swarm.rotations, swarm.translations, strict=True)
-        ]
+        rotations, centres = world_from_camera(swarm.rotations, swarm.translations, origin)
+        pose = Pose(rotations[0], centres[0])
         probabilities = self._mode_probabilities(swarm, problem.points.shape[1])
-        covariance = pose_covariance(tangent, R, t) + mode_spread(
-            poses[0], poses[1:], probabilities[1:]
-        )
+        differences = pose_differences(rotations, centres, pose)
+        covariance = pose_covariance(tangent, R, t) + mode_spread(differences, probabilities)
         if np.sqrt(np.linalg.eigvalsh(covariance[:3, :3])[-1]) > c.max_sigma_m:
             return _failure(prior, RegistrationStatus.NO_TEXTURE, swarm.evaluations)
         return Registration(
-            poses[0],
+            pose,
             covariance,
             float(swarm.scores[0]),
             float(swarm.overlaps[0]),
@@ -240,7 +264,11 @@ def _input_status(
         )
     if len(anchors.points_world) < config.min_anchors:
         return RegistrationStatus.TOO_FEW_ANCHORS
-    arrays = [anchors.points_world, *anchors.features, *anchors.confidence]
+    arrays: list[NDArray[np.floating]] = [
+        anchors.points_world,
+        *anchors.features,
+        *anchors.confidence,
+    ]
     for level in query.levels:
         arrays += [level.features, level.confidence]
     # A sum is not finite when any term is not, and costs a tenth of isfinite().all().

@@ -8,6 +8,8 @@ and the retraction are float64; points, features and sums are float32. Threads s
 and hold no GIL. Equations are numbered in docs/registration.md.
 """
 
+# ruff: noqa: PLR0917, PLR0912, PLR0915 (kernels pass arrays and unroll sums, for speed)
+
 from __future__ import annotations
 
 from collections.abc import Callable

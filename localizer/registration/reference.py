@@ -69,9 +69,11 @@ def projection_jacobian(problem: LevelProblem, x: Array, translation: Array) -> 
     du[:, 0, 0], du[:, 0, 2] = fx / z, -fx * x[:, 0] / z**2
     du[:, 1, 1], du[:, 1, 2] = fy / z, -fy * x[:, 1] / z**2
     arm = x - translation
-    dx = np.concatenate(
-        [np.broadcast_to(np.eye(3), (len(x), 3, 3)), -np.stack([hat(a) for a in arm])], axis=2
-    )
+    dx = np.zeros((len(x), 3, 6))
+    dx[:, :, :3] = np.eye(3)
+    dx[:, 0, 4], dx[:, 0, 5] = arm[:, 2], -arm[:, 1]  # columns 3 to 5 are -hat(arm)
+    dx[:, 1, 3], dx[:, 1, 5] = -arm[:, 2], arm[:, 0]
+    dx[:, 2, 3], dx[:, 2, 4] = arm[:, 1], -arm[:, 0]
     jacobian: Array = du @ dx
     return jacobian
 
