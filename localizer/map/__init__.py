@@ -1,0 +1,1 @@
+"""The map: importers, the tile cache on disk, streaming, picking."""

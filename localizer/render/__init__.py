@@ -1,0 +1,1 @@
+"""Renderers: RGB and metric depth of the map from a pose."""

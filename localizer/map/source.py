@@ -1,0 +1,76 @@
+"""What an importer hands to the builder: a tree of nodes whose tiles load by themselves."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from localizer.pose import Array
+from localizer.types import Float32, Image
+
+
+@dataclass(frozen=True, eq=False)
+class SourceMesh:
+    """Triangles with one texture, as an importer reads it.
+
+    positions: (V, 3) float64, in the importer's frame; uvs: (V, 2) float32, v down; faces: (F, 3) int32; image: (h, w, 3)
+    uint8 RGB; jpeg: the image's own bytes where it is a JPEG that was not changed; palette: the
+    image is a grid of flat colours that mips would mix.
+    """
+
+    positions: Array
+    uvs: Float32
+    faces: NDArray[np.int32]
+    image: Image
+    jpeg: bytes | None = None
+    repeat: bool = False
+    palette: bool = False
+
+
+class TileSource(Protocol):
+    """One tile that can be imported by itself, in any process (so it pickles)."""
+
+    @property
+    def name(self) -> str:
+        """How errors name it."""
+        ...
+
+    def load(self) -> Sequence[SourceMesh]:
+        """Meshes with positions in ECEF metres; raises `MapSourceError`."""
+        ...
+
+
+@dataclass(frozen=True, eq=False)
+class SourceNode:
+    """One node of the tile tree. geometric_error in metres; replaces: REPLACE, else ADD."""
+
+    geometric_error: float
+    replaces: bool
+    tiles: Sequence[TileSource]
+    children: list[SourceNode] = field(default_factory=list)
+
+    def walk(self) -> Iterator[SourceNode]:
+        """This node and everything below it, parents first."""
+        stack = [self]
+        while stack:
+            node = stack.pop()
+            yield node
+            stack.extend(reversed(node.children))
+
+
+@dataclass(frozen=True, eq=False)
+class SourceTree:
+    """A map source. centre: (3,) ECEF metres; geoid_separation_m and attribution as far as the source
+    tells; files: everything it is made of, so that a change of the source can be seen.
+    """
+
+    root: SourceNode
+    centre: Array
+    geoid_separation_m: float | None
+    attribution: str
+    files: tuple[Path, ...]

@@ -1,0 +1,227 @@
+"""Streaming: the tiles of a view from memory, the missing ones loaded behind its back.
+
+`select` never waits for the disk unless it is told to. Missing detail is replaced by resident
+parents and loaded by one thread (decoding releases the GIL); least recently used nodes leave when
+the byte budget is full.
+"""
+
+from __future__ import annotations
+
+import logging
+import threading
+from collections import OrderedDict
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from localizer.camera import Camera
+from localizer.errors import MapCacheError
+from localizer.map.cache import TileCache
+from localizer.map.select import DetailLimits, Selection, TileSelector
+from localizer.map.tile import TileMesh
+from localizer.pose import Pose
+
+_log = logging.getLogger(__name__)
+
+_RELAX = 1.4  # step by which detail is reduced when a view does not fit into the budget
+
+
+@dataclass(frozen=True)
+class StreamCounters:
+    """Since the streamer was made. hits, misses: wanted nodes that were or were not resident;
+    complete: selections at the wanted detail throughout; stalls: selections with a hole;
+    failures: tiles that could not be read; loaded, evicted: nodes; resident_bytes: now.
+    """
+
+    selections: int = 0
+    complete: int = 0
+    stalls: int = 0
+    hits: int = 0
+    misses: int = 0
+    loaded: int = 0
+    evicted: int = 0
+    failures: int = 0
+    resident_bytes: int = 0
+
+
+class TileStreamer:
+    """Tiles of a cache within a byte budget. `select` and `prefetch` may be called by one thread."""
+
+    def __init__(
+        self,
+        cache: TileCache,
+        byte_budget: int = 512 << 20,
+        max_error_px: float = DetailLimits.max_error_px,
+        max_texel_px: float = DetailLimits.max_texel_px,
+    ) -> None:
+        self.cache = cache
+        self._index = cache.index
+        self._selector = TileSelector(cache.index, cache.frame)
+        self._limits = DetailLimits(max_error_px, max_texel_px)
+        self._budget = byte_budget
+        self._node_bytes = _node_bytes(cache)
+        self._meshes: OrderedDict[int, list[TileMesh]] = OrderedDict()  # least recent first
+        self._resident = np.zeros(len(self._node_bytes), np.bool_)
+        self._failed: dict[int, MapCacheError] = {}
+        self._bytes = 0
+        self._counts = dict.fromkeys(StreamCounters.__dataclass_fields__, 0)
+        self._lock = threading.Condition()
+        self._queue: list[int] = []  # nodes to load, most urgent first
+        self._ahead: list[int] = []  # after those
+        self._loading: int | None = None
+        self._protected: set[int] = set()  # in the current view
+        self._closed = False
+        self._thread = threading.Thread(target=self._run, name="tile-loader", daemon=True)
+        self._thread.start()
+
+    def select(
+        self, world_from_camera: Pose, camera: Camera, *, wait: bool = False
+    ) -> list[TileMesh]:
+        """Meshes to draw for a view.
+
+        wait: block until all wanted detail is resident; then a tile that cannot be read raises
+        `MapCacheError`, while without `wait` its parent stays in view and the failure is logged.
+        """
+        limits = self._fitting_limits(world_from_camera, camera)
+        with self._lock:
+            choice = self._choose(world_from_camera, camera, limits)
+            while wait and len(choice.requests):
+                self._raise_failure(choice)
+                # Stand-ins that only bridge the time until the wanted nodes are there can go.
+                self._lock.wait()
+                choice = self._choose(world_from_camera, camera, limits)
+            if wait:
+                self._raise_failure(choice)
+            self._count(choice)
+            return [mesh for node in choice.shown for mesh in self._touched(int(node))]
+
+    def prefetch(self, world_from_camera: Pose, camera: Camera) -> None:
+        """Load what a view will need later, after what the current one needs."""
+        limits = self._fitting_limits(world_from_camera, camera)
+        with self._lock:
+            ahead = self._selector.select(world_from_camera, camera, self._resident, limits)
+            room = self._budget - int(self._node_bytes[list(self._protected)].sum())
+            self._ahead = []
+            for node in ahead.wanted:
+                room -= int(self._node_bytes[node])
+                if room < 0:
+                    break
+                if self._resident[node]:
+                    self._meshes.move_to_end(int(node))
+                elif node not in self._failed:
+                    self._ahead.append(int(node))
+            self._lock.notify_all()
+
+    def counters(self) -> StreamCounters:
+        """What has happened so far."""
+        with self._lock:
+            return StreamCounters(**self._counts | {"resident_bytes": self._bytes})
+
+    def close(self) -> None:
+        """Stop the loader thread and drop all tiles."""
+        with self._lock:
+            self._closed = True
+            self._lock.notify_all()
+        self._thread.join()
+        with self._lock:
+            self._meshes.clear()
+            self._resident[:] = False
+            self._bytes = 0
+
+    def __enter__(self) -> TileStreamer:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def _fitting_limits(self, world_from_camera: Pose, camera: Camera) -> DetailLimits:
+        """The finest limits at which the view's wanted nodes fit into the budget."""
+        limits = self._limits
+        everything = np.ones(len(self._resident), np.bool_)
+        for _ in range(16):
+            choice = self._selector.select(world_from_camera, camera, everything, limits)
+            if self._node_bytes[choice.wanted].sum() <= self._budget:
+                break
+            limits = limits.relaxed(_RELAX)
+        return limits
+
+    def _choose(self, world_from_camera: Pose, camera: Camera, limits: DetailLimits) -> Selection:
+        """Select, and hand the loader its list. The lock is held."""
+        if self._closed:
+            raise RuntimeError("the tile streamer is closed")
+        choice = self._selector.select(world_from_camera, camera, self._resident, limits)
+        self._protected = {0, *choice.wanted.tolist(), *choice.shown.tolist()}
+        self._queue = [n for n in choice.requests.tolist() if n not in self._failed]
+        self._lock.notify_all()
+        return choice
+
+    def _raise_failure(self, choice: Selection) -> None:
+        for node in choice.requests.tolist():
+            if node in self._failed:
+                raise self._failed[node]
+
+    def _touched(self, node: int) -> Sequence[TileMesh]:
+        self._meshes.move_to_end(node)
+        return self._meshes[node]
+
+    def _count(self, choice: Selection) -> None:
+        hits = int(self._resident[choice.wanted].sum())
+        self._counts["selections"] += 1
+        self._counts["hits"] += hits
+        self._counts["misses"] += len(choice.wanted) - hits
+        self._counts["complete"] += hits == len(choice.wanted)
+        self._counts["stalls"] += choice.hole
+
+    def _run(self) -> None:
+        while True:
+            with self._lock:
+                while not self._closed and not self._queue and not self._ahead:
+                    self._lock.wait()
+                if self._closed:
+                    return
+                node = (self._queue or self._ahead).pop(0)
+                if self._resident[node]:
+                    continue
+            meshes: list[TileMesh] | None = None
+            failure: MapCacheError | None = None
+            start = int(self._index.tile_start[node])
+            try:
+                tiles = range(start, start + int(self._index.tile_count[node]))
+                meshes = [self.cache.load_tile(t) for t in tiles]
+            except MapCacheError as error:
+                failure = error
+            with self._lock:
+                if meshes is not None:
+                    self._insert(node, meshes)
+                elif failure is not None:
+                    _log.error("%s", failure)
+                    self._failed[node] = failure
+                    self._counts["failures"] += 1
+                self._lock.notify_all()
+
+    def _insert(self, node: int, meshes: list[TileMesh]) -> None:
+        self._make_room(int(self._node_bytes[node]))
+        self._meshes[node] = meshes
+        self._resident[node] = True
+        self._bytes += int(self._node_bytes[node])
+        self._counts["loaded"] += 1
+
+    def _make_room(self, needed: int) -> None:
+        """Drop least recently used nodes; the current view's stay, so that it can complete."""
+        for node in list(self._meshes):
+            if self._bytes + needed <= self._budget:
+                return
+            if node in self._protected:
+                continue
+            del self._meshes[node]
+            self._resident[node] = False
+            self._bytes -= int(self._node_bytes[node])
+            self._counts["evicted"] += 1
+
+
+def _node_bytes(cache: TileCache) -> NDArray[np.int64]:
+    index = cache.index
+    total = np.concatenate([[0], np.cumsum(index.size)])
+    return np.asarray(total[index.tile_start + index.tile_count] - total[index.tile_start])

@@ -1,0 +1,155 @@
+"""One drawable piece of the map: `TileMesh`, its texture in the layout that kernels read, mips."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from localizer.pose import Array, Pose
+from localizer.types import Float32, Image
+
+_SMALLEST_MIP = 4  # texels on the longer side; below it a mip holds no more than a mean colour
+
+
+@dataclass(frozen=True, eq=False)
+class PackedTexture:
+    """A mip chain in one buffer. texels: (T, 3) uint8 RGB, mip after mip, rows top to bottom;
+    offsets: (L,) int64 first texel of each mip; sizes: (L, 2) int32 (width, height).
+    """
+
+    texels: Image
+    offsets: NDArray[np.int64]
+    sizes: NDArray[np.int32]
+
+    @classmethod
+    def empty(cls, sizes: Sequence[tuple[int, int]]) -> PackedTexture:
+        """Room for mips of the given (width, height), finest first; texels are not set."""
+        counts = [w * h for w, h in sizes]
+        offsets = np.concatenate([[0], np.cumsum(counts)]).astype(np.int64)
+        texels = np.empty((int(offsets[-1]), 3), np.uint8)
+        return cls(texels, offsets[:-1].copy(), np.asarray(sizes, np.int32).reshape(-1, 2))
+
+    def mip(self, level: int) -> Image:
+        """View (h, w, 3) of one level."""
+        w, h = (int(n) for n in self.sizes[level])
+        start = int(self.offsets[level])
+        return self.texels[start : start + w * h].reshape(h, w, 3)
+
+
+@dataclass(frozen=True, eq=False)
+class TileMesh:
+    """A textured triangle mesh with its place in the world.
+
+    positions: (V, 3) float32 metres, tile-local; uvs: (V, 2) float32, v down (texture row 0 is
+    v = 0); faces: (F, 3) int32; mips: (h, w, 3) uint8 RGB each, finest first; world_from_tile: to
+    ENU about the map's origin; repeat: texture coordinates wrap around instead of being clamped.
+    """
+
+    positions: Float32
+    uvs: Float32
+    faces: NDArray[np.int32]
+    mips: tuple[Image, ...]
+    world_from_tile: Pose
+    repeat: bool = False
+
+    @classmethod
+    def from_packed(
+        cls,
+        positions: Float32,
+        uvs: Float32,
+        faces: NDArray[np.int32],
+        texture: PackedTexture,
+        world_from_tile: Pose,
+        repeat: bool = False,
+    ) -> TileMesh:
+        """From a texture that is packed already; `mips` become views of it."""
+        mips = tuple(texture.mip(i) for i in range(len(texture.sizes)))
+        mesh = cls(positions, uvs, faces, mips, world_from_tile, repeat)
+        mesh.__dict__["texture"] = texture  # fills the cached property
+        return mesh
+
+    @cached_property
+    def texture(self) -> PackedTexture:
+        """The mips in one buffer, as the CPU renderer reads them."""
+        packed = PackedTexture.empty([(m.shape[1], m.shape[0]) for m in self.mips])
+        for level, mip in enumerate(self.mips):
+            packed.mip(level)[:] = mip
+        return packed
+
+    @cached_property
+    def bounds(self) -> tuple[Array, Array]:
+        """Lowest and highest tile-local corner, (3,) each."""
+        if len(self.positions) == 0:
+            return np.zeros(3), np.zeros(3)
+        return (
+            self.positions.min(axis=0).astype(np.float64),
+            self.positions.max(axis=0).astype(np.float64),
+        )
+
+    @property
+    def nbytes(self) -> int:
+        """Bytes that the mesh holds in memory, its mips counted once."""
+        arrays = (self.positions, self.uvs, self.faces, *self.mips)
+        return int(sum(a.nbytes for a in arrays))
+
+    def placed(self, world_from_tile: Pose) -> TileMesh:
+        """The same mesh elsewhere; arrays are shared."""
+        return TileMesh.from_packed(
+            self.positions, self.uvs, self.faces, self.texture, world_from_tile, self.repeat
+        )
+
+
+def mip_sizes(width: int, height: int) -> list[tuple[int, int]]:
+    """(width, height) of every level, finest first."""
+    sizes = [(width, height)]
+    while max(sizes[-1]) > _SMALLEST_MIP:
+        w, h = sizes[-1]
+        sizes.append((max(1, w // 2), max(1, h // 2)))
+    return sizes
+
+
+def build_mips(image: Image, used: NDArray[np.bool_] | None = None) -> tuple[Image, ...]:
+    """Mip chain of an RGB image (h, w, 3).
+
+    used: (h, w), the texels that some triangle shows. Coarser mips average only those, and what is
+    unused there takes its colour from the next coarser one: else the background of a texture
+    atlas bleeds into the chart borders.
+    """
+    if used is None or used.all() or not used.any():
+        mips = [image]
+        for w, h in mip_sizes(image.shape[1], image.shape[0])[1:]:
+            mips.append(cv2.resize(mips[-1], (w, h), interpolation=cv2.INTER_AREA).astype(np.uint8))
+        return tuple(mips)
+    weight = used.astype(np.float32)
+    colour = image.astype(np.float32) * weight[..., None]
+    levels = []
+    for w, h in mip_sizes(image.shape[1], image.shape[0])[1:]:
+        colour = cv2.resize(colour, (w, h), interpolation=cv2.INTER_AREA).reshape(h, w, 3)
+        weight = cv2.resize(weight, (w, h), interpolation=cv2.INTER_AREA).reshape(h, w)
+        levels.append((colour, weight))
+    filled: list[Image] = []
+    coarser = image[used].mean(axis=0, dtype=np.float64).astype(np.float32).reshape(1, 1, 3)
+    for colour, weight in reversed(levels):
+        h, w = weight.shape
+        coarser = cv2.resize(coarser, (w, h), interpolation=cv2.INTER_LINEAR).reshape(h, w, 3)
+        mean = colour / np.maximum(weight, 1e-6)[..., None]
+        coarser = np.where(weight[..., None] > 1e-3, mean, coarser).astype(np.float32)
+        filled.append(np.clip(np.rint(coarser), 0, 255).astype(np.uint8))
+    return (image, *reversed(filled))
+
+
+def texel_coverage(
+    uvs: Float32, faces: NDArray[np.int32], width: int, height: int
+) -> NDArray[np.bool_]:
+    """(height, width) mask of the texels that the triangles show, borders included."""
+    mask = np.zeros((height, width), np.uint8)
+    fixed = np.clip(uvs.astype(np.float64) * (width, height) - 0.5, -1, (width, height))
+    triangles = np.rint(fixed).astype(np.int32)[faces]
+    for triangle in triangles:  # fillPoly fills by parity: overlaps would cancel
+        cv2.fillConvexPoly(mask, triangle, 1)
+    return mask.astype(bool)

@@ -1,0 +1,70 @@
+"""The renderer protocol and what its backends share."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Protocol
+
+import numpy as np
+
+from localizer.camera import Camera
+from localizer.errors import CameraError
+from localizer.map.tile import TileMesh
+from localizer.pose import Pose
+from localizer.types import RenderedView
+
+NEAR_M = 0.5  # nearer surfaces are cut off: no aircraft's camera is that close to its map
+SKY = (176, 196, 216)
+
+
+class MapRenderer(Protocol):
+    """Renders a map's RGB and depth. One thread renders at a time."""
+
+    name: str
+
+    def render(
+        self,
+        world_from_camera: Pose,
+        camera: Camera,
+        extra: Sequence[TileMesh] = (),
+        *,
+        wait: bool = False,
+    ) -> RenderedView:
+        """The view of an ideal pinhole `camera`.
+
+        extra: meshes to draw besides the map (moving objects). wait: block until all wanted detail
+        is in memory. The returned arrays belong to the caller.
+        """
+        ...
+
+    def close(self) -> None:
+        """Release threads and devices."""
+        ...
+
+
+def require_pinhole(camera: Camera) -> None:
+    """Renderers draw straight lines straight: distortion is the caller's (`undistortion_maps`)."""
+    if camera.is_distorted:
+        raise CameraError(
+            "the renderer takes an ideal pinhole camera; use camera.without_distortion() and "
+            "undistort the image instead"
+        )
+
+
+def is_visible(mesh: TileMesh, world_from_camera: Pose, camera: Camera) -> bool:
+    """Whether the mesh's bounding sphere meets the view."""
+    low, high = mesh.bounds
+    radius = 0.5 * float(np.linalg.norm(high - low))
+    centre = mesh.world_from_tile.apply(0.5 * (low + high))
+    x, y, z = world_from_camera.inverse.apply(centre)
+    if z < NEAR_M - radius:
+        return False
+    for offset, focal, near_edge, far_edge in (
+        (x, camera.fx, -camera.cx, camera.width - camera.cx),
+        (y, camera.fy, -camera.cy, camera.height - camera.cy),
+    ):
+        for edge, sign in ((near_edge, 1.0), (far_edge, -1.0)):
+            slope = edge / focal
+            if sign * (offset - slope * z) < -radius * np.hypot(1.0, slope):
+                return False
+    return True
