@@ -30,5 +30,5 @@ class MapStack:
 def build_localizer(stack: MapStack, camera: Camera, config: LocalizerConfig) -> Localizer:
     """A localizer for one camera over an open map."""
     extractor = load_extractor(config.model, threads=config.feature_threads)
-    optimizer = JNGO(threads=config.threads)
+    optimizer = JNGO(config.registration, threads=config.threads)
     return Localizer(stack.renderer, extractor, optimizer, camera, config)

@@ -9,6 +9,7 @@ import yaml
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from companion.errors import ConfigError
+from companion.sources.base import SourceSettings
 from localizer.camera import Camera
 from localizer.config import LocalizerConfig
 from localizer.errors import CameraError
@@ -39,25 +40,15 @@ class CameraModel(_Model):
         )
 
 
-class MountConfig(_Model):
-    """How the camera sits on its gimbal (or, for a fixed camera, on the body)."""
-
-    roll_deg: float = Field(0.0, ge=-180, le=180)
-    pitch_deg: float = Field(0.0, ge=-180, le=180)
-    yaw_deg: float = Field(0.0, ge=-180, le=180)
-    lever_arm_m: tuple[float, float, float] = Field(
-        (0.0, 0.0, 0.0), description="camera from the autopilot, body axes: forward right down"
-    )
-
-
 class FeedConfig(_Model):
-    """Where the video comes from."""
+    """Where the video comes from. How the camera is mounted stands under ``bridge.camera``."""
 
     source: str = Field(description="udp://, rtsp://, /dev/videoN, a video file or a folder")
     model: CameraModel
-    mount: MountConfig = MountConfig()
-    latency_ms: float = Field(0.0, ge=0, le=2000, description="exposure to arrival, if unstamped")
-    stall_timeout_s: float = Field(2.0, gt=0, description="silence after which the feed reopens")
+    lever_arm_m: tuple[float, float, float] = Field(
+        (0.0, 0.0, 0.0), description="camera from the autopilot, body axes: forward right down"
+    )
+    settings: SourceSettings = SourceSettings()
 
 
 class TargetConfig(_Model):
@@ -76,6 +67,15 @@ class PriorConfig(_Model):
     rotation_sigma_deg: float = Field(4.0, gt=0)
 
 
+class RecordConfig(_Model):
+    """What is kept of a flight."""
+
+    folder: Path = Field(description="estimates, targets, events, health and snapshots")
+    snapshot_interval_s: float | None = Field(
+        10.0, gt=0, description="a video frame is kept this often; none: never"
+    )
+
+
 class CompanionConfig(_Model):
     """One deployment."""
 
@@ -85,7 +85,7 @@ class CompanionConfig(_Model):
     bridge: BridgeConfig = BridgeConfig()
     targets: TargetConfig = TargetConfig()
     prior: PriorConfig = PriorConfig()
-    record: Path | None = Field(None, description="folder of the flight's records")
+    record: RecordConfig | None = None
 
 
 def load_config(path: Path) -> CompanionConfig:
@@ -127,6 +127,8 @@ def _resolve(config: CompanionConfig, folder: Path) -> CompanionConfig:
     localizer = config.localizer
     if localizer.model is not None:
         localizer = localizer.model_copy(update={"model": folder / localizer.model})
-    record = None if config.record is None else folder / config.record
+    record = config.record
+    if record is not None:
+        record = record.model_copy(update={"folder": folder / record.folder})
     update = {"map": folder / config.map, "localizer": localizer, "record": record}
     return config.model_copy(update=update)

@@ -10,9 +10,12 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import Any, TextIO
 
+import cv2
+
+from companion.config import RecordConfig
 from localizer.geo import LocalFrame
 from localizer.pose import quaternion_from_matrix
-from localizer.types import PoseEstimate, TargetFix
+from localizer.types import Frame, PoseEstimate, TargetFix
 
 _QUEUE_SIZE = 4096
 _FLUSH_S = 1.0
@@ -37,8 +40,12 @@ class Recorder:
     Nothing here blocks its callers: rows beyond a bounded queue are dropped and counted.
     """
 
-    def __init__(self, folder: Path, frame: LocalFrame) -> None:
-        folder.mkdir(parents=True, exist_ok=True)
+    def __init__(self, config: RecordConfig, frame: LocalFrame) -> None:
+        folder = config.folder
+        self._snapshots = folder / "snapshots"
+        self._snapshots.mkdir(parents=True, exist_ok=True)
+        self._interval_ns = (config.snapshot_interval_s or 0.0) * 1e9
+        self._next_snapshot_ns = 0.0
         self._frame = frame
         self._rows: queue.Queue[tuple[str, Iterable[Any]] | None] = queue.Queue(_QUEUE_SIZE)
         self.dropped = 0
@@ -86,6 +93,12 @@ class Recorder:
         """Record something that happened, at the current time."""
         self._put("events", (time.monotonic_ns(), level, text))
 
+    def snapshot(self, frame: Frame) -> None:
+        """Keep the frame's image, named by its exposure time, if it is time for one."""
+        if self._interval_ns and frame.exposure_time_ns >= self._next_snapshot_ns:
+            self._next_snapshot_ns = frame.exposure_time_ns + self._interval_ns
+            self._put("snapshot", (frame,))
+
     def close(self) -> None:
         """Write what is queued and close the files."""
         self._rows.put(None)
@@ -106,6 +119,14 @@ class Recorder:
         except queue.Full:
             self.dropped += 1
 
+    def _write(self, name: str, row: Iterable[Any]) -> None:
+        if name == "snapshot":
+            (frame,) = row
+            bgr = cv2.cvtColor(frame.image, cv2.COLOR_RGB2BGR)
+            cv2.imwrite(str(self._snapshots / f"{frame.exposure_time_ns}.jpg"), bgr)
+        elif name:
+            self._writers[name].writerow(row)
+
     def _run(self) -> None:
         flushed = time.monotonic()
         while True:
@@ -115,9 +136,7 @@ class Recorder:
                 item = ("", ())
             if item is None:
                 return
-            name, row = item
-            if name:
-                self._writers[name].writerow(row)
+            self._write(*item)
             if time.monotonic() - flushed > _FLUSH_S:
                 flushed = time.monotonic()
                 for file in self._files.values():

@@ -8,6 +8,7 @@ from pydantic import BaseModel, ConfigDict, Field
 
 from localizer.integrity import IntegrityConfig
 from localizer.motion import MotionConfig
+from localizer.registration.jngo import JNGOConfig
 
 
 class LocalizerConfig(BaseModel):
@@ -22,5 +23,6 @@ class LocalizerConfig(BaseModel):
     feature_threads: int = Field(1, ge=1, description="CPU threads of each feature extraction")
     cache_mib: int = Field(384, ge=16, description="resident tiles, MiB")
     seed: int = Field(0, ge=0, description="seed of anchors and hypotheses")
+    registration: JNGOConfig = JNGOConfig()
     motion: MotionConfig = MotionConfig()
     integrity: IntegrityConfig = IntegrityConfig()

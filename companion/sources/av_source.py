@@ -290,16 +290,20 @@ class LiveVideoSource:
                     return "closed"
                 self._take(picture, arrival_ns, clock)
             return "the sender ended the stream"
+        except av.error.ExitError:  # the read time-out
+            return f"no data for {self._settings.stall_timeout_s:g} s"
         except av.error.FFmpegError as error:
-            silence = (time.monotonic_ns() - self._last_picture_ns) / 1e9
-            return f"no picture for {silence:.1f} s ({error.strerror})"
+            return f"the stream broke off: {error}"
         finally:
             decoder.close()
 
     def _take(self, picture: av.VideoFrame | None, arrival_ns: int, clock: ExposureClock) -> None:
         if picture is None:
             self._count(undecodable=1)
-            if arrival_ns - self._last_picture_ns > self._settings.stall_timeout_s * 1e9:
+            # A receiver that has just joined waits for a key frame: no stall yet.
+            live = self._state is StreamState.LIVE
+            patience_s = self._settings.stall_timeout_s if live else _OPEN_TIMEOUT_S
+            if arrival_ns - self._last_picture_ns > patience_s * 1e9:
                 self._report_stall("data arrives but no picture can be decoded (no key frame yet?)")
             return
         check_size(picture.width, picture.height, self._camera, self._location)

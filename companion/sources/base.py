@@ -33,7 +33,7 @@ StateCallback = Callable[[StreamState, str], None]
 @dataclass(frozen=True)
 class SourceCounters:
     """received: pictures decoded; delivered: handed out by `frames`; dropped: overwritten by a
-    newer one before they were fetched; undecodable: packets or pictures that were damaged;
+    newer one before they were fetched; undecodable: packets that gave no whole picture;
     reconnects: connections after the first.
     """
 

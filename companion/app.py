@@ -1,0 +1,197 @@
+"""The companion process: every part wired once, started and stopped in order.
+
+Data flows one way: feed -> engine -> (bridge, targets, recorder). Each consumer only puts the
+estimate into its own queue on the localization thread.
+"""
+
+from __future__ import annotations
+
+import logging
+import threading
+from functools import partial
+
+import numpy as np
+
+from companion.build import MapStack, build_localizer
+from companion.config import CompanionConfig
+from companion.detections import DetectionListener
+from companion.fixes import vehicle_prior, vision_fix
+from companion.health import HealthMonitor
+from companion.recorder import Recorder
+from companion.sources import StreamState, open_source
+from companion.target_reporter import Target, TargetReporter
+from localizer.engine import DualThreadEngine
+from localizer.map.pick import cast_ray
+from localizer.types import PoseEstimate, PosePrior, ReferenceBundle, TrackingState
+from mavlink_bridge.bridge import Bridge
+from mavlink_bridge.config import BridgeConfig
+from mavlink_bridge.messages import TargetReport
+
+_log = logging.getLogger(__name__)
+
+
+class Companion:
+    """One running deployment. `run` blocks until `stop` is called or the feed ends."""
+
+    def __init__(self, config: CompanionConfig) -> None:
+        self._config = config
+        self._camera = config.camera.model.camera()
+        self._lever_arm = np.array(config.camera.lever_arm_m)
+        self._stack = MapStack(config.map, config.localizer)
+        manifest = self._stack.cache.manifest
+        self._frame = self._stack.cache.frame
+        self._geoid_separation_m = manifest.geoid_separation_m
+        record = config.record
+        self._recorder = Recorder(record, self._frame) if record else None
+        self._bridge = Bridge(_bridge_config(config), manifest.geoid_separation_m)
+        localizer = build_localizer(self._stack, self._camera, config.localizer)
+        self._engine = DualThreadEngine(localizer, (self._on_estimate,), self._vehicle_prior)
+        self._targets = TargetReporter(
+            config.targets, partial(cast_ray, self._stack.streamer), self._on_target
+        )
+        self._source = open_source(
+            config.camera.source, self._camera, config.camera.settings, self._on_feed_state
+        )
+        self._listener: DetectionListener | None = None
+        self._health = HealthMonitor(
+            self._engine, self._bridge, lambda: self._source.state, self._event, record
+        )
+        self._was_tracking = False
+        self._target_numbers: dict[str, int] = {}
+        self._stop = threading.Event()
+        self._feed_error: Exception | None = None
+
+    def run(self) -> None:
+        """Fly until stopped. Raises what ended the feed, after everything is shut down."""
+        self._start()
+        feeder = threading.Thread(target=self._feed, name="feed")
+        feeder.start()
+        try:
+            while not self._stop.wait(0.2):  # in slices: signals are handled between them
+                pass
+        finally:
+            self._source.close()
+            feeder.join()
+            self._shutdown()
+        if self._feed_error is not None:
+            raise self._feed_error
+
+    def stop(self) -> None:
+        """End `run`; may be called from a signal handler or any thread."""
+        self._stop.set()
+
+    def _start(self) -> None:
+        self._bridge.start()
+        self._targets.start()
+        if self._config.targets.detections is not None:
+            self._listener = DetectionListener(
+                self._config.targets.detections, self._targets.add_detection
+            )
+        self._engine.start()
+        self._health.start()
+        self._event("info", f"map {self._config.map}, feed {self._config.camera.source}")
+
+    def _shutdown(self) -> None:
+        self._engine.stop()
+        if self._listener is not None:
+            self._listener.close()
+        self._targets.stop()
+        self._health.stop()
+        self._bridge.stop()
+        self._stack.close()
+        if self._recorder is not None:
+            self._recorder.close()
+
+    def _feed(self) -> None:
+        try:
+            for frame in self._source.frames():
+                self._engine.submit(frame)
+                if self._recorder is not None:
+                    self._recorder.snapshot(frame)
+        except Exception as error:
+            self._feed_error = error
+        self._stop.set()
+
+    def _on_feed_state(self, state: StreamState, text: str) -> None:
+        self._event("warning" if state is StreamState.STALLED else "info", f"feed: {text}")
+
+    def _vehicle_prior(self, time_ns: int) -> PosePrior | None:
+        sigma = self._config.prior
+        return vehicle_prior(
+            self._bridge.state(),
+            self._bridge.attitude_at(time_ns),
+            self._bridge.gimbal_at(time_ns),
+            self._frame,
+            self._geoid_separation_m,
+            self._lever_arm,
+            (sigma.position_sigma_m, float(np.radians(sigma.rotation_sigma_deg))),
+            time_ns,
+        )
+
+    def _on_estimate(self, estimate: PoseEstimate, _: ReferenceBundle) -> None:
+        if self._recorder is not None:
+            self._recorder.estimate(estimate)
+        self._targets.add_estimate(estimate)
+        self._health.add_estimate(estimate)
+        tracking = estimate.state is TrackingState.TRACKING
+        if estimate.accepted and tracking:
+            self._inject(estimate, reset=not self._was_tracking)
+        # DEGRADED keeps the filter's track: only a new start after LOST may carry a jump.
+        if tracking or estimate.state is TrackingState.LOST:
+            self._was_tracking = tracking
+
+    def _inject(self, estimate: PoseEstimate, reset: bool) -> None:
+        time_ns = estimate.exposure_time_ns
+        self._bridge.submit(
+            vision_fix(
+                estimate,
+                self._frame,
+                self._bridge.attitude_at(time_ns),
+                self._bridge.gimbal_at(time_ns),
+                self._lever_arm,
+                reset,
+            )
+        )
+
+    def _on_target(self, target: Target) -> None:
+        fix = target.fix
+        if self._recorder is not None:
+            self._recorder.target(fix, target.velocity)
+        position = self._frame.position(fix.position_world)
+        east, north, up = target.velocity
+        camera = target.estimate.camera
+        self._bridge.report(
+            TargetReport(
+                time_ns=fix.exposure_time_ns,
+                latitude_deg=position.latitude_deg,
+                longitude_deg=position.longitude_deg,
+                height_m=position.height_m,
+                velocity_ned=(float(north), float(east), float(-up)),
+                h_accuracy_m=float(np.sqrt(fix.covariance[0, 0] + fix.covariance[1, 1])),
+                v_accuracy_m=float(np.sqrt(fix.covariance[2, 2])),
+                pixel=(fix.pixel[0] / camera.width, fix.pixel[1] / camera.height),
+                target_id=self._target_number(fix.target_id),
+            )
+        )
+
+    def _target_number(self, name: str) -> int:
+        """A small stable number for a target's name, as MAVLink wants it."""
+        return self._target_numbers.setdefault(name, len(self._target_numbers))
+
+    def _event(self, level: str, text: str) -> None:
+        _log.log(logging.WARNING if level == "warning" else logging.INFO, "%s", text)
+        if self._recorder is not None:
+            self._recorder.event(level, text)
+
+
+def _bridge_config(config: CompanionConfig) -> BridgeConfig:
+    """The bridge announces the camera that the feed really has."""
+    camera = config.camera.model.camera()
+    announced = config.bridge.camera.model_copy(
+        update={
+            "width_px": camera.width,
+            "height_px": camera.height,
+            "horizontal_fov_deg": camera.horizontal_fov_deg,
+        }
+    )
+    return config.bridge.model_copy(update={"camera": announced})

@@ -1,0 +1,109 @@
+"""Between the map's camera poses and the vehicle: pure geometry, no threads, no MAVLink.
+
+Axes: the map's ENU; NED at the vehicle; body FRD; gimbal (x along the boresight, y right, z down);
+camera OpenCV (x right, y down, z forward). The gimbal's attitude comes from the bridge, which
+knows its flags and the camera's mounting on it.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from localizer.errors import GeoreferenceError
+from localizer.geo import NED_FROM_ENU, Geodetic, LocalFrame
+from localizer.pose import Array, Pose, euler_from_matrix, matrix_from_quaternion
+from localizer.types import PoseEstimate, PosePrior
+from mavlink_bridge.messages import Attitude, GimbalAttitude, VehicleState, VisionFix
+
+# OpenCV's z (forward), x (right), y (down) are the gimbal's x, y, z.
+GIMBAL_FROM_CAMERA: Array = np.array([[0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
+
+# An autopilot position older than this does not start tracking.
+_MAX_POSITION_AGE_NS = 2_000_000_000
+
+
+def ned_from_map(frame: LocalFrame, position: Geodetic) -> Array:
+    """Rotation (3, 3) from the map's ENU axes to NED at `position` (0.5 arcmin per km apart)."""
+    local = LocalFrame(position).ecef_from_enu.rotation
+    return NED_FROM_ENU @ local.T @ frame.ecef_from_enu.rotation
+
+
+def vision_fix(
+    estimate: PoseEstimate,
+    frame: LocalFrame,
+    attitude: Attitude | None,
+    gimbal: GimbalAttitude | None,
+    lever_arm_m: Array,
+    reset: bool,
+) -> VisionFix:
+    """The vehicle's position and attitude as the camera's estimate implies them.
+
+    attitude and gimbal at the exposure: together they give the camera's orientation on the body.
+    Without them the vehicle's attitude is unknown (NaN) and the lever arm is not applied.
+    """
+    camera = frame.position(estimate.world_from_camera.translation)
+    to_ned = ned_from_map(frame, camera)
+    ned_from_camera = to_ned @ estimate.world_from_camera.rotation
+    roll = pitch = yaw = math.nan
+    body = estimate.world_from_camera.translation
+    if attitude is not None and gimbal is not None:
+        ned_from_body = ned_from_camera @ body_from_camera(attitude, gimbal).T
+        roll, pitch, yaw = euler_from_matrix(ned_from_body)
+        body = body - to_ned.T @ ned_from_body @ lever_arm_m
+    position = frame.position(body)
+    return VisionFix(
+        time_ns=estimate.exposure_time_ns,
+        latitude_deg=position.latitude_deg,
+        longitude_deg=position.longitude_deg,
+        height_m=position.height_m,
+        roll_rad=roll,
+        pitch_rad=pitch,
+        yaw_rad=yaw,
+        position_covariance_ned=to_ned @ estimate.covariance[:3, :3] @ to_ned.T,
+        attitude_sigma_rad=float(np.sqrt(estimate.covariance.diagonal()[3:].max())),
+        reset=reset,
+        quality=round(100 * min(max(estimate.quality, 0.0), 1.0)),
+    )
+
+
+def body_from_camera(attitude: Attitude, gimbal: GimbalAttitude) -> Array:
+    """Rotation (3, 3) of the camera on the body, from two attitudes against NED."""
+    ned_from_body = matrix_from_quaternion(attitude.quaternion)
+    return ned_from_body.T @ matrix_from_quaternion(gimbal.quaternion) @ GIMBAL_FROM_CAMERA
+
+
+def vehicle_prior(
+    state: VehicleState,
+    attitude: Attitude | None,
+    gimbal: GimbalAttitude | None,
+    frame: LocalFrame,
+    geoid_separation_m: float,
+    lever_arm_m: Array,
+    sigma: tuple[float, float],
+    time_ns: int,
+) -> PosePrior | None:
+    """The camera's pose at `time_ns` as the autopilot knows it; None while it does not.
+
+    sigma: of position (m) and rotation (rad).
+    """
+    age_ns = time_ns - state.position_time_ns
+    if attitude is None or gimbal is None or abs(age_ns) > _MAX_POSITION_AGE_NS:
+        return None
+    try:
+        position = Geodetic(
+            state.latitude_deg, state.longitude_deg, state.altitude_amsl_m + geoid_separation_m
+        )
+    except GeoreferenceError:
+        return None
+    from_ned = ned_from_map(frame, position).T
+    ned_offset = matrix_from_quaternion(attitude.quaternion) @ lever_arm_m
+    if state.local_velocity_ned is not None:
+        ned_offset = ned_offset + np.array(state.local_velocity_ned) * age_ns * 1e-9
+    body = frame.enu_from_geodetic(
+        position.latitude_deg, position.longitude_deg, position.height_m
+    )
+    rotation = from_ned @ matrix_from_quaternion(gimbal.quaternion) @ GIMBAL_FROM_CAMERA
+    covariance = np.diag(np.repeat(np.square(sigma), 3))
+    return PosePrior(Pose(rotation, body + from_ned @ ned_offset), covariance, time_ns)

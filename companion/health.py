@@ -1,0 +1,124 @@
+"""One picture of the process's health, once a second: to the bridge, the record and the log."""
+
+from __future__ import annotations
+
+import json
+import threading
+import time
+from collections import deque
+from collections.abc import Callable
+from dataclasses import asdict
+
+import numpy as np
+
+from companion.config import RecordConfig
+from companion.sources import StreamState
+from localizer.engine import DualThreadEngine
+from localizer.types import PoseEstimate, TrackingState
+from mavlink_bridge.bridge import Bridge
+from mavlink_bridge.messages import HealthLevel
+
+_PERIOD_S = 1.0
+_WINDOW = 200
+_STALE_S = 2.0
+
+
+class HealthMonitor:
+    """Watches the parts and reports transitions. Its thread owns ``health.json``."""
+
+    def __init__(
+        self,
+        engine: DualThreadEngine,
+        bridge: Bridge,
+        feed_state: Callable[[], StreamState],
+        event: Callable[[str, str], None],
+        record: RecordConfig | None,
+    ) -> None:
+        self._engine = engine
+        self._bridge = bridge
+        self._feed_state = feed_state
+        self._event = event
+        self._file = record.folder / "health.json" if record else None
+        self._estimates: deque[tuple[float, PoseEstimate]] = deque(maxlen=_WINDOW)
+        self._last_text = ""
+        self._stop = threading.Event()
+        self._thread = threading.Thread(target=self._run, name="health")
+
+    def start(self) -> None:
+        """Start watching."""
+        self._thread.start()
+
+    def stop(self) -> None:
+        """Stop, after one last report."""
+        self._stop.set()
+        self._thread.join()
+
+    def add_estimate(self, estimate: PoseEstimate) -> None:
+        """Note an estimate. Never blocks."""
+        self._estimates.append((time.monotonic(), estimate))
+
+    def _run(self) -> None:
+        while True:
+            stopping = self._stop.wait(_PERIOD_S)
+            level, text = self._assess()
+            self._bridge.set_health(level, text)
+            if text != self._last_text:
+                self._last_text = text
+                self._event("info" if level is HealthLevel.OK else "warning", text)
+            self._write(level, text)
+            if stopping:
+                return
+
+    def _assess(self) -> tuple[HealthLevel, str]:
+        """The worst thing that is true now, in one line."""
+        feed = self._feed_state()
+        if feed is StreamState.STALLED:
+            return HealthLevel.DEGRADED, "video feed stalled"
+        if not self._estimates:
+            error = self._engine.health.last_error
+            return HealthLevel.STARTING, error or "waiting for video and a pose prior"
+        age = time.monotonic() - self._estimates[-1][0]
+        if age > _STALE_S:
+            error = self._engine.health.last_error or "no frame is being localized"
+            return HealthLevel.DEGRADED, error
+        state = self._estimates[-1][1].state
+        if state is TrackingState.LOST:
+            return HealthLevel.FAILED, "localization lost"
+        if state is TrackingState.DEGRADED:
+            return HealthLevel.DEGRADED, "localization degraded"
+        if state is TrackingState.INITIALIZING:
+            return HealthLevel.STARTING, "localization initializing"
+        return HealthLevel.OK, "localization tracking"
+
+    def _write(self, level: HealthLevel, text: str) -> None:
+        if self._file is None:
+            return
+        report = {
+            "level": level.value,
+            "text": text,
+            "time_ns": time.monotonic_ns(),
+            "engine": asdict(self._engine.health),
+            "rate_hz": self._rate(),
+            "stages_ms": self._stages(),
+            "bridge": self._bridge.counters(),
+        }
+        temporary = self._file.with_suffix(".tmp")
+        temporary.write_text(json.dumps(report, indent=1, default=str))
+        temporary.replace(self._file)
+
+    def _rate(self) -> float:
+        """Localized frames per second over the last few seconds."""
+        now = time.monotonic()
+        return sum(1 for t, _ in list(self._estimates) if now - t < 5.0) / 5.0
+
+    def _stages(self) -> dict[str, dict[str, float]]:
+        """p50 and p95 of each stage over the window, ms."""
+        recent = [e.stage_ms for _, e in list(self._estimates)]
+        stages = {name for stage_ms in recent for name in stage_ms}
+        return {
+            name: {
+                "p50": float(np.percentile([s[name] for s in recent if name in s], 50)),
+                "p95": float(np.percentile([s[name] for s in recent if name in s], 95)),
+            }
+            for name in sorted(stages)
+        }

@@ -1,0 +1,32 @@
+"""``companion run``: the flight process."""
+
+from __future__ import annotations
+
+import logging
+import signal
+from pathlib import Path
+from typing import Annotated
+
+import typer
+from rich.logging import RichHandler
+
+from companion.config import load_config
+
+
+def run_command(
+    config: Annotated[Path, typer.Argument(help="deployment YAML, see configs/")],
+    verbose: Annotated[bool, typer.Option("--verbose", "-v", help="log more")] = False,
+) -> None:
+    """Localize the camera feed and inject positions until interrupted."""
+    logging.basicConfig(
+        level=logging.DEBUG if verbose else logging.INFO,
+        format="%(message)s",
+        handlers=[RichHandler(show_path=False)],
+    )
+    settings = load_config(config)
+    from companion.app import Companion
+
+    companion = Companion(settings)
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, lambda *_: companion.stop())
+    companion.run()

@@ -1,0 +1,144 @@
+"""From a flight's records to numbers: pure functions over arrays read from CSV."""
+
+from __future__ import annotations
+
+import csv
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from localizer.metrics import LocalizationMetrics, localization_metrics
+from localizer.pose import Array, Pose, matrix_from_quaternion
+
+Columns = Mapping[str, Array]
+
+
+def read_csv(path: Path, text: Sequence[str] = ()) -> dict[str, np.ndarray]:
+    """Columns of a CSV file as float64 arrays; those named in `text` as strings, those that end in
+    ``_ns`` as int64 (a float64 would round nanoseconds).
+    """
+    with path.open(newline="", encoding="utf-8") as file:
+        rows = list(csv.DictReader(file))
+        names = rows[0].keys() if rows else []
+    columns: dict[str, np.ndarray] = {}
+    for name in names:
+        values = [row[name] for row in rows]
+        if name in text:
+            columns[name] = np.array(values)
+        elif name.endswith("_ns"):
+            columns[name] = np.array([int(v) for v in values], dtype=np.int64)
+        else:
+            columns[name] = np.array([float(v) for v in values])
+    return columns
+
+
+@dataclass(frozen=True)
+class FrameErrors:
+    """Errors of every frame that the camera exposed in a span. Arrays (F,); NaN: no estimate.
+
+    processed: whether the localizer took the frame (or it was dropped for a newer one).
+    """
+
+    time_ns: np.ndarray
+    translation_m: Array
+    rotation_deg: Array
+    processed: np.ndarray
+
+
+def poses(columns: Columns) -> list[Pose]:
+    """Rows with east_m, north_m, up_m and qw..qz as poses world_from_camera."""
+    t = np.column_stack([columns[k] for k in ("east_m", "north_m", "up_m")])
+    q = np.column_stack([columns[k] for k in ("qw", "qx", "qy", "qz")])
+    return [Pose(matrix_from_quaternion(qi), ti) for qi, ti in zip(q, t, strict=True)]
+
+
+def frame_errors(
+    truth: Columns, estimates: Columns, span_ns: tuple[int, int], tolerance_ns: int = 2_000_000
+) -> FrameErrors:
+    """Match estimates to exposed frames by exposure time and measure them."""
+    inside = (truth["exposure_time_ns"] >= span_ns[0]) & (truth["exposure_time_ns"] <= span_ns[1])
+    times = truth["exposure_time_ns"][inside]
+    true_poses = [p for p, keep in zip(poses(truth), inside, strict=True) if keep]
+    estimated = poses(estimates) if len(estimates) else []
+    stamps = np.asarray(estimates.get("exposure_time_ns", np.empty(0, np.int64)))
+    accepted = np.asarray(estimates.get("accepted", np.empty(0))) > 0
+    n = len(times)
+    translation, rotation = np.full(n, np.nan), np.full(n, np.nan)
+    processed = np.zeros(n, bool)
+    for i, (time_ns, pose) in enumerate(zip(times, true_poses, strict=True)):
+        if not len(stamps):
+            break
+        k = int(np.argmin(np.abs(stamps - time_ns)))
+        if abs(int(stamps[k]) - int(time_ns)) > tolerance_ns:
+            continue
+        processed[i] = True
+        if accepted[k]:
+            translation[i], rotation[i] = pose.distance_to(estimated[k])
+    return FrameErrors(times, translation, rotation, processed)
+
+
+def localization_summary(errors: FrameErrors) -> LocalizationMetrics:
+    """The paper's columns over the frames that the localizer processed.
+
+    fps is localized frames per second of flight, not the throughput of the machine.
+    """
+    done = errors.processed
+    localized = int(np.isfinite(errors.translation_m).sum())
+    span_s = max(float(errors.time_ns[-1] - errors.time_ns[0]) * 1e-9, 1e-9) if len(done) else 1.0
+    metrics = localization_metrics(errors.translation_m[done], errors.rotation_deg[done], 1.0)
+    values = metrics.__dict__ | {"fps": localized / span_s}
+    return LocalizationMetrics(**values)
+
+
+@dataclass(frozen=True)
+class Spread:
+    """Median, 95th percentile and maximum of an error."""
+
+    median: float
+    p95: float
+    maximum: float
+
+    @classmethod
+    def of(cls, values: Array) -> Spread:
+        """Of the finite values; NaN when there is none."""
+        finite = np.asarray(values)[np.isfinite(values)]
+        if not len(finite):
+            return cls(float("nan"), float("nan"), float("nan"))
+        return cls(*(float(x) for x in (*np.percentile(finite, [50, 95]), finite.max())))
+
+
+def ekf_errors(vehicle: Columns, span_ns: tuple[int, int]) -> tuple[np.ndarray, Array, Array]:
+    """(times, horizontal error, vertical error) of the autopilot's position against the truth."""
+    t = vehicle["time_ns"]
+    inside = (t >= span_ns[0]) & (t <= span_ns[1])
+    d = [vehicle[f"ekf_{a}_m"][inside] - vehicle[f"{a}_m"][inside] for a in ("east", "north", "up")]
+    return t[inside], np.hypot(d[0], d[1]), np.abs(d[2])
+
+
+def target_errors(
+    targets: Columns, truth_at: Mapping[str, Mapping[int, Array]], span_ns: tuple[int, int]
+) -> dict[str, Array]:
+    """3-D errors of each target's fixes within the span; truth_at[name][time_ns] is (3,) ENU."""
+    errors: dict[str, Array] = {}
+    for name, truth in truth_at.items():
+        rows = np.flatnonzero(
+            (targets["target_id"] == name)
+            & (targets["exposure_time_ns"] >= span_ns[0])
+            & (targets["exposure_time_ns"] <= span_ns[1])
+        )
+        fixes = np.column_stack([targets[k][rows] for k in ("east_m", "north_m", "up_m")])
+        times = [int(t) for t in targets["exposure_time_ns"][rows]]
+        known = [i for i, t in enumerate(times) if t in truth]
+        true = np.array([truth[times[i]] for i in known]).reshape(-1, 3)
+        errors[name] = np.linalg.norm(fixes[known] - true, axis=1)
+    return errors
+
+
+def stage_latencies(estimates: Columns, span_ns: tuple[int, int]) -> dict[str, Spread]:
+    """Milliseconds of every stage within the span."""
+    t = estimates["exposure_time_ns"]
+    inside = (t >= span_ns[0]) & (t <= span_ns[1])
+    names = [k for k in estimates if k.endswith("_ms")]
+    return {name.removesuffix("_ms"): Spread.of(estimates[name][inside]) for name in names}
