@@ -1,0 +1,252 @@
+"""UDP loopback: what a real sender's stream becomes at the companion."""
+
+from __future__ import annotations
+
+import socket
+import threading
+import time
+
+import numpy as np
+import pytest
+
+from companion.errors import StreamOpenError, StreamSizeError
+from companion.sources import FrameSource, SourceSettings, StreamState, open_source
+from localizer.camera import Camera
+from localizer.types import Frame, Image
+from sitl.stream import VideoSender
+
+CAMERA = Camera.from_fov(320, 240, 70.0)
+_CELL = 16
+_BITS = 10
+
+
+def free_port() -> int:
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as s:
+        s.bind(("127.0.0.1", 0))
+        return int(s.getsockname()[1])
+
+
+def counter_image(number: int, camera: Camera = CAMERA) -> Image:
+    """Smooth background, and `number` as black and white cells along the top."""
+    v, u = np.mgrid[: camera.height, : camera.width]
+    image = np.stack([u * 255 // camera.width, v * 255 // camera.height, (u + v) // 4], axis=-1)
+    for bit in range(_BITS):
+        image[:_CELL, bit * _CELL : (bit + 1) * _CELL] = 255 * (number >> bit & 1)
+    return image.astype(np.uint8)
+
+
+def read_counter(image: Image) -> int:
+    h = _CELL // 2
+    bits = [image[h - 2 : h + 2, b * _CELL + h - 2 : b * _CELL + h + 2].mean() > 128
+            for b in range(_BITS)]  # fmt: skip
+    return sum(1 << b for b, bit in enumerate(bits) if bit)
+
+
+class PacedSender:
+    """Sends counter images at a fixed rate from a thread; remembers when each was exposed.
+
+    delay_s: what a camera's own processing takes between exposure and sending.
+    """
+
+    def __init__(
+        self,
+        url: str,
+        rate_hz: float = 20.0,
+        *,
+        camera: Camera = CAMERA,
+        misp: bool = True,
+        delay_s: float = 0.0,
+        first: int = 0,
+    ) -> None:
+        self.exposed: dict[int, int] = {}
+        self._url, self._rate, self._camera, self._misp = url, rate_hz, camera, misp
+        self._delay, self._next = delay_s, first
+        self._stop = threading.Event()
+        self._thread = threading.Thread(target=self._run, daemon=True)
+
+    def __enter__(self) -> PacedSender:
+        self._thread.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._stop.set()
+        self._thread.join(5.0)
+
+    def _run(self) -> None:
+        c = self._camera
+        sender = VideoSender(self._url, c.width, c.height, self._rate, misp=self._misp)
+        while not self._stop.is_set():
+            exposed = time.monotonic_ns()
+            self.exposed[self._next] = exposed
+            image = counter_image(self._next, c)
+            time.sleep(self._delay)
+            sender.send(image, exposed)
+            self._next = (self._next + 1) % (1 << _BITS)
+            self._stop.wait(max(0.0, 1 / self._rate - (time.monotonic_ns() - exposed) / 1e9))
+        sender.close()
+
+
+class Watch:
+    """Collects a source's frames and states from a thread, with the time each frame came out."""
+
+    def __init__(self, url: str, camera: Camera = CAMERA, **settings: object) -> None:
+        self.frames: list[tuple[Frame, int]] = []
+        self.states: list[StreamState] = []
+        self.texts: list[str] = []
+        self.error: Exception | None = None
+        self.source: FrameSource = open_source(
+            url, camera, SourceSettings.model_validate(settings), self._on_state
+        )
+        self._thread = threading.Thread(target=self._run, daemon=True)
+
+    def __enter__(self) -> Watch:
+        self._thread.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.source.close()
+        self._thread.join(10.0)
+        assert not self._thread.is_alive()
+
+    def wait_for(self, count: int, timeout_s: float = 15.0) -> None:
+        self.wait_until(lambda: len(self.frames) >= count, timeout_s)
+
+    def wait_until(self, condition: object, timeout_s: float = 15.0) -> None:
+        deadline = time.monotonic() + timeout_s
+        while not condition():  # type: ignore[operator]
+            assert time.monotonic() < deadline, (len(self.frames), self.states, self.texts)
+            time.sleep(0.02)
+
+    def _run(self) -> None:
+        try:
+            for frame in self.source.frames():
+                self.frames.append((frame, time.monotonic_ns()))
+        except Exception as error:
+            self.error = error
+
+    def _on_state(self, state: StreamState, text: str) -> None:
+        self.states.append(state)
+        self.texts.append(text)
+
+
+@pytest.fixture
+def url() -> str:
+    return f"udp://127.0.0.1:{free_port()}"
+
+
+def _compare(watch: Watch, sender: PacedSender, skip: int = 0) -> tuple[np.ndarray, np.ndarray]:
+    """(error of the exposure time, glass-to-glass latency) per frame, ms."""
+    rows = []
+    for frame, seen_ns in watch.frames[skip:]:
+        true_ns = sender.exposed[read_counter(frame.image)]
+        rows.append(((frame.exposure_time_ns - true_ns) / 1e6, (seen_ns - true_ns) / 1e6))
+    error, latency = np.array(rows).T
+    return error, latency
+
+
+def test_exposure_times_by_misp_stamps_are_exact_and_latency_is_low(url: str) -> None:
+    with Watch(url) as watch, PacedSender(url, delay_s=0.02) as sender:
+        watch.wait_for(40)
+    error, latency = _compare(watch, sender)
+    print(
+        f"\nglass to glass, ms: median {np.median(latency):.1f}"
+        f" p95 {np.percentile(latency, 95):.1f} (20 of them the sender's own);"
+        f" exposure error max {np.abs(error).max():.4f}"
+    )
+    assert np.abs(error).max() < 0.1
+    # One frame period is 50 ms: a receiver that held pictures back until the next one fails here.
+    assert np.median(latency) < 20 + 40
+    counters = watch.source.counters
+    assert counters.delivered == len(watch.frames)
+    assert counters.received - counters.delivered - counters.dropped in (0, 1)
+    sequences = [f.sequence for f, _ in watch.frames]
+    assert sequences == sorted(set(sequences))
+
+
+def test_exposure_times_by_presentation_times_need_the_fixed_latency_only(url: str) -> None:
+    delay = 0.03
+    with (
+        Watch(url, timing="pts", latency_ms=1000 * delay) as watch,
+        PacedSender(url, misp=False, delay_s=delay) as sender,
+    ):
+        watch.wait_for(40)
+    # The smallest lag needs some frames to be found: the first came in a burst after the probing.
+    error, _ = _compare(watch, sender, skip=10)
+    print(f"\nexposure error by pts, ms: {error.min():.2f} to {error.max():.2f}")
+    assert error.min() > -1.0
+    assert error.max() < 5.0
+    times = [f.exposure_time_ns for f, _ in watch.frames]
+    assert times == sorted(times)
+
+
+def test_a_stream_that_stops_is_reported_and_taken_up_again(url: str) -> None:
+    with Watch(url, stall_timeout_s=0.4, retry_max_s=0.5) as watch:
+        with PacedSender(url):
+            watch.wait_for(10)
+        watch.wait_until(lambda: StreamState.STALLED in watch.states)
+        assert url in watch.texts[watch.states.index(StreamState.STALLED)]
+        before = len(watch.frames)
+        with PacedSender(url, first=500) as second:
+            watch.wait_for(before + 10)
+    states = [s for s in watch.states if s is not StreamState.CONNECTING]
+    assert states == [StreamState.LIVE, StreamState.STALLED, StreamState.LIVE, StreamState.CLOSED]
+    assert watch.error is None
+    assert watch.source.counters.reconnects >= 1
+    frame, seen_ns = watch.frames[-1]
+    assert read_counter(frame.image) in second.exposed
+    assert 0 < seen_ns - frame.exposure_time_ns < 0.3e9
+
+
+def test_a_consumer_that_is_slow_gets_the_newest_frame_and_the_rest_are_counted(url: str) -> None:
+    with PacedSender(url, rate_hz=30.0):
+        source = open_source(url, CAMERA)
+        ages = []
+        for _, frame in zip(range(6), source.frames(), strict=False):
+            ages.append((time.monotonic_ns() - frame.exposure_time_ns) / 1e6)
+            time.sleep(0.25)
+        counters = source.counters
+        source.close()
+    assert max(ages[1:]) < 100  # a queue would make them grow by 250 ms a frame
+    assert counters.delivered == 6
+    assert counters.dropped >= 20
+
+
+def test_a_stream_of_another_size_is_an_error_that_names_both(url: str) -> None:
+    with Watch(url, camera=Camera.from_fov(640, 480, 70.0)) as watch, PacedSender(url):
+        watch.wait_until(lambda: watch.error is not None)
+    assert isinstance(watch.error, StreamSizeError)
+    for text in ("320x240", "640x480", url):
+        assert text in str(watch.error)
+    assert watch.states[-2:] == [StreamState.FAILED, StreamState.CLOSED]
+
+
+def test_closing_ends_the_iteration_before_any_frame_came(url: str) -> None:
+    with Watch(url, stall_timeout_s=0.3) as watch:
+        time.sleep(0.2)
+    assert watch.frames == []
+    assert watch.error is None
+    assert watch.states[-1] is StreamState.CLOSED
+
+
+def test_a_port_in_use_is_reported_and_kept_trying(url: str) -> None:
+    port = int(url.rsplit(":", 1)[1])
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as holder:
+        holder.bind(("127.0.0.1", port))
+        with Watch(url, retry_max_s=0.3) as watch:
+            watch.wait_until(lambda: StreamState.STALLED in watch.states)
+            assert "in use" in watch.texts[-1]
+            holder.close()
+            with PacedSender(url):
+                watch.wait_for(3)
+
+
+def test_a_missing_video_device_is_named() -> None:
+    with pytest.raises(StreamOpenError, match=r"/dev/video97.*plugged in"):
+        open_source("/dev/video97", CAMERA)
+
+
+def test_an_rtsp_server_that_is_not_there_is_reported_and_kept_trying() -> None:
+    with Watch("rtsp://127.0.0.1:9/none", retry_max_s=0.3) as watch:
+        watch.wait_until(lambda: StreamState.STALLED in watch.states)
+        assert "cannot connect" in watch.texts[watch.states.index(StreamState.STALLED)]
+    assert watch.error is None

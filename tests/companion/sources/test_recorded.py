@@ -1,0 +1,153 @@
+"""Video files and image folders."""
+
+from __future__ import annotations
+
+import time
+from pathlib import Path
+
+import av
+import cv2
+import numpy as np
+import pytest
+from pydantic import ValidationError
+
+from companion.errors import StreamDecodeError, StreamOpenError, StreamSizeError
+from companion.sources import SourceSettings, StreamState, open_source
+from localizer.camera import Camera
+
+CAMERA = Camera.from_fov(160, 120, 70.0)
+COUNT = 12
+
+
+def _image(level: int) -> np.ndarray:
+    image = np.zeros((120, 160, 3), np.uint8)
+    image[...] = (level, 255 - level, 40)
+    return image
+
+
+@pytest.fixture
+def video(tmp_path: Path) -> Path:
+    path = tmp_path / "flight.mp4"
+    with av.open(str(path), "w") as container:
+        stream = container.add_stream("libx264", rate=20, options={"g": "4"})
+        stream.width, stream.height, stream.pix_fmt = 160, 120, "yuv420p"
+        for i in range(COUNT):
+            picture = av.VideoFrame.from_ndarray(_image(20 * i), format="rgb24")
+            container.mux(stream.encode(picture))
+        container.mux(stream.encode())
+    return path
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    path = tmp_path / "images"
+    path.mkdir()
+    for i in range(COUNT):
+        cv2.imwrite(str(path / f"img{i}.png"), _image(20 * i)[..., ::-1])
+    return path
+
+
+@pytest.mark.parametrize("kind", ["video", "folder"])
+def test_every_image_comes_once_in_order_in_rgb(kind: str, request: pytest.FixtureRequest) -> None:
+    states = []
+    settings = SourceSettings(rate_hz=20)
+    path = request.getfixturevalue(kind)
+    source = open_source(path, CAMERA, settings, lambda s, _: states.append(s))
+    frames = list(source.frames())
+    for i, frame in enumerate(frames):
+        assert frame.sequence == i
+        expected = (20 * i, 255 - 20 * i, 40)
+        assert np.abs(frame.image.reshape(-1, 3).mean(0) - expected).max() < 6
+    steps = np.diff([f.exposure_time_ns for f in frames])
+    assert len(frames) == COUNT
+    np.testing.assert_allclose(steps, 50e6, atol=1e3)
+    assert states == [StreamState.LIVE, StreamState.ENDED]
+    assert source.counters.delivered == COUNT
+    assert source.counters.dropped == 0
+
+
+@pytest.mark.parametrize("kind", ["video", "folder"])
+def test_realtime_plays_at_the_recorded_pace(kind: str, request: pytest.FixtureRequest) -> None:
+    path = request.getfixturevalue(kind)
+    start = time.monotonic()
+    list(open_source(path, CAMERA, SourceSettings(rate_hz=20, realtime=True)).frames())
+    assert 0.5 < time.monotonic() - start < 2.0
+
+
+@pytest.mark.parametrize("kind", ["video", "folder"])
+def test_another_size_than_the_cameras_is_named(kind: str, request: pytest.FixtureRequest) -> None:
+    source = open_source(request.getfixturevalue(kind), Camera.from_fov(640, 480, 70.0))
+    with pytest.raises(StreamSizeError, match=r"160x120.*640x480"):
+        list(source.frames())
+    assert source.state is StreamState.FAILED
+
+
+def test_closing_ends_the_frames(folder: Path) -> None:
+    source = open_source(folder, CAMERA)
+    frames = source.frames()
+    next(frames)
+    source.close()
+    assert list(frames) == []
+
+
+def test_timestamps_are_used_as_they_stand(folder: Path) -> None:
+    lines = [f"img{i}.png {10**9 + i * 33_000_000}" for i in range(COUNT)]
+    (folder / "timestamps.txt").write_text("# name time_ns\n" + "\n".join(lines))
+    times = [f.exposure_time_ns for f in open_source(folder, CAMERA).frames()]
+    assert times == [10**9 + i * 33_000_000 for i in range(COUNT)]
+
+
+def test_timestamps_that_lack_an_image_or_are_no_numbers_are_named(folder: Path) -> None:
+    (folder / "timestamps.txt").write_text("img0.png 1\n")
+    with pytest.raises(StreamOpenError, match=r"11 of 12 images, first img1.png"):
+        open_source(folder, CAMERA)
+    (folder / "timestamps.txt").write_text("img0.png 1\nimg1.png soon\n")
+    with pytest.raises(StreamDecodeError, match=r"line 2.*soon"):
+        open_source(folder, CAMERA)
+
+
+def test_a_damaged_image_is_named(folder: Path) -> None:
+    (folder / "img3.png").write_bytes(b"not a picture")
+    source = open_source(folder, CAMERA)
+    with pytest.raises(StreamDecodeError, match=r"img3.png"):
+        list(source.frames())
+    assert source.counters.delivered == 3
+
+
+def test_a_video_damaged_from_the_start_is_named(tmp_path: Path) -> None:
+    path = tmp_path / "broken.mp4"
+    path.write_bytes(b"\0" * 5000)
+    with pytest.raises(StreamOpenError, match=r"broken.mp4"):
+        list(open_source(path, CAMERA).frames())
+
+
+def test_a_video_with_a_damaged_rest_gives_what_is_good(video: Path, tmp_path: Path) -> None:
+    stream = tmp_path / "cut.ts"
+    with av.open(str(video)) as source, av.open(str(stream), "w") as target:
+        output = target.add_stream_from_template(source.streams.video[0])
+        for packet in source.demux(source.streams.video[0]):
+            if packet.dts is not None:
+                packet.stream = output
+                target.mux(packet)
+    data = bytearray(stream.read_bytes())
+    half = len(data) // 2
+    data[half:] = np.random.default_rng(0).bytes(len(data) - half)
+    stream.write_bytes(data)
+    frames = open_source(stream, CAMERA)
+    count = len(list(frames.frames()))
+    assert 0 < count < COUNT
+    assert frames.state is StreamState.ENDED
+
+
+def test_what_is_not_there_is_named(tmp_path: Path) -> None:
+    with pytest.raises(StreamOpenError, match=r"nowhere"):
+        open_source(tmp_path / "nowhere", CAMERA)
+    with pytest.raises(StreamOpenError, match=r"holds no images"):
+        open_source(tmp_path, CAMERA)
+    with pytest.raises(StreamOpenError, match=r"gopher://.*use udp://"):
+        open_source("gopher://host/1", CAMERA)
+
+
+def test_unknown_settings_are_refused() -> None:
+    with pytest.raises(ValidationError, match=r"latency_sec"):
+        SourceSettings.model_validate({"latency_sec": 1})

@@ -1,0 +1,104 @@
+"""Exposure times from stamps, with simulated clocks."""
+
+from __future__ import annotations
+
+import time
+
+import numpy as np
+import pytest
+
+from companion.sources.misp import UUID, MispTime, parse_message, sei_nal
+from companion.sources.timing import ExposureClock, MinimumLag, Stamps
+
+MS = 1_000_000
+
+
+def test_a_misp_stamp_survives_the_round_trip_and_matches_the_standards_layout() -> None:
+    stamp = MispTime(0x0005_1A2B_3C4D_5E6F, locked=True)
+    nal = sei_nal(stamp)
+    assert nal[:7] == bytes([0, 0, 0, 1, 6, 5, 28])
+    assert nal[7:23] == UUID == bytes.fromhex("4d4953506d6963726f73656374696d65")
+    assert nal[23:35].hex() == "1f" + "0005ff1a2bff3c4dff5e6f"
+    assert nal[-1] == 0x80
+    assert parse_message(nal[7:-1]) == stamp
+    assert parse_message(sei_nal(MispTime(1, locked=False))[7:-1]) == MispTime(1, locked=False)
+
+
+@pytest.mark.parametrize("time_us", [0, 0x0000_0100_0000_0000, 2**64 - 1])
+def test_no_start_code_appears_in_a_stamp(time_us: int) -> None:
+    message = sei_nal(MispTime(time_us, locked=True))[4:]
+    assert not any(message[i : i + 2] == b"\0\0" and message[i + 2] <= 3
+                   for i in range(len(message) - 2))  # fmt: skip
+
+
+def test_other_sei_messages_are_not_stamps() -> None:
+    assert parse_message(b"x264 - core 164" + bytes(40)) is None
+    assert parse_message(UUID + b"\x1f" + bytes(11)) is None
+    assert parse_message(UUID) is None
+
+
+def test_the_smallest_lag_finds_the_senders_clock_under_jitter() -> None:
+    rng = np.random.default_rng(3)
+    clock = MinimumLag(latency_ns=40 * MS)
+    true = 10**12 + np.arange(300) * 100 * MS
+    arrival = true + 40 * MS + (rng.exponential(15, 300) * MS).astype(int)
+    arrival = np.maximum.accumulate(arrival)
+    sender = true - 987_654_321_000  # another epoch
+    mapped = np.array([clock.map(int(s), int(a)) for s, a in zip(sender, arrival, strict=True)])
+    assert np.abs(mapped - true)[50:].max() < 3 * MS
+    assert (np.diff(mapped) >= 0).all()
+
+
+def test_the_smallest_lag_follows_a_slow_clock() -> None:
+    clock = MinimumLag()
+    true = np.arange(3000) * 100 * MS  # five minutes
+    sender = (true * (1 - 50e-6)).astype(int)  # 50 ppm slow: 15 ms behind at the end
+    mapped = [clock.map(int(s), int(t)) for s, t in zip(sender, true, strict=True)]
+    assert abs(mapped[-1] - true[-1]) < 1.1 * MS
+
+
+def test_a_sender_that_starts_again_is_taken_up_at_once() -> None:
+    clock = MinimumLag()
+    clock.map(500 * 10**9, 100 * 10**9)
+    assert clock.map(0, 101 * 10**9) == 101 * 10**9
+    assert clock.map(100 * 10**9, 102 * 10**9) == 102 * 10**9
+
+
+def _misp_us(monotonic_ns: int, offset_ns: int = 0) -> int:
+    return (monotonic_ns + offset_ns + time.time_ns() - time.monotonic_ns()) // 1000
+
+
+def test_a_locked_misp_stamp_is_taken_as_it_is_and_the_latency_setting_is_not() -> None:
+    now = time.monotonic_ns()
+    clock = ExposureClock(latency_ns=90 * MS)
+    stamps = Stamps(pts_ns=7, misp=MispTime(_misp_us(now - 60 * MS), locked=True))
+    assert clock.exposure_time(stamps, now) == pytest.approx(now - 60 * MS, abs=0.1 * MS)
+
+
+@pytest.mark.parametrize(
+    ("offset_ns", "locked"), [(0, False), (3600 * 10**9, True), (-5 * 10**9, True)]
+)
+def test_a_misp_clock_that_is_not_ours_gives_differences_only(
+    offset_ns: int, locked: bool, caplog: pytest.LogCaptureFixture
+) -> None:
+    now = time.monotonic_ns()
+    clock = ExposureClock(latency_ns=30 * MS)
+    for i, lag in enumerate([30, 55, 48]):
+        true = now + i * 100 * MS
+        stamps = Stamps(None, MispTime(_misp_us(true, offset_ns), locked))
+        result = clock.exposure_time(stamps, true + lag * MS)
+        assert result == pytest.approx(true, abs=0.2 * MS)
+    assert caplog.text.count("MISP clock") == 1
+
+
+def test_device_stamps_on_the_monotonic_clock_are_exposure_times() -> None:
+    now = time.monotonic_ns()
+    clock = ExposureClock(latency_ns=30 * MS, device=True)
+    assert clock.exposure_time(Stamps(now - 25 * MS, None), now) == now - 25 * MS
+    wall_clock = Stamps(time.time_ns(), None)
+    assert clock.exposure_time(wall_clock, now) == now - 30 * MS
+
+
+def test_without_any_stamp_the_arrival_less_the_latency_is_left() -> None:
+    clock = ExposureClock(latency_ns=30 * MS)
+    assert clock.exposure_time(Stamps(None, None), 10**12) == 10**12 - 30 * MS
