@@ -1,7 +1,23 @@
 """Registration: geo-anchors, pose hypotheses and the JNGO optimizer (docs/registration.md)."""
 
 from localizer.registration.anchors import select_anchors
-from localizer.registration.backend import QuadraticPrior
 from localizer.registration.jngo import JNGO, JNGOConfig, Registration
+from localizer.registration.priors import (
+    PoseConstraint,
+    attitude_constraint,
+    combine,
+    height_constraint,
+    position_constraint,
+)
 
-__all__ = ["JNGO", "JNGOConfig", "QuadraticPrior", "Registration", "select_anchors"]
+__all__ = [
+    "JNGO",
+    "JNGOConfig",
+    "PoseConstraint",
+    "Registration",
+    "attitude_constraint",
+    "combine",
+    "height_constraint",
+    "position_constraint",
+    "select_anchors",
+]

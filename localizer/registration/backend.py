@@ -120,11 +120,7 @@ def local_origin(anchors: Anchors, world_from_camera: Pose) -> Array:
 
 
 def level_problems(
-    query: FeaturePyramid,
-    camera: Camera,
-    anchors: Anchors,
-    origin: Array,
-    prior: QuadraticPrior | None = None,
+    query: FeaturePyramid, camera: Camera, anchors: Anchors, origin: Array
 ) -> tuple[LevelProblem, ...]:
     """The problems of all levels, coarse to fine, in the local frame about `origin` (3,)."""
     points = np.ascontiguousarray((anchors.points_world - origin).T, dtype=np.float32)
@@ -142,7 +138,6 @@ def level_problems(
                 points,
                 np.ascontiguousarray(features, dtype=np.float32),
                 np.ascontiguousarray(confidence, dtype=np.float32),
-                prior,
             )
         )
     return tuple(problems)

@@ -9,13 +9,16 @@ from localizer.pose import Array, Pose
 from localizer.registration.reference import Linearization, pose_tangent_map
 
 
-def tangent_covariance(model: Linearization, correlation: float, floor: float) -> Array | None:
+def tangent_covariance(
+    model: Linearization, correlation: float, floor: float, prior_weight: float = 0.0
+) -> Array | None:
     """Covariance (6, 6) of xi = (rho, phi) at the optimum, None where H is singular.
 
     The sandwich ``H^-1 (sum_j g_j g_j') H^-1`` (equation 11) uses the residuals' own variance and
     their correlation between channels; `correlation` is the factor for anchors whose features see
     the same image content. `floor` is the least share of the feature noise's isotropic model, so
-    that a perfect fit does not claim perfect knowledge.
+    that a perfect fit does not claim perfect knowledge. A prior of weight `prior_weight` adds its
+    own noise.
     """
     scale = model.weights * model.robust
     total = model.weights.sum()
@@ -33,7 +36,8 @@ def tangent_covariance(model: Linearization, correlation: float, floor: float) -
     isotropic = variance * np.einsum(
         "n,nci,ncj->ij", (scale / total) ** 2, model.jacobians, model.jacobians
     )
-    covariance: Array = correlation * inverse @ (meat + floor * isotropic) @ inverse
+    noise = correlation * (meat + floor * isotropic) + prior_weight * model.prior_hessian
+    covariance: Array = inverse @ noise @ inverse
     return 0.5 * (covariance + covariance.T)
 
 

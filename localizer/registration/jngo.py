@@ -7,7 +7,7 @@ docs/registration.md is the specification.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -33,6 +33,7 @@ from localizer.registration.covariance import (
 )
 from localizer.registration.hypotheses import generate_hypotheses
 from localizer.registration.kernel_numba import NumbaBackend
+from localizer.registration.priors import PoseConstraint
 from localizer.registration.reference import Linearization, ReferenceBackend, linearize
 from localizer.types import Anchors, FeaturePyramid, PosePrior, RegistrationStatus
 
@@ -126,7 +127,7 @@ class JNGO:
         prior: PosePrior,
         *,
         motion: PosePrior | None = None,
-        constraint: QuadraticPrior | None = None,
+        constraint: PoseConstraint | None = None,
         seed: int = 0,
     ) -> Registration:
         """Pose of the query's camera, a pinhole of the query image's size.
@@ -139,18 +140,22 @@ class JNGO:
         if status is not RegistrationStatus.OK:
             return _failure(prior, status)
         origin = local_origin(anchors, prior.world_from_camera)
-        problems = level_problems(query, camera, anchors, origin, constraint)
-        swarm = self._refine(problems, origin, prior, motion, seed)
+        problems = level_problems(query, camera, anchors, origin)
+        swarm = self._refine(
+            problems, origin, prior, motion=motion, constraint=constraint, seed=seed
+        )
         if not np.isfinite(swarm.scores[0]):
             return _failure(prior, RegistrationStatus.NO_OVERLAP, swarm.evaluations)
-        return self._result(problems[-1], origin, prior, swarm)
+        return self._result(origin, prior, swarm)
 
     def _refine(
         self,
         problems: tuple[LevelProblem, ...],
         origin: Array,
         prior: PosePrior,
+        *,
         motion: PosePrior | None,
+        constraint: PoseConstraint | None,
         seed: int,
     ) -> _Swarm:
         c = self.config
@@ -165,7 +170,8 @@ class JNGO:
         R, t = camera_from_local(rotations, centres, origin)
         keep = (*c.keep[: len(problems) - 1], c.hypotheses)
         evaluations = 0
-        for problem, iterations, survivors in zip(problems, c.iterations, keep, strict=True):
+        for level, iterations, survivors in zip(problems, c.iterations, keep, strict=True):
+            problem = self._constrained(level, constraint, R, t, origin)
             result = self.backend.refine(problem, R, t, iterations, c.settings)
             evaluations += result.evaluations
             totals = self._totals(
@@ -176,11 +182,33 @@ class JNGO:
             R, t = result.rotations[order], result.translations[order]
             scores, overlaps = result.scores[order], result.overlaps[order]
         if c.polish and np.isfinite(scores[0]):
-            result = self.backend.refine(problems[-1], R[:1], t[:1], c.polish, c.settings)
+            result = self.backend.refine(problem, R[:1], t[:1], c.polish, c.settings)
             evaluations += result.evaluations
             R[:1], t[:1] = result.rotations, result.translations
             scores[:1], overlaps[:1] = result.scores, result.overlaps
-        return _Swarm(R, t, scores, overlaps, evaluations)
+        return _Swarm(problem, R, t, scores, overlaps, evaluations)
+
+    def _constrained(
+        self,
+        problem: LevelProblem,
+        constraint: PoseConstraint | None,
+        R: Array,
+        t: Array,
+        origin: Array,
+    ) -> LevelProblem:
+        """The problem with the constraint's cost in the units of the level's best score."""
+        if constraint is None or self.config.prior_weight == 0:
+            return problem
+        best = self.backend.refine(problem, R, t, 0, self.config.settings).scores.min()
+        if not np.isfinite(best):
+            return problem
+        pose = constraint.world_from_camera
+        rotation, translation = camera_from_local(
+            pose.rotation[None], pose.translation[None], origin
+        )
+        target = Pose(rotation[0], translation[0])
+        weight = self.config.prior_weight * float(best)
+        return replace(problem, prior=QuadraticPrior(target, constraint.information, weight))
 
     def _totals(
         self, R: Array, t: Array, scores: Array, origin: Array, motion: PosePrior | None
@@ -196,13 +224,12 @@ class JNGO:
         totals: Array = scores + self.config.motion_weight * best * squared
         return totals
 
-    def _result(
-        self, problem: LevelProblem, origin: Array, prior: PosePrior, swarm: _Swarm
-    ) -> Registration:
-        c = self.config
+    def _result(self, origin: Array, prior: PosePrior, swarm: _Swarm) -> Registration:
+        c, problem = self.config, swarm.problem
         R, t = swarm.rotations[0], swarm.translations[0]
         model = linearize(problem, R, t, c.settings)
-        tangent = tangent_covariance(model, c.correlation, c.covariance_floor)
+        weight = 0.0 if problem.prior is None else problem.prior.weight
+        tangent = tangent_covariance(model, c.correlation, c.covariance_floor, weight)
         if tangent is None:
             return _failure(prior, RegistrationStatus.NO_TEXTURE, swarm.evaluations)
         rotations, centres = world_from_camera(swarm.rotations, swarm.translations, origin)
@@ -232,11 +259,27 @@ class JNGO:
         probabilities: Array = likelihood / likelihood.sum()
         return probabilities
 
+    def warm_up(self, channels: int) -> None:
+        """Compile (or load from numba's cache) the kernel for feature maps of `channels`."""
+        rng = np.random.default_rng(0)
+        problem = LevelProblem(
+            rng.standard_normal((8, 8, channels)).astype(np.float32),
+            np.ones((8, 8), np.float32),
+            (4.0, 4.0),
+            (4.0, 4.0),
+            rng.uniform(-1, 1, (3, 20)).astype(np.float32),
+            rng.standard_normal((20, channels)).astype(np.float32),
+            np.ones(20, np.float32),
+        )
+        pose = np.eye(3)[None], np.array([[0.0, 0.0, 4.0]])
+        self.backend.refine(problem, *pose, 1, self.config.settings)
+
 
 @dataclass(frozen=True)
 class _Swarm:
-    """Survivors of the last level, best first."""
+    """Survivors of the last level, best first, and that level's problem."""
 
+    problem: LevelProblem
     rotations: Array
     translations: Array
     scores: Array

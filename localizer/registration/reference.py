@@ -28,7 +28,7 @@ class Linearization:
 
     residuals: (N, C), jacobians: (N, C, 6), weights: (N,) joint confidence, 0 out of view;
     robust: (N,) Huber's weights; score: mean robust cost; hessian: (6, 6) and gradient: (6,) of
-    half the score under xi = (rho, phi); visible: (N,).
+    half the score under xi = (rho, phi), prior_hessian: (6, 6) the prior's part of it; visible: (N,).
     """
 
     residuals: Array
@@ -39,6 +39,7 @@ class Linearization:
     score: float
     hessian: Array
     gradient: Array
+    prior_hessian: Array
 
 
 def project(problem: LevelProblem, rotation: Array, translation: Array) -> tuple[Array, Array]:
@@ -100,18 +101,21 @@ def linearize(
     robust = np.where(norm <= delta, 1.0, delta / np.maximum(norm, 1e-12))
     total = weights.sum()
     if visible.sum() < minimum_visible(problem, settings) or not total > 0:
-        empty = np.zeros((6, 6))
+        none = np.zeros((6, 6))
         return Linearization(
-            residuals, jacobians, weights, robust, visible, np.inf, empty, np.zeros(6)
+            residuals, jacobians, weights, robust, visible, np.inf, none, np.zeros(6), none
         )
     scale = weights * robust / total
     hessian = np.einsum("n,nci,ncj->ij", scale, jacobians, jacobians)
     gradient = np.einsum("n,nci,nc->i", scale, jacobians, residuals)
     score = float(weights @ cost / total)
+    prior_hessian = np.zeros((6, 6))
     if problem.prior is not None:
-        extra, H, g = prior_terms(problem.prior, rotation, translation)
-        score, hessian, gradient = score + extra, hessian + H, gradient + g
-    return Linearization(residuals, jacobians, weights, robust, visible, score, hessian, gradient)
+        extra, prior_hessian, g = prior_terms(problem.prior, rotation, translation)
+        score, hessian, gradient = score + extra, hessian + prior_hessian, gradient + g
+    return Linearization(
+        residuals, jacobians, weights, robust, visible, score, hessian, gradient, prior_hessian
+    )
 
 
 def minimum_visible(problem: LevelProblem, settings: LMSettings) -> int:

@@ -1,0 +1,77 @@
+"""Knowledge about the camera pose from other sensors, as residuals of the registration.
+
+Each function gives a `PoseConstraint`; `combine` adds several; `JNGO.register` takes the result
+(docs/registration.md, section 9). All are optional and none is used unless it is given.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from localizer.pose import Array, Pose, so3_exp, so3_log
+
+
+@dataclass(frozen=True)
+class PoseConstraint:
+    """A quadratic cost ``d' L d`` about a pose.
+
+    d: (6,) difference to `world_from_camera` (position, left rotation vector; world axes).
+    information: L (6, 6), zero along what is not known.
+    """
+
+    world_from_camera: Pose
+    information: Array
+
+
+def attitude_constraint(
+    rotation: Array, tilt_sigma_rad: float, heading_sigma_rad: float
+) -> PoseConstraint:
+    """The camera's rotation (3, 3) world_from_camera from the autopilot and the gimbal.
+
+    tilt_sigma_rad: of roll and pitch, which gravity shows well; heading_sigma_rad: about the
+    vertical, which the compass shows badly.
+    """
+    information = np.zeros((6, 6))
+    information[3, 3] = information[4, 4] = tilt_sigma_rad**-2
+    information[5, 5] = heading_sigma_rad**-2
+    return PoseConstraint(Pose(rotation, np.zeros(3)), information)
+
+
+def height_constraint(height_m: float, sigma_m: float) -> PoseConstraint:
+    """The camera's world z in metres, from the barometer or a rangefinder above known ground."""
+    information = np.zeros((6, 6))
+    information[2, 2] = sigma_m**-2
+    return PoseConstraint(Pose(np.eye(3), np.array([0.0, 0.0, height_m])), information)
+
+
+def position_constraint(position: Array, covariance: Array) -> PoseConstraint:
+    """The camera's world position (3,) with covariance (3, 3), predicted from the velocity."""
+    information = np.zeros((6, 6))
+    information[:3, :3] = np.linalg.inv(covariance)
+    return PoseConstraint(Pose(np.eye(3), np.asarray(position, dtype=np.float64)), information)
+
+
+def combine(*constraints: PoseConstraint) -> PoseConstraint:
+    """One constraint with the sum of the costs, up to a constant.
+
+    Rotations are linearised about the first constraint that knows one.
+    """
+    rotation = next(
+        (c.world_from_camera.rotation for c in constraints if c.information[3:, 3:].any()),
+        np.eye(3),
+    )
+    information, weighted = np.zeros((6, 6)), np.zeros(6)
+    for c in constraints:
+        turn = np.zeros(3)
+        if c.information[3:, 3:].any():
+            turn = so3_log(c.world_from_camera.rotation @ rotation.T)
+        d = np.concatenate([c.world_from_camera.translation, turn])
+        information += c.information
+        weighted += c.information @ d
+    # Sensors differ by orders of magnitude (m², rad²): scale before the rank decision.
+    scale = np.sqrt(np.maximum(np.diag(information), 1e-300))
+    scaled = information / np.outer(scale, scale)
+    mean = np.linalg.pinv(scaled, hermitian=True) @ (weighted / scale) / scale
+    return PoseConstraint(Pose(so3_exp(mean[3:]) @ rotation, mean[:3]), information)
