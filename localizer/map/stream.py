@@ -87,13 +87,13 @@ class TileStreamer:
         limits = self._fitting_limits(world_from_camera, camera)
         with self._lock:
             choice = self._choose(world_from_camera, camera, limits)
-            while wait and len(choice.requests):
-                self._raise_failure(choice)
-                # Stand-ins that only bridge the time until the wanted nodes are there can go.
+            while wait and not self._resident[choice.wanted].all():
+                self._queue = choice.wanted[~self._resident[choice.wanted]].tolist()
+                for node in self._queue:
+                    if node in self._failed:
+                        raise self._failed[node]
                 self._lock.wait()
                 choice = self._choose(world_from_camera, camera, limits)
-            if wait:
-                self._raise_failure(choice)
             self._count(choice)
             return [mesh for node in choice.shown for mesh in self._touched(int(node))]
 
@@ -156,11 +156,6 @@ class TileStreamer:
         self._queue = [n for n in choice.requests.tolist() if n not in self._failed]
         self._lock.notify_all()
         return choice
-
-    def _raise_failure(self, choice: Selection) -> None:
-        for node in choice.requests.tolist():
-            if node in self._failed:
-                raise self._failed[node]
 
     def _touched(self, node: int) -> Sequence[TileMesh]:
         self._meshes.move_to_end(node)
