@@ -1,0 +1,130 @@
+"""The geometry between a vehicle and its camera, in both directions; no threads, no MAVLink.
+
+Axes: body FRD (x forward, y right, z down); gimbal (x along the boresight, y right, z down); camera
+OpenCV (x right, y down, z forward); NED at the vehicle; world = the map's ENU. The simulated camera
+and the companion both use this chain, so that a sign is wrong in both or in neither: the tests hold
+it to hand-made cases.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from enum import Enum
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from localizer.geo import NED_FROM_ENU, Geodetic, LocalFrame
+from localizer.pose import Array, Pose, matrix_from_euler
+
+# OpenCV's z (forward), x (right), y (down) are the gimbal's x, y, z.
+GIMBAL_FROM_CAMERA: Array = np.array([[0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
+
+
+class GimbalFrame(Enum):
+    """What a gimbal's angles are measured against.
+
+    HEADING: roll and pitch from the horizon, yaw from the vehicle's heading (MAVLink's
+    GIMBAL_DEVICE_FLAGS_YAW_IN_VEHICLE_FRAME, what ArduPilot sends). EARTH: yaw from true north.
+    BODY: all three from the body, as of a camera that is screwed on.
+    """
+
+    HEADING = "heading"
+    EARTH = "earth"
+    BODY = "body"
+
+
+@dataclass(frozen=True)
+class GimbalAngles:
+    """A gimbal's attitude, applied as Rz(yaw) Ry(pitch) Rx(roll); pitch -pi/2 looks straight down."""
+
+    roll_rad: float
+    pitch_rad: float
+    yaw_rad: float
+    frame: GimbalFrame = GimbalFrame.HEADING
+
+
+@dataclass(frozen=True)
+class Mount:
+    """How the camera sits on the vehicle.
+
+    rotation: (3, 3), camera housing to gimbal (both x forward, y right, z down), the calibration's
+    boresight correction. lever_arm_m: (3,), from the autopilot to the camera, body axes.
+    """
+
+    rotation: Array
+    lever_arm_m: Array
+
+    @classmethod
+    def from_degrees(
+        cls,
+        roll_deg: float = 0.0,
+        pitch_deg: float = 0.0,
+        yaw_deg: float = 0.0,
+        lever_arm_m: ArrayLike = (0.0, 0.0, 0.0),
+    ) -> Mount:
+        """From Euler angles, as a configuration gives them."""
+        angles = np.radians([roll_deg, pitch_deg, yaw_deg])
+        return cls(matrix_from_euler(*angles), np.asarray(lever_arm_m, dtype=np.float64))
+
+
+def ned_from_world(frame: LocalFrame, position: Geodetic) -> Array:
+    """Rotation (3, 3) from the map's ENU axes to NED at `position` (0.5 arcmin per km apart)."""
+    local = LocalFrame(position).ecef_from_enu.rotation
+    return NED_FROM_ENU @ local.T @ frame.ecef_from_enu.rotation
+
+
+def heading(ned_from_body: Array) -> float:
+    """Yaw (rad, from true north, clockwise) of a body attitude (3, 3)."""
+    return float(np.arctan2(ned_from_body[1, 0], ned_from_body[0, 0]))
+
+
+def gimbal_attitude(ned_from_body: Array, gimbal: GimbalAngles) -> Array:
+    """NED from gimbal, (3, 3)."""
+    R = matrix_from_euler(gimbal.roll_rad, gimbal.pitch_rad, gimbal.yaw_rad)
+    if gimbal.frame is GimbalFrame.EARTH:
+        return R
+    if gimbal.frame is GimbalFrame.BODY:
+        return ned_from_body @ R
+    return matrix_from_euler(0.0, 0.0, heading(ned_from_body)) @ R
+
+
+def camera_attitude(ned_from_body: Array, gimbal: GimbalAngles, mount: Mount) -> Array:
+    """NED from camera (OpenCV axes), (3, 3)."""
+    return gimbal_attitude(ned_from_body, gimbal) @ mount.rotation @ GIMBAL_FROM_CAMERA
+
+
+def body_from_camera(ned_from_body: Array, ned_from_camera: Array) -> Array:
+    """Rotation (3, 3) of the camera on the body, from their two attitudes."""
+    return ned_from_body.T @ ned_from_camera
+
+
+def world_from_camera(
+    position: ArrayLike,
+    ned_from_body: Array,
+    ned_from_camera: Array,
+    lever_arm_m: ArrayLike,
+    ned_from_world: Array = NED_FROM_ENU,
+) -> Pose:
+    """The camera's pose of a vehicle at `position` (3,), world metres.
+
+    ned_from_world: from the function of that name; by default as at the map's origin.
+    """
+    arm = ned_from_world.T @ ned_from_body @ np.asarray(lever_arm_m, dtype=np.float64)
+    centre = np.asarray(position, dtype=np.float64) + arm
+    return Pose(ned_from_world.T @ ned_from_camera, centre)
+
+
+def vehicle_from_camera_pose(
+    camera: Pose,
+    body_from_camera: Array,
+    lever_arm_m: ArrayLike,
+    ned_from_world: Array = NED_FROM_ENU,
+) -> tuple[Array, Array]:
+    """Inverse of `world_from_camera`: (position (3,) in world metres, NED from body (3, 3)).
+
+    camera: world_from_camera. body_from_camera: how the camera was turned on the body then.
+    """
+    ned_from_body = ned_from_world @ camera.rotation @ body_from_camera.T
+    arm = ned_from_world.T @ ned_from_body @ np.asarray(lever_arm_m, dtype=np.float64)
+    return camera.translation - arm, ned_from_body
