@@ -1,0 +1,224 @@
+"""The dual-thread engine over fakes of the renderer, the network and the optimizer."""
+
+import threading
+import time
+
+import numpy as np
+import pytest
+
+from localizer.camera import Camera
+from localizer.config import LocalizerConfig
+from localizer.engine import DualThreadEngine
+from localizer.errors import CameraError, OutsideMapError
+from localizer.pipeline import Localizer, Undistorter, working_camera
+from localizer.pose import Pose
+from localizer.registration.jngo import Registration
+from localizer.types import (
+    FeatureLevel,
+    FeaturePyramid,
+    Frame,
+    PosePrior,
+    RegistrationStatus,
+    RenderedView,
+    TrackingState,
+)
+
+CAMERA = Camera.from_fov(640, 480, 60.0)
+NADIR = Pose(np.diag([1.0, -1.0, -1.0]), np.array([0.0, 0.0, 100.0]))
+INTERVAL_NS = 20_000_000
+
+
+class FakeRenderer:
+    name = "fake"
+
+    def __init__(self) -> None:
+        self.depth = 100.0
+        self.poses: list[Pose] = []
+
+    def render(self, world_from_camera, camera, extra=(), *, wait=False):
+        self.poses.append(world_from_camera)
+        rgb = np.zeros((camera.height, camera.width, 3), np.uint8)
+        depth = np.full(rgb.shape[:2], self.depth, np.float32)
+        return RenderedView(rgb, depth, world_from_camera, camera)
+
+
+class FakeExtractor:
+    name = "fake"
+
+    def extract(self, rgb):
+        h, w = rgb.shape[:2]
+        rng = np.random.default_rng(0)
+        levels = tuple(
+            FeatureLevel(
+                rng.standard_normal((h // s, w // s, 4)).astype(np.float32),
+                np.ones((h // s, w // s), np.float32),
+                s,
+            )
+            for s in (8, 4, 2)
+        )
+        return FeaturePyramid(levels, w, h)
+
+
+class FakeOptimizer:
+    """Finds the camera where `truth` says it is, 1 cm off; or raises what `error` holds."""
+
+    def __init__(self) -> None:
+        self.error: Exception | None = None
+        self.status = RegistrationStatus.OK
+        self.offset = np.zeros(3)
+
+    def register(self, query, camera, anchors, prior, *, motion=None, seed=0):
+        if self.error is not None:
+            raise self.error
+        pose = Pose(NADIR.rotation, NADIR.translation + 0.01 + self.offset)
+        return Registration(pose, np.eye(6) * 0.01, 0.1, 0.9, 0.8, self.status, 1, 1)
+
+
+def _localizer(renderer=None, optimizer=None) -> Localizer:
+    return Localizer(
+        renderer or FakeRenderer(),
+        FakeExtractor(),
+        optimizer or FakeOptimizer(),  # type: ignore[arg-type]
+        CAMERA,
+        LocalizerConfig(),
+    )
+
+
+def _frame(sequence: int) -> Frame:
+    image = np.zeros((480, 640, 3), np.uint8)
+    return Frame(image, 10**9 + sequence * INTERVAL_NS, CAMERA, sequence)
+
+
+def _prior(time_ns: int) -> PosePrior:
+    return PosePrior(NADIR, np.eye(6), time_ns)
+
+
+class Flight:
+    """An engine, its estimates, and frames on demand."""
+
+    def __init__(self, localizer: Localizer, provider=_prior) -> None:
+        self.estimates = []
+        self.engine = DualThreadEngine(
+            localizer, (lambda e, _: self.estimates.append(e),), provider
+        )
+        self.sequence = 0
+        self.engine.start()
+
+    def feed_until(self, condition, timeout_s=10.0):
+        deadline = time.monotonic() + timeout_s
+        while not condition():
+            assert time.monotonic() < deadline, self.engine.health
+            self.engine.submit(_frame(self.sequence))
+            self.sequence += 1
+            time.sleep(INTERVAL_NS * 1e-9)
+
+
+@pytest.fixture
+def flight(request):
+    flights = []
+
+    def start(*args, **kwargs) -> Flight:
+        flights.append(Flight(*args, **kwargs))
+        return flights[-1]
+
+    yield start
+    for f in flights:
+        f.engine.stop()
+
+
+def test_reaches_tracking_from_a_prior_and_stops_cleanly(flight):
+    before = threading.active_count()
+    f = flight(_localizer())
+    f.feed_until(lambda: f.estimates and f.estimates[-1].state is TrackingState.TRACKING)
+    estimate = f.estimates[-1]
+    assert estimate.accepted
+    assert set(estimate.stage_ms) == {"reference", "extract", "register", "latency"}
+    f.engine.stop()
+    assert threading.active_count() == before
+
+
+def test_without_a_prior_nothing_is_estimated(flight):
+    f = flight(_localizer(), provider=lambda _: None)
+    with pytest.raises(AssertionError):
+        f.feed_until(lambda: bool(f.estimates), timeout_s=1.0)
+    assert f.engine.health.errors == 0
+
+
+def test_an_error_on_a_thread_is_reported_and_survived(flight):
+    optimizer = FakeOptimizer()
+    f = flight(_localizer(optimizer=optimizer))
+    f.feed_until(lambda: bool(f.estimates))
+    optimizer.error = RuntimeError("boom")
+    f.feed_until(lambda: "boom" in f.engine.health.last_error)
+    optimizer.error = None
+    count = len(f.estimates)
+    f.feed_until(lambda: len(f.estimates) > count + 2)
+    assert f.engine.health.last_error == ""
+    assert f.engine.health.errors > 0
+
+
+def test_leaving_the_map_is_named_and_survived(flight):
+    renderer = FakeRenderer()
+    renderer.depth = 0.0
+    f = flight(_localizer(renderer=renderer))
+    f.feed_until(lambda: "does not meet the map" in f.engine.health.last_error)
+    renderer.depth = 100.0
+    f.feed_until(lambda: bool(f.estimates))
+
+
+def test_a_lost_tracker_asks_outside_and_comes_back(flight):
+    optimizer = FakeOptimizer()
+    f = flight(_localizer(optimizer=optimizer))
+    f.feed_until(lambda: f.estimates and f.estimates[-1].state is TrackingState.TRACKING)
+    optimizer.status = RegistrationStatus.NO_OVERLAP
+    f.feed_until(lambda: f.estimates[-1].state is TrackingState.LOST)
+    assert not f.estimates[-1].accepted
+    optimizer.status = RegistrationStatus.OK
+    f.feed_until(lambda: f.estimates[-1].state is TrackingState.TRACKING)
+
+
+def test_a_jump_against_the_prediction_is_not_accepted():
+    optimizer = FakeOptimizer()
+    localizer = _localizer(optimizer=optimizer)
+    localizer.set_prior(_prior(10**9))
+    anchors = localizer.make_reference(_prior(10**9)).anchors
+    for k in range(1, 6):
+        frame = _frame(k)
+        assert localizer.localize(frame, localizer.extract_query(frame), anchors).accepted
+    optimizer.offset = np.array([40.0, 0.0, 0.0])
+    frame = _frame(6)
+    assert not localizer.localize(frame, localizer.extract_query(frame), anchors).accepted
+
+
+def test_localizing_before_a_prior_is_an_error():
+    localizer = _localizer()
+    with pytest.raises(OutsideMapError, match="no pose prior"):
+        localizer.localize(_frame(0), FakeExtractor().extract(np.zeros((240, 320, 3))), None)
+
+
+def test_a_frame_of_another_size_is_named():
+    undistort = Undistorter(CAMERA, working_camera(CAMERA, 320))
+    bad = Frame(np.zeros((100, 100, 3), np.uint8), 0, CAMERA, 7)
+    with pytest.raises(CameraError, match="frame 7 is 100x100"):
+        undistort(bad)
+
+
+@pytest.mark.parametrize("size", [(640, 480), (1920, 1080), (1024, 768)])
+def test_undistorted_image_agrees_with_the_projection(size):
+    """A dot drawn where the distorted camera sees a point is found where the pinhole sees it."""
+    camera = Camera(size[0], size[1], 0.8 * size[0], 0.8 * size[0], 0.51 * size[0], 0.49 * size[1],
+                    (-0.12, 0.03, 0.001, -0.0005, 0.0))  # fmt: skip
+    target = working_camera(camera, 320)
+    assert target.width % 8 == 0
+    assert target.height % 8 == 0
+    point = np.array([0.3, -0.2, 1.0])
+    source_pixel, _ = camera.project(point)
+    u, v = np.mgrid[0 : size[0], 0 : size[1]] + 0.5
+    sigma = 0.01 * size[0]
+    dot = np.exp(-((u - source_pixel[0]) ** 2 + (v - source_pixel[1]) ** 2) / (2 * sigma**2)).T
+    image = np.repeat((dot * 255).astype(np.uint8)[..., None], 3, axis=2)
+    seen = Undistorter(camera, target)(Frame(image, 0, camera, 0))[..., 0].astype(float)
+    rows, columns = np.indices(seen.shape) + 0.5
+    centroid = np.array([(columns * seen).sum(), (rows * seen).sum()]) / seen.sum()
+    expected, _ = target.project(point)
+    np.testing.assert_allclose(centroid, expected, atol=0.15)
