@@ -1,1 +1,29 @@
 """Everything that speaks MAVLink, and nothing that sees images."""
+
+from mavlink_bridge.bridge import Bridge
+from mavlink_bridge.config import BridgeConfig
+from mavlink_bridge.messages import (
+    Attitude,
+    CameraView,
+    GimbalAttitude,
+    HealthLevel,
+    Origin,
+    TargetReport,
+    TrackRequest,
+    VehicleState,
+    VisionFix,
+)
+
+__all__ = [
+    "Attitude",
+    "Bridge",
+    "BridgeConfig",
+    "CameraView",
+    "GimbalAttitude",
+    "HealthLevel",
+    "Origin",
+    "TargetReport",
+    "TrackRequest",
+    "VehicleState",
+    "VisionFix",
+]

@@ -1,0 +1,177 @@
+"""The bridge's configuration, checked when it is read (pydantic, frozen, no unknown keys)."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+from typing import Literal
+
+from pydantic import BaseModel, ConfigDict, Field, field_validator, model_validator
+
+InjectionMessage = Literal[
+    "vision_position_estimate", "odometry", "gps_input", "global_position_sensor"
+]
+Mode = Literal["off", "shadow", "inject", "rc"]
+
+
+class _Model(BaseModel):
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+
+class OriginConfig(_Model):
+    """The EKF origin to set when the vehicle has none: WGS84 degrees and metres AMSL.
+
+    ArduPilot ignores a second origin, so an origin that the vehicle already has wins.
+    Give the altitude of the take-off ground: the barometer reads zero there.
+    """
+
+    latitude_deg: float = Field(ge=-90.0, le=90.0)
+    longitude_deg: float = Field(ge=-180.0, le=180.0)
+    altitude_amsl_m: float = Field(ge=-500.0, le=9000.0)
+
+
+class YawGuardConfig(_Model):
+    """Cross-check of the vision yaw against the autopilot's.
+
+    A vision frame rotated by 5 deg costs 25 m and raises no warning in ArduPilot.
+    """
+
+    enabled: bool = True
+    limit_deg: float = Field(default=4.0, gt=0.0, le=45.0)
+    outlier_deg: float = Field(default=25.0, gt=0.0, le=180.0)
+    window_s: float = Field(default=3.0, gt=0.0, le=30.0)
+    minimum_samples: int = Field(default=5, ge=1)
+
+
+class InjectionConfig(_Model):
+    """What is sent to the flight controller, how often, and when it is withheld."""
+
+    message: InjectionMessage = "vision_position_estimate"
+    rate_hz: float = Field(default=20.0, ge=4.0, le=30.0)
+    delay_ms: float = Field(
+        default=100.0,
+        ge=0.0,
+        le=250.0,
+        description="age at which a fix is sent: VISO_DELAY_MS, GPS1_DELAY_MS or EKF2_EV_DELAY",
+    )
+    sigma_floor_m: float = Field(default=0.1, gt=0.0)
+    max_sigma_m: float = Field(default=10.0, gt=0.0, description="nothing is sent above it")
+    max_extrapolation_s: float = Field(default=2.0, gt=0.0, le=10.0)
+    acceleration_sigma_mps2: float = Field(default=2.0, gt=0.0)
+    send_attitude: bool = True
+    covariance: Literal["profile", "cbrt", "sqrt", "variance"] = "profile"
+    gps_id: int = Field(default=0, ge=0, le=3, description="0-based GPS instance of GPS_INPUT")
+    gps_velocity: bool = True
+    gps_yaw: bool = False
+    yaw_guard: YawGuardConfig = YawGuardConfig()
+
+    @model_validator(mode="after")
+    def _rate_suits_message(self) -> InjectionConfig:
+        if self.message == "gps_input" and self.rate_hz < 5.0:
+            raise ValueError("gps_input needs rate_hz >= 5 (ArduPilot: GPS not healthy below)")
+        return self
+
+
+class SourceSwitchConfig(_Model):
+    """Automatic change of the EKF source set when GNSS is judged bad (42007)."""
+
+    enabled: bool = False
+    gnss_set: int = Field(default=1, ge=1, le=3)
+    vision_set: int = Field(default=2, ge=1, le=3)
+    bad_after_s: float = Field(default=1.5, gt=0.0)
+    good_after_s: float = Field(default=20.0, gt=0.0)
+    return_to_gnss: bool = False
+    inconsistency_sigmas: float = Field(default=5.0, gt=0.0)
+
+
+class RcGateConfig(_Model):
+    """In mode ``rc`` the channel's pulse width decides between shadow and inject."""
+
+    channel: int = Field(default=9, ge=1, le=18)
+    inject_above_us: int = Field(default=1700, ge=900, le=2100)
+
+
+class CameraConfig(_Model):
+    """What the ground station is told about the camera, and how it is mounted."""
+
+    announce: bool = True
+    vendor: str = Field(default="PiLoT companion", max_length=31)
+    model: str = Field(default="map camera", max_length=31)
+    width_px: int = Field(default=1280, ge=1, le=65535)
+    height_px: int = Field(default=720, ge=1, le=65535)
+    horizontal_fov_deg: float = Field(default=60.0, gt=0.0, lt=180.0)
+    stream_uri: str = Field(default="", max_length=159)
+    mount: Literal["gimbal", "fixed"] = "gimbal"
+    mount_roll_deg: float = Field(default=0.0, ge=-180.0, le=180.0)
+    mount_pitch_deg: float = Field(default=0.0, ge=-180.0, le=180.0)
+    mount_yaw_deg: float = Field(default=0.0, ge=-180.0, le=180.0)
+
+    @property
+    def vertical_fov_deg(self) -> float:
+        """Vertical field of view of square pixels, degrees."""
+        half = math.tan(math.radians(self.horizontal_fov_deg) / 2.0)
+        return math.degrees(2.0 * math.atan(half * self.height_px / self.width_px))
+
+
+class TargetsConfig(_Model):
+    """How targets are reported."""
+
+    rate_hz: float = Field(default=5.0, gt=0.0, le=30.0)
+    adsb: bool = Field(default=False, description="ADSB_VEHICLE, on the ground link only")
+    cot_endpoint: str = Field(default="", description="host:port of a Cursor-on-Target listener")
+    cot_stale_s: float = Field(default=30.0, gt=0.0)
+
+
+class SigningConfig(_Model):
+    """MAVLink 2 signing: a 32-byte key as 64 hexadecimal digits in a file of mode 0600."""
+
+    key_file: Path
+    link_id: int = Field(default=1, ge=0, le=255)
+
+
+class BridgeConfig(_Model):
+    """Everything the bridge needs to know.
+
+    connection strings: ``udpin:HOST:PORT``, ``udpout:HOST:PORT``, ``tcp:HOST:PORT``,
+    ``tcpin:HOST:PORT``, ``serial:DEVICE:BAUD``.
+    """
+
+    connection: str = "udpin:127.0.0.1:14551"
+    ground_connection: str | None = None
+    mode: Mode = "inject"
+    system_id: int | None = Field(default=None, ge=1, le=255, description="None: the vehicle's own")
+    localizer_component: int = Field(default=197, ge=1, le=255)
+    companion_component: int = Field(default=191, ge=1, le=255)
+    camera_component: int = Field(default=100, ge=1, le=255)
+    attitude_rate_hz: float = Field(default=50.0, ge=5.0, le=200.0)
+    injection: InjectionConfig = InjectionConfig()
+    origin: OriginConfig | None = None
+    switch: SourceSwitchConfig = SourceSwitchConfig()
+    rc: RcGateConfig = RcGateConfig()
+    camera: CameraConfig = CameraConfig()
+    targets: TargetsConfig = TargetsConfig()
+    signing: SigningConfig | None = None
+    ground_signing: SigningConfig | None = None
+    tlog: Path | None = None
+    link_timeout_s: float = Field(default=5.0, gt=0.0)
+
+    @field_validator("connection", "ground_connection")
+    @classmethod
+    def _connection_is_an_endpoint(cls, value: str | None) -> str | None:
+        from mavlink_bridge.errors import EndpointError
+        from mavlink_bridge.transport import Endpoint
+
+        if value is not None:
+            try:
+                Endpoint.parse(value)
+            except EndpointError as error:
+                raise ValueError(str(error)) from error
+        return value
+
+    @model_validator(mode="after")
+    def _adsb_needs_a_ground_link(self) -> BridgeConfig:
+        if self.targets.adsb and self.ground_connection is None:
+            raise ValueError(
+                "targets.adsb needs ground_connection: ArduPilot ingests ADSB_VEHICLE as traffic"
+            )
+        return self

@@ -1,0 +1,404 @@
+"""From vision fixes to the messages that a flight controller fuses.
+
+Timing. A fix is sent when its age reaches `delay_ms`, the value the flight controller is told
+(VISO_DELAY_MS, GPS1_DELAY_MS, EKF2_EV_DELAY), so the least latency it sees is exactly that; a late
+fix goes out at once with its own exposure time, and the jitter is removed by the flight controller.
+Between fixes, and for fixes older than it can fuse, the newest fix is propagated to ``now -
+delay_ms`` with its covariance grown. Stamps never run back.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import Counter, deque
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from pymavlink.dialects.v20 import ardupilotmega as mavlink
+
+from mavlink_bridge import quaternion as quat
+from mavlink_bridge.clock import SteadyUtc
+from mavlink_bridge.config import InjectionConfig, InjectionMessage
+from mavlink_bridge.messages import Attitude, Origin, VisionFix
+from mavlink_bridge.origin import ned_from_origin
+from mavlink_bridge.profile import CovarianceFormula, FirmwareProfile, covariance_entry
+from mavlink_bridge.propagate import FixPropagator, PropagatedFix
+from mavlink_bridge.yaw_guard import YawGuard
+
+NAN = math.nan
+_QUEUE = 32
+_FUTURE_SLACK_NS = 20_000_000
+_STALE_NS = 3_000_000_000
+# Index of the diagonal (x, y, z, roll, pitch, yaw) in MAVLink's row-major upper triangle of 6x6.
+DIAGONAL = (0, 6, 11, 15, 18, 20)
+_IGNORE_VELOCITY = (
+    mavlink.GPS_INPUT_IGNORE_FLAG_VEL_HORIZ
+    | mavlink.GPS_INPUT_IGNORE_FLAG_VEL_VERT
+    | mavlink.GPS_INPUT_IGNORE_FLAG_SPEED_ACCURACY
+)
+_CLAIMED_SATELLITES = 12  # ArduPilot refuses to arm below 6, or with hdop ignored
+_CLAIMED_HDOP = 0.8
+_CLAIMED_VDOP = 1.0
+
+
+@dataclass(frozen=True)
+class Estimate:
+    """What is about to be sent. position: as propagated; attitude: (roll, pitch, yaw), NaN unknown.
+
+    fresh: a fix as it came, not propagated. quality: 0..100.
+    """
+
+    position: PropagatedFix
+    attitude: tuple[float, float, float]
+    attitude_sigma_rad: float
+    quality: int
+    reset_counter: int
+    fresh: bool
+
+
+@dataclass(frozen=True)
+class Withheld:
+    """Why nothing is sent although it is time. counter: the name it is counted under."""
+
+    reason: str
+    counter: str
+
+
+@dataclass(frozen=True)
+class Injection:
+    """One message to send, and the estimate it was made from."""
+
+    message: Any
+    estimate: Estimate
+
+
+def pose_covariance(
+    P: np.ndarray, attitude_sigma_rad: float, formula: CovarianceFormula
+) -> list[float]:
+    """The 21 entries of VISION_POSITION_ESTIMATE and ODOMETRY for an NED covariance P (3, 3).
+
+    ArduPilot reads one error from the three position entries, so all three carry the worst
+    horizontal sigma; PX4 reads variances.
+    """
+    entries = [0.0] * 21
+    if formula == "variance":
+        entries[0], entries[6], entries[11] = (float(P[i, i]) for i in range(3))
+        entries[1], entries[2], entries[7] = float(P[0, 1]), float(P[0, 2]), float(P[1, 2])
+    else:
+        error = math.sqrt(float(np.linalg.eigvalsh(P[:2, :2])[-1]))
+        for i in DIAGONAL[:3]:
+            entries[i] = covariance_entry(error, formula)
+    for i in DIAGONAL[3:]:
+        entries[i] = covariance_entry(attitude_sigma_rad, formula)
+    return entries
+
+
+def vision_position_estimate(
+    e: Estimate, ned: tuple[float, float, float], formula: CovarianceFormula
+) -> Any:
+    """VISION_POSITION_ESTIMATE (102): NED metres from the EKF origin, yaw from true north."""
+    covariance = pose_covariance(e.position.covariance_ned, e.attitude_sigma_rad, formula)
+    return mavlink.MAVLink_vision_position_estimate_message(
+        e.position.time_ns // 1000, *ned, *e.attitude, covariance, e.reset_counter
+    )
+
+
+def odometry(
+    e: Estimate,
+    ned: tuple[float, float, float],
+    formula: CovarianceFormula,
+    frame: int,
+) -> Any:
+    """ODOMETRY (331): position NED, velocity in the body frame by the message's own quaternion."""
+    q = quat.from_euler(*e.attitude)
+    vn, ve, vd = (float(v) for v in e.position.velocity_ned)
+    body = quat.rotate(quat.conjugate(q), (vn, ve, vd))
+    covariance = pose_covariance(e.position.covariance_ned, e.attitude_sigma_rad, formula)
+    Rbn = np.array([quat.rotate(quat.conjugate(q), tuple(row)) for row in np.eye(3)]).T
+    Pv = Rbn @ e.position.velocity_covariance_ned @ Rbn.T
+    velocity_covariance = [NAN] * 21
+    for k, i in enumerate(DIAGONAL[:3]):
+        velocity_covariance[i] = float(Pv[k, k])
+    return mavlink.MAVLink_odometry_message(
+        e.position.time_ns // 1000,
+        frame,
+        mavlink.MAV_FRAME_BODY_FRD,
+        *ned,
+        list(q),
+        *body,
+        NAN,
+        NAN,
+        NAN,
+        covariance,
+        velocity_covariance,
+        e.reset_counter,
+        mavlink.MAV_ESTIMATOR_TYPE_VISION,
+        e.quality,
+    )
+
+
+def gps_input(
+    e: Estimate, altitude_amsl_m: float, week_ms: tuple[int, int], config: InjectionConfig
+) -> Any:
+    """GPS_INPUT (232), every field filled: ArduPilot never arms on one with HDOP ignored."""
+    p = e.position
+    yaw = 0  # 0 means none; north is 36000
+    if config.gps_yaw and math.isfinite(e.attitude[2]):
+        yaw = round(math.degrees(e.attitude[2]) % 360.0 * 100.0) or 36000
+    vn, ve, vd = (float(v) for v in p.velocity_ned) if config.gps_velocity else (0.0, 0.0, 0.0)
+    week, ms = week_ms
+    return mavlink.MAVLink_gps_input_message(
+        p.time_ns // 1000,
+        config.gps_id,
+        0 if config.gps_velocity else _IGNORE_VELOCITY,
+        ms,
+        week,
+        mavlink.GPS_FIX_TYPE_3D_FIX,
+        round(p.latitude_deg * 1e7),
+        round(p.longitude_deg * 1e7),
+        altitude_amsl_m,
+        _CLAIMED_HDOP,
+        _CLAIMED_VDOP,
+        vn,
+        ve,
+        vd,
+        p.speed_sigma_mps,
+        p.horizontal_sigma_m,
+        p.vertical_sigma_m,
+        _CLAIMED_SATELLITES,
+        yaw,
+    )
+
+
+def global_position_sensor(e: Estimate, altitude_amsl_m: float, now_ns: int) -> Any:
+    """GLOBAL_POSITION_SENSOR (296): latitude, longitude and both altitudes."""
+    p = e.position
+    return mavlink.MAVLink_global_position_sensor_message(
+        0,
+        0,
+        0,
+        p.time_ns // 1000,
+        max(0, (now_ns - p.time_ns) // 1000),
+        mavlink.GLOBAL_POSITION_SRC_VISION,
+        0,
+        round(p.latitude_deg * 1e7),
+        round(p.longitude_deg * 1e7),
+        p.height_m,
+        altitude_amsl_m,
+        p.horizontal_sigma_m,
+        p.vertical_sigma_m,
+    )
+
+
+@dataclass(frozen=True)
+class InjectionContext:
+    """What the injector must know about the vehicle. now: the origin and profile of this moment."""
+
+    origin: Origin | None
+    profile: FirmwareProfile
+    attitude_at: Callable[[int], Attitude | None]
+
+
+class Injector:
+    """Turns fixes into a steady stream of injections. One thread calls `submit` and `step`."""
+
+    def __init__(self, config: InjectionConfig, geoid_separation_m: float, utc: SteadyUtc) -> None:
+        self._config = config
+        self._geoid_m = geoid_separation_m
+        self._utc = utc
+        self._delay_ns = int(config.delay_ms * 1e6)
+        self._period_ns = int(1e9 / config.rate_hz)
+        self._propagator = FixPropagator(config.acceleration_sigma_mps2, config.sigma_floor_m)
+        self.guard = YawGuard(config.yaw_guard)
+        self._waiting: deque[VisionFix] = deque(maxlen=_QUEUE)
+        self._fresh: VisionFix | None = None
+        self._reset_pending = False
+        self._reset_counter = 0
+        self._newest_ns = 0
+        self._last_slot_ns = 0
+        self._last_stamp_ns = 0
+        self._last_was_fill = False
+        self.yaw_difference_rad = NAN
+        self.reason = "no fix yet"
+        self.counters: Counter[str] = Counter()
+
+    @property
+    def reset_counter(self) -> int:
+        """The counter of the last message."""
+        return self._reset_counter
+
+    def submit(self, fix: VisionFix, now_ns: int) -> None:
+        """Queue a fix; one that is late by seconds, from the future or out of order is dropped."""
+        if fix.time_ns <= self._newest_ns:
+            self.counters["fixes_out_of_order"] += 1
+            self._keep_reset(fix)
+            return
+        if fix.time_ns > now_ns + _FUTURE_SLACK_NS:
+            self.counters["fixes_from_future"] += 1
+            self._keep_reset(fix)
+            return
+        if now_ns - fix.time_ns > _STALE_NS:
+            self.counters["fixes_stale"] += 1
+            self._keep_reset(fix)
+            return
+        self._newest_ns = fix.time_ns
+        self.counters["fixes"] += 1
+        self._waiting.append(fix)
+
+    def step(self, now_ns: int, context: InjectionContext) -> Injection | None:
+        """What to send now, if anything."""
+        self._take_due(now_ns, context)
+        outcome = self._next(now_ns, context)
+        if outcome is None:
+            return None
+        self._last_slot_ns = now_ns
+        if isinstance(outcome, Withheld):
+            self.reason = outcome.reason
+            self.counters[outcome.counter] += 1
+            return None
+        self.reason = ""
+        self._last_stamp_ns = outcome.estimate.position.time_ns
+        self._last_was_fill = not outcome.estimate.fresh
+        self.counters["sent_fresh" if outcome.estimate.fresh else "sent_propagated"] += 1
+        return outcome
+
+    def next_due_ns(self, now_ns: int) -> int:
+        """When `step` must be called next."""
+        due = [now_ns + self._period_ns]
+        if self._waiting:
+            due.append(self._waiting[0].time_ns + self._delay_ns)
+        if self._propagator.fix is not None:
+            due.append(self._fill_due_ns())
+        if self._fresh is not None:
+            due.append(self._earliest_ns())
+        return max(min(due), now_ns + 500_000)
+
+    # --- fixes come of age -----------------------------------------------------------------------
+
+    def _take_due(self, now_ns: int, context: InjectionContext) -> None:
+        while self._waiting and self._waiting[0].time_ns + self._delay_ns <= now_ns:
+            fix = self._waiting.popleft()
+            attitude = context.attitude_at(fix.time_ns)
+            verdict = self.guard.check(
+                fix.time_ns, fix.yaw_rad, NAN if attitude is None else attitude.yaw_rad
+            )
+            if math.isfinite(verdict.difference_rad):
+                self.yaw_difference_rad = verdict.difference_rad
+            self._keep_reset(fix)
+            if not verdict.accept:
+                self.counters["fixes_yaw_refused"] += 1
+                continue
+            self._propagator.update(fix)
+            if self._fresh is not None:
+                self.counters["fixes_superseded"] += 1
+            self._fresh = fix
+
+    def _keep_reset(self, fix: VisionFix) -> None:
+        """A jump must be told even when the fix that carried it is not sent itself."""
+        self._reset_pending = self._reset_pending or fix.reset
+
+    # --- what to send ----------------------------------------------------------------------------
+
+    def _earliest_ns(self) -> int:
+        """Not more than half as fast again as the wanted rate: 30 Hz never passes 50 Hz."""
+        return self._last_slot_ns + int(self._period_ns / 1.5)
+
+    def _fill_due_ns(self) -> int:
+        """A propagated message waits for a late fix for half a period, once."""
+        patience = 1.0 if self._last_was_fill else 1.5
+        return self._last_slot_ns + int(self._period_ns * patience)
+
+    def _next(self, now_ns: int, context: InjectionContext) -> Injection | Withheld | None:
+        if self._propagator.fix is None and not self.guard.blocked:
+            return None
+        fill_due = now_ns >= self._fill_due_ns()
+        if self.guard.blocked:
+            self._fresh = None
+            degrees = math.degrees(self.yaw_difference_rad)
+            reason = f"vision yaw differs from the autopilot's by {degrees:+.1f} deg"
+            return Withheld(reason, "withheld_yaw") if fill_due else None
+        if self._fresh is not None and now_ns >= self._earliest_ns():
+            fix, self._fresh = self._fresh, None
+            too_old = now_ns - fix.time_ns > int(context.profile.max_delay_ms * 1e6)
+            if not too_old and fix.time_ns > self._last_stamp_ns:
+                return self._make(fix.time_ns, now_ns, context, fresh=True)
+            fill_due = True
+        return (
+            self._make(now_ns - self._delay_ns, now_ns, context, fresh=False) if fill_due else None
+        )
+
+    def _make(
+        self, time_ns: int, now_ns: int, context: InjectionContext, *, fresh: bool
+    ) -> Injection | Withheld | None:
+        fix = self._propagator.fix
+        position = self._propagator.at(time_ns)
+        if fix is None or position is None or time_ns <= self._last_stamp_ns:
+            return None
+        if (time_ns - fix.time_ns) * 1e-9 > self._config.max_extrapolation_s:
+            return Withheld("no fresh fix", "withheld_stale")
+        sigma = position.horizontal_sigma_m
+        if sigma > self._config.max_sigma_m:
+            return Withheld(f"covariance too large ({sigma:.1f} m)", "withheld_covariance")
+        attitude = self._attitude(fix, time_ns, context)
+        counter = (self._reset_counter + self._reset_pending) % 256
+        estimate = Estimate(position, attitude, fix.attitude_sigma_rad, fix.quality, counter, fresh)
+        outcome = self._message(estimate, now_ns, context)
+        if isinstance(outcome, Injection):
+            self._reset_counter, self._reset_pending = counter, False
+        return outcome
+
+    def _attitude(
+        self, fix: VisionFix, time_ns: int, context: InjectionContext
+    ) -> tuple[float, float, float]:
+        """Vision attitude at time_ns: the fix's, turned as the autopilot turned since."""
+        vision = (fix.roll_rad, fix.pitch_rad, fix.yaw_rad)
+        if time_ns == fix.time_ns or not all(math.isfinite(angle) for angle in vision):
+            return vision
+        then, now = context.attitude_at(fix.time_ns), context.attitude_at(time_ns)
+        if then is None or now is None:
+            return vision
+        turned = quat.multiply(quat.conjugate(then.quaternion), now.quaternion)
+        return quat.to_euler(quat.multiply(quat.from_euler(*vision), turned))
+
+    def _message(self, e: Estimate, now_ns: int, context: InjectionContext) -> Injection | Withheld:
+        kind: InjectionMessage = self._config.message
+        altitude = e.position.height_m - self._geoid_m
+        if kind == "gps_input":
+            week_ms = self._utc.gps_week_ms(e.position.time_ns)
+            return Injection(gps_input(e, altitude, week_ms, self._config), e)
+        if kind == "global_position_sensor":
+            return Injection(global_position_sensor(e, altitude, now_ns), e)
+        if context.origin is None:
+            return Withheld("the EKF has no origin", "withheld_no_origin")
+        ned = ned_from_origin(
+            context.origin,
+            e.position.latitude_deg,
+            e.position.longitude_deg,
+            altitude,
+            context.profile.projection,
+        )
+        formula = context.profile.covariance
+        if self._config.covariance != "profile":
+            formula = self._config.covariance
+        if kind == "odometry":
+            return self._odometry(e, ned, formula, context)
+        if not self._config.send_attitude:
+            e = replace(e, attitude=(NAN, NAN, NAN))
+        return Injection(vision_position_estimate(e, ned, formula), e)
+
+    def _odometry(
+        self,
+        e: Estimate,
+        ned: tuple[float, float, float],
+        formula: CovarianceFormula,
+        context: InjectionContext,
+    ) -> Injection | Withheld:
+        """Velocity is rotated by the message's quaternion, so there must be one."""
+        if not all(math.isfinite(angle) for angle in e.attitude):
+            now = context.attitude_at(e.position.time_ns)
+            if now is None:
+                return Withheld("no attitude for ODOMETRY", "withheld_no_attitude")
+            e = replace(e, attitude=(now.roll_rad, now.pitch_rad, now.yaw_rad))
+        return Injection(odometry(e, ned, formula, context.profile.odometry_frame), e)

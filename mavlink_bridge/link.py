@@ -1,0 +1,304 @@
+"""One MAVLink link: one endpoint, one owner thread, bounded queues, reconnection, counters.
+
+Everything that touches the transport, the parser and the packers happens in the owner thread; a
+handler's callbacks run there too. `send` may be called from anywhere.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import logging
+import os
+import select
+import threading
+import time
+from collections import deque
+from collections.abc import Callable, Collection, Mapping
+from dataclasses import asdict, dataclass
+from typing import Any, Protocol
+
+from pymavlink.dialects.v20 import ardupilotmega as mavlink
+
+from mavlink_bridge import signing
+from mavlink_bridge.clock import monotonic_ns, utc_us
+from mavlink_bridge.errors import BridgeStateError, EndpointError
+from mavlink_bridge.framing import FrameReader
+from mavlink_bridge.recorder import TlogRecorder
+from mavlink_bridge.transport import Endpoint, Transport, open_transport
+
+log = logging.getLogger(__name__)
+
+_OUTBOX = 512
+_MAX_UNSENT = 64 * 1024
+_BACKOFF_S = (0.1, 5.0)
+_LONGEST_WAIT_S = 0.5
+_MAX_READS = 64
+
+
+class LinkHandler(Protocol):
+    """What a link calls, always in its owner thread."""
+
+    def on_open(self, link: Link) -> None:
+        """The transport was (re)opened."""
+
+    def on_message(self, link: Link, message: Any, time_ns: int) -> None:
+        """A message arrived; time_ns is when its bytes were read."""
+
+    def on_tick(self, link: Link, now_ns: int) -> int:
+        """Do what is due and return when to be called next (CLOCK_MONOTONIC ns)."""
+
+
+@dataclass
+class LinkCounters:
+    """What a link did."""
+
+    opened: int = 0
+    open_failures: int = 0
+    rx_bytes: int = 0
+    tx_bytes: int = 0
+    tx_messages: int = 0
+    tx_rate_limited: int = 0
+    tx_dropped: int = 0
+    handler_errors: int = 0
+    timeouts: int = 0
+
+
+class Link:
+    """A MAVLink 2 link that stays up.
+
+    min_interval_ns: shortest time between two messages of one id and component; faster ones are
+    dropped and counted. timeout_s: silence after which a stream (TCP, serial) is reopened.
+    """
+
+    def __init__(
+        self,
+        endpoint: Endpoint,
+        handler: LinkHandler,
+        *,
+        name: str = "link",
+        wanted: Collection[int] | None = None,
+        min_interval_ns: Mapping[int, int] | None = None,
+        signing_key: bytes | None = None,
+        signing_link_id: int = 1,
+        recorder: TlogRecorder | None = None,
+        timeout_s: float = 5.0,
+        opener: Callable[[Endpoint], Transport] = open_transport,
+    ) -> None:
+        self.endpoint = endpoint
+        self.name = name
+        self.counters = LinkCounters()
+        self.system_id = 0
+        self._handler = handler
+        self._reader = FrameReader(wanted, signing_key)
+        self._min_interval_ns = dict(min_interval_ns or {})
+        self._key, self._key_link = signing_key, signing_link_id
+        self._recorder = recorder
+        self._timeout_ns = int(timeout_s * 1e9)
+        self._open = opener
+        self._packers: dict[int, Any] = {}
+        self._last_sent_ns: dict[tuple[int, int], int] = {}
+        self._outbox: deque[tuple[Any, int]] = deque(maxlen=_OUTBOX)
+        self._unsent = bytearray()
+        self._stop = threading.Event()
+        self._thread: threading.Thread | None = None
+        self._transport: Transport | None = None
+        self._wake_read, self._wake_write = os.pipe()
+        os.set_blocking(self._wake_read, False)
+        os.set_blocking(self._wake_write, False)
+
+    @property
+    def connected(self) -> bool:
+        """Whether the transport is open (UDP: always, once bound)."""
+        return self._transport is not None
+
+    def start(self) -> None:
+        """Start the owner thread; the first connection attempt happens in it."""
+        if self._thread is not None:
+            raise BridgeStateError(f"{self.name}: already started; make a new link")
+        self._thread = threading.Thread(target=self._run, name=f"mavlink-{self.name}", daemon=True)
+        self._thread.start()
+
+    def stop(self) -> None:
+        """Stop the owner thread and close the transport."""
+        self._stop.set()
+        self.wake()
+        if self._thread is not None and self._thread is not threading.current_thread():
+            self._thread.join(timeout=5.0)
+            if not self._thread.is_alive() and self._wake_read >= 0:
+                os.close(self._wake_read)
+                os.close(self._wake_write)
+                self._wake_read = self._wake_write = -1
+
+    def wake(self) -> None:
+        """Make the owner thread run `on_tick` now."""
+        # A full pipe wakes the thread anyway, and a closed one has no thread to wake.
+        with contextlib.suppress(OSError):
+            os.write(self._wake_write, b"w")
+
+    def send(self, message: Any, component: int) -> bool:
+        """Send as `component` of the vehicle's system; False when it was dropped at once."""
+        if threading.current_thread() is self._thread:
+            return self._send_now(message, component)
+        if len(self._outbox) == _OUTBOX:
+            self.counters.tx_dropped += 1
+        self._outbox.append((message, component))
+        self.wake()
+        return True
+
+    def stats(self) -> dict[str, int]:
+        """Counters of link and framing."""
+        return {**asdict(self.counters), **asdict(self._reader.counters)}
+
+    # --- owner thread ---------------------------------------------------------------------------
+
+    def _run(self) -> None:
+        backoff_s = _BACKOFF_S[0]
+        while not self._stop.is_set():
+            try:
+                self._transport = self._open(self.endpoint)
+            except (OSError, EndpointError) as error:
+                self.counters.open_failures += 1
+                if self.counters.open_failures == 1:
+                    log.warning(
+                        "%s: %s cannot be opened (%s), retrying", self.name, self.endpoint, error
+                    )
+                self._stop.wait(backoff_s)
+                backoff_s = min(2.0 * backoff_s, _BACKOFF_S[1])
+                continue
+            opened_ns = monotonic_ns()
+            self.counters.opened += 1
+            try:
+                self._serve(self._transport)
+            except OSError as error:
+                log.warning("%s: %s lost (%s), reconnecting", self.name, self.endpoint, error)
+            finally:
+                self._transport.close()
+                self._transport = None
+            # An endpoint that accepts and closes at once must be backed off from, too.
+            backoff_s = (
+                _BACKOFF_S[0] if monotonic_ns() - opened_ns > 2e9 else min(2 * backoff_s, 5.0)
+            )
+            self._stop.wait(backoff_s)
+
+    def _serve(self, transport: Transport) -> None:
+        self._reader.reset()
+        self._unsent.clear()
+        self._guard(self._handler.on_open, self)
+        last_rx_ns = monotonic_ns()
+        deadline_ns = 0
+        while not self._stop.is_set():
+            now_ns = monotonic_ns()
+            wait_s = min(max(deadline_ns - now_ns, 0) * 1e-9, _LONGEST_WAIT_S)
+            writers = [transport] if self._unsent else []
+            readers: list[Any] = [transport, self._wake_read]
+            readable, writable, _ = select.select(readers, writers, [], wait_s)
+            if self._wake_read in readable:
+                os.read(self._wake_read, 4096)
+            if transport in readable and self._receive(transport):
+                last_rx_ns = monotonic_ns()
+            if writable:
+                self._flush()
+            while self._outbox:
+                self._send_now(*self._outbox.popleft())
+            now_ns = monotonic_ns()
+            due = self._guard(self._handler.on_tick, self, now_ns)
+            deadline_ns = due if due is not None else now_ns + int(_LONGEST_WAIT_S * 1e9)
+            if transport.stream and now_ns - last_rx_ns > self._timeout_ns:
+                self.counters.timeouts += 1
+                raise TimeoutError(f"nothing received for {self._timeout_ns * 1e-9:.1f} s")
+
+    def _receive(self, transport: Transport) -> bool:
+        """Read and dispatch what has arrived, a bounded amount; True if there was something."""
+        received = False
+        for _ in range(_MAX_READS):
+            data = transport.read()
+            if not data:
+                break
+            received = True
+            time_ns = monotonic_ns()
+            self.counters.rx_bytes += len(data)
+            raw: deque[bytes] | None = deque() if self._recorder is not None else None
+            messages = self._reader.feed(data, raw)
+            if self._recorder is not None and raw:
+                stamp = utc_us()
+                for frame in raw:
+                    self._recorder.write(frame, stamp)
+            for message in messages:
+                self._guard(self._handler.on_message, self, message, time_ns)
+            if transport.stream:
+                break  # select tells whether there is more
+        return received
+
+    def _guard(self, function: Callable[..., Any], *arguments: Any) -> Any:
+        """Call a handler; its error is logged and counted, and the link lives on."""
+        try:
+            return function(*arguments)
+        except Exception:
+            self.counters.handler_errors += 1
+            if self.counters.handler_errors in (1, 10, 100, 1000):
+                log.exception(
+                    "%s: handler failed (%d times)", self.name, self.counters.handler_errors
+                )
+            return None
+
+    def _packer(self, component: int) -> Any:
+        packer = self._packers.get(component)
+        if packer is None:
+            packer = mavlink.MAVLink(None, self.system_id, component)
+            if self._key is not None:
+                signing.enable(packer, self._key, self._key_link)
+            self._packers[component] = packer
+        packer.srcSystem = self.system_id
+        return packer
+
+    def _send_now(self, message: Any, component: int) -> bool:
+        if self._transport is None or self.system_id == 0:
+            self.counters.tx_dropped += 1
+            return False
+        now_ns = monotonic_ns()
+        identity = (message.get_msgId(), component)
+        interval = self._min_interval_ns.get(identity[0])
+        if interval is not None and now_ns - self._last_sent_ns.get(identity, 0) < interval:
+            self.counters.tx_rate_limited += 1
+            return False
+        if len(self._unsent) > _MAX_UNSENT:
+            self.counters.tx_dropped += 1
+            return False
+        packer = self._packer(component)
+        if self._key is not None:
+            # Never behind the wall clock: a peer that restarted refuses streams a minute old.
+            packer.signing.timestamp = max(packer.signing.timestamp, signing.signing_timestamp())
+        frame = message.pack(packer)
+        packer.seq = (packer.seq + 1) % 256
+        self._last_sent_ns[identity] = now_ns
+        return self._write(frame)
+
+    def _write(self, frame: bytes) -> bool:
+        assert self._transport is not None
+        if self._transport.stream:
+            self._unsent += frame
+            self._flush()
+        elif self._transport.write(frame) == 0:
+            self.counters.tx_dropped += 1
+            return False
+        self.counters.tx_messages += 1
+        self.counters.tx_bytes += len(frame)
+        if self._recorder is not None:
+            self._recorder.write(frame, utc_us())
+        return True
+
+    def _flush(self) -> None:
+        """Send what is left over of a stream."""
+        assert self._transport is not None
+        if self._unsent:
+            del self._unsent[: self._transport.write(bytes(self._unsent))]
+
+
+def sleep_until(predicate: Callable[[], bool], timeout_s: float, step_s: float = 0.01) -> bool:
+    """Poll until the predicate holds; False after the timeout."""
+    end = time.monotonic() + timeout_s
+    while not predicate():
+        if time.monotonic() > end:
+            return False
+        time.sleep(step_s)
+    return True

@@ -1,0 +1,149 @@
+"""The EKF origin and the flat-earth scalings that the flight controllers invert.
+
+Positions are sent as NED metres from the EKF origin, and the flight controller turns them back to
+latitude and longitude by its own approximation; using a better one here would only add its error.
+"""
+
+from __future__ import annotations
+
+import logging
+import math
+from collections.abc import Callable
+from typing import Any, Literal
+
+from pymavlink.dialects.v20 import ardupilotmega as mavlink
+
+from mavlink_bridge.config import OriginConfig
+from mavlink_bridge.messages import Origin
+
+log = logging.getLogger(__name__)
+
+Projection = Literal["ardupilot", "px4"]
+
+# ArduPilot, AP_Common/Location.h: metres per 1e-7 degree of latitude.
+METRES_PER_DEGREE = 0.011131884502145034 * 1e7
+_PX4_RADIUS_M = 6371000.0  # PX4 lib/geo: CONSTANTS_RADIUS_OF_EARTH
+_ASK_EVERY_NS = 1_000_000_000
+_ASKS_BEFORE_SETTING = 3
+
+
+def _longitude_scale(latitude_deg: float) -> float:
+    """cos(latitude), floored as ArduPilot's `Location::longitude_scale` does."""
+    return max(math.cos(math.radians(latitude_deg)), 0.01)
+
+
+def _wrap_degrees(angle: float) -> float:
+    return (angle + 180.0) % 360.0 - 180.0
+
+
+def north_east(
+    origin_lat: float,
+    origin_lon: float,
+    latitude_deg: float,
+    longitude_deg: float,
+    projection: Projection = "ardupilot",
+) -> tuple[float, float]:
+    """(north, east) metres from the origin, in the firmware's own scaling.
+
+    ArduPilot: `Location::get_distance_NE` (longitude scaled at the mean latitude).
+    PX4: azimuthal equidistant projection on a sphere (`MapProjection::project`).
+    """
+    d_lon = _wrap_degrees(longitude_deg - origin_lon)
+    if projection == "ardupilot":
+        scale = _longitude_scale((origin_lat + latitude_deg) / 2.0)
+        north = (latitude_deg - origin_lat) * METRES_PER_DEGREE
+        return north, d_lon * METRES_PER_DEGREE * scale
+    lat, ref = math.radians(latitude_deg), math.radians(origin_lat)
+    cos_d = math.cos(math.radians(d_lon))
+    arc = math.sin(ref) * math.sin(lat) + math.cos(ref) * math.cos(lat) * cos_d
+    c = math.acos(max(-1.0, min(1.0, arc)))
+    k = c / math.sin(c) if abs(c) > 1e-12 else 1.0
+    return (
+        k * (math.cos(ref) * math.sin(lat) - math.sin(ref) * math.cos(lat) * cos_d) * _PX4_RADIUS_M,
+        k * math.cos(lat) * math.sin(math.radians(d_lon)) * _PX4_RADIUS_M,
+    )
+
+
+def offset(
+    origin_lat: float, origin_lon: float, north_m: float, east_m: float
+) -> tuple[float, float]:
+    """(latitude, longitude) degrees of a point; inverse of `north_east` in ArduPilot's scaling."""
+    latitude = origin_lat + north_m / METRES_PER_DEGREE
+    scale = _longitude_scale((origin_lat + latitude) / 2.0)
+    return latitude, _wrap_degrees(origin_lon + east_m / (METRES_PER_DEGREE * scale))
+
+
+def ned_from_origin(
+    origin: Origin,
+    latitude_deg: float,
+    longitude_deg: float,
+    altitude_amsl_m: float,
+    projection: Projection = "ardupilot",
+) -> tuple[float, float, float]:
+    """NED metres from the EKF origin."""
+    north, east = north_east(
+        origin.latitude_deg, origin.longitude_deg, latitude_deg, longitude_deg, projection
+    )
+    return north, east, origin.altitude_amsl_m - altitude_amsl_m
+
+
+class OriginKeeper:
+    """Reads the vehicle's origin, and sets the configured one only when there is none.
+
+    A second origin is silently ignored by ArduPilot, so what GPS_GLOBAL_ORIGIN says is the truth,
+    whatever was sent.
+    """
+
+    def __init__(self, configured: OriginConfig | None) -> None:
+        self.origin: Origin | None = None
+        self._configured = configured
+        self._asked = 0
+        self._next_ns = 0
+        self._told = False
+
+    def reset(self) -> None:
+        """The flight controller rebooted: its origin is gone."""
+        self.origin, self._asked, self._told = None, 0, False
+
+    def on_origin(self, message: Any) -> str | None:
+        """GPS_GLOBAL_ORIGIN; returns a line for the operator when it is news."""
+        read = Origin(message.latitude * 1e-7, message.longitude * 1e-7, message.altitude * 1e-3)
+        if read.latitude_deg == 0.0 and read.longitude_deg == 0.0:
+            return None  # what firmwares send before they have one
+        if read == self.origin:
+            return None
+        moved = self.origin is not None
+        self.origin = read
+        if moved:
+            return "EKF origin moved; positions follow it"
+        if self._configured is not None:
+            north, east = north_east(
+                self._configured.latitude_deg,
+                self._configured.longitude_deg,
+                read.latitude_deg,
+                read.longitude_deg,
+            )
+            apart = math.hypot(north, east)
+            if apart > 1.0:
+                return f"EKF origin is {apart:.0f} m from the configured one; using the EKF's"
+        return "EKF origin known"
+
+    def tick(self, now_ns: int, system_id: int, ask: Callable[[int], None]) -> Any | None:
+        """Ask for the origin while unknown (`ask(49)`); SET_GPS_GLOBAL_ORIGIN when it is due."""
+        if self.origin is not None or now_ns < self._next_ns:
+            return None
+        self._next_ns = now_ns + _ASK_EVERY_NS
+        self._asked += 1
+        ask(mavlink.MAVLINK_MSG_ID_GPS_GLOBAL_ORIGIN)
+        if self._configured is None or self._asked <= _ASKS_BEFORE_SETTING:
+            return None
+        if not self._told:
+            log.info("the vehicle has no EKF origin: setting the configured one")
+            self._told = True
+        return mavlink.MAVLink_set_gps_global_origin_message(
+            system_id,
+            round(self._configured.latitude_deg * 1e7),
+            round(self._configured.longitude_deg * 1e7),
+            round(self._configured.altitude_amsl_m * 1e3),
+            now_ns // 1000,
+        )

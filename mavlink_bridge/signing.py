@@ -1,0 +1,59 @@
+"""MAVLink 2 signing: the key file, and one signing state per sending component.
+
+https://mavlink.io/en/guide/message_signing.html
+"""
+
+from __future__ import annotations
+
+import os
+import stat
+import time
+from pathlib import Path
+from typing import Any
+
+from mavlink_bridge.errors import SigningKeyError
+
+_SIGNING_EPOCH_S = 1420070400  # 2015-01-01 UTC
+_TICKS_PER_S = 100_000  # time stamps count 10 microseconds
+
+
+def load_key(path: Path) -> bytes:
+    """The 32-byte key of a file of 64 hexadecimal digits that only its owner can read."""
+    try:
+        mode = path.stat().st_mode
+        text = path.read_text(encoding="ascii").strip()
+    except (OSError, UnicodeDecodeError) as error:
+        raise SigningKeyError(f"{path}: signing key cannot be read ({error})") from error
+    if stat.S_IMODE(mode) & 0o077:
+        raise SigningKeyError(f"{path}: signing key is readable by others; chmod 600 it")
+    try:
+        key = bytes.fromhex(text)
+    except ValueError as error:
+        raise SigningKeyError(f"{path}: signing key must be 64 hexadecimal digits") from error
+    if len(key) != 32:
+        raise SigningKeyError(f"{path}: signing key has {len(key)} bytes, needs 32")
+    return key
+
+
+def create_key(path: Path) -> bytes:
+    """Write a new random key to a file that only its owner can read, and return it."""
+    key = os.urandom(32)
+    descriptor = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600)
+    with os.fdopen(descriptor, "w", encoding="ascii") as file:
+        file.write(key.hex() + "\n")
+    return key
+
+
+def signing_timestamp(unix_time_s: float | None = None) -> int:
+    """Signing time stamp: 10 microsecond ticks since 2015-01-01 UTC."""
+    now = time.time() if unix_time_s is None else unix_time_s
+    return int((now - _SIGNING_EPOCH_S) * _TICKS_PER_S)
+
+
+def enable(mav: Any, key: bytes, link_id: int) -> None:
+    """Make a pymavlink `MAVLink` sign what it packs and refuse what is not signed with `key`."""
+    mav.signing.secret_key = key
+    mav.signing.link_id = link_id
+    mav.signing.timestamp = signing_timestamp()
+    mav.signing.sign_outgoing = True
+    mav.signing.allow_unsigned_callback = None

@@ -1,0 +1,220 @@
+"""Byte transports under a MAVLink link: UDP in and out, TCP client and server, serial.
+
+All are non-blocking once open and selectable by file descriptor. `read` returns b"" when nothing
+is there and raises OSError when the other side is gone; `write` returns how many bytes it took.
+"""
+
+from __future__ import annotations
+
+import os
+import socket
+from dataclasses import dataclass
+from typing import Any, Literal, Protocol
+
+from mavlink_bridge.errors import EndpointError
+
+Kind = Literal["udpin", "udpout", "tcp", "tcpin", "serial"]
+_CONNECT_TIMEOUT_S = 2.0
+_READ_SIZE = 65536
+_KINDS: dict[str, Kind] = {
+    "udpin": "udpin",
+    "udp": "udpin",
+    "udpout": "udpout",
+    "tcp": "tcp",
+    "tcpout": "tcp",
+    "tcpin": "tcpin",
+    "serial": "serial",
+}
+
+
+@dataclass(frozen=True)
+class Endpoint:
+    """One end of a link. address: host or serial device; number: port or baud rate."""
+
+    kind: Kind
+    address: str
+    number: int
+
+    @classmethod
+    def parse(cls, text: str) -> Endpoint:
+        """From ``kind:address:number``, such as ``udpin:0.0.0.0:14550``; EndpointError if not."""
+        kind, _, rest = text.partition(":")
+        address, _, number = rest.rpartition(":")
+        if kind not in _KINDS or not address or not number.isdigit():
+            raise EndpointError(
+                f"{text!r} is no endpoint; write udpin:HOST:PORT, udpout:HOST:PORT, tcp:HOST:PORT, "
+                "tcpin:HOST:PORT or serial:DEVICE:BAUD"
+            )
+        if _KINDS[kind] != "serial" and not 0 <= int(number) <= 65535:
+            raise EndpointError(f"{text!r}: {number} is no port number")
+        return cls(_KINDS[kind], address, int(number))
+
+    def __str__(self) -> str:
+        return f"{self.kind}:{self.address}:{self.number}"
+
+
+class Transport(Protocol):
+    """An open byte stream or datagram socket."""
+
+    @property
+    def stream(self) -> bool:
+        """Whether an end of it can be seen (TCP, serial), unlike UDP's."""
+
+    def fileno(self) -> int:
+        """Descriptor for select."""
+
+    def read(self) -> bytes:
+        """What has arrived, b"" if nothing; OSError when the other side is gone."""
+
+    def write(self, data: bytes) -> int:
+        """Send; number of bytes taken (0 when there is nobody to send to, or no room)."""
+
+    def close(self) -> None:
+        """Close it."""
+
+
+class UdpTransport:
+    """A UDP socket. With `remote` None it listens and answers whoever spoke last."""
+
+    stream = False
+
+    def __init__(self, local: tuple[str, int] | None, remote: tuple[str, int] | None) -> None:
+        self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+        self._remote = remote
+        self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 1 << 20)
+        self._socket.setblocking(False)
+        if local is not None:
+            self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+            try:
+                self._socket.bind(local)
+            except OSError:
+                self._socket.close()
+                raise
+        self._learn = remote is None
+
+    @property
+    def port(self) -> int:
+        """The local port."""
+        return int(self._socket.getsockname()[1])
+
+    def fileno(self) -> int:
+        """Descriptor for select."""
+        return self._socket.fileno()
+
+    def read(self) -> bytes:
+        """One datagram; the sender becomes the peer when none was configured."""
+        try:
+            data, sender = self._socket.recvfrom(_READ_SIZE)
+        except (BlockingIOError, ConnectionRefusedError):
+            # Refused: an ICMP answer to something sent before the peer listened; UDP goes on.
+            return b""
+        if self._learn:
+            self._remote = sender
+        return data
+
+    def write(self, data: bytes) -> int:
+        """One datagram to the peer."""
+        if self._remote is None:
+            return 0
+        try:
+            return self._socket.sendto(data, self._remote)
+        except (BlockingIOError, ConnectionRefusedError):
+            return 0
+
+    def close(self) -> None:
+        """Close the socket."""
+        self._socket.close()
+
+
+class TcpTransport:
+    """A connected TCP socket."""
+
+    stream = True
+
+    def __init__(self, connected: socket.socket) -> None:
+        self._socket = connected
+        self._socket.setblocking(False)
+        # An estimate must not wait for the acknowledgement of the one before.
+        self._socket.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+
+    def fileno(self) -> int:
+        """Descriptor for select."""
+        return self._socket.fileno()
+
+    def read(self) -> bytes:
+        """What has arrived; ConnectionResetError at the end of the stream."""
+        try:
+            data = self._socket.recv(_READ_SIZE)
+        except BlockingIOError:
+            return b""
+        if not data:
+            raise ConnectionResetError("the other side closed the connection")
+        return data
+
+    def write(self, data: bytes) -> int:
+        """Send what fits."""
+        try:
+            return self._socket.send(data)
+        except BlockingIOError:
+            return 0
+
+    def close(self) -> None:
+        """Close the socket."""
+        self._socket.close()
+
+
+class SerialTransport:
+    """A serial port, by pyserial."""
+
+    stream = True
+
+    def __init__(self, device: str, baud: int) -> None:
+        try:
+            import serial  # type: ignore[import-untyped]
+        except ImportError as error:
+            raise EndpointError("serial endpoints need pyserial: pip install pyserial") from error
+        # pyserial derives SerialException from OSError; a missing device is retried like any other.
+        self._port: Any = serial.Serial(device, baud, timeout=0, write_timeout=0, exclusive=True)
+
+    def fileno(self) -> int:
+        """Descriptor for select."""
+        return int(self._port.fileno())
+
+    def read(self) -> bytes:
+        """What has arrived; OSError when the device is gone."""
+        return bytes(self._port.read(max(1, self._port.in_waiting)))
+
+    def write(self, data: bytes) -> int:
+        """Send what fits."""
+        try:
+            return os.write(self.fileno(), data)
+        except BlockingIOError:
+            return 0
+
+    def close(self) -> None:
+        """Close the port."""
+        self._port.close()
+
+
+def _accept(endpoint: Endpoint) -> TcpTransport:
+    """Wait a bounded time for one client; TimeoutError (an OSError) if none comes."""
+    with socket.socket(socket.AF_INET, socket.SOCK_STREAM) as listener:
+        listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        listener.bind((endpoint.address, endpoint.number))
+        listener.listen(1)
+        listener.settimeout(_CONNECT_TIMEOUT_S)
+        return TcpTransport(listener.accept()[0])
+
+
+def open_transport(endpoint: Endpoint) -> Transport:
+    """Open the endpoint; OSError if that fails now and is worth trying again."""
+    where = (endpoint.address, endpoint.number)
+    if endpoint.kind == "udpin":
+        return UdpTransport(where, None)
+    if endpoint.kind == "udpout":
+        return UdpTransport(None, (socket.gethostbyname(endpoint.address), endpoint.number))
+    if endpoint.kind == "tcp":
+        return TcpTransport(socket.create_connection(where, timeout=_CONNECT_TIMEOUT_S))
+    if endpoint.kind == "tcpin":
+        return _accept(endpoint)
+    return SerialTransport(endpoint.address, endpoint.number)
