@@ -1,0 +1,1 @@
+"""Training of the feature networks (extra `train`): pairs, losses, loop, export. Needs torch."""

@@ -1,0 +1,77 @@
+"""Command line of the training: ``python -m localizer.training {generate,train,export,curves}``."""
+
+from __future__ import annotations
+
+import logging
+import threading
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from localizer.training.config import TrainConfig, load_config
+from localizer.training.pairs import SceneConfig
+from localizer.training.shards import PhotoSource, write_shards
+
+app = typer.Typer(help=__doc__, no_args_is_help=True, add_completion=False)
+
+ConfigPath = Annotated[Path, typer.Argument(help="YAML file of the run, see configs/.")]
+
+
+@app.command()
+def generate(config: ConfigPath) -> None:
+    """Write the run's shards that are not on disk yet."""
+    _generate(load_config(config))
+
+
+@app.command()
+def train(
+    config: ConfigPath,
+    steps: Annotated[int | None, typer.Option(help="Stop after so many more steps.")] = None,
+) -> None:
+    """Train, from the checkpoint where there is one; shards are generated alongside."""
+    from localizer.training.train import Trainer
+
+    loaded = load_config(config)
+    trainer = Trainer(loaded)
+    generator = threading.Thread(target=_generate, args=(loaded,), daemon=True)
+    generator.start()
+    trainer.run(steps)
+
+
+@app.command()
+def export(
+    checkpoint: Annotated[Path, typer.Argument(help="Checkpoint (.pt) of a run.")],
+    model: Annotated[Path, typer.Argument(help="ONNX file to write; its JSON goes beside it.")],
+) -> None:
+    """Write a checkpoint's averaged weights as an ONNX model with its description."""
+    from localizer.training.export import export as write
+
+    difference = write(checkpoint, model)
+    typer.echo(f"{model}: largest difference to torch {difference:.2g}")
+
+
+@app.command()
+def curves(log: Annotated[Path, typer.Argument(help="CSV that a run wrote.")]) -> None:
+    """Plot a run's metrics beside its CSV."""
+    from localizer.training.curves import plot
+
+    typer.echo(plot(log))
+
+
+def scene_config(config: TrainConfig) -> SceneConfig:
+    """What the generator needs of a run's configuration."""
+    return SceneConfig(photo_share=config.data.photo_share, light_variety=config.data.light_variety)
+
+
+def _generate(config: TrainConfig) -> None:
+    data = config.data
+    photos = None if data.photos is None else PhotoSource(data.photos, data.photo_groups)
+    seeds = range(data.first_seed, data.first_seed + data.scenes)
+    for path in write_shards(data.shards, seeds, scene_config(config), photos, data.workers):
+        logging.getLogger(__name__).debug("%s", path)
+
+
+if __name__ == "__main__":
+    logging.basicConfig(level=logging.INFO, format="%(asctime)s %(message)s")
+    app()

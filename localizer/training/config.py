@@ -1,0 +1,72 @@
+"""The configuration of one training run: one YAML file, every key documented there."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import yaml
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
+
+from localizer.errors import ModelError
+from localizer.training.model import ModelConfig
+
+
+class _Frozen(BaseModel):
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+
+class DataSection(_Frozen):
+    """Where pairs come from. Shards are generated in the order of their seeds."""
+
+    shards: Path
+    first_seed: int = Field(ge=1000)
+    scenes: int = Field(gt=0)
+    initial_scenes: int = Field(gt=0)
+    scenes_per_step: float = Field(ge=0.0)
+    photos: Path | None
+    photo_groups: tuple[str, ...]
+    photo_share: float = Field(ge=0.0, le=1.0)
+    light_variety: bool
+    appearance: bool
+    workers: int = Field(gt=0)
+
+
+class OptimizerSection(_Frozen):
+    """Steps and step sizes. The rate warms up, then falls as a cosine to a hundredth."""
+
+    steps: int = Field(gt=0)
+    batch: int = Field(gt=0)
+    crop: tuple[int, int]
+    anchors: int = Field(ge=32)
+    learning_rate: float = Field(gt=0.0)
+    warmup_steps: int = Field(ge=0)
+    weight_decay: float = Field(ge=0.0)
+    ema_decay: float = Field(gt=0.0, lt=1.0)
+    contrast_weight: float
+    alignment_weight: float
+    alignment_ramp_steps: int = Field(ge=1)
+    lm_iterations: int = Field(gt=0)
+    start_error_px: tuple[float, float, float]
+    threads: int = Field(gt=0)
+
+
+class TrainConfig(_Frozen):
+    """A whole run."""
+
+    name: str
+    seed: int
+    output: Path
+    checkpoint_steps: int = Field(gt=0)
+    model: ModelConfig
+    data: DataSection
+    optimizer: OptimizerSection
+
+
+def load_config(path: Path) -> TrainConfig:
+    """Read a YAML file; unknown keys and bad values raise `ModelError` with their names."""
+    try:
+        return TrainConfig.model_validate(yaml.safe_load(path.read_text()))
+    except OSError as error:
+        raise ModelError(f"{path}: cannot be read: {error.strerror}") from error
+    except (ValidationError, yaml.YAMLError) as error:
+        raise ModelError(f"{path}: {error}") from error

@@ -1,0 +1,219 @@
+"""Batches of augmented crops from shards; what a step sees depends on seed and step alone."""
+
+from __future__ import annotations
+
+import time
+from collections import OrderedDict
+from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from localizer.synth.appearance import Appearance, apply_appearance, sample_appearance
+from localizer.training.losses import Batch
+from localizer.training.pairs import Pair, relative_pose
+from localizer.training.shards import read_shard, shard_path
+from localizer.types import Float32, Image
+
+_DENSEST_HAZE = 2.0  # optical depth at the scene's median distance; beyond it nothing is left
+
+
+@dataclass(frozen=True)
+class LoaderConfig:
+    """pairs and anchors of a batch, crop size in pixels, whether queries get weather and sensor."""
+
+    batch: int
+    anchors: int
+    crop: tuple[int, int]
+    appearance: bool
+    cached_shards: int = 700
+
+
+class ShardStream:
+    """Deals batches from shards `first_seed` on, of which the first `available(step)` are in use.
+
+    A step waits for the shards it may draw from, so that training can begin while later shards are
+    still being generated and yet see the same data every time.
+    """
+
+    def __init__(
+        self,
+        folder: Path,
+        first_seed: int,
+        available: tuple[int, float, int],
+        config: LoaderConfig,
+        seed: int,
+    ) -> None:
+        self._folder, self._first, self._config, self._seed = folder, first_seed, config, seed
+        self._initial, self._growth, self._total = available
+        self._cache: OrderedDict[int, list[Pair]] = OrderedDict()
+        self._pool = ThreadPoolExecutor(1)
+        self._next: tuple[int, Future[Batch]] | None = None
+
+    def batch(self, step: int) -> Batch:
+        """The batch of a step; the next one is prepared meanwhile."""
+        if self._next is not None and self._next[0] == step:
+            current = self._next[1]
+        else:
+            current = self._pool.submit(self._make, step)
+        self._next = (step + 1, self._pool.submit(self._make, step + 1))
+        return current.result()
+
+    def close(self) -> None:
+        """Stop preparing batches."""
+        self._pool.shutdown(wait=False, cancel_futures=True)
+
+    def _make(self, step: int) -> Batch:
+        rng = np.random.default_rng((self._seed, step))
+        count = int(min(self._total, self._initial + step * self._growth))
+        samples: list[Sample] = []
+        while len(samples) < self._config.batch:
+            pairs = self._shard(self._first + int(rng.integers(count)))
+            if not pairs:
+                continue
+            made = crop_pair(pairs[int(rng.integers(len(pairs)))], self._config, rng)
+            if made is not None:
+                samples.append(made)
+        return collate(samples)
+
+    def _shard(self, seed: int) -> list[Pair]:
+        if seed in self._cache:
+            self._cache.move_to_end(seed)
+            return self._cache[seed]
+        path = shard_path(self._folder, seed)
+        while not path.exists():
+            time.sleep(0.5)
+        self._cache[seed] = read_shard(path)
+        if len(self._cache) > self._config.cached_shards:
+            self._cache.popitem(last=False)
+        return self._cache[seed]
+
+
+@dataclass(frozen=True)
+class Sample:
+    """One augmented crop pair; arrays as in `localizer.training.losses.Batch`, without B."""
+
+    reference: Image
+    query: Image
+    points: Float32
+    reference_pixels: Float32
+    query_pixels: Float32
+    visible: Float32
+    query_from_reference: NDArray[np.float64]
+    K_query: Float32
+
+
+def crop_pair(pair: Pair, config: LoaderConfig, rng: np.random.Generator) -> Sample | None:
+    """Weather on the query, windows that see the same ground, anchors; None without overlap."""
+    width, height = config.crop
+    camera = pair.camera
+    query, reference = pair.query, pair.reference
+    if config.appearance:
+        look = tamed(sample_appearance(rng, pair.condition), pair.query_depth)
+        query = apply_appearance(query, pair.query_depth, look, rng)
+        if rng.random() < 0.5:
+            survey = replace(
+                sample_appearance(rng, "day"), motion_blur_px=0.0, extinction_per_m=0.0
+            )
+            reference = apply_appearance(reference, pair.reference_depth, survey, rng)
+    T = relative_pose(pair)
+    rx = int(rng.integers(0, camera.width - width + 1))
+    ry = int(rng.integers(0, camera.height - height + 1))
+    window = pair.reference_depth[ry : ry + height, rx : rx + width]
+    rows, cols = np.nonzero(window > 0)
+    if len(rows) < 2 * config.anchors:
+        return None
+    pick = rng.choice(len(rows), 2 * config.anchors, replace=False)
+    pixels = np.stack([cols[pick] + rx, rows[pick] + ry], 1) + 0.5
+    points = camera.rays(pixels) * window[rows[pick], cols[pick]][:, None]
+    local = points @ T[:3, :3].T + T[:3, 3]
+    seen, inside = camera.project(local)
+    if inside.sum() < config.anchors // 3:
+        return None
+    # The query's window follows the content, with some freedom, so that large motions stay in view.
+    middle = np.median(seen[inside], axis=0) + rng.normal(0, 8, 2)
+    qx = int(np.clip(middle[0] - width / 2, 0, camera.width - width))
+    qy = int(np.clip(middle[1] - height / 2, 0, camera.height - height))
+    visible = inside & _unoccluded(seen, local[:, 2], pair.query_depth)
+    moved = seen - (qx, qy)
+    visible &= ((moved > 3) & (moved < (width - 3, height - 3))).all(1)
+    if visible.sum() < config.anchors // 4:
+        return None
+    order = np.r_[np.flatnonzero(visible)[: int(0.85 * config.anchors)], np.flatnonzero(~visible)]
+    order = np.r_[order, np.flatnonzero(visible)[int(0.85 * config.anchors) :]][: config.anchors]
+    sample = Sample(
+        reference[ry : ry + height, rx : rx + width],
+        query[qy : qy + height, qx : qx + width],
+        points[order].astype(np.float32),
+        (pixels[order] - (rx, ry)).astype(np.float32),
+        np.nan_to_num(moved[order]).astype(np.float32),
+        visible[order].astype(np.float32),
+        T,
+        np.array([camera.fx, camera.fy, camera.cx - qx, camera.cy - qy], np.float32),
+    )
+    return mirrored(sample) if rng.random() < 0.5 else sample
+
+
+def mirrored(sample: Sample) -> Sample:
+    """The same pair seen in a mirror: images flipped, x negated in both camera frames."""
+    width = sample.query.shape[1]
+    M = np.diag([-1.0, 1.0, 1.0, 1.0])
+    flip = np.array([-1.0, 1.0], np.float32)
+    return Sample(
+        sample.reference[:, ::-1],
+        sample.query[:, ::-1],
+        sample.points * np.array([-1, 1, 1], np.float32),
+        sample.reference_pixels * flip + np.array([width, 0], np.float32),
+        sample.query_pixels * flip + np.array([width, 0], np.float32),
+        sample.visible,
+        M @ sample.query_from_reference @ M,
+        sample.K_query * np.array([1, 1, -1, 1], np.float32)
+        + np.array([0, 0, width, 0], np.float32),
+    )
+
+
+def collate(samples: list[Sample]) -> Batch:
+    """Stack samples into tensors."""
+    images = np.stack([s.reference for s in samples] + [s.query for s in samples])
+    # channels_last tensors corrupt memory in torch 2.13's CPU backward pass.
+    pixels = torch.from_numpy(np.ascontiguousarray(images.transpose(0, 3, 1, 2)))
+    stacked = [
+        torch.from_numpy(np.stack(a).astype(np.float32))
+        for a in zip(
+            *(
+                (
+                    s.points,
+                    s.reference_pixels,
+                    s.query_pixels,
+                    s.visible,
+                    s.query_from_reference,
+                    s.K_query,
+                )
+                for s in samples
+            ),
+            strict=True,
+        )
+    ]
+    return Batch(pixels.float() / 255.0, *stacked)
+
+
+def tamed(appearance: Appearance, depth: Float32) -> Appearance:
+    """The appearance with haze no denser than leaves something to see at these distances."""
+    surface = depth[depth > 0]
+    if not surface.size:
+        return appearance
+    limit = _DENSEST_HAZE / float(np.median(surface))
+    return replace(appearance, extinction_per_m=min(appearance.extinction_per_m, limit))
+
+
+def _unoccluded(
+    pixels: NDArray[np.float64], z: NDArray[np.float64], depth: Float32
+) -> NDArray[np.bool_]:
+    """Whether the surface seen at `pixels` is the one at distance `z`."""
+    h, w = depth.shape
+    col = np.nan_to_num(pixels[:, 0]).astype(int).clip(0, w - 1)
+    row = np.nan_to_num(pixels[:, 1]).astype(int).clip(0, h - 1)
+    return np.abs(depth[row, col] - z) < 0.012 * z + 0.5

@@ -1,0 +1,103 @@
+"""Pairs on disk: one shard (``SEED.npz``) per generated place, written once and streamed.
+
+A shard's content depends on its seed and the scene configuration alone.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator
+from concurrent.futures import ProcessPoolExecutor
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from localizer.camera import Camera
+from localizer.errors import SequenceError
+from localizer.pose import Pose
+from localizer.training.land import PhotoLibrary
+from localizer.training.pairs import Pair, SceneConfig, scene_pairs
+
+
+@dataclass(frozen=True)
+class PhotoSource:
+    """Where the real textures are and which groups of them to use."""
+
+    root: Path
+    groups: tuple[str, ...]
+
+
+def write_shards(
+    out: Path, seeds: range, scenes: SceneConfig, photos: PhotoSource | None, workers: int
+) -> Iterator[Path]:
+    """Generate the shards of `seeds` that are not on disk yet; yields each as it is finished."""
+    out.mkdir(parents=True, exist_ok=True)
+    missing = [seed for seed in seeds if not shard_path(out, seed).exists()]
+    with ProcessPoolExecutor(workers, initializer=os.nice, initargs=(5,)) as pool:
+        tasks = (pool.submit(write_shard, out, seed, scenes, photos) for seed in missing)
+        # All are submitted at once; results are awaited in order.
+        for task in list(tasks):
+            yield task.result()
+
+
+def shard_path(folder: Path, seed: int) -> Path:
+    """Where the shard of a seed lies."""
+    return folder / f"{seed:08d}.npz"
+
+
+def write_shard(out: Path, seed: int, scenes: SceneConfig, photos: PhotoSource | None) -> Path:
+    """Generate and store one place's pairs; a reader never sees half a file."""
+    library = None if photos is None else PhotoLibrary(photos.root, photos.groups)
+    pairs = list(scene_pairs(seed, scenes, library))
+    path = shard_path(out, seed)
+    partial = path.with_suffix(".partial.npz")
+    np.savez(
+        partial,
+        reference=_stack([p.reference for p in pairs], scenes, np.uint8),
+        query=_stack([p.query for p in pairs], scenes, np.uint8),
+        reference_depth=_stack([p.reference_depth for p in pairs], scenes, np.float16),
+        query_depth=_stack([p.query_depth for p in pairs], scenes, np.float16),
+        world_from_reference=np.array([p.world_from_reference.matrix for p in pairs]),
+        world_from_query=np.array([p.world_from_query.matrix for p in pairs]),
+        focal_px=np.array([p.camera.fx for p in pairs]),
+        condition=np.array([p.condition for p in pairs]),
+        outdated=np.array([p.outdated for p in pairs]),
+        source=np.array([p.source for p in pairs]),
+    )
+    partial.rename(path)
+    return path
+
+
+def read_shard(path: Path) -> list[Pair]:
+    """The pairs of one shard."""
+    try:
+        with np.load(path) as data:
+            z = {key: data[key] for key in data.files}
+    except (OSError, ValueError) as error:
+        raise SequenceError(f"{path}: cannot be read as a shard: {error}") from error
+    count, height, width = z["reference"].shape[:3]
+    return [
+        Pair(
+            z["reference"][k],
+            z["reference_depth"][k].astype(np.float32),
+            z["query"][k],
+            z["query_depth"][k].astype(np.float32),
+            Pose.from_matrix(z["world_from_reference"][k]),
+            Pose.from_matrix(z["world_from_query"][k]),
+            Camera(
+                width, height, z["focal_px"][k], z["focal_px"][k], width / 2, height / 2
+            ),
+            str(z["condition"][k]),
+            bool(z["outdated"][k]),
+            str(z["source"][k]),
+        )
+        for k in range(count)
+    ]  # fmt: skip
+
+
+def _stack(arrays: list[np.ndarray], scenes: SceneConfig, dtype: type) -> np.ndarray:
+    if not arrays:
+        shape = (0, scenes.height, scenes.width)
+        return np.zeros((*shape, 3) if dtype is np.uint8 else shape, dtype)
+    return np.stack(arrays).astype(dtype)

@@ -1,0 +1,187 @@
+"""The training loop: both losses together, EMA, exact resumption, curves."""
+
+from __future__ import annotations
+
+import csv
+import logging
+import time
+from pathlib import Path
+
+import numpy as np
+import torch
+from torch import Tensor, nn
+
+from localizer.training.config import OptimizerSection, TrainConfig
+from localizer.training.data import LoaderConfig, ShardStream
+from localizer.training.losses import Batch, alignment_loss, contrast_loss, sample, se3_exp
+from localizer.training.model import STRIDES, TinyNet
+
+logger = logging.getLogger(__name__)
+
+
+class Trainer:
+    """A run that stops and continues at any step with the same result."""
+
+    def __init__(self, config: TrainConfig) -> None:
+        self.config = config
+        torch.manual_seed(config.seed)
+        torch.set_num_threads(config.optimizer.threads)
+        self.device = torch.device("cuda" if torch.cuda.is_available() else "cpu")
+        self.model = TinyNet(config.model).to(self.device).train()
+        self.average = TinyNet(config.model).to(self.device).eval()
+        self.average.load_state_dict(self.model.state_dict())
+        self.log_scale = nn.Parameter(torch.full((3,), 2.3, device=self.device))
+        self.optimizer = torch.optim.AdamW(
+            [
+                {"params": list(self.model.parameters())},
+                {"params": [self.log_scale], "weight_decay": 0.0},
+            ],
+            lr=config.optimizer.learning_rate,
+            weight_decay=config.optimizer.weight_decay,
+        )
+        self.step = 0
+        self.seconds = 0.0
+        self._resume()
+
+    @property
+    def checkpoint(self) -> Path:
+        """The newest state of this run."""
+        return self.config.output / f"{self.config.name}.pt"
+
+    def run(self, steps: int | None = None) -> None:
+        """Train up to the configured number of steps, or `steps` more."""
+        last = self.config.optimizer.steps
+        if steps is not None:
+            last = min(last, self.step + steps)
+        data, o = self.config.data, self.config.optimizer
+        loader = LoaderConfig(o.batch, o.anchors, o.crop, data.appearance)
+        available = (data.initial_scenes, data.scenes_per_step, data.scenes)
+        stream = ShardStream(data.shards, data.first_seed, available, loader, self.config.seed)
+        rows: list[dict[str, float]] = []
+        began = time.monotonic() - self.seconds
+        try:
+            while self.step < last:
+                rows.append(self._train_step(stream.batch(self.step)))
+                self.step += 1
+                self.seconds = time.monotonic() - began
+                if self.step % self.config.checkpoint_steps == 0 or self.step == last:
+                    self._save()
+                if self.step % 25 == 0 or self.step == last:
+                    self._log(rows)
+                    rows = []
+        finally:
+            stream.close()
+
+    def _train_step(self, batch: Batch) -> dict[str, float]:
+        o = self.config.optimizer
+        batch = Batch(*(t.to(self.device) for t in vars(batch).values()))
+        for group in self.optimizer.param_groups:
+            group["lr"] = learning_rate(self.step, o)
+        loss, parts = self._loss(batch)
+        self.optimizer.zero_grad()
+        loss.backward()
+        norm = nn.utils.clip_grad_norm_([*self.model.parameters(), self.log_scale], 5.0)
+        if torch.isfinite(norm):
+            self.optimizer.step()
+            self._update_average()
+        else:
+            logger.warning("step %d skipped: gradient is not finite", self.step)
+        return parts | {"loss": float(loss.detach()), "gradient": float(norm)}
+
+    def _loss(self, batch: Batch) -> tuple[Tensor, dict[str, float]]:
+        o = self.config.optimizer
+        pairs = batch.points.shape[0]
+        levels = self.model(batch.images.contiguous())
+        ramp = min(1.0, self.step / o.alignment_ramp_steps)
+        generator = torch.Generator().manual_seed(self.config.seed * 1_000_003 + self.step)
+        total, parts = batch.points.new_zeros(()), {}
+        for k, ((features, confidence), stride) in enumerate(zip(levels, STRIDES, strict=True)):
+            at = batch.reference_pixels / stride
+            anchors = sample(features[:pairs], at)
+            trust = sample(confidence[:pairs, None], at)[..., 0]
+            query = features[pairs:]
+            contrast = contrast_loss(
+                anchors, query, batch.query_pixels / stride, batch.visible,
+                self.log_scale[k].exp(), 64,
+            )  # fmt: skip
+            start = perturbed(batch, o.start_error_px[k], generator)
+            alignment, error = alignment_loss(
+                batch, (anchors, trust), (query, confidence[pairs:]), stride, start,
+                o.lm_iterations,
+            )  # fmt: skip
+            total = total + o.contrast_weight * contrast
+            total = total + ramp * o.alignment_weight * alignment
+            parts[f"contrast_{k}"] = float(contrast.detach())
+            parts[f"alignment_{k}"] = float(alignment.detach())
+            parts[f"error_px_{k}"] = float(error)
+        return total, parts
+
+    def _update_average(self) -> None:
+        decay = min(self.config.optimizer.ema_decay, (1 + self.step) / (10 + self.step))
+        with torch.no_grad():
+            for mean, value in zip(
+                self.average.state_dict().values(), self.model.state_dict().values(), strict=True
+            ):
+                if mean.is_floating_point():
+                    mean.lerp_(value, 1 - decay)
+                else:
+                    mean.copy_(value)
+
+    def _save(self) -> None:
+        self.config.output.mkdir(parents=True, exist_ok=True)
+        partial = self.checkpoint.with_suffix(".partial")
+        torch.save(
+            {
+                "model": self.model.state_dict(),
+                "average": self.average.state_dict(),
+                "log_scale": self.log_scale.detach(),
+                "optimizer": self.optimizer.state_dict(),
+                "step": self.step,
+                "seconds": self.seconds,
+                "config": self.config.model_dump(mode="json"),
+            },
+            partial,
+        )
+        partial.rename(self.checkpoint)
+
+    def _resume(self) -> None:
+        if not self.checkpoint.exists():
+            return
+        state = torch.load(self.checkpoint, map_location=self.device, weights_only=True)
+        self.model.load_state_dict(state["model"])
+        self.average.load_state_dict(state["average"])
+        with torch.no_grad():
+            self.log_scale.copy_(state["log_scale"])
+        self.optimizer.load_state_dict(state["optimizer"])
+        self.step, self.seconds = state["step"], state["seconds"]
+        logger.info("resumed %s at step %d", self.checkpoint, self.step)
+
+    def _log(self, rows: list[dict[str, float]]) -> None:
+        means: dict[str, float] = {k: float(np.mean([r[k] for r in rows])) for k in rows[0]}
+        row = {"step": float(self.step), "seconds": round(self.seconds, 1)} | means
+        path = self.config.output / f"{self.config.name}.csv"
+        new = not path.exists()
+        path.parent.mkdir(parents=True, exist_ok=True)
+        with path.open("a", newline="") as file:
+            writer = csv.DictWriter(file, row.keys())
+            if new:
+                writer.writeheader()
+            writer.writerow({k: f"{v:.5g}" for k, v in row.items()})
+        shown = " ".join(f"{k} {v:.3g}" for k, v in row.items())
+        logger.info("%s", shown)
+
+
+def learning_rate(step: int, o: OptimizerSection) -> float:
+    """Linear warm-up, then a cosine to a hundredth of the peak."""
+    warm = min(1.0, (step + 1) / max(o.warmup_steps, 1))
+    cosine = 0.5 * (1 + np.cos(np.pi * min(1.0, step / o.steps)))
+    return float(o.learning_rate * warm * (0.01 + 0.99 * cosine))
+
+
+def perturbed(batch: Batch, error_px: float, generator: torch.Generator) -> Tensor:
+    """True poses moved so that anchors are off by about `error_px` image pixels."""
+    depth = batch.points[..., 2].median(dim=1).values
+    xi = torch.randn(len(depth), 6, generator=generator).to(depth.device) * 0.6
+    angle = error_px / batch.K_query[:, 0]
+    size = torch.stack([angle * depth] * 3 + [angle] * 3, 1)
+    return se3_exp(xi * size) @ batch.query_from_reference
