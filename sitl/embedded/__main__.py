@@ -1,0 +1,83 @@
+"""``python -m sitl.embedded``: run the vehicle until it is stopped, as ArduPilot SITL runs."""
+
+from __future__ import annotations
+
+import argparse
+import signal
+import sys
+from pathlib import Path
+from types import FrameType
+
+from sitl.embedded.errors import VehicleError
+from sitl.embedded.geodesy import Location
+from sitl.embedded.mavlink_server import MavlinkServer
+from sitl.embedded.parameters import Parameters, read_parameter_file
+from sitl.embedded.vehicle import Vehicle
+
+SERIAL_OFFSETS = (0, 2, 3)  # serial0, serial1, serial2 of ArduPilot SITL, from the base port
+
+
+def _home(text: str) -> tuple[Location, float]:
+    try:
+        latitude, longitude, altitude, heading = (float(part) for part in text.split(","))
+    except ValueError as error:
+        raise argparse.ArgumentTypeError(
+            f"expected LAT,LON,ALT_AMSL,HEADING in degrees and metres, got {text!r}"
+        ) from error
+    if not (-90 <= latitude <= 90 and -180 <= longitude <= 180):
+        raise argparse.ArgumentTypeError(f"no place on Earth: {text!r}")
+    return Location(latitude, longitude, altitude), heading
+
+
+def _arguments(argv: list[str] | None) -> argparse.Namespace:
+    parser = argparse.ArgumentParser(prog="python -m sitl.embedded", description=__doc__)
+    parser.add_argument("--home", type=_home, required=True, metavar="LAT,LON,ALT_AMSL,HEADING")
+    parser.add_argument("--port", type=int, default=5760, help="base TCP port (serial0)")
+    parser.add_argument("--params", type=Path, action="append", default=[], help=".parm file")
+    parser.add_argument("--speedup", type=float, default=1.0, help="simulated s per real s")
+    parser.add_argument("--seed", type=int, default=0, help="seed of all sensor noise and gusts")
+    return parser.parse_args(argv)
+
+
+def _stop(_signal: int, _frame: FrameType | None) -> None:
+    raise SystemExit(0)
+
+
+def main(argv: list[str] | None = None) -> int:
+    """Run the vehicle; returns the exit status."""
+    arguments = _arguments(argv)
+    signal.signal(signal.SIGTERM, _stop)
+    home, heading_deg = arguments.home
+    try:
+        parameters = Parameters()
+        for path in arguments.params:
+            for name, value in read_parameter_file(path).items():
+                if not parameters.set(name, value):
+                    print(f"{path}: the embedded vehicle has no parameter {name}", file=sys.stderr)
+        parameters.set("SIM_SPEEDUP", arguments.speedup)
+        system_id = int(parameters["SYSID_THISMAV"])
+        ports = tuple(arguments.port + offset for offset in SERIAL_OFFSETS)
+        _compile(home)
+        server = MavlinkServer(ports, system_id)
+    except VehicleError as error:
+        print(error, file=sys.stderr)
+        return 1
+    try:
+        Vehicle(home, heading_deg, parameters, server, arguments.seed).run()
+    except KeyboardInterrupt:
+        return 0
+    finally:
+        server.close()
+    return 0
+
+
+def _compile(home: Location) -> None:
+    """Fly a moment without links, so that no client waits for the kernels' first compilation."""
+    vehicle = Vehicle(home, 0.0, Parameters(), MavlinkServer((), 1))
+    vehicle.modes.arm()
+    for _ in range(60):
+        vehicle.step()
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,88 @@
+"""Quaternion kernels (w, x, y, z; body to NED) shared by dynamics, estimator and controller."""
+
+from __future__ import annotations
+
+from math import asin, atan2, cos, sin, sqrt
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+
+
+@njit(cache=True)
+def matrix(q: Array) -> Array:
+    """Rotation matrix (3, 3), body to NED."""
+    w, x, y, z = q[0], q[1], q[2], q[3]
+    R = np.empty((3, 3))
+    R[0, 0] = 1 - 2 * (y * y + z * z)
+    R[0, 1] = 2 * (x * y - w * z)
+    R[0, 2] = 2 * (x * z + w * y)
+    R[1, 0] = 2 * (x * y + w * z)
+    R[1, 1] = 1 - 2 * (x * x + z * z)
+    R[1, 2] = 2 * (y * z - w * x)
+    R[2, 0] = 2 * (x * z - w * y)
+    R[2, 1] = 2 * (y * z + w * x)
+    R[2, 2] = 1 - 2 * (x * x + y * y)
+    return R
+
+
+@njit(cache=True)
+def rotate_body(q: Array, rx: float, ry: float, rz: float) -> None:
+    """``q <- q * exp(r)`` in place: a rotation vector in body axes, radians."""
+    angle = sqrt(rx * rx + ry * ry + rz * rz)
+    s = 0.5 if angle < 1e-9 else sin(0.5 * angle) / angle
+    c, bx, by, bz = cos(0.5 * angle), s * rx, s * ry, s * rz
+    w, x, y, z = q[0], q[1], q[2], q[3]
+    a = w * c - x * bx - y * by - z * bz
+    b = w * bx + x * c + y * bz - z * by
+    d = w * by - x * bz + y * c + z * bx
+    e = w * bz + x * by - y * bx + z * c
+    n = 1.0 / sqrt(a * a + b * b + d * d + e * e)
+    q[0], q[1], q[2], q[3] = a * n, b * n, d * n, e * n
+
+
+@njit(cache=True)
+def rotate_world(q: Array, rx: float, ry: float, rz: float) -> None:
+    """``q <- exp(r) * q`` in place: a rotation vector in NED axes, radians."""
+    angle = sqrt(rx * rx + ry * ry + rz * rz)
+    s = 0.5 if angle < 1e-9 else sin(0.5 * angle) / angle
+    c, bx, by, bz = cos(0.5 * angle), s * rx, s * ry, s * rz
+    w, x, y, z = q[0], q[1], q[2], q[3]
+    a = c * w - bx * x - by * y - bz * z
+    b = c * x + bx * w + by * z - bz * y
+    d = c * y - bx * z + by * w + bz * x
+    e = c * z + bx * y - by * x + bz * w
+    n = 1.0 / sqrt(a * a + b * b + d * d + e * e)
+    q[0], q[1], q[2], q[3] = a * n, b * n, d * n, e * n
+
+
+def quaternion(roll_rad: float, pitch_rad: float, yaw_rad: float) -> Array:
+    """Quaternion (4,) of aerospace Euler angles in radians."""
+    cr, sr = cos(roll_rad / 2), sin(roll_rad / 2)
+    cp, sp = cos(pitch_rad / 2), sin(pitch_rad / 2)
+    cy, sy = cos(yaw_rad / 2), sin(yaw_rad / 2)
+    return np.array(
+        [
+            cr * cp * cy + sr * sp * sy,
+            sr * cp * cy - cr * sp * sy,
+            cr * sp * cy + sr * cp * sy,
+            cr * cp * sy - sr * sp * cy,
+        ]
+    )
+
+
+def euler(q: Array) -> tuple[float, float, float]:
+    """(roll, pitch, yaw) in radians of a quaternion (4,)."""
+    w, x, y, z = (float(c) for c in q)
+    return (
+        atan2(2 * (w * x + y * z), 1 - 2 * (x * x + y * y)),
+        asin(max(-1.0, min(1.0, 2 * (w * y - z * x)))),
+        atan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z)),
+    )
+
+
+def wrap_pi(angle_rad: float) -> float:
+    """The angle in (-pi, pi]."""
+    return atan2(sin(angle_rad), cos(angle_rad))
