@@ -33,6 +33,7 @@ from mavlink_bridge.origin import OriginKeeper
 from mavlink_bridge.profile import FirmwareProfile, select_profile
 from mavlink_bridge.recorder import TlogRecorder
 from mavlink_bridge.signing import load_key
+from mavlink_bridge.streams import StreamKeeper, wanted_streams
 from mavlink_bridge.targets_out import cursor_on_target
 from mavlink_bridge.transport import Endpoint, UdpTransport
 from mavlink_bridge.vehicle import MESSAGES_IN, VehicleTracker
@@ -40,7 +41,6 @@ from mavlink_bridge.vehicle import MESSAGES_IN, VehicleTracker
 log = logging.getLogger(__name__)
 
 _SECOND_NS = 1_000_000_000
-_REQUEST_EVERY_NS = 5 * _SECOND_NS
 _RC_FRESH_NS = _SECOND_NS
 _QUEUE = 64
 _TEXTS = 32
@@ -322,9 +322,10 @@ class _FlightControllerSide(_Side):
         self.counters: Counter[str] = Counter()
         self.injector = Injector(self.config.injection, bridge._geoid_m, bridge._utc)
         self.origin = OriginKeeper(self.config.origin)
+        self.streams = StreamKeeper()
         self._sync_sent: dict[int, int] = {}
         self._next_sync_ns = 0
-        self._next_request_ns = 0
+        self._next_version_ns = 0
         self._connected = False
         self._reason = ""
         self._profile_told = ""
@@ -339,6 +340,7 @@ class _FlightControllerSide(_Side):
             return
         if not self.tracker.accepts(message):
             return
+        self.streams.seen(kind, time_ns)
         if kind == "TIMESYNC":
             self._timesync(link, message, time_ns)
         elif kind == "GPS_GLOBAL_ORIGIN":
@@ -372,7 +374,7 @@ class _FlightControllerSide(_Side):
         self.origin.reset()
         self.tracker.set_origin(None)
         self.injector.guard.reset()
-        self._next_request_ns = 0
+        self.streams.reset()
         self.bridge.say(mavlink.MAV_SEVERITY_WARNING, "PiLoT: flight controller rebooted")
 
     # --- the clockwork --------------------------------------------------------------------------
@@ -380,7 +382,8 @@ class _FlightControllerSide(_Side):
     def on_open(self, link: Link) -> None:
         """Ask for everything again."""
         super().on_open(link)
-        self._next_request_ns = self._next_sync_ns = 0
+        self.streams.reset()
+        self._next_sync_ns = 0
         self._sync_sent.clear()
 
     def on_tick(self, link: Link, now_ns: int) -> int:
@@ -402,41 +405,24 @@ class _FlightControllerSide(_Side):
         if state.connected != self._connected:
             self._connected = state.connected
             if state.connected:
-                self._next_request_ns = 0
+                self.streams.reset()
                 log.info("flight controller found: system %s", state.system_id)
             else:
                 self.counters["lost"] += 1
                 log.warning("flight controller lost: no heartbeat for 3 s")
 
     def _ask(self, link: Link, state: VehicleState, now_ns: int) -> None:
-        """Message intervals, again and again: a flight controller may reboot unseen."""
-        if now_ns < self._next_request_ns:
-            return
-        self._next_request_ns = now_ns + _REQUEST_EVERY_NS
-        for name, rate_hz in self._streams():
+        """Streams that do not flow, and the firmware's version."""
+        for stream in self.streams.due(wanted_streams(self.config, state.autopilot), now_ns):
+            interval_us = round(1e6 / stream.rate_hz)
             self._command(
-                link, mavlink.MAV_CMD_SET_MESSAGE_INTERVAL, _message_id(name), round(1e6 / rate_hz)
+                link, mavlink.MAV_CMD_SET_MESSAGE_INTERVAL, stream.message_id, interval_us
             )
-        if state.version is None:
+        if state.version is None and now_ns >= self._next_version_ns:
+            self._next_version_ns = now_ns + _SECOND_NS
             self._command(
                 link, mavlink.MAV_CMD_REQUEST_MESSAGE, mavlink.MAVLINK_MSG_ID_AUTOPILOT_VERSION
             )
-
-    def _streams(self) -> list[tuple[str, float]]:
-        rate = self.config.attitude_rate_hz
-        streams = [
-            ("ATTITUDE", rate),
-            ("LOCAL_POSITION_NED", 10.0),
-            ("GLOBAL_POSITION_INT", 5.0),
-            ("EKF_STATUS_REPORT", 2.0),
-            ("GPS_RAW_INT", 2.0),
-        ]
-        if self.config.camera.mount == "gimbal":
-            streams.append(("GIMBAL_DEVICE_ATTITUDE_STATUS", min(rate, 25.0)))
-            streams.append(("MOUNT_STATUS", 10.0))
-        if self.config.mode == "rc":
-            streams.append(("RC_CHANNELS", 5.0))
-        return streams
 
     def _command(self, link: Link, command: int, *parameters: float) -> None:
         padded = [*parameters, *([0.0] * (7 - len(parameters)))]

@@ -1,0 +1,93 @@
+"""Which messages the flight controller is asked to stream, and asking again for what is missing."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from pymavlink.dialects.v20 import ardupilotmega as mavlink
+
+from mavlink_bridge.config import BridgeConfig
+
+_CHECK_EVERY_NS = 2_000_000_000
+_SILENT_NS = 3_000_000_000
+_OPTIONAL_ATTEMPTS = 2
+
+
+@dataclass(frozen=True)
+class Stream:
+    """A message to be streamed. optional: a firmware may not know it; then asking ends soon.
+
+    unless: not asked for while that message comes.
+    """
+
+    name: str
+    rate_hz: float
+    optional: bool = False
+    unless: str = ""
+
+    @property
+    def message_id(self) -> int:
+        """The MAVLink message id."""
+        return int(getattr(mavlink, f"MAVLINK_MSG_ID_{self.name}"))
+
+
+def wanted_streams(config: BridgeConfig, autopilot: str) -> tuple[Stream, ...]:
+    """The streams a configuration needs from a firmware."""
+    estimator = "ESTIMATOR_STATUS" if autopilot == "px4" else "EKF_STATUS_REPORT"
+    streams = [
+        Stream("ATTITUDE", config.attitude_rate_hz),
+        Stream("LOCAL_POSITION_NED", 10.0),
+        Stream("GLOBAL_POSITION_INT", 5.0),
+        Stream("GPS_RAW_INT", 5.0),
+        Stream(estimator, 2.0),
+    ]
+    if config.camera.mount == "gimbal":
+        device = "GIMBAL_DEVICE_ATTITUDE_STATUS"
+        streams.append(Stream(device, min(config.attitude_rate_hz, 25.0), optional=True))
+        streams.append(Stream("MOUNT_STATUS", 10.0, optional=True, unless=device))
+    if config.mode == "rc":
+        streams.append(Stream("RC_CHANNELS", 5.0))
+    return tuple(streams)
+
+
+class StreamKeeper:
+    """Asks for each stream until it comes, and again when it stops."""
+
+    def __init__(self) -> None:
+        self._seen_ns: dict[str, int] = {}
+        self._attempts: dict[str, int] = {}
+        self._next_ns = 0
+
+    def reset(self) -> None:
+        """The flight controller rebooted or the link was reopened."""
+        self._seen_ns.clear()
+        self._attempts.clear()
+        self._next_ns = 0
+
+    def seen(self, name: str, time_ns: int) -> None:
+        """A message arrived."""
+        self._seen_ns[name] = time_ns
+
+    def due(self, streams: tuple[Stream, ...], now_ns: int) -> list[Stream]:
+        """The streams to ask for now."""
+        if now_ns < self._next_ns:
+            return []
+        self._next_ns = now_ns + _CHECK_EVERY_NS
+        return [stream for stream in streams if self._ask(stream, now_ns)]
+
+    def _flows(self, name: str, now_ns: int) -> bool:
+        return now_ns - self._seen_ns.get(name, -_SILENT_NS) < _SILENT_NS
+
+    def _ask(self, stream: Stream, now_ns: int) -> bool:
+        attempts = self._attempts.get(stream.name, 0)
+        if self._flows(stream.name, now_ns):
+            # Some stream at a default rate until they are asked once.
+            self._attempts[stream.name] = max(attempts, 1)
+            return attempts == 0
+        if stream.unless and (self._flows(stream.unless, now_ns) or not self._tried(stream.unless)):
+            return False
+        self._attempts[stream.name] = attempts + 1
+        return not stream.optional or attempts < _OPTIONAL_ATTEMPTS
+
+    def _tried(self, name: str) -> bool:
+        return self._attempts.get(name, 0) > _OPTIONAL_ATTEMPTS
