@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import logging
 import threading
-from functools import partial
 
 import numpy as np
 
@@ -21,7 +20,8 @@ from companion.recorder import Recorder
 from companion.sources import StreamState, open_source
 from companion.target_reporter import Target, TargetReporter
 from localizer.engine import DualThreadEngine
-from localizer.map.pick import cast_ray
+from localizer.pose import Array
+from localizer.targets import SurfacePoint, cast_ray
 from localizer.types import PoseEstimate, PosePrior, ReferenceBundle, TrackingState
 from mavlink_bridge.bridge import Bridge
 from mavlink_bridge.config import BridgeConfig
@@ -46,9 +46,7 @@ class Companion:
         self._bridge = Bridge(_bridge_config(config), manifest.geoid_separation_m)
         localizer = build_localizer(self._stack, self._camera, config.localizer)
         self._engine = DualThreadEngine(localizer, (self._on_estimate,), self._vehicle_prior)
-        self._targets = TargetReporter(
-            config.targets, partial(cast_ray, self._stack.streamer), self._on_target
-        )
+        self._targets = TargetReporter(config.targets, self._cast_ray, self._on_target)
         self._source = open_source(
             config.camera.source, self._camera, config.camera.settings, self._on_feed_state
         )
@@ -152,6 +150,9 @@ class Companion:
                 reset,
             )
         )
+
+    def _cast_ray(self, origin: Array, direction: Array) -> SurfacePoint | None:
+        return cast_ray(self._stack.streamer.current(), origin, direction)
 
     def _on_target(self, target: Target) -> None:
         fix = target.fix

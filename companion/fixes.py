@@ -11,23 +11,15 @@ import math
 
 import numpy as np
 
+from companion.geometry import GIMBAL_FROM_CAMERA, ned_from_world
 from localizer.errors import GeoreferenceError
-from localizer.geo import NED_FROM_ENU, Geodetic, LocalFrame
+from localizer.geo import Geodetic, LocalFrame
 from localizer.pose import Array, Pose, euler_from_matrix, matrix_from_quaternion
 from localizer.types import PoseEstimate, PosePrior
 from mavlink_bridge.messages import Attitude, GimbalAttitude, VehicleState, VisionFix
 
-# OpenCV's z (forward), x (right), y (down) are the gimbal's x, y, z.
-GIMBAL_FROM_CAMERA: Array = np.array([[0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
-
 # An autopilot position older than this does not start tracking.
 _MAX_POSITION_AGE_NS = 2_000_000_000
-
-
-def ned_from_map(frame: LocalFrame, position: Geodetic) -> Array:
-    """Rotation (3, 3) from the map's ENU axes to NED at `position` (0.5 arcmin per km apart)."""
-    local = LocalFrame(position).ecef_from_enu.rotation
-    return NED_FROM_ENU @ local.T @ frame.ecef_from_enu.rotation
 
 
 def vision_fix(
@@ -44,7 +36,7 @@ def vision_fix(
     Without them the vehicle's attitude is unknown (NaN) and the lever arm is not applied.
     """
     camera = frame.position(estimate.world_from_camera.translation)
-    to_ned = ned_from_map(frame, camera)
+    to_ned = ned_from_world(frame, camera)
     ned_from_camera = to_ned @ estimate.world_from_camera.rotation
     roll = pitch = yaw = math.nan
     body = estimate.world_from_camera.translation
@@ -97,7 +89,7 @@ def vehicle_prior(
         )
     except GeoreferenceError:
         return None
-    from_ned = ned_from_map(frame, position).T
+    from_ned = ned_from_world(frame, position).T
     ned_offset = matrix_from_quaternion(attitude.quaternion) @ lever_arm_m
     if state.local_velocity_ned is not None:
         ned_offset = ned_offset + np.array(state.local_velocity_ned) * age_ns * 1e-9

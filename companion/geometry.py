@@ -36,7 +36,7 @@ class GimbalFrame(Enum):
 
 @dataclass(frozen=True)
 class GimbalAngles:
-    """A gimbal's attitude, applied as Rz(yaw) Ry(pitch) Rx(roll); pitch -pi/2 looks straight down."""
+    """A gimbal's attitude, applied as Rz(yaw) Ry(pitch) Rx(roll); pitch -pi/2 looks down."""
 
     roll_rad: float
     pitch_rad: float

@@ -5,6 +5,7 @@ Paper, Sec. 3.3.2 (end): a query pixel is mapped to the map by a ray from the es
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -12,8 +13,13 @@ from filterpy.common import Q_discrete_white_noise
 from filterpy.kalman import predict as kalman_predict
 from filterpy.kalman import update as kalman_update
 
+from localizer.map.pick import cast_rays
+from localizer.map.tile import TileMesh
 from localizer.pose import Array, hat
 from localizer.types import PoseEstimate, TargetFix
+
+
+_NORMAL_ANGLE = 4e-3  # rad: half a metre at 120 m
 
 
 @dataclass(frozen=True)
@@ -28,6 +34,28 @@ def ray_in_world(estimate: PoseEstimate, pixel: tuple[float, float]) -> tuple[Ar
     """Origin (3,) and unit direction (3,) in world axes of a pixel of the (distorted) frame."""
     direction = estimate.world_from_camera.rotation @ estimate.camera.rays(np.asarray(pixel))
     return estimate.world_from_camera.translation, direction / np.linalg.norm(direction)
+
+
+def cast_ray(
+    meshes: Sequence[TileMesh], origin: Array, direction: Array
+) -> SurfacePoint | None:
+    """Where a ray (origin (3,), unit direction (3,), world) first meets the map; None if nowhere.
+
+    The normal is that of the plane through three neighbouring hits, so that a single triangle of a
+    rough mesh does not decide it.
+    """
+    sideways = np.linalg.svd(direction[None, :])[2][1:]
+    offsets = _NORMAL_ANGLE * np.array([[0.0, 0.0], [1.0, 0.0], [-0.5, 0.9], [-0.5, -0.9]])
+    directions = direction + offsets @ sideways
+    t = cast_rays(meshes, origin, directions)
+    if not np.isfinite(t[0]):
+        return None
+    points = origin + directions * t[:, None]
+    normal = np.cross(points[2] - points[1], points[3] - points[1])
+    length = float(np.linalg.norm(normal))
+    if not np.isfinite(length) or length == 0.0:
+        normal, length = -direction, 1.0  # at the map's border: as if it faced the camera
+    return SurfacePoint(points[0], normal / length)
 
 
 def target_covariance(

@@ -63,6 +63,7 @@ class TileStreamer:
         self._budget = byte_budget
         self._node_bytes = _node_bytes(cache)
         self._meshes: OrderedDict[int, list[TileMesh]] = OrderedDict()  # least recent first
+        self._current: list[TileMesh] = []
         self._resident = np.zeros(len(self._node_bytes), np.bool_)
         self._failed: dict[int, MapCacheError] = {}
         self._bytes = 0
@@ -95,7 +96,13 @@ class TileStreamer:
                 self._lock.wait()
                 choice = self._choose(world_from_camera, camera, limits)
             self._count(choice)
-            return [mesh for node in choice.shown for mesh in self._touched(int(node))]
+            self._current = [mesh for node in choice.shown for mesh in self._touched(int(node))]
+            return list(self._current)
+
+    def current(self) -> list[TileMesh]:
+        """The meshes of the latest `select`; may be called from any thread (for picking)."""
+        with self._lock:
+            return list(self._current)
 
     def prefetch(self, world_from_camera: Pose, camera: Camera) -> None:
         """Load what a view will need later, after what the current one needs."""

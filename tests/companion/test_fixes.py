@@ -3,7 +3,8 @@ import math
 import numpy as np
 import pytest
 
-from companion.fixes import GIMBAL_FROM_CAMERA, ned_from_map, vehicle_prior, vision_fix
+from companion.fixes import vehicle_prior, vision_fix
+from companion.geometry import GIMBAL_FROM_CAMERA, ned_from_world
 from localizer.camera import Camera
 from localizer.geo import Geodetic, LocalFrame
 from localizer.pose import matrix_from_euler, quaternion_from_matrix
@@ -102,8 +103,8 @@ def test_prior_follows_the_velocity_and_refuses_old_or_missing_positions():
 
 def test_north_is_the_vehicles_own_north():
     far = FRAME.position([20_000.0, 0.0, 0.0])
-    R = ned_from_map(FRAME, far)
-    tilt = math.degrees(math.acos((np.trace(R @ ned_from_map(FRAME, ORIGIN).T) - 1) / 2))
+    R = ned_from_world(FRAME, far)
+    tilt = math.degrees(math.acos((np.trace(R @ ned_from_world(FRAME, ORIGIN).T) - 1) / 2))
     assert 0.2 < tilt < 0.4  # 20 km east: 0.18° of tilt and 0.2° of convergence
 
 
