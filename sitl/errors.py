@@ -1,0 +1,11 @@
+"""Named errors of the simulation: each says what is wrong, where, and what to do."""
+
+from __future__ import annotations
+
+
+class SimulationError(Exception):
+    """Base of every error that the simulation raises on purpose."""
+
+
+class WorldCameraError(SimulationError):
+    """A world camera that could not start, or whose process died."""

@@ -1,0 +1,112 @@
+"""Cars and people that move through the world: pure functions of time, so that truth is known."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from localizer.map.tile import TileMesh
+from localizer.pose import Array, Pose
+
+_TURN_M = 2.5  # half the length over which a direction is taken: objects turn smoothly at corners
+
+
+@dataclass(frozen=True, eq=False)
+class Mover:
+    """An object that goes round a closed path at constant speed.
+
+    path: (N, 3) world metres on the ground, the last point joins the first. phase_m: place on the
+    path at `epoch_ns` (CLOCK_MONOTONIC). mesh: x forward, y left, z up, origin on the ground.
+    """
+
+    name: str
+    path: Array
+    speed_mps: float
+    phase_m: float
+    mesh: TileMesh
+    epoch_ns: int = 0
+
+    @cached_property
+    def _lengths(self) -> Array:
+        steps = np.diff(np.vstack([self.path, self.path[:1]]), axis=0)
+        return np.concatenate([[0.0], np.cumsum(np.linalg.norm(steps, axis=1))])
+
+    def position_at(self, time_ns: int) -> Array:
+        """Ground point (3,) below the object, world metres."""
+        return self._point(self._travelled(time_ns))
+
+    def velocity_at(self, time_ns: int) -> Array:
+        """(3,) metres per second."""
+        return self.speed_mps * self._direction(self._travelled(time_ns))
+
+    def pose_at(self, time_ns: int) -> Pose:
+        """world_from_object: upright, x along the way."""
+        s = self._travelled(time_ns)
+        x, y = self._direction(s)[:2]
+        c, n = np.array([x, y]) / max(np.hypot(x, y), 1e-9)
+        return Pose(np.array([[c, -n, 0.0], [n, c, 0.0], [0.0, 0.0, 1.0]]), self._point(s))
+
+    def placed_at(self, time_ns: int) -> TileMesh:
+        """The mesh where it is at a time."""
+        return self.mesh.placed(self.pose_at(time_ns))
+
+    def _travelled(self, time_ns: int) -> float:
+        return self.phase_m + self.speed_mps * (time_ns - self.epoch_ns) * 1e-9
+
+    def _point(self, s: float) -> Array:
+        s = s % self._lengths[-1]
+        closed = np.vstack([self.path, self.path[:1]])
+        return np.array([np.interp(s, self._lengths, closed[:, axis]) for axis in range(3)])
+
+    def _direction(self, s: float) -> Array:
+        chord = self._point(s + _TURN_M) - self._point(s - _TURN_M)
+        return np.asarray(chord / max(float(np.linalg.norm(chord)), 1e-9))
+
+
+def there_and_back(lane: ArrayLike, out_m: float, back_m: float) -> Array:
+    """Closed path (2 N, 3) from an open lane (N, 3): along it, `out_m` to its right, and back,
+    `back_m` to the right of that way.
+    """
+    lane = np.asarray(lane, dtype=np.float64)
+    return np.vstack([_beside(lane, out_m), _beside(lane[::-1], back_m)])
+
+
+def _beside(line: Array, offset_m: float) -> Array:
+    tangent = np.gradient(line[:, :2], axis=0)
+    tangent /= np.maximum(np.linalg.norm(tangent, axis=1, keepdims=True), 1e-9)
+    right = np.column_stack([tangent[:, 1], -tangent[:, 0]])
+    moved = line.copy()
+    moved[:, :2] += offset_m * right
+    return moved
+
+
+def spread(
+    paths: Sequence[Array],
+    meshes: Sequence[TileMesh],
+    count: int,
+    *,
+    prefix: str,
+    speeds_mps: tuple[float, float],
+    rng: np.random.Generator,
+    epoch_ns: int = 0,
+) -> tuple[Mover, ...]:
+    """`count` movers on closed paths drawn by length; meshes, speeds and places drawn at random."""
+    lengths = np.array(
+        [np.linalg.norm(np.diff(np.vstack([p, p[:1]]), axis=0), axis=1).sum() for p in paths]
+    )
+    chosen = rng.choice(len(paths), count, p=lengths / lengths.sum())
+    return tuple(
+        Mover(
+            name=f"{prefix}{i}",
+            path=paths[k],
+            speed_mps=float(rng.uniform(*speeds_mps)),
+            phase_m=float(rng.uniform(0, lengths[k])),
+            mesh=meshes[int(rng.integers(len(meshes)))],
+            epoch_ns=epoch_ns,
+        )
+        for i, k in enumerate(chosen)
+    )
