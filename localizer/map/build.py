@@ -5,12 +5,11 @@ from __future__ import annotations
 import hashlib
 import multiprocessing
 import os
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, Literal
 
 import cv2
 import numpy as np
@@ -20,21 +19,22 @@ from scipy.spatial import ConvexHull, QhullError
 from localizer.errors import GeoreferenceError, MapSourceError
 from localizer.geo import Geodetic, LocalFrame, geodetic_from_ecef
 from localizer.map.cache import ADD, REPLACE, Manifest, TileIndex, tile_name
-from localizer.map.source import SourceMesh, SourceNode, SourceTree, TileSource
+from localizer.map.raster import is_raster, read_rasters
+from localizer.map.source import SourceMesh, SourceNode, SourceTree, TileSource, VerticalDatum
 from localizer.map.staging import Record, Staging, StoredTile, publish, staging
 from localizer.map.tiles3d import read_tileset
 from localizer.pose import Array
 
-VerticalDatum = Literal["ellipsoidal", "amsl"]
+_IMPORTABLE = "3D Tiles (tileset.json or its folder), or a DSM and an orthophoto (GeoTIFF)"
 _NAMED_FAILURES = 20  # how many bad tiles an error message lists
 
 
 def build_cache(
-    source: Path,
+    source: Path | Sequence[Path],
     out: Path,
     *,
     geoid_separation_m: float | None = None,
-    vertical_datum: VerticalDatum = "ellipsoidal",
+    vertical_datum: VerticalDatum | None = None,
     origin: Geodetic | None = None,
     attribution: str | None = None,
     skip_bad_tiles: bool = False,
@@ -44,20 +44,23 @@ def build_cache(
 ) -> Manifest:
     """Import a map source into a tile cache at `out`.
 
-    geoid_separation_m: height of the geoid above the ellipsoid at the map (MAVLink altitudes are
+    source: a `tileset.json` or its folder, or a DSM and an orthophoto. geoid_separation_m: height of the geoid above the ellipsoid at the map (MAVLink altitudes are
     above the geoid); needed unless the source carries it. vertical_datum: what the source's heights
-    are; "amsl" ones are lifted by the separation. origin: of the world frame, else the source's
+    are; "amsl" ones are lifted by the separation; needed unless the source's format fixes it. origin: of the world frame, else the source's
     centre. skip_bad_tiles: leave out tiles that cannot be imported (their parents are shown there)
     instead of failing. workers: processes, else one per core; more than one needs the usual
     ``if __name__ == "__main__"`` guard in a script. An interrupted build goes on where it stopped.
     """
-    tree = read_source(Path(source))
-    separation = _geoid_separation(tree, geoid_separation_m, Path(source))
-    lift = separation if vertical_datum == "amsl" else 0.0
+    sources = [Path(source)] if isinstance(source, str | Path) else [Path(s) for s in source]
+    named = " ".join(map(str, sources))
+    tree = read_source(sources)
+    separation = _geoid_separation(tree, geoid_separation_m, named)
+    datum = _vertical_datum(tree, vertical_datum, named)
+    lift = separation if datum == "amsl" else 0.0
     frame = LocalFrame(origin or _origin(tree, lift))
     parameters = {
         "origin": [frame.origin.latitude_deg, frame.origin.longitude_deg, frame.origin.height_m],
-        "vertical_datum": vertical_datum,
+        "vertical_datum": datum,
         "geoid_separation_m": separation,
         "source_fingerprint": _fingerprint(tree.files),
     }
@@ -66,13 +69,13 @@ def build_cache(
         records = _import_all(tree.root, job, workers or os.cpu_count() or 1, progress)
         skipped = _failures(tree.root, records)
         if skipped and not skip_bad_tiles:
-            raise MapSourceError(_failure_text(Path(source), skipped))
+            raise MapSourceError(_failure_text(named, skipped))
         index, manifest = _assemble(tree, records, staged, frame)
         manifest = manifest.model_copy(
             update={
-                "vertical_datum": vertical_datum,
+                "vertical_datum": datum,
                 "geoid_separation_m": separation,
-                "source": str(Path(source).resolve()),
+                "source": named,
                 "attribution": tree.attribution if attribution is None else attribution,
                 "build": parameters,
                 "skipped": skipped,
@@ -81,13 +84,18 @@ def build_cache(
         return publish(staged, Path(out), index, manifest)
 
 
-def read_source(source: Path) -> SourceTree:
+def read_source(sources: Sequence[Path]) -> SourceTree:
     """The tile tree of any source that can be imported."""
-    if not source.exists():
-        raise MapSourceError(f"{source}: no such file or folder")
-    if source.is_dir() or source.suffix.lower() == ".json":
-        return read_tileset(source)
-    raise MapSourceError(f"{source}: not a source that can be imported (tileset.json)")
+    for path in sources:
+        if not path.exists():
+            raise MapSourceError(f"{path}: no such file or folder")
+    if all(is_raster(path) for path in sources):
+        return read_rasters(sources)
+    if len(sources) > 1:
+        raise MapSourceError("several sources can only be a DSM and an orthophoto")
+    if sources[0].is_dir() or sources[0].suffix.lower() == ".json":
+        return read_tileset(sources[0])
+    raise MapSourceError(f"{sources[0]}: not a source that can be imported: {_IMPORTABLE}")
 
 
 @dataclass(frozen=True)
@@ -207,7 +215,7 @@ def _failures(root: SourceNode, records: dict[int, Record]) -> dict[str, str]:
     return {t.name: e for k, t in named if (e := records[k].error) is not None}
 
 
-def _failure_text(source: Path, failures: dict[str, str]) -> str:
+def _failure_text(source: str, failures: dict[str, str]) -> str:
     lines = [f"{name}: {why}" for name, why in list(failures.items())[:_NAMED_FAILURES]]
     more = len(failures) - len(lines)
     return "\n  ".join(
@@ -219,7 +227,7 @@ def _failure_text(source: Path, failures: dict[str, str]) -> str:
     )
 
 
-def _geoid_separation(tree: SourceTree, given: float | None, source: Path) -> float:
+def _geoid_separation(tree: SourceTree, given: float | None, source: str) -> float:
     value = tree.geoid_separation_m if given is None else given
     if value is None:
         raise GeoreferenceError(
@@ -229,6 +237,16 @@ def _geoid_separation(tree: SourceTree, given: float | None, source: Path) -> fl
     if not -120 <= value <= 100:
         raise GeoreferenceError(f"a geoid separation of {value} m does not occur on Earth")
     return value
+
+
+def _vertical_datum(tree: SourceTree, given: VerticalDatum | None, source: str) -> VerticalDatum:
+    datum = given or tree.vertical_datum
+    if datum is None:
+        raise GeoreferenceError(
+            f"{source} does not say what its heights are; give the vertical datum: ellipsoidal (WGS84) "
+            "or amsl (above the geoid)"
+        )
+    return datum
 
 
 def _origin(tree: SourceTree, lift: float) -> Geodetic:

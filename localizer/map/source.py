@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Protocol
+from typing import Literal, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,13 +13,15 @@ from numpy.typing import NDArray
 from localizer.pose import Array
 from localizer.types import Float32, Image
 
+VerticalDatum = Literal["ellipsoidal", "amsl"]
+
 
 @dataclass(frozen=True, eq=False)
 class SourceMesh:
     """Triangles with one texture, as an importer reads it.
 
-    positions: (V, 3) float64, in the importer's frame; uvs: (V, 2) float32, v down; faces: (F, 3) int32; image: (h, w, 3)
-    uint8 RGB; jpeg: the image's own bytes where it is a JPEG that was not changed; palette: the
+    positions: (V, 3) float64, in the importer's frame; uvs: (V, 2) float32, v down; faces: (F, 3)
+    int32; image: (h, w, 3) uint8 RGB; jpeg: the image's own bytes where it is a JPEG that was not changed; palette: the
     image is a grid of flat colours that mips would mix.
     """
 
@@ -65,8 +67,8 @@ class SourceNode:
 
 @dataclass(frozen=True, eq=False)
 class SourceTree:
-    """A map source. centre: (3,) ECEF metres; geoid_separation_m and attribution as far as the source
-    tells; files: everything it is made of, so that a change of the source can be seen.
+    """A map source. centre: (3,) ECEF metres; geoid_separation_m, attribution and vertical_datum as
+    far as the source tells; files: everything it is made of, so that a change of the source can be seen.
     """
 
     root: SourceNode
@@ -74,3 +76,4 @@ class SourceTree:
     geoid_separation_m: float | None
     attribution: str
     files: tuple[Path, ...]
+    vertical_datum: VerticalDatum | None = None

@@ -1,4 +1,4 @@
-"""3D Tiles 1.0 and 1.1, explicit tilesets: the tree, and the content of a tile (b3dm, glb, glTF)."""
+"""3D Tiles 1.0 and 1.1, explicit tilesets: the tree and the content (b3dm, glb, glTF)."""
 
 from __future__ import annotations
 
@@ -84,6 +84,7 @@ def read_tileset(path: Path) -> SourceTree:
         None if separation is None else float(separation),
         str(asset.get("copyright", extras.get("attribution", ""))),
         tuple(reader.files),
+        "ellipsoidal",  # by the specification
     )
 
 

@@ -1,0 +1,360 @@
+"""DSM and orthophoto to tiles: a quadtree of height-field meshes, read window by window.
+
+The grid of the finest level is the DSM's own, so its heights are kept as they are; each coarser level
+averages 2 x 2. Vertical skirts along the tile borders hide the cracks between levels.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from functools import lru_cache
+from pathlib import Path
+
+import fast_simplification
+import numpy as np
+import rasterio
+import rasterio.warp
+from affine import Affine
+from numpy.typing import NDArray
+from pyproj import CRS, Transformer
+from rasterio._err import CPLE_BaseError
+from rasterio.enums import ColorInterp, Resampling
+from rasterio.errors import RasterioError
+from rasterio.io import DatasetReader
+from rasterio.vrt import WarpedVRT
+
+from localizer.errors import GeoreferenceError, MapSourceError
+from localizer.geo import ecef_from_geodetic
+from localizer.map.source import SourceMesh, SourceNode, SourceTree
+from localizer.pose import Array
+from localizer.types import Image
+
+TEXELS = 512  # of a tile's side
+MIN_CELLS = 16  # of a tile's side
+REDUCTION = 0.5  # share of triangles that simplification takes away above the finest level
+# Detail limits are set for photogrammetric tilesets, whose stated error is several times the step
+# of their grid; a height field's is put on the same scale.
+ERROR_PER_STEP = 2.0
+
+
+@dataclass(frozen=True)
+class Grid:
+    """The quadtree's geometry. crs: projected, metres, as WKT; left, top: where the first vertex is;
+    step: (east, south) metres between vertices of the finest level; cells: a tile's side.
+    """
+
+    crs: str
+    left: float
+    top: float
+    step: tuple[float, float]
+    cells: int
+    levels: int
+
+
+@dataclass(frozen=True)
+class RasterTile:
+    """Tile (column, row) of a level, 0 the coarsest; one `TileSource`."""
+
+    dsm: Path
+    ortho: Path
+    grid: Grid
+    level: int
+    column: int
+    row: int
+
+    @property
+    def name(self) -> str:
+        """How errors name it."""
+        return f"{self.level}/{self.column}/{self.row}"
+
+    @property
+    def step(self) -> tuple[float, float]:
+        """Metres between this tile's vertices."""
+        factor = 2 ** (self.grid.levels - 1 - self.level)
+        return self.grid.step[0] * factor, self.grid.step[1] * factor
+
+    def load(self) -> Sequence[SourceMesh]:
+        """See `TileSource.load`."""
+        try:
+            heights = self._heights()
+            if heights.mask.all():
+                return []
+            image, shown = self._image()
+        except (RasterioError, CPLE_BaseError, OSError, ValueError) as error:
+            raise MapSourceError(f"cannot be read: {error}") from error
+        mesh = _height_mesh(heights, shown, self.step, lossless=self._finest)
+        if mesh is None:
+            return []
+        local, faces = mesh
+        left, top = self._corner
+        crs_points = local + (left, top, 0.0)
+        extent = np.array(self.step) * self.grid.cells
+        uvs = (local[:, :2] * (1, -1) / extent).astype(np.float32)
+        return [SourceMesh(_ecef(self.grid.crs, crs_points), uvs, faces, image)]
+
+    @property
+    def _finest(self) -> bool:
+        return self.level == self.grid.levels - 1
+
+    @property
+    def _corner(self) -> tuple[float, float]:
+        east, south = (s * self.grid.cells for s in self.step)
+        return self.grid.left + self.column * east, self.grid.top - self.row * south
+
+    def _heights(self) -> np.ma.MaskedArray:
+        """Heights at the vertices, (cells + 1, cells + 1) float64; masked where unknown."""
+        (east, south), (left, top) = self.step, self._corner
+        transform = Affine(east, 0, left - east / 2, 0, -south, top + south / 2)
+        how = Resampling.bilinear if self._finest else Resampling.average
+        n = self.grid.cells + 1
+        with _warped(self.dsm, self.grid.crs, transform, n, how) as vrt:
+            heights = vrt.read(1, masked=True).astype(np.float64)
+            bad = ~np.isfinite(heights.filled(np.nan)) | (vrt.dataset_mask() == 0)
+        return np.ma.masked_array(heights.data, bad)
+
+    def _image(self) -> tuple[Image, NDArray[np.bool_]]:
+        """Texture (TEXELS, TEXELS, 3), and per texel whether the orthophoto shows something."""
+        (east, south), (left, top) = self.step, self._corner
+        size = self.grid.cells / TEXELS
+        transform = Affine(east * size, 0, left, 0, -south * size, top)
+        with _warped(self.ortho, self.grid.crs, transform, TEXELS, Resampling.average) as vrt:
+            bands = (1, 2, 3) if vrt.count >= 3 else (1, 1, 1)
+            image = np.moveaxis(vrt.read(bands), 0, -1)
+            shown = vrt.dataset_mask() > 0
+        return np.ascontiguousarray(image, np.uint8), shown
+
+
+def is_raster(path: Path) -> bool:
+    """Whether the file is named like a raster that this importer reads."""
+    return path.suffix.lower() in (".tif", ".tiff", ".vrt")
+
+
+def read_rasters(paths: Sequence[Path]) -> SourceTree:
+    """The tree of a DSM (one band of heights) and an orthophoto (bands of colours)."""
+    dsm, ortho = _told_apart(paths)
+    with rasterio.open(dsm) as heights, rasterio.open(ortho) as colours:
+        grid = _grid(heights, colours)
+        centre = _ecef(grid.crs, np.array([[*_centre(heights, grid.crs), 0.0]]))[0]
+        bounds = rasterio.warp.transform_bounds(heights.crs, grid.crs, *heights.bounds)
+    return SourceTree(_node(dsm, ortho, grid, bounds, 0, 0, 0), centre, None, "", (dsm, ortho))
+
+
+def _node(
+    dsm: Path,
+    ortho: Path,
+    grid: Grid,
+    bounds: tuple[float, float, float, float],
+    level: int,
+    column: int,
+    row: int,
+) -> SourceNode:
+    tile = RasterTile(dsm, ortho, grid, level, column, row)
+    children = []
+    if level < grid.levels - 1:
+        size = 2 ** (grid.levels - 2 - level) * grid.cells
+        width, height = size * grid.step[0], size * grid.step[1]
+        for r in (2 * row, 2 * row + 1):
+            for c in (2 * column, 2 * column + 1):
+                # Half a step more: the vertices sit at cell centres.
+                outside = (
+                    grid.left + c * width >= bounds[2] - grid.step[0]
+                    or grid.top - r * height <= bounds[1] + grid.step[1]
+                )
+                if not outside:
+                    children.append(_node(dsm, ortho, grid, bounds, level + 1, c, r))
+    error = 0.0 if not children else ERROR_PER_STEP * max(tile.step)
+    return SourceNode(error, True, (tile,), children)
+
+
+def _told_apart(paths: Sequence[Path]) -> tuple[Path, Path]:
+    found: dict[str, Path] = {}
+    for path in paths:
+        try:
+            with rasterio.open(path) as data:
+                if data.crs is None:
+                    raise GeoreferenceError(f"{path}: the raster has no CRS; assign it one")
+                kind = _kind(data)
+        except RasterioError as error:
+            raise MapSourceError(f"{path}: cannot be read as a raster: {error}") from error
+        if kind in found:
+            raise MapSourceError(f"{path}: a second {kind}; give one DSM and one orthophoto")
+        found[kind] = path
+    for kind in ("DSM", "orthophoto"):
+        if kind not in found:
+            raise MapSourceError(
+                f"a map of rasters needs a {kind} too; give a DSM and an orthophoto"
+            )
+    return found["DSM"], found["orthophoto"]
+
+
+def _kind(data: DatasetReader) -> str:
+    """By the bands: heights are one band wider than a byte, colours are bytes."""
+    colours = [
+        b for b, c in zip(data.dtypes, data.colorinterp, strict=True) if c != ColorInterp.alpha
+    ]
+    if len(colours) == 1 and colours[0] != "uint8":
+        return "DSM"
+    if all(dtype == "uint8" for dtype in colours) and len(colours) in (1, 3, 4):
+        return "orthophoto"
+    raise MapSourceError(
+        f"{data.name}: {len(colours)} bands of {', '.join(sorted(set(colours)))}: neither a DSM (one "
+        "band of heights) nor an orthophoto (8-bit grey or RGB)"
+    )
+
+
+def _grid(dsm: DatasetReader, ortho: DatasetReader) -> Grid:
+    crs = _metric_crs(dsm)
+    if CRS(dsm.crs) == crs and not dsm.transform.b and not dsm.transform.d:
+        step = abs(dsm.transform.a), abs(dsm.transform.e)
+        left, bottom, right, top = dsm.bounds
+    else:
+        transform, width, height = rasterio.warp.calculate_default_transform(
+            dsm.crs, crs.to_wkt(), dsm.width, dsm.height, *dsm.bounds
+        )
+        step = abs(transform.a), abs(transform.e)
+        left, top = transform.c, transform.f
+        right, bottom = left + width * step[0], top - height * step[1]
+    gsd = _texel_size(ortho, crs)
+    cells = max(MIN_CELLS, 2 * math.ceil(TEXELS * gsd / max(step) / 2))
+    cells = min(cells, TEXELS)
+    span = max((right - left) / step[0], (top - bottom) / step[1]) / cells
+    levels = 1 + max(0, math.ceil(math.log2(max(span, 1.0))))
+    return Grid(crs.to_wkt(), left + step[0] / 2, top - step[1] / 2, step, cells, levels)
+
+
+def _metric_crs(data: DatasetReader) -> CRS:
+    """The raster's own horizontal CRS where that is in metres, else the UTM zone of its centre."""
+    own = CRS(data.crs)
+    flat = own.sub_crs_list[0] if own.is_compound else own
+    if flat.is_projected and all(
+        a.unit_name in ("metre", "meter", "m") for a in flat.axis_info[:2]
+    ):
+        return flat
+    lon, lat = _centre(data, "EPSG:4326")
+    return CRS.from_epsg((32600 if lat >= 0 else 32700) + int((lon + 180) // 6) % 60 + 1)
+
+
+def _centre(data: DatasetReader, crs: str) -> tuple[float, float]:
+    x, y = data.transform * (data.width / 2, data.height / 2)
+    transformer = Transformer.from_crs(CRS(data.crs).to_2d(), CRS(crs), always_xy=True)
+    x, y = transformer.transform(x, y)
+    return float(x), float(y)
+
+
+def _texel_size(ortho: DatasetReader, crs: CRS) -> float:
+    transform, _, _ = rasterio.warp.calculate_default_transform(
+        ortho.crs, crs.to_wkt(), ortho.width, ortho.height, *ortho.bounds
+    )
+    return float(math.sqrt(abs(transform.a * transform.e)))
+
+
+@lru_cache(maxsize=4)
+def _opened(path: Path) -> DatasetReader:
+    return rasterio.open(path)
+
+
+@contextmanager
+def _warped(
+    path: Path, crs: str, transform: Affine, size: int, how: Resampling
+) -> Iterator[WarpedVRT]:
+    """A raster resampled to a square grid."""
+    data = _opened(path)
+    same = CRS(data.crs) == CRS(crs)
+    with WarpedVRT(
+        data,
+        src_crs=data.crs,
+        crs=data.crs if same else crs,
+        transform=transform,
+        width=size,
+        height=size,
+        resampling=how,
+        tolerance=0.01,  # of a pixel; 0 is refused
+    ) as vrt:
+        yield vrt
+
+
+@lru_cache(maxsize=4)
+def _geographic(crs: str) -> Transformer:
+    return Transformer.from_crs(CRS(crs).to_2d(), CRS("EPSG:4326"), always_xy=True)
+
+
+def _ecef(crs: str, points: Array) -> Array:
+    """ECEF (N, 3) of CRS easting, northing and ellipsoidal height (N, 3)."""
+    lon, lat = _geographic(crs).transform(points[:, 0], points[:, 1])
+    return ecef_from_geodetic(lat, lon, points[:, 2])
+
+
+def _height_mesh(
+    heights: np.ma.MaskedArray,
+    shown: NDArray[np.bool_],
+    step: tuple[float, float],
+    *,
+    lossless: bool,
+) -> tuple[Array, NDArray[np.int32]] | None:
+    """Vertices (V, 3), x east and y north of the tile's first vertex, and faces (F, 3).
+
+    None where nothing is left. Cells with an unknown corner or no picture are left out.
+    """
+    n = heights.shape[0] - 1
+    known = ~np.ma.getmaskarray(heights)
+    whole = known[:-1, :-1] & known[1:, :-1] & known[:-1, 1:] & known[1:, 1:]
+    rows = np.minimum((np.arange(n) + 0.5) * shown.shape[0] / n, shown.shape[0] - 1).astype(int)
+    whole &= shown[np.ix_(rows, rows)]
+    if not whole.any():
+        return None
+    r, c = np.nonzero(whole)
+    corner = r * (n + 1) + c
+    below = corner + n + 1
+    faces = np.concatenate(
+        [np.stack([corner, below, corner + 1], 1), np.stack([corner + 1, below, below + 1], 1)]
+    )
+    gy, gx = np.mgrid[0 : n + 1, 0 : n + 1]
+    points = np.stack([gx * step[0], -gy * step[1], np.where(known, heights.data, 0.0)], -1)
+    used, index = np.unique(faces, return_inverse=True)
+    points, faces = points.reshape(-1, 3)[used], index.reshape(-1, 3)
+    points, faces = _simplified(points, faces, lossless)
+    extent = (n * step[0], n * step[1])
+    return _skirted(points, faces.astype(np.int32), extent, depth=2 * max(step))
+
+
+def _simplified(
+    points: Array, faces: NDArray[np.int64], lossless: bool
+) -> tuple[Array, NDArray[np.int64]]:
+    base = points.mean(axis=0)
+    local = points - base
+    if lossless:
+        out, kept = fast_simplification.simplify(local, faces, 0.5, lossless=True)
+    else:
+        out, kept = fast_simplification.simplify(local, faces, REDUCTION)
+    if len(kept) == 0:
+        return points, faces
+    return np.asarray(out, np.float64) + base, np.asarray(kept)
+
+
+def _skirted(
+    points: Array, faces: NDArray[np.int32], extent: tuple[float, float], depth: float
+) -> tuple[Array, NDArray[np.int32]]:
+    """With vertical strips hung from the edges that lie on the tile's border."""
+    edges = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
+    slack = 1e-3 * max(extent)
+    x, y = points[edges, 0], points[edges, 1]
+    on_border = (
+        (np.abs(x) < slack).all(1)
+        | (np.abs(x - extent[0]) < slack).all(1)
+        | (np.abs(y) < slack).all(1)
+        | (np.abs(y + extent[1]) < slack).all(1)
+    )
+    edges = edges[on_border]
+    top, inverse = np.unique(edges, return_inverse=True)
+    bottom = inverse.reshape(-1, 2).astype(np.int32) + np.int32(len(points))
+    hung = points[top] - (0.0, 0.0, depth)
+    strips = np.concatenate(
+        [
+            np.stack([edges[:, 1], edges[:, 0], bottom[:, 0]], 1),
+            np.stack([edges[:, 1], bottom[:, 0], bottom[:, 1]], 1),
+        ]
+    )
+    return np.concatenate([points, hung]), np.concatenate([faces, strips]).astype(np.int32)
