@@ -16,7 +16,7 @@ from mavlink_bridge.camera_component import CameraComponent
 from mavlink_bridge.clock import SteadyUtc, monotonic_ns
 from mavlink_bridge.config import BridgeConfig
 from mavlink_bridge.errors import BridgeStateError
-from mavlink_bridge.inject import Injection, InjectionContext, Injector
+from mavlink_bridge.inject import NO_FIX_YET, Injection, InjectionContext, Injector
 from mavlink_bridge.link import Link
 from mavlink_bridge.messages import (
     Attitude,
@@ -45,6 +45,7 @@ _RC_FRESH_NS = _SECOND_NS
 _QUEUE = 64
 _TEXTS = 32
 _TIMESYNC_PENDING = 8
+_FIRST_GUESS = 1  # the system id that vehicles are delivered with
 
 _SYSTEM_STATUS = {
     HealthLevel.STARTING: mavlink.MAV_STATE_BOOT,
@@ -327,7 +328,7 @@ class _FlightControllerSide(_Side):
         self._next_sync_ns = 0
         self._next_version_ns = 0
         self._connected = False
-        self._reason = ""
+        self._reason = NO_FIX_YET
         self._profile_told = ""
 
     # --- messages in ----------------------------------------------------------------------------
@@ -391,6 +392,9 @@ class _FlightControllerSide(_Side):
         state = self.tracker.snapshot(now_ns)
         link.system_id = self.config.system_id or state.system_id or 0
         self._watch(state)
+        if not link.system_id and link.endpoint.kind == "udpout":
+            # Behind UDP an autopilot answers whoever spoke first, so somebody has to.
+            link.system_id = _FIRST_GUESS
         if link.system_id:
             self.heartbeat(link, now_ns)
         if state.connected:

@@ -28,6 +28,7 @@ from mavlink_bridge.propagate import FixPropagator, PropagatedFix
 from mavlink_bridge.yaw_guard import YawGuard
 
 NAN = math.nan
+NO_FIX_YET = "no fix yet"
 _QUEUE = 32
 _FUTURE_SLACK_NS = 20_000_000
 _STALE_NS = 3_000_000_000
@@ -221,7 +222,7 @@ class Injector:
         self._last_stamp_ns = 0
         self._last_was_fill = False
         self.yaw_difference_rad = NAN
-        self.reason = "no fix yet"
+        self.reason = NO_FIX_YET
         self.counters: Counter[str] = Counter()
 
     @property

@@ -135,7 +135,9 @@ class OriginKeeper:
         self._next_ns = now_ns + _ASK_EVERY_NS
         self._asked += 1
         ask(mavlink.MAVLINK_MSG_ID_GPS_GLOBAL_ORIGIN)
-        if self._configured is None or self._asked <= _ASKS_BEFORE_SETTING:
+        # After setting, one more question: the answer may be under way.
+        patient = self._asked <= _ASKS_BEFORE_SETTING or self._asked % 2 == 1
+        if self._configured is None or patient:
             return None
         if not self._told:
             log.info("the vehicle has no EKF origin: setting the configured one")

@@ -1,0 +1,423 @@
+"""The whole bridge against a small autopilot over UDP loopback."""
+
+from __future__ import annotations
+
+import math
+import socket
+import threading
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from pymavlink import mavutil
+from pymavlink.dialects.v20 import ardupilotmega as mavlink
+
+from mavlink_bridge import Bridge, BridgeConfig, HealthLevel, TargetReport, TrackRequest, VisionFix
+from mavlink_bridge.config import InjectionConfig, OriginConfig, SigningConfig, TargetsConfig
+from mavlink_bridge.errors import BridgeStateError, FixError
+from mavlink_bridge.link import sleep_until
+from mavlink_bridge.signing import create_key
+
+HOME = (47.397742, 8.545594)
+GEOID = 47.0
+ORIGIN = OriginConfig(latitude_deg=HOME[0], longitude_deg=HOME[1], altitude_amsl_m=488.0)
+
+
+def config(port: int, **options: Any) -> BridgeConfig:
+    options.setdefault("origin", ORIGIN)
+    options.setdefault("injection", InjectionConfig(rate_hz=20, delay_ms=30))
+    return BridgeConfig(connection=f"udpout:127.0.0.1:{port}", **options)
+
+
+class GroundStation:
+    """Listens on UDP for what the bridge's ground link says."""
+
+    def __init__(self) -> None:
+        self.socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+        self.socket.bind(("127.0.0.1", 0))
+        self.socket.settimeout(0.1)
+        self.port = self.socket.getsockname()[1]
+        self.codec = mavlink.MAVLink(None, 255, 190)
+        self.received: list[Any] = []
+        self.peer: Any = None
+        self._stop = threading.Event()
+        self._thread = threading.Thread(target=self._run, daemon=True)
+        self._thread.start()
+
+    def _run(self) -> None:
+        while not self._stop.is_set():
+            try:
+                data, self.peer = self.socket.recvfrom(65536)
+            except TimeoutError:
+                continue
+            self.received += self.codec.parse_buffer(data) or []
+
+    def of(self, name: str) -> list[Any]:
+        return [m for m in list(self.received) if m.get_type() == name]
+
+    def send(self, message: Any) -> None:
+        self.socket.sendto(message.pack(self.codec), self.peer)
+
+    def stop(self) -> None:
+        self._stop.set()
+        self._thread.join()
+        self.socket.close()
+
+
+@pytest.fixture
+def ground() -> Iterator[GroundStation]:
+    station = GroundStation()
+    yield station
+    station.stop()
+
+
+@pytest.fixture
+def run() -> Iterator[Callable[..., Bridge]]:
+    """Starts bridges and waits until they have found the autopilot."""
+    made: list[Bridge] = []
+
+    def start(settings: BridgeConfig, autopilot: Any, **options: Any) -> Bridge:
+        bridge = Bridge(settings, GEOID, **options)
+        made.append(bridge)
+        bridge.start()
+        assert sleep_until(lambda: bridge.state().connected, 3.0)
+        return bridge
+
+    yield start
+    for bridge in made:
+        bridge.stop()
+
+
+def feed(bridge: Bridge, seconds: float, hz: float = 20.0, **options: Any) -> None:
+    end = time.monotonic() + seconds
+    options.setdefault("yaw_rad", 0.0)
+    while time.monotonic() < end:
+        bridge.submit(make_fix(**options))
+        time.sleep(1.0 / hz)
+
+
+def make_fix(**options: Any) -> VisionFix:
+    options.setdefault("time_ns", time.monotonic_ns() - 20_000_000)
+    options.setdefault("position_covariance_ned", np.eye(3) * 0.25)
+    return VisionFix(
+        latitude_deg=HOME[0],
+        longitude_deg=HOME[1],
+        height_m=488.0 + GEOID + 60.0,
+        roll_rad=0.0,
+        pitch_rad=0.0,
+        **options,
+    )
+
+
+def test_identity_origin_and_injection(autopilot: Any, run: Callable[..., Bridge]) -> None:
+    bridge = run(config(autopilot.port), autopilot)
+    assert sleep_until(lambda: bridge.state().origin is not None, 8.0)
+    feed(bridge, 1.0)
+    vision = autopilot.wait_for("VISION_POSITION_ESTIMATE", 10)
+    assert {m.get_srcSystem() for m in vision} == {1}
+    assert {m.get_srcComponent() for m in vision} == {197}
+    assert (vision[-1].x, vision[-1].y, vision[-1].z) == pytest.approx((0, 0, -60), abs=0.02)
+    heartbeats = autopilot.of("HEARTBEAT")
+    assert {m.get_srcComponent() for m in heartbeats} == {197, 191, 100}
+    assert {m.type for m in heartbeats if m.get_srcComponent() == 100} == {mavlink.MAV_TYPE_CAMERA}
+    assert all(m.autopilot == mavlink.MAV_AUTOPILOT_INVALID for m in heartbeats)
+    assert len(autopilot.of("SET_GPS_GLOBAL_ORIGIN")) == 1
+    state = bridge.state()
+    assert state.version == (4, 7, 0)
+    assert state.profile == "ArduPilot 4.5-4.7"
+    assert state.clock_source == "timesync"
+    # Exposure on our own clock.
+    assert abs(vision[-1].usec * 1000 - time.monotonic_ns()) < 10e9
+
+
+def test_second_origin_is_never_sent(autopilot: Any, run: Callable[..., Bridge]) -> None:
+    autopilot.origin = (HOME[0] + 0.001, HOME[1], 480.0)
+    bridge = run(config(autopilot.port), autopilot)
+    assert sleep_until(lambda: bridge.state().origin is not None, 5.0)
+    feed(bridge, 0.5)
+    vision = autopilot.wait_for("VISION_POSITION_ESTIMATE", 3)
+    assert vision[-1].x == pytest.approx(-111.3, abs=0.1)
+    assert vision[-1].z == pytest.approx(-68.0, abs=0.1)
+    assert autopilot.of("SET_GPS_GLOBAL_ORIGIN") == []
+    assert any("from the configured one" in text for text in bridge.texts())
+
+
+def test_shadow_and_off_send_nothing(autopilot: Any, run: Callable[..., Bridge]) -> None:
+    autopilot.origin = (*HOME, 488.0)
+    bridge = run(config(autopilot.port, mode="shadow"), autopilot)
+    assert sleep_until(lambda: bridge.state().origin is not None, 5.0)
+    feed(bridge, 0.7)
+    assert autopilot.of("VISION_POSITION_ESTIMATE") == []
+    assert bridge.counters()["bridge_shadowed"] > 5
+
+
+def test_rc_channel_gates_injection(autopilot: Any, run: Callable[..., Bridge]) -> None:
+    autopilot.origin = (*HOME, 488.0)
+    autopilot.rc = {9: 1100}
+    bridge = run(config(autopilot.port, mode="rc"), autopilot)
+    assert sleep_until(lambda: bridge.state().origin is not None, 5.0)
+    feed(bridge, 0.6)
+    assert autopilot.of("VISION_POSITION_ESTIMATE") == []
+    autopilot.rc = {9: 1900}
+    assert sleep_until(lambda: bridge.injecting, 2.0)
+    feed(bridge, 0.4)
+    assert len(autopilot.of("VISION_POSITION_ESTIMATE")) > 3
+    autopilot.rc = {}
+    assert sleep_until(lambda: not bridge.injecting, 3.0)
+
+
+def test_rotated_frame_is_refused_and_told_once(autopilot: Any, run: Callable[..., Bridge]) -> None:
+    autopilot.origin = (*HOME, 488.0)
+    bridge = run(config(autopilot.port), autopilot)
+    assert sleep_until(lambda: bridge.state().origin is not None, 5.0)
+    feed(bridge, 1.0, yaw_rad=math.radians(5.0))
+    before = len(autopilot.of("VISION_POSITION_ESTIMATE"))
+    feed(bridge, 1.0, yaw_rad=math.radians(5.0))
+    assert len(autopilot.of("VISION_POSITION_ESTIMATE")) == before
+    told = [text for text in bridge.texts() if "yaw differs" in text]
+    assert len(told) == 1
+    texts = [m.text for m in autopilot.of("STATUSTEXT")]
+    assert len([t for t in texts if "yaw differs" in t]) == 1
+
+
+def test_health_follows_into_heartbeats_and_texts_on_transitions_only(
+    autopilot: Any, run: Callable[..., Bridge]
+) -> None:
+    bridge = run(config(autopilot.port), autopilot)
+    for _ in range(5):
+        bridge.set_health(HealthLevel.DEGRADED, "lost, searching")
+    assert sleep_until(
+        lambda: any(
+            m.system_status == mavlink.MAV_STATE_CRITICAL
+            for m in autopilot.of("HEARTBEAT")
+            if m.get_srcComponent() == 197
+        ),
+        3.0,
+    )
+    assert [m.text for m in autopilot.of("STATUSTEXT") if "lost" in m.text] == [
+        "PiLoT: lost, searching"
+    ]
+
+
+def test_streams_are_asked_for_until_they_come(autopilot: Any, run: Callable[..., Bridge]) -> None:
+    run(config(autopilot.port), autopilot)
+    asked = autopilot.wait_for("COMMAND_LONG", 5)
+    ids = {int(m.param1) for m in asked if m.command == mavlink.MAV_CMD_SET_MESSAGE_INTERVAL}
+    assert {30, 32, 33, 24, 193, 285} <= ids
+
+
+def test_reboot_in_flight_is_survived(autopilot: Any, run: Callable[..., Bridge]) -> None:
+    bridge = run(config(autopilot.port), autopilot)
+    assert sleep_until(lambda: bridge.state().origin is not None, 8.0)
+    feed(bridge, 0.3)
+    autopilot.reboot()
+    assert sleep_until(lambda: bridge.state().reboots == 1, 3.0)
+    assert sleep_until(lambda: bridge.state().origin is not None, 8.0)
+    before = len(autopilot.of("VISION_POSITION_ESTIMATE"))
+    feed(bridge, 0.5)
+    assert len(autopilot.of("VISION_POSITION_ESTIMATE")) > before + 4
+    assert bridge.attitude_at(time.monotonic_ns() - 100_000_000) is not None
+
+
+def test_silence_is_a_lost_vehicle_and_injection_resumes(
+    autopilot: Any, run: Callable[..., Bridge]
+) -> None:
+    autopilot.origin = (*HOME, 488.0)
+    bridge = run(config(autopilot.port), autopilot)
+    assert sleep_until(lambda: bridge.state().origin is not None, 5.0)
+    autopilot.streaming = False
+    assert sleep_until(lambda: not bridge.state().connected, 5.0)
+    autopilot.streaming = True
+    assert sleep_until(lambda: bridge.state().connected, 3.0)
+    feed(bridge, 0.5)
+    autopilot.wait_for("VISION_POSITION_ESTIMATE", 4)
+
+
+def test_noise_on_the_link_does_not_stop_it(autopilot: Any, run: Callable[..., Bridge]) -> None:
+    autopilot.origin = (*HOME, 488.0)
+    bridge = run(config(autopilot.port), autopilot)
+    rng = np.random.default_rng(6)
+    for _ in range(300):
+        autopilot.send_bytes(rng.bytes(int(rng.integers(1, 300))))
+    assert sleep_until(lambda: bridge.state().origin is not None, 5.0)
+    feed(bridge, 0.4)
+    autopilot.wait_for("VISION_POSITION_ESTIMATE", 4)
+    assert bridge.counters()["fc_bad_bytes"] > 10_000
+    assert bridge.counters()["fc_handler_errors"] == 0
+
+
+def test_timesync_requests_are_answered_on_our_clock(
+    autopilot: Any, run: Callable[..., Bridge]
+) -> None:
+    run(config(autopilot.port), autopilot)
+    autopilot.send(mavlink.MAVLink_timesync_message(0, 123456789))
+    assert sleep_until(
+        lambda: any(m.ts1 == 123456789 and m.tc1 != 0 for m in autopilot.of("TIMESYNC")), 2.0
+    )
+    answer = next(m for m in autopilot.of("TIMESYNC") if m.tc1 != 0)
+    assert abs(answer.tc1 - time.monotonic_ns()) < 5e9
+
+
+def report(**options: Any) -> TargetReport:
+    return TargetReport(
+        time.monotonic_ns(),
+        HOME[0] + 0.001,
+        HOME[1],
+        500.0 + GEOID,
+        h_accuracy_m=2.5,
+        v_accuracy_m=1.5,
+        pixel=(0.4, 0.6),
+        **options,
+    )
+
+
+def test_targets_go_to_the_ground_link_and_not_to_the_flight_controller(
+    autopilot: Any, ground: GroundStation, run: Callable[..., Bridge]
+) -> None:
+    settings = config(
+        autopilot.port,
+        ground_connection=f"udpout:127.0.0.1:{ground.port}",
+        targets=TargetsConfig(adsb=True),
+    )
+    bridge = run(settings, autopilot)
+    for _ in range(20):
+        bridge.report(report(velocity_ned=(3.0, 4.0, 0.0), target_id=3))
+        time.sleep(0.05)
+    assert sleep_until(lambda: len(ground.of("CAMERA_TRACKING_GEO_STATUS")) > 2, 3.0)
+    m = ground.of("CAMERA_TRACKING_GEO_STATUS")[-1]
+    assert m.get_srcComponent() == 100
+    assert m.get_srcSystem() == 1
+    assert m.lat == round((HOME[0] + 0.001) * 1e7)
+    assert m.alt == pytest.approx(500.0)
+    assert (m.h_acc, m.v_acc) == (2.5, 1.5)
+    assert m.hdg == pytest.approx(math.atan2(4.0, 3.0))
+    image = ground.of("CAMERA_TRACKING_IMAGE_STATUS")[-1]
+    assert (image.point_x, image.point_y) == pytest.approx((0.4, 0.6))
+    adsb = ground.of("ADSB_VEHICLE")[-1]
+    assert adsb.hor_velocity == 500
+    assert adsb.heading == pytest.approx(5313, abs=1)
+    assert not autopilot.of("CAMERA_TRACKING_GEO_STATUS")
+    assert not autopilot.of("ADSB_VEHICLE")
+
+
+def test_without_a_ground_link_targets_are_routed_by_the_flight_controller(
+    autopilot: Any, run: Callable[..., Bridge]
+) -> None:
+    bridge = run(config(autopilot.port), autopilot)
+    bridge.report(report())
+    m = autopilot.wait_for("CAMERA_TRACKING_GEO_STATUS")[0]
+    assert m.get_srcComponent() == 100
+    assert math.isnan(m.vel_n)
+
+
+def test_camera_protocol(autopilot: Any, ground: GroundStation, run: Callable[..., Bridge]) -> None:
+    asked: list[TrackRequest] = []
+    settings = config(autopilot.port, ground_connection=f"udpout:127.0.0.1:{ground.port}")
+    run(settings, autopilot, on_track=asked.append)
+    assert sleep_until(lambda: ground.peer is not None, 3.0)
+
+    def command(number: int, *parameters: float, component: int = 100) -> None:
+        padded = [*parameters, *([0.0] * (7 - len(parameters)))]
+        ground.send(mavlink.MAVLink_command_long_message(1, component, number, 0, *padded))
+
+    command(mavlink.MAV_CMD_REQUEST_MESSAGE, 259)
+    assert sleep_until(lambda: len(ground.of("CAMERA_INFORMATION")) == 1, 2.0)
+    information = ground.of("CAMERA_INFORMATION")[0]
+    assert information.flags & mavlink.CAMERA_CAP_FLAGS_HAS_TRACKING_GEO_STATUS
+    assert bytes(information.model_name).rstrip(b"\0") == b"map camera"
+    command(mavlink.MAV_CMD_REQUEST_VIDEO_STREAM_INFORMATION, 1)
+    assert sleep_until(lambda: len(ground.of("VIDEO_STREAM_INFORMATION")) == 1, 2.0)
+    command(mavlink.MAV_CMD_CAMERA_TRACK_POINT, 0.25, 0.75, 0.1)
+    command(mavlink.MAV_CMD_CAMERA_TRACK_RECTANGLE, 0.1, 0.2, 0.3, 0.4)
+    command(mavlink.MAV_CMD_CAMERA_STOP_TRACKING)
+    command(mavlink.MAV_CMD_CAMERA_TRACK_POINT, 1.5, math.nan)  # outside the picture
+    command(mavlink.MAV_CMD_CAMERA_TRACK_POINT, 0.5, 0.5, component=1)  # not for the camera
+    assert sleep_until(lambda: len(ground.of("COMMAND_ACK")) == 6, 2.0)
+    assert [r.kind for r in asked] == ["point", "rectangle", "stop"]
+    assert asked[0].coordinates == pytest.approx((0.25, 0.75))
+    results = [m.result for m in ground.of("COMMAND_ACK")]
+    assert results == [0, 0, 0, 0, 0, mavlink.MAV_RESULT_DENIED]
+    assert all(m.target_system == 255 for m in ground.of("COMMAND_ACK"))
+
+
+def test_cursor_on_target(autopilot: Any, run: Callable[..., Bridge]) -> None:
+    from xml.etree import ElementTree
+
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as listener:
+        listener.bind(("127.0.0.1", 0))
+        listener.settimeout(2.0)
+        targets = TargetsConfig(cot_endpoint=f"127.0.0.1:{listener.getsockname()[1]}")
+        bridge = run(config(autopilot.port, targets=targets), autopilot)
+        bridge.report(report(target_id=9))
+        event = ElementTree.fromstring(listener.recv(65536))
+    point = event.find("point")
+    assert point is not None
+    assert float(point.attrib["lat"]) == pytest.approx(HOME[0] + 0.001)
+    assert float(point.attrib["hae"]) == pytest.approx(547.0)
+    assert (point.attrib["ce"], point.attrib["le"]) == ("2.5", "1.5")
+    assert event.attrib["uid"] == "pilot-target-9"
+    assert event.attrib["time"] < event.attrib["stale"]
+
+
+def test_tlog_is_read_by_pymavlinks_own_tools(
+    autopilot: Any, run: Callable[..., Bridge], tmp_path: Path
+) -> None:
+    autopilot.origin = (*HOME, 488.0)
+    path = tmp_path / "flight.tlog"
+    bridge = run(config(autopilot.port, tlog=path), autopilot)
+    assert sleep_until(lambda: bridge.state().origin is not None, 5.0)
+    feed(bridge, 0.4)
+    bridge.stop()
+    log = mavutil.mavlink_connection(str(path))
+    kinds = set()
+    stamps = []
+    while (m := log.recv_match()) is not None:
+        kinds.add(m.get_type())
+        stamps.append(m._timestamp)
+    assert {"ATTITUDE", "HEARTBEAT", "VISION_POSITION_ESTIMATE", "TIMESYNC"} <= kinds
+    assert "BAD_DATA" not in kinds
+    assert abs(stamps[-1] - time.time()) < 10.0
+
+
+def test_signed_link(make_autopilot: Any, run: Callable[..., Bridge], tmp_path: Path) -> None:
+    key = create_key(tmp_path / "key")
+    signed = make_autopilot(key=key)
+    settings = config(signed.port, signing=SigningConfig(key_file=tmp_path / "key"))
+    bridge = run(settings, signed)
+    heartbeats = signed.wait_for("HEARTBEAT", 3)
+    assert all(m.get_signed() for m in heartbeats)
+    assert bridge.counters()["fc_bad_signatures"] == 0
+    unsigned = mavlink.MAVLink(None, 1, 1)
+    attitude = mavlink.MAVLink_attitude_message(signed.boot_ms, 0.0, 0.0, 3.0, 0.0, 0.0, 0.0)
+    signed.send_bytes(attitude.pack(unsigned))
+    assert sleep_until(lambda: bridge.counters()["fc_unsigned"] == 1, 2.0)
+
+
+def test_threads_end_with_the_bridge(autopilot: Any, run: Callable[..., Bridge]) -> None:
+    before = threading.active_count()
+    bridge = run(config(autopilot.port), autopilot)
+    assert threading.active_count() == before + 1
+    bridge.stop()
+    assert threading.active_count() == before
+    with pytest.raises(BridgeStateError, match="already started"):
+        bridge.start()
+
+
+@pytest.mark.parametrize(
+    "wrong",
+    [
+        {"latitude_deg": 91.0},
+        {"longitude_deg": math.nan},
+        {"height_m": math.inf},
+        {"position_covariance_ned": np.eye(2)},
+        {"position_covariance_ned": np.full((3, 3), np.nan)},
+        {"quality": 101},
+    ],
+)
+def test_unphysical_fixes_are_refused(wrong: dict[str, Any]) -> None:
+    good = {"time_ns": 1, "latitude_deg": 47.0, "longitude_deg": 8.0, "height_m": 500.0}
+    with pytest.raises(FixError, match="vision fix"):
+        VisionFix(**{**good, **wrong})

@@ -1,0 +1,317 @@
+"""The injector by itself: timing, covariance, reset counter, yaw guard, bounds."""
+
+from __future__ import annotations
+
+import itertools
+import math
+from typing import Any
+
+import numpy as np
+import pytest
+
+from mavlink_bridge.clock import SteadyUtc
+from mavlink_bridge.config import InjectionConfig, YawGuardConfig
+from mavlink_bridge.inject import DIAGONAL, Injection, InjectionContext, Injector
+from mavlink_bridge.messages import Attitude, Origin, VisionFix
+from mavlink_bridge.profile import (
+    ARDUPILOT,
+    ARDUPILOT_SQRT,
+    PX4,
+    FirmwareProfile,
+    error_from_entry,
+)
+from mavlink_bridge.quaternion import from_euler
+
+MS = 1_000_000
+SECOND = 1_000 * MS
+HOME = (47.397742, 8.545594)
+GEOID = 47.0
+ORIGIN = Origin(*HOME, 488.0)
+METRE = 1.0 / 111318.84502145034
+
+
+def context(
+    origin: Origin | None = ORIGIN, profile: FirmwareProfile = ARDUPILOT, yaw: float = 0.0
+) -> InjectionContext:
+    def attitude_at(time_ns: int) -> Attitude:
+        return Attitude(time_ns, 0.0, 0.0, yaw, from_euler(0.0, 0.0, yaw))
+
+    return InjectionContext(origin, profile, attitude_at)
+
+
+def injector(**options: Any) -> Injector:
+    utc = SteadyUtc(utc_ns=1_700_000_000 * SECOND, at_monotonic_ns=0)
+    return Injector(InjectionConfig(**options), GEOID, utc)
+
+
+def fix(time_ns: int, north: float = 0.0, east: float = 0.0, **options: Any) -> VisionFix:
+    options.setdefault("yaw_rad", 0.0)
+    options.setdefault("position_covariance_ned", np.eye(3) * 0.25)
+    return VisionFix(
+        time_ns,
+        HOME[0] + north * METRE,
+        HOME[1] + east * METRE / math.cos(math.radians(HOME[0])),
+        488.0 + GEOID + 60.0,
+        0.0,
+        0.0,
+        **options,
+    )
+
+
+def fly(
+    it: Injector,
+    *,
+    seconds: float,
+    fix_hz: float,
+    latency_ms: float,
+    speed: float = 0.0,
+    where: InjectionContext | None = None,
+    start: int = SECOND,
+    change: Any = None,
+) -> list[tuple[int, Injection]]:
+    """Feed fixes of a vehicle that flies north, in 1 ms steps; (send time, injection) of each."""
+    sent = []
+    arriving: list[tuple[int, VisionFix]] = []
+    period = int(SECOND / fix_hz)
+    for t in range(start, start + int(seconds * SECOND), MS):
+        if (t - start) % period < MS:
+            f = fix(t, north=speed * t / SECOND)
+            f = change(f) if change else f
+            if f is not None:
+                arriving.append((t + int(latency_ms * MS), f))
+        while arriving and arriving[0][0] <= t:
+            it.submit(arriving.pop(0)[1], t)
+        injection = it.step(t, where or context())
+        if injection is not None:
+            sent.append((t, injection))
+    return sent
+
+
+def test_fix_is_sent_at_the_configured_delay_with_its_exposure_time() -> None:
+    it = injector(rate_hz=10, delay_ms=100)
+    sent = fly(it, seconds=3, fix_hz=10, latency_ms=40)
+    lags = {(t - i.estimate.position.time_ns) // MS for t, i in sent}
+    assert lags == {100}
+    assert all(i.estimate.fresh for _, i in sent)
+    assert sent[0][1].message.usec == sent[0][1].estimate.position.time_ns // 1000
+
+
+def test_position_is_ned_from_the_origin_and_altitude_is_amsl() -> None:
+    it = injector(rate_hz=10, delay_ms=0)
+    it.submit(fix(SECOND, north=120.0, east=-35.0), SECOND)
+    message = it.step(SECOND, context()).message  # type: ignore[union-attr]
+    assert (message.x, message.y, message.z) == pytest.approx((120.0, -35.0, -60.0), abs=0.01)
+
+
+def test_slow_fixes_are_propagated_to_a_steady_rate_and_least_lag_stays_the_delay() -> None:
+    it = injector(rate_hz=20, delay_ms=100)
+    sent = fly(it, seconds=6, fix_hz=4, latency_ms=150, speed=10.0)
+    late = [(t, i) for t, i in sent if t > 3 * SECOND]
+    rate = len(late) / 4.0
+    assert 18 <= rate <= 26
+    lags = [(t - i.estimate.position.time_ns) / MS for t, i in late]
+    assert min(lags) == pytest.approx(100.0, abs=1.0)
+    gaps = np.diff([t for t, _ in late]) / MS
+    assert gaps.max() <= 76.0
+    # Where the vehicle was at the stamp, not where the last fix saw it.
+    errors = [i.message.x - 10.0 * i.estimate.position.time_ns / SECOND for _, i in late]
+    assert np.abs(errors).max() < 0.3
+
+
+def test_stamps_never_run_back() -> None:
+    it = injector(rate_hz=30, delay_ms=50)
+    sent = fly(it, seconds=5, fix_hz=7, latency_ms=180, speed=5.0)
+    stamps = [i.message.usec for _, i in sent]
+    assert len(stamps) > 100
+    assert all(b > a for a, b in itertools.pairwise(stamps))
+
+
+def test_rate_never_passes_what_ardupilot_drops() -> None:
+    it = injector(rate_hz=30, delay_ms=100)
+    sent = fly(it, seconds=3, fix_hz=90, latency_ms=50)
+    gaps = np.diff([t for t, _ in sent]) / SECOND
+    assert (1.0 / gaps).max() <= 50.0
+
+
+def test_fix_too_old_to_fuse_is_propagated() -> None:
+    it = injector(rate_hz=10, delay_ms=200)
+    sent = fly(it, seconds=4, fix_hz=10, latency_ms=400, speed=8.0)
+    assert not any(i.estimate.fresh for _, i in sent)
+    lags = {(t - i.estimate.position.time_ns) // MS for t, i in sent}
+    assert lags == {200}
+    steady = [i for t, i in sent if t > 3 * SECOND]
+    errors = [i.message.x - 8.0 * i.estimate.position.time_ns / SECOND for i in steady]
+    assert np.abs(errors).max() < 0.2
+
+
+def test_covariance_grows_between_fixes_and_sending_ends_at_the_bound() -> None:
+    it = injector(rate_hz=20, delay_ms=0, max_sigma_m=2.0)
+    for k in range(20):
+        it.submit(fix(SECOND + k * 100 * MS), SECOND + k * 100 * MS)
+        it.step(SECOND + k * 100 * MS, context())
+    last = SECOND + 1900 * MS
+    sigmas = []
+    for t in range(last + MS, last + 6 * SECOND, MS):
+        injection = it.step(t, context())
+        if injection is not None:
+            sigmas.append(injection.estimate.position.horizontal_sigma_m)
+    assert sigmas == sorted(sigmas)
+    assert sigmas[0] < 0.7
+    assert 1.5 < sigmas[-1] <= 2.0
+    assert it.counters["withheld_covariance"] > 10
+    assert "covariance" in it.reason or "fresh" in it.reason
+
+
+@pytest.mark.parametrize("profile", [ARDUPILOT, ARDUPILOT_SQRT, PX4])
+@pytest.mark.parametrize("sigma", [0.5, 2.0])
+def test_firmware_reads_the_error_that_was_meant(profile: FirmwareProfile, sigma: float) -> None:
+    it = injector(rate_hz=10, delay_ms=0, sigma_floor_m=1e-6)
+    it.submit(fix(SECOND, position_covariance_ned=np.eye(3) * sigma**2), SECOND)
+    covariance = it.step(SECOND, context(profile=profile)).message.covariance  # type: ignore[union-attr]
+    if profile is ARDUPILOT:  # GCS_Common.cpp: cbrtf(sq(c0) + sq(c6) + sq(c11))
+        read = sum(covariance[i] ** 2 for i in DIAGONAL[:3]) ** (1 / 3)
+    elif profile is ARDUPILOT_SQRT:  # pull request 32084
+        read = math.sqrt(sum(covariance[i] for i in DIAGONAL[:3]))
+    else:
+        read = math.sqrt(covariance[0])
+    assert read == pytest.approx(sigma, rel=1e-4)
+    assert error_from_entry(covariance[0], profile.covariance) == pytest.approx(sigma, rel=1e-4)
+
+
+def test_reset_counter_changes_on_the_very_message_that_carries_the_jump() -> None:
+    it = injector(rate_hz=20, delay_ms=100)
+    jump_at = 3 * SECOND
+
+    def jump(f: VisionFix) -> VisionFix:
+        if f.time_ns < jump_at:
+            return f
+        first = jump_at <= f.time_ns < jump_at + 125 * MS
+        return fix(f.time_ns, north=10.0, reset=first)
+
+    sent = fly(it, seconds=5, fix_hz=8, latency_ms=60, change=jump)
+    counters = [i.message.reset_counter for _, i in sent]
+    norths = [i.message.x for _, i in sent]
+    first = counters.index(1)
+    assert set(counters) == {0, 1}
+    assert norths[first - 1] == pytest.approx(0.0, abs=0.5)
+    assert norths[first] == pytest.approx(10.0, abs=0.5)
+    assert all(n == pytest.approx(10.0, abs=0.5) for n in norths[first:])
+
+
+def test_reset_of_a_fix_that_is_not_sent_itself_is_not_lost() -> None:
+    it = injector(rate_hz=10, delay_ms=0)
+    it.submit(fix(SECOND), SECOND)
+    it.step(SECOND, context())
+    # Two fixes inside one slot: the older carries the reset and is superseded.
+    it.submit(fix(SECOND + 10 * MS, north=10.0, reset=True), SECOND + 10 * MS)
+    it.submit(fix(SECOND + 20 * MS, north=10.0), SECOND + 20 * MS)
+    it.step(SECOND + 20 * MS, context())
+    sent = None
+    for t in range(SECOND + 21 * MS, SECOND + 200 * MS, MS):
+        sent = sent or it.step(t, context())
+    assert sent is not None
+    assert sent.message.reset_counter == 1
+    assert sent.message.x == pytest.approx(10.0, abs=0.1)
+
+
+def test_rotated_vision_frame_is_refused_with_a_reason_and_released_with_hysteresis() -> None:
+    it = injector(rate_hz=10, delay_ms=0, yaw_guard=YawGuardConfig(window_s=1.0))
+
+    def rotated(f: VisionFix) -> VisionFix:
+        wrong = 5.0 if f.time_ns < 4 * SECOND else 0.5
+        return fix(f.time_ns, yaw_rad=math.radians(wrong))
+
+    sent = fly(it, seconds=8, fix_hz=10, latency_ms=0, change=rotated)
+    times = [t for t, _ in sent]
+    assert not [t for t in times if 1.6 * SECOND < t < 4 * SECOND]
+    assert [t for t in times if t > 6 * SECOND]
+    assert it.counters["withheld_yaw"] > 10
+    assert it.yaw_difference_rad == pytest.approx(math.radians(0.5), abs=1e-6)
+
+
+def test_single_wild_yaw_is_dropped_without_blocking() -> None:
+    it = injector(rate_hz=10, delay_ms=0)
+
+    def wild(f: VisionFix) -> VisionFix:
+        return fix(f.time_ns, yaw_rad=1.5, north=50.0) if f.time_ns == 3 * SECOND else f
+
+    sent = fly(it, seconds=4, fix_hz=10, latency_ms=0, change=wild)
+    assert max(abs(i.message.x) for _, i in sent) < 1.0
+    assert it.counters["fixes_yaw_refused"] == 1
+
+
+def test_without_an_origin_nothing_local_is_sent_and_the_reason_says_so() -> None:
+    it = injector(rate_hz=10, delay_ms=0)
+    assert fly(it, seconds=1, fix_hz=10, latency_ms=0, where=context(origin=None)) == []
+    assert it.reason == "the EKF has no origin"
+
+
+def test_late_future_and_unordered_fixes_are_dropped_and_counted() -> None:
+    it = injector()
+    it.submit(fix(10 * SECOND), 10 * SECOND)
+    it.submit(fix(9 * SECOND), 10 * SECOND)
+    it.submit(fix(12 * SECOND), 11 * SECOND)
+    it.submit(fix(11 * SECOND), 20 * SECOND)
+    assert it.counters["fixes"] == 1
+    assert it.counters["fixes_out_of_order"] == 1
+    assert it.counters["fixes_from_future"] == 1
+    assert it.counters["fixes_stale"] == 1
+
+
+def test_unknown_attitude_is_sent_as_nan() -> None:
+    it = injector(delay_ms=0)
+    unknown = fix(SECOND, yaw_rad=math.nan)
+    it.submit(unknown, SECOND)
+    message = it.step(SECOND, context()).message  # type: ignore[union-attr]
+    assert math.isnan(message.yaw)
+    assert it.guard.unchecked == 1
+
+
+def test_odometry_has_the_frames_ardupilot_accepts_and_body_velocity() -> None:
+    it = injector(message="odometry", rate_hz=10, delay_ms=0)
+    east = math.radians(90.0)
+
+    def turned(f: VisionFix) -> VisionFix:
+        return fix(f.time_ns, north=10.0 * f.time_ns / SECOND, yaw_rad=east, quality=77)
+
+    sent = fly(it, seconds=4, fix_hz=10, latency_ms=0, where=context(yaw=east), change=turned)
+    m = sent[-1][1].message
+    assert (m.frame_id, m.child_frame_id) == (20, 12)
+    # Nose to the east, flying north: the body moves to its left.
+    assert (m.vx, m.vy, m.vz) == pytest.approx((0.0, -10.0, 0.0), abs=0.3)
+    assert m.quality == 77
+    assert 0.0 < m.velocity_covariance[0] < 1.0
+    assert m.q == pytest.approx([math.cos(east / 2), 0.0, 0.0, math.sin(east / 2)], abs=1e-6)
+
+
+def test_gps_input_fills_every_field() -> None:
+    it = injector(message="gps_input", rate_hz=5, delay_ms=100, gps_yaw=True)
+    sent = fly(it, seconds=4, fix_hz=5, latency_ms=40, speed=10.0, where=context(origin=None))
+    t, injection = sent[-1]
+    m = injection.message
+    assert m.fix_type == 3
+    assert m.satellites_visible >= 6
+    assert m.hdop < 1.4
+    assert m.ignore_flags == 0
+    assert m.alt == pytest.approx(548.0, abs=0.01)
+    assert m.yaw == 36000
+    assert m.vn == pytest.approx(10.0, abs=0.3)
+    gps_s = 1_700_000_000 + m.time_usec * 1e-6 - 315_964_800 + 18
+    assert m.time_week == int(gps_s // 604800)
+    assert m.time_week_ms == pytest.approx(gps_s % 604800 * 1000, abs=1.1)
+    assert (t - injection.estimate.position.time_ns) / MS == pytest.approx(100.0, abs=1.0)
+
+
+def test_gps_input_without_velocity_sets_the_ignore_flags() -> None:
+    it = injector(message="gps_input", rate_hz=5, delay_ms=0, gps_velocity=False)
+    sent = fly(it, seconds=1, fix_hz=5, latency_ms=0)
+    assert sent[0][1].message.ignore_flags == 8 | 16 | 32
+    assert sent[0][1].message.yaw == 0
+
+
+def test_global_position_sensor_carries_both_altitudes() -> None:
+    it = injector(message="global_position_sensor", rate_hz=10, delay_ms=0)
+    it.submit(fix(SECOND), SECOND)
+    m = it.step(SECOND, context(profile=PX4)).message  # type: ignore[union-attr]
+    assert (m.alt_ellipsoid, m.alt) == pytest.approx((595.0, 548.0), abs=0.01)
+    assert m.eph == pytest.approx(0.51, abs=0.02)
