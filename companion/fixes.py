@@ -11,10 +11,16 @@ import math
 
 import numpy as np
 
-from companion.geometry import GIMBAL_FROM_CAMERA, ned_from_world
+from companion.geometry import (
+    GIMBAL_FROM_CAMERA,
+    body_from_camera,
+    ned_from_world,
+    vehicle_from_camera_pose,
+    world_from_camera,
+)
 from localizer.errors import GeoreferenceError
 from localizer.geo import Geodetic, LocalFrame
-from localizer.pose import Array, Pose, euler_from_matrix, matrix_from_quaternion
+from localizer.pose import Array, euler_from_matrix, matrix_from_quaternion
 from localizer.types import PoseEstimate, PosePrior
 from mavlink_bridge.messages import Attitude, GimbalAttitude, VehicleState, VisionFix
 
@@ -37,13 +43,13 @@ def vision_fix(
     """
     camera = frame.position(estimate.world_from_camera.translation)
     to_ned = ned_from_world(frame, camera)
-    ned_from_camera = to_ned @ estimate.world_from_camera.rotation
     roll = pitch = yaw = math.nan
     body = estimate.world_from_camera.translation
     if attitude is not None and gimbal is not None:
-        ned_from_body = ned_from_camera @ body_from_camera(attitude, gimbal).T
+        body, ned_from_body = vehicle_from_camera_pose(
+            estimate.world_from_camera, camera_on_body(attitude, gimbal), lever_arm_m, to_ned
+        )
         roll, pitch, yaw = euler_from_matrix(ned_from_body)
-        body = body - to_ned.T @ ned_from_body @ lever_arm_m
     position = frame.position(body)
     return VisionFix(
         time_ns=estimate.exposure_time_ns,
@@ -60,10 +66,10 @@ def vision_fix(
     )
 
 
-def body_from_camera(attitude: Attitude, gimbal: GimbalAttitude) -> Array:
-    """Rotation (3, 3) of the camera on the body, from two attitudes against NED."""
-    ned_from_body = matrix_from_quaternion(attitude.quaternion)
-    return ned_from_body.T @ matrix_from_quaternion(gimbal.quaternion) @ GIMBAL_FROM_CAMERA
+def camera_on_body(attitude: Attitude, gimbal: GimbalAttitude) -> Array:
+    """Rotation (3, 3) of the camera on the body, from the autopilot's two attitudes."""
+    ned_from_camera = matrix_from_quaternion(gimbal.quaternion) @ GIMBAL_FROM_CAMERA
+    return body_from_camera(matrix_from_quaternion(attitude.quaternion), ned_from_camera)
 
 
 def vehicle_prior(
@@ -89,13 +95,12 @@ def vehicle_prior(
         )
     except GeoreferenceError:
         return None
-    from_ned = ned_from_world(frame, position).T
-    ned_offset = matrix_from_quaternion(attitude.quaternion) @ lever_arm_m
+    body = frame.enu_from_geodetic(position.latitude_deg, position.longitude_deg, position.height_m)
+    to_ned = ned_from_world(frame, position)
     if state.local_velocity_ned is not None:
-        ned_offset = ned_offset + np.array(state.local_velocity_ned) * age_ns * 1e-9
-    body = frame.enu_from_geodetic(
-        position.latitude_deg, position.longitude_deg, position.height_m
-    )
-    rotation = from_ned @ matrix_from_quaternion(gimbal.quaternion) @ GIMBAL_FROM_CAMERA
+        body = body + to_ned.T @ np.array(state.local_velocity_ned) * age_ns * 1e-9
+    ned_from_body = matrix_from_quaternion(attitude.quaternion)
+    ned_from_camera = matrix_from_quaternion(gimbal.quaternion) @ GIMBAL_FROM_CAMERA
+    camera = world_from_camera(body, ned_from_body, ned_from_camera, lever_arm_m, to_ned)
     covariance = np.diag(np.repeat(np.square(sigma), 3))
-    return PosePrior(Pose(rotation, body + from_ned @ ned_offset), covariance, time_ns)
+    return PosePrior(camera, covariance, time_ns)

@@ -23,7 +23,7 @@ from localizer.metrics import LocalizationMetrics, localization_metrics
 from localizer.pipeline import Localizer
 from localizer.pose import Array, Pose, so3_exp
 from localizer.posefile import read_poses, world_from_camera
-from localizer.types import Frame, Image, PoseEstimate, PosePrior, ReferenceBundle
+from localizer.types import Frame, Image, PoseEstimate, PosePrior, ReferenceBundle, RegistrationStatus
 
 PriorMode = Literal["first", "each"]
 
@@ -154,13 +154,20 @@ def _localize(
 ) -> tuple[PoseEstimate, ReferenceBundle]:
     """Reference and query features side by side, then registration, `passes` times."""
     pending = pool.submit(localizer.extract_query, frame)
-    for _ in range(passes):
+    while True:
         prior = localizer.predict(frame.exposure_time_ns)
         if prior is None:
             raise SequenceError("no prior was set before localizing")
         bundle = localizer.make_reference(prior, wait=True)
         estimate = localizer.localize(frame, pending.result(), bundle.anchors)
-    return estimate, bundle
+        passes -= 1
+        if passes == 0:
+            return estimate, bundle
+        if estimate.status is RegistrationStatus.OK:
+            # The same image again is no new evidence: start anew from its result, halving sigma.
+            localizer.set_prior(
+                PosePrior(estimate.world_from_camera, prior.covariance / 4, prior.time_ns)
+            )
 
 
 def _measure(

@@ -2,8 +2,8 @@
 
 An estimate is accepted when the registration succeeded, enough anchors were seen, its quality is
 high enough and it agrees with the prediction (Mahalanobis gate). Runs of rejections lead from
-TRACKING over DEGRADED to LOST; consecutive acceptances lead back. While LOST the prediction is no
-judge, so agreement is asked of consecutive estimates with each other instead.
+TRACKING over DEGRADED to LOST; consecutive acceptances lead back. A registration that is good in
+itself but contradicts the prediction is rejected, and widens the prediction (`motion.inflated`).
 """
 
 from __future__ import annotations
@@ -43,7 +43,6 @@ class Integrity:
 
 
 def is_acceptable(
-    integrity: Integrity,
     config: IntegrityConfig,
     status: RegistrationStatus,
     overlap: float,

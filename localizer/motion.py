@@ -19,6 +19,8 @@ from pydantic import BaseModel, ConfigDict, Field
 from localizer.pose import Array, Pose, so3_exp, so3_log
 from localizer.types import PosePrior
 
+_MAX_SIGMA_M = 10.0  # beyond it nothing is gained: the swarm's own limits are reached
+_MAX_SIGMA_RAD = float(np.radians(8.0))
 _H = np.hstack([np.eye(6), np.zeros((6, 6))])
 
 
@@ -27,8 +29,8 @@ class MotionConfig(BaseModel):
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
-    acceleration_sigma: float = Field(2.0, gt=0, description="m/s²")
-    angular_acceleration_sigma: float = Field(0.6, gt=0, description="rad/s²")
+    acceleration_sigma: float = Field(3.0, gt=0, description="m/s²")
+    angular_acceleration_sigma: float = Field(1.0, gt=0, description="rad/s²")
     initial_velocity_sigma: float = Field(8.0, gt=0, description="m/s")
     initial_angular_rate_sigma: float = Field(0.3, gt=0, description="rad/s")
 
@@ -88,11 +90,18 @@ def update(
     return _fold_rotation(mean, P, ahead.rotation, time_ns)
 
 
-def shifted(state: MotionState, pose: Pose) -> MotionState:
-    """The same motion about another pose: after a relocalization the velocity stays known."""
-    mean = state.mean.copy()
-    mean[:3] = pose.translation
-    return replace(state, mean=mean, rotation=pose.rotation)
+def inflated(state: MotionState, config: MotionConfig) -> MotionState:
+    """The same motion believed half as much: what a good measurement contradicts is a manoeuvre
+    that the constant-velocity model did not foresee, or a wrong measurement. Doubling sigma lets
+    the former in after a frame or two, while the latter would have to repeat itself.
+    """
+    limit = np.repeat(
+        [_MAX_SIGMA_M, _MAX_SIGMA_RAD, config.initial_velocity_sigma,
+         config.initial_angular_rate_sigma], 3,
+    )  # fmt: skip
+    sigma = np.sqrt(state.covariance.diagonal())
+    scale = np.clip(limit / sigma, 1.0, 2.0)
+    return replace(state, covariance=state.covariance * np.outer(scale, scale))
 
 
 def mahalanobis_squared(prior: PosePrior, pose: Pose, extra: Array | float = 0.0) -> float:

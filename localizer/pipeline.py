@@ -164,28 +164,26 @@ class Localizer:
             seed=config.seed + frame.sequence,
         )
         elapsed_ms = (time.perf_counter() - started) * 1e3
-        acceptable = self._acceptable(tracker.integrity, result, ahead.prior)
+        acceptable = self._acceptable(result, ahead.prior)
         integrity = judge(tracker.integrity, config.integrity, acceptable)
         self._store(tracker, self._next_motion(ahead, result, frame, acceptable), integrity)
         return _estimate(frame, result, integrity, acceptable, {"register": elapsed_ms})
 
-    def _acceptable(self, integrity: Integrity, result: Registration, prior: PosePrior) -> bool:
+    def _acceptable(self, result: Registration, prior: PosePrior) -> bool:
         # Also before tracking: the gate is against the prior's own covariance, which is wide then.
         distance = motion.mahalanobis_squared(prior, result.world_from_camera, result.covariance)
         return is_acceptable(
-            integrity,
-            self._config.integrity,
-            result.status,
-            result.overlap,
-            result.quality,
-            distance,
+            self._config.integrity, result.status, result.overlap, result.quality, distance
         )
 
     def _next_motion(
         self, ahead: MotionState, result: Registration, frame: Frame, acceptable: bool
     ) -> MotionState:
         if not acceptable:
-            return ahead
+            credible = is_acceptable(
+                self._config.integrity, result.status, result.overlap, result.quality, 0.0
+            )
+            return motion.inflated(ahead, self._config.motion) if credible else ahead
         return motion.update(
             ahead,
             result.world_from_camera,

@@ -39,6 +39,6 @@ def test_every_criterion_can_reject():
         {"quality": 0.01},
         {"distance_squared": 1e4},
     ]
-    assert is_acceptable(Integrity(), CONFIG, **good)
+    assert is_acceptable(CONFIG, **good)
     for change in bad:
-        assert not is_acceptable(Integrity(), CONFIG, **(good | change)), change
+        assert not is_acceptable(CONFIG, **(good | change)), change

@@ -62,3 +62,15 @@ def test_filtered_errors_match_the_filters_own_covariance():
 def test_mahalanobis_counts_sigmas():
     moved = Pose(np.eye(3), np.array([3.0, 0.0, 0.0]))
     assert motion.mahalanobis_squared(_prior(), moved) == pytest.approx(9.0)
+
+
+def test_inflation_doubles_sigma_up_to_its_limits():
+    state = motion.predict(motion.start(_prior(0.1), CONFIG), SECOND, CONFIG)
+    wider = motion.inflated(state, CONFIG)
+    ratio = np.sqrt(wider.covariance.diagonal() / state.covariance.diagonal())
+    assert (ratio[:3] > 1.0).all()
+    assert (ratio <= 2.0 + 1e-9).all()
+    for _ in range(20):
+        wider = motion.inflated(wider, CONFIG)
+    assert np.sqrt(wider.covariance.diagonal()[:3]).max() <= 10.0 + 1e-6
+    assert np.linalg.eigvalsh(wider.covariance).min() >= 0
