@@ -19,12 +19,12 @@ from scipy.spatial import ConvexHull, QhullError
 from localizer.errors import GeoreferenceError, MapSourceError
 from localizer.geo import Geodetic, LocalFrame, geodetic_from_ecef
 from localizer.map.cache import ADD, REPLACE, Manifest, TileIndex, tile_name
-from localizer.map.raster import is_raster, read_rasters
 from localizer.map.source import SourceMesh, SourceNode, SourceTree, TileSource, VerticalDatum
 from localizer.map.staging import Record, Staging, StoredTile, publish, staging
 from localizer.map.tiles3d import read_tileset
 from localizer.pose import Array
 
+_RASTERS = (".tif", ".tiff", ".vrt")
 _IMPORTABLE = "3D Tiles (tileset.json or its folder), or a DSM and an orthophoto (GeoTIFF)"
 _NAMED_FAILURES = 20  # how many bad tiles an error message lists
 
@@ -44,12 +44,14 @@ def build_cache(
 ) -> Manifest:
     """Import a map source into a tile cache at `out`.
 
-    source: a `tileset.json` or its folder, or a DSM and an orthophoto. geoid_separation_m: height of the geoid above the ellipsoid at the map (MAVLink altitudes are
-    above the geoid); needed unless the source carries it. vertical_datum: what the source's heights
-    are; "amsl" ones are lifted by the separation; needed unless the source's format fixes it. origin: of the world frame, else the source's
-    centre. skip_bad_tiles: leave out tiles that cannot be imported (their parents are shown there)
-    instead of failing. workers: processes, else one per core; more than one needs the usual
-    ``if __name__ == "__main__"`` guard in a script. An interrupted build goes on where it stopped.
+    source: a `tileset.json` or its folder, or a DSM and an orthophoto. geoid_separation_m: height
+    of the geoid above the ellipsoid at the map (MAVLink altitudes are above the geoid); needed
+    unless the source carries it. vertical_datum: what the source's heights are; "amsl" ones are
+    lifted by the separation; needed unless the source's format fixes it. origin: of the world
+    frame, else the source's centre. skip_bad_tiles: leave out tiles that cannot be imported (their
+    parents are shown there) instead of failing. workers: processes, else one per core; more than
+    one needs the usual ``if __name__ == "__main__"`` guard in a script. An interrupted build goes
+    on where it stopped.
     """
     sources = [Path(source)] if isinstance(source, str | Path) else [Path(s) for s in source]
     named = " ".join(map(str, sources))
@@ -89,13 +91,23 @@ def read_source(sources: Sequence[Path]) -> SourceTree:
     for path in sources:
         if not path.exists():
             raise MapSourceError(f"{path}: no such file or folder")
-    if all(is_raster(path) for path in sources):
-        return read_rasters(sources)
+    if all(path.suffix.lower() in _RASTERS for path in sources):
+        return _read_rasters(sources)
     if len(sources) > 1:
         raise MapSourceError("several sources can only be a DSM and an orthophoto")
     if sources[0].is_dir() or sources[0].suffix.lower() == ".json":
         return read_tileset(sources[0])
     raise MapSourceError(f"{sources[0]}: not a source that can be imported: {_IMPORTABLE}")
+
+
+def _read_rasters(sources: Sequence[Path]) -> SourceTree:
+    try:
+        from localizer.map.raster import read_rasters
+    except ImportError as error:
+        raise MapSourceError(
+            f"rasters need the packages rasterio and fast-simplification: {error}"
+        ) from error
+    return read_rasters(sources)
 
 
 @dataclass(frozen=True)
@@ -243,8 +255,8 @@ def _vertical_datum(tree: SourceTree, given: VerticalDatum | None, source: str) 
     datum = given or tree.vertical_datum
     if datum is None:
         raise GeoreferenceError(
-            f"{source} does not say what its heights are; give the vertical datum: ellipsoidal (WGS84) "
-            "or amsl (above the geoid)"
+            f"{source} does not say what its heights are; give the vertical datum: ellipsoidal "
+            "(WGS84) or amsl (above the geoid)"
         )
     return datum
 

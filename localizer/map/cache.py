@@ -34,9 +34,9 @@ REPLACE, ADD = 0, 1
 class Manifest(BaseModel):
     """What a cache says about itself.
 
-    gsd_m: texel size of the finest tiles on the ground; levels: depth of the tile tree; extent: outline
-    of the map as (latitude_deg, longitude_deg) corners; skipped: source tiles that could not be
-    imported, with the reason; index_sha256: hash of the index, which holds the tiles' hashes.
+    gsd_m: texel size of the finest tiles; levels: depth of the tile tree; extent: outline of the
+    map as (latitude_deg, longitude_deg) corners; skipped: source tiles that could not be imported,
+    with the reason; index_sha256: hash of the index, which holds the tiles' hashes.
     """
 
     model_config = ConfigDict(frozen=True, extra="forbid")
@@ -227,7 +227,7 @@ def decode_tile(data: bytes, world_from_tile: Pose) -> TileMesh:
         cv2.cvtColor(image, cv2.COLOR_BGR2RGB, dst=texture.mip(level))
     repeat = bool(arrays["repeat"][0]) if "repeat" in arrays else False
     return TileMesh.from_packed(
-        positions, uvs, faces.view(np.int32), texture, world_from_tile, repeat
+        positions, uvs, faces.view(np.int32), texture, world_from_tile, repeat=repeat
     )
 
 
@@ -259,7 +259,8 @@ def _read_manifest(path: Path) -> Manifest:
     version = data.get("format_version") if isinstance(data, dict) else None
     if version != FORMAT_VERSION:
         raise MapCacheError(
-            f"{where}: cache format {version!r}, this program reads {FORMAT_VERSION}; build it again"
+            f"{where}: cache format {version!r}, this program reads {FORMAT_VERSION}; "
+            "build it again"
         )
     try:
         return Manifest.model_validate(data)

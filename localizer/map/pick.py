@@ -1,5 +1,7 @@
 """From a pixel to the map's surface: by the rendered depth, or exactly by its triangles."""
 
+# ruff: noqa: PLR0917 (kernels pass arrays)
+
 from __future__ import annotations
 
 from collections.abc import Sequence
@@ -20,17 +22,18 @@ def pick(
 ) -> tuple[Array, NDArray[np.bool_]]:
     """Surface points (N, 3) in world metres under pixels (N, 2), and which of them exist.
 
-    1/z is linear in the image on a plane, so it is interpolated bilinearly. Where neighbouring depths
-    jump (a roof's edge, the skyline) that would invent points in mid-air: there the triangles of
-    `meshes` (what the view was drawn from) are intersected exactly, or without `meshes` the
-    nearest pixel's depth is taken.
+    1/z is linear in the image on a plane, so it is interpolated bilinearly. Where neighbouring
+    depths jump (a roof's edge, the skyline) that would invent points in mid-air: there the nearest
+    pixel's depth is taken. With `meshes` (what the view was drawn from) every ray is intersected
+    with their triangles instead, exactly; about 0.3 ms a pixel.
     """
     pixels = np.asarray(pixels, dtype=np.float64).reshape(-1, 2)
-    z, certain = _interpolated_depth(view.depth, pixels)
     rays = view.camera.rays(pixels)
     if len(meshes):
-        directions = rays[~certain] @ view.world_from_camera.rotation.T
-        z[~certain] = cast_rays(meshes, view.world_from_camera.translation, directions)
+        directions = rays @ view.world_from_camera.rotation.T
+        z = cast_rays(meshes, view.world_from_camera.translation, directions)
+    else:
+        z = _interpolated_depth(view.depth, pixels)
     valid = np.isfinite(z) & (z > 0)
     points = view.world_from_camera.apply(rays * np.where(valid, z, np.nan)[:, None])
     return points, valid
@@ -51,10 +54,8 @@ def cast_rays(meshes: Sequence[TileMesh], origin: ArrayLike, directions: ArrayLi
     return np.where(np.isfinite(nearest), nearest, np.nan)
 
 
-def _interpolated_depth(
-    depth: NDArray[np.float32], pixels: Array
-) -> tuple[Array, NDArray[np.bool_]]:
-    """Depth at sub-pixel positions, and where no edge makes it doubtful."""
+def _interpolated_depth(depth: NDArray[np.float32], pixels: Array) -> Array:
+    """Depth (N,) at sub-pixel positions, 0 outside the image and where there is none."""
     h, w = depth.shape
     inside = (pixels >= 0).all(axis=1) & (pixels[:, 0] <= w) & (pixels[:, 1] <= h)
     x = np.clip(np.nan_to_num(pixels[:, 0]) - 0.5, 0, w - 1)
@@ -70,8 +71,7 @@ def _interpolated_depth(
     with np.errstate(divide="ignore", invalid="ignore"):
         interpolated = 1 / (weights / corners).sum(axis=0)
     nearest = depth[np.rint(y).astype(int), np.rint(x).astype(int)]
-    z = np.where(inside, np.where(smooth, interpolated, nearest), 0.0)
-    return z, smooth | ~inside
+    return np.where(inside, np.where(smooth, interpolated, nearest), 0.0)
 
 
 @njit(cache=True, nogil=True)

@@ -1,19 +1,21 @@
 """DSM and orthophoto to tiles: a quadtree of height-field meshes, read window by window.
 
-The grid of the finest level is the DSM's own, so its heights are kept as they are; each coarser level
-averages 2 x 2. Vertical skirts along the tile borders hide the cracks between levels.
+The grid of the finest level is the DSM's own, so its heights are kept as they are; each coarser
+level averages 2 x 2. Vertical skirts along the tile borders hide the cracks between levels.
 """
+
+# ruff: noqa: RUF005 (sums of arrays are meant, not lists)
 
 from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 from pathlib import Path
 
-import fast_simplification
+import fast_simplification  # type: ignore[import-untyped]
 import numpy as np
 import rasterio
 import rasterio.warp
@@ -42,7 +44,7 @@ ERROR_PER_STEP = 2.0
 
 @dataclass(frozen=True)
 class Grid:
-    """The quadtree's geometry. crs: projected, metres, as WKT; left, top: where the first vertex is;
+    """The quadtree's geometry. crs: projected, metres, as WKT; left, top: of the first vertex;
     step: (east, south) metres between vertices of the finest level; cells: a tile's side.
     """
 
@@ -89,7 +91,7 @@ class RasterTile:
         if mesh is None:
             return []
         local, faces = mesh
-        left, top = self._corner
+        left, top = self.corner
         crs_points = local + (left, top, 0.0)
         extent = np.array(self.step) * self.grid.cells
         uvs = (local[:, :2] * (1, -1) / extent).astype(np.float32)
@@ -100,13 +102,14 @@ class RasterTile:
         return self.level == self.grid.levels - 1
 
     @property
-    def _corner(self) -> tuple[float, float]:
+    def corner(self) -> tuple[float, float]:
+        """Easting and northing of the first vertex."""
         east, south = (s * self.grid.cells for s in self.step)
         return self.grid.left + self.column * east, self.grid.top - self.row * south
 
     def _heights(self) -> np.ma.MaskedArray:
         """Heights at the vertices, (cells + 1, cells + 1) float64; masked where unknown."""
-        (east, south), (left, top) = self.step, self._corner
+        (east, south), (left, top) = self.step, self.corner
         transform = Affine(east, 0, left - east / 2, 0, -south, top + south / 2)
         how = Resampling.bilinear if self._finest else Resampling.average
         n = self.grid.cells + 1
@@ -117,7 +120,7 @@ class RasterTile:
 
     def _image(self) -> tuple[Image, NDArray[np.bool_]]:
         """Texture (TEXELS, TEXELS, 3), and per texel whether the orthophoto shows something."""
-        (east, south), (left, top) = self.step, self._corner
+        (east, south), (left, top) = self.step, self.corner
         size = self.grid.cells / TEXELS
         transform = Affine(east * size, 0, left, 0, -south * size, top)
         with _warped(self.ortho, self.grid.crs, transform, TEXELS, Resampling.average) as vrt:
@@ -127,11 +130,6 @@ class RasterTile:
         return np.ascontiguousarray(image, np.uint8), shown
 
 
-def is_raster(path: Path) -> bool:
-    """Whether the file is named like a raster that this importer reads."""
-    return path.suffix.lower() in (".tif", ".tiff", ".vrt")
-
-
 def read_rasters(paths: Sequence[Path]) -> SourceTree:
     """The tree of a DSM (one band of heights) and an orthophoto (bands of colours)."""
     dsm, ortho = _told_apart(paths)
@@ -139,33 +137,24 @@ def read_rasters(paths: Sequence[Path]) -> SourceTree:
         grid = _grid(heights, colours)
         centre = _ecef(grid.crs, np.array([[*_centre(heights, grid.crs), 0.0]]))[0]
         bounds = rasterio.warp.transform_bounds(heights.crs, grid.crs, *heights.bounds)
-    return SourceTree(_node(dsm, ortho, grid, bounds, 0, 0, 0), centre, None, "", (dsm, ortho))
+    return SourceTree(
+        _node(RasterTile(dsm, ortho, grid, 0, 0, 0), bounds), centre, None, "", (dsm, ortho)
+    )
 
 
-def _node(
-    dsm: Path,
-    ortho: Path,
-    grid: Grid,
-    bounds: tuple[float, float, float, float],
-    level: int,
-    column: int,
-    row: int,
-) -> SourceNode:
-    tile = RasterTile(dsm, ortho, grid, level, column, row)
+def _node(tile: RasterTile, bounds: tuple[float, float, float, float]) -> SourceNode:
+    """The subtree of a tile. bounds: the DSM's left, bottom, right, top in the grid's CRS."""
+    grid = tile.grid
     children = []
-    if level < grid.levels - 1:
-        size = 2 ** (grid.levels - 2 - level) * grid.cells
-        width, height = size * grid.step[0], size * grid.step[1]
-        for r in (2 * row, 2 * row + 1):
-            for c in (2 * column, 2 * column + 1):
-                # Half a step more: the vertices sit at cell centres.
-                outside = (
-                    grid.left + c * width >= bounds[2] - grid.step[0]
-                    or grid.top - r * height <= bounds[1] + grid.step[1]
-                )
-                if not outside:
-                    children.append(_node(dsm, ortho, grid, bounds, level + 1, c, r))
-    error = 0.0 if not children else ERROR_PER_STEP * max(tile.step)
+    if tile.level < grid.levels - 1:
+        for row in (2 * tile.row, 2 * tile.row + 1):
+            for column in (2 * tile.column, 2 * tile.column + 1):
+                child = replace(tile, level=tile.level + 1, column=column, row=row)
+                left, top = child.corner
+                # The last vertex sits half a step inside the DSM's edge.
+                if left < bounds[2] - grid.step[0] and top > bounds[1] + grid.step[1]:
+                    children.append(_node(child, bounds))
+    error = ERROR_PER_STEP * max(tile.step) if children else 0.0
     return SourceNode(error, True, (tile,), children)
 
 
@@ -184,24 +173,22 @@ def _told_apart(paths: Sequence[Path]) -> tuple[Path, Path]:
         found[kind] = path
     for kind in ("DSM", "orthophoto"):
         if kind not in found:
-            raise MapSourceError(
-                f"a map of rasters needs a {kind} too; give a DSM and an orthophoto"
-            )
+            raise MapSourceError(f"a map of rasters needs a {kind} too, of the same ground")
     return found["DSM"], found["orthophoto"]
 
 
 def _kind(data: DatasetReader) -> str:
     """By the bands: heights are one band wider than a byte, colours are bytes."""
-    colours = [
-        b for b, c in zip(data.dtypes, data.colorinterp, strict=True) if c != ColorInterp.alpha
-    ]
+    bands = zip(data.dtypes, data.colorinterp, strict=True)
+    colours = [dtype for dtype, meaning in bands if meaning != ColorInterp.alpha]
     if len(colours) == 1 and colours[0] != "uint8":
         return "DSM"
     if all(dtype == "uint8" for dtype in colours) and len(colours) in (1, 3, 4):
         return "orthophoto"
+    kinds = ", ".join(sorted(set(colours)))
     raise MapSourceError(
-        f"{data.name}: {len(colours)} bands of {', '.join(sorted(set(colours)))}: neither a DSM (one "
-        "band of heights) nor an orthophoto (8-bit grey or RGB)"
+        f"{data.name}: {len(colours)} bands of {kinds}: neither a DSM (one band of heights) nor an "
+        "orthophoto (8-bit grey or RGB)"
     )
 
 
@@ -229,9 +216,8 @@ def _metric_crs(data: DatasetReader) -> CRS:
     """The raster's own horizontal CRS where that is in metres, else the UTM zone of its centre."""
     own = CRS(data.crs)
     flat = own.sub_crs_list[0] if own.is_compound else own
-    if flat.is_projected and all(
-        a.unit_name in ("metre", "meter", "m") for a in flat.axis_info[:2]
-    ):
+    metric = all(axis.unit_name in ("metre", "meter", "m") for axis in flat.axis_info[:2])
+    if flat.is_projected and metric:
         return flat
     lon, lat = _centre(data, "EPSG:4326")
     return CRS.from_epsg((32600 if lat >= 0 else 32700) + int((lon + 180) // 6) % 60 + 1)

@@ -1,5 +1,7 @@
 """Which tiles a view needs: screen-space error, frustum and horizon culling (numba kernel)."""
 
+# ruff: noqa: PLR0917, PLR0912, PLR0915 (the kernel passes arrays and is one loop body)
+
 from __future__ import annotations
 
 from dataclasses import dataclass
@@ -168,7 +170,7 @@ def _select(  # type: ignore[no-untyped-def]
     nodes,
     priority,
 ):
-    """Fills nodes with (wanted, shown, requests) and returns their counts and whether a hole is left.
+    """Fills nodes with (wanted, shown, requests); returns their counts and whether a hole is left.
 
     Nodes are in breadth-first order, so passes over the arrays take the place of recursion.
     """

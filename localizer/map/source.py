@@ -21,8 +21,8 @@ class SourceMesh:
     """Triangles with one texture, as an importer reads it.
 
     positions: (V, 3) float64, in the importer's frame; uvs: (V, 2) float32, v down; faces: (F, 3)
-    int32; image: (h, w, 3) uint8 RGB; jpeg: the image's own bytes where it is a JPEG that was not changed; palette: the
-    image is a grid of flat colours that mips would mix.
+    int32; image: (h, w, 3) uint8 RGB; jpeg: the image's own bytes where it is a JPEG that was not
+    changed; palette: the image is a grid of flat colours that mips would mix.
     """
 
     positions: Array
@@ -67,8 +67,10 @@ class SourceNode:
 
 @dataclass(frozen=True, eq=False)
 class SourceTree:
-    """A map source. centre: (3,) ECEF metres; geoid_separation_m, attribution and vertical_datum as
-    far as the source tells; files: everything it is made of, so that a change of the source can be seen.
+    """A map source.
+
+    centre: (3,) ECEF metres; geoid_separation_m, attribution, vertical_datum: as far as the source
+    tells; files: everything it is made of, so that a change of the source can be seen.
     """
 
     root: SourceNode

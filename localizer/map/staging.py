@@ -21,6 +21,7 @@ from localizer.map.cache import INDEX_NAME, MANIFEST_NAME, Manifest, TileIndex, 
 from localizer.map.source import SourceMesh
 from localizer.map.tile import build_mips, texel_coverage
 from localizer.pose import Array
+from localizer.types import Image
 
 
 @dataclass(frozen=True)
@@ -55,10 +56,7 @@ class Staging:
         """The record of a source tile that is finished, its files present."""
         try:
             data = json.loads(self._record_path(key).read_bytes())
-            tiles = tuple(
-                StoredTile(**{k: tuple(v) if isinstance(v, list) else v for k, v in t.items()})
-                for t in data["tiles"]
-            )
+            tiles = tuple(_stored_from_json(t) for t in data["tiles"])
             record = Record(tiles, data["error"])
         except (OSError, ValueError, TypeError, KeyError):
             return None
@@ -94,6 +92,11 @@ class Staging:
 
     def _record_path(self, key: int) -> Path:
         return self.folder / "records" / f"{key // 1000:04d}" / f"{key:07d}.json"
+
+
+def _stored_from_json(data: dict[str, Any]) -> StoredTile:
+    fields: dict[str, Any] = {k: tuple(v) if isinstance(v, list) else v for k, v in data.items()}
+    return StoredTile(**fields)
 
 
 @contextmanager
@@ -148,13 +151,14 @@ def stored_tile(mesh: SourceMesh) -> tuple[bytes, StoredTile]:
     low, high = world.min(axis=0), world.max(axis=0)
     center = np.round(0.5 * (low + high), 3)
     local = (world - center).astype(np.float32)
+    h, w = mesh.image.shape[:2]
     if mesh.palette:
-        mips = (mesh.image,)
+        mips: tuple[Image, ...] = (mesh.image,)  # flat colours: coarser levels would mix them
     elif mesh.repeat:
         mips = build_mips(mesh.image)
     else:
-        h, w = mesh.image.shape[:2]
         mips = build_mips(mesh.image, texel_coverage(uvs, faces, w, h))
+    gsd = 0.0 if mesh.palette else texel_size(world, uvs, faces, (w, h))
     data = encode_tile(local, uvs, faces, mips, repeat=mesh.repeat, finest_jpeg=mesh.jpeg)
     texels = sum(m.nbytes for m in mips)
     return data, StoredTile(
@@ -162,7 +166,7 @@ def stored_tile(mesh: SourceMesh) -> tuple[bytes, StoredTile]:
         local.nbytes + uvs.nbytes + faces.nbytes + texels,
         len(data),
         len(faces),
-        texel_size(world, uvs, faces, mesh.image.shape[1], mesh.image.shape[0], mesh.palette),
+        gsd,
         _triple(center),
         _triple(low),
         _triple(high),
@@ -173,14 +177,10 @@ def texel_size(
     positions: Array,
     uvs: NDArray[np.float32],
     faces: NDArray[np.int32],
-    width: int,
-    height: int,
-    palette: bool = False,
+    size: tuple[int, int],
 ) -> float:
-    """Metres per texel over a mesh's surface; 0 for flat colours, which have no detail to lose."""
-    if palette:
-        return 0.0
-    p, t = positions[faces], uvs[faces].astype(np.float64) * (width, height)
+    """Metres per texel over a mesh's surface. size: (width, height) of its texture."""
+    p, t = positions[faces], uvs[faces].astype(np.float64) * size
     area = 0.5 * np.linalg.norm(np.cross(p[:, 1] - p[:, 0], p[:, 2] - p[:, 0]), axis=-1).sum()
     a, b = t[:, 1] - t[:, 0], t[:, 2] - t[:, 0]
     texels = 0.5 * np.abs(a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]).sum()

@@ -30,9 +30,11 @@ _RELAX = 1.4  # step by which detail is reduced when a view does not fit into th
 
 @dataclass(frozen=True)
 class StreamCounters:
-    """Since the streamer was made. hits, misses: wanted nodes that were or were not resident;
-    complete: selections at the wanted detail throughout; stalls: selections with a hole;
-    failures: tiles that could not be read; loaded, evicted: nodes; resident_bytes: now.
+    """Since the streamer was made.
+
+    hits, misses: wanted nodes that were in memory or not; complete: selections at the wanted detail
+    throughout; stalls: selections with a hole; failures: nodes that could not be read; loaded,
+    evicted: nodes; resident_bytes: now.
     """
 
     selections: int = 0
@@ -47,7 +49,7 @@ class StreamCounters:
 
 
 class TileStreamer:
-    """Tiles of a cache within a byte budget. `select` and `prefetch` may be called by one thread."""
+    """Tiles of a cache within a byte budget; one thread selects and prefetches."""
 
     def __init__(
         self,

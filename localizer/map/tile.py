@@ -65,6 +65,7 @@ class TileMesh:
         faces: NDArray[np.int32],
         texture: PackedTexture,
         world_from_tile: Pose,
+        *,
         repeat: bool = False,
     ) -> TileMesh:
         """From a texture that is packed already; `mips` become views of it."""
@@ -94,13 +95,18 @@ class TileMesh:
     @property
     def nbytes(self) -> int:
         """Bytes that the mesh holds in memory, its mips counted once."""
-        arrays = (self.positions, self.uvs, self.faces, *self.mips)
-        return int(sum(a.nbytes for a in arrays))
+        own = self.positions.nbytes + self.uvs.nbytes + self.faces.nbytes
+        return int(own + sum(m.nbytes for m in self.mips))
 
     def placed(self, world_from_tile: Pose) -> TileMesh:
         """The same mesh elsewhere; arrays are shared."""
         return TileMesh.from_packed(
-            self.positions, self.uvs, self.faces, self.texture, world_from_tile, self.repeat
+            self.positions,
+            self.uvs,
+            self.faces,
+            self.texture,
+            world_from_tile,
+            repeat=self.repeat,
         )
 
 

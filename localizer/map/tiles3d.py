@@ -144,7 +144,7 @@ class _Reader:
         self._open.pop()
         return node
 
-    def _node(
+    def _node(  # noqa: PLR0917
         self, data: dict[str, Any], parent: Array, replaces: bool, up: str, path: Path, depth: int
     ) -> SourceNode:
         self._count += 1
@@ -167,8 +167,8 @@ class _Reader:
             else:
                 tiles.append(ContentFile(file, self.folder, T, up))
                 self.files.append(file)
-        for child in data.get("children", []):
-            child = _object(child, f"{path}: a child")
+        for item in data.get("children", []):
+            child = _object(item, f"{path}: a child")
             children.append(self._node(child, T, refine == "REPLACE", up, path, depth + 1))
         error = _number(data.get("geometricError", 0.0), f"{path}: geometricError")
         scale = float(np.linalg.norm(T[:3, :3], axis=0).max())
@@ -180,8 +180,8 @@ def _content_uris(data: dict[str, Any], path: Path) -> list[str]:
     if "content" in data:
         contents = [data["content"], *contents]
     uris = []
-    for content in contents:
-        content = _object(content, f"{path}: content")
+    for item in contents:
+        content = _object(item, f"{path}: content")
         uri = content.get("uri", content.get("url"))  # `url` before 1.0 was final
         if not isinstance(uri, str):
             raise MapSourceError(f"{path}: a content has no uri")

@@ -1,11 +1,13 @@
 """CPU renderer: RGB and metric depth by a rasteriser in numba, outside the GIL.
 
 Two passes. Per mesh: transform the vertices to the image and list the faces that may cover a pixel
-centre (of small triangles most do not); faces that cross the near plane are clipped into a short list
-of their own. Per horizontal strip: depth-tested filling of the listed faces, with bilinear look-up
-in the mip that the pixel's footprint asks for. Both faces of a triangle are drawn: photogrammetry is not
-consistently wound.
+centre (of small triangles most do not); faces that cross the near plane are clipped into a short
+list of their own. Per horizontal strip: depth-tested filling of the listed faces, with bilinear
+look-up in the mip that the pixel's footprint asks for. Both sides of a triangle are drawn:
+photogrammetry is not consistently wound.
 """
+
+# ruff: noqa: PLR0917, PLR0915 (kernels pass arrays and unroll, for speed)
 
 from __future__ import annotations
 
