@@ -63,7 +63,10 @@ def main(argv: list[str] | None = None) -> int:
         print(error, file=sys.stderr)
         return 1
     try:
-        Vehicle(home, heading_deg, parameters, server, arguments.seed).run()
+        vehicle = Vehicle(home, heading_deg, parameters, server, arguments.seed)
+        for number, port in enumerate(ports):
+            print(f"SERIAL{number} on TCP port {port}", flush=True)  # as ArduPilot SITL prints
+        vehicle.run()
     except KeyboardInterrupt:
         return 0
     finally:

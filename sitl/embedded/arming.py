@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from sitl.embedded.estimator import EXTERNAL, GPS, Estimator
 from sitl.embedded.parameters import Parameters
 
+_ALL, _GPS_CHECK, _INS, _VISION = 1, 1 << 3, 1 << 4, 1 << 18  # ARMING_CHECK
 GYRO_SETTLE_S = 25.0  # as measured on ArduPilot SITL
 
 
@@ -28,10 +29,7 @@ class ArmingContext:
 
 def arming_failures(context: ArmingContext) -> list[str]:
     """Texts of all checks that fail; empty when the vehicle may arm."""
-    failures = []
-    if context.parameters["ARMING_CHECK"] != 0:
-        failures += _optional(context)
-    failures += _mandatory(context)
+    failures = _optional(context) + _mandatory(context)
     if not context.mode_armable:
         failures.append(f"{context.mode_name} mode not armable")
     return failures
@@ -39,17 +37,22 @@ def arming_failures(context: ArmingContext) -> list[str]:
 
 def _optional(c: ArmingContext) -> list[str]:
     failures = []
-    if c.time_s < GYRO_SETTLE_S:
+    if _enabled(c, _INS) and c.time_s < GYRO_SETTLE_S:
         failures.append("Gyros inconsistent")
-    if c.parameters["GPS1_TYPE"] > 0 and not c.gps_fix:
-        failures.append("GPS 1: Bad fix")
-    elif c.parameters["GPS1_TYPE"] > 0 and not c.gps_healthy:
-        failures.append("GPS 1: not healthy")
-    elif not c.home_set:
-        failures.append("AHRS: waiting for home")
-    if c.parameters["VISO_TYPE"] > 0 and not c.vision_healthy:
+    if _enabled(c, _GPS_CHECK):
+        if c.parameters["GPS1_TYPE"] > 0 and not c.gps_fix:
+            failures.append("GPS 1: Bad fix")
+        elif c.parameters["GPS1_TYPE"] > 0 and not c.gps_healthy:
+            failures.append("GPS 1: not healthy")
+        elif not c.home_set:
+            failures.append("AHRS: waiting for home")
+    if _enabled(c, _VISION) and c.parameters["VISO_TYPE"] > 0 and not c.vision_healthy:
         failures.append("VisOdom: not healthy")
     return failures
+
+
+def _enabled(c: ArmingContext, check: int) -> bool:
+    return bool(int(c.parameters["ARMING_CHECK"]) & (_ALL | check))
 
 
 def _mandatory(c: ArmingContext) -> list[str]:

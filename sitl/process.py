@@ -1,0 +1,203 @@
+"""A simulated vehicle as a child process with TCP ports: what ArduPilot and the stand-in share."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import shutil
+import signal
+import socket
+import subprocess
+import tempfile
+import time
+from abc import ABC, abstractmethod
+from pathlib import Path
+from types import TracebackType
+from typing import Literal, TypeVar
+
+from sitl.errors import SimulationError
+
+VehicleKind = Literal["ardupilot", "embedded"]
+
+BASE_PORT, PORTS_PER_INSTANCE = 5760, 10  # ArduPilot SITL's -I n shifts every port by 10 n
+_GCS_OFFSET, _COMPANION_OFFSET, _SPARE_OFFSET = 0, 2, 3
+_INSTANCES = range(200)
+_POLL_S = 0.05
+_STOP_TIMEOUT_S = 5.0
+_LOG_TAIL = 1500  # characters of the process's log quoted in an error
+
+_Self = TypeVar("_Self", bound="VehicleProcess")
+
+
+class VehicleProcessError(SimulationError):
+    """A simulated vehicle that did not start, or died; says where its log is."""
+
+
+class VehicleProcess(ABC):
+    """A vehicle process. Use as a context manager, or `start` and `stop`.
+
+    gcs_endpoint and companion_endpoint ("tcp:127.0.0.1:PORT") are its first two serial ports;
+    spare_endpoint is a third, free for an independent observer.
+    """
+
+    kind: VehicleKind
+    start_timeout_s: float
+
+    def __init__(self, speedup: float = 1.0) -> None:
+        self.speedup = speedup
+        self.folder = Path(tempfile.mkdtemp(prefix=f"{self.kind}-"))
+        self.log_path = self.folder / "vehicle.log"
+        self._instance = -1
+        self._process: subprocess.Popen[bytes] | None = None
+
+    @abstractmethod
+    def command(self, instance: int) -> list[str]:
+        """The command line of an instance; it runs in `folder`."""
+
+    # --- where it listens --------------------------------------------------------------------
+
+    @property
+    def gcs_endpoint(self) -> str:
+        """For the ground station (serial0)."""
+        return self._endpoint(_GCS_OFFSET)
+
+    @property
+    def companion_endpoint(self) -> str:
+        """For the companion computer (serial1)."""
+        return self._endpoint(_COMPANION_OFFSET)
+
+    @property
+    def spare_endpoint(self) -> str:
+        """For an observer (serial2)."""
+        return self._endpoint(_SPARE_OFFSET)
+
+    def _endpoint(self, offset: int) -> str:
+        if self._instance < 0:
+            raise VehicleProcessError(f"the {self.kind} vehicle has no ports before it is started")
+        return f"tcp:127.0.0.1:{_port(self._instance, offset)}"
+
+    # --- life --------------------------------------------------------------------------------
+
+    @property
+    def alive(self) -> bool:
+        """Whether the process runs."""
+        return self._process is not None and self._process.poll() is None
+
+    def start(self) -> None:
+        """Start on free ports and wait until it listens; VehicleProcessError when it does not."""
+        # Instances are tried from a place of this process's own, so that vehicles that start at
+        # the same time do not reach for the same ports.
+        first = os.getpid() * 7 % len(_INSTANCES)
+        for step in _INSTANCES:
+            instance = (first + step) % len(_INSTANCES)
+            if not _free(instance):
+                continue
+            self._instance = instance
+            self._launch()
+            if self._wait_listening():
+                return
+            if "in use" not in self.log_tail().lower():
+                break
+        tail = self.log_tail()
+        self.stop(keep_log=True)
+        raise VehicleProcessError(
+            f"the {self.kind} vehicle did not start; its log {self.log_path} ends:\n{tail}"
+        )
+
+    def _launch(self) -> None:
+        command = self.command(self._instance)
+        with self.log_path.open("wb") as log:
+            try:
+                self._process = subprocess.Popen(
+                    command,
+                    cwd=self.folder,
+                    stdin=subprocess.DEVNULL,
+                    stdout=log,
+                    stderr=subprocess.STDOUT,
+                    start_new_session=True,  # an interrupt of ours must not end it unasked
+                )
+            except OSError as error:
+                raise VehicleProcessError(f"cannot run {command[0]}: {error}") from error
+
+    def _wait_listening(self) -> bool:
+        deadline = time.monotonic() + self.start_timeout_s
+        marker = f"SERIAL2 on TCP port {_port(self._instance, _SPARE_OFFSET)}"
+        while time.monotonic() < deadline and self.alive:
+            # The log is watched, as a probing connection would take the port's only client slot.
+            if marker in self.log_tail(100_000):
+                return True
+            time.sleep(_POLL_S)
+        self._end()
+        return False
+
+    def log_tail(self, characters: int = _LOG_TAIL) -> str:
+        """The end of what the process has printed."""
+        try:
+            return self.log_path.read_text("utf-8", "replace")[-characters:]
+        except FileNotFoundError:
+            return ""
+
+    def check(self) -> None:
+        """VehicleProcessError if the process has died."""
+        if self._process is not None and not self.alive:
+            raise VehicleProcessError(
+                f"the {self.kind} vehicle died (status {self._process.returncode}); "
+                f"its log {self.log_path} ends:\n{self.log_tail()}"
+            )
+
+    def cpu_seconds(self) -> float:
+        """Processor time the vehicle has used so far."""
+        if self._process is None:
+            return 0.0
+        fields = Path(f"/proc/{self._process.pid}/stat").read_text().rsplit(")", 1)[1].split()
+        return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
+
+    def stop(self, *, keep_log: bool = False) -> None:
+        """End the process and remove its folder, unless its log is to be kept."""
+        self._end()
+        if not keep_log:
+            shutil.rmtree(self.folder, ignore_errors=True)
+
+    def _end(self) -> None:
+        if self._process is None:
+            return
+        with contextlib.suppress(ProcessLookupError):
+            self._process.send_signal(signal.SIGTERM)
+        try:
+            self._process.wait(_STOP_TIMEOUT_S)
+        except subprocess.TimeoutExpired:
+            self._process.kill()
+            self._process.wait()
+
+    def __enter__(self: _Self) -> _Self:
+        self.start()
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        traceback: TracebackType | None,
+    ) -> None:
+        self.stop(keep_log=kind is not None)
+
+
+def write_parameters(path: Path, parameters: dict[str, float]) -> None:
+    """An ArduPilot .parm file."""
+    lines = [f"{name} {value:.9g}\n" for name, value in parameters.items()]
+    path.write_text("".join(lines), encoding="utf-8")
+
+
+def _port(instance: int, offset: int) -> int:
+    return BASE_PORT + PORTS_PER_INSTANCE * instance + offset
+
+
+def _free(instance: int) -> bool:
+    for offset in (_GCS_OFFSET, _COMPANION_OFFSET, _SPARE_OFFSET):
+        with socket.socket(socket.AF_INET, socket.SOCK_STREAM) as probe:
+            probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+            try:
+                probe.bind(("127.0.0.1", _port(instance, offset)))
+            except OSError:
+                return False
+    return True
