@@ -9,7 +9,7 @@ from __future__ import annotations
 import csv
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from types import TracebackType
 
@@ -18,15 +18,30 @@ import numpy as np
 from localizer.camera import Camera
 from localizer.pose import Array, Pose, quaternion_from_matrix
 from localizer.render.base import MapRenderer
-from localizer.synth.appearance import Appearance, apply_appearance
+from localizer.synth.appearance import Appearance
 from localizer.types import Float32, Image, RenderedView
 from sitl.distortion import Lens
 from sitl.moving import Mover
+from sitl.sensor import Sensor
 from sitl.truth import PoseTrack
 
 FRAME_COLUMNS = (
     "exposure_time_ns", "sequence", "east_m", "north_m", "up_m", "qw", "qx", "qy", "qz",
 )  # fmt: skip
+
+# A hazy late afternoon through a small sensor. The stream's own compression comes on top.
+HAZY_AFTERNOON = Appearance(
+    exposure=0.92,
+    contrast=0.95,
+    gamma=1.06,
+    saturation=0.85,
+    balance=(1.05, 1.0, 0.93),
+    extinction_per_m=3e-4,
+    vignetting=0.2,
+    shot_noise=0.015,
+    read_noise=0.006,
+    defocus_px=0.5,
+)
 
 
 @dataclass(frozen=True)
@@ -61,11 +76,10 @@ class WorldCamera:
         self.camera = camera
         self._renderer = renderer
         self._lens = Lens.of(camera)
-        self._appearance = appearance
+        self._sensor = Sensor(appearance, seed)
         self._movers = tuple(movers)
         self._scene_from_world = scene_from_world or Pose.identity()
         self._shutter_ns = round(shutter_s * 1e9)
-        self._rng = np.random.default_rng(seed)
 
     def expose(self, time_ns: int, track: PoseTrack) -> Exposure | None:
         """The picture at a time; None where the track has no pose."""
@@ -78,8 +92,8 @@ class WorldCamera:
         image = self._lens.distort(view.rgb)
         depth = self._lens.distort_depth(view.depth)
         bent = time.perf_counter()
-        appearance = self._with_motion(track, pose, depth, time_ns)
-        image = apply_appearance(image, depth, appearance, self._rng)
+        length_px, angle_deg = self._blur(track, pose, depth, time_ns)
+        image = self._sensor.apply(image, depth, length_px, angle_deg)
         done = time.perf_counter()
         stages = {
             "render": 1e3 * (rendered - start),
@@ -97,14 +111,14 @@ class WorldCamera:
         # Waiting for detail: a real camera does not show coarse ground while data is loading.
         return self._renderer.render(scene, self._lens.pinhole, extra, wait=True)
 
-    def _with_motion(
+    def _blur(
         self, track: PoseTrack, pose: Pose, depth: Float32, time_ns: int
-    ) -> Appearance:
+    ) -> tuple[float, float]:
+        """Length (pixels) and direction (degrees) of the motion during the shutter."""
         before = track.at(time_ns - self._shutter_ns // 2) or pose
         after = track.at(time_ns + self._shutter_ns // 2) or pose
         flow = centre_flow(before, after, self.camera, _typical_depth(depth))
-        length, angle = float(np.hypot(*flow)), float(np.degrees(np.arctan2(flow[1], flow[0])))
-        return replace(self._appearance, motion_blur_px=length, motion_blur_deg=angle)
+        return float(np.hypot(*flow)), float(np.degrees(np.arctan2(flow[1], flow[0])))
 
 
 def centre_flow(before: Pose, after: Pose, camera: Camera, depth_m: float) -> Array:
