@@ -57,6 +57,7 @@ class Kind(Enum):
     SILO = "silo"
     TENT = "tent"
     DECK = "deck"
+    CONTAINER = "container"
 
 
 @dataclass(frozen=True)
@@ -573,6 +574,20 @@ def _deck(shell: _Shell, rng: np.random.Generator) -> None:
               (190, 188, 184), (130, 128, 126), ALL_LEVELS)  # fmt: skip
 
 
+def _container(shell: _Shell, rng: np.random.Generator) -> None:
+    b = shell.building
+    colour = _pick(rng, ((150, 70, 56), (64, 92, 130), (90, 120, 96), (196, 196, 192),
+                         (190, 130, 60), (110, 112, 116)), 12.0)  # fmt: skip
+    x, y = (-b.length / 2, b.length / 2), (-b.width / 2, b.width / 2)
+    foot = b.foot_z - b.base_z
+    for ax, ay, bx, by in ((x[0], y[0], x[1], y[0]), (x[1], y[0], x[1], y[1]),
+                           (x[1], y[1], x[0], y[1]), (x[0], y[1], x[0], y[0])):  # fmt: skip
+        shell.add([(ax, ay, foot), (bx, by, foot), (bx, by, b.eaves_m), (ax, ay, b.eaves_m)],
+                  Cover.METAL, colour, levels=NEAR_LEVELS)  # fmt: skip
+    shell.add([(x[0], y[0], b.eaves_m), (x[1], y[0], b.eaves_m), (x[1], y[1], b.eaves_m),
+               (x[0], y[1], b.eaves_m)], Cover.METAL, colour, levels=ALL_LEVELS)  # fmt: skip
+
+
 _BUILDERS = {
     Kind.GABLE: _gable_house,
     Kind.HIP: _hip_house,
@@ -589,4 +604,5 @@ _BUILDERS = {
     Kind.SILO: _silo,
     Kind.TENT: _tent,
     Kind.DECK: _deck,
+    Kind.CONTAINER: _container,
 }

@@ -465,14 +465,58 @@ def _plan_houses(
             middle = int(s + lot / 2)
             if middle >= len(line) - 8:
                 break
-            _plan_plot(planner, rng, line, middle, lot, street, rows)
+            _plan_plot(planner, rng, line, middle, lot, street, rows, outline.mean(0))
             s += int(lot)
-    _scatter_trees(planner, rng, outline, int(rng.integers(8, 20)), 0.8)
+    _plan_interior(planner, rng, outline)
+    _scatter_trees(planner, rng, outline, int(rng.integers(14, 34)), 0.75)
+
+
+def _plan_interior(planner: _Planner, rng: np.random.Generator, outline: Array) -> None:
+    """The middle of a residential block: allotments, infill houses on a lane, or an orchard."""
+    angle, middle = _axis(outline), outline.mean(0)
+    frame = np.array([[np.cos(angle), np.sin(angle)], [-np.sin(angle), np.cos(angle)]])
+    ground, use = planner.ground, rng.random()
+    if use < 0.45:  # allotments
+        lane = ground.region(Material.GRAVEL, vary=0.1)
+        ground.polygon(LAYER_GARDEN, rectangle(middle, angle, 37, 27), lane)
+        for u in np.arange(-15, 16, 7.5):
+            for v in (-9.6, -3.6, 3.6, 9.6):
+                at = middle + np.array([u, v]) @ frame
+                cover = Material(rng.choice([Material.LAWN, Material.SOIL, Material.CROP,
+                                             Material.BED]))  # fmt: skip
+                plot = ground.region(cover, angle=angle, spacing=rng.uniform(0.7, 1.1), vary=0.12)
+                ground.polygon(LAYER_GARDEN, rectangle(at, angle, 6.7, 5.4), plot)
+                bed = ground.region(Material.BED, vary=0.12)
+                ground.polygon(LAYER_GARDEN, rectangle(at + [0, 1.4], angle, 5.5, 1.6), bed)
+                if rng.random() < 0.6:
+                    planner.place(rng, Kind.SHED, at + rng.uniform(-1, 1, 2), angle, 3.0, 2.5, 2.1,
+                                  0.2)  # fmt: skip
+                elif rng.random() < 0.5:
+                    planner.tree(rng, at, 1.0, 2)
+    elif use < 0.8:  # a second row behind
+        lane = ground.region(Material.ASPHALT if rng.random() < 0.5 else Material.GRAVEL)
+        for _ in range(6):
+            at = middle + rng.uniform(-15, 15, 2) @ frame
+            kind = Kind(rng.choice(["gable", "hip", "flat", "l_gable"]))
+            turn = angle + rng.choice([0.0, np.pi / 2])
+            house = planner.place(rng, kind, at, turn, rng.uniform(9, 13), rng.uniform(8.5, 11),
+                                  rng.uniform(3.0, 6.5), 4.0)  # fmt: skip
+            if house is not None:
+                plot = ground.region(Material.LAWN, angle=turn, vary=0.12)
+                ground.polygon(LAYER_PLOT, rectangle(at, turn, 20, 19), plot)
+                patio = ground.region(Material.PAVING, angle=turn, vary=0.1)
+                ground.polygon(LAYER_GARDEN, house.corners(1.3), patio)
+        ground.stroke(LAYER_GARDEN, _curve(outline[4], middle, middle + (middle - outline[4]) * 0.3),
+                      3.0, lane)  # fmt: skip
+    else:
+        for u in np.arange(-14, 15, 6.0):
+            for v in np.arange(-12, 13, 5.5):
+                planner.tree(rng, middle + np.array([u, v]) @ frame, rng.uniform(0.9, 1.5), 2)
 
 
 def _plan_plot(
     planner: _Planner, rng: np.random.Generator, line: Array, s: int, lot: float, street: Street,
-    row: bool,
+    row: bool, middle: Array,
 ) -> None:  # fmt: skip
     p, tangent, normal = _frame(line, s)
     angle = float(np.arctan2(tangent[1], tangent[0]))
@@ -497,10 +541,11 @@ def _plan_plot(
     if house is None:
         return
     ground = planner.ground
-    depth = front + setback + deep + rng.uniform(8, 15)
+    depth = front + setback + deep + rng.uniform(9, 16)
+    depth = min(depth, max(front + setback + deep + 5.0, 0.72 * float((middle - p) @ normal)))
     near, far = p + normal * front, p + normal * depth
     half = tangent * lot / 2
-    lawn = ground.region(Material.LAWN, angle=angle + rng.choice([0.0, np.pi / 2]), vary=0.10)
+    lawn = ground.region(Material.LAWN, angle=angle + rng.choice([0.0, np.pi / 2]), vary=0.14)
     ground.polygon(LAYER_PLOT, [near - half, near + half, far + half, far - half], lawn)
     side = rng.choice([-1.0, 1.0])
     drive = near + tangent * side * (lot / 2 - 2.2)
@@ -533,8 +578,8 @@ def _plan_garden(
     lot: float, angle: float,
 ) -> None:  # fmt: skip
     ground = planner.ground
-    for _ in range(int(rng.integers(1, 4))):
-        at = far - normal * rng.uniform(1, 5) + tangent * rng.uniform(-0.45, 0.45) * lot
+    for _ in range(int(rng.integers(2, 6))):
+        at = far - normal * rng.uniform(0.5, 9) + tangent * rng.uniform(-0.47, 0.47) * lot
         bed = ground.region(Material.BED, vary=0.1)
         ground.polygon(LAYER_GARDEN, rectangle(at, angle, rng.uniform(2, 6), rng.uniform(0.8, 2)),
                        bed)  # fmt: skip
@@ -551,16 +596,23 @@ def _plan_garden(
         ground.polygon(LAYER_GARDEN, rectangle(at, angle, rng.uniform(4, 7), 3.5), rows)
     elif extra < 0.4:
         planner.place(rng, Kind.SHED, at, angle, 3.0, 2.4, 2.1, 0.3)
-    for _ in range(int(rng.integers(0, 4))):
-        at = far - normal * rng.uniform(0, 9) + tangent * rng.uniform(-0.5, 0.5) * lot
+    for _ in range(int(rng.integers(1, 6))):
+        at = far - normal * rng.uniform(0, 11) + tangent * rng.uniform(-0.5, 0.5) * lot
         planner.tree(rng, at, rng.uniform(0.5, 1.1), 2 if rng.random() < 0.4 else None)
 
 
 def _fence_plot(
     planner: _Planner, rng: np.random.Generator, near: Array, far: Array, half: Array
 ) -> None:
-    for a, b, chance in ((near - half, far - half, 0.45), (far - half, far + half, 0.35)):
-        if rng.random() < chance and planner.taken.free(np.stack([a, b, (a + b) / 2]), 0.5).all():
+    inward = (far - near) / max(float(np.linalg.norm(far - near)), 1e-9)
+    front = near + inward * 0.8
+    gap = half * 0.35
+    for a, b, chance in (
+        (front - half, far - half, 0.55), (far - half, far + half, 0.45),
+        (front - half, front - gap, 0.4), (front + gap * 0.2, front + half * 0.45, 0.3),
+    ):  # fmt: skip
+        points = a + np.linspace(0, 1, 7)[:, None] * (b - a)
+        if rng.random() < chance and planner.taken.free(points, 0.5).all():
             planner.hedges.append(
                 Hedge(a, b, rng.uniform(0.6, 1.1), rng.uniform(1.0, 2.1), int(rng.integers(1 << 30)))
             )
@@ -588,25 +640,35 @@ def _plan_centre(
             p, tangent, normal = _frame(line, int(s + length / 2))
             width = rng.uniform(10.5, 13.5)
             kind = Kind(rng.choice(["gable", "hip", "flat", "office"], p=[0.42, 0.16, 0.27, 0.15]))
-            setback = rng.choice([0.4, 0.4, 2.5])
             floors = int(rng.integers(2, 6))
-            planner.place(
-                rng, kind, p + normal * (street.reach_m + setback + width / 2),
-                float(np.arctan2(tangent[1], tangent[0])), length - 0.4, width,
-                floors * 2.9 + 0.6, 0.1,
-            )  # fmt: skip
+            for setback in (1.2, 2.4, 4.0):
+                if planner.place(
+                    rng, kind, p + normal * (street.reach_m + setback + width / 2),
+                    float(np.arctan2(tangent[1], tangent[0])), length - 0.4, width,
+                    floors * 2.9 + 0.6, 0.1,
+                ):  # fmt: skip
+                    break
             s += int(np.ceil(length + rng.choice([0.0, 0.0, 3.5])))
     middle = outline.mean(0)
     angle = _axis(outline)
-    court = planner.ground.region(Material.LAWN, angle=angle, vary=0.1)
-    planner.ground.polygon(
-        LAYER_PLOT, rectangle(middle, angle, rng.uniform(15, 26), rng.uniform(12, 24)), court
-    )
-    _park_rows(planner, rng, middle + rng.uniform(-4, 4, 2), angle, 16.0, 16.0, 0.7)
-    for _ in range(3):
+    for _ in range(7):  # yards of many owners
+        cover = Material(rng.choice([Material.LAWN, Material.ASPHALT, Material.CONCRETE,
+                                     Material.GRAVEL, Material.BED, Material.PAVING]))  # fmt: skip
+        yard = planner.ground.region(cover, angle=angle, vary=0.14)
         at = middle + rng.uniform(-24, 24, 2)
+        planner.ground.polygon(
+            LAYER_PLOT, rectangle(at, angle, rng.uniform(9, 26), rng.uniform(8, 22)), yard
+        )
+    for _ in range(3):
+        at = middle + rng.uniform(-14, 14, 2)
+        if rng.random() < 0.7:
+            planner.place(rng, Kind.FLAT, at, angle + rng.choice([0.0, np.pi / 2]),
+                          rng.uniform(12, 24), rng.uniform(8, 12), rng.uniform(3.4, 12), 2.5)  # fmt: skip
+    _park_rows(planner, rng, middle + rng.uniform(-6, 6, 2), angle, 16.0, 16.0, 0.7)
+    for _ in range(8):
+        at = middle + rng.uniform(-28, 28, 2)
         planner.place(rng, Kind.SHED, at, angle, rng.uniform(5, 14), rng.uniform(3.5, 7), 3.0, 1.0)
-    _scatter_trees(planner, rng, outline, 10, 0.9)
+    _scatter_trees(planner, rng, outline, 16, 0.9)
 
 
 def _plan_blocks(
@@ -615,6 +677,7 @@ def _plan_blocks(
     angle, middle = _axis(outline), outline.mean(0)
     c, s = np.cos(angle), np.sin(angle)
     along, across = np.array([c, s]), np.array([-s, c])
+    first = len(planner.buildings)
     if rng.random() < 0.35:
         for _ in range(3):
             at = middle + along * rng.uniform(-26, 26) + across * rng.uniform(-24, 24)
@@ -629,8 +692,25 @@ def _plan_blocks(
     for v in (-13.0, 13.0):
         line = [middle + across * v - along * 45, middle + across * v + along * 45]
         planner.ground.stroke(LAYER_PLOT, line, 2.2, path)
+    for b in planner.buildings[first:]:
+        apron = planner.ground.region(Material.BED if rng.random() < 0.5 else Material.PAVING)
+        planner.ground.polygon(LAYER_PLOT, b.corners(1.6), apron)
+        walk = planner.ground.region(Material.PAVING, angle=angle)
+        start = np.array(b.centre)
+        planner.ground.stroke(LAYER_PLOT, [start, start + across * 14.0], 1.8, walk)
     _park_rows(planner, rng, middle + across * 13 + along * 20, angle, 18.0, 17.0, 0.7)
-    _scatter_trees(planner, rng, outline, 26, 1.0)
+    _park_rows(planner, rng, middle - across * 13 - along * 18, angle, 26.0, 17.0, 0.7)
+    play = middle - across * 13 + along * rng.uniform(8, 22)
+    sand = planner.ground.region(Material.GRAVEL, vary=0.1)
+    planner.ground.polygon(LAYER_GARDEN, rectangle(play, angle + 0.3, 8, 6), sand)
+    red = planner.ground.region(Material.TRACK, vary=0.1)
+    planner.ground.polygon(LAYER_GARDEN, rectangle(play + along * 9, angle, 6, 9), red)
+    for _ in range(9):
+        at = middle + along * rng.uniform(-40, 40) + across * rng.uniform(-36, 36)
+        bed = planner.ground.region(Material.BED, vary=0.1)
+        shrub = rectangle(at, rng.uniform(0, 3), rng.uniform(3, 9), rng.uniform(1.5, 4))
+        planner.ground.polygon(LAYER_GARDEN, shrub, bed)
+    _scatter_trees(planner, rng, outline, 40, 1.0)
 
 
 def _plan_industry(
@@ -643,11 +723,20 @@ def _plan_industry(
     planner.ground.polygon(
         LAYER_PLOT, rectangle(middle + rng.uniform(-15, 15, 2), angle, 50, 34), yard
     )
-    for _ in range(14):
-        at = middle + along * rng.uniform(-32, 32) + across * rng.uniform(-32, 32)
+    for _ in range(5):
+        cover = Material(rng.choice([Material.ASPHALT, Material.CONCRETE, Material.GRAVEL,
+                                     Material.MEADOW]))  # fmt: skip
+        patch = planner.ground.region(cover, angle=angle, vary=0.14)
+        at = middle + along * rng.uniform(-34, 34) + across * rng.uniform(-34, 34)
+        shape = rectangle(at, angle, rng.uniform(12, 34), rng.uniform(9, 28))
+        planner.ground.polygon(LAYER_PLOT, shape, patch)
+    for attempt in range(34):
+        at = middle + along * rng.uniform(-36, 36) + across * rng.uniform(-36, 36)
         kind = Kind(rng.choice(["hall", "sawtooth", "office", "silo", "tent"],
                                p=[0.58, 0.1, 0.2, 0.08, 0.04]))  # fmt: skip
-        length, width, eaves = rng.uniform(18, 62), rng.uniform(14, 32), rng.uniform(5.5, 11)
+        shrink = 1.0 - 0.6 * attempt / 34
+        length, width = rng.uniform(30, 62) * shrink, rng.uniform(20, 34) * shrink
+        eaves = rng.uniform(5, 11) * (0.5 + 0.5 * shrink)
         if kind is Kind.OFFICE:
             length, width, eaves = rng.uniform(16, 30), rng.uniform(11, 15), rng.uniform(7, 15)
         elif kind is Kind.SILO:
@@ -655,8 +744,14 @@ def _plan_industry(
             eaves = rng.uniform(8, 16)
         elif kind is Kind.TENT:
             length, width, eaves = rng.uniform(20, 40), rng.uniform(8, 12), 3.0
-        planner.place(rng, kind, at, angle + rng.choice([0, np.pi / 2]), length, width, eaves, 5.0)
-    _park_rows(planner, rng, middle + along * 24, angle, 28.0, 17.0, 0.6)
+        planner.place(rng, kind, at, angle + rng.choice([0, np.pi / 2]), length, width, eaves, 3.5)
+    for side in (24.0, -26.0, 8.0):
+        _park_rows(planner, rng, middle + along * side + across * rng.uniform(-24, 24), angle, 26.0,
+                   17.0, 0.6)  # fmt: skip
+    for _ in range(22):  # containers and trailers
+        at = middle + along * rng.uniform(-38, 38) + across * rng.uniform(-38, 38)
+        for k in range(int(rng.integers(1, 4))):
+            planner.place(rng, Kind.CONTAINER, at + across * 2.8 * k, angle, 12.0, 2.44, 2.6, 0.1)
     for line, street in _frontages(planner, i, j):
         strip = offset_line(line, street.reach_m + 1.5)
         grass = planner.ground.region(Material.MEADOW)
@@ -701,7 +796,9 @@ def _plan_carpark(
     angle, middle = _axis(outline), outline.mean(0)
     across = np.array([-np.sin(angle), np.cos(angle)])
     kind = Kind.HALL if rng.random() < 0.6 else Kind.DECK
-    planner.place(rng, kind, middle + across * 21, angle, 46.0, 22.0, 6.5, 2.0)
+    for length in (46.0, 38.0, 30.0, 22.0):
+        if planner.place(rng, kind, middle + across * 19, angle, length, 19.0, 6.5, 2.0):
+            break
     for length in (56.0, 46.0, 36.0):
         before = len(planner.slots)
         _park_rows(planner, rng, middle - across * 12, angle, length, 34.0, 0.65)
@@ -762,12 +859,29 @@ def _plan_sports(
             draw([(sign * a, -span), (sign * (a - depth), -span), (sign * (a - depth), span),
                   (sign * a, span)])  # fmt: skip
     planner.corners.extend(rectangle(middle, angle, length, width))
+    for sign in (-1, 1):
+        _plan_court(planner, rng, middle + np.array([-s, c]) * sign * (b + 14.0) + np.array([c, s])
+                    * sign * a * 0.4, angle)  # fmt: skip
     side = middle + np.array([-s, c]) * (b + 9)
     planner.place(rng, Kind.FLAT, side, angle, 18.0, 6.5, 3.2, 0.5)
     for line, street in _frontages(planner, i, j):
         for k in range(10, len(line) - 10, 12):
             p, _, normal = _frame(line, k)
             planner.tree(rng, p + normal * (street.reach_m + 2.5), 1.0, 0)
+
+
+def _plan_court(planner: _Planner, rng: np.random.Generator, centre: Array, angle: float) -> None:
+    """A tennis court with its run-off."""
+    if not planner.taken.claim(rectangle(centre, angle, 30.0, 15.0)):
+        return
+    ground = planner.ground
+    cover = Material.TRACK if rng.random() < 0.7 else Material.ASPHALT
+    clay = ground.region(cover, vary=0.1)
+    ground.polygon(LAYER_GARDEN, rectangle(centre, angle, 30.0, 15.0), clay)
+    mark = ground.region(Material.MARKING)
+    for length, width in ((23.8, 11.0), (23.8, 8.2), (12.8, 8.2)):
+        corners = rectangle(centre, angle, length, width)
+        ground.stroke(LAYER_GARDEN + 1, np.vstack([corners, corners[:1]]), 0.13, mark)
 
 
 def _plan_park(
@@ -789,7 +903,15 @@ def _plan_park(
     planner.ground.polygon(LAYER_PATH + 1, ring, inner)
     if pond:
         planner.taken.claim(ring)
-    _scatter_trees(planner, rng, outline, 60, 1.2)
+    for _ in range(8):
+        at = outline.mean(0) + rng.uniform(-34, 34, 2)
+        bed = planner.ground.region(Material.BED, vary=0.12)
+        turn = np.linspace(0, 2 * np.pi, 20)
+        size = rng.uniform(1.5, 5, 2)
+        planner.ground.polygon(
+            LAYER_GARDEN, at + size * np.stack([np.cos(turn), np.sin(turn)], -1), bed
+        )
+    _scatter_trees(planner, rng, outline, 95, 1.2)
 
 
 def _curve(a: Array, b: Array, c: Array) -> Array:
@@ -902,8 +1024,11 @@ def _plan_farm(
 def _plan_riverside(
     planner: _Planner, rng: np.random.Generator, i: int, j: int, outline: Array
 ) -> None:
-    _scatter_trees(planner, rng, outline, 34, 1.2)
-    _scatter_trees(planner, rng, outline, 10, 0.8)
+    _scatter_trees(planner, rng, outline, 40, 1.2)
+    _scatter_trees(planner, rng, outline, 16, 0.8)
+    for _ in range(30):
+        p = outline.mean(0) + rng.uniform(-50, 50, 2)
+        planner.tree(rng, p, rng.uniform(0.7, 1.6), 2)
 
 
 def _park_along_streets(

@@ -120,13 +120,13 @@ def _ground_albedo(material, x, y, angle, spacing, seed, dryness, crop, leaf, rg
     r = g = b = 128.0
     if material == 0 or material == 1 or material == 11:  # meadow, lawn, sports turf
         if material == 0:
-            r, g, b = 104.0, 116.0, 62.0
+            r, g, b = 104.0, 112.0, 68.0
             rough = 1.0
         elif material == 1:
-            r, g, b = 96.0, 120.0, 64.0
+            r, g, b = 96.0, 112.0, 68.0
             rough = 0.75
         else:
-            r, g, b = 84.0, 122.0, 60.0
+            r, g, b = 86.0, 114.0, 66.0
             rough = 0.45
         tuft = _noise(x * 0.42 + 3 * n3, y * 0.42, 16)
         dry = min(max(dryness + 1.1 * n4 + 0.9 * n3 * rough + 0.5 * tuft - 0.1, 0.0), 1.0)
@@ -147,10 +147,10 @@ def _ground_albedo(material, x, y, angle, spacing, seed, dryness, crop, leaf, rg
         r, g, b = 108.0, 107.0, 108.0
         patch = _hash(int(np.floor(along / 7.3 + n3)), int(np.floor(across / 3.1)), int(seed))
         value = 1 + 0.22 * n1 + 0.18 * n2 + 0.24 * n3 + 0.16 * n4 + 0.30 * grain
-        if patch > 0.86:
-            value *= 0.80
-        elif patch < 0.07:
-            value *= 1.15
+        if patch > 0.92:
+            value *= 0.86
+        elif patch < 0.05:
+            value *= 1.10
         crack = abs(_noise(x * 0.35 + 0.6 * n2, y * 0.35 + 0.5 * n1, 17))
         if crack < 0.012:
             value *= 0.68
@@ -218,7 +218,7 @@ def _ground_albedo(material, x, y, angle, spacing, seed, dryness, crop, leaf, rg
         r, g, b = 164.0, 88.0, 70.0
         value = 1 + 0.14 * n1 + 0.12 * n3 + 0.14 * grain
     elif material == 13:
-        r, g, b = 166.0, 150.0, 132.0
+        r, g, b = 158.0, 150.0, 140.0
         k = np.floor(across / 0.45)
         i = np.floor(along / 0.7 + 0.5 * (k - 2 * np.floor(k / 2)))
         value = 1 + 0.30 * (_hash(int(i), int(k), 41) - 0.5) + 0.12 * n1 + 0.22 * n3 + 0.1 * grain
@@ -574,10 +574,10 @@ def paint_crown(base, conifer, seed, shade, sun, sun_rgb, sky_rgb, out):
             if clump + 0.5 * fine < -0.38:
                 gap = 0.5
             value = (1 + 0.55 * clump + 0.5 * fine) * gap
-            sky = 0.35 + 0.65 * max(0.0, nz)
+            sky = 0.55 + 0.45 * max(0.0, nz)
             hue = _noise(dx * 2.1, dy * 2.1, seed + 6)
             for c in range(3):
-                light = sky_rgb[c] * sky + sun_rgb[c] * cosine * (1 - shade)
+                light = sky_rgb[c] * sky + sun_rgb[c] * (cosine * (1 - shade) + 0.08)
                 tone = base[c] * (1 + (0.2 * hue if c == 0 else (0.05 * hue if c == 1 else 0)))
                 out[i, j, c] = _byte(tone * value * light)
 
