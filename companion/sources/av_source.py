@@ -264,6 +264,8 @@ class LiveVideoSource:
                 self._report(StreamState.FAILED, str(error))
                 self._slot.close(error)
                 return
+            except av.error.ExitError:  # the open time-out
+                reason = f"nothing came within {_OPEN_TIMEOUT_S:g} s; is the camera sending there?"
             except av.error.FFmpegError as error:
                 reason = f"cannot connect: {error}"
             if self._closing.is_set():
