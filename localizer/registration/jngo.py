@@ -38,6 +38,7 @@ from localizer.registration.reference import Linearization, ReferenceBackend, li
 from localizer.types import Anchors, FeaturePyramid, PosePrior, RegistrationStatus
 
 _PROBES = 12  # anchors whose projections tell hypotheses apart
+_LEAST_SCORE = 1e-3  # unit of the motion term and priors where features fit perfectly
 
 
 class JNGOConfig(BaseModel):
@@ -207,14 +208,14 @@ class JNGO:
             pose.rotation[None], pose.translation[None], origin
         )
         target = Pose(rotation[0], translation[0])
-        weight = self.config.prior_weight * float(best)
+        weight = self.config.prior_weight * max(float(best), _LEAST_SCORE)
         return replace(problem, prior=QuadraticPrior(target, constraint.information, weight))
 
     def _totals(
         self, R: Array, t: Array, scores: Array, origin: Array, motion: PosePrior | None
     ) -> Array:
         """Eq. 10: photometric cost plus the squared Mahalanobis distance to the prediction."""
-        best = scores.min()
+        best = max(scores.min(), _LEAST_SCORE)
         if motion is None or not np.isfinite(best) or self.config.motion_weight == 0:
             return scores
         information = np.linalg.pinv(motion.covariance, hermitian=True)
@@ -253,7 +254,7 @@ class JNGO:
     def _mode_probabilities(self, swarm: _Swarm, anchors: int) -> Array:
         """Posterior weight (M,) of each surviving mode under independent feature noise."""
         effective = anchors * swarm.overlaps[0] / self.config.correlation
-        best = max(swarm.scores[0], 1e-6)
+        best = max(swarm.scores[0], _LEAST_SCORE)
         excess = np.maximum(swarm.scores - swarm.scores[0], 0.0) / best
         likelihood = np.exp(-0.5 * effective * excess)
         probabilities: Array = likelihood / likelihood.sum()

@@ -28,7 +28,7 @@ class Linearization:
 
     residuals: (N, C), jacobians: (N, C, 6), weights: (N,) joint confidence, 0 out of view;
     robust: (N,) Huber's weights; score: mean robust cost; hessian: (6, 6) and gradient: (6,) of
-    half the score under xi = (rho, phi), prior_hessian: (6, 6) the prior's part of it; visible: (N,).
+    half the score under xi = (rho, phi); prior_hessian: (6, 6) the prior's part; visible: (N,).
     """
 
     residuals: Array

@@ -1,0 +1,103 @@
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from localizer.registration import select_anchors
+
+
+@pytest.fixture(scope="module")
+def reference(place, camera, scene):
+    return place.view(scene.reference, camera), place.pyramid(scene.reference, camera)
+
+
+def test_anchors_lie_on_the_ground(reference, place):
+    anchors = select_anchors(*reference)
+    x, y, z = anchors.points_world.T
+    np.testing.assert_allclose(z, place.height(x, y), atol=1e-3)
+
+
+def test_unprojection_and_projection_are_inverse(reference):
+    view, pyramid = reference
+    anchors = select_anchors(view, pyramid)
+    pixels, inside = view.camera.project(view.world_from_camera.inverse.apply(anchors.points_world))
+    assert inside.all()
+    np.testing.assert_allclose(pixels, anchors.pixels, atol=1e-4)
+    assert np.all(anchors.pixels % 1 == 0.5)
+
+
+def test_count_and_shapes(reference):
+    anchors = select_anchors(*reference, count=200)
+    assert anchors.points_world.shape == (200, 3)
+    assert [f.shape for f in anchors.features] == [(200, 16)] * 3
+    assert all(f.dtype == np.float32 and f.flags.c_contiguous for f in anchors.features)
+
+
+def test_spread_over_the_whole_view(reference, camera):
+    """Every cell of a 4 x 4 split gets its share, within a third."""
+    anchors = select_anchors(*reference, count=480)
+    columns = (anchors.pixels[:, 0] * 4 // camera.width).astype(int)
+    rows = (anchors.pixels[:, 1] * 4 // camera.height).astype(int)
+    counts = np.bincount(rows * 4 + columns, minlength=16)
+    assert counts.min() >= 20
+    assert counts.max() <= 40
+
+
+def test_no_anchor_near_holes_and_depth_edges(reference):
+    view, pyramid = reference
+    depth = view.depth.copy()
+    depth[:40] = 0.0
+    depth[70:100, 50:90] -= 15.0  # a flat roof
+    anchors = select_anchors(replace(view, depth=depth), pyramid)
+    u, v = anchors.pixels.T
+    assert v.min() > 42
+    across = (v > 68) & (v < 102)
+    for edge in (50, 90):
+        assert not np.any(across & (np.abs(u - edge) < 2))
+    assert np.any((v > 72) & (v < 98) & (u > 52) & (u < 88))
+
+
+def test_a_steep_plane_is_no_depth_edge(camera, scene, reference):
+    """1/depth of a plane is linear in the pixel, however grazing the view."""
+    view, pyramid = reference
+    v, _ = np.mgrid[0 : camera.height, 0 : camera.width] + 0.5
+    down = np.radians(8.0) + np.arctan((v - camera.cy) / camera.fy)
+    depth = np.where(down > 0.02, 100.0 / np.sin(down) * np.cos(down - np.radians(8.0)), 0.0)
+    anchors = select_anchors(replace(view, depth=depth.astype(np.float32)), pyramid)
+    top = anchors.pixels[:, 1].min()
+    horizon = np.flatnonzero(depth[:, 0] > 0)[0]
+    assert top < horizon + 8
+
+
+def test_confident_and_textured_places_are_preferred(reference):
+    view, pyramid = reference
+    levels = []
+    for level in pyramid.levels:
+        confidence = level.confidence.copy()
+        confidence[:, ::2] *= 0.02
+        levels.append(replace(level, confidence=confidence))
+    fine = levels[-1]
+    anchors = select_anchors(view, replace(pyramid, levels=(*pyramid.levels[:2], fine)))
+    column = (anchors.pixels[:, 0] / fine.stride).astype(int)
+    assert np.mean(column % 2 == 1) > 0.65
+
+
+def test_deterministic_by_seed(reference):
+    a, b, c = (select_anchors(*reference, count=100, seed=s) for s in (4, 4, 5))
+    np.testing.assert_array_equal(a.pixels, b.pixels)
+    assert not np.array_equal(a.pixels, c.pixels)
+
+
+def test_morton_order_keeps_neighbours_together(reference):
+    pixels = select_anchors(*reference).pixels
+    steps = np.linalg.norm(np.diff(pixels, axis=0), axis=1)
+    shuffled = np.random.default_rng(0).permutation(pixels)
+    assert steps.mean() < 0.3 * np.linalg.norm(np.diff(shuffled, axis=0), axis=1).mean()
+
+
+def test_view_of_nothing_gives_no_anchors(reference):
+    view, pyramid = reference
+    anchors = select_anchors(replace(view, depth=np.zeros_like(view.depth)), pyramid)
+    assert anchors.points_world.shape == (0, 3)

@@ -1,0 +1,252 @@
+"""The whole optimizer: convergence, statuses, covariance, priors."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from pydantic import ValidationError
+
+from localizer.pose import Pose, so3_exp, so3_log
+from localizer.registration import (
+    JNGO,
+    JNGOConfig,
+    attitude_constraint,
+    combine,
+    height_constraint,
+    position_constraint,
+    select_anchors,
+)
+from localizer.types import RegistrationStatus
+
+
+@pytest.fixture(scope="module")
+def jngo():
+    return JNGO(threads=2)
+
+
+def errors(registration, true):
+    return np.concatenate(
+        [
+            true.translation - registration.world_from_camera.translation,
+            so3_log(true.rotation @ registration.world_from_camera.rotation.T),
+        ]
+    )
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_converges_from_the_papers_box(jngo, scene_factory, prior, seed):
+    scene = scene_factory(seed, 8.0, 8.0)
+    result = jngo.register(
+        scene.query, scene.camera, scene.anchors, prior(scene.reference, 4.0, 5.0)
+    )
+    assert result.status is RegistrationStatus.OK
+    distance, angle = result.world_from_camera.distance_to(scene.true)
+    assert distance < 0.5  # 118 m above ground, 0.8 m per pixel
+    assert angle < 0.2
+    assert result.quality > 0.7
+    assert result.overlap > 0.4
+
+
+def test_swarm_reaches_what_one_hypothesis_does_not(scene_factory, prior):
+    """The paper's Table 4: rotation-aware sampling is what bridges large rotations."""
+    single = JNGO(JNGOConfig(hypotheses=1, keep=(1, 1)))
+    swarm = JNGO()
+    reached = {"single": 0, "swarm": 0}
+    for seed in range(12):
+        scene = scene_factory(100 + seed, 3.0, 9.0)
+        for name, optimizer in (("single", single), ("swarm", swarm)):
+            result = optimizer.register(
+                scene.query, scene.camera, scene.anchors, prior(scene.reference, 2.0, 5.0)
+            )
+            reached[name] += result.world_from_camera.distance_to(scene.true)[0] < 1.0
+    assert reached["swarm"] == 12
+    assert reached["single"] <= 8
+
+
+def test_backends_agree_on_the_whole_schedule(scene, prior):
+    config = JNGOConfig(hypotheses=16, keep=(6, 3))
+    about = prior(scene.reference, 1.0, 1.5)
+    a = JNGO(config, "reference").register(scene.query, scene.camera, scene.anchors, about)
+    b = JNGO(config, "numba").register(scene.query, scene.camera, scene.anchors, about)
+    distance, angle = a.world_from_camera.distance_to(b.world_from_camera)
+    assert distance < 1e-3
+    assert angle < 1e-3
+    np.testing.assert_allclose(a.covariance, b.covariance, rtol=0.02, atol=1e-9)
+
+
+def test_same_seed_same_bits(jngo, scene, prior):
+    about = prior(scene.reference, 1.0, 3.0)
+    arguments = (scene.query, scene.camera, scene.anchors, about)
+    a, b = jngo.register(*arguments, seed=3), jngo.register(*arguments, seed=3)
+    np.testing.assert_array_equal(a.world_from_camera.matrix, b.world_from_camera.matrix)
+    np.testing.assert_array_equal(a.covariance, b.covariance)
+
+
+def test_covariance_matches_the_errors(scene_factory, prior):
+    """Normalised estimation error squared: 6 if calibrated; most runs within its 95 % bound."""
+    jngo = JNGO()
+    nees = []
+    for seed in range(40):
+        scene = scene_factory(200 + seed, 1.0, 1.0)
+        result = jngo.register(
+            scene.query, scene.camera, scene.anchors, prior(scene.reference, 1.0, 1.0)
+        )
+        d = errors(result, scene.true)
+        nees.append(d @ np.linalg.solve(result.covariance, d))
+    assert 1.0 < np.mean(nees) < 12.0
+    assert np.mean(np.array(nees) < 12.59) > 0.85
+
+
+def failed(result, about, status):
+    assert result.status is status
+    assert result.world_from_camera is about.world_from_camera
+    np.testing.assert_array_equal(result.covariance, about.covariance)
+    assert np.isinf(result.score)
+    assert result.quality == 0.0
+
+
+def test_all_anchors_behind_the_camera(jngo, scene, prior):
+    back = Pose(scene.true.rotation @ np.diag([1.0, -1.0, -1.0]), scene.true.translation)
+    about = prior(back, 1.0, 1.0)
+    result = jngo.register(scene.query, scene.camera, scene.anchors, about)
+    failed(result, about, RegistrationStatus.NO_OVERLAP)
+
+
+def constant(pyramid):
+    flat = np.zeros(16, np.float32)
+    flat[0] = 1.0
+    levels = tuple(
+        replace(level, features=np.ascontiguousarray(np.broadcast_to(flat, level.features.shape)))
+        for level in pyramid.levels
+    )
+    return replace(pyramid, levels=levels)
+
+
+def test_query_without_texture(jngo, scene, prior):
+    about = prior(scene.reference, 1.0, 1.0)
+    result = jngo.register(constant(scene.query), scene.camera, scene.anchors, about)
+    failed(result, about, RegistrationStatus.NO_TEXTURE)
+
+
+@pytest.mark.parametrize("value", [np.nan, np.inf])
+@pytest.mark.parametrize("where", ["query", "confidence", "anchors", "points"])
+def test_features_that_are_not_finite(jngo, scene, prior, value, where):
+    query, anchors = scene.query, scene.anchors
+    if where in ("query", "confidence"):
+        name = "features" if where == "query" else "confidence"
+        broken = getattr(query.levels[1], name).copy()
+        broken[5, 7] = value
+        levels = (query.levels[0], replace(query.levels[1], **{name: broken}), query.levels[2])
+        query = replace(query, levels=levels)
+    elif where == "anchors":
+        broken = anchors.features[2].copy()
+        broken[3] = value
+        anchors = replace(anchors, features=(*anchors.features[:2], broken))
+    else:
+        points = anchors.points_world.copy()
+        points[0, 1] = value
+        anchors = replace(anchors, points_world=points)
+    about = prior(scene.reference, 1.0, 1.0)
+    result = jngo.register(query, scene.camera, anchors, about)
+    failed(result, about, RegistrationStatus.BAD_FEATURES)
+
+
+def test_too_few_anchors(jngo, scene, prior):
+    a = scene.anchors
+    few = replace(
+        a,
+        points_world=a.points_world[:20],
+        pixels=a.pixels[:20],
+        features=tuple(f[:20] for f in a.features),
+        confidence=tuple(c[:20] for c in a.confidence),
+    )
+    about = prior(scene.reference, 1.0, 1.0)
+    result = jngo.register(scene.query, scene.camera, few, about)
+    failed(result, about, RegistrationStatus.TOO_FEW_ANCHORS)
+
+
+def test_quality_tells_another_place_from_this_one(jngo, scene, prior, place, camera):
+    about = prior(scene.reference, 1.0, 2.0)
+    right = jngo.register(scene.query, camera, scene.anchors, about)
+    elsewhere = Pose(scene.true.rotation, scene.true.translation + np.array([900.0, 700.0, 0.0]))
+    wrong = jngo.register(place.pyramid(elsewhere, camera), camera, scene.anchors, about)
+    assert right.quality > wrong.quality + 0.3
+
+
+def repeating(place, period):
+    """The place made flat, with features that repeat every `period` metres both ways."""
+    rng = np.random.default_rng(0)
+    waves = []
+    for _ in range(3):
+        k = 2 * np.pi / period * rng.integers(-1, 2, (2, 16, 6))
+        waves.append(np.stack([*k, rng.uniform(0, 2 * np.pi, (16, 6))], axis=-1))
+    return replace(place, hills=np.zeros((1, 4)), waves=tuple(waves))
+
+
+def test_motion_term_chooses_between_equal_modes(place, camera, prior):
+    """On a repeating ground two poses one period apart score the same; Eq. 10 decides."""
+    period = 24.0
+    ground = repeating(place, period)
+    nadir = Pose(np.diag([1.0, -1.0, -1.0]), np.array([0.0, 0.0, 110.0]))
+    anchors = select_anchors(ground.view(nadir, camera), ground.pyramid(nadir, camera), 300)
+    query = ground.pyramid(nadir, camera, noise=0.1, seed=1)
+    jngo = JNGO(JNGOConfig(translation_sigma_m=10.0, spread_sigmas=0.1))
+    midway = Pose(nadir.rotation, nadir.translation + np.array([0.5 * period, 0.0, 0.0]))
+    for mode_x in (0.0, period):
+        mode = nadir.translation + np.array([mode_x, 0.0, 0.0])
+        motion = prior(Pose(nadir.rotation, mode), 4.0, 3.0)
+        result = jngo.register(query, camera, anchors, prior(midway, 10.0, 1.0), motion=motion)
+        assert np.linalg.norm(result.world_from_camera.translation - mode) < 1.0
+
+
+def test_a_height_constraint_pulls_the_height(jngo, scene, prior):
+    about = prior(scene.reference, 1.0, 1.0)
+    arguments = (scene.query, scene.camera, scene.anchors, about)
+    free = jngo.register(*arguments)
+    wanted = free.world_from_camera.translation[2] + 2.0
+    held = jngo.register(*arguments, constraint=height_constraint(wanted, 0.01))
+    assert held.world_from_camera.translation[2] == pytest.approx(wanted, abs=0.2)
+    assert held.covariance[2, 2] < free.covariance[2, 2]
+    loose = jngo.register(*arguments, constraint=height_constraint(wanted, 1000.0))
+    distance, _ = loose.world_from_camera.distance_to(free.world_from_camera)
+    assert distance < 0.02
+
+
+def test_an_attitude_constraint_pulls_the_attitude(jngo, scene, prior):
+    arguments = (scene.query, scene.camera, scene.anchors, prior(scene.reference, 1.0, 1.0))
+    turned = so3_exp([0.0, 0.0, 0.01]) @ scene.true.rotation
+    held = jngo.register(*arguments, constraint=attitude_constraint(turned, 1e-5, 1e-5))
+    angle = so3_log(held.world_from_camera.rotation @ turned.T)
+    assert np.linalg.norm(angle) < 1e-3
+
+
+def test_combined_constraints_are_their_information_mean():
+    a = position_constraint(np.array([0.0, 0.0, 100.0]), np.diag([4.0, 4.0, 4.0]))
+    b = height_constraint(104.0, 2.0)
+    c = attitude_constraint(so3_exp([0.0, 0.0, 0.3]), 0.01, 0.1)
+    both = combine(a, b, c)
+    np.testing.assert_allclose(both.world_from_camera.translation, [0.0, 0.0, 102.0], atol=1e-9)
+    np.testing.assert_allclose(both.world_from_camera.rotation, c.world_from_camera.rotation)
+    assert both.information[2, 2] == pytest.approx(0.5)
+    only_height = combine(b)
+    np.testing.assert_allclose(only_height.world_from_camera.translation, [0.0, 0.0, 104.0])
+
+
+def test_config_rejects_unknown_keys_and_values():
+    with pytest.raises(ValidationError, match="hypothesis_count"):
+        JNGOConfig(hypothesis_count=3)
+    with pytest.raises(ValidationError, match="min_overlap"):
+        JNGOConfig(min_overlap=1.5)
+
+
+def test_unknown_backend_is_named():
+    with pytest.raises(ValueError, match="cuda-magic"):
+        JNGO(backend="cuda-magic")
+
+
+def test_level_count_mismatch_is_named(jngo, scene, prior):
+    short = replace(scene.query, levels=scene.query.levels[:2])
+    with pytest.raises(ValueError, match="3 feature levels"):
+        jngo.register(short, scene.camera, scene.anchors, prior(scene.reference, 1.0, 1.0))
