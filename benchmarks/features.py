@@ -2,8 +2,8 @@
 
     python benchmarks/features.py --pairs 60 [--model FILE.onnx ...] [--json OUT.json]
 
-Every pair shows a generated place that no training run has seen (seeds from 5,000,000 on), its query
-under its own light, weather and season. The reference is rendered 5 m and 5 deg from the query's
+Every pair shows a generated place that no training run has seen (seeds from 5,000,000 on), its
+query under its own light, weather and season. The reference is rendered 5 m and 5 deg from the query's
 true pose; the direct methods go through the same `JNGO`, SIFT through PnP-RANSAC on the rendered
 depth. Shares come with Wilson's 95 % intervals.
 """
@@ -137,7 +137,9 @@ def benchmark_pairs(count: int, first_seed: int, threads: int) -> list[tuple[Pai
 
     places = -(-count // len(CONDITIONS)) + 2
     with ThreadPoolExecutor(threads) as pool:
-        found = [p for chunk in pool.map(place, range(first_seed, first_seed + places)) for p in chunk]
+        found = [
+            p for chunk in pool.map(place, range(first_seed, first_seed + places)) for p in chunk
+        ]
     return found[:count]
 
 
@@ -157,9 +159,7 @@ def evaluate(
             pose = method(view, query, prior, seed + k)
             seconds = time.perf_counter() - began
             metres, degrees = pose.distance_to(pair.world_from_query)
-            outcomes.append(
-                Outcome(name, pair.condition, pair.outdated, metres, degrees, seconds)
-            )
+            outcomes.append(Outcome(name, pair.condition, pair.outdated, metres, degrees, seconds))
     return outcomes
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import pickle
 from pathlib import Path
 
 import numpy as np
@@ -36,7 +37,7 @@ def load_network(checkpoint: Path) -> tuple[TinyNet, TrainConfig, dict[str, obje
     """The averaged network of a checkpoint in evaluation mode, its configuration, its progress."""
     try:
         state = torch.load(checkpoint, map_location="cpu", weights_only=True)
-    except (OSError, RuntimeError, EOFError) as error:
+    except (OSError, RuntimeError, EOFError, pickle.UnpicklingError) as error:
         raise ModelError(f"{checkpoint}: not a readable checkpoint: {error}") from error
     config = TrainConfig.model_validate(state["config"])
     network = TinyNet(config.model)

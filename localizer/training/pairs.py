@@ -95,7 +95,8 @@ def scene_pairs(seed: int, config: SceneConfig, library: PhotoLibrary | None) ->
         if lived is None or k % config.queries_per_light == 0:
             condition = _condition(rng, config.conditions, k // config.queries_per_light)
             outdated = bool(rng.random() < 0.4)
-            lived = _lived(rng, place, condition, outdated, config.light_variety)
+            fixed = None if config.light_variety else survey.light
+            lived = _lived(rng, place, condition, outdated, fixed)
         pair = _pair(rng, survey, lived, config)
         if pair is None:
             continue
@@ -140,11 +141,15 @@ def _survey(rng: np.random.Generator, place: Place) -> LitScene:
 
 
 def _lived(
-    rng: np.random.Generator, place: Place, condition: str, outdated: bool, variety: bool
+    rng: np.random.Generator,
+    place: Place,
+    condition: str,
+    outdated: bool,
+    light: Light | None,
 ) -> LitScene:
-    """The place on the day of the flight."""
+    """The place on the day of the flight; a given light also keeps the map's season."""
     land, prisms = place.land, list(place.prisms)
-    if variety:
+    if light is None:
         albedo = place.seasons[0] if place.seasons and rng.random() < 0.6 else land.albedo
         if rng.random() < 0.7:
             albedo = season_shift(albedo, rng)
@@ -159,9 +164,8 @@ def _lived(
     if condition == "night" and rng.random() < 0.4:
         direct = 0.5  # moonlight
     elevation = rng.uniform(8, 22) if condition == "dusk" else rng.uniform(22, 75)
-    if not variety:
-        direct, elevation = 0.7, 50.0
-    return light_scene(compose(land, prisms), _sun(rng, elevation, direct), _sky(rng, condition))
+    sun = _sun(rng, elevation, direct)
+    return light_scene(compose(land, prisms), light or sun, _sky(rng, condition))
 
 
 def _car_count(rng: np.random.Generator, place: Place) -> int:

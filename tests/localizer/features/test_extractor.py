@@ -1,0 +1,143 @@
+import hashlib
+import json
+import logging
+import subprocess
+import sys
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from localizer.errors import ModelError
+from localizer.features import GradientExtractor, OnnxExtractor, extractor, load_extractor
+from localizer.types import FeaturePyramid
+
+
+@pytest.fixture
+def image() -> np.ndarray:
+    rng = np.random.default_rng(3)
+    small = rng.integers(0, 256, (30, 40, 3), dtype=np.uint8)
+    return cv2.resize(small, (320, 240), interpolation=cv2.INTER_CUBIC)
+
+
+def assert_is_pyramid(pyramid: FeaturePyramid, image: np.ndarray) -> None:
+    assert (pyramid.width, pyramid.height) == (image.shape[1], image.shape[0])
+    strides = [level.stride for level in pyramid.levels]
+    assert strides == sorted(strides, reverse=True)
+    for level in pyramid.levels:
+        shape = (image.shape[0] // level.stride, image.shape[1] // level.stride)
+        assert level.features.shape[:2] == shape
+        assert level.confidence.shape == shape
+        assert level.features.dtype == level.confidence.dtype == np.float32
+        assert level.features.flags.c_contiguous
+        np.testing.assert_allclose(np.linalg.norm(level.features, axis=-1), 1.0, atol=1e-4)
+        assert level.confidence.min() >= 0.0
+        assert level.confidence.max() <= 1.0
+
+
+def test_gradient_gives_a_pyramid(image: np.ndarray) -> None:
+    assert_is_pyramid(GradientExtractor().extract(image), image)
+
+
+def test_gradient_ignores_exposure_and_contrast_sign(image: np.ndarray) -> None:
+    extract = GradientExtractor().extract
+    plain, darker, inverted = extract(image), extract(image // 2), extract(255 - image)
+    for a, b, c in zip(plain.levels, darker.levels, inverted.levels, strict=True):
+        assert float((a.features * b.features).sum(-1).mean()) > 0.97
+        assert float((a.features * c.features).sum(-1).mean()) > 0.97
+
+
+def test_gradient_tells_orientations_apart() -> None:
+    stripes = np.zeros((240, 320, 3), np.uint8)
+    stripes[:, ::16] = 255
+    vertical = GradientExtractor().extract(cv2.blur(stripes, (8, 1))).levels[2].features
+    turned = np.ascontiguousarray(stripes[:240, :240].transpose(1, 0, 2))
+    horizontal = GradientExtractor().extract(cv2.blur(turned, (1, 8))).levels[2].features
+    assert vertical[60, 60, :-1].argmax() != horizontal[60, 60, :-1].argmax()
+
+
+@pytest.mark.parametrize(
+    "bad",
+    [
+        np.zeros((240, 321, 3), np.uint8),
+        np.zeros((240, 320), np.uint8),
+        np.zeros((240, 320, 3), np.float32),
+    ],
+)
+def test_bad_images_are_named(bad: np.ndarray) -> None:
+    with pytest.raises(ModelError, match="image"):
+        GradientExtractor().extract(bad)
+
+
+def test_without_shipped_weights_the_fallback_says_so(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    monkeypatch.setattr(extractor, "SHIPPED_MODEL", tmp_path / "tiny.onnx")
+    with caplog.at_level(logging.WARNING):
+        loaded = load_extractor()
+    assert "fallback" in loaded.name
+    assert "tiny.onnx" in caplog.text
+
+
+def test_shipped_weights_run_at_sizes_divisible_by_eight(image: np.ndarray) -> None:
+    loaded = load_extractor(threads=1)
+    assert isinstance(loaded, OnnxExtractor)
+    assert loaded.name == f"tiny (onnxruntime, {loaded.provider})"
+    assert_is_pyramid(loaded.extract(image), image)
+    odd = np.ascontiguousarray(image[:200, :264])
+    assert_is_pyramid(loaded.extract(odd), odd)
+    with pytest.raises(ModelError, match="divisible by 8"):
+        loaded.extract(np.ascontiguousarray(image[:, :300]))
+
+
+def test_a_model_asked_for_by_path_must_exist(tmp_path: Path) -> None:
+    with pytest.raises(ModelError, match="no such model file"):
+        load_extractor(tmp_path / "other.onnx")
+
+
+def copied_model(folder: Path) -> Path:
+    model = folder / "tiny.onnx"
+    model.write_bytes(extractor.SHIPPED_MODEL.read_bytes())
+    model.with_suffix(".json").write_text(extractor.SHIPPED_MODEL.with_suffix(".json").read_text())
+    return model
+
+
+def test_a_changed_byte_is_found(tmp_path: Path) -> None:
+    model = copied_model(tmp_path)
+    data = bytearray(model.read_bytes())
+    data[len(data) // 2] ^= 1
+    model.write_bytes(data)
+    with pytest.raises(ModelError, match="SHA-256"):
+        load_extractor(model)
+
+
+def test_a_description_that_lies_about_levels_is_found(tmp_path: Path) -> None:
+    model = copied_model(tmp_path)
+    description = json.loads(model.with_suffix(".json").read_text())
+    description["levels"][0]["channels"] += 1
+    model.with_suffix(".json").write_text(json.dumps(description))
+    with pytest.raises(ModelError, match="its description says"):
+        load_extractor(model)
+
+
+def test_a_file_that_is_no_graph_is_found(tmp_path: Path) -> None:
+    model = copied_model(tmp_path)
+    model.write_bytes(b"not a graph")
+    description = json.loads(model.with_suffix(".json").read_text())
+    description["sha256"] = hashlib.sha256(b"not a graph").hexdigest()
+    model.with_suffix(".json").write_text(json.dumps(description))
+    with pytest.raises(ModelError, match="cannot load"):
+        load_extractor(model)
+
+
+def test_a_model_without_description_is_found(tmp_path: Path) -> None:
+    model = copied_model(tmp_path)
+    model.with_suffix(".json").unlink()
+    with pytest.raises(ModelError, match="JSON"):
+        load_extractor(model)
+
+
+def test_the_flight_path_does_not_import_torch() -> None:
+    code = "import sys, localizer.features; sys.exit('torch' in sys.modules)"
+    assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0

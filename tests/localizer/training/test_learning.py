@@ -1,0 +1,191 @@
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+torch = pytest.importorskip("torch")
+
+from localizer.errors import ModelError  # noqa: E402
+from localizer.features import OnnxExtractor  # noqa: E402
+from localizer.pose import Pose  # noqa: E402
+from localizer.training.config import TrainConfig, load_config  # noqa: E402
+from localizer.training.curves import plot  # noqa: E402
+from localizer.training.data import LoaderConfig, collate, crop_pair, mirrored  # noqa: E402
+from localizer.training.export import export  # noqa: E402
+from localizer.training.losses import (  # noqa: E402
+    Batch,
+    alignment_loss,
+    contrast_loss,
+    project,
+    sample,
+    se3_exp,
+)
+from localizer.training.model import ModelConfig, TinyNet, fuse  # noqa: E402
+from localizer.training.pairs import SceneConfig, scene_pairs  # noqa: E402
+from localizer.training.shards import write_shard  # noqa: E402
+from localizer.training.train import Trainer, perturbed  # noqa: E402
+
+SHIPPED = Path(__file__).parents[3] / "configs" / "train_tiny.yaml"
+SCENES = SceneConfig(cells=256, width=128, height=96, references=3, queries_per_light=3)
+LOADER = LoaderConfig(batch=2, anchors=64, crop=(96, 64), appearance=True)
+
+
+@pytest.fixture(scope="module")
+def shards(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("shards")
+    for seed in (2000, 2001):
+        write_shard(folder, seed, SCENES, None)
+    return folder
+
+
+@pytest.fixture
+def config(shards: Path, tmp_path: Path) -> TrainConfig:
+    run = load_config(SHIPPED)
+    data = run.data.model_copy(update={"shards": shards, "first_seed": 2000, "scenes": 2,
+                                       "initial_scenes": 2, "scenes_per_step": 0.0})  # fmt: skip
+    optimizer = run.optimizer.model_copy(update={"batch": 2, "anchors": 64, "crop": (96, 64),
+                                                 "steps": 6, "threads": 1})  # fmt: skip
+    model = ModelConfig(channels=8, widths=(8, 8, 16), decoder=(8, 8), dilations=(1, 2))
+    return run.model_copy(update={"output": tmp_path, "data": data, "optimizer": optimizer,
+                                  "model": model, "checkpoint_steps": 3})  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def batch() -> Batch:
+    rng = np.random.default_rng(0)
+    samples = []
+    for pair in scene_pairs(2000, SCENES, None):
+        made = crop_pair(pair, LOADER, rng)
+        if made is not None:
+            samples.append(made)
+    return collate(samples)
+
+
+def test_anchors_project_where_the_query_shows_them(batch: Batch) -> None:
+    pixels, _ = project(batch.query_from_reference, batch.points, batch.K_query)
+    error = (pixels - batch.query_pixels).norm(dim=-1)[batch.visible > 0]
+    assert float(error.max()) < 0.02
+    assert float(batch.visible.mean()) > 0.25
+
+
+def test_the_mirror_keeps_projection_true() -> None:
+    rng = np.random.default_rng(1)
+    pair = next(iter(scene_pairs(2001, SCENES, None)))
+    made = crop_pair(pair, LOADER, rng)
+    assert made is not None
+    flipped = collate([mirrored(made)])
+    pixels, _ = project(flipped.query_from_reference, flipped.points, flipped.K_query)
+    seen = flipped.visible > 0
+    assert float((pixels - flipped.query_pixels).norm(dim=-1)[seen].max()) < 0.02
+    assert np.linalg.det(flipped.query_from_reference[0, :3, :3].numpy()) == pytest.approx(1.0)
+
+
+def test_sampling_is_exact_on_a_linear_field() -> None:
+    v, u = torch.meshgrid(torch.arange(8) + 0.5, torch.arange(12) + 0.5, indexing="ij")
+    field = torch.stack([u, v, 2 * u - v])[None]
+    at = torch.tensor([[[3.2, 4.9], [0.5, 0.5], [10.1, 6.3]]])
+    expected = torch.stack([at[..., 0], at[..., 1], 2 * at[..., 0] - at[..., 1]], -1)
+    torch.testing.assert_close(sample(field, at), expected)
+
+
+def test_se3_exp_is_the_libraries() -> None:
+    xi = torch.tensor([[1.0, -2.0, 0.5, 0.1, 0.2, -0.3]])
+    expected = Pose.exp(xi[0].numpy()).matrix
+    np.testing.assert_allclose(se3_exp(xi)[0].numpy(), expected, atol=1e-5)
+
+
+def ideal_features(batch: Batch, stride: int) -> tuple[torch.Tensor, torch.Tensor]:
+    """Anchor features and a query map that agree at the true pose: smooth waves over the image."""
+    h, w = batch.images.shape[2] // stride, batch.images.shape[3] // stride
+    v, u = torch.meshgrid(torch.arange(h) + 0.5, torch.arange(w) + 0.5, indexing="ij")
+    waves = torch.stack([torch.sin(u / 3), torch.cos(u / 3), torch.sin(v / 3), torch.cos(v / 3)])
+    query = (waves / 2**0.5).expand(len(batch.points), -1, -1, -1)
+    return sample(query, batch.query_pixels / stride), query
+
+
+def test_lm_walks_to_the_true_pose_on_ideal_features(batch: Batch) -> None:
+    batch = replace(batch, visible=torch.ones_like(batch.visible))
+    anchors, query = ideal_features(batch, 2)
+    start = perturbed(batch, 3.0, torch.Generator().manual_seed(0))
+    trust = torch.ones(anchors.shape[:2])
+    everywhere = torch.ones(query.shape[0], *query.shape[2:])
+    _, begin = alignment_loss(batch, (anchors, trust), (query, everywhere), 2, start, 1)
+    loss, error = alignment_loss(batch, (anchors, trust), (query, everywhere), 2, start, 6)
+    assert float(error) < 0.3 * float(begin)
+    assert torch.isfinite(loss)
+
+
+def test_contrast_prefers_features_that_agree(batch: Batch) -> None:
+    anchors, query = ideal_features(batch, 2)
+    scale = torch.tensor(10.0)
+    truth = batch.query_pixels / 2
+    right = contrast_loss(anchors, query, truth, batch.visible, scale, 32)
+    wrong = contrast_loss(anchors.flip(1), query, truth, batch.visible, scale, 32)
+    assert float(right) < float(wrong)
+
+
+def test_fusing_blocks_keeps_the_function() -> None:
+    torch.manual_seed(0)
+    network = TinyNet(ModelConfig())
+    image = torch.rand(2, 3, 64, 96)
+    for _ in range(3):  # give the batch statistics values of their own
+        network.train()(torch.rand(4, 3, 64, 96))
+    network.eval()
+    with torch.no_grad():
+        before = network(image)
+        after = fuse(network)(image)
+    for (f0, c0), (f1, c1) in zip(before, after, strict=True):
+        torch.testing.assert_close(f0, f1, atol=1e-4, rtol=1e-3)
+        torch.testing.assert_close(c0, c1, atol=1e-4, rtol=1e-3)
+        torch.testing.assert_close(f0.norm(dim=1), torch.ones_like(f0[:, 0]), atol=1e-3, rtol=0)
+
+
+def test_a_run_resumes_exactly(config: TrainConfig, tmp_path: Path) -> None:
+    whole = Trainer(config.model_copy(update={"output": tmp_path / "whole"}))
+    whole.run()
+    parts = config.model_copy(update={"output": tmp_path / "parts"})
+    Trainer(parts).run(steps=3)
+    second = Trainer(parts)
+    assert second.step == 3
+    second.run()
+    for a, b in zip(
+        whole.average.state_dict().values(), second.average.state_dict().values(), strict=True
+    ):
+        torch.testing.assert_close(a, b, rtol=0, atol=0)
+    assert plot(tmp_path / "whole" / "tiny.csv").stat().st_size > 1000
+
+
+def test_training_lowers_the_loss(config: TrainConfig) -> None:
+    optimizer = config.optimizer.model_copy(update={"steps": 60, "warmup_steps": 5})
+    trainer = Trainer(config.model_copy(update={"optimizer": optimizer}))
+    trainer.run()
+    rows = (config.output / "tiny.csv").read_text().splitlines()
+    name = rows[0].split(",").index("contrast_0")
+    first, last = float(rows[1].split(",")[name]), float(rows[-1].split(",")[name])
+    assert last < first - 0.2
+
+
+def test_export_is_checked_against_torch(config: TrainConfig, tmp_path: Path) -> None:
+    trainer = Trainer(config)
+    trainer.run(steps=3)
+    model = tmp_path / "model" / "tiny.onnx"
+    assert export(trainer.checkpoint, model) < 2e-4
+    extractor = OnnxExtractor(model, threads=1)
+    assert [level.stride for level in extractor.info.levels] == [8, 4, 2]
+    text = model.with_suffix(".json").read_text()
+    assert str(config.data.shards) not in text
+
+
+def test_unknown_keys_are_named(tmp_path: Path) -> None:
+    path = tmp_path / "run.yaml"
+    path.write_text(SHIPPED.read_text() + "\nlerning_rate: 1\n")
+    with pytest.raises(ModelError, match="lerning_rate"):
+        load_config(path)
+
+
+def test_a_broken_checkpoint_is_named(tmp_path: Path) -> None:
+    path = tmp_path / "tiny.pt"
+    path.write_bytes(b"not a checkpoint")
+    with pytest.raises(ModelError, match=r"tiny\.pt"):
+        export(path, tmp_path / "tiny.onnx")

@@ -1,0 +1,92 @@
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from localizer.errors import SequenceError
+from localizer.pose import Pose
+from localizer.training.land import PhotoLibrary
+from localizer.training.pairs import Pair, SceneConfig, scene_pairs, warp_check
+from localizer.training.shards import read_shard, write_shard, write_shards
+
+SMALL = SceneConfig(cells=256, width=128, height=96, references=3, queries_per_light=3)
+
+
+@pytest.fixture(scope="module")
+def pairs() -> list[Pair]:
+    return [p for seed in (1000, 1001, 1002) for p in scene_pairs(seed, SMALL, None)]
+
+
+def likeness(pair: Pair) -> float:
+    """Correlation of local structure between reference and warped query where both see."""
+    warped, mask = warp_check(pair)
+    a = pair.reference.astype(np.float32).mean(-1)
+    b = warped.mean(-1)
+    return float(np.corrcoef(a[mask], b[mask])[0, 1])
+
+
+def test_depth_and_poses_bring_the_query_into_the_reference() -> None:
+    # Same light and season in both views: what is left is geometry (paper, Fig. 14).
+    plain = replace(SMALL, light_variety=False)
+    for seed in (1003, 1004):
+        for pair in scene_pairs(seed, plain, None):
+            right = likeness(pair)
+            moved = Pose(
+                pair.world_from_query.rotation,
+                pair.world_from_query.translation + 0.04 * float(np.median(pair.query_depth)),
+            )
+            wrong = likeness(replace(pair, world_from_query=moved))
+            assert right > 0.4
+            assert wrong < right - 0.1
+
+
+def test_views_overlap_and_motion_is_the_papers(pairs: list[Pair]) -> None:
+    assert len(pairs) >= 7
+    for pair in pairs:
+        metres, degrees = pair.world_from_reference.distance_to(pair.world_from_query)
+        assert metres <= 15.0
+        assert degrees <= 15.0 + 1e-6
+        assert warp_check(pair)[1].mean() > 0.25
+        # The camera looks 20 to 90 degrees down.
+        assert np.degrees(np.arcsin(-pair.world_from_reference.rotation[2, 2])) > 19.0
+
+
+def test_exact_motion_is_kept() -> None:
+    config = replace(SMALL, motion=(5.0, 5.0))
+    for pair in scene_pairs(1005, config, None):
+        metres, degrees = pair.world_from_reference.distance_to(pair.world_from_query)
+        assert metres == pytest.approx(5.0)
+        assert degrees == pytest.approx(5.0)
+
+
+def test_a_seed_gives_the_same_pairs(pairs: list[Pair]) -> None:
+    again = next(iter(scene_pairs(1000, SMALL, None)))
+    np.testing.assert_array_equal(again.query, pairs[0].query)
+    np.testing.assert_array_equal(again.reference_depth, pairs[0].reference_depth)
+
+
+def test_shards_keep_what_was_generated(pairs: list[Pair], tmp_path: Path) -> None:
+    stored = read_shard(write_shard(tmp_path, 1000, SMALL, None))[0]
+    np.testing.assert_array_equal(stored.reference, pairs[0].reference)
+    np.testing.assert_allclose(stored.reference_depth, pairs[0].reference_depth, rtol=1e-3)
+    assert stored.camera == pairs[0].camera
+    assert stored.world_from_query.distance_to(pairs[0].world_from_query) == (0.0, 0.0)
+
+
+def test_shards_on_disk_are_not_made_again(tmp_path: Path) -> None:
+    made = list(write_shards(tmp_path, range(1000, 1002), SMALL, None, workers=2))
+    assert [p.stem for p in made] == ["00001000", "00001001"]
+    assert list(write_shards(tmp_path, range(1000, 1002), SMALL, None, workers=2)) == []
+
+
+def test_a_broken_shard_is_named(tmp_path: Path) -> None:
+    path = tmp_path / "00001000.npz"
+    path.write_bytes(b"PK")
+    with pytest.raises(SequenceError, match="00001000"):
+        read_shard(path)
+
+
+def test_a_missing_texture_group_is_named(tmp_path: Path) -> None:
+    with pytest.raises(SequenceError, match="moon"):
+        PhotoLibrary(tmp_path, ("moon",))
