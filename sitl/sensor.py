@@ -1,10 +1,8 @@
 """`localizer.synth.appearance` at video rate: the same model, fused into two passes over the image.
 
 The general function costs as much as rendering does; the world camera shares two cores with the
-companion it tests. What few live scenes need (lamps, rain, snow, JPEG) is left to that function.
+companion it tests. What few live scenes need (lamps, rain, snow) is left to that function.
 """
-
-# ruff: noqa: PLR0917 (kernels pass arrays)
 
 from __future__ import annotations
 
@@ -31,9 +29,7 @@ class Sensor:
         self._appearance = appearance
         self._rng = np.random.default_rng(seed)
         a = appearance
-        self._is_simple = not (
-            a.lamps or a.rain_streaks or a.snow_flakes or a.snow_cover or a.jpeg_quality < 100
-        )
+        self._is_simple = not (a.lamps or a.rain_streaks or a.snow_flakes or a.snow_cover)
         x = np.linspace(0.0, _CURVE_MAX, _CURVE_SIZE)
         self._curve = (x**a.gamma).astype(np.float32)
         self._noise = self._rng.standard_normal(_NOISE_SIZE, dtype=np.float32)
@@ -59,7 +55,7 @@ class Sensor:
         start = int(self._rng.integers(_NOISE_SIZE))
         shot, read = _f32(a.shot_noise**2), _f32(a.read_noise**2)
         _expose(image.reshape(-1), self._noise, start, shot, read, out.reshape(-1))
-        return out
+        return out if a.jpeg_quality == 100 else _compressed(out, a.jpeg_quality)
 
 
 def line_kernel(length_px: float, angle_deg: float) -> Float32:
@@ -84,6 +80,11 @@ def _linear_tone(rgb: Image, a: Appearance) -> tuple[Float32, Float32]:
     # Contrast turns about the mean of the image as it is by then; all before it is linear.
     mean = float((matrix @ (np.array(cv2.mean(rgb)[:3]) / 255)).mean())
     return _f32(a.contrast * matrix / 255), _f32(np.full(3, (1 - a.contrast) * mean))
+
+
+def _compressed(image: Image, quality: int) -> Image:
+    _, data = cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, quality])
+    return np.asarray(cv2.imdecode(data, cv2.IMREAD_UNCHANGED))
 
 
 def _f32(value: Any) -> Any:

@@ -24,13 +24,13 @@ def _scene(seed: int = 0) -> tuple[np.ndarray, np.ndarray]:
 def _appearances() -> list[Appearance]:
     rng = np.random.default_rng(7)
     drawn = [sample_appearance(rng, name) for name in ("day", "day", "dusk", "fog")]
-    return [HAZY_AFTERNOON, Appearance(), *(replace(a, jpeg_quality=100) for a in drawn)]
+    return [HAZY_AFTERNOON, Appearance(), *drawn]
 
 
 @pytest.mark.parametrize("index", range(6))
 def test_without_noise_the_fast_path_is_the_general_one(index: int) -> None:
     quiet = replace(
-        _appearances()[index], shot_noise=0.0, read_noise=0.0, motion_blur_px=0.0, lamps=0
+        _appearances()[index], shot_noise=0.0, read_noise=0.0, motion_blur_px=0.0, jpeg_quality=100
     )
     rgb, depth = _scene(index)
     expected = apply_appearance(rgb, depth, quiet, np.random.default_rng(0))
@@ -50,6 +50,14 @@ def test_the_noise_has_the_general_ones_strength_and_differs_between_frames() ->
         assert first.std() == pytest.approx(expected, rel=0.05)
         correlation = np.corrcoef(first.ravel(), second.ravel())[0, 1]
         assert abs(correlation) < 0.05
+
+
+def test_a_sensors_own_compression_is_kept() -> None:
+    rgb, depth = _scene()
+    compressed = Appearance(jpeg_quality=30)
+    expected = apply_appearance(rgb, depth, compressed, np.random.default_rng(0))
+    result = Sensor(compressed).apply(rgb, depth, 0.0, 0.0)
+    np.testing.assert_array_equal(result, expected)
 
 
 @pytest.mark.parametrize("condition", ["rain", "snow"])
