@@ -1,4 +1,4 @@
-"""The command line: ``companion run | eval | map | world | doctor``. Thin; the work is elsewhere."""
+"""The command line: ``companion run | eval | map | world | doctor``."""
 
 from __future__ import annotations
 

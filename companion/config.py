@@ -35,9 +35,7 @@ class CameraModel(_Model):
 
     def camera(self) -> Camera:
         """As the geometry type."""
-        return Camera(
-            self.width, self.height, self.fx, self.fy, self.cx, self.cy, self.distortion
-        )
+        return Camera(self.width, self.height, self.fx, self.fy, self.cx, self.cy, self.distortion)
 
 
 class FeedConfig(_Model):

@@ -112,9 +112,7 @@ def _write_report(
         writer.writerows(rows)
 
 
-def _write_overlays(
-    folder: Path, frames: list[EvaluatedFrame], data: Sequence, width: int
-) -> None:
+def _write_overlays(folder: Path, frames: list[EvaluatedFrame], data: Sequence, width: int) -> None:
     import numpy as np
 
     index = np.unique(np.linspace(0, len(frames) - 1, _OVERLAYS).astype(int))

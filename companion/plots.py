@@ -54,7 +54,10 @@ class MapPicture:
 
 
 def plot_tracks(
-    path: Path, tracks: Mapping[str, Array], background: MapPicture | None, marks: Mapping[str, Array]
+    path: Path,
+    tracks: Mapping[str, Array],
+    background: MapPicture | None,
+    marks: Mapping[str, Array],
 ) -> None:
     """Tracks (N, 2+) in ENU metres and named marks (2+,) over the map."""
     figure = Figure(figsize=(9, 9), layout="constrained")

@@ -145,9 +145,7 @@ class Localizer:
         """Features of the frame (does not need the reference, so it may run beside it)."""
         return self._extractor.extract(self._undistorter(frame))
 
-    def localize(
-        self, frame: Frame, query: FeaturePyramid, anchors: Anchors
-    ) -> PoseEstimate:
+    def localize(self, frame: Frame, query: FeaturePyramid, anchors: Anchors) -> PoseEstimate:
         """Register the frame against the anchors, judge the result and update the filter."""
         tracker = self.tracker
         if tracker.motion is None:

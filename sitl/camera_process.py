@@ -26,6 +26,7 @@ from localizer.map.cache import TileCache
 from localizer.map.stream import TileStreamer
 from localizer.render.numba_raster import NumbaRenderer
 from localizer.synth.appearance import Appearance
+from sitl.detector import Detector, Observed
 from sitl.errors import WorldCameraError
 from sitl.moving import Mover
 from sitl.stream import VideoSender
@@ -45,7 +46,7 @@ class WorldCameraConfig:
 
     cache: tiles of the live world. origin: of the map's ENU frame, in which truth samples and
     movers are given. log: where the true pose of every frame is written. threads: of the
-    rasteriser.
+    rasteriser. targets: what a `Detector` watches and reports to the address `detections`.
     """
 
     cache: Path
@@ -62,6 +63,8 @@ class WorldCameraConfig:
     threads: int = 1
     bit_rate: int = 4_000_000
     misp: bool = True
+    targets: tuple[Observed, ...] = ()
+    detections: str | None = None
 
 
 @dataclass(frozen=True)
@@ -206,6 +209,9 @@ class _Studio:
         self._sender = VideoSender(
             c.url, c.camera.width, c.camera.height, c.rate_hz, bit_rate=c.bit_rate, misp=c.misp
         )
+        self._detector = (
+            Detector(c.detections, c.camera, c.targets, seed=c.seed) if c.detections else None
+        )
         self._track = PoseTrack()
         self._paused = self._stopped = False
         self._frames = self._skipped = 0
@@ -216,6 +222,8 @@ class _Studio:
 
     def __exit__(self, *_: object) -> None:
         self._sender.close()
+        if self._detector is not None:
+            self._detector.close()
         self._log.close()
         self._renderer.close()
         self._streamer.close()
@@ -262,6 +270,8 @@ class _Studio:
             return
         start = time.perf_counter()
         self._sender.send(exposure.image, time_ns)
+        if self._detector is not None:
+            self._detector.observe(time_ns, exposure.world_from_camera, exposure.depth)
         self._log.add(self._frames, time_ns, exposure.world_from_camera)
         self._frames += 1
         stages = exposure.stage_ms | {"encode": 1e3 * (time.perf_counter() - start)}

@@ -62,10 +62,11 @@ class PilotError(SimulationError):
 @dataclass(frozen=True)
 class Truth:
     """The vehicle's true state. altitude: AMSL; quaternion: (4,) w, x, y, z, FRD to NED;
-    velocity_ned: (3,) m/s; time_ns: CLOCK_MONOTONIC.
+    velocity_ned: (3,) m/s; time_ns: CLOCK_MONOTONIC; boot_s: simulated seconds since boot.
     """
 
     time_ns: int
+    boot_s: float
     latitude_deg: float
     longitude_deg: float
     altitude_m: float
@@ -110,9 +111,10 @@ class GimbalState:
 
 @dataclass(frozen=True)
 class EkfSample:
-    """LOCAL_POSITION_NED with the EKF origin and flags of its time."""
+    """LOCAL_POSITION_NED with the EKF origin and flags of its time; times as in `Truth`."""
 
     time_ns: int
+    boot_s: float
     position_ned: tuple[float, float, float]
     velocity_ned: tuple[float, float, float]
     origin: Location | None
@@ -368,6 +370,7 @@ class Pilot:
         t = _share(a.time_ns, b.time_ns, time_ns)
         return Truth(
             time_ns,
+            a.boot_s + t * (b.boot_s - a.boot_s),
             a.latitude_deg + t * (b.latitude_deg - a.latitude_deg),
             a.longitude_deg + t * (b.longitude_deg - a.longitude_deg),
             a.altitude_m + t * (b.altitude_m - a.altitude_m),
@@ -384,6 +387,11 @@ class Pilot:
         t = _share(a.time_ns, b.time_ns, time_ns)
         return GimbalState(time_ns, _slerp(a.quaternion, b.quaternion, t), b.flags)
 
+    def newest_common_ns(self) -> int | None:
+        """The latest time at which both truth and gimbal are known."""
+        truth, gimbal = self._truth.newest, self._gimbal.newest
+        return min(truth.time_ns, gimbal.time_ns) if truth and gimbal else None
+
     def truth_track(self) -> list[Truth]:
         """Everything recorded of the true state."""
         return self._truth.all()
@@ -398,14 +406,24 @@ class Pilot:
 
     def ekf_errors(self, since_ns: int = 0, until_ns: int = 1 << 62) -> Array:
         """NED errors (N, 3) in metres of the EKF's positions against the truth of their times."""
+        # Paired by the vehicle's own clock: CLOCK_MONOTONIC stamps move when simulated time stalls.
+        truth = self.truth_track()
+        times = np.array([t.boot_s for t in truth])
         errors = []
         for sample in self.ekf_track():
             where = sample.location
-            if where is None or not since_ns <= sample.time_ns <= until_ns:
+            i = int(np.searchsorted(times, sample.boot_s))
+            if (
+                where is None
+                or not since_ns <= sample.time_ns <= until_ns
+                or not 0 < i < len(times)
+            ):
                 continue
-            truth = self.truth_at(sample.time_ns)
-            if truth is not None:
-                errors.append(truth.location.ned_of(where))
+            a, b = truth[i - 1].location, truth[i].location
+            t = (sample.boot_s - times[i - 1]) / (times[i] - times[i - 1])
+            leg = a.ned_of(b)
+            true = a.offset(t * leg[0], t * leg[1], t * leg[2])
+            errors.append(true.ned_of(where))
         return np.array(errors, dtype=np.float64).reshape(-1, 3)
 
     def subscribe(self, callback: Callable[[Truth], None]) -> None:
@@ -801,6 +819,7 @@ class Pilot:
             return
         truth = Truth(
             self._clock.monotonic_ns(self._attitude_ms),
+            self._attitude_ms / 1000.0,
             message.lat_int / 1e7,
             message.lon_int / 1e7,
             message.alt,
@@ -824,6 +843,7 @@ class Pilot:
         self._ekf.add(
             EkfSample(
                 self._clock.monotonic_ns(message.time_boot_ms),
+                message.time_boot_ms / 1000.0,
                 (message.x, message.y, message.z),
                 (message.vx, message.vy, message.vz),
                 self.origin,

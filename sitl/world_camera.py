@@ -46,9 +46,12 @@ HAZY_AFTERNOON = Appearance(
 
 @dataclass(frozen=True)
 class Exposure:
-    """One picture and its truth. image: (H, W, 3) uint8, distorted, with all of the appearance."""
+    """One picture and its truth. image: (H, W, 3) uint8, distorted, with all of the appearance;
+    depth: (H, W), metres along the optical axis, distorted alike.
+    """
 
     image: Image
+    depth: Float32
     time_ns: int
     world_from_camera: Pose
     stage_ms: dict[str, float]
@@ -100,7 +103,7 @@ class WorldCamera:
             "distort": 1e3 * (bent - rendered),
             "appearance": 1e3 * (done - bent),
         }
-        return Exposure(image, time_ns, pose, stages)
+        return Exposure(image, depth, time_ns, pose, stages)
 
     def _render(self, pose: Pose, time_ns: int) -> RenderedView:
         extra = []

@@ -274,7 +274,8 @@ class Estimator:
         if not self._aligned:
             return EkfFlags.UNINITIALIZED
         flags = EkfFlags.ATTITUDE | EkfFlags.VELOCITY_VERT | EkfFlags.POS_VERT_ABS
-        if not (self._velocity_timeout and self._position_timeout):
+        unaided = self.aiding is Aiding.NONE  # then a constant position is fused, and counts
+        if unaided or not (self._velocity_timeout and self._position_timeout):
             flags |= EkfFlags.VELOCITY_HORIZ
         if self.position_valid:
             flags |= (
@@ -283,7 +284,7 @@ class Estimator:
                 | EkfFlags.PRED_POS_HORIZ_REL
                 | EkfFlags.PRED_POS_HORIZ_ABS
             )
-        if self.aiding is Aiding.NONE:
+        if unaided:
             flags |= EkfFlags.CONST_POS_MODE
         if self.gps_glitching:
             flags |= EkfFlags.GPS_GLITCHING

@@ -17,6 +17,7 @@ _VISION_TIMEOUT_MS = 300
 _GPS_TIMEOUT_MS = 4000
 _GPS_MAX_GAP_MS = 215
 _GPS_MAVLINK = 14
+_GPS_DEFAULT_DELAY_MS = 200
 _LOCAL_FRD, _BODY_FRD = 20, 12
 # GPS_INPUT_IGNORE_FLAGS
 _IGNORE_HDOP, _IGNORE_HORIZONTAL_SPEED, _IGNORE_VERTICAL_SPEED, _IGNORE_SPEED_ACCURACY = (
@@ -41,6 +42,7 @@ class Injection:
         self._gps_times: deque[int] = deque(maxlen=10)
         self._gps_fix_type = 0
         self.gps: GpsData | None = None
+        self.receiver_has_fix = False  # of the simulated GPS1; GPS2 waits until it has lost it
 
     # --- vision ------------------------------------------------------------------------------
 
@@ -130,8 +132,9 @@ class Injection:
         return (times[-1] - times[0]) / (len(times) - 1) <= _GPS_MAX_GAP_MS
 
     def gps_input(self, message: Any, jitter: JitterCorrection, now_ms: int) -> None:
-        """GPS_INPUT for GPS1 (gps_id 0) when GPS1_TYPE is 14."""
-        if self._parameters["GPS1_TYPE"] != _GPS_MAVLINK or message.gps_id != 0:
+        """GPS_INPUT: gps_id 0 where GPS1_TYPE is 14, 1 where GPS2_TYPE is."""
+        receiver = f"GPS{message.gps_id + 1}"
+        if message.gps_id > 1 or self._parameters[f"{receiver}_TYPE"] != _GPS_MAVLINK:
             return
         flags = message.ignore_flags
         self._gps_times.append(now_ms)
@@ -155,7 +158,9 @@ class Injection:
             _NO_HDOP if flags & _IGNORE_HDOP else message.hdop,
             radians(message.yaw / 100.0) if message.yaw else None,
         )
-        delay = int(self._parameters["GPS1_DELAY_MS"]) or 200
+        if message.gps_id == 1 and self.receiver_has_fix:
+            return
+        delay = int(self._parameters[f"{receiver}_DELAY_MS"]) or _GPS_DEFAULT_DELAY_MS
         self._estimator.add(self.gps, stamp - delay)
 
 

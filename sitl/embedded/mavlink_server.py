@@ -8,6 +8,7 @@ where their target was heard, unknown message ids go nowhere.
 from __future__ import annotations
 
 import contextlib
+import math
 import select
 import socket
 from collections.abc import Iterator
@@ -80,8 +81,9 @@ class Link:
             if now_s >= when:
                 ready.append(message_id)
         for message_id in ready:
+            # Phases are locked to boot time, so that messages of one rate share one tick.
             interval = self.intervals[message_id]
-            self.due[message_id] = max(self.due[message_id] + interval, now_s - interval)
+            self.due[message_id] = (math.floor(now_s / interval + 1e-6) + 1) * interval - 1e-6
         return sorted(ready)
 
     def receive(self) -> list[Any]:

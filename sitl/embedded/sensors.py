@@ -24,7 +24,7 @@ _BARO_NOISE, _BARO_WALK = 0.12, 0.015  # m; m/sqrt(s)
 _COMPASS_NOISE, _COMPASS_OFFSET = 0.02, 0.01  # rad of heading
 _GPS_PERIOD_S, _GPS_LATENCY_S = 0.2, 0.1
 _GPS_WANDER_S = 60.0  # correlation time of the slowly moving part
-_GPS_HORIZONTAL, _GPS_VERTICAL, _GPS_WHITE, _GPS_SPEED = 0.25, 0.4, 0.08, 0.05
+_GPS_HORIZONTAL, _GPS_VERTICAL, _GPS_WHITE, _GPS_SPEED = 0.25, 0.25, 0.08, 0.05
 
 
 @dataclass(frozen=True)

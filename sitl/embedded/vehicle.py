@@ -99,6 +99,8 @@ class Vehicle:
 
     def step(self) -> None:
         """One 10 ms tick: inputs, sensors, estimator, control, physics, outputs."""
+        simulated = self.parameters["GPS1_TYPE"] in _GPS_SIMULATED
+        self.injection.receiver_has_fix = simulated and self.gps_has_fix
         for link, message in self.server.poll():
             self.commands.handle(link, message)
         self.tick += 1

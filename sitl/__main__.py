@@ -1,0 +1,81 @@
+"""``python -m sitl demo``: the GNSS-denied demo flight."""
+
+from __future__ import annotations
+
+import logging
+import shutil
+import sys
+from pathlib import Path
+from typing import Annotated
+
+import typer
+from rich.console import Console
+from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
+
+from companion.errors import CompanionError
+from localizer.errors import LocalizerError
+from sitl.assets import prepare
+from sitl.errors import SimulationError
+from sitl.flight import fly
+from sitl.report import make_report, print_report
+from sitl.scenario import Scenario, ScenarioError, VehicleKind, load_scenario
+
+app = typer.Typer(no_args_is_help=True, pretty_exceptions_enable=False)
+
+
+@app.callback()
+def _group() -> None:
+    """Simulated flights."""
+
+
+@app.command()
+def demo(
+    seed: Annotated[int, typer.Option(min=0, help="world, traffic, light and noise")] = 0,
+    fc: Annotated[str, typer.Option(help="auto, ardupilot or embedded")] = "auto",
+    scenario: Annotated[Path | None, typer.Option(help="scenario YAML; none: the default")] = None,
+    out: Annotated[Path, typer.Option(help="folder of the report")] = Path("report"),
+    worlds: Annotated[Path | None, typer.Option(help="folder of generated worlds")] = None,
+) -> None:
+    """Fly a GNSS-denied mission on vision alone and report its accuracy."""
+    kinds: dict[str, VehicleKind] = {
+        "auto": "auto", "ardupilot": "ardupilot", "embedded": "embedded"
+    }  # fmt: skip
+    if fc not in kinds:
+        raise ScenarioError(f"--fc is auto, ardupilot or embedded, not {fc!r}")
+    script = load_scenario(scenario) if scenario else Scenario()
+    console = Console()
+    assets = prepare(seed, worlds, lambda text: console.print(f"[dim]{text}[/]"))
+    _clear(out)
+    columns = (TextColumn("{task.description}"), BarColumn(), TimeElapsedColumn())
+    with Progress(*columns, console=console) as bar:
+        task = bar.add_task("", total=1.0)
+        record = fly(
+            assets, script, kinds[fc], seed, out,
+            lambda phase, share: bar.update(task, description=phase, completed=share),
+        )  # fmt: skip
+    print_report(make_report(record, script, seed), out)
+
+
+def _clear(out: Path) -> None:
+    """Remove an earlier report; anything else in the way is the user's."""
+    if not out.exists():
+        return
+    if any(out.iterdir()) and not (out / "companion.yaml").exists():
+        raise ScenarioError(
+            f"{out}: holds files that are not a flight's report; give another --out"
+        )
+    shutil.rmtree(out)
+
+
+def main() -> None:
+    """Entry point: named errors become one clear line and exit code 2."""
+    logging.basicConfig(level=logging.WARNING)
+    try:
+        app()
+    except (SimulationError, CompanionError, LocalizerError) as error:
+        Console(stderr=True).print(f"[bold red]{type(error).__name__}[/]: {error}", soft_wrap=True)
+        sys.exit(2)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,58 @@
+"""What a flight needs on disk: the world as surveyed and as it is today, and the caches of both."""
+
+from __future__ import annotations
+
+import os
+import shutil
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+from localizer.map.build import build_cache
+from localizer.map.cache import TileCache
+from localizer.synth.config import WorldConfig, look_of
+from localizer.synth.world import WorldInfo, build_visits
+
+# Raised when generated worlds change, so that old ones are not flown by mistake.
+_GENERATION = 1
+
+
+@dataclass(frozen=True)
+class FlightAssets:
+    """A world on disk. map_cache: what the companion gets; live_cache: what its camera sees."""
+
+    world: WorldInfo
+    map_cache: Path
+    live_cache: Path
+
+
+def default_folder() -> Path:
+    """Where worlds are kept: PILOT_CACHE, else the user's cache folder."""
+    base = os.environ.get("PILOT_CACHE")
+    if base:
+        return Path(base)
+    return Path(os.environ.get("XDG_CACHE_HOME", Path.home() / ".cache")) / "pilot-companion"
+
+
+def prepare(
+    seed: int, folder: Path | None = None, say: Callable[[str], None] = lambda _: None
+) -> FlightAssets:
+    """Build what is missing of a world, by the importer that users use; the rest is reused."""
+    home = (folder or default_folder()) / f"world-{_GENERATION}-{seed}"
+    done = home / "complete"
+    survey, live = home / "survey", home / "live"
+    if not done.exists():
+        shutil.rmtree(home, ignore_errors=True)
+        home.mkdir(parents=True)
+        say(f"generating world {seed} (about two minutes, once)")
+        config = WorldConfig(seed, 1600.0)
+        visits = {survey: ("survey", look_of("survey")), live: ("live", look_of("live"))}
+        build_visits(config, visits)
+        for visit in visits:
+            say(f"importing the {visit.name} tileset")
+            build_cache(visit / "tileset.json", home / f"{visit.name}-cache", progress=False)
+        done.touch()
+    caches = (home / "survey-cache", home / "live-cache")
+    for cache in caches:
+        TileCache.open(cache)  # a damaged cache is named before the flight, not in it
+    return FlightAssets(WorldInfo.load(survey), *caches)

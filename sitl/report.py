@@ -1,0 +1,281 @@
+"""A flight's report: numbers, plots, overlays and tables in one folder."""
+
+from __future__ import annotations
+
+import csv
+import json
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+import cv2
+import numpy as np
+from rich.console import Console
+from rich.table import Table
+
+from companion.config import CompanionConfig, load_config
+from companion.plots import (
+    ErrorSeries,
+    MapPicture,
+    overlay_sheet,
+    plot_errors,
+    plot_tracks,
+    save_image,
+)
+from companion.versions import versions
+from localizer.camera import Camera
+from localizer.features.extractor import load_extractor
+from localizer.map.cache import TileCache
+from localizer.map.stream import TileStreamer
+from localizer.metrics import LocalizationMetrics
+from localizer.pipeline import Undistorter
+from localizer.pose import Array, Pose
+from localizer.render.numba_raster import NumbaRenderer
+from localizer.types import Frame
+from sitl.analysis import (
+    Columns,
+    FrameErrors,
+    Spread,
+    ekf_errors,
+    frame_errors,
+    localization_summary,
+    poses,
+    read_csv,
+    stage_latencies,
+    target_errors,
+)
+from sitl.flight import FlightRecord
+from sitl.scenario import Scenario
+
+_OVERLAYS = 4
+_MAP_PICTURE_M = 900.0
+_MAP_PICTURE_PX = 900
+
+
+@dataclass(frozen=True)
+class FlightReport:
+    """The flight's figures over the span without GNSS.
+
+    localizer: the paper's columns over processed frames; completeness_sent: per cent of all frames
+    that the camera sent in the span with an accepted estimate. targets: name to 3-D error.
+    """
+
+    vehicle: str
+    denied_s: float
+    flown_m: float
+    localizer: LocalizationMetrics
+    completeness_sent: float
+    frames_sent: int
+    frames_dropped: int
+    ekf_horizontal_m: Spread
+    ekf_vertical_m: Spread
+    home_error_m: float
+    fixed_targets_m: Spread
+    targets_m: Mapping[str, Spread]
+    target_fixes: Mapping[str, int]
+    stages_ms: Mapping[str, Spread]
+    camera_ms: Mapping[str, tuple[float, float]]
+
+
+def make_report(record: FlightRecord, scenario: Scenario, seed: int) -> FlightReport:
+    """Measure the records and write report.json, frames, plots and overlays into their folder."""
+    folder, span = record.folder, record.denied_ns
+    truth = read_csv(folder / "frames.csv")
+    estimates = read_csv(folder / "companion" / "estimates.csv", text=("state", "status"))
+    targets = read_csv(folder / "companion" / "targets.csv", text=("target_id",))
+    vehicle = read_csv(folder / "vehicle.csv")
+    errors = frame_errors(truth, estimates, span)
+    ekf_times, horizontal, vertical = ekf_errors(vehicle, span)
+    by_target = _target_errors(record, targets)
+    fixed = [e for name, e in by_target.items() if not name.startswith("car")]
+    accepted = np.isfinite(errors.translation_m)
+    report = FlightReport(
+        vehicle=record.vehicle,
+        denied_s=(span[1] - span[0]) * 1e-9,
+        flown_m=_flown(vehicle, span),
+        localizer=localization_summary(errors),
+        completeness_sent=100.0 * float(accepted.mean()) if len(accepted) else 0.0,
+        frames_sent=len(accepted),
+        frames_dropped=int((~errors.processed).sum()),
+        ekf_horizontal_m=Spread.of(horizontal),
+        ekf_vertical_m=Spread.of(vertical),
+        home_error_m=record.home_error_m,
+        fixed_targets_m=Spread.of(np.concatenate([*fixed, np.empty(0)])),
+        targets_m={name: Spread.of(e) for name, e in by_target.items()},
+        target_fixes={name: len(e) for name, e in by_target.items()},
+        stages_ms=stage_latencies(estimates, span),
+        camera_ms=record.camera.stage_ms,
+    )
+    config = load_config(folder / "companion.yaml")
+    _write_json(folder, report, record, scenario, seed, config)
+    _write_frames(folder / "frames_report.csv", errors)
+    _plot(folder, record, truth, estimates, vehicle, errors, (ekf_times, horizontal), config)
+    return report
+
+
+def _target_errors(record: FlightRecord, targets: Columns) -> dict[str, Array]:
+    if not len(targets):
+        return {t.name: np.empty(0) for t in record.targets}
+    times = [int(t) for t in targets["exposure_time_ns"]]
+    truth = {t.name: {ns: t.position_at(ns) for ns in times} for t in record.targets}
+    return target_errors(targets, truth, record.denied_ns)
+
+
+def _flown(vehicle: Columns, span: tuple[int, int]) -> float:
+    inside = (vehicle["time_ns"] >= span[0]) & (vehicle["time_ns"] <= span[1])
+    track = np.column_stack([vehicle[k][inside] for k in ("east_m", "north_m", "up_m")])
+    return float(np.linalg.norm(np.diff(track[::5], axis=0), axis=1).sum())
+
+
+def _write_json(
+    folder: Path,
+    report: FlightReport,
+    record: FlightRecord,
+    scenario: Scenario,
+    seed: int,
+    config: CompanionConfig,
+) -> None:
+    document = {
+        "report": asdict(report),
+        "versions": versions(),
+        "seed": seed,
+        "features": load_extractor(config.localizer.model).name,
+        "scenario": scenario.model_dump(mode="json"),
+        "config": config.model_dump(mode="json"),
+        "texts": list(record.texts),
+    }
+    (folder / "report.json").write_text(json.dumps(document, indent=1, default=float))
+
+
+def _write_frames(path: Path, errors: FrameErrors) -> None:
+    with path.open("w", newline="", encoding="utf-8") as file:
+        writer = csv.writer(file)
+        writer.writerow(
+            ("exposure_time_ns", "processed", "translation_error_m", "rotation_error_deg")
+        )
+        for row in zip(
+            errors.time_ns, errors.processed, errors.translation_m, errors.rotation_deg, strict=True
+        ):
+            writer.writerow((int(row[0]), int(row[1]), f"{row[2]:.4f}", f"{row[3]:.4f}"))
+
+
+def _plot(
+    folder: Path,
+    record: FlightRecord,
+    truth: Columns,
+    estimates: Columns,
+    vehicle: Columns,
+    errors: FrameErrors,
+    ekf: tuple[Array, Array],
+    config: CompanionConfig,
+) -> None:
+    start = record.denied_ns[0]
+    all_errors = frame_errors(truth, estimates, (0, 2**62))
+    series = [
+        ErrorSeries(
+            "localizer", _seconds(all_errors.time_ns, start), all_errors.translation_m, "m"
+        ),
+        ErrorSeries("EKF, horizontal", _seconds(ekf[0], start), ekf[1], "m"),
+        ErrorSeries(
+            "localizer", _seconds(all_errors.time_ns, start), all_errors.rotation_deg, "degrees"
+        ),
+    ]
+    end = (record.denied_ns[1] - start) * 1e-9
+    plot_errors(folder / "errors.png", series, [(0.0, end, "GNSS denied")])
+    cache = TileCache.open(config.map)
+    streamer = TileStreamer(cache)
+    try:
+        renderer = NumbaRenderer(streamer)
+        accepted = np.asarray(estimates["accepted"]) > 0
+        tracks = {
+            "truth": _track(vehicle, ""),
+            "autopilot's EKF": _track(vehicle, "ekf_"),
+            "localizer (camera)": _track(estimates, "")[accepted],
+        }
+        marks = {t.name: t.position_at(start) for t in record.targets}
+        plot_tracks(folder / "tracks.png", tracks, _map_picture(renderer), marks)
+        _overlays(folder, estimates, renderer, config)
+    finally:
+        streamer.close()
+
+
+def _seconds(time_ns: Array, start: int) -> Array:
+    return np.asarray((np.asarray(time_ns) - start) * 1e-9, dtype=np.float64)
+
+
+def _track(columns: Columns, prefix: str) -> Array:
+    return np.column_stack([columns[f"{prefix}{k}_m"] for k in ("east", "north", "up")])
+
+
+def _map_picture(renderer: NumbaRenderer) -> MapPicture:
+    """The map from high above through a long lens: nearly an orthophoto."""
+    height = 6000.0
+    size = _MAP_PICTURE_M
+    fov = float(np.degrees(2 * np.arctan(size / height)))
+    camera = Camera.from_fov(_MAP_PICTURE_PX, _MAP_PICTURE_PX, fov)
+    pose = Pose(np.diag([1.0, -1.0, -1.0]), np.array([0.0, 0.0, height]))
+    view = renderer.render(pose, camera, wait=True)
+    return MapPicture(view.rgb, -size, size, -size, size)
+
+
+def _overlays(
+    folder: Path, estimates: Columns, renderer: NumbaRenderer, config: CompanionConfig
+) -> None:
+    """Recorded video frames against the map rendered at their estimated poses."""
+    stamps = np.asarray(estimates["exposure_time_ns"])
+    accepted = np.asarray(estimates["accepted"]) > 0
+    estimated = poses(estimates)
+    camera = config.camera.model.camera()
+    target = camera.without_distortion()
+    undistort = Undistorter(camera, target)
+    snapshots = sorted((folder / "companion" / "snapshots").glob("*.jpg"))
+    usable = []
+    for path in snapshots:
+        k = int(np.argmin(np.abs(stamps - int(path.stem))))
+        if accepted[k] and abs(int(stamps[k]) - int(path.stem)) < 2_000_000:
+            usable.append((path, k))
+    chosen = np.unique(np.linspace(0, max(len(usable) - 1, 0), _OVERLAYS).astype(int))
+    for number, i in enumerate(chosen if usable else []):
+        path, k = usable[i]
+        image = cv2.cvtColor(cv2.imread(str(path)), cv2.COLOR_BGR2RGB).astype(np.uint8)
+        video = undistort(Frame(image, int(path.stem), camera, 0))
+        view = renderer.render(estimated[k], target, wait=True)
+        caption = f"video | map at the estimated pose | checkerboard   t = {path.stem} ns"
+        save_image(folder / f"overlay-{number}.jpg", overlay_sheet(video, view.rgb, caption))
+
+
+def print_report(report: FlightReport, folder: Path) -> None:
+    """The tables that end a flight."""
+    console = Console()
+    m = report.localizer
+    table = Table(title=f"GNSS denied for {report.denied_s:.0f} s, {report.flown_m:.0f} m flown "
+                        f"({report.vehicle})")  # fmt: skip
+    table.add_column("")
+    for column in ("median", "p95", "max", ""):
+        table.add_column(column, justify="right")
+    table.add_row("localizer position, m", f"{m.median_translation_m:.2f}", "", "",
+                  f"R@1/3/5 {m.recall_1:.1f}/{m.recall_3:.1f}/{m.recall_5:.1f} %")  # fmt: skip
+    table.add_row("localizer rotation, °", f"{m.median_rotation_deg:.3f}", "", "",
+                  f"completeness {m.completeness:.1f} % ({report.completeness_sent:.1f} % of sent)",
+                  )  # fmt: skip
+    _add(table, "EKF horizontal, m", report.ekf_horizontal_m, f"home {report.home_error_m:.1f} m")
+    _add(table, "EKF vertical, m", report.ekf_vertical_m, "")
+    _add(table, "fixed targets, m", report.fixed_targets_m, "3-D")
+    for name, spread in report.targets_m.items():
+        _add(table, f"  {name}, m", spread, f"{report.target_fixes[name]} fixes")
+    console.print(table)
+    stages = Table(title=f"{m.fps:.1f} localized frames/s, {report.frames_dropped} of "
+                         f"{report.frames_sent} frames dropped")  # fmt: skip
+    stages.add_column("stage, ms")
+    stages.add_column("p50", justify="right")
+    stages.add_column("p95", justify="right")
+    for name, spread in report.stages_ms.items():
+        stages.add_row(name, f"{spread.median:.0f}", f"{spread.p95:.0f}")
+    for name, (p50, p95) in report.camera_ms.items():
+        stages.add_row(f"world camera: {name}", f"{p50:.0f}", f"{p95:.0f}")
+    console.print(stages)
+    console.print(f"report: [green]{folder}[/]/report.json, tracks.png, errors.png, overlay-*.jpg")
+
+
+def _add(table: Table, name: str, spread: Spread, note: str) -> None:
+    table.add_row(name, f"{spread.median:.2f}", f"{spread.p95:.2f}", f"{spread.maximum:.2f}", note)

@@ -1,0 +1,92 @@
+"""A flight's script as data: where, what is denied when, the legs, and the camera."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Literal
+
+import yaml
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
+
+from localizer.camera import Camera
+from sitl.errors import SimulationError
+
+VehicleKind = Literal["auto", "ardupilot", "embedded"]
+Injection = Literal["vision_position_estimate", "gps_input"]
+
+
+class ScenarioError(SimulationError):
+    """A scenario file that cannot be read or does not hold."""
+
+
+class _Model(BaseModel):
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+
+class Leg(_Model):
+    """A waypoint: metres east and north of home, height above home, and the gimbal's pitch on the
+    way there (-90 looks straight down).
+    """
+
+    east_m: float
+    north_m: float
+    height_m: float = 120.0
+    gimbal_pitch_deg: float = Field(-75.0, ge=-90, le=0)
+
+
+class CameraSpec(_Model):
+    """The world camera's video."""
+
+    width: int = 640
+    height: int = 480
+    horizontal_fov_deg: float = Field(65.0, gt=20, lt=120)
+    distortion: tuple[float, float, float, float, float] = (-0.09, 0.02, 0.0006, -0.0004, 0.0)
+    rate_hz: float = Field(10.0, gt=0, le=60)
+
+    def camera(self) -> Camera:
+        """The calibrated model."""
+        ideal = Camera.from_fov(self.width, self.height, self.horizontal_fov_deg)
+        return Camera(
+            ideal.width, ideal.height, ideal.fx, ideal.fy, ideal.cx, ideal.cy, self.distortion
+        )
+
+
+_LEGS = (
+    Leg(east_m=0, north_m=220, height_m=120, gimbal_pitch_deg=-75),
+    Leg(east_m=220, north_m=260, height_m=140, gimbal_pitch_deg=-60),
+    Leg(east_m=270, north_m=40, height_m=130, gimbal_pitch_deg=-90),
+    Leg(east_m=110, north_m=-170, height_m=110, gimbal_pitch_deg=-55),
+    Leg(east_m=-140, north_m=-90, height_m=120, gimbal_pitch_deg=-70),
+    Leg(east_m=0, north_m=0, height_m=120, gimbal_pitch_deg=-80),
+)
+
+
+class Scenario(_Model):
+    """One GNSS-denied flight."""
+
+    takeoff_height_m: float = Field(120.0, gt=20)
+    deny_after_s: float = Field(20.0, gt=0, description="after the take-off height is reached")
+    speed_m_s: float = Field(10.0, gt=0, le=25)
+    legs: tuple[Leg, ...] = Field(_LEGS, min_length=1)
+    camera: CameraSpec = CameraSpec()
+    condition: Literal["day", "dusk", "night", "fog", "rain", "snow"] = "day"
+    cars: int = Field(30, ge=1)
+    people: int = Field(40, ge=0)
+    injection: Injection = "vision_position_estimate"
+    injection_delay_ms: float = Field(220.0, ge=0, le=250, description="VISO_DELAY_MS")
+
+
+def load_scenario(path: Path) -> Scenario:
+    """Read a scenario file; unknown keys and bad values are named."""
+    try:
+        data = yaml.safe_load(path.read_text(encoding="utf-8")) or {}
+        return Scenario.model_validate(data)
+    except OSError as error:
+        raise ScenarioError(f"{path}: cannot be read: {error.strerror}") from error
+    except (yaml.YAMLError, UnicodeDecodeError) as error:
+        raise ScenarioError(f"{path}: not valid YAML: {error}") from error
+    except ValidationError as error:
+        problems = "\n".join(
+            f"  {'.'.join(str(p) for p in e['loc'])}: {e['msg']}" for e in error.errors()
+        )
+        raise ScenarioError(f"{path}:\n{problems}") from error
