@@ -9,7 +9,7 @@ from typing import Annotated
 
 import typer
 from rich.console import Console
-from rich.progress import track
+from rich.progress import Progress
 from rich.table import Table
 
 from companion.build import MapStack, build_localizer
@@ -56,15 +56,15 @@ def evaluate_command(
     try:
         data = _limited(load_sequence(sequence, stack.cache.frame, name), limit)
         localizer = build_localizer(stack, data.camera, config)
-        bar = iter(track(range(len(data.images)), description="localizing"))
-        frames, metrics = evaluate(
-            localizer,
-            data,
-            Perturbation(noise_m, noise_deg, seed),
-            mode,
-            progress=lambda _: next(bar, None),
-        )
-        next(bar, None)
+        with Progress() as bar:
+            task = bar.add_task("localizing", total=len(data.images))
+            frames, metrics = evaluate(
+                localizer,
+                data,
+                Perturbation(noise_m, noise_deg, seed),
+                mode,
+                progress=lambda _: bar.advance(task),
+            )
         settings = {
             "sequence": str(sequence), "map": str(map_cache), "prior": prior, "seed": seed,
             "noise_m": noise_m, "noise_deg": noise_deg, "width": localizer.camera.width,

@@ -23,6 +23,14 @@ _WINDOW = 200
 _STALE_S = 2.0
 
 
+_OF_STATE = {
+    TrackingState.INITIALIZING: (HealthLevel.STARTING, "localization initializing"),
+    TrackingState.TRACKING: (HealthLevel.OK, "localization tracking"),
+    TrackingState.DEGRADED: (HealthLevel.DEGRADED, "localization degraded"),
+    TrackingState.LOST: (HealthLevel.FAILED, "localization lost"),
+}
+
+
 class HealthMonitor:
     """Watches the parts and reports transitions. Its thread owns ``health.json``."""
 
@@ -74,21 +82,13 @@ class HealthMonitor:
         feed = self._feed_state()
         if feed is StreamState.STALLED:
             return HealthLevel.DEGRADED, "video feed stalled"
+        error = self._engine.health.last_error
         if not self._estimates:
-            error = self._engine.health.last_error
             return HealthLevel.STARTING, error or "waiting for video and a pose prior"
-        age = time.monotonic() - self._estimates[-1][0]
-        if age > _STALE_S:
-            error = self._engine.health.last_error or "no frame is being localized"
-            return HealthLevel.DEGRADED, error
-        state = self._estimates[-1][1].state
-        if state is TrackingState.LOST:
-            return HealthLevel.FAILED, "localization lost"
-        if state is TrackingState.DEGRADED:
-            return HealthLevel.DEGRADED, "localization degraded"
-        if state is TrackingState.INITIALIZING:
-            return HealthLevel.STARTING, "localization initializing"
-        return HealthLevel.OK, "localization tracking"
+        arrived, estimate = self._estimates[-1]
+        if time.monotonic() - arrived > _STALE_S:
+            return HealthLevel.DEGRADED, error or "no frame is being localized"
+        return _OF_STATE[estimate.state]
 
     def _write(self, level: HealthLevel, text: str) -> None:
         if self._file is None:

@@ -62,12 +62,9 @@ class Camera:
         d = data.get("distortion") or [data.get(k, 0.0) for k in ("k1", "k2", "p1", "p2", "k3")]
         try:
             k = (*(float(x) for x in d), 0.0, 0.0, 0.0, 0.0, 0.0)[:5]
-            return cls(
-                int(data["width"]),
-                int(data["height"]),
-                *(float(data[key]) for key in _KEYS[2:]),
-                distortion=(k[0], k[1], k[2], k[3], k[4]),
-            )
+            fx, fy, cx, cy = (float(data[key]) for key in _KEYS[2:])
+            width, height = int(data["width"]), int(data["height"])
+            return cls(width, height, fx, fy, cx, cy, (k[0], k[1], k[2], k[3], k[4]))
         except (TypeError, ValueError) as error:
             raise CameraError(f"{where}: {error}") from error
 

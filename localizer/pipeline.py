@@ -10,7 +10,7 @@ import threading
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import cv2
 import numpy as np
@@ -47,7 +47,7 @@ class TrackerState:
     """What the two halves share; replaced as a whole, never changed."""
 
     motion: MotionState | None = None
-    integrity: Integrity = Integrity()
+    integrity: Integrity = field(default_factory=Integrity)
 
 
 def working_camera(camera: Camera, width: int) -> Camera:

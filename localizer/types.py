@@ -67,8 +67,8 @@ class FeaturePyramid:
 class Anchors:
     """The N geo-anchors of a reference view (paper, Eq. 1).
 
-    points_world: (N, 3) float64; pixels: (N, 2) float32 in the reference image; per level, coarse to
-    fine, the reference features (N, C) float32 and confidences (N,) float32 at those pixels.
+    points_world: (N, 3) float64; pixels: (N, 2) float32 in the reference image; per level, coarse
+    to fine, the reference features (N, C) float32 and confidences (N,) float32 there.
     """
 
     points_world: Array

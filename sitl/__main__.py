@@ -62,7 +62,7 @@ def _clear(out: Path) -> None:
         return
     if any(out.iterdir()) and not (out / "companion.yaml").exists():
         raise ScenarioError(
-            f"{out}: holds files that are not a flight's report; give another --out"
+            f"{out}: holds other files than a flight's report; give another --out"
         )
     shutil.rmtree(out)
 

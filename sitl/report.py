@@ -171,14 +171,11 @@ def _plot(
 ) -> None:
     start = record.denied_ns[0]
     all_errors = frame_errors(truth, estimates, (0, 2**62))
+    exposed_s = _seconds(all_errors.time_ns, start)
     series = [
-        ErrorSeries(
-            "localizer", _seconds(all_errors.time_ns, start), all_errors.translation_m, "m"
-        ),
+        ErrorSeries("localizer", exposed_s, all_errors.translation_m, "m"),
         ErrorSeries("EKF, horizontal", _seconds(ekf[0], start), ekf[1], "m"),
-        ErrorSeries(
-            "localizer", _seconds(all_errors.time_ns, start), all_errors.rotation_deg, "degrees"
-        ),
+        ErrorSeries("localizer", exposed_s, all_errors.rotation_deg, "degrees"),
     ]
     end = (record.denied_ns[1] - start) * 1e-9
     plot_errors(folder / "errors.png", series, [(0.0, end, "GNSS denied")])

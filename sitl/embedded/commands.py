@@ -351,12 +351,7 @@ class Commands:
     def _timesync(self, link: Link, message: Any) -> None:
         if message.tc1 == 0:
             link.send(
-                mavlink.MAVLink_timesync_message(
-                    self._vehicle.time_ms * 1_000_000,
-                    message.ts1,
-                    message.get_srcSystem(),
-                    message.get_srcComponent(),
-                )
+                mavlink.MAVLink_timesync_message(self._vehicle.time_ms * 1_000_000, message.ts1)
             )
 
     # --- parameters, RC, streams -------------------------------------------------------------

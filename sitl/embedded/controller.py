@@ -26,7 +26,8 @@ Vector = tuple[float, float, float]
 
 _MAX_LEAN = radians(30.0)  # ArduPilot's ANGLE_MAX
 _MAX_YAW_RATE = radians(60.0)
-_JERK = 8.0  # m/s³, horizontal
+_MAX_ACCELERATION = 5.0  # m/s², horizontal; what the greatest lean gives
+_JERK = 15.0  # m/s³, horizontal
 _POSITION_P, _VELOCITY_P, _VELOCITY_I = 1.0, 2.0, 0.5
 _HEIGHT_P, _CLIMB_P, _CLIMB_I = 1.0, 4.0, 1.0
 
@@ -91,6 +92,7 @@ class Carrot:
     speed: float = 0.0  # along the leg, m/s
     position: Vector = field(init=False)
     velocity: Vector = field(init=False, default=(0.0, 0.0, 0.0))
+    acceleration: Vector = field(init=False, default=(0.0, 0.0, 0.0))
     _travelled: float = field(init=False, default=0.0)
 
     def __post_init__(self) -> None:
@@ -106,7 +108,8 @@ class Carrot:
         leg = tuple(e - s for s, e in zip(self.start, self.end, strict=True))
         length = sqrt(sum(c * c for c in leg))
         if length < 1e-3 or self._travelled >= length:
-            self.position, self.velocity = self.end, (0.0, 0.0, 0.0)
+            self.position = self.end
+            self.velocity = self.acceleration = (0.0, 0.0, 0.0)
             return
         direction = tuple(c / length for c in leg)
         cap, acceleration = _along(direction, limits)
@@ -115,19 +118,18 @@ class Carrot:
         wanted = min(cap, sqrt(2.0 * acceleration * (length - self._travelled)) + 0.05)
         wanted *= min(1.0, max(0.0, 2.0 * (1.0 - lag / leash)))
         step = acceleration * dt
-        self.speed += min(max(wanted - self.speed, -2.0 * step), step)
+        change = min(max(wanted - self.speed, -2.0 * step), step)
+        self.speed += change
         self._travelled = min(length, self._travelled + self.speed * dt)
-        if self._travelled >= length:
-            self.speed = 0.0
         n, e, d = direction
         self.position = (
             self.start[0] + n * self._travelled,
             self.start[1] + e * self._travelled,
             self.start[2] + d * self._travelled,
         )
-        if self._travelled >= length:
-            self.position = self.end
         self.velocity = (n * self.speed, e * self.speed, d * self.speed)
+        rate = change / dt
+        self.acceleration = (n * rate, e * rate, d * rate)
 
 
 def _along(direction: tuple[float, ...], limits: Limits) -> tuple[float, float]:
@@ -175,19 +177,23 @@ class PositionController:
         down = feedforward[2] + sqrt_controller(error[2], _HEIGHT_P, limits.vertical_acceleration)
         return north, east, min(max(down, -1.2 * limits.climb), 1.2 * limits.descent)
 
-    def horizontal(self, wanted: Vector, velocity: Vector, dt: float) -> tuple[float, float]:
-        """Horizontal acceleration command (m/s²) for a velocity target; keeps the integrator."""
-        command = []
+    def horizontal(
+        self, wanted: Vector, velocity: Vector, feedforward: Vector, dt: float
+    ) -> tuple[float, float]:
+        """Horizontal acceleration command (m/s²) for a velocity target and its own acceleration."""
+        errors = [wanted[i] - velocity[i] for i in range(2)]
+        raw = [feedforward[i] + _VELOCITY_P * errors[i] + self._integral[i] for i in range(2)]
+        size = hypot(raw[0], raw[1])
+        if size > _MAX_ACCELERATION:  # saturated: hold the integrators
+            raw = [c * _MAX_ACCELERATION / size for c in raw]
+        else:
+            for i in range(2):
+                integral = self._integral[i] + _VELOCITY_I * errors[i] * dt
+                self._integral[i] = min(max(integral, -4.0), 4.0)
+        limit = _JERK * dt
         for i in range(2):
-            error = wanted[i] - velocity[i]
-            integral = self._integral[i] + _VELOCITY_I * error * dt
-            self._integral[i] = min(max(integral, -4.0), 4.0)
-            raw = _VELOCITY_P * error + self._integral[i]
-            limit = _JERK * dt
-            change = min(max(raw - self._acceleration[i], -limit), limit)
-            self._acceleration[i] += change
-            command.append(self._acceleration[i])
-        return command[0], command[1]
+            self._acceleration[i] += min(max(raw[i] - self._acceleration[i], -limit), limit)
+        return self._acceleration[0], self._acceleration[1]
 
     def thrust(
         self, wanted_down: float, velocity_down: float, tilt_cosine: float, dt: float

@@ -375,12 +375,14 @@ class FlightModes:
         if self._yaw_target is not None:
             self._controller.turn(self._yaw_target, TICK_S)
         wanted: Vector
+        feedforward: Vector = (0.0, 0.0, 0.0)
         if self._velocity_target is not None:
             wanted = self._velocity_target
             self._hold_here()
         else:
             carrot = self._carrot or Carrot(position, position)
             carrot.move(position, limits, TICK_S)
+            feedforward = carrot.acceleration
             error = tuple(a - b for a, b in zip(carrot.position, position, strict=True))
             wanted = self._controller.velocity_for(
                 (error[0], error[1], error[2]), carrot.velocity, limits
@@ -394,7 +396,7 @@ class FlightModes:
         if not self.estimator.position_valid and self.mode is Mode.LAND:
             # Without a position LAND keeps the vehicle level, and the wind takes it.
             return np.array([*quaternion(0.0, 0.0, self._controller.yaw_rad), thrust])
-        lean = self._controller.horizontal(wanted, self.estimator.velocity, TICK_S)
+        lean = self._controller.horizontal(wanted, self.estimator.velocity, feedforward, TICK_S)
         return np.array([*self._controller.lean(lean, self._yaw), thrust])
 
     def _landing_speed(self) -> float:
