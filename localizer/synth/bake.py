@@ -1,5 +1,6 @@
 """Painting and writing tiles: a block of 200 m at a time, then the coarse tiles above them."""
 
+# ruff: noqa: PLR0917 (a tile is named by its level, place and corner)
 from __future__ import annotations
 
 import pickle
@@ -40,6 +41,7 @@ _GUTTER_PX, _PAD_PX = 16, 4
 _MAX_CHART_PX = 800
 _CAR_PX_PER_M = 16
 _GRID = {LEAF: 1, MID: 2, TOP: 4, ROOT: 8}  # terrain cells merged per side
+_NAMES = {LEAF: "leaf", MID: "mid", TOP: "top", ROOT: "root"}
 _SIDE_M = {LEAF: LEAF_M, MID: BLOCK_M, TOP: TOP_M}
 
 
@@ -92,7 +94,9 @@ def make_scene(plan: WorldPlan, look: Look) -> Scene:
     axis = (np.arange(n) + 0.5) * DSM_GSD_M - half
     index = ((axis + plan.terrain.half_m) / TERRAIN_SPACING_M).astype(np.float32)
     u, v = np.meshgrid(index, index[::-1])
-    ground = cv2.remap(plan.terrain.heights, u, v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+    heights = plan.terrain.heights
+    ground = cv2.remap(heights, u, v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+    ground = np.asarray(ground, np.float32)
     dsm = ground.copy()
     triangles = [_fan(s.polygon) for b in buildings for s in build(b) if s.levels & MID]
     triangles += [_fan(q) for h in plan.hedges for q in _hedge_quads(plan.terrain, h)]
@@ -207,7 +211,7 @@ class Baker:
             local, np.concatenate([uv, uv_shown]).astype(np.float32),
             np.concatenate([faces, shown.faces + len(points)]), atlas.image,
         )  # fmt: skip
-        uri = f"{ {LEAF: 'leaf', MID: 'mid', TOP: 'top', ROOT: 'root'}[level]}_{place[0]}_{place[1]}.glb"
+        uri = f"{_NAMES[level]}_{place[0]}_{place[1]}.glb"
         (self.folder / uri).write_bytes(data)
         low, high = local.min(0).astype(float), local.max(0).astype(float)
         dropped = self._dropped_m(level, west, north, side)

@@ -1,9 +1,11 @@
 """Buildings: from a footprint and a kind to planar surfaces that can be painted and meshed."""
 
+# ruff: noqa: PLR0917 (a box has three intervals)
 from __future__ import annotations
 
 from dataclasses import dataclass, field
 from enum import Enum
+from itertools import pairwise
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -188,7 +190,7 @@ class _Shell:
         foot = self.building.foot_z - self.building.base_z
         (x0, x1), (y0, y1) = x, y
         ring = [(x0, y0), (x1, y0), (x1, y1), (x0, y1), (x0, y0)]
-        for (ax, ay), (bx, by) in zip(ring, ring[1:], strict=False):
+        for (ax, ay), (bx, by) in pairwise(ring):
             self.wall([(ax, ay, foot), (bx, by, foot), (bx, by, top), (ax, ay, top)], top)
 
     def box(
@@ -198,7 +200,7 @@ class _Shell:
         """A plain box without a floor: chimneys, vents, lift houses."""
         (x0, x1), (y0, y1), (z0, z1) = x, y, z
         ring = [(x0, y0), (x1, y0), (x1, y1), (x0, y1), (x0, y0)]
-        for (ax, ay), (bx, by) in zip(ring, ring[1:], strict=False):
+        for (ax, ay), (bx, by) in pairwise(ring):
             quad = [(ax, ay, z0), (bx, by, z0), (bx, by, z1), (ax, ay, z1)]
             self.add(quad, Cover.PLAIN, side, levels=levels)
         self.add([(x0, y0, z1), (x1, y0, z1), (x1, y1, z1), (x0, y1, z1)], Cover.PLAIN, lid,
@@ -212,12 +214,16 @@ class _Shell:
         foot = self.building.foot_z - self.building.base_z
         (x0, x1), (y0, y1) = x, y
         if along_x:
+
             def put(a: float, b: float, z: float) -> tuple[float, float, float]:
                 return (a, b, z)
+
             a0, a1, b0, b1 = x0, x1, y0, y1
         else:  # the same turned by +90 degrees
+
             def put(a: float, b: float, z: float) -> tuple[float, float, float]:
                 return (-b, a, z)
+
             a0, a1, b0, b1 = y0, y1, -x1, -x0
         mid, rise = (b0 + b1) / 2, (b1 - b0) / 2 * np.tan(pitch)
         ridge, o = eaves + rise, overhang
@@ -513,7 +519,7 @@ def _barn(shell: _Shell, rng: np.random.Generator) -> None:
 
 def _shed(shell: _Shell, rng: np.random.Generator) -> None:
     b = shell.building
-    shell.base = _pick(rng, PLASTER + ((120, 92, 70),))
+    shell.base = _pick(rng, (*PLASTER, (120, 92, 70)))
     shell.params = (2.6, 3.0, 1.0, 0.8, 1.0, float(FacadeStyle.BLANK))
     x, y = (-b.length / 2, b.length / 2), (-b.width / 2, b.width / 2)
     if rng.random() < 0.5:
@@ -547,7 +553,7 @@ def _silo(shell: _Shell, rng: np.random.Generator) -> None:
     angle = np.linspace(0, 2 * np.pi, sides + 1)
     ring = np.stack([radius * np.cos(angle), radius * np.sin(angle)], -1)
     foot = b.foot_z - b.base_z
-    for p, q in zip(ring, ring[1:], strict=False):
+    for p, q in pairwise(ring):
         shell.add([(*p, foot), (*q, foot), (*q, b.eaves_m), (*p, b.eaves_m)], Cover.METAL,
                   shell.base)  # fmt: skip
         shell.add([(*p, b.eaves_m), (*q, b.eaves_m), (0, 0, b.eaves_m + radius * 0.4)], Cover.METAL,

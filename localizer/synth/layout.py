@@ -1,9 +1,11 @@
 """The plan of a world: what stands where. Made once per seed; every visit paints the same plan."""
 
+# ruff: noqa: PLR0917 (every cell is planned from the same state)
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
 from enum import Enum
+from itertools import pairwise
 
 import cv2
 import numpy as np
@@ -223,7 +225,7 @@ def _zones(config: WorldConfig, lattice: Lattice, terrain: Terrain
     small = config.size_m < 1000
     radius = config.town_radius_m
     if radius is None:
-        radius = rng.uniform(0.2, 1.1) * config.size_m if small else 0.45 * config.size_m
+        radius = rng.uniform(0.2, 1.1) * config.size_m if small else 0.38 * config.size_m
     centre = rng.uniform(-0.3, 0.3, 2) * config.size_m if small else rng.uniform(-80, 80, 2)
     industry = rng.uniform(0, 2 * np.pi)
     wave = rng.uniform(0, 2 * np.pi, 4)
@@ -410,7 +412,7 @@ def _frontages(planner: _Planner, i: int, j: int) -> list[tuple[Array, Street]]:
     """The sides of a cell that face a street: line (N, 2) at 1 m with the cell on its left."""
     corners = [(i, j), (i + 1, j), (i + 1, j + 1), (i, j + 1), (i, j)]
     found = []
-    for a, b in zip(corners, corners[1:], strict=False):
+    for a, b in pairwise(corners):
         street = planner.net.side(a, b)
         if street is not None:
             line = street.points if a < b else street.points[::-1]
@@ -472,46 +474,66 @@ def _plan_houses(
 
 
 def _plan_interior(planner: _Planner, rng: np.random.Generator, outline: Array) -> None:
-    """The middle of a residential block: allotments, infill houses on a lane, or an orchard."""
-    angle, middle = _axis(outline), outline.mean(0)
-    frame = np.array([[np.cos(angle), np.sin(angle)], [-np.sin(angle), np.cos(angle)]])
-    ground, use = planner.ground, rng.random()
-    if use < 0.45:  # allotments
-        lane = ground.region(Material.GRAVEL, vary=0.1)
-        ground.polygon(LAYER_GARDEN, rectangle(middle, angle, 37, 27), lane)
-        for u in np.arange(-15, 16, 7.5):
-            for v in (-9.6, -3.6, 3.6, 9.6):
-                at = middle + np.array([u, v]) @ frame
-                cover = Material(rng.choice([Material.LAWN, Material.SOIL, Material.CROP,
-                                             Material.BED]))  # fmt: skip
-                plot = ground.region(cover, angle=angle, spacing=rng.uniform(0.7, 1.1), vary=0.12)
-                ground.polygon(LAYER_GARDEN, rectangle(at, angle, 6.7, 5.4), plot)
-                bed = ground.region(Material.BED, vary=0.12)
-                ground.polygon(LAYER_GARDEN, rectangle(at + [0, 1.4], angle, 5.5, 1.6), bed)
-                if rng.random() < 0.6:
-                    planner.place(rng, Kind.SHED, at + rng.uniform(-1, 1, 2), angle, 3.0, 2.5, 2.1,
-                                  0.2)  # fmt: skip
-                elif rng.random() < 0.5:
-                    planner.tree(rng, at, 1.0, 2)
-    elif use < 0.8:  # a second row behind
-        lane = ground.region(Material.ASPHALT if rng.random() < 0.5 else Material.GRAVEL)
-        for _ in range(6):
-            at = middle + rng.uniform(-15, 15, 2) @ frame
-            kind = Kind(rng.choice(["gable", "hip", "flat", "l_gable"]))
-            turn = angle + rng.choice([0.0, np.pi / 2])
-            house = planner.place(rng, kind, at, turn, rng.uniform(9, 13), rng.uniform(8.5, 11),
-                                  rng.uniform(3.0, 6.5), 4.0)  # fmt: skip
-            if house is not None:
-                plot = ground.region(Material.LAWN, angle=turn, vary=0.12)
-                ground.polygon(LAYER_PLOT, rectangle(at, turn, 20, 19), plot)
-                patio = ground.region(Material.PAVING, angle=turn, vary=0.1)
-                ground.polygon(LAYER_GARDEN, house.corners(1.3), patio)
-        ground.stroke(LAYER_GARDEN, _curve(outline[4], middle, middle + (middle - outline[4]) * 0.3),
-                      3.0, lane)  # fmt: skip
+    """The middle of a residential block: allotments, a second row of houses, or an orchard."""
+    use = rng.random()
+    if use < 0.45:
+        _plan_allotments(planner, rng, outline)
+    elif use < 0.8:
+        _plan_second_row(planner, rng, outline)
     else:
-        for u in np.arange(-14, 15, 6.0):
-            for v in np.arange(-12, 13, 5.5):
-                planner.tree(rng, middle + np.array([u, v]) @ frame, rng.uniform(0.9, 1.5), 2)
+        for local in _grid(np.arange(-14, 15, 6.0), np.arange(-12, 13, 5.5)):
+            planner.tree(rng, outline.mean(0) + local @ _turn(outline), rng.uniform(0.9, 1.5), 2)
+
+
+def _turn(outline: Array) -> Array:
+    """(2, 2): row vectors along and across a cell's axis to ENU."""
+    c, s = np.cos(_axis(outline)), np.sin(_axis(outline))
+    return np.array([[c, s], [-s, c]])
+
+
+def _grid(u: ArrayLike, v: ArrayLike) -> Array:
+    """All pairs (N, 2)."""
+    return np.stack(np.meshgrid(u, v, indexing="ij"), -1).reshape(-1, 2)
+
+
+def _plan_allotments(planner: _Planner, rng: np.random.Generator, outline: Array) -> None:
+    angle, middle, frame = _axis(outline), outline.mean(0), _turn(outline)
+    ground = planner.ground
+    lane = ground.region(Material.GRAVEL, vary=0.1)
+    ground.polygon(LAYER_GARDEN, rectangle(middle, angle, 37, 27), lane)
+    for local in _grid(np.arange(-15, 16, 7.5), (-9.6, -3.6, 3.6, 9.6)):
+        at = middle + local @ frame
+        cover = Material(rng.choice([Material.LAWN, Material.SOIL, Material.CROP, Material.BED]))
+        plot = ground.region(cover, angle=angle, spacing=rng.uniform(0.7, 1.1), vary=0.12)
+        ground.polygon(LAYER_GARDEN, rectangle(at, angle, 6.7, 5.4), plot)
+        bed = ground.region(Material.BED, vary=0.12)
+        side = at + np.array([0.0, 1.7]) @ frame
+        ground.polygon(LAYER_GARDEN, rectangle(side, angle, 5.5, 1.6), bed)
+        if rng.random() < 0.6:
+            corner = at + rng.uniform(-1, 1, 2)
+            planner.place(rng, Kind.SHED, corner, angle, 3.0, 2.5, 2.1, 0.2)
+        elif rng.random() < 0.5:
+            planner.tree(rng, at, 1.0, 2)
+
+
+def _plan_second_row(planner: _Planner, rng: np.random.Generator, outline: Array) -> None:
+    angle, middle, frame = _axis(outline), outline.mean(0), _turn(outline)
+    ground = planner.ground
+    for _ in range(6):
+        at = middle + rng.uniform(-15, 15, 2) @ frame
+        kind = Kind(rng.choice(["gable", "hip", "flat", "l_gable"]))
+        turn = angle + rng.choice([0.0, np.pi / 2])
+        length, width, eaves = rng.uniform(9, 13), rng.uniform(8.5, 11), rng.uniform(3.0, 6.5)
+        house = planner.place(rng, kind, at, turn, length, width, eaves, 4.0)
+        if house is None:
+            continue
+        plot = ground.region(Material.LAWN, angle=turn, vary=0.12)
+        ground.polygon(LAYER_PLOT, rectangle(at, turn, 20, 19), plot)
+        patio = ground.region(Material.PAVING, angle=turn, vary=0.1)
+        ground.polygon(LAYER_GARDEN, house.corners(1.3), patio)
+    lane = ground.region(Material.ASPHALT if rng.random() < 0.5 else Material.GRAVEL)
+    end = middle + (middle - outline[4]) * 0.3
+    ground.stroke(LAYER_GARDEN, _curve(outline[4], middle, end), 3.0, lane)
 
 
 def _plan_plot(
@@ -562,9 +584,7 @@ def _plan_plot(
         planner.slots.append((*spot, heading, 0.8))
     patio = ground.region(Material.PAVING, angle=turn, vary=0.08)
     back = centre + normal * (deep / 2 + 2.0)
-    ground.polygon(
-        LAYER_GARDEN, rectangle(back, angle, rng.uniform(4, 8), 4.0), patio
-    )
+    ground.polygon(LAYER_GARDEN, rectangle(back, angle, rng.uniform(4, 8), 4.0), patio)
     if rng.random() < 0.6:
         spot = near + tangent * side * (lot / 2 - 2.2) + normal * (run + 2.8)
         planner.place(rng, Kind.SHED, spot, angle + np.pi / 2, rng.uniform(5.0, 6.5),
@@ -614,7 +634,7 @@ def _fence_plot(
         points = a + np.linspace(0, 1, 7)[:, None] * (b - a)
         if rng.random() < chance and planner.taken.free(points, 0.5).all():
             planner.hedges.append(
-                Hedge(a, b, rng.uniform(0.6, 1.1), rng.uniform(1.0, 2.1), int(rng.integers(1 << 30)))
+                Hedge(a, b, rng.uniform(0.6, 1.1), rng.uniform(1.0, 2.1), int(rng.integers(10**9)))
             )
 
 
@@ -663,7 +683,8 @@ def _plan_centre(
         at = middle + rng.uniform(-14, 14, 2)
         if rng.random() < 0.7:
             planner.place(rng, Kind.FLAT, at, angle + rng.choice([0.0, np.pi / 2]),
-                          rng.uniform(12, 24), rng.uniform(8, 12), rng.uniform(3.4, 12), 2.5)  # fmt: skip
+                          rng.uniform(12, 24), rng.uniform(8, 12), rng.uniform(3.4, 12),
+                          2.5)  # fmt: skip
     _park_rows(planner, rng, middle + rng.uniform(-6, 6, 2), angle, 16.0, 16.0, 0.7)
     for _ in range(8):
         at = middle + rng.uniform(-28, 28, 2)
@@ -682,7 +703,8 @@ def _plan_blocks(
         for _ in range(3):
             at = middle + along * rng.uniform(-26, 26) + across * rng.uniform(-24, 24)
             planner.place(rng, Kind.TOWER, at, angle + rng.choice([0, np.pi / 2]),
-                          rng.uniform(17, 24), rng.uniform(15, 19), rng.uniform(20, 38), 6.0)  # fmt: skip
+                          rng.uniform(17, 24), rng.uniform(15, 19), rng.uniform(20, 38),
+                          6.0)  # fmt: skip
     else:
         for v in (-26.0, 0.0, 26.0):
             at = middle + across * v + along * rng.uniform(-4, 4)
@@ -838,6 +860,7 @@ def _plan_sports(
         if planner.taken.claim(rectangle(middle, angle, length, width, 3.0)):
             break
     else:
+        _plan_park(planner, rng, i, j, outline)
         return
     if rng.random() < 0.5:
         ground.polygon(LAYER_PLOT, rectangle(middle, angle, length, width, 4.0),
@@ -884,9 +907,7 @@ def _plan_court(planner: _Planner, rng: np.random.Generator, centre: Array, angl
         ground.stroke(LAYER_GARDEN + 1, np.vstack([corners, corners[:1]]), 0.13, mark)
 
 
-def _plan_park(
-    planner: _Planner, rng: np.random.Generator, i: int, j: int, outline: Array
-) -> None:
+def _plan_park(planner: _Planner, rng: np.random.Generator, i: int, j: int, outline: Array) -> None:
     path = planner.ground.region(Material.GRAVEL)
     middle = outline.mean(0) + rng.uniform(-8, 8, 2)
     for k in (0, 8, 16, 24):
@@ -994,9 +1015,7 @@ def _plan_orchard(
                 planner.tree(rng, p, rng.uniform(1.1, 1.5), 2)
 
 
-def _plan_farm(
-    planner: _Planner, rng: np.random.Generator, i: int, j: int, outline: Array
-) -> None:
+def _plan_farm(planner: _Planner, rng: np.random.Generator, i: int, j: int, outline: Array) -> None:
     angle, middle = _axis(outline) + rng.normal(0, 0.2), outline.mean(0)
     yard = planner.ground.region(Material.CONCRETE, angle=angle, vary=0.1)
     planner.ground.polygon(LAYER_PLOT, rectangle(middle, angle, 42, 34), yard)

@@ -1,5 +1,6 @@
 """Shadows and sky light from a digital surface model of everything that stands in the world."""
 
+# ruff: noqa: PLR0917, PLR1730 (kernels pass arrays)
 from __future__ import annotations
 
 import cv2
@@ -16,7 +17,7 @@ SHADOW_REACH_M = 90.0
 
 
 @njit(cache=True, nogil=True, fastmath=True)
-def raise_surface(dsm, triangles, west, north, gsd):
+def raise_surface(dsm, triangles, west, north, gsd):  # type: ignore[no-untyped-def]
     """Raise dsm (H, W) float32 to the height of triangles (T, 3, 3) ENU seen from above."""
     rows, columns = dsm.shape
     for k in range(triangles.shape[0]):
@@ -45,7 +46,7 @@ def raise_surface(dsm, triangles, west, north, gsd):
 
 
 @njit(cache=True, nogil=True, fastmath=True)
-def _shadow_ceiling(dsm, top, left, shape_h, shape_w, step_u, step_v, drop, steps, out):
+def _shadow_ceiling(dsm, top, left, shape_h, shape_w, step_u, step_v, drop, steps, out):  # type: ignore[no-untyped-def]
     """out[i, j] = highest shadow ray over the pixel: max over t of dsm(p + t sun) - t tan."""
     rows, columns = dsm.shape
     highest = dsm.max()

@@ -1,4 +1,4 @@
-"""Meshes whose vertices point into charts (small images), and the packing of charts into atlases."""
+"""Meshes whose vertices point into charts (small images), and packing charts into atlases."""
 
 from __future__ import annotations
 
@@ -71,9 +71,7 @@ class ChartedMesh:
             scale[k] = size[0] / w, size[1] / h
             charts.append(cv2.resize(image, size, interpolation=cv2.INTER_AREA))
         st = self.st * scale[self.chart] if len(self.st) else self.st
-        return ChartedMesh(
-            self.positions, self.chart, st, self.faces, self.levels, tuple(charts)
-        )
+        return ChartedMesh(self.positions, self.chart, st, self.faces, self.levels, tuple(charts))
 
 
 @dataclass(frozen=True)

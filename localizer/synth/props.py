@@ -37,7 +37,9 @@ class PropShape:
 
 def _shape(quads: list[tuple[list[tuple[float, float, float]], str]]) -> PropShape:
     """Quads seen counter-clockwise from outside; 'top' and 'side' choose the projection."""
-    positions, st, faces = [], [], []
+    positions: list[tuple[float, float, float]] = []
+    st: list[tuple[float, float]] = []
+    faces: list[tuple[int, int, int]] = []
     for points, view in quads:
         k = len(positions)
         for x, y, z in points:

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 
@@ -21,7 +23,7 @@ _STOP_M = 9.0  # markings end this far before a junction
 
 @dataclass(frozen=True)
 class Street:
-    """One lattice edge. points: (N, 2) ENU from node `a` to node `b`; rank 0 main, 1 side, 2 lane."""
+    """One lattice edge. points: (N, 2) ENU from node `a` to `b`; rank 0 main, 1 side, 2 lane."""
 
     points: Array
     a: int
@@ -70,7 +72,7 @@ class Lattice:
     def cell(self, i: int, j: int) -> Array:
         """Outline (N, 2) of a cell, counter-clockwise."""
         corners = [(i, j), (i + 1, j), (i + 1, j + 1), (i, j + 1), (i, j)]
-        parts = [self.line(p, q)[:-1] for p, q in zip(corners, corners[1:], strict=False)]
+        parts = [self.line(p, q)[:-1] for p, q in pairwise(corners)]
         return np.concatenate(parts)
 
     def centre(self, i: int, j: int) -> Array:
@@ -171,24 +173,9 @@ def make_streets(config: WorldConfig, terrain: Terrain, urban: dict[tuple[int, i
                     sides = [urban.get((i, j), False), urban.get((i - 1, j), False)]
                 distance, nearest = terrain.river.distance(points)
                 wet = bool((distance < terrain.river.width[nearest] / 2 + 8).any())
-                draw = rng.random()
-                if main:
-                    rank = 0
-                elif wet:
-                    continue
-                elif all(sides):
-                    if draw < 0.10:
-                        continue
-                    rank = 1
-                elif any(sides):
-                    if draw < 0.25:
-                        continue
-                    rank = 1
-                else:
-                    if draw > 0.22:
-                        continue
-                    rank = 2
-                found.append((a, b, Street(points, node(*a), node(*b), rank)))
+                rank = _rank(main, wet, sum(sides), rng.random())
+                if rank is not None:
+                    found.append((a, b, Street(points, node(*a), node(*b), rank)))
 
     found = _largest_component(found, nu * nv)
     uv = np.stack(np.meshgrid(lattice.u, lattice.v, indexing="ij"), -1)
@@ -200,11 +187,21 @@ def make_streets(config: WorldConfig, terrain: Terrain, urban: dict[tuple[int, i
     )
 
 
+def _rank(main: bool, wet: bool, urban_sides: int, draw: float) -> int | None:
+    """Rank of a lattice edge, None for no street; only main roads cross the river."""
+    if main:
+        return 0
+    if wet or draw > (0.22, 0.75, 0.90)[urban_sides]:
+        return None
+    return 1 if urban_sides else 2
+
+
 def _largest_component(
     edges: list[tuple[tuple[int, int], tuple[int, int], Street]], n: int
 ) -> list[tuple[tuple[int, int], tuple[int, int], Street]]:
     rows, columns = [s.a for *_, s in edges], [s.b for *_, s in edges]
-    graph = coo_matrix((np.ones(len(edges)), (rows, columns)), shape=(n, n))
+    ends = (np.array(rows), np.array(columns))
+    graph = coo_matrix((np.ones(len(edges)), ends), shape=(n, n))
     _, label = connected_components(graph, directed=False)
     best = np.bincount(label[rows]).argmax()
     return [e for e in edges if label[e[2].a] == best]
@@ -239,7 +236,7 @@ def resample(points: Array, step_m: float) -> Array:
 def cut_ends(points: Array, start_m: float, end_m: float) -> Array | None:
     """The line without its first and last metres, at 1 m steps; None if nothing remains."""
     fine = resample(points, 1.0)
-    kept = fine[int(round(start_m)) : len(fine) - int(round(end_m))]
+    kept = fine[round(start_m) : len(fine) - round(end_m)]
     return kept if len(kept) >= 3 else None
 
 
@@ -273,7 +270,11 @@ def paint_streets(net: StreetNet, plan: GroundPlan) -> None:
 
 
 def _paint_marks(
-    street: Street, plan: GroundPlan, mark: int, degree: Array, rank_at: Array
+    street: Street,
+    plan: GroundPlan,
+    mark: int,
+    degree: NDArray[np.int64],
+    rank_at: NDArray[np.int64],
 ) -> None:
     width = street.width_m
     junction = [degree[n] >= 3 for n in (street.a, street.b)]

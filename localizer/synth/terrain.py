@@ -66,7 +66,7 @@ class Terrain:
     def gradient(self) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
         """Slope to the east and to the north on the grid, each (n, n)."""
         north, east = np.gradient(self.heights, self.spacing_m)
-        return east.astype(np.float32), north.astype(np.float32)
+        return np.asarray(east, np.float32), np.asarray(north, np.float32)
 
 
 def smoothstep(x: ArrayLike, low: float, high: float) -> Array:

@@ -5,6 +5,8 @@ repeat, tiles join without seams, and two visits differ only in what the `Look` 
 sRGB values used as albedo; light is ``sky * ambient_occlusion + sun * cos(angle) * lit``.
 """
 
+# ruff: noqa: PLR0917, PLR0912, PLR0915, PLR0911, PLW3301, PLR1714, SIM102 (kernels pass arrays and
+# branch over materials)
 from __future__ import annotations
 
 from dataclasses import dataclass
@@ -65,14 +67,14 @@ class Light:
 
 
 @njit(cache=True, nogil=True, inline="always")
-def _hash(ix, iy, seed):
+def _hash(ix, iy, seed):  # type: ignore[no-untyped-def]
     h = (ix * 374761393 + iy * 668265263 + seed * 974634421) & 0xFFFFFFFF
     h = ((h ^ (h >> 13)) * 1274126177) & 0xFFFFFFFF
     return ((h ^ (h >> 16)) & 0xFFFFFF) * (1.0 / 16777216.0)
 
 
 @njit(cache=True, nogil=True, inline="always")
-def _noise(x, y, seed):
+def _noise(x, y, seed):  # type: ignore[no-untyped-def]
     """Value noise in [-0.5, 0.5], one lattice cell per unit."""
     fx, fy = np.floor(x), np.floor(y)
     ix, iy = int(fx), int(fy)
@@ -84,13 +86,13 @@ def _noise(x, y, seed):
 
 
 @njit(cache=True, nogil=True, inline="always")
-def _step(x, low, high):
+def _step(x, low, high):  # type: ignore[no-untyped-def]
     t = min(max((x - low) / (high - low), 0.0), 1.0)
     return t * t * (3 - 2 * t)
 
 
 @njit(cache=True, nogil=True, inline="always")
-def _bilinear(grid, u, v):
+def _bilinear(grid, u, v):  # type: ignore[no-untyped-def]
     """Sample at column u, row v (sample centres at integers), clamped."""
     h, w = grid.shape
     u = min(max(u, 0.0), w - 1.001)
@@ -103,12 +105,12 @@ def _bilinear(grid, u, v):
 
 
 @njit(cache=True, nogil=True, inline="always")
-def _byte(x):
+def _byte(x):  # type: ignore[no-untyped-def]
     return np.uint8(min(max(x, 0.0), 255.0))
 
 
 @njit(cache=True, nogil=True, fastmath=True)
-def _ground_albedo(material, x, y, angle, spacing, seed, dryness, crop, leaf, rgb):
+def _ground_albedo(material, x, y, angle, spacing, seed, dryness, crop, leaf, rgb):  # type: ignore[no-untyped-def]
     """Colour of one ground texel at ENU (x, y) into rgb (3,)."""
     n1 = _noise(x * 3.1, y * 3.1, 11)
     n2 = _noise(x * 0.83, y * 0.83, 12)
@@ -184,7 +186,7 @@ def _ground_albedo(material, x, y, angle, spacing, seed, dryness, crop, leaf, rg
         sr, sg, sb = 136.0 * soil_v, 112.0 * soil_v, 86.0 * soil_v
         green = _step(stage, 0.12, 0.42)
         ripe = _step(stage, 0.72, 0.98)
-        pr, pg, pb = 92.0, 120.0, 52.0
+        pr, pg, pb = 94.0, 114.0, 62.0
         hue = _hash(int(seed), 5, 9)
         pr, pg = pr + 24 * hue, pg + 12 * hue
         pr, pg, pb = pr + ripe * (194 - pr), pg + ripe * (168 - pg), pb + ripe * (104 - pb)
@@ -257,7 +259,7 @@ def _ground_albedo(material, x, y, angle, spacing, seed, dryness, crop, leaf, rg
 
 
 @njit(cache=True, nogil=True, fastmath=True)
-def paint_ground(
+def paint_ground(  # type: ignore[no-untyped-def]
     region, material, tint, shape, west, north, gsd,
     heights, slope_e, slope_n, spacing, half,
     ceiling, ambient, light_west, light_north, light_gsd, sun, sun_rgb, sky_rgb, season, out,
@@ -288,14 +290,14 @@ def paint_ground(
 
 
 @njit(cache=True, nogil=True, fastmath=True)
-def _glass(s, z, pane, rgb):
+def _glass(s, z, pane, rgb):  # type: ignore[no-untyped-def]
     """A window pane: dark, with a reflection that depends on the pane."""
     tone = 34.0 + 60.0 * pane * pane + 26.0 * _noise(s * 0.9, z * 0.9, 81)
     rgb[0], rgb[1], rgb[2] = tone * 0.92, tone * 1.02, tone * 1.14
 
 
 @njit(cache=True, nogil=True, fastmath=True)
-def _facade_albedo(s, height, width, eaves, base, accent, p, seed, rgb):
+def _facade_albedo(s, height, width, eaves, base, accent, p, seed, rgb):  # type: ignore[no-untyped-def]
     """Colour at s metres from the wall's left end and `height` metres above the ground floor.
 
     p: floor height, window spacing, window width, window height, sill, style.
@@ -402,7 +404,7 @@ def _facade_albedo(s, height, width, eaves, base, accent, p, seed, rgb):
 
 
 @njit(cache=True, nogil=True, fastmath=True)
-def _roof_albedo(cover, s, t, width, length, base, accent, p, seed, leaf, dryness, rgb):
+def _roof_albedo(cover, s, t, width, length, base, accent, p, seed, leaf, dryness, rgb):  # type: ignore[no-untyped-def]
     """Colour of a roof texel, s along the eave and t down the slope, in metres."""
     n1 = _noise(s * 3.3, t * 3.3, seed)
     n2 = _noise(s * 0.9, t * 0.9, seed + 1)
@@ -508,7 +510,7 @@ def _roof_albedo(cover, s, t, width, length, base, accent, p, seed, leaf, drynes
 
 
 @njit(cache=True, nogil=True, fastmath=True)
-def paint_surface(
+def paint_surface(  # type: ignore[no-untyped-def]
     cover, origin, right, down, normal, gsd, width, length, base, accent, p, floor_z, eaves_z,
     seed, ceiling, ambient, light_west, light_north, light_gsd, sun, sun_rgb, sky_rgb, season, out,
 ):  # fmt: skip
@@ -547,7 +549,7 @@ def paint_surface(
 
 
 @njit(cache=True, nogil=True, fastmath=True)
-def paint_crown(base, conifer, seed, shade, sun, sun_rgb, sky_rgb, out):
+def paint_crown(base, conifer, seed, shade, sun, sun_rgb, sky_rgb, out):  # type: ignore[no-untyped-def]
     """A crown seen from above, (n, n, 3): azimuthal about the trunk, edge = underside."""
     n = out.shape[0]
     half = n / 2

@@ -27,7 +27,7 @@ _LINEAR, _LINEAR_MIPMAP_LINEAR, _CLAMP = 9729, 9987, 33071
 
 @dataclass
 class TileNode:
-    """A tile: content file, origin (3,) ENU of its own frame, and ENU bounds of itself and below."""
+    """A tile: content file, origin (3,) ENU of its own frame, ENU bounds of itself and below."""
 
     uri: str
     origin: Array

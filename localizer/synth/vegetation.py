@@ -1,5 +1,6 @@
 """Trees and hedges as low-poly crowns whose texture is painted as seen from above."""
 
+# ruff: noqa: PLR0917
 from __future__ import annotations
 
 import numpy as np
@@ -98,15 +99,16 @@ def tree_meshes(
                 vertices, faces = crown_template(conifer, dense, level)
                 n, m = len(index), len(vertices)
                 seeds = trees.seed[index]
-                bumps = (np.sin(seeds[:, None] * 0.7391 + np.arange(m) * 2.3) * 0.14 + 1.0)[..., None]
+                wobble = np.sin(seeds[:, None] * 0.7391 + np.arange(m) * 2.3)
+                bumps = (1.0 + 0.14 * wobble)[..., None]
                 squash = 1 + 0.16 * np.sin(seeds * 1.31)[:, None]
                 xyz = np.empty((n, m, 3))
                 radius = trees.radius[index][:, None]
                 local = vertices[None, :, :2] * bumps
                 xyz[..., 0] = trees.xy[index, 0][:, None] + local[..., 0] * radius * squash
                 xyz[..., 1] = trees.xy[index, 1][:, None] + local[..., 1] * radius / squash
-                xyz[..., 2] = ground_z[pick][:, None] + vertices[None, :, 2] * (
-                    trees.height[index][:, None]
+                xyz[..., 2] = (
+                    ground_z[pick][:, None] + vertices[None, :, 2] * (trees.height[index][:, None])
                 )
                 # Azimuthal texture: the lowest ring lies on the rim of the disc.
                 reach = np.linalg.norm(vertices[:, :2], axis=1)

@@ -10,7 +10,7 @@ from collections import defaultdict
 from collections.abc import Iterable, Iterator
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from contextlib import contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -43,7 +43,7 @@ class WorldInfo:
     """What is known about a generated world besides its tiles.
 
     targets: named static points on surfaces, ENU. roads: right-hand lanes of the main roads as
-    polylines (N, 3) ENU, longest first. buildings, triangles: counts at the finest level.
+    polylines (N, 3) ENU, longest first. buildings: how many stand there, sheds included.
     """
 
     seed: int
@@ -211,8 +211,7 @@ def _blocks(
         return
     with tempfile.TemporaryDirectory() as temporary:
         scene_file = Path(temporary) / "scene.pickle"
-        slim = replace(scene, plan=scene.plan)
-        scene_file.write_bytes(pickle.dumps(slim, pickle.HIGHEST_PROTOCOL))
+        scene_file.write_bytes(pickle.dumps(scene, pickle.HIGHEST_PROTOCOL))
         context = multiprocessing.get_context("spawn")
         with ProcessPoolExecutor(
             processes, context, initializer=start_worker, initargs=(scene_file, folder)
