@@ -20,7 +20,7 @@ from localizer.types import Anchors, FeatureLevel, FeaturePyramid, Float32
 
 @dataclass(frozen=True)
 class LMSettings:
-    """Levenberg-Marquardt and robust-loss settings (docs/registration.md, sections 3 to 5).
+    """Levenberg-Marquardt and robust-loss settings (docs/registration.md, sections 3 and 5).
 
     huber: threshold on the residual norm of one anchor; unit features differ by at most 2.
     damping: first factor of the diagonal that is added to it (Marquardt's scaling, per axis);

@@ -58,7 +58,7 @@ def pose_differences(rotations: Array, centres: Array, other: Pose) -> Array:
 
 
 def mode_spread(differences: Array, probabilities: Array) -> Array:
-    """(6, 6) second moment of competing modes about the chosen pose (equation 15).
+    """(6, 6) second moment of competing modes about the chosen pose (equation 14).
 
     differences: (M, 6) of the modes to the chosen pose.
     """

@@ -104,7 +104,7 @@ def _weigh(n, w, confidence, anchor_confidence, huber, buf, index):  # type: ign
 
 @njit(**_JIT)
 def _accumulate(n, t, focal, buf, sums):  # type: ignore[no-untyped-def]
-    """Equations 5 to 7 over the anchors in view: 21 sums of H and 6 of g."""
+    """Equations 6 and 7 over the anchors in view: 21 sums of H and 6 of g."""
     fx, fy = _F(focal[0]), _F(focal[1])
     t0, t1, t2 = _F(t[0]), _F(t[1]), _F(t[2])
     kx, ky, kz = buf[5], buf[6], buf[7]
@@ -217,7 +217,7 @@ def _solve(sums, scale, damping, L, step):  # type: ignore[no-untyped-def]
 
 @njit(**_JIT)
 def _retract(R, t, step, R_out, t_out):  # type: ignore[no-untyped-def]
-    """Equation 3: ``R_out = exp(phi) R``, ``t_out = t + rho``."""
+    """Equation 5: ``R_out = exp(phi) R``, ``t_out = t + rho``."""
     x, y, z = step[3], step[4], step[5]
     angle2 = x * x + y * y + z * z
     if angle2 < 1e-12:
@@ -251,7 +251,7 @@ def _log(R, out):  # type: ignore[no-untyped-def]
 
 @njit(**_JIT)
 def _add_prior(R, t, R0, t0, information, weight, sums):  # type: ignore[no-untyped-def]
-    """Equation 14: add the quadratic prior to H, g and the score; returns its cost."""
+    """Equation 15: add the quadratic prior to H, g and the score; returns its cost."""
     d, J = np.empty(6), np.zeros((6, 6))
     relative = R.T @ R0
     _log(relative, d[3:])
@@ -291,7 +291,7 @@ def refine_kernel(channels: int) -> Callable[..., int]:
 
     @njit(**_JIT)
     def sample(n, w, features, anchor_features, buf, index):  # type: ignore[no-untyped-def]
-        """Equation 6: reduce the channels of each anchor in view to rows 10 to 15."""
+        """Equations 3 and 7: reduce the channels of each anchor in view to rows 10 to 15."""
         ka, kb = buf[8], buf[9]
         kA, kB, kD, kp, kq, ke = buf[10], buf[11], buf[12], buf[13], buf[14], buf[15]
         anchor, cell = index[0], index[1]
@@ -348,7 +348,7 @@ def refine_kernel(channels: int) -> Callable[..., int]:
         anchor_features, anchor_confidence, h, w, iterations, huber, damping0, down, up,
         min_visible, prior_R, prior_t, information, prior_weight, buf, index,
     ):  # fmt: skip
-        """Levenberg-Marquardt (equations 8 to 10) on hypotheses start to stop, in place."""
+        """Levenberg-Marquardt (equations 8 and 9) on hypotheses start to stop, in place."""
         sums, best = np.zeros(_SUMS), np.zeros(_SUMS)
         scale, L, step = np.zeros(6), np.zeros((6, 6)), np.zeros(6)
         R_try, t_try = np.zeros((3, 3)), np.zeros(3)

@@ -63,7 +63,7 @@ def _feature_gradients(features: Array, u: Array, v: Array) -> tuple[Array, Arra
 
 
 def projection_jacobian(problem: LevelProblem, x: Array, translation: Array) -> Array:
-    """d(u, v) / d(rho, phi), (N, 2, 6): equation 5, rotation about the local origin."""
+    """d(u, v) / d(rho, phi), (N, 2, 6): equation 6, rotation about the local origin."""
     fx, fy = problem.focal
     z = np.maximum(x[:, 2], MIN_DEPTH)
     du = np.zeros((len(x), 2, 3))
@@ -135,7 +135,7 @@ def pose_tangent_map(rotation: Array, translation: Array) -> Array:
 def prior_terms(
     prior: QuadraticPrior, rotation: Array, translation: Array
 ) -> tuple[float, Array, Array]:
-    """Cost, Hessian (6, 6) and gradient (6,) of a `QuadraticPrior` (equation 14)."""
+    """Cost, Hessian (6, 6) and gradient (6,) of a `QuadraticPrior` (equation 15)."""
     R0, t0 = prior.camera_from_local.rotation, prior.camera_from_local.translation
     d = np.concatenate([R0.T @ t0 - rotation.T @ translation, so3_log(rotation.T @ R0)])
     J = pose_tangent_map(rotation, translation)
@@ -148,7 +148,7 @@ def prior_terms(
 
 
 def retract(rotation: Array, translation: Array, step: Array) -> tuple[Array, Array]:
-    """Equation 3: rotate about the local origin, then translate; both in camera axes."""
+    """Equation 5: rotate about the local origin, then translate; both in camera axes."""
     return so3_exp(step[3:]) @ rotation, translation + step[:3]
 
 
