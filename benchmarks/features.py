@@ -3,9 +3,12 @@
     python benchmarks/features.py --pairs 60 [--model FILE.onnx ...] [--json OUT.json]
 
 Every pair shows a generated place that no training run has seen (seeds from 5,000,000 on), its
-query under its own light, weather and season. The reference is rendered 5 m and 5 deg from the query's
-true pose; the direct methods go through the same `JNGO`, SIFT through PnP-RANSAC on the rendered
-depth. Shares come with Wilson's 95 % intervals.
+query under its own light, weather and season. The reference is rendered 5 m and 5 deg from the
+query's true pose; the direct methods go through the same `JNGO`, SIFT through PnP-RANSAC on the
+rendered depth. Shares come with Wilson's 95 % intervals.
+
+    python benchmarks/features.py --real ../shared/data/caliterra    (real photos)
+    python benchmarks/features.py --real ../shared/data/quito        (real mesh, made weather)
 """
 
 from __future__ import annotations
@@ -14,19 +17,17 @@ import argparse
 import json
 import time
 from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
 
 import cv2
 import numpy as np
+from feature_pairs import DEGREES, METRES, TestPair, made_pairs, real_pairs
 
 from localizer.features import FeatureExtractor, GradientExtractor, load_extractor
 from localizer.pose import Pose
 from localizer.registration import JNGO, select_anchors
-from localizer.synth.appearance import CONDITIONS, apply_appearance, sample_appearance
-from localizer.training.data import tamed
-from localizer.training.pairs import Pair, SceneConfig, scene_pairs
+from localizer.synth.appearance import CONDITIONS
 from localizer.types import (
     FeatureLevel,
     FeaturePyramid,
@@ -35,16 +36,6 @@ from localizer.types import (
     RenderedView,
 )
 
-_METRES, _DEGREES = 5.0, 5.0
-_SCENES = SceneConfig(
-    width=320,
-    height=240,
-    references=len(CONDITIONS),
-    queries_per_light=1,
-    cell_m=(0.25, 0.55),
-    conditions=CONDITIONS,
-    motion=(_METRES, _DEGREES),
-)
 Method = Callable[[RenderedView, Image, PosePrior, int], Pose]
 
 
@@ -124,41 +115,17 @@ def sift_pnp(view: RenderedView, query: Image, prior: PosePrior, seed: int) -> P
     return view.world_from_camera @ query_from_reference.inverse
 
 
-def benchmark_pairs(count: int, first_seed: int, threads: int) -> list[tuple[Pair, Image]]:
-    """`count` pairs of unseen places with the final query images, conditions in equal shares."""
-
-    def place(seed: int) -> list[tuple[Pair, Image]]:
-        rng = np.random.default_rng((seed, 1))
-        made = []
-        for pair in scene_pairs(seed, _SCENES, None):
-            look = tamed(sample_appearance(rng, pair.condition), pair.query_depth)
-            made.append((pair, apply_appearance(pair.query, pair.query_depth, look, rng)))
-        return made
-
-    places = -(-count // len(CONDITIONS)) + 2
-    with ThreadPoolExecutor(threads) as pool:
-        found = [
-            p for chunk in pool.map(place, range(first_seed, first_seed + places)) for p in chunk
-        ]
-    return found[:count]
-
-
-def evaluate(
-    methods: dict[str, Method], pairs: list[tuple[Pair, Image]], seed: int
-) -> list[Outcome]:
+def evaluate(methods: dict[str, Method], pairs: list[TestPair], seed: int) -> list[Outcome]:
     """Every method on every pair."""
-    axes = np.diag([(_METRES**2) / 3] * 3 + [np.radians(_DEGREES) ** 2 / 3] * 3)
+    axes = np.diag([METRES**2 / 3] * 3 + [np.radians(DEGREES) ** 2 / 3] * 3)
     outcomes = []
-    for k, (pair, query) in enumerate(pairs):
-        view = RenderedView(
-            pair.reference, pair.reference_depth, pair.world_from_reference, pair.camera
-        )
-        prior = PosePrior(pair.world_from_reference, axes, 0)
+    for k, pair in enumerate(pairs):
+        prior = PosePrior(pair.view.world_from_camera, axes, 0)
         for name, method in methods.items():
             began = time.perf_counter()
-            pose = method(view, query, prior, seed + k)
+            pose = method(pair.view, pair.query, prior, seed + k)
             seconds = time.perf_counter() - began
-            metres, degrees = pose.distance_to(pair.world_from_query)
+            metres, degrees = pose.distance_to(pair.truth)
             outcomes.append(Outcome(name, pair.condition, pair.outdated, metres, degrees, seconds))
     return outcomes
 
@@ -198,7 +165,8 @@ def table(outcomes: list[Outcome]) -> dict[str, dict[str, dict[str, float | int]
     result: dict[str, dict[str, dict[str, float | int]]] = {}
     for method in dict.fromkeys(o.method for o in outcomes):
         mine = [o for o in outcomes if o.method == method]
-        groups = {"all": mine} | {c: [o for o in mine if o.condition == c] for c in CONDITIONS}
+        kinds = dict.fromkeys([*CONDITIONS, *(o.condition for o in mine)])
+        groups = {"all": mine} | {c: [o for o in mine if o.condition == c] for c in kinds}
         groups["outdated map"] = [o for o in mine if o.outdated]
         result[method] = {g: summary(members) for g, members in groups.items() if members}
     return result
@@ -225,9 +193,13 @@ def main() -> None:
     parser.add_argument("--seed", type=int, default=0, help="0, 1, 2: other places and draws")
     parser.add_argument("--model", type=Path, action="append", default=[])
     parser.add_argument("--only-models", action="store_true", help="leave the baselines out")
+    parser.add_argument("--real", type=Path, help="folder of a real set, instead of made places")
     parser.add_argument("--json", type=Path)
     args = parser.parse_args()
-    pairs = benchmark_pairs(args.pairs, 5_000_000 + 10_000 * args.seed, threads=2)
+    if args.real is None:
+        pairs = made_pairs(args.pairs, 5_000_000 + 10_000 * args.seed, threads=2)
+    else:
+        pairs = real_pairs(args.real, args.pairs, args.seed)
     methods: dict[str, Method] = {}
     if not args.only_models:
         methods = {

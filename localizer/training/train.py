@@ -30,7 +30,7 @@ class Trainer:
         self.model = TinyNet(config.model).to(self.device).train()
         self.average = TinyNet(config.model).to(self.device).eval()
         self.average.load_state_dict(self.model.state_dict())
-        self.log_scale = nn.Parameter(torch.full((3,), 2.3, device=self.device))
+        self.log_scale = nn.Parameter(torch.full((3,), 3.2, device=self.device))
         self.optimizer = torch.optim.AdamW(
             [
                 {"params": list(self.model.parameters())},
