@@ -33,7 +33,7 @@ _HEIGHT_P, _CLIMB_P, _CLIMB_I = 1.0, 4.0, 1.0
 
 
 @njit(cache=True)
-def attitude_control(  # noqa: PLR0917
+def attitude_control(
     q: Array, gyro: Array, target: Array, integrator: Array, dt: float, motors: Array
 ) -> None:
     """Motor thrusts (4,) N for a target attitude (quaternion) and total thrust, (5,), in place."""

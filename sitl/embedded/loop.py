@@ -16,7 +16,7 @@ TICK_S = SUBSTEPS * SUBSTEP_S
 
 
 @njit(cache=True)
-def advance(  # noqa: PLR0917
+def advance(
     x: Array,
     output: Array,
     target: Array,

@@ -1,0 +1,129 @@
+"""Physics and kernels against closed forms."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+
+from sitl.embedded import dynamics
+from sitl.embedded.controller import Carrot, Limits, PositionController, attitude_control
+from sitl.embedded.dynamics import GRAVITY, MASS, MOTOR_MAX
+from sitl.embedded.rotation import euler, quaternion
+
+DT = 0.0025
+
+
+def airborne(height=100.0):
+    x = dynamics.initial_state(0.0)
+    x[2] = -height
+    return x
+
+
+def fly(x, motors, seconds, wind=(0.0, 0.0, 0.0)):
+    force = np.zeros(3)
+    for _ in range(round(seconds / DT)):
+        dynamics.step(x, np.asarray(motors, dtype=float), np.asarray(wind, dtype=float), DT, force)
+    return force
+
+
+def test_rests_on_the_ground_and_feels_gravity():
+    x = dynamics.initial_state(math.radians(70))
+    force = fly(x, [0, 0, 0, 0], 2.0)
+    assert np.allclose(x[:6], 0.0)
+    assert np.allclose(force, [0, 0, -GRAVITY])
+    assert euler(x[6:10])[2] == pytest.approx(math.radians(70))
+
+
+def test_falls_freely_and_then_at_terminal_speed():
+    x = airborne(1000.0)
+    fly(x, [0, 0, 0, 0], 0.1)
+    assert x[5] == pytest.approx(GRAVITY * 0.1, rel=0.02)
+    fly(x, [0, 0, 0, 0], 20.0)
+    # drag balances weight: k1 v + k2 v² = g
+    k1, k2 = dynamics.DRAG_LINEAR, dynamics.DRAG_QUADRATIC
+    terminal = (-k1 + math.sqrt(k1**2 + 4 * k2 * GRAVITY)) / (2 * k2)
+    assert x[5] == pytest.approx(terminal, rel=0.01)
+
+
+def test_hover_thrust_holds_height():
+    x = airborne()
+    hover = MASS * GRAVITY / 4
+    x[dynamics.THRUST :] = hover
+    force = fly(x, [hover] * 4, 5.0)
+    assert x[2] == pytest.approx(-100.0, abs=1e-6)
+    assert np.allclose(force, [0, 0, -GRAVITY])
+
+
+def test_thrust_follows_the_command_with_the_motors_time_constant():
+    x = airborne()
+    fly(x, [MOTOR_MAX] * 4, dynamics.MOTOR_TIME_CONSTANT)
+    assert x[dynamics.THRUST] == pytest.approx(MOTOR_MAX * (1 - math.exp(-1)), rel=0.05)
+
+
+@pytest.mark.parametrize(
+    ("faster", "axis", "sign"),
+    [((1, 2), 0, 1), ((0, 2), 1, 1), ((0, 1), 2, 1), ((0, 3), 0, -1)],
+    ids=["left motors roll right", "front motors pitch up", "ccw motors yaw right", "right: left"],
+)
+def test_motor_order_is_ardupilots_quad_x(faster, axis, sign):
+    x = airborne()
+    motors = [MASS * GRAVITY / 4] * 4
+    for i in faster:
+        motors[i] += 0.5
+    fly(x, motors, 0.1)
+    rates = x[dynamics.RATES : dynamics.RATES + 3]
+    assert rates[axis] * sign > 0
+    others = [abs(rates[i]) for i in range(3) if i != axis]
+    assert max(others) < 0.05 * abs(rates[axis])
+
+
+def test_wind_carries_a_level_vehicle_along():
+    x = airborne()
+    hover = MASS * GRAVITY / 4
+    x[dynamics.THRUST :] = hover
+    fly(x, [hover] * 4, 60.0, wind=(4.0, -2.0, 0.0))
+    assert x[3:5] == pytest.approx([4.0, -2.0], abs=0.05)
+
+
+def test_attitude_control_reaches_a_lean():
+    x = airborne()
+    target = np.array([*quaternion(0.3, -0.2, 0.5), MASS * GRAVITY])
+    integrator, motors, force = np.zeros(3), np.zeros(4), np.zeros(3)
+    for _ in range(800):
+        attitude_control(x[6:10], x[10:13], target, integrator, DT, motors)
+        dynamics.step(x, motors, np.zeros(3), DT, force)
+    assert euler(x[6:10]) == pytest.approx((0.3, -0.2, 0.5), abs=0.01)
+
+
+def test_carrot_keeps_speed_and_acceleration_limits_and_stops_at_the_end():
+    limits = Limits(10.0, 2.5, 1.5, 2.5, 1.0)
+    carrot = Carrot((0.0, 0.0, 0.0), (200.0, 0.0, 0.0))
+    speeds = [0.0]
+    for _ in range(6000):
+        carrot.move(carrot.position, limits, 0.01)
+        speeds.append(carrot.velocity[0])
+        if carrot.arrived:
+            break
+    assert carrot.position == (200.0, 0.0, 0.0)
+    assert max(speeds) == pytest.approx(10.0, rel=0.01)
+    assert np.diff(speeds[:-1]).max() <= 2.5 * 0.01 + 1e-9
+    assert len(speeds) * 0.01 == pytest.approx(200 / 10 + 10 / 2.5, rel=0.05)
+
+
+def test_carrot_waits_for_a_vehicle_that_lags():
+    limits = Limits(10.0, 2.5, 1.5, 2.5, 1.0)
+    carrot = Carrot((0.0, 0.0, 0.0), (200.0, 0.0, 0.0))
+    for _ in range(6000):
+        carrot.move((0.0, 0.0, 0.0), limits, 0.01)
+    assert carrot.position[0] < 20.0
+
+
+def test_lean_points_the_thrust_the_way_to_accelerate():
+    controller = PositionController()
+    controller.reset(0.0)
+    for north, east in ((2.0, 0.0), (0.0, 2.0), (-1.5, 1.0)):
+        roll, pitch, _ = euler(controller.lean((north, east), 0.0))
+        assert -math.tan(pitch) * GRAVITY == pytest.approx(north, rel=0.02, abs=1e-6)
+        assert math.tan(roll) / math.cos(pitch) * GRAVITY == pytest.approx(east, rel=0.02, abs=1e-6)

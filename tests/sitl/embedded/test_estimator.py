@@ -1,0 +1,324 @@
+"""Navigation kernels against closed forms, and the filter's rules one by one."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+
+from sitl.embedded import navigation as nav
+from sitl.embedded.dynamics import GRAVITY
+from sitl.embedded.estimator import (
+    Aiding,
+    Baro,
+    EkfFlags,
+    Estimator,
+    ExternalPosition,
+    ExternalVelocity,
+    GpsData,
+)
+from sitl.embedded.geodesy import METRES_PER_DEGREE, Location, north_east
+from sitl.embedded.parameters import Parameters
+from sitl.embedded.rotation import euler, quaternion, rotate_world
+from sitl.embedded.timesync import JitterCorrection
+
+ORIGIN = Location(47.397742, 8.545594, 488.0)
+AT_REST = np.array([0, 0, 0, 0, 0, -GRAVITY * 0.01, 0.01])
+
+
+def nominal(roll=0.0, pitch=0.0, yaw=0.0):
+    s = np.zeros(nav.NOMINAL_SIZE)
+    s[nav.Q : nav.Q + 4] = quaternion(roll, pitch, yaw)
+    return s
+
+
+def test_strapdown_stays_at_rest_and_falls_as_it_should():
+    s = nominal(0.0, 0.0, 1.0)
+    for _ in range(1000):
+        nav.strapdown(s, AT_REST)
+    assert np.allclose(s[nav.V : nav.P + 3], 0.0, atol=1e-9)
+    for _ in range(100):
+        nav.strapdown(s, np.array([0, 0, 0, 0, 0, 0, 0.01]))
+    assert s[nav.V + 2] == pytest.approx(GRAVITY)
+    assert s[nav.P + 2] == pytest.approx(GRAVITY / 2)
+
+
+def test_strapdown_turns_by_the_gyro_less_its_bias():
+    s = nominal()
+    s[nav.BG + 2] = 0.1
+    for _ in range(100):
+        nav.strapdown(s, np.array([0, 0, 0.006, 0, 0, -GRAVITY * 0.01, 0.01]))
+    assert euler(s[0:4])[2] == pytest.approx(0.5)
+
+
+def perturbed(s, error):
+    out = s.copy()
+    rotate_world(out[nav.Q : nav.Q + 4], *error[0:3])
+    out[nav.V :] += error[3:]
+    return out
+
+
+def difference(a, b):
+    """Error state that takes b to a, to first order."""
+    ra, rb = quaternion_to_matrix(a[0:4]), quaternion_to_matrix(b[0:4])
+    turn = ra @ rb.T
+    rotation = 0.5 * np.array(
+        [turn[2, 1] - turn[1, 2], turn[0, 2] - turn[2, 0], turn[1, 0] - turn[0, 1]]
+    )
+    return np.concatenate([rotation, a[nav.V :] - b[nav.V :]])
+
+
+def quaternion_to_matrix(q):
+    from sitl.embedded.rotation import matrix
+
+    return matrix(q)
+
+
+def test_covariance_propagates_by_the_numerical_jacobian():
+    rng = np.random.default_rng(0)
+    s = nominal(0.2, -0.3, 1.1)
+    s[nav.V :] = rng.normal(0, 0.05, nav.NOMINAL_SIZE - 4)
+    imu = np.array([0.004, -0.003, 0.006, 0.02, -0.01, -0.09, 0.01])
+    A = rng.normal(0, 1, (15, 15))
+    cov = A @ A.T
+    step = 1e-6
+    base = s.copy()
+    nav.strapdown(base, imu)
+    F = np.empty((15, 15))
+    for i in range(15):
+        moved = perturbed(s, step * np.eye(15)[i])
+        nav.strapdown(moved, imu)
+        F[:, i] = difference(moved, base) / step
+    expected = F @ cov @ F.T
+    nav.predict(s, cov, imu, np.zeros(4))
+    # Second-order terms of one 10 ms step (position by half dt²) are left out of F on purpose.
+    assert np.allclose(cov, expected, rtol=5e-3, atol=5e-2)
+    assert np.allclose(s, base)
+
+
+def test_fuse_is_the_textbook_kalman_update():
+    rng = np.random.default_rng(1)
+    A = rng.normal(0, 0.1, (15, 15))
+    cov = A @ A.T + 0.01 * np.eye(15)
+    s = nominal(yaw=0.4)
+    H = np.eye(15)[6:7]
+    S = float((H @ cov @ H.T).item() + 0.25)
+    K = cov @ H.T / S
+    expected_cov, dx = cov - K @ H @ cov, (K * 0.5).ravel()
+    expected = perturbed(s, dx)
+    nav.fuse(s, cov, 6, 0.5, 0.25)
+    assert np.allclose(cov, expected_cov)
+    assert np.allclose(s, expected, atol=1e-12)
+
+
+def test_replay_equals_propagating_all_along():
+    rng = np.random.default_rng(2)
+    ring = np.zeros((8, 7))
+    ring[:, :6] = rng.normal(0, 0.01, (8, 6))
+    ring[:, 6] = 0.01
+    s, direct, out = nominal(0.1, 0.2, 0.3), nominal(0.1, 0.2, 0.3), np.zeros(nav.NOMINAL_SIZE)
+    for k in (6, 7, 0, 1):
+        nav.strapdown(direct, ring[k])
+    nav.replay(s, ring, 6, 4, out)
+    assert np.allclose(out, direct)
+
+
+# --- the filter's rules ------------------------------------------------------------------------
+
+VISION = {
+    "GPS1_TYPE": 0,
+    "VISO_TYPE": 1,
+    "VISO_DELAY_MS": 0,
+    "VISO_POS_M_NSE": 0.5,
+    "EK3_SRC1_POSXY": 6,
+    "EK3_SRC1_VELXY": 0,
+    "EK3_SRC1_VELZ": 0,
+}
+
+
+class Still:
+    """A filter whose vehicle stands still."""
+
+    def __init__(self, parameters=None):
+        self.texts = []
+        self.filter = Estimator(
+            Parameters({**VISION, **(parameters or {})}), lambda _s, t: self.texts.append(t)
+        )
+        self.filter.align(0.0)
+        self.filter.set_origin(ORIGIN)
+        self.ms = 0
+
+    def run(self, seconds, fix=None, every_ms=100, velocity=None, gps=None):
+        for _ in range(round(seconds * 100)):
+            self.ms += 10
+            if fix is not None and self.ms % every_ms == 0:
+                self.filter.add_external(fix, self.ms)
+            if velocity is not None and self.ms % every_ms == 0:
+                self.filter.add_external_velocity(velocity, self.ms)
+            if gps is not None and self.ms % 200 == 0:
+                self.filter.add(gps, self.ms)
+            if self.ms % 100 == 0:
+                self.filter.add(Baro(0.0), self.ms)
+            self.filter.update(AT_REST, self.ms)
+
+
+def at(north, east=0.0, sigma=0.5, yaw=None, reset=False):
+    return ExternalPosition((north, east, 0.0), sigma, yaw, 0.2, reset)
+
+
+def test_starts_aiding_with_the_first_fix_and_says_so():
+    still = Still()
+    still.run(2)
+    assert still.filter.aiding is Aiding.NONE
+    assert still.filter.flags & EkfFlags.CONST_POS_MODE
+    still.run(1, at(5.0))
+    assert still.filter.position_valid
+    assert still.filter.position[0] == pytest.approx(5.0, abs=0.1)
+    assert "EKF3 IMU0 is using external nav data" in still.texts
+
+
+def test_a_second_origin_is_ignored():
+    still = Still()
+    assert not still.filter.set_origin(Location(0.0, 0.0, 0.0))
+    assert still.filter.origin == ORIGIN
+
+
+def test_fixes_over_fifty_hertz_are_dropped():
+    still = Still()
+    still.run(1, at(0.0))
+    assert still.filter.add_external(at(0.0), still.ms + 100)
+    assert not still.filter.add_external(at(0.0), still.ms + 110)
+    assert still.filter.add_external(at(0.0), still.ms + 120)
+
+
+def test_not_a_number_is_dropped():
+    still = Still()
+    assert not still.filter.add_external(at(math.nan), 1000)
+
+
+def test_a_smaller_claimed_sigma_pulls_harder():
+    pulls = []
+    for sigma in (0.5, 3.0):
+        still = Still()
+        still.run(5, at(0.0, sigma=sigma))
+        still.run(0.05)
+        still.filter.add_external(at(1.0, sigma=sigma), still.ms)
+        still.run(0.3)
+        pulls.append(still.filter.position[0])
+    assert pulls[0] > 1.5 * pulls[1] > 0
+
+
+def test_loss_of_fixes_ends_the_position_after_7_s_and_aiding_after_15_s():
+    still = Still()
+    still.run(5, at(0.0))
+    still.run(6.8)
+    assert still.filter.position_valid
+    still.run(0.6)
+    assert not still.filter.position_valid
+    assert still.filter.aiding is Aiding.ABSOLUTE
+    still.run(8)
+    assert still.filter.aiding is Aiding.NONE
+    assert "EKF3 IMU0 stopped aiding" in still.texts
+    still.run(1, at(0.0))
+    assert still.filter.position_valid
+
+
+def test_velocity_from_vision_keeps_position_for_10_s_and_then_never_takes_the_jump():
+    """ardupilot.md: a jump without reset_counter while velocity is fused is never accepted."""
+    still = Still({"EK3_SRC1_VELXY": 6, "EK3_SRC1_VELZ": 6})
+    steady = ExternalVelocity((0.0, 0.0, 0.0), 0.1)
+    still.run(5, at(0.0), velocity=steady)
+    still.run(9.5, at(10.0), velocity=steady)
+    assert still.filter.position_valid
+    still.run(1.5, at(10.0), velocity=steady)
+    assert not still.filter.position_valid
+
+
+def test_yaw_from_vision_is_used_only_where_it_is_the_source():
+    for source, expected in ((1, 0.0), (6, 0.3)):
+        still = Still({"EK3_SRC1_YAW": source})
+        still.run(20, at(0.0, yaw=0.3))
+        assert euler(still.filter.output[0:4])[2] == pytest.approx(expected, abs=0.05)
+
+
+def test_height_comes_from_vision_where_it_is_the_source_and_from_baro_after():
+    still = Still({"EK3_SRC1_POSZ": 6})
+    above = ExternalPosition((0.0, 0.0, -5.0), 0.3, None, 0.2, False)
+    still.run(10, above)
+    assert still.filter.position[2] == pytest.approx(-5.0, abs=0.3)
+    still.run(30)
+    assert still.filter.position[2] > -2.0
+
+
+GPS_DATA = GpsData(47.397742, 8.545594, 488.0, (0.0, 0.0), 0.0, 0.5, 0.3, 10, 1.0)
+ON_GPS = {"GPS1_TYPE": 1, "EK3_SRC1_POSXY": 3, "EK3_SRC1_VELXY": 3, "EK3_SRC1_VELZ": 3}
+
+
+def test_gps_is_used_after_ten_seconds_of_good_fixes():
+    still = Still(ON_GPS)
+    still.run(9.5, gps=GPS_DATA)
+    assert still.filter.aiding is Aiding.NONE
+    still.run(2, gps=GPS_DATA)
+    assert still.filter.position_valid
+
+
+def test_a_gps_of_few_satellites_or_unknown_hdop_is_never_used():
+    from dataclasses import replace
+
+    for poor in (replace(GPS_DATA, satellites=5), replace(GPS_DATA, hdop=99.99)):
+        still = Still(ON_GPS)
+        still.run(20, gps=poor)
+        assert still.filter.aiding is Aiding.NONE
+
+
+def test_a_gps_jump_glitches_and_is_taken_after_10_to_20_s():
+    from dataclasses import replace
+
+    still = Still(ON_GPS)
+    still.run(15, gps=GPS_DATA)
+    moved = replace(GPS_DATA, latitude_deg=GPS_DATA.latitude_deg + 30 / METRES_PER_DEGREE)
+    still.run(3, gps=moved)
+    assert still.filter.gps_glitching
+    assert still.filter.flags & EkfFlags.GPS_GLITCHING
+    assert abs(still.filter.position[0]) < 1.0
+    still.run(17, gps=moved)
+    assert still.filter.position[0] == pytest.approx(30.0, abs=1.0)
+
+
+def test_external_position_command_only_resets_an_unaided_filter():
+    still = Still()
+    still.run(3, at(0.0))
+    assert not still.filter.force_position(50.0, 0.0, 10.0)
+    still.run(2)
+    assert still.filter.force_position(50.0, 0.0, 10.0)
+    still.run(0.02)
+    assert still.filter.position[0] == pytest.approx(50.0, abs=0.5)
+
+
+def test_jitter_correction_removes_jitter_and_keeps_the_least_lag():
+    correction = JitterCorrection()
+    rng = np.random.default_rng(0)
+    epoch = 1_700_000_000_000_000
+    late = []
+    for k in range(300):
+        taken = k * 100_000
+        received = taken + 80_000 + int(rng.uniform(0, 60_000))
+        late.append(correction.correct(epoch + taken, received) - taken)
+    # After the first window every stamp is the same 80 ms late, to a few ms.
+    assert max(late[100:]) - min(late[100:]) < 5_000
+    assert np.mean(late[100:]) == pytest.approx(80_000, abs=5_000)
+
+
+def test_jitter_correction_allows_at_most_half_a_second():
+    correction = JitterCorrection()
+    correction.correct(0, 1_000_000)
+    assert correction.correct(100_000, 3_000_000) == 2_500_000
+
+
+def test_locations_scale_as_ardupilot_does():
+    there = ORIGIN.offset(1000.0, -2000.0, -50.0)
+    assert ORIGIN.ned_of(there) == pytest.approx((1000.0, -2000.0, -50.0), abs=1e-6)
+    north, east = north_east(ORIGIN, ORIGIN.latitude_deg + 1e-7, ORIGIN.longitude_deg)
+    assert north == pytest.approx(0.011131884502145034)
+    assert east == 0.0

@@ -1,0 +1,233 @@
+"""The pilot's clock and tracks, and real flights over TCP of the embedded vehicle."""
+
+from __future__ import annotations
+
+import math
+import time
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from sitl import ardupilot
+from sitl.ardupilot import ArduPilotNotFoundError, ArduPilotSitl, find_arducopter
+from sitl.embedded.geodesy import Location
+from sitl.feed import FeedConfig, Message, TruthFeed
+from sitl.pilot import (
+    BootClock,
+    Pilot,
+    PilotError,
+    Track,
+    gimbal_step,
+    return_step,
+    speed_step,
+    takeoff_step,
+    waypoint_step,
+)
+from sitl.process import VehicleProcessError
+from sitl.vehicles import (
+    GIMBAL,
+    SPEEDS,
+    EmbeddedSitl,
+    open_vehicle,
+    vision_only_parameters,
+    vision_parameters,
+)
+
+HOME = Location(47.397742, 8.545594, 488.0)
+SPEEDUP = 5.0
+
+
+def test_boot_clock_takes_the_least_latency():
+    clock = BootClock(speedup=2.0)
+    for boot_ms, latency_ms in ((100, 7), (120, 3), (140, 20)):
+        clock.observe(boot_ms, int((1000 + boot_ms / 2 + latency_ms) * 1e6))
+    assert clock.monotonic_ns(140) == int((1000 + 70 + 3) * 1e6)
+
+
+def test_track_brackets_a_time_and_forgets_the_oldest():
+    track = Track(limit=10)
+    for t in range(100):
+        track.add(SimpleNamespace(time_ns=10 * t))
+    before, after = track.around(985)
+    assert (before.time_ns, after.time_ns) == (980, 990)
+    assert track.around(991) is None
+    assert track.around(0) is None
+    assert len(track.all()) <= 20
+    track.add(SimpleNamespace(time_ns=5))
+    assert track.newest.time_ns == 990
+
+
+def test_a_vehicle_that_dies_at_once_is_reported_with_its_log():
+    vehicle = EmbeddedSitl(HOME, parameters={})
+    vehicle.command = lambda _instance: ["/bin/sh", "-c", "echo out of propellers; exit 3"]
+    with pytest.raises(VehicleProcessError, match="out of propellers"):
+        vehicle.start()
+
+
+def test_no_endpoint_before_the_start():
+    vehicle = EmbeddedSitl(HOME)
+    with pytest.raises(VehicleProcessError, match="before it is started"):
+        _ = vehicle.gcs_endpoint
+    vehicle.stop()
+
+
+def test_no_vehicle_at_the_endpoint():
+    with pytest.raises(PilotError, match="no vehicle listens"):
+        Pilot("tcp:127.0.0.1:9").connect(timeout_s=0.5)
+
+
+def test_a_missing_arducopter_is_a_named_error(monkeypatch, tmp_path):
+    monkeypatch.setenv("PATH", str(tmp_path))
+    monkeypatch.delenv("ARDUPILOT_HOME", raising=False)
+    with pytest.raises(ArduPilotNotFoundError, match="ARDUPILOT_HOME"):
+        ArduPilotSitl(HOME)
+    assert open_vehicle("auto", HOME).kind == "embedded"
+
+
+def test_missing_default_parameters_are_a_named_error(monkeypatch, tmp_path):
+    binary = tmp_path / "arducopter"
+    binary.write_text("#!/bin/sh\n")
+    binary.chmod(0o755)
+    monkeypatch.setenv("ARDUPILOT_HOME", str(tmp_path))
+    assert find_arducopter() == binary
+    with pytest.raises(ArduPilotNotFoundError, match=r"copter\.parm"):
+        ArduPilotSitl(HOME)
+
+
+def test_finds_binary_and_defaults_in_a_source_tree(monkeypatch, tmp_path):
+    binary = tmp_path / "build/sitl/bin/arducopter"
+    defaults = tmp_path / "Tools/autotest/default_params/copter.parm"
+    for path in (binary, defaults):
+        path.parent.mkdir(parents=True)
+        path.write_text("")
+    binary.chmod(0o755)
+    monkeypatch.setenv("ARDUPILOT_HOME", str(tmp_path))
+    assert find_arducopter() == binary
+    assert ardupilot.find_defaults(binary) == defaults
+
+
+# --- flights, of either vehicle ------------------------------------------------------------------
+
+
+KINDS = ["embedded", pytest.param("ardupilot", marks=pytest.mark.sitl)]
+
+
+@pytest.fixture(params=KINDS)
+def kind(request):
+    if request.param == "ardupilot" and find_arducopter() is None:
+        pytest.skip("no arducopter binary on PATH or below ARDUPILOT_HOME")
+    return request.param
+
+
+def horizontal(a: Location, b: Location) -> float:
+    return math.hypot(*a.ned_of(b)[:2])
+
+
+def test_flies_a_mission_on_gps_and_then_on_vision(kind):
+    parameters = {**vision_parameters(), **GIMBAL, **SPEEDS}
+    with open_vehicle(kind, HOME, 30.0, parameters, speedup=SPEEDUP) as vehicle:
+        pilot = Pilot(vehicle.gcs_endpoint, SPEEDUP, vehicle.check)
+        with pilot:
+            feed = TruthFeed(pilot, vehicle.companion_endpoint, FeedConfig(sigma_m=0.3))
+            pilot.wait_ready()
+            pilot.arm()
+            pilot.takeoff(40.0)
+            far = HOME.offset(120.0, 0.0, 0.0)
+            turn = HOME.offset(120.0, 80.0, 0.0)
+            steps = [
+                takeoff_step(40.0),
+                speed_step(8.0),
+                waypoint_step(far.latitude_deg, far.longitude_deg, 40.0),
+                gimbal_step(-60.0, 20.0),
+                waypoint_step(turn.latitude_deg, turn.longitude_deg, 50.0),
+                return_step(),
+            ]
+            pilot.upload_mission(steps)
+            assert [i.command for i in pilot.download_mission()][1:] == [s.command for s in steps]
+            pilot.use_source_set(2)
+            denied = time.monotonic_ns()
+            pilot.gps(on=False)
+            pilot.start_mission()
+            pilot.wait(lambda: 5 in pilot.reached, 120.0, "the last waypoint")
+            assert horizontal(pilot.truth.location, turn) < 6.0
+            errors = pilot.ekf_errors(denied)
+            flat = np.hypot(errors[:, 0], errors[:, 1])
+            assert len(flat) > 100
+            assert np.percentile(flat, 95) < 2.0
+            _check_gimbal(pilot)
+            pilot.wait(lambda: not pilot.armed, 180.0, "the landing")
+            assert horizontal(pilot.truth.location, HOME) < 4.0
+            feed.close()
+            assert feed.sent > 500
+
+
+def _check_gimbal(pilot):
+    newest = pilot.gimbal_track()[-1]
+    roll, pitch, yaw = (math.degrees(a) for a in newest.roll_pitch_yaw)
+    assert (roll, pitch, yaw) == pytest.approx((0.0, -60.0, 20.0), abs=1.0)
+    assert newest.yaw_in_vehicle_frame
+    state = pilot.gimbal_at(newest.time_ns - 10_000_000)
+    assert state is not None
+    assert pilot.truth_at(newest.time_ns - 50_000_000) is not None
+
+
+def test_without_positions_the_vehicle_is_lost(kind):
+    with open_vehicle(kind, HOME, 0.0, {**SPEEDS, "SIM_WIND_SPD": 3}, speedup=SPEEDUP) as vehicle:
+        pilot = Pilot(vehicle.gcs_endpoint, SPEEDUP, vehicle.check)
+        with pilot:
+            pilot.wait_ready()
+            pilot.arm()
+            pilot.takeoff(80.0)
+            pilot.sleep(2)
+            here, denied = pilot.truth.location, time.monotonic_ns()
+            pilot.gps(on=False)
+            pilot.sleep(60)
+            assert pilot.has_text("EKF Failsafe: changed to LAND Mode", denied)
+            assert horizontal(here, pilot.truth.location) > 10.0
+
+
+@pytest.mark.parametrize("message", [Message.ODOMETRY, Message.GPS_INPUT])
+def test_other_messages_hold_the_vehicle_too(kind, message):
+    if message is Message.ODOMETRY:
+        parameters = {**vision_only_parameters(), "EK3_SRC1_VELXY": 6, "EK3_SRC1_VELZ": 6}
+    else:
+        from sitl.vehicles import gps_input_only_parameters
+
+        parameters = gps_input_only_parameters()
+    with open_vehicle(
+        kind, HOME, 0.0, {**parameters, **SPEEDS, "SIM_GPS1_ENABLE": 0}, speedup=SPEEDUP
+    ) as vehicle:
+        pilot = Pilot(vehicle.gcs_endpoint, SPEEDUP, vehicle.check)
+        with pilot:
+            config = FeedConfig(message=message, sigma_m=0.3)
+            feed = TruthFeed(pilot, vehicle.companion_endpoint, config, origin=HOME)
+            pilot.sleep(3)
+            pilot.set_origin(HOME)
+            pilot.wait_ready()
+            pilot.arm()
+            pilot.takeoff(30.0)
+            since = time.monotonic_ns()
+            here = pilot.truth.location
+            pilot.sleep(20)
+            assert horizontal(here, pilot.truth.location) < 3.0
+            errors = pilot.ekf_errors(since)
+            assert np.median(np.hypot(errors[:, 0], errors[:, 1])) < 0.6
+            feed.close()
+
+
+def test_refusals_reach_the_pilot(kind):
+    with open_vehicle(kind, HOME, 0.0, {"SIM_GPS1_ENABLE": 0}, speedup=SPEEDUP) as vehicle:
+        pilot = Pilot(vehicle.gcs_endpoint, SPEEDUP, vehicle.check)
+        with pilot:
+            pilot.sleep(26)
+            pilot.set_mode("GUIDED")
+            with pytest.raises(PilotError, match=r"GPS 1: Bad fix|Need Position Estimate"):
+                pilot.arm(timeout_s=6.0)
+            with pytest.raises(PilotError, match="NO_SUCH_PARAM"):
+                pilot.parameter("NO_SUCH_PARAM")
+            with pilot.fast_forward(8.0):
+                assert pilot.parameter("SIM_SPEEDUP") == 8.0
+            assert pilot.parameter("SIM_SPEEDUP") == SPEEDUP
+    with pytest.raises(VehicleProcessError, match="died"):
+        vehicle.check()
