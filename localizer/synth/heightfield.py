@@ -6,7 +6,7 @@ some of the reference's objects and have others. Walls get facades with windows 
 World axes: x along columns, y along rows, z up, metres; camera axes are OpenCV's.
 """
 
-# ruff: noqa: PLR0917, PLR0912, PLR0915 (kernels pass arrays and unroll sums, for speed)
+# ruff: noqa: PLR0912, PLR0915 (kernels pass arrays and unroll sums, for speed)
 
 from __future__ import annotations
 

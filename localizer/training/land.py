@@ -352,7 +352,7 @@ def _box(
     return (half @ np.array([[c, s], [-s, c]]) + at).astype(np.float32)
 
 
-def _plant(  # noqa: PLR0917
+def _plant(
     rng: np.random.Generator,
     height: Float32,
     albedo: Float32,

@@ -4,8 +4,6 @@ Shapes: B pairs, N anchors a pair, C channels. Pixels have centres at +0.5, as e
 (B, 4) is fx, fy, cx, cy at image scale; a level of stride s divides it by s.
 """
 
-# ruff: noqa: PLR0917 (losses take tensors by position)
-
 from __future__ import annotations
 
 from dataclasses import dataclass

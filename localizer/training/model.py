@@ -141,7 +141,7 @@ def _pair(inputs: int, outputs: int, *, stride: int = 1, dilation: int = 1) -> l
     ]
 
 
-def _conv_bn(  # noqa: PLR0917
+def _conv_bn(
     inputs: int, outputs: int, size: int, stride: int, groups: int, dilation: int, padding: int
 ) -> nn.Sequential:
     conv = nn.Conv2d(

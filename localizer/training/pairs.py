@@ -93,7 +93,7 @@ def scene_pairs(seed: int, config: SceneConfig, library: PhotoLibrary | None) ->
     condition, outdated = "day", False
     for k in range(config.references):
         if lived is None or k % config.queries_per_light == 0:
-            condition = _condition(rng, config.conditions, k // config.queries_per_light)
+            condition = draw_condition(rng, config.conditions, k // config.queries_per_light)
             outdated = bool(rng.random() < 0.4)
             fixed = None if config.light_variety else survey.light
             lived = _lived(rng, place, condition, outdated, fixed)
@@ -103,7 +103,7 @@ def scene_pairs(seed: int, config: SceneConfig, library: PhotoLibrary | None) ->
         reference, query, camera = pair
         image, depth = render(survey, reference, camera)
         seen, seen_depth = render(lived, query, camera, supersample=2)
-        softened = _soften(rng, image)
+        softened = soften(rng, image)
         yield Pair(
             softened, depth, seen, seen_depth, reference, query, camera, condition, outdated, source
         )
@@ -185,7 +185,8 @@ def _sky(rng: np.random.Generator, condition: str) -> tuple[float, float, float]
     return (level * 0.85, level * 0.93, level) if condition == "day" else (level, level, level)
 
 
-def _condition(rng: np.random.Generator, wanted: tuple[str, ...], turn: int) -> str:
+def draw_condition(rng: np.random.Generator, wanted: tuple[str, ...], turn: int) -> str:
+    """The condition of a query: the wanted ones in turn, or drawn with the training's shares."""
     if wanted:
         return wanted[turn % len(wanted)]
     conditions = ("day", "dusk", "night", "fog", "rain", "snow")
@@ -200,7 +201,7 @@ def _pair(
         fov = rng.uniform(30, 90)
         camera = Camera.from_fov(config.width, config.height, fov)
         reference, distance = _viewpoint(rng, survey, camera)
-        query = _moved(rng, reference, distance, config.motion)
+        query = moved(rng, reference, distance, config.motion)
         if not (_clear(survey, reference) and _clear(lived, query)):
             continue
         if _overlap(survey, reference, query, camera) >= _OVERLAP:
@@ -215,15 +216,21 @@ def _viewpoint(rng: np.random.Generator, scene: LitScene, camera: Camera) -> tup
     gsd = scene.cell_m * np.exp(rng.uniform(np.log(0.6), np.log(2.0)))
     pitch = np.radians(90 - 70 * rng.random() ** 1.6)
     distance = float(np.clip(camera.fx * gsd, 50 / np.sin(pitch), 800 / np.sin(pitch)))
+    target = np.array([x, y, height_at(scene, x, y)])
+    return look_at(target, distance, pitch, rng), distance
+
+
+def look_at(target: Array, distance: float, pitch_rad: float, rng: np.random.Generator) -> Pose:
+    """A camera at `distance` from `target`, `pitch_rad` below the horizon, with some roll."""
     yaw, roll = rng.uniform(0, 2 * np.pi), np.radians(rng.normal(0, 3))
-    forward = np.array([np.cos(pitch) * np.cos(yaw), np.cos(pitch) * np.sin(yaw), -np.sin(pitch)])
+    flat = np.cos(pitch_rad)
+    forward = np.array([flat * np.cos(yaw), flat * np.sin(yaw), -np.sin(pitch_rad)])
     right = np.array([np.sin(yaw), -np.cos(yaw), 0.0])
     rotation = np.stack([right, np.cross(forward, right), forward], 1) @ so3_exp((0, 0, roll))
-    target = np.array([x, y, height_at(scene, x, y)])
-    return Pose(rotation, target - distance * forward), distance
+    return Pose(rotation, target - distance * forward)
 
 
-def _moved(
+def moved(
     rng: np.random.Generator, pose: Pose, distance: float, exact: tuple[float, float] | None
 ) -> Pose:
     """The query pose: up to 15 m and 15 deg away, or a few frames of video further."""
@@ -255,7 +262,7 @@ def _overlap(scene: LitScene, reference: Pose, query: Pose, camera: Camera) -> f
     return float(inside.mean())
 
 
-def _soften(rng: np.random.Generator, image: Image) -> Image:
+def soften(rng: np.random.Generator, image: Image) -> Image:
     """The map's texture may be coarser than the view."""
     if rng.random() < 0.5:
         return image

@@ -47,10 +47,13 @@ def shard_path(folder: Path, seed: int) -> Path:
 
 
 def write_shard(out: Path, seed: int, scenes: SceneConfig, photos: PhotoSource | None) -> Path:
-    """Generate and store one place's pairs; a reader never sees half a file."""
+    """Generate and store one place's pairs."""
     library = None if photos is None else PhotoLibrary(photos.root, photos.groups)
-    pairs = list(scene_pairs(seed, scenes, library))
-    path = shard_path(out, seed)
+    return store(shard_path(out, seed), list(scene_pairs(seed, scenes, library)), scenes)
+
+
+def store(path: Path, pairs: list[Pair], scenes: SceneConfig) -> Path:
+    """Write a shard; a reader never sees half a file."""
     partial = path.with_suffix(".partial.npz")
     np.savez(
         partial,
