@@ -19,7 +19,7 @@ from companion.geometry import (
     world_from_camera,
 )
 from localizer.errors import GeoreferenceError
-from localizer.geo import Geodetic, LocalFrame
+from localizer.geo import NED_FROM_ENU, Geodetic, LocalFrame
 from localizer.pose import Array, euler_from_matrix, matrix_from_quaternion
 from localizer.types import PoseEstimate, PosePrior
 from mavlink_bridge.messages import Attitude, GimbalAttitude, VehicleState, VisionFix
@@ -70,6 +70,15 @@ def camera_on_body(attitude: Attitude, gimbal: GimbalAttitude) -> Array:
     """Rotation (3, 3) of the camera on the body, from the autopilot's two attitudes."""
     ned_from_camera = matrix_from_quaternion(gimbal.quaternion) @ GIMBAL_FROM_CAMERA
     return body_from_camera(matrix_from_quaternion(attitude.quaternion), ned_from_camera)
+
+
+def camera_turn(begin: GimbalAttitude, end: GimbalAttitude) -> Array:
+    """Rotation (3, 3) between two camera attitudes, in the map's ENU axes (end = turn @ begin).
+
+    The map's axes stand for the vehicle's own NED: over a turn the difference is of second order.
+    """
+    turn = matrix_from_quaternion(end.quaternion) @ matrix_from_quaternion(begin.quaternion).T
+    return NED_FROM_ENU.T @ turn @ NED_FROM_ENU
 
 
 def vehicle_prior(

@@ -15,12 +15,14 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 from localizer.errors import LocalizerError
+from localizer.integrity import Integrity
 from localizer.mailbox import Mailbox
 from localizer.pipeline import Localizer, stopwatch
 from localizer.types import Frame, PoseEstimate, PosePrior, ReferenceBundle, TrackingState
 
 _log = logging.getLogger(__name__)
 _IDLE_S = 0.2
+_REPORT_EVERY_S = 5.0
 _DEFAULT_INTERVAL_NS = 100_000_000
 
 Subscriber = Callable[[PoseEstimate, ReferenceBundle], None]
@@ -60,6 +62,7 @@ class DualThreadEngine:
         self._frames: Mailbox[Frame] = Mailbox()
         self._render_times: Mailbox[int] = Mailbox()
         self._bundle: ReferenceBundle | None = None
+        self._reported_s = -_REPORT_EVERY_S
         self._interval_ns = _DEFAULT_INTERVAL_NS
         self._last_exposure_ns: int | None = None
         self._reference_ms: dict[str, float] = {}
@@ -120,30 +123,32 @@ class DualThreadEngine:
         frame = self._frames.take(_IDLE_S)
         if frame is None or not self._has_prior(frame.exposure_time_ns):
             return
-        bundle = self._bundle
-        if bundle is None:
-            self._render_times.put(frame.exposure_time_ns + self._interval_ns)
-            return
-        stage_ms = dict(self._reference_ms)
-        with stopwatch(stage_ms, "extract"):
-            query = self._localizer.extract_query(frame)
-        estimate = self._localizer.localize(frame, query, bundle.anchors)
-        self._render_times.put(self._next_exposure(frame))
+        bundle, stage_ms = self._bundle, dict(self._reference_ms)
+        try:
+            if bundle is None:
+                return
+            with stopwatch(stage_ms, "extract"):
+                query = self._localizer.extract_query(frame)
+            estimate = self._localizer.localize(frame, query, bundle.anchors)
+        finally:  # whatever became of this frame, the next one needs a reference
+            self._render_times.put(self._next_exposure(frame))
         latency_ms = (time.monotonic_ns() - frame.exposure_time_ns) * 1e-6
         stage_ms |= estimate.stage_ms | {"latency": latency_ms}
         self._publish(replace(estimate, stage_ms=stage_ms), bundle)
 
     def _has_prior(self, time_ns: int) -> bool:
-        """Whether there is a prediction to start from; a LOST tracker asks outside for one."""
+        """Whether there is a prediction to start from.
+
+        Until the first acceptance, and again when LOST, the pose known outside is the better one.
+        """
         tracker = self._localizer.tracker
         known = tracker.motion is not None
-        if known and tracker.integrity.state is not TrackingState.LOST:
+        if known and not _wants_prior(tracker.integrity):
             return True
         prior = self._prior_provider(time_ns)
         if prior is None:
             return known
         self._localizer.set_prior(prior)
-        self._bundle = None
         return True
 
     def _next_exposure(self, frame: Frame) -> int:
@@ -164,13 +169,19 @@ class DualThreadEngine:
 
     def _report(self, text: str) -> None:
         with self._health_lock:
-            fresh = text != self._health.last_error
             self._health = replace(self._health, last_error=text)
         self._count(errors=1)
-        if fresh:
+        now = time.monotonic()
+        if now - self._reported_s > _REPORT_EVERY_S:
+            self._reported_s = now
             _log.warning("%s", text)
 
     def _count(self, **increments: int) -> None:
         with self._health_lock:
             h = self._health
             self._health = replace(h, **{k: getattr(h, k) + n for k, n in increments.items()})
+
+
+def _wants_prior(integrity: Integrity) -> bool:
+    untouched = integrity.accepted_in_row == 0 and integrity.state is TrackingState.INITIALIZING
+    return untouched or integrity.state is TrackingState.LOST

@@ -12,6 +12,7 @@ from dataclasses import dataclass, replace
 
 from pydantic import BaseModel, ConfigDict, Field
 
+from localizer.registration.jngo import Registration
 from localizer.types import RegistrationStatus, TrackingState
 
 
@@ -22,10 +23,11 @@ class IntegrityConfig(BaseModel):
 
     min_overlap: float = Field(0.35, ge=0, le=1, description="share of anchors in view")
     min_quality: float = Field(0.15, ge=0, le=1, description="registration quality")
+    max_sigma_m: float = Field(4.0, gt=0, description="position sigma of a usable estimate")
     gate: float = Field(40.0, gt=0, description="squared Mahalanobis distance, 6 dof")
     confirmations: int = Field(3, ge=1, description="acceptances in a row that begin TRACKING")
     degraded_after: int = Field(3, ge=1, description="rejections in a row that end TRACKING")
-    lost_after: int = Field(15, ge=1, description="rejections in a row until LOST")
+    lost_after: int = Field(10, ge=1, description="rejections in a row until LOST")
 
 
 @dataclass(frozen=True)
@@ -42,17 +44,13 @@ class Integrity:
         return self.state in (TrackingState.TRACKING, TrackingState.DEGRADED)
 
 
-def is_acceptable(
-    config: IntegrityConfig,
-    status: RegistrationStatus,
-    overlap: float,
-    quality: float,
-    distance_squared: float,
-) -> bool:
-    """The acceptance test for one registration."""
-    if status is not RegistrationStatus.OK:
+def is_acceptable(config: IntegrityConfig, result: Registration, distance_squared: float) -> bool:
+    """The acceptance test for one registration; distance_squared: Mahalanobis, to the prediction."""
+    if result.status is not RegistrationStatus.OK:
         return False
-    if overlap < config.min_overlap or quality < config.min_quality:
+    if result.overlap < config.min_overlap or result.quality < config.min_quality:
+        return False
+    if result.covariance.diagonal()[:3].max() > config.max_sigma_m**2:
         return False
     return distance_squared <= config.gate
 

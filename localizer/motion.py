@@ -31,6 +31,7 @@ class MotionConfig(BaseModel):
 
     acceleration_sigma: float = Field(3.0, gt=0, description="m/s²")
     angular_acceleration_sigma: float = Field(1.0, gt=0, description="rad/s²")
+    turn_sigma: float = Field(0.006, gt=0, description="error of a measured turn, rad")
     initial_velocity_sigma: float = Field(8.0, gt=0, description="m/s")
     initial_angular_rate_sigma: float = Field(0.3, gt=0, description="rad/s")
 
@@ -69,25 +70,39 @@ def start(prior: PosePrior, config: MotionConfig, velocity: Array | None = None)
     return MotionState(mean, P, prior.world_from_camera.rotation, prior.time_ns)
 
 
-def predict(state: MotionState, time_ns: int, config: MotionConfig) -> MotionState:
-    """The state moved to `time_ns`; a time before the state's own moves it back the same way."""
+def predict(
+    state: MotionState, time_ns: int, config: MotionConfig, turn: Array | None = None
+) -> MotionState:
+    """The state moved to `time_ns`; a time before the state's own moves it back the same way.
+
+    turn: rotation (3, 3) of the camera since the state's time in world axes (new = turn @ old), if
+    something measured it; else the angular rate is taken as constant.
+    """
     dt = (time_ns - state.time_ns) * 1e-9
     if dt == 0.0:
         return state
     F = np.eye(12)
     F[:6, 6:] = np.eye(6) * dt
-    mean, P = kalman_predict(state.mean, state.covariance, F, _process_noise(abs(dt), config))
-    return _fold_rotation(mean, P, state.rotation, time_ns)
+    Q = _process_noise(abs(dt), config)
+    if turn is not None:
+        F[3:6, 9:] = 0.0
+        Q[3:6, :] = Q[:, 3:6] = 0.0
+        Q[3:6, 3:6] = np.eye(3) * config.turn_sigma**2
+    mean, P = kalman_predict(state.mean, state.covariance, F, Q)
+    if turn is None:
+        return _fold_rotation(mean, P, state.rotation, time_ns)
+    mean, P = np.asarray(mean).reshape(12).copy(), np.asarray(P).copy()
+    mean[9:] = so3_log(turn) / dt
+    P[9:, :] = P[:, 9:] = 0.0
+    P[9:, 9:] = np.eye(3) * config.initial_angular_rate_sigma**2
+    return _fold_rotation(mean, P, turn @ state.rotation, time_ns)
 
 
-def update(
-    state: MotionState, pose: Pose, covariance: Array, time_ns: int, config: MotionConfig
-) -> MotionState:
-    """Fuse a measured pose with covariance (6, 6) at `time_ns`."""
-    ahead = predict(state, time_ns, config)
+def update(ahead: MotionState, pose: Pose, covariance: Array) -> MotionState:
+    """Fuse a pose measured at the time of the predicted state `ahead`, covariance (6, 6)."""
     z = np.concatenate([pose.translation, so3_log(pose.rotation @ ahead.rotation.T)])
     mean, P = kalman_update(ahead.mean, ahead.covariance, z, covariance, _H)
-    return _fold_rotation(mean, P, ahead.rotation, time_ns)
+    return _fold_rotation(mean, P, ahead.rotation, ahead.time_ns)
 
 
 def inflated(state: MotionState, config: MotionConfig) -> MotionState:

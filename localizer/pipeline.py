@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 
@@ -37,6 +37,9 @@ from localizer.types import (
     RegistrationStatus,
     TrackingState,
 )
+
+# Rotation (3, 3) of the camera in world axes between two times in ns (new = turn @ old), or None.
+TurnBetween = Callable[[int, int], "Array | None"]
 
 # A reference view with less of the map in it than this has nothing to register against.
 _MIN_MAP_SHARE = 0.1
@@ -92,7 +95,11 @@ def _shrink(image: Image, camera: Camera) -> Image:
 
 
 class Localizer:
-    """The algorithm for one camera. Each half may run on its own thread."""
+    """The algorithm for one camera. Each half may run on its own thread.
+
+    turn: how the camera turned between two times, by another sensor's account; it replaces the
+    constant angular rate of the motion model where it knows.
+    """
 
     def __init__(
         self,
@@ -101,11 +108,13 @@ class Localizer:
         optimizer: JNGO,
         camera: Camera,
         config: LocalizerConfig,
+        turn: TurnBetween = lambda _begin_ns, _end_ns: None,
     ) -> None:
         self._renderer = renderer
         self._extractor = extractor
         self._optimizer = optimizer
         self._config = config
+        self._turn = turn
         self.camera = working_camera(camera, config.width)
         self._undistorter = Undistorter(camera, self.camera)
         self._lock = threading.Lock()
@@ -124,9 +133,13 @@ class Localizer:
             self._tracker = TrackerState(state, Integrity())
 
     def predict(self, time_ns: int) -> PosePrior | None:
-        """The constant-velocity prediction at `time_ns`; None before the first prior."""
+        """The motion model's prediction at `time_ns`; None before the first prior."""
         state = self.tracker.motion
-        return motion.predict(state, time_ns, self._config.motion).prior if state else None
+        return self._ahead(state, time_ns).prior if state else None
+
+    def _ahead(self, state: MotionState, time_ns: int) -> MotionState:
+        turn = self._turn(state.time_ns, time_ns)
+        return motion.predict(state, time_ns, self._config.motion, turn)
 
     def make_reference(self, prior: PosePrior, *, wait: bool = False) -> ReferenceBundle:
         """Render the view at the prior's pose and select its geo-anchors (paper, Eq. 1 and 2)."""
@@ -151,7 +164,7 @@ class Localizer:
         if tracker.motion is None:
             raise OutsideMapError("no pose prior yet: call set_prior before localizing")
         config = self._config
-        ahead = motion.predict(tracker.motion, frame.exposure_time_ns, config.motion)
+        ahead = self._ahead(tracker.motion, frame.exposure_time_ns)
         started = time.perf_counter()
         result = self._optimizer.register(
             query,
@@ -164,31 +177,21 @@ class Localizer:
         elapsed_ms = (time.perf_counter() - started) * 1e3
         acceptable = self._acceptable(result, ahead.prior)
         integrity = judge(tracker.integrity, config.integrity, acceptable)
-        self._store(tracker, self._next_motion(ahead, result, frame, acceptable), integrity)
+        self._store(tracker, self._next_motion(ahead, result, acceptable), integrity)
         return _estimate(frame, result, integrity, acceptable, {"register": elapsed_ms})
 
     def _acceptable(self, result: Registration, prior: PosePrior) -> bool:
         # Also before tracking: the gate is against the prior's own covariance, which is wide then.
         distance = motion.mahalanobis_squared(prior, result.world_from_camera, result.covariance)
-        return is_acceptable(
-            self._config.integrity, result.status, result.overlap, result.quality, distance
-        )
+        return is_acceptable(self._config.integrity, result, distance)
 
     def _next_motion(
-        self, ahead: MotionState, result: Registration, frame: Frame, acceptable: bool
+        self, ahead: MotionState, result: Registration, acceptable: bool
     ) -> MotionState:
         if not acceptable:
-            credible = is_acceptable(
-                self._config.integrity, result.status, result.overlap, result.quality, 0.0
-            )
+            credible = is_acceptable(self._config.integrity, result, 0.0)
             return motion.inflated(ahead, self._config.motion) if credible else ahead
-        return motion.update(
-            ahead,
-            result.world_from_camera,
-            result.covariance,
-            frame.exposure_time_ns,
-            self._config.motion,
-        )
+        return motion.update(ahead, result.world_from_camera, result.covariance)
 
     def _store(self, seen: TrackerState, state: MotionState, integrity: Integrity) -> None:
         """Keep the new state unless a prior from outside replaced it meanwhile."""

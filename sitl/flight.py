@@ -53,7 +53,7 @@ _TRUTH_PERIOD_S = 0.02
 _TRACKING_TIMEOUT_S = 60.0
 _LEG_MARGIN_S = 60.0
 _COMPANION_STOP_S = 20.0
-_MOVING_TARGET = "car0"
+MOVING = "car"  # what the moving targets' names begin with
 
 Progress = Callable[[str, float], None]
 
@@ -137,10 +137,10 @@ def fly(
 def observed_targets(
     assets: FlightAssets, movers: tuple[Mover, ...], frame: LocalFrame
 ) -> tuple[Observed, ...]:
-    """The world's named points and one of its cars, in the map's ENU."""
+    """The world's named points and its moving cars, in the map's ENU."""
     to_map = frame.ecef_from_enu.inverse @ assets.world.frame.ecef_from_enu
     fixed = (FixedPoint(t.name, to_map.apply(t.position)) for t in assets.world.targets)
-    return (*fixed, *(m for m in movers if m.name == _MOVING_TARGET))
+    return (*fixed, *(m for m in movers if m.name.startswith(MOVING)))
 
 
 class _Run:

@@ -1,4 +1,11 @@
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
 from localizer.integrity import Integrity, IntegrityConfig, is_acceptable, judge
+from localizer.pose import Pose
+from localizer.registration.jngo import Registration
 from localizer.types import RegistrationStatus, TrackingState
 
 CONFIG = IntegrityConfig(confirmations=3, degraded_after=2, lost_after=5)
@@ -31,14 +38,24 @@ def test_lost_recovers_only_by_confirmations():
     assert _run(lost, "+++").state is TrackingState.TRACKING
 
 
-def test_every_criterion_can_reject():
-    good = {"status": RegistrationStatus.OK, "overlap": 0.9, "quality": 0.9, "distance_squared": 1}
-    bad = [
+def _registration(**change) -> Registration:
+    good = Registration(Pose.identity(), np.eye(6), 0.1, 0.9, 0.9, RegistrationStatus.OK, 1, 1)
+    return replace(good, **change)
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
         {"status": RegistrationStatus.NO_TEXTURE},
         {"overlap": 0.1},
         {"quality": 0.01},
-        {"distance_squared": 1e4},
-    ]
-    assert is_acceptable(CONFIG, **good)
-    for change in bad:
-        assert not is_acceptable(CONFIG, **(good | change)), change
+        {"covariance": np.eye(6) * 100.0},
+    ],
+)
+def test_every_criterion_can_reject(change):
+    assert is_acceptable(CONFIG, _registration(), 1.0)
+    assert not is_acceptable(CONFIG, _registration(**change), 1.0)
+
+
+def test_the_gate_rejects():
+    assert not is_acceptable(CONFIG, _registration(), 1e4)

@@ -20,7 +20,8 @@ def test_filter_learns_a_constant_velocity_and_turn_rate():
     for k in range(1, 31):
         t = 0.1 * k
         pose = Pose(so3_exp(rate * t), velocity * t)
-        state = motion.update(state, pose, np.eye(6) * 1e-4, round(t * SECOND), CONFIG)
+        ahead = motion.predict(state, round(t * SECOND), CONFIG)
+        state = motion.update(ahead, pose, np.eye(6) * 1e-4)
     ahead = motion.predict(state, round(3.5 * SECOND), CONFIG)
     truth = Pose(so3_exp(rate * 3.5), velocity * 3.5)
     translation, rotation = truth.distance_to(ahead.prior.world_from_camera)
@@ -53,7 +54,8 @@ def test_filtered_errors_match_the_filters_own_covariance():
             noise = rng.normal(0, [0.3] * 3 + [0.005] * 3)
             seen = Pose(so3_exp(noise[3:]) @ truth.rotation, truth.translation + noise[:3])
             R = np.diag([0.09] * 3 + [0.005**2] * 3)
-            state = motion.update(state, seen, R, round(k * dt * SECOND), CONFIG)
+            ahead = motion.predict(state, round(k * dt * SECOND), CONFIG)
+            state = motion.update(ahead, seen, R)
         nees.append(motion.mahalanobis_squared(state.prior, truth))
     # The rotation never accelerates here, so its part is conservative.
     assert 2.0 < np.mean(nees) < 8.0
@@ -74,3 +76,15 @@ def test_inflation_doubles_sigma_up_to_its_limits():
         wider = motion.inflated(wider, CONFIG)
     assert np.sqrt(wider.covariance.diagonal()[:3]).max() <= 10.0 + 1e-6
     assert np.linalg.eigvalsh(wider.covariance).min() >= 0
+
+
+def test_a_measured_turn_replaces_the_constant_rate():
+    state = motion.start(_prior(0.01), CONFIG)
+    turn = so3_exp([0.0, 0.0, 0.5])
+    ahead = motion.predict(state, SECOND, CONFIG, turn)
+    np.testing.assert_allclose(ahead.rotation, turn, atol=1e-12)
+    blind = motion.predict(state, SECOND, CONFIG)
+    assert ahead.covariance[5, 5] < 0.01 * blind.covariance[5, 5]
+    # and what follows without a measurement goes on turning at that rate
+    later = motion.predict(ahead, 2 * SECOND, CONFIG)
+    np.testing.assert_allclose(later.rotation, so3_exp([0.0, 0.0, 1.0]), atol=1e-9)
