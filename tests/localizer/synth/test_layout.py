@@ -1,0 +1,116 @@
+"""The plan of the demo-sized world: what the issue asks to stand in it."""
+
+from collections import Counter
+
+import numpy as np
+import pytest
+from scipy.sparse import coo_matrix
+from scipy.sparse.csgraph import connected_components
+
+from localizer.synth.buildings import Kind, build
+from localizer.synth.config import WorldConfig
+from localizer.synth.ground import Material
+from localizer.synth.layout import URBAN, WorldPlan, _zones, plan_world
+from localizer.synth.streets import make_lattice, make_streets
+from localizer.synth.terrain import make_terrain
+
+
+@pytest.fixture(scope="module", params=[1, 2])
+def plan(request: pytest.FixtureRequest) -> WorldPlan:
+    return plan_world(WorldConfig(request.param))
+
+
+def test_relief(plan):
+    assert float(np.ptp(plan.terrain.heights)) >= 60.0
+
+
+def test_buildings_are_many_varied_and_apart(plan):
+    kinds = Counter(b.kind for b in plan.buildings)
+    houses = sum(n for k, n in kinds.items() if k not in {Kind.SHED, Kind.CONTAINER})
+    assert houses >= 800
+    assert {Kind.GABLE, Kind.HIP, Kind.L_GABLE, Kind.FLAT, Kind.HALL, Kind.ROW} <= set(kinds)
+    assert kinds[Kind.CHURCH] >= 1
+    centres = np.array([b.centre for b in plan.buildings])
+    away = np.linalg.norm(centres[:, None] - centres[None], axis=-1)
+    np.fill_diagonal(away, np.inf)
+    assert away.min() > 2.0
+
+
+def test_ground_has_fields_water_streets_and_markings(plan):
+    present = set(plan.regions.material[[s.region for s in plan.shapes]])
+    wanted = {
+        Material.CROP,
+        Material.WATER,
+        Material.ASPHALT,
+        Material.MARKING,
+        Material.KERB,
+        Material.PAVEMENT,
+        Material.TURF,
+    }
+    assert wanted <= present
+
+
+def test_trees_and_parking_places(plan):
+    assert len(plan.trees.xy) > 2000
+    assert len(plan.slots) > 500
+    assert np.abs(plan.trees.xy).max() <= plan.config.half_m
+
+
+def test_buildings_keep_off_the_water(plan):
+    centres = np.array([b.centre for b in plan.buildings])
+    distance, nearest = plan.terrain.river.distance(centres)
+    assert (distance > plan.terrain.river.width[nearest] / 2).all()
+
+
+def test_targets_lie_on_surfaces_near_the_middle(plan):
+    assert len(plan.targets) == 3
+    for target in plan.targets:
+        x, y, z = target.position
+        assert np.hypot(x, y) < 500.0
+        above = z - float(plan.terrain.height(x, y))
+        if "roof" in target.name:
+            assert above > 3.0
+        else:
+            assert abs(above) < 1e-6
+
+
+def test_cars_have_minutes_of_road(plan):
+    road = plan.roads[0]
+    length = np.linalg.norm(np.diff(road, axis=0), axis=1).sum()
+    assert length > 1200.0
+    assert np.abs(road[:, :2]).max() < plan.config.half_m
+
+
+def test_streets_are_one_net():
+    config = WorldConfig(3)
+    terrain, lattice = make_terrain(config), make_lattice(config)
+    zones = _zones(config, lattice, terrain)
+    net = make_streets(config, terrain, {c: z in URBAN for c, z in zones.items()}, lattice)
+    a, b = (np.array([getattr(s, end) for s in net.streets]) for end in "ab")
+    n = len(net.nodes)
+    _, label = connected_components(coo_matrix((np.ones(len(a)), (a, b)), shape=(n, n)), False)
+    assert len(set(label[a])) == 1
+    assert {s.rank for s in net.streets} == {0, 1, 2}
+
+
+def test_surfaces_face_outwards(plan):
+    """Seen from its own middle, every outer wall and roof of a simple house looks away."""
+    for building in [b for b in plan.buildings if b.kind is Kind.HIP][:20]:
+        middle = np.array([*building.centre, building.base_z + building.eaves_m / 2])
+        for surface in build(building)[:8]:
+            away = surface.polygon.mean(axis=0) - middle
+            assert away @ surface.normal > 0
+            np.testing.assert_allclose(
+                np.cross(surface.down, surface.right), surface.normal, atol=1e-9
+            )
+
+
+def test_a_chart_covers_its_polygon(plan):
+    for building in plan.buildings[:60]:
+        for surface in build(building):
+            away = surface.polygon - surface.origin
+            s, t = away @ surface.right, away @ surface.down
+            assert min(s.min(), t.min()) > -1e-6
+            assert s.max() < surface.extent[0] + 1e-6
+            assert t.max() < surface.extent[1] + 1e-6
+            assert np.abs(away @ surface.normal).max() < 0.05

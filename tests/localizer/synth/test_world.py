@@ -1,0 +1,293 @@
+"""A generated world as the files that others read, by an independent reader of 3D Tiles."""
+
+import hashlib
+import json
+import struct
+import time
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from localizer.errors import MapSourceError
+from localizer.geo import ecef_from_geodetic
+from localizer.synth.config import SURVEY, WorldConfig
+from localizer.synth.world import WorldInfo, build_visits, build_world
+
+TERRAIN_FACES = 2 * 20 * 20  # of a leaf, first in its face list
+
+
+@dataclass
+class Content:
+    positions: np.ndarray  # (V, 3) in the tile's z-up frame
+    uvs: np.ndarray
+    faces: np.ndarray
+    jpeg: bytes
+
+    @property
+    def image(self) -> np.ndarray:
+        return cv2.imdecode(np.frombuffer(self.jpeg, np.uint8), cv2.IMREAD_COLOR)[..., ::-1]
+
+
+@dataclass
+class Tile:
+    name: str
+    depth: int
+    ecef_from_tile: np.ndarray  # (4, 4)
+    box: np.ndarray  # (12,)
+    error: float
+    content: Content
+    json: dict
+    parent: "Tile | None"
+
+
+def read_tileset(folder: Path) -> list[Tile]:
+    document = json.loads((folder / "tileset.json").read_text())
+    assert document["asset"]["version"] == "1.1"
+    return list(_walk(folder, document["root"], np.eye(4), None))
+
+
+def _walk(folder: Path, tile: dict, above: np.ndarray, parent: Tile | None) -> Iterator[Tile]:
+    own = np.array(tile.get("transform", np.eye(4).T.ravel())).reshape(4, 4).T
+    uri = tile["content"]["uri"]
+    this = Tile(
+        uri,
+        0 if parent is None else parent.depth + 1,
+        above @ own,
+        np.array(tile["boundingVolume"]["box"]),
+        tile["geometricError"],
+        read_glb((folder / uri).read_bytes()),
+        tile,
+        parent,
+    )
+    yield this
+    for child in tile.get("children", []):
+        yield from _walk(folder, child, this.ecef_from_tile, this)
+
+
+def read_glb(data: bytes) -> Content:
+    magic, version, total = struct.unpack_from("<4sII", data)
+    assert (magic, version, total) == (b"glTF", 2, len(data))
+    length, kind = struct.unpack_from("<I4s", data, 12)
+    assert kind == b"JSON"
+    assert length % 4 == 0
+    document = json.loads(data[20 : 20 + length])
+    size, kind = struct.unpack_from("<I4s", data, 20 + length)
+    assert kind == b"BIN\0"
+    binary = data[28 + length : 28 + length + size]
+    assert document["buffers"][0]["byteLength"] == size
+
+    def accessor(index: int) -> np.ndarray:
+        a = document["accessors"][index]
+        view = document["bufferViews"][a["bufferView"]]
+        width = {"VEC3": 3, "VEC2": 2, "SCALAR": 1}[a["type"]]
+        dtype = {5126: "<f4", 5125: "<u4"}[a["componentType"]]
+        assert view["byteOffset"] % 4 == 0
+        assert view["byteLength"] == a["count"] * width * 4
+        values = np.frombuffer(binary, dtype, a["count"] * width, view["byteOffset"])
+        values = values.reshape(-1, width)
+        if "min" in a:
+            np.testing.assert_allclose(values.min(0), a["min"], rtol=1e-6)
+            np.testing.assert_allclose(values.max(0), a["max"], rtol=1e-6)
+        return values
+
+    primitive = document["meshes"][0]["primitives"][0]
+    x, y, z = accessor(primitive["attributes"]["POSITION"]).astype(float).T
+    image = document["images"][0]
+    assert image["mimeType"] == "image/jpeg"
+    view = document["bufferViews"][image["bufferView"]]
+    return Content(
+        np.stack([x, -z, y], -1),  # glTF is y-up
+        accessor(primitive["attributes"]["TEXCOORD_0"]),
+        accessor(primitive["indices"]).reshape(-1, 3).astype(np.int64),
+        binary[view["byteOffset"] : view["byteOffset"] + view["byteLength"]],
+    )
+
+
+def box_half(tile) -> tuple[np.ndarray, np.ndarray]:
+    box = tile.box.reshape(4, 3)
+    assert np.count_nonzero(box[1:] - np.diag(np.diag(box[1:]))) == 0
+    return box[0], np.diag(box[1:])
+
+
+def to_enu(info: WorldInfo, tile, points: np.ndarray) -> np.ndarray:
+    T = tile.ecef_from_tile
+    return info.frame.ecef_from_enu.inverse.apply(points @ T[:3, :3].T + T[:3, 3])
+
+
+@pytest.fixture(scope="module")
+def survey(small_world):
+    folder, info = small_world["survey"]
+    return info, read_tileset(folder)
+
+
+def hashes(folder: Path) -> dict[str, str]:
+    files = sorted(p for p in folder.iterdir() if p.is_file())
+    return {p.name: hashlib.sha256(p.read_bytes()).hexdigest() for p in files}
+
+
+def test_same_seed_gives_the_same_bytes_in_any_number_of_processes(small_world, tmp_path):
+    folder, info = small_world["survey"]
+    config = WorldConfig(info.seed, info.size_m, town_radius_m=260.0)
+    build_visits(config, {tmp_path: ("survey", SURVEY)}, processes=2)
+    assert hashes(tmp_path) == hashes(folder)
+
+
+def test_another_seed_gives_another_place(small_world, tmp_path):
+    _, info = small_world["survey"]
+    other = build_world(info.seed + 1, tmp_path, size_m=400.0, processes=1)
+    assert other.origin != info.origin
+    assert np.abs(other.terrain.heights - info.terrain.heights).max() > 1.0
+
+
+def test_a_small_world_takes_seconds(small_world, tmp_path):
+    start = time.process_time()  # the machine may be busy: CPU seconds of this process
+    build_world(9, tmp_path, size_m=400.0, processes=1)
+    assert time.process_time() - start < 15.0
+
+
+def test_tileset_is_a_quadtree_of_four_levels_on_earth(survey):
+    info, tiles = survey
+    depths = [t.depth for t in tiles]
+    assert [depths.count(d) for d in range(4)] == [1, 1, 4, 16]
+    for tile in tiles:
+        assert tile.json["refine"] == "REPLACE"
+        R = tile.ecef_from_tile[:3, :3]
+        np.testing.assert_allclose(R @ R.T, np.eye(3), atol=1e-12)
+        if tile.parent is not None:
+            assert tile.error <= tile.parent.error
+    leaf_errors = [t.error for t in tiles if t.depth == 3]
+    assert max(leaf_errors) == 0.0
+    centre = tiles[0].ecef_from_tile[:3, 3]
+    o = info.origin
+    origin = ecef_from_geodetic(o.latitude_deg, o.longitude_deg, o.height_m)
+    assert np.linalg.norm(centre - origin) < 60.0
+
+
+def test_boxes_hold_their_content_and_their_children(survey):
+    info, tiles = survey
+    for tile in tiles:
+        centre, half = box_half(tile)
+        assert (np.abs(tile.content.positions - centre) <= half + 1e-3).all()
+        if tile.parent is None:
+            continue
+        above, reach = box_half(tile.parent)
+        signs = np.array(np.meshgrid([-1, 1], [-1, 1], [-1, 1])).reshape(3, -1).T
+        corners = to_enu(info, tile, centre + signs * half)
+        T = np.linalg.inv(tile.parent.ecef_from_tile)
+        ecef = info.frame.ecef_from_enu.apply(corners)
+        inside = ecef @ T[:3, :3].T + T[:3, 3]
+        assert (np.abs(inside - above) <= reach + 1e-3).all()
+
+
+def test_leaf_terrain_is_the_ground_that_the_world_info_tells(survey):
+    info, tiles = survey
+    for tile in tiles:
+        if tile.depth != 3:
+            continue
+        used = np.unique(tile.content.faces[:TERRAIN_FACES])
+        enu = to_enu(info, tile, tile.content.positions[used])
+        height = info.ground_height(enu[:, 0], enu[:, 1])
+        np.testing.assert_allclose(enu[:, 2], height, atol=2e-3)
+
+
+def test_coarse_terrain_stays_within_its_geometric_error(survey):
+    info, tiles = survey
+    for tile in tiles:
+        if tile.depth == 3:
+            continue
+        faces = tile.content.faces[: 2 * 100]
+        corners = to_enu(info, tile, tile.content.positions[faces].reshape(-1, 3)).reshape(-1, 3, 3)
+        middle = corners.mean(axis=1)
+        away = np.abs(middle[:, 2] - info.ground_height(middle[:, 0], middle[:, 1]))
+        assert away.max() <= tile.error
+
+
+def test_textures_are_jpegs_of_at_least_15_cm_texels(survey):
+    _, tiles = survey
+    for tile in tiles:
+        image = tile.content.image
+        assert image.ndim == 3
+        uv, faces = tile.content.uvs, tile.content.faces
+        assert uv.min() >= 0
+        assert uv.max() <= 1
+        if tile.depth != 3:
+            continue
+        p = tile.content.positions[faces[:TERRAIN_FACES]][..., :2]
+        t = uv[faces[:TERRAIN_FACES]].astype(float) * image.shape[1::-1]
+        metres = np.linalg.norm(p[:, 1] - p[:, 0], axis=1)
+        texels = np.linalg.norm(t[:, 1] - t[:, 0], axis=1)
+        assert (metres / texels).max() <= 0.15
+
+
+def test_ground_texture_has_detail(survey):
+    """Registration needs contrast: of the finest ground only water may be nearly plain."""
+    _, tiles = survey
+    spread = []
+    for tile in tiles:
+        if tile.depth == 3:
+            ground = tile.content.image[16:816, 16:816].astype(float).mean(axis=2)
+            spread.append(ground.reshape(8, 100, 8, 100).std(axis=(1, 3)))
+    assert np.quantile(spread, 0.1) > 6.0  # grey levels within 12.5 m
+
+
+def test_neighbouring_tiles_agree_at_their_border(survey):
+    """Heights of shared border nodes are equal, so leaves leave no cracks between them."""
+    info, tiles = survey
+    seen: dict[tuple[int, int], float] = {}
+    shared = 0
+    for tile in tiles:
+        if tile.depth != 3:
+            continue
+        used = np.unique(tile.content.faces[:TERRAIN_FACES])
+        for x, y, z in to_enu(info, tile, tile.content.positions[used]):
+            key = (round(x), round(y))
+            shared += key in seen
+            assert abs(seen.setdefault(key, z) - z) < 2e-3
+    assert shared > 400
+
+
+def test_live_is_the_same_place_in_another_light(small_world):
+    survey = {t.name: t for t in read_tileset(small_world["survey"][0])}
+    live = {t.name: t for t in read_tileset(small_world["live"][0])}
+    assert survey.keys() == live.keys()
+    for name, tile in survey.items():
+        other = live[name]
+        np.testing.assert_array_equal(tile.content.positions[:400], other.content.positions[:400])
+        ground = np.s_[16:416, 16:416]
+        a, b = (t.content.image[ground].astype(float) for t in (tile, other))
+        assert np.abs(a - b).mean() > 6.0
+    assert small_world["survey"][1].targets[0].name == small_world["live"][1].targets[0].name
+
+
+def test_world_info_survives_the_disk(small_world):
+    folder, info = small_world["survey"]
+    back = WorldInfo.load(folder)
+    assert back.origin == info.origin
+    assert back.variant == "survey"
+    for a, b in zip(back.targets, info.targets, strict=True):
+        assert a.name == b.name
+        np.testing.assert_allclose(a.position, b.position)
+    east, north = np.random.default_rng(0).uniform(-190, 190, (2, 50))
+    np.testing.assert_allclose(back.ground_height(east, north), info.ground_height(east, north))
+    for road in back.roads:
+        np.testing.assert_allclose(
+            road[:, 2], info.ground_height(road[:, 0], road[:, 1]), atol=0.02
+        )
+
+
+def test_missing_and_foreign_folders_are_named(tmp_path):
+    with pytest.raises(MapSourceError, match=r"world\.json"):
+        WorldInfo.load(tmp_path)
+    (tmp_path / "world.json").write_text("{}")
+    with pytest.raises(MapSourceError, match="not a generated world"):
+        WorldInfo.load(tmp_path)
+
+
+@pytest.mark.parametrize("size", [0.0, 300.0, -400.0])
+def test_a_size_that_tiles_cannot_cover_is_refused(size):
+    with pytest.raises(MapSourceError, match="multiple of 400"):
+        WorldConfig(1, size)
