@@ -175,7 +175,7 @@ def gimbal_step(pitch_deg: float, yaw_deg: float) -> MissionStep:
     """Point the gimbal; yaw from the vehicle's nose."""
     return MissionStep(
         mavlink.MAV_CMD_DO_GIMBAL_MANAGER_PITCHYAW,
-        (pitch_deg, yaw_deg, math.nan, math.nan),
+        (pitch_deg, yaw_deg, 0.0, 0.0),
         raw_x=0,
     )
 

@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from math import isnan
 from typing import Any, Protocol
 
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from sitl.embedded.geodesy import Location
 
-ACCEPTED, UNSUPPORTED, NO_SPACE, INVALID_SEQUENCE, CANCELLED = 0, 3, 4, 13, 15
+# MAV_MISSION_RESULT
+ACCEPTED, UNSUPPORTED, NO_SPACE, _INVALID_PARAMETER_1, INVALID_SEQUENCE = 0, 3, 4, 6, 13
 _MISSION_TYPE = 0  # MAV_MISSION_TYPE_MISSION
 _MAX_ITEMS = 700
 _RELATIVE_FRAMES = (3, 6)
@@ -122,7 +124,13 @@ class MissionStore:
             self._expected = 0
             self._acknowledge(UNSUPPORTED, reply)
             return False
-        self._incoming.append(item_from(message))
+        item = item_from(message)
+        bad = _not_a_number(item)
+        if bad is not None:
+            self._expected = 0
+            self._acknowledge(_INVALID_PARAMETER_1 + bad, reply)
+            return False
+        self._incoming.append(item)
         if len(self._incoming) < self._expected:
             self._request(len(self._incoming), reply)
             return False
@@ -155,6 +163,14 @@ class MissionStore:
                 item.altitude_m,
             )
         )
+
+
+def _not_a_number(item: MissionItem) -> int | None:
+    """Index of the first NaN parameter; only the yaw of a place may be one, as in ArduPilot."""
+    for index, value in enumerate(item.parameters):
+        if isnan(value) and not (index == 3 and item.command in NAVIGATION):
+            return index
+    return None
 
 
 def item_from(message: Any) -> MissionItem:

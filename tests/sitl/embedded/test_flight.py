@@ -180,14 +180,13 @@ def item(command, north=0.0, east=0.0, height=0.0, *, home):
 
 def test_flies_a_mission_with_speed_gimbal_and_return(bench, home):
     b = bench({"MNT1_TYPE": 7, "WPNAV_SPEED_UP": 500, "LAND_SPEED_HIGH": 300})
-    nan = math.nan
     bare = {"latitude_deg": 0.0, "longitude_deg": 0.0, "altitude_m": 0.0, "frame": 3}
     b.vehicle.mission.items = [
         item(mis.WAYPOINT, home=home),
         item(mis.TAKEOFF, height=40.0, home=home),
         MissionItem(command=mis.CHANGE_SPEED, parameters=(1.0, 6.0, -1.0, 0.0), **bare),
         item(mis.WAYPOINT, 100, 0, 40.0, home=home),
-        MissionItem(command=mis.GIMBAL_PITCHYAW, parameters=(-70.0, 20.0, nan, nan), **bare),
+        MissionItem(command=mis.GIMBAL_PITCHYAW, parameters=(-70.0, 20.0, 0.0, 0.0), **bare),
         item(mis.WAYPOINT, 100, 80, 60.0, home=home),
         MissionItem(command=mis.RTL, parameters=(0.0, 0.0, 0.0, 0.0), **bare),
     ]

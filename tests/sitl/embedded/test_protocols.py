@@ -121,6 +121,16 @@ def test_an_item_out_of_order_is_refused():
     assert replies[-1].type == mavlink.MAV_MISSION_INVALID_SEQUENCE
 
 
+def test_a_parameter_that_is_no_number_is_refused():
+    store, replies = MissionStore(), Replies()
+    store.handle(sent_by_gcs(mavlink.MAVLink_mission_count_message(1, 1, 2)), replies)
+    store.handle(mission_item(0), replies)
+    item = mission_item(1, command=1000)
+    item.param3 = math.nan
+    store.handle(item, replies)
+    assert replies[-1].type == mavlink.MAV_MISSION_INVALID_PARAM3
+
+
 def test_clears_the_mission_and_has_no_fence():
     store, replies = MissionStore(), Replies()
     upload(store, [16, 22])
