@@ -54,7 +54,8 @@ def evaluate_command(
     config = LocalizerConfig(width=width, model=model, seed=seed, feature_threads=2)
     stack = MapStack(map_cache, config)
     try:
-        data = _limited(load_sequence(sequence, stack.cache.frame, name), limit)
+        data = load_sequence(sequence, stack.cache.frame, name)
+        data = data if limit is None else data.first(limit)
         localizer = build_localizer(stack, data.camera, config)
         with Progress() as bar:
             task = bar.add_task("localizing", total=len(data.images))
@@ -75,10 +76,6 @@ def evaluate_command(
     finally:
         stack.close()
     print_metrics(metrics, str(sequence))
-
-
-def _limited(data: Sequence, limit: int | None) -> Sequence:
-    return data if limit is None else Sequence(data.images[:limit], data.truth[:limit], data.camera)
 
 
 def print_metrics(metrics: LocalizationMetrics, title: str) -> None:

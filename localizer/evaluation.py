@@ -6,10 +6,11 @@ set (``images/NAME/``, ``poses/NAME.txt``, with ``camera.json`` or ``cameras/NAM
 
 from __future__ import annotations
 
+import itertools
 import time
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal
 
@@ -23,7 +24,14 @@ from localizer.metrics import LocalizationMetrics, localization_metrics
 from localizer.pipeline import Localizer
 from localizer.pose import Array, Pose, so3_exp
 from localizer.posefile import read_poses, world_from_camera
-from localizer.types import Frame, Image, PoseEstimate, PosePrior, ReferenceBundle, RegistrationStatus
+from localizer.types import (
+    Frame,
+    Image,
+    PoseEstimate,
+    PosePrior,
+    ReferenceBundle,
+    RegistrationStatus,
+)
 
 PriorMode = Literal["first", "each"]
 
@@ -36,6 +44,7 @@ class Sequence:
     """A recorded sequence: image paths in order, and the true pose of each."""
 
     images: tuple[Path, ...]
+    times_ns: tuple[int, ...]
     truth: tuple[Pose, ...]
     camera: Camera
 
@@ -45,7 +54,16 @@ class Sequence:
         if data is None:
             raise SequenceError(f"{self.images[index]}: missing or not an image")
         rgb: Image = cv2.cvtColor(data, cv2.COLOR_BGR2RGB).astype(np.uint8, copy=False)
-        return Frame(rgb, (index + 1) * _FRAME_INTERVAL_NS, self.camera, index)
+        return Frame(rgb, self.times_ns[index], self.camera, index)
+
+    def first(self, count: int) -> Sequence:
+        """The first frames of the sequence."""
+        return replace(
+            self,
+            images=self.images[:count],
+            times_ns=self.times_ns[:count],
+            truth=self.truth[:count],
+        )
 
 
 @dataclass(frozen=True)
@@ -98,7 +116,25 @@ def load_sequence(path: Path, frame: LocalFrame, name: str | None = None) -> Seq
             f"first {missing[0]}"
         )
     truth = tuple(world_from_camera(row, frame) for row in rows)
-    return Sequence(paths, truth, Camera.from_json(camera))
+    return Sequence(paths, _times(images, paths), truth, Camera.from_json(camera))
+
+
+def _times(images: Path, paths: tuple[Path, ...]) -> tuple[int, ...]:
+    """Exposure times from ``timestamps.txt`` (name and ns per line); else 30 frames a second."""
+    file = images / "timestamps.txt"
+    if not file.is_file():
+        return tuple((index + 1) * _FRAME_INTERVAL_NS for index in range(len(paths)))
+    try:
+        stamps = {
+            name: int(time_ns)
+            for name, time_ns in (x.split() for x in file.read_text().split("\n") if x)
+        }
+        times = tuple(stamps[path.name] for path in paths)
+    except (OSError, ValueError, KeyError) as error:
+        raise SequenceError(f"{file}: not 'name nanoseconds' for every image: {error}") from error
+    if any(b <= a for a, b in itertools.pairwise(times)):
+        raise SequenceError(f"{file}: exposure times must increase")
+    return times
 
 
 def _layout(path: Path, name: str | None) -> tuple[Path, Path, Path]:

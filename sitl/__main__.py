@@ -17,6 +17,7 @@ from localizer.errors import LocalizerError
 from sitl.assets import prepare
 from sitl.errors import SimulationError
 from sitl.flight import fly
+from sitl.kinematic import record_scenario
 from sitl.report import make_report, print_report
 from sitl.scenario import Scenario, ScenarioError, VehicleKind, load_scenario
 
@@ -56,14 +57,31 @@ def demo(
     print_report(make_report(record, script, seed), out)
 
 
+@app.command()
+def sequence(
+    out: Annotated[Path, typer.Argument(help="folder of the sequence")],
+    seed: Annotated[int, typer.Option(min=0, help="world, traffic, light and noise")] = 0,
+    scenario: Annotated[Path | None, typer.Option(help="scenario YAML; none: the default")] = None,
+    condition: Annotated[str | None, typer.Option(help="light and weather instead of its")] = None,
+    worlds: Annotated[Path | None, typer.Option(help="folder of generated worlds")] = None,
+) -> None:
+    """Record the scenario's path, flown without dynamics, as a sequence for `companion eval`."""
+    script = load_scenario(scenario) if scenario else Scenario()
+    if condition is not None:
+        script = Scenario.model_validate(script.model_dump() | {"condition": condition})
+    console = Console()
+    assets = prepare(seed, worlds, lambda text: console.print(f"[dim]{text}[/]"))
+    with console.status("rendering"):
+        count = record_scenario(assets, script, seed, out)
+    console.print(f"[green]{out}[/]: {count} frames; its map is {assets.map_cache}")
+
+
 def _clear(out: Path) -> None:
     """Remove an earlier report; anything else in the way is the user's."""
     if not out.exists():
         return
     if any(out.iterdir()) and not (out / "companion.yaml").exists():
-        raise ScenarioError(
-            f"{out}: holds other files than a flight's report; give another --out"
-        )
+        raise ScenarioError(f"{out}: holds other files than a flight's report; give another --out")
     shutil.rmtree(out)
 
 
