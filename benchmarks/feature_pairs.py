@@ -21,6 +21,7 @@ from localizer.render.numba_raster import NumbaRenderer
 from localizer.synth.appearance import CONDITIONS, apply_appearance, sample_appearance
 from localizer.training.data import tamed
 from localizer.training.pairs import SceneConfig, scene_pairs
+from localizer.training.worlds import world_pairs
 from localizer.types import Image, RenderedView
 
 METRES, DEGREES = 5.0, 5.0  # distance of the reference view from the query's true pose
@@ -66,6 +67,20 @@ def made_pairs(count: int, first_seed: int, threads: int) -> list[TestPair]:
     with ThreadPoolExecutor(threads) as pool:
         found = [pair for pairs in pool.map(place, places) for pair in pairs]
     return found[:count]
+
+
+def mesh_pairs(count: int, seed: int) -> list[TestPair]:
+    """Pairs of a generated mesh world that no training run has seen."""
+    rng = np.random.default_rng((seed, 2))
+    made = []
+    for pair in world_pairs(900_000 + seed, _MADE, count=count):
+        look = tamed(sample_appearance(rng, pair.condition), pair.query_depth)
+        query = apply_appearance(pair.query, pair.query_depth, look, rng)
+        view = RenderedView(
+            pair.reference, pair.reference_depth, pair.world_from_reference, pair.camera
+        )
+        made.append(TestPair(view, query, pair.world_from_query, pair.condition, False))
+    return made
 
 
 def real_pairs(folder: Path, count: int, seed: int) -> list[TestPair]:

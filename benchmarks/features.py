@@ -22,7 +22,7 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-from feature_pairs import DEGREES, METRES, TestPair, made_pairs, real_pairs
+from feature_pairs import DEGREES, METRES, TestPair, made_pairs, mesh_pairs, real_pairs
 
 from localizer.features import FeatureExtractor, GradientExtractor, load_extractor
 from localizer.pose import Pose
@@ -194,9 +194,12 @@ def main() -> None:
     parser.add_argument("--model", type=Path, action="append", default=[])
     parser.add_argument("--only-models", action="store_true", help="leave the baselines out")
     parser.add_argument("--real", type=Path, help="folder of a real set, instead of made places")
+    parser.add_argument("--mesh", action="store_true", help="a mesh world instead of height fields")
     parser.add_argument("--json", type=Path)
     args = parser.parse_args()
-    if args.real is None:
+    if args.mesh:
+        pairs = mesh_pairs(args.pairs, args.seed)
+    elif args.real is None:
         pairs = made_pairs(args.pairs, 5_000_000 + 10_000 * args.seed, threads=2)
     else:
         pairs = real_pairs(args.real, args.pairs, args.seed)

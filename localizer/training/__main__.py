@@ -11,7 +11,8 @@ import typer
 
 from localizer.training.config import TrainConfig, load_config
 from localizer.training.pairs import SceneConfig
-from localizer.training.shards import PhotoSource, write_shards
+from localizer.training.shards import PhotoSource, write_shards, write_world_shards
+from localizer.training.worlds import FIRST_SEED
 
 app = typer.Typer(help=__doc__, no_args_is_help=True, add_completion=False)
 
@@ -68,6 +69,9 @@ def _generate(config: TrainConfig) -> None:
     data = config.data
     photos = None if data.photos is None else PhotoSource(data.photos, data.photo_groups)
     seeds = range(data.first_seed, data.first_seed + data.scenes)
+    worlds = range(FIRST_SEED, FIRST_SEED + data.worlds)
+    for path in write_world_shards(data.shards, worlds, scene_config(config)):
+        logging.getLogger(__name__).debug("%s", path)
     for path in write_shards(data.shards, seeds, scene_config(config), photos, data.workers):
         logging.getLogger(__name__).debug("%s", path)
 

@@ -26,6 +26,8 @@ class DataSection(_Frozen):
     photos: Path | None
     photo_groups: tuple[str, ...]
     photo_share: float = Field(ge=0.0, le=1.0)
+    worlds: int = Field(ge=0)
+    world_share: float = Field(ge=0.0, le=1.0)
     light_variety: bool
     appearance: bool
     workers: int = Field(gt=0)

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from localizer.synth.appearance import Appearance, apply_appearance, sample_appearance
 from localizer.training.losses import Batch
 from localizer.training.pairs import Pair, relative_pose
-from localizer.training.shards import read_shard, shard_path
+from localizer.training.shards import read_shard
 from localizer.types import Float32, Image
 
 _DENSEST_HAZE = 2.0  # optical depth at the scene's median distance; beyond it nothing is left
@@ -32,24 +32,36 @@ class LoaderConfig:
     cached_shards: int = 700
 
 
+@dataclass(frozen=True)
+class Schedule:
+    """Which shards a step draws from. paths: in order of generation, of which the first `initial`
+    plus `growth` a step are in use; world_paths: mesh worlds, all in use, with their share.
+    """
+
+    paths: tuple[Path, ...]
+    initial: int
+    growth: float
+    world_paths: tuple[Path, ...]
+    world_share: float
+
+    def draw(self, step: int, rng: np.random.Generator) -> Path:
+        """The shard of one sample."""
+        if self.world_paths and rng.random() < self.world_share:
+            return self.world_paths[int(rng.integers(len(self.world_paths)))]
+        count = min(len(self.paths), int(self.initial + step * self.growth))
+        return self.paths[int(rng.integers(count))]
+
+
 class ShardStream:
-    """Deals batches from shards `first_seed` on, of which the first `available(step)` are in use.
+    """Deals batches of the shards that a schedule names.
 
     A step waits for the shards it may draw from, so that training can begin while later shards are
     still being generated and yet see the same data every time.
     """
 
-    def __init__(
-        self,
-        folder: Path,
-        first_seed: int,
-        available: tuple[int, float, int],
-        config: LoaderConfig,
-        seed: int,
-    ) -> None:
-        self._folder, self._first, self._config, self._seed = folder, first_seed, config, seed
-        self._initial, self._growth, self._total = available
-        self._cache: OrderedDict[int, list[Pair]] = OrderedDict()
+    def __init__(self, schedule: Schedule, config: LoaderConfig, seed: int) -> None:
+        self._schedule, self._config, self._seed = schedule, config, seed
+        self._cache: OrderedDict[Path, list[Pair]] = OrderedDict()
         self._pool = ThreadPoolExecutor(1)
         self._next: tuple[int, Future[Batch]] | None = None
 
@@ -68,10 +80,9 @@ class ShardStream:
 
     def _make(self, step: int) -> Batch:
         rng = np.random.default_rng((self._seed, step))
-        count = int(min(self._total, self._initial + step * self._growth))
         samples: list[Sample] = []
         while len(samples) < self._config.batch:
-            pairs = self._shard(self._first + int(rng.integers(count)))
+            pairs = self._shard(self._schedule.draw(step, rng))
             if not pairs:
                 continue
             made = crop_pair(pairs[int(rng.integers(len(pairs)))], self._config, rng)
@@ -79,17 +90,16 @@ class ShardStream:
                 samples.append(made)
         return collate(samples)
 
-    def _shard(self, seed: int) -> list[Pair]:
-        if seed in self._cache:
-            self._cache.move_to_end(seed)
-            return self._cache[seed]
-        path = shard_path(self._folder, seed)
+    def _shard(self, path: Path) -> list[Pair]:
+        if path in self._cache:
+            self._cache.move_to_end(path)
+            return self._cache[path]
         while not path.exists():
             time.sleep(0.5)
-        self._cache[seed] = read_shard(path)
+        self._cache[path] = read_shard(path)
         if len(self._cache) > self._config.cached_shards:
             self._cache.popitem(last=False)
-        return self._cache[seed]
+        return self._cache[path]
 
 
 @dataclass(frozen=True)

@@ -18,6 +18,10 @@ from localizer.errors import SequenceError
 from localizer.pose import Pose
 from localizer.training.land import PhotoLibrary
 from localizer.training.pairs import Pair, SceneConfig, scene_pairs
+from localizer.training.worlds import world_pairs
+
+WORLD_SHARDS = 8  # per mesh world
+WORLD_SHARD_PAIRS = 10
 
 
 @dataclass(frozen=True)
@@ -39,6 +43,23 @@ def write_shards(
         # All are submitted at once; results are awaited in order.
         for task in list(tasks):
             yield task.result()
+
+
+def write_world_shards(out: Path, seeds: range, scenes: SceneConfig) -> Iterator[Path]:
+    """Generate the mesh worlds of `seeds` whose shards are not all on disk yet."""
+    for seed in seeds:
+        paths = world_shard_paths(out, seed)
+        if all(path.exists() for path in paths):
+            continue
+        pairs = list(world_pairs(seed, scenes, count=len(paths) * WORLD_SHARD_PAIRS))
+        out.mkdir(parents=True, exist_ok=True)
+        for k, path in enumerate(paths):
+            yield store(path, pairs[k * WORLD_SHARD_PAIRS : (k + 1) * WORLD_SHARD_PAIRS], scenes)
+
+
+def world_shard_paths(out: Path, seed: int) -> list[Path]:
+    """Where the shards of one world lie."""
+    return [out / f"world-{seed:06d}-{k}.npz" for k in range(WORLD_SHARDS)]
 
 
 def shard_path(folder: Path, seed: int) -> Path:

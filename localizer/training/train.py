@@ -11,10 +11,12 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from localizer.training.config import OptimizerSection, TrainConfig
-from localizer.training.data import LoaderConfig, ShardStream
+from localizer.training.config import DataSection, OptimizerSection, TrainConfig
+from localizer.training.data import LoaderConfig, Schedule, ShardStream
 from localizer.training.losses import Batch, alignment_loss, contrast_loss, sample, se3_exp
 from localizer.training.model import STRIDES, TinyNet
+from localizer.training.shards import shard_path, world_shard_paths
+from localizer.training.worlds import FIRST_SEED
 
 logger = logging.getLogger(__name__)
 
@@ -55,8 +57,7 @@ class Trainer:
             last = min(last, self.step + steps)
         data, o = self.config.data, self.config.optimizer
         loader = LoaderConfig(o.batch, o.anchors, o.crop, data.appearance)
-        available = (data.initial_scenes, data.scenes_per_step, data.scenes)
-        stream = ShardStream(data.shards, data.first_seed, available, loader, self.config.seed)
+        stream = ShardStream(schedule(data), loader, self.config.seed)
         rows: list[dict[str, float]] = []
         began = time.monotonic() - self.seconds
         try:
@@ -169,6 +170,19 @@ class Trainer:
             writer.writerow({k: f"{v:.5g}" for k, v in row.items()})
         shown = " ".join(f"{k} {v:.3g}" for k, v in row.items())
         logger.info("%s", shown)
+
+
+def schedule(data: DataSection) -> Schedule:
+    """The shards of a run."""
+    seeds = range(data.first_seed, data.first_seed + data.scenes)
+    worlds = range(FIRST_SEED, FIRST_SEED + data.worlds)
+    return Schedule(
+        tuple(shard_path(data.shards, seed) for seed in seeds),
+        data.initial_scenes,
+        data.scenes_per_step,
+        tuple(path for seed in worlds for path in world_shard_paths(data.shards, seed)),
+        data.world_share,
+    )
 
 
 def learning_rate(step: int, o: OptimizerSection) -> float:

@@ -43,7 +43,8 @@ def shards(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def config(shards: Path, tmp_path: Path) -> TrainConfig:
     run = load_config(SHIPPED)
     data = run.data.model_copy(update={"shards": shards, "first_seed": 2000, "scenes": 2,
-                                       "initial_scenes": 2, "scenes_per_step": 0.0})  # fmt: skip
+                                       "initial_scenes": 2, "scenes_per_step": 0.0,
+                                       "worlds": 0})  # fmt: skip
     optimizer = run.optimizer.model_copy(update={"batch": 2, "anchors": 64, "crop": (96, 64),
                                                  "steps": 6, "threads": 1})  # fmt: skip
     model = ModelConfig(channels=8, widths=(8, 8, 16), decoder=(8, 8), dilations=(1, 2))
