@@ -37,7 +37,7 @@ class YawGuardConfig(_Model):
     """
 
     enabled: bool = True
-    limit_deg: float = Field(default=4.0, gt=0.0, le=45.0)
+    limit_deg: float = Field(default=3.5, gt=0.0, le=45.0)
     outlier_deg: float = Field(default=25.0, gt=0.0, le=180.0)
     window_s: float = Field(default=3.0, gt=0.0, le=30.0)
     minimum_samples: int = Field(default=5, ge=1)
@@ -56,7 +56,12 @@ class InjectionConfig(_Model):
     )
     sigma_floor_m: float = Field(default=0.1, gt=0.0)
     max_sigma_m: float = Field(default=10.0, gt=0.0, description="nothing is sent above it")
-    max_extrapolation_s: float = Field(default=2.0, gt=0.0, le=10.0)
+    max_extrapolation_s: float = Field(
+        default=0.5,
+        gt=0.0,
+        le=10.0,
+        description="longest gap bridged by propagation; the EKF's own inertial one is better",
+    )
     acceleration_sigma_mps2: float = Field(default=2.0, gt=0.0)
     send_attitude: bool = True
     covariance: Literal["profile", "cbrt", "sqrt", "variance"] = "profile"

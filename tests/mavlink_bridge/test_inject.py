@@ -145,7 +145,7 @@ def test_fix_too_old_to_fuse_is_propagated() -> None:
 
 
 def test_covariance_grows_between_fixes_and_sending_ends_at_the_bound() -> None:
-    it = injector(rate_hz=20, delay_ms=0, max_sigma_m=2.0)
+    it = injector(rate_hz=20, delay_ms=0, max_sigma_m=2.0, max_extrapolation_s=5.0)
     for k in range(20):
         it.submit(fix(SECOND + k * 100 * MS), SECOND + k * 100 * MS)
         it.step(SECOND + k * 100 * MS, context())
