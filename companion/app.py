@@ -14,7 +14,7 @@ import numpy as np
 from companion.build import MapStack, build_localizer
 from companion.config import CompanionConfig
 from companion.detections import DetectionListener
-from companion.fixes import camera_turn, vehicle_prior, vision_fix
+from companion.fixes import camera_rotation, vehicle_prior, vision_fix
 from companion.health import HealthMonitor
 from companion.recorder import Recorder
 from companion.sources import StreamState, open_source
@@ -44,7 +44,7 @@ class Companion:
         record = config.record
         self._recorder = Recorder(record, self._frame) if record else None
         self._bridge = Bridge(_bridge_config(config), manifest.geoid_separation_m)
-        localizer = build_localizer(self._stack, self._camera, config.localizer, self._turn)
+        localizer = build_localizer(self._stack, self._camera, config.localizer, self._rotation_at)
         self._engine = DualThreadEngine(localizer, (self._on_estimate,), self._vehicle_prior)
         self._targets = TargetReporter(config.targets, self._cast_ray, self._on_target)
         self._source = open_source(
@@ -126,10 +126,10 @@ class Companion:
             time_ns,
         )
 
-    def _turn(self, begin_ns: int, end_ns: int) -> Array | None:
-        """The camera's turn in the map's axes by the autopilot's attitude and gimbal."""
-        begin, end = self._bridge.gimbal_at(begin_ns), self._bridge.gimbal_at(end_ns)
-        return camera_turn(begin, end) if begin is not None and end is not None else None
+    def _rotation_at(self, time_ns: int) -> Array | None:
+        """The camera's rotation in the map's axes by the autopilot's attitude and gimbal."""
+        gimbal = self._bridge.gimbal_at(time_ns)
+        return camera_rotation(gimbal) if gimbal is not None else None
 
     def _on_estimate(self, estimate: PoseEstimate, _: ReferenceBundle) -> None:
         if self._recorder is not None:

@@ -9,7 +9,7 @@ from localizer.config import LocalizerConfig
 from localizer.features.extractor import load_extractor
 from localizer.map.cache import TileCache
 from localizer.map.stream import TileStreamer
-from localizer.pipeline import Localizer, TurnBetween
+from localizer.pipeline import Localizer, RotationAt
 from localizer.registration.jngo import JNGO
 from localizer.render.numba_raster import NumbaRenderer
 
@@ -31,9 +31,9 @@ def build_localizer(
     stack: MapStack,
     camera: Camera,
     config: LocalizerConfig,
-    turn: TurnBetween = lambda _begin_ns, _end_ns: None,
+    rotation_at: RotationAt = lambda _time_ns: None,
 ) -> Localizer:
-    """A localizer for one camera over an open map. turn: see `Localizer`."""
+    """A localizer for one camera over an open map. rotation_at: see `Localizer`."""
     extractor = load_extractor(config.model, threads=config.feature_threads)
     optimizer = JNGO(config.registration, threads=config.threads)
-    return Localizer(stack.renderer, extractor, optimizer, camera, config, turn)
+    return Localizer(stack.renderer, extractor, optimizer, camera, config, rotation_at)

@@ -72,13 +72,12 @@ def camera_on_body(attitude: Attitude, gimbal: GimbalAttitude) -> Array:
     return body_from_camera(matrix_from_quaternion(attitude.quaternion), ned_from_camera)
 
 
-def camera_turn(begin: GimbalAttitude, end: GimbalAttitude) -> Array:
-    """Rotation (3, 3) between two camera attitudes, in the map's ENU axes (end = turn @ begin).
+def camera_rotation(gimbal: GimbalAttitude) -> Array:
+    """Rotation (3, 3) world_from_camera by the gimbal's report.
 
-    The map's axes stand for the vehicle's own NED: over a turn the difference is of second order.
+    The map origin's axes stand for the vehicle's: 0.1° at 10 km, far below the gimbal's own error.
     """
-    turn = matrix_from_quaternion(end.quaternion) @ matrix_from_quaternion(begin.quaternion).T
-    return NED_FROM_ENU.T @ turn @ NED_FROM_ENU
+    return NED_FROM_ENU.T @ matrix_from_quaternion(gimbal.quaternion) @ GIMBAL_FROM_CAMERA
 
 
 def vehicle_prior(

@@ -11,6 +11,15 @@ from localizer.motion import MotionConfig
 from localizer.registration.jngo import JNGOConfig
 
 
+class AttitudePrior(BaseModel):
+    """How well the autopilot's attitude and the gimbal's angles tell the camera's rotation."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    tilt_sigma_deg: float = Field(0.7, gt=0, description="roll and pitch, which gravity shows")
+    heading_sigma_deg: float = Field(4.0, gt=0, description="yaw, by the compass")
+
+
 class LocalizerConfig(BaseModel):
     """What the dual-thread engine needs to know."""
 
@@ -24,5 +33,6 @@ class LocalizerConfig(BaseModel):
     cache_mib: int = Field(384, ge=16, description="resident tiles, MiB")
     seed: int = Field(0, ge=0, description="seed of anchors and hypotheses")
     registration: JNGOConfig = JNGOConfig()
+    attitude: AttitudePrior | None = AttitudePrior()
     motion: MotionConfig = MotionConfig()
     integrity: IntegrityConfig = IntegrityConfig()

@@ -25,6 +25,7 @@ from localizer.motion import MotionState
 from localizer.pose import Array
 from localizer.registration.anchors import select_anchors
 from localizer.registration.jngo import JNGO, Registration
+from localizer.registration.priors import PoseConstraint, attitude_constraint
 from localizer.render.base import MapRenderer
 from localizer.types import (
     Anchors,
@@ -38,8 +39,8 @@ from localizer.types import (
     TrackingState,
 )
 
-# Rotation (3, 3) of the camera in world axes between two times in ns (new = turn @ old), or None.
-TurnBetween = Callable[[int, int], "Array | None"]
+# The camera's rotation (3, 3), world_from_camera, at a time in ns by another sensor, or None.
+RotationAt = Callable[[int], "Array | None"]
 
 # A reference view with less of the map in it than this has nothing to register against.
 _MIN_MAP_SHARE = 0.1
@@ -97,8 +98,9 @@ def _shrink(image: Image, camera: Camera) -> Image:
 class Localizer:
     """The algorithm for one camera. Each half may run on its own thread.
 
-    turn: how the camera turned between two times, by another sensor's account; it replaces the
-    constant angular rate of the motion model where it knows.
+    rotation_at: the camera's attitude by another sensor's account (autopilot and gimbal). Its turns
+    replace the constant angular rate of the motion model, and it enters the registration as a
+    weak prior (`AttitudePrior`).
     """
 
     def __init__(
@@ -108,13 +110,13 @@ class Localizer:
         optimizer: JNGO,
         camera: Camera,
         config: LocalizerConfig,
-        turn: TurnBetween = lambda _begin_ns, _end_ns: None,
+        rotation_at: RotationAt = lambda _time_ns: None,
     ) -> None:
         self._renderer = renderer
         self._extractor = extractor
         self._optimizer = optimizer
         self._config = config
-        self._turn = turn
+        self._rotation_at = rotation_at
         self.camera = working_camera(camera, config.width)
         self._undistorter = Undistorter(camera, self.camera)
         self._lock = threading.Lock()
@@ -138,8 +140,16 @@ class Localizer:
         return self._ahead(state, time_ns).prior if state else None
 
     def _ahead(self, state: MotionState, time_ns: int) -> MotionState:
-        turn = self._turn(state.time_ns, time_ns)
+        begin, end = self._rotation_at(state.time_ns), self._rotation_at(time_ns)
+        turn = end @ begin.T if begin is not None and end is not None else None
         return motion.predict(state, time_ns, self._config.motion, turn)
+
+    def _attitude(self, time_ns: int) -> PoseConstraint | None:
+        sigma, rotation = self._config.attitude, self._rotation_at(time_ns)
+        if sigma is None or rotation is None:
+            return None
+        tilt, heading = np.radians([sigma.tilt_sigma_deg, sigma.heading_sigma_deg])
+        return attitude_constraint(rotation, float(tilt), float(heading))
 
     def make_reference(self, prior: PosePrior, *, wait: bool = False) -> ReferenceBundle:
         """Render the view at the prior's pose and select its geo-anchors (paper, Eq. 1 and 2)."""
@@ -172,6 +182,7 @@ class Localizer:
             anchors,
             ahead.prior,
             motion=ahead.prior if tracker.integrity.trusts_prediction else None,
+            constraint=self._attitude(frame.exposure_time_ns),
             seed=config.seed + frame.sequence,
         )
         elapsed_ms = (time.perf_counter() - started) * 1e3

@@ -67,7 +67,7 @@ class FakeOptimizer:
         self.status = RegistrationStatus.OK
         self.offset = np.zeros(3)
 
-    def register(self, query, camera, anchors, prior, *, motion=None, seed=0):
+    def register(self, query, camera, anchors, prior, *, motion=None, constraint=None, seed=0):
         if self.error is not None:
             raise self.error
         pose = Pose(NADIR.rotation, NADIR.translation + 0.01 + self.offset)
