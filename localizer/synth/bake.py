@@ -1,6 +1,5 @@
 """Painting and writing tiles: a block of 200 m at a time, then the coarse tiles above them."""
 
-# ruff: noqa: PLR0917 (a tile is named by its level, place and corner)
 from __future__ import annotations
 
 import pickle

@@ -1,6 +1,5 @@
 """Buildings: from a footprint and a kind to planar surfaces that can be painted and meshed."""
 
-# ruff: noqa: PLR0917 (a box has three intervals)
 from __future__ import annotations
 
 from dataclasses import dataclass, field
@@ -119,6 +118,13 @@ def rectangle(
     return local @ np.array([[c, s], [-s, c]]) + np.asarray(centre)
 
 
+def _cross(a: Array, b: Array) -> Array:
+    """np.cross of two (3,), many times faster."""
+    ax, ay, az = a
+    bx, by, bz = b
+    return np.array([ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx])
+
+
 _NO_PARAMS = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
 
 
@@ -153,8 +159,8 @@ class _Shell:
         polygon[:, 0] = b.centre[0] + c * local[:, 0] - s * local[:, 1]
         polygon[:, 1] = b.centre[1] + s * local[:, 0] + c * local[:, 1]
         polygon[:, 2] = b.base_z + local[:, 2]
-        normal = np.cross(polygon[1] - polygon[0], polygon[2] - polygon[0])
-        size = np.linalg.norm(normal)
+        normal = _cross(polygon[1] - polygon[0], polygon[2] - polygon[0])
+        size = np.sqrt(normal @ normal)
         if size < 1e-6:
             return
         normal /= size
@@ -162,8 +168,8 @@ class _Shell:
             down = np.array([s, -c, 0.0])
         else:
             down = np.array([0.0, 0.0, -1.0]) + normal[2] * normal
-            down /= np.linalg.norm(down)
-        right = np.cross(normal, down)
+            down /= np.sqrt(down @ down)
+        right = _cross(normal, down)
         u, v = polygon @ right, polygon @ down
         anchor = polygon[0]
         origin = anchor + right * (u.min() - u[0]) + down * (v.min() - v[0])

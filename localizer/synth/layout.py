@@ -1,6 +1,5 @@
 """The plan of a world: what stands where. Made once per seed; every visit paints the same plan."""
 
-# ruff: noqa: PLR0917 (every cell is planned from the same state)
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
@@ -31,6 +30,9 @@ from localizer.synth.terrain import Terrain, make_terrain
 
 _OCCUPANCY_GSD_M = 0.5
 LAYER_BASE, LAYER_PLOT, LAYER_GARDEN, LAYER_WATER, LAYER_PATH = 0, 1, 2, 10, 20
+
+
+_CROSS = np.array([[0.0, 0.0], [1.0, 0.0], [-1.0, 0.0], [0.0, 1.0], [0.0, -1.0]])
 
 
 class Zone(Enum):
@@ -140,14 +142,12 @@ class _Occupancy:
 
     def free(self, xy: Array, radius: float) -> NDArray[np.bool_]:
         """Which points (N, 2) have nothing within about `radius`, and lie inside the world."""
-        ok = np.ones(len(xy), bool)
         n = self.grid.shape[0]
-        for dx, dy in ((0, 0), (1, 0), (-1, 0), (0, 1), (0, -1)):
-            uv = self._pixels(xy + radius * np.array([dx, dy]))
-            ok &= (uv >= 0).all(1) & (uv < n).all(1)
-            uv = np.clip(uv, 0, n - 1)
-            ok &= self.grid[uv[:, 1], uv[:, 0]] == 0
-        return ok
+        uv = self._pixels((xy[:, None] + radius * _CROSS).reshape(-1, 2))
+        inside = (uv >= 0) & (uv < n)
+        uv = np.minimum(np.maximum(uv, 0), n - 1)
+        ok = inside[:, 0] & inside[:, 1] & (self.grid[uv[:, 1], uv[:, 0]] == 0)
+        return np.asarray(ok.reshape(-1, len(_CROSS)).all(axis=1))
 
 
 @dataclass

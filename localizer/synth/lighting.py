@@ -1,6 +1,6 @@
 """Shadows and sky light from a digital surface model of everything that stands in the world."""
 
-# ruff: noqa: PLR0917, PLR1730 (kernels pass arrays)
+# ruff: noqa: PLR1730 (kernels pass arrays)
 from __future__ import annotations
 
 import cv2
@@ -45,25 +45,42 @@ def raise_surface(dsm, triangles, west, north, gsd):  # type: ignore[no-untyped-
                         dsm[i, j] = z
 
 
+_CELL = 16  # pixels; a ray leaps over cells that cannot reach it
+
+
+def _reachable(dsm: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Highest surface (h, w) within a cell of _CELL pixels and its eight neighbours."""
+    rows, columns = (-(-n // _CELL) for n in dsm.shape)
+    padded = np.full((rows * _CELL, columns * _CELL), dsm.min(), np.float32)
+    padded[: dsm.shape[0], : dsm.shape[1]] = dsm
+    cells = padded.reshape(rows, _CELL, columns, _CELL).max(axis=(1, 3))
+    return np.asarray(cv2.dilate(cells, np.ones((3, 3), np.uint8)), np.float32)
+
+
 @njit(cache=True, nogil=True, fastmath=True)
-def _shadow_ceiling(dsm, top, left, shape_h, shape_w, step_u, step_v, drop, steps, out):  # type: ignore[no-untyped-def]
+def _shadow_ceiling(  # type: ignore[no-untyped-def]
+    dsm, reachable, top, left, step_u, step_v, drop, steps, out
+):
     """out[i, j] = highest shadow ray over the pixel: max over t of dsm(p + t sun) - t tan."""
     rows, columns = dsm.shape
-    highest = dsm.max()
-    for i in range(shape_h):
-        for j in range(shape_w):
+    for i in range(out.shape[0]):
+        for j in range(out.shape[1]):
             best = -1e9
             u, v = float(left + j), float(top + i)
-            for k in range(2, steps):
+            k = 2
+            while k < steps:
                 a, b = u + k * step_u, v + k * step_v
-                fall = k * drop
-                if a < 0 or b < 0 or a >= columns - 1 or b >= rows - 1 or highest - fall < best:
+                if a < 0 or b < 0 or a >= columns - 1 or b >= rows - 1:
                     break
                 ia, ib = int(a), int(b)
+                if (k - 2) % _CELL == 0 and reachable[ib // _CELL, ia // _CELL] - k * drop <= best:
+                    k += _CELL
+                    continue
                 fa, fb = a - ia, b - ib
                 z = (dsm[ib, ia] * (1 - fa) + dsm[ib, ia + 1] * fa) * (1 - fb)
                 z += (dsm[ib + 1, ia] * (1 - fa) + dsm[ib + 1, ia + 1] * fa) * fb
-                best = max(best, z - fall)
+                best = max(best, z - k * drop)
+                k += 1
             out[i, j] = best
 
 
@@ -90,8 +107,8 @@ def make_light(
     level = float(np.hypot(sun[0], sun[1]))
     ceiling = np.empty((height, width), np.float32)
     _shadow_ceiling(
-        near, top - row, left - column, height, width,
-        sun[0] / level, -sun[1] / level, DSM_GSD_M * sun[2] / level, reach, ceiling,
+        near, _reachable(near), top - row, left - column, sun[0] / level, -sun[1] / level,
+        DSM_GSD_M * sun[2] / level, reach, ceiling,
     )  # fmt: skip
     closed = np.zeros((height, width), np.float32)
     # Neighbours that rise over a point hide sky: near ones more sharply than far ones.

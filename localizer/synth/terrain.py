@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import cv2
 import numpy as np
@@ -25,9 +26,13 @@ class River:
     width: Array
     level: Array
 
+    @cached_property
+    def _tree(self) -> cKDTree:
+        return cKDTree(self.points)
+
     def distance(self, xy: ArrayLike) -> tuple[Array, NDArray[np.intp]]:
         """Distance (...,) in metres from points (..., 2) to the middle line, and nearest index."""
-        distance, index = cKDTree(self.points).query(np.asarray(xy))
+        distance, index = self._tree.query(np.asarray(xy))
         return np.asarray(distance), np.asarray(index)
 
 

@@ -5,7 +5,7 @@ repeat, tiles join without seams, and two visits differ only in what the `Look` 
 sRGB values used as albedo; light is ``sky * ambient_occlusion + sun * cos(angle) * lit``.
 """
 
-# ruff: noqa: PLR0917, PLR0912, PLR0915, PLR0911, PLW3301, PLR1714, SIM102 (kernels pass arrays and
+# ruff: noqa: PLR0912, PLR0915, PLR0911, PLW3301, PLR1714, SIM102 (kernels pass arrays and
 # branch over materials)
 from __future__ import annotations
 

@@ -1,6 +1,5 @@
 """Trees and hedges as low-poly crowns whose texture is painted as seen from above."""
 
-# ruff: noqa: PLR0917
 from __future__ import annotations
 
 import numpy as np
