@@ -1,15 +1,15 @@
-"""A brushless gimbal as ArduPilot drives and reports one (MNT1_TYPE 7, or 1 with servos).
+"""A stabilised gimbal as ArduPilot drives and reports one (MNT1_TYPE 7 or 1).
 
-Roll and pitch are held in the earth frame, yaw is measured from the vehicle's nose. The reported
-quaternion is the physical attitude, with the flags ArduPilot always sets: ROLL_LOCK, PITCH_LOCK,
-YAW_IN_VEHICLE_FRAME, and YAW_LOCK while yaw is held in the earth frame.
+Roll and pitch are held in the earth frame, yaw is measured from the vehicle's nose. The flags are
+those ArduPilot always sets: ROLL_LOCK, PITCH_LOCK, YAW_IN_VEHICLE_FRAME, and YAW_LOCK while yaw is
+held in the earth frame.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 from enum import Enum
-from math import atan2, hypot, isnan, radians
+from math import atan2, cos, hypot, isnan, radians, sin
 
 from sitl.embedded.geodesy import Location
 from sitl.embedded.parameters import Parameters
@@ -17,6 +17,7 @@ from sitl.embedded.rotation import Array, quaternion, wrap_pi
 
 FLAG_RETRACT, FLAG_NEUTRAL, FLAG_ROLL_LOCK, FLAG_PITCH_LOCK, FLAG_YAW_LOCK = 1, 2, 4, 8, 16
 FLAG_YAW_IN_VEHICLE_FRAME = 32
+_SERVO = 1  # MNT1_TYPE
 _SLEW = radians(60.0)  # rad/s of the motors
 
 
@@ -65,8 +66,30 @@ class Gimbal:
 
     @property
     def attitude(self) -> Array:
-        """Quaternion (4,): earth-frame roll and pitch, vehicle-frame yaw."""
+        """True quaternion (4,): earth-frame roll and pitch, vehicle-frame yaw."""
         return quaternion(self.roll_rad, self.pitch_rad, self.yaw_rad)
+
+    def reported(self, vehicle_roll_rad: float, vehicle_pitch_rad: float) -> Array:
+        """The quaternion that is sent: the true one of a brushless gimbal (type 7).
+
+        For a servo gimbal (type 1) ArduPilot sends the servo angles, from which the vehicle's lean
+        is subtracted, under the same earth-frame flags.
+        """
+        if self.parameters["MNT1_TYPE"] != _SERVO:
+            return self.attitude
+        c, s = cos(self.yaw_rad), sin(self.yaw_rad)
+        lean_roll = c * vehicle_roll_rad + s * vehicle_pitch_rad
+        lean_pitch = -s * vehicle_roll_rad + c * vehicle_pitch_rad
+        limits = [
+            (
+                radians(self.parameters[f"MNT1_{axis}_MIN"]),
+                radians(self.parameters[f"MNT1_{axis}_MAX"]),
+            )
+            for axis in ("ROLL", "PITCH")
+        ]
+        roll = min(max(self.roll_rad - lean_roll, limits[0][0]), limits[0][1])
+        pitch = min(max(self.pitch_rad - lean_pitch, limits[1][0]), limits[1][1])
+        return quaternion(roll, pitch, self.yaw_rad)
 
     def point(self, pitch_deg: float, yaw_deg: float, *, yaw_locked: bool) -> None:
         """MAV_CMD_DO_MOUNT_CONTROL, MAV_CMD_DO_GIMBAL_MANAGER_PITCHYAW; NaN keeps an angle."""

@@ -23,19 +23,8 @@ _SENSOR_GPS, _SENSOR_VISION, _SENSOR_AHRS, _SENSOR_PREARM = 1 << 5, 1 << 7, 1 <<
 _SENSORS_ALWAYS = 0b1111 | 1 << 10 | 1 << 11 | 1 << 15
 _CAPABILITIES = 2 | 4 | 8 | 128 | 256 | 8192  # float params, int missions and commands, MAVLink 2
 
-# What every link gets without asking, in Hz.
-DEFAULT_STREAMS = {
-    mavlink.MAVLINK_MSG_ID_HEARTBEAT: 1.0,
-    mavlink.MAVLINK_MSG_ID_SYS_STATUS: 1.0,
-    mavlink.MAVLINK_MSG_ID_ATTITUDE: 4.0,
-    mavlink.MAVLINK_MSG_ID_LOCAL_POSITION_NED: 4.0,
-    mavlink.MAVLINK_MSG_ID_GLOBAL_POSITION_INT: 4.0,
-    mavlink.MAVLINK_MSG_ID_GPS_RAW_INT: 2.0,
-    mavlink.MAVLINK_MSG_ID_VFR_HUD: 2.0,
-    mavlink.MAVLINK_MSG_ID_EKF_STATUS_REPORT: 2.0,
-    mavlink.MAVLINK_MSG_ID_MISSION_CURRENT: 1.0,
-    mavlink.MAVLINK_MSG_ID_HOME_POSITION: 0.5,
-}
+# What every link gets without asking, in Hz: as ArduPilot SITL, nothing but the heartbeat.
+DEFAULT_STREAMS = {mavlink.MAVLINK_MSG_ID_HEARTBEAT: 1.0}
 
 
 class Telemetry:
@@ -305,7 +294,8 @@ class Telemetry:
         v = self._vehicle
         if not v.gimbal.fitted:
             return None
-        q = [float(c) for c in v.gimbal.attitude]
+        roll, pitch, _ = euler(v.estimator.output[0:4])
+        q = [float(c) for c in v.gimbal.reported(roll, pitch)]
         return mavlink.MAVLink_gimbal_device_attitude_status_message(
             0, 0, v.time_ms, v.gimbal.flags, q, nan, nan, nan, 0, nan, nan, 1
         )

@@ -68,7 +68,7 @@ class Vehicle:
         self._gps_sample_at = -1e9
         self._integrator = np.zeros(3)
         self._increment = np.zeros(7)
-        self._last_prearm = 0.0
+        self._announced = (False, False)
         for link in server.links:
             for message_id, hertz in DEFAULT_STREAMS.items():
                 link.set_interval(message_id, 1.0 / hertz)
@@ -125,8 +125,24 @@ class Vehicle:
             self.modes.check_ekf()
         if self.tick % 3000 == 0 and not self.modes.armed:
             self.report_failures("PreArm")
+        self._announce()
         self.telemetry.stream()
         self.server.flush()
+
+    def _announce(self) -> None:
+        """What ArduPilot sends unasked: origin and home when they are set, TIMESYNC every 10 s."""
+        if self.tick % 1000 == 0:
+            self.server.broadcast(mavlink.MAVLink_timesync_message(0, self.time_ms * 1_000_000))
+        known = (self.estimator.origin is not None, self.modes.home is not None)
+        if known != self._announced:
+            self._announced = known
+            for message_id in (
+                mavlink.MAVLINK_MSG_ID_GPS_GLOBAL_ORIGIN,
+                mavlink.MAVLINK_MSG_ID_HOME_POSITION,
+            ):
+                message = self.telemetry.message(message_id)
+                if message is not None:
+                    self.server.broadcast(message)
 
     # --- physics and sensors -----------------------------------------------------------------
 

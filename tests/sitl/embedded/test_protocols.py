@@ -172,6 +172,16 @@ def test_the_gimbal_moves_at_a_finite_rate_within_its_limits():
     assert math.degrees(gimbal.pitch_rad) == pytest.approx(20.0)
 
 
+def test_a_servo_gimbal_reports_angles_less_the_lean():
+    """Seen on ArduPilot 4.7: MNT1_TYPE 1 at pitch -60 reports -40 while the nose is down 20."""
+    gimbal = Gimbal(Parameters({"MNT1_TYPE": 1}))
+    gimbal.point(-60.0, 0.0, yaw_locked=False)
+    settle(gimbal)
+    reported = euler(gimbal.reported(0.0, math.radians(-20.0)))
+    assert math.degrees(reported[1]) == pytest.approx(-40.0)
+    assert math.degrees(euler(gimbal.attitude)[1]) == pytest.approx(-60.0)
+
+
 def test_looks_at_a_place():
     gimbal = Gimbal(Parameters({"MNT1_TYPE": 7}))
     gimbal.look_at(HERE.offset(60.0, 60.0, 85.0))
@@ -223,6 +233,7 @@ def linked():
     gcs, companion = Client(ports[0], 255, 190), Client(ports[1], 1, 191)
 
     def run(ticks=30):
+        time.sleep(0.02)  # what was sent must have arrived: simulated time does not wait
         for _ in range(ticks):
             vehicle.step()
         time.sleep(0.02)
@@ -246,6 +257,12 @@ def test_streams_a_heartbeat_on_every_link(linked):
     to_gcs, to_companion = run(210)
     for messages in (to_gcs, to_companion):
         assert kinds(messages, 1).count("HEARTBEAT") in (2, 3)
+
+
+def test_streams_nothing_else_unasked(linked):
+    _, _, _, run = linked
+    to_gcs, _ = run(1100)
+    assert set(kinds(to_gcs, 1)) == {"HEARTBEAT", "TIMESYNC"}
 
 
 def test_a_stream_interval_holds_in_simulated_time(linked):
