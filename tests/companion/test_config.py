@@ -49,3 +49,11 @@ def test_files_that_are_no_mapping(tmp_path, text):
 def test_missing_file(tmp_path):
     with pytest.raises(ConfigError, match="cannot be read"):
         load_config(tmp_path / "none.yaml")
+
+
+def test_the_shipped_deployment_file_is_complete_and_valid():
+    """Every top-level key stands in it, so that an operator sees all there is to set."""
+    path = Path(__file__).parents[2] / "configs" / "deployment.yaml"
+    config = load_config(path)
+    assert set(yaml.safe_load(path.read_text())) == set(type(config).model_fields)
+    assert config.bridge.mode == "shadow"

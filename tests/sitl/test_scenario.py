@@ -1,0 +1,62 @@
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from localizer.pose import so3_log
+from sitl.embedded.geodesy import Location
+from sitl.flight import mission
+from sitl.kinematic import camera_path
+from sitl.scenario import Scenario, ScenarioError, load_scenario
+
+CONFIGS = Path(__file__).parents[2] / "configs"
+
+
+def test_the_shipped_demo_file_says_what_the_defaults_are():
+    assert load_scenario(CONFIGS / "demo.yaml") == Scenario()
+
+
+@pytest.mark.parametrize(
+    ("text", "named"),
+    [
+        ("speed_m_s: fast", "speed_m_s"),
+        ("altitude: 3", "altitude"),
+        ("legs: []", "legs"),
+        ("a: [", "not valid YAML"),
+        ("condition: disco", "condition"),
+    ],
+)
+def test_bad_scenarios_are_named(tmp_path, text, named):
+    path = tmp_path / "scenario.yaml"
+    path.write_text(text)
+    with pytest.raises(ScenarioError, match=named):
+        load_scenario(path)
+
+
+def test_the_default_mission_is_long_and_comes_home():
+    scenario = Scenario()
+    corners = np.array([(0.0, 0.0)] + [(leg.east_m, leg.north_m) for leg in scenario.legs])
+    assert np.linalg.norm(np.diff(corners, axis=0), axis=1).sum() >= 1000
+    assert tuple(corners[-1]) == (0.0, 0.0)
+    assert len({leg.height_m for leg in scenario.legs}) > 2
+    assert len({leg.gimbal_pitch_deg for leg in scenario.legs}) > 2
+    home = Location(47.0, 8.0, 400.0)
+    steps = mission(scenario, home)
+    assert len(steps) == 1 + 2 * len(scenario.legs)
+    north, east, _ = home.ned_of(Location(steps[2].latitude_deg, steps[2].longitude_deg, 400.0))
+    assert (east, north) == pytest.approx((0.0, 220.0), abs=0.01)
+
+
+def test_the_kinematic_path_is_smooth_and_visits_every_corner():
+    scenario = Scenario()
+    path = list(camera_path(scenario, ground_m=5.0))
+    positions = np.array([pose.translation for _, pose in path])
+    assert np.linalg.norm(np.diff(positions, axis=0), axis=1).max() < scenario.speed_m_s * 0.021
+    for leg in scenario.legs:
+        corner = np.array([leg.east_m, leg.north_m, 5.0 + leg.height_m])
+        assert np.linalg.norm(positions - corner, axis=1).min() < 0.1
+    turns = [
+        np.linalg.norm(so3_log(a.rotation.T @ b.rotation))
+        for (_, a), (_, b) in zip(path[::5], path[5::5], strict=False)
+    ]
+    assert np.degrees(max(turns)) < 8.0
