@@ -160,6 +160,11 @@ class BridgeConfig(_Model):
     tlog: Path | None = None
     link_timeout_s: float = Field(default=5.0, gt=0.0)
 
+    @field_validator("mode", mode="before")
+    @classmethod
+    def _off_is_false_in_yaml(cls, value: object) -> object:
+        return "off" if value is False else value
+
     @field_validator("connection", "ground_connection")
     @classmethod
     def _connection_is_an_endpoint(cls, value: str | None) -> str | None:

@@ -222,6 +222,7 @@ class Injector:
         self._last_stamp_ns = 0
         self._last_was_fill = False
         self.yaw_difference_rad = NAN
+        self.latency_ms = NAN
         self.reason = NO_FIX_YET
         self.counters: Counter[str] = Counter()
 
@@ -245,6 +246,7 @@ class Injector:
             self._keep_reset(fix)
             return
         self._newest_ns = fix.time_ns
+        self.latency_ms = _smoothed(self.latency_ms, (now_ns - fix.time_ns) * 1e-6)
         self.counters["fixes"] += 1
         self._waiting.append(fix)
 
@@ -403,3 +405,8 @@ class Injector:
                 return Withheld("no attitude for ODOMETRY", "withheld_no_attitude")
             e = replace(e, attitude=(now.roll_rad, now.pitch_rad, now.yaw_rad))
         return Injection(odometry(e, ned, formula, context.profile.odometry_frame), e)
+
+
+def _smoothed(mean: float, value: float) -> float:
+    """Running mean over about 20 values; the first one starts it."""
+    return mean + 0.05 * (value - mean) if math.isfinite(mean) else value

@@ -4,40 +4,26 @@ from __future__ import annotations
 
 import math
 import threading
-from bisect import bisect_left
-from collections import deque
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Any
 
 from pymavlink import mavutil
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from mavlink_bridge import quaternion as quat
+from mavlink_bridge.buffers import (
+    GIMBAL_SOURCES,
+    AttitudeBuffer,
+    GimbalBuffer,
+    GimbalSample,
+    VectorBuffer,
+    attitude,
+)
 from mavlink_bridge.clock import BootClock
 from mavlink_bridge.messages import Attitude, GimbalAttitude, Origin, VehicleState
 from mavlink_bridge.profile import autopilot_name, decode_version, select_profile
 
-_BUFFER = 512
-_MAX_GAP_NS = 500_000_000
-_MAX_EXTRAPOLATION_NS = 100_000_000
-_GIMBAL_FALLBACK_NS = 1_000_000_000
 _HEARTBEAT_LOST_NS = 3_000_000_000
-
-# Best first: a poorer source is only used while no better one speaks.
-_GIMBAL_SOURCES = ("GIMBAL_DEVICE_ATTITUDE_STATUS", "MOUNT_ORIENTATION", "MOUNT_STATUS")
-
-
-@dataclass(frozen=True)
-class GimbalSample:
-    """One gimbal message: gimbal to the horizon frame that points to north or to the nose.
-
-    earth_frame: yaw is from true north, else from the vehicle's heading.
-    """
-
-    time_ns: int
-    quaternion: quat.Quaternion
-    earth_frame: bool
-    source: str
 
 
 def gimbal_in_earth_frame(flags: int) -> bool:
@@ -47,91 +33,6 @@ def gimbal_in_earth_frame(flags: int) -> bool:
     if flags & mavlink.GIMBAL_DEVICE_FLAGS_YAW_IN_EARTH_FRAME:
         return True
     return bool(flags & mavlink.GIMBAL_DEVICE_FLAGS_YAW_LOCK)
-
-
-class AttitudeBuffer:
-    """The last attitudes, in time order, interpolated between samples."""
-
-    def __init__(self) -> None:
-        self._samples: deque[Attitude] = deque(maxlen=_BUFFER)
-
-    def clear(self) -> None:
-        """Forget all."""
-        self._samples.clear()
-
-    def add(self, sample: Attitude) -> None:
-        """Append; one that is not newer than the newest is dropped."""
-        if not self._samples or sample.time_ns > self._samples[-1].time_ns:
-            self._samples.append(sample)
-
-    def at(self, time_ns: int) -> Attitude | None:
-        """Attitude at a time, None outside the buffer or inside a gap of more than 0.5 s."""
-        samples = list(self._samples)
-        if not samples or time_ns < samples[0].time_ns:
-            return None
-        newest = samples[-1]
-        if time_ns >= newest.time_ns:
-            ahead = time_ns - newest.time_ns
-            if ahead > _MAX_EXTRAPOLATION_NS:
-                return None
-            q = quat.turn(newest.quaternion, newest.rates, ahead * 1e-9)
-            return _attitude(time_ns, q, newest.rates)
-        index = bisect_left(samples, time_ns, key=lambda sample: sample.time_ns)
-        before, after = samples[max(index - 1, 0)], samples[index]
-        span = after.time_ns - before.time_ns
-        if span > _MAX_GAP_NS:
-            return None
-        t = (time_ns - before.time_ns) / span if span else 1.0
-        q = quat.slerp(before.quaternion, after.quaternion, t)
-        return _attitude(time_ns, q, after.rates if t > 0.5 else before.rates)
-
-
-class GimbalBuffer:
-    """The last gimbal attitudes of the best source that speaks."""
-
-    def __init__(self) -> None:
-        self._samples: deque[GimbalSample] = deque(maxlen=_BUFFER)
-
-    def clear(self) -> None:
-        """Forget all."""
-        self._samples.clear()
-
-    def add(self, sample: GimbalSample) -> None:
-        """Append, unless a better source spoke within the last second."""
-        if self._samples:
-            newest = self._samples[-1]
-            if sample.source != newest.source:
-                rank = _GIMBAL_SOURCES.index(sample.source)
-                worse = rank > _GIMBAL_SOURCES.index(newest.source)
-                if worse and sample.time_ns - newest.time_ns < _GIMBAL_FALLBACK_NS:
-                    return
-                self._samples.clear()
-            elif sample.time_ns <= newest.time_ns or sample.earth_frame != newest.earth_frame:
-                if sample.time_ns <= newest.time_ns:
-                    return
-                self._samples.clear()
-        self._samples.append(sample)
-
-    def at(self, time_ns: int) -> GimbalSample | None:
-        """Interpolated sample; the newest is held for 0.5 s (a gimbal moves slowly)."""
-        samples = list(self._samples)
-        if not samples or time_ns < samples[0].time_ns:
-            return None
-        if time_ns >= samples[-1].time_ns:
-            return samples[-1] if time_ns - samples[-1].time_ns <= _MAX_GAP_NS else None
-        index = bisect_left(samples, time_ns, key=lambda sample: sample.time_ns)
-        before, after = samples[max(index - 1, 0)], samples[index]
-        span = after.time_ns - before.time_ns
-        if span > 2 * _MAX_GAP_NS:
-            return None
-        t = (time_ns - before.time_ns) / span if span else 1.0
-        return replace(
-            before, time_ns=time_ns, quaternion=quat.slerp(before.quaternion, after.quaternion, t)
-        )
-
-
-def _attitude(time_ns: int, q: quat.Quaternion, rates: quat.Vector) -> Attitude:
-    return Attitude(time_ns, *quat.to_euler(q), quaternion=q, rates=rates)
 
 
 class VehicleTracker:
@@ -147,6 +48,8 @@ class VehicleTracker:
         self._heartbeat_ns: int | None = None
         self._attitudes = AttitudeBuffer()
         self._gimbals = GimbalBuffer()
+        self._globals = VectorBuffer()
+        self._locals = VectorBuffer()
 
     def snapshot(self, now_ns: int) -> VehicleState:
         """The state now."""
@@ -188,6 +91,16 @@ class VehicleTracker:
             time_ns, roll, pitch, yaw, quat.wrap_pi(yaw - body.yaw_rad), q, source
         )
 
+    def global_at(self, time_ns: int) -> tuple[float, ...] | None:
+        """The EKF's (latitude, longitude in degrees, altitude AMSL) at a time."""
+        with self._lock:
+            return self._globals.at(time_ns)
+
+    def local_at(self, time_ns: int) -> tuple[float, ...] | None:
+        """The EKF's NED position from its origin at a time."""
+        with self._lock:
+            return self._locals.at(time_ns)
+
     def set_origin(self, origin: Origin | None) -> None:
         """What the origin keeper read."""
         with self._lock:
@@ -200,7 +113,7 @@ class VehicleTracker:
             if system != self._state.system_id:
                 return False
             # Gimbals of other vendors are components of their own.
-            return component == self._state.component_id or message.get_type() in _GIMBAL_SOURCES
+            return component == self._state.component_id or message.get_type() in GIMBAL_SOURCES
         return self._is_autopilot(message) and self._wanted_id in (None, system)
 
     @staticmethod
@@ -222,8 +135,8 @@ class VehicleTracker:
             stamp_ns = self.clock.to_monotonic(boot_ms * 1_000_000, received_ns)
         with self._lock:
             if rebooted:
-                self._attitudes.clear()
-                self._gimbals.clear()
+                for buffer in (self._attitudes, self._gimbals, self._globals, self._locals):
+                    buffer.clear()
                 self._state = replace(self._state, origin=None)
             handler = _HANDLERS.get(message.get_type())
             if handler is not None:
@@ -262,16 +175,16 @@ class VehicleTracker:
 
     def _attitude_quaternion(self, m: Any, time_ns: int) -> None:
         q = quat.normalise((m.q1, m.q2, m.q3, m.q4))
-        self._attitudes.add(_attitude(time_ns, q, (m.rollspeed, m.pitchspeed, m.yawspeed)))
+        self._attitudes.add(attitude(time_ns, q, (m.rollspeed, m.pitchspeed, m.yawspeed)))
 
     def _gimbal_device(self, m: Any, time_ns: int) -> None:
         earth = gimbal_in_earth_frame(m.flags)
-        self._gimbals.add(GimbalSample(time_ns, quat.normalise(m.q), earth, _GIMBAL_SOURCES[0]))
+        self._gimbals.add(GimbalSample(time_ns, quat.normalise(m.q), earth, GIMBAL_SOURCES[0]))
 
     def _mount_orientation(self, m: Any, time_ns: int) -> None:
         roll, pitch, yaw = (math.radians(a) for a in (m.roll, m.pitch, m.yaw))
         q = quat.from_euler(roll, pitch, yaw)
-        self._gimbals.add(GimbalSample(time_ns, q, False, _GIMBAL_SOURCES[1]))
+        self._gimbals.add(GimbalSample(time_ns, q, False, GIMBAL_SOURCES[1]))
 
     def _mount_status(self, m: Any, time_ns: int) -> None:
         # pointing_a, b, c: pitch, roll, yaw in centidegrees, yaw from the vehicle's nose.
@@ -279,9 +192,10 @@ class VehicleTracker:
             math.radians(0.01 * a) for a in (m.pointing_a, m.pointing_b, m.pointing_c)
         )
         q = quat.from_euler(roll, pitch, yaw)
-        self._gimbals.add(GimbalSample(time_ns, q, False, _GIMBAL_SOURCES[2]))
+        self._gimbals.add(GimbalSample(time_ns, q, False, GIMBAL_SOURCES[2]))
 
     def _local_position(self, m: Any, time_ns: int) -> None:
+        self._locals.add(time_ns, (m.x, m.y, m.z))
         self._state = replace(
             self._state,
             local_position_ned=(m.x, m.y, m.z),
@@ -290,6 +204,7 @@ class VehicleTracker:
         )
 
     def _global_position(self, m: Any, time_ns: int) -> None:
+        self._globals.add(time_ns, (m.lat * 1e-7, m.lon * 1e-7, m.alt * 1e-3))
         self._state = replace(
             self._state,
             latitude_deg=m.lat * 1e-7,

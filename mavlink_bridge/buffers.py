@@ -1,0 +1,156 @@
+"""Short histories of what the vehicle reported, read at any time in between."""
+
+from __future__ import annotations
+
+from bisect import bisect_left
+from collections import deque
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+from mavlink_bridge import quaternion as quat
+from mavlink_bridge.messages import Attitude
+
+_LENGTH = 512
+MAX_GAP_NS = 500_000_000
+_MAX_EXTRAPOLATION_NS = 100_000_000
+_GIMBAL_FALLBACK_NS = 1_000_000_000
+
+# Best first: a poorer source is only used while no better one speaks.
+GIMBAL_SOURCES = ("GIMBAL_DEVICE_ATTITUDE_STATUS", "MOUNT_ORIENTATION", "MOUNT_STATUS")
+
+
+@dataclass(frozen=True)
+class VectorSample:
+    """Numbers that were reported for a time."""
+
+    time_ns: int
+    values: tuple[float, ...]
+
+
+@dataclass(frozen=True)
+class GimbalSample:
+    """One gimbal message: gimbal to the horizon frame that points to north or to the nose.
+
+    earth_frame: yaw is from true north, else from the vehicle's heading.
+    """
+
+    time_ns: int
+    quaternion: quat.Quaternion
+    earth_frame: bool
+    source: str
+
+
+def attitude(time_ns: int, q: quat.Quaternion, rates: quat.Vector) -> Attitude:
+    """An `Attitude` from its quaternion."""
+    return Attitude(time_ns, *quat.to_euler(q), quaternion=q, rates=rates)
+
+
+def _around(samples: Sequence[Any], time_ns: int) -> tuple[Any, Any, float]:
+    """The samples before and after, and the share t of the way; time_ns is inside."""
+    index = bisect_left(samples, time_ns, key=lambda sample: sample.time_ns)
+    before, after = samples[max(index - 1, 0)], samples[index]
+    span = after.time_ns - before.time_ns
+    return before, after, (time_ns - before.time_ns) / span if span else 1.0
+
+
+class VectorBuffer:
+    """Positions and the like, linear between samples."""
+
+    def __init__(self) -> None:
+        self._samples: deque[VectorSample] = deque(maxlen=_LENGTH)
+
+    def clear(self) -> None:
+        """Forget all."""
+        self._samples.clear()
+
+    def add(self, time_ns: int, values: tuple[float, ...]) -> None:
+        """Append; a sample that is not newer than the newest is dropped."""
+        if not self._samples or time_ns > self._samples[-1].time_ns:
+            self._samples.append(VectorSample(time_ns, values))
+
+    def at(self, time_ns: int) -> tuple[float, ...] | None:
+        """Values at a time, None outside the buffer or inside a gap of more than 0.5 s."""
+        samples = list(self._samples)
+        if not samples or not samples[0].time_ns <= time_ns <= samples[-1].time_ns:
+            return None
+        before, after, t = _around(samples, time_ns)
+        if after.time_ns - before.time_ns > MAX_GAP_NS:
+            return None
+        return tuple(a + t * (b - a) for a, b in zip(before.values, after.values, strict=True))
+
+
+class AttitudeBuffer:
+    """The last attitudes, spherical between samples."""
+
+    def __init__(self) -> None:
+        self._samples: deque[Attitude] = deque(maxlen=_LENGTH)
+
+    def clear(self) -> None:
+        """Forget all."""
+        self._samples.clear()
+
+    def add(self, sample: Attitude) -> None:
+        """Append; one that is not newer than the newest is dropped."""
+        if not self._samples or sample.time_ns > self._samples[-1].time_ns:
+            self._samples.append(sample)
+
+    def at(self, time_ns: int) -> Attitude | None:
+        """Attitude at a time, None outside the buffer or inside a gap of more than 0.5 s.
+
+        Up to 0.1 s beyond the newest it is turned on at that one's rates.
+        """
+        samples = list(self._samples)
+        if not samples or time_ns < samples[0].time_ns:
+            return None
+        newest = samples[-1]
+        ahead = time_ns - newest.time_ns
+        if ahead >= 0:
+            if ahead > _MAX_EXTRAPOLATION_NS:
+                return None
+            q = quat.turn(newest.quaternion, newest.rates, ahead * 1e-9)
+            return attitude(time_ns, q, newest.rates)
+        before, after, t = _around(samples, time_ns)
+        if after.time_ns - before.time_ns > MAX_GAP_NS:
+            return None
+        q = quat.slerp(before.quaternion, after.quaternion, t)
+        return attitude(time_ns, q, after.rates if t > 0.5 else before.rates)
+
+
+class GimbalBuffer:
+    """The last gimbal attitudes of the best source that speaks."""
+
+    def __init__(self) -> None:
+        self._samples: deque[GimbalSample] = deque(maxlen=_LENGTH)
+
+    def clear(self) -> None:
+        """Forget all."""
+        self._samples.clear()
+
+    def add(self, sample: GimbalSample) -> None:
+        """Append, unless a better source spoke within the last second."""
+        if self._samples:
+            newest = self._samples[-1]
+            rank = GIMBAL_SOURCES.index(sample.source)
+            worse = rank > GIMBAL_SOURCES.index(newest.source)
+            age = sample.time_ns - newest.time_ns
+            if age <= 0 or (worse and age < _GIMBAL_FALLBACK_NS):
+                return
+            if sample.source != newest.source or sample.earth_frame != newest.earth_frame:
+                # Angles of two frames cannot be interpolated.
+                self._samples.clear()
+        self._samples.append(sample)
+
+    def at(self, time_ns: int) -> GimbalSample | None:
+        """Interpolated sample; the newest is held for 0.5 s (a gimbal moves slowly)."""
+        samples = list(self._samples)
+        if not samples or time_ns < samples[0].time_ns:
+            return None
+        newest = samples[-1]
+        if time_ns >= newest.time_ns:
+            return newest if time_ns - newest.time_ns <= MAX_GAP_NS else None
+        before, after, t = _around(samples, time_ns)
+        if after.time_ns - before.time_ns > 2 * MAX_GAP_NS:
+            return None
+        q = quat.slerp(before.quaternion, after.quaternion, t)
+        return replace(before, time_ns=time_ns, quaternion=q)

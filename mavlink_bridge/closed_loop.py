@@ -1,0 +1,113 @@
+"""Was it used? What was sent, held against what the EKF reports, and the reason in one line."""
+
+from __future__ import annotations
+
+import math
+from collections import deque
+from collections.abc import Callable
+from dataclasses import dataclass
+
+from pymavlink.dialects.v20 import ardupilotmega as mavlink
+
+from mavlink_bridge.config import InjectionMessage
+from mavlink_bridge.messages import VehicleState
+
+_SETTLE_NS = 3_000_000_000
+_WINDOW_NS = 3_000_000_000
+_COMPARE_AFTER_NS = 300_000_000
+_SIGMAS = 5.0
+_SLACK_M = 2.0
+_MINIMUM_HZ = 4.0
+_GPS_MINIMUM_HZ = 4.65  # an average gap over 215 ms makes ArduPilot's receiver unhealthy
+_VARIANCE_LIMIT = 1.0  # the innovation test's own threshold
+
+_SOURCE = {
+    "vision_position_estimate": "VISO_TYPE=1 and EK3_SRCn_POSXY=6",
+    "odometry": "VISO_TYPE=1 and EK3_SRCn_POSXY=6",
+    "gps_input": "GPS1_TYPE=14 and EK3_SRCn_POSXY=3",
+    "global_position_sensor": "EKF2_AGP_CTRL",
+}
+
+
+@dataclass(frozen=True)
+class LoopVerdict:
+    """Whether the EKF follows what is sent. reason: one line; empty while all is well.
+
+    difference_m: median horizontal distance between sent and estimated position, NaN unknown.
+    """
+
+    used: bool
+    reason: str
+    difference_m: float
+
+
+class ClosedLoopCheck:
+    """Remembers what was sent and judges; one thread."""
+
+    def __init__(self, message: InjectionMessage) -> None:
+        self._message = message
+        self._sent: deque[tuple[int, float, float, float]] = deque(maxlen=256)
+        self._pending: deque[tuple[int, float, float, float]] = deque(maxlen=256)
+        self._differences: deque[tuple[int, float, float]] = deque(maxlen=256)
+        self._began_ns: int | None = None
+
+    def sent(self, stamp_ns: int, now_ns: int, north: float, east: float, sigma_m: float) -> None:
+        """A position went out: valid at stamp_ns, NE metres from the EKF origin."""
+        if not self._sent or now_ns - self._sent[-1][0] > _SETTLE_NS:
+            self._began_ns = now_ns
+        self._sent.append((now_ns, north, east, sigma_m))
+        self._pending.append((stamp_ns, north, east, sigma_m))
+
+    def verdict(
+        self,
+        now_ns: int,
+        state: VehicleState,
+        local_at: Callable[[int], tuple[float, ...] | None],
+    ) -> LoopVerdict | None:
+        """The verdict, or None while it is too early to tell or nothing is being sent."""
+        self._compare(now_ns, local_at)
+        recent = [s for s in self._sent if now_ns - s[0] < _WINDOW_NS]
+        if not recent or self._began_ns is None or now_ns - self._began_ns < _SETTLE_NS:
+            return None
+        differences = sorted(d for t, d, _ in self._differences if now_ns - t < _WINDOW_NS)
+        difference = differences[len(differences) // 2] if differences else math.nan
+        reason = self._reason(len(recent), state, difference, recent[-1][3])
+        return LoopVerdict(not reason, reason, difference)
+
+    def _compare(self, now_ns: int, local_at: Callable[[int], tuple[float, ...] | None]) -> None:
+        """Hold each sent position against the EKF's at the same time, once that has come."""
+        while self._pending and now_ns - self._pending[0][0] > _COMPARE_AFTER_NS:
+            stamp_ns, north, east, sigma = self._pending.popleft()
+            local = local_at(stamp_ns)
+            if local is not None:
+                distance = math.hypot(local[0] - north, local[1] - east)
+                self._differences.append((now_ns, distance, sigma))
+
+    def _reason(self, count: int, state: VehicleState, difference: float, sigma: float) -> str:
+        rate = count / (_WINDOW_NS * 1e-9)
+        wanted = _GPS_MINIMUM_HZ if self._message == "gps_input" else _MINIMUM_HZ
+        flags = state.ekf_flags
+        reasons = (
+            (rate < wanted, f"rate {rate:.1f} Hz is below {wanted:.1f} Hz"),
+            (
+                bool(flags & mavlink.EKF_UNINITIALIZED) and state.autopilot == "ardupilot",
+                "the EKF is not initialised yet",
+            ),
+            (
+                bool(flags & mavlink.EKF_CONST_POS_MODE),
+                f"the EKF has no position source; check {_SOURCE[self._message]}",
+            ),
+            (
+                math.isnan(difference),
+                f"the EKF reports no local position; check {_SOURCE[self._message]}",
+            ),
+            (
+                difference > _SIGMAS * sigma + _SLACK_M,
+                f"the EKF is {difference:.1f} m from what is sent; check frame, origin and source",
+            ),
+            (
+                state.ekf_horizontal_variance > _VARIANCE_LIMIT,
+                "the EKF rejects positions (innovation gate); check VISO_POS_M_NSE and delay",
+            ),
+        )
+        return next((reason for holds, reason in reasons if holds), "")

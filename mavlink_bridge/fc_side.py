@@ -1,0 +1,310 @@
+"""The flight controller's link: identity, clock, streams, origin, injection, and its outcome."""
+
+from __future__ import annotations
+
+import logging
+from collections import Counter, deque
+from typing import Any
+
+from pymavlink.dialects.v20 import ardupilotmega as mavlink
+
+from mavlink_bridge.clock import monotonic_ns
+from mavlink_bridge.closed_loop import ClosedLoopCheck, LoopVerdict
+from mavlink_bridge.inject import NO_FIX_YET, Injection, InjectionContext, Injector
+from mavlink_bridge.link import Link
+from mavlink_bridge.messages import VehicleState, VisionFix
+from mavlink_bridge.origin import OriginKeeper, north_east
+from mavlink_bridge.profile import FirmwareProfile, select_profile
+from mavlink_bridge.propagate import PropagatedFix
+from mavlink_bridge.shadow import ShadowScorer, gnss_healthy
+from mavlink_bridge.side import COMMANDS_IN, SECOND_NS, Shared, Side
+from mavlink_bridge.streams import StreamKeeper, wanted_streams
+from mavlink_bridge.switching import SourceSwitch
+from mavlink_bridge.vehicle import MESSAGES_IN
+
+log = logging.getLogger(__name__)
+
+_RC_FRESH_NS = SECOND_NS
+_RC_HIGHEST_US = 2200  # above it no receiver speaks; 65535 means "no such channel"
+_QUEUE = 64
+_TIMESYNC_PENDING = 8
+_FIRST_GUESS = 1  # the system id that vehicles are delivered with
+_IDLE_NS = 100_000_000
+_REFERENCE_WAIT_NS = 500_000_000
+_VISION_GOOD_NS = SECOND_NS
+
+
+def message_id(name: str) -> int:
+    """The id of a MAVLink message."""
+    return int(getattr(mavlink, f"MAVLINK_MSG_ID_{name}"))
+
+
+FC_WANTED = frozenset(
+    message_id(name)
+    for name in (*MESSAGES_IN, *COMMANDS_IN, "TIMESYNC", "GPS_GLOBAL_ORIGIN", "COMMAND_ACK")
+)
+
+
+class FlightControllerSide(Side):
+    """Runs in the flight-controller link's thread; only `fixes` is filled from outside."""
+
+    def __init__(self, shared: Shared) -> None:
+        super().__init__(shared, ground=False)
+        self.fixes: deque[VisionFix] = deque(maxlen=_QUEUE)
+        self.counters: Counter[str] = Counter()
+        self.injector = Injector(self.config.injection, shared.geoid_separation_m, shared.utc)
+        self.origin = OriginKeeper(self.config.origin)
+        self.streams = StreamKeeper()
+        self.shadow = ShadowScorer()
+        self.loop = ClosedLoopCheck(self.config.injection.message)
+        self.switch = SourceSwitch(self.config.switch)
+        self.verdict: LoopVerdict | None = None
+        self.vision: PropagatedFix | None = None
+        self._to_compare: deque[PropagatedFix] = deque(maxlen=_QUEUE)
+        self._sync_sent: dict[int, int] = {}
+        self._next_sync_ns = 0
+        self._next_version_ns = 0
+        self._next_check_ns = 0
+        self._delivered_ns = 0
+        self._connected = False
+        self._told: dict[str, str] = {"inject": _plain(NO_FIX_YET)}
+
+    # --- messages in ----------------------------------------------------------------------------
+
+    def on_message(self, link: Link, message: Any, time_ns: int) -> None:
+        """One message from the flight controller's link (also from others, routed by it)."""
+        kind = message.get_type()
+        if kind in COMMANDS_IN:
+            self.camera_command(link, message, time_ns)
+            return
+        if not self.tracker.accepts(message):
+            return
+        self.streams.seen(kind, time_ns)
+        if kind == "TIMESYNC":
+            self._timesync(link, message, time_ns)
+        elif kind == "GPS_GLOBAL_ORIGIN":
+            self._origin(message)
+        elif kind == "COMMAND_ACK":
+            self._ack(message)
+        elif self.tracker.handle(message, time_ns):
+            self._rebooted()
+
+    def _timesync(self, link: Link, message: Any, time_ns: int) -> None:
+        if message.tc1 == 0:
+            answer = mavlink.MAVLink_timesync_message(monotonic_ns(), message.ts1)
+            link.send(answer, self.config.companion_component)
+            return
+        sent_ns = self._sync_sent.pop(message.ts1, None)
+        if sent_ns is not None:
+            self.tracker.clock.timesync(message.tc1, sent_ns, time_ns)
+
+    def _origin(self, message: Any) -> None:
+        news = self.origin.on_origin(message)
+        self.tracker.set_origin(self.origin.origin)
+        if news is not None:
+            self.shared.say(mavlink.MAV_SEVERITY_INFO, f"PiLoT: {news}")
+
+    def _ack(self, message: Any) -> None:
+        accepted = message.result in (
+            mavlink.MAV_RESULT_ACCEPTED,
+            mavlink.MAV_RESULT_IN_PROGRESS,
+        )
+        if not accepted:
+            self.counters["commands_refused"] += 1
+        if message.command == mavlink.MAV_CMD_SET_EKF_SOURCE_SET:
+            self.switch.acknowledged(accepted)
+            if not accepted:
+                self.shared.say(mavlink.MAV_SEVERITY_WARNING, "PiLoT: source switch refused")
+
+    def _rebooted(self) -> None:
+        self.counters["reboots"] += 1
+        self.origin.reset()
+        self.tracker.set_origin(None)
+        self.injector.guard.reset()
+        self.switch.reset()
+        self.streams.reset()
+        self.shared.say(mavlink.MAV_SEVERITY_WARNING, "PiLoT: flight controller rebooted")
+
+    # --- the clockwork --------------------------------------------------------------------------
+
+    def on_open(self, link: Link) -> None:
+        """Ask for everything again."""
+        super().on_open(link)
+        self.streams.reset()
+        self._next_sync_ns = self._next_version_ns = 0
+        self._sync_sent.clear()
+
+    def on_tick(self, link: Link, now_ns: int) -> int:
+        """Everything that is due; returns when the next thing is."""
+        state = self.tracker.snapshot(now_ns)
+        link.system_id = self.config.system_id or state.system_id or 0
+        self._watch(state)
+        if not link.system_id and link.endpoint.kind == "udpout":
+            # Behind UDP an autopilot answers whoever spoke first, so somebody has to.
+            link.system_id = _FIRST_GUESS
+        if link.system_id:
+            self.heartbeat(link, now_ns)
+        if state.connected:
+            self._ask(link, state, now_ns)
+            self._sync(link, now_ns)
+            self._keep_origin(link, now_ns)
+            if self.config.ground_connection is None and self.config.camera.announce:
+                self.serve_camera(link, state, now_ns)
+        return self._inject(link, state, now_ns)
+
+    def _watch(self, state: VehicleState) -> None:
+        if state.connected == self._connected:
+            return
+        self._connected = state.connected
+        if state.connected:
+            self.streams.reset()
+            log.info("flight controller found: system %s", state.system_id)
+        else:
+            self.counters["lost"] += 1
+            log.warning("flight controller lost: no heartbeat for 3 s")
+
+    def _ask(self, link: Link, state: VehicleState, now_ns: int) -> None:
+        """Streams that do not flow, and the firmware's version."""
+        for stream in self.streams.due(wanted_streams(self.config, state.autopilot), now_ns):
+            interval_us = round(1e6 / stream.rate_hz)
+            self._command(
+                link, mavlink.MAV_CMD_SET_MESSAGE_INTERVAL, stream.message_id, interval_us
+            )
+        if state.version is None and now_ns >= self._next_version_ns:
+            self._next_version_ns = now_ns + SECOND_NS
+            self._command(link, mavlink.MAV_CMD_REQUEST_MESSAGE, message_id("AUTOPILOT_VERSION"))
+
+    def _command(self, link: Link, command: int, *parameters: float) -> None:
+        padded = [*parameters, *([0.0] * (7 - len(parameters)))]
+        message = mavlink.MAVLink_command_long_message(
+            link.system_id, mavlink.MAV_COMP_ID_AUTOPILOT1, command, 0, *padded
+        )
+        link.send(message, self.config.companion_component)
+
+    def _sync(self, link: Link, now_ns: int) -> None:
+        if now_ns < self._next_sync_ns:
+            return
+        self._next_sync_ns = now_ns + SECOND_NS
+        while len(self._sync_sent) >= _TIMESYNC_PENDING:
+            del self._sync_sent[next(iter(self._sync_sent))]
+        sent_ns = monotonic_ns()
+        self._sync_sent[sent_ns] = sent_ns
+        link.send(mavlink.MAVLink_timesync_message(0, sent_ns), self.config.companion_component)
+
+    def _keep_origin(self, link: Link, now_ns: int) -> None:
+        def ask(wanted: int) -> None:
+            self._command(link, mavlink.MAV_CMD_REQUEST_MESSAGE, wanted)
+
+        message = self.origin.tick(now_ns, link.system_id, ask)
+        if message is not None and self.config.mode in ("inject", "rc"):
+            self.counters["origins_sent"] += 1
+            link.send(message, self.config.companion_component)
+
+    # --- injection ------------------------------------------------------------------------------
+
+    def mode(self, state: VehicleState, now_ns: int) -> str:
+        """off, shadow or inject; mode rc follows its channel, and no channel means shadow."""
+        if self.config.mode != "rc":
+            return self.config.mode
+        gate = self.config.rc
+        channels = state.rc_channels_us
+        fresh = now_ns - state.rc_time_ns < _RC_FRESH_NS and len(channels) >= gate.channel
+        if fresh and gate.inject_above_us <= channels[gate.channel - 1] <= _RC_HIGHEST_US:
+            return "inject"
+        return "shadow"
+
+    def profile(self, state: VehicleState) -> FirmwareProfile:
+        """The firmware's profile; one that is unknown, or lacks the message, is told once."""
+        profile = select_profile(state.autopilot, state.version)
+        if state.connected and state.version is not None:
+            problem = ""
+            message = self.config.injection.message
+            if not profile.known:
+                problem = "unknown firmware, using the safe profile"
+            elif message not in profile.messages:
+                problem = f"{profile.name} does not take {message.upper()}"
+            self._tell("profile", problem)
+        return profile
+
+    def _inject(self, link: Link, state: VehicleState, now_ns: int) -> int:
+        while self.fixes:
+            self.injector.submit(self.fixes.popleft(), now_ns)
+        mode = self.mode(state, now_ns)
+        if mode == "off" or not state.connected:
+            return now_ns + _IDLE_NS
+        context = InjectionContext(
+            self.origin.origin, self.profile(state), self.tracker.attitude_at
+        )
+        injection = self.injector.step(now_ns, context)
+        if injection is not None:
+            self.vision = injection.estimate.position
+            self._deliver(link, mode, injection, now_ns)
+        reason = self.injector.reason
+        self._tell("inject", f"not sent: {reason}" if reason else "", "injecting", prefix=mode)
+        if now_ns >= self._next_check_ns:
+            self._next_check_ns = now_ns + _IDLE_NS
+            self._check(link, state, now_ns)
+        return self.injector.next_due_ns(now_ns)
+
+    def _deliver(self, link: Link, mode: str, injection: Injection, now_ns: int) -> None:
+        position = injection.estimate.position
+        self._delivered_ns = now_ns
+        if injection.estimate.fresh:
+            self._to_compare.append(position)
+        if mode != "inject":
+            self.counters["shadowed"] += 1
+            return
+        if not link.send(injection.message, self.config.localizer_component):
+            return
+        self.counters["injected"] += 1
+        origin = self.origin.origin
+        if origin is not None:
+            north, east = north_east(
+                origin.latitude_deg,
+                origin.longitude_deg,
+                position.latitude_deg,
+                position.longitude_deg,
+            )
+            sigma = position.horizontal_sigma_m
+            self.loop.sent(position.time_ns, now_ns, north, east, sigma)
+
+    def _check(self, link: Link, state: VehicleState, now_ns: int) -> None:
+        """What came of it, ten times a second: score, verdict, source switch."""
+        while self._to_compare and now_ns - self._to_compare[0].time_ns > _REFERENCE_WAIT_NS:
+            fix = self._to_compare.popleft()
+            reference = self.tracker.global_at(fix.time_ns)
+            on_gnss = self.switch.current == self.config.switch.gnss_set
+            if reference is not None and on_gnss and gnss_healthy(state, now_ns):
+                self.shadow.compare(fix, reference)
+        self.verdict = self.loop.verdict(now_ns, state, self.tracker.local_at)
+        if self.verdict is not None:
+            self._tell("loop", self.verdict.reason, "the EKF follows")
+        good = not self.injector.guard.blocked and now_ns - self._delivered_ns < _VISION_GOOD_NS
+        good = good and self.mode(state, now_ns) == "inject"
+        order = self.switch.decide(now_ns, state, self.vision, good)
+        if order is not None:
+            self.counters["source_switches"] += 1
+            self._command(link, mavlink.MAV_CMD_SET_EKF_SOURCE_SET, order.source_set)
+            self.shared.say(
+                mavlink.MAV_SEVERITY_WARNING,
+                f"PiLoT: EKF source set {order.source_set}: {order.reason}",
+            )
+
+    def _tell(self, topic: str, problem: str, relief: str = "", *, prefix: str = "") -> None:
+        """A problem when it begins or changes (digits aside, or it would never stop), and its end.
+
+        prefix: part of what is compared, not of what is said.
+        """
+        plain = f"{prefix if not problem else ''}{_plain(problem)}"
+        if plain == self._told.get(topic, ""):
+            return
+        known = topic in self._told
+        self._told[topic] = plain
+        if problem:
+            self.shared.say(mavlink.MAV_SEVERITY_WARNING, f"PiLoT: {problem}")
+        elif relief and known and prefix in ("", "inject"):
+            self.shared.say(mavlink.MAV_SEVERITY_INFO, f"PiLoT: {relief}")
+
+
+def _plain(text: str) -> str:
+    return "".join(c for c in text if not c.isdigit() and c not in "+-.")
