@@ -18,7 +18,7 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -34,6 +34,7 @@ from sitl.camera_process import CameraStatistics, WorldCameraConfig, WorldCamera
 from sitl.detector import FixedPoint, Observed
 from sitl.embedded.geodesy import Location
 from sitl.errors import SimulationError
+from sitl.gimbal_error import GimbalError
 from sitl.moving import Mover
 from sitl.pilot import EkfSample, MissionStep, Pilot, Truth, gimbal_step, speed_step, waypoint_step
 from sitl.process import VehicleProcess
@@ -113,7 +114,7 @@ def fly(
             _camera_config(folder, assets, scenario, cache, movers, ports, seed)
         )
         stack.enter_context(camera)
-        stack.enter_context(_truth_feed(pilot, camera, cache))
+        stack.enter_context(_truth_feed(pilot, camera, cache, GimbalError(seed)))
         companion = stack.enter_context(_companion(config, folder))
         run = _Run(pilot, scenario, home, folder, companion, progress)
         denied_ns = run.fly()
@@ -347,7 +348,9 @@ def _companion(config: Path, folder: Path) -> Iterator[subprocess.Popen[bytes]]:
 
 
 @contextmanager
-def _truth_feed(pilot: Pilot, camera: WorldCameraProcess, cache: TileCache) -> Iterator[None]:
+def _truth_feed(
+    pilot: Pilot, camera: WorldCameraProcess, cache: TileCache, gimbal_error: GimbalError
+) -> Iterator[None]:
     """Tells the world camera where the vehicle is, 50 times a second, on a thread."""
     stop = threading.Event()
 
@@ -357,6 +360,8 @@ def _truth_feed(pilot: Pilot, camera: WorldCameraProcess, cache: TileCache) -> I
             sample = _truth_sample(pilot, cache)
             if sample is not None and sample.time_ns > last_ns:
                 last_ns = sample.time_ns
+                angles = gimbal_error.true_angles(sample.gimbal, last_ns)
+                sample = replace(sample, gimbal=angles)
                 try:
                     camera.send(sample)
                 except SimulationError:
@@ -372,7 +377,7 @@ def _truth_feed(pilot: Pilot, camera: WorldCameraProcess, cache: TileCache) -> I
 
 
 def _truth_sample(pilot: Pilot, cache: TileCache) -> TruthSample | None:
-    """The newest instant at which both the vehicle and its gimbal are known."""
+    """The newest instant at which both the vehicle and its gimbal (as it reports) are known."""
     newest = pilot.newest_common_ns()
     truth = pilot.truth_at(newest) if newest else None
     gimbal = pilot.gimbal_at(newest) if newest else None

@@ -1,0 +1,44 @@
+"""What a gimbal does not report of itself: its alignment on the vehicle, and its horizon's wander.
+
+A simulated gimbal that points exactly where it says would hand the localizer its attitude for free.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from companion.geometry import GimbalAngles
+
+_ALIGNMENT_SIGMA = np.radians(0.5)  # per axis, constant over a flight: mounting and calibration
+_WANDER_SIGMA = np.radians(0.3)  # per axis: the attitude estimate it is stabilised with
+_WANDER_TIME_S = 6.0
+
+
+class GimbalError:
+    """Turns reported angles into true ones: a constant and a first-order Gauss-Markov process."""
+
+    def __init__(self, seed: int) -> None:
+        self._rng = np.random.default_rng([seed, 17])
+        self._alignment = self._rng.normal(0.0, _ALIGNMENT_SIGMA, 3)
+        self._wander = self._rng.normal(0.0, _WANDER_SIGMA, 3)
+        self._time_ns: int | None = None
+
+    def true_angles(self, reported: GimbalAngles, time_ns: int) -> GimbalAngles:
+        """The true angles at a time; times must not decrease."""
+        self._advance(time_ns)
+        roll, pitch, yaw = self._alignment + self._wander
+        return replace(
+            reported,
+            roll_rad=reported.roll_rad + roll,
+            pitch_rad=reported.pitch_rad + pitch,
+            yaw_rad=reported.yaw_rad + yaw,
+        )
+
+    def _advance(self, time_ns: int) -> None:
+        elapsed_s = 0.0 if self._time_ns is None else (time_ns - self._time_ns) * 1e-9
+        self._time_ns = time_ns
+        kept = np.exp(-elapsed_s / _WANDER_TIME_S)
+        drive = self._rng.normal(0.0, _WANDER_SIGMA * np.sqrt(1.0 - kept**2), 3)
+        self._wander = kept * self._wander + drive
