@@ -245,7 +245,7 @@ def _overlays(
         video = undistort(Frame(image, int(path.stem), camera, 0))
         view = renderer.render(estimated[k], target, wait=True)
         caption = f"video | map at the estimated pose | checkerboard   t = {path.stem} ns"
-        save_image(folder / f"overlay-{number}.jpg", overlay_sheet(video, view.rgb, caption))
+        save_image(folder / f"overlay-{number}.png", overlay_sheet(video, view.rgb, caption))
 
 
 def print_report(report: FlightReport, folder: Path) -> None:
@@ -279,7 +279,7 @@ def print_report(report: FlightReport, folder: Path) -> None:
     for name, (p50, p95) in report.camera_ms.items():
         stages.add_row(f"world camera: {name}", f"{p50:.0f}", f"{p95:.0f}")
     console.print(stages)
-    console.print(f"report: [green]{folder}[/]/report.json, tracks.png, errors.png, overlay-*.jpg")
+    console.print(f"report: [green]{folder}[/]/report.json, tracks.png, errors.png, overlay-*.png")
 
 
 def _add(table: Table, name: str, spread: Spread, note: str) -> None:
