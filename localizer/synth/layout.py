@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from localizer.pose import Array
-from localizer.synth.buildings import Building, Kind, build, rectangle
+from localizer.synth.buildings import Building, Kind, Surface, build, rectangle
 from localizer.synth.config import WorldConfig
 from localizer.synth.ground import GroundPlan, Material, Regions, Shape
 from localizer.synth.streets import (
@@ -364,7 +364,7 @@ def _roads(planner: _Planner) -> tuple[Array, ...]:
 
 
 def _targets(planner: _Planner) -> tuple[Target, ...]:
-    """Three static points near the middle: a crossing, a roof corner, a pitch or field corner."""
+    """Static points near the middle: a crossing, a flat roof, a corner of a pitch (or a node)."""
     terrain, net = planner.terrain, planner.net
     degree = np.bincount([n for s in net.streets for n in (s.a, s.b)], minlength=len(net.nodes))
     rank = np.bincount([n for s in net.streets if s.rank == 0 for n in (s.a, s.b)],
@@ -373,18 +373,43 @@ def _targets(planner: _Planner) -> tuple[Target, ...]:
     crossing = net.nodes[int(np.argmin(score))]
     points = [("crossing", _on_ground(terrain, crossing))]
 
-    flat = [b for b in planner.buildings if b.kind in (Kind.OFFICE, Kind.DECK, Kind.HALL)]
-    flat = flat or planner.buildings
-    if flat:
-        best = min(flat, key=lambda b: abs(float(np.hypot(*b.centre)) - 150.0))
-        corner = best.corners()[2]
-        vertices = np.concatenate([s.polygon for s in build(best)])
-        at_corner = np.linalg.norm(vertices[:, :2] - corner, axis=1) < 0.05
-        points.append(("roof corner", np.array([*corner, vertices[at_corner, 2].max()])))
+    roof = _roof_point(planner.buildings)
+    if roof is not None:
+        points.append(("roof", roof))
     corners = planner.corners or [net.nodes[int(np.argsort(score)[1])]]
     pitch = min(corners, key=lambda c: float(np.linalg.norm(c)))
     points.append(("pitch corner", _on_ground(terrain, pitch)))
     return tuple(Target(name, p) for name, p in points)
+
+
+def _roof_point(buildings: list[Building]) -> Array | None:
+    """A point on a flat roof, 3 m inside its corner: at the very edge a pixel's ray that is a
+    little off would miss the roof and hit the ground far behind.
+    """
+    kinds = (Kind.OFFICE, Kind.DECK, Kind.FLAT, Kind.HALL)
+    flat = [b for b in buildings if b.kind in kinds]
+    for building in sorted(flat, key=lambda b: abs(float(np.hypot(*b.centre)) - 150.0)):
+        surfaces = build(building)
+        for corner in rectangle(
+            building.centre, building.angle, building.length - 6.0, building.width - 6.0
+        ):
+            z = [_height_over(surfaces, corner + 1.2 * step) for step in _CROSS]
+            if np.ptp(z) < 0.02 and z[0] > building.base_z + 2.0:
+                return np.array([*corner, z[0]])
+    return None
+
+
+def _height_over(surfaces: list[Surface], xy: Array) -> float:
+    """Height of the highest surface over a point (2,), -inf where there is none."""
+    best = -np.inf
+    for surface in surfaces:
+        if surface.normal[2] < 1e-3:
+            continue
+        outline = surface.polygon[:, :2].astype(np.float32)
+        if cv2.pointPolygonTest(outline, (float(xy[0]), float(xy[1])), False) >= 0:
+            p, n = surface.polygon[0], surface.normal
+            best = max(best, float(p[2] - ((xy - p[:2]) @ n[:2]) / n[2]))
+    return best
 
 
 def _on_ground(terrain: Terrain, xy: Array) -> Array:
