@@ -1,0 +1,58 @@
+"""An independent MAVLink client (MAVSDK) takes the embedded vehicle for what it says it is."""
+
+from __future__ import annotations
+
+import math
+import time
+
+import pytest
+from mavsdk import ComponentType, Configuration, Mavsdk
+from mavsdk.plugins.info import Info
+from mavsdk.plugins.mission_raw import MissionItem, MissionRaw
+from mavsdk.plugins.param import Param
+from mavsdk.plugins.telemetry import Telemetry
+
+from sitl.embedded.geodesy import Location
+from sitl.vehicles import EmbeddedSitl, vision_only_parameters
+
+HOME = Location(47.397742, 8.545594, 488.0)
+
+
+@pytest.fixture
+def system():
+    with EmbeddedSitl(HOME, 40.0, vision_only_parameters(), speedup=5.0) as vehicle:
+        sdk = Mavsdk(Configuration.create_with_component_type(ComponentType.GROUND_STATION))
+        sdk.add_any_connection(vehicle.gcs_endpoint.replace("tcp:", "tcpout://"))
+        try:
+            yield sdk.first_autopilot(20.0)
+        finally:
+            sdk.destroy()
+
+
+def test_mavsdk_reads_version_parameters_missions_and_telemetry(system):
+    assert system is not None
+    assert system.get_system_id() == 1
+
+    version = Info(system).get_version()
+    assert (version.flight_sw_major, version.flight_sw_minor) == (4, 7)
+    assert Param(system).get_param_float("WPNAV_SPEED") == 1000.0
+
+    missions = MissionRaw(system)
+    places = [(16, 0), (22, 0), (16, 5000), (21, 0)]
+    items = [
+        MissionItem(
+            seq, 3, command, int(seq == 0), 1, 0, 0, 0, 0, 473977420 + dx, 85455940, 30.0, 0
+        )
+        for seq, (command, dx) in enumerate(places)
+    ]
+    missions.upload_mission(items)
+    back = missions.download_mission()
+    assert [(i.command, i.x) for i in back] == [(i.command, i.x) for i in items]
+
+    telemetry = Telemetry(system)
+    telemetry.set_rate_attitude_euler(10.0)
+    deadline = time.monotonic() + 10.0
+    while math.isnan(telemetry.attitude_euler().yaw_deg) and time.monotonic() < deadline:
+        time.sleep(0.1)
+    assert telemetry.attitude_euler().yaw_deg == pytest.approx(40.0, abs=5.0)
+    assert not telemetry.armed()
