@@ -26,12 +26,11 @@ import numpy as np
 import yaml
 
 from companion.geometry import GimbalAngles, GimbalFrame
-from localizer.geo import LocalFrame
 from localizer.map.cache import TileCache
 from localizer.synth.appearance import sample_appearance
 from sitl.assets import FlightAssets
 from sitl.camera_process import CameraStatistics, WorldCameraConfig, WorldCameraProcess
-from sitl.detector import FixedPoint, Observed
+from sitl.detector import Observed
 from sitl.embedded.geodesy import Location
 from sitl.errors import SimulationError
 from sitl.gimbal_error import GimbalError
@@ -39,6 +38,7 @@ from sitl.moving import Mover
 from sitl.pilot import EkfSample, MissionStep, Pilot, Truth, gimbal_step, speed_step, waypoint_step
 from sitl.process import VehicleProcess
 from sitl.scenario import Scenario, VehicleKind
+from sitl.targets import observed_targets
 from sitl.traffic import traffic
 from sitl.truth import TruthSample
 from sitl.vehicles import (
@@ -54,7 +54,6 @@ _TRUTH_PERIOD_S = 0.02
 _TRACKING_TIMEOUT_S = 60.0
 _LEG_MARGIN_S = 60.0
 _COMPANION_STOP_S = 20.0
-MOVING = "car"  # what the moving targets' names begin with
 
 Progress = Callable[[str, float], None]
 
@@ -108,10 +107,11 @@ def fly(
             assets.world, cache.frame, cars=scenario.cars, people=scenario.people, seed=seed,
             epoch_ns=time.monotonic_ns(),
         )  # fmt: skip
+        targets = observed_targets(assets, scenario, movers)
         config = _write_companion_config(folder, assets, scenario, vehicle, ports)
         progress("starting the world camera", 0.0)
         camera = WorldCameraProcess(
-            _camera_config(folder, assets, scenario, cache, movers, ports, seed)
+            _camera_config(folder, assets, scenario, movers, targets, ports, seed)
         )
         stack.enter_context(camera)
         stack.enter_context(_truth_feed(pilot, camera, cache, GimbalError(seed)))
@@ -130,18 +130,9 @@ def fly(
         denied_ns,
         camera.statistics,
         home_error_m,
-        observed_targets(assets, movers, cache.frame),
+        targets,
         texts,
     )
-
-
-def observed_targets(
-    assets: FlightAssets, movers: tuple[Mover, ...], frame: LocalFrame
-) -> tuple[Observed, ...]:
-    """The world's named points and its moving cars, in the map's ENU."""
-    to_map = frame.ecef_from_enu.inverse @ assets.world.frame.ecef_from_enu
-    fixed = (FixedPoint(t.name, to_map.apply(t.position)) for t in assets.world.targets)
-    return (*fixed, *(m for m in movers if m.name.startswith(MOVING)))
 
 
 class _Run:
@@ -274,14 +265,14 @@ def _camera_config(
     folder: Path,
     assets: FlightAssets,
     scenario: Scenario,
-    cache: TileCache,
     movers: tuple[Mover, ...],
+    targets: tuple[Observed, ...],
     ports: _Ports,
     seed: int,
 ) -> WorldCameraConfig:
     return WorldCameraConfig(
         cache=assets.live_cache,
-        origin=cache.manifest.origin,
+        origin=TileCache.open(assets.map_cache).manifest.origin,
         camera=scenario.camera.camera(),
         url=f"udp://127.0.0.1:{ports.video}",
         log=folder / "frames.csv",
@@ -289,7 +280,7 @@ def _camera_config(
         appearance=sample_appearance(np.random.default_rng([seed, 11]), scenario.condition),
         movers=movers,
         seed=seed,
-        targets=observed_targets(assets, movers, cache.frame),
+        targets=targets,
         detections=f"127.0.0.1:{ports.detections}",
     )
 

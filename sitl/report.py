@@ -44,7 +44,8 @@ from sitl.analysis import (
     stage_latencies,
     target_errors,
 )
-from sitl.flight import MOVING, FlightRecord
+from sitl.detector import FixedPoint
+from sitl.flight import FlightRecord
 from sitl.scenario import Scenario
 
 _OVERLAYS = 4
@@ -88,8 +89,9 @@ def make_report(record: FlightRecord, scenario: Scenario, seed: int) -> FlightRe
     errors = frame_errors(truth, estimates, span)
     ekf_times, horizontal, vertical = ekf_errors(vehicle, span)
     by_target = _target_errors(record, targets)
-    fixed = [e for name, e in by_target.items() if not name.startswith(MOVING)]
-    moving = {name: e for name, e in by_target.items() if name.startswith(MOVING)}
+    still = {t.name for t in record.targets if isinstance(t, FixedPoint)}
+    fixed = [e for name, e in by_target.items() if name in still]
+    moving = {name: e for name, e in by_target.items() if name not in still}
     # Every car that was seen is in `moving_targets_m`; one line of the table is the longest seen.
     longest = max(moving, key=lambda name: len(moving[name]), default="")
     by_target = {n: e for n, e in by_target.items() if n not in moving or n == longest}
@@ -195,7 +197,7 @@ def _plot(
             "autopilot's EKF": _track(vehicle, "ekf_"),
             "localizer (camera)": _track(estimates, "")[accepted],
         }
-        fixed = (t for t in record.targets if not t.name.startswith(MOVING))
+        fixed = (t for t in record.targets if isinstance(t, FixedPoint))
         marks = {t.name: t.position_at(start) for t in fixed}
         plot_tracks(folder / "tracks.png", tracks, _map_picture(renderer), marks)
         _overlays(folder, estimates, renderer, config)
