@@ -22,13 +22,15 @@ from localizer.types import Anchors, FeatureLevel, FeaturePyramid, Float32
 class LMSettings:
     """Levenberg-Marquardt and robust-loss settings (docs/registration.md, sections 3 and 5).
 
-    huber: threshold on the residual norm of one anchor; unit features differ by at most 2.
+    scale: of the residual norm of one anchor, where the loss leaves the square: Huber's threshold,
+    or Geman and McClure's scale if `redescending`. Unit features differ by at most 2.
     damping: first factor of the diagonal that is added to it (Marquardt's scaling, per axis);
     it is multiplied by damping_down after an accepted and by damping_up after a rejected step.
     min_overlap: share of the anchors that must project into the image.
     """
 
-    huber: float = 0.5
+    scale: float = 0.5
+    redescending: bool = False
     damping: float = 0.03
     damping_down: float = 0.3
     damping_up: float = 8.0

@@ -34,10 +34,11 @@ from localizer.registration.covariance import (
 from localizer.registration.hypotheses import generate_hypotheses
 from localizer.registration.kernel_numba import NumbaBackend
 from localizer.registration.priors import PoseConstraint
-from localizer.registration.reference import Linearization, ReferenceBackend, linearize
+from localizer.registration.reference import Linearization, ReferenceBackend, linearize, robust_loss
 from localizer.types import Anchors, FeaturePyramid, PosePrior, RegistrationStatus
 
 _PROBES = 12  # anchors whose projections tell hypotheses apart
+_LEAST_SCALE = 0.02  # of the polishing loss, where features fit perfectly
 _LEAST_SCORE = 1e-3  # unit of the motion term and priors where features fit perfectly
 
 
@@ -58,8 +59,10 @@ class JNGOConfig(BaseModel):
     keep: tuple[int, ...] = Field(
         default=(32, 8), description="survivors after each level but the last"
     )
-    polish: int = Field(
-        default=6, ge=0, description="further finest-level LM steps on the best hypothesis"
+    polish: int = Field(default=6, ge=0, description="further finest-level LM steps per stage")
+    polish_scales: tuple[float, ...] = Field(
+        default=(2.0, 1.0, 0.7),
+        description="Geman-McClure scales of the winner's last steps, in median norms",
     )
     distinct_px: float = Field(
         default=0.25, ge=0, description="least rms distance of survivors, level px"
@@ -71,11 +74,9 @@ class JNGOConfig(BaseModel):
     )
     min_anchors: int = Field(default=50, ge=6, description="anchors below which nothing is tried")
     motion_weight: float = Field(
-        default=0.04, ge=0, description="lambda of Eq. 10, in best costs per d²"
+        default=0.02, ge=0, description="lambda of Eq. 10, in best costs per d²"
     )
-    prior_weight: float = Field(
-        default=0.04, ge=0, description="weight of priors given as residuals"
-    )
+    prior_weight: float = Field(default=0.02, ge=0, description="weight of a constraint, likewise")
     correlation: float = Field(
         default=8.0, gt=0, description="covariance factor for correlated features"
     )
@@ -89,14 +90,15 @@ class JNGOConfig(BaseModel):
     @property
     def settings(self) -> LMSettings:
         """What the backends need of it."""
-        return LMSettings(self.huber, self.damping, min_overlap=self.min_overlap)
+        return LMSettings(self.huber, damping=self.damping, min_overlap=self.min_overlap)
 
 
 @dataclass(frozen=True)
 class Registration:
     """A registered pose, or the prior's with the reason why not.
 
-    covariance: (6, 6) as `PosePrior`'s. score: mean robust cost, lower is better, inf on failure.
+    covariance: (6, 6) as `PosePrior`'s. score: mean Huber cost, lower is
+    better, inf on failure.
     overlap: share of the anchors in view. quality: 0 (no better than chance) to 1. modes: distinct
     surviving poses. evaluations: cost evaluations spent.
     """
@@ -147,7 +149,7 @@ class JNGO:
         )
         if not np.isfinite(swarm.scores[0]):
             return _failure(prior, RegistrationStatus.NO_OVERLAP, swarm.evaluations)
-        return self._result(origin, prior, swarm)
+        return self._result(origin, prior, self._sharpen(self._converge(swarm, origin, motion)))
 
     def _refine(
         self,
@@ -182,12 +184,48 @@ class JNGO:
             order = order[:survivors]
             R, t = result.rotations[order], result.translations[order]
             scores, overlaps = result.scores[order], result.overlaps[order]
-        if c.polish and np.isfinite(scores[0]):
-            result = self.backend.refine(problem, R[:1], t[:1], c.polish, c.settings)
-            evaluations += result.evaluations
+            if not np.isfinite(scores[0]):
+                break
+        return _Swarm(problem, c.settings, R, t, scores, overlaps, evaluations)
+
+    def _converge(self, swarm: _Swarm, origin: Array, motion: PosePrior | None) -> _Swarm:
+        """More finest-level steps on the survivors, and their final order."""
+        steps = self.config.polish
+        if steps == 0:
+            return swarm
+        result = self.backend.refine(
+            swarm.problem, swarm.rotations, swarm.translations, steps, swarm.settings
+        )
+        R, t = result.rotations, result.translations
+        order = np.argsort(self._totals(R, t, result.scores, origin, motion), kind="stable")
+        return _Swarm(
+            swarm.problem,
+            swarm.settings,
+            R[order],
+            t[order],
+            result.scores[order],
+            result.overlaps[order],
+            swarm.evaluations + result.evaluations,
+        )
+
+    def _sharpen(self, swarm: _Swarm) -> _Swarm:
+        """The winner's pose under ever narrower redescending losses; the scores stay Huber's."""
+        c = self.config
+        if c.polish == 0:
+            return swarm
+        R, t = swarm.rotations.copy(), swarm.translations.copy()
+        model = linearize(swarm.problem, R[0], t[0], c.settings)
+        median = _weighted_median(np.linalg.norm(model.residuals, axis=1), model.weights)
+        settings, evaluations = swarm.settings, swarm.evaluations
+        for factor in c.polish_scales:
+            scale = max(factor * median, _LEAST_SCALE)
+            settings = replace(c.settings, scale=scale, redescending=True)
+            result = self.backend.refine(swarm.problem, R[:1], t[:1], c.polish, settings)
             R[:1], t[:1] = result.rotations, result.translations
-            scores[:1], overlaps[:1] = result.scores, result.overlaps
-        return _Swarm(problem, R, t, scores, overlaps, evaluations)
+            evaluations += result.evaluations
+        return replace(
+            swarm, rotations=R, translations=t, settings=settings, evaluations=evaluations
+        )
 
     def _constrained(
         self,
@@ -228,7 +266,7 @@ class JNGO:
     def _result(self, origin: Array, prior: PosePrior, swarm: _Swarm) -> Registration:
         c, problem = self.config, swarm.problem
         R, t = swarm.rotations[0], swarm.translations[0]
-        model = linearize(problem, R, t, c.settings)
+        model = linearize(problem, R, t, swarm.settings)
         weight = 0.0 if problem.prior is None else problem.prior.weight
         tangent = tangent_covariance(model, c.correlation, c.covariance_floor, weight)
         if tangent is None:
@@ -278,9 +316,10 @@ class JNGO:
 
 @dataclass(frozen=True)
 class _Swarm:
-    """Survivors of the last level, best first, and that level's problem."""
+    """Survivors, best first, with their level's problem and the loss of the first one's pose."""
 
     problem: LevelProblem
+    settings: LMSettings
     rotations: Array
     translations: Array
     scores: Array
@@ -359,11 +398,14 @@ def _quality(problem: LevelProblem, model: Linearization, settings: LMSettings) 
     sampled = model.residuals[visible] + problem.anchor_features[visible]
     others = np.roll(problem.anchor_features[visible], len(visible) // 2, axis=0)
     weights = model.weights[visible]
-    norms = np.linalg.norm(sampled - others, axis=1)
-    delta = settings.huber
-    chance = weights @ np.where(norms <= delta, norms**2, 2 * delta * norms - delta**2)
-    chance /= max(weights.sum(), 1e-12)
-    norms = np.linalg.norm(model.residuals[visible], axis=1)
-    score = weights @ np.where(norms <= delta, norms**2, 2 * delta * norms - delta**2)
-    score /= max(weights.sum(), 1e-12)
-    return float(np.clip(1.0 - score / max(chance, 1e-12), 0.0, 1.0))
+    chance, _ = robust_loss(np.linalg.norm(sampled - others, axis=1), settings)
+    actual, _ = robust_loss(np.linalg.norm(model.residuals[visible], axis=1), settings)
+    return float(
+        np.clip(1.0 - float(weights @ actual) / max(float(weights @ chance), 1e-12), 0.0, 1.0)
+    )
+
+
+def _weighted_median(values: Array, weights: Array) -> float:
+    order = np.argsort(values)
+    cumulated = np.cumsum(weights[order])
+    return float(values[order][np.searchsorted(cumulated, 0.5 * cumulated[-1])])

@@ -8,7 +8,7 @@ and the retraction are float64; points, features and sums are float32. Threads s
 and hold no GIL. Equations are numbered in docs/registration.md.
 """
 
-# ruff: noqa: PLR0917, PLR0912, PLR0915 (kernels pass arrays and unroll sums, for speed)
+# ruff: noqa: PLR0912, PLR0915 (kernels pass arrays and unroll sums, for speed)
 
 from __future__ import annotations
 
@@ -78,10 +78,8 @@ def _compact(h, w, buf, index):  # type: ignore[no-untyped-def]
 
 
 @njit(**_JIT)
-def _weigh(n, w, confidence, anchor_confidence, huber, buf, index):  # type: ignore[no-untyped-def]
-    """Joint confidence (equation 2) and Huber (equation 4): (cost, weight); row 16 gets the IRLS
-    weight.
-    """
+def _weigh(n, w, confidence, anchor_confidence, delta, redescending, buf, index):  # type: ignore[no-untyped-def]
+    """Equations 2 and 4: (cost, weight); row 16 gets the anchors' IRLS weights."""
     ka, kb, ke, kw = buf[8], buf[9], buf[15], buf[16]
     anchor, cell = index[0], index[1]
     for k in range(n):
@@ -91,14 +89,22 @@ def _weigh(n, w, confidence, anchor_confidence, huber, buf, index):  # type: ign
         low = confidence[i + w] + a * (confidence[i + w + 1] - confidence[i + w])
         kw[k] = anchor_confidence[anchor[k]] * (top + b * (low - top))
     cost, total = _F(0), _F(0)
+    if redescending:
+        inverse = _F(1) / (delta * delta)
+        for k in range(n):
+            share = _F(1) / (_F(1) + ke[k] * inverse)
+            total += kw[k]
+            cost += kw[k] * ke[k] * share
+            kw[k] *= share * share
+        return cost, total
     for k in range(n):
         e = ke[k]
         norm = np.sqrt(e)
         weight = kw[k]
         total += weight
-        inlier = norm <= huber
-        cost += weight * (e if inlier else huber * (_F(2) * norm - huber))
-        kw[k] = weight if inlier else weight * huber / norm
+        inlier = norm <= delta
+        cost += weight * (e if inlier else delta * (_F(2) * norm - delta))
+        kw[k] = weight if inlier else weight * delta / norm
     return cost, total
 
 
@@ -322,7 +328,8 @@ def refine_kernel(channels: int) -> Callable[..., int]:
     @njit(**_JIT)
     def evaluate(  # type: ignore[no-untyped-def]
         R, t, focal, centre, points, features, confidence, anchor_features, anchor_confidence,
-        h, w, huber, min_visible, prior_R, prior_t, information, prior_weight, buf, index, sums,
+        h, w, delta, redescending, min_visible, prior_R, prior_t, information, prior_weight,
+        buf, index, sums,
     ):  # fmt: skip
         """Score of a pose and the count of anchors in view; sums gets H and g."""
         _project(R, t, points, focal, centre, buf)
@@ -330,7 +337,9 @@ def refine_kernel(channels: int) -> Callable[..., int]:
         if n < min_visible:
             return np.inf, n
         sample(n, w, features, anchor_features, buf, index)
-        cost, total = _weigh(n, w, confidence, anchor_confidence, _F(huber), buf, index)
+        cost, total = _weigh(
+            n, w, confidence, anchor_confidence, _F(delta), redescending, buf, index
+        )
         if not total > _F(0):
             return np.inf, n
         _accumulate(n, t, focal, buf, sums)
@@ -345,8 +354,8 @@ def refine_kernel(channels: int) -> Callable[..., int]:
     @njit(**_JIT)
     def refine(  # type: ignore[no-untyped-def]
         start, stop, R, t, scores, visible, focal, centre, points, features, confidence,
-        anchor_features, anchor_confidence, h, w, iterations, huber, damping0, down, up,
-        min_visible, prior_R, prior_t, information, prior_weight, buf, index,
+        anchor_features, anchor_confidence, h, w, iterations, delta, redescending, damping0,
+        down, up, min_visible, prior_R, prior_t, information, prior_weight, buf, index,
     ):  # fmt: skip
         """Levenberg-Marquardt (equations 8 and 9) on hypotheses start to stop, in place."""
         sums, best = np.zeros(_SUMS), np.zeros(_SUMS)
@@ -357,8 +366,8 @@ def refine_kernel(channels: int) -> Callable[..., int]:
             damping = damping0
             scores[m], visible[m] = evaluate(
                 R[m], t[m], focal, centre, points, features, confidence, anchor_features,
-                anchor_confidence, h, w, huber, min_visible, prior_R, prior_t, information,
-                prior_weight, buf, index, best,
+                anchor_confidence, h, w, delta, redescending, min_visible, prior_R, prior_t,
+                information, prior_weight, buf, index, best,
             )  # fmt: skip
             evaluations += 1
             if not scores[m] < np.inf:
@@ -370,8 +379,8 @@ def refine_kernel(channels: int) -> Callable[..., int]:
                 _retract(R[m], t[m], step, R_try, t_try)
                 score, n = evaluate(
                     R_try, t_try, focal, centre, points, features, confidence, anchor_features,
-                    anchor_confidence, h, w, huber, min_visible, prior_R, prior_t, information,
-                    prior_weight, buf, index, sums,
+                    anchor_confidence, h, w, delta, redescending, min_visible, prior_R, prior_t,
+                    information, prior_weight, buf, index, sums,
                 )  # fmt: skip
                 evaluations += 1
                 if score < scores[m]:
@@ -420,7 +429,7 @@ class NumbaBackend:
             np.asarray(problem.focal), np.asarray(problem.centre), problem.points,
             problem.features.reshape(-1), problem.confidence.reshape(-1),
             problem.anchor_features.reshape(-1), problem.anchor_confidence,
-            h, w, iterations, float(settings.huber), float(settings.damping),
+            h, w, iterations, float(settings.scale), settings.redescending, float(settings.damping),
             float(settings.damping_down), float(settings.damping_up),
             minimum_visible(problem, settings),
             np.ascontiguousarray(prior_R), np.ascontiguousarray(prior_t),

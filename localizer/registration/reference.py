@@ -27,7 +27,7 @@ class Linearization:
     """The cost at one pose and its second-order model (equations 4 to 7).
 
     residuals: (N, C), jacobians: (N, C, 6), weights: (N,) joint confidence, 0 out of view;
-    robust: (N,) Huber's weights; score: mean robust cost; hessian: (6, 6) and gradient: (6,) of
+    robust: (N,) the loss's weights; score: mean robust cost; hessian: (6, 6) and gradient: (6,) of
     half the score under xi = (rho, phi); prior_hessian: (6, 6) the prior's part; visible: (N,).
     """
 
@@ -96,9 +96,7 @@ def linearize(
     joint = problem.anchor_confidence * sample_bilinear(problem.confidence, u, v)
     weights = np.where(visible, joint, 0.0)
     norm = np.linalg.norm(residuals, axis=1)
-    delta = settings.huber
-    cost = np.where(norm <= delta, norm**2, 2 * delta * norm - delta**2)
-    robust = np.where(norm <= delta, 1.0, delta / np.maximum(norm, 1e-12))
+    cost, robust = robust_loss(norm, settings)
     total = weights.sum()
     if visible.sum() < minimum_visible(problem, settings) or not total > 0:
         none = np.zeros((6, 6))
@@ -116,6 +114,16 @@ def linearize(
     return Linearization(
         residuals, jacobians, weights, robust, visible, score, hessian, gradient, prior_hessian
     )
+
+
+def robust_loss(norm: Array, settings: LMSettings) -> tuple[Array, Array]:
+    """Cost and IRLS weight (N,) of residual norms (N,): equation 4."""
+    delta = settings.scale
+    if settings.redescending:
+        share = 1.0 / (1.0 + (norm / delta) ** 2)
+        return norm**2 * share, share**2
+    cost = np.where(norm <= delta, norm**2, 2 * delta * norm - delta**2)
+    return cost, np.where(norm <= delta, 1.0, delta / np.maximum(norm, 1e-12))
 
 
 def minimum_visible(problem: LevelProblem, settings: LMSettings) -> int:
