@@ -26,7 +26,7 @@ from localizer.map.source import SourceMesh
 from localizer.pose import Array, matrix_from_quaternion
 from localizer.types import Image
 
-MAX_TEXTURE_PIXELS = 16384 * 16384
+MAX_TEXTURE_PIXELS = 1 << 27
 MAX_ELEMENTS = 50_000_000  # vertices or indices of one primitive
 MAX_NODE_DEPTH = 64
 
@@ -55,6 +55,9 @@ _WRAP_REPEAT = 10497
 _OUTSIDE_UNIT_SQUARE = 0.01  # texture coordinates off by less are rounding, not repetition
 
 
+# What walking over JSON of the wrong shape raises; everything expected is checked by name.
+_MALFORMED = (AttributeError, IndexError, KeyError, OverflowError, TypeError, ValueError)
+
 Reader = Callable[[str], bytes]  # resolves a relative URI of the file; raises MapSourceError
 
 
@@ -63,8 +66,11 @@ def read_gltf(data: bytes, read_uri: Reader) -> tuple[list[SourceMesh], Array]:
 
     Meshes of one image are merged. Positions are in the document's axes (y up), nodes applied.
     """
-    document = _Document(data, read_uri)
-    return document.meshes(), document.rtc_center()
+    try:
+        document = _Document(data, read_uri)
+        return document.meshes(), document.rtc_center()
+    except _MALFORMED as error:
+        raise MapSourceError(f"malformed glTF: {error!r}") from error
 
 
 class _Document:
@@ -114,11 +120,15 @@ class _Document:
         if mode not in (4, 5, 6):
             return None  # points and lines have no surface
         attributes, faces = self._geometry(primitive)
-        positions = attributes["POSITION"][:, :3].astype(np.float64)
+        positions = attributes["POSITION"].astype(np.float64)
+        if positions.shape[1] != 3:
+            raise MapSourceError("positions are not of three coordinates")
         if not np.isfinite(positions).all():
             raise MapSourceError("positions are not finite")
         if faces is None:
             faces = np.arange(len(positions))
+        if faces.dtype.kind not in "iu":
+            raise MapSourceError("indices are not whole numbers")
         triangles = _triangles(faces.astype(np.int64).ravel(), mode)
         if len(triangles) and (triangles.max() >= len(positions) or triangles.min() < 0):
             raise MapSourceError("an index points beyond the vertices")

@@ -1,7 +1,5 @@
 """From a pixel to the map's surface: by the rendered depth, or exactly by its triangles."""
 
-# ruff: noqa: PLR0917 (kernels pass arrays)
-
 from __future__ import annotations
 
 from collections.abc import Sequence

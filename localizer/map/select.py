@@ -1,6 +1,6 @@
 """Which tiles a view needs: screen-space error, frustum and horizon culling (numba kernel)."""
 
-# ruff: noqa: PLR0917, PLR0912, PLR0915 (the kernel passes arrays and is one loop body)
+# ruff: noqa: PLR0912, PLR0915 (the kernel passes arrays and is one loop body)
 
 from __future__ import annotations
 
@@ -52,9 +52,9 @@ class TileSelector:
 
     def __init__(self, index: TileIndex, frame: LocalFrame) -> None:
         self._index = index
-        lowest = float(index.box_min[:, 2].min()) - _HORIZON_MARGIN_M
         radius = _curvature_radius(frame)
-        self._globe = np.array([lowest - radius, radius])
+        lowest = _lowest_ground(index, radius) - _HORIZON_MARGIN_M
+        self._globe = np.array([-radius, radius + lowest])
 
     def select(
         self,
@@ -106,6 +106,15 @@ def _curvature_radius(frame: LocalFrame) -> float:
     s = np.sin(np.radians(frame.origin.latitude_deg))
     w = 1 - _ECCENTRICITY_SQUARED * s * s
     return float(_SEMI_MAJOR_M * np.sqrt(1 - _ECCENTRICITY_SQUARED) / w)
+
+
+def _lowest_ground(index: TileIndex, radius: float) -> float:
+    """Height of the map's lowest point above a sphere that touches z = 0 at the origin, metres."""
+    leaf = index.child_count == 0
+    low, high = index.box_min[leaf], index.box_max[leaf]
+    nearest = np.clip(0.0, low, high)
+    nearest[:, 2] = low[:, 2] + radius
+    return float(np.linalg.norm(nearest, axis=1).min() - radius)
 
 
 @njit(cache=True, nogil=True)

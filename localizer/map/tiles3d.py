@@ -65,6 +65,13 @@ class ContentFile:
 
 def read_tileset(path: Path) -> SourceTree:
     """Read `tileset.json` (or the folder that holds it) and every tileset it refers to."""
+    try:
+        return _read_tileset(path)
+    except (AttributeError, KeyError, OverflowError, TypeError, ValueError) as error:
+        raise MapSourceError(f"{path}: malformed tileset: {error!r}") from error
+
+
+def _read_tileset(path: Path) -> SourceTree:
     path = (path / "tileset.json" if path.is_dir() else path).resolve()
     reader = _Reader(path.parent)
     document = reader.load(path)
@@ -144,7 +151,7 @@ class _Reader:
         self._open.pop()
         return node
 
-    def _node(  # noqa: PLR0917
+    def _node(
         self, data: dict[str, Any], parent: Array, replaces: bool, up: str, path: Path, depth: int
     ) -> SourceNode:
         self._count += 1

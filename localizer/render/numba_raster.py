@@ -7,7 +7,7 @@ look-up in the mip that the pixel's footprint asks for. Both sides of a triangle
 photogrammetry is not consistently wound.
 """
 
-# ruff: noqa: PLR0917, PLR0915 (kernels pass arrays and unroll, for speed)
+# ruff: noqa: PLR0915 (kernels pass arrays and unroll, for speed)
 
 from __future__ import annotations
 
