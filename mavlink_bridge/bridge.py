@@ -227,6 +227,7 @@ class Bridge:
             result.update({f"{link.name}_{k}": v for k, v in link.stats().items()})
         result.update({f"inject_{k}": v for k, v in dict(injector.counters).items()})
         result.update({f"bridge_{k}": v for k, v in dict(self._fc.counters).items()})
+        result.update({f"rx_{k}": v for k, v in dict(self._fc.streams.counts).items()})
         result["inject_reason"] = injector.reason
         result["reset_counter"] = injector.reset_counter
         result["yaw_difference_deg"] = math.degrees(injector.yaw_difference_rad)

@@ -71,7 +71,9 @@ class ClosedLoopCheck:
             return None
         differences = sorted(d for t, d, _ in self._differences if now_ns - t < _WINDOW_NS)
         difference = differences[len(differences) // 2] if differences else math.nan
-        reason = self._reason(len(recent), state, difference, recent[-1][3])
+        span_s = (recent[-1][0] - recent[0][0]) * 1e-9
+        rate = (len(recent) - 1) / span_s if span_s > 0.0 else 0.0
+        reason = self._reason(rate, state, difference, recent[-1][3])
         return LoopVerdict(not reason, reason, difference)
 
     def _compare(self, now_ns: int, local_at: Callable[[int], tuple[float, ...] | None]) -> None:
@@ -83,8 +85,7 @@ class ClosedLoopCheck:
                 distance = math.hypot(local[0] - north, local[1] - east)
                 self._differences.append((now_ns, distance, sigma))
 
-    def _reason(self, count: int, state: VehicleState, difference: float, sigma: float) -> str:
-        rate = count / (_WINDOW_NS * 1e-9)
+    def _reason(self, rate: float, state: VehicleState, difference: float, sigma: float) -> str:
         wanted = _GPS_MINIMUM_HZ if self._message == "gps_input" else _MINIMUM_HZ
         flags = state.ekf_flags
         reasons = (

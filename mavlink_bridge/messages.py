@@ -41,6 +41,7 @@ class VisionFix:
     """One position (and attitude) of the vehicle's body, seen by the localizer.
 
     position_covariance_ned: (3, 3) m^2. roll, pitch, yaw: body to NED; NaN where unknown.
+    velocity_ned: m/s with its sigma where it was measured; None lets the bridge derive it.
     reset: this fix carries a jump of the localizer's own estimate. quality: 0..100.
     """
 
@@ -55,6 +56,8 @@ class VisionFix:
     attitude_sigma_rad: float = 0.02
     reset: bool = False
     quality: int = 100
+    velocity_ned: tuple[float, float, float] | None = None
+    velocity_sigma_mps: float = 0.3
 
     def __post_init__(self) -> None:
         _check_position("vision fix", self.latitude_deg, self.longitude_deg, self.height_m)
@@ -64,6 +67,8 @@ class VisionFix:
         object.__setattr__(self, "position_covariance_ned", P)
         if not 0 <= self.quality <= 100:
             raise FixError(f"vision fix: quality must be 0..100, got {self.quality}")
+        if self.velocity_ned is not None and not all(math.isfinite(v) for v in self.velocity_ned):
+            raise FixError(f"vision fix: velocity {self.velocity_ned} is not finite; give None")
 
 
 @dataclass(frozen=True)

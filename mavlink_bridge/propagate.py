@@ -76,6 +76,7 @@ class FixPropagator:
         gap_s = np.inf if last is None else (fix.time_ns - last.time_ns) * 1e-9
         if self._filter is None or gap_s > _FORGET_AFTER_S:
             self._start(fix, R)
+            self._measure_velocity(fix)
             return
         F, Q = self._motion(gap_s)
         self._filter.predict(F=F, Q=Q)
@@ -88,6 +89,13 @@ class FixPropagator:
             self._filter.P[:3, :3] = R
         else:
             self._filter.update(z, R=R)
+        self._measure_velocity(fix)
+
+    def _measure_velocity(self, fix: VisionFix) -> None:
+        if fix.velocity_ned is not None and self._filter is not None:
+            H = np.hstack([np.zeros((3, 3)), np.eye(3)])
+            R = np.eye(3) * fix.velocity_sigma_mps**2
+            self._filter.update(np.array(fix.velocity_ned), R=R, H=H)
 
     def at(self, time_ns: int) -> PropagatedFix | None:
         """The newest fix carried to `time_ns`; None before the first."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from dataclasses import dataclass
 
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
@@ -54,6 +55,7 @@ class StreamKeeper:
     """Asks for each stream until it comes, and again when it stops."""
 
     def __init__(self) -> None:
+        self.counts: Counter[str] = Counter()
         self._seen_ns: dict[str, int] = {}
         self._attempts: dict[str, int] = {}
         self._next_ns = 0
@@ -67,6 +69,7 @@ class StreamKeeper:
     def seen(self, name: str, time_ns: int) -> None:
         """A message arrived."""
         self._seen_ns[name] = time_ns
+        self.counts[name] += 1
 
     def due(self, streams: tuple[Stream, ...], now_ns: int) -> list[Stream]:
         """The streams to ask for now."""

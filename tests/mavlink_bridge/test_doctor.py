@@ -1,0 +1,165 @@
+"""Parameter rules, and the examination of a small autopilot."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import pytest
+from pymavlink.dialects.v20 import ardupilotmega as mavlink
+
+from mavlink_bridge import BridgeConfig
+from mavlink_bridge.config import InjectionConfig, OriginConfig
+from mavlink_bridge.doctor import (
+    ardupilot_rules,
+    check_parameters,
+    examine,
+    find_source_set,
+    px4_rules,
+    repair,
+)
+from mavlink_bridge.errors import ParameterError
+from mavlink_bridge.parameters import ParameterClient, decode_value, encode_value
+
+ORIGIN = OriginConfig(latitude_deg=47.0, longitude_deg=8.0, altitude_amsl_m=500.0)
+GOOD = {
+    "AHRS_EKF_TYPE": 3.0,
+    "EK3_ENABLE": 1.0,
+    "VISO_TYPE": 1.0,
+    "EK3_SRC1_POSXY": 6.0,
+    "EK3_SRC1_VELXY": 0.0,
+    "EK3_SRC1_VELZ": 0.0,
+    "EK3_SRC1_POSZ": 1.0,
+    "EK3_SRC1_YAW": 1.0,
+    "VISO_DELAY_MS": 100.0,
+    "VISO_SCALE": 1.0,
+    "VISO_POS_X": 0.0,
+    "VISO_POS_Y": 0.0,
+    "VISO_POS_Z": 0.0,
+    "VISO_QUAL_MIN": 0.0,
+    "GPS1_TYPE": 0.0,
+}
+
+
+def config(port: int = 14551, **injection: Any) -> BridgeConfig:
+    return BridgeConfig(
+        connection=f"udpout:127.0.0.1:{port}",
+        injection=InjectionConfig(**injection),
+        origin=ORIGIN,
+    )
+
+
+def failures(settings: BridgeConfig, parameters: dict[str, float]) -> set[str]:
+    rules = ardupilot_rules(settings, find_source_set(settings, parameters.get))
+    return {f.name for f in check_parameters(rules, parameters.get) if not f.ok}
+
+
+def test_the_measured_set_is_right() -> None:
+    assert failures(config(), GOOD) == set()
+
+
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [
+        ("EK3_SRC1_VELXY", 3.0),
+        ("EK3_SRC1_VELZ", 3.0),
+        ("VISO_TYPE", 0.0),
+        ("VISO_DELAY_MS", 10.0),
+        ("VISO_QUAL_MIN", 50.0),
+        ("EK3_SRC1_POSXY", 3.0),
+        ("EK3_SRC1_YAW", 6.0),
+        ("GPS1_TYPE", 1.0),
+        ("AHRS_EKF_TYPE", 2.0),
+    ],
+)
+def test_each_wrong_parameter_is_found(name: str, value: float) -> None:
+    assert failures(config(), {**GOOD, name: value}) == {name}
+
+
+def test_second_source_set_is_found_and_gps_is_left_alone_there() -> None:
+    second = {k.replace("SRC1", "SRC2"): v for k, v in GOOD.items()}
+    second |= {"EK3_SRC1_POSXY": 3.0, "GPS1_TYPE": 1.0}
+    assert find_source_set(config(), second.get) == 2
+    assert failures(config(), second) == set()
+
+
+def test_gps_input_with_old_names_and_another_receiver() -> None:
+    parameters = {
+        "AHRS_EKF_TYPE": 3.0,
+        "EK3_ENABLE": 1.0,
+        "GPS_TYPE2": 1.0,
+        "GPS_DELAY_MS2": 100.0,
+        "EK3_SRC1_POSXY": 3.0,
+        "EK3_SRC1_VELXY": 3.0,
+        "EK3_SRC1_VELZ": 3.0,
+        "EK3_SRC1_POSZ": 1.0,
+        "EK3_SRC1_YAW": 1.0,
+    }
+    settings = config(message="gps_input", gps_id=1)
+    assert failures(settings, parameters) == {"GPS_TYPE2"}
+    still = config(message="gps_input", gps_id=1, gps_velocity=False)
+    assert failures(still, {**parameters, "GPS_TYPE2": 14.0}) == {
+        "EK3_SRC1_VELXY",
+        "EK3_SRC1_VELZ",
+    }
+
+
+def test_odometry_wants_velocity_noise_that_is_true() -> None:
+    parameters = {**GOOD, "EK3_SRC1_VELXY": 6.0, "EK3_SRC1_VELZ": 6.0, "VISO_VEL_M_NSE": 0.1}
+    assert failures(config(message="odometry"), parameters) == {"VISO_VEL_M_NSE"}
+
+
+def test_px4_bits_are_added_to_what_is_there() -> None:
+    parameters = {"EKF2_EV_CTRL": 8.0, "EKF2_EV_DELAY": 100.0}
+    findings = check_parameters(px4_rules(config()), parameters.get)
+    assert [(f.name, f.ok, f.fix) for f in findings] == [
+        ("EKF2_EV_CTRL", False, 9.0),
+        ("EKF2_EV_DELAY", True, None),
+    ]
+
+
+@pytest.mark.parametrize("kind", [mavlink.MAV_PARAM_TYPE_INT32, mavlink.MAV_PARAM_TYPE_INT8])
+@pytest.mark.parametrize("value", [0, 1, 9, -3, 100])
+def test_px4_integers_travel_as_bytes(kind: int, value: int) -> None:
+    wire = encode_value(value, kind, bytewise=True)
+    assert decode_value(wire, kind, bytewise=True) == value
+    assert decode_value(float(value), kind, bytewise=False) == value
+
+
+def gimbal(fake: Any, boot_ms: int) -> list[Any]:
+    return [
+        mavlink.MAVLink_gimbal_device_attitude_status_message(
+            0, 0, boot_ms, 32, [1.0, 0.0, 0.0, 0.0], 0.0, 0.0, 0.0, 0, 0.0, 0.0
+        )
+    ]
+
+
+def test_examination_and_repair(autopilot: Any) -> None:
+    autopilot.parameters = {**GOOD, "EK3_SRC1_VELXY": 3.0, "VISO_DELAY_MS": 10.0}
+    autopilot.extra = gimbal
+    settings = config(autopilot.port)
+    diagnosis = examine(settings)
+    wrong = {f.name: f for f in diagnosis.findings if not f.ok}
+    assert set(wrong) == {"EK3_SRC1_VELXY", "VISO_DELAY_MS"}
+    assert diagnosis.exit_code == 2
+    assert (wrong["VISO_DELAY_MS"].found, wrong["VISO_DELAY_MS"].needed) == ("10", "100")
+    assert {"connection", "firmware", "clock", "ATTITUDE", "EKF origin", "gimbal"} <= {
+        f.name for f in diagnosis.findings if f.ok
+    }
+    assert not repair(settings, diagnosis.fixable)
+    assert autopilot.parameters["VISO_DELAY_MS"] == 100.0
+    assert examine(settings).exit_code == 0
+
+
+def test_silence_is_one_required_failure(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("mavlink_bridge.doctor._CONNECT_S", 0.3)
+    diagnosis = examine(config(9))
+    assert diagnosis.exit_code == 2
+    assert [f.name for f in diagnosis.findings] == ["connection"]
+
+
+def test_unknown_parameter_cannot_be_written(autopilot: Any) -> None:
+    autopilot.parameters = {"A": 1.0}
+    with ParameterClient(config(autopilot.port)) as client:
+        assert client.read("NO_SUCH") is None
+        with pytest.raises(ParameterError, match="no such parameter"):
+            client.write("NO_SUCH", 1.0)
