@@ -16,10 +16,10 @@ from sitl.embedded.dynamics import ATTITUDE, POSITION, VELOCITY
 from sitl.embedded.loop import SUBSTEPS, TICK_S
 from sitl.embedded.rotation import Array, euler, wrap_pi
 
-_GYRO_NOISE = 0.005  # rad/s per 400 Hz sample
-_ACCEL_NOISE = 0.12  # m/s²
+_GYRO_NOISE = 0.01  # rad/s per 400 Hz sample
+_ACCEL_NOISE = 0.4  # m/s²
 _GYRO_BIAS, _GYRO_WALK = 0.0008, 1e-5  # rad/s at start; rad/s/sqrt(s)
-_ACCEL_BIAS, _ACCEL_WALK = 0.02, 3e-4  # m/s²; m/s²/sqrt(s)
+_ACCEL_BIAS, _ACCEL_WALK = 0.03, 1e-3  # m/s²; m/s²/sqrt(s)
 _BARO_NOISE, _BARO_WALK = 0.12, 0.015  # m; m/sqrt(s)
 _COMPASS_NOISE, _COMPASS_OFFSET = 0.02, 0.01  # rad of heading
 _GPS_PERIOD_S, _GPS_LATENCY_S = 0.2, 0.1
