@@ -45,7 +45,7 @@ class Integrity:
 
 
 def is_acceptable(config: IntegrityConfig, result: Registration, distance_squared: float) -> bool:
-    """The acceptance test for one registration; distance_squared: Mahalanobis, to the prediction."""
+    """Whether one registration may be used; distance_squared: Mahalanobis, from the prediction."""
     if result.status is not RegistrationStatus.OK:
         return False
     if result.overlap < config.min_overlap or result.quality < config.min_quality:

@@ -14,7 +14,7 @@ ROOT = Path(__file__).resolve().parent.parent
 
 @pytest.fixture(scope="session")
 def real_data() -> Callable[[str], Path]:
-    """``real_data("quito")``: the folder of a real data set, or a skip that says where it is not."""
+    """``real_data("quito")``: a real data set's folder, or a skip that names where it is not."""
     base = Path(os.environ.get("PILOT_DATA", ROOT.parent / "shared" / "data"))
 
     def folder(name: str) -> Path:
