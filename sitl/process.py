@@ -104,6 +104,16 @@ class VehicleProcess(ABC):
             f"the {self.kind} vehicle did not start; its log {self.log_path} ends:\n{tail}"
         )
 
+    def restart(self) -> None:
+        """End the vehicle and start it anew on the same ports, as after a power loss."""
+        self._end()
+        self._launch()
+        if not self._wait_listening():
+            raise VehicleProcessError(
+                f"the {self.kind} vehicle did not come back; its log {self.log_path} ends:\n"
+                f"{self.log_tail()}"
+            )
+
     def _launch(self) -> None:
         command = self.command(self._instance)
         with self.log_path.open("wb") as log:

@@ -7,7 +7,7 @@ metre, as measured on ArduPilot SITL. Everything is drawn from one seeded genera
 from __future__ import annotations
 
 from collections import deque
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from math import exp, sqrt
 
 import numpy as np
@@ -37,6 +37,52 @@ class GpsSample:
     horizontal_accuracy: float
     vertical_accuracy: float
     speed_accuracy: float
+    satellites: int = 10
+    fix: bool = True
+
+
+class Jammer:
+    """What a jammed receiver puts out: no fix at first, then fixes that leap, with a wild claim.
+
+    Rates and sizes are those of ArduPilot's SIM_GPS1_JAM.
+    """
+
+    def __init__(self, rng: np.random.Generator, clean: GpsSample) -> None:
+        self._rng = rng
+        self._silent_until_s = clean.time_s + float(rng.uniform(1.0, 6.0))
+        self._position = clean.position.copy()
+        self._velocity = clean.velocity.copy()
+        self._accuracies = (0.5, 0.8, 0.3)
+        self._satellites, self._fix = 0, False
+
+    def distort(self, clean: GpsSample) -> GpsSample:
+        """The sample that comes out instead of a clean one, `_GPS_PERIOD_S` after the last."""
+        if clean.time_s < self._silent_until_s:
+            return replace(clean, satellites=0, fix=False)
+        rng = self._rng
+        if self._changes(3.0):
+            self._satellites = int(rng.integers(2, 17))
+            self._fix = self._satellites >= 4 and bool(rng.integers(2))
+        if self._changes(0.5):
+            self._velocity[2] = rng.uniform(-400, 400)
+        if self._changes(0.8):
+            self._velocity[0:2] = rng.uniform(-400, 400, 2)
+        if self._changes(1.1):
+            self._position[0:2] += rng.uniform(-200, 200, 2)
+        if self._changes(3.0):
+            h, v, s = rng.uniform(0, 1, 3) * (300.0, 300.0, 50.0)
+            self._accuracies = (float(h), float(v), float(s))
+        return GpsSample(
+            clean.time_s,
+            self._position.copy(),
+            self._velocity.copy(),
+            *self._accuracies,
+            self._satellites,
+            self._fix,
+        )
+
+    def _changes(self, hertz: float) -> bool:
+        return bool(self._rng.uniform() < hertz * _GPS_PERIOD_S)
 
 
 class Sensors:
@@ -55,6 +101,7 @@ class Sensors:
         self._gps_wander = self._rng.normal(0, 1, 3) * self._gps_sigma
         self._gps_pending: deque[GpsSample] = deque()
         self._gps_next_s = 0.0
+        self._jammer: Jammer | None = None
 
     def imu_noise(self) -> Array:
         """Noise of the next tick's samples (SUBSTEPS, 6); the biases take a step too."""
@@ -84,16 +131,19 @@ class Sensors:
     def _measure(self, time_s: float, x: Array, jammed: bool) -> GpsSample:
         keep = exp(-_GPS_PERIOD_S / _GPS_WANDER_S)
         draw = self._rng.standard_normal(9)
-        sigma = self._gps_sigma * (40.0 if jammed else 1.0)
-        if jammed:
-            keep = exp(-_GPS_PERIOD_S / 3.0)
-        self._gps_wander = keep * self._gps_wander + sqrt(1 - keep**2) * sigma * draw[0:3]
-        speed = 5.0 if jammed else _GPS_SPEED
-        return GpsSample(
+        step = sqrt(1 - keep**2) * self._gps_sigma * draw[0:3]
+        self._gps_wander = keep * self._gps_wander + step
+        clean = GpsSample(
             time_s,
             x[POSITION : POSITION + 3] + self._gps_wander + _GPS_WHITE * draw[3:6],
-            x[VELOCITY : VELOCITY + 3] + speed * draw[6:9],
-            horizontal_accuracy=20.0 if jammed else 0.5,
-            vertical_accuracy=30.0 if jammed else 0.8,
-            speed_accuracy=5.0 if jammed else 0.3,
+            x[VELOCITY : VELOCITY + 3] + _GPS_SPEED * draw[6:9],
+            horizontal_accuracy=0.5,
+            vertical_accuracy=0.8,
+            speed_accuracy=0.3,
         )
+        if not jammed:
+            self._jammer = None
+            return clean
+        if self._jammer is None:
+            self._jammer = Jammer(self._rng, clean)
+        return self._jammer.distort(clean)

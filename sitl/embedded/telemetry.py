@@ -183,7 +183,7 @@ class Telemetry:
                 return None
             where = v.launch.offset(*(float(c) for c in sample.position))
             latitude, longitude = where.latitude_deg, where.longitude_deg
-            altitude, satellites, hdop = where.altitude_m, 10, 1.2
+            altitude, satellites, hdop = where.altitude_m, sample.satellites, 1.2
             accuracy, kind = sample.horizontal_accuracy, 6
         return mavlink.MAVLink_gps_raw_int_message(
             stamp,

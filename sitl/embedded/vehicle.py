@@ -169,7 +169,8 @@ class Vehicle:
         p = self.parameters
         powered = p["SIM_GPS1_ENABLE"] > 0 and p["GPS1_TYPE"] in _GPS_SIMULATED
         sample = self.sensors.gps(self.time_s, self.truth, p["SIM_GPS1_JAM"] > 0)
-        if powered and sample is not None and self.time_s >= _GPS_FIX_AFTER_S:
+        started = self.time_s >= _GPS_FIX_AFTER_S
+        if powered and started and sample is not None and sample.fix:
             self.gps_sample, self._gps_sample_at = sample, self.time_s
             where = self.launch.offset(*(float(c) for c in sample.position))
             n, e, d = (float(c) for c in sample.velocity)
@@ -182,7 +183,7 @@ class Vehicle:
                     d,
                     sample.horizontal_accuracy,
                     sample.speed_accuracy,
-                    satellites=10,
+                    sample.satellites,
                     hdop=1.2,
                 ),
                 round(sample.time_s * 1000),

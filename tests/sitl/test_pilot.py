@@ -216,6 +216,18 @@ def test_other_messages_hold_the_vehicle_too(kind, message):
             feed.close()
 
 
+def test_a_vehicle_comes_back_on_its_ports(kind):
+    with open_vehicle(kind, HOME, 0.0, {}, speedup=SPEEDUP) as vehicle:
+        endpoint = vehicle.gcs_endpoint
+        with Pilot(endpoint, SPEEDUP, vehicle.check) as pilot:
+            pilot.sleep(5)
+            before = pilot.time_s
+        vehicle.restart()
+        assert vehicle.gcs_endpoint == endpoint
+        with Pilot(endpoint, SPEEDUP, vehicle.check) as pilot:
+            assert 0 < pilot.time_s < before + 5
+
+
 def test_refusals_reach_the_pilot(kind):
     with open_vehicle(kind, HOME, 0.0, {"SIM_GPS1_ENABLE": 0}, speedup=SPEEDUP) as vehicle:
         pilot = Pilot(vehicle.gcs_endpoint, SPEEDUP, vehicle.check)

@@ -76,6 +76,17 @@ def test_gps_loss_without_a_switch_lands_though_vision_flows(bench, gps_then_vis
     assert b.time_of("EKF Failsafe: changed to LAND Mode") - killed == pytest.approx(7.8, abs=0.8)
 
 
+@pytest.mark.parametrize("seed", [1, 2, 3])
+def test_a_jammed_gps_fails_the_filter_within_seconds(bench, seed):
+    """ardupilot.md: LAND after 4.6 s; how soon depends on when the receiver lies first."""
+    b = bench({}, seed)
+    b.take_off(60.0)
+    jammed = b.vehicle.time_s
+    b.vehicle.parameters.set("SIM_GPS1_JAM", 1)
+    b.run(10)
+    assert b.time_of("EKF Failsafe: changed to LAND Mode") - jammed < 9.0
+
+
 def test_vision_only_flight_reaches_the_reference_accuracy(bench, vision_only, home):
     """ardupilot.md: 10 Hz, sigma 0.5 m, 100 ms, VISO_DELAY_MS 100: 0.23 / 0.50 / 0.89 m."""
     b = bench({**vision_only, "SIM_WIND_SPD": 0, "SIM_WIND_TURB": 0})
