@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 import sys
-from pathlib import Path
-from typing import Annotated
 
 import typer
 from rich.console import Console
 
+from companion.doctor_cli import doctor_command
 from companion.errors import CompanionError
 from companion.eval_cli import evaluate_command
 from companion.map_cli import app as map_app
@@ -24,16 +23,9 @@ app = typer.Typer(
 )
 app.command("run")(run_command)
 app.command("eval")(evaluate_command)
+app.command("doctor")(doctor_command)
 app.add_typer(map_app, name="map", help="Build and inspect tile caches.")
 app.add_typer(world_app, name="world", help="Generated worlds for tests and demos.")
-
-
-@app.command("doctor")
-def doctor_command(config: Annotated[Path, typer.Argument(help="deployment YAML")]) -> None:
-    """Check a deployment against the connected vehicle (parameters, clock, link, map)."""
-    from companion.doctor import doctor
-
-    raise typer.Exit(doctor(config))
 
 
 def main() -> None:

@@ -1,0 +1,101 @@
+"""Is this deployment ready? The bridge's examination plus map, model, camera and machine."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Iterable
+from pathlib import Path
+
+from companion.config import CompanionConfig
+from companion.errors import CompanionError
+from companion.sources import SourceSettings, open_source
+from localizer.errors import LocalizerError
+from localizer.features.extractor import load_extractor
+from localizer.geo import LocalFrame
+from localizer.map.cache import TileCache
+from mavlink_bridge.doctor import Diagnosis, Finding, examine
+
+_FEED_S = 8.0
+_MIN_RATE_HZ = 5.0
+_GOVERNOR = Path("/sys/devices/system/cpu/cpu0/cpufreq/scaling_governor")
+
+
+def examine_deployment(config: CompanionConfig, *, vehicle: bool = True) -> Diagnosis:
+    """Every check; `vehicle` false leaves out what needs the flight controller."""
+    findings = [_check_map(config), _check_model(config), _check_camera(config), _check_power()]
+    if vehicle:
+        findings += examine(config.bridge).findings
+    return Diagnosis(tuple(findings))
+
+
+def _check_map(config: CompanionConfig) -> Finding:
+    try:
+        cache = TileCache.open(config.map)
+    except LocalizerError as error:
+        return _failed("map", "unreadable", "a tile cache", str(error))
+    m = cache.manifest
+    origin = m.origin
+    found = (
+        f"{m.tiles} tiles, {m.gsd_m:.2f} m/px, {_extent_km(m.extent, cache.frame):.2f} km across"
+    )
+    where = f"about {origin.latitude_deg:.5f} {origin.longitude_deg:.5f}; `companion map verify`"
+    return Finding("map", found, "a tile cache", where, True, True)
+
+
+def _extent_km(extent: Iterable[tuple[float, float]], frame: LocalFrame) -> float:
+    """Largest distance between two corners of the (latitude, longitude) outline."""
+    points = [frame.enu_from_geodetic(a, b, frame.origin.height_m) for a, b in extent]
+    distances = [float(((p - q) ** 2).sum() ** 0.5) for p in points for q in points]
+    return max(distances, default=0.0) / 1000
+
+
+def _check_model(config: CompanionConfig) -> Finding:
+    try:
+        name = load_extractor(config.localizer.model).name
+    except LocalizerError as error:
+        return _failed("model", "unreadable", "a feature network", str(error))
+    trained = "fallback" not in name
+    return Finding("model", name, "a feature network", "", trained, False)
+
+
+def _check_camera(config: CompanionConfig) -> Finding:
+    """Read the feed for a few seconds: pictures of the calibrated size, often enough."""
+    feed = config.camera
+    settings = SourceSettings.model_validate(feed.settings.model_dump() | {"realtime": True})
+    try:
+        source = open_source(feed.source, feed.model.camera(), settings)
+    except (CompanionError, LocalizerError) as error:
+        return _failed("camera", "no feed", "pictures", str(error))
+    times: list[int] = []
+    timer = threading.Timer(_FEED_S, source.close)
+    timer.start()
+    try:
+        for frame in source.frames():
+            times.append(frame.exposure_time_ns)
+    except (CompanionError, LocalizerError) as error:
+        return _failed("camera", "refused", "pictures of the calibrated size", str(error))
+    finally:
+        timer.cancel()
+        source.close()
+    if len(times) < 2:
+        why = f"nothing arrived from {feed.source} in {_FEED_S:.0f} s: is the stream running?"
+        return _failed("camera", "silent", "pictures", why)
+    rate = (len(times) - 1) / max((times[-1] - times[0]) * 1e-9, 1e-9)
+    found = f"{feed.model.width}x{feed.model.height}, {rate:.1f} Hz"
+    needed = f">= {_MIN_RATE_HZ:.0f} Hz"
+    return Finding("camera", found, needed, "tracking follows turns by it", rate >= _MIN_RATE_HZ,
+                   True)  # fmt: skip
+
+
+def _check_power() -> Finding:
+    try:
+        governor = _GOVERNOR.read_text().strip()
+    except OSError:
+        return Finding("power mode", "not told by this machine", "performance", "", True, False)
+    good = governor in ("performance", "schedutil")
+    why = "slower clocks make late fixes (Jetson: nvpmodel -m 0, jetson_clocks)"
+    return Finding("power mode", governor, "performance", why, good, False)
+
+
+def _failed(name: str, found: str, needed: str, why: str) -> Finding:
+    return Finding(name, found, needed, why, False, True)

@@ -1,0 +1,50 @@
+"""``companion doctor``: the examination as a table, and the writing of parameters."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+from rich.console import Console
+from rich.table import Table
+
+from companion.config import load_config
+from mavlink_bridge.doctor import Diagnosis
+
+
+def doctor_command(
+    config: Annotated[Path, typer.Argument(help="deployment YAML")],
+    fix: Annotated[
+        bool, typer.Option(help="write parameters that are wrong, after asking")
+    ] = False,
+    yes: Annotated[bool, typer.Option(help="do not ask")] = False,
+    vehicle: Annotated[bool, typer.Option(help="examine the flight controller too")] = True,
+) -> None:
+    """Check a deployment; exit code 0 good, 1 advice, 2 not fit to fly."""
+    from companion.doctor import examine_deployment
+    from mavlink_bridge.doctor import repair
+
+    settings = load_config(config)
+    console = Console()
+    with console.status("examining"):
+        diagnosis = examine_deployment(settings, vehicle=vehicle)
+    _print(console, diagnosis)
+    if fix and diagnosis.fixable:
+        names = ", ".join(f"{f.name} = {f.fix:g}" for f in diagnosis.fixable if f.fix is not None)
+        if yes or typer.confirm(f"Write {names}?"):
+            reboot = repair(settings.bridge, diagnosis.fixable)
+            console.print("written" + ("; reboot the flight controller" if reboot else ""))
+            diagnosis = examine_deployment(settings, vehicle=vehicle)
+            _print(console, diagnosis)
+    raise typer.Exit(diagnosis.exit_code)
+
+
+def _print(console: Console, diagnosis: Diagnosis) -> None:
+    table = Table(title="fit to fly" if diagnosis.ok else "NOT fit to fly")
+    for column in ("", "what", "found", "needed", "why"):
+        table.add_column(column)
+    for f in diagnosis.findings:
+        mark = "[green]ok" if f.ok else ("[red]wrong" if f.required else "[yellow]advice")
+        table.add_row(mark, f.name, f.found, f.needed, f.why)
+    console.print(table)

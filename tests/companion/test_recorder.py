@@ -1,0 +1,40 @@
+import csv
+
+import numpy as np
+
+from companion.config import RecordConfig
+from companion.recorder import ESTIMATE_COLUMNS, Recorder
+from localizer.camera import Camera
+from localizer.geo import Geodetic, LocalFrame
+from localizer.pose import Pose, so3_exp
+from localizer.types import Frame, PoseEstimate, RegistrationStatus, TargetFix, TrackingState
+from sitl.analysis import poses, read_csv
+
+FRAME = LocalFrame(Geodetic(47.3, 8.5, 450.0))
+CAMERA = Camera.from_fov(64, 48, 60)
+
+
+def test_what_is_recorded_can_be_read_back(tmp_path):
+    recorder = Recorder(RecordConfig(folder=tmp_path, snapshot_interval_s=1.0), FRAME)
+    pose = Pose(so3_exp([2.0, 0.5, -0.3]), np.array([1.25, -3.5, 120.0]))
+    estimate = PoseEstimate(
+        pose, np.eye(6) * 0.04, 0.8, TrackingState.TRACKING, RegistrationStatus.OK, True,
+        1_700_000_000_123_456_789, 7, CAMERA, {"register": 12.5},
+    )  # fmt: skip
+    recorder.estimate(estimate)
+    recorder.target(TargetFix("car", np.zeros(3), np.eye(3), (3.0, 4.0), 5), (1.0, 2.0, 0.0))
+    recorder.event("warning", 'a, "quoted" text\nof two lines')
+    image = np.full((48, 64, 3), 200, np.uint8)
+    for time_ns in (10**9, 1_500_000_000, 2 * 10**9):
+        recorder.snapshot(Frame(image, time_ns, CAMERA, 0))
+    recorder.close()
+    columns = read_csv(tmp_path / "estimates.csv", text=("state", "status"))
+    assert tuple(columns) == ESTIMATE_COLUMNS
+    assert columns["exposure_time_ns"][0] == 1_700_000_000_123_456_789
+    translation, rotation = poses(columns)[0].distance_to(pose)
+    assert translation < 1e-3
+    assert rotation < 1e-5
+    with (tmp_path / "events.csv").open(newline="") as file:
+        assert list(csv.DictReader(file))[0]["text"] == 'a, "quoted" text\nof two lines'
+    names = sorted(p.stem for p in (tmp_path / "snapshots").glob("*.jpg"))
+    assert names == ["1000000000", "2000000000"]

@@ -1,0 +1,97 @@
+import threading
+import time
+
+import numpy as np
+
+from companion.config import TargetConfig
+from companion.detections import Detection
+from companion.target_reporter import TargetReporter
+from localizer.camera import Camera
+from localizer.pose import Pose
+from localizer.targets import SurfacePoint
+from localizer.types import PoseEstimate, RegistrationStatus, TrackingState
+
+CAMERA = Camera.from_fov(640, 480, 60)
+NADIR = Pose(np.diag([1.0, -1.0, -1.0]), np.array([0.0, 0.0, 100.0]))
+MS = 1_000_000
+
+
+def _estimate(time_ns: int, accepted: bool = True) -> PoseEstimate:
+    return PoseEstimate(
+        NADIR, np.eye(6) * 1e-4, 1.0, TrackingState.TRACKING, RegistrationStatus.OK, accepted,
+        time_ns, 0, CAMERA,
+    )  # fmt: skip
+
+
+def _ground(origin, direction):
+    hit = origin - direction * origin[2] / direction[2]
+    return SurfacePoint(hit, np.array([0.0, 0.0, 1.0]))
+
+
+class Session:
+    def __init__(self, cast=_ground, rate_hz=5.0):
+        self.targets = []
+        self.came = threading.Event()
+        self.reporter = TargetReporter(TargetConfig(rate_hz=rate_hz), cast, self._add)
+        self.reporter.start()
+
+    def _add(self, target):
+        self.targets.append(target)
+        self.came.set()
+
+    def __enter__(self):
+        return self
+
+    def __exit__(self, *_):
+        self.reporter.stop()
+
+
+def test_detection_and_estimate_of_one_frame_meet_in_either_order():
+    for first in ("detection", "estimate"):
+        with Session() as s:
+            detection = Detection("a", 50 * MS, 320.0, 240.0)
+            if first == "detection":
+                s.reporter.add_detection(detection)
+                s.reporter.add_estimate(_estimate(50 * MS))
+            else:
+                s.reporter.add_estimate(_estimate(50 * MS))
+                s.reporter.add_detection(detection)
+            assert s.came.wait(5), first
+            np.testing.assert_allclose(s.targets[0].fix.position_world, [0, 0, 0], atol=1e-6)
+
+
+def test_rejected_estimates_and_other_frames_are_not_used():
+    with Session() as s:
+        s.reporter.add_detection(Detection("a", 50 * MS, 320.0, 240.0))
+        s.reporter.add_estimate(_estimate(50 * MS, accepted=False))
+        s.reporter.add_estimate(_estimate(150 * MS))
+        assert not s.came.wait(0.5)
+
+
+def test_a_ray_into_the_sky_is_counted():
+    with Session(cast=lambda *_: None) as s:
+        s.reporter.add_detection(Detection("a", 50 * MS, 320.0, 240.0))
+        s.reporter.add_estimate(_estimate(50 * MS))
+        deadline = time.monotonic() + 5
+        while s.reporter.missed == 0 and time.monotonic() < deadline:
+            time.sleep(0.01)
+        assert s.reporter.missed == 1
+        assert not s.targets
+
+
+def test_reports_keep_their_rate_and_a_failing_cast_does_not_end_them():
+    calls = []
+
+    def cast(origin, direction):
+        calls.append(1)
+        if len(calls) == 1:
+            raise RuntimeError("boom")
+        return _ground(origin, direction)
+
+    with Session(cast=cast, rate_hz=5.0) as s:
+        for k in range(21):
+            s.reporter.add_estimate(_estimate(k * 50 * MS))
+            s.reporter.add_detection(Detection("a", k * 50 * MS, 320.0, 240.0))
+            time.sleep(0.01)
+        time.sleep(0.3)
+    assert 4 <= len(s.targets) <= 6  # 1 s at 5 Hz
