@@ -32,14 +32,15 @@ _STRIPS_PER_THREAD = 3  # more than one, so that a crowded strip does not leave 
 
 @dataclass(frozen=True, eq=False)
 class _Prepared:
-    """A mesh after the first pass. screen: (V, 3) float32 x, y, 1/z; listed: (n,) face indices;
-    clipped: (m, 15) float32, triangles cut at the near plane as x, y, 1/z, u, v per corner.
+    """Triangles after the first pass. screen: (V, 3) float32 x, y, 1/z; uvs: (V, 2) float32;
+    faces: (F, 3) int32; listed: (n,) int32, the faces to fill.
     """
 
-    mesh: TileMesh
     screen: Float32
+    uvs: Float32
+    faces: NDArray[np.int32]
     listed: NDArray[np.int32]
-    clipped: Float32
+    mesh: TileMesh
 
 
 class NumbaRenderer:
@@ -93,7 +94,8 @@ class NumbaRenderer:
         meshes = _front_to_back([m for m in meshes if len(m.faces)], world_from_camera)
         rgb = np.empty((camera.height, camera.width, 3), np.uint8)
         depth = np.empty((camera.height, camera.width), np.float32)
-        prepared = self._prepare(meshes, world_from_camera.inverse, camera)
+        parts = self._prepare(meshes, world_from_camera.inverse, camera)
+        prepared = [p for group in parts for p in group if len(p.listed)]
         strips = self._threads * _STRIPS_PER_THREAD if self._threads > 1 else 1
         edges = np.linspace(0, camera.height, strips + 1).astype(int)
 
@@ -101,15 +103,11 @@ class NumbaRenderer:
             y0, y1 = int(edges[strip]), int(edges[strip + 1])
             _clear(rgb, depth, self._sky, y0, y1)
             for p in prepared:
-                m, t = p.mesh, p.mesh.texture
-                _fill_listed(
-                    p.screen, m.uvs, m.faces, p.listed, m.repeat,
+                t = p.mesh.texture
+                _fill(
+                    p.screen, p.uvs, p.faces, p.listed, p.mesh.repeat,
                     t.texels, t.offsets, t.sizes, rgb, depth, y0, y1,
                 )  # fmt: skip
-                if len(p.clipped):
-                    _fill_clipped(
-                        p.clipped, m.repeat, t.texels, t.offsets, t.sizes, rgb, depth, y0, y1
-                    )
             _depth_from_inverse(depth, y0, y1)
 
         self._map(fill, range(strips))
@@ -122,7 +120,7 @@ class NumbaRenderer:
 
     def _prepare(
         self, meshes: list[TileMesh], camera_from_world: Pose, camera: Camera
-    ) -> list[_Prepared]:
+    ) -> list[list[_Prepared]]:
         vertices = np.cumsum([0, *(len(m.positions) for m in meshes)])
         faces = np.cumsum([0, *(len(m.faces) for m in meshes)])
         if vertices[-1] > len(self._vertices):
@@ -131,7 +129,7 @@ class NumbaRenderer:
             self._faces = np.empty(int(1.3 * faces[-1]), np.int32)
         intrinsics = np.array([camera.fx, camera.fy, camera.cx, camera.cy], np.float32)
 
-        def prepare(i: int) -> _Prepared:
+        def prepare(i: int) -> list[_Prepared]:
             mesh = meshes[i]
             # Composed in float64, so that only small numbers meet the float32 kernels.
             camera_from_tile = camera_from_world @ mesh.world_from_tile
@@ -141,13 +139,17 @@ class NumbaRenderer:
             near = np.float32(NEAR_M)
             _project(mesh.positions, T, intrinsics, near, screen)
             kept, crossing = _list_faces(screen, mesh.faces, camera.width, camera.height, listed)
-            clipped = _NOTHING
+            parts = [_Prepared(screen, mesh.uvs, mesh.faces, listed[:kept], mesh)]
             if crossing:
-                clipped = _clip(
-                    mesh.positions, mesh.uvs, mesh.faces, listed[len(listed) - crossing :],
-                    T, intrinsics, near,
-                )  # fmt: skip
-            return _Prepared(mesh, screen, listed[:kept], clipped)
+                cut = listed[len(listed) - crossing :]
+                points, uvs = _clip(mesh.positions, mesh.uvs, mesh.faces, cut, T, intrinsics, near)
+                corners = np.arange(len(points), dtype=np.int32)
+                parts.append(
+                    _Prepared(
+                        points, uvs, corners.reshape(-1, 3), corners[: len(points) // 3], mesh
+                    )
+                )
+            return parts
 
         return self._map(prepare, range(len(meshes)))
 
@@ -155,9 +157,6 @@ class NumbaRenderer:
         if self._pool is None:
             return [function(i) for i in items]
         return list(self._pool.map(function, items))
-
-
-_NOTHING: Float32 = np.empty((0, 15), np.float32)
 
 
 def _front_to_back(meshes: list[TileMesh], world_from_camera: Pose) -> list[TileMesh]:
@@ -243,11 +242,14 @@ def _list_faces(screen, faces, width, height, listed):  # type: ignore[no-untype
 
 @njit(cache=True, nogil=True)
 def _clip(positions, uvs, faces, crossing, T, intrinsics, near):  # type: ignore[no-untyped-def]
-    """Faces cut at the near plane: one or two triangles each, (m, 15)."""
-    out = np.empty((2 * crossing.shape[0], 15), np.float32)
+    """Faces cut at the near plane, one or two triangles each: their corners as `_project` gives
+    them (3 m, 3), and texture coordinates (3 m, 2).
+    """
+    screen = np.empty((6 * crossing.shape[0], 3), np.float32)
+    cut_uvs = np.empty((6 * crossing.shape[0], 2), np.float32)
     corner = np.empty((3, 5), np.float32)  # camera x, y, z, then u, v
     polygon = np.empty((4, 5), np.float32)
-    m = 0
+    n = 0
     for i in range(crossing.shape[0]):
         for k in range(3):
             v = faces[crossing[i], k]
@@ -272,129 +274,116 @@ def _clip(positions, uvs, faces, crossing, T, intrinsics, near):  # type: ignore
                 polygon[count, 2] = near
                 count += 1
         for third in range(2, count):
-            for place, k in enumerate((0, third - 1, third)):
+            for k in (0, third - 1, third):
                 inverse = np.float32(1) / polygon[k, 2]
-                out[m, 5 * place] = polygon[k, 0] * inverse * intrinsics[0] + intrinsics[2]
-                out[m, 5 * place + 1] = polygon[k, 1] * inverse * intrinsics[1] + intrinsics[3]
-                out[m, 5 * place + 2] = inverse
-                out[m, 5 * place + 3] = polygon[k, 3]
-                out[m, 5 * place + 4] = polygon[k, 4]
-            m += 1
-    return out[:m]
+                screen[n, 0] = polygon[k, 0] * inverse * intrinsics[0] + intrinsics[2]
+                screen[n, 1] = polygon[k, 1] * inverse * intrinsics[1] + intrinsics[3]
+                screen[n, 2] = inverse
+                cut_uvs[n, 0], cut_uvs[n, 1] = polygon[k, 3], polygon[k, 4]
+                n += 1
+    return screen[:n], cut_uvs[:n]
 
 
 @njit(cache=True, nogil=True, fastmath=True)
-def _fill_listed(  # type: ignore[no-untyped-def]
+def _fill(  # type: ignore[no-untyped-def]
     screen, uvs, faces, listed, repeat, texels, offsets, sizes, rgb, inverse_depth, y0, y1
 ):
-    top, bottom = np.float32(y0) + np.float32(0.5), np.float32(y1) - np.float32(0.5)
+    """Fill the listed faces within rows y0 to y1. inverse_depth holds the nearest 1/z so far."""
+    one, half, zero = np.float32(1), np.float32(0.5), np.float32(0)
+    quarter = np.float32(0.25)
+    slack = np.float32(-1e-5)  # rounding must not open cracks between neighbours
+    top, bottom = np.float32(y0) + half, np.float32(y1) - half
+    width = inverse_depth.shape[1]
+    levels = sizes.shape[0]
+    finest = np.float32(sizes[0, 0]) * np.float32(sizes[0, 1])
     for i in range(listed.shape[0]):
         f = listed[i]
         a, b, c = faces[f, 0], faces[f, 1], faces[f, 2]
         ya, yb, yc = screen[a, 1], screen[b, 1], screen[c, 1]
-        if max(ya, yb, yc) < top or min(ya, yb, yc) > bottom:
+        low, high = min(ya, yb, yc), max(ya, yb, yc)
+        if high < top or low > bottom:
             continue
-        _triangle(
-            screen[a, 0], ya, screen[a, 2], uvs[a, 0], uvs[a, 1],
-            screen[b, 0], yb, screen[b, 2], uvs[b, 0], uvs[b, 1],
-            screen[c, 0], yc, screen[c, 2], uvs[c, 0], uvs[c, 1],
-            repeat, texels, offsets, sizes, rgb, inverse_depth, y0, y1,
-        )  # fmt: skip
+        xa, xb, xc = screen[a, 0], screen[b, 0], screen[c, 0]
+        first_x = max(0, int(np.ceil(min(xa, xb, xc) - half)))
+        last_x = min(width - 1, int(np.floor(max(xa, xb, xc) - half)))
+        first_y = max(y0, int(np.ceil(low - half)))
+        last_y = min(y1 - 1, int(np.floor(high - half)))
 
-
-@njit(cache=True, nogil=True, fastmath=True)
-def _fill_clipped(  # type: ignore[no-untyped-def]
-    triangles, repeat, texels, offsets, sizes, rgb, inverse_depth, y0, y1
-):
-    for i in range(triangles.shape[0]):
-        t = triangles[i]
-        _triangle(
-            t[0], t[1], t[2], t[3], t[4], t[5], t[6], t[7], t[8], t[9],
-            t[10], t[11], t[12], t[13], t[14],
-            repeat, texels, offsets, sizes, rgb, inverse_depth, y0, y1,
-        )  # fmt: skip
-
-
-@njit(cache=True, nogil=True, fastmath=True)
-def _triangle(  # type: ignore[no-untyped-def]
-    xa, ya, ia, ua, va, xb, yb, ib, ub, vb, xc, yc, ic, uc, vc,
-    repeat, texels, offsets, sizes, rgb, inverse_depth, y0, y1,
-):  # fmt: skip
-    """Fill one triangle within rows y0 to y1. ia, ib, ic: 1/z; inverse_depth holds 1/z so far."""
-    one, half = np.float32(1), np.float32(0.5)
-    width = inverse_depth.shape[1]
-    first_x = max(0, int(np.ceil(min(xa, xb, xc) - half)))
-    last_x = min(width - 1, int(np.floor(max(xa, xb, xc) - half)))
-    first_y = max(y0, int(np.ceil(min(ya, yb, yc) - half)))
-    last_y = min(y1 - 1, int(np.floor(max(ya, yb, yc) - half)))
-    if first_x > last_x or first_y > last_y:
-        return
-    area = (xb - xa) * (yc - ya) - (xc - xa) * (yb - ya)
-    if area == 0:
-        return
-    inverse_area = one / area
-
-    # Texels per pixel, as an area: the Jacobian of the perspective map is this constant times z^3.
-    uv_area = (ub - ua) * (vc - va) - (uc - ua) * (vb - va)
-    texel_area = abs(uv_area * inverse_area) * ia * ib * ic
-    texel_area *= np.float32(sizes[0, 0]) * np.float32(sizes[0, 1])
-    levels = sizes.shape[0]
-    level = 0
-    shrink = one  # 4 ** -level
-    w, h = sizes[0, 0], sizes[0, 1]
-    base = offsets[0]
-    fw, fh = np.float32(w), np.float32(h)
-
-    ua, va, ub, vb, uc, vc = ua * ia, va * ia, ub * ib, vb * ib, uc * ic, vc * ic
-    slack = np.float32(-1e-5)  # rounding must not open cracks between neighbours
-    step_a, step_b = -(yc - yb) * inverse_area, -(ya - yc) * inverse_area
-    for y in range(first_y, last_y + 1):
-        py = np.float32(y) + half
-        px = np.float32(first_x) + half
-        a0 = ((xc - xb) * (py - yb) - (yc - yb) * (px - xb)) * inverse_area
-        b0 = ((xa - xc) * (py - yc) - (ya - yc) * (px - xc)) * inverse_area
-        entered = False
-        for x in range(first_x, last_x + 1):
-            along = np.float32(x - first_x)
-            la, lb = a0 + along * step_a, b0 + along * step_b
-            lc = one - la - lb
-            if la < slack or lb < slack or lc < slack:
-                if entered:
-                    break
-                continue
-            entered = True
-            iz = la * ia + lb * ib + lc * ic
-            if iz <= inverse_depth[y, x]:
-                continue
-            inverse_depth[y, x] = iz
-            z = one / iz
-            footprint = texel_area * z * z * z
-            while level < levels - 1 and footprint * shrink > np.float32(2):
-                level += 1
-                shrink *= np.float32(0.25)
-                w, h, base = sizes[level, 0], sizes[level, 1], offsets[level]
+        # Set up in float64: corners of large triangles lie thousands of pixels outside the image,
+        # where float32 would cost millimetres of depth. Along a row all is linear, for float32.
+        ax, ay = np.float64(xa), np.float64(ya)
+        bx, by, cx, cy = xb - ax, yb - ay, xc - ax, yc - ay
+        area = bx * cy - cx * by
+        if area == 0.0:
+            continue
+        inverse_area = 1.0 / area
+        step_b, step_c = cy * inverse_area, -by * inverse_area
+        ia, ib, ic = screen[a, 2], screen[b, 2], screen[c, 2]
+        da, db, dc = np.float32(-step_b - step_c), np.float32(step_b), np.float32(step_c)
+        d_iz = np.float32(step_b * (ib - ia) + step_c * (ic - ia))
+        px = first_x + 0.5 - ax
+        textured = False
+        for y in range(first_y, last_y + 1):
+            py = y + 0.5 - ay
+            lb, lc = (cy * px - cx * py) * inverse_area, (bx * py - by * px) * inverse_area
+            row_b, row_c = np.float32(lb), np.float32(lc)
+            row_a = np.float32(1.0 - lb - lc)
+            row_iz = np.float32(ia + lb * (ib - ia) + lc * (ic - ia))
+            entered = False
+            for x in range(first_x, last_x + 1):
+                t = np.float32(x - first_x)
+                wa, wb, wc = row_a + t * da, row_b + t * db, row_c + t * dc
+                if wa < slack or wb < slack or wc < slack:
+                    if entered:
+                        break
+                    continue
+                entered = True
+                iz = row_iz + t * d_iz
+                if iz <= inverse_depth[y, x]:
+                    continue
+                inverse_depth[y, x] = iz
+                if not textured:  # most listed faces show no pixel and never come here
+                    textured = True
+                    ua, va = uvs[a, 0], uvs[a, 1]
+                    ub, vb = uvs[b, 0], uvs[b, 1]
+                    uc, vc = uvs[c, 0], uvs[c, 1]
+                    # Texels per pixel, as an area: the Jacobian of the perspective map is this
+                    # constant times z^3.
+                    texel_area = abs((ub - ua) * (vc - va) - (uc - ua) * (vb - va)) * finest
+                    texel_area *= np.float32(abs(inverse_area)) * ia * ib * ic
+                    ua, va, ub, vb, uc, vc = ua * ia, va * ia, ub * ib, vb * ib, uc * ic, vc * ic
+                    level, shrink = 0, one  # shrink: 4 ** -level
+                    w, h, base = sizes[0, 0], sizes[0, 1], offsets[0]
+                z = one / iz
+                footprint = texel_area * z * z * z
+                while level < levels - 1 and footprint * shrink > np.float32(2):
+                    level += 1
+                    shrink *= quarter
+                    w, h, base = sizes[level, 0], sizes[level, 1], offsets[level]
+                while level > 0 and footprint * shrink < half:
+                    level -= 1
+                    shrink *= np.float32(4)
+                    w, h, base = sizes[level, 0], sizes[level, 1], offsets[level]
                 fw, fh = np.float32(w), np.float32(h)
-            while level > 0 and footprint * shrink < np.float32(0.5):
-                level -= 1
-                shrink *= np.float32(4)
-                w, h, base = sizes[level, 0], sizes[level, 1], offsets[level]
-                fw, fh = np.float32(w), np.float32(h)
-            u, v = (la * ua + lb * ub + lc * uc) * z, (la * va + lb * vb + lc * vc) * z
-            if repeat:
-                u -= np.floor(u)
-                v -= np.floor(v)
-            u = min(max(u * fw - half, np.float32(0)), fw - one)
-            v = min(max(v * fh - half, np.float32(0)), fh - one)
-            iu, iv = np.int32(u), np.int32(v)
-            wu = np.int32((u - np.float32(iu)) * np.float32(256))
-            wv = np.int32((v - np.float32(iv)) * np.float32(256))
-            k = base + iv * w + iu
-            right = 1 if iu + 1 < w else 0
-            down = w if iv + 1 < h else 0
-            for q in range(3):
-                upper = np.int32(texels[k, q]) * (256 - wu) + np.int32(texels[k + right, q]) * wu
-                lower = (
-                    np.int32(texels[k + down, q]) * (256 - wu)
-                    + np.int32(texels[k + down + right, q]) * wu
-                )
-                rgb[y, x, q] = (upper * (256 - wv) + lower * wv) >> 16
+                u = (wa * ua + wb * ub + wc * uc) * z
+                v = (wa * va + wb * vb + wc * vc) * z
+                if repeat:
+                    u -= np.floor(u)
+                    v -= np.floor(v)
+                u = min(max(u * fw - half, zero), fw - one)
+                v = min(max(v * fh - half, zero), fh - one)
+                iu, iv = np.int32(u), np.int32(v)
+                wu = np.int32((u - np.float32(iu)) * np.float32(256))
+                wv = np.int32((v - np.float32(iv)) * np.float32(256))
+                k = base + iv * w + iu
+                right = 1 if iu + 1 < w else 0
+                down = w if iv + 1 < h else 0
+                for q in range(3):
+                    upper = (
+                        np.int32(texels[k, q]) * (256 - wu) + np.int32(texels[k + right, q]) * wu
+                    )
+                    lower = (
+                        np.int32(texels[k + down, q]) * (256 - wu)
+                        + np.int32(texels[k + down + right, q]) * wu
+                    )
+                    rgb[y, x, q] = (upper * (256 - wv) + lower * wv) >> 16
