@@ -110,8 +110,9 @@ class TargetReporter:
         return None
 
     def _locate(self, detection: Detection, estimate: PoseEstimate) -> None:
-        last = self._reported_ns.get(detection.target_id, 0)
-        if estimate.exposure_time_ns - last < 0.9e9 / self._config.rate_hz:
+        last = self._reported_ns.get(detection.target_id)
+        wait_ns = 0.9e9 / self._config.rate_hz  # frames do not fall on the period exactly
+        if last is not None and estimate.exposure_time_ns - last < wait_ns:
             return
         pixel = (detection.u, detection.v)
         hit = self._cast(*ray_in_world(estimate, pixel))

@@ -35,17 +35,20 @@ def default_folder() -> Path:
 
 
 def prepare(
-    seed: int, folder: Path | None = None, say: Callable[[str], None] = lambda _: None
+    seed: int,
+    folder: Path | None = None,
+    say: Callable[[str], None] = lambda _: None,
+    size_m: float = 1600.0,
 ) -> FlightAssets:
     """Build what is missing of a world, by the importer that users use; the rest is reused."""
-    home = (folder or default_folder()) / f"world-{_GENERATION}-{seed}"
+    home = (folder or default_folder()) / f"world-{_GENERATION}-{seed}-{size_m:.0f}"
     done = home / "complete"
     survey, live = home / "survey", home / "live"
     if not done.exists():
         shutil.rmtree(home, ignore_errors=True)
         home.mkdir(parents=True)
-        say(f"generating world {seed} (about two minutes, once)")
-        config = WorldConfig(seed, 1600.0)
+        say(f"generating world {seed} (a few minutes, once)")
+        config = WorldConfig(seed, size_m)
         visits = {survey: ("survey", look_of("survey")), live: ("live", look_of("live"))}
         build_visits(config, visits)
         for visit in visits:
