@@ -121,6 +121,7 @@ class VehicleProcess(ABC):
                 self._process = subprocess.Popen(
                     command,
                     cwd=self.folder,
+                    env={**os.environ, "PYTHONPATH": _search_path()},
                     stdin=subprocess.DEVNULL,
                     stdout=log,
                     stderr=subprocess.STDOUT,
@@ -196,6 +197,12 @@ def write_parameters(path: Path, parameters: dict[str, float]) -> None:
     """An ArduPilot .parm file."""
     lines = [f"{name} {value:.9g}\n" for name, value in parameters.items()]
     path.write_text("".join(lines), encoding="utf-8")
+
+
+def _search_path() -> str:
+    """PYTHONPATH with this checkout first: the process runs in a folder of its own."""
+    here = str(Path(__file__).resolve().parents[1])
+    return os.pathsep.join(filter(None, [here, os.environ.get("PYTHONPATH")]))
 
 
 def _port(instance: int, offset: int) -> int:

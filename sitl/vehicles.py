@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 import sys
-from pathlib import Path
 from typing import Literal
 
 from sitl.ardupilot import ArduPilotSitl, find_arducopter
 from sitl.embedded.geodesy import Location
-from sitl.process import VehicleProcess, write_parameters
+from sitl.process import BASE_PORT, PORTS_PER_INSTANCE, VehicleProcess, write_parameters
 
 GPS_SOURCE, VISION_SOURCE = 1, 2  # MAV_CMD_SET_EKF_SOURCE_SET
 
@@ -121,12 +120,10 @@ class EmbeddedSitl(VehicleProcess):
         """See `VehicleProcess.command`."""
         return [
             sys.executable,
-            "-c",
-            # The package is found by path, as the process runs in a folder of its own.
-            f"import sys; sys.path.insert(0, {str(Path(__file__).parents[1])!r}); "
-            "from sitl.embedded.__main__ import main; sys.exit(main())",
+            "-m",
+            "sitl.embedded",
             f"--home={self._home}",
-            f"--port={5760 + 10 * instance}",
+            f"--port={BASE_PORT + PORTS_PER_INSTANCE * instance}",
             f"--params={self._parameters}",
             f"--speedup={self.speedup:g}",
             f"--seed={self._seed}",

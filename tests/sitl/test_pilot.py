@@ -228,6 +228,17 @@ def test_a_vehicle_comes_back_on_its_ports(kind):
             assert 0 < pilot.time_s < before + 5
 
 
+def test_waiting_for_a_vehicle_that_died_ends_at_once():
+    with open_vehicle("embedded", HOME, 0.0, {}, speedup=SPEEDUP) as vehicle:
+        pilot = Pilot(vehicle.gcs_endpoint, SPEEDUP, vehicle.check)
+        with pilot:
+            vehicle.stop(keep_log=True)
+            start = time.monotonic()
+            with pytest.raises(VehicleProcessError, match="died"):
+                pilot.sleep(600)
+            assert time.monotonic() - start < 5.0
+
+
 def test_refusals_reach_the_pilot(kind):
     with open_vehicle(kind, HOME, 0.0, {"SIM_GPS1_ENABLE": 0}, speedup=SPEEDUP) as vehicle:
         pilot = Pilot(vehicle.gcs_endpoint, SPEEDUP, vehicle.check)
