@@ -37,10 +37,15 @@ class YawGuardConfig(_Model):
     """
 
     enabled: bool = True
-    limit_deg: float = Field(default=3.5, gt=0.0, le=45.0)
-    outlier_deg: float = Field(default=25.0, gt=0.0, le=180.0)
-    window_s: float = Field(default=3.0, gt=0.0, le=30.0)
-    minimum_samples: int = Field(default=5, ge=1)
+    limit_deg: float = Field(
+        default=3.5,
+        gt=0.0,
+        le=45.0,
+        description="against the autopilot, or against the difference seen so far",
+    )
+    gross_deg: float = Field(default=20.0, gt=0.0, le=90.0, description="never more than this")
+    memory_s: float = Field(default=60.0, gt=0.0, description="how long a difference is remembered")
+    minimum_samples: int = Field(default=5, ge=1, description="in a row, to block and to release")
 
 
 class InjectionConfig(_Model):

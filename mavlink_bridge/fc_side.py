@@ -67,7 +67,7 @@ class FlightControllerSide(Side):
         self._next_check_ns = 0
         self._delivered_ns = 0
         self._connected = False
-        self._told: dict[str, str] = {"inject": _plain(NO_FIX_YET)}
+        self._told: dict[str, str] = {"inject": "nothing yet"}
 
     # --- messages in ----------------------------------------------------------------------------
 
@@ -240,7 +240,9 @@ class FlightControllerSide(Side):
             self.vision = injection.estimate.position
             self._deliver(link, mode, injection, now_ns)
         reason = self.injector.reason
-        self._tell("inject", f"not sent: {reason}" if reason else "", "injecting", prefix=mode)
+        if reason != NO_FIX_YET:
+            problem = f"not sent: {reason}" if reason else ""
+            self._tell("inject", problem, "injecting", prefix=mode)
         if now_ns >= self._next_check_ns:
             self._next_check_ns = now_ns + _IDLE_NS
             self._check(link, state, now_ns)

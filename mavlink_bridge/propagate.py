@@ -95,7 +95,8 @@ class FixPropagator:
         if fix.velocity_ned is not None and self._filter is not None:
             H = np.hstack([np.zeros((3, 3)), np.eye(3)])
             R = np.eye(3) * fix.velocity_sigma_mps**2
-            self._filter.update(np.array(fix.velocity_ned), R=R, H=H)
+            # filterpy shapes z only when it uses its own H.
+            self._filter.update(np.array(fix.velocity_ned).reshape(3, 1), R=R, H=H)
 
     def at(self, time_ns: int) -> PropagatedFix | None:
         """The newest fix carried to `time_ns`; None before the first."""

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from mavlink_bridge.clock import SteadyUtc
-from mavlink_bridge.config import InjectionConfig, YawGuardConfig
+from mavlink_bridge.config import InjectionConfig
 from mavlink_bridge.inject import DIAGONAL, Injection, InjectionContext, Injector
 from mavlink_bridge.messages import Attitude, Origin, VisionFix
 from mavlink_bridge.profile import (
@@ -214,19 +214,51 @@ def test_reset_of_a_fix_that_is_not_sent_itself_is_not_lost() -> None:
     assert sent.message.x == pytest.approx(10.0, abs=0.1)
 
 
-def test_rotated_vision_frame_is_refused_with_a_reason_and_released_with_hysteresis() -> None:
-    it = injector(rate_hz=10, delay_ms=0, yaw_guard=YawGuardConfig(window_s=1.0))
+def turned_by(schedule: Any) -> Any:
+    """Fixes whose yaw differs from the autopilot's by schedule(seconds) degrees."""
+    return lambda f: fix(f.time_ns, yaw_rad=math.radians(schedule(f.time_ns / SECOND)))
 
-    def rotated(f: VisionFix) -> VisionFix:
-        wrong = 5.0 if f.time_ns < 4 * SECOND else 0.5
-        return fix(f.time_ns, yaw_rad=math.radians(wrong))
 
-    sent = fly(it, seconds=8, fix_hz=10, latency_ms=0, change=rotated)
-    times = [t for t, _ in sent]
-    assert not [t for t in times if 1.6 * SECOND < t < 4 * SECOND]
-    assert [t for t in times if t > 6 * SECOND]
+def test_frame_rotated_from_the_start_is_never_sent_and_the_reason_is_told() -> None:
+    it = injector(rate_hz=10, delay_ms=0)
+    assert fly(it, seconds=3, fix_hz=10, latency_ms=0, change=turned_by(lambda _: 5.0)) == []
     assert it.counters["withheld_yaw"] > 10
-    assert it.yaw_difference_rad == pytest.approx(math.radians(0.5), abs=1e-6)
+    assert it.reason == "vision yaw differs from the autopilot's by +5.0 deg"
+
+
+def test_frame_that_rotates_in_flight_is_refused_at_once_and_released_when_right_again() -> None:
+    it = injector(rate_hz=10, delay_ms=0)
+    change = turned_by(lambda t: 5.0 if 3.0 <= t < 6.0 else 0.3)
+    sent = fly(it, seconds=8, fix_hz=10, latency_ms=0, change=change)
+    exposures = [i.estimate.position.time_ns / SECOND for _, i in sent if i.estimate.fresh]
+    assert not [t for t in exposures if 3.0 <= t < 6.3]
+    assert [t for t in exposures if t > 6.7]
+    assert it.counters["fixes_yaw_refused"] == 34  # 30 rotated, 4 on probation
+
+
+def test_drift_of_the_autopilots_own_yaw_does_not_withhold_vision() -> None:
+    # Hover on ODOMETRY: 6 deg in 6 s, vision right all the time.
+    it = injector(rate_hz=10, delay_ms=0)
+    sent = fly(it, seconds=12, fix_hz=10, latency_ms=0, change=turned_by(lambda t: min(t, 8.0)))
+    assert len(sent) >= 118
+    assert it.counters["fixes_yaw_refused"] == 0
+
+
+def test_gross_difference_is_refused_however_slowly_it_came() -> None:
+    it = injector(rate_hz=10, delay_ms=0)
+    sent = fly(it, seconds=30, fix_hz=10, latency_ms=0, change=turned_by(lambda t: t - 1.0))
+    assert max(i.estimate.position.time_ns for _, i in sent if i.estimate.fresh) <= 21.1 * SECOND
+
+
+def test_difference_is_remembered_over_a_dropout() -> None:
+    it = injector(rate_hz=10, delay_ms=0)
+
+    def dropout(f: VisionFix) -> VisionFix | None:
+        t = f.time_ns / SECOND
+        return None if 9.0 <= t < 15.0 else turned_by(lambda t: min(t, 6.0))(f)
+
+    sent = fly(it, seconds=17, fix_hz=10, latency_ms=0, change=dropout)
+    assert [t for t, _ in sent if t > 15.5 * SECOND]
 
 
 def test_single_wild_yaw_is_dropped_without_blocking() -> None:
@@ -282,6 +314,22 @@ def test_odometry_has_the_frames_ardupilot_accepts_and_body_velocity() -> None:
     assert m.quality == 77
     assert 0.0 < m.velocity_covariance[0] < 1.0
     assert m.q == pytest.approx([math.cos(east / 2), 0.0, 0.0, math.sin(east / 2)], abs=1e-6)
+
+
+def test_measured_velocity_is_used() -> None:
+    it = injector(message="odometry", rate_hz=10, delay_ms=0)
+
+    def measured(f: VisionFix) -> VisionFix:
+        return fix(
+            f.time_ns,
+            north=3.0 * f.time_ns / SECOND,
+            velocity_ned=(3.0, -2.0, 1.0),
+            velocity_sigma_mps=0.05,
+        )
+
+    m = fly(it, seconds=1, fix_hz=10, latency_ms=0, change=measured)[-1][1].message
+    assert (m.vx, m.vy, m.vz) == pytest.approx((3.0, -2.0, 1.0), abs=0.15)
+    assert m.velocity_covariance[0] < 0.1**2
 
 
 def test_gps_input_fills_every_field() -> None:
