@@ -35,7 +35,7 @@ from sitl.embedded.geodesy import Location
 from sitl.errors import SimulationError
 from sitl.gimbal_error import GimbalError
 from sitl.moving import Mover
-from sitl.pilot import EkfSample, MissionStep, Pilot, Truth, gimbal_step, speed_step, waypoint_step
+from sitl.pilot import MissionStep, Pilot, gimbal_step, speed_step, waypoint_step
 from sitl.process import VehicleProcess
 from sitl.scenario import Scenario, VehicleKind
 from sitl.targets import observed_targets
@@ -377,12 +377,12 @@ def _truth_sample(pilot: Pilot, cache: TileCache) -> TruthSample | None:
     roll, pitch, yaw = gimbal.roll_pitch_yaw
     frame = GimbalFrame.HEADING if gimbal.yaw_in_vehicle_frame else GimbalFrame.EARTH
     angles = GimbalAngles(roll, pitch, yaw, frame)
-    return TruthSample(truth.time_ns, _enu(truth, cache), truth.quaternion, angles)
+    return TruthSample(truth.time_ns, _enu(truth.location, cache), truth.quaternion, angles)
 
 
-def _enu(truth: Truth, cache: TileCache) -> Any:
-    height = truth.altitude_m + cache.manifest.geoid_separation_m
-    return cache.frame.enu_from_geodetic(truth.latitude_deg, truth.longitude_deg, height)
+def _enu(place: Location, cache: TileCache) -> Any:
+    height = place.altitude_m + cache.manifest.geoid_separation_m
+    return cache.frame.enu_from_geodetic(place.latitude_deg, place.longitude_deg, height)
 
 
 def _write_vehicle_csv(path: Path, pilot: Pilot, cache: TileCache) -> None:
@@ -391,18 +391,7 @@ def _write_vehicle_csv(path: Path, pilot: Pilot, cache: TileCache) -> None:
         writer = csv.writer(file)
         names = ("east_m", "north_m", "up_m")
         writer.writerow(("time_ns", *names, *(f"ekf_{n}" for n in names)))
-        for sample in pilot.ekf_track():
-            truth = pilot.truth_at(sample.time_ns)
-            ekf = _ekf_enu(sample, cache)
-            if truth is None or ekf is None:
-                continue
-            values = (*_enu(truth, cache), *ekf)
-            writer.writerow((sample.time_ns, *(f"{v:.4f}" for v in values)))
-
-
-def _ekf_enu(sample: EkfSample, cache: TileCache) -> Any:
-    place = sample.location
-    if place is None:
-        return None
-    height = place.altitude_m + cache.manifest.geoid_separation_m
-    return cache.frame.enu_from_geodetic(place.latitude_deg, place.longitude_deg, height)
+        for sample, true in pilot.ekf_pairs():
+            if sample.location is not None:
+                values = (*_enu(true, cache), *_enu(sample.location, cache))
+                writer.writerow((sample.time_ns, *(f"{v:.4f}" for v in values)))

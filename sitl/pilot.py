@@ -404,26 +404,27 @@ class Pilot:
         """Everything recorded of the EKF's position."""
         return self._ekf.all()
 
-    def ekf_errors(self, since_ns: int = 0, until_ns: int = 1 << 62) -> Array:
-        """NED errors (N, 3) in metres of the EKF's positions against the truth of their times."""
+    def ekf_pairs(self) -> Iterator[tuple[EkfSample, Location]]:
+        """Every position that the EKF reported, with where the vehicle truly was then."""
         # Paired by the vehicle's own clock: CLOCK_MONOTONIC stamps move when simulated time stalls.
         truth = self.truth_track()
         times = np.array([t.boot_s for t in truth])
-        errors = []
         for sample in self.ekf_track():
-            where = sample.location
             i = int(np.searchsorted(times, sample.boot_s))
-            if (
-                where is None
-                or not since_ns <= sample.time_ns <= until_ns
-                or not 0 < i < len(times)
-            ):
+            if sample.location is None or not 0 < i < len(times):
                 continue
             a, b = truth[i - 1].location, truth[i].location
             t = (sample.boot_s - times[i - 1]) / (times[i] - times[i - 1])
             leg = a.ned_of(b)
-            true = a.offset(t * leg[0], t * leg[1], t * leg[2])
-            errors.append(true.ned_of(where))
+            yield sample, a.offset(t * leg[0], t * leg[1], t * leg[2])
+
+    def ekf_errors(self, since_ns: int = 0, until_ns: int = 1 << 62) -> Array:
+        """NED errors (N, 3) in metres of the EKF's positions against the truth of their times."""
+        errors = [
+            true.ned_of(sample.location)
+            for sample, true in self.ekf_pairs()
+            if sample.location is not None and since_ns <= sample.time_ns <= until_ns
+        ]
         return np.array(errors, dtype=np.float64).reshape(-1, 3)
 
     def subscribe(self, callback: Callable[[Truth], None]) -> None:
