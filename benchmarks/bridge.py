@@ -101,7 +101,7 @@ def run(load: float, seconds: float) -> dict[str, float]:
         connection=f"udpout:127.0.0.1:{here.recv()}",
         origin=OriginConfig(latitude_deg=HOME[0], longitude_deg=HOME[1], altitude_amsl_m=488.0),
         # No waiting for the age of fixes here: the delay under test is the bridge's own.
-        injection=InjectionConfig(rate_hz=30, delay_ms=0, max_extrapolation_s=0.1),
+        injection=InjectionConfig(rate_hz=FIX_HZ, delay_ms=0),
     )
     submitted: dict[int, int] = {}
     with Bridge(config, 0.0) as bridge:
