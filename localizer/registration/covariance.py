@@ -2,42 +2,102 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 from scipy.spatial.transform import Rotation
 
 from localizer.pose import Array, Pose
-from localizer.registration.reference import Linearization, pose_tangent_map
+from localizer.registration.backend import LevelProblem, LMSettings, sample_bilinear
+from localizer.registration.reference import (
+    feature_gradients,
+    in_view,
+    pose_tangent_map,
+    prior_terms,
+    project,
+    projection_jacobian,
+    robust_loss,
+)
+
+
+@dataclass(frozen=True)
+class AnchorModel:
+    """Per anchor in view, what the covariance needs of its residual (equations 2 to 7).
+
+    projection: (N, 2, 6) of equation 6; structure: (N, 2, 2) and slope: (N, 2), S and b of
+    equation 7; squares: (N,) squared residual norms; weights: (N,) joint confidences; robust: (N,)
+    the loss's weights; channels: C; prior_hessian: (6, 6).
+    """
+
+    projection: Array
+    structure: Array
+    slope: Array
+    squares: Array
+    weights: Array
+    robust: Array
+    channels: int
+    prior_hessian: Array
+
+
+def anchor_model(
+    problem: LevelProblem, rotation: Array, translation: Array, settings: LMSettings
+) -> AnchorModel:
+    """The model at one pose, of the anchors in view."""
+    x, uv = project(problem, rotation, translation)
+    visible = in_view(problem, x, uv)
+    x, (u, v) = x[visible], uv[visible].T
+    residuals = (sample_bilinear(problem.features, u, v) - problem.anchor_features[visible]).astype(
+        np.float32
+    )
+    gradient = np.stack(feature_gradients(problem.features, u, v), axis=1).astype(np.float32)
+    squares = np.einsum("nc,nc->n", residuals, residuals)
+    confidence = problem.anchor_confidence[visible] * sample_bilinear(problem.confidence, u, v)
+    prior_hessian = np.zeros((6, 6))
+    if problem.prior is not None:
+        _, prior_hessian, _ = prior_terms(problem.prior, rotation, translation)
+    return AnchorModel(
+        projection_jacobian(problem, x, translation),
+        (gradient @ gradient.transpose(0, 2, 1)).astype(np.float64),
+        (gradient @ residuals[:, :, None])[:, :, 0].astype(np.float64),
+        squares,
+        confidence,
+        robust_loss(np.sqrt(squares), settings)[1],
+        residuals.shape[1],
+        prior_hessian,
+    )
 
 
 def tangent_covariance(
-    model: Linearization, correlation: float, floor: float, prior_weight: float = 0.0
+    model: AnchorModel, correlation: float, floor: float, prior_weight: float = 0.0
 ) -> Array | None:
     """Covariance (6, 6) of xi = (rho, phi) at the optimum, None where H is singular.
 
-    The sandwich ``H^-1 (sum_j g_j g_j') H^-1`` (equation 11) uses the residuals' own variance and
-    their correlation between channels; `correlation` is the factor for anchors whose features see
-    the same image content. `floor` is the least share of the feature noise's isotropic model, so
-    that a perfect fit does not claim perfect knowledge. A prior of weight `prior_weight` adds its
-    own noise.
+    The sandwich of equation 11 takes the residuals' own variance, and their correlation between
+    channels, from the data. correlation: variance factor for anchors that see the same image
+    content. floor: least share of the isotropic model, so that a perfect fit does not claim
+    perfect knowledge. A prior of weight `prior_weight` adds its own noise.
     """
     scale = model.weights * model.robust
     total = model.weights.sum()
-    per_anchor = np.einsum("nci,nc->ni", model.jacobians, model.residuals) * scale[:, None] / total
-    meat = per_anchor.T @ per_anchor
-    spread = 1.0 / np.sqrt(np.maximum(np.diag(model.hessian), 1e-300))
-    scaled = model.hessian * np.outer(spread, spread)
-    values = np.linalg.eigvalsh(scaled)
-    if not np.all(np.isfinite(values)) or values[0] < 1e-9:
+    if not total > 0:
+        return None
+    J = model.projection
+    share = (scale / total)[:, None, None]
+    information = J.transpose(0, 2, 1) @ (share * model.structure) @ J
+    hessian = information.sum(axis=0) + model.prior_hessian
+    diagonal = np.diag(hessian)
+    if not np.all(diagonal > 0):
+        return None
+    spread = 1.0 / np.sqrt(diagonal)
+    scaled = hessian * np.outer(spread, spread)
+    if np.linalg.eigvalsh(scaled)[0] < 1e-9:
         return None
     inverse = np.linalg.inv(scaled) * np.outer(spread, spread)
-    squares = np.einsum("nc,nc->n", model.residuals, model.residuals)
-    channels = model.residuals.shape[1]
-    variance = (scale @ squares / max(scale.sum(), 1e-12)) / channels
-    isotropic = variance * np.einsum(
-        "n,nci,ncj->ij", (scale / total) ** 2, model.jacobians, model.jacobians
-    )
-    noise = correlation * (meat + floor * isotropic) + prior_weight * model.prior_hessian
-    covariance: Array = inverse @ noise @ inverse
+    per_anchor = (J.transpose(0, 2, 1) @ (share * model.slope[:, :, None]))[:, :, 0]
+    variance = scale @ model.squares / max(scale.sum(), 1e-12) / model.channels
+    isotropic = variance * (share * information).sum(axis=0)
+    noise = correlation * (per_anchor.T @ per_anchor + floor * isotropic)
+    covariance: Array = inverse @ (noise + prior_weight * model.prior_hessian) @ inverse
     return 0.5 * (covariance + covariance.T)
 
 

@@ -23,9 +23,11 @@ from localizer.registration.backend import (
     camera_from_local,
     level_problems,
     local_origin,
+    sample_bilinear,
     world_from_camera,
 )
 from localizer.registration.covariance import (
+    anchor_model,
     mode_spread,
     pose_covariance,
     pose_differences,
@@ -34,8 +36,8 @@ from localizer.registration.covariance import (
 from localizer.registration.hypotheses import generate_hypotheses
 from localizer.registration.kernel_numba import NumbaBackend
 from localizer.registration.priors import PoseConstraint
-from localizer.registration.reference import Linearization, ReferenceBackend, linearize, robust_loss
-from localizer.types import Anchors, FeaturePyramid, PosePrior, RegistrationStatus
+from localizer.registration.reference import ReferenceBackend, in_view, project, robust_loss
+from localizer.types import Anchors, FeaturePyramid, Float32, PosePrior, RegistrationStatus
 
 _PROBES = 12  # anchors whose projections tell hypotheses apart
 _LEAST_SCALE = 0.02  # of the polishing loss, where features fit perfectly
@@ -55,6 +57,10 @@ class JNGOConfig(BaseModel):
     spread_sigmas: float = Field(default=2.2, gt=0, description="grid half-width in prior sigmas")
     iterations: tuple[int, ...] = Field(
         default=(2, 3, 4), description="LM steps per level, coarse to fine"
+    )
+    swarm_anchors: tuple[int, ...] = Field(
+        default=(250, 500, 500),
+        description="anchors used per level, spread evenly; all by the winner",
     )
     keep: tuple[int, ...] = Field(
         default=(32, 8), description="survivors after each level but the last"
@@ -78,7 +84,10 @@ class JNGOConfig(BaseModel):
     )
     prior_weight: float = Field(default=0.02, ge=0, description="weight of a constraint, likewise")
     correlation: float = Field(
-        default=8.0, gt=0, description="covariance factor for correlated features"
+        default=5.0, gt=0, description="covariance factor for map and feature errors"
+    )
+    correlation_area_px: float = Field(
+        default=130.0, ge=0, description="finest-level px² within which anchors say the same"
     )
     covariance_floor: float = Field(
         default=0.05, ge=0, description="least share of the isotropic model"
@@ -149,7 +158,9 @@ class JNGO:
         )
         if not np.isfinite(swarm.scores[0]):
             return _failure(prior, RegistrationStatus.NO_OVERLAP, swarm.evaluations)
-        return self._result(origin, prior, self._sharpen(self._converge(swarm, origin, motion)))
+        swarm = self._converge(swarm, origin, motion)
+        full = replace(problems[-1], prior=swarm.problem.prior)
+        return self._result(origin, prior, self._sharpen(replace(swarm, problem=full)))
 
     def _refine(
         self,
@@ -173,8 +184,10 @@ class JNGO:
         R, t = camera_from_local(rotations, centres, origin)
         keep = (*c.keep[: len(problems) - 1], c.hypotheses)
         evaluations = 0
-        for level, iterations, survivors in zip(problems, c.iterations, keep, strict=True):
-            problem = self._constrained(level, constraint, R, t, origin)
+        for level, iterations, survivors, anchors in zip(
+            problems, c.iterations, keep, c.swarm_anchors, strict=True
+        ):
+            problem = self._constrained(_thinned(level, anchors), constraint, R, t, origin)
             result = self.backend.refine(problem, R, t, iterations, c.settings)
             evaluations += result.evaluations
             totals = self._totals(
@@ -214,8 +227,7 @@ class JNGO:
         if c.polish == 0:
             return swarm
         R, t = swarm.rotations.copy(), swarm.translations.copy()
-        model = linearize(swarm.problem, R[0], t[0], c.settings)
-        median = _weighted_median(np.linalg.norm(model.residuals, axis=1), model.weights)
+        median = _median_residual(_thinned(swarm.problem, c.swarm_anchors[-1]), R[0], t[0])
         settings, evaluations = swarm.settings, swarm.evaluations
         for factor in c.polish_scales:
             scale = max(factor * median, _LEAST_SCALE)
@@ -266,14 +278,15 @@ class JNGO:
     def _result(self, origin: Array, prior: PosePrior, swarm: _Swarm) -> Registration:
         c, problem = self.config, swarm.problem
         R, t = swarm.rotations[0], swarm.translations[0]
-        model = linearize(problem, R, t, swarm.settings)
+        model = anchor_model(problem, R, t, swarm.settings)
         weight = 0.0 if problem.prior is None else problem.prior.weight
-        tangent = tangent_covariance(model, c.correlation, c.covariance_floor, weight)
+        correlation = self._correlation(problem, len(model.weights))
+        tangent = tangent_covariance(model, correlation, c.covariance_floor, weight)
         if tangent is None:
             return _failure(prior, RegistrationStatus.NO_TEXTURE, swarm.evaluations)
         rotations, centres = world_from_camera(swarm.rotations, swarm.translations, origin)
         pose = Pose(rotations[0], centres[0])
-        probabilities = self._mode_probabilities(swarm, problem.points.shape[1])
+        probabilities = self._mode_probabilities(swarm)
         differences = pose_differences(rotations, centres, pose)
         covariance = pose_covariance(tangent, R, t) + mode_spread(differences, probabilities)
         if np.sqrt(np.linalg.eigvalsh(covariance[:3, :3])[-1]) > c.max_sigma_m:
@@ -283,15 +296,21 @@ class JNGO:
             covariance,
             float(swarm.scores[0]),
             float(swarm.overlaps[0]),
-            _quality(problem, model, c.settings),
+            _quality(_thinned(problem, c.swarm_anchors[-1]), R, t, c.settings),
             RegistrationStatus.OK,
             int(np.isfinite(swarm.scores).sum()),
             swarm.evaluations,
         )
 
-    def _mode_probabilities(self, swarm: _Swarm, anchors: int) -> Array:
-        """Posterior weight (M,) of each surviving mode under independent feature noise."""
-        effective = anchors * swarm.overlaps[0] / self.config.correlation
+    def _correlation(self, problem: LevelProblem, anchors: int) -> float:
+        """Variance factor of `anchors` in view: neighbours that share image content count once."""
+        density = anchors / problem.confidence.size
+        return self.config.correlation + self.config.correlation_area_px * density
+
+    def _mode_probabilities(self, swarm: _Swarm) -> Array:
+        """Posterior weight (M,) of each surviving mode, by the scores of the swarm's anchors."""
+        anchors = self.config.swarm_anchors[-1] * swarm.overlaps[0]
+        effective = anchors / self._correlation(swarm.problem, anchors)
         best = max(swarm.scores[0], _LEAST_SCORE)
         excess = np.maximum(swarm.scores - swarm.scores[0], 0.0) / best
         likelihood = np.exp(-0.5 * effective * excess)
@@ -366,6 +385,19 @@ def _failure(prior: PosePrior, status: RegistrationStatus, evaluations: int = 0)
     )
 
 
+def _thinned(problem: LevelProblem, count: int) -> LevelProblem:
+    """The problem with about `count` of its anchors: every k-th of the Morton order, so spread."""
+    step = problem.points.shape[1] // max(count, 1)
+    if step < 2:
+        return problem
+    return replace(
+        problem,
+        points=np.ascontiguousarray(problem.points[:, ::step]),
+        anchor_features=np.ascontiguousarray(problem.anchor_features[::step]),
+        anchor_confidence=np.ascontiguousarray(problem.anchor_confidence[::step]),
+    )
+
+
 def _distinct(
     problem: LevelProblem, R: Array, t: Array, totals: Array, distance_px: float
 ) -> NDArray[np.int64]:
@@ -392,20 +424,28 @@ def _distinct(
     return finite[kept]
 
 
-def _quality(problem: LevelProblem, model: Linearization, settings: LMSettings) -> float:
+def _sampled(problem: LevelProblem, R: Array, t: Array) -> tuple[Array, Float32, Array]:
+    """Of the anchors in view: query and anchor features (n, C), joint weights (n,)."""
+    x, uv = project(problem, R, t)
+    visible = in_view(problem, x, uv)
+    u, v = uv[visible].T
+    weights = problem.anchor_confidence[visible] * sample_bilinear(problem.confidence, u, v)
+    return sample_bilinear(problem.features, u, v), problem.anchor_features[visible], weights
+
+
+def _quality(problem: LevelProblem, R: Array, t: Array, settings: LMSettings) -> float:
     """1 - score / score of chance, where chance pairs each anchor with another's query feature."""
-    visible = np.flatnonzero(model.visible)
-    sampled = model.residuals[visible] + problem.anchor_features[visible]
-    others = np.roll(problem.anchor_features[visible], len(visible) // 2, axis=0)
-    weights = model.weights[visible]
-    chance, _ = robust_loss(np.linalg.norm(sampled - others, axis=1), settings)
-    actual, _ = robust_loss(np.linalg.norm(model.residuals[visible], axis=1), settings)
-    return float(
-        np.clip(1.0 - float(weights @ actual) / max(float(weights @ chance), 1e-12), 0.0, 1.0)
-    )
+    query, reference, weights = _sampled(problem, R, t)
+    others = np.roll(reference, len(reference) // 2, axis=0)
+    actual, _ = robust_loss(np.linalg.norm(query - reference, axis=1), settings)
+    chance, _ = robust_loss(np.linalg.norm(query - others, axis=1), settings)
+    return float(np.clip(1.0 - float(weights @ actual) / max(float(weights @ chance), 1e-12), 0, 1))
 
 
-def _weighted_median(values: Array, weights: Array) -> float:
-    order = np.argsort(values)
+def _median_residual(problem: LevelProblem, R: Array, t: Array) -> float:
+    """Weighted median of the residual norms."""
+    query, reference, weights = _sampled(problem, R, t)
+    norms = np.linalg.norm(query - reference, axis=1)
+    order = np.argsort(norms)
     cumulated = np.cumsum(weights[order])
-    return float(values[order][np.searchsorted(cumulated, 0.5 * cumulated[-1])])
+    return float(norms[order][np.searchsorted(cumulated, 0.5 * cumulated[-1])])

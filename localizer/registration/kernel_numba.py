@@ -59,14 +59,16 @@ def _project(R, t, points, focal, centre, buf):  # type: ignore[no-untyped-def]
 
 
 @njit(**_JIT)
-def _compact(h, w, buf, index):  # type: ignore[no-untyped-def]
-    """Keep the anchors in view: x, y, z, fractions into rows 5 to 9, (anchor, cell) into index."""
+def _compact(count, h, w, buf, index):  # type: ignore[no-untyped-def]
+    """Of `count` anchors keep those in view: x, y, z, fractions into rows 5 to 9, and into index
+    the anchor and the cell; returns how many.
+    """
     bx, by, bz, bu, bv = buf[0], buf[1], buf[2], buf[3], buf[4]
     kx, ky, kz, ka, kb = buf[5], buf[6], buf[7], buf[8], buf[9]
     anchor, cell = index[0], index[1]
     umax, vmax, near, zero = _F(w - 1), _F(h - 1), _F(MIN_DEPTH), _F(0)
     n = 0
-    for j in range(bx.shape[0]):
+    for j in range(count):
         u, v = bu[j], bv[j]
         if u >= zero and u < umax and v >= zero and v < vmax and bz[j] > near:
             iu, iv = int(u), int(v)
@@ -333,7 +335,7 @@ def refine_kernel(channels: int) -> Callable[..., int]:
     ):  # fmt: skip
         """Score of a pose and the count of anchors in view; sums gets H and g."""
         _project(R, t, points, focal, centre, buf)
-        n = _compact(h, w, buf, index)
+        n = _compact(points.shape[1], h, w, buf, index)
         if n < min_visible:
             return np.inf, n
         sample(n, w, features, anchor_features, buf, index)
@@ -449,7 +451,7 @@ class NumbaBackend:
         return Refinement(R, t, scores, visible / N, int(evaluations))
 
     def _workspace(self, anchors: int) -> list[tuple[np.ndarray, np.ndarray]]:
-        if not self._scratch or self._scratch[0][0].shape[1] != anchors:
+        if not self._scratch or self._scratch[0][0].shape[1] < anchors:
             self._scratch = [
                 (np.empty((_ROWS, anchors), np.float32), np.empty((2, anchors), np.int64))
                 for _ in range(self._threads)

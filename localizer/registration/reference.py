@@ -18,6 +18,7 @@ from localizer.registration.backend import (
     Refinement,
     sample_bilinear,
 )
+from localizer.types import Float32
 
 MIN_DEPTH = 0.1  # m; anchors nearer than this, or behind, are not in view
 
@@ -28,7 +29,7 @@ class Linearization:
 
     residuals: (N, C), jacobians: (N, C, 6), weights: (N,) joint confidence, 0 out of view;
     robust: (N,) the loss's weights; score: mean robust cost; hessian: (6, 6) and gradient: (6,) of
-    half the score under xi = (rho, phi); prior_hessian: (6, 6) the prior's part; visible: (N,).
+    half the score under xi = (rho, phi); visible: (N,).
     """
 
     residuals: Array
@@ -39,7 +40,6 @@ class Linearization:
     score: float
     hessian: Array
     gradient: Array
-    prior_hessian: Array
 
 
 def project(problem: LevelProblem, rotation: Array, translation: Array) -> tuple[Array, Array]:
@@ -49,7 +49,15 @@ def project(problem: LevelProblem, rotation: Array, translation: Array) -> tuple
     return x, x[:, :2] / z * np.asarray(problem.focal) + np.asarray(problem.centre)
 
 
-def _feature_gradients(features: Array, u: Array, v: Array) -> tuple[Array, Array]:
+def in_view(problem: LevelProblem, x: Array, uv: Array) -> NDArray[np.bool_]:
+    """Which anchors (N,) lie before the camera and between four feature cells."""
+    h, w = problem.confidence.shape
+    u, v = uv.T
+    inside: NDArray[np.bool_] = (u >= 0) & (u < w - 1) & (v >= 0) & (v < h - 1)
+    return inside & (x[:, 2] > MIN_DEPTH)
+
+
+def feature_gradients(features: Float32, u: Array, v: Array) -> tuple[Array, Array]:
     """Derivatives (N, C) of the bilinear interpolation along x and y, exact within a cell."""
     h, w = features.shape[:2]
     x0 = np.clip(np.floor(u).astype(np.int64), 0, w - 2)
@@ -83,14 +91,12 @@ def linearize(
     problem: LevelProblem, rotation: Array, translation: Array, settings: LMSettings
 ) -> Linearization:
     """Score, gradient and Gauss-Newton Hessian at one pose."""
-    h, w = problem.confidence.shape
-    features = problem.features.astype(np.float64)
     x, uv = project(problem, rotation, translation)
     u, v = uv.T
-    visible = (x[:, 2] > MIN_DEPTH) & (u >= 0) & (u < w - 1) & (v >= 0) & (v < h - 1)
+    visible = in_view(problem, x, uv)
     u, v = np.where(visible, u, 0.0), np.where(visible, v, 0.0)
     residuals = sample_bilinear(problem.features, u, v) - problem.anchor_features
-    gx, gy = _feature_gradients(features, u, v)
+    gx, gy = feature_gradients(problem.features, u, v)
     gradient_uv = np.stack([gx, gy], axis=2)
     jacobians = gradient_uv @ projection_jacobian(problem, x, translation)
     joint = problem.anchor_confidence * sample_bilinear(problem.confidence, u, v)
@@ -99,21 +105,18 @@ def linearize(
     cost, robust = robust_loss(norm, settings)
     total = weights.sum()
     if visible.sum() < minimum_visible(problem, settings) or not total > 0:
-        none = np.zeros((6, 6))
+        empty = np.zeros((6, 6))
         return Linearization(
-            residuals, jacobians, weights, robust, visible, np.inf, none, np.zeros(6), none
+            residuals, jacobians, weights, robust, visible, np.inf, empty, np.zeros(6)
         )
     scale = weights * robust / total
     hessian = np.einsum("n,nci,ncj->ij", scale, jacobians, jacobians)
     gradient = np.einsum("n,nci,nc->i", scale, jacobians, residuals)
     score = float(weights @ cost / total)
-    prior_hessian = np.zeros((6, 6))
     if problem.prior is not None:
-        extra, prior_hessian, g = prior_terms(problem.prior, rotation, translation)
-        score, hessian, gradient = score + extra, hessian + prior_hessian, gradient + g
-    return Linearization(
-        residuals, jacobians, weights, robust, visible, score, hessian, gradient, prior_hessian
-    )
+        extra, H, g = prior_terms(problem.prior, rotation, translation)
+        score, hessian, gradient = score + extra, hessian + H, gradient + g
+    return Linearization(residuals, jacobians, weights, robust, visible, score, hessian, gradient)
 
 
 def robust_loss(norm: Array, settings: LMSettings) -> tuple[Array, Array]:

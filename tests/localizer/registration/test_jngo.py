@@ -65,6 +65,20 @@ def test_swarm_reaches_what_one_hypothesis_does_not(scene_factory, prior):
     assert reached["single"] <= 8
 
 
+def test_more_anchors_sharpen_the_winner(jngo, place, camera, scene_factory, prior):
+    errors_by_count = {150: [], 1500: []}
+    for seed in range(10):
+        scene = scene_factory(300 + seed, 1.0, 1.0)
+        view = place.view(scene.reference, camera)
+        features = place.pyramid(scene.reference, camera, 0.1, seed)
+        query = place.pyramid(scene.true, camera, 0.1, seed + 50)
+        for count, found in errors_by_count.items():
+            anchors = select_anchors(view, features, count)
+            result = jngo.register(query, camera, anchors, prior(scene.reference, 1.0, 1.0))
+            found.append(result.world_from_camera.distance_to(scene.true)[0])
+    assert np.median(errors_by_count[1500]) < 0.6 * np.median(errors_by_count[150])
+
+
 def test_backends_agree_on_the_whole_schedule(scene, prior):
     config = JNGOConfig(hypotheses=16, keep=(6, 3))
     about = prior(scene.reference, 1.0, 1.5)
