@@ -1,29 +1,173 @@
-"""``companion map``: build and inspect tile caches."""
+"""``companion map``: build tile caches and look at them."""
 
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
 import typer
 from rich.console import Console
+from rich.table import Table
 
 app = typer.Typer(no_args_is_help=True)
+
+CachePath = Annotated[Path, typer.Argument(help="folder of a tile cache")]
 
 
 @app.callback()
 def _group() -> None:
-    """Tile caches."""
+    """Tile caches: import a map source, check it, look at it."""
 
 
 @app.command("build")
 def build(
-    source: Annotated[Path, typer.Argument(help="tileset.json")],
-    out: Annotated[Path, typer.Option(help="folder of the cache")],
-    geoid_separation: Annotated[float | None, typer.Option(help="metres")] = None,
+    source: Annotated[
+        list[Path],
+        typer.Argument(
+            help="3D Tiles (tileset.json or its folder), a mesh (.glb, .gltf, .obj) with a "
+            "georeference, or a DSM and an orthophoto (GeoTIFF)"
+        ),
+    ],
+    out: Annotated[Path, typer.Option(help="folder of the cache to make")],
+    geoid_separation: Annotated[
+        float | None,
+        typer.Option(help="geoid above the ellipsoid, metres; needed unless the source says it"),
+    ] = None,
+    vertical_datum: Annotated[
+        Literal["ellipsoidal", "amsl"] | None,
+        typer.Option(help="of the source's heights: ellipsoidal or amsl"),
+    ] = None,
+    georeference: Annotated[
+        Path | None, typer.Option(help="georeference of a mesh: JSON, or ODM's offset file")
+    ] = None,
+    up_axis: Annotated[
+        Literal["y", "z"] | None, typer.Option(help="of a mesh: y (glTF's default) or z (OBJ's)")
+    ] = None,
+    attribution: Annotated[str | None, typer.Option(help="who made the source")] = None,
+    skip_bad_tiles: Annotated[
+        bool, typer.Option(help="leave out tiles that cannot be imported instead of failing")
+    ] = False,
+    overwrite: Annotated[bool, typer.Option(help="replace a cache that is there")] = False,
+    workers: Annotated[int | None, typer.Option(help="processes; one per core")] = None,
+    scheduler: Annotated[
+        str | None, typer.Option(help="address of a Dask scheduler that shares the file system")
+    ] = None,
 ) -> None:
-    """Import a source into a tile cache."""
+    """Import a source into a tile cache; goes on where an interrupted build stopped."""
     from localizer.map.build import build_cache
 
-    manifest = build_cache(source, out, geoid_separation_m=geoid_separation)
-    Console().print(f"[green]{out}[/]: {manifest.tiles} tiles, {manifest.triangles} triangles")
+    manifest = build_cache(
+        source,
+        out,
+        geoid_separation_m=geoid_separation,
+        vertical_datum=vertical_datum,
+        georeference=georeference,
+        up_axis=up_axis,
+        attribution=attribution,
+        skip_bad_tiles=skip_bad_tiles,
+        overwrite=overwrite,
+        workers=workers,
+        scheduler=scheduler,
+    )
+    Console().print(
+        f"[green]{out}[/]: {manifest.tiles} tiles, {manifest.triangles} triangles, "
+        f"{manifest.gsd_m:.3f} m texels, {manifest.bytes / 1e6:.1f} MB"
+    )
+    if manifest.skipped:
+        Console().print(f"[yellow]{len(manifest.skipped)} source tiles were left out")
+
+
+@app.command("info")
+def info(cache: CachePath) -> None:
+    """Coverage, texel size, levels and sizes."""
+    from localizer.map.cache import TileCache
+    from localizer.map.inspect import levels
+
+    opened = TileCache.open(cache)
+    m = opened.manifest
+    box = opened.index.box_max[0] - opened.index.box_min[0]
+    facts = {
+        "source": m.source,
+        "attribution": m.attribution or "not given",
+        "origin": f"{m.origin.latitude_deg:.7f}, {m.origin.longitude_deg:.7f}, "
+        f"{m.origin.height_m:.2f} m (ellipsoidal)",
+        "heights of the source": f"{m.vertical_datum}, geoid separation {m.geoid_separation_m} m",
+        "extent": f"{box[0]:.0f} x {box[1]:.0f} m, {m.height_range_m[0]:.1f} to "
+        f"{m.height_range_m[1]:.1f} m (ellipsoidal)",
+        "texel size": f"{m.gsd_m:.3f} m",
+        "tiles": f"{m.tiles} in {m.levels} levels, {m.bytes / 1e6:.1f} MB",
+        "triangles": f"{m.triangles} at the finest level",
+        "left out": f"{len(m.skipped)} source tiles",
+    }
+    table = Table("", str(cache), show_lines=False)
+    for name, value in facts.items():
+        table.add_row(name, value)
+    Console().print(table)
+    table = Table("level", "tiles", "texel m", "geometric error m", "MB")
+    for level in levels(opened):
+        row = (level.gsd_m, level.geometric_error_m, level.megabytes)
+        table.add_row(str(level.level), str(level.tiles), *(f"{x:.2f}" for x in row))
+    Console().print(table)
+
+
+@app.command("verify")
+def verify(cache: CachePath) -> None:
+    """Check every tile's hash and look for holes in the surface; exit 1 when a tile is damaged."""
+    from localizer.map.cache import TileCache
+    from localizer.map.inspect import verify as check
+
+    result = check(TileCache.open(cache))
+    console = Console()
+    for line in result.damaged:
+        console.print(f"[red]{line}")
+    for hole in result.holes[:10]:
+        lat, lon = hole.centre
+        console.print(f"hole of {hole.area_m2:.0f} m² at {lat:.6f}, {lon:.6f}")
+    console.print(
+        f"{result.tiles - len(result.damaged)} of {result.tiles} tiles intact, "
+        f"{len(result.holes)} holes, {result.covered_m2 / 1e6:.3f} km² covered"
+    )
+    if not result.ok:
+        raise typer.Exit(1)
+
+
+@app.command("render")
+def render(
+    cache: CachePath,
+    latitude: Annotated[float, typer.Option(help="degrees")],
+    longitude: Annotated[float, typer.Option(help="degrees")],
+    height: Annotated[float, typer.Option(help="metres above the ellipsoid")],
+    heading: Annotated[float, typer.Option(help="degrees clockwise from north")] = 0.0,
+    pitch: Annotated[float, typer.Option(help="degrees above the horizon")] = -90.0,
+    width: Annotated[int, typer.Option(help="pixels")] = 1280,
+    image_height: Annotated[int, typer.Option(help="pixels")] = 960,
+    fov: Annotated[float, typer.Option(help="horizontal field of view, degrees")] = 60.0,
+    out: Annotated[Path, typer.Option(help="PNG; the depth goes beside it")] = Path("view.png"),
+) -> None:
+    """A picture of the map and of its depth from a pose."""
+    from localizer.camera import Camera
+    from localizer.map import inspect
+    from localizer.map.cache import TileCache
+
+    opened = TileCache.open(cache)
+    pose = inspect.camera_pose(opened, latitude, longitude, height, heading, pitch)
+    view = inspect.render_view(opened, pose, Camera.from_fov(width, image_height, fov))
+    depth = out.with_name(f"{out.stem}_depth{out.suffix}")
+    inspect.write_picture(out, view.rgb)
+    inspect.write_picture(depth, inspect.depth_picture(view.depth))
+    shown = view.depth[view.depth > 0]
+    Console().print(f"{out}, {depth}: depth {shown.min():.1f} to {shown.max():.1f} m")
+
+
+@app.command("export")
+def export(
+    cache: CachePath,
+    out: Annotated[Path, typer.Option(help="GLB to write")],
+    level: Annotated[int | None, typer.Option(help="depth of the tile tree; the finest")] = None,
+) -> None:
+    """The map's surface as one GLB (y up, metres about the cache's origin)."""
+    from localizer.map.cache import TileCache
+    from localizer.map.inspect import export_glb
+
+    triangles = export_glb(TileCache.open(cache), out, level)
+    Console().print(f"{out}: {triangles} triangles, {out.stat().st_size / 1e6:.1f} MB")

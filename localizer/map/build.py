@@ -9,6 +9,7 @@ from collections.abc import Iterable, Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
 from dataclasses import dataclass, replace
+from itertools import islice
 from pathlib import Path
 
 import cv2
@@ -19,13 +20,18 @@ from scipy.spatial import ConvexHull, QhullError
 from localizer.errors import GeoreferenceError, MapSourceError
 from localizer.geo import Geodetic, LocalFrame, geodetic_from_ecef
 from localizer.map.cache import ADD, REPLACE, Manifest, TileIndex, tile_name
+from localizer.map.georeference import Georeference, UpAxis, read_georeference
 from localizer.map.source import SourceMesh, SourceNode, SourceTree, TileSource, VerticalDatum
 from localizer.map.staging import Record, Staging, StoredTile, publish, staging
 from localizer.map.tiles3d import read_tileset
 from localizer.pose import Array
 
+_MESHES = (".glb", ".gltf", ".obj")
 _RASTERS = (".tif", ".tiff", ".vrt")
-_IMPORTABLE = "3D Tiles (tileset.json or its folder), or a DSM and an orthophoto (GeoTIFF)"
+_IMPORTABLE = (
+    "3D Tiles (tileset.json or its folder), a mesh (.glb, .gltf, .obj) with a georeference, or a "
+    "DSM and an orthophoto (GeoTIFF)"
+)
 _NAMED_FAILURES = 20  # how many bad tiles an error message lists
 
 
@@ -35,27 +41,32 @@ def build_cache(
     *,
     geoid_separation_m: float | None = None,
     vertical_datum: VerticalDatum | None = None,
+    georeference: Georeference | Path | None = None,
+    up_axis: UpAxis | None = None,
     origin: Geodetic | None = None,
     attribution: str | None = None,
     skip_bad_tiles: bool = False,
     overwrite: bool = False,
     workers: int | None = None,
     progress: bool = True,
+    scheduler: str | None = None,
 ) -> Manifest:
     """Import a map source into a tile cache at `out`.
 
-    source: a `tileset.json` or its folder, or a DSM and an orthophoto. geoid_separation_m: height
-    of the geoid above the ellipsoid at the map (MAVLink altitudes are above the geoid); needed
-    unless the source carries it. vertical_datum: what the source's heights are; "amsl" ones are
-    lifted by the separation; needed unless the source's format fixes it. origin: of the world
+    source: a `tileset.json` or its folder, a mesh (glTF, GLB, OBJ), or a DSM and an orthophoto.
+    geoid_separation_m: height of the geoid above the ellipsoid at the map (MAVLink altitudes are
+    above the geoid); needed unless the source carries it. vertical_datum: what the source's heights
+    are; "amsl" ones are lifted by the separation; needed unless the source's format fixes it.
+    georeference, up_axis: of a mesh, see `read_georeference` and `read_mesh`. origin: of the world
     frame, else the source's centre. skip_bad_tiles: leave out tiles that cannot be imported (their
     parents are shown there) instead of failing. workers: processes, else one per core; more than
-    one needs the usual ``if __name__ == "__main__"`` guard in a script. An interrupted build goes
-    on where it stopped.
+    one needs the usual ``if __name__ == "__main__"`` guard in a script. scheduler: address of a
+    Dask scheduler whose workers share the file system, instead of local processes. An interrupted
+    build goes on where it stopped.
     """
     sources = [Path(source)] if isinstance(source, str | Path) else [Path(s) for s in source]
     named = " ".join(map(str, sources))
-    tree = read_source(sources)
+    tree = read_source(sources, georeference, up_axis)
     separation = _geoid_separation(tree, geoid_separation_m, named)
     datum = _vertical_datum(tree, vertical_datum, named)
     lift = separation if datum == "amsl" else 0.0
@@ -68,7 +79,9 @@ def build_cache(
     }
     with staging(Path(out), parameters, overwrite=overwrite) as staged:
         job = _Job(staged, frame, lift)
-        records = _import_all(tree.root, job, workers or os.cpu_count() or 1, progress)
+        records = _import_all(
+            tree.root, job, workers or os.cpu_count() or 1, scheduler, progress=progress
+        )
         skipped = _failures(tree.root, records)
         if skipped and not skip_bad_tiles:
             raise MapSourceError(_failure_text(named, skipped))
@@ -86,7 +99,11 @@ def build_cache(
         return publish(staged, Path(out), index, manifest)
 
 
-def read_source(sources: Sequence[Path]) -> SourceTree:
+def read_source(
+    sources: Sequence[Path],
+    georeference: Georeference | Path | None = None,
+    up_axis: UpAxis | None = None,
+) -> SourceTree:
     """The tile tree of any source that can be imported."""
     for path in sources:
         if not path.exists():
@@ -95,6 +112,8 @@ def read_source(sources: Sequence[Path]) -> SourceTree:
         return _read_rasters(sources)
     if len(sources) > 1:
         raise MapSourceError("several sources can only be a DSM and an orthophoto")
+    if sources[0].suffix.lower() in _MESHES:
+        return _read_mesh(sources[0], georeference, up_axis)
     if sources[0].is_dir() or sources[0].suffix.lower() == ".json":
         return read_tileset(sources[0])
     raise MapSourceError(f"{sources[0]}: not a source that can be imported: {_IMPORTABLE}")
@@ -108,6 +127,22 @@ def _read_rasters(sources: Sequence[Path]) -> SourceTree:
             f"rasters need the packages rasterio and fast-simplification: {error}"
         ) from error
     return read_rasters(sources)
+
+
+def _read_mesh(
+    source: Path, georeference: Georeference | Path | None, up_axis: UpAxis | None
+) -> SourceTree:
+    if georeference is None:
+        raise GeoreferenceError(
+            f"{source}: a mesh does not say where on Earth it stands; give a georeference file"
+        )
+    if isinstance(georeference, Path):
+        georeference = read_georeference(georeference)
+    try:
+        from localizer.map.mesh import read_mesh
+    except ImportError as error:
+        raise MapSourceError(f"meshes need the package fast-simplification: {error}") from error
+    return read_mesh(source, georeference, up_axis)
 
 
 @dataclass(frozen=True)
@@ -144,7 +179,9 @@ def _tiles(root: SourceNode) -> Iterator[TileSource]:
         yield from node.tiles
 
 
-def _import_all(root: SourceNode, job: _Job, workers: int, progress: bool) -> dict[int, Record]:
+def _import_all(
+    root: SourceNode, job: _Job, workers: int, scheduler: str | None, *, progress: bool
+) -> dict[int, Record]:
     """Records of every source tile, by its place in `_tiles` order."""
     records: dict[int, Record] = {}
     todo: list[tuple[int, TileSource]] = []
@@ -159,7 +196,10 @@ def _import_all(root: SourceNode, job: _Job, workers: int, progress: bool) -> di
     columns = (TextColumn("importing tiles"), BarColumn(), MofNCompleteColumn())
     with Progress(*columns, TimeRemainingColumn(), disable=not progress) as bar:
         task = bar.add_task("", total=len(records) + len(todo), completed=len(records))
-        run = _run_here(job, todo) if workers == 1 else _run_pool(job, todo, workers)
+        if scheduler is not None:
+            run = _run_dask(job, todo, scheduler)
+        else:
+            run = _run_here(job, todo) if workers == 1 else _run_pool(job, todo, workers)
         for key, record in run:
             records[key] = record
             bar.advance(task)
@@ -169,6 +209,31 @@ def _import_all(root: SourceNode, job: _Job, workers: int, progress: bool) -> di
 def _run_here(job: _Job, todo: Iterable[tuple[int, TileSource]]) -> Iterator[tuple[int, Record]]:
     for key, tile in todo:
         yield key, job.run(key, tile)
+
+
+def _run_dask(
+    job: _Job, todo: list[tuple[int, TileSource]], address: str
+) -> Iterator[tuple[int, Record]]:
+    try:
+        from distributed import Client, as_completed
+    except ImportError as error:
+        raise MapSourceError(f"a Dask scheduler needs the package distributed: {error}") from error
+    with Client(address) as client:
+        queue = iter(todo)
+        room = 4 * max(
+            1, sum(client.nthreads().values())
+        )  # queued tiles, so that memory is bounded
+        running = as_completed(
+            [client.submit(_numbered, job, *item, pure=False) for item in islice(queue, room)]
+        )
+        for future in running:
+            yield future.result()
+            for item in islice(queue, 1):
+                running.add(client.submit(_numbered, job, *item, pure=False))
+
+
+def _numbered(job: _Job, key: int, tile: TileSource) -> tuple[int, Record]:
+    return key, job.run(key, tile)
 
 
 def _run_pool(
@@ -252,6 +317,8 @@ def _geoid_separation(tree: SourceTree, given: float | None, source: str) -> flo
 
 
 def _vertical_datum(tree: SourceTree, given: VerticalDatum | None, source: str) -> VerticalDatum:
+    if given not in (None, "ellipsoidal", "amsl"):
+        raise GeoreferenceError(f"vertical datum {given!r}: ellipsoidal and amsl are known")
     datum = given or tree.vertical_datum
     if datum is None:
         raise GeoreferenceError(

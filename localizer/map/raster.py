@@ -15,7 +15,6 @@ from dataclasses import dataclass, replace
 from functools import lru_cache
 from pathlib import Path
 
-import fast_simplification  # type: ignore[import-untyped]
 import numpy as np
 import rasterio
 import rasterio.warp
@@ -29,17 +28,13 @@ from rasterio.io import DatasetReader
 from rasterio.vrt import WarpedVRT
 
 from localizer.errors import GeoreferenceError, MapSourceError
-from localizer.geo import ecef_from_geodetic
+from localizer.map.georeference import ecef_from_crs
+from localizer.map.heightmesh import ERROR_PER_STEP, height_mesh
 from localizer.map.source import SourceMesh, SourceNode, SourceTree
-from localizer.pose import Array
 from localizer.types import Image
 
 TEXELS = 512  # of a tile's side
 MIN_CELLS = 16  # of a tile's side
-REDUCTION = 0.5  # share of triangles that simplification takes away above the finest level
-# Detail limits are set for photogrammetric tilesets, whose stated error is several times the step
-# of their grid; a height field's is put on the same scale.
-ERROR_PER_STEP = 2.0
 
 
 @dataclass(frozen=True)
@@ -87,7 +82,7 @@ class RasterTile:
             image, shown = self._image()
         except (RasterioError, CPLE_BaseError, OSError, ValueError) as error:
             raise MapSourceError(f"cannot be read: {error}") from error
-        mesh = _height_mesh(heights, shown, self.step, lossless=self._finest)
+        mesh = height_mesh(heights, shown, self.step, lossless=self._finest)
         if mesh is None:
             return []
         local, faces = mesh
@@ -95,7 +90,7 @@ class RasterTile:
         crs_points = local + (left, top, 0.0)
         extent = np.array(self.step) * self.grid.cells
         uvs = (local[:, :2] * (1, -1) / extent).astype(np.float32)
-        return [SourceMesh(_ecef(self.grid.crs, crs_points), uvs, faces, image)]
+        return [SourceMesh(ecef_from_crs(self.grid.crs, crs_points), uvs, faces, image)]
 
     @property
     def _finest(self) -> bool:
@@ -135,7 +130,7 @@ def read_rasters(paths: Sequence[Path]) -> SourceTree:
     dsm, ortho = _told_apart(paths)
     with rasterio.open(dsm) as heights, rasterio.open(ortho) as colours:
         grid = _grid(heights, colours)
-        centre = _ecef(grid.crs, np.array([[*_centre(heights, grid.crs), 0.0]]))[0]
+        centre = ecef_from_crs(grid.crs, np.array([[*_centre(heights, grid.crs), 0.0]]))[0]
         bounds = rasterio.warp.transform_bounds(heights.crs, grid.crs, *heights.bounds)
     return SourceTree(
         _node(RasterTile(dsm, ortho, grid, 0, 0, 0), bounds), centre, None, "", (dsm, ortho)
@@ -260,87 +255,3 @@ def _warped(
         tolerance=0.01,  # of a pixel; 0 is refused
     ) as vrt:
         yield vrt
-
-
-@lru_cache(maxsize=4)
-def _geographic(crs: str) -> Transformer:
-    return Transformer.from_crs(CRS(crs).to_2d(), CRS("EPSG:4326"), always_xy=True)
-
-
-def _ecef(crs: str, points: Array) -> Array:
-    """ECEF (N, 3) of CRS easting, northing and ellipsoidal height (N, 3)."""
-    lon, lat = _geographic(crs).transform(points[:, 0], points[:, 1])
-    return ecef_from_geodetic(lat, lon, points[:, 2])
-
-
-def _height_mesh(
-    heights: np.ma.MaskedArray,
-    shown: NDArray[np.bool_],
-    step: tuple[float, float],
-    *,
-    lossless: bool,
-) -> tuple[Array, NDArray[np.int32]] | None:
-    """Vertices (V, 3), x east and y north of the tile's first vertex, and faces (F, 3).
-
-    None where nothing is left. Cells with an unknown corner or no picture are left out.
-    """
-    n = heights.shape[0] - 1
-    known = ~np.ma.getmaskarray(heights)
-    whole = known[:-1, :-1] & known[1:, :-1] & known[:-1, 1:] & known[1:, 1:]
-    rows = np.minimum((np.arange(n) + 0.5) * shown.shape[0] / n, shown.shape[0] - 1).astype(int)
-    whole &= shown[np.ix_(rows, rows)]
-    if not whole.any():
-        return None
-    r, c = np.nonzero(whole)
-    corner = r * (n + 1) + c
-    below = corner + n + 1
-    faces = np.concatenate(
-        [np.stack([corner, below, corner + 1], 1), np.stack([corner + 1, below, below + 1], 1)]
-    )
-    gy, gx = np.mgrid[0 : n + 1, 0 : n + 1]
-    points = np.stack([gx * step[0], -gy * step[1], np.where(known, heights.data, 0.0)], -1)
-    used, index = np.unique(faces, return_inverse=True)
-    points, faces = points.reshape(-1, 3)[used], index.reshape(-1, 3)
-    points, faces = _simplified(points, faces, lossless)
-    extent = (n * step[0], n * step[1])
-    return _skirted(points, faces.astype(np.int32), extent, depth=2 * max(step))
-
-
-def _simplified(
-    points: Array, faces: NDArray[np.int64], lossless: bool
-) -> tuple[Array, NDArray[np.int64]]:
-    base = points.mean(axis=0)
-    local = points - base
-    if lossless:
-        out, kept = fast_simplification.simplify(local, faces, 0.5, lossless=True)
-    else:
-        out, kept = fast_simplification.simplify(local, faces, REDUCTION)
-    if len(kept) == 0:
-        return points, faces
-    return np.asarray(out, np.float64) + base, np.asarray(kept)
-
-
-def _skirted(
-    points: Array, faces: NDArray[np.int32], extent: tuple[float, float], depth: float
-) -> tuple[Array, NDArray[np.int32]]:
-    """With vertical strips hung from the edges that lie on the tile's border."""
-    edges = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
-    slack = 1e-3 * max(extent)
-    x, y = points[edges, 0], points[edges, 1]
-    on_border = (
-        (np.abs(x) < slack).all(1)
-        | (np.abs(x - extent[0]) < slack).all(1)
-        | (np.abs(y) < slack).all(1)
-        | (np.abs(y + extent[1]) < slack).all(1)
-    )
-    edges = edges[on_border]
-    top, inverse = np.unique(edges, return_inverse=True)
-    bottom = inverse.reshape(-1, 2).astype(np.int32) + np.int32(len(points))
-    hung = points[top] - (0.0, 0.0, depth)
-    strips = np.concatenate(
-        [
-            np.stack([edges[:, 1], edges[:, 0], bottom[:, 0]], 1),
-            np.stack([edges[:, 1], bottom[:, 0], bottom[:, 1]], 1),
-        ]
-    )
-    return np.concatenate([points, hung]), np.concatenate([faces, strips]).astype(np.int32)

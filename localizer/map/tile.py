@@ -126,26 +126,31 @@ def build_mips(image: Image, used: NDArray[np.bool_] | None = None) -> tuple[Ima
     unused there takes its colour from the next coarser one: else the background of a texture
     atlas bleeds into the chart borders.
     """
-    if used is None or used.all() or not used.any():
+    h, w = image.shape[:2]
+    mask = np.ones((h, w), np.uint8) if used is None else used.astype(np.uint8)
+    count = cv2.countNonZero(mask)
+    if count in (0, h * w):
         mips = [image]
-        for w, h in mip_sizes(image.shape[1], image.shape[0])[1:]:
-            mips.append(cv2.resize(mips[-1], (w, h), interpolation=cv2.INTER_AREA).astype(np.uint8))
+        for size in mip_sizes(w, h)[1:]:
+            mips.append(cv2.resize(mips[-1], size, interpolation=cv2.INTER_AREA).astype(np.uint8))
         return tuple(mips)
-    weight = used.astype(np.float32)
-    colour = image.astype(np.float32) * weight[..., None]
+    # Colours times weight, and the weight itself, averaged alike.
+    colour = cv2.bitwise_and(image, image, mask=mask)
+    weight = mask.astype(np.float32)
     levels = []
-    for w, h in mip_sizes(image.shape[1], image.shape[0])[1:]:
-        colour = cv2.resize(colour, (w, h), interpolation=cv2.INTER_AREA).reshape(h, w, 3)
-        weight = cv2.resize(weight, (w, h), interpolation=cv2.INTER_AREA).reshape(h, w)
-        levels.append((colour, weight))
+    for size in mip_sizes(w, h)[1:]:
+        colour = cv2.resize(colour, size, interpolation=cv2.INTER_AREA).astype(np.float32)
+        weight = cv2.resize(weight, size, interpolation=cv2.INTER_AREA).reshape(size[::-1])
+        levels.append((colour.reshape(*size[::-1], 3), weight))
     filled: list[Image] = []
-    coarser = image[used].mean(axis=0, dtype=np.float64).astype(np.float32).reshape(1, 1, 3)
+    coarser = np.array(cv2.mean(image, mask)[:3], np.float32).reshape(1, 1, 3)
     for colour, weight in reversed(levels):
         h, w = weight.shape
         coarser = cv2.resize(coarser, (w, h), interpolation=cv2.INTER_LINEAR).reshape(h, w, 3)
-        mean = colour / np.maximum(weight, 1e-6)[..., None]
-        coarser = np.where(weight[..., None] > 1e-3, mean, coarser).astype(np.float32)
-        filled.append(np.clip(np.rint(coarser), 0, 255).astype(np.uint8))
+        scale = cv2.merge([1 / np.maximum(weight, 1e-3)] * 3).reshape(h, w, 3)
+        mean = cv2.multiply(colour, scale)
+        cv2.copyTo(mean, (weight > 1e-3).astype(np.uint8), coarser)
+        filled.append(cv2.convertScaleAbs(coarser).reshape(h, w, 3).astype(np.uint8))
     return (image, *reversed(filled))
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import Protocol
 
 import numpy as np
@@ -15,6 +16,30 @@ from localizer.types import RenderedView
 
 NEAR_M = 0.5  # nearer surfaces are cut off: no aircraft's camera is that close to its map
 SKY = (176, 196, 216)
+
+
+class TileProvider(Protocol):
+    """Where a renderer gets its tiles: a `TileStreamer`, or `StaticTiles`."""
+
+    def select(
+        self, world_from_camera: Pose, camera: Camera, *, wait: bool = False
+    ) -> Sequence[TileMesh]:
+        """Meshes to draw for a view."""
+        ...
+
+
+@dataclass(frozen=True)
+class StaticTiles:
+    """Always the same meshes, for scenes that fit into memory."""
+
+    meshes: Sequence[TileMesh]
+
+    def select(
+        self, world_from_camera: Pose, camera: Camera, *, wait: bool = False
+    ) -> Sequence[TileMesh]:
+        """See `TileProvider.select`."""
+        del wait  # everything is there
+        return [m for m in self.meshes if is_visible(m, world_from_camera, camera)]
 
 
 class MapRenderer(Protocol):

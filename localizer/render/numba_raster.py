@@ -7,7 +7,7 @@ look-up in the mip that the pixel's footprint asks for. Both sides of a triangle
 photogrammetry is not consistently wound.
 """
 
-# ruff: noqa: PLR0915 (kernels pass arrays and unroll, for speed)
+# ruff: noqa: PLR0912, PLR0915 (kernels pass arrays and unroll, for speed)
 
 from __future__ import annotations
 
@@ -21,10 +21,9 @@ from numba import njit
 from numpy.typing import NDArray
 
 from localizer.camera import Camera
-from localizer.map.stream import TileStreamer
 from localizer.map.tile import TileMesh
 from localizer.pose import Array, Pose
-from localizer.render.base import NEAR_M, SKY, is_visible, require_pinhole
+from localizer.render.base import NEAR_M, SKY, TileProvider, is_visible, require_pinhole
 from localizer.types import Float32, Image, RenderedView
 
 _STRIPS_PER_THREAD = 3  # more than one, so that a crowded strip does not leave a thread idle
@@ -48,7 +47,7 @@ class NumbaRenderer:
 
     def __init__(
         self,
-        streamer: TileStreamer,
+        streamer: TileProvider,
         threads: int = 2,
         sky: tuple[int, int, int] = SKY,
     ) -> None:
