@@ -53,12 +53,13 @@ class OptimizerSection(_Frozen):
 
 
 class TrainConfig(_Frozen):
-    """A whole run."""
+    """A whole run. warm_start: checkpoint whose averaged weights are the first ones."""
 
     name: str
     seed: int
     output: Path
     checkpoint_steps: int = Field(gt=0)
+    warm_start: Path | None = None
     model: ModelConfig
     data: DataSection
     optimizer: OptimizerSection

@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import torch
+from pydantic import ValidationError
 from torch import Tensor, nn
 
 from localizer.errors import ModelError
@@ -39,7 +40,10 @@ def load_network(checkpoint: Path) -> tuple[TinyNet, TrainConfig, dict[str, obje
         state = torch.load(checkpoint, map_location="cpu", weights_only=True)
     except (OSError, RuntimeError, EOFError, pickle.UnpicklingError) as error:
         raise ModelError(f"{checkpoint}: not a readable checkpoint: {error}") from error
-    config = TrainConfig.model_validate(state["config"])
+    try:
+        config = TrainConfig.model_validate(state["config"])
+    except ValidationError as error:
+        raise ModelError(f"{checkpoint}: of another version of the training: {error}") from error
     network = TinyNet(config.model)
     network.load_state_dict(state["average"])
     progress = {"steps": state["step"], "seconds": round(state["seconds"])}
@@ -75,6 +79,7 @@ def export(checkpoint: Path, model: Path) -> float:
             "model": config.model.model_dump(mode="json"),
             "optimizer": config.optimizer.model_dump(mode="json"),
             # Paths are of one machine; what decides the weights is the rest.
+            "warm_start": config.warm_start is not None,
             "data": config.data.model_dump(mode="json", exclude={"shards", "photos", "workers"}),
         },
     }

@@ -78,7 +78,7 @@ def alignment_loss(
         pixels, _ = project(pose, batch.points, batch.K_query)
         squared = ((pixels - batch.query_pixels) ** 2).sum(-1).clamp(max=1e5)
         weight = 1.0 if k == iterations - 1 else 0.5
-        total = total + weight * _mean(barron(squared, 2.0), batch.visible, cap=20.0)
+        total = total + weight * _mean(barron(squared, stride / 2), batch.visible, cap=20.0)
         errors = _mean(squared.detach().sqrt(), batch.visible)
     return total, errors
 

@@ -30,6 +30,9 @@ class Trainer:
         torch.set_num_threads(config.optimizer.threads)
         self.device = torch.device("cuda" if torch.cuda.is_available() else "cpu")
         self.model = TinyNet(config.model).to(self.device).train()
+        if config.warm_start is not None:
+            state = torch.load(config.warm_start, map_location=self.device, weights_only=True)
+            self.model.load_state_dict(state["average"])
         self.average = TinyNet(config.model).to(self.device).eval()
         self.average.load_state_dict(self.model.state_dict())
         self.log_scale = nn.Parameter(torch.full((3,), 3.2, device=self.device))

@@ -7,7 +7,7 @@ import pytest
 torch = pytest.importorskip("torch")
 
 from localizer.errors import ModelError  # noqa: E402
-from localizer.features import OnnxExtractor  # noqa: E402
+from localizer.features import GradientExtractor, OnnxExtractor  # noqa: E402
 from localizer.pose import Pose  # noqa: E402
 from localizer.training.config import TrainConfig, load_config  # noqa: E402
 from localizer.training.curves import plot  # noqa: E402
@@ -22,6 +22,7 @@ from localizer.training.losses import (  # noqa: E402
     se3_exp,
 )
 from localizer.training.model import ModelConfig, TinyNet, fuse  # noqa: E402
+from localizer.training.orientation import OrientationFeatures  # noqa: E402
 from localizer.training.pairs import SceneConfig, scene_pairs  # noqa: E402
 from localizer.training.shards import write_shard  # noqa: E402
 from localizer.training.train import Trainer, perturbed  # noqa: E402
@@ -47,7 +48,7 @@ def config(shards: Path, tmp_path: Path) -> TrainConfig:
                                        "worlds": 0})  # fmt: skip
     optimizer = run.optimizer.model_copy(update={"batch": 2, "anchors": 64, "crop": (96, 64),
                                                  "steps": 6, "threads": 1})  # fmt: skip
-    model = ModelConfig(channels=8, widths=(8, 8, 16), decoder=(8, 8), dilations=(1, 2))
+    model = ModelConfig(channels=16, widths=(8, 8, 16), decoder=(8, 8), dilations=(1, 2))
     return run.model_copy(update={"output": tmp_path, "data": data, "optimizer": optimizer,
                                   "model": model, "checkpoint_steps": 3})  # fmt: skip
 
@@ -124,6 +125,16 @@ def test_contrast_prefers_features_that_agree(batch: Batch) -> None:
     right = contrast_loss(anchors, query, truth, batch.visible, scale, 32)
     wrong = contrast_loss(anchors.flip(1), query, truth, batch.visible, scale, 32)
     assert float(right) < float(wrong)
+
+
+def test_the_fixed_channels_are_the_fallbacks(batch: Batch) -> None:
+    image = batch.images[:1]
+    rgb = np.ascontiguousarray((image[0].permute(1, 2, 0).numpy() * 255).round().astype(np.uint8))
+    for level in GradientExtractor().extract(rgb).levels:
+        features, confidence = OrientationFeatures(level.stride)(image)
+        alike = (features[0].permute(1, 2, 0).numpy() * level.features).sum(-1)
+        assert alike.mean() > 0.98
+        assert np.abs(confidence[0].numpy() - level.confidence).mean() < 0.03
 
 
 def test_fusing_blocks_keeps_the_function() -> None:
