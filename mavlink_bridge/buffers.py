@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from bisect import bisect_left
 from collections import deque
 from collections.abc import Sequence
@@ -41,9 +42,18 @@ class GimbalSample:
     source: str
 
 
-def attitude(time_ns: int, q: quat.Quaternion, rates: quat.Vector) -> Attitude:
+def attitude(
+    time_ns: int, q: quat.Quaternion, rates: quat.Vector, gyro_heading_rad: float = 0.0
+) -> Attitude:
     """An `Attitude` from its quaternion."""
-    return Attitude(time_ns, *quat.to_euler(q), quaternion=q, rates=rates)
+    return Attitude(time_ns, *quat.to_euler(q), q, rates, gyro_heading_rad)
+
+
+def heading_rate(sample: Attitude) -> float:
+    """Rate of the heading, rad/s, from body rates and tilt (aerospace Euler kinematics)."""
+    _, q, r = sample.rates
+    cos_pitch = max(math.cos(sample.pitch_rad), 0.1)
+    return (q * math.sin(sample.roll_rad) + r * math.cos(sample.roll_rad)) / cos_pitch
 
 
 def _around(samples: Sequence[Any], time_ns: int) -> tuple[Any, Any, float]:
@@ -91,9 +101,18 @@ class AttitudeBuffer:
         self._samples.clear()
 
     def add(self, sample: Attitude) -> None:
-        """Append; one that is not newer than the newest is dropped."""
-        if not self._samples or sample.time_ns > self._samples[-1].time_ns:
-            self._samples.append(sample)
+        """Append with its gyro heading; one that is not newer than the newest is dropped."""
+        if self._samples:
+            last = self._samples[-1]
+            dt = (sample.time_ns - last.time_ns) * 1e-9
+            if dt <= 0.0:
+                return
+            turned = 0.5 * (heading_rate(last) + heading_rate(sample)) * dt
+            if dt > MAX_GAP_NS * 1e-9:
+                # What the gyros did in a gap is unknown; the estimator's yaw went through it.
+                turned = quat.wrap_pi(sample.yaw_rad - last.yaw_rad)
+            sample = replace(sample, gyro_heading_rad=last.gyro_heading_rad + turned)
+        self._samples.append(sample)
 
     def at(self, time_ns: int) -> Attitude | None:
         """Attitude at a time, None outside the buffer or inside a gap of more than 0.5 s.
@@ -108,13 +127,16 @@ class AttitudeBuffer:
         if ahead >= 0:
             if ahead > _MAX_EXTRAPOLATION_NS:
                 return None
-            q = quat.turn(newest.quaternion, newest.rates, ahead * 1e-9)
-            return attitude(time_ns, q, newest.rates)
+            seconds = ahead * 1e-9
+            q = quat.turn(newest.quaternion, newest.rates, seconds)
+            heading = newest.gyro_heading_rad + heading_rate(newest) * seconds
+            return attitude(time_ns, q, newest.rates, heading)
         before, after, t = _around(samples, time_ns)
         if after.time_ns - before.time_ns > MAX_GAP_NS:
             return None
         q = quat.slerp(before.quaternion, after.quaternion, t)
-        return attitude(time_ns, q, after.rates if t > 0.5 else before.rates)
+        heading = before.gyro_heading_rad + t * (after.gyro_heading_rad - before.gyro_heading_rad)
+        return attitude(time_ns, q, after.rates if t > 0.5 else before.rates, heading)
 
 
 class GimbalBuffer:

@@ -41,10 +41,10 @@ class YawGuardConfig(_Model):
         default=3.5,
         gt=0.0,
         le=45.0,
-        description="against the autopilot, or against the difference seen so far",
+        description="against the autopilot's yaw, or against its gyros since the fixes before",
     )
     gross_deg: float = Field(default=20.0, gt=0.0, le=90.0, description="never more than this")
-    memory_s: float = Field(default=60.0, gt=0.0, description="how long a difference is remembered")
+    memory_s: float = Field(default=60.0, gt=0.0, description="how long the gyros are trusted")
     minimum_samples: int = Field(default=5, ge=1, description="in a row, to block and to release")
 
 

@@ -126,7 +126,8 @@ class TrackRequest:
 class Attitude:
     """The vehicle's attitude at a time. quaternion: (w, x, y, z), body (FRD) to NED.
 
-    rates: body angular rates (roll, pitch, yaw) in rad/s.
+    rates: body angular rates (roll, pitch, yaw) in rad/s. gyro_heading_rad: the heading's rate
+    integrated since the link began, unwrapped; it has no reference but no resets either.
     """
 
     time_ns: int
@@ -135,6 +136,7 @@ class Attitude:
     yaw_rad: float
     quaternion: tuple[float, float, float, float]
     rates: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    gyro_heading_rad: float = 0.0
 
 
 @dataclass(frozen=True)

@@ -76,7 +76,6 @@ class FixPropagator:
         gap_s = np.inf if last is None else (fix.time_ns - last.time_ns) * 1e-9
         if self._filter is None or gap_s > _FORGET_AFTER_S:
             self._start(fix, R)
-            self._measure_velocity(fix)
             return
         F, Q = self._motion(gap_s)
         self._filter.predict(F=F, Q=Q)
@@ -89,14 +88,6 @@ class FixPropagator:
             self._filter.P[:3, :3] = R
         else:
             self._filter.update(z, R=R)
-        self._measure_velocity(fix)
-
-    def _measure_velocity(self, fix: VisionFix) -> None:
-        if fix.velocity_ned is not None and self._filter is not None:
-            H = np.hstack([np.zeros((3, 3)), np.eye(3)])
-            R = np.eye(3) * fix.velocity_sigma_mps**2
-            # filterpy shapes z only when it uses its own H.
-            self._filter.update(np.array(fix.velocity_ned).reshape(3, 1), R=R, H=H)
 
     def at(self, time_ns: int) -> PropagatedFix | None:
         """The newest fix carried to `time_ns`; None before the first."""
@@ -104,8 +95,10 @@ class FixPropagator:
         if fix is None or kalman is None:
             return None
         dt = (time_ns - fix.time_ns) * 1e-9
-        velocity = kalman.x[3:, 0].copy()
-        Pv = kalman.P[3:, 3:].copy()
+        if fix.velocity_ned is not None:
+            velocity, Pv = np.array(fix.velocity_ned), np.eye(3) * fix.velocity_sigma_mps**2
+        else:
+            velocity, Pv = kalman.x[3:, 0].copy(), kalman.P[3:, 3:].copy()
         north, east, down = velocity * dt
         latitude, longitude = offset(fix.latitude_deg, fix.longitude_deg, north, east)
         q = self._acceleration**2

@@ -1,10 +1,11 @@
 """Cross-check of the vision yaw against the autopilot's, because ArduPilot makes none.
 
 Measured: a vision frame rotated by 5 deg costs 25 m with no warning, and a 30 deg wrong yaw is
-accepted with EK3_SRC1_YAW = 6. Measured as well: in hover on ODOMETRY the EKF's own yaw wandered by
-6 deg within seconds while vision was right, and withholding vision then ended in LAND. So a fix
-passes when its yaw agrees with the autopilot's, or when their difference is the one that was seen
-with the fixes before: the autopilot's yaw may drift, a vision frame that turns does so at once.
+accepted with EK3_SRC1_YAW = 6. Measured as well: the EKF's own yaw steps by up to 8 deg when it is
+aligned again after take-off, and wanders by 6 deg in hover on ODOMETRY, while vision is right;
+withholding vision then ended in LAND. So a fix passes when its yaw agrees with the autopilot's, or
+when it turned since the fixes before as the gyros did: the autopilot's yaw may drift and step, a
+vision frame that turns does so against the gyros.
 """
 
 from __future__ import annotations
@@ -15,11 +16,12 @@ from collections import deque
 from dataclasses import dataclass
 
 from mavlink_bridge.config import YawGuardConfig
+from mavlink_bridge.messages import Attitude
 from mavlink_bridge.quaternion import wrap_pi
 
 _BASELINE_NS = 1_000_000_000
 _RELEASE_SHARE = 0.7
-_DRIFT_RAD_PER_S = math.radians(0.3)  # of the autopilot's yaw while no fix is seen
+_DRIFT_RAD_PER_S = math.radians(0.3)  # of the gyros while no fix is seen
 
 
 @dataclass(frozen=True)
@@ -50,15 +52,16 @@ class YawGuard:
         self._in_a_row = 0
         self.blocked = False
 
-    def check(self, time_ns: int, vision_yaw_rad: float, autopilot_yaw_rad: float) -> YawVerdict:
-        """Judge one fix; NaN on either side cannot be judged and follows the standing verdict."""
+    def check(self, time_ns: int, vision_yaw_rad: float, autopilot: Attitude | None) -> YawVerdict:
+        """Judge one fix; without a yaw on either side it follows the standing verdict."""
         if not self._config.enabled:
             return YawVerdict(True, math.nan)
-        if not (math.isfinite(vision_yaw_rad) and math.isfinite(autopilot_yaw_rad)):
+        if autopilot is None or not math.isfinite(vision_yaw_rad):
             self.unchecked += 1
             return YawVerdict(not self.blocked, math.nan)
-        difference = wrap_pi(vision_yaw_rad - autopilot_yaw_rad)
-        good = self._agrees(time_ns, difference)
+        difference = wrap_pi(vision_yaw_rad - autopilot.yaw_rad)
+        to_gyros = wrap_pi(vision_yaw_rad - autopilot.gyro_heading_rad)
+        good = self._agrees(time_ns, difference, to_gyros)
         if good != self.blocked:
             self._in_a_row = 0
         else:
@@ -67,10 +70,10 @@ class YawGuard:
                 self.blocked, self._in_a_row = not self.blocked, 0
         accept = good and not self.blocked
         if accept:
-            self._accepted.append((time_ns, difference))
+            self._accepted.append((time_ns, to_gyros))
         return YawVerdict(accept, difference)
 
-    def _agrees(self, time_ns: int, difference: float) -> bool:
+    def _agrees(self, time_ns: int, difference: float, to_gyros: float) -> bool:
         limit = math.radians(self._config.limit_deg) * (_RELEASE_SHARE if self.blocked else 1.0)
         gross = math.radians(self._config.gross_deg)
         if abs(difference) <= limit:
@@ -81,7 +84,6 @@ class YawGuard:
         gap_s = (time_ns - newest_ns) * 1e-9
         if gap_s > self._config.memory_s:
             return False
-        recent = [d for t, d in self._accepted if newest_ns - t <= _BASELINE_NS]
-        # A turn within the wrap is impossible here: both are within `gross` of zero.
-        change = abs(difference - statistics.median(recent))
+        recent = [wrap_pi(d - to_gyros) for t, d in self._accepted if newest_ns - t <= _BASELINE_NS]
+        change = abs(statistics.median(recent))
         return change <= min(limit + _DRIFT_RAD_PER_S * gap_s, gross)

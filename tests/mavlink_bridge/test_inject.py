@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 import math
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -31,10 +32,17 @@ METRE = 1.0 / 111318.84502145034
 
 
 def context(
-    origin: Origin | None = ORIGIN, profile: FirmwareProfile = ARDUPILOT, yaw: float = 0.0
+    origin: Origin | None = ORIGIN,
+    profile: FirmwareProfile = ARDUPILOT,
+    yaw: float = 0.0,
+    yaw_error_deg: Callable[[float], float] = lambda _: 0.0,
 ) -> InjectionContext:
+    """yaw_error_deg: the error of the estimated yaw by seconds; the gyros are right."""
+
     def attitude_at(time_ns: int) -> Attitude:
-        return Attitude(time_ns, 0.0, 0.0, yaw, from_euler(0.0, 0.0, yaw))
+        estimated = yaw + math.radians(yaw_error_deg(time_ns / SECOND))
+        q = from_euler(0.0, 0.0, estimated)
+        return Attitude(time_ns, 0.0, 0.0, estimated, q, gyro_heading_rad=0.7)
 
     return InjectionContext(origin, profile, attitude_at)
 
@@ -236,28 +244,36 @@ def test_frame_that_rotates_in_flight_is_refused_at_once_and_released_when_right
     assert it.counters["fixes_yaw_refused"] == 34  # 30 rotated, 4 on probation
 
 
-def test_drift_of_the_autopilots_own_yaw_does_not_withhold_vision() -> None:
-    # Hover on ODOMETRY: 6 deg in 6 s, vision right all the time.
+@pytest.mark.parametrize(
+    "error",
+    [
+        lambda t: -min(t, 8.0),  # hover on ODOMETRY: 6 deg in seconds
+        lambda t: -8.0 if t > 4.0 else 0.0,  # aligned again in flight
+    ],
+)
+def test_autopilots_own_yaw_error_does_not_withhold_vision(error: Any) -> None:
     it = injector(rate_hz=10, delay_ms=0)
-    sent = fly(it, seconds=12, fix_hz=10, latency_ms=0, change=turned_by(lambda t: min(t, 8.0)))
+    sent = fly(it, seconds=12, fix_hz=10, latency_ms=0, where=context(yaw_error_deg=error))
     assert len(sent) >= 118
     assert it.counters["fixes_yaw_refused"] == 0
+    assert math.degrees(it.yaw_difference_rad) == pytest.approx(8.0)
 
 
 def test_gross_difference_is_refused_however_slowly_it_came() -> None:
     it = injector(rate_hz=10, delay_ms=0)
-    sent = fly(it, seconds=30, fix_hz=10, latency_ms=0, change=turned_by(lambda t: t - 1.0))
-    assert max(i.estimate.position.time_ns for _, i in sent if i.estimate.fresh) <= 21.1 * SECOND
+    where = context(yaw_error_deg=lambda t: t - 1.0)
+    sent = fly(it, seconds=30, fix_hz=10, latency_ms=0, where=where)
+    assert 20 * SECOND < max(i.estimate.position.time_ns for _, i in sent) <= 22 * SECOND
 
 
-def test_difference_is_remembered_over_a_dropout() -> None:
+def test_gyros_are_trusted_over_a_dropout() -> None:
     it = injector(rate_hz=10, delay_ms=0)
+    where = context(yaw_error_deg=lambda t: 6.0 if t > 5.0 else 0.0)
 
     def dropout(f: VisionFix) -> VisionFix | None:
-        t = f.time_ns / SECOND
-        return None if 9.0 <= t < 15.0 else turned_by(lambda t: min(t, 6.0))(f)
+        return None if 9 * SECOND <= f.time_ns < 15 * SECOND else f
 
-    sent = fly(it, seconds=17, fix_hz=10, latency_ms=0, change=dropout)
+    sent = fly(it, seconds=17, fix_hz=10, latency_ms=0, where=where, change=dropout)
     assert [t for t, _ in sent if t > 15.5 * SECOND]
 
 

@@ -66,6 +66,20 @@ def test_attitude_is_extrapolated_a_little_and_not_more() -> None:
     assert it.attitude_at(10 * SECOND - 50 * MS) is None
 
 
+def test_gyro_heading_follows_the_turn_and_ignores_resets_of_the_estimator() -> None:
+    it = tracker()
+    rate = math.radians(50.0)
+    for i in range(500):
+        t = i / 50
+        estimated = quat.wrap_pi(rate * t + (0.14 if t > 5.0 else 0.0))
+        m = mavlink.MAVLink_attitude_message(int(t * 1000), 0.0, 0.0, estimated, 0.0, 0.0, rate)
+        it.handle(sent(m), 10 * SECOND + int(t * SECOND))
+    early, late = (it.attitude_at(10 * SECOND + ms * MS) for ms in (1000, 9000))
+    assert early is not None
+    assert late is not None
+    assert late.gyro_heading_rad - early.gyro_heading_rad == pytest.approx(rate * 8.0, abs=1e-3)
+
+
 def test_gap_in_the_attitudes_is_no_attitude() -> None:
     it = tracker()
     for ms in (0, 100, 900, 1000):
