@@ -1,4 +1,4 @@
-"""Command line of the training: ``python -m localizer.training {generate,train,export,curves}``."""
+"""Training from the command line: ``python -m localizer.training COMMAND``."""
 
 from __future__ import annotations
 
@@ -58,6 +58,19 @@ def curves(log: Annotated[Path, typer.Argument(help="CSV that a run wrote.")]) -
     from localizer.training.curves import plot
 
     typer.echo(plot(log))
+
+
+@app.command()
+def sheet(
+    shards: Annotated[list[Path], typer.Argument(help="Shards (.npz) to show pairs of.")],
+    out: Annotated[Path, typer.Option(help="PNG to write.")] = Path("pairs.png"),
+    pairs: Annotated[int, typer.Option(help="Pairs from each shard.")] = 2,
+) -> None:
+    """Show training pairs, each with its depth-warp check."""
+    from localizer.training.shards import read_shard
+    from localizer.training.sheet import contact_sheet
+
+    typer.echo(contact_sheet([p for s in shards for p in read_shard(s)[:pairs]], out))
 
 
 def scene_config(config: TrainConfig) -> SceneConfig:

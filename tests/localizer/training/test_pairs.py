@@ -1,6 +1,7 @@
 from dataclasses import replace
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 
@@ -9,6 +10,7 @@ from localizer.pose import Pose
 from localizer.training.land import PhotoLibrary
 from localizer.training.pairs import Pair, SceneConfig, scene_pairs, warp_check
 from localizer.training.shards import read_shard, write_shard, write_shards
+from localizer.training.sheet import contact_sheet
 
 SMALL = SceneConfig(cells=256, width=128, height=96, references=3, queries_per_light=3)
 
@@ -72,6 +74,15 @@ def test_shards_keep_what_was_generated(pairs: list[Pair], tmp_path: Path) -> No
     np.testing.assert_allclose(stored.reference_depth, pairs[0].reference_depth, rtol=1e-3)
     assert stored.camera == pairs[0].camera
     assert stored.world_from_query.distance_to(pairs[0].world_from_query) == (0.0, 0.0)
+
+
+def test_the_contact_sheet_shows_every_pair(pairs: list[Pair], tmp_path: Path) -> None:
+    image = cv2.imread(str(contact_sheet(pairs[:2], tmp_path / "sheet.png")))
+    assert image.shape == (2 * SMALL.height, 5 * SMALL.width, 3)
+    checker = image[: SMALL.height, 3 * SMALL.width : 4 * SMALL.width]
+    reference = image[: SMALL.height, : SMALL.width]
+    changed = (checker != reference).any(-1).mean()
+    assert 0.05 < changed < 0.6
 
 
 def test_shards_on_disk_are_not_made_again(tmp_path: Path) -> None:
