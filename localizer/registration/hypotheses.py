@@ -8,46 +8,58 @@ from scipy.spatial.transform import Rotation
 from localizer.pose import Array
 from localizer.types import PosePrior
 
+_LEAST_TICKS = 3  # per axis, however well the attitude is known
+
 
 def generate_hypotheses(
     prior: PosePrior,
     count: int = 144,
     *,
     box_deg: float = 11.0,
+    step_deg: float = 2.0,
     translation_limit_m: float = 1.0,
     reach: float = 2.2,
     seed: int = 0,
 ) -> tuple[Array, Array]:
-    """Rotations (M, 3, 3) and centres (M, 3) of M = `count` poses world_from_camera.
+    """Rotations (M, 3, 3) and centres (M, 3) of M <= `count` poses world_from_camera.
 
-    The unperturbed prior is the first. Rotation: a square grid over the two axes that move the
-    whole image, the camera's x (pitch) and y (yaw). Its half-width per axis is `reach` standard
-    deviations of the prior and at most `box_deg`; with the paper's 144 and 11 degrees the step is
-    2 degrees. Rotation about the optical axis, and translation: normal with the prior's
-    covariance, the deviation cut to ``box_deg / reach`` and `translation_limit_m` per axis. The
-    grid's farthest corner gives its place to the zero perturbation.
+    The unperturbed prior is the first. Rotation: a grid over the two axes that move the whole
+    image, the camera's x (pitch) and y (yaw). Its half-width per axis is `reach` standard
+    deviations of the prior and at most `box_deg`; its step is at most `step_deg` as long as
+    `count` allows. The paper's 144, 11 and 2 degrees make a 12 x 12 grid; a prior that is known
+    better makes a smaller one. Rotation about the optical axis, and translation: normal with the
+    prior's covariance, the deviation cut to ``box_deg / reach`` and `translation_limit_m` per
+    axis. The grid's farthest corner gives its place to the zero perturbation.
     """
     R = prior.world_from_camera.rotation
     sigma = np.sqrt(np.maximum(np.diag(R.T @ prior.covariance[3:, 3:] @ R), 0.0))
     box = np.radians(box_deg)
+    half = np.minimum(box, reach * sigma[:2])
+    grid = _grid(half, np.radians(step_deg), count)
     rng = np.random.default_rng(seed)
-    offsets = np.zeros((count, 3))
-    offsets[1:, :2] = _grid(count - 1) * np.minimum(box, reach * sigma[:2])
-    offsets[1:, 2] = rng.normal(0.0, min(sigma[2], box / reach), count - 1)
+    offsets = np.zeros((len(grid), 3))
+    offsets[1:, :2] = grid[:-1]
+    offsets[1:, 2] = rng.normal(0.0, min(sigma[2], box / reach), len(grid) - 1)
     root = _limited_square_root(prior.covariance[:3, :3], translation_limit_m)
-    shifts = rng.normal(0.0, 1.0, (count, 3)) @ root.T
+    shifts = rng.normal(0.0, 1.0, (len(grid), 3)) @ root.T
     shifts[0] = 0.0
     rotations: Array = R @ Rotation.from_rotvec(offsets).as_matrix()
     return rotations, prior.world_from_camera.translation + shifts
 
 
-def _grid(count: int) -> Array:
-    """The `count` points (count, 2) nearest to 0 of the smallest square grid over [-1, 1]²."""
-    side = int(np.ceil(np.sqrt(count)))
-    ticks = np.linspace(-1.0, 1.0, side) if side > 1 else np.zeros(1)
-    points = np.stack(np.meshgrid(ticks, ticks), axis=-1).reshape(-1, 2)
-    order = np.argsort(np.round(np.linalg.norm(points, axis=1), 9), kind="stable")
-    nearest: Array = points[order[:count]]
+def _grid(half: Array, step: float, count: int) -> Array:
+    """At most `count` points (M, 2), nearest first, of a grid over +-half per axis."""
+    most = max(1, int(np.sqrt(count)))
+    least = min(_LEAST_TICKS, most)
+    ticks = [
+        np.linspace(-h, h, n) if n > 1 else np.zeros(1)
+        for h, n in zip(
+            half, np.clip(np.ceil(2 * half / step - 1e-9) + 1, least, most).astype(int), strict=True
+        )
+    ]
+    points = np.stack(np.meshgrid(*ticks), axis=-1).reshape(-1, 2)
+    distance = np.round(np.linalg.norm(points / np.maximum(half, 1e-12), axis=1), 9)
+    nearest: Array = points[np.argsort(distance, kind="stable")]
     return nearest
 
 

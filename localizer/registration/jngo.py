@@ -40,6 +40,7 @@ from localizer.registration.reference import ReferenceBackend, in_view, project,
 from localizer.types import Anchors, FeaturePyramid, Float32, PosePrior, RegistrationStatus
 
 _PROBES = 12  # anchors whose projections tell hypotheses apart
+_COVARIANCE_ANCHORS = 1000  # enough for a covariance, cheap enough for every frame
 _LEAST_SCALE = 0.02  # of the polishing loss, where features fit perfectly
 _LEAST_SCORE = 1e-3  # unit of the motion term and priors where features fit perfectly
 
@@ -49,8 +50,9 @@ class JNGOConfig(BaseModel):
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
-    hypotheses: int = Field(default=144, ge=1, description="size M of the swarm")
+    hypotheses: int = Field(default=144, ge=1, description="largest size M of the swarm")
     box_deg: float = Field(default=11.0, gt=0, description="largest pitch and yaw perturbation")
+    step_deg: float = Field(default=2.0, gt=0, description="largest step of the pitch and yaw grid")
     translation_sigma_m: float = Field(
         default=1.0, ge=0, description="largest sigma of the perturbation"
     )
@@ -177,6 +179,7 @@ class JNGO:
             prior,
             c.hypotheses,
             box_deg=c.box_deg,
+            step_deg=c.step_deg,
             translation_limit_m=c.translation_sigma_m,
             reach=c.spread_sigmas,
             seed=seed,
@@ -278,9 +281,12 @@ class JNGO:
     def _result(self, origin: Array, prior: PosePrior, swarm: _Swarm) -> Registration:
         c, problem = self.config, swarm.problem
         R, t = swarm.rotations[0], swarm.translations[0]
-        model = anchor_model(problem, R, t, swarm.settings)
+        sample = _thinned(problem, _COVARIANCE_ANCHORS)
+        share = sample.points.shape[1] / problem.points.shape[1]
+        model = anchor_model(sample, R, t, swarm.settings)
         weight = 0.0 if problem.prior is None else problem.prior.weight
-        correlation = self._correlation(problem, len(model.weights))
+        # The sample's sandwich is 1 / share times that of all anchors.
+        correlation = share * self._correlation(problem, len(model.weights) / share)
         tangent = tangent_covariance(model, correlation, c.covariance_floor, weight)
         if tangent is None:
             return _failure(prior, RegistrationStatus.NO_TEXTURE, swarm.evaluations)
@@ -302,7 +308,7 @@ class JNGO:
             swarm.evaluations,
         )
 
-    def _correlation(self, problem: LevelProblem, anchors: int) -> float:
+    def _correlation(self, problem: LevelProblem, anchors: float) -> float:
         """Variance factor of `anchors` in view: neighbours that share image content count once."""
         density = anchors / problem.confidence.size
         return self.config.correlation + self.config.correlation_area_px * density

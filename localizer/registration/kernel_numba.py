@@ -34,6 +34,7 @@ _JIT: dict[str, Any] = {
     "boundscheck": False,
 }
 _F = np.float32
+_HYPOTHESES_PER_THREAD = 8  # fewer finish sooner than another thread wakes up
 _ROWS = 24  # scratch rows of N floats per worker
 _SUMS = 29  # 21 of H (lower triangle), 6 of g, cost, weight
 
@@ -437,7 +438,7 @@ class NumbaBackend:
             np.ascontiguousarray(prior_R), np.ascontiguousarray(prior_t),
             np.ascontiguousarray(information), 0.0 if prior is None else float(prior.weight),
         )  # fmt: skip
-        workers = min(self._threads, M)
+        workers = max(1, min(self._threads, M // _HYPOTHESES_PER_THREAD))
         scratch = self._workspace(N)
         cuts = np.linspace(0, M, workers + 1).astype(int)
         if workers == 1:

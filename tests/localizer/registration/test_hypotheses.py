@@ -48,7 +48,7 @@ def test_the_papers_box():
 def test_the_unperturbed_prior_is_always_there(count):
     prior = wide()
     rotations, centres = generate_hypotheses(prior, count)
-    assert len(rotations) == len(centres) == count
+    assert len(rotations) == len(centres) == min(int(np.sqrt(count)), 12) ** 2
     np.testing.assert_allclose(rotations[0], prior.world_from_camera.rotation, atol=1e-14)
     np.testing.assert_array_equal(centres[0], prior.world_from_camera.translation)
 
@@ -60,7 +60,7 @@ def test_spread_follows_the_covariance_per_axis():
     covariance[:3, :3] = np.diag([0.01, 0.04, 0.0])
     covariance[3:, 3:] = R @ np.diag(np.radians([0.2, 3.0, 0.1]) ** 2) @ R.T
     prior = prior_with(covariance)
-    rotations, centres = generate_hypotheses(prior, 144, seed=1)
+    rotations, centres = generate_hypotheses(prior, 144, step_deg=0.1, seed=1)
     turns = camera_turns(prior, rotations)
     assert np.abs(turns[:, 0]).max() < 0.6
     assert 5.5 < np.abs(turns[:, 1]).max() < 7.5
@@ -68,6 +68,14 @@ def test_spread_follows_the_covariance_per_axis():
     assert shifts[:, 0].std() == pytest.approx(0.1, rel=0.25)
     assert shifts[:, 1].std() == pytest.approx(0.2, rel=0.25)
     assert np.abs(shifts[:, 2]).max() < 1e-9
+
+
+@pytest.mark.parametrize(("sigma_deg", "size"), [(0.1, 9), (1.0, 16), (2.0, 36), (20.0, 144)])
+def test_a_better_prior_needs_fewer_hypotheses(sigma_deg, size):
+    """The paper's 2 degree step over +-2.2 sigma, at least 3 x 3."""
+    prior = prior_with(np.diag([1.0] * 3 + [np.radians(sigma_deg) ** 2] * 3))
+    rotations, _ = generate_hypotheses(prior, 144)
+    assert len(rotations) == size
 
 
 def test_translation_is_limited_to_the_papers_sigma():

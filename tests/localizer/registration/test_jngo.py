@@ -206,7 +206,7 @@ def test_motion_term_chooses_between_equal_modes(place, camera, prior):
     nadir = Pose(np.diag([1.0, -1.0, -1.0]), np.array([0.0, 0.0, 110.0]))
     anchors = select_anchors(ground.view(nadir, camera), ground.pyramid(nadir, camera), 300)
     query = ground.pyramid(nadir, camera, noise=0.1, seed=1)
-    jngo = JNGO(JNGOConfig(translation_sigma_m=10.0, spread_sigmas=0.1))
+    jngo = JNGO(JNGOConfig(translation_sigma_m=10.0, spread_sigmas=0.1, step_deg=0.02))
     midway = Pose(nadir.rotation, nadir.translation + np.array([0.5 * period, 0.0, 0.0]))
     for mode_x in (0.0, period):
         mode = nadir.translation + np.array([mode_x, 0.0, 0.0])
