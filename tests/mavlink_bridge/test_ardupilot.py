@@ -15,14 +15,25 @@ from typing import Any
 
 import numpy as np
 import pytest
+from pymavlink import mavutil
+from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
-from mavlink_bridge import Bridge, BridgeConfig, VisionFix
-from mavlink_bridge.config import InjectionConfig, OriginConfig
+from mavlink_bridge import Bridge, BridgeConfig, TargetReport, VisionFix
+from mavlink_bridge.config import InjectionConfig, OriginConfig, SourceSwitchConfig
+from mavlink_bridge.doctor import examine, repair
+from mavlink_bridge.link import sleep_until
 from mavlink_bridge.origin import METRES_PER_DEGREE
 from sitl.ardupilot import ArduPilotSitl, find_arducopter
 from sitl.embedded.geodesy import Location
 from sitl.pilot import Pilot
-from sitl.vehicles import gps_input_only_parameters, vision_only_parameters
+from sitl.vehicles import (
+    GIMBAL,
+    GPS_OFF,
+    SPEEDS,
+    gps_input_only_parameters,
+    vision_only_parameters,
+    vision_parameters,
+)
 
 pytestmark = [
     pytest.mark.sitl,
@@ -31,9 +42,13 @@ pytestmark = [
 
 HOME = Location(47.397742, 8.545594, 488.0)
 GEOID = 47.3
+ORIGIN = OriginConfig(
+    latitude_deg=HOME.latitude_deg,
+    longitude_deg=HOME.longitude_deg,
+    altitude_amsl_m=HOME.altitude_m,
+)
 HEIGHT = 60.0
 SIDE = 120.0
-SPEEDS = {"WPNAV_SPEED": 1000, "WPNAV_SPEED_UP": 500, "WPNAV_ACCEL": 250}
 
 
 @dataclass
@@ -133,9 +148,15 @@ def fly() -> Iterator[Callable[..., Flight]]:
     ends: list[Callable[[], Any]] = []
 
     def start(
-        parameters: dict[str, float], injection: InjectionConfig, **feed_options: Any
+        parameters: dict[str, float],
+        injection: InjectionConfig,
+        *,
+        gps: bool = False,
+        switch: SourceSwitchConfig | None = None,
+        **feed_options: Any,
     ) -> Flight:
-        vehicle = ArduPilotSitl(HOME, parameters={**parameters, **SPEEDS, "SIM_GPS1_ENABLE": 0})
+        receiver = {} if gps else GPS_OFF
+        vehicle = ArduPilotSitl(HOME, parameters={**parameters, **SPEEDS, **receiver})
         vehicle.start()
         ends.append(vehicle.stop)
         pilot = Pilot(vehicle.gcs_endpoint, alive=vehicle.check)
@@ -266,3 +287,81 @@ def test_gps_input(fly: Callable[..., Flight]) -> None:
     median, p95, _ = report("GPS_INPUT without velocity", flight.errors(began))
     assert median <= 0.34 * 1.25
     assert p95 <= 0.71 * 1.25
+
+
+def test_gnss_loss_switches_the_source_set(fly: Callable[..., Flight]) -> None:
+    flight = fly(
+        vision_parameters(),
+        InjectionConfig(rate_hz=10, delay_ms=100),
+        gps=True,
+        switch=SourceSwitchConfig(enabled=True),
+        sigma_m=0.3,
+    )
+    assert flight.bridge.shadow_score().go, flight.bridge.shadow_score().line()
+    assert flight.bridge.counters()["ekf_source_set"] == 1
+    hover = flight.pilot.truth
+    flight.pilot.gps(on=False)
+    flight.pilot.sleep(15.0)
+    assert flight.bridge.counters()["ekf_source_set"] == 2
+    assert any("EKF source set 2: GNSS" in text for text in flight.bridge.texts())
+    assert flight.pilot.mode == "GUIDED"
+    moved = flight.pilot.truth.location.ned_of(hover.location)
+    assert math.hypot(moved[0], moved[1]) < 1.2 * 1.25
+    assert flight.bridge.counters()["bridge_source_switches"] == 1
+
+
+def test_doctor_finds_and_fixes_what_is_wrong() -> None:
+    wrong = {
+        "GPS1_TYPE": 0,
+        "VISO_TYPE": 1,
+        "EK3_SRC1_POSXY": 6,
+        "EK3_SRC1_VELXY": 3,
+        "EK3_SRC1_VELZ": 3,
+        "EK3_SRC1_POSZ": 1,
+        "EK3_SRC1_YAW": 1,
+        "VISO_DELAY_MS": 10,
+        "VISO_QUAL_MIN": 40,
+    }
+    with ArduPilotSitl(HOME, parameters={**wrong, **GIMBAL}) as vehicle:
+        config = BridgeConfig(connection=vehicle.companion_endpoint, origin=ORIGIN)
+        before = examine(config)
+        assert before.exit_code == 2
+        bad = {f.name for f in before.findings if not f.ok}
+        assert bad == {"EK3_SRC1_VELXY", "EK3_SRC1_VELZ", "VISO_DELAY_MS", "VISO_QUAL_MIN"}
+        repair(config, before.fixable)
+        after = examine(config)
+        assert after.exit_code == 0, [f for f in after.findings if not f.ok]
+
+
+def test_gimbal_and_targets_through_ardupilots_routing() -> None:
+    with ArduPilotSitl(HOME, parameters=GIMBAL) as vehicle:
+        station = mavutil.mavlink_connection(
+            vehicle.spare_endpoint, source_system=255, source_component=190, dialect="ardupilotmega"
+        )
+        bridge = Bridge(BridgeConfig(connection=vehicle.companion_endpoint, mode="shadow"), GEOID)
+        with bridge:
+            assert sleep_until(lambda: bridge.state().connected, 20.0)
+            seen: dict[str, Any] = {}
+            end = time.monotonic() + 20.0
+            while len(seen) < 3 and time.monotonic() < end:
+                bridge.report(
+                    TargetReport(time.monotonic_ns(), 47.398, 8.546, 535.3, pixel=(0.5, 0.5))
+                )
+                station.mav.heartbeat_send(6, 8, 0, 0, 4)
+                station.mav.command_long_send(1, 100, 512, 0, 259, 0, 0, 0, 0, 0, 0)
+                while (m := station.recv_match(blocking=True, timeout=0.1)) is not None:
+                    if m.get_srcComponent() == 100 and m.get_type() != "HEARTBEAT":
+                        seen.setdefault(m.get_type(), m)
+                    if time.monotonic() > end:
+                        break
+            geo = seen["CAMERA_TRACKING_GEO_STATUS"]
+            assert (geo.lat, geo.lon) == (473980000, 85460000)
+            assert geo.alt == pytest.approx(535.3 - GEOID, abs=0.01)
+            assert seen["CAMERA_INFORMATION"].flags & mavlink.CAMERA_CAP_FLAGS_HAS_TRACKING_POINT
+
+            def gimbal() -> Any:
+                return bridge.gimbal_at(time.monotonic_ns() - 200_000_000)
+
+            assert sleep_until(lambda: gimbal() is not None, 15.0)
+            assert gimbal().source == "GIMBAL_DEVICE_ATTITUDE_STATUS"
+        station.close()
