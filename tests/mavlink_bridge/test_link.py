@@ -1,0 +1,314 @@
+"""Links by themselves: TCP that breaks, serial, limits, queues; streams that are asked for."""
+
+from __future__ import annotations
+
+import os
+import pty
+import socket
+import threading
+import time
+import tty
+from collections.abc import Callable, Iterator
+from typing import Any
+
+import pytest
+from pydantic import ValidationError
+from pymavlink.dialects.v20 import ardupilotmega as mavlink
+
+from mavlink_bridge import BridgeConfig
+from mavlink_bridge.config import InjectionConfig, TargetsConfig
+from mavlink_bridge.errors import BridgeStateError, EndpointError
+from mavlink_bridge.link import Link, sleep_until
+from mavlink_bridge.streams import StreamKeeper, wanted_streams
+from mavlink_bridge.transport import Endpoint
+
+SECOND = 1_000_000_000
+HEARTBEAT = mavlink.MAVLink_heartbeat_message(2, 3, 81, 4, 4, 3)
+
+
+def packed(system: int = 1) -> bytes:
+    return bytes(HEARTBEAT.pack(mavlink.MAVLink(None, system, 1)))
+
+
+class Recorder:
+    """A handler that remembers; `fail` makes it raise."""
+
+    def __init__(self) -> None:
+        self.opened = 0
+        self.messages: list[Any] = []
+        self.ticks = 0
+        self.fail = False
+
+    def on_open(self, link: Link) -> None:
+        self.opened += 1
+
+    def on_message(self, link: Link, message: Any, time_ns: int) -> None:
+        self.messages.append(message)
+        if self.fail:
+            raise RuntimeError("handler")
+
+    def on_tick(self, link: Link, now_ns: int) -> int:
+        self.ticks += 1
+        return now_ns + SECOND // 10
+
+
+@pytest.fixture
+def start() -> Iterator[Callable[..., tuple[Link, Recorder]]]:
+    links = []
+
+    def make(endpoint: str, **options: Any) -> tuple[Link, Recorder]:
+        handler = Recorder()
+        link = Link(Endpoint.parse(endpoint), handler, **options)
+        link.system_id = 1
+        links.append(link)
+        link.start()
+        return link, handler
+
+    yield make
+    for link in links:
+        link.stop()
+
+
+def listen(port: int = 0) -> socket.socket:
+    server = socket.socket(socket.AF_INET, socket.SOCK_STREAM)
+    server.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+    server.bind(("127.0.0.1", port))
+    server.listen(4)
+    server.settimeout(8.0)
+    return server
+
+
+@pytest.mark.parametrize(
+    ("text", "kind", "address", "number"),
+    [
+        ("udpin:0.0.0.0:14550", "udpin", "0.0.0.0", 14550),
+        ("tcp:host.example:5762", "tcp", "host.example", 5762),
+        ("serial:/dev/ttyTHS1:921600", "serial", "/dev/ttyTHS1", 921600),
+        ("udpout:10.0.0.1:14550", "udpout", "10.0.0.1", 14550),
+    ],
+)
+def test_endpoints(text: str, kind: str, address: str, number: int) -> None:
+    endpoint = Endpoint.parse(text)
+    assert (endpoint.kind, endpoint.address, endpoint.number) == (kind, address, number)
+    assert str(endpoint) == text
+
+
+@pytest.mark.parametrize("text", ["", "tcp", "tcp:host", "ftp:host:1", "tcp:host:port", "tcp::1"])
+def test_wrong_endpoints_say_what_is_wanted(text: str) -> None:
+    with pytest.raises(EndpointError, match="udpin:HOST:PORT"):
+        Endpoint.parse(text)
+    with pytest.raises(ValidationError, match="is no endpoint"):
+        BridgeConfig(connection=text)
+
+
+def test_port_out_of_range() -> None:
+    with pytest.raises(EndpointError, match="70000 is no port"):
+        Endpoint.parse("tcp:host:70000")
+
+
+def test_configuration_refuses_what_cannot_work() -> None:
+    with pytest.raises(ValidationError, match="rate_hz >= 5"):
+        InjectionConfig(message="gps_input", rate_hz=4.0)
+    with pytest.raises(ValidationError, match="needs ground_connection"):
+        BridgeConfig(targets=TargetsConfig(adsb=True))
+    with pytest.raises(ValidationError, match="extra"):
+        BridgeConfig(conection="tcp:localhost:1")  # type: ignore[call-arg]
+    assert BridgeConfig(mode=False).mode == "off"  # type: ignore[arg-type]
+
+
+def test_tcp_is_reopened_when_the_server_goes_and_comes_back(
+    start: Callable[..., tuple[Link, Recorder]],
+) -> None:
+    server = listen()
+    port = server.getsockname()[1]
+    link, handler = start(f"tcp:127.0.0.1:{port}")
+    first, _ = server.accept()
+    first.sendall(packed())
+    assert sleep_until(lambda: len(handler.messages) == 1, 3.0)
+    first.close()
+    server.close()
+    assert sleep_until(lambda: link.counters.open_failures > 0, 5.0)
+    assert not link.connected
+    server = listen(port)
+    second, _ = server.accept()
+    second.sendall(packed())
+    assert sleep_until(lambda: len(handler.messages) == 2, 5.0)
+    assert handler.opened == 2
+    second.close()
+    server.close()
+
+
+def test_silent_tcp_is_reopened(start: Callable[..., tuple[Link, Recorder]]) -> None:
+    with listen() as server:
+        link, _ = start(f"tcp:127.0.0.1:{server.getsockname()[1]}", timeout_s=0.4)
+        silent, _ = server.accept()
+        again, _ = server.accept()
+        assert link.counters.timeouts >= 1
+        silent.close()
+        again.close()
+
+
+def test_half_a_frame_before_a_break_does_not_spoil_the_next(
+    start: Callable[..., tuple[Link, Recorder]],
+) -> None:
+    with listen() as server:
+        _, handler = start(f"tcp:127.0.0.1:{server.getsockname()[1]}")
+        first, _ = server.accept()
+        first.sendall(packed()[:7])
+        time.sleep(0.1)
+        first.close()
+        second, _ = server.accept()
+        second.sendall(packed())
+        assert sleep_until(lambda: len(handler.messages) == 1, 3.0)
+        second.close()
+
+
+def test_peer_that_does_not_read_costs_messages_not_memory_or_time(
+    start: Callable[..., tuple[Link, Recorder]],
+) -> None:
+    with listen() as server:
+        link, _ = start(f"tcp:127.0.0.1:{server.getsockname()[1]}")
+        deaf, _ = server.accept()
+        text = mavlink.MAVLink_statustext_message(6, b"x" * 50)
+        begun = time.monotonic()
+        for _ in range(200):
+            for _ in range(400):
+                link.send(text, 191)
+            time.sleep(0.002)
+        assert time.monotonic() - begun < 10.0
+        assert sleep_until(lambda: link.counters.tx_dropped > 1000, 3.0)
+        assert len(link._unsent) < 128 * 1024
+        deaf.close()
+
+
+def test_tcp_server_takes_a_client(start: Callable[..., tuple[Link, Recorder]]) -> None:
+    with listen() as probe:
+        port = probe.getsockname()[1]
+    _, handler = start(f"tcpin:127.0.0.1:{port}")
+    client = None
+    end = time.monotonic() + 5.0
+    while client is None and time.monotonic() < end:
+        try:
+            client = socket.create_connection(("127.0.0.1", port), timeout=1.0)
+        except ConnectionRefusedError:
+            time.sleep(0.05)
+    assert client is not None
+    client.sendall(packed())
+    assert sleep_until(lambda: len(handler.messages) == 1, 3.0)
+    client.close()
+
+
+def test_serial_port_both_ways_and_unplugged(
+    start: Callable[..., tuple[Link, Recorder]],
+) -> None:
+    master, slave = pty.openpty()
+    tty.setraw(slave)
+    link, handler = start(f"serial:{os.ttyname(slave)}:115200")
+    assert sleep_until(lambda: link.connected, 3.0)
+    os.write(master, packed())
+    assert sleep_until(lambda: len(handler.messages) == 1, 3.0)
+    link.send(HEARTBEAT, 191)
+    codec = mavlink.MAVLink(None)
+    (message,) = codec.parse_buffer(os.read(master, 4096))
+    assert (message.get_srcSystem(), message.get_srcComponent()) == (1, 191)
+    os.close(slave)
+    os.close(master)
+    assert sleep_until(lambda: link.counters.open_failures > 0, 5.0)
+
+
+def test_rate_limit_is_per_message_and_component(
+    start: Callable[..., tuple[Link, Recorder]],
+) -> None:
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as peer:
+        peer.bind(("127.0.0.1", 0))
+        link, _ = start(
+            f"udpout:127.0.0.1:{peer.getsockname()[1]}",
+            min_interval_ns={mavlink.MAVLINK_MSG_ID_HEARTBEAT: SECOND // 5},
+        )
+        assert sleep_until(lambda: link.connected, 3.0)
+        for _ in range(50):
+            link.send(HEARTBEAT, 191)
+            link.send(HEARTBEAT, 197)
+            link.send(mavlink.MAVLink_timesync_message(0, 1), 191)
+            time.sleep(0.01)
+        assert sleep_until(lambda: link.counters.tx_rate_limited > 80, 2.0)
+        assert 50 + 2 * 2 <= link.counters.tx_messages <= 50 + 2 * 6
+
+
+def test_failing_handler_is_counted_and_the_link_lives(
+    start: Callable[..., tuple[Link, Recorder]],
+) -> None:
+    with listen() as server:
+        link, handler = start(f"tcp:127.0.0.1:{server.getsockname()[1]}")
+        client, _ = server.accept()
+        handler.fail = True
+        client.sendall(packed() * 3)
+        assert sleep_until(lambda: link.counters.handler_errors == 3, 3.0)
+        handler.fail = False
+        client.sendall(packed())
+        assert sleep_until(lambda: len(handler.messages) == 4, 3.0)
+        client.close()
+
+
+def test_nothing_is_sent_before_the_vehicles_id_is_known(
+    start: Callable[..., tuple[Link, Recorder]],
+) -> None:
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as peer:
+        peer.bind(("127.0.0.1", 0))
+        link, _ = start(f"udpout:127.0.0.1:{peer.getsockname()[1]}")
+        link.system_id = 0
+        assert sleep_until(lambda: link.connected, 3.0)
+        link.send(HEARTBEAT, 191)
+        assert sleep_until(lambda: link.counters.tx_dropped == 1, 2.0)
+        assert link.counters.tx_messages == 0
+
+
+def test_neither_threads_nor_descriptors_leak() -> None:
+    def descriptors() -> int:
+        return len(os.listdir("/proc/self/fd"))
+
+    threads, before = threading.active_count(), descriptors()
+    for _ in range(20):
+        link = Link(Endpoint.parse("udpin:127.0.0.1:0"), Recorder())
+        link.start()
+        assert sleep_until(lambda link=link: link.connected, 2.0)  # type: ignore[misc]
+        link.stop()
+    assert threading.active_count() == threads
+    assert descriptors() == before
+    with pytest.raises(BridgeStateError, match="already started"):
+        link.start()
+
+
+# --- streams ------------------------------------------------------------------------------------
+
+
+def names(keeper: StreamKeeper, config: BridgeConfig, now_s: float) -> set[str]:
+    return {s.name for s in keeper.due(wanted_streams(config, "ardupilot"), int(now_s * SECOND))}
+
+
+def test_streams_are_asked_once_while_they_flow_and_again_when_they_stop() -> None:
+    keeper, config = StreamKeeper(), BridgeConfig()
+    assert "ATTITUDE" in names(keeper, config, 10.0)
+    for t in range(11, 20):
+        keeper.seen("ATTITUDE", t * SECOND)
+        assert "ATTITUDE" not in names(keeper, config, t + 0.5)
+    assert "ATTITUDE" in names(keeper, config, 25.0)
+
+
+def test_old_gimbal_message_is_asked_for_only_when_the_new_one_stays_silent() -> None:
+    keeper, config = StreamKeeper(), BridgeConfig()
+    asked = [names(keeper, config, 10.0 + 2.5 * i) for i in range(12)]
+    new, old = "GIMBAL_DEVICE_ATTITUDE_STATUS", "MOUNT_STATUS"
+    assert [new in a for a in asked[:4]] == [True, True, False, False]
+    assert old not in asked[0] | asked[1]
+    assert sum(old in a for a in asked) == 2
+    flowing = StreamKeeper()
+    for t in range(10, 30):
+        flowing.seen(new, t * SECOND)
+        assert old not in names(flowing, config, t + 0.1)
+
+
+def test_rc_channels_and_estimator_by_configuration() -> None:
+    wanted = {s.name for s in wanted_streams(BridgeConfig(mode="rc"), "px4")}
+    assert {"RC_CHANNELS", "ESTIMATOR_STATUS"} <= wanted
+    assert "EKF_STATUS_REPORT" not in wanted
