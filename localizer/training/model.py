@@ -2,10 +2,11 @@
 
 Each level gives unit-length features and a confidence in (0, 1), the complement of the paper's
 uncertainty (Sec. 3.3.1, A.1). Eight channels are fixed orientation energy (`orientation`), the rest
-is learned; what share each has in the squared distance is learned too. The learned confidence
-scales the orientation's between a third and one: left free, it gathered the anchors in a few places
-and cost accuracy. The finest level is at stride 2: half the paper's, a quarter of the work. The
-coarsest stage is dilated, because at stride 8 a wide field of view costs next to nothing.
+is learned; what share each has in the squared distance is learned too. The confidence is the
+orientation's clarity: one that was learned with the features gathered the anchors in a few places
+and cost accuracy each time it was tried (docs/model-card.md). The finest level is at stride 2: half
+the paper's, a quarter of the work. The coarsest stage is dilated, because at stride 8 a wide field
+of view costs next to nothing.
 """
 
 from __future__ import annotations
@@ -109,7 +110,6 @@ class TinyNet(nn.Module):
         self.orientation = nn.ModuleList(OrientationFeatures(s) for s in STRIDES)
         self.share = nn.Parameter(torch.zeros(len(STRIDES)))
         self.features = nn.ModuleList(nn.Conv2d(c, learned, 1) for c in (w2, d1, d2))
-        self.confidence = nn.ModuleList(nn.Conv2d(c, 1, 1) for c in (w2, d1, d2))
 
     def forward(self, image: Tensor) -> list[tuple[Tensor, Tensor]]:
         """See the class."""
@@ -125,8 +125,7 @@ class TinyNet(nn.Module):
             unit = f * torch.rsqrt((f * f).sum(1, keepdim=True) + 1e-8)
             share = torch.sigmoid(self.share[k])
             both = torch.cat([torch.sqrt(share) * oriented, torch.sqrt(1 - share) * unit], 1)
-            trust = clear * (0.3 + 0.7 * torch.sigmoid(self.confidence[k](x))[:, 0])
-            levels.append((both, trust))
+            levels.append((both, clear))
         return levels
 
 
