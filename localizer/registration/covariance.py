@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from localizer.pose import Array, Pose
@@ -26,7 +27,8 @@ class AnchorModel:
 
     projection: (N, 2, 6) of equation 6; structure: (N, 2, 2) and slope: (N, 2), S and b of
     equation 7; squares: (N,) squared residual norms; weights: (N,) joint confidences; robust: (N,)
-    the loss's weights; channels: C; prior_hessian: (6, 6).
+    the loss's weights; cell: (N,) number, from 0 on, of the image cell in which it lies; channels:
+    C; prior_hessian: (6, 6).
     """
 
     projection: Array
@@ -35,14 +37,19 @@ class AnchorModel:
     squares: Array
     weights: Array
     robust: Array
+    cell: NDArray[np.int64]
     channels: int
     prior_hessian: Array
 
 
 def anchor_model(
-    problem: LevelProblem, rotation: Array, translation: Array, settings: LMSettings
+    problem: LevelProblem,
+    rotation: Array,
+    translation: Array,
+    settings: LMSettings,
+    cell_px: float,
 ) -> AnchorModel:
-    """The model at one pose, of the anchors in view."""
+    """The model at one pose, of the anchors in view; `cell_px` is the side of a cell."""
     x, uv = project(problem, rotation, translation)
     visible = in_view(problem, x, uv)
     x, (u, v) = x[visible], uv[visible].T
@@ -62,9 +69,17 @@ def anchor_model(
         squares,
         confidence,
         robust_loss(np.sqrt(squares), settings)[1],
+        _cells(u, v, cell_px),
         residuals.shape[1],
         prior_hessian,
     )
+
+
+def _cells(u: Array, v: Array, side: float) -> NDArray[np.int64]:
+    across = int(u.max(initial=0.0) // side) + 1
+    key = (v // side).astype(np.int64) * across + (u // side).astype(np.int64)
+    number: NDArray[np.int64] = np.unique(key, return_inverse=True)[1]
+    return number
 
 
 def tangent_covariance(
@@ -72,10 +87,10 @@ def tangent_covariance(
 ) -> Array | None:
     """Covariance (6, 6) of xi = (rho, phi) at the optimum, None where H is singular.
 
-    The sandwich of equation 11 takes the residuals' own variance, and their correlation between
-    channels, from the data. correlation: variance factor for anchors that see the same image
-    content. floor: least share of the isotropic model, so that a perfect fit does not claim
-    perfect knowledge. A prior of weight `prior_weight` adds its own noise.
+    The sandwich of equation 11 takes the residuals' variance, and their correlation between
+    channels and within a cell of the image, from the data. correlation: variance factor for what
+    it cannot see. floor: least share of the isotropic model, so that a perfect fit does not claim perfect
+    knowledge. A prior of weight `prior_weight` adds its own noise.
     """
     scale = model.weights * model.robust
     total = model.weights.sum()
@@ -94,9 +109,15 @@ def tangent_covariance(
         return None
     inverse = np.linalg.inv(scaled) * np.outer(spread, spread)
     per_anchor = (J.transpose(0, 2, 1) @ (share * model.slope[:, :, None]))[:, :, 0]
+    cells = int(model.cell.max()) + 1
+    if cells <= 6:
+        return None
+    per_cell = np.zeros((cells, 6))
+    np.add.at(per_cell, model.cell, per_anchor)
+    meat = per_cell.T @ per_cell * (cells / (cells - 6))
     variance = scale @ model.squares / max(scale.sum(), 1e-12) / model.channels
     isotropic = variance * (share * information).sum(axis=0)
-    noise = correlation * (per_anchor.T @ per_anchor + floor * isotropic)
+    noise = correlation * (meat + floor * isotropic)
     covariance: Array = inverse @ (noise + prior_weight * model.prior_hessian) @ inverse
     return 0.5 * (covariance + covariance.T)
 

@@ -85,11 +85,9 @@ class JNGOConfig(BaseModel):
         default=0.02, ge=0, description="lambda of Eq. 10, in best costs per d²"
     )
     prior_weight: float = Field(default=0.02, ge=0, description="weight of a constraint, likewise")
-    correlation: float = Field(
-        default=5.0, gt=0, description="covariance factor for map and feature errors"
-    )
-    correlation_area_px: float = Field(
-        default=130.0, ge=0, description="finest-level px² within which anchors say the same"
+    correlation: float = Field(default=14.0, gt=0, description="covariance factor, calibrated")
+    correlation_px: float = Field(
+        default=16.0, gt=0, description="finest-level cell within which residuals may correlate"
     )
     covariance_floor: float = Field(
         default=0.05, ge=0, description="least share of the isotropic model"
@@ -282,17 +280,14 @@ class JNGO:
         c, problem = self.config, swarm.problem
         R, t = swarm.rotations[0], swarm.translations[0]
         sample = _thinned(problem, _COVARIANCE_ANCHORS)
-        share = sample.points.shape[1] / problem.points.shape[1]
-        model = anchor_model(sample, R, t, swarm.settings)
+        model = anchor_model(sample, R, t, swarm.settings, c.correlation_px)
         weight = 0.0 if problem.prior is None else problem.prior.weight
-        # The sample's sandwich is 1 / share times that of all anchors.
-        correlation = share * self._correlation(problem, len(model.weights) / share)
-        tangent = tangent_covariance(model, correlation, c.covariance_floor, weight)
+        tangent = tangent_covariance(model, c.correlation, c.covariance_floor, weight)
         if tangent is None:
             return _failure(prior, RegistrationStatus.NO_TEXTURE, swarm.evaluations)
         rotations, centres = world_from_camera(swarm.rotations, swarm.translations, origin)
         pose = Pose(rotations[0], centres[0])
-        probabilities = self._mode_probabilities(swarm)
+        probabilities = _mode_probabilities(swarm.scores, int(model.cell.max()) + 1)
         differences = pose_differences(rotations, centres, pose)
         covariance = pose_covariance(tangent, R, t) + mode_spread(differences, probabilities)
         if np.sqrt(np.linalg.eigvalsh(covariance[:3, :3])[-1]) > c.max_sigma_m:
@@ -307,21 +302,6 @@ class JNGO:
             int(np.isfinite(swarm.scores).sum()),
             swarm.evaluations,
         )
-
-    def _correlation(self, problem: LevelProblem, anchors: float) -> float:
-        """Variance factor of `anchors` in view: neighbours that share image content count once."""
-        density = anchors / problem.confidence.size
-        return self.config.correlation + self.config.correlation_area_px * density
-
-    def _mode_probabilities(self, swarm: _Swarm) -> Array:
-        """Posterior weight (M,) of each surviving mode, by the scores of the swarm's anchors."""
-        anchors = self.config.swarm_anchors[-1] * swarm.overlaps[0]
-        effective = anchors / self._correlation(swarm.problem, anchors)
-        best = max(swarm.scores[0], _LEAST_SCORE)
-        excess = np.maximum(swarm.scores - swarm.scores[0], 0.0) / best
-        likelihood = np.exp(-0.5 * effective * excess)
-        probabilities: Array = likelihood / likelihood.sum()
-        return probabilities
 
     def warm_up(self, channels: int) -> None:
         """Compile (or load from numba's cache) the kernel for feature maps of `channels`."""
@@ -389,6 +369,14 @@ def _failure(prior: PosePrior, status: RegistrationStatus, evaluations: int = 0)
     return Registration(
         prior.world_from_camera, prior.covariance, np.inf, 0.0, 0.0, status, 0, evaluations
     )
+
+
+def _mode_probabilities(scores: Array, effective: float) -> Array:
+    """Posterior weight (M,) of each surviving mode, were so many anchors independent."""
+    excess = np.maximum(scores - scores[0], 0.0) / max(scores[0], _LEAST_SCORE)
+    likelihood = np.exp(-0.5 * effective * excess)
+    probabilities: Array = likelihood / likelihood.sum()
+    return probabilities
 
 
 def _thinned(problem: LevelProblem, count: int) -> LevelProblem:
