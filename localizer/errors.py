@@ -35,6 +35,10 @@ class OutsideMapError(MapError):
     """A pose whose view does not meet the map."""
 
 
+class RenderError(LocalizerError):
+    """A renderer backend that is not available, or that is used by the wrong thread."""
+
+
 class ModelError(LocalizerError):
     """A feature network that is missing, corrupt or of the wrong shape."""
 

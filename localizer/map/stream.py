@@ -57,7 +57,14 @@ class TileStreamer:
         byte_budget: int = 512 << 20,
         max_error_px: float = DetailLimits.max_error_px,
         max_texel_px: float = DetailLimits.max_texel_px,
+        bytes_per_select: int = 64 << 20,
     ) -> None:
+        """Start the loader thread.
+
+        byte_budget: of decoded tiles. max_error_px, max_texel_px: see `DetailLimits`.
+        bytes_per_select: how much new data one selection may bring in, so that a renderer that has
+        to upload it keeps its pace; a selection that waits is not bounded.
+        """
         self.cache = cache
         self._index = cache.index
         self._selector = TileSelector(cache.index, cache.frame)
@@ -73,7 +80,9 @@ class TileStreamer:
         self._lock = threading.Condition()
         self._queue: list[int] = []  # nodes to load, most urgent first
         self._ahead: list[int] = []  # after those
-        self._loading: int | None = None
+        self._arrived: list[tuple[int, list[TileMesh]]] = []  # loaded, not yet in use
+        self._arrived_bytes = 0
+        self._bytes_per_select = bytes_per_select
         self._protected: set[int] = set()  # in the current view
         self._closed = False
         self._thread = threading.Thread(target=self._run, name="tile-loader", daemon=True)
@@ -89,13 +98,16 @@ class TileStreamer:
         """
         limits = self._fitting_limits(world_from_camera, camera)
         with self._lock:
+            self._take_in(None if wait else self._bytes_per_select)
             choice = self._choose(world_from_camera, camera, limits)
             while wait and not self._resident[choice.wanted].all():
                 self._queue = choice.wanted[~self._resident[choice.wanted]].tolist()
                 for node in self._queue:
                     if node in self._failed:
                         raise self._failed[node]
+                self._lock.notify_all()
                 self._lock.wait()
+                self._take_in(None)
                 choice = self._choose(world_from_camera, camera, limits)
             self._count(choice)
             self._current = [mesh for node in choice.shown for mesh in self._touched(int(node))]
@@ -126,7 +138,8 @@ class TileStreamer:
     def counters(self) -> StreamCounters:
         """What has happened so far."""
         with self._lock:
-            return StreamCounters(**self._counts | {"resident_bytes": self._bytes})
+            resident = self._bytes + self._arrived_bytes
+            return StreamCounters(**self._counts | {"resident_bytes": resident})
 
     def close(self) -> None:
         """Stop the loader thread and drop all tiles."""
@@ -136,6 +149,7 @@ class TileStreamer:
         self._thread.join()
         with self._lock:
             self._meshes.clear()
+            self._arrived.clear()
             self._resident[:] = False
             self._bytes = 0
 
@@ -181,12 +195,12 @@ class TileStreamer:
     def _run(self) -> None:
         while True:
             with self._lock:
-                while not self._closed and not self._queue and not self._ahead:
+                while not self._closed and not self._has_work():
                     self._lock.wait()
                 if self._closed:
                     return
                 node = (self._queue or self._ahead).pop(0)
-                if self._resident[node]:
+                if self._resident[node] or any(node == n for n, _ in self._arrived):
                     continue
             meshes: list[TileMesh] | None = None
             failure: MapCacheError | None = None
@@ -198,24 +212,37 @@ class TileStreamer:
                 failure = error
             with self._lock:
                 if meshes is not None:
-                    self._insert(node, meshes)
+                    self._arrived.append((node, meshes))
+                    self._arrived_bytes += int(self._node_bytes[node])
+                    self._counts["loaded"] += 1
                 elif failure is not None:
                     _log.error("%s", failure)
                     self._failed[node] = failure
                     self._counts["failures"] += 1
                 self._lock.notify_all()
 
-    def _insert(self, node: int, meshes: list[TileMesh]) -> None:
-        self._make_room(int(self._node_bytes[node]))
-        self._meshes[node] = meshes
-        self._resident[node] = True
-        self._bytes += int(self._node_bytes[node])
-        self._counts["loaded"] += 1
+    def _has_work(self) -> bool:
+        """Whether there is a node to load, and room to put it down."""
+        waiting = self._arrived_bytes >= self._bytes_per_select
+        return bool(self._queue or self._ahead) and not waiting
+
+    def _take_in(self, limit: int | None) -> None:
+        """Bring loaded nodes into use, at most `limit` bytes but at least one. The lock is held."""
+        taken = 0
+        while self._arrived and (limit is None or taken < limit):
+            node, meshes = self._arrived.pop(0)
+            size = int(self._node_bytes[node])
+            self._arrived_bytes -= size
+            taken += size
+            self._make_room(size)
+            self._meshes[node] = meshes
+            self._resident[node] = True
+            self._bytes += size
 
     def _make_room(self, needed: int) -> None:
         """Drop least recently used nodes; the current view's stay, so that it can complete."""
         for node in list(self._meshes):
-            if self._bytes + needed <= self._budget:
+            if self._bytes + self._arrived_bytes + needed <= self._budget:
                 return
             if node in self._protected:
                 continue
