@@ -18,7 +18,6 @@ from localizer.map.tile import TileMesh
 from localizer.pose import Array, hat
 from localizer.types import PoseEstimate, TargetFix
 
-
 _NORMAL_ANGLE = 4e-3  # rad: half a metre at 120 m
 
 
@@ -36,9 +35,7 @@ def ray_in_world(estimate: PoseEstimate, pixel: tuple[float, float]) -> tuple[Ar
     return estimate.world_from_camera.translation, direction / np.linalg.norm(direction)
 
 
-def cast_ray(
-    meshes: Sequence[TileMesh], origin: Array, direction: Array
-) -> SurfacePoint | None:
+def cast_ray(meshes: Sequence[TileMesh], origin: Array, direction: Array) -> SurfacePoint | None:
     """Where a ray (origin (3,), unit direction (3,), world) first meets the map; None if nowhere.
 
     The normal is that of the plane through three neighbouring hits, so that a single triangle of a
