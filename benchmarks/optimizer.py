@@ -170,6 +170,10 @@ def main() -> None:
     few = tuple(x[:4] for x in swarm)
     counts = sorted({1, arguments.threads})
     console = Console()
+    load = os.getloadavg()[0]
+    console.print(
+        f"{os.cpu_count()} cores, load average {load:.1f} at the start: idle is below 0.5"
+    )
 
     table = Table(title=f"ms per LM iteration, M={HYPOTHESES} N={ANCHORS} C={CHANNELS}")
     for heading in ("backend", *(f"{s} x {s}" for s in SIZES), "times faster than naive at 256"):

@@ -89,8 +89,8 @@ def tangent_covariance(
 
     The sandwich of equation 11 takes the residuals' variance, and their correlation between
     channels and within a cell of the image, from the data. correlation: variance factor for what
-    it cannot see. floor: least share of the isotropic model, so that a perfect fit does not claim perfect
-    knowledge. A prior of weight `prior_weight` adds its own noise.
+    it cannot see. floor: least share of the isotropic model, so that a perfect fit does not claim
+    perfect knowledge. A prior of weight `prior_weight` adds its own noise.
     """
     scale = model.weights * model.robust
     total = model.weights.sum()
