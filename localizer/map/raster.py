@@ -219,7 +219,7 @@ def _metric_crs(data: DatasetReader) -> CRS:
 
 
 def _centre(data: DatasetReader, crs: str) -> tuple[float, float]:
-    x, y = data.transform * (data.width / 2, data.height / 2)
+    x, y = data.xy(data.height / 2, data.width / 2, offset="ul")
     transformer = Transformer.from_crs(CRS(data.crs).to_2d(), CRS(crs), always_xy=True)
     x, y = transformer.transform(x, y)
     return float(x), float(y)

@@ -1,5 +1,7 @@
 """Meshes with a georeference: where they stand, how they are cut, the levels made for them."""
 
+# ruff: noqa: RUF005 (sums of arrays are meant, not lists)
+
 from __future__ import annotations
 
 import cv2
