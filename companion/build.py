@@ -4,12 +4,14 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import numpy as np
+
 from localizer.camera import Camera
 from localizer.config import LocalizerConfig
-from localizer.features.extractor import load_extractor
+from localizer.features.extractor import FeatureExtractor, load_extractor
 from localizer.map.cache import TileCache
 from localizer.map.stream import TileStreamer
-from localizer.pipeline import Localizer, RotationAt
+from localizer.pipeline import Localizer, RotationAt, working_camera
 from localizer.registration.jngo import JNGO
 from localizer.render.numba_raster import NumbaRenderer
 
@@ -36,4 +38,19 @@ def build_localizer(
     """A localizer for one camera over an open map. rotation_at: see `Localizer`."""
     extractor = load_extractor(config.model, threads=config.feature_threads)
     optimizer = JNGO(config.registration, threads=config.threads)
+    _warm_up(stack.renderer, extractor, optimizer, camera, config)
     return Localizer(stack.renderer, extractor, optimizer, camera, config, rotation_at)
+
+
+def _warm_up(
+    renderer: NumbaRenderer,
+    extractor: FeatureExtractor,
+    optimizer: JNGO,
+    camera: Camera,
+    config: LocalizerConfig,
+) -> None:
+    """Compile and load everything now: the first frame of a flight must not wait ten seconds."""
+    size = working_camera(camera, config.width)
+    pyramid = extractor.extract(np.zeros((size.height, size.width, 3), np.uint8))
+    optimizer.warm_up(pyramid.levels[0].features.shape[-1])
+    renderer.warm_up()
