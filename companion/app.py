@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import logging
 import threading
+from contextlib import ExitStack
 
 import numpy as np
 
@@ -31,74 +32,74 @@ _log = logging.getLogger(__name__)
 
 
 class Companion:
-    """One running deployment. `run` blocks until `stop` is called or the feed ends."""
+    """One running deployment. `run` blocks until `stop` is set or the feed ends.
 
-    def __init__(self, config: CompanionConfig) -> None:
+    Whatever fails on the way up, what was already up is shut down: a part's thread that stayed
+    behind would keep the process from ending.
+    """
+
+    def __init__(self, config: CompanionConfig, stop: threading.Event) -> None:
         self._config = config
+        self._stop = stop
+        with ExitStack() as up:
+            self._build(config, up)
+            self._up = up.pop_all()
+
+    def _build(self, config: CompanionConfig, up: ExitStack) -> None:
         self._camera = config.camera.model.camera()
         self._lever_arm = np.array(config.camera.lever_arm_m)
         self._stack = MapStack(config.map, config.localizer)
+        up.callback(self._stack.close)
         manifest = self._stack.cache.manifest
         self._frame = self._stack.cache.frame
         self._geoid_separation_m = manifest.geoid_separation_m
         record = config.record
         self._recorder = Recorder(record, self._frame) if record else None
+        if self._recorder is not None:
+            up.callback(self._recorder.close)
         self._bridge = Bridge(_bridge_config(config), manifest.geoid_separation_m)
+        up.callback(self._bridge.stop)
         localizer = build_localizer(self._stack, self._camera, config.localizer, self._rotation_at)
         self._engine = DualThreadEngine(localizer, (self._on_estimate,), self._vehicle_prior)
         self._targets = TargetReporter(config.targets, self._cast_ray, self._on_target)
         self._source = open_source(
             config.camera.source, self._camera, config.camera.settings, self._on_feed_state
         )
-        self._listener: DetectionListener | None = None
         self._health = HealthMonitor(
             self._engine, self._bridge, lambda: self._source.state, self._event, record
         )
         self._was_tracking = False
         self._target_numbers: dict[str, int] = {}
-        self._stop = threading.Event()
         self._feed_error: Exception | None = None
 
     def run(self) -> None:
         """Fly until stopped. Raises what ended the feed, after everything is shut down."""
-        self._start()
-        feeder = threading.Thread(target=self._feed, name="feed")
-        feeder.start()
-        try:
+        with self._up as up:
+            self._start(up)
             while not self._stop.wait(0.2):  # in slices: signals are handled between them
                 pass
-        finally:
-            self._source.close()
-            feeder.join()
-            self._shutdown()
         if self._feed_error is not None:
             raise self._feed_error
 
-    def stop(self) -> None:
-        """End `run`; may be called from a signal handler or any thread."""
-        self._stop.set()
-
-    def _start(self) -> None:
+    def _start(self, up: ExitStack) -> None:
+        """Start every part; `up` stops them in the reverse order, the feed first."""
         self._bridge.start()
+        self._health.start()
+        up.callback(self._health.stop)
         self._targets.start()
+        up.callback(self._targets.stop)
         if self._config.targets.detections is not None:
-            self._listener = DetectionListener(
+            listener = DetectionListener(
                 self._config.targets.detections, self._targets.add_detection
             )
+            up.callback(listener.close)
         self._engine.start()
-        self._health.start()
+        up.callback(self._engine.stop)
+        feeder = threading.Thread(target=self._feed, name="feed")
+        feeder.start()
+        up.callback(feeder.join)
+        up.callback(self._source.close)
         self._event("info", f"map {self._config.map}, feed {self._config.camera.source}")
-
-    def _shutdown(self) -> None:
-        self._engine.stop()
-        if self._listener is not None:
-            self._listener.close()
-        self._targets.stop()
-        self._health.stop()
-        self._bridge.stop()
-        self._stack.close()
-        if self._recorder is not None:
-            self._recorder.close()
 
     def _feed(self) -> None:
         try:

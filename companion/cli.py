@@ -6,6 +6,7 @@ import sys
 
 import typer
 from rich.console import Console
+from rich.markup import escape
 
 from companion.doctor_cli import doctor_command
 from companion.errors import CompanionError
@@ -33,5 +34,7 @@ def main() -> None:
     try:
         app()
     except (CompanionError, LocalizerError, BridgeError) as error:
-        Console(stderr=True).print(f"[bold red]{type(error).__name__}[/]: {error}", soft_wrap=True)
+        # Escaped: a path or a value in the text may look like the console's markup.
+        name, text = type(error).__name__, escape(str(error))
+        Console(stderr=True).print(f"[bold red]{name}[/]: {text}", soft_wrap=True, highlight=False)
         sys.exit(2)

@@ -27,5 +27,9 @@ class ConfigError(CompanionError):
     """A configuration that cannot be read or does not hold; names file and key."""
 
 
+class ReportError(CompanionError):
+    """A report or record that cannot be written where it was asked for."""
+
+
 class DetectionError(CompanionError):
     """A datagram that is not a pixel detection."""

@@ -7,6 +7,7 @@ import json
 from pathlib import Path
 from typing import Annotated
 
+import numpy as np
 import typer
 from rich.console import Console
 from rich.progress import Progress
@@ -16,6 +17,7 @@ from companion.build import MapStack, build_localizer
 from companion.errors import ConfigError
 from companion.plots import ErrorSeries, overlay_sheet, plot_errors, save_image
 from companion.versions import versions
+from localizer.camera import Camera
 from localizer.config import LocalizerConfig
 from localizer.evaluation import (
     EvaluatedFrame,
@@ -30,6 +32,7 @@ from localizer.features.extractor import load_extractor
 from localizer.geo import LocalFrame
 from localizer.metrics import LocalizationMetrics
 from localizer.pipeline import Undistorter
+from localizer.render.base import MapRenderer
 
 _OVERLAYS = 4
 
@@ -72,7 +75,7 @@ def evaluate_command(
             "height": localizer.camera.height, "features": load_extractor(model).name,
         }  # fmt: skip
         _write_report(report, frames, metrics, settings, stack.cache.frame)
-        _write_overlays(report, frames, data, localizer.camera.width)
+        _write_overlays(report, frames, data, stack.renderer, localizer.camera)
     finally:
         stack.close()
     print_metrics(metrics, str(sequence))
@@ -109,18 +112,20 @@ def _write_report(
         writer.writerows(rows)
 
 
-def _write_overlays(folder: Path, frames: list[EvaluatedFrame], data: Sequence, width: int) -> None:
-    import numpy as np
-
-    index = np.unique(np.linspace(0, len(frames) - 1, _OVERLAYS).astype(int))
-    for i in index:
-        frame = data.frame(int(i))
-        view = frames[i].bundle.view
-        video = Undistorter(data.camera, view.camera)(frame)
-        caption = (
-            f"{frames[i].name}: {frames[i].translation_error_m:.2f} m "
-            f"{frames[i].rotation_error_deg:.2f} deg, reference at the prediction"
-        )
+def _write_overlays(
+    folder: Path,
+    frames: list[EvaluatedFrame],
+    data: Sequence,
+    renderer: MapRenderer,
+    camera: Camera,
+) -> None:
+    """A few frames over the map rendered at their estimated poses, and the errors of all."""
+    undistort = Undistorter(data.camera, camera)
+    for i in np.unique(np.linspace(0, len(frames) - 1, _OVERLAYS).astype(int)):
+        f = frames[i]
+        view = renderer.render(f.estimate.world_from_camera, camera, wait=True)
+        video = undistort(data.frame(int(i)))
+        caption = f"{f.name}: {f.translation_error_m:.2f} m {f.rotation_error_deg:.2f} deg"
         save_image(folder / f"overlay-{i:04d}.png", overlay_sheet(video, view.rgb, caption))
     number = np.arange(len(frames), dtype=np.float64)
     plot_errors(

@@ -49,6 +49,7 @@ class HealthMonitor:
         self._file = record.folder / "health.json" if record else None
         self._estimates: deque[tuple[float, PoseEstimate]] = deque(maxlen=_WINDOW)
         self._last_text = ""
+        self._write_failed = False
         self._stop = threading.Event()
         self._thread = threading.Thread(target=self._run, name="health")
 
@@ -103,8 +104,13 @@ class HealthMonitor:
             "bridge": self._bridge.counters(),
         }
         temporary = self._file.with_suffix(".tmp")
-        temporary.write_text(json.dumps(report, indent=1, default=str))
-        temporary.replace(self._file)
+        try:
+            temporary.write_text(json.dumps(report, indent=1, default=str))
+            temporary.replace(self._file)
+        except OSError as error:  # a full disk must not end the reports to the vehicle
+            if not self._write_failed:
+                self._event("warning", f"{self._file} cannot be written: {error}")
+            self._write_failed = True
 
     def _rate(self) -> float:
         """Localized frames per second over the last few seconds."""

@@ -3,20 +3,23 @@
 from __future__ import annotations
 
 import csv
+import logging
 import queue
 import threading
 import time
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Any, TextIO
 
 import cv2
 
 from companion.config import RecordConfig
+from companion.errors import ReportError
 from localizer.geo import LocalFrame
 from localizer.pose import quaternion_from_matrix
 from localizer.types import Frame, PoseEstimate, TargetFix
 
+_log = logging.getLogger(__name__)
 _QUEUE_SIZE = 4096
 _FLUSH_S = 1.0
 
@@ -37,24 +40,29 @@ EVENT_COLUMNS = ("time_ns", "level", "text")
 class Recorder:
     """Writes ``estimates.csv``, ``targets.csv`` and ``events.csv`` in a folder.
 
-    Nothing here blocks its callers: rows beyond a bounded queue are dropped and counted.
+    Nothing here blocks its callers: rows beyond a bounded queue are dropped and counted. So is what
+    the disk does not take (full, gone): the flight goes on without its record.
     """
 
     def __init__(self, config: RecordConfig, frame: LocalFrame) -> None:
         folder = config.folder
         self._snapshots = folder / "snapshots"
-        self._snapshots.mkdir(parents=True, exist_ok=True)
         self._interval_ns = (config.snapshot_interval_s or 0.0) * 1e9
         self._next_snapshot_ns = 0.0
         self._frame = frame
         self._rows: queue.Queue[tuple[str, Iterable[Any]] | None] = queue.Queue(_QUEUE_SIZE)
         self.dropped = 0
+        self._failed = False
         self._files: dict[str, TextIO] = {}
-        self._writers = {
-            "estimates": self._open(folder / "estimates.csv", ESTIMATE_COLUMNS),
-            "targets": self._open(folder / "targets.csv", TARGET_COLUMNS),
-            "events": self._open(folder / "events.csv", EVENT_COLUMNS),
-        }
+        try:
+            self._snapshots.mkdir(parents=True, exist_ok=True)
+            self._writers = {
+                "estimates": self._open(folder / "estimates.csv", ESTIMATE_COLUMNS),
+                "targets": self._open(folder / "targets.csv", TARGET_COLUMNS),
+                "events": self._open(folder / "events.csv", EVENT_COLUMNS),
+            }
+        except OSError as error:
+            raise ReportError(f"record.folder {folder}: cannot be written: {error}") from error
         self._thread = threading.Thread(target=self._run, name="recorder")
         self._thread.start()
 
@@ -104,7 +112,7 @@ class Recorder:
         self._rows.put(None)
         self._thread.join()
         for file in self._files.values():
-            file.close()
+            self._guarded(file.close)
 
     def _open(self, path: Path, columns: tuple[str, ...]) -> Any:
         file = path.open("w", newline="", encoding="utf-8")
@@ -123,7 +131,9 @@ class Recorder:
         if name == "snapshot":
             (frame,) = row
             bgr = cv2.cvtColor(frame.image, cv2.COLOR_RGB2BGR)
-            cv2.imwrite(str(self._snapshots / f"{frame.exposure_time_ns}.jpg"), bgr)
+            path = self._snapshots / f"{frame.exposure_time_ns}.jpg"
+            if not cv2.imwrite(str(path), bgr):
+                raise OSError(f"{path} was not written")
         elif name:
             self._writers[name].writerow(row)
 
@@ -136,8 +146,17 @@ class Recorder:
                 item = ("", ())
             if item is None:
                 return
-            self._write(*item)
+            self._guarded(self._write, *item)
             if time.monotonic() - flushed > _FLUSH_S:
                 flushed = time.monotonic()
                 for file in self._files.values():
-                    file.flush()
+                    self._guarded(file.flush)
+
+    def _guarded(self, write: Callable[..., None], *arguments: Any) -> None:
+        try:
+            write(*arguments)
+        except OSError as error:
+            self.dropped += 1
+            if not self._failed:
+                self._failed = True
+                _log.warning("the record is incomplete, its disk fails: %s", error)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 import signal
+import threading
 from pathlib import Path
 from typing import Annotated
 
@@ -24,9 +25,10 @@ def run_command(
         handlers=[RichHandler(show_path=False)],
     )
     settings = load_config(config)
+    # Before anything is started: an interrupt must not catch a part half way up.
+    interrupted = threading.Event()
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, lambda *_: interrupted.set())
     from companion.app import Companion
 
-    companion = Companion(settings)
-    for number in (signal.SIGINT, signal.SIGTERM):
-        signal.signal(number, lambda *_: companion.stop())
-    companion.run()
+    Companion(settings, interrupted).run()

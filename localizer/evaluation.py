@@ -24,14 +24,7 @@ from localizer.metrics import LocalizationMetrics, localization_metrics
 from localizer.pipeline import Localizer
 from localizer.pose import Array, Pose, so3_exp
 from localizer.posefile import read_poses, world_from_camera
-from localizer.types import (
-    Frame,
-    Image,
-    PoseEstimate,
-    PosePrior,
-    ReferenceBundle,
-    RegistrationStatus,
-)
+from localizer.types import Frame, Image, PoseEstimate, PosePrior, RegistrationStatus
 
 PriorMode = Literal["first", "each"]
 
@@ -72,7 +65,6 @@ class EvaluatedFrame:
 
     name: str
     estimate: PoseEstimate
-    bundle: ReferenceBundle
     translation_error_m: float
     rotation_error_deg: float
 
@@ -180,14 +172,14 @@ def evaluate(
                 localizer.set_prior(prior)
             outcome = _localize(localizer, frame, passes if fresh else 1, pool)
             seconds += time.perf_counter() - started
-            frames.append(_measure(sequence, index, *outcome))
+            frames.append(_measure(sequence, index, outcome))
             progress(index)
     return frames, _summary(frames, seconds)
 
 
 def _localize(
     localizer: Localizer, frame: Frame, passes: int, pool: ThreadPoolExecutor
-) -> tuple[PoseEstimate, ReferenceBundle]:
+) -> PoseEstimate:
     """Reference and query features side by side, then registration, `passes` times."""
     pending = pool.submit(localizer.extract_query, frame)
     while True:
@@ -198,7 +190,7 @@ def _localize(
         estimate = localizer.localize(frame, pending.result(), bundle.anchors)
         passes -= 1
         if passes == 0:
-            return estimate, bundle
+            return estimate
         if estimate.status is RegistrationStatus.OK:
             # The same image again is no new evidence: start anew from its result, halving sigma.
             localizer.set_prior(
@@ -206,15 +198,13 @@ def _localize(
             )
 
 
-def _measure(
-    sequence: Sequence, index: int, estimate: PoseEstimate, bundle: ReferenceBundle
-) -> EvaluatedFrame:
+def _measure(sequence: Sequence, index: int, estimate: PoseEstimate) -> EvaluatedFrame:
     truth = sequence.truth[index]
     translation, rotation = truth.distance_to(estimate.world_from_camera)
     if not estimate.accepted:
         translation = rotation = float("nan")
     name = sequence.images[index].name
-    return EvaluatedFrame(name, estimate, bundle, translation, rotation)
+    return EvaluatedFrame(name, estimate, translation, rotation)
 
 
 def _summary(frames: list[EvaluatedFrame], seconds: float) -> LocalizationMetrics:

@@ -1,0 +1,72 @@
+"""``companion eval`` on a sequence rendered from a generated world, in both folder layouts."""
+
+import json
+import shutil
+
+import pytest
+from typer.testing import CliRunner
+
+from companion.cli import app
+from localizer.errors import SequenceError
+from sitl.assets import prepare
+from sitl.kinematic import record_scenario
+from sitl.scenario import CameraSpec, Leg, Scenario
+
+FRAMES = 25
+
+
+@pytest.fixture(scope="module")
+def recorded(tmp_path_factory):
+    assets = prepare(5, tmp_path_factory.mktemp("worlds"), size_m=400.0)
+    leg = Leg(east_m=0, north_m=26, height_m=80, gimbal_pitch_deg=-85)
+    scenario = Scenario(
+        takeoff_height_m=80, legs=(leg,), cars=2, people=2, camera=CameraSpec(rate_hz=5)
+    )
+    out = tmp_path_factory.mktemp("sequence")
+    assert record_scenario(assets, scenario, 5, out) >= FRAMES
+    return assets, out
+
+
+def _run(*arguments):
+    result = CliRunner().invoke(app, ["eval", *map(str, arguments)], catch_exceptions=False)
+    assert result.exit_code == 0, result.output
+    return result
+
+
+@pytest.mark.parametrize("prior", ["first", "each"])
+def test_report_has_the_papers_columns(recorded, tmp_path, prior):
+    assets, sequence = recorded
+    _run(sequence, "--map", assets.map_cache, "--report", tmp_path, "--limit", FRAMES,
+         "--prior", prior)  # fmt: skip
+    report = json.loads((tmp_path / "report.json").read_text())
+    keys = {"frames", "median_translation_m", "median_rotation_deg", "recall_1", "recall_3",
+            "recall_5", "completeness", "fps"}  # fmt: skip
+    assert keys <= set(report)
+    assert report["frames"] == FRAMES
+    assert report["recall_3"] >= 80
+    assert report["median_translation_m"] < 1.0
+    assert (tmp_path / "frames.csv").stat().st_size > 0
+    assert len(list(tmp_path.glob("overlay-*.png"))) == 4
+
+
+def test_pilots_own_layout_is_read(recorded, tmp_path):
+    assets, sequence = recorded
+    root = tmp_path / "dataset"
+    shutil.copytree(sequence / "images", root / "images" / "one")
+    (root / "poses").mkdir()
+    for name in ("one", "two"):
+        shutil.copy(sequence / "poses.txt", root / "poses" / f"{name}.txt")
+    shutil.copy(sequence / "camera.json", root)
+    arguments = (root, "--map", assets.map_cache, "--report", tmp_path / "r", "--limit", 3)
+    with pytest.raises(SequenceError, match="name one"):
+        _run(*arguments)
+    _run(*arguments, "--name", "one")
+
+
+def test_a_missing_image_is_named(recorded, tmp_path):
+    assets, sequence = recorded
+    broken = tmp_path / "broken"
+    shutil.copytree(sequence, broken)
+    (broken / "images" / "000003.jpg").unlink()
+    with pytest.raises(SequenceError, match=r"1 of .* missing, first 000003\.jpg"):
+        _run(broken, "--map", assets.map_cache, "--report", tmp_path / "r")
