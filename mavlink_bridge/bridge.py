@@ -7,6 +7,7 @@ import math
 import threading
 from collections import deque
 from collections.abc import Callable
+from typing import Any
 
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
@@ -45,6 +46,7 @@ _SEVERITY = {
     HealthLevel.DEGRADED: mavlink.MAV_SEVERITY_WARNING,
     HealthLevel.FAILED: mavlink.MAV_SEVERITY_ERROR,
 }
+_MAX_CHUNKS = 4
 _GROUND_WANTED = frozenset(message_id(name) for name in COMMANDS_IN)
 
 
@@ -67,6 +69,7 @@ class Bridge:
         self._health_lock = threading.Lock()
         self._health = (HealthLevel.STARTING, "")
         self._texts: deque[tuple[int, str]] = deque(maxlen=_TEXTS)
+        self._text_id = 0
         self._recorder = None if config.tlog is None else TlogRecorder(config.tlog)
         self._tracker = VehicleTracker(
             config.system_id, _mount(config), config.camera.mount == "fixed"
@@ -181,9 +184,9 @@ class Bridge:
         """A line for the operator: STATUSTEXT on the ground side, and the log."""
         self._texts.append((severity, text))
         log.log(logging.WARNING if severity <= mavlink.MAV_SEVERITY_WARNING else logging.INFO, text)
-        raw = text.encode("ascii", "replace")[:_TEXT_LENGTH]
-        message = mavlink.MAVLink_statustext_message(severity, raw)
-        self._ground_link.send(message, self._config.companion_component)
+        self._text_id = self._text_id % 0xFFFF + 1
+        for message in status_texts(severity, text, self._text_id):
+            self._ground_link.send(message, self._config.companion_component)
 
     # --- out ------------------------------------------------------------------------------------
 
@@ -235,6 +238,21 @@ class Bridge:
         result["clock_round_trip_ms"] = (self._tracker.clock.round_trip_ns or 0) * 1e-6
         result["ekf_source_set"] = self._fc.switch.current
         return result
+
+
+def status_texts(severity: int, text: str, text_id: int) -> list[Any]:
+    """STATUSTEXT (253) of a line, in chunks of 50 characters under one id where it is longer."""
+    raw = text.encode("ascii", "replace")[: _MAX_CHUNKS * _TEXT_LENGTH]
+    chunks = [raw[i : i + _TEXT_LENGTH] for i in range(0, max(len(raw), 1), _TEXT_LENGTH)]
+    if len(chunks) == 1:
+        return [mavlink.MAVLink_statustext_message(severity, raw)]
+    if len(chunks[-1]) == _TEXT_LENGTH:
+        # A receiver knows the end by a chunk that is not full.
+        chunks.append(b"")
+    return [
+        mavlink.MAVLink_statustext_message(severity, chunk, text_id, i)
+        for i, chunk in enumerate(chunks)
+    ]
 
 
 def _mount(config: BridgeConfig) -> quat.Quaternion:

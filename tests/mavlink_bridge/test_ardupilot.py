@@ -162,15 +162,13 @@ def fly() -> Iterator[Callable[..., Flight]]:
         pilot = Pilot(vehicle.gcs_endpoint, alive=vehicle.check)
         pilot.connect()
         ends.append(pilot.close)
-        origin = OriginConfig(
-            latitude_deg=HOME.latitude_deg,
-            longitude_deg=HOME.longitude_deg,
-            altitude_amsl_m=HOME.altitude_m,
+        config = BridgeConfig(
+            connection=vehicle.companion_endpoint,
+            origin=None if gps else ORIGIN,
+            injection=injection,
+            switch=switch or SourceSwitchConfig(),
         )
-        bridge = Bridge(
-            BridgeConfig(connection=vehicle.companion_endpoint, origin=origin, injection=injection),
-            GEOID,
-        )
+        bridge = Bridge(config, GEOID)
         bridge.start()
         ends.append(bridge.stop)
         feed = Feed(pilot, bridge, **feed_options)
@@ -302,7 +300,7 @@ def test_gnss_loss_switches_the_source_set(fly: Callable[..., Flight]) -> None:
     hover = flight.pilot.truth
     flight.pilot.gps(on=False)
     flight.pilot.sleep(15.0)
-    assert flight.bridge.counters()["ekf_source_set"] == 2
+    assert flight.bridge.counters()["ekf_source_set"] == 2, flight.bridge.state()
     assert any("EKF source set 2: GNSS" in text for text in flight.bridge.texts())
     assert flight.pilot.mode == "GUIDED"
     moved = flight.pilot.truth.location.ned_of(hover.location)

@@ -16,6 +16,7 @@ from pymavlink import mavutil
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from mavlink_bridge import Bridge, BridgeConfig, HealthLevel, TargetReport, TrackRequest, VisionFix
+from mavlink_bridge.bridge import status_texts
 from mavlink_bridge.config import InjectionConfig, OriginConfig, SigningConfig, TargetsConfig
 from mavlink_bridge.errors import BridgeStateError, FixError
 from mavlink_bridge.link import sleep_until
@@ -200,6 +201,17 @@ def test_health_follows_into_heartbeats_and_texts_on_transitions_only(
     assert [m.text for m in autopilot.of("STATUSTEXT") if "lost" in m.text] == [
         "PiLoT: lost, searching"
     ]
+
+
+@pytest.mark.parametrize(("length", "chunks"), [(1, 1), (50, 1), (51, 2), (100, 3), (500, 5)])
+def test_long_texts_are_sent_in_chunks(length: int, chunks: int) -> None:
+    text = "".join(chr(65 + i % 26) for i in range(length))
+    messages = status_texts(4, text, 7)
+    assert len(messages) == chunks
+    assert "".join(m.text for m in messages) == text[:200]
+    if chunks > 1:
+        assert [(m.id, m.chunk_seq) for m in messages] == [(7, i) for i in range(chunks)]
+        assert len(messages[-1].text) < 50
 
 
 def test_streams_are_asked_for_until_they_come(autopilot: Any, run: Callable[..., Bridge]) -> None:
