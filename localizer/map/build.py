@@ -66,15 +66,47 @@ def build_cache(
     """
     sources = [Path(source)] if isinstance(source, str | Path) else [Path(s) for s in source]
     named = " ".join(map(str, sources))
-    tree = read_source(sources, georeference, up_axis)
-    separation = _geoid_separation(tree, geoid_separation_m, named)
-    datum = _vertical_datum(tree, vertical_datum, named)
+    return build_tree(
+        read_source(sources, georeference, up_axis),
+        out,
+        name=named,
+        geoid_separation_m=geoid_separation_m,
+        vertical_datum=vertical_datum,
+        origin=origin,
+        attribution=attribution,
+        skip_bad_tiles=skip_bad_tiles,
+        overwrite=overwrite,
+        workers=workers,
+        progress=progress,
+        scheduler=scheduler,
+    )
+
+
+def build_tree(
+    tree: SourceTree,
+    out: Path,
+    *,
+    name: str,
+    geoid_separation_m: float | None = None,
+    vertical_datum: VerticalDatum | None = None,
+    origin: Geodetic | None = None,
+    attribution: str | None = None,
+    skip_bad_tiles: bool = False,
+    overwrite: bool = False,
+    workers: int | None = None,
+    progress: bool = True,
+    scheduler: str | None = None,
+) -> Manifest:
+    """Build a cache from any importer's tree; see `build_cache`. name: of the source."""
+    separation = _geoid_separation(tree, geoid_separation_m, name)
+    datum = _vertical_datum(tree, vertical_datum, name)
     lift = separation if datum == "amsl" else 0.0
     frame = LocalFrame(origin or _origin(tree, lift))
     parameters = {
         "origin": [frame.origin.latitude_deg, frame.origin.longitude_deg, frame.origin.height_m],
         "vertical_datum": datum,
         "geoid_separation_m": separation,
+        "options": tree.options,
         "source_fingerprint": _fingerprint(tree.files),
     }
     with staging(Path(out), parameters, overwrite=overwrite) as staged:
@@ -84,13 +116,13 @@ def build_cache(
         )
         skipped = _failures(tree.root, records)
         if skipped and not skip_bad_tiles:
-            raise MapSourceError(_failure_text(named, skipped))
+            raise MapSourceError(_failure_text(name, skipped))
         index, manifest = _assemble(tree, records, staged, frame)
         manifest = manifest.model_copy(
             update={
                 "vertical_datum": datum,
                 "geoid_separation_m": separation,
-                "source": named,
+                "source": name,
                 "attribution": tree.attribution if attribution is None else attribution,
                 "build": parameters,
                 "skipped": skipped,

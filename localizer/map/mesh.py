@@ -103,7 +103,14 @@ def read_mesh(path: Path, georeference: Georeference, up_axis: UpAxis | None) ->
     # A mesh about an origin keeps that as the world's; one in a CRS is given its middle.
     middle = [*(0.5 * (low + high))[:2], low[2]] if georeference.origin is None else [0.0, 0.0, 0.0]
     root = MeshTile(path, axis, georeference, grid, 0, 0, 0)
-    return SourceTree(_node(root), georeference.ecef(np.array([middle]))[0], None, "", (path,))
+    return SourceTree(
+        _node(root),
+        georeference.ecef(np.array([middle]))[0],
+        None,
+        "",
+        (path,),
+        options=f"{georeference} {axis}",
+    )
 
 
 def _node(tile: MeshTile) -> SourceNode:

@@ -70,7 +70,8 @@ class SourceTree:
     """A map source.
 
     centre: (3,) ECEF metres; geoid_separation_m, attribution, vertical_datum: as far as the source
-    tells; files: everything it is made of, so that a change of the source can be seen.
+    tells; files: everything it is made of, so that a change of the source can be seen; options:
+    what else decided the tree.
     """
 
     root: SourceNode
@@ -79,3 +80,4 @@ class SourceTree:
     attribution: str
     files: tuple[Path, ...]
     vertical_datum: VerticalDatum | None = None
+    options: str = ""

@@ -26,13 +26,13 @@ from localizer.pose import Array, Pose
 from localizer.render.base import NEAR_M, SKY, TileProvider, is_visible, require_pinhole
 from localizer.types import Float32, Image, RenderedView
 
-_STRIPS_PER_THREAD = 3  # more than one, so that a crowded strip does not leave a thread idle
+_STRIPS_PER_THREAD = 2  # more than one, so that a crowded strip does not leave a thread idle
 
 
 @dataclass(frozen=True, eq=False)
 class _Prepared:
     """Triangles after the first pass. screen: (V, 3) float32 x, y, 1/z; uvs: (V, 2) float32;
-    faces: (F, 3) int32; listed: (n,) int32, the faces to fill.
+    faces: (F, 3) int32; listed: (n,) int32, the faces to fill; top, bottom: the rows they reach.
     """
 
     screen: Float32
@@ -40,6 +40,8 @@ class _Prepared:
     faces: NDArray[np.int32]
     listed: NDArray[np.int32]
     mesh: TileMesh
+    top: float
+    bottom: float
 
 
 class NumbaRenderer:
@@ -102,6 +104,8 @@ class NumbaRenderer:
             y0, y1 = int(edges[strip]), int(edges[strip + 1])
             _clear(rgb, depth, self._sky, y0, y1)
             for p in prepared:
+                if p.bottom < y0 or p.top > y1:
+                    continue
                 t = p.mesh.texture
                 _fill(
                     p.screen, p.uvs, p.faces, p.listed, p.mesh.repeat,
@@ -137,16 +141,17 @@ class NumbaRenderer:
             listed = self._faces[faces[i] : faces[i + 1]]
             near = np.float32(NEAR_M)
             _project(mesh.positions, T, intrinsics, near, screen)
-            kept, crossing = _list_faces(screen, mesh.faces, camera.width, camera.height, listed)
-            parts = [_Prepared(screen, mesh.uvs, mesh.faces, listed[:kept], mesh)]
+            kept, crossing, top, bottom = _list_faces(
+                screen, mesh.faces, camera.width, camera.height, listed
+            )
+            parts = [_Prepared(screen, mesh.uvs, mesh.faces, listed[:kept], mesh, top, bottom)]
             if crossing:
                 cut = listed[len(listed) - crossing :]
                 points, uvs = _clip(mesh.positions, mesh.uvs, mesh.faces, cut, T, intrinsics, near)
                 corners = np.arange(len(points), dtype=np.int32)
+                some = corners[: len(points) // 3]
                 parts.append(
-                    _Prepared(
-                        points, uvs, corners.reshape(-1, 3), corners[: len(points) // 3], mesh
-                    )
+                    _Prepared(points, uvs, corners.reshape(-1, 3), some, mesh, 0, camera.height)
                 )
             return parts
 
@@ -211,12 +216,13 @@ def _project(positions, T, intrinsics, near, screen):  # type: ignore[no-untyped
 @njit(cache=True, nogil=True, fastmath=True)
 def _list_faces(screen, faces, width, height, listed):  # type: ignore[no-untyped-def]
     """Faces that may cover a pixel centre, from the front of `listed`; faces that cross the near
-    plane from its back. Returns both counts.
+    plane from its back. Returns both counts, and the first and last row of the former.
     """
     half = np.float32(0.5)
     right, bottom = np.float32(width) - half, np.float32(height) - half
     kept = 0
     crossing = 0
+    top_row, bottom_row = np.float32(height), np.float32(0)
     last = listed.shape[0] - 1
     for f in range(faces.shape[0]):
         a, b, c = faces[f, 0], faces[f, 1], faces[f, 2]
@@ -236,7 +242,8 @@ def _list_faces(screen, faces, width, height, listed):  # type: ignore[no-untype
             continue
         listed[kept] = f
         kept += 1
-    return kept, crossing
+        top_row, bottom_row = min(top_row, y0), max(bottom_row, y1)
+    return kept, crossing, top_row, bottom_row
 
 
 @njit(cache=True, nogil=True)
