@@ -200,6 +200,14 @@ def test_other_systems_ground_stations_and_companions_are_not_the_vehicle() -> N
     assert not it.accepts(other)
 
 
+def test_position_at_null_island_is_no_position() -> None:
+    it = tracker()
+    for lat in (0, 473977420):
+        m = mavlink.MAVLink_global_position_int_message(1, lat, 0, 500000, 0, 0, 0, 0, 0)
+        it.handle(sent(m), 10 * SECOND)
+        assert math.isfinite(it.snapshot(SECOND).latitude_deg) is (lat != 0)
+
+
 def test_heartbeat_age_and_connection() -> None:
     it = tracker()
     assert it.snapshot(2 * SECOND).connected
