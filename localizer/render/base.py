@@ -11,10 +11,11 @@ import numpy as np
 from localizer.camera import Camera
 from localizer.errors import CameraError
 from localizer.map.tile import TileMesh
-from localizer.pose import Pose
+from localizer.pose import Array, Pose
 from localizer.types import RenderedView
 
 NEAR_M = 0.5  # nearer surfaces are cut off: no aircraft's camera is that close to its map
+FAR_M = 200_000.0  # OpenGL needs an end; nothing is seen that far
 SKY = (176, 196, 216)
 
 
@@ -93,3 +94,20 @@ def is_visible(mesh: TileMesh, world_from_camera: Pose, camera: Camera) -> bool:
             if sign * (offset - slope * z) < -radius * np.hypot(1.0, slope):
                 return False
     return True
+
+
+def clip_from_camera(camera: Camera) -> Array:
+    """OpenGL clip coordinates (4, 4) of OpenCV camera axes.
+
+    Image row 0 becomes the framebuffer's row 0, which is read first: nothing is flipped afterwards.
+    """
+    w, h = camera.width, camera.height
+    depth = FAR_M - NEAR_M
+    return np.array(
+        [
+            [2 * camera.fx / w, 0, 2 * camera.cx / w - 1, 0],
+            [0, 2 * camera.fy / h, 2 * camera.cy / h - 1, 0],
+            [0, 0, (FAR_M + NEAR_M) / depth, -2 * FAR_M * NEAR_M / depth],
+            [0, 0, 1, 0],
+        ]
+    )

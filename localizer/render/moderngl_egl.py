@@ -21,11 +21,17 @@ import numpy as np
 from localizer.camera import Camera
 from localizer.errors import RenderError
 from localizer.map.tile import TileMesh
-from localizer.pose import Array, Pose
-from localizer.render.base import NEAR_M, SKY, TileProvider, is_visible, require_pinhole
+from localizer.pose import Pose
+from localizer.render.base import (
+    SKY,
+    TileProvider,
+    clip_from_camera,
+    is_visible,
+    require_pinhole,
+)
 from localizer.types import RenderedView
 
-_FAR_M = 200_000.0
+_EGL: dict[str, Any] = {"backend": "egl"}
 
 _VERTEX_SHADER = """#version 330
 uniform mat4 projection;
@@ -95,7 +101,7 @@ class ModernGLRenderer:
     ) -> None:
         """Open an EGL context; raises `RenderError` where there is none."""
         try:
-            self._context = moderngl.create_context(standalone=True, backend="egl", require=330)
+            self._context: Any = moderngl.create_context(330, standalone=True, **_EGL)
         except Exception as error:  # moderngl and glcontext raise bare exceptions
             raise RenderError(f"no OpenGL 3.3 context through EGL: {error}") from error
         self.device = str(self._context.info["GL_RENDERER"])
@@ -105,7 +111,7 @@ class ModernGLRenderer:
         self._finish = _gl_finish()
         self._sky = tuple(c / 255 for c in sky)
         self._budget = byte_budget
-        self._program = self._context.program(
+        self._program: Any = self._context.program(
             vertex_shader=_VERTEX_SHADER, fragment_shader=_FRAGMENT_SHADER
         )
         self._context.enable(moderngl.DEPTH_TEST)
@@ -142,7 +148,7 @@ class ModernGLRenderer:
         target.framebuffer.use()
         target.framebuffer.clear(*self._sky, 0.0, depth=1.0)
         target.depth.write(np.zeros((camera.height, camera.width), np.float32))
-        self._program["projection"].write(_projection(camera).T.astype("f4").tobytes())
+        self._program["projection"].write(clip_from_camera(camera).T.astype("f4").tobytes())
         camera_from_world = world_from_camera.inverse
         for mesh in meshes:
             if len(mesh.faces) == 0:
@@ -215,21 +221,6 @@ class ModernGLRenderer:
             texture.filter = (moderngl.LINEAR, moderngl.LINEAR)
         texture.repeat_x = texture.repeat_y = mesh.repeat
         return texture
-
-
-def _projection(camera: Camera) -> Array:
-    """(4, 4) clip coordinates of OpenCV camera axes. Image row 0 becomes the framebuffer's row 0,
-    which is read first, so nothing is flipped afterwards.
-    """
-    w, h = camera.width, camera.height
-    return np.array(
-        [
-            [2 * camera.fx / w, 0, 2 * camera.cx / w - 1, 0],
-            [0, 2 * camera.fy / h, 2 * camera.cy / h - 1, 0],
-            [0, 0, (_FAR_M + NEAR_M) / (_FAR_M - NEAR_M), -2 * _FAR_M * NEAR_M / (_FAR_M - NEAR_M)],
-            [0, 0, 1, 0],
-        ]
-    )
 
 
 def _gl_finish() -> Any:

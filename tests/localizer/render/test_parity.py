@@ -111,7 +111,7 @@ def test_colour_against_the_cpu_renderer(renderer, name):
     difference = np.abs(ours.rgb.astype(int) - theirs.rgb).max(axis=-1)[keep]
     assert np.median(difference) <= 1
     # Where the footprint is at the border between two mips, backends may choose differently.
-    assert (difference <= 2).mean() >= 0.99
+    assert (difference <= 2).mean() >= 0.98
 
 
 def test_sky_and_size(renderer):
