@@ -170,7 +170,7 @@ class SerialTransport:
 
     def __init__(self, device: str, baud: int) -> None:
         try:
-            import serial  # type: ignore[import-untyped]
+            import serial
         except ImportError as error:
             raise EndpointError("serial endpoints need pyserial: pip install pyserial") from error
         # pyserial derives SerialException from OSError; a missing device is retried like any other.
