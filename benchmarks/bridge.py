@@ -4,8 +4,8 @@
 
 An autopilot (a process of its own, UDP loopback) streams LOAD times what the bridge asks for, while
 fixes are submitted at 20 Hz (more than 50 Hz ArduPilot drops). Latency is from `Bridge.submit` to
-the arrival of VISION_POSITION_ESTIMATE in the autopilot's process, on the same clock. CPU is that of
-the bridge's process alone.
+the arrival of VISION_POSITION_ESTIMATE in the autopilot's process, on the same clock. CPU is that
+of the bridge's process alone.
 """
 
 from __future__ import annotations
