@@ -1,5 +1,10 @@
 """``python -m companion``."""
 
-from companion.cli import main
+import sys
 
-main()
+try:  # the imports take seconds, in which an operator may think better of it
+    from companion.cli import main
+
+    main()
+except KeyboardInterrupt:
+    sys.exit(130)

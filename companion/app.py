@@ -32,18 +32,38 @@ _log = logging.getLogger(__name__)
 
 
 class Companion:
-    """One running deployment. `run` blocks until `stop` is set or the feed ends.
+    """One deployment. `run` blocks until `interrupt` is called or the feed ends."""
 
-    Whatever fails on the way up, what was already up is shut down: a part's thread that stayed
-    behind would keep the process from ending.
-    """
-
-    def __init__(self, config: CompanionConfig, stop: threading.Event) -> None:
+    def __init__(self, config: CompanionConfig) -> None:
         self._config = config
-        self._stop = stop
+        self._stop = threading.Event()
+        self._is_up = False
+
+    def run(self) -> None:
+        """Fly until stopped. Raises what ended the feed, after everything is shut down.
+
+        Whatever fails on the way up, what was already up is shut down: a part's thread that stayed
+        behind would keep the process from ending.
+        """
         with ExitStack() as up:
-            self._build(config, up)
-            self._up = up.pop_all()
+            try:
+                self._build(self._config, up)
+            except Exception:
+                if self._stop.is_set():  # an interrupted compiler raises errors of its own
+                    raise KeyboardInterrupt from None
+                raise
+            self._is_up = True
+            self._start(up)
+            while not self._stop.wait(0.2):  # in slices: signals are handled between them
+                pass
+        if self._feed_error is not None:
+            raise self._feed_error
+
+    def interrupt(self) -> None:
+        """End `run`; for a signal handler. The way up takes seconds and is not waited for."""
+        self._stop.set()
+        if not self._is_up:
+            raise KeyboardInterrupt
 
     def _build(self, config: CompanionConfig, up: ExitStack) -> None:
         self._camera = config.camera.model.camera()
@@ -59,27 +79,19 @@ class Companion:
             up.callback(self._recorder.close)
         self._bridge = Bridge(_bridge_config(config), manifest.geoid_separation_m)
         up.callback(self._bridge.stop)
-        localizer = build_localizer(self._stack, self._camera, config.localizer, self._rotation_at)
-        self._engine = DualThreadEngine(localizer, (self._on_estimate,), self._vehicle_prior)
-        self._targets = TargetReporter(config.targets, self._cast_ray, self._on_target)
+        # Before the localizer, whose compilation takes its time: a wrong source is told at once.
         self._source = open_source(
             config.camera.source, self._camera, config.camera.settings, self._on_feed_state
         )
+        localizer = build_localizer(self._stack, self._camera, config.localizer, self._rotation_at)
+        self._engine = DualThreadEngine(localizer, (self._on_estimate,), self._vehicle_prior)
+        self._targets = TargetReporter(config.targets, self._cast_ray, self._on_target)
         self._health = HealthMonitor(
             self._engine, self._bridge, lambda: self._source.state, self._event, record
         )
         self._was_tracking = False
         self._target_numbers: dict[str, int] = {}
         self._feed_error: Exception | None = None
-
-    def run(self) -> None:
-        """Fly until stopped. Raises what ended the feed, after everything is shut down."""
-        with self._up as up:
-            self._start(up)
-            while not self._stop.wait(0.2):  # in slices: signals are handled between them
-                pass
-        if self._feed_error is not None:
-            raise self._feed_error
 
     def _start(self, up: ExitStack) -> None:
         """Start every part; `up` stops them in the reverse order, the feed first."""

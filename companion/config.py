@@ -6,8 +6,9 @@ from pathlib import Path
 from typing import Any
 
 import yaml
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator
 
+from companion.detections import parse_host_port
 from companion.errors import ConfigError
 from companion.sources.base import SourceSettings
 from localizer.camera import Camera
@@ -56,6 +57,16 @@ class TargetConfig(_Model):
     rate_hz: float = Field(5.0, gt=0, le=30, description="reports per second and target")
     pixel_sigma: float = Field(1.5, gt=0, description="error of a detection, pixels")
     map_sigma_m: float = Field(0.3, gt=0, description="error of the map's surface, metres")
+
+    @field_validator("detections")
+    @classmethod
+    def _is_an_address(cls, value: str | None) -> str | None:
+        if value is not None:
+            try:
+                parse_host_port(value)
+            except ConfigError as error:
+                raise ValueError(str(error)) from error
+        return value
 
 
 class PriorConfig(_Model):

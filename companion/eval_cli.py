@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import json
 from pathlib import Path
+from tempfile import TemporaryFile
 from typing import Annotated
 
 import numpy as np
@@ -14,7 +15,7 @@ from rich.progress import Progress
 from rich.table import Table
 
 from companion.build import MapStack, build_localizer
-from companion.errors import ConfigError
+from companion.errors import ConfigError, ReportError
 from companion.plots import ErrorSeries, overlay_sheet, plot_errors, save_image
 from companion.versions import versions
 from localizer.camera import Camera
@@ -44,8 +45,10 @@ def evaluate_command(
     name: Annotated[str | None, typer.Option(help="which sequence of a PiLoT data set")] = None,
     prior: Annotated[str, typer.Option(help="first: one prior; each: one per frame")] = "first",
     seed: Annotated[int, typer.Option(min=0, help="seed of the prior's noise")] = 0,
-    noise_m: Annotated[float, typer.Option(min=0, help="prior noise up to, m")] = 10.0,
-    noise_deg: Annotated[float, typer.Option(min=0, help="prior noise up to, degrees")] = 10.0,
+    noise_m: Annotated[float, typer.Option(min=0, max=1e6, help="prior noise up to, m")] = 10.0,
+    noise_deg: Annotated[
+        float, typer.Option(min=0, max=180, help="prior noise up to, degrees")
+    ] = 10.0,
     width: Annotated[int, typer.Option(min=64, max=2048, help="working width, pixels")] = 320,
     model: Annotated[Path | None, typer.Option(help="ONNX feature network")] = None,
     limit: Annotated[int | None, typer.Option(min=1, help="only the first N frames")] = None,
@@ -53,6 +56,7 @@ def evaluate_command(
     """Localize every frame of a recorded sequence from a perturbed prior and measure it."""
     if prior not in ("first", "each"):
         raise ConfigError(f"--prior is first or each, not {prior!r}")
+    _prepare(report)
     mode: PriorMode = "first" if prior == "first" else "each"
     config = LocalizerConfig(width=width, model=model, seed=seed, feature_threads=2)
     stack = MapStack(map_cache, config)
@@ -74,11 +78,14 @@ def evaluate_command(
             "noise_m": noise_m, "noise_deg": noise_deg, "width": localizer.camera.width,
             "height": localizer.camera.height, "features": load_extractor(model).name,
         }  # fmt: skip
-        _write_report(report, frames, metrics, settings, stack.cache.frame)
-        _write_overlays(report, frames, data, stack.renderer, localizer.camera)
+        print_metrics(metrics, str(sequence))  # first: they are told even if the disk is full
+        try:
+            _write_report(report, frames, metrics, settings, stack.cache.frame)
+            _write_overlays(report, frames, data, stack.renderer, localizer.camera)
+        except OSError as error:
+            raise ReportError(f"--report {report}: cannot be written: {error}") from error
     finally:
         stack.close()
-    print_metrics(metrics, str(sequence))
 
 
 def print_metrics(metrics: LocalizationMetrics, title: str) -> None:
@@ -95,6 +102,16 @@ def print_metrics(metrics: LocalizationMetrics, title: str) -> None:
     Console().print(table)
 
 
+def _prepare(folder: Path) -> None:
+    """Make the report's folder and try it, before minutes are spent on what goes into it."""
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        with TemporaryFile(dir=folder):
+            pass
+    except OSError as error:
+        raise ReportError(f"--report {folder}: cannot be written: {error}") from error
+
+
 def _write_report(
     folder: Path,
     frames: list[EvaluatedFrame],
@@ -102,7 +119,6 @@ def _write_report(
     settings: dict[str, object],
     local: LocalFrame,
 ) -> None:
-    folder.mkdir(parents=True, exist_ok=True)
     report = metrics.to_dict() | {"settings": settings, "versions": versions()}
     (folder / "report.json").write_text(json.dumps(report, indent=2))
     rows = list(csv_rows(frames, local))

@@ -39,7 +39,8 @@ def overlay_sheet(video: Image, render: Image, caption: str) -> Image:
 
 def save_image(path: Path, rgb: Image) -> None:
     """Write an RGB image as PNG or JPEG, by suffix."""
-    cv2.imwrite(str(path), cv2.cvtColor(rgb, cv2.COLOR_RGB2BGR))
+    if not cv2.imwrite(str(path), cv2.cvtColor(rgb, cv2.COLOR_RGB2BGR)):
+        raise OSError(f"{path} was not written")
 
 
 @dataclass(frozen=True)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import logging
 import signal
-import threading
 from pathlib import Path
 from typing import Annotated
 
@@ -25,10 +24,9 @@ def run_command(
         handlers=[RichHandler(show_path=False)],
     )
     settings = load_config(config)
-    # Before anything is started: an interrupt must not catch a part half way up.
-    interrupted = threading.Event()
-    for number in (signal.SIGINT, signal.SIGTERM):
-        signal.signal(number, lambda *_: interrupted.set())
     from companion.app import Companion
 
-    Companion(settings, interrupted).run()
+    companion = Companion(settings)
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, lambda *_: companion.interrupt())
+    companion.run()

@@ -65,7 +65,7 @@ class Camera:
             fx, fy, cx, cy = (float(data[key]) for key in _KEYS[2:])
             width, height = int(data["width"]), int(data["height"])
             return cls(width, height, fx, fy, cx, cy, (k[0], k[1], k[2], k[3], k[4]))
-        except (TypeError, ValueError) as error:
+        except (TypeError, ValueError, OverflowError, CameraError) as error:
             raise CameraError(f"{where}: {error}") from error
 
     @classmethod

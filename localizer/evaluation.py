@@ -18,7 +18,7 @@ import cv2
 import numpy as np
 
 from localizer.camera import Camera
-from localizer.errors import SequenceError
+from localizer.errors import OutsideMapError, SequenceError
 from localizer.geo import LocalFrame
 from localizer.metrics import LocalizationMetrics, localization_metrics
 from localizer.pipeline import Localizer
@@ -46,6 +46,11 @@ class Sequence:
         data = cv2.imread(str(self.images[index]), cv2.IMREAD_COLOR)
         if data is None:
             raise SequenceError(f"{self.images[index]}: missing or not an image")
+        if data.shape[:2] != (self.camera.height, self.camera.width):
+            raise SequenceError(
+                f"{self.images[index]}: is {data.shape[1]}x{data.shape[0]}, the camera model says "
+                f"{self.camera.width}x{self.camera.height}: give this sequence's calibration"
+            )
         rgb: Image = cv2.cvtColor(data, cv2.COLOR_BGR2RGB).astype(np.uint8, copy=False)
         return Frame(rgb, self.times_ns[index], self.camera, index)
 
@@ -158,9 +163,11 @@ def evaluate(
 
     mode ``first``: only the first frame's prior is known, as in the paper. ``each``: every frame
     starts from its own perturbed truth. passes: how often a frame that starts from a perturbed
-    prior is rendered and registered, each time from the last result.
+    prior is rendered and registered, each time from the last result. A frame that is predicted
+    outside the map counts as not localized; `OutsideMapError` if that befalls every frame.
     """
     frames: list[EvaluatedFrame] = []
+    outside: list[OutsideMapError] = []
     seconds = 0.0
     with ThreadPoolExecutor(1, thread_name_prefix="query") as pool:
         for index in range(len(sequence.images)):
@@ -170,10 +177,18 @@ def evaluate(
             if fresh:
                 prior = perturbation.prior(sequence.truth[index], index, frame.exposure_time_ns)
                 localizer.set_prior(prior)
-            outcome = _localize(localizer, frame, passes if fresh else 1, pool)
+            try:
+                outcome = _localize(localizer, frame, passes if fresh else 1, pool)
+            except OutsideMapError as error:
+                if mode == "first" and fresh:  # every other frame hangs on this prior
+                    raise
+                outside.append(error)
+                outcome = _not_localized(localizer, frame)
             seconds += time.perf_counter() - started
             frames.append(_measure(sequence, index, outcome))
             progress(index)
+    if len(outside) == len(frames):
+        raise outside[0]
     return frames, _summary(frames, seconds)
 
 
@@ -196,6 +211,24 @@ def _localize(
             localizer.set_prior(
                 PosePrior(estimate.world_from_camera, prior.covariance / 4, prior.time_ns)
             )
+
+
+def _not_localized(localizer: Localizer, frame: Frame) -> PoseEstimate:
+    """The prediction, as the answer for a frame whose prediction is outside the map."""
+    prior = localizer.predict(frame.exposure_time_ns)
+    if prior is None:
+        raise SequenceError("no prior was set before localizing")
+    return PoseEstimate(
+        world_from_camera=prior.world_from_camera,
+        covariance=prior.covariance,
+        quality=0.0,
+        state=localizer.tracker.integrity.state,
+        status=RegistrationStatus.TOO_FEW_ANCHORS,
+        accepted=False,
+        exposure_time_ns=frame.exposure_time_ns,
+        sequence=frame.sequence,
+        camera=frame.camera,
+    )
 
 
 def _measure(sequence: Sequence, index: int, estimate: PoseEstimate) -> EvaluatedFrame:

@@ -10,6 +10,7 @@ from typing import Annotated
 
 import typer
 from rich.console import Console
+from rich.markup import escape
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 
 from companion.errors import CompanionError
@@ -91,7 +92,9 @@ def main() -> None:
     try:
         app()
     except (SimulationError, CompanionError, LocalizerError) as error:
-        Console(stderr=True).print(f"[bold red]{type(error).__name__}[/]: {error}", soft_wrap=True)
+        # Escaped: a path or a value in the text may look like the console's markup.
+        name, text = type(error).__name__, escape(str(error))
+        Console(stderr=True).print(f"[bold red]{name}[/]: {text}", soft_wrap=True, highlight=False)
         sys.exit(2)
 
 

@@ -32,6 +32,7 @@ def test_minimal_config_and_paths_relative_to_the_file(tmp_path):
         ({"localizer": {"motion": {"acceleration_sigma": -1}}}, "acceleration_sigma"),
         ({"camera": {"source": "udp://x:1", "model": MODEL | {"fx": -1}}}, "camera.model.fx"),
         ({"bridge": {"connection": "carrier-pigeon:1"}}, "bridge.connection"),
+        ({"targets": {"detections": "nonsense"}}, "targets.detections"),
     ],
 )
 def test_every_problem_is_named_by_its_key(tmp_path, change, named):

@@ -3,11 +3,14 @@
 import json
 import shutil
 
+import cv2
+import numpy as np
 import pytest
 from typer.testing import CliRunner
 
 from companion.cli import app
-from localizer.errors import SequenceError
+from companion.errors import ReportError
+from localizer.errors import CameraError, OutsideMapError, SequenceError
 from sitl.assets import prepare
 from sitl.kinematic import record_scenario
 from sitl.scenario import CameraSpec, Leg, Scenario
@@ -70,3 +73,48 @@ def test_a_missing_image_is_named(recorded, tmp_path):
     (broken / "images" / "000003.jpg").unlink()
     with pytest.raises(SequenceError, match=r"1 of .* missing, first 000003\.jpg"):
         _run(broken, "--map", assets.map_cache, "--report", tmp_path / "r")
+
+
+def test_an_image_of_another_size_is_named(recorded, tmp_path):
+    assets, sequence = recorded
+    broken = tmp_path / "broken"
+    shutil.copytree(sequence, broken)
+    path = broken / "images" / "000001.jpg"
+    cv2.imwrite(str(path), np.zeros((240, 320, 3), np.uint8))
+    with pytest.raises(SequenceError, match=r"000001\.jpg: is 320x240"):
+        _run(broken, "--map", assets.map_cache, "--report", tmp_path / "r")
+
+
+def test_a_wrong_camera_file_is_named(recorded, tmp_path):
+    assets, sequence = recorded
+    broken = tmp_path / "broken"
+    shutil.copytree(sequence, broken)
+    camera = json.loads((broken / "camera.json").read_text())
+    (broken / "camera.json").write_text(json.dumps(camera | {"fx": -1}))
+    with pytest.raises(CameraError, match=r"camera\.json: focal lengths"):
+        _run(broken, "--map", assets.map_cache, "--report", tmp_path / "r")
+
+
+def test_a_report_that_cannot_be_written_is_told_before_the_work(recorded, tmp_path):
+    assets, _ = recorded
+    (tmp_path / "r").touch()
+    with pytest.raises(ReportError, match="--report"):
+        _run(tmp_path / "no-sequence", "--map", assets.map_cache, "--report", tmp_path / "r")
+
+
+def test_frames_outside_the_map_count_as_not_localized(recorded, tmp_path):
+    assets, sequence = recorded
+    lost = tmp_path / "lost"
+    shutil.copytree(sequence, lost)
+    lines = (lost / "poses.txt").read_text().splitlines()[:3]
+    fields = lines[1].split()
+    fields[1] = str(float(fields[1]) + 0.5)  # degrees of longitude
+    (lost / "poses.txt").write_text("\n".join([lines[0], " ".join(fields), lines[2]]))
+    common = ("--map", assets.map_cache, "--report", tmp_path / "r", "--prior", "each")
+    _run(lost, *common)
+    report = json.loads((tmp_path / "r" / "report.json").read_text())
+    assert report["frames"] == 3
+    assert report["completeness"] == pytest.approx(200 / 3)
+    (lost / "poses.txt").write_text(" ".join(fields))
+    with pytest.raises(OutsideMapError):
+        _run(lost, *common)

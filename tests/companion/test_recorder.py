@@ -1,8 +1,13 @@
 import csv
+import logging
+import os
+from pathlib import Path
 
 import numpy as np
+import pytest
 
 from companion.config import RecordConfig
+from companion.errors import ReportError
 from companion.recorder import ESTIMATE_COLUMNS, Recorder
 from localizer.camera import Camera
 from localizer.geo import Geodetic, LocalFrame
@@ -38,3 +43,23 @@ def test_what_is_recorded_can_be_read_back(tmp_path):
         assert next(iter(csv.DictReader(file)))["text"] == 'a, "quoted" text\nof two lines'
     names = sorted(p.stem for p in (tmp_path / "snapshots").glob("*.jpg"))
     assert names == ["1000000000", "2000000000"]
+
+
+def test_a_file_in_the_folders_place_is_a_named_error(tmp_path):
+    (tmp_path / "flight").touch()
+    with pytest.raises(ReportError, match=r"record\.folder .*flight"):
+        Recorder(RecordConfig(folder=tmp_path / "flight"), FRAME)
+
+
+@pytest.mark.skipif(not os.path.exists("/dev/full"), reason="no /dev/full here")
+def test_a_full_disk_costs_rows_and_not_the_recorder(tmp_path, caplog):
+    (tmp_path / "events.csv").symlink_to("/dev/full")
+    recorder = Recorder(RecordConfig(folder=tmp_path), FRAME)
+    with caplog.at_level(logging.WARNING):
+        for _ in range(2000):  # more than a file's buffer holds
+            recorder.event("info", "x" * 100)
+        recorder.target(TargetFix("car", np.zeros(3), np.eye(3), (3.0, 4.0), 5), (1.0, 2.0, 0.0))
+        recorder.close()
+    assert recorder.dropped > 0
+    assert sum("record is incomplete" in r.message for r in caplog.records) == 1
+    assert Path(tmp_path / "targets.csv").read_text().count("car") == 1

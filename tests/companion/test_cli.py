@@ -1,0 +1,66 @@
+"""The command line as a process: what an operator sees of wrong input and of an interrupt."""
+
+import signal
+import subprocess
+import sys
+import time
+
+import pytest
+import yaml
+
+from sitl.assets import prepare
+
+MODEL = {"width": 640, "height": 480, "fx": 550, "fy": 550, "cx": 320, "cy": 240}
+START_S = 120  # of a process, on a machine that compiles everything anew
+
+
+@pytest.fixture(scope="module")
+def map_cache(tmp_path_factory):
+    return prepare(5, tmp_path_factory.mktemp("worlds"), size_m=400.0).map_cache
+
+
+def _start(tmp_path, **changes):
+    config = {
+        "camera": {"source": "udp://127.0.0.1:5", "model": MODEL},
+        "bridge": {"connection": "tcp:127.0.0.1:9"},
+        "record": {"folder": str(tmp_path / "record")},
+    }
+    path = tmp_path / "companion.yaml"
+    path.write_text(yaml.safe_dump(config | changes))
+    return subprocess.Popen(
+        [sys.executable, "-m", "companion", "run", str(path)],
+        stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
+    )  # fmt: skip
+
+
+def _ended(process):
+    out, err = process.communicate(timeout=START_S)
+    assert "Traceback" not in out + err
+    return process.returncode, err.strip()
+
+
+@pytest.mark.parametrize("source", ["nothing.mp4", "http://x"])
+def test_a_part_that_fails_on_the_way_up_leaves_no_thread_behind(map_cache, tmp_path, source):
+    camera = {"source": source, "model": MODEL}
+    code, text = _ended(_start(tmp_path, map=str(map_cache), camera=camera))
+    assert code == 2
+    assert text.startswith("StreamOpenError: ")
+    assert len(text.splitlines()) == 1
+
+
+def test_markup_in_a_message_is_shown_as_it_is(tmp_path):
+    code, text = _ended(_start(tmp_path, map="[/red]nowhere"))
+    assert code == 2
+    assert "[/red]nowhere: no tile cache here" in text
+
+
+@pytest.mark.parametrize("ready", ["record", "record/health.json"])
+def test_an_interrupt_ends_it_cleanly_at_any_moment(map_cache, tmp_path, ready):
+    """On the way up (the record's folder is made before compilation), and when it runs."""
+    process = _start(tmp_path, map=str(map_cache))
+    deadline = time.monotonic() + START_S
+    while not (tmp_path / ready).exists() and time.monotonic() < deadline:
+        time.sleep(0.02)
+    process.send_signal(signal.SIGINT)
+    code, _ = _ended(process)
+    assert code in ((0,) if ready.endswith("json") else (0, 130))
