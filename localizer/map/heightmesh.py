@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import fast_simplification  # type: ignore[import-untyped]
+import fast_simplification
 import numpy as np
 from numpy.typing import NDArray
 
