@@ -233,6 +233,7 @@ def test_vision_position_estimate(fly: Callable[..., Flight]) -> None:
     assert counters["fc_bad_checksums"] == 0
 
 
+@pytest.mark.long
 def test_latency_of_250_ms_is_compensated(fly: Callable[..., Flight]) -> None:
     flight = fly(
         vision_only_parameters(delay_ms=250.0),
@@ -250,6 +251,7 @@ def test_latency_of_250_ms_is_compensated(fly: Callable[..., Flight]) -> None:
 ODOMETRY = {"EK3_SRC1_VELXY": 6, "EK3_SRC1_VELZ": 6}
 
 
+@pytest.mark.long
 def test_odometry_with_measured_velocity(fly: Callable[..., Flight]) -> None:
     flight = fly(
         vision_only_parameters() | ODOMETRY,
@@ -263,6 +265,7 @@ def test_odometry_with_measured_velocity(fly: Callable[..., Flight]) -> None:
     assert p95 <= 0.25 * 1.25
 
 
+@pytest.mark.long
 def test_odometry_with_derived_velocity(fly: Callable[..., Flight]) -> None:
     # Velocity from positions is worse than VISO_VEL_M_NSE's default of 0.1 m/s claims.
     flight = fly(
@@ -277,6 +280,7 @@ def test_odometry_with_derived_velocity(fly: Callable[..., Flight]) -> None:
     assert p95 <= 0.8
 
 
+@pytest.mark.long
 def test_gps_input(fly: Callable[..., Flight]) -> None:
     flight = fly(
         gps_input_only_parameters(),
@@ -289,6 +293,7 @@ def test_gps_input(fly: Callable[..., Flight]) -> None:
     assert p95 <= 0.71 * 1.25
 
 
+@pytest.mark.long
 def test_gnss_loss_switches_the_source_set(fly: Callable[..., Flight]) -> None:
     flight = fly(
         vision_parameters(),
