@@ -124,7 +124,8 @@ class Companion:
         self._stop.set()
 
     def _on_feed_state(self, state: StreamState, text: str) -> None:
-        self._event("warning" if state is StreamState.STALLED else "info", f"feed: {text}")
+        bad = state in (StreamState.STALLED, StreamState.FAILED)
+        self._event("warning" if bad else "info", f"feed: {text}")
 
     def _vehicle_prior(self, time_ns: int) -> PosePrior | None:
         sigma = self._config.prior

@@ -33,7 +33,8 @@ def main() -> None:
     """Entry point: named errors become one clear line and exit code 2."""
     try:
         app()
-    except (CompanionError, LocalizerError, BridgeError) as error:
+    # OSError: of a disk or a folder, which the program cannot help and which names its path.
+    except (CompanionError, LocalizerError, BridgeError, OSError) as error:
         # Escaped: a path or a value in the text may look like the console's markup.
         name, text = type(error).__name__, escape(str(error))
         Console(stderr=True).print(f"[bold red]{name}[/]: {text}", soft_wrap=True, highlight=False)

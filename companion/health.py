@@ -81,8 +81,13 @@ class HealthMonitor:
     def _assess(self) -> tuple[HealthLevel, str]:
         """The worst thing that is true now, in one line."""
         feed = self._feed_state()
+        if feed is StreamState.FAILED:
+            return HealthLevel.FAILED, "video feed failed"
         if feed is StreamState.STALLED:
             return HealthLevel.DEGRADED, "video feed stalled"
+        # Told in health.json and the record only: the vehicle cannot hear it.
+        if not self._bridge.state().connected:
+            return HealthLevel.DEGRADED, "no heartbeat from the flight controller"
         error = self._engine.health.last_error
         if not self._estimates:
             return HealthLevel.STARTING, error or "waiting for video and a pose prior"

@@ -20,7 +20,13 @@ from sitl.errors import SimulationError
 from sitl.flight import fly
 from sitl.kinematic import record_scenario
 from sitl.report import make_report, print_report
-from sitl.scenario import Scenario, ScenarioError, VehicleKind, load_scenario
+from sitl.scenario import Scenario, ScenarioError, VehicleKind, check_inside, load_scenario
+
+# What a flight and its report leave in their folder.
+_REPORT_FILES = (
+    "companion", "companion.log", "companion.yaml", "errors.png", "frames.csv",
+    "frames_report.csv", "overlay-*", "report.json", "tracks.png", "vehicle.csv",
+)  # fmt: skip
 
 app = typer.Typer(no_args_is_help=True, pretty_exceptions_enable=False)
 
@@ -47,6 +53,7 @@ def demo(
     script = load_scenario(scenario) if scenario else Scenario()
     console = Console()
     assets = prepare(seed, worlds, lambda text: console.print(f"[dim]{text}[/]"))
+    check_inside(script, assets.world.size_m)
     _clear(out)
     columns = (TextColumn("{task.description}"), BarColumn(), TimeElapsedColumn())
     with Progress(*columns, console=console) as bar:
@@ -70,8 +77,11 @@ def sequence(
     script = load_scenario(scenario) if scenario else Scenario()
     if condition is not None:
         script = Scenario.model_validate(script.model_dump() | {"condition": condition})
+    if out.exists() and (not out.is_dir() or any(out.iterdir())):
+        raise ScenarioError(f"{out}: exists already and is not empty; give another folder")
     console = Console()
     assets = prepare(seed, worlds, lambda text: console.print(f"[dim]{text}[/]"))
+    check_inside(script, assets.world.size_m)
     with console.status("rendering"):
         count = record_scenario(assets, script, seed, out)
     console.print(f"[green]{out}[/]: {count} frames; its map is {assets.map_cache}")
@@ -81,8 +91,14 @@ def _clear(out: Path) -> None:
     """Remove an earlier report; anything else in the way is the user's."""
     if not out.exists():
         return
-    if any(out.iterdir()) and not (out / "companion.yaml").exists():
-        raise ScenarioError(f"{out}: holds other files than a flight's report; give another --out")
+    if not out.is_dir():
+        raise ScenarioError(f"{out}: is a file; give a folder as --out")
+    foreign = [p.name for p in out.iterdir() if not any(p.match(x) for x in _REPORT_FILES)]
+    if foreign:
+        raise ScenarioError(
+            f"{out}: holds other files than a flight's report, such as {min(foreign)}; "
+            "give another --out"
+        )
     shutil.rmtree(out)
 
 
@@ -91,7 +107,8 @@ def main() -> None:
     logging.basicConfig(level=logging.WARNING)
     try:
         app()
-    except (SimulationError, CompanionError, LocalizerError) as error:
+    # OSError: of a disk or a folder, which the program cannot help and which names its path.
+    except (SimulationError, CompanionError, LocalizerError, OSError) as error:
         # Escaped: a path or a value in the text may look like the console's markup.
         name, text = type(error).__name__, escape(str(error))
         Console(stderr=True).print(f"[bold red]{name}[/]: {text}", soft_wrap=True, highlight=False)

@@ -35,10 +35,10 @@ class Leg(_Model):
 
 
 class CameraSpec(_Model):
-    """The world camera's video."""
+    """The world camera's video. H.264 of this chroma format takes even sizes only."""
 
-    width: int = 640
-    height: int = 480
+    width: int = Field(640, ge=64, le=4096, multiple_of=2)
+    height: int = Field(480, ge=64, le=4096, multiple_of=2)
     horizontal_fov_deg: float = Field(65.0, gt=20, lt=120)
     distortion: tuple[float, float, float, float, float] = (-0.09, 0.02, 0.0006, -0.0004, 0.0)
     rate_hz: float = Field(10.0, gt=0, le=60)
@@ -90,3 +90,13 @@ def load_scenario(path: Path) -> Scenario:
             f"  {'.'.join(str(p) for p in e['loc'])}: {e['msg']}" for e in error.errors()
         )
         raise ScenarioError(f"{path}:\n{problems}") from error
+
+
+def check_inside(scenario: Scenario, size_m: float) -> None:
+    """ScenarioError for a leg that leaves the world, a square of `size_m` about home."""
+    for number, leg in enumerate(scenario.legs):
+        if not max(abs(leg.east_m), abs(leg.north_m)) <= size_m / 2:
+            raise ScenarioError(
+                f"legs.{number}: {leg.east_m:g} m east, {leg.north_m:g} m north is outside the "
+                f"world, which reaches {size_m / 2:g} m from home"
+            )

@@ -8,6 +8,7 @@ import time
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
+from urllib.parse import urlsplit
 
 import av
 import numpy as np
@@ -341,6 +342,7 @@ def live_input(location: str, camera: Camera, settings: SourceSettings) -> _Inpu
     if location.startswith("udp://"):
         # Without noparse FFmpeg's H.264 parser holds each picture until the next one begins: one
         # frame period. MPEG-TS carries one picture per PES packet, so the parser is not needed.
+        _check_address(location)
         flags = {"fflags": "nobuffer+noparse+nofillin"}
         udp = {"buffer_size": "2000000", "fifo_size": "32768", "overrun_nonfatal": "1"}
         return _Input(location, common | flags | udp, format="mpegts")
@@ -354,6 +356,16 @@ def live_input(location: str, camera: Camera, settings: SourceSettings) -> _Inpu
         )
     size = {"video_size": f"{camera.width}x{camera.height}", "fflags": "nobuffer"}
     return _Input(str(device), size, format="v4l2", device=True)
+
+
+def _check_address(location: str) -> None:
+    """FFmpeg takes any port modulo 65536 and would wait for ever."""
+    try:
+        good = bool(urlsplit(location).port)
+    except ValueError:
+        good = False
+    if not good:
+        raise StreamOpenError(f"{location}: expected udp://HOST:PORT with a port of 1 to 65535")
 
 
 def _rgb(picture: av.VideoFrame, reformatter: av.video.reformatter.VideoReformatter) -> Image:

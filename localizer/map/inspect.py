@@ -14,6 +14,7 @@ from PIL import Image as PillowImage
 
 from localizer.camera import Camera
 from localizer.errors import MapCacheError, OutsideMapError
+from localizer.geo import Geodetic
 from localizer.map.cache import TileCache
 from localizer.map.stream import TileStreamer
 from localizer.map.tile import TileMesh
@@ -113,7 +114,8 @@ def camera_pose(
     """World pose of a level camera. height_m: ellipsoidal; heading: clockwise from north; pitch: of
     the optical axis above the horizon, -90 looks straight down.
     """
-    position = cache.frame.enu_from_geodetic(latitude_deg, longitude_deg, height_m)
+    p = Geodetic(latitude_deg, longitude_deg, height_m)  # names what is no place on Earth
+    position = cache.frame.enu_from_geodetic(p.latitude_deg, p.longitude_deg, p.height_m)
     attitude = matrix_from_euler(0.0, np.radians(pitch_deg), np.radians(heading_deg))
     return Pose(_ENU_FROM_NED @ attitude @ _BODY_FROM_CAMERA, position)
 

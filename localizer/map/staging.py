@@ -11,6 +11,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
 import numpy as np
@@ -106,6 +107,8 @@ def staging(out: Path, parameters: dict[str, Any], *, overwrite: bool) -> Iterat
     """
     if out.exists() and not overwrite:
         raise MapCacheError(f"{out} exists already; choose another folder or ask to overwrite it")
+    if out.exists() and not (out / MANIFEST_NAME).is_file() and not _is_empty(out):
+        raise MapCacheError(f"{out} is no tile cache and is not overwritten; choose another folder")
     folder = out.with_name(out.name + ".building")
     folder.mkdir(parents=True, exist_ok=True)
     with (folder / "lock").open("w") as lock:
@@ -133,13 +136,15 @@ def publish(staged: Staging, out: Path, index: TileIndex, manifest: Manifest) ->
         shutil.rmtree(folder / name, ignore_errors=True)
     for name in ("build.json", "lock"):
         (folder / name).unlink(missing_ok=True)
-    old = out.with_name(out.name + ".old")
-    shutil.rmtree(old, ignore_errors=True)
-    if out.exists():
-        out.rename(old)
-    folder.rename(out)
-    shutil.rmtree(old, ignore_errors=True)
+    with TemporaryDirectory(prefix=f"{out.name}.old-", dir=out.parent) as old:
+        if out.exists():
+            out.rename(Path(old) / out.name)
+        folder.rename(out)
     return final
+
+
+def _is_empty(path: Path) -> bool:
+    return path.is_dir() and not any(path.iterdir())
 
 
 def stored_tile(mesh: SourceMesh) -> tuple[bytes, StoredTile]:

@@ -64,3 +64,12 @@ def test_an_interrupt_ends_it_cleanly_at_any_moment(map_cache, tmp_path, ready):
     process.send_signal(signal.SIGINT)
     code, _ = _ended(process)
     assert code in ((0,) if ready.endswith("json") else (0, 130))
+
+
+def test_a_folder_that_cannot_be_made_is_one_line(map_cache, tmp_path):
+    (tmp_path / "file").touch()
+    bridge = {"connection": "tcp:127.0.0.1:9", "tlog": str(tmp_path / "file" / "flight.tlog")}
+    code, text = _ended(_start(tmp_path, map=str(map_cache), bridge=bridge))
+    assert code == 2
+    assert "file" in text
+    assert len(text.splitlines()) == 1

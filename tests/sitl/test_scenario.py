@@ -7,7 +7,7 @@ from localizer.pose import so3_log
 from sitl.embedded.geodesy import Location
 from sitl.flight import mission
 from sitl.kinematic import camera_path
-from sitl.scenario import Scenario, ScenarioError, load_scenario
+from sitl.scenario import Leg, Scenario, ScenarioError, check_inside, load_scenario
 
 CONFIGS = Path(__file__).parents[2] / "configs"
 
@@ -24,6 +24,7 @@ def test_the_shipped_demo_file_says_what_the_defaults_are():
         ("legs: []", "legs"),
         ("a: [", "not valid YAML"),
         ("condition: disco", "condition"),
+        ("camera: {width: 3, height: 2}", "camera.width"),
     ],
 )
 def test_bad_scenarios_are_named(tmp_path, text, named):
@@ -60,3 +61,11 @@ def test_the_kinematic_path_is_smooth_and_visits_every_corner():
         for (_, a), (_, b) in zip(path[::5], path[5::5], strict=False)
     ]
     assert np.degrees(max(turns)) < 8.0
+
+
+@pytest.mark.parametrize("east", [801.0, -9e4, float("nan")])
+def test_a_leg_outside_the_world_is_named(east):
+    check_inside(Scenario(), 1600.0)
+    home = Leg(east_m=0, north_m=0)
+    with pytest.raises(ScenarioError, match=r"legs\.1: .* reaches 800 m"):
+        check_inside(Scenario(legs=(home, Leg(east_m=east, north_m=0))), 1600.0)

@@ -250,3 +250,9 @@ def test_an_rtsp_server_that_is_not_there_is_reported_and_kept_trying() -> None:
         watch.wait_until(lambda: StreamState.STALLED in watch.states)
         assert "cannot connect" in watch.texts[watch.states.index(StreamState.STALLED)]
     assert watch.error is None
+
+
+@pytest.mark.parametrize("url", ["udp://127.0.0.1", "udp://127.0.0.1:99999", "udp://127.0.0.1:x"])
+def test_an_address_without_a_possible_port_is_named(url):
+    with pytest.raises(StreamOpenError, match="HOST:PORT"):
+        open_source(url, CAMERA)

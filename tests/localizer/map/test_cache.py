@@ -205,6 +205,19 @@ def test_overwrite_replaces_the_cache(source, tmp_path):
     assert [p.name for p in tmp_path.iterdir() if p.name.startswith("c")] == ["c"]
 
 
+def test_overwrite_spares_what_is_no_cache(source, tmp_path):
+    out = tmp_path / "c"
+    out.mkdir()
+    (out / "thesis.tex").touch()
+    (tmp_path / "c.old").mkdir()
+    (tmp_path / "c.old" / "draft.tex").touch()
+    with pytest.raises(MapCacheError, match="no tile cache"):
+        build_cache(source, out, workers=1, progress=False, overwrite=True)
+    (out / "thesis.tex").unlink()
+    build_cache(source, out, workers=1, progress=False, overwrite=True)
+    assert (tmp_path / "c.old" / "draft.tex").exists()
+
+
 def test_a_source_that_is_not_there(tmp_path):
     with pytest.raises(MapSourceError, match="no such file"):
         build_cache(tmp_path / "x", tmp_path / "c")

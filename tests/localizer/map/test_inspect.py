@@ -12,7 +12,7 @@ from typer.testing import CliRunner
 
 from companion.cli import app
 from localizer.camera import Camera
-from localizer.errors import OutsideMapError
+from localizer.errors import GeoreferenceError, OutsideMapError
 from localizer.map.cache import TileCache
 from localizer.map.inspect import (
     camera_pose,
@@ -128,3 +128,8 @@ def test_dask_builds_the_same_cache(source, cache, tmp_path):
             source, tmp_path / "c", scheduler=cluster.scheduler_address, progress=False
         )
     assert manifest == cache.manifest
+
+
+def test_a_pose_off_the_earth_is_named(cache):
+    with pytest.raises(GeoreferenceError):
+        camera_pose(cache, 95.0, 8.0, 100.0)

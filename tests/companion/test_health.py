@@ -1,0 +1,65 @@
+"""What the health monitor makes of its parts, and that a bad disk does not silence it."""
+
+import json
+import time
+from types import SimpleNamespace
+
+import pytest
+
+from companion.config import RecordConfig
+from companion.health import HealthMonitor
+from companion.sources import StreamState
+from localizer.engine import EngineHealth
+from mavlink_bridge.messages import HealthLevel
+
+
+class FakeBridge:
+    def __init__(self, connected):
+        self._connected = connected
+        self.told = []
+
+    def state(self):
+        return SimpleNamespace(connected=self._connected)
+
+    def set_health(self, level, text):
+        self.told.append((level, text))
+
+    def counters(self):
+        return {}
+
+
+def _one_report(folder, state, connected):
+    """What the bridge is told, and the events, of a monitor that is started and stopped."""
+    bridge, events = FakeBridge(connected), []
+    engine = SimpleNamespace(health=EngineHealth())
+    monitor = HealthMonitor(
+        engine, bridge, lambda: state, lambda *e: events.append(e), RecordConfig(folder=folder)
+    )
+    monitor.start()
+    monitor.stop()
+    return bridge.told, events
+
+
+@pytest.mark.parametrize(
+    ("state", "connected", "level", "text"),
+    [
+        (StreamState.LIVE, True, HealthLevel.STARTING, "waiting for video"),
+        (StreamState.LIVE, False, HealthLevel.DEGRADED, "no heartbeat"),
+        (StreamState.STALLED, True, HealthLevel.DEGRADED, "stalled"),
+        (StreamState.FAILED, True, HealthLevel.FAILED, "failed"),
+    ],
+)
+def test_the_worst_thing_is_told(tmp_path, state, connected, level, text):
+    told, events = _one_report(tmp_path, state, connected)
+    assert told[-1][0] is level
+    assert text in told[-1][1]
+    assert text in events[-1][1]
+    written = json.loads((tmp_path / "health.json").read_text())
+    assert written["level"] == level.value
+    assert time.monotonic_ns() - written["time_ns"] < 5e9
+
+
+def test_a_file_that_cannot_be_written_is_an_event_and_the_bridge_is_still_told(tmp_path):
+    told, events = _one_report(tmp_path / "gone", StreamState.LIVE, True)
+    assert told
+    assert any("cannot be written" in text for _, text in events)

@@ -1,0 +1,55 @@
+"""``python -m sitl``: nothing of the user's is removed or written over."""
+
+import pytest
+from typer.testing import CliRunner
+
+from sitl import __main__ as cli
+from sitl.scenario import ScenarioError
+
+
+@pytest.fixture(autouse=True)
+def no_work(monkeypatch):
+    """Refusals come before a world is built or flown; an accepted folder gets as far as flying."""
+
+    class World:
+        size_m = 1600.0
+
+    class Assets:
+        world = World()
+
+    def fly(*_):
+        raise RuntimeError("flying")
+
+    monkeypatch.setattr(cli, "prepare", lambda *_: Assets())
+    monkeypatch.setattr(cli, "fly", fly)
+
+
+def _run(*arguments):
+    return CliRunner().invoke(cli.app, [str(a) for a in arguments], catch_exceptions=False)
+
+
+@pytest.mark.parametrize("command", ["demo", "sequence"])
+def test_a_folder_with_other_files_is_left_alone(tmp_path, command):
+    out = tmp_path / "mine"
+    out.mkdir()
+    (out / "companion.yaml").touch()  # an operator may well have one of his own
+    (out / "thesis.tex").touch()
+    with pytest.raises(ScenarioError, match="mine"):
+        _run(command, *(["--out", out] if command == "demo" else [out]))
+    assert (out / "thesis.tex").exists()
+
+
+@pytest.mark.parametrize("command", ["demo", "sequence"])
+def test_a_file_in_the_folders_place_is_named(tmp_path, command):
+    out = tmp_path / "file"
+    out.touch()
+    with pytest.raises(ScenarioError, match="file"):
+        _run(command, *(["--out", out] if command == "demo" else [out]))
+
+
+def test_an_earlier_report_is_replaced(tmp_path):
+    (tmp_path / "report" / "companion").mkdir(parents=True)
+    (tmp_path / "report" / "overlay-0.jpg").touch()
+    with pytest.raises(RuntimeError, match="flying"):
+        _run("demo", "--out", tmp_path / "report")
+    assert not (tmp_path / "report").exists()
