@@ -23,7 +23,9 @@ def build(
     variant: Annotated[
         str, typer.Option(help="survey: as a map shows it; live: another day and season")
     ] = "survey",
-    size: Annotated[float, typer.Option(min=200, max=4000, help="side length, m")] = 1600.0,
+    size: Annotated[
+        float, typer.Option(min=400, max=4000, help="side length, a multiple of 400 m")
+    ] = 1600.0,
 ) -> None:
     """Generate a world and write it as a 3D Tiles 1.1 tileset."""
     from localizer.synth.world import build_world
