@@ -99,6 +99,7 @@ def run(load: float, seconds: float) -> dict[str, float]:
     process.start()
     config = BridgeConfig(
         connection=f"udpout:127.0.0.1:{here.recv()}",
+        mode="inject",
         origin=OriginConfig(latitude_deg=HOME[0], longitude_deg=HOME[1], altitude_amsl_m=488.0),
         # No waiting for the age of fixes here: the delay under test is the bridge's own.
         injection=InjectionConfig(rate_hz=FIX_HZ, delay_ms=0),

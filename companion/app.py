@@ -14,10 +14,10 @@ import numpy as np
 
 from companion.build import MapStack, build_localizer
 from companion.config import CompanionConfig
-from companion.detections import DetectionListener
+from companion.detections import Detection, DetectionListener
 from companion.fixes import camera_rotation, vehicle_prior, vision_fix
 from companion.health import HealthMonitor
-from companion.recorder import Recorder
+from companion.recorder import Recorder, fresh_folder
 from companion.sources import StreamState, open_source
 from companion.target_reporter import Target, TargetReporter
 from localizer.engine import DualThreadEngine
@@ -26,7 +26,7 @@ from localizer.targets import SurfacePoint, cast_ray
 from localizer.types import PoseEstimate, PosePrior, ReferenceBundle, TrackingState
 from mavlink_bridge.bridge import Bridge
 from mavlink_bridge.config import BridgeConfig
-from mavlink_bridge.messages import TargetReport
+from mavlink_bridge.messages import TargetReport, TrackRequest
 
 _log = logging.getLogger(__name__)
 
@@ -74,10 +74,15 @@ class Companion:
         self._frame = self._stack.cache.frame
         self._geoid_separation_m = manifest.geoid_separation_m
         record = config.record
+        if record is not None:
+            record = record.model_copy(update={"folder": fresh_folder(record.folder)})
         self._recorder = Recorder(record, self._frame) if record else None
         if self._recorder is not None:
             up.callback(self._recorder.close)
-        self._bridge = Bridge(_bridge_config(config), manifest.geoid_separation_m)
+        self._last_exposure_ns = 0
+        self._bridge = Bridge(
+            _bridge_config(config), manifest.geoid_separation_m, on_track=self._on_track
+        )
         up.callback(self._bridge.stop)
         # Before the localizer, whose compilation takes its time: a wrong source is told at once.
         self._source = open_source(
@@ -149,6 +154,8 @@ class Companion:
         if self._recorder is not None:
             self._recorder.estimate(estimate)
         self._targets.add_estimate(estimate)
+        if estimate.accepted:
+            self._last_exposure_ns = estimate.exposure_time_ns
         self._health.add_estimate(estimate)
         tracking = estimate.state is TrackingState.TRACKING
         if estimate.accepted and tracking:
@@ -156,6 +163,15 @@ class Companion:
         # DEGRADED keeps the filter's track: only a new start after LOST may carry a jump.
         if tracking or estimate.state is TrackingState.LOST:
             self._was_tracking = tracking
+
+    def _on_track(self, request: TrackRequest) -> None:
+        """The ground station's click: the place under that pixel of the newest localized frame."""
+        if request.kind == "stop":
+            return
+        x, y = np.array(request.coordinates).reshape(-1, 2).mean(axis=0)
+        u, v = x * self._camera.width, y * self._camera.height
+        detection = Detection("ground station", self._last_exposure_ns, float(u), float(v))
+        self._targets.add_detection(detection)
 
     def _inject(self, estimate: PoseEstimate, reset: bool) -> None:
         time_ns = estimate.exposure_time_ns

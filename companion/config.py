@@ -139,5 +139,26 @@ def _resolve(config: CompanionConfig, folder: Path) -> CompanionConfig:
     record = config.record
     if record is not None:
         record = record.model_copy(update={"folder": folder / record.folder})
-    update = {"map": folder / config.map, "localizer": localizer, "record": record}
+    camera = config.camera
+    if "://" not in camera.source:  # a device, a file or a folder
+        camera = camera.model_copy(update={"source": str(folder / camera.source)})
+    update = {
+        "map": folder / config.map,
+        "camera": camera,
+        "localizer": localizer,
+        "bridge": _resolve_bridge(config.bridge, folder),
+        "record": record,
+    }
     return config.model_copy(update=update)
+
+
+def _resolve_bridge(bridge: BridgeConfig, folder: Path) -> BridgeConfig:
+    update: dict[str, Any] = {}
+    if bridge.tlog is not None:
+        update["tlog"] = folder / bridge.tlog
+    for name in ("signing", "ground_signing"):
+        signing = getattr(bridge, name)
+        if signing is not None:
+            key_file = folder / signing.key_file
+            update[name] = signing.model_copy(update={"key_file": key_file})
+    return bridge.model_copy(update=update)

@@ -41,7 +41,7 @@ _OVERLAYS = 4
 def evaluate_command(
     sequence: Annotated[Path, typer.Argument(help="folder: images/, poses.txt, camera.json")],
     map_cache: Annotated[Path, typer.Option("--map", help="tile cache")],
-    report: Annotated[Path, typer.Option(help="folder of the report")] = Path("report/eval"),
+    report: Annotated[Path, typer.Option(help="folder of the report")] = Path("eval-report"),
     name: Annotated[str | None, typer.Option(help="which sequence of a PiLoT data set")] = None,
     prior: Annotated[str, typer.Option(help="first: one prior; each: one per frame")] = "first",
     seed: Annotated[int, typer.Option(min=0, help="seed of the prior's noise")] = 0,
@@ -150,4 +150,5 @@ def _write_overlays(
             ErrorSeries("position", number, np.array([f.translation_error_m for f in frames]), "m"),
             ErrorSeries("rotation", number, np.array([f.rotation_error_deg for f in frames]), "°"),
         ],
+        abscissa="frame",
     )

@@ -107,6 +107,7 @@ class HealthMonitor:
             "rate_hz": self._rate(),
             "stages_ms": self._stages(),
             "bridge": self._bridge.counters(),
+            "shadow": self._bridge.shadow_score().line(),
         }
         temporary = self._file.with_suffix(".tmp")
         try:

@@ -91,7 +91,10 @@ class ErrorSeries:
 
 
 def plot_errors(
-    path: Path, series: Sequence[ErrorSeries], shaded: Sequence[tuple[float, float, str]] = ()
+    path: Path,
+    series: Sequence[ErrorSeries],
+    shaded: Sequence[tuple[float, float, str]] = (),
+    abscissa: str = "time, s",
 ) -> None:
     """Errors over time, one row per unit; `shaded` marks spans (begin, end, name)."""
     units = list(dict.fromkeys(s.unit for s in series))
@@ -102,7 +105,7 @@ def plot_errors(
             axes.plot(s.time_s, s.error, linewidth=0.9, label=s.label)
         for begin, end, name in shaded:
             axes.axvspan(begin, end, color="tab:orange", alpha=0.12, label=name)
-        axes.set(xlabel="time, s", ylabel=f"error, {unit}")
+        axes.set(xlabel=abscissa, ylabel=f"error, {unit}")
         axes.set_ylim(bottom=0)
         axes.grid(alpha=0.3)
         axes.legend(loc="upper right", fontsize="small")

@@ -37,6 +37,17 @@ TARGET_COLUMNS = (
 EVENT_COLUMNS = ("time_ns", "level", "text")
 
 
+def fresh_folder(folder: Path) -> Path:
+    """`folder`, or with a number behind it if it holds a record already: a restart in the air must
+    not overwrite the flight's first half.
+    """
+    candidate, number = folder, 2
+    while (candidate / "estimates.csv").exists():
+        candidate = folder.with_name(f"{folder.name}-{number}")
+        number += 1
+    return candidate
+
+
 class Recorder:
     """Writes ``estimates.csv``, ``targets.csv`` and ``events.csv`` in a folder.
 

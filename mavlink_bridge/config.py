@@ -148,7 +148,7 @@ class BridgeConfig(_Model):
 
     connection: str = "udpin:127.0.0.1:14551"
     ground_connection: str | None = None
-    mode: Mode = "inject"
+    mode: Mode = "shadow"
     system_id: int | None = Field(default=None, ge=1, le=255, description="None: the vehicle's own")
     localizer_component: int = Field(default=197, ge=1, le=255)
     companion_component: int = Field(default=191, ge=1, le=255)

@@ -116,7 +116,9 @@ def find_source_set(config: BridgeConfig, read: Read) -> int:
     for number in _SOURCE_SETS:
         if read(f"EK3_SRC{number}_POSXY") == wanted:
             return number
-    return 1
+    # A vehicle that flies on GNSS keeps doing so: vision goes into the set it is switched to.
+    receiver = read("GPS1_TYPE") or read("GPS_TYPE") or 0.0
+    return config.switch.vision_set if receiver else 1
 
 
 def ardupilot_rules(config: BridgeConfig, source_set: int) -> list[Rule]:

@@ -15,6 +15,7 @@ from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 
 from companion.errors import CompanionError
 from localizer.errors import LocalizerError
+from localizer.synth.appearance import CONDITIONS
 from sitl.assets import prepare
 from sitl.errors import SimulationError
 from sitl.flight import fly
@@ -76,6 +77,8 @@ def sequence(
     """Record the scenario's path, flown without dynamics, as a sequence for `companion eval`."""
     script = load_scenario(scenario) if scenario else Scenario()
     if condition is not None:
+        if condition not in CONDITIONS:
+            raise ScenarioError(f"--condition is one of {', '.join(CONDITIONS)}, not {condition!r}")
         script = Scenario.model_validate(script.model_dump() | {"condition": condition})
     if out.exists() and (not out.is_dir() or any(out.iterdir())):
         raise ScenarioError(f"{out}: exists already and is not empty; give another folder")

@@ -302,6 +302,7 @@ def _write_companion_config(
         },
         "bridge": {
             "connection": vehicle.companion_endpoint,
+            "mode": "inject",
             "injection": {
                 "message": scenario.injection,
                 "delay_ms": scenario.injection_delay_ms,

@@ -27,6 +27,9 @@ class FakeBridge:
     def counters(self):
         return {}
 
+    def shadow_score(self):
+        return SimpleNamespace(line=lambda: "no comparison yet")
+
 
 def _one_report(folder, state, connected):
     """What the bridge is told, and the events, of a monitor that is started and stopped."""

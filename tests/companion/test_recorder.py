@@ -8,7 +8,7 @@ import pytest
 
 from companion.config import RecordConfig
 from companion.errors import ReportError
-from companion.recorder import ESTIMATE_COLUMNS, Recorder
+from companion.recorder import ESTIMATE_COLUMNS, Recorder, fresh_folder
 from localizer.camera import Camera
 from localizer.geo import Geodetic, LocalFrame
 from localizer.pose import Pose, so3_exp
@@ -63,3 +63,12 @@ def test_a_full_disk_costs_rows_and_not_the_recorder(tmp_path, caplog):
     assert recorder.dropped > 0
     assert sum("record is incomplete" in r.message for r in caplog.records) == 1
     assert Path(tmp_path / "targets.csv").read_text().count("car") == 1
+
+
+def test_a_restart_spares_the_earlier_record(tmp_path):
+    folder = tmp_path / "latest"
+    assert fresh_folder(folder) == folder
+    for expected in ("latest", "latest-2", "latest-3"):
+        chosen = fresh_folder(folder)
+        assert chosen.name == expected
+        Recorder(RecordConfig(folder=chosen), FRAME).close()

@@ -166,6 +166,7 @@ def fly() -> Iterator[Callable[..., Flight]]:
         ends.append(pilot.close)
         config = BridgeConfig(
             connection=vehicle.companion_endpoint,
+            mode="inject",
             origin=None if gps else ORIGIN,
             injection=injection,
             switch=switch or SourceSwitchConfig(),

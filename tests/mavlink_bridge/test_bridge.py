@@ -29,6 +29,7 @@ ORIGIN = OriginConfig(latitude_deg=HOME[0], longitude_deg=HOME[1], altitude_amsl
 
 def config(port: int, **options: Any) -> BridgeConfig:
     options.setdefault("origin", ORIGIN)
+    options.setdefault("mode", "inject")
     options.setdefault("injection", InjectionConfig(rate_hz=20, delay_ms=30))
     return BridgeConfig(connection=f"udpout:127.0.0.1:{port}", **options)
 

@@ -82,6 +82,16 @@ def test_second_source_set_is_found_and_gps_is_left_alone_there() -> None:
     assert failures(config(), second) == set()
 
 
+def test_a_vehicle_on_gnss_keeps_its_first_source_set() -> None:
+    """Vision goes into the set it is switched to; the receiver is not taken away."""
+    stock = {"EK3_SRC1_POSXY": 3.0, "EK3_SRC2_POSXY": 0.0, "GPS1_TYPE": 1.0}
+    assert find_source_set(config(), stock.get) == 2
+    rules = ardupilot_rules(config(), 2)
+    names = {name for rule in rules for name in rule.names}
+    assert "GPS1_TYPE" not in names
+    assert "EK3_SRC1_POSXY" not in names
+
+
 def test_gps_input_with_old_names_and_another_receiver() -> None:
     parameters = {
         "AHRS_EKF_TYPE": 3.0,
