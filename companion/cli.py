@@ -1,8 +1,13 @@
-"""The command line: ``companion run | eval | map | world | doctor``."""
+"""The command line: ``companion run | eval | map | world | doctor``.
+
+Exit codes: 0 done; 1 `doctor` found advice; 2 wrong usage, a named error, or `doctor` found the
+vehicle not fit to fly; 130 interrupted (`run` that was flying ends with 0).
+"""
 
 from __future__ import annotations
 
 import sys
+from typing import Annotated
 
 import typer
 from rich.console import Console
@@ -13,6 +18,7 @@ from companion.errors import CompanionError
 from companion.eval_cli import evaluate_command
 from companion.map_cli import app as map_app
 from companion.run_cli import run_command
+from companion.versions import versions
 from companion.world_cli import app as world_app
 from localizer.errors import LocalizerError
 from mavlink_bridge.errors import BridgeError
@@ -22,6 +28,26 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
     help="GNSS-denied navigation from video and a geo-referenced 3D map.",
 )
+
+
+def _print_version(wanted: bool) -> None:
+    if wanted:
+        typer.echo(f"companion {versions().get('pilot-companion', 'not installed')}")
+        raise typer.Exit
+
+
+@app.callback()
+def _options(
+    _: Annotated[
+        bool,
+        typer.Option(
+            "--version", callback=_print_version, is_eager=True, help="print the version and exit"
+        ),
+    ] = False,
+) -> None:
+    """Options of every command."""
+
+
 app.command("run")(run_command)
 app.command("eval")(evaluate_command)
 app.command("doctor")(doctor_command)

@@ -4,10 +4,13 @@ import signal
 import subprocess
 import sys
 import time
+from importlib import metadata
 
 import pytest
 import yaml
+from typer.testing import CliRunner
 
+from companion.cli import app
 from sitl.assets import prepare
 
 MODEL = {"width": 640, "height": 480, "fx": 550, "fy": 550, "cx": 320, "cy": 240}
@@ -73,3 +76,23 @@ def test_a_folder_that_cannot_be_made_is_one_line(map_cache, tmp_path):
     assert code == 2
     assert "file" in text
     assert len(text.splitlines()) == 1
+
+
+def test_an_interrupt_during_the_imports_ends_it_without_a_word():
+    process = subprocess.Popen(
+        [sys.executable, "-X", "importtime", "-m", "companion", "--help"],
+        stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
+    )  # fmt: skip
+    assert process.stderr is not None
+    before = next(line for line in process.stderr if "numpy" in line)
+    process.send_signal(signal.SIGINT)
+    out, err = process.communicate(timeout=START_S)
+    assert process.returncode == 130
+    assert out == ""
+    assert "Traceback" not in before + err
+
+
+def test_the_version_is_that_of_the_package():
+    result = CliRunner().invoke(app, ["--version"])
+    assert result.exit_code == 0
+    assert result.output.strip() == f"companion {metadata.version('pilot-companion')}"
