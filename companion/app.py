@@ -79,7 +79,7 @@ class Companion:
         self._recorder = Recorder(record, self._frame) if record else None
         if self._recorder is not None:
             up.callback(self._recorder.close)
-        self._last_exposure_ns = 0
+        self._newest: PoseEstimate | None = None
         self._bridge = Bridge(
             _bridge_config(config), manifest.geoid_separation_m, on_track=self._on_track
         )
@@ -129,7 +129,9 @@ class Companion:
         self._stop.set()
 
     def _on_feed_state(self, state: StreamState, text: str) -> None:
-        bad = state in (StreamState.STALLED, StreamState.FAILED)
+        bad = state in (
+            StreamState.STALLED, StreamState.FAILED, StreamState.SCALED, StreamState.MISFIT
+        )  # fmt: skip
         self._event("warning" if bad else "info", f"feed: {text}")
 
     def _vehicle_prior(self, time_ns: int) -> PosePrior | None:
@@ -155,7 +157,7 @@ class Companion:
             self._recorder.estimate(estimate)
         self._targets.add_estimate(estimate)
         if estimate.accepted:
-            self._last_exposure_ns = estimate.exposure_time_ns
+            self._newest = estimate
         self._health.add_estimate(estimate)
         tracking = estimate.state is TrackingState.TRACKING
         if estimate.accepted and tracking:
@@ -166,11 +168,12 @@ class Companion:
 
     def _on_track(self, request: TrackRequest) -> None:
         """The ground station's click: the place under that pixel of the newest localized frame."""
-        if request.kind == "stop":
+        newest = self._newest
+        if request.kind == "stop" or newest is None:
             return
         x, y = np.array(request.coordinates).reshape(-1, 2).mean(axis=0)
-        u, v = x * self._camera.width, y * self._camera.height
-        detection = Detection("ground station", self._last_exposure_ns, float(u), float(v))
+        u, v = x * newest.camera.width, y * newest.camera.height
+        detection = Detection("ground station", newest.exposure_time_ns, float(u), float(v))
         self._targets.add_detection(detection)
 
     def _inject(self, estimate: PoseEstimate, reset: bool) -> None:

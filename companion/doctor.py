@@ -67,11 +67,13 @@ def _check_camera(config: CompanionConfig) -> Finding:
     except (CompanionError, LocalizerError) as error:
         return _failed("camera", "no feed", "pictures", str(error))
     times: list[int] = []
+    seen = camera = feed.model.camera()
     timer = threading.Timer(_FEED_S, source.close)
     timer.start()
     try:
         for frame in source.frames():
             times.append(frame.exposure_time_ns)
+            seen = frame.camera
     except (CompanionError, LocalizerError) as error:
         return _failed("camera", "refused", "pictures of the calibrated size", str(error))
     finally:
@@ -81,10 +83,13 @@ def _check_camera(config: CompanionConfig) -> Finding:
         why = f"nothing arrived from {feed.source} in {_FEED_S:.0f} s: is the stream running?"
         return _failed("camera", "silent", "pictures", why)
     rate = (len(times) - 1) / max((times[-1] - times[0]) * 1e-9, 1e-9)
-    found = f"{feed.model.width}x{feed.model.height}, {rate:.1f} Hz"
-    needed = f">= {_MIN_RATE_HZ:.0f} Hz"
-    enough = rate >= 0.95 * _MIN_RATE_HZ  # measured over a few seconds
-    return Finding("camera", found, needed, "tracking follows turns by it", enough, True)
+    found = f"{seen.width}x{seen.height}, {rate:.1f} Hz"
+    needed = f"{camera.width}x{camera.height}, >= {_MIN_RATE_HZ:.0f} Hz"
+    if rate < 0.95 * _MIN_RATE_HZ:  # measured over a few seconds
+        return Finding("camera", found, needed, "tracking follows turns by it", False, True)
+    scaled = seen != camera
+    why = "the calibration is scaled: wrong if the camera crops or zooms" if scaled else ""
+    return Finding("camera", found, needed, why, not scaled, False)
 
 
 def _check_power() -> Finding:

@@ -22,7 +22,11 @@ _PERIOD_S = 1.0
 _WINDOW = 200
 _STALE_S = 2.0
 
-
+_OF_FEED = {
+    StreamState.FAILED: (HealthLevel.FAILED, "video feed failed"),
+    StreamState.MISFIT: (HealthLevel.FAILED, "video size does not fit the calibration"),
+    StreamState.STALLED: (HealthLevel.DEGRADED, "video feed stalled"),
+}
 _OF_STATE = {
     TrackingState.INITIALIZING: (HealthLevel.STARTING, "localization initializing"),
     TrackingState.TRACKING: (HealthLevel.OK, "localization tracking"),
@@ -81,10 +85,8 @@ class HealthMonitor:
     def _assess(self) -> tuple[HealthLevel, str]:
         """The worst thing that is true now, in one line."""
         feed = self._feed_state()
-        if feed is StreamState.FAILED:
-            return HealthLevel.FAILED, "video feed failed"
-        if feed is StreamState.STALLED:
-            return HealthLevel.DEGRADED, "video feed stalled"
+        if feed in _OF_FEED:
+            return _OF_FEED[feed]
         # Told in health.json and the record only: the vehicle cannot hear it.
         if not self._bridge.state().connected:
             return HealthLevel.DEGRADED, "no heartbeat from the flight controller"
@@ -94,7 +96,8 @@ class HealthMonitor:
         arrived, estimate = self._estimates[-1]
         if time.monotonic() - arrived > _STALE_S:
             return HealthLevel.DEGRADED, error or "no frame is being localized"
-        return _OF_STATE[estimate.state]
+        level, text = _OF_STATE[estimate.state]
+        return level, text + (", video scaled" if feed is StreamState.SCALED else "")
 
     def _write(self, level: HealthLevel, text: str) -> None:
         if self._file is None:

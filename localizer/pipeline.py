@@ -65,7 +65,7 @@ class Undistorter:
     """Turns frames of a (distorted) camera into the working pinhole's images."""
 
     def __init__(self, source: Camera, target: Camera) -> None:
-        self._source, self._target = source, target
+        self.source, self._target = source, target
         # Shrinking by more than 2 under bilinear sampling aliases: average down to twice the
         # target first, undistort there, and average again.
         double = (2 * target.width, 2 * target.height)
@@ -77,10 +77,10 @@ class Undistorter:
     def __call__(self, frame: Frame) -> Image:
         """The frame's image (height, width, 3) uint8 at the target's size."""
         height, width = frame.image.shape[:2]
-        if (width, height) != (self._source.width, self._source.height):
+        if (width, height) != (self.source.width, self.source.height):
             raise CameraError(
                 f"frame {frame.sequence} is {width}x{height}, the camera model says "
-                f"{self._source.width}x{self._source.height}: give this stream's calibration"
+                f"{self.source.width}x{self.source.height}: give this stream's calibration"
             )
         image = _shrink(frame.image, self._middle)
         if self._maps is not None:
@@ -166,6 +166,8 @@ class Localizer:
 
     def extract_query(self, frame: Frame) -> FeaturePyramid:
         """Features of the frame (does not need the reference, so it may run beside it)."""
+        if frame.camera != self._undistorter.source:  # the stream changed its size in flight
+            self._undistorter = Undistorter(frame.camera, self.camera)
         return self._extractor.extract(self._undistorter(frame))
 
     def localize(self, frame: Frame, query: FeaturePyramid, anchors: Anchors) -> PoseEstimate:

@@ -14,13 +14,14 @@ import av
 import numpy as np
 from av.sidedata.sidedata import Type as SideDataType
 
-from companion.errors import StreamDecodeError, StreamError, StreamOpenError
+from companion.errors import StreamDecodeError, StreamError, StreamOpenError, StreamSizeError
 from companion.sources.base import (
     SourceCounters,
     SourceSettings,
     StateCallback,
     StreamState,
-    check_size,
+    fitted_camera,
+    scaling_text,
 )
 from companion.sources.misp import MispTime, parse_message
 from companion.sources.slot import NewestSlot
@@ -139,7 +140,8 @@ class VideoFileSource:
         start = time.monotonic_ns()
         first: int | None = None
         for picture in self._readable(decoder):
-            check_size(picture.width, picture.height, self._camera, str(self._path))
+            camera = fitted_camera(picture.width, picture.height, self._camera, str(self._path))
+            self._tell_scaling(camera)
             pts = self._pts_ns(picture, decoder)
             first = pts if first is None else first
             offset = pts - first
@@ -148,12 +150,17 @@ class VideoFileSource:
             if self._closed.is_set():
                 return
             n = self._counters.delivered
-            frame = Frame(_rgb(picture, self._to_rgb), start + offset, self._camera, n)
+            frame = Frame(_rgb(picture, self._to_rgb), start + offset, camera, n)
             self._counters = replace(self._counters, received=n + 1, delivered=n + 1)
             yield frame
         if not self._counters.delivered:
             raise StreamDecodeError(f"{self._path}: no picture in it can be decoded; replace it")
         self._report(StreamState.ENDED, f"{self._path}: end of file, {self._counters}")
+
+    def _tell_scaling(self, camera: Camera) -> None:
+        if camera is not self._camera and self._state is not StreamState.SCALED:
+            text = scaling_text(camera.width, camera.height, self._camera, str(self._path))
+            self._report(StreamState.SCALED, text)
 
     def _readable(self, decoder: _Decoder) -> Iterator[av.VideoFrame]:
         try:
@@ -205,7 +212,7 @@ class LiveVideoSource:
         self._settings = settings or SourceSettings()
         self._input = live_input(location, camera, self._settings)
         self._on_state = on_state
-        self._slot: NewestSlot[tuple[av.VideoFrame, int, int]] = NewestSlot()
+        self._slot: NewestSlot[tuple[av.VideoFrame, Camera, int, int]] = NewestSlot()
         self._closing = threading.Event()
         self._reader: threading.Thread | None = None
         self._lock = threading.Lock()
@@ -226,14 +233,18 @@ class LiveVideoSource:
         return self._state
 
     def frames(self) -> Iterator[Frame]:
-        """The newest picture each time; raises `StreamSizeError`, ends only when closed."""
+        """The newest picture each time; ends only when closed.
+
+        Raises `StreamSizeError` when the first picture has another shape than the camera model. A
+        stream that changes its shape later is reported as MISFIT until it fits again.
+        """
         self._start()
         while (item := self._slot.get()) is not None:
-            picture, exposure_ns, sequence = item
+            picture, camera, exposure_ns, sequence = item
             # Converted here and not in the reader: pictures that are dropped cost no conversion.
             image = _rgb(picture, self._to_rgb)
             self._count(delivered=1)
-            yield Frame(image, exposure_ns, self._camera, sequence)
+            yield Frame(image, exposure_ns, camera, sequence)
 
     def close(self) -> None:
         """Ends `frames`; waits for the reader, at most about the open time-out."""
@@ -304,21 +315,36 @@ class LiveVideoSource:
         if picture is None:
             self._count(undecodable=1)
             # A receiver that has just joined waits for a key frame: no stall yet.
-            live = self._state is StreamState.LIVE
+            live = self._state in (StreamState.LIVE, StreamState.SCALED)
             patience_s = self._settings.stall_timeout_s if live else _OPEN_TIMEOUT_S
             if arrival_ns - self._last_picture_ns > patience_s * 1e9:
                 self._report_stall("data arrives but no picture can be decoded (no key frame yet?)")
             return
-        check_size(picture.width, picture.height, self._camera, self._location)
         self._last_picture_ns = arrival_ns
+        camera = self._fitted(picture)
+        if camera is None:
+            return
         stamps = Stamps(_pts_ns(picture), _misp_time(picture))
         exposure_ns = clock.exposure_time(stamps, arrival_ns)
-        self._slot.put((picture, exposure_ns, self._counters.received))
+        self._slot.put((picture, camera, exposure_ns, self._counters.received))
         self._count(received=1)
-        if self._state is not StreamState.LIVE:
-            self._report(
-                StreamState.LIVE, f"{self._location}: live, {picture.width}x{picture.height}"
-            )
+        width, height = camera.width, camera.height
+        if camera is self._camera:
+            self._report_change(StreamState.LIVE, f"{self._location}: live, {width}x{height}")
+        else:
+            text = scaling_text(width, height, self._camera, self._location)
+            self._report_change(StreamState.SCALED, text)
+
+    def _fitted(self, picture: av.VideoFrame) -> Camera | None:
+        """The picture's camera. None for another shape, which in flight must not end the feed."""
+        try:
+            return fitted_camera(picture.width, picture.height, self._camera, self._location)
+        except StreamSizeError as error:
+            if not self._counters.received:
+                raise
+            self._count(misfits=1)
+            self._report_change(StreamState.MISFIT, str(error))
+            return None
 
     def _count(self, **more: int) -> None:
         with self._lock:
@@ -326,8 +352,11 @@ class LiveVideoSource:
             self._counters = replace(c, **{k: getattr(c, k) + n for k, n in more.items()})
 
     def _report_stall(self, reason: str) -> None:
-        if self._state is not StreamState.STALLED:
-            self._report(StreamState.STALLED, f"{self._location}: {reason}")
+        self._report_change(StreamState.STALLED, f"{self._location}: {reason}")
+
+    def _report_change(self, state: StreamState, text: str) -> None:
+        if self._state is not state:
+            self._report(state, text)
 
     def _report(self, state: StreamState, text: str) -> None:
         self._state = state

@@ -14,13 +14,23 @@ from companion.sources.timing import Timing
 from localizer.camera import Camera
 from localizer.types import Frame
 
+# Relative difference of width / height that rounding to even sizes makes; 1080 padded to 1088
+# lines (0.7 %) lies outside.
+_SHAPE_TOLERANCE = 0.005
+
 
 class StreamState(Enum):
-    """Where a feed stands; `SourceSettings` says when a live one counts as stalled."""
+    """Where a feed stands; `SourceSettings` says when a live one counts as stalled.
+
+    SCALED: its pictures have another size than the calibration but the same shape, and are used.
+    MISFIT: they have another shape, and are not.
+    """
 
     IDLE = "not started"
     CONNECTING = "connecting"
     LIVE = "live"
+    SCALED = "live, scaled"
+    MISFIT = "of another shape"
     STALLED = "stalled"
     ENDED = "ended"
     FAILED = "failed"
@@ -33,14 +43,15 @@ StateCallback = Callable[[StreamState, str], None]
 @dataclass(frozen=True)
 class SourceCounters:
     """received: pictures decoded; delivered: handed out by `frames`; dropped: overwritten by a
-    newer one before they were fetched; undecodable: packets that gave no whole picture;
-    reconnects: connections after the first.
+    newer one before they were fetched; undecodable: packets that gave no whole picture; misfits:
+    pictures whose shape is not the calibration's; reconnects: connections after the first.
     """
 
     received: int = 0
     delivered: int = 0
     dropped: int = 0
     undecodable: int = 0
+    misfits: int = 0
     reconnects: int = 0
 
 
@@ -105,11 +116,25 @@ class FrameSource(Protocol):
         ...
 
 
-def check_size(width: int, height: int, camera: Camera, where: str) -> None:
-    """Raises `StreamSizeError` when a picture is not of the camera model's size."""
-    if (width, height) != (camera.width, camera.height):
+def fitted_camera(width: int, height: int, camera: Camera, where: str) -> Camera:
+    """The camera of a picture of this size: the calibrated one, or that scaled.
+
+    Raises `StreamSizeError` when the picture's shape shows that it was cropped or padded.
+    """
+    if (width, height) == (camera.width, camera.height):
+        return camera
+    if abs(width * camera.height / (height * camera.width) - 1.0) > _SHAPE_TOLERANCE:
         raise StreamSizeError(
             f"{where} delivers {width}x{height} but the camera model is "
             f"{camera.width}x{camera.height}: set the stream to the calibrated size, or give the "
             f"camera model of {width}x{height} (intrinsics do not carry over to a cropped size)"
         )
+    return camera.resized(width, height)
+
+
+def scaling_text(width: int, height: int, camera: Camera, where: str) -> str:
+    """What an operator is told of pictures that are used although their size is not calibrated."""
+    return (
+        f"{where}: delivers {width}x{height}, taken as the calibrated "
+        f"{camera.width}x{camera.height} scaled down or up (wrong if the camera crops or zooms)"
+    )

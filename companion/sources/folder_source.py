@@ -17,7 +17,8 @@ from companion.sources.base import (
     SourceSettings,
     StateCallback,
     StreamState,
-    check_size,
+    fitted_camera,
+    scaling_text,
 )
 from localizer.camera import Camera
 from localizer.types import Frame, Image
@@ -125,11 +126,15 @@ class FolderSource:
     def _load(self, path: Path, time_ns: int, sequence: int) -> Frame:
         try:
             image = read_image(path)
-            check_size(image.shape[1], image.shape[0], self._camera, str(path))
+            height, width = image.shape[:2]
+            camera = fitted_camera(width, height, self._camera, str(path))
         except Exception as error:
             self._report(StreamState.FAILED, str(error))
             raise
-        return Frame(image, time_ns, self._camera, sequence)
+        if camera is not self._camera and self._state is not StreamState.SCALED:
+            text = scaling_text(width, height, self._camera, str(path))
+            self._report(StreamState.SCALED, text)
+        return Frame(image, time_ns, camera, sequence)
 
     def _offset_ns(self, sequence: int, first: int) -> int:
         if self._times:

@@ -10,6 +10,7 @@ from companion.config import RecordConfig
 from companion.health import HealthMonitor
 from companion.sources import StreamState
 from localizer.engine import EngineHealth
+from localizer.types import TrackingState
 from mavlink_bridge.messages import HealthLevel
 
 
@@ -31,13 +32,15 @@ class FakeBridge:
         return SimpleNamespace(line=lambda: "no comparison yet")
 
 
-def _one_report(folder, state, connected):
+def _one_report(folder, state, connected, tracking=None):
     """What the bridge is told, and the events, of a monitor that is started and stopped."""
     bridge, events = FakeBridge(connected), []
     engine = SimpleNamespace(health=EngineHealth())
     monitor = HealthMonitor(
         engine, bridge, lambda: state, lambda *e: events.append(e), RecordConfig(folder=folder)
     )
+    if tracking is not None:
+        monitor.add_estimate(SimpleNamespace(state=tracking, stage_ms={}))
     monitor.start()
     monitor.stop()
     return bridge.told, events
@@ -50,6 +53,7 @@ def _one_report(folder, state, connected):
         (StreamState.LIVE, False, HealthLevel.DEGRADED, "no heartbeat"),
         (StreamState.STALLED, True, HealthLevel.DEGRADED, "stalled"),
         (StreamState.FAILED, True, HealthLevel.FAILED, "failed"),
+        (StreamState.MISFIT, True, HealthLevel.FAILED, "size does not fit"),
     ],
 )
 def test_the_worst_thing_is_told(tmp_path, state, connected, level, text):
@@ -60,6 +64,11 @@ def test_the_worst_thing_is_told(tmp_path, state, connected, level, text):
     written = json.loads((tmp_path / "health.json").read_text())
     assert written["level"] == level.value
     assert time.monotonic_ns() - written["time_ns"] < 5e9
+
+
+def test_scaled_video_is_told_beside_what_localization_makes_of_it(tmp_path):
+    told, _ = _one_report(tmp_path, StreamState.SCALED, True, TrackingState.TRACKING)
+    assert told[-1] == (HealthLevel.OK, "localization tracking, video scaled")
 
 
 def test_a_file_that_cannot_be_written_is_an_event_and_the_bridge_is_still_told(tmp_path):

@@ -2,7 +2,9 @@
 
 import threading
 import time
+from types import SimpleNamespace
 
+import cv2
 import numpy as np
 import pytest
 
@@ -201,6 +203,22 @@ def test_a_frame_of_another_size_is_named():
     bad = Frame(np.zeros((100, 100, 3), np.uint8), 0, CAMERA, 7)
     with pytest.raises(CameraError, match="frame 7 is 100x100"):
         undistort(bad)
+
+
+def test_a_stream_that_changes_its_size_is_undistorted_with_its_own_camera():
+    """The same lens at half the size gives the same working image, but for sampling."""
+    camera = Camera(640, 480, 500.0, 500.0, 320.0, 240.0, (-0.12, 0.03, 0.001, -0.0005, 0.0))
+    seen = []
+    extractor = SimpleNamespace(extract=seen.append)
+    localizer = Localizer(FakeRenderer(), extractor, FakeOptimizer(), camera, LocalizerConfig())
+    ramp = np.broadcast_to(np.linspace(0, 255, 640).astype(np.uint8)[None, :, None], (480, 640, 3))
+    half = cv2.resize(np.ascontiguousarray(ramp), (320, 240), interpolation=cv2.INTER_AREA)
+    for image, its in ((ramp, camera), (half, camera.resized(320, 240)), (ramp, camera)):
+        localizer.extract_query(Frame(np.ascontiguousarray(image), 0, its, 0))
+    assert [image.shape for image in seen] == [(240, 320, 3)] * 3
+    inner = np.s_[20:-20, 20:-20]  # both are black outside the lens's picture
+    np.testing.assert_allclose(seen[1][inner].astype(float), seen[0][inner], atol=2.5)
+    np.testing.assert_array_equal(seen[2], seen[0])
 
 
 @pytest.mark.parametrize("size", [(640, 480), (1920, 1080), (1024, 768)])

@@ -211,13 +211,49 @@ def test_a_consumer_that_is_slow_gets_the_newest_frame_and_the_rest_are_counted(
     assert counters.dropped >= 20
 
 
-def test_a_stream_of_another_size_is_an_error_that_names_both(url: str) -> None:
-    with Watch(url, camera=Camera.from_fov(640, 480, 70.0)) as watch, PacedSender(url):
+def test_a_stream_of_another_shape_is_an_error_that_names_both(url: str) -> None:
+    with Watch(url, camera=Camera.from_fov(640, 360, 70.0)) as watch, PacedSender(url):
         watch.wait_until(lambda: watch.error is not None)
     assert isinstance(watch.error, StreamSizeError)
-    for text in ("320x240", "640x480", url):
+    for text in ("320x240", "640x360", url):
         assert text in str(watch.error)
     assert watch.states[-2:] == [StreamState.FAILED, StreamState.CLOSED]
+
+
+def test_a_stream_that_changes_its_size_in_flight_goes_on_with_the_scaled_camera(url: str) -> None:
+    half = CAMERA.resized(160, 120)
+    with Watch(url, stall_timeout_s=0.4, retry_max_s=0.5) as watch:
+        with PacedSender(url):
+            watch.wait_for(5)
+        with PacedSender(url, camera=half):
+            watch.wait_until(lambda: watch.states[-1] is StreamState.SCALED)
+            watch.wait_until(lambda: watch.frames[-1][0].camera == half)
+    frame, _ = watch.frames[-1]
+    assert frame.image.shape == (120, 160, 3)
+    assert watch.frames[0][0].camera == CAMERA
+    text = watch.texts[watch.states.index(StreamState.SCALED)]
+    assert "160x120" in text
+    assert "320x240" in text
+    assert watch.error is None
+
+
+def test_a_stream_that_changes_its_shape_in_flight_is_reported_until_it_fits(url: str) -> None:
+    wide = Camera.from_fov(320, 180, 70.0)
+    with Watch(url, stall_timeout_s=0.4, retry_max_s=0.5) as watch:
+        with PacedSender(url):
+            watch.wait_for(5)
+        with PacedSender(url, camera=wide):
+            watch.wait_until(lambda: watch.states[-1] is StreamState.MISFIT)
+            text = watch.texts[-1]
+            assert "320x180" in text
+            assert "320x240" in text
+        with PacedSender(url, first=500):
+            watch.wait_until(lambda: watch.states[-1] is StreamState.LIVE)
+            before = len(watch.frames)
+            watch.wait_for(before + 3)
+    assert watch.error is None
+    assert all(f.image.shape == (240, 320, 3) for f, _ in watch.frames)
+    assert watch.source.counters.misfits > 0
 
 
 def test_closing_ends_the_iteration_before_any_frame_came(url: str) -> None:

@@ -13,6 +13,7 @@ from pydantic import ValidationError
 
 from companion.errors import StreamDecodeError, StreamOpenError, StreamSizeError
 from companion.sources import SourceSettings, StreamState, open_source
+from companion.sources.base import fitted_camera
 from localizer.camera import Camera
 
 CAMERA = Camera.from_fov(160, 120, 70.0)
@@ -75,11 +76,36 @@ def test_realtime_plays_at_the_recorded_pace(kind: str, request: pytest.FixtureR
 
 
 @pytest.mark.parametrize("kind", ["video", "folder"])
-def test_another_size_than_the_cameras_is_named(kind: str, request: pytest.FixtureRequest) -> None:
-    source = open_source(request.getfixturevalue(kind), Camera.from_fov(640, 480, 70.0))
-    with pytest.raises(StreamSizeError, match=r"160x120.*640x480"):
+def test_another_shape_than_the_cameras_is_named(kind: str, request: pytest.FixtureRequest) -> None:
+    source = open_source(request.getfixturevalue(kind), Camera.from_fov(640, 360, 70.0))
+    with pytest.raises(StreamSizeError, match=r"160x120.*640x360"):
         list(source.frames())
     assert source.state is StreamState.FAILED
+
+
+@pytest.mark.parametrize("kind", ["video", "folder"])
+def test_another_size_of_the_same_shape_scales_the_camera(
+    kind: str, request: pytest.FixtureRequest
+) -> None:
+    told = []
+    calibrated = Camera(640, 480, 500.0, 510.0, 330.0, 236.0, (-0.1, 0.02, 0.001, -0.001, 0.0))
+    source = open_source(
+        request.getfixturevalue(kind), calibrated, on_state=lambda *state: told.append(state)
+    )
+    frames = list(source.frames())
+    assert len(frames) == COUNT
+    expected = Camera(160, 120, 125.0, 127.5, 82.5, 59.0, calibrated.distortion)
+    assert all(f.camera == expected for f in frames)
+    assert [s for s, _ in told] == [StreamState.LIVE, StreamState.SCALED, StreamState.ENDED]
+    assert "160x120" in told[1][1]
+
+
+@pytest.mark.parametrize(("width", "height"), [(1920, 1088), (960, 720), (1280, 1024)])
+def test_a_padded_or_cropped_picture_is_no_scaled_one(width: int, height: int) -> None:
+    camera = Camera.from_fov(1920, 1080, 70.0)
+    with pytest.raises(StreamSizeError):
+        fitted_camera(width, height, camera, "camera")
+    assert fitted_camera(854, 480, camera, "camera").width == 854
 
 
 def test_closing_ends_the_frames(folder: Path) -> None:

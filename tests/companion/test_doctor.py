@@ -1,0 +1,60 @@
+"""The companion's own checks of a deployment; the flight controller's are the bridge's."""
+
+import cv2
+import numpy as np
+import pytest
+
+from companion.config import parse_config
+from companion.doctor import examine_deployment
+from sitl.assets import prepare
+
+SIZE = (160, 120)
+MODEL = {"width": 160, "height": 120, "fx": 140, "fy": 140, "cx": 80, "cy": 60}
+
+
+@pytest.fixture(scope="module")
+def map_cache(tmp_path_factory):
+    return prepare(5, tmp_path_factory.mktemp("worlds"), size_m=400.0).map_cache
+
+
+@pytest.fixture
+def feed(tmp_path):
+    folder = tmp_path / "images"
+    folder.mkdir()
+    for i in range(12):
+        image = np.full((SIZE[1], SIZE[0], 3), 10 * i, np.uint8)
+        cv2.imwrite(str(folder / f"{i}.png"), image)
+    return folder
+
+
+def _findings(map_cache, source, model=MODEL, rate_hz=20.0):
+    camera = {"source": str(source), "model": model, "settings": {"rate_hz": rate_hz}}
+    config = parse_config({"map": str(map_cache), "camera": camera}, "test")
+    return {f.name: f for f in examine_deployment(config, vehicle=False).findings}
+
+
+def test_a_good_deployment(map_cache, feed):
+    findings = _findings(map_cache, feed)
+    assert set(findings) == {"map", "model", "camera", "power mode"}
+    assert all(findings[name].ok for name in ("map", "model", "camera"))
+    assert findings["camera"].found == "160x120, 20.0 Hz"
+    assert "tiles" in findings["map"].found
+
+
+def test_a_scaled_feed_is_advice_and_a_slow_or_cropped_one_is_wrong(map_cache, feed):
+    double = {k: 2 * v for k, v in MODEL.items()}
+    scaled = _findings(map_cache, feed, double)["camera"]
+    assert (scaled.ok, scaled.required) == (False, False)
+    assert "320x240" in scaled.needed
+    cropped = _findings(map_cache, feed, double | {"height": 180})["camera"]
+    assert (cropped.ok, cropped.required) == (False, True)
+    assert "160x120" in cropped.why
+    slow = _findings(map_cache, feed, rate_hz=4.0)["camera"]
+    assert (slow.ok, slow.required) == (False, True)
+
+
+def test_what_is_missing_is_named(tmp_path, feed):
+    findings = _findings(tmp_path / "no-map", tmp_path / "no-feed.mp4")
+    for name in ("map", "camera"):
+        assert (findings[name].ok, findings[name].required) == (False, True)
+        assert f"no-{'map' if name == 'map' else 'feed.mp4'}" in findings[name].why
