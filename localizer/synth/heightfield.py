@@ -93,8 +93,13 @@ def compose(land: Land, prisms: Sequence[Prism]) -> Scene:
     return Scene(height, albedo, index, facades, land.cell_m)
 
 
-def light_scene(scene: Scene, light: Light, sky: tuple[float, float, float]) -> LitScene:
-    """Shade the scene with sun, sky and cast shadows, and build what the ray marcher needs."""
+def light_scene(
+    scene: Scene, light: Light, sky: tuple[float, float, float], texel_cells: float = 1.0
+) -> LitScene:
+    """Shade the scene with sun, sky and cast shadows, and build what the ray marcher needs.
+
+    texel_cells: size of a sample of the baked texture; above one it is coarser than the cells.
+    """
     height, cell = scene.height, scene.cell_m
     gy, gx = np.gradient(height, cell)
     sx, sy, sz = light.sun
@@ -109,6 +114,10 @@ def light_scene(scene: Scene, light: Light, sky: tuple[float, float, float]) -> 
     block_max = cv2.dilate(height, np.ones((3, 3), np.uint8))
     n = height.shape[0]
     block_max = block_max.reshape(n // BLOCK, BLOCK, n // BLOCK, BLOCK).max((1, 3))
+    if texel_cells > 1.0:
+        side = max(round(n / texel_cells), 32)
+        coarse = cv2.resize(texture, (side, side), interpolation=cv2.INTER_AREA)
+        texture = cv2.resize(coarse, (n, n), interpolation=cv2.INTER_LINEAR)
     mips = [texture]
     while mips[-1].shape[0] % 2 == 0 and mips[-1].shape[0] > 32:
         side = mips[-1].shape[0] // 2

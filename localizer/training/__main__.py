@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 import threading
+from itertools import chain
 from pathlib import Path
 from typing import Annotated
 
@@ -79,13 +80,18 @@ def scene_config(config: TrainConfig) -> SceneConfig:
 
 
 def _generate(config: TrainConfig) -> None:
+    """In the order in which training asks: first scenes, mesh worlds, the other scenes."""
     data = config.data
     photos = None if data.photos is None else PhotoSource(data.photos, data.photo_groups)
-    seeds = range(data.first_seed, data.first_seed + data.scenes)
+    scenes = scene_config(config)
+    first = range(data.first_seed, data.first_seed + min(data.initial_scenes, data.scenes))
+    rest = range(first.stop, data.first_seed + data.scenes)
     worlds = range(FIRST_SEED, FIRST_SEED + data.worlds)
-    for path in write_world_shards(data.shards, worlds, scene_config(config)):
-        logging.getLogger(__name__).debug("%s", path)
-    for path in write_shards(data.shards, seeds, scene_config(config), photos, data.workers):
+    for path in chain(
+        write_shards(data.shards, first, scenes, photos, data.workers),
+        write_world_shards(data.shards, worlds, scenes),
+        write_shards(data.shards, rest, scenes, photos, data.workers),
+    ):
         logging.getLogger(__name__).debug("%s", path)
 
 

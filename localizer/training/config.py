@@ -28,15 +28,20 @@ class DataSection(_Frozen):
     photo_share: float = Field(ge=0.0, le=1.0)
     worlds: int = Field(ge=0)
     world_share: float = Field(ge=0.0, le=1.0)
+    world_first_step: int = Field(ge=0)
     light_variety: bool
     appearance: bool
     workers: int = Field(gt=0)
 
 
 class OptimizerSection(_Frozen):
-    """Steps and step sizes. The rate warms up, then falls as a cosine to a hundredth."""
+    """Steps and step sizes. The rate warms up, stays, and falls to zero as a cosine over the last
+    `decay_steps`, so that a run can be made longer or shorter until its decay begins.
+    """
 
     steps: int = Field(gt=0)
+    decay_steps: int = Field(gt=0)
+    mixed_precision: bool
     batch: int = Field(gt=0)
     crop: tuple[int, int]
     anchors: int = Field(ge=32)

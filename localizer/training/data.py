@@ -35,7 +35,8 @@ class LoaderConfig:
 @dataclass(frozen=True)
 class Schedule:
     """Which shards a step draws from. paths: in order of generation, of which the first `initial`
-    plus `growth` a step are in use; world_paths: mesh worlds, all in use, with their share.
+    plus `growth` a step are in use; world_paths: mesh worlds, with their share of the samples from
+    `world_first` on.
     """
 
     paths: tuple[Path, ...]
@@ -43,10 +44,11 @@ class Schedule:
     growth: float
     world_paths: tuple[Path, ...]
     world_share: float
+    world_first: int = 0
 
     def draw(self, step: int, rng: np.random.Generator) -> Path:
         """The shard of one sample."""
-        if self.world_paths and rng.random() < self.world_share:
+        if self.world_paths and step >= self.world_first and rng.random() < self.world_share:
             return self.world_paths[int(rng.integers(len(self.world_paths)))]
         count = min(len(self.paths), int(self.initial + step * self.growth))
         return self.paths[int(rng.integers(count))]

@@ -12,9 +12,12 @@ from scipy.spatial import cKDTree
 
 from localizer.errors import SequenceError
 from localizer.synth.heightfield import Land, Prism
+from localizer.training.noise import noise
 from localizer.types import Float32
 
 Color = tuple[float, float, float]
+
+_SEASONS = "neon_sjer_pairs"  # group whose plots were photographed at two dates
 
 # RGB albedo of the land-cover classes: grass, crop, forest floor, soil, water, meadow.
 _COVER = np.array(
@@ -33,25 +36,14 @@ _COVER = np.array(
 @dataclass(frozen=True)
 class Place:
     """A training place. seasons: albedos of the same ground at other dates, where the data has
-    them; water (n, n) bool is flat.
+    them; lasting: (n, n) in 0..1, one where the fine texture stays: roads, roofs, pavement.
     """
 
     land: Land
     prisms: list[Prism]
     roads: list[Float32]
+    lasting: Float32
     seasons: tuple[Float32, ...] = ()
-
-
-def noise(n: int, rng: np.random.Generator, base: int, octaves: int, gain: float) -> Float32:
-    """Fractal value noise (n, n), about zero mean and unit variance per octave."""
-    out: Float32 = np.zeros((n, n), np.float32)
-    amplitude = np.float32(1.0)
-    for octave in range(octaves):
-        k = min(base * 2**octave, n) + 3
-        grid = rng.standard_normal((k, k), dtype=np.float32)
-        out += amplitude * cv2.resize(grid, (n, n), interpolation=cv2.INTER_CUBIC)
-        amplitude *= np.float32(gain)
-    return out
 
 
 def generated_place(rng: np.random.Generator, n: int, cell_m: float) -> Place:
@@ -65,7 +57,7 @@ def generated_place(rng: np.random.Generator, n: int, cell_m: float) -> Place:
     albedo = np.clip(albedo, 0.03, 1.0)
     roads = _streets(rng, n, cell_m, town)
     buildings = _buildings_along(rng, roads, n, cell_m, town)
-    albedo = _paint_roads(rng, albedo, roads, cell_m)
+    albedo, lasting = _paint_roads(rng, albedo, roads, cell_m)
     blocked = np.zeros((n, n), np.uint8)
     for road in roads:
         cv2.polylines(blocked, [np.rint(road).astype(np.int32)], False, 1, max(int(9 / cell_m), 1))
@@ -73,7 +65,7 @@ def generated_place(rng: np.random.Generator, n: int, cell_m: float) -> Place:
         cv2.fillConvexPoly(blocked, np.rint(b.corners).astype(np.int32), 1)
     _plant(rng, height, albedo, (cover == 2) & (blocked == 0), blocked, cell_m)
     land = Land(height.astype(np.float32), np.clip(albedo, 0.02, 1).astype(np.float32), cell_m)
-    return Place(land, buildings, roads)
+    return Place(land, buildings, roads, _with_roofs(lasting, buildings))
 
 
 def photo_place(
@@ -93,14 +85,23 @@ def photo_place(
     # A photographed roof is kept where there is one: the extrusion takes the texture's own colour.
     kept = [_with_ground_color(b, layers[0], rng) for b in buildings]
     land = Land(height.astype(np.float32), np.clip(albedos[0], 0.02, 1.2), cell_m)
-    return Place(land, kept, [], tuple(np.clip(a, 0.02, 1.2) for a in albedos[1:]))
+    others = tuple(np.clip(a, 0.02, 1.2) for a in albedos[1:])
+    return Place(land, kept, [], _with_roofs(_hard_surfaces(layers[0]), kept), others)
 
 
 class PhotoLibrary:
-    """Real textures below a folder, by group; a group may be left out for testing on it."""
+    """Real textures below a folder, by group.
 
-    def __init__(self, root: Path, groups: tuple[str, ...]) -> None:
+    Groups are kept apart for training and test by naming them. Of the cross-season plots, which are
+    one group, every fourth is for tests: `held_out` takes those, otherwise the others are taken.
+    """
+
+    def __init__(self, root: Path, groups: tuple[str, ...], *, held_out: bool = False) -> None:
         self._files = {g: sorted((root / g).rglob("*.jpg")) for g in groups}
+        if _SEASONS in self._files:
+            plots = sorted({f.parent for f in self._files[_SEASONS]})
+            mine = {p for k, p in enumerate(plots) if (k % 4 == 3) == held_out}
+            self._files[_SEASONS] = [f for f in self._files[_SEASONS] if f.parent in mine]
         empty = [g for g, files in self._files.items() if not files]
         if empty:
             raise SequenceError(f"{root}: no *.jpg below {', '.join(empty)}")
@@ -110,7 +111,7 @@ class PhotoLibrary:
         """One place's texture layers, (n, n, 3) uint8 RGB each."""
         group = str(rng.choice(self.groups))
         files = self._files[group]
-        if group == "neon_sjer_pairs":
+        if group == _SEASONS:
             return self._seasons(rng, n, files)
         if group == "neon_forest":
             chosen = rng.choice(len(files), 9, replace=True)
@@ -195,6 +196,22 @@ def new_buildings(rng: np.random.Generator, place: Place, count: int) -> list[Pr
     return [_building(rng, rng.uniform(0, n, 2), rng.uniform(0, np.pi), cell) for _ in range(count)]
 
 
+def _hard_surfaces(texture: NDArray[np.uint8]) -> Float32:
+    """Where a photo shows grey, blue or strongly red ground: pavement and roofs, not vegetation or
+    soil, which are green to yellow-brown.
+    """
+    smooth = cv2.GaussianBlur(texture.astype(np.float32), (0, 0), 1.5)
+    red, green, blue = smooth[..., 0], smooth[..., 1], smooth[..., 2]
+    soft = np.clip((green - blue - 4.0) / 10.0, 0, 1) * np.clip((40.0 - (red - green)) / 15.0, 0, 1)
+    return (1.0 - soft).astype(np.float32)
+
+
+def _with_roofs(lasting: Float32, prisms: list[Prism]) -> Float32:
+    for prism in prisms:
+        cv2.fillConvexPoly(lasting, np.rint(prism.corners).astype(np.int32), 1.0)
+    return lasting
+
+
 def _relief(rng: np.random.Generator, n: int, cell_m: float) -> float:
     """Amplitude of the terrain in metres: from flat to hilly, bounded by a share of the extent."""
     return float(min(rng.choice((1.0, 3.0, 8.0, 20.0)), 0.04 * n * cell_m))
@@ -259,8 +276,9 @@ def _runs(line: Float32, keep: NDArray[np.bool_]) -> list[Float32]:
 
 def _paint_roads(
     rng: np.random.Generator, albedo: Float32, roads: list[Float32], cell_m: float
-) -> Float32:
-    paint = albedo.copy()
+) -> tuple[Float32, Float32]:
+    """The albedo with roads, and (n, n) one on their surface."""
+    paint, surface = albedo.copy(), np.zeros(albedo.shape[:2], np.float32)
     tone = rng.uniform(0.25, 0.5)
     for road in roads:
         points = [np.rint(road * 8).astype(np.int32)]
@@ -271,9 +289,11 @@ def _paint_roads(
         verge = tuple(min(1.0, c + 0.12) for c in color)
         cv2.polylines(paint, points, False, verge, max(round(width * 1.6), 1), cv2.LINE_AA, 3)
         cv2.polylines(paint, points, False, color, max(round(width), 1), cv2.LINE_AA, 3)
+        cv2.polylines(surface, points, False, 1.0, max(round(width), 1), cv2.LINE_8, 3)
         if cell_m < 0.5 and rng.random() < 0.6:
             cv2.polylines(paint, points, False, (0.75, 0.75, 0.7), 1, cv2.LINE_AA, 3)
-    return paint * (albedo / np.maximum(cv2.GaussianBlur(albedo, (0, 0), 6), 0.05)) ** 0.5
+    grain = (albedo / np.maximum(cv2.GaussianBlur(albedo, (0, 0), 6), 0.05)) ** 0.5
+    return paint * grain, surface
 
 
 def _buildings_along(

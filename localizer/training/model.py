@@ -2,7 +2,8 @@
 
 Each level gives unit-length features and a confidence in (0, 1), the complement of the paper's
 uncertainty (Sec. 3.3.1, A.1). Eight channels are fixed orientation energy (`orientation`), the rest
-is learned; what share each has in the squared distance is learned too. The confidence is the
+is learned; what share each has in the squared distance is learned too, pixel by pixel, because
+orientation does not last on grass, leaves and water. The confidence is the
 orientation's clarity: one that was learned with the features gathered the anchors in a few places
 and cost accuracy each time it was tried (docs/model-card.md). The finest level is at stride 2: half
 the paper's, a quarter of the work. The coarsest stage is dilated, because at stride 8 a wide field
@@ -108,7 +109,7 @@ class TinyNet(nn.Module):
         self.merge2 = nn.Sequential(MobileOneBlock(d2, d2, 3), MobileOneBlock(d2, d2, 3))
         learned = config.channels - CHANNELS
         self.orientation = nn.ModuleList(OrientationFeatures(s) for s in STRIDES)
-        self.share = nn.Parameter(torch.zeros(len(STRIDES)))
+        self.share = nn.ModuleList(_half(c) for c in (w2, d1, d2))
         self.features = nn.ModuleList(nn.Conv2d(c, learned, 1) for c in (w2, d1, d2))
 
     def forward(self, image: Tensor) -> list[tuple[Tensor, Tensor]]:
@@ -121,9 +122,9 @@ class TinyNet(nn.Module):
         levels = []
         for k, x in enumerate((c, d, e)):
             oriented, clear = self.orientation[k](image)
-            f = self.features[k](x)
+            f = self.features[k](x).float()
             unit = f * torch.rsqrt((f * f).sum(1, keepdim=True) + 1e-8)
-            share = torch.sigmoid(self.share[k])
+            share = torch.sigmoid(self.share[k](x).float())
             both = torch.cat([torch.sqrt(share) * oriented, torch.sqrt(1 - share) * unit], 1)
             levels.append((both, clear))
         return levels
@@ -172,6 +173,14 @@ def _affine(bn: nn.BatchNorm2d) -> tuple[Tensor, Tensor]:
 def _folded(branch: nn.Sequential) -> tuple[Tensor, Tensor]:
     gain, shift = _affine(branch[1])
     return branch[0].weight * gain[:, None, None, None], shift
+
+
+def _half(channels: int) -> nn.Conv2d:
+    """The logit of the orientation's share at a pixel: half everywhere at first."""
+    conv = nn.Conv2d(channels, 1, 1)
+    nn.init.zeros_(conv.weight)
+    nn.init.zeros_(conv.bias)
+    return conv
 
 
 def _double(x: Tensor) -> Tensor:

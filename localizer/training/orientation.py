@@ -46,7 +46,11 @@ class OrientationFeatures(nn.Module):
 
     @torch.no_grad()
     def forward(self, image: Tensor) -> tuple[Tensor, Tensor]:
-        """See the class."""
+        """See the class. Half precision would lose it the weak edges of night and fog."""
+        with torch.autocast(image.device.type, enabled=False):
+            return self._features(image)
+
+    def _features(self, image: Tensor) -> tuple[Tensor, Tensor]:
         gray = (image * self.gray).sum(1, keepdim=True)
         small = _separable(gray, self.reduce, self.stride)
         gradient = F.conv2d(F.pad(small, [1, 1, 1, 1], mode="replicate"), self.sobel)

@@ -35,8 +35,11 @@ from localizer.training.land import (
     photo_place,
     season_shift,
 )
+from localizer.training.revisit import coarse_mesh, draw_texel, plain_walls, regrown, wetted
 from localizer.types import Float32, Image
 
+_PLAIN_WALLS = 0.4  # share of the maps whose facades were not photographed
+_COARSE_MESH = 0.8  # share of the maps on a photogrammetric mesh instead of the true surface
 _OVERLAP = 0.45  # least share of the reference's surface that the query must see
 
 
@@ -63,7 +66,9 @@ class SceneConfig:
     """Size and variety of the scenes and views. light_variety False keeps the map's own light and
     season in the query (the ablation of the paper's Table 4). cell_m: range of the size of a cell,
     which sets the altitude. conditions: taken in turn when given, else drawn. motion: metres and
-    degrees between the two views, exactly, instead of the training's mixture.
+    degrees between the two views, exactly, instead of the training's mixture. shared_detail: the
+    query repeats the map's fine texture and the map is nearly as sharp as the query; no flight is
+    like that, it is kept as the easier condition of earlier reports.
     """
 
     cells: int = 1024
@@ -76,6 +81,7 @@ class SceneConfig:
     cell_m: tuple[float, float] = (0.2, 2.2)
     conditions: tuple[str, ...] = ()
     motion: tuple[float, float] | None = None
+    shared_detail: bool = False
 
 
 def scene_pairs(seed: int, config: SceneConfig, library: PhotoLibrary | None) -> Iterator[Pair]:
@@ -88,7 +94,7 @@ def scene_pairs(seed: int, config: SceneConfig, library: PhotoLibrary | None) ->
         place, source = photo_place(rng, n, cell, library.sample(rng, n)), "photo"
     else:
         place, source = generated_place(rng, n, cell), "generated"
-    survey = _survey(rng, place)
+    survey = _survey(rng, place, config)
     lived: LitScene | None = None
     condition, outdated = "day", False
     for k in range(config.references):
@@ -96,16 +102,17 @@ def scene_pairs(seed: int, config: SceneConfig, library: PhotoLibrary | None) ->
             condition = draw_condition(rng, config.conditions, k // config.queries_per_light)
             outdated = bool(rng.random() < 0.4)
             fixed = None if config.light_variety else survey.light
-            lived = _lived(rng, place, condition, outdated, fixed)
+            lived = _lived(rng, place, condition, outdated, fixed, config.shared_detail)
         pair = _pair(rng, survey, lived, config)
         if pair is None:
             continue
         reference, query, camera = pair
         image, depth = render(survey, reference, camera)
         seen, seen_depth = render(lived, query, camera, supersample=2)
-        softened = soften(rng, image)
+        if config.shared_detail:
+            image = soften(rng, image)
         yield Pair(
-            softened, depth, seen, seen_depth, reference, query, camera, condition, outdated, source
+            image, depth, seen, seen_depth, reference, query, camera, condition, outdated, source
         )
 
 
@@ -129,9 +136,15 @@ def warp_check(pair: Pair) -> tuple[Float32, NDArray[np.bool_]]:
     return warped, inside & same & (pair.reference_depth > 0)
 
 
-def _survey(rng: np.random.Generator, place: Place) -> LitScene:
-    """The map: the place on the day of the survey, sometimes with coarse mesh and texture."""
+def _survey(rng: np.random.Generator, place: Place, config: SceneConfig) -> LitScene:
+    """The map: the place on the day of the survey, as a baked texture on a coarse mesh."""
     prisms = [*place.prisms, *parked_cars(rng, place, _car_count(rng, place))]
+    if not config.shared_detail:
+        if rng.random() < _PLAIN_WALLS:
+            prisms = plain_walls(prisms)
+        light = _sun(rng, rng.uniform(30, 70), rng.uniform(0.0, 1.0))
+        lit = light_scene(compose(place.land, prisms), light, _sky(rng, "day"), draw_texel(rng))
+        return coarse_mesh(lit, rng) if rng.random() < _COARSE_MESH else lit
     scene = compose(place.land, prisms)
     if rng.random() < 0.25:
         blurred = cv2.GaussianBlur(scene.height, (0, 0), rng.uniform(0.5, 1.5))
@@ -146,6 +159,7 @@ def _lived(
     condition: str,
     outdated: bool,
     light: Light | None,
+    shared_detail: bool,
 ) -> LitScene:
     """The place on the day of the flight; a given light also keeps the map's season."""
     land, prisms = place.land, list(place.prisms)
@@ -154,6 +168,9 @@ def _lived(
         if rng.random() < 0.7:
             albedo = season_shift(albedo, rng)
         land = Land(land.height, albedo, land.cell_m)
+    if not shared_detail:
+        albedo = regrown(land.albedo, place.lasting, land.cell_m, rng)
+        land = Land(land.height, wetted(albedo, place.lasting, rng), land.cell_m)
     if outdated:
         prisms = without(prisms, rng, rng.uniform(0.03, 0.25))
         prisms += new_buildings(rng, place, int(rng.integers(3, 40)))
@@ -263,7 +280,7 @@ def _overlap(scene: LitScene, reference: Pose, query: Pose, camera: Camera) -> f
 
 
 def soften(rng: np.random.Generator, image: Image) -> Image:
-    """The map's texture may be coarser than the view."""
+    """A map texture somewhat coarser than the view (the easier, earlier condition)."""
     if rng.random() < 0.5:
         return image
     return cv2.GaussianBlur(image, (0, 0), rng.uniform(0.4, 1.3))

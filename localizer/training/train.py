@@ -95,7 +95,8 @@ class Trainer:
     def _loss(self, batch: Batch) -> tuple[Tensor, dict[str, float]]:
         o = self.config.optimizer
         pairs = batch.points.shape[0]
-        levels = self.model(batch.images.contiguous())
+        with torch.autocast(self.device.type, torch.bfloat16, enabled=o.mixed_precision):
+            levels = self.model(batch.images.contiguous())
         ramp = min(1.0, self.step / o.alignment_ramp_steps)
         generator = torch.Generator().manual_seed(self.config.seed * 1_000_003 + self.step)
         total, parts = batch.points.new_zeros(()), {}
@@ -185,14 +186,15 @@ def schedule(data: DataSection) -> Schedule:
         data.scenes_per_step,
         tuple(path for seed in worlds for path in world_shard_paths(data.shards, seed)),
         data.world_share,
+        data.world_first_step,
     )
 
 
 def learning_rate(step: int, o: OptimizerSection) -> float:
-    """Linear warm-up, then a cosine to a hundredth of the peak."""
+    """Linear warm-up, a plateau, a cosine to zero over the last `decay_steps`."""
     warm = min(1.0, (step + 1) / max(o.warmup_steps, 1))
-    cosine = 0.5 * (1 + np.cos(np.pi * min(1.0, step / o.steps)))
-    return float(o.learning_rate * warm * (0.01 + 0.99 * cosine))
+    left = min(1.0, (o.steps - step) / o.decay_steps)
+    return float(o.learning_rate * warm * 0.5 * (1 - np.cos(np.pi * left)))
 
 
 def perturbed(batch: Batch, error_px: float, generator: torch.Generator) -> Tensor:

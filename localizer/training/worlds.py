@@ -27,8 +27,8 @@ from localizer.training.pairs import (
     draw_condition,
     look_at,
     moved,
-    soften,
 )
+from localizer.training.revisit import coarser, draw_texel
 
 FIRST_SEED = 1000
 
@@ -101,7 +101,7 @@ def _pair(
         return None
     condition = draw_condition(rng, (), 0)
     return Pair(
-        soften(rng, view.rgb),
+        view.rgb if scenes.shared_detail else coarser(view.rgb, draw_texel(rng)),
         view.depth,
         seen.rgb,
         seen.depth,
