@@ -1,4 +1,4 @@
-"""``python -m sitl demo``: the GNSS-denied demo flight."""
+"""``python -m sitl``: the GNSS-denied demo flight, sequences, and the scenario suite."""
 
 from __future__ import annotations
 
@@ -20,14 +20,24 @@ from sitl.assets import prepare
 from sitl.errors import SimulationError
 from sitl.flight import fly
 from sitl.kinematic import record_scenario
+from sitl.process import VehicleKind as FlownKind
 from sitl.report import make_report, print_report
 from sitl.scenario import Scenario, ScenarioError, VehicleKind, check_inside, load_scenario
+from sitl.suite.case import SCENARIOS, load_cases
+from sitl.suite.report import print_row, print_table, write_report
+from sitl.suite.runner import run_suite
 
 # What a flight and its report leave in their folder.
 _REPORT_FILES = (
     "companion", "companion.log", "companion.yaml", "errors.png", "frames.csv",
     "frames_report.csv", "overlay-*", "report.json", "tracks.png", "vehicle.csv",
 )  # fmt: skip
+
+_SUITE_KINDS: dict[str, tuple[FlownKind, ...]] = {
+    "embedded": ("embedded",),
+    "ardupilot": ("ardupilot",),
+    "both": ("ardupilot", "embedded"),
+}
 
 app = typer.Typer(no_args_is_help=True, pretty_exceptions_enable=False)
 
@@ -88,6 +98,28 @@ def sequence(
     with console.status("rendering"):
         count = record_scenario(assets, script, seed, out)
     console.print(f"[green]{out}[/]: {count} frames; its map is {assets.map_cache}")
+
+
+@app.command()
+def suite(
+    fc: Annotated[str, typer.Option(help="embedded, ardupilot or both")] = "embedded",
+    only: Annotated[list[str] | None, typer.Option(help="scenario name; may be repeated")] = None,
+    out: Annotated[Path, typer.Option(help="folder of the report")] = Path("report-suite"),
+    jobs: Annotated[int | None, typer.Option(min=1, help="flights side by side")] = None,
+    seed: Annotated[int, typer.Option(min=0, help="noise of fixes and embedded sensors")] = 1,
+    scenarios: Annotated[Path, typer.Option(help="folder of scenario files")] = SCENARIOS,
+) -> None:
+    """Fly every scenario and compare with what ArduPilot was measured to do; exit 1: one fails."""
+    if fc not in _SUITE_KINDS:
+        raise ScenarioError(f"--fc is embedded, ardupilot or both, not {fc!r}")
+    cases = load_cases(only or (), scenarios)
+    if out.exists() and not out.is_dir():
+        raise ScenarioError(f"{out}: is a file; give a folder as --out")
+    console = Console()
+    rows = run_suite(cases, _SUITE_KINDS[fc], jobs, seed, lambda row: print_row(console, row))
+    print_table(console, rows)
+    write_report(rows, out)
+    raise typer.Exit(0 if all(row.ok for row in rows) else 1)
 
 
 def _clear(out: Path) -> None:

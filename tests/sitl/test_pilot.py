@@ -12,7 +12,7 @@ import pytest
 from sitl import ardupilot
 from sitl.ardupilot import ArduPilotNotFoundError, ArduPilotSitl, find_arducopter
 from sitl.embedded.geodesy import Location
-from sitl.feed import FeedConfig, Message, TruthFeed
+from sitl.feed import FixModel, TruthFeed
 from sitl.pilot import (
     BootClock,
     Pilot,
@@ -30,7 +30,6 @@ from sitl.vehicles import (
     SPEEDS,
     EmbeddedSitl,
     open_vehicle,
-    vision_only_parameters,
     vision_parameters,
 )
 
@@ -129,7 +128,7 @@ def test_flies_a_mission_on_gps_and_then_on_vision(kind):
     with open_vehicle(kind, HOME, 30.0, parameters, speedup=SPEEDUP) as vehicle:
         pilot = Pilot(vehicle.gcs_endpoint, SPEEDUP, vehicle.check)
         with pilot:
-            feed = TruthFeed(pilot, vehicle.companion_endpoint, FeedConfig(sigma_m=0.3))
+            feed = TruthFeed(pilot, vehicle.companion_endpoint, FixModel(sigma_m=0.3))
             pilot.wait_ready()
             pilot.arm()
             pilot.takeoff(40.0)
@@ -185,35 +184,6 @@ def test_without_positions_the_vehicle_is_lost(kind):
             pilot.sleep(60)
             assert pilot.has_text("EKF Failsafe: changed to LAND Mode", denied)
             assert horizontal(here, pilot.truth.location) > 10.0
-
-
-@pytest.mark.parametrize("message", [Message.ODOMETRY, Message.GPS_INPUT])
-def test_other_messages_hold_the_vehicle_too(kind, message):
-    if message is Message.ODOMETRY:
-        parameters = {**vision_only_parameters(), "EK3_SRC1_VELXY": 6, "EK3_SRC1_VELZ": 6}
-    else:
-        from sitl.vehicles import gps_input_only_parameters
-
-        parameters = gps_input_only_parameters()
-    with open_vehicle(
-        kind, HOME, 0.0, {**parameters, **SPEEDS, "SIM_GPS1_ENABLE": 0}, speedup=SPEEDUP
-    ) as vehicle:
-        pilot = Pilot(vehicle.gcs_endpoint, SPEEDUP, vehicle.check)
-        with pilot:
-            config = FeedConfig(message=message, sigma_m=0.3)
-            feed = TruthFeed(pilot, vehicle.companion_endpoint, config, origin=HOME)
-            pilot.sleep(3)
-            pilot.set_origin(HOME)
-            pilot.wait_ready()
-            pilot.arm()
-            pilot.takeoff(30.0)
-            since = time.monotonic_ns()
-            here = pilot.truth.location
-            pilot.sleep(20)
-            assert horizontal(here, pilot.truth.location) < 3.0
-            errors = pilot.ekf_errors(since)
-            assert np.median(np.hypot(errors[:, 0], errors[:, 1])) < 0.6
-            feed.close()
 
 
 def test_a_vehicle_comes_back_on_its_ports(kind):

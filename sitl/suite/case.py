@@ -1,0 +1,192 @@
+"""A scenario file as data: who injects what, the faults in time, and what must come of it."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import yaml
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+
+from mavlink_bridge import BridgeConfig
+from sitl.feed import FixModel, RawMessage
+from sitl.scenario import ScenarioError
+from sitl.suite.checks import Check
+from sitl.vehicles import (
+    GPS_OFF,
+    SPEEDS,
+    gps_input_only_parameters,
+    vision_only_parameters,
+    vision_parameters,
+)
+
+SCENARIOS = Path(__file__).parents[1] / "scenarios"
+
+
+class _Model(BaseModel):
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+
+class VehicleSpec(_Model):
+    """The vehicle's parameters: a named set and what differs from it.
+
+    vision: EK3_SRC1 on external navigation, no receiver. gnss_then_vision: a receiver in source
+    set 1, vision in set 2. gps_input: GPS_INPUT is the only receiver.
+    origin_north_m: None leaves the EKF origin to the injector; a number sets it before, this far
+    north of home.
+    """
+
+    sources: Literal["vision", "gnss_then_vision", "gps_input"]
+    parameters: dict[str, float] = {}
+    origin_north_m: float | None = None
+
+    @property
+    def receiver(self) -> bool:
+        """Whether the simulated GNSS receiver is on at the start."""
+        return self.sources == "gnss_then_vision"
+
+    def all_parameters(self) -> dict[str, float]:
+        """Everything that is set over the firmware's defaults."""
+        named = {
+            "vision": vision_only_parameters,
+            "gnss_then_vision": vision_parameters,
+            "gps_input": gps_input_only_parameters,
+        }[self.sources]()
+        off = {} if self.receiver else GPS_OFF
+        return {**named, **SPEEDS, **off, **self.parameters}
+
+
+class Flight(_Model):
+    """Where it flies. side_m 0 hovers; seconds None ends when the square is closed.
+
+    ground: never arms; `seconds` are spent on the ground.
+    """
+
+    side_m: float = Field(200.0, ge=0, le=1000)
+    height_m: float = Field(60.0, ge=5, le=200)
+    seconds: float | None = Field(None, gt=0, le=300)
+    ground: bool = False
+
+    @model_validator(mode="after")
+    def _ends(self) -> Flight:
+        if self.seconds is None and (self.ground or self.side_m == 0):
+            raise ValueError("a hover, or a case on the ground, needs `seconds`")
+        return self
+
+
+class Event(_Model):
+    """Something that happens at_s seconds after the take-off height is reached.
+
+    fixes: fields of `fixes` that change; reset: the first fix after it announces a jump.
+    vehicle: parameters set by the ground station. source_set: ordered by the ground station.
+    """
+
+    at_s: float = Field(ge=0)
+    fixes: dict[str, Any] = {}
+    reset: bool = False
+    vehicle: dict[str, float] = {}
+    source_set: int | None = Field(None, ge=1, le=3)
+    reboot: bool = False
+
+    @model_validator(mode="after")
+    def _does_something(self) -> Event:
+        if not (self.fixes or self.vehicle or self.source_set or self.reboot):
+            raise ValueError("nothing happens: give fixes, vehicle, source_set or reboot")
+        return self
+
+    @property
+    def label(self) -> str:
+        """For the plot."""
+        parts = [f"{k}={v}" for k, v in {**self.fixes, **self.vehicle}.items()]
+        if self.reset:
+            parts.append("reset")
+        if self.source_set is not None:
+            parts.append(f"set {self.source_set}")
+        if self.reboot:
+            parts.append("reboot")
+        return ", ".join(parts)
+
+
+class Ground(_Model):
+    """What is done before take-off. doctor: wrong parameters are found and mended by
+    `companion doctor --fix`; reboot: the autopilot starts anew while it is being injected.
+    """
+
+    doctor: bool = False
+    reboot: bool = False
+
+
+class Case(_Model):
+    """One scenario. Exactly one of bridge (our bridge's configuration, without the connection) and
+    raw (a bare MAVLink sender) injects.
+
+    ci: among the few that every test run flies on the embedded vehicle.
+    """
+
+    name: str
+    title: str
+    ci: bool = False
+    vehicle: VehicleSpec
+    fixes: FixModel = FixModel()
+    bridge: dict[str, Any] | None = None
+    raw: RawMessage | None = None
+    flight: Flight = Flight()
+    before: Ground = Ground()
+    timeline: tuple[Event, ...] = ()
+    expect: tuple[Annotated[Check, Field(discriminator="check")], ...] = Field(min_length=1)
+
+    @property
+    def via(self) -> str:
+        """Who injects."""
+        return "bridge" if self.raw is None else "raw"
+
+    @model_validator(mode="after")
+    def _is_whole(self) -> Case:
+        if (self.bridge is None) == (self.raw is None):
+            raise ValueError("give exactly one of `bridge` and `raw`")
+        if self.bridge is not None:
+            BridgeConfig.model_validate(self.bridge)
+        elif self.before != Ground():
+            raise ValueError("`before` needs the bridge")
+        if list(self.timeline) != sorted(self.timeline, key=lambda e: e.at_s):
+            raise ValueError("timeline: events must be in the order of at_s")
+        for event in self.timeline:
+            self.changed(self.fixes, event)
+        return self
+
+    @staticmethod
+    def changed(model: FixModel, event: Event) -> FixModel:
+        """The fixes after an event."""
+        return FixModel.model_validate({**model.model_dump(), **event.fixes})
+
+
+def load_case(path: Path) -> Case:
+    """Read a scenario file; ScenarioError names the file and every problem in it."""
+    try:
+        data = yaml.safe_load(path.read_text(encoding="utf-8"))
+    except OSError as error:
+        raise ScenarioError(f"{path}: cannot be read: {error.strerror}") from error
+    except (yaml.YAMLError, UnicodeDecodeError) as error:
+        raise ScenarioError(f"{path}: not valid YAML: {error}") from error
+    if not isinstance(data, dict):
+        raise ScenarioError(f"{path}: expected a mapping of settings at the top")
+    try:
+        return Case.model_validate({"name": path.stem, **data})
+    except ValidationError as error:
+        problems = "\n".join(
+            f"  {'.'.join(str(p) for p in e['loc'])}: {e['msg']}" for e in error.errors()
+        )
+        raise ScenarioError(f"{path}:\n{problems}") from error
+
+
+def load_cases(names: Iterable[str] = (), folder: Path = SCENARIOS) -> tuple[Case, ...]:
+    """All scenarios of a folder, or those named; ScenarioError for a name that is not there."""
+    files = {path.stem: path for path in sorted(folder.glob("*.yaml"))}
+    chosen = list(names) or list(files)
+    unknown = [name for name in chosen if name not in files]
+    if unknown:
+        raise ScenarioError(
+            f"no scenario {', '.join(unknown)} in {folder}; there are: {', '.join(files)}"
+        )
+    return tuple(load_case(files[name]) for name in chosen)

@@ -1,0 +1,301 @@
+"""Expectations of a scenario, held against its record; each says what it saw in any case."""
+
+from __future__ import annotations
+
+import math
+from abc import abstractmethod
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+from pydantic import BaseModel, ConfigDict, Field
+
+from sitl.suite.record import Record
+
+FOREVER = math.inf
+
+
+@dataclass(frozen=True)
+class Finding:
+    """One expectation's outcome. better: the figure lies below the reference's band."""
+
+    ok: bool
+    what: str
+    better: bool = False
+
+
+class _Expectation(BaseModel):
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    @abstractmethod
+    def judge(self, record: Record) -> Finding:
+        """Hold the record against the expectation."""
+
+
+class _Span(_Expectation):
+    from_s: float = 0.0
+    to_s: float = FOREVER
+
+
+class Reference(_Span):
+    """The median of the horizontal EKF error is the reference's within per cent.
+
+    Below the band it counts as reproduced only in the sense of "no worse", and is marked.
+    """
+
+    check: Literal["reference"]
+    median: float = Field(gt=0)
+    p95: float | None = None
+    max: float | None = None
+    within_percent: float = Field(25.0, gt=0)
+
+    def judge(self, record: Record) -> Finding:
+        """See `_Expectation.judge`."""
+        errors = record.horizontal(self.from_s, self.to_s)
+        if len(errors) < 100:
+            return Finding(False, f"only {len(errors)} EKF positions")
+        median = float(np.median(errors))
+        change = 100.0 * (median / self.median - 1.0)
+        what = f"median {median:.2f} m, {change:+.0f} % of {self.median:.2f}"
+        return Finding(change <= self.within_percent, what, change < -self.within_percent)
+
+
+class MedianBelow(_Span):
+    """The median of the horizontal EKF error stays at or below a limit."""
+
+    check: Literal["median_below"]
+    metres: float
+
+    def judge(self, record: Record) -> Finding:
+        """See `_Expectation.judge`."""
+        errors = record.horizontal(self.from_s, self.to_s)
+        if not len(errors):
+            return Finding(False, "no EKF positions")
+        median = float(np.median(errors))
+        return Finding(median <= self.metres, f"median {median:.2f} of {self.metres:g} m")
+
+
+class MaxError(_Span):
+    """The largest horizontal EKF error lies between two limits."""
+
+    check: Literal["max_error"]
+    at_least: float = 0.0
+    at_most: float = FOREVER
+
+    def judge(self, record: Record) -> Finding:
+        """See `_Expectation.judge`."""
+        errors = record.horizontal(self.from_s, self.to_s)
+        if not len(errors):
+            return Finding(False, "no EKF positions")
+        largest = float(errors.max())
+        what = f"max {largest:.2f} m, wanted {self.at_least:g} to {self.at_most:g}"
+        return Finding(self.at_least <= largest <= self.at_most, what)
+
+
+class Jumps(_Expectation):
+    """The EKF's north error goes to north_m with the jump at at_s: it is there settled_s later and
+    for 2 s more, and never beyond by more than overshoot_m.
+    """
+
+    check: Literal["jump"]
+    at_s: float
+    north_m: float
+    settled_s: float
+    tolerance_m: float = 1.0
+    overshoot_m: float = 2.0
+
+    def judge(self, record: Record) -> Finding:
+        """See `_Expectation.judge`."""
+        begin = self.at_s + self.settled_s
+        there = record.north(begin, begin + 2.0)
+        whole = record.north(self.at_s, begin + 2.0)
+        if len(there) < 10:
+            return Finding(False, "no EKF positions after the jump")
+        median = float(np.median(there))
+        beyond = float(np.max((whole - self.north_m) * math.copysign(1.0, self.north_m)))
+        ok = abs(median - self.north_m) <= self.tolerance_m and beyond <= self.overshoot_m
+        what = f"{median:.1f} m {self.settled_s:g} s after a jump of {self.north_m:g} m"
+        return Finding(ok, f"{what}, overshoot {beyond:.1f}")
+
+
+class Lags(_Expectation):
+    """An unannounced jump is refused for a while: the north error stays below half of north_m until
+    after_s and has passed it by before_s (seconds after at_s).
+    """
+
+    check: Literal["jump_refused"]
+    at_s: float
+    north_m: float
+    after_s: float
+    before_s: float
+
+    def judge(self, record: Record) -> Finding:
+        """See `_Expectation.judge`."""
+        taken = [
+            t - self.at_s
+            for t, north, _ in record.errors
+            if t >= self.at_s and abs(north) > abs(self.north_m) / 2
+        ]
+        wanted = f"wanted {self.after_s:g} to {self.before_s:g} s"
+        if not taken:
+            return Finding(math.isinf(self.before_s), "jump never taken")
+        return Finding(
+            self.after_s <= taken[0] <= self.before_s,
+            f"jump taken after {taken[0]:.1f} s, {wanted}",
+        )
+
+
+class Says(_Span):
+    """A status text came (or, with absent, did not) within the span."""
+
+    check: Literal["text"]
+    contains: str
+    sender: Literal["vehicle", "bridge"] = "vehicle"
+    absent: bool = False
+
+    def judge(self, record: Record) -> Finding:
+        """See `_Expectation.judge`."""
+        times = [
+            t.at_s
+            for t in record.texts
+            if t.sender == self.sender
+            and self.contains in t.text
+            and self.from_s <= t.at_s <= self.to_s
+        ]
+        said = f"{times[0]:.1f} s" if times else "never"
+        what = f"{self.sender}: '{self.contains}' {said}"
+        return Finding(bool(times) != self.absent, what)
+
+
+class Silent(_Span):
+    """The vehicle says nothing of a severity that an operator would act on: no text contains any
+    of the words.
+    """
+
+    check: Literal["no_warning"]
+    words: tuple[str, ...] = ("EKF variance", "Failsafe", "rror", "ailed", "litch", "nhealthy")
+
+    def judge(self, record: Record) -> Finding:
+        """See `_Expectation.judge`."""
+        heard = [
+            t.text
+            for t in record.texts
+            if t.sender == "vehicle"
+            and self.from_s <= t.at_s <= self.to_s
+            and any(word in t.text for word in self.words)
+        ]
+        return Finding(not heard, "; ".join(heard[:3]) or "vehicle: no warning")
+
+
+class InMode(_Expectation):
+    """The flight mode at a time; at_s None: at the end."""
+
+    check: Literal["mode"]
+    mode: str
+    at_s: float | None = None
+
+    def judge(self, record: Record) -> Finding:
+        """See `_Expectation.judge`."""
+        sample = record.at(FOREVER if self.at_s is None else self.at_s)
+        mode = sample.mode if sample else "none"
+        when = "at the end" if self.at_s is None else f"at {self.at_s:g} s"
+        return Finding(mode == self.mode, f"{mode} {when}")
+
+
+class Moved(_Span):
+    """The vehicle truly moved at most this far from where it was at from_s."""
+
+    check: Literal["moved"]
+    at_most: float
+
+    def judge(self, record: Record) -> Finding:
+        """See `_Expectation.judge`."""
+        inside = [s for s in record.samples if self.from_s <= s.at_s <= self.to_s]
+        if not inside:
+            return Finding(False, "no samples")
+        a = inside[0]
+        far = max(math.hypot(s.north_m - a.north_m, s.east_m - a.east_m) for s in inside)
+        return Finding(far <= self.at_most, f"moved {far:.2f} of {self.at_most:g} m")
+
+
+class Injected(_Span):
+    """How many messages our bridge injected within the span."""
+
+    check: Literal["injected"]
+    at_least: int = 0
+    at_most: float = FOREVER
+
+    def judge(self, record: Record) -> Finding:
+        """See `_Expectation.judge`."""
+        counts = [s.injected for s in record.samples if self.from_s <= s.at_s <= self.to_s]
+        if not counts:
+            return Finding(False, "no samples")
+        # A counter that falls has started anew with the bridge; ours lives as long as the case.
+        sent = counts[-1] - counts[0]
+        return Finding(self.at_least <= sent <= self.at_most, f"{sent} injected")
+
+
+class SourceSet(_Expectation):
+    """The EKF source set that the bridge holds active, at a time; by_s: reached by then."""
+
+    check: Literal["source_set"]
+    number: int
+    from_s: float
+    by_s: float
+
+    def judge(self, record: Record) -> Finding:
+        """See `_Expectation.judge`."""
+        reached = [
+            s.at_s for s in record.samples if s.at_s >= self.from_s and s.source_set == self.number
+        ]
+        if not reached:
+            return Finding(False, f"never on source set {self.number}")
+        ok = self.from_s < reached[0] <= self.by_s
+        return Finding(ok, f"source set {self.number} at {reached[0]:.1f} s")
+
+
+class Refused(_Expectation):
+    """On the ground: arming is refused, with one of these texts."""
+
+    check: Literal["arming_refused"]
+    any_of: tuple[str, ...]
+
+    def judge(self, record: Record) -> Finding:
+        """See `_Expectation.judge`."""
+        if record.refusals is None:
+            return Finding(False, "arming was accepted")
+        told = "; ".join(record.refusals) or "without a text"
+        return Finding(any(text in told for text in self.any_of), f"refused: {told}")
+
+
+class Diagnosed(_Expectation):
+    """`companion doctor` finds exactly these parameters wrong, and nothing after its --fix."""
+
+    check: Literal["doctor"]
+    finds: tuple[str, ...]
+
+    def judge(self, record: Record) -> Finding:
+        """See `_Expectation.judge`."""
+        d = record.doctor
+        if d is None:
+            return Finding(False, "the doctor was not asked")
+        ok = set(d.found) == set(self.finds) and d.exit_before == 2 and d.exit_after == 0
+        what = f"found {', '.join(d.found)}; exit {d.exit_before} before, {d.exit_after} after"
+        return Finding(ok, what)
+
+
+Check = (
+    Reference
+    | MedianBelow
+    | MaxError
+    | Jumps
+    | Lags
+    | Says
+    | Silent
+    | InMode
+    | Moved
+    | Injected
+    | SourceSet
+    | Refused
+    | Diagnosed
+)

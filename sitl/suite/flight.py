@@ -1,0 +1,257 @@
+"""One scenario flown: vehicle, pilot, injector, the timeline of faults, and the record of it."""
+
+from __future__ import annotations
+
+import math
+import time
+from contextlib import ExitStack
+from typing import Any
+
+import numpy as np
+
+from mavlink_bridge import Bridge, BridgeConfig
+from sitl.embedded.geodesy import Location
+from sitl.feed import BridgeFeed, FixModel, TruthFeed
+from sitl.pilot import Pilot, PilotError
+from sitl.process import VehicleKind, VehicleProcess
+from sitl.suite.case import Case, Event
+from sitl.suite.doctor import consult
+from sitl.suite.record import Record, Sample, Text
+from sitl.vehicles import open_vehicle
+
+HOME = Location(47.397742, 8.545594, 488.0)
+GEOID_M = 47.3
+_AUTOPILOT = 1
+_RAW_SPEEDUP = 2.0  # as the reference was flown; our bridge lives in real time
+_GYROS_SETTLED_S = 27.0  # ArduPilot SITL refuses to arm before about 25 s
+_SETTLE_S = 3.0
+_NEAR_M = 3.0
+_STEP_S = 0.1
+_LONGEST_S = 240.0
+_ARMING_TRIES = 3
+
+
+def fly(case: Case, kind: VehicleKind, seed: int = 0) -> Record:
+    """Fly a scenario on a vehicle; SimulationError when it could not be flown at all."""
+    with ExitStack() as stack:
+        speedup = 1.0 if case.raw is None else _RAW_SPEEDUP
+        parameters = case.vehicle.all_parameters()
+        vehicle = open_vehicle(kind, HOME, 0.0, parameters, speedup=speedup, seed=seed)
+        return _CaseFlight(case, stack.enter_context(vehicle), stack, seed).run()
+
+
+class _CaseFlight:
+    """The running of one scenario; everything it opens is closed by `stack`."""
+
+    def __init__(self, case: Case, vehicle: VehicleProcess, stack: ExitStack, seed: int) -> None:
+        self._case, self._vehicle, self._stack, self._seed = case, vehicle, stack, seed
+        self._record = Record()
+        self._pilots: list[Pilot] = []
+        self._pilot = self._connect()
+        self._bridge: Bridge | None = None
+        self._feed: BridgeFeed | TruthFeed
+        self._model: FixModel = case.fixes
+        self._start_ns = 0
+        side = case.flight.side_m
+        self._corners = [(side, 0.0), (side, side), (0.0, side), (0.0, 0.0)] if side else []
+        self._waiting = list(case.timeline)
+
+    def run(self) -> Record:
+        """Everything from power on to the record."""
+        case = self._case
+        self._wait_on_ground()
+        self._inject()
+        if case.before.reboot:
+            self._pilot.wait_ready()
+            self._reboot()
+        if not case.flight.ground:
+            self._take_off()
+        self._start_ns = time.monotonic_ns()
+        self._send_to_corner()
+        while not self._over():
+            self._happen()
+            self._sample()
+            self._steer()
+            self._pilot.sleep(_STEP_S)
+        if case.flight.ground:
+            self._record.refusals = self._refusals()
+        for pilot in self._pilots:
+            self._collect(pilot)
+        if self._bridge is not None:
+            self._record.counters = self._bridge.counters()
+        return self._record
+
+    # --- before ----------------------------------------------------------------------------------
+
+    def _connect(self) -> Pilot:
+        pilot = Pilot(self._vehicle.gcs_endpoint, self._vehicle.speedup, self._vehicle.check)
+        pilot.connect()
+        self._stack.callback(pilot.close)
+        self._pilots.append(pilot)
+        return pilot
+
+    def _wait_on_ground(self) -> None:
+        """What takes simulated time and needs no injection is run fast."""
+        pilot, spec = self._pilot, self._case.vehicle
+        with pilot.fast_forward():
+            pilot.wait(lambda: pilot.time_s > _GYROS_SETTLED_S, 60.0, "the gyros to settle")
+            if spec.receiver:
+                pilot.wait_ready()
+        if spec.origin_north_m is not None:
+            pilot.set_origin(HOME.offset(spec.origin_north_m, 0.0, 0.0))
+        elif self._case.raw is not None and not spec.receiver:
+            pilot.set_origin(HOME)
+
+    def _inject(self) -> None:
+        case, endpoint = self._case, self._vehicle.companion_endpoint
+        if case.raw is not None:
+            self._feed = TruthFeed(self._pilot, endpoint, case.fixes, case.raw, seed=self._seed)
+            self._stack.callback(self._feed.close)
+            return
+        config = bridge_config(case, endpoint)
+        if case.before.doctor:
+            self._record.doctor = consult(config)
+        self._bridge = Bridge(config, GEOID_M)
+        self._bridge.start()
+        self._stack.callback(self._bridge.stop)
+        self._feed = BridgeFeed(self._pilot, self._bridge, case.fixes, HOME, GEOID_M, self._seed)
+        self._stack.callback(self._feed.close)
+
+    def _take_off(self) -> None:
+        self._pilot.wait_ready()
+        self._pilot.arm()
+        self._pilot.takeoff(self._case.flight.height_m)
+        self._pilot.sleep(_SETTLE_S)
+
+    # --- during ----------------------------------------------------------------------------------
+
+    @property
+    def _now_s(self) -> float:
+        return self._seconds(time.monotonic_ns())
+
+    def _seconds(self, time_ns: int) -> float:
+        """Simulated seconds since the start of a CLOCK_MONOTONIC time."""
+        return (time_ns - self._start_ns) * 1e-9 * self._vehicle.speedup
+
+    def _over(self) -> bool:
+        limit = self._case.flight.seconds
+        if limit is not None:
+            return self._now_s >= limit
+        self._record.closed = not self._corners
+        lost = self._pilot.mode != "GUIDED" and not self._waiting
+        return self._record.closed or lost or self._now_s > _LONGEST_S
+
+    def _happen(self) -> None:
+        while self._waiting and self._waiting[0].at_s <= self._now_s:
+            event = self._waiting.pop(0)
+            self._record.events.append((self._now_s, event.label))
+            self._do(event)
+
+    def _do(self, event: Event) -> None:
+        if event.fixes:
+            self._model = Case.changed(self._model, event)
+            self._feed.change(self._model, reset=event.reset)
+        for name, value in event.vehicle.items():
+            self._pilot.set_parameter(name, value)
+        if event.source_set is not None:
+            self._pilot.use_source_set(event.source_set)
+        if event.reboot:
+            self._reboot()
+            self._corners = []
+            self._take_off()
+
+    def _reboot(self) -> None:
+        """The simulator starts anew with it: on the ground, at home."""
+        self._pilot.close()
+        self._vehicle.restart()
+        self._pilot = self._connect()
+        if isinstance(self._feed, BridgeFeed):
+            self._feed.pilot = self._pilot
+
+    def _sample(self) -> None:
+        pilot = self._pilot
+        north, east, _ = HOME.ned_of(pilot.truth.location)
+        counters = self._bridge.counters() if self._bridge is not None else {}
+        self._record.samples.append(
+            Sample(
+                self._now_s,
+                north,
+                east,
+                pilot.mode or "",
+                pilot.armed,
+                int(counters.get("bridge_injected", 0)),
+                int(counters.get("ekf_source_set", 0)),
+            )
+        )
+
+    def _steer(self) -> None:
+        ekf = self._pilot.ekf
+        if not self._corners or ekf is None or ekf.location is None:
+            return
+        north, east, _ = HOME.ned_of(ekf.location)
+        if math.hypot(north - self._corners[0][0], east - self._corners[0][1]) < _NEAR_M:
+            self._corners.pop(0)
+            self._send_to_corner()
+
+    def _send_to_corner(self) -> None:
+        if self._corners and self._pilot.mode == "GUIDED" and not self._case.flight.ground:
+            where = HOME.offset(*self._corners[0], 0.0)
+            height = self._case.flight.height_m
+            self._pilot.go_to(where.latitude_deg, where.longitude_deg, height)
+
+    def _refusals(self) -> list[str] | None:
+        """Try to arm on the ground; the texts of the refusal, None where it is accepted."""
+        pilot = self._pilot
+        pilot.set_mode("GUIDED")
+        since = time.monotonic_ns()
+        try:
+            pilot.arm(timeout_s=float(_ARMING_TRIES))
+        except PilotError:
+            texts = [t.text for t in pilot.texts if t.time_ns > since and "rm: " in t.text]
+            return sorted(set(texts))
+        return None
+
+    # --- after -----------------------------------------------------------------------------------
+
+    def _collect(self, pilot: Pilot) -> None:
+        """Errors and texts of a pilot: there is a new one after every reboot."""
+        record = self._record
+        record.texts += [
+            Text(
+                self._seconds(t.time_ns),
+                "vehicle" if t.component == _AUTOPILOT else "bridge",
+                t.text,
+            )
+            for t in pilot.texts
+        ]
+        truth = pilot.truth_track()
+        times = np.array([t.boot_s for t in truth])
+        true = np.array([HOME.ned_of(t.location)[:2] for t in truth]).reshape(-1, 2)
+        for sample in pilot.ekf_track():
+            at_s = self._seconds(sample.time_ns)
+            i = int(np.searchsorted(times, sample.boot_s))
+            if at_s < 0 or sample.location is None or not 0 < i < len(times):
+                continue
+            share = (sample.boot_s - times[i - 1]) / (times[i] - times[i - 1])
+            ekf = np.array(HOME.ned_of(sample.location)[:2])
+            north, east = ekf - (true[i - 1] + share * (true[i] - true[i - 1]))
+            record.errors.append((at_s, float(north), float(east)))
+            north, east = ekf - true[i - 1]
+            record.unpaired.append((at_s, float(north), float(east)))
+
+
+def bridge_config(case: Case, connection: str) -> BridgeConfig:
+    """The scenario's bridge, on a connection: injecting, with home as its origin where there is no
+    receiver to give one.
+    """
+    settings: dict[str, Any] = {"mode": "inject", **(case.bridge or {})}
+    if not case.vehicle.receiver:
+        settings.setdefault(
+            "origin",
+            {
+                "latitude_deg": HOME.latitude_deg,
+                "longitude_deg": HOME.longitude_deg,
+                "altitude_amsl_m": HOME.altitude_m,
+            },
+        )
+    return BridgeConfig.model_validate({**settings, "connection": connection})

@@ -1,0 +1,85 @@
+"""What a flight of the suite leaves behind: plain lists, so that it can be stored and read again.
+
+Seconds count from the take-off height reached (on the ground: from the start of injection), in
+simulated time.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Text:
+    """A STATUSTEXT. sender: "vehicle", or "bridge" for what our bridge told the operator."""
+
+    at_s: float
+    sender: str
+    text: str
+
+
+@dataclass(frozen=True)
+class Sample:
+    """The flight's state, ten times a second. north, east: true metres from home."""
+
+    at_s: float
+    north_m: float
+    east_m: float
+    mode: str
+    armed: bool
+    injected: int
+    source_set: int
+
+
+@dataclass(frozen=True)
+class Doctor:
+    """What `companion doctor` found wrong, and the exit codes before and after its `--fix`."""
+
+    found: tuple[str, ...]
+    exit_before: int
+    exit_after: int
+
+
+@dataclass
+class Record:
+    """errors: (seconds, north, east) of every EKF position against the truth of its time.
+
+    unpaired: as errors, against the newest truth that had arrived, as the reference measured.
+    refusals: texts of the last refused arming; None when nobody tried or it was accepted.
+    """
+
+    errors: list[tuple[float, float, float]] = field(default_factory=list)
+    unpaired: list[tuple[float, float, float]] = field(default_factory=list)
+    samples: list[Sample] = field(default_factory=list)
+    texts: list[Text] = field(default_factory=list)
+    events: list[tuple[float, str]] = field(default_factory=list)
+    refusals: list[str] | None = None
+    doctor: Doctor | None = None
+    counters: dict[str, float | int | str] = field(default_factory=dict)
+    closed: bool = False
+
+    def horizontal(self, from_s: float = 0.0, to_s: float = np.inf) -> Array:
+        """Horizontal EKF errors (N,) in metres within a span of seconds."""
+        return _norms(self.errors, from_s, to_s)
+
+    def as_reference(self, from_s: float = 0.0, to_s: float = np.inf) -> Array:
+        """As `horizontal`, paired as the reference paired."""
+        return _norms(self.unpaired, from_s, to_s)
+
+    def north(self, from_s: float, to_s: float) -> Array:
+        """North EKF errors (N,) in metres within a span of seconds."""
+        return np.array([n for t, n, _ in self.errors if from_s <= t <= to_s])
+
+    def at(self, seconds: float) -> Sample | None:
+        """The first sample at or after a time; the last one where there is none."""
+        later = [s for s in self.samples if s.at_s >= seconds]
+        return later[0] if later else (self.samples[-1] if self.samples else None)
+
+
+def _norms(rows: list[tuple[float, float, float]], from_s: float, to_s: float) -> Array:
+    return np.array([np.hypot(n, e) for t, n, e in rows if from_s <= t <= to_s])

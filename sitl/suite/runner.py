@@ -1,0 +1,134 @@
+"""All scenarios, several flights side by side, each judged as it lands."""
+
+from __future__ import annotations
+
+import multiprocessing
+import os
+import time
+from collections.abc import Callable, Iterable
+from concurrent.futures import Future, ProcessPoolExecutor, as_completed
+from concurrent.futures.process import BrokenProcessPool
+from dataclasses import dataclass
+
+import numpy as np
+
+from sitl.errors import SimulationError
+from sitl.process import VehicleKind
+from sitl.suite.case import Case
+from sitl.suite.checks import Finding, Reference
+from sitl.suite.flight import fly
+from sitl.suite.record import Array, Record
+
+Figures = tuple[float, float, float]
+
+
+@dataclass(frozen=True)
+class Row:
+    """One line of the report. record: None where the flight could not be flown; error says why."""
+
+    case: Case
+    vehicle: VehicleKind
+    record: Record | None
+    findings: tuple[Finding, ...]
+    error: str = ""
+    wall_s: float = 0.0
+
+    @property
+    def ok(self) -> bool:
+        """Whether it was flown and every expectation holds."""
+        return not self.error and all(f.ok for f in self.findings)
+
+    @property
+    def verdict(self) -> str:
+        """pass; better: passes, with a median below the reference's band; FAIL; ERROR."""
+        if self.error:
+            return "ERROR"
+        if not self.ok:
+            return "FAIL"
+        return "better" if any(f.better for f in self.findings) else "pass"
+
+    @property
+    def reference(self) -> Reference | None:
+        """The figures to be reproduced, where the case has any."""
+        return next((e for e in self.case.expect if isinstance(e, Reference)), None)
+
+    @property
+    def measured(self) -> Figures | None:
+        """Median, p95 and maximum of the horizontal EKF error over the reference's span."""
+        if self.record is None:
+            return None
+        span = self.reference or Reference(check="reference", median=1.0)
+        return figures(self.record.horizontal(span.from_s, span.to_s))
+
+
+def figures(errors: Array) -> Figures | None:
+    """Median, 95th percentile and maximum; None of nothing."""
+    if not len(errors):
+        return None
+    median, p95, largest = (float(v) for v in (*np.percentile(errors, [50, 95]), errors.max()))
+    return median, p95, largest
+
+
+def judge(case: Case, record: Record) -> tuple[Finding, ...]:
+    """Every expectation of the case, held against the record."""
+    return tuple(expectation.judge(record) for expectation in case.expect)
+
+
+def run_case(case: Case, kind: VehicleKind, seed: int) -> Row:
+    """Fly and judge one scenario; what goes wrong becomes the row's error."""
+    start = time.monotonic()
+    try:
+        record = fly(case, kind, seed)
+    except (SimulationError, OSError) as error:
+        text = f"{type(error).__name__}: {error}"
+        return Row(case, kind, None, (), text, time.monotonic() - start)
+    return Row(case, kind, record, judge(case, record), "", time.monotonic() - start)
+
+
+def run_suite(
+    cases: Iterable[Case],
+    kinds: Iterable[VehicleKind],
+    jobs: int | None = None,
+    seed: int = 1,
+    landed: Callable[[Row], None] = lambda _row: None,
+) -> list[Row]:
+    """Fly all cases on all vehicles, `jobs` at a time; rows in the order of the cases.
+
+    landed: called with every row as it comes.
+    """
+    kinds = list(kinds)
+    wanted = [(case, kind) for kind in kinds for case in cases]
+    # Long flights first, so that none of them is alone at the end.
+    longest_first = sorted(wanted, key=lambda w: -_expected_s(w[0]))
+    rows: dict[tuple[str, str], Row] = {}
+    context = multiprocessing.get_context("spawn")
+    with ProcessPoolExecutor(jobs or default_jobs(), mp_context=context) as pool:
+        futures = {
+            pool.submit(run_case, case, kind, seed): (case, kind) for case, kind in longest_first
+        }
+        for future in as_completed(futures):
+            case, kind = futures[future]
+            row = _row(future, case, kind)
+            rows[case.name, kind] = row
+            landed(row)
+    return [rows[case.name, kind] for case, kind in wanted]
+
+
+def default_jobs() -> int:
+    """Twice the processors: a real-time flight, its bridge and its pilot take 0.3 of one."""
+    return 2 * (os.cpu_count() or 1)
+
+
+def _row(future: Future[Row], case: Case, kind: VehicleKind) -> Row:
+    try:
+        return future.result()
+    except BrokenProcessPool:
+        return Row(case, kind, None, (), "the flight's process died")
+    except Exception as error:
+        # One flight that breaks must not cost the report of the others.
+        return Row(case, kind, None, (), f"{type(error).__name__}: {error}")
+
+
+def _expected_s(case: Case) -> float:
+    flight = case.flight
+    return flight.seconds or 4 * (flight.side_m / 10.0 + 5.0) / (2.0 if case.raw else 1.0)
