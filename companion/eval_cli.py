@@ -11,6 +11,7 @@ from typing import Annotated
 import numpy as np
 import typer
 from rich.console import Console
+from rich.markup import escape
 from rich.progress import Progress
 from rich.table import Table
 
@@ -21,6 +22,7 @@ from companion.versions import versions
 from localizer.camera import Camera
 from localizer.config import LocalizerConfig
 from localizer.evaluation import (
+    CSV_COLUMNS,
     EvaluatedFrame,
     Perturbation,
     PriorMode,
@@ -36,6 +38,7 @@ from localizer.pipeline import Undistorter
 from localizer.render.base import MapRenderer
 
 _OVERLAYS = 4
+_PROBLEMS = 5  # texts that are printed
 
 
 def evaluate_command(
@@ -78,7 +81,10 @@ def evaluate_command(
             "noise_m": noise_m, "noise_deg": noise_deg, "width": localizer.camera.width,
             "height": localizer.camera.height, "features": load_extractor(model).name,
         }  # fmt: skip
-        print_metrics(metrics, str(sequence))  # first: they are told even if the disk is full
+        _print_problems(frames)
+        unusable = sum(f.estimate is None for f in frames)
+        # Before the files: they are told even if the disk is full.
+        print_metrics(metrics, unusable, str(sequence))
         try:
             _write_report(report, frames, metrics, settings, stack.cache.frame)
             _write_overlays(report, frames, data, stack.renderer, localizer.camera)
@@ -88,14 +94,24 @@ def evaluate_command(
         stack.close()
 
 
-def print_metrics(metrics: LocalizationMetrics, title: str) -> None:
-    """The columns of the paper's Table 2."""
+def _print_problems(frames: list[EvaluatedFrame]) -> None:
+    problems = [f.problem for f in frames if f.problem]
+    console = Console(stderr=True)
+    for text in problems[:_PROBLEMS]:
+        console.print(escape(text), style="yellow", soft_wrap=True, highlight=False)
+    if len(problems) > _PROBLEMS:
+        console.print(f"... {len(problems) - _PROBLEMS} more: see frames.csv", style="yellow")
+
+
+def print_metrics(metrics: LocalizationMetrics, unusable: int, title: str) -> None:
+    """The columns of the paper's Table 2, and how many images could not be used."""
     table = Table(title=title)
-    for column in ("frames", "Med m", "Med °", "R@1", "R@3", "R@5", "Comp. %", "FPS"):
+    for column in ("frames", "unusable", "Med m", "Med °", "R@1", "R@3", "R@5", "Comp. %", "FPS"):
         table.add_column(column, justify="right")
     m = metrics
     table.add_row(
-        str(m.frames), f"{m.median_translation_m:.2f}", f"{m.median_rotation_deg:.3f}",
+        str(m.frames), str(unusable),
+        f"{m.median_translation_m:.2f}", f"{m.median_rotation_deg:.3f}",
         f"{m.recall_1:.1f}", f"{m.recall_3:.1f}", f"{m.recall_5:.1f}",
         f"{m.completeness:.1f}", f"{m.fps:.1f}",
     )  # fmt: skip
@@ -119,13 +135,15 @@ def _write_report(
     settings: dict[str, object],
     local: LocalFrame,
 ) -> None:
-    report = metrics.to_dict() | {"settings": settings, "versions": versions()}
+    unusable = [f.name for f in frames if f.estimate is None]
+    report = metrics.to_dict() | {
+        "unusable_images": unusable, "settings": settings, "versions": versions()
+    }  # fmt: skip
     (folder / "report.json").write_text(json.dumps(report, indent=2))
-    rows = list(csv_rows(frames, local))
     with (folder / "frames.csv").open("w", newline="", encoding="utf-8") as file:
-        writer = csv.DictWriter(file, rows[0].keys())
+        writer = csv.DictWriter(file, CSV_COLUMNS)
         writer.writeheader()
-        writer.writerows(rows)
+        writer.writerows(csv_rows(frames, local))
 
 
 def _write_overlays(
@@ -137,10 +155,11 @@ def _write_overlays(
 ) -> None:
     """A few frames over the map rendered at their estimated poses, and the errors of all."""
     undistort = Undistorter(data.camera, camera)
-    for i in np.unique(np.linspace(0, len(frames) - 1, _OVERLAYS).astype(int)):
-        f = frames[i]
-        view = renderer.render(f.estimate.world_from_camera, camera, wait=True)
-        video = undistort(data.frame(int(i)))
+    usable = [(i, f, f.estimate) for i, f in enumerate(frames) if f.estimate is not None]
+    for k in np.unique(np.linspace(0, len(usable) - 1, _OVERLAYS).astype(int)):
+        i, f, estimate = usable[k]
+        view = renderer.render(estimate.world_from_camera, camera, wait=True)
+        video = undistort(data.frame(i))
         caption = f"{f.name}: {f.translation_error_m:.2f} m {f.rotation_error_deg:.2f} deg"
         save_image(folder / f"overlay-{i:04d}.png", overlay_sheet(video, view.rgb, caption))
     number = np.arange(len(frames), dtype=np.float64)

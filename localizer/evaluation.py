@@ -18,7 +18,7 @@ import cv2
 import numpy as np
 
 from localizer.camera import Camera
-from localizer.errors import OutsideMapError, SequenceError
+from localizer.errors import LocalizerError, OutsideMapError, SequenceError
 from localizer.geo import LocalFrame
 from localizer.metrics import LocalizationMetrics, localization_metrics
 from localizer.pipeline import Localizer
@@ -30,6 +30,11 @@ PriorMode = Literal["first", "each"]
 
 # Video that says nothing of time is taken as 30 frames per second (the paper's data sets).
 _FRAME_INTERVAL_NS = 33_333_333
+
+CSV_COLUMNS = (
+    "name", "latitude_deg", "longitude_deg", "height_m", "translation_error_m",
+    "rotation_error_deg", "quality", "state", "status", "accepted", "problem",
+)  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -66,12 +71,16 @@ class Sequence:
 
 @dataclass(frozen=True)
 class EvaluatedFrame:
-    """One frame's outcome. Errors are NaN where integrity accepted no estimate."""
+    """One frame's outcome. Errors are NaN where integrity accepted no estimate.
+
+    estimate: None for an image that cannot be used; `problem` says why then.
+    """
 
     name: str
-    estimate: PoseEstimate
-    translation_error_m: float
-    rotation_error_deg: float
+    estimate: PoseEstimate | None
+    translation_error_m: float = float("nan")
+    rotation_error_deg: float = float("nan")
+    problem: str = ""
 
 
 @dataclass(frozen=True)
@@ -164,31 +173,40 @@ def evaluate(
     mode ``first``: only the first frame's prior is known, as in the paper. ``each``: every frame
     starts from its own perturbed truth. passes: how often a frame that starts from a perturbed
     prior is rendered and registered, each time from the last result. A frame that is predicted
-    outside the map counts as not localized; `OutsideMapError` if that befalls every frame.
+    outside the map, or whose image cannot be used, counts as not localized; `OutsideMapError` or
+    `SequenceError` if that befalls every frame.
     """
     frames: list[EvaluatedFrame] = []
-    outside: list[OutsideMapError] = []
+    errors: list[LocalizerError] = []
+    has_prior = False
     seconds = 0.0
     with ThreadPoolExecutor(1, thread_name_prefix="query") as pool:
         for index in range(len(sequence.images)):
-            frame = sequence.frame(index)
+            try:
+                frame = sequence.frame(index)
+            except SequenceError as error:
+                errors.append(error)
+                frames.append(EvaluatedFrame(sequence.images[index].name, None, problem=str(error)))
+                progress(index)
+                continue
             started = time.perf_counter()
-            fresh = mode == "each" or index == 0
+            fresh = mode == "each" or not has_prior
             if fresh:
                 prior = perturbation.prior(sequence.truth[index], index, frame.exposure_time_ns)
                 localizer.set_prior(prior)
+                has_prior = True
             try:
                 outcome = _localize(localizer, frame, passes if fresh else 1, pool)
             except OutsideMapError as error:
                 if mode == "first" and fresh:  # every other frame hangs on this prior
                     raise
-                outside.append(error)
+                errors.append(error)
                 outcome = _not_localized(localizer, frame)
             seconds += time.perf_counter() - started
             frames.append(_measure(sequence, index, outcome))
             progress(index)
-    if len(outside) == len(frames):
-        raise outside[0]
+    if len(errors) == len(frames):
+        raise errors[0]
     return frames, _summary(frames, seconds)
 
 
@@ -241,24 +259,29 @@ def _measure(sequence: Sequence, index: int, estimate: PoseEstimate) -> Evaluate
 
 
 def _summary(frames: list[EvaluatedFrame], seconds: float) -> LocalizationMetrics:
+    """seconds: spent on the frames whose image could be used; the rate is theirs."""
     translation = np.array([f.translation_error_m for f in frames])
     rotation = np.array([f.rotation_error_deg for f in frames])
-    return localization_metrics(translation, rotation, seconds)
+    usable = sum(f.estimate is not None for f in frames)
+    metrics = localization_metrics(translation, rotation, seconds)
+    return replace(metrics, fps=metrics.fps * usable / len(frames))
 
 
-def csv_rows(frames: list[EvaluatedFrame], frame: LocalFrame) -> Iterator[dict[str, object]]:
-    """One dictionary per frame for a CSV file."""
+def csv_rows(frames: list[EvaluatedFrame], frame: LocalFrame) -> Iterator[dict[str, str]]:
+    """One dictionary per frame for a CSV file; what an unusable image has no value for is ""."""
     for f in frames:
-        position = frame.position(f.estimate.world_from_camera.translation)
-        yield {
-            "name": f.name,
-            "latitude_deg": f"{position.latitude_deg:.9f}",
-            "longitude_deg": f"{position.longitude_deg:.9f}",
-            "height_m": f"{position.height_m:.3f}",
-            "translation_error_m": f"{f.translation_error_m:.4f}",
-            "rotation_error_deg": f"{f.rotation_error_deg:.4f}",
-            "quality": f"{f.estimate.quality:.3f}",
-            "state": f.estimate.state.value,
-            "status": f.estimate.status.name,
-            "accepted": int(f.estimate.accepted),
-        }
+        row = dict.fromkeys(CSV_COLUMNS, "") | {"name": f.name, "problem": f.problem}
+        if f.estimate is not None:
+            position = frame.position(f.estimate.world_from_camera.translation)
+            row |= {
+                "latitude_deg": f"{position.latitude_deg:.9f}",
+                "longitude_deg": f"{position.longitude_deg:.9f}",
+                "height_m": f"{position.height_m:.3f}",
+                "translation_error_m": f"{f.translation_error_m:.4f}",
+                "rotation_error_deg": f"{f.rotation_error_deg:.4f}",
+                "quality": f"{f.estimate.quality:.3f}",
+                "state": f.estimate.state.value,
+                "status": f.estimate.status.name,
+                "accepted": str(int(f.estimate.accepted)),
+            }
+        yield row

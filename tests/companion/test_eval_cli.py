@@ -1,5 +1,6 @@
 """``companion eval`` on a sequence rendered from a generated world, in both folder layouts."""
 
+import csv
 import json
 import shutil
 
@@ -75,14 +76,29 @@ def test_a_missing_image_is_named(recorded, tmp_path):
         _run(broken, "--map", assets.map_cache, "--report", tmp_path / "r")
 
 
-def test_an_image_of_another_size_is_named(recorded, tmp_path):
+def test_images_that_cannot_be_used_are_named_and_counted_and_the_rest_is_localized(
+    recorded, tmp_path
+):
     assets, sequence = recorded
     broken = tmp_path / "broken"
     shutil.copytree(sequence, broken)
-    path = broken / "images" / "000001.jpg"
-    cv2.imwrite(str(path), np.zeros((240, 320, 3), np.uint8))
-    with pytest.raises(SequenceError, match=r"000001\.jpg: is 320x240"):
-        _run(broken, "--map", assets.map_cache, "--report", tmp_path / "r")
+    images = broken / "images"
+    (images / "000000.jpg").write_bytes(b"no image")  # the prior is the next frame's then
+    cv2.imwrite(str(images / "000003.jpg"), np.zeros((240, 320, 3), np.uint8))
+    arguments = (broken, "--map", assets.map_cache, "--report", tmp_path / "r")
+    result = _run(*arguments, "--limit", 6)
+    assert "000000.jpg: missing or not an image" in result.output
+    assert "000003.jpg: is 320x240" in result.output
+    report = json.loads((tmp_path / "r" / "report.json").read_text())
+    assert report["frames"] == 6
+    assert report["unusable_images"] == ["000000.jpg", "000003.jpg"]
+    assert report["completeness"] == pytest.approx(400 / 6)
+    with (tmp_path / "r" / "frames.csv").open(newline="") as file:
+        rows = list(csv.DictReader(file))
+    assert [bool(r["problem"]) for r in rows] == [True, False, False, True, False, False]
+    assert [r["accepted"] for r in rows] == ["", "1", "1", "", "1", "1"]
+    with pytest.raises(SequenceError, match=r"000000\.jpg"):
+        _run(*arguments, "--limit", 1)
 
 
 def test_a_wrong_camera_file_is_named(recorded, tmp_path):
