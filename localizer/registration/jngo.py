@@ -41,7 +41,7 @@ from localizer.types import Anchors, FeaturePyramid, Float32, PosePrior, Registr
 
 _PROBES = 12  # anchors whose projections tell hypotheses apart
 _COVARIANCE_ANCHORS = 1000  # enough for a covariance, cheap enough for every frame
-_LEAST_SCALE = 0.02  # of the polishing loss, where features fit perfectly
+_LEAST_SCALE = 0.02  # of the sharpening loss, where features fit perfectly
 _LEAST_SCORE = 1e-3  # unit of the motion term and priors where features fit perfectly
 
 
@@ -67,10 +67,11 @@ class JNGOConfig(BaseModel):
     keep: tuple[int, ...] = Field(
         default=(32, 8), description="survivors after each level but the last"
     )
-    polish: int = Field(default=6, ge=0, description="further finest-level LM steps per stage")
-    polish_scales: tuple[float, ...] = Field(
+    converge: int = Field(default=6, ge=0, description="further LM steps of the last survivors")
+    sharpen: int = Field(default=6, ge=0, description="the winner's LM steps on all anchors, each")
+    sharpen_scales: tuple[float, ...] = Field(
         default=(2.0, 1.0, 0.7),
-        description="Geman-McClure scales of the winner's last steps, in median norms",
+        description="for each of these Geman-McClure scales, in median residual norms",
     )
     distinct_px: float = Field(
         default=0.25, ge=0, description="least rms distance of survivors, level px"
@@ -204,7 +205,7 @@ class JNGO:
 
     def _converge(self, swarm: _Swarm, origin: Array, motion: PosePrior | None) -> _Swarm:
         """More finest-level steps on the survivors, and their final order."""
-        steps = self.config.polish
+        steps = self.config.converge
         if steps == 0:
             return swarm
         result = self.backend.refine(
@@ -225,15 +226,15 @@ class JNGO:
     def _sharpen(self, swarm: _Swarm) -> _Swarm:
         """The winner's pose under ever narrower redescending losses; the scores stay Huber's."""
         c = self.config
-        if c.polish == 0:
+        if c.sharpen == 0:
             return swarm
         R, t = swarm.rotations.copy(), swarm.translations.copy()
         median = _median_residual(_thinned(swarm.problem, c.swarm_anchors[-1]), R[0], t[0])
         settings, evaluations = swarm.settings, swarm.evaluations
-        for factor in c.polish_scales:
+        for factor in c.sharpen_scales:
             scale = max(factor * median, _LEAST_SCALE)
             settings = replace(c.settings, scale=scale, redescending=True)
-            result = self.backend.refine(swarm.problem, R[:1], t[:1], c.polish, settings)
+            result = self.backend.refine(swarm.problem, R[:1], t[:1], c.sharpen, settings)
             R[:1], t[:1] = result.rotations, result.translations
             evaluations += result.evaluations
         return replace(

@@ -1,0 +1,185 @@
+"""What the convergence benchmark compares: the paper's steps, ours, and ours with one thing changed.
+
+A variant is a configuration and, where a choice is not one of the configuration's, replacements of
+the functions that make it. Nothing here is used by the product.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass, replace
+from typing import Any
+from unittest import mock
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from localizer.pose import Array, Pose
+from localizer.registration import anchors as anchor_module
+from localizer.registration import hypotheses as hypothesis_module
+from localizer.registration.backend import Backend, LevelProblem, LMSettings, Refinement
+from localizer.registration.jngo import JNGO, JNGOConfig
+from localizer.types import Anchors, PosePrior
+
+DEFAULT_ANCHORS = 2000
+FULL = "ours"
+
+
+@dataclass(frozen=True)
+class Variant:
+    """One row. anchors: N; motion: whether the prior serves as the prediction of Eq. 10; patches:
+    (dotted name, replacement); confidence: False takes all confidences as 1; loss: changes the
+    backend's settings.
+    """
+
+    name: str
+    config: JNGOConfig = JNGOConfig()
+    anchors: int = DEFAULT_ANCHORS
+    motion: bool = True
+    confidence: bool = True
+    patches: tuple[tuple[str, object], ...] = ()
+    loss: Callable[[LMSettings], LMSettings] | None = None
+
+    def optimizer(self) -> JNGO:
+        """An optimizer of this variant, one thread."""
+        made = JNGO(self.config, threads=1)
+        if self.loss is not None:
+            made.backend = _OtherLoss(made.backend, self.loss)
+        return made
+
+    @contextmanager
+    def active(self) -> Iterator[None]:
+        """The patches, while anchors are selected and registered."""
+        with ExitStack() as stack:
+            for name, replacement in self.patches:
+                stack.enter_context(mock.patch(f"localizer.registration.{name}", replacement))
+            yield
+
+
+class _OtherLoss:
+    """A backend that replaces the settings it is given."""
+
+    def __init__(self, backend: Backend, change: Callable[[LMSettings], LMSettings]) -> None:
+        self.name, self._backend, self._change = backend.name, backend, change
+
+    def refine(
+        self, problem: LevelProblem, rotations: Array, translations: Array, iterations: int,
+        settings: LMSettings,
+    ) -> Refinement:  # fmt: skip
+        """As `Backend.refine`."""
+        return self._backend.refine(
+            problem, rotations, translations, iterations, self._change(settings)
+        )
+
+
+def paper_rows() -> list[Variant]:
+    """Table 4's system rows: the paper's optimizer, without anything of ours."""
+    paper = JNGOConfig(
+        hypotheses=1, keep=(144, 144), converge=0, sharpen=0, swarm_anchors=(500, 500, 500),
+        distinct_px=0.0, motion_weight=0.02,
+    )  # fmt: skip
+    theirs = (*_CAMERA_ORIGIN, *_VERTICAL_TURNS)
+    swarm = paper.model_copy(update={"hypotheses": 144})
+    return [
+        Variant("paper: one hypothesis", paper, 500, motion=False, patches=theirs),
+        Variant("paper: + rotation-aware swarm", swarm, 500, motion=False, patches=theirs),
+        Variant("paper: + motion term", swarm, 500, patches=theirs),
+    ]
+
+
+def our_rows() -> list[Variant]:
+    """The default, and the default with one thing changed at a time."""
+    c = JNGOConfig()
+
+    def changed(name: str, **values: object) -> Variant:
+        return Variant(name, c.model_copy(update=values))
+
+    last = c.swarm_anchors[-1]
+    return [
+        Variant(FULL),
+        changed("one hypothesis", hypotheses=1),
+        changed("36 hypotheses at most", hypotheses=36),
+        Variant("without motion term", motion=False),
+        changed("no halving: all 144 to the end", keep=(144, 144)),
+        changed("halving to 16 and 4", keep=(16, 4)),
+        changed("survivors may repeat", distinct_px=0.0),
+        changed("survivors do not converge", converge=0),
+        changed("winner not sharpened", sharpen=0),
+        changed("sharpened at one scale", sharpen_scales=(1.0,)),
+        Variant("sharpened under Huber", loss=_huber),
+        Variant("redescending loss in the search", loss=_redescending),
+        Variant("turns about the vertical", patches=_VERTICAL_TURNS),
+        Variant("origin at the camera (Eq. 9)", patches=_CAMERA_ORIGIN),
+        Variant("origin at the plain centroid", patches=_PLAIN_CENTROID),
+        Variant("fixed phase of candidates", patches=_FIXED_PHASE),
+        Variant("anchors anywhere (no importance)", patches=_NO_IMPORTANCE),
+        Variant("anchors on depth edges too", patches=_DEPTH_EDGES),
+        changed("250 swarm anchors everywhere", swarm_anchors=(250, 250, 250)),
+        changed("500 swarm anchors everywhere", swarm_anchors=(last, last, last)),
+        Variant("N = 500", anchors=500),
+        Variant("N = 1000", anchors=1000),
+        Variant("N = 4000", anchors=4000),
+        Variant("without confidence", confidence=False),
+    ]
+
+
+def unweighted(anchors: Anchors) -> Anchors:
+    """The anchors with every confidence 1."""
+    return replace(anchors, confidence=tuple(np.ones_like(c) for c in anchors.confidence))
+
+
+def _huber(settings: LMSettings) -> LMSettings:
+    return replace(settings, redescending=False, scale=0.5)
+
+
+def _redescending(settings: LMSettings) -> LMSettings:
+    return settings if settings.redescending else replace(settings, redescending=True)
+
+
+def _camera_origin(_anchors: Anchors, world_from_camera: Pose) -> Array:
+    return np.array(world_from_camera.translation)
+
+
+def _plain_centroid(anchors: Anchors, _world_from_camera: Pose) -> Array:
+    return np.asarray(anchors.points_world.mean(axis=0))
+
+
+def _vertical_turns(prior: PosePrior, *arguments: Any, **values: Any) -> tuple[Array, Array]:
+    """The same swarm with yaw about the world's vertical and pitch about the horizontal x axis."""
+    R = prior.world_from_camera.rotation
+    rotations, centres = hypothesis_module.generate_hypotheses(prior, *arguments, **values)
+    offsets = Rotation.from_matrix(R.T @ rotations).as_rotvec()
+    across = np.array([R[0, 0], R[1, 0], 0.0])
+    across /= max(float(np.linalg.norm(across)), 1e-9)
+    pitch = Rotation.from_rotvec(offsets[:, :1] * across)
+    yaw = Rotation.from_rotvec(offsets[:, 1:2] * np.array([0.0, 0.0, 1.0]))
+    roll = Rotation.from_rotvec(offsets[:, 2:] * R[:, 2])
+    return np.asarray((yaw * pitch * roll).as_matrix() @ R), centres
+
+
+class _ConstantRandom:
+    """Of numpy's generator, what `_candidates` uses: always the upper left pixel of a block."""
+
+    @staticmethod
+    def integers(_low: int, _high: int, shape: tuple[int, ...]) -> np.ndarray:
+        return np.zeros(shape, np.int64)
+
+
+_candidates = anchor_module._candidates
+
+
+def _fixed_candidates(depth: np.ndarray, _rng: np.random.Generator) -> tuple[np.ndarray, ...]:
+    return _candidates(depth, _ConstantRandom())  # type: ignore[arg-type]
+
+
+def _flat_importance(_features: object, shape: tuple[int, ...]) -> np.ndarray:
+    return np.ones(shape, np.float32)
+
+
+_CAMERA_ORIGIN = (("jngo.local_origin", _camera_origin),)
+_PLAIN_CENTROID = (("jngo.local_origin", _plain_centroid),)
+_VERTICAL_TURNS = (("jngo.generate_hypotheses", _vertical_turns),)
+_FIXED_PHASE = (("anchors._candidates", _fixed_candidates),)
+_NO_IMPORTANCE = (("anchors._importance", _flat_importance),)
+_DEPTH_EDGES = (("anchors._MAX_CURVATURE", np.inf),)
