@@ -17,6 +17,7 @@ from mavlink_bridge.closed_loop import LoopVerdict
 from mavlink_bridge.config import BridgeConfig, SigningConfig
 from mavlink_bridge.errors import BridgeStateError
 from mavlink_bridge.fc_side import FC_WANTED, FlightControllerSide, message_id
+from mavlink_bridge.gate import InjectionGate
 from mavlink_bridge.link import Link, LinkHandler
 from mavlink_bridge.messages import (
     Attitude,
@@ -35,6 +36,7 @@ from mavlink_bridge.signing import load_key
 from mavlink_bridge.targets_out import cursor_on_target
 from mavlink_bridge.transport import Endpoint, UdpTransport
 from mavlink_bridge.vehicle import VehicleTracker
+from mavlink_bridge.watch import VehicleWatch
 
 log = logging.getLogger(__name__)
 
@@ -54,6 +56,8 @@ class Bridge:
     """Speaks MAVLink for the localizer. Every public method may be called from any thread.
 
     on_track: called (in a link's thread; must return at once) when the operator asks for tracking.
+    on_text: called likewise with every line for the operator (severity, text), for a record.
+    Raises errors of `mavlink_bridge.errors` for keys, files and endpoints that cannot be used.
     """
 
     def __init__(
@@ -62,6 +66,7 @@ class Bridge:
         geoid_separation_m: float,
         *,
         on_track: Callable[[TrackRequest], None] | None = None,
+        on_text: Callable[[int, str], None] = lambda _severity, _text: None,
     ) -> None:
         self._config = config
         self._started = False
@@ -70,7 +75,10 @@ class Bridge:
         self._health = (HealthLevel.STARTING, "")
         self._texts: deque[tuple[int, str]] = deque(maxlen=_TEXTS)
         self._text_id = 0
-        self._recorder = None if config.tlog is None else TlogRecorder(config.tlog)
+        self._on_text = on_text
+        self._recorder = None
+        if config.tlog is not None:
+            self._recorder = TlogRecorder(config.tlog, self._record_failed)
         self._tracker = VehicleTracker(
             config.system_id, _mount(config), config.camera.mount == "fixed"
         )
@@ -83,6 +91,8 @@ class Bridge:
             lambda: self._health[0],
             self.say,
             on_track,
+            VehicleWatch(self.say),
+            InjectionGate(config.rc, self._gate_changed) if config.mode == "rc" else None,
         )
         self._fc = FlightControllerSide(shared)
         self._fc_link = self._link(config.connection, self._fc, "fc", FC_WANTED, config.signing)
@@ -129,6 +139,8 @@ class Bridge:
         if self._started:
             raise BridgeStateError("the bridge was already started; make a new one")
         self._started = True
+        if self._recorder is not None:
+            self._recorder.start()
         for link in self._links:
             link.start()
 
@@ -152,7 +164,7 @@ class Bridge:
 
     def submit(self, fix: VisionFix) -> None:
         """Hand over a fix; never blocks."""
-        self._fc.fixes.append(fix)
+        self._fc.fixes.put(fix)
         self._fc_link.wake()
 
     def report(self, target: TargetReport) -> None:
@@ -172,21 +184,32 @@ class Bridge:
         self._ground.outbound.append(item)
         self._ground_link.wake()
 
-    def set_health(self, level: HealthLevel, text: str = "") -> None:
-        """The localizer's health; a change of level or text is told to the operator once."""
+    def set_health(self, level: HealthLevel, text: str = "", *, tell: bool = True) -> None:
+        """The localizer's health; a change of level or text is told to the operator once.
+
+        tell: false for what the bridge tells by itself.
+        """
         with self._health_lock:
             if (level, text) == self._health:
                 return
             self._health = (level, text)
-        self.say(_SEVERITY[level], f"PiLoT: {text or level.value}")
+        if tell:
+            self.say(_SEVERITY[level], f"PiLoT: {text or level.value}")
 
     def say(self, severity: int, text: str) -> None:
         """A line for the operator: STATUSTEXT on the ground side, and the log."""
         self._texts.append((severity, text))
         log.log(logging.WARNING if severity <= mavlink.MAV_SEVERITY_WARNING else logging.INFO, text)
+        self._on_text(severity, text)
         self._text_id = self._text_id % 0xFFFF + 1
         for message in status_texts(severity, text, self._text_id):
             self._ground_link.send(message, self._config.companion_component)
+
+    def _gate_changed(self, text: str) -> None:
+        self.say(mavlink.MAV_SEVERITY_NOTICE, f"PiLoT: {text}")
+
+    def _record_failed(self, why: str) -> None:
+        self.say(mavlink.MAV_SEVERITY_WARNING, f"PiLoT: tlog is incomplete: {why}")
 
     # --- out ------------------------------------------------------------------------------------
 
@@ -208,8 +231,8 @@ class Bridge:
 
     @property
     def injecting(self) -> bool:
-        """Whether fixes are sent to the flight controller right now (mode and RC gate)."""
-        return self._fc.mode(self.state(), monotonic_ns()) == "inject"
+        """Whether fixes are sent to the flight controller right now (mode and gate)."""
+        return self._fc.mode() == "inject"
 
     def shadow_score(self) -> ShadowScore:
         """How vision compared with GNSS while that was healthy: the go or no-go before denial."""
@@ -236,6 +259,11 @@ class Bridge:
         result["yaw_difference_deg"] = math.degrees(injector.yaw_difference_rad)
         result["fix_latency_ms"] = injector.latency_ms
         result["clock_round_trip_ms"] = (self._tracker.clock.round_trip_ns or 0) * 1e-6
+        result["clock_rate"] = self._tracker.clock.rate
+        result["clock_steps"] = self._tracker.clock.steps
+        result["ignored_messages"] = self._tracker.ignored
+        result["fixes_not_taken"] = self._fc.fixes.dropped
+        result["tlog_dropped"] = 0 if self._recorder is None else self._recorder.dropped
         result["ekf_source_set"] = self._fc.switch.current
         return result
 

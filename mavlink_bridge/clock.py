@@ -9,14 +9,21 @@ from __future__ import annotations
 
 import time
 from collections import deque
+from dataclasses import dataclass
 
 _WINDOW_NS = 30_000_000_000
 _MAX_SAMPLES = 128
-_STEP_NS = 500_000_000
+_RUN_BACK_NS = 1_000_000_000
+_RUN_BACK_CONFIRMATIONS = 3
 _MAX_ROUND_TRIP_NS = 500_000_000
+_STAMP_GRAIN_NS = 1_000_000  # boot times are whole milliseconds in most messages
+_DRIFT = 200e-6  # of two crystals against each other, at worst
+_RATE_SPAN_NS = 5_000_000_000
+_RATES = (0.01, 100.0)
 GPS_EPOCH_UNIX_S = 315_964_800  # 1980-01-06 UTC
 GPS_LEAP_SECONDS = 18  # GPS - UTC, unchanged since 2017-01-01
 _WEEK_MS = 604_800_000
+_NOT_BEFORE_UNIX_S = 1_672_531_200  # 2023-01-01: a clock that says less was never set
 
 
 def monotonic_ns() -> int:
@@ -43,36 +50,70 @@ class SteadyUtc:
         """UTC nanoseconds since 1970 of a monotonic time."""
         return time_ns + self._offset_ns
 
+    @property
+    def is_set(self) -> bool:
+        """Whether the wall clock was set: without a battery or network it begins in the past."""
+        return self.utc_ns(monotonic_ns()) >= _NOT_BEFORE_UNIX_S * 1_000_000_000
+
     def gps_week_ms(self, time_ns: int) -> tuple[int, int]:
-        """GPS week and milliseconds of the week of a monotonic time."""
+        """GPS week and milliseconds of the week of a monotonic time; (0, 0) if nobody knows it.
+
+        ArduPilot takes week 0 for no time; any other sets its clock.
+        """
+        if self.utc_ns(time_ns) < _NOT_BEFORE_UNIX_S * 1_000_000_000:
+            return 0, 0
         gps_ms = self.utc_ns(time_ns) // 1_000_000 - (GPS_EPOCH_UNIX_S - GPS_LEAP_SECONDS) * 1000
         return gps_ms // _WEEK_MS, gps_ms % _WEEK_MS
+
+
+@dataclass(frozen=True)
+class _Sync:
+    """One TIMESYNC answer: the boot time at `middle_ns`, right within half the round trip."""
+
+    middle_ns: int
+    boot_ns: int
+    round_trip_ns: int
+
+    def explains(self, other: _Sync, rate: float) -> bool:
+        """Whether both are of one clock that runs at `rate`: true times lie within the trips."""
+        elapsed = other.middle_ns - self.middle_ns
+        apart = other.boot_ns - self.boot_ns - rate * elapsed
+        trips = max(rate, 1.0) * (self.round_trip_ns + other.round_trip_ns) / 2.0
+        return abs(apart) <= trips + _DRIFT * rate * abs(elapsed) + 2.0 * _STAMP_GRAIN_NS
 
 
 class BootClock:
     """Maps the flight controller's boot time to CLOCK_MONOTONIC; times in ns.
 
-    ``monotonic = boot + offset``. It notices a reboot by itself (a stamped time that runs back, or
-    an offset that steps) and starts over.
+    ``monotonic = middle + (boot - boot of that middle) / rate``, from the fastest round trip of
+    30 s. Two answers whose round trips cannot both be true show that the clock stepped, or that it
+    runs at another rate: a third answer tells which (a simulation at N times real speed runs at
+    rate N). A boot time that runs back, or a clock that stepped behind, is a reboot.
     """
 
     def __init__(self) -> None:
         self.reboots = 0
+        self.steps = 0
+        self.rate = 1.0
         self.source = "none"
         self.round_trip_ns: int | None = None
         self._lag: deque[tuple[int, int]] = deque(maxlen=_MAX_SAMPLES)
-        self._sync: deque[tuple[int, int, int]] = deque(maxlen=_MAX_SAMPLES)
+        self._sync: deque[_Sync] = deque(maxlen=_MAX_SAMPLES)
+        self._doubted: _Sync | None = None
+        self._anchor: tuple[int, int] | None = None
         self._newest_boot_ns = 0
-        self._offset_ns: int | None = None
+        self._behind: list[int] = []
 
     @property
     def offset_ns(self) -> int | None:
-        """``monotonic - boot``, None before anything was heard."""
-        return self._offset_ns
+        """``monotonic - boot`` at the last measurement, None before anything was heard."""
+        return None if self._anchor is None else self._anchor[0] - self._anchor[1]
 
     def observe(self, boot_ns: int, received_ns: int) -> bool:
         """A stamped message arrived; True if it shows that the flight controller rebooted."""
-        rebooted = self._newest_boot_ns - boot_ns > 2 * _STEP_NS
+        rebooted = self._ran_back(boot_ns)
+        if self._behind:
+            return False  # an old frame that came late, or the first ones after a reboot
         if rebooted:
             self._restart()
         self._newest_boot_ns = max(self._newest_boot_ns, boot_ns)
@@ -81,35 +122,90 @@ class BootClock:
         while self._lag and received_ns - self._lag[0][0] > _WINDOW_NS:
             self._lag.popleft()
         if not self._sync:
-            self._offset_ns = min(lag for _, lag in self._lag)
+            self._anchor = (boot_ns + min(lag for _, lag in self._lag), boot_ns)
             self.source = "minimum lag"
         return rebooted
 
     def timesync(self, boot_ns: int, sent_ns: int, received_ns: int) -> bool:
-        """A TIMESYNC answer: tc1 = boot_ns to our ts1 = sent_ns; False when it is implausible."""
+        """A TIMESYNC answer: tc1 = boot_ns to our ts1 = sent_ns; True if it shows a reboot."""
         round_trip = received_ns - sent_ns
         if not 0 <= round_trip <= _MAX_ROUND_TRIP_NS:
             return False
-        offset = (sent_ns + received_ns) // 2 - boot_ns
-        if self._sync and abs(offset - self._sync[-1][2]) > _STEP_NS:
-            self._sync.clear()
-        self._sync.append((received_ns, round_trip, offset))
-        while received_ns - self._sync[0][0] > _WINDOW_NS:
-            self._sync.popleft()
-        _, self.round_trip_ns, self._offset_ns = min(self._sync, key=lambda sample: sample[1])
-        self.source = "timesync"
-        return True
+        sample = _Sync((sent_ns + received_ns) // 2, boot_ns, round_trip)
+        rebooted = False
+        if self._sync and not self._sync[-1].explains(sample, self.rate):
+            rebooted = self._reconsider(sample)
+        else:
+            self._doubted = None
+            self._sync.append(sample)
+        self._fit(received_ns)
+        return rebooted
 
     def to_monotonic(self, boot_ns: int, received_ns: int) -> int:
         """CLOCK_MONOTONIC of a boot time; never later than the message's arrival."""
-        if self._offset_ns is None:
+        if self._anchor is None:
             return received_ns
-        return min(boot_ns + self._offset_ns, received_ns)
+        middle_ns, at_ns = self._anchor
+        return min(middle_ns + round((boot_ns - at_ns) / self.rate), received_ns)
+
+    def _ran_back(self, boot_ns: int) -> bool:
+        """Whether boot time began anew: several stamps in a row, each after the one before.
+
+        One alone may be an old frame that was duplicated or came late.
+        """
+        if self._newest_boot_ns - boot_ns <= _RUN_BACK_NS:
+            self._behind.clear()
+            return False
+        if self._behind and boot_ns < self._behind[-1]:
+            self._behind.clear()
+        self._behind.append(boot_ns)
+        if len(self._behind) < _RUN_BACK_CONFIRMATIONS:
+            return False
+        self._behind.clear()
+        return True
+
+    def _reconsider(self, sample: _Sync) -> bool:
+        """An answer that contradicts the last: another rate, or a step; True for a reboot."""
+        before, last = self._doubted, self._sync[-1]
+        elapsed = sample.middle_ns - last.middle_ns
+        rate = (sample.boot_ns - last.boot_ns) / elapsed if elapsed > 0 else 0.0
+        self._sync.clear()
+        self._doubted = last
+        if before is not None and _RATES[0] < rate < _RATES[1] and before.explains(sample, rate):
+            self.rate = rate
+            self._sync.extend((before, last, sample))
+            return False
+        self.steps += 1
+        behind = last.boot_ns + self.rate * elapsed - sample.boot_ns
+        # A simulation that cannot keep its speed falls behind without a reboot.
+        rebooted = behind > _RUN_BACK_NS + max(self.rate - 1.0, 0.0) * elapsed
+        if rebooted:
+            self._restart()
+            self._newest_boot_ns = sample.boot_ns
+        self._sync.append(sample)
+        return rebooted
+
+    def _fit(self, now_ns: int) -> None:
+        while now_ns - self._sync[0].middle_ns > _WINDOW_NS:
+            self._sync.popleft()
+        best = min(self._sync, key=lambda sample: sample.round_trip_ns)
+        self.round_trip_ns, self._anchor = best.round_trip_ns, (best.middle_ns, best.boot_ns)
+        self.source = "timesync"
+        first, last = self._sync[0], self._sync[-1]
+        span = last.middle_ns - first.middle_ns
+        if span >= _RATE_SPAN_NS:
+            measured = (last.boot_ns - first.boot_ns) / span
+            error = (first.round_trip_ns + last.round_trip_ns) / 2.0 / span
+            # Equal rates within the error of the measurement are equal: noise is no drift.
+            self.rate = 1.0 if abs(measured - 1.0) <= error else measured
 
     def _restart(self) -> None:
         self.reboots += 1
         self._lag.clear()
         self._sync.clear()
-        self._offset_ns = None
+        self._doubted = None
+        self._behind.clear()
+        self._anchor = None
+        self.rate = 1.0
         self._newest_boot_ns = 0
         self.source = "none"

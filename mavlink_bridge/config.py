@@ -15,7 +15,7 @@ Mode = Literal["off", "shadow", "inject", "rc"]
 
 
 class _Model(BaseModel):
-    model_config = ConfigDict(frozen=True, extra="forbid")
+    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
 
 
 class OriginConfig(_Model):
@@ -44,8 +44,18 @@ class YawGuardConfig(_Model):
         description="against the autopilot's yaw, or against its gyros since the fixes before",
     )
     gross_deg: float = Field(default=20.0, gt=0.0, le=90.0, description="never more than this")
-    memory_s: float = Field(default=60.0, gt=0.0, description="how long the gyros are trusted")
-    minimum_samples: int = Field(default=5, ge=1, description="in a row, to block and to release")
+    memory_s: float = Field(
+        default=60.0, gt=0.0, le=600.0, description="how long the gyros are trusted"
+    )
+    minimum_samples: int = Field(
+        default=5, ge=1, le=100, description="in a row, to block and to release"
+    )
+
+    @model_validator(mode="after")
+    def _gross_is_more(self) -> YawGuardConfig:
+        if self.gross_deg < self.limit_deg:
+            raise ValueError("gross_deg must be at least limit_deg")
+        return self
 
 
 class InjectionConfig(_Model):
@@ -59,15 +69,17 @@ class InjectionConfig(_Model):
         le=250.0,
         description="age at which a fix is sent: VISO_DELAY_MS, GPS1_DELAY_MS or EKF2_EV_DELAY",
     )
-    sigma_floor_m: float = Field(default=0.1, gt=0.0)
-    max_sigma_m: float = Field(default=10.0, gt=0.0, description="nothing is sent above it")
+    sigma_floor_m: float = Field(default=0.1, gt=0.0, le=100.0)
+    max_sigma_m: float = Field(
+        default=10.0, gt=0.0, le=100.0, description="nothing is sent above it"
+    )
     max_extrapolation_s: float = Field(
         default=0.5,
         gt=0.0,
         le=10.0,
         description="longest gap bridged by propagation; the EKF's own inertial one is better",
     )
-    acceleration_sigma_mps2: float = Field(default=2.0, gt=0.0)
+    acceleration_sigma_mps2: float = Field(default=2.0, gt=0.0, le=50.0)
     send_attitude: bool = True
     covariance: Literal["profile", "cbrt", "sqrt", "variance"] = "profile"
     gps_id: int = Field(default=0, ge=0, le=3, description="0-based GPS instance of GPS_INPUT")
@@ -77,6 +89,8 @@ class InjectionConfig(_Model):
 
     @model_validator(mode="after")
     def _rate_suits_message(self) -> InjectionConfig:
+        if self.sigma_floor_m >= self.max_sigma_m:
+            raise ValueError("sigma_floor_m must be below max_sigma_m, or nothing is ever sent")
         if self.message == "gps_input" and self.rate_hz < 5.0:
             raise ValueError("gps_input needs rate_hz >= 5 (ArduPilot: GPS not healthy below)")
         return self
@@ -88,17 +102,27 @@ class SourceSwitchConfig(_Model):
     enabled: bool = False
     gnss_set: int = Field(default=1, ge=1, le=3)
     vision_set: int = Field(default=2, ge=1, le=3)
-    bad_after_s: float = Field(default=1.5, gt=0.0)
-    good_after_s: float = Field(default=20.0, gt=0.0)
+    bad_after_s: float = Field(default=1.5, gt=0.0, le=60.0)
+    good_after_s: float = Field(default=20.0, gt=0.0, le=3600.0)
     return_to_gnss: bool = False
-    inconsistency_sigmas: float = Field(default=5.0, gt=0.0)
+    inconsistency_sigmas: float = Field(default=5.0, ge=1.0, le=100.0)
+
+    @model_validator(mode="after")
+    def _sets_differ(self) -> SourceSwitchConfig:
+        if self.gnss_set == self.vision_set:
+            raise ValueError("gnss_set and vision_set must be two different source sets")
+        return self
 
 
 class RcGateConfig(_Model):
-    """In mode ``rc`` the channel's pulse width decides between shadow and inject."""
+    """In mode ``rc`` a channel's pulse width or a command decides between shadow and inject."""
 
     channel: int = Field(default=9, ge=1, le=18)
     inject_above_us: int = Field(default=1700, ge=900, le=2100)
+    command: Literal["user_1", "user_2", "user_3", "user_4", "user_5"] | None = Field(
+        default="user_1",
+        description="MAV_CMD_USER_n to the localizer's component: param1 1 injects, 0 does not",
+    )
 
 
 class CameraConfig(_Model):
@@ -129,7 +153,14 @@ class TargetsConfig(_Model):
     rate_hz: float = Field(default=5.0, gt=0.0, le=30.0)
     adsb: bool = Field(default=False, description="ADSB_VEHICLE, on the ground link only")
     cot_endpoint: str = Field(default="", description="host:port of a Cursor-on-Target listener")
-    cot_stale_s: float = Field(default=30.0, gt=0.0)
+    cot_stale_s: float = Field(default=30.0, gt=0.0, le=86400.0)
+
+    @field_validator("cot_endpoint")
+    @classmethod
+    def _is_host_and_port(cls, value: str) -> str:
+        if value:
+            _check_endpoint(f"udpout:{value}", "write host:port")
+        return value
 
 
 class SigningConfig(_Model):
@@ -150,9 +181,9 @@ class BridgeConfig(_Model):
     ground_connection: str | None = None
     mode: Mode = "shadow"
     system_id: int | None = Field(default=None, ge=1, le=255, description="None: the vehicle's own")
-    localizer_component: int = Field(default=197, ge=1, le=255)
-    companion_component: int = Field(default=191, ge=1, le=255)
-    camera_component: int = Field(default=100, ge=1, le=255)
+    localizer_component: int = Field(default=197, ge=2, le=255)  # 1 is the autopilot
+    companion_component: int = Field(default=191, ge=2, le=255)
+    camera_component: int = Field(default=100, ge=2, le=255)
     attitude_rate_hz: float = Field(default=50.0, ge=5.0, le=200.0)
     injection: InjectionConfig = InjectionConfig()
     origin: OriginConfig | None = None
@@ -163,7 +194,7 @@ class BridgeConfig(_Model):
     signing: SigningConfig | None = None
     ground_signing: SigningConfig | None = None
     tlog: Path | None = None
-    link_timeout_s: float = Field(default=5.0, gt=0.0)
+    link_timeout_s: float = Field(default=5.0, ge=1.0, le=60.0)
 
     @field_validator("mode", mode="before")
     @classmethod
@@ -173,15 +204,18 @@ class BridgeConfig(_Model):
     @field_validator("connection", "ground_connection")
     @classmethod
     def _connection_is_an_endpoint(cls, value: str | None) -> str | None:
-        from mavlink_bridge.errors import EndpointError
-        from mavlink_bridge.transport import Endpoint
-
         if value is not None:
-            try:
-                Endpoint.parse(value)
-            except EndpointError as error:
-                raise ValueError(str(error)) from error
+            _check_endpoint(value)
         return value
+
+    @model_validator(mode="after")
+    def _links_and_components_differ(self) -> BridgeConfig:
+        if self.ground_connection == self.connection:
+            raise ValueError("ground_connection is the flight controller's; leave it empty")
+        components = (self.localizer_component, self.companion_component, self.camera_component)
+        if len(set(components)) < 3:
+            raise ValueError("localizer, companion and camera need a component id each")
+        return self
 
     @model_validator(mode="after")
     def _adsb_needs_a_ground_link(self) -> BridgeConfig:
@@ -190,3 +224,13 @@ class BridgeConfig(_Model):
                 "targets.adsb needs ground_connection: ArduPilot ingests ADSB_VEHICLE as traffic"
             )
         return self
+
+
+def _check_endpoint(text: str, hint: str = "") -> None:
+    from mavlink_bridge.errors import EndpointError
+    from mavlink_bridge.transport import Endpoint
+
+    try:
+        Endpoint.parse(text)
+    except EndpointError as error:
+        raise ValueError(hint or str(error)) from error

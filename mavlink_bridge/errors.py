@@ -25,3 +25,11 @@ class FixError(BridgeError):
 
 class ParameterError(BridgeError):
     """A flight-controller parameter that cannot be read or written."""
+
+
+class RecordError(BridgeError):
+    """A .tlog file that cannot be opened."""
+
+
+class MissionError(BridgeError):
+    """A mission that the flight controller does not hand over."""

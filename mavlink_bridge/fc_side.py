@@ -10,9 +10,9 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from mavlink_bridge.clock import monotonic_ns
 from mavlink_bridge.closed_loop import ClosedLoopCheck, LoopVerdict
-from mavlink_bridge.inject import NO_FIX_YET, Injection, InjectionContext, Injector
+from mavlink_bridge.inject import NO_FIX_YET, FixQueue, Injection, InjectionContext, Injector
 from mavlink_bridge.link import Link
-from mavlink_bridge.messages import VehicleState, VisionFix
+from mavlink_bridge.messages import VehicleState
 from mavlink_bridge.origin import OriginKeeper, north_east
 from mavlink_bridge.profile import FirmwareProfile, select_profile
 from mavlink_bridge.propagate import PropagatedFix
@@ -24,14 +24,13 @@ from mavlink_bridge.vehicle import MESSAGES_IN
 
 log = logging.getLogger(__name__)
 
-_RC_FRESH_NS = SECOND_NS
-_RC_HIGHEST_US = 2200  # above it no receiver speaks; 65535 means "no such channel"
 _QUEUE = 64
 _TIMESYNC_PENDING = 8
 _FIRST_GUESS = 1  # the system id that vehicles are delivered with
 _IDLE_NS = 100_000_000
 _REFERENCE_WAIT_NS = 500_000_000
 _VISION_GOOD_NS = SECOND_NS
+_RELIEF_SHARE = 0.9  # of a limit, below which its warning ends
 
 
 def message_id(name: str) -> int:
@@ -50,12 +49,12 @@ class FlightControllerSide(Side):
 
     def __init__(self, shared: Shared) -> None:
         super().__init__(shared, ground=False)
-        self.fixes: deque[VisionFix] = deque(maxlen=_QUEUE)
+        self.fixes = FixQueue(_QUEUE)
         self.counters: Counter[str] = Counter()
         self.injector = Injector(self.config.injection, shared.geoid_separation_m, shared.utc)
         self.origin = OriginKeeper(self.config.origin)
         self.streams = StreamKeeper()
-        self.shadow = ShadowScorer()
+        self.shadow = ShadowScorer(shared.geoid_separation_m)
         self.loop = ClosedLoopCheck(self.config.injection.message)
         self.switch = SourceSwitch(self.config.switch)
         self.verdict: LoopVerdict | None = None
@@ -75,7 +74,7 @@ class FlightControllerSide(Side):
         """One message from the flight controller's link (also from others, routed by it)."""
         kind = message.get_type()
         if kind in COMMANDS_IN:
-            self.camera_command(link, message, time_ns)
+            self.command(link, message, time_ns)
             return
         if not self.tracker.accepts(message):
             return
@@ -85,9 +84,11 @@ class FlightControllerSide(Side):
         elif kind == "GPS_GLOBAL_ORIGIN":
             self._origin(message)
         elif kind == "COMMAND_ACK":
-            self._ack(message)
+            self._ack(link, message)
         elif self.tracker.handle(message, time_ns):
             self._rebooted()
+        elif kind == "RC_CHANNELS" and self.shared.gate is not None:
+            self.shared.gate.channels(self.tracker.snapshot(time_ns).rc_channels_us)
 
     def _timesync(self, link: Link, message: Any, time_ns: int) -> None:
         if message.tc1 == 0:
@@ -95,8 +96,8 @@ class FlightControllerSide(Side):
             link.send(answer, self.config.companion_component)
             return
         sent_ns = self._sync_sent.pop(message.ts1, None)
-        if sent_ns is not None:
-            self.tracker.clock.timesync(message.tc1, sent_ns, time_ns)
+        if sent_ns is not None and self.tracker.timesync(message.tc1, sent_ns, time_ns):
+            self._rebooted()
 
     def _origin(self, message: Any) -> None:
         news = self.origin.on_origin(message)
@@ -104,7 +105,13 @@ class FlightControllerSide(Side):
         if news is not None:
             self.shared.say(mavlink.MAV_SEVERITY_INFO, f"PiLoT: {news}")
 
-    def _ack(self, message: Any) -> None:
+    def _ack(self, link: Link, message: Any) -> None:
+        # Extension fields, 0 from old firmware: an answer to somebody else's command is not ours.
+        if message.target_system not in (0, link.system_id) or message.target_component not in (
+            0,
+            self.config.companion_component,
+        ):
+            return
         accepted = message.result in (
             mavlink.MAV_RESULT_ACCEPTED,
             mavlink.MAV_RESULT_IN_PROGRESS,
@@ -118,12 +125,17 @@ class FlightControllerSide(Side):
 
     def _rebooted(self) -> None:
         self.counters["reboots"] += 1
-        self.origin.reset()
-        self.tracker.set_origin(None)
+        self._forget_origin()
         self.injector.guard.reset()
         self.switch.reset()
+        self._told.pop("switch", None)
         self.streams.reset()
         self.shared.say(mavlink.MAV_SEVERITY_WARNING, "PiLoT: flight controller rebooted")
+
+    def _forget_origin(self) -> None:
+        """Nothing is sent relative to an origin that may be another one by now."""
+        self.origin.reset()
+        self.tracker.set_origin(None)
 
     # --- the clockwork --------------------------------------------------------------------------
 
@@ -139,8 +151,9 @@ class FlightControllerSide(Side):
         state = self.tracker.snapshot(now_ns)
         link.system_id = self.config.system_id or state.system_id or 0
         self._watch(state)
-        if not link.system_id and link.endpoint.kind == "udpout":
-            # Behind UDP an autopilot answers whoever spoke first, so somebody has to.
+        if not link.system_id and (link.endpoint.kind == "udpout" or self.config.signing):
+            # Behind UDP an autopilot answers whoever spoke first. A signing one that does not know
+            # the time signs with an old stamp until it has heard a newer one. So we speak first.
             link.system_id = _FIRST_GUESS
         if link.system_id:
             self.heartbeat(link, now_ns)
@@ -153,15 +166,17 @@ class FlightControllerSide(Side):
         return self._inject(link, state, now_ns)
 
     def _watch(self, state: VehicleState) -> None:
+        self.shared.watch.check(state)
         if state.connected == self._connected:
             return
         self._connected = state.connected
         if state.connected:
             self.streams.reset()
-            log.info("flight controller found: system %s", state.system_id)
+            self._next_version_ns = 0
         else:
             self.counters["lost"] += 1
-            log.warning("flight controller lost: no heartbeat for 3 s")
+            # It may come back as another: after a reboot, with another origin.
+            self._forget_origin()
 
     def _ask(self, link: Link, state: VehicleState, now_ns: int) -> None:
         """Streams that do not flow, and the firmware's version."""
@@ -196,22 +211,18 @@ class FlightControllerSide(Side):
             self._command(link, mavlink.MAV_CMD_REQUEST_MESSAGE, wanted)
 
         message = self.origin.tick(now_ns, link.system_id, ask)
-        if message is not None and self.config.mode in ("inject", "rc"):
+        mode = self.mode()
+        if message is not None and mode == "inject":
             self.counters["origins_sent"] += 1
             link.send(message, self.config.companion_component)
 
     # --- injection ------------------------------------------------------------------------------
 
-    def mode(self, state: VehicleState, now_ns: int) -> str:
-        """off, shadow or inject; mode rc follows its channel, and no channel means shadow."""
-        if self.config.mode != "rc":
+    def mode(self) -> str:
+        """off, shadow or inject; mode rc follows its gate."""
+        if self.shared.gate is None:
             return self.config.mode
-        gate = self.config.rc
-        channels = state.rc_channels_us
-        fresh = now_ns - state.rc_time_ns < _RC_FRESH_NS and len(channels) >= gate.channel
-        if fresh and gate.inject_above_us <= channels[gate.channel - 1] <= _RC_HIGHEST_US:
-            return "inject"
-        return "shadow"
+        return "inject" if self.shared.gate.open else "shadow"
 
     def profile(self, state: VehicleState) -> FirmwareProfile:
         """The firmware's profile; one that is unknown, or lacks the message, is told once."""
@@ -227,10 +238,11 @@ class FlightControllerSide(Side):
         return profile
 
     def _inject(self, link: Link, state: VehicleState, now_ns: int) -> int:
-        while self.fixes:
-            self.injector.submit(self.fixes.popleft(), now_ns)
-        mode = self.mode(state, now_ns)
+        for fix in self.fixes.take():
+            self.injector.submit(fix, now_ns)
+        mode = self.mode()
         if mode == "off" or not state.connected:
+            self.injector.skip()
             return now_ns + _IDLE_NS
         context = InjectionContext(
             self.origin.origin, self.profile(state), self.tracker.attitude_at
@@ -246,6 +258,7 @@ class FlightControllerSide(Side):
         if now_ns >= self._next_check_ns:
             self._next_check_ns = now_ns + _IDLE_NS
             self._check(link, state, now_ns)
+            self._warn(context.profile)
         return self.injector.next_due_ns(now_ns)
 
     def _deliver(self, link: Link, mode: str, injection: Injection, now_ns: int) -> None:
@@ -282,15 +295,38 @@ class FlightControllerSide(Side):
         if self.verdict is not None:
             self._tell("loop", self.verdict.reason, "the EKF follows")
         good = not self.injector.guard.blocked and now_ns - self._delivered_ns < _VISION_GOOD_NS
-        good = good and self.mode(state, now_ns) == "inject"
+        good = good and self.mode() == "inject"
         order = self.switch.decide(now_ns, state, self.vision, good)
         if order is not None:
             self.counters["source_switches"] += 1
             self._command(link, mavlink.MAV_CMD_SET_EKF_SOURCE_SET, order.source_set)
-            self.shared.say(
-                mavlink.MAV_SEVERITY_WARNING,
-                f"PiLoT: EKF source set {order.source_set}: {order.reason}",
+            # Set 2 for a reason and set 1 for another differ by more than digits.
+            self._tell("switch", f"EKF source set {order.source_set}: {order.reason}")
+
+    def _warn(self, profile: FirmwareProfile) -> None:
+        """What is wrong with the fixes themselves, told once."""
+        self._tell("latency", self._latency_problem(profile), "fixes are in time again")
+        blind = "vision yaw is not checked: no attitude or no gimbal angles"
+        self._tell("blind", blind if self.injector.guard.blind else "", "vision yaw is checked")
+        gps = self.config.injection.message == "gps_input"
+        unset = gps and not self.shared.utc.is_set
+        problem = "this computer's clock is not set: GPS_INPUT carries no time"
+        self._tell("utc", problem if unset else "")
+
+    def _latency_problem(self, profile: FirmwareProfile) -> str:
+        latency, delay = self.injector.latency_ms, self.config.injection.delay_ms
+        if not self.injector.latency_is_known:
+            return ""
+        gps = self.config.injection.message == "gps_input"
+        name = profile.gps_delay_parameter if gps else profile.delay_parameter
+        share = _RELIEF_SHARE if self._told.get("latency") else 1.0
+        if latency > share * profile.max_delay_ms:
+            return (
+                f"fixes are {latency:.0f} ms old, over the {profile.max_delay_ms:.0f} ms of {name}"
             )
+        if latency > share * delay:
+            return f"fixes are {latency:.0f} ms old: raise delay_ms ({delay:.0f}) and {name}"
+        return ""
 
     def _tell(self, topic: str, problem: str, relief: str = "", *, prefix: str = "") -> None:
         """A problem when it begins or changes (digits aside, or it would never stop), and its end.

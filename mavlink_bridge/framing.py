@@ -82,6 +82,11 @@ class FrameReader:
         self._buffer = bytearray()
         self._sequences: dict[tuple[int, int], int] = {}
 
+    @property
+    def signing_timestamp(self) -> int:
+        """The newest time stamp of a frame signed with our key, 10 us ticks; 0 without a key."""
+        return int(self._codec.signing.timestamp) if self._signed else 0
+
     def reset(self) -> None:
         """Forget a half-received frame (the transport was reopened); signing streams are kept."""
         self._buffer.clear()

@@ -10,53 +10,36 @@ delay_ms`` with its covariance grown. Stamps never run back.
 from __future__ import annotations
 
 import math
+import statistics
+import threading
 from collections import Counter, deque
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Any
 
-import numpy as np
-from pymavlink.dialects.v20 import ardupilotmega as mavlink
-
 from mavlink_bridge import quaternion as quat
 from mavlink_bridge.clock import SteadyUtc
 from mavlink_bridge.config import InjectionConfig, InjectionMessage
+from mavlink_bridge.injection_messages import (
+    Estimate,
+    global_position_sensor,
+    gps_input,
+    odometry,
+    vision_position_estimate,
+)
 from mavlink_bridge.messages import Attitude, Origin, VisionFix
 from mavlink_bridge.origin import ned_from_origin
-from mavlink_bridge.profile import CovarianceFormula, FirmwareProfile, covariance_entry
-from mavlink_bridge.propagate import FixPropagator, PropagatedFix
+from mavlink_bridge.profile import CovarianceFormula, FirmwareProfile
+from mavlink_bridge.propagate import FixPropagator
 from mavlink_bridge.yaw_guard import YawGuard
 
 NAN = math.nan
 NO_FIX_YET = "no fix yet"
 _QUEUE = 32
+_LATENCIES = 50
+_FARTHEST_M = 100_000.0  # from the origin: farther, one of the two is wrong
 _FUTURE_SLACK_NS = 20_000_000
 _STALE_NS = 3_000_000_000
-# Index of the diagonal (x, y, z, roll, pitch, yaw) in MAVLink's row-major upper triangle of 6x6.
-DIAGONAL = (0, 6, 11, 15, 18, 20)
-_IGNORE_VELOCITY = (
-    mavlink.GPS_INPUT_IGNORE_FLAG_VEL_HORIZ
-    | mavlink.GPS_INPUT_IGNORE_FLAG_VEL_VERT
-    | mavlink.GPS_INPUT_IGNORE_FLAG_SPEED_ACCURACY
-)
-_CLAIMED_SATELLITES = 12  # ArduPilot refuses to arm below 6, or with hdop ignored
-_CLAIMED_HDOP = 0.8
-_CLAIMED_VDOP = 1.0
-
-
-@dataclass(frozen=True)
-class Estimate:
-    """What is about to be sent. position: as propagated; attitude: (roll, pitch, yaw), NaN unknown.
-
-    fresh: a fix as it came, not propagated. quality: 0..100.
-    """
-
-    position: PropagatedFix
-    attitude: tuple[float, float, float]
-    attitude_sigma_rad: float
-    quality: int
-    reset_counter: int
-    fresh: bool
 
 
 @dataclass(frozen=True)
@@ -75,124 +58,6 @@ class Injection:
     estimate: Estimate
 
 
-def pose_covariance(
-    P: np.ndarray, attitude_sigma_rad: float, formula: CovarianceFormula
-) -> list[float]:
-    """The 21 entries of VISION_POSITION_ESTIMATE and ODOMETRY for an NED covariance P (3, 3).
-
-    ArduPilot reads one error from the three position entries, so all three carry the worst
-    horizontal sigma; PX4 reads variances.
-    """
-    entries = [0.0] * 21
-    if formula == "variance":
-        entries[0], entries[6], entries[11] = (float(P[i, i]) for i in range(3))
-        entries[1], entries[2], entries[7] = float(P[0, 1]), float(P[0, 2]), float(P[1, 2])
-    else:
-        error = math.sqrt(float(np.linalg.eigvalsh(P[:2, :2])[-1]))
-        for i in DIAGONAL[:3]:
-            entries[i] = covariance_entry(error, formula)
-    for i in DIAGONAL[3:]:
-        entries[i] = covariance_entry(attitude_sigma_rad, formula)
-    return entries
-
-
-def vision_position_estimate(
-    e: Estimate, ned: tuple[float, float, float], formula: CovarianceFormula
-) -> Any:
-    """VISION_POSITION_ESTIMATE (102): NED metres from the EKF origin, yaw from true north."""
-    covariance = pose_covariance(e.position.covariance_ned, e.attitude_sigma_rad, formula)
-    return mavlink.MAVLink_vision_position_estimate_message(
-        e.position.time_ns // 1000, *ned, *e.attitude, covariance, e.reset_counter
-    )
-
-
-def odometry(
-    e: Estimate,
-    ned: tuple[float, float, float],
-    formula: CovarianceFormula,
-    frame: int,
-) -> Any:
-    """ODOMETRY (331): position NED, velocity in the body frame by the message's own quaternion."""
-    q = quat.from_euler(*e.attitude)
-    vn, ve, vd = (float(v) for v in e.position.velocity_ned)
-    body = quat.rotate(quat.conjugate(q), (vn, ve, vd))
-    covariance = pose_covariance(e.position.covariance_ned, e.attitude_sigma_rad, formula)
-    Rbn = np.array([quat.rotate(quat.conjugate(q), tuple(row)) for row in np.eye(3)]).T
-    Pv = Rbn @ e.position.velocity_covariance_ned @ Rbn.T
-    velocity_covariance = [NAN] * 21
-    for k, i in enumerate(DIAGONAL[:3]):
-        velocity_covariance[i] = float(Pv[k, k])
-    return mavlink.MAVLink_odometry_message(
-        e.position.time_ns // 1000,
-        frame,
-        mavlink.MAV_FRAME_BODY_FRD,
-        *ned,
-        list(q),
-        *body,
-        NAN,
-        NAN,
-        NAN,
-        covariance,
-        velocity_covariance,
-        e.reset_counter,
-        mavlink.MAV_ESTIMATOR_TYPE_VISION,
-        e.quality,
-    )
-
-
-def gps_input(
-    e: Estimate, altitude_amsl_m: float, week_ms: tuple[int, int], config: InjectionConfig
-) -> Any:
-    """GPS_INPUT (232), every field filled: ArduPilot never arms on one with HDOP ignored."""
-    p = e.position
-    yaw = 0  # 0 means none; north is 36000
-    if config.gps_yaw and math.isfinite(e.attitude[2]):
-        yaw = round(math.degrees(e.attitude[2]) % 360.0 * 100.0) or 36000
-    vn, ve, vd = (float(v) for v in p.velocity_ned) if config.gps_velocity else (0.0, 0.0, 0.0)
-    week, ms = week_ms
-    return mavlink.MAVLink_gps_input_message(
-        p.time_ns // 1000,
-        config.gps_id,
-        0 if config.gps_velocity else _IGNORE_VELOCITY,
-        ms,
-        week,
-        mavlink.GPS_FIX_TYPE_3D_FIX,
-        round(p.latitude_deg * 1e7),
-        round(p.longitude_deg * 1e7),
-        altitude_amsl_m,
-        _CLAIMED_HDOP,
-        _CLAIMED_VDOP,
-        vn,
-        ve,
-        vd,
-        p.speed_sigma_mps,
-        p.horizontal_sigma_m,
-        p.vertical_sigma_m,
-        _CLAIMED_SATELLITES,
-        yaw,
-    )
-
-
-def global_position_sensor(e: Estimate, altitude_amsl_m: float, now_ns: int) -> Any:
-    """GLOBAL_POSITION_SENSOR (296): latitude, longitude and both altitudes."""
-    p = e.position
-    return mavlink.MAVLink_global_position_sensor_message(
-        0,
-        0,
-        0,
-        p.time_ns // 1000,
-        max(0, (now_ns - p.time_ns) // 1000),
-        mavlink.GLOBAL_POSITION_SRC_VISION,
-        0,
-        round(p.latitude_deg * 1e7),
-        round(p.longitude_deg * 1e7),
-        p.height_m,
-        altitude_amsl_m,
-        p.horizontal_sigma_m,
-        p.vertical_sigma_m,
-    )
-
-
 @dataclass(frozen=True)
 class InjectionContext:
     """What the injector must know about the vehicle. now: the origin and profile of this moment."""
@@ -200,6 +65,37 @@ class InjectionContext:
     origin: Origin | None
     profile: FirmwareProfile
     attitude_at: Callable[[int], Attitude | None]
+
+
+class FixQueue:
+    """Fixes on their way from any thread to the link's; the oldest go first when it is full.
+
+    A jump that went with a dropped fix is told by the next.
+    """
+
+    def __init__(self, length: int) -> None:
+        self._length = length
+        self._fixes: deque[VisionFix] = deque()
+        self._lock = threading.Lock()
+        self.dropped = 0
+
+    def put(self, fix: VisionFix) -> None:
+        """Append; never blocks for long."""
+        with self._lock:
+            self._fixes.append(fix)
+            if len(self._fixes) > self._length:
+                self.dropped += 1
+                if self._fixes.popleft().reset:
+                    self._fixes[0] = replace(self._fixes[0], reset=True)
+
+    def take(self) -> list[VisionFix]:
+        """All that wait, oldest first."""
+        if not self._fixes:
+            return []
+        with self._lock:
+            fixes = list(self._fixes)
+            self._fixes.clear()
+        return fixes
 
 
 class Injector:
@@ -213,7 +109,8 @@ class Injector:
         self._period_ns = int(1e9 / config.rate_hz)
         self._propagator = FixPropagator(config.acceleration_sigma_mps2, config.sigma_floor_m)
         self.guard = YawGuard(config.yaw_guard)
-        self._waiting: deque[VisionFix] = deque(maxlen=_QUEUE)
+        self._waiting: deque[VisionFix] = deque()
+        self._latencies_ms: deque[float] = deque(maxlen=_LATENCIES)
         self._fresh: VisionFix | None = None
         self._reset_pending = False
         self._reset_counter = 0
@@ -222,7 +119,6 @@ class Injector:
         self._last_stamp_ns = 0
         self._last_was_fill = False
         self.yaw_difference_rad = NAN
-        self.latency_ms = NAN
         self.reason = NO_FIX_YET
         self.counters: Counter[str] = Counter()
 
@@ -230,6 +126,16 @@ class Injector:
     def reset_counter(self) -> int:
         """The counter of the last message."""
         return self._reset_counter
+
+    @property
+    def latency_ms(self) -> float:
+        """Median age of the last 50 fixes when they came; NaN before the first."""
+        return statistics.median(self._latencies_ms) if self._latencies_ms else NAN
+
+    @property
+    def latency_is_known(self) -> bool:
+        """Whether enough fixes came to judge by."""
+        return len(self._latencies_ms) == _LATENCIES
 
     def submit(self, fix: VisionFix, now_ns: int) -> None:
         """Queue a fix; one that is late by seconds, from the future or out of order is dropped."""
@@ -246,9 +152,18 @@ class Injector:
             self._keep_reset(fix)
             return
         self._newest_ns = fix.time_ns
-        self.latency_ms = _smoothed(self.latency_ms, (now_ns - fix.time_ns) * 1e-6)
+        self._latencies_ms.append((now_ns - fix.time_ns) * 1e-6)
         self.counters["fixes"] += 1
         self._waiting.append(fix)
+        if len(self._waiting) > _QUEUE:
+            self.counters["fixes_overflowed"] += 1
+            self._keep_reset(self._waiting.popleft())
+
+    def skip(self) -> None:
+        """Nothing can be sent now: forget what waits, but not that the position jumped."""
+        while self._waiting:
+            self._keep_reset(self._waiting.popleft())
+        self._fresh = None
 
     def step(self, now_ns: int, context: InjectionContext) -> Injection | None:
         """What to send now, if anything."""
@@ -380,6 +295,9 @@ class Injector:
             altitude,
             context.profile.projection,
         )
+        if math.hypot(*ned) > _FARTHEST_M:
+            reason = f"the EKF origin is {math.hypot(*ned) * 1e-3:.0f} km away"
+            return Withheld(reason, "withheld_far_origin")
         formula = context.profile.covariance
         if self._config.covariance != "profile":
             formula = self._config.covariance
@@ -403,8 +321,3 @@ class Injector:
                 return Withheld("no attitude for ODOMETRY", "withheld_no_attitude")
             e = replace(e, attitude=(now.roll_rad, now.pitch_rad, now.yaw_rad))
         return Injection(odometry(e, ned, formula, context.profile.odometry_frame), e)
-
-
-def _smoothed(mean: float, value: float) -> float:
-    """Running mean over about 20 values; the first one starts it."""
-    return mean + 0.05 * (value - mean) if math.isfinite(mean) else value

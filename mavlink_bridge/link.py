@@ -29,7 +29,8 @@ from mavlink_bridge.transport import Endpoint, Transport, open_transport
 log = logging.getLogger(__name__)
 
 _OUTBOX = 512
-_MAX_UNSENT = 64 * 1024
+_MAX_UNSENT = 4096  # bytes; more would wait so long on a slow port that it is worthless
+_IDLE_TICK_S = 0.2
 _BACKOFF_S = (0.1, 5.0)
 _LONGEST_WAIT_S = 0.5
 _MAX_READS = 64
@@ -45,7 +46,10 @@ class LinkHandler(Protocol):
         """A message arrived; time_ns is when its bytes were read."""
 
     def on_tick(self, link: Link, now_ns: int) -> int:
-        """Do what is due and return when to be called next (CLOCK_MONOTONIC ns)."""
+        """Do what is due and return when to be called next (CLOCK_MONOTONIC ns).
+
+        It is called while the transport is closed, too: what is sent then is dropped and counted.
+        """
 
 
 @dataclass
@@ -60,6 +64,7 @@ class LinkCounters:
     tx_rate_limited: int = 0
     tx_dropped: int = 0
     handler_errors: int = 0
+    failures: int = 0
     timeouts: int = 0
 
 
@@ -154,58 +159,81 @@ class Link:
     def _run(self) -> None:
         backoff_s = _BACKOFF_S[0]
         while not self._stop.is_set():
-            try:
-                self._transport = self._open(self.endpoint)
-            except (OSError, EndpointError) as error:
-                self.counters.open_failures += 1
-                if self.counters.open_failures == 1:
-                    log.warning(
-                        "%s: %s cannot be opened (%s), retrying", self.name, self.endpoint, error
-                    )
-                self._stop.wait(backoff_s)
-                backoff_s = min(2.0 * backoff_s, _BACKOFF_S[1])
-                continue
             opened_ns = monotonic_ns()
-            self.counters.opened += 1
-            try:
-                self._serve(self._transport)
-            except OSError as error:
-                log.warning("%s: %s lost (%s), reconnecting", self.name, self.endpoint, error)
-            finally:
-                self._transport.close()
-                self._transport = None
+            self._transport = self._try_open()
+            if self._transport is not None:
+                self._serve_until_lost(self._transport)
             # An endpoint that accepts and closes at once must be backed off from, too.
-            backoff_s = (
-                _BACKOFF_S[0] if monotonic_ns() - opened_ns > 2e9 else min(2 * backoff_s, 5.0)
-            )
-            self._stop.wait(backoff_s)
+            lasted = self._transport is not None and monotonic_ns() - opened_ns > 2e9
+            self._transport = None
+            backoff_s = _BACKOFF_S[0] if lasted else backoff_s
+            self._idle(backoff_s)
+            backoff_s = min(2.0 * backoff_s, _BACKOFF_S[1])
+
+    def _try_open(self) -> Transport | None:
+        try:
+            return self._open(self.endpoint)
+        except (OSError, EndpointError) as error:
+            self.counters.open_failures += 1
+            if self.counters.open_failures == 1:
+                log.warning(
+                    "%s: %s cannot be opened (%s), retrying", self.name, self.endpoint, error
+                )
+        return None
+
+    def _serve_until_lost(self, transport: Transport) -> None:
+        self.counters.opened += 1
+        try:
+            self._serve(transport)
+        except OSError as error:
+            log.warning("%s: %s lost (%s), reconnecting", self.name, self.endpoint, error)
+        except Exception:  # whatever it is, the link must come back
+            self.counters.failures += 1
+            log.exception("%s: %s failed, reconnecting", self.name, self.endpoint)
+        finally:
+            transport.close()
+
+    def _idle(self, seconds: float) -> None:
+        """Wait without a transport: the handler's clock goes on."""
+        end_ns = monotonic_ns() + int(seconds * 1e9)
+        while (left_ns := end_ns - monotonic_ns()) > 0:
+            if self._stop.wait(min(left_ns * 1e-9, _IDLE_TICK_S)):
+                return
+            self._empty_outbox()
+            self._guard(self._handler.on_tick, self, monotonic_ns())
 
     def _serve(self, transport: Transport) -> None:
         self._reader.reset()
         self._unsent.clear()
         self._guard(self._handler.on_open, self)
+        # poll, not select: a process of many files has descriptors that select refuses.
+        poller = select.poll()
+        poller.register(self._wake_read, select.POLLIN)
+        poller.register(transport, select.POLLIN)
         last_rx_ns = monotonic_ns()
         deadline_ns = 0
         while not self._stop.is_set():
-            now_ns = monotonic_ns()
-            wait_s = min(max(deadline_ns - now_ns, 0) * 1e-9, _LONGEST_WAIT_S)
-            writers = [transport] if self._unsent else []
-            readers: list[Any] = [transport, self._wake_read]
-            readable, writable, _ = select.select(readers, writers, [], wait_s)
-            if self._wake_read in readable:
+            wait_s = min(max(deadline_ns - monotonic_ns(), 0) * 1e-9, _LONGEST_WAIT_S)
+            poller.modify(transport, select.POLLIN | (select.POLLOUT if self._unsent else 0))
+            ready = dict(poller.poll(wait_s * 1e3))
+            if self._wake_read in ready:
                 os.read(self._wake_read, 4096)
-            if transport in readable and self._receive(transport):
+            events = ready.get(transport.fileno(), 0)
+            if events & ~select.POLLOUT and self._receive(transport):
                 last_rx_ns = monotonic_ns()
-            if writable:
+            if events & select.POLLOUT:
                 self._flush()
-            while self._outbox:
-                self._send_now(*self._outbox.popleft())
+            self._empty_outbox()
             now_ns = monotonic_ns()
             due = self._guard(self._handler.on_tick, self, now_ns)
             deadline_ns = due if due is not None else now_ns + int(_LONGEST_WAIT_S * 1e9)
             if transport.stream and now_ns - last_rx_ns > self._timeout_ns:
                 self.counters.timeouts += 1
                 raise TimeoutError(f"nothing received for {self._timeout_ns * 1e-9:.1f} s")
+
+    def _empty_outbox(self) -> None:
+        while self._outbox:
+            self._send_now(*self._outbox.popleft())
 
     def _receive(self, transport: Transport) -> bool:
         """Read and dispatch what has arrived, a bounded amount; True if there was something."""
@@ -266,8 +294,12 @@ class Link:
             return False
         packer = self._packer(component)
         if self._key is not None:
-            # Never behind the wall clock: a peer that restarted refuses streams a minute old.
-            packer.signing.timestamp = max(packer.signing.timestamp, signing.signing_timestamp())
+            # Never behind the wall clock or the peer: either refuses streams a minute old.
+            packer.signing.timestamp = max(
+                packer.signing.timestamp,
+                signing.signing_timestamp(),
+                self._reader.signing_timestamp,
+            )
         frame = message.pack(packer)
         packer.seq = (packer.seq + 1) % 256
         self._last_sent_ns[identity] = now_ns

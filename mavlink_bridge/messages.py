@@ -36,6 +36,14 @@ def _check_position(what: str, latitude_deg: float, longitude_deg: float, height
         )
 
 
+def _is_covariance(P: Array) -> bool:
+    if P.shape != (3, 3) or not np.all(np.isfinite(P)):
+        return False
+    scale = max(float(np.abs(P).max()), 1e-12)
+    symmetric = bool(np.abs(P - P.T).max() <= 1e-6 * scale)
+    return symmetric and float(np.linalg.eigvalsh(P)[0]) >= -1e-6 * scale
+
+
 @dataclass(frozen=True)
 class VisionFix:
     """One position (and attitude) of the vehicle's body, seen by the localizer.
@@ -62,13 +70,22 @@ class VisionFix:
     def __post_init__(self) -> None:
         _check_position("vision fix", self.latitude_deg, self.longitude_deg, self.height_m)
         P = np.asarray(self.position_covariance_ned, dtype=np.float64)
-        if P.shape != (3, 3) or not np.all(np.isfinite(P)) or np.any(np.diag(P) < 0.0):
-            raise FixError(f"vision fix: covariance must be (3, 3), finite, >= 0; got {P.tolist()}")
+        if not _is_covariance(P):
+            raise FixError(
+                "vision fix: covariance must be (3, 3), finite, symmetric and not negative; got "
+                f"{P.tolist()}"
+            )
         object.__setattr__(self, "position_covariance_ned", P)
         if not 0 <= self.quality <= 100:
             raise FixError(f"vision fix: quality must be 0..100, got {self.quality}")
         if self.velocity_ned is not None and not all(math.isfinite(v) for v in self.velocity_ned):
             raise FixError(f"vision fix: velocity {self.velocity_ned} is not finite; give None")
+        angles = (self.roll_rad, self.pitch_rad, self.yaw_rad)
+        if any(math.isinf(angle) for angle in angles):
+            raise FixError(f"vision fix: attitude {angles} is infinite; give NaN where unknown")
+        sigmas = (self.attitude_sigma_rad, self.velocity_sigma_mps)
+        if not all(math.isfinite(sigma) and sigma >= 0.0 for sigma in sigmas):
+            raise FixError(f"vision fix: attitude and velocity sigma must be >= 0, got {sigmas}")
 
 
 @dataclass(frozen=True)

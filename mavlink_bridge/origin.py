@@ -24,6 +24,7 @@ Projection = Literal["ardupilot", "px4"]
 METRES_PER_DEGREE = 0.011131884502145034 * 1e7
 _PX4_RADIUS_M = 6371000.0  # PX4 lib/geo: CONSTANTS_RADIUS_OF_EARTH
 _ASK_EVERY_NS = 1_000_000_000
+_CHECK_EVERY_NS = 10_000_000_000
 _ASKS_BEFORE_SETTING = 3
 
 
@@ -102,14 +103,16 @@ class OriginKeeper:
         self._told = False
 
     def reset(self) -> None:
-        """The flight controller rebooted: its origin is gone."""
-        self.origin, self._asked, self._told = None, 0, False
+        """The flight controller rebooted, or may have while the link was lost: ask again."""
+        self.origin, self._asked, self._told, self._next_ns = None, 0, False, 0
 
     def on_origin(self, message: Any) -> str | None:
         """GPS_GLOBAL_ORIGIN; returns a line for the operator when it is news."""
         read = Origin(message.latitude * 1e-7, message.longitude * 1e-7, message.altitude * 1e-3)
         if read.latitude_deg == 0.0 and read.longitude_deg == 0.0:
             return None  # what firmwares send before they have one
+        if abs(read.latitude_deg) > 90.0 or abs(read.longitude_deg) > 180.0:
+            return None
         if read == self.origin:
             return None
         moved = self.origin is not None
@@ -129,8 +132,12 @@ class OriginKeeper:
         return "EKF origin known"
 
     def tick(self, now_ns: int, system_id: int, ask: Callable[[int], None]) -> Any | None:
-        """Ask for the origin while unknown (`ask(49)`); SET_GPS_GLOBAL_ORIGIN when it is due."""
-        if self.origin is not None or now_ns < self._next_ns:
+        """Ask for the origin (`ask(49)`), seldom once it is known; SET_GPS_GLOBAL_ORIGIN if due."""
+        if now_ns < self._next_ns:
+            return None
+        if self.origin is not None:
+            self._next_ns = now_ns + _CHECK_EVERY_NS
+            ask(mavlink.MAVLINK_MSG_ID_GPS_GLOBAL_ORIGIN)
             return None
         self._next_ns = now_ns + _ASK_EVERY_NS
         self._asked += 1

@@ -31,7 +31,6 @@ class FirmwareProfile:
     covariance: CovarianceFormula
     projection: Projection
     max_delay_ms: float
-    max_rate_hz: float
     messages: tuple[InjectionMessage, ...]
     odometry_frame: int
     delay_parameter: str
@@ -50,7 +49,6 @@ ARDUPILOT = FirmwareProfile(
     covariance="cbrt",
     projection="ardupilot",
     max_delay_ms=250.0,
-    max_rate_hz=50.0,
     messages=_ARDUPILOT_MESSAGES,
     odometry_frame=mavlink.MAV_FRAME_LOCAL_FRD,
     delay_parameter="VISO_DELAY_MS",
@@ -62,7 +60,6 @@ ARDUPILOT_SQRT = FirmwareProfile(
     covariance="sqrt",
     projection="ardupilot",
     max_delay_ms=250.0,
-    max_rate_hz=50.0,
     messages=_ARDUPILOT_MESSAGES,
     odometry_frame=mavlink.MAV_FRAME_LOCAL_FRD,
     delay_parameter="VISO_DELAY_MS",
@@ -73,7 +70,6 @@ PX4 = FirmwareProfile(
     covariance="variance",
     projection="px4",
     max_delay_ms=300.0,
-    max_rate_hz=50.0,
     messages=("vision_position_estimate", "odometry", "global_position_sensor"),
     odometry_frame=mavlink.MAV_FRAME_LOCAL_NED,
     delay_parameter="EKF2_EV_DELAY",
@@ -85,7 +81,6 @@ GENERIC = FirmwareProfile(
     covariance="cbrt",
     projection="ardupilot",
     max_delay_ms=250.0,
-    max_rate_hz=30.0,
     messages=("vision_position_estimate",),
     odometry_frame=mavlink.MAV_FRAME_LOCAL_FRD,
     delay_parameter="VISO_DELAY_MS",

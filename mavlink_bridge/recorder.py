@@ -1,38 +1,111 @@
-"""Raw .tlog recorder: each frame behind its UTC time, as every MAVLink ground tool reads it."""
+"""Raw .tlog recorder: each frame behind its UTC time, as every MAVLink ground tool reads it.
+
+Writing has a thread of its own: a memory card that stalls for a second must not delay an injection.
+"""
 
 from __future__ import annotations
 
+import logging
 import struct
 import threading
+from collections import deque
+from collections.abc import Callable
 from pathlib import Path
 
+from mavlink_bridge.errors import RecordError
+
+log = logging.getLogger(__name__)
+
 _MAX_BYTES = 2 << 30
+_MAX_WAITING = 8192  # frames: 10 s of five times the usual traffic
+_WRITE_EVERY_S = 0.2
 
 
 class TlogRecorder:
-    """Appends frames to a .tlog file: 8 bytes of big-endian microseconds UTC, then the frame."""
+    """Appends frames to a .tlog file: 8 bytes of big-endian microseconds UTC, then the frame.
 
-    def __init__(self, path: Path, max_bytes: int = _MAX_BYTES) -> None:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        self._file = path.open("ab")
-        self._lock = threading.Lock()
+    Raises `RecordError` when the file cannot be opened. Later, what the disk does not take is
+    dropped and counted, and on_failure (called once, in the recorder's thread) is told why.
+    """
+
+    def __init__(
+        self,
+        path: Path,
+        on_failure: Callable[[str], None] = lambda _: None,
+        max_bytes: int = _MAX_BYTES,
+    ) -> None:
+        try:
+            path.parent.mkdir(parents=True, exist_ok=True)
+            self._file = path.open("ab", buffering=0)
+        except OSError as error:
+            raise RecordError(
+                f"bridge.tlog {path}: cannot be written ({error.strerror}); choose another file "
+                "or leave tlog empty"
+            ) from error
+        self._path = path
+        self._on_failure = on_failure
         self._left = max_bytes
+        self._waiting: deque[tuple[int, bytes]] = deque()
+        self._stop = threading.Event()
+        self._thread: threading.Thread | None = None
+        self._failed = False
         self.dropped = 0
 
+    def start(self) -> None:
+        """Start writing."""
+        self._thread = threading.Thread(target=self._run, name="tlog", daemon=True)
+        self._thread.start()
+
     def write(self, frame: bytes, time_us: int) -> None:
-        """Record one frame; a full disk or a full file costs the record, not the flight."""
-        with self._lock:
-            size = 8 + len(frame)
-            if self._file.closed or self._left < size:
-                self.dropped += 1
-                return
-            try:
-                self._file.write(struct.pack(">Q", time_us) + frame)
-                self._left -= size
-            except OSError:
-                self.dropped += 1
+        """Record one frame; never blocks."""
+        if len(self._waiting) >= _MAX_WAITING:
+            self.dropped += 1
+            return
+        self._waiting.append((time_us, frame))
 
     def close(self) -> None:
-        """Flush and close."""
-        with self._lock:
+        """Write what waits and close the file."""
+        self._stop.set()
+        if self._thread is not None:
+            self._thread.join(timeout=5.0)
+        try:
             self._file.close()
+        except OSError as error:
+            self._fail(str(error))
+
+    def _run(self) -> None:
+        while not self._stop.wait(_WRITE_EVERY_S):
+            self._write_waiting()
+        self._write_waiting()
+
+    def _write_waiting(self) -> None:
+        """One write of whole records, so that a crash leaves a file that can be read."""
+        records = bytearray()
+        count = len(self._waiting)
+        for _ in range(count):
+            time_us, frame = self._waiting.popleft()
+            records += struct.pack(">Q", time_us) + frame
+        if not records:
+            return
+        if len(records) > self._left:
+            self.dropped += count
+            self._fail("the file has reached its greatest size")
+            return
+        try:
+            written = self._file.write(records)
+        except OSError as error:
+            written = 0
+            self._fail(error.strerror or str(error))
+        self._left -= written
+        if written == len(records):
+            return
+        self.dropped += count
+        if written:
+            self._left = 0  # half a record ends the file: what came behind it could not be read
+            self._fail("the disk took only a part")
+
+    def _fail(self, why: str) -> None:
+        if not self._failed:
+            self._failed = True
+            log.warning("%s: the record is incomplete: %s", self._path, why)
+            self._on_failure(why)

@@ -27,15 +27,17 @@ _MEDIAN_LIMIT_M = 3.0
 _P95_LIMIT_M = 6.0
 _RATE_LIMIT_HZ = 4.0
 # A chi-square of two degrees of freedom is 1.39 in the median; three times the claimed sigma is 9x.
+_HEIGHT_LIMIT_M = 10.0  # barometer and GNSS heights differ by metres, wrong geoids by tens
 _CONSISTENCY_LIMIT = 9.0 * 1.39
 
 
 @dataclass(frozen=True)
 class ShadowScore:
-    """How vision compared with GNSS over the last two minutes, horizontally.
+    """How vision compared with GNSS over the last two minutes; errors are horizontal.
 
-    bias_ne_m: mean north and east difference. consistency: median squared Mahalanobis distance
-    (1.4 is ideal). reasons: why it is a no-go; empty if it is a go.
+    bias_ne_m: mean north and east difference. height_m: median difference of the heights.
+    consistency: median squared Mahalanobis distance (1.4 is ideal). reasons: why it is a no-go;
+    empty if it is a go.
     """
 
     go: bool
@@ -43,6 +45,7 @@ class ShadowScore:
     median_m: float
     p95_m: float
     bias_ne_m: tuple[float, float]
+    height_m: float
     consistency: float
     rate_hz: float
     reasons: tuple[str, ...]
@@ -64,20 +67,22 @@ def gnss_healthy(state: VehicleState, now_ns: int) -> bool:
 class ShadowScorer:
     """Collects comparisons in one thread; `score` may be called from any."""
 
-    def __init__(self) -> None:
+    def __init__(self, geoid_separation_m: float) -> None:
+        self._geoid_m = geoid_separation_m
         self._lock = threading.Lock()
-        self._samples: deque[tuple[int, float, float, float]] = deque(maxlen=_LENGTH)
+        self._samples: deque[tuple[int, float, float, float, float]] = deque(maxlen=_LENGTH)
 
     def compare(self, fix: PropagatedFix, reference: tuple[float, ...]) -> None:
-        """A fix, and the autopilot's (latitude, longitude, ...) at the same time."""
+        """A fix, and the autopilot's (latitude, longitude, altitude AMSL) at the same time."""
         difference = np.array(
             north_east(reference[0], reference[1], fix.latitude_deg, fix.longitude_deg)
         )
         P = fix.covariance_ned[:2, :2] + np.eye(2) * _REFERENCE_SIGMA_M**2
         distance = float(difference @ np.linalg.solve(P, difference))
         north, east = (float(d) for d in difference)
+        up = fix.height_m - self._geoid_m - reference[2]
         with self._lock:
-            self._samples.append((fix.time_ns, north, east, distance))
+            self._samples.append((fix.time_ns, north, east, distance, up))
 
     def score(self, now_ns: int, yaw_difference_rad: float, yaw_blocked: bool) -> ShadowScore:
         """The verdict on the last two minutes."""
@@ -86,7 +91,7 @@ class ShadowScorer:
         if not len(samples):
             reason = "no fix could be compared with GNSS"
             nan = math.nan
-            return ShadowScore(False, 0, nan, nan, (nan, nan), nan, 0.0, (reason,))
+            return ShadowScore(False, 0, nan, nan, (nan, nan), nan, nan, 0.0, (reason,))
         errors = np.hypot(samples[:, 1], samples[:, 2])
         median, p95 = float(np.median(errors)), float(np.percentile(errors, 95))
         consistency = float(np.median(samples[:, 3]))
@@ -103,9 +108,12 @@ class ShadowScorer:
             reasons.append(f"p95 error {p95:.1f} m")
         if consistency > _CONSISTENCY_LIMIT:
             reasons.append("errors exceed the claimed covariance")
+        height = float(np.median(samples[:, 4]))
+        if abs(height) > _HEIGHT_LIMIT_M:
+            reasons.append(f"height differs by {height:+.0f} m; check geoid, datum, barometer")
         if yaw_blocked:
             reasons.append(f"yaw differs by {math.degrees(yaw_difference_rad):+.1f} deg")
         bias = (float(samples[:, 1].mean()), float(samples[:, 2].mean()))
         return ShadowScore(
-            not reasons, len(samples), median, p95, bias, consistency, rate, tuple(reasons)
+            not reasons, len(samples), median, p95, bias, height, consistency, rate, tuple(reasons)
         )

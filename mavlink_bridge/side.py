@@ -13,6 +13,7 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 from mavlink_bridge.camera_component import CameraComponent
 from mavlink_bridge.clock import SteadyUtc
 from mavlink_bridge.config import BridgeConfig
+from mavlink_bridge.gate import InjectionGate
 from mavlink_bridge.link import Link
 from mavlink_bridge.messages import (
     CameraView,
@@ -23,6 +24,7 @@ from mavlink_bridge.messages import (
     VehicleState,
 )
 from mavlink_bridge.vehicle import VehicleTracker
+from mavlink_bridge.watch import VehicleWatch
 
 SECOND_NS = 1_000_000_000
 COMMANDS_IN = ("COMMAND_LONG", "COMMAND_INT")
@@ -39,7 +41,10 @@ SYSTEM_STATUS = {
 
 @dataclass(frozen=True)
 class Shared:
-    """What the bridge lends to its sides. say: tell the operator (severity, text)."""
+    """What the bridge lends to its sides. say: tell the operator (severity, text).
+
+    gate: None unless the mode is ``rc``.
+    """
 
     config: BridgeConfig
     geoid_separation_m: float
@@ -49,6 +54,8 @@ class Shared:
     health: Callable[[], HealthLevel]
     say: Callable[[int, str], None]
     on_track: Callable[[TrackRequest], None] | None
+    watch: VehicleWatch
+    gate: InjectionGate | None
 
     def uptime_ms(self, now_ns: int) -> int:
         """Milliseconds since the bridge began: its own time_boot_ms."""
@@ -104,10 +111,24 @@ class Side:
             position = Origin(state.latitude_deg, state.longitude_deg, state.altitude_amsl_m)
         self.camera.tick(now_ns, position, self.shared.uptime_ms(now_ns), link.send)
 
-    def camera_command(self, link: Link, message: Any, time_ns: int) -> None:
-        """A command that may be for the camera."""
-        if self.config.camera.announce and message.target_system in (0, link.system_id):
+    def command(self, link: Link, message: Any, time_ns: int) -> None:
+        """A command of a ground station to one of our components."""
+        localizer = self.config.localizer_component
+        if (message.target_system, message.target_component) == (link.system_id, localizer):
+            self._localizer_command(link, message)
+        elif self.config.camera.announce and message.target_system in (0, link.system_id):
             self.camera.command(message, time_ns, self.shared.uptime_ms(time_ns), link.send)
+
+    def _localizer_command(self, link: Link, message: Any) -> None:
+        """The command that gates injection; every other one is refused in the protocol's way."""
+        gate = self.shared.gate
+        result = mavlink.MAV_RESULT_UNSUPPORTED
+        if gate is not None:
+            result = gate.command(message.command, message.param1)
+        ack = mavlink.MAVLink_command_ack_message(
+            message.command, result, 0, 0, message.get_srcSystem(), message.get_srcComponent()
+        )
+        link.send(ack, self.config.localizer_component)
 
 
 class GroundSide(Side):
@@ -117,14 +138,15 @@ class GroundSide(Side):
         super().__init__(shared, ground=True)
 
     def on_message(self, link: Link, message: Any, time_ns: int) -> None:
-        """Commands for the camera."""
+        """Commands for our components."""
         if message.get_type() in COMMANDS_IN:
-            self.camera_command(link, message, time_ns)
+            self.command(link, message, time_ns)
 
     def on_tick(self, link: Link, now_ns: int) -> int:
         """Heartbeats and targets, once the vehicle's system id is known."""
         state = self.tracker.snapshot(now_ns)
         link.system_id = self.config.system_id or state.system_id or 0
+        self.shared.watch.check(state)
         if link.system_id:
             self.heartbeat(link, now_ns)
             if self.config.camera.announce:

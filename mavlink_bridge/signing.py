@@ -45,9 +45,12 @@ def create_key(path: Path) -> bytes:
 
 
 def signing_timestamp(unix_time_s: float | None = None) -> int:
-    """Signing time stamp: 10 microsecond ticks since 2015-01-01 UTC."""
+    """Signing time stamp: 10 microsecond ticks since 2015-01-01 UTC.
+
+    0 before that: a computer without a battery clock may wake up in 1970.
+    """
     now = time.time() if unix_time_s is None else unix_time_s
-    return int((now - _SIGNING_EPOCH_S) * _TICKS_PER_S)
+    return max(int((now - _SIGNING_EPOCH_S) * _TICKS_PER_S), 0)
 
 
 def enable(mav: Any, key: bytes, link_id: int) -> None:

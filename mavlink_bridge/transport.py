@@ -16,6 +16,9 @@ from mavlink_bridge.errors import EndpointError
 Kind = Literal["udpin", "udpout", "tcp", "tcpin", "serial"]
 _CONNECT_TIMEOUT_S = 2.0
 _READ_SIZE = 65536
+_MARKERS = (b"\xfd", b"\xfe")  # of MAVLink 2 and 1
+_HIGHEST_BAUD = 12_000_000
+_LISTENING = ("udpin", "udp", "tcpin")
 _KINDS: dict[str, Kind] = {
     "udpin": "udpin",
     "udp": "udpin",
@@ -45,8 +48,11 @@ class Endpoint:
                 f"{text!r} is no endpoint; write udpin:HOST:PORT, udpout:HOST:PORT, tcp:HOST:PORT, "
                 "tcpin:HOST:PORT or serial:DEVICE:BAUD"
             )
-        if _KINDS[kind] != "serial" and not 0 <= int(number) <= 65535:
-            raise EndpointError(f"{text!r}: {number} is no port number")
+        lowest = 0 if kind in _LISTENING else 1  # 0 lets the system choose
+        highest = _HIGHEST_BAUD if kind == "serial" else 65535
+        if not lowest <= int(number) <= highest:
+            what = "baud rate" if kind == "serial" else "port number"
+            raise EndpointError(f"{text!r}: {number} is no {what}")
         return cls(_KINDS[kind], address, int(number))
 
     def __str__(self) -> str:
@@ -102,13 +108,13 @@ class UdpTransport:
         return self._socket.fileno()
 
     def read(self) -> bytes:
-        """One datagram; the sender becomes the peer when none was configured."""
+        """One datagram; who sends MAVLink becomes the peer when none was configured."""
         try:
             data, sender = self._socket.recvfrom(_READ_SIZE)
         except (BlockingIOError, ConnectionRefusedError):
             # Refused: an ICMP answer to something sent before the peer listened; UDP goes on.
             return b""
-        if self._learn:
+        if self._learn and data[:1] in _MARKERS:
             self._remote = sender
         return data
 

@@ -24,6 +24,7 @@ from mavlink_bridge.messages import Attitude, GimbalAttitude, Origin, VehicleSta
 from mavlink_bridge.profile import autopilot_name, decode_version, select_profile
 
 _HEARTBEAT_LOST_NS = 3_000_000_000
+_OLD_NS = 2_000_000_000
 
 
 def gimbal_in_earth_frame(flags: int) -> bool:
@@ -50,6 +51,7 @@ class VehicleTracker:
         self._gimbals = GimbalBuffer()
         self._globals = VectorBuffer()
         self._locals = VectorBuffer()
+        self.ignored = 0
 
     def snapshot(self, now_ns: int) -> VehicleState:
         """The state now."""
@@ -133,15 +135,33 @@ class VehicleTracker:
         if boot_ms is not None and message.get_srcComponent() == self._state.component_id:
             rebooted = self.clock.observe(boot_ms * 1_000_000, received_ns)
             stamp_ns = self.clock.to_monotonic(boot_ms * 1_000_000, received_ns)
+        if rebooted:
+            self._forget()
         with self._lock:
-            if rebooted:
-                for buffer in (self._attitudes, self._gimbals, self._globals, self._locals):
-                    buffer.clear()
-                self._state = replace(self._state, origin=None)
             handler = _HANDLERS.get(message.get_type())
-            if handler is not None:
+            # An old frame that came late (or again) must not undo what newer ones said.
+            if handler is None or received_ns - stamp_ns > _OLD_NS:
+                self.ignored += handler is not None
+                return rebooted
+            try:
                 handler(self, message, stamp_ns)
+            except ValueError:  # not finite, or no rotation: estimators start up like that
+                self.ignored += 1
         return rebooted
+
+    def timesync(self, boot_ns: int, sent_ns: int, received_ns: int) -> bool:
+        """Take in a TIMESYNC answer; True if it shows that the flight controller rebooted."""
+        rebooted = self.clock.timesync(boot_ns, sent_ns, received_ns)
+        if rebooted:
+            self._forget()
+        return rebooted
+
+    def _forget(self) -> None:
+        """What was dated by the clock before a reboot, and the origin, are void."""
+        with self._lock:
+            for buffer in (self._attitudes, self._gimbals, self._globals, self._locals):
+                buffer.clear()
+            self._state = replace(self._state, origin=None)
 
     # --- one method per message, under the lock --------------------------------------------------
 
@@ -169,11 +189,13 @@ class VehicleTracker:
         self._state = replace(self._state, version=version, profile=name)
 
     def _attitude_euler(self, m: Any, time_ns: int) -> None:
+        _check_finite(m.roll, m.pitch, m.yaw, m.rollspeed, m.pitchspeed, m.yawspeed)
         q = quat.from_euler(m.roll, m.pitch, m.yaw)
         rates = (m.rollspeed, m.pitchspeed, m.yawspeed)
         self._attitudes.add(Attitude(time_ns, m.roll, m.pitch, m.yaw, q, rates))
 
     def _attitude_quaternion(self, m: Any, time_ns: int) -> None:
+        _check_finite(m.rollspeed, m.pitchspeed, m.yawspeed)
         q = quat.normalise((m.q1, m.q2, m.q3, m.q4))
         self._attitudes.add(attitude(time_ns, q, (m.rollspeed, m.pitchspeed, m.yawspeed)))
 
@@ -182,6 +204,7 @@ class VehicleTracker:
         self._gimbals.add(GimbalSample(time_ns, quat.normalise(m.q), earth, GIMBAL_SOURCES[0]))
 
     def _mount_orientation(self, m: Any, time_ns: int) -> None:
+        _check_finite(m.roll, m.pitch, m.yaw)
         roll, pitch, yaw = (math.radians(a) for a in (m.roll, m.pitch, m.yaw))
         q = quat.from_euler(roll, pitch, yaw)
         self._gimbals.add(GimbalSample(time_ns, q, False, GIMBAL_SOURCES[1]))
@@ -195,6 +218,7 @@ class VehicleTracker:
         self._gimbals.add(GimbalSample(time_ns, q, False, GIMBAL_SOURCES[2]))
 
     def _local_position(self, m: Any, time_ns: int) -> None:
+        _check_finite(m.x, m.y, m.z, m.vx, m.vy, m.vz)
         self._locals.add(time_ns, (m.x, m.y, m.z))
         self._state = replace(
             self._state,
@@ -206,6 +230,8 @@ class VehicleTracker:
     def _global_position(self, m: Any, time_ns: int) -> None:
         if m.lat == 0 and m.lon == 0:
             return  # what firmwares send before they have a position
+        if abs(m.lat) > 900_000_000:
+            raise ValueError(f"latitude {m.lat}")
         self._globals.add(time_ns, (m.lat * 1e-7, m.lon * 1e-7, m.alt * 1e-3))
         self._state = replace(
             self._state,
@@ -255,6 +281,11 @@ class VehicleTracker:
 
     def _text(self, m: Any, _: int) -> None:
         self._state = replace(self._state, last_text=str(m.text))
+
+
+def _check_finite(*values: float) -> None:
+    if not all(math.isfinite(value) for value in values):
+        raise ValueError(f"{values} is not finite")
 
 
 _HANDLERS = {

@@ -21,6 +21,7 @@ from mavlink_bridge.quaternion import wrap_pi
 
 _BASELINE_NS = 1_000_000_000
 _RELEASE_SHARE = 0.7
+_BLIND_AFTER = 20  # fixes in a row
 _DRIFT_RAD_PER_S = math.radians(0.3)  # of the gyros while no fix is seen
 
 
@@ -45,6 +46,12 @@ class YawGuard:
         self._in_a_row = 0
         self.blocked = False
         self.unchecked = 0
+        self._unchecked_in_a_row = 0
+
+    @property
+    def blind(self) -> bool:
+        """Whether fixes have passed for a while without a yaw to compare."""
+        return self._unchecked_in_a_row >= _BLIND_AFTER
 
     def reset(self) -> None:
         """The autopilot started over: its yaw did, too."""
@@ -58,7 +65,9 @@ class YawGuard:
             return YawVerdict(True, math.nan)
         if autopilot is None or not math.isfinite(vision_yaw_rad):
             self.unchecked += 1
+            self._unchecked_in_a_row += 1
             return YawVerdict(not self.blocked, math.nan)
+        self._unchecked_in_a_row = 0
         difference = wrap_pi(vision_yaw_rad - autopilot.yaw_rad)
         to_gyros = wrap_pi(vision_yaw_rad - autopilot.gyro_heading_rad)
         good = self._agrees(time_ns, difference, to_gyros)

@@ -167,8 +167,56 @@ def test_rc_channel_gates_injection(autopilot: Any, run: Callable[..., Bridge]) 
     assert sleep_until(lambda: bridge.injecting, 2.0)
     feed(bridge, 0.4)
     assert len(autopilot.of("VISION_POSITION_ESTIMATE")) > 3
+    # A receiver that falls silent takes no position away; the switch does.
     autopilot.rc = {}
-    assert sleep_until(lambda: not bridge.injecting, 3.0)
+    feed(bridge, 1.5)
+    assert bridge.injecting
+    autopilot.rc = {9: 1100}
+    assert sleep_until(lambda: not bridge.injecting, 2.0)
+    told = [text for text in bridge.texts() if "injection o" in text]
+    assert told == ["PiLoT: injection on (channel 9)", "PiLoT: injection off, shadow (channel 9)"]
+
+
+@pytest.mark.parametrize("over_ground", [False, True])
+def test_command_gates_injection(
+    over_ground: bool, autopilot: Any, ground: GroundStation, run: Callable[..., Bridge]
+) -> None:
+    autopilot.origin = (*HOME, 488.0)
+    connection = f"udpout:127.0.0.1:{ground.port}" if over_ground else None
+    bridge = run(config(autopilot.port, mode="rc", ground_connection=connection), autopilot)
+    assert sleep_until(lambda: bridge.state().origin is not None, 5.0)
+    station: Any = ground if over_ground else autopilot
+    assert sleep_until(lambda: not over_ground or ground.peer is not None, 3.0)
+
+    def ask(command: int, wanted: float, *, system: int = 1, component: int = 197) -> int:
+        before = len(station.of("COMMAND_ACK"))
+        message = mavlink.MAVLink_command_long_message(
+            system, component, command, 0, wanted, 0, 0, 0, 0, 0, 0
+        )
+        if over_ground:
+            ground.send(message)
+        else:
+            autopilot.send(message, component=190, system=255)
+        if not sleep_until(lambda: len(station.of("COMMAND_ACK")) > before, 1.0):
+            return -1
+        ack = station.of("COMMAND_ACK")[-1]
+        assert (ack.command, ack.get_srcComponent(), ack.target_system) == (command, 197, 255)
+        return int(ack.result)
+
+    assert not bridge.injecting
+    assert ask(mavlink.MAV_CMD_USER_1, 1.0, system=2) == -1  # another vehicle's
+    assert ask(mavlink.MAV_CMD_USER_2, 1.0) == mavlink.MAV_RESULT_UNSUPPORTED
+    assert ask(mavlink.MAV_CMD_USER_1, math.nan) == mavlink.MAV_RESULT_DENIED
+    assert not bridge.injecting
+    assert ask(mavlink.MAV_CMD_USER_1, 1.0) == mavlink.MAV_RESULT_ACCEPTED
+    assert ask(mavlink.MAV_CMD_USER_1, 1.0) == mavlink.MAV_RESULT_ACCEPTED  # sent again
+    assert bridge.injecting
+    feed(bridge, 0.4)
+    assert len(autopilot.of("VISION_POSITION_ESTIMATE")) > 3
+    assert ask(mavlink.MAV_CMD_USER_1, 0.0) == mavlink.MAV_RESULT_ACCEPTED
+    assert not bridge.injecting
+    told = [text for text in bridge.texts() if "injection o" in text]
+    assert told == ["PiLoT: injection on (command)", "PiLoT: injection off, shadow (command)"]
 
 
 def test_rotated_frame_is_refused_and_told_once(autopilot: Any, run: Callable[..., Bridge]) -> None:
@@ -427,6 +475,12 @@ def test_threads_end_with_the_bridge(autopilot: Any, run: Callable[..., Bridge])
         {"height_m": math.inf},
         {"position_covariance_ned": np.eye(2)},
         {"position_covariance_ned": np.full((3, 3), np.nan)},
+        {"position_covariance_ned": np.diag([1.0, 1.0, -1.0])},
+        {"position_covariance_ned": np.array([[1.0, 5.0, 0], [5.0, 1.0, 0], [0, 0, 1.0]])},
+        {"position_covariance_ned": np.array([[1.0, 0.5, 0], [0.0, 1.0, 0], [0, 0, 1.0]])},
+        {"yaw_rad": math.inf},
+        {"attitude_sigma_rad": math.nan},
+        {"velocity_sigma_mps": -1.0},
         {"quality": 101},
     ],
 )

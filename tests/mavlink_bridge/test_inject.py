@@ -12,7 +12,8 @@ import pytest
 
 from mavlink_bridge.clock import SteadyUtc
 from mavlink_bridge.config import InjectionConfig
-from mavlink_bridge.inject import DIAGONAL, Injection, InjectionContext, Injector
+from mavlink_bridge.inject import Injection, InjectionContext, Injector
+from mavlink_bridge.injection_messages import DIAGONAL
 from mavlink_bridge.messages import Attitude, Origin, VisionFix
 from mavlink_bridge.profile import (
     ARDUPILOT,

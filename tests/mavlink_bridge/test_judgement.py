@@ -59,7 +59,7 @@ def vehicle(now_ns: int = SECOND, **options: Any) -> VehicleState:
 
 def scored(error_m: float, *, sigma: float = 0.5, hz: float = 10.0, seconds: float = 10.0) -> Any:
     rng = np.random.default_rng(1)
-    scorer = ShadowScorer()
+    scorer = ShadowScorer(100.0)
     for i in range(int(hz * seconds)):
         north = error_m + rng.normal(0.0, 0.2)
         scorer.compare(position(int(i * SECOND / hz), north, sigma), (*HOME, 500.0))
@@ -93,13 +93,13 @@ def test_bad_vision_is_a_no_go_with_its_reason(options: dict[str, float], reason
 
 
 def test_nothing_compared_is_a_no_go() -> None:
-    score = ShadowScorer().score(SECOND, 0.0, False)
+    score = ShadowScorer(100.0).score(SECOND, 0.0, False)
     assert not score.go
     assert "no fix could be compared" in score.line()
 
 
 def test_blocked_yaw_is_a_no_go() -> None:
-    scorer = ShadowScorer()
+    scorer = ShadowScorer(100.0)
     for i in range(100):
         scorer.compare(position(i * 100 * MS), (*HOME, 500.0))
     assert scorer.score(10 * SECOND, math.radians(5.0), True).reasons == (

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import random
 from collections.abc import Callable
 from typing import Any
 
@@ -11,7 +10,6 @@ import pytest
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from mavlink_bridge import quaternion as quat
-from mavlink_bridge.clock import BootClock, SteadyUtc
 from mavlink_bridge.config import OriginConfig
 from mavlink_bridge.messages import Origin
 from mavlink_bridge.origin import OriginKeeper, ned_from_origin, north_east, offset
@@ -216,61 +214,48 @@ def test_heartbeat_age_and_connection() -> None:
     assert late.heartbeat_age_s == pytest.approx(4.0)
 
 
-# --- clock ------------------------------------------------------------------------------------
-
-
-def test_timesync_finds_the_offset_under_jitter() -> None:
-    rng = random.Random(4)
-    clock = BootClock()
-    offset_ns = 77 * SECOND
-    for i in range(30):
-        sent_ns = 100 * SECOND + i * SECOND
-        out, back = (int(rng.expovariate(1 / 5.0) * MS) + MS // 2 for _ in range(2))
-        clock.timesync(sent_ns + out - offset_ns, sent_ns, sent_ns + out + back)
-    assert clock.offset_ns == pytest.approx(offset_ns, abs=2 * MS)
-    assert clock.source == "timesync"
-
-
-def test_minimum_lag_bounds_the_offset_before_timesync() -> None:
-    rng = random.Random(5)
-    clock = BootClock()
-    for i in range(100):
-        boot = i * 20 * MS
-        clock.observe(boot, boot + 50 * SECOND + 2 * MS + int(rng.expovariate(0.2) * MS))
-    assert clock.offset_ns == pytest.approx(50 * SECOND + 2 * MS, abs=MS)
-    assert clock.source == "minimum lag"
-
-
-def test_implausible_timesync_answers_are_refused() -> None:
-    clock = BootClock()
-    assert not clock.timesync(0, 10 * SECOND, 9 * SECOND)
-    assert not clock.timesync(0, 10 * SECOND, 12 * SECOND)
-    assert clock.offset_ns is None
-
-
 def test_reboot_is_noticed_and_the_clock_starts_over() -> None:
     it = tracker()
     feed_yaw(it, 10.0, 3.0, 0.1)
-    rebooted = it.handle(
-        sent(mavlink.MAVLink_attitude_message(5, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)), 20 * SECOND
-    )
-    assert rebooted
-    assert it.clock.offset_ns == 20 * SECOND - 5 * MS
+    rebooted = [
+        it.handle(
+            sent(mavlink.MAVLink_attitude_message(ms, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)),
+            20 * SECOND + ms * MS,
+        )
+        for ms in (5, 25, 45, 65)
+    ]
+    assert rebooted == [False, False, True, False]
+    assert it.clock.offset_ns == 20 * SECOND
     assert it.attitude_at(10 * SECOND + 100 * MS) is None
+    assert it.attitude_at(20 * SECOND + 50 * MS) is not None
     assert it.snapshot(20 * SECOND).reboots == 1
 
 
-def test_stamps_are_never_later_than_their_arrival() -> None:
-    clock = BootClock()
-    clock.timesync(0, 10 * SECOND, 10 * SECOND + 2 * MS)
-    assert clock.to_monotonic(5 * SECOND, 12 * SECOND) == 12 * SECOND
-
-
-def test_gps_week_of_a_known_moment() -> None:
-    # 2024-01-01T00:00:00 UTC is GPS week 2295, second 86418 (18 leap seconds into Monday).
-    utc = SteadyUtc(utc_ns=1_704_067_200 * SECOND, at_monotonic_ns=0)
-    assert utc.gps_week_ms(0) == (2295, 86_418_000)
-    assert utc.gps_week_ms(250 * MS) == (2295, 86_418_250)
+def test_what_is_not_finite_or_old_is_ignored() -> None:
+    it = tracker()
+    feed_yaw(it, 10.0, 1.0, 0.0)
+    now = 11 * SECOND
+    nan = math.nan
+    for m in (
+        mavlink.MAVLink_attitude_message(950, nan, 0.0, 0.0, 0.0, 0.0, 0.0),
+        mavlink.MAVLink_attitude_quaternion_message(960, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0),
+        mavlink.MAVLink_local_position_ned_message(970, nan, 0.0, 0.0, 0.0, 0.0, 0.0),
+        mavlink.MAVLink_global_position_int_message(980, 1_000_000_000, 5, 0, 0, 0, 0, 0, 0),
+    ):
+        it.handle(sent(m), now)
+    assert it.ignored == 4
+    state = it.snapshot(now)
+    assert state.local_position_ned is None
+    assert math.isnan(state.latitude_deg)
+    at = it.attitude_at(now - 100 * MS)
+    assert at is not None
+    assert math.isfinite(at.yaw_rad)
+    # A copy of an old frame does not turn the position back.
+    good = mavlink.MAVLink_local_position_ned_message(1000, 5.0, 0.0, 0.0, 0.0, 0.0, 0.0)
+    it.handle(sent(good), now)
+    old = mavlink.MAVLink_local_position_ned_message(500, 1.0, 0.0, 0.0, 0.0, 0.0, 0.0)
+    it.handle(sent(old), now + 3 * SECOND)
+    assert it.snapshot(now).local_position_ned == (5.0, 0.0, 0.0)
 
 
 # --- origin -----------------------------------------------------------------------------------
