@@ -13,6 +13,7 @@ from scipy.spatial import cKDTree
 from localizer.errors import SequenceError
 from localizer.synth.heightfield import Land, Prism
 from localizer.training.noise import noise
+from localizer.training.revisit import hard_surfaces
 from localizer.types import Float32
 
 Color = tuple[float, float, float]
@@ -86,7 +87,7 @@ def photo_place(
     kept = [_with_ground_color(b, layers[0], rng) for b in buildings]
     land = Land(height.astype(np.float32), np.clip(albedos[0], 0.02, 1.2), cell_m)
     others = tuple(np.clip(a, 0.02, 1.2) for a in albedos[1:])
-    return Place(land, kept, [], _with_roofs(_hard_surfaces(layers[0]), kept), others)
+    return Place(land, kept, [], _with_roofs(hard_surfaces(layers[0]), kept), others)
 
 
 class PhotoLibrary:
@@ -194,16 +195,6 @@ def new_buildings(rng: np.random.Generator, place: Place, count: int) -> list[Pr
     """Buildings where the map has none: what was built since."""
     n, cell = place.land.height.shape[0], place.land.cell_m
     return [_building(rng, rng.uniform(0, n, 2), rng.uniform(0, np.pi), cell) for _ in range(count)]
-
-
-def _hard_surfaces(texture: NDArray[np.uint8]) -> Float32:
-    """Where a photo shows grey, blue or strongly red ground: pavement and roofs, not vegetation or
-    soil, which are green to yellow-brown.
-    """
-    smooth = cv2.GaussianBlur(texture.astype(np.float32), (0, 0), 1.5)
-    red, green, blue = smooth[..., 0], smooth[..., 1], smooth[..., 2]
-    soft = np.clip((green - blue - 4.0) / 10.0, 0, 1) * np.clip((40.0 - (red - green)) / 15.0, 0, 1)
-    return (1.0 - soft).astype(np.float32)
 
 
 def _with_roofs(lasting: Float32, prisms: list[Prism]) -> Float32:

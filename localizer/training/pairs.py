@@ -47,6 +47,7 @@ _OVERLAP = 0.45  # least share of the reference's surface that the query must se
 class Pair:
     """Both views of one pair. reference, query: (H, W, 3) uint8; depths (H, W) float32, metres
     along the axis, 0 = sky. The query is clean: its `condition` says what weather to put on it.
+    outdated: buildings are gone and new; season: the query's vegetation is of another time of year.
     """
 
     reference: Image
@@ -59,6 +60,7 @@ class Pair:
     condition: str
     outdated: bool
     source: str
+    season: bool = False
 
 
 @dataclass(frozen=True)
@@ -96,13 +98,13 @@ def scene_pairs(seed: int, config: SceneConfig, library: PhotoLibrary | None) ->
         place, source = generated_place(rng, n, cell), "generated"
     survey = _survey(rng, place, config)
     lived: LitScene | None = None
-    condition, outdated = "day", False
+    condition, outdated, season = "day", False, False
     for k in range(config.references):
         if lived is None or k % config.queries_per_light == 0:
             condition = draw_condition(rng, config.conditions, k // config.queries_per_light)
             outdated = bool(rng.random() < 0.4)
             fixed = None if config.light_variety else survey.light
-            lived = _lived(rng, place, condition, outdated, fixed, config.shared_detail)
+            lived, season = _lived(rng, place, condition, outdated, fixed, config.shared_detail)
         pair = _pair(rng, survey, lived, config)
         if pair is None:
             continue
@@ -112,8 +114,9 @@ def scene_pairs(seed: int, config: SceneConfig, library: PhotoLibrary | None) ->
         if config.shared_detail:
             image = soften(rng, image)
         yield Pair(
-            image, depth, seen, seen_depth, reference, query, camera, condition, outdated, source
-        )
+            image, depth, seen, seen_depth, reference, query, camera, condition, outdated, source,
+            season,
+        )  # fmt: skip
 
 
 def warp_check(pair: Pair) -> tuple[Float32, NDArray[np.bool_]]:
@@ -160,13 +163,16 @@ def _lived(
     outdated: bool,
     light: Light | None,
     shared_detail: bool,
-) -> LitScene:
-    """The place on the day of the flight; a given light also keeps the map's season."""
-    land, prisms = place.land, list(place.prisms)
+) -> tuple[LitScene, bool]:
+    """The place on the day of the flight, and whether that is another season than the map's; a
+    given light also keeps the season.
+    """
+    land, prisms, season = place.land, list(place.prisms), False
     if light is None:
-        albedo = place.seasons[0] if place.seasons and rng.random() < 0.6 else land.albedo
+        season = bool(place.seasons) and rng.random() < 0.6
+        albedo = place.seasons[0] if season else land.albedo
         if rng.random() < 0.7:
-            albedo = season_shift(albedo, rng)
+            albedo, season = season_shift(albedo, rng), True
         land = Land(land.height, albedo, land.cell_m)
     if not shared_detail:
         albedo = regrown(land.albedo, place.lasting, land.cell_m, rng)
@@ -182,7 +188,7 @@ def _lived(
         direct = 0.5  # moonlight
     elevation = rng.uniform(8, 22) if condition == "dusk" else rng.uniform(22, 75)
     sun = _sun(rng, elevation, direct)
-    return light_scene(compose(land, prisms), light or sun, _sky(rng, condition))
+    return light_scene(compose(land, prisms), light or sun, _sky(rng, condition)), season
 
 
 def _car_count(rng: np.random.Generator, place: Place) -> int:

@@ -22,6 +22,16 @@ _MESH_M = (0.3, 2.0)  # horizontal resolution of a photogrammetric surface
 _BUMPS_M = (0.03, 0.25)  # its vertical noise
 
 
+def hard_surfaces(texture: Image) -> Float32:
+    """Where a photo shows grey, blue or strongly red ground: pavement and roofs, not vegetation or
+    soil, which are green to yellow-brown.
+    """
+    smooth = cv2.GaussianBlur(texture.astype(np.float32), (0, 0), 1.5)
+    red, green, blue = smooth[..., 0], smooth[..., 1], smooth[..., 2]
+    soft = np.clip((green - blue - 4.0) / 10.0, 0, 1) * np.clip((40.0 - (red - green)) / 15.0, 0, 1)
+    return (1.0 - soft).astype(np.float32)
+
+
 def regrown(albedo: Float32, lasting: Float32, cell_m: float, rng: np.random.Generator) -> Float32:
     """The albedo (n, n, 3) with new fine texture of the same strength where nothing lasts.
 

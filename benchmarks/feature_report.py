@@ -1,0 +1,144 @@
+"""Outcomes of the feature benchmark as CSV and as tables with confidence intervals."""
+
+from __future__ import annotations
+
+import csv
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass, fields
+from pathlib import Path
+
+import numpy as np
+
+from localizer.synth.appearance import CONDITIONS
+
+_DRAWS = 2000  # of the bootstrap
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """One method on one pair: errors (metres, degrees) and the pair's kind."""
+
+    method: str
+    seed: int
+    pair: int
+    place: int
+    condition: str
+    outdated: bool
+    season: bool
+    metres: float
+    degrees: float
+    seconds: float
+
+    def within(self, limit: float) -> bool:
+        """Whether position and rotation are within `limit` metres and degrees."""
+        return self.metres < limit and self.degrees < limit
+
+
+def write_outcomes(outcomes: Sequence[Outcome], path: Path) -> None:
+    """Store outcomes, so that a report needs no second run."""
+    with path.open("w", newline="") as file:
+        writer = csv.DictWriter(file, [f.name for f in fields(Outcome)])
+        writer.writeheader()
+        writer.writerows(asdict(o) for o in outcomes)
+
+
+def read_outcomes(paths: Sequence[Path]) -> list[Outcome]:
+    """Outcomes of several runs together."""
+    found = []
+    for path in paths:
+        with path.open(newline="") as file:
+            found += [
+                Outcome(
+                    row["method"],
+                    int(row["seed"]),
+                    int(row["pair"]),
+                    int(row["place"]),
+                    row["condition"],
+                    row["outdated"] == "True",
+                    row["season"] == "True",
+                    float(row["metres"]),
+                    float(row["degrees"]),
+                    float(row["seconds"]),
+                )
+                for row in csv.DictReader(file)
+            ]
+    return found
+
+
+def wilson(hits: int, count: int) -> tuple[float, float]:
+    """95 % interval of a share, in percent."""
+    if count == 0:
+        return 0.0, 100.0
+    z, p = 1.96, hits / count
+    middle = (p + z * z / (2 * count)) / (1 + z * z / count)
+    half = z / (1 + z * z / count) * np.sqrt(p * (1 - p) / count + z * z / (4 * count**2))
+    return 100 * (middle - half), 100 * (middle + half)
+
+
+def difference(a: Sequence[Outcome], b: Sequence[Outcome]) -> tuple[float, float, float]:
+    """Points by which `a` beats `b` within 1 m / 1 deg, with a 95 % interval: a bootstrap over
+    places, because the pairs of a place are alike. Both must be of the same pairs in order.
+    """
+    gain = np.array([x.within(1) - float(y.within(1)) for x, y in zip(a, b, strict=True)])
+    names = [(x.seed, x.place) for x in a]
+    index = {name: k for k, name in enumerate(dict.fromkeys(names))}
+    group = np.array([index[name] for name in names])
+    totals = np.bincount(group, gain, len(index))
+    sizes = np.bincount(group, minlength=len(index))
+    draws = np.random.default_rng(0).integers(0, len(index), (_DRAWS, len(index)))
+    shares = totals[draws].sum(1) / sizes[draws].sum(1)
+    low, high = np.percentile(100 * shares, (2.5, 97.5))
+    return 100 * float(gain.mean()), float(low), float(high)
+
+
+def groups(outcomes: Sequence[Outcome]) -> dict[str, list[Outcome]]:
+    """All, each seed where there are several, each condition, changed season, outdated map."""
+    kinds = dict.fromkeys([*CONDITIONS, *(o.condition for o in outcomes)])
+    seeds = sorted({o.seed for o in outcomes})
+    found = {"all": list(outcomes)}
+    if len(seeds) > 1:
+        found |= {f"seed {s}": [o for o in outcomes if o.seed == s] for s in seeds}
+    found |= {c: [o for o in outcomes if o.condition == c] for c in kinds}
+    found["other season"] = [o for o in outcomes if o.season]
+    found["outdated map"] = [o for o in outcomes if o.outdated]
+    return {name: members for name, members in found.items() if members}
+
+
+def report(outcomes: Sequence[Outcome]) -> str:
+    """Markdown table: per group and method the share within 1 m / 1 deg with Wilson's interval and
+    within 3 m / 3 deg, the medians; then the last method's lead over each other one.
+    """
+    by_method = {
+        m: [o for o in outcomes if o.method == m] for m in dict.fromkeys(o.method for o in outcomes)
+    }
+    split = {m: groups(mine) for m, mine in by_method.items()}
+    methods = list(by_method)
+    lines = ["| pairs | n | " + " | ".join(methods) + " |", "|---" * (len(methods) + 2) + "|"]
+    for name, members in split[methods[0]].items():
+        cells = [_cell(split[m].get(name, [])) for m in methods]
+        lines.append(f"| {name} | {len(members)} | " + " | ".join(cells) + " |")
+    medians = [_medians(mine) for mine in by_method.values()]
+    lines.append("| median error | | " + " | ".join(medians) + " |")
+    last = methods[-1]
+    for other in methods[:-1]:
+        gain, low, high = difference(by_method[last], by_method[other])
+        lines.append(
+            f"\n{last} - {other} at 1 m/1 deg: {gain:+.1f} [{low:+.1f}, {high:+.1f}] points"
+        )
+    return "\n".join(lines)
+
+
+def _cell(members: Sequence[Outcome]) -> str:
+    if not members:
+        return ""
+    near = sum(o.within(1) for o in members)
+    close = sum(o.within(3) for o in members)
+    low, high = wilson(near, len(members))
+    share, share3 = 100 * near / len(members), 100 * close / len(members)
+    return f"{share:.0f} [{low:.0f}, {high:.0f}], {share3:.0f}"
+
+
+def _medians(members: Sequence[Outcome]) -> str:
+    metres = float(np.median([o.metres for o in members]))
+    degrees = float(np.median([o.degrees for o in members]))
+    return f"{metres:.2f} m, {degrees:.2f}°"
