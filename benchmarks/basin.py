@@ -25,7 +25,7 @@ import matplotlib.pyplot as plt
 import numpy as np
 from basin_variants import FULL, Variant, our_rows, paper_rows, unweighted
 from basin_views import View, load_views
-from features import wilson
+from feature_report import wilson
 
 from localizer.features import load_extractor
 from localizer.map.cache import TileCache
@@ -33,9 +33,9 @@ from localizer.map.stream import TileStreamer
 from localizer.pose import Array, Pose, so3_exp, so3_log
 from localizer.registration import JNGOConfig, select_anchors
 from localizer.render.numba_raster import NumbaRenderer
-from localizer.types import PosePrior, RegistrationStatus
+from localizer.types import Anchors, PosePrior, RegistrationStatus
 
-STARTS = ((3.0, 3.0), (5.0, 5.0), (10.0, 10.0))  # metres, degrees: the paper's columns
+STARTS = (3.0, 5.0, 10.0)  # metres and degrees: the paper's columns
 AXES = ("yaw", "pitch", "roll", "x", "y", "z")  # camera axes; yaw about y, pitch about x
 STEPS = (1.0, 2.0, 3.0, 4.0, 6.0, 8.0, 10.0, 12.0, 15.0)  # degrees or metres
 _CHUNK = 10
@@ -102,8 +102,8 @@ def axis_start(axis: str, size: float, seed: int) -> Start:
     return Start(f"{axis} {size:.0f}", tuple(shift), tuple(turn))
 
 
-def ablation_starts(index: int) -> list[Start]:
-    return [random_start(m, d, index) for m, d in STARTS]
+def ablation_starts(index: int, sizes: tuple[float, ...]) -> list[Start]:
+    return [random_start(size, size, index) for size in sizes]
 
 
 def axis_starts(index: int) -> list[Start]:
@@ -133,11 +133,15 @@ def run_views(
                 if (reference.depth > 0).mean() < _LEAST_DEPTH:
                     continue  # the start leads off the map: no method could tell
                 features = extractor.extract(reference.rgb)
+                chosen: dict[tuple[object, ...], Anchors] = {}
                 for variant, optimizer in optimizers:
                     with variant.active():
-                        anchors = select_anchors(reference, features, variant.anchors, index)
-                        if not variant.confidence:
-                            anchors = unweighted(anchors)
+                        if variant.selection not in chosen:
+                            made = select_anchors(reference, features, variant.anchors, index)
+                            chosen[variant.selection] = (
+                                made if variant.confidence else unweighted(made)
+                            )
+                        anchors = chosen[variant.selection]
                         began = time.thread_time()
                         found = optimizer.register(
                             query, view.camera, anchors, prior,
@@ -227,7 +231,9 @@ def ablation(args: argparse.Namespace) -> list[Outcome]:
     rows = paper_rows() + our_rows()
     if args.only:
         rows = [v for v in rows if any(text in v.name for text in args.only) or v.name == FULL]
-    outcomes = run(views, rows, ablation_starts, args.model, args.processes)
+    outcomes = run(
+        views, rows, partial(ablation_starts, sizes=tuple(args.starts)), args.model, args.processes
+    )
     print(f"{args.set}: {len(views)} views; R@1 = share within 1 m and 1 degree")
     last = ""
     for variant, start, mine, full in sorted(
@@ -248,8 +254,8 @@ def ablation(args: argparse.Namespace) -> list[Outcome]:
 def axis_variants() -> list[Variant]:
     """Fig. 10: one hypothesis on the levels from coarse, from mid or from fine on; and the swarm.
 
-    A level that is left out gets no iterations. All end with the same sharpening, so that "converged"
-    means the same: within 1 m and 1 degree.
+    A level that is left out gets no iterations. All end with the same sharpening, so that
+    "converged" means the same: within 1 m and 1 degree.
     """
     one = JNGOConfig(hypotheses=1)
     return [
@@ -327,6 +333,7 @@ def main() -> None:
     parser.add_argument("--pairs", type=int, default=320)
     parser.add_argument("--processes", type=int, default=2)
     parser.add_argument("--model", type=Path, help="ONNX features; none: the shipped ones")
+    parser.add_argument("--starts", nargs="*", type=float, default=STARTS, help="m and degrees")
     parser.add_argument("--only", nargs="*", help="variants whose name contains one of these")
     parser.add_argument("--plot", type=Path)
     parser.add_argument("--json", type=Path, help="every outcome")

@@ -90,7 +90,7 @@ def vehicle_prior(
     sigma: tuple[float, float],
     time_ns: int,
 ) -> PosePrior | None:
-    """The camera's pose at `time_ns` as the autopilot knows it; None while it does not.
+    """The camera's pose and velocity at `time_ns` as the autopilot knows them; None if it does not.
 
     sigma: of position (m) and rotation (rad).
     """
@@ -105,10 +105,12 @@ def vehicle_prior(
         return None
     body = frame.enu_from_geodetic(position.latitude_deg, position.longitude_deg, position.height_m)
     to_ned = ned_from_world(frame, position)
+    velocity: Array | None = None
     if state.local_velocity_ned is not None:
-        body = body + to_ned.T @ np.array(state.local_velocity_ned) * age_ns * 1e-9
+        velocity = to_ned.T @ np.array(state.local_velocity_ned)
+        body = body + velocity * age_ns * 1e-9
     ned_from_body = matrix_from_quaternion(attitude.quaternion)
     ned_from_camera = matrix_from_quaternion(gimbal.quaternion) @ GIMBAL_FROM_CAMERA
     camera = world_from_camera(body, ned_from_body, ned_from_camera, lever_arm_m, to_ned)
     covariance = np.diag(np.repeat(np.square(sigma), 3))
-    return PosePrior(camera, covariance, time_ns)
+    return PosePrior(camera, covariance, time_ns, velocity)

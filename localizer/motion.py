@@ -32,7 +32,8 @@ class MotionConfig(BaseModel):
     acceleration_sigma: float = Field(3.0, gt=0, description="m/s²")
     angular_acceleration_sigma: float = Field(1.0, gt=0, description="rad/s²")
     turn_sigma: float = Field(0.006, gt=0, description="error of a measured turn, rad")
-    initial_velocity_sigma: float = Field(8.0, gt=0, description="m/s")
+    initial_velocity_sigma: float = Field(8.0, gt=0, description="m/s, of an unknown velocity")
+    prior_velocity_sigma: float = Field(2.0, gt=0, description="m/s, of the velocity of a prior")
     initial_angular_rate_sigma: float = Field(0.3, gt=0, description="rad/s")
 
 
@@ -57,14 +58,16 @@ class MotionState:
         return PosePrior(pose, self.covariance[:6, :6].copy(), self.time_ns)
 
 
-def start(prior: PosePrior, config: MotionConfig, velocity: Array | None = None) -> MotionState:
-    """A filter that knows `prior` and, if given, the velocity (3,) in m/s."""
+def start(prior: PosePrior, config: MotionConfig) -> MotionState:
+    """A filter that knows `prior` and nothing else."""
     mean = np.zeros(12)
     mean[:3] = prior.world_from_camera.translation
-    mean[6:9] = 0.0 if velocity is None else velocity
+    known = prior.velocity is not None
+    if known:
+        mean[6:9] = prior.velocity
     P = np.zeros((12, 12))
     P[:6, :6] = prior.covariance
-    velocity_sigma = config.initial_velocity_sigma if velocity is None else 1.0
+    velocity_sigma = config.prior_velocity_sigma if known else config.initial_velocity_sigma
     P[6:9, 6:9] = np.eye(3) * velocity_sigma**2
     P[9:, 9:] = np.eye(3) * config.initial_angular_rate_sigma**2
     return MotionState(mean, P, prior.world_from_camera.rotation, prior.time_ns)

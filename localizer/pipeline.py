@@ -128,9 +128,9 @@ class Localizer:
         with self._lock:
             return self._tracker
 
-    def set_prior(self, prior: PosePrior, velocity: Array | None = None) -> None:
+    def set_prior(self, prior: PosePrior) -> None:
         """Begin (again) from a pose known from outside, e.g. the autopilot's."""
-        state = motion.start(prior, self._config.motion, velocity)
+        state = motion.start(prior, self._config.motion)
         with self._lock:
             self._tracker = TrackerState(state, Integrity())
 

@@ -89,12 +89,14 @@ class ReferenceBundle:
 @dataclass(frozen=True)
 class PosePrior:
     """A predicted camera pose. covariance: (6, 6) over (position in world axes, m; rotation as a
-    left-multiplied small rotation vector in world axes, rad).
+    left-multiplied small rotation vector in world axes, rad). velocity: (3,) in world axes, m/s,
+    if it is known.
     """
 
     world_from_camera: Pose
     covariance: Array
     time_ns: int
+    velocity: Array | None = None
 
 
 class RegistrationStatus(Enum):

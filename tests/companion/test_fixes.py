@@ -96,6 +96,8 @@ def test_prior_follows_the_velocity_and_refuses_old_or_missing_positions():
     now, later = _prior(moving, a, g, 0), _prior(moving, a, g, 500_000_000)
     moved = later.world_from_camera.translation - now.world_from_camera.translation
     np.testing.assert_allclose(moved, [0.0, 5.0, 0.0], atol=1e-6)
+    np.testing.assert_allclose(later.velocity, [0.0, 10.0, 0.0], atol=1e-6)
+    assert _prior(_state(ORIGIN), a, g).velocity is None
     assert _prior(moving, a, g, 5_000_000_000) is None
     assert _prior(moving, None, g) is None
     assert _prior(VehicleState(), a, g) is None

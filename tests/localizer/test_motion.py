@@ -1,3 +1,5 @@
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -88,3 +90,12 @@ def test_a_measured_turn_replaces_the_constant_rate():
     # and what follows without a measurement goes on turning at that rate
     later = motion.predict(ahead, 2 * SECOND, CONFIG)
     np.testing.assert_allclose(later.rotation, so3_exp([0.0, 0.0, 1.0]), atol=1e-9)
+
+
+def test_the_priors_velocity_starts_the_filter():
+    """A prior that knows its velocity is moved by it, with less doubt than one that does not."""
+    moving = replace(_prior(), velocity=np.array([12.0, 0.0, 0.0]))
+    ahead = motion.predict(motion.start(moving, CONFIG), SECOND, CONFIG)
+    still = motion.predict(motion.start(_prior(), CONFIG), SECOND, CONFIG)
+    np.testing.assert_allclose(ahead.mean[:3] - still.mean[:3], [12.0, 0.0, 0.0], atol=1e-9)
+    assert ahead.covariance[0, 0] < 0.25 * still.covariance[0, 0]
