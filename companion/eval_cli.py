@@ -163,11 +163,13 @@ def _write_overlays(
         caption = f"{f.name}: {f.translation_error_m:.2f} m {f.rotation_error_deg:.2f} deg"
         save_image(folder / f"overlay-{i:04d}.png", overlay_sheet(video, view.rgb, caption))
     number = np.arange(len(frames), dtype=np.float64)
+    position = np.array([f.translation_error_m for f in frames])
+    rotation = np.array([f.rotation_error_deg for f in frames])
     plot_errors(
         folder / "errors.png",
         [
-            ErrorSeries("position", number, np.array([f.translation_error_m for f in frames]), "m"),
-            ErrorSeries("rotation", number, np.array([f.rotation_error_deg for f in frames]), "°"),
+            ErrorSeries("position", number, position, "3-D position error, m"),
+            ErrorSeries("rotation", number, rotation, "rotation error, °"),
         ],
         abscissa="frame",
     )

@@ -82,12 +82,12 @@ def plot_tracks(
 
 @dataclass(frozen=True)
 class ErrorSeries:
-    """One curve of `plot_errors`: time in s, error in `unit`."""
+    """One curve of `plot_errors`: time in s, error in what `panel` says, e.g. "3-D error, m"."""
 
     label: str
     time_s: Array
     error: Array
-    unit: str
+    panel: str
 
 
 def plot_errors(
@@ -96,16 +96,21 @@ def plot_errors(
     shaded: Sequence[tuple[float, float, str]] = (),
     abscissa: str = "time, s",
 ) -> None:
-    """Errors over time, one row per unit; `shaded` marks spans (begin, end, name)."""
-    units = list(dict.fromkeys(s.unit for s in series))
-    figure = Figure(figsize=(10, 2.6 * len(units)), layout="constrained")
-    for row, unit in enumerate(units, start=1):
-        axes = figure.add_subplot(len(units), 1, row)
-        for s in (s for s in series if s.unit == unit):
-            axes.plot(s.time_s, s.error, linewidth=0.9, label=s.label)
+    """Errors over time, one row per panel; `shaded` marks spans (begin, end, name).
+
+    A label has the same colour in every panel; a curve is broken where its error is NaN.
+    """
+    panels = list(dict.fromkeys(s.panel for s in series))
+    labels = list(dict.fromkeys(s.label for s in series))
+    figure = Figure(figsize=(10, 2.6 * len(panels)), layout="constrained")
+    for row, panel in enumerate(panels, start=1):
+        axes = figure.add_subplot(len(panels), 1, row)
+        for s in (s for s in series if s.panel == panel):
+            colour = f"C{labels.index(s.label)}"
+            axes.plot(s.time_s, s.error, linewidth=0.9, label=s.label, color=colour)
         for begin, end, name in shaded:
-            axes.axvspan(begin, end, color="tab:orange", alpha=0.12, label=name)
-        axes.set(xlabel=abscissa, ylabel=f"error, {unit}")
+            axes.axvspan(begin, end, color="tab:gray", alpha=0.15, label=name)
+        axes.set(xlabel=abscissa, ylabel=panel)
         axes.set_ylim(bottom=0)
         axes.grid(alpha=0.3)
         axes.legend(loc="upper right", fontsize="small")

@@ -38,11 +38,13 @@ def read_csv(path: Path, text: Sequence[str] = ()) -> dict[str, np.ndarray]:
 class FrameErrors:
     """Errors of every frame that the camera exposed in a span. Arrays (F,); NaN: no estimate.
 
+    translation_m: 3-D; horizontal_m: its part in the plane, comparable with the EKF's.
     processed: whether the localizer took the frame (or it was dropped for a newer one).
     """
 
     time_ns: np.ndarray
     translation_m: Array
+    horizontal_m: Array
     rotation_deg: Array
     processed: np.ndarray
 
@@ -65,7 +67,7 @@ def frame_errors(
     stamps = np.asarray(estimates.get("exposure_time_ns", np.empty(0, np.int64)))
     accepted = np.asarray(estimates.get("accepted", np.empty(0))) > 0
     n = len(times)
-    translation, rotation = np.full(n, np.nan), np.full(n, np.nan)
+    translation, horizontal, rotation = (np.full(n, np.nan) for _ in range(3))
     processed = np.zeros(n, bool)
     for i, (time_ns, pose) in enumerate(zip(times, true_poses, strict=True)):
         if not len(stamps):
@@ -76,7 +78,8 @@ def frame_errors(
         processed[i] = True
         if accepted[k]:
             translation[i], rotation[i] = pose.distance_to(estimated[k])
-    return FrameErrors(times, translation, rotation, processed)
+            horizontal[i] = np.hypot(*(estimated[k].translation - pose.translation)[:2])
+    return FrameErrors(times, translation, horizontal, rotation, processed)
 
 
 def localization_summary(errors: FrameErrors) -> LocalizationMetrics:

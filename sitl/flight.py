@@ -181,7 +181,7 @@ class _Run:
         return float(np.hypot(north, east))
 
     def _deny(self) -> None:
-        if self._scenario.injection == "vision_position_estimate":
+        if self._scenario.injection != "gps_input":  # that is a second receiver of the same set
             self._pilot.use_source_set(VISION_SOURCE)
         self._pilot.gps(False)
 
@@ -300,6 +300,7 @@ def _write_companion_config(
             "source": f"udp://127.0.0.1:{ports.video}",
             "model": camera.to_dict(),
         },
+        "localizer": {"width": scenario.localizer_width},
         "bridge": {
             "connection": vehicle.companion_endpoint,
             "mode": "inject",

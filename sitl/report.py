@@ -44,6 +44,7 @@ from sitl.analysis import (
     stage_latencies,
     target_errors,
 )
+from sitl.criteria import Criterion, judge, latency_warning
 from sitl.detector import FixedPoint
 from sitl.flight import FlightRecord
 from sitl.scenario import Scenario
@@ -57,14 +58,18 @@ _MAP_PICTURE_PX = 900
 class FlightReport:
     """The flight's figures over the span without GNSS.
 
-    localizer: the paper's columns over processed frames; completeness_sent: per cent of all frames
-    that the camera sent in the span with an accepted estimate. targets: name to 3-D error.
+    localizer: the paper's columns over processed frames, and the spreads of its accepted estimates'
+    errors; completeness_sent: per cent of all frames that the camera sent in the span with an
+    accepted estimate. targets: name to 3-D error. warning: of late estimates.
     """
 
     vehicle: str
     denied_s: float
     flown_m: float
     localizer: LocalizationMetrics
+    localizer_m: Spread
+    localizer_horizontal_m: Spread
+    localizer_deg: Spread
     completeness_sent: float
     frames_sent: int
     frames_dropped: int
@@ -77,6 +82,8 @@ class FlightReport:
     target_fixes: Mapping[str, int]
     stages_ms: Mapping[str, Spread]
     camera_ms: Mapping[str, tuple[float, float]]
+    criteria: tuple[Criterion, ...]
+    warning: str | None
 
 
 def make_report(record: FlightRecord, scenario: Scenario, seed: int) -> FlightReport:
@@ -96,25 +103,33 @@ def make_report(record: FlightRecord, scenario: Scenario, seed: int) -> FlightRe
     longest = max(moving, key=lambda name: len(moving[name]), default="")
     by_target = {n: e for n, e in by_target.items() if n not in moving or n == longest}
     accepted = np.isfinite(errors.translation_m)
+    config = load_config(folder / "companion.yaml")
+    summary = localization_summary(errors)
+    ekf, fixed_targets = Spread.of(horizontal), Spread.of(np.concatenate([*fixed, np.empty(0)]))
+    stages = stage_latencies(estimates, span)
     report = FlightReport(
         vehicle=record.vehicle,
         denied_s=(span[1] - span[0]) * 1e-9,
         flown_m=_flown(vehicle, span),
-        localizer=localization_summary(errors),
+        localizer=summary,
+        localizer_m=Spread.of(errors.translation_m),
+        localizer_horizontal_m=Spread.of(errors.horizontal_m),
+        localizer_deg=Spread.of(errors.rotation_deg),
         completeness_sent=100.0 * float(accepted.mean()) if len(accepted) else 0.0,
         frames_sent=len(accepted),
         frames_dropped=int((~errors.processed).sum()),
-        ekf_horizontal_m=Spread.of(horizontal),
+        ekf_horizontal_m=ekf,
         ekf_vertical_m=Spread.of(vertical),
         home_error_m=record.home_error_m,
-        fixed_targets_m=Spread.of(np.concatenate([*fixed, np.empty(0)])),
+        fixed_targets_m=fixed_targets,
         moving_targets_m=Spread.of(np.concatenate([*moving.values(), np.empty(0)])),
         targets_m={name: Spread.of(e) for name, e in by_target.items()},
         target_fixes={name: len(e) for name, e in by_target.items()},
-        stages_ms=stage_latencies(estimates, span),
+        stages_ms=stages,
         camera_ms=record.camera.stage_ms,
+        criteria=judge(summary, ekf, fixed_targets),
+        warning=latency_warning(stages["latency"], config.bridge.injection.delay_ms),
     )
-    config = load_config(folder / "companion.yaml")
     _write_json(folder, report, record, scenario, seed, config)
     _write_frames(folder / "frames_report.csv", errors)
     _plot(folder, record, truth, estimates, vehicle, errors, (ekf_times, horizontal), config)
@@ -144,7 +159,7 @@ def _write_json(
     config: CompanionConfig,
 ) -> None:
     document = {
-        "report": asdict(report),
+        "report": asdict(report) | {"passed": all(c.ok for c in report.criteria)},
         "versions": versions(),
         "seed": seed,
         "features": load_extractor(config.localizer.model).name,
@@ -159,12 +174,12 @@ def _write_frames(path: Path, errors: FrameErrors) -> None:
     with path.open("w", newline="", encoding="utf-8") as file:
         writer = csv.writer(file)
         writer.writerow(
-            ("exposure_time_ns", "processed", "translation_error_m", "rotation_error_deg")
-        )
-        for row in zip(
-            errors.time_ns, errors.processed, errors.translation_m, errors.rotation_deg, strict=True
-        ):
-            writer.writerow((int(row[0]), int(row[1]), f"{row[2]:.4f}", f"{row[3]:.4f}"))
+            ("exposure_time_ns", "processed", "translation_error_m", "horizontal_error_m",
+             "rotation_error_deg")
+        )  # fmt: skip
+        values = (errors.translation_m, errors.horizontal_m, errors.rotation_deg)
+        for time_ns, processed, *row in zip(errors.time_ns, errors.processed, *values, strict=True):
+            writer.writerow((int(time_ns), int(processed), *(f"{x:.4f}" for x in row)))
 
 
 def _plot(
@@ -181,9 +196,10 @@ def _plot(
     all_errors = frame_errors(truth, estimates, (0, 2**62))
     exposed_s = _seconds(all_errors.time_ns, start)
     series = [
-        ErrorSeries("localizer", exposed_s, all_errors.translation_m, "m"),
-        ErrorSeries("EKF, horizontal", _seconds(ekf[0], start), ekf[1], "m"),
-        ErrorSeries("localizer", exposed_s, all_errors.rotation_deg, "degrees"),
+        ErrorSeries("localizer", exposed_s, all_errors.translation_m, "3-D position error, m"),
+        ErrorSeries("localizer", exposed_s, all_errors.horizontal_m, "horizontal error, m"),
+        ErrorSeries("autopilot's EKF", _seconds(ekf[0], start), ekf[1], "horizontal error, m"),
+        ErrorSeries("localizer", exposed_s, all_errors.rotation_deg, "rotation error, °"),
     ]
     end = (record.denied_ns[1] - start) * 1e-9
     plot_errors(folder / "errors.png", series, [(0.0, end, "GNSS denied")])
@@ -259,11 +275,12 @@ def print_report(report: FlightReport, folder: Path) -> None:
     table.add_column("")
     for column in ("median", "p95", "max", ""):
         table.add_column(column, justify="right")
-    table.add_row("localizer position, m", f"{m.median_translation_m:.2f}", "", "",
-                  f"R@1/3/5 {m.recall_1:.1f}/{m.recall_3:.1f}/{m.recall_5:.1f} %")  # fmt: skip
-    table.add_row("localizer rotation, °", f"{m.median_rotation_deg:.3f}", "", "",
-                  f"completeness {m.completeness:.1f} % ({report.completeness_sent:.1f} % of sent)",
-                  )  # fmt: skip
+    _add(table, "localizer 3-D, m", report.localizer_m,
+         f"R@1/3/5 {m.recall_1:.1f}/{m.recall_3:.1f}/{m.recall_5:.1f} %")  # fmt: skip
+    _add(table, "localizer horizontal, m", report.localizer_horizontal_m, "")
+    _add(table, "localizer rotation, °", report.localizer_deg,
+         f"completeness {m.completeness:.1f} % ({report.completeness_sent:.1f} % of sent)",
+         )  # fmt: skip
     _add(table, "EKF horizontal, m", report.ekf_horizontal_m, f"home {report.home_error_m:.1f} m")
     _add(table, "EKF vertical, m", report.ekf_vertical_m, "")
     _add(table, "fixed targets, m", report.fixed_targets_m, "3-D")
@@ -281,7 +298,22 @@ def print_report(report: FlightReport, folder: Path) -> None:
     for name, (p50, p95) in report.camera_ms.items():
         stages.add_row(f"world camera: {name}", f"{p50:.0f}", f"{p95:.0f}")
     console.print(stages)
+    console.print(_verdict(report))
+    if report.warning is not None:
+        console.print(f"[yellow]warning:[/] {report.warning}", highlight=False)
     console.print(f"report: [green]{folder}[/]/report.json, tracks.png, errors.png, overlay-*.png")
+
+
+def _verdict(report: FlightReport) -> Table:
+    passed = all(c.ok for c in report.criteria)
+    table = Table(title="[green]targets reached" if passed else "[red]targets missed")
+    for column in ("target", "found", "needed", ""):
+        table.add_column(column, justify="left" if column in ("target", "") else "right")
+    for c in report.criteria:
+        needed = f"{'>=' if c.at_least else '<='} {c.limit:g} {c.unit}"
+        mark = "[green]ok" if c.ok else "[red]missed"
+        table.add_row(c.name, f"{c.value:.2f} {c.unit}", needed, mark)
+    return table
 
 
 def _add(table: Table, name: str, spread: Spread, note: str) -> None:

@@ -12,7 +12,7 @@ from localizer.camera import Camera
 from sitl.errors import SimulationError
 
 VehicleKind = Literal["auto", "ardupilot", "embedded"]
-Injection = Literal["vision_position_estimate", "gps_input"]
+Injection = Literal["vision_position_estimate", "odometry", "gps_input"]
 
 
 class ScenarioError(SimulationError):
@@ -72,6 +72,7 @@ class Scenario(_Model):
     condition: Literal["day", "dusk", "night", "fog", "rain", "snow"] = "day"
     cars: int = Field(30, ge=1)
     people: int = Field(40, ge=0)
+    localizer_width: int = Field(320, ge=64, le=2048, description="the localizer's working width")
     injection: Injection = "vision_position_estimate"
     injection_delay_ms: float = Field(220.0, ge=0, le=250, description="VISO_DELAY_MS")
 

@@ -1,4 +1,4 @@
-"""Fixtures for every test: the real data sets and the autopilot binary, or a printed skip."""
+"""Fixtures for every test: a world, the real data sets and the autopilot, or a printed skip."""
 
 from __future__ import annotations
 
@@ -8,6 +8,8 @@ from collections.abc import Callable
 from pathlib import Path
 
 import pytest
+
+from sitl.assets import FlightAssets, prepare
 
 ROOT = Path(__file__).resolve().parent.parent
 
@@ -23,6 +25,12 @@ def real_data() -> Callable[[str], Path]:
         return base / name
 
     return folder
+
+
+@pytest.fixture(scope="session")
+def small_assets(tmp_path_factory: pytest.TempPathFactory) -> FlightAssets:
+    """A 400 m world with both caches: half a minute of generating, so all tests share it."""
+    return prepare(5, tmp_path_factory.mktemp("worlds"), size_m=400.0)
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:

@@ -11,15 +11,14 @@ import yaml
 from typer.testing import CliRunner
 
 from companion.cli import app
-from sitl.assets import prepare
 
 MODEL = {"width": 640, "height": 480, "fx": 550, "fy": 550, "cx": 320, "cy": 240}
 START_S = 120  # of a process, on a machine that compiles everything anew
 
 
-@pytest.fixture(scope="module")
-def map_cache(tmp_path_factory):
-    return prepare(5, tmp_path_factory.mktemp("worlds"), size_m=400.0).map_cache
+@pytest.fixture
+def map_cache(small_assets):
+    return small_assets.map_cache
 
 
 def _start(tmp_path, **changes):

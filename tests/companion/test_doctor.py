@@ -6,15 +6,14 @@ import pytest
 
 from companion.config import parse_config
 from companion.doctor import examine_deployment
-from sitl.assets import prepare
 
 SIZE = (160, 120)
 MODEL = {"width": 160, "height": 120, "fx": 140, "fy": 140, "cx": 80, "cy": 60}
 
 
-@pytest.fixture(scope="module")
-def map_cache(tmp_path_factory):
-    return prepare(5, tmp_path_factory.mktemp("worlds"), size_m=400.0).map_cache
+@pytest.fixture
+def map_cache(small_assets):
+    return small_assets.map_cache
 
 
 @pytest.fixture

@@ -12,7 +12,6 @@ from typer.testing import CliRunner
 from companion.cli import app
 from companion.errors import ReportError
 from localizer.errors import CameraError, OutsideMapError, SequenceError
-from sitl.assets import prepare
 from sitl.kinematic import record_scenario
 from sitl.scenario import CameraSpec, Leg, Scenario
 
@@ -20,15 +19,14 @@ FRAMES = 25
 
 
 @pytest.fixture(scope="module")
-def recorded(tmp_path_factory):
-    assets = prepare(5, tmp_path_factory.mktemp("worlds"), size_m=400.0)
+def recorded(small_assets, tmp_path_factory):
     leg = Leg(east_m=0, north_m=26, height_m=80, gimbal_pitch_deg=-85)
     scenario = Scenario(
         takeoff_height_m=80, legs=(leg,), cars=2, people=2, camera=CameraSpec(rate_hz=5)
     )
     out = tmp_path_factory.mktemp("sequence")
-    assert record_scenario(assets, scenario, 5, out) >= FRAMES
-    return assets, out
+    assert record_scenario(small_assets, scenario, 5, out) >= FRAMES
+    return small_assets, out
 
 
 def _run(*arguments):

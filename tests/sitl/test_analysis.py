@@ -24,19 +24,20 @@ def _columns(poses, times, **more):
     }
 
 
-def _pose(x, angle=0.0):
-    return Pose(so3_exp([0, 0, angle]), np.array([x, 0.0, 0.0]))
+def _pose(x, angle=0.0, up=0.0):
+    return Pose(so3_exp([0, 0, angle]), np.array([x, 0.0, up]))
 
 
 def test_frames_are_matched_by_time_and_measured():
     truth = _columns([_pose(0.0), _pose(1.0), _pose(2.0), _pose(3.0)], [0, 10**8, 2 * 10**8, 3e8])
     estimates = _columns(
-        [_pose(0.5), _pose(2.0, 0.1), _pose(9.0)], [0, 2 * 10**8, 3 * 10**8],
+        [_pose(0.3, up=0.4), _pose(2.0, 0.1), _pose(9.0)], [0, 2 * 10**8, 3 * 10**8],
         accepted=np.array([1, 1, 0]),
     )  # fmt: skip
     errors = frame_errors(truth, estimates, (0, 10**9))
     np.testing.assert_array_equal(errors.processed, [True, False, True, True])
     np.testing.assert_allclose(errors.translation_m, [0.5, np.nan, 0.0, np.nan], atol=1e-9)
+    np.testing.assert_allclose(errors.horizontal_m, [0.3, np.nan, 0.0, np.nan], atol=1e-9)
     assert errors.rotation_deg[2] == pytest.approx(np.degrees(0.1))
     summary = localization_summary(errors)
     assert summary.frames == 3

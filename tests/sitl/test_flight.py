@@ -4,34 +4,30 @@ import json
 
 import pytest
 
-from sitl.assets import prepare
 from sitl.flight import fly
 from sitl.report import make_report, print_report
 from sitl.scenario import CameraSpec, Leg, Scenario
 
+# Real time, so light: it must hold on two cores that other work shares.
 SCENARIO = Scenario(
-    takeoff_height_m=100,
-    deny_after_s=5,
+    takeoff_height_m=80,
+    deny_after_s=3,
     legs=(
-        Leg(east_m=0, north_m=70, height_m=100, gimbal_pitch_deg=-80),
-        Leg(east_m=60, north_m=40, height_m=105, gimbal_pitch_deg=-70),
-        Leg(east_m=0, north_m=0, height_m=100, gimbal_pitch_deg=-85),
+        Leg(east_m=0, north_m=60, height_m=80, gimbal_pitch_deg=-80),
+        Leg(east_m=50, north_m=30, height_m=85, gimbal_pitch_deg=-70),
+        Leg(east_m=0, north_m=0, height_m=80, gimbal_pitch_deg=-85),
     ),
-    cars=6,
-    people=5,
-    camera=CameraSpec(rate_hz=8),
+    cars=3,
+    people=3,
+    camera=CameraSpec(width=320, height=240, rate_hz=8),
+    localizer_width=192,
 )
 
 
-@pytest.fixture(scope="module")
-def assets(tmp_path_factory):
-    return prepare(3, tmp_path_factory.mktemp("worlds"), size_m=800.0)
-
-
 @pytest.mark.parametrize("kind", ["embedded", pytest.param("ardupilot", marks=pytest.mark.sitl)])
-def test_a_short_flight_without_gnss_comes_home(assets, tmp_path, kind):
+def test_a_short_flight_without_gnss_comes_home(small_assets, tmp_path, kind):
     folder = tmp_path / "report"
-    record = fly(assets, SCENARIO, kind, 3, folder)
+    record = fly(small_assets, SCENARIO, kind, 3, folder)
     report = make_report(record, SCENARIO, 3)
     print_report(report, folder)
     assert report.vehicle == kind
