@@ -20,6 +20,7 @@ from companion.health import HealthMonitor
 from companion.recorder import Recorder, fresh_folder
 from companion.sources import StreamState, open_source
 from companion.target_reporter import Target, TargetReporter
+from companion.view_reporter import ViewReporter
 from localizer.engine import DualThreadEngine
 from localizer.pose import Array
 from localizer.targets import SurfacePoint, cast_ray
@@ -29,6 +30,7 @@ from mavlink_bridge.config import BridgeConfig
 from mavlink_bridge.messages import TargetReport, TrackRequest
 
 _log = logging.getLogger(__name__)
+_WARNING = 4  # MAV_SEVERITY_WARNING; lower is worse
 
 
 class Companion:
@@ -81,7 +83,10 @@ class Companion:
             up.callback(self._recorder.close)
         self._newest: PoseEstimate | None = None
         self._bridge = Bridge(
-            _bridge_config(config), manifest.geoid_separation_m, on_track=self._on_track
+            _bridge_config(config),
+            manifest.geoid_separation_m,
+            on_track=self._on_track,
+            on_text=self._on_text,
         )
         up.callback(self._bridge.stop)
         # Before the localizer, whose compilation takes its time: a wrong source is told at once.
@@ -91,6 +96,9 @@ class Companion:
         localizer = build_localizer(self._stack, self._camera, config.localizer, self._rotation_at)
         self._engine = DualThreadEngine(localizer, (self._on_estimate,), self._vehicle_prior)
         self._targets = TargetReporter(config.targets, self._cast_ray, self._on_target)
+        self._view = ViewReporter(
+            config.bridge.targets.rate_hz, self._frame, self._cast_ray, self._bridge.look
+        )
         self._health = HealthMonitor(
             self._engine, self._bridge, lambda: self._source.state, self._event, record
         )
@@ -105,6 +113,9 @@ class Companion:
         up.callback(self._health.stop)
         self._targets.start()
         up.callback(self._targets.stop)
+        if self._config.bridge.camera.announce:
+            self._view.start()
+            up.callback(self._view.stop)
         if self._config.targets.detections is not None:
             listener = DetectionListener(
                 self._config.targets.detections, self._targets.add_detection
@@ -156,6 +167,7 @@ class Companion:
         if self._recorder is not None:
             self._recorder.estimate(estimate)
         self._targets.add_estimate(estimate)
+        self._view.add_estimate(estimate)
         if estimate.accepted:
             self._newest = estimate
         self._health.add_estimate(estimate)
@@ -216,6 +228,11 @@ class Companion:
     def _target_number(self, name: str) -> int:
         """A small stable number for a target's name, as MAVLink wants it."""
         return self._target_numbers.setdefault(name, len(self._target_numbers))
+
+    def _on_text(self, severity: int, text: str) -> None:
+        """What the operator was told belongs in the record; the bridge has logged it."""
+        if self._recorder is not None:
+            self._recorder.event("warning" if severity <= _WARNING else "info", text)
 
     def _event(self, level: str, text: str) -> None:
         _log.log(logging.WARNING if level == "warning" else logging.INFO, "%s", text)

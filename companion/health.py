@@ -21,6 +21,7 @@ from mavlink_bridge.messages import HealthLevel
 _PERIOD_S = 1.0
 _WINDOW = 200
 _STALE_S = 2.0
+_SILENT_VEHICLE = "no heartbeat from the flight controller"
 
 _OF_FEED = {
     StreamState.FAILED: (HealthLevel.FAILED, "video feed failed"),
@@ -52,7 +53,6 @@ class HealthMonitor:
         self._event = event
         self._file = record.folder / "health.json" if record else None
         self._estimates: deque[tuple[float, PoseEstimate]] = deque(maxlen=_WINDOW)
-        self._last_text = ""
         self._write_failed = False
         self._stop = threading.Event()
         self._thread = threading.Thread(target=self._run, name="health")
@@ -74,10 +74,8 @@ class HealthMonitor:
         while True:
             stopping = self._stop.wait(_PERIOD_S)
             level, text = self._assess()
-            self._bridge.set_health(level, text)
-            if text != self._last_text:
-                self._last_text = text
-                self._event("info" if level is HealthLevel.OK else "warning", text)
+            # The bridge logs and records what it tells; a silent vehicle it tells by itself.
+            self._bridge.set_health(level, text, tell=text != _SILENT_VEHICLE)
             self._write(level, text)
             if stopping:
                 return
@@ -87,9 +85,8 @@ class HealthMonitor:
         feed = self._feed_state()
         if feed in _OF_FEED:
             return _OF_FEED[feed]
-        # Told in health.json and the record only: the vehicle cannot hear it.
         if not self._bridge.state().connected:
-            return HealthLevel.DEGRADED, "no heartbeat from the flight controller"
+            return HealthLevel.DEGRADED, _SILENT_VEHICLE
         error = self._engine.health.last_error
         if not self._estimates:
             return HealthLevel.STARTING, error or "waiting for video and a pose prior"

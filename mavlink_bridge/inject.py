@@ -199,7 +199,7 @@ class Injector:
         while self._waiting and self._waiting[0].time_ns + self._delay_ns <= now_ns:
             fix = self._waiting.popleft()
             attitude = context.attitude_at(fix.time_ns)
-            verdict = self.guard.check(fix.time_ns, fix.yaw_rad, attitude)
+            verdict = self.guard.check(fix.time_ns, fix.yaw_rad, attitude, reset=fix.reset)
             if math.isfinite(verdict.difference_rad):
                 self.yaw_difference_rad = verdict.difference_rad
             self._keep_reset(fix)

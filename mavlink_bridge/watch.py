@@ -2,15 +2,20 @@
 
 from __future__ import annotations
 
-import logging
 import threading
 from collections.abc import Callable
 
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
+from mavlink_bridge.clock import monotonic_ns
 from mavlink_bridge.messages import VehicleState
 
-log = logging.getLogger(__name__)
+_PATIENCE_NS = 5_000_000_000
+_TEXTS = {
+    "there": (mavlink.MAV_SEVERITY_INFO, "flight controller found"),
+    "lost": (mavlink.MAV_SEVERITY_WARNING, "flight controller lost: no heartbeat for 3 s"),
+    "silent": (mavlink.MAV_SEVERITY_WARNING, "no heartbeat from the flight controller"),
+}
 
 
 class VehicleWatch:
@@ -22,21 +27,22 @@ class VehicleWatch:
     def __init__(self, say: Callable[[int, str], None]) -> None:
         self._say = say
         self._lock = threading.Lock()
-        self._connected: bool | None = None
+        self._begun_ns = monotonic_ns()
+        self._known = "nothing"
 
     def check(self, state: VehicleState) -> None:
         """Tell what changed since the last call."""
         with self._lock:
-            before, now = self._connected, state.connected
-            if now == before or (before is None and not now):
+            before = self._known
+            if state.connected:
+                self._known = "there"
+            elif before == "there":
+                self._known = "lost"
+            elif before == "nothing" and monotonic_ns() - self._begun_ns > _PATIENCE_NS:
+                self._known = "silent"
+            if self._known == before:
                 return
-            self._connected = now
-        if before is None:
-            log.info("flight controller found: system %s", state.system_id)
-        elif now:
-            self._say(mavlink.MAV_SEVERITY_INFO, "PiLoT: flight controller is back")
-        else:
-            self._say(
-                mavlink.MAV_SEVERITY_WARNING,
-                "PiLoT: flight controller lost: no heartbeat for 3 s",
-            )
+        severity, text = _TEXTS[self._known]
+        if before == "lost":
+            text = "flight controller is back"
+        self._say(severity, f"PiLoT: {text}")

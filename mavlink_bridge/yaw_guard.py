@@ -3,9 +3,11 @@
 Measured: a vision frame rotated by 5 deg costs 25 m with no warning, and a 30 deg wrong yaw is
 accepted with EK3_SRC1_YAW = 6. Measured as well: the EKF's own yaw steps by up to 8 deg when it is
 aligned again after take-off, and wanders by 6 deg in hover on ODOMETRY, while vision is right;
-withholding vision then ended in LAND. So a fix passes when its yaw agrees with the autopilot's, or
-when it turned since the fixes before as the gyros did: the autopilot's yaw may drift and step, a
-vision frame that turns does so against the gyros.
+withholding vision then ended in LAND. So the first fixes pass when their yaw agrees with the
+autopilot's, and later ones when they turned since the fixes before as the gyros did: the
+autopilot's yaw may drift and step, a vision frame that turns does so against the gyros. Agreement
+with the autopilot does not excuse that: a frame that turned by 5 deg came to lie within 3 deg of an
+EKF yaw that was off by 2 deg.
 """
 
 from __future__ import annotations
@@ -42,7 +44,8 @@ class YawGuard:
 
     def __init__(self, config: YawGuardConfig) -> None:
         self._config = config
-        self._accepted: deque[tuple[int, float]] = deque(maxlen=256)
+        # (time, vision minus gyro heading, vision minus autopilot)
+        self._accepted: deque[tuple[int, float, float]] = deque(maxlen=256)
         self._in_a_row = 0
         self.blocked = False
         self.unchecked = 0
@@ -59,8 +62,18 @@ class YawGuard:
         self._in_a_row = 0
         self.blocked = False
 
-    def check(self, time_ns: int, vision_yaw_rad: float, autopilot: Attitude | None) -> YawVerdict:
-        """Judge one fix; without a yaw on either side it follows the standing verdict."""
+    def check(
+        self,
+        time_ns: int,
+        vision_yaw_rad: float,
+        autopilot: Attitude | None,
+        *,
+        reset: bool = False,
+    ) -> YawVerdict:
+        """Judge one fix; without a yaw on either side it follows the standing verdict.
+
+        reset: the localizer itself says that its estimate jumps with this fix.
+        """
         if not self._config.enabled:
             return YawVerdict(True, math.nan)
         if autopilot is None or not math.isfinite(vision_yaw_rad):
@@ -70,7 +83,7 @@ class YawGuard:
         self._unchecked_in_a_row = 0
         difference = wrap_pi(vision_yaw_rad - autopilot.yaw_rad)
         to_gyros = wrap_pi(vision_yaw_rad - autopilot.gyro_heading_rad)
-        good = self._agrees(time_ns, difference, to_gyros)
+        good = self._agrees(time_ns, difference, to_gyros, reset)
         if good != self.blocked:
             self._in_a_row = 0
         else:
@@ -78,21 +91,26 @@ class YawGuard:
             if self._in_a_row >= self._config.minimum_samples:
                 self.blocked, self._in_a_row = not self.blocked, 0
         accept = good and not self.blocked
+        if good and reset:
+            self._accepted.clear()  # what follows is held against this fix, not against the past
         if accept:
-            self._accepted.append((time_ns, to_gyros))
+            self._accepted.append((time_ns, to_gyros, difference))
         return YawVerdict(accept, difference)
 
-    def _agrees(self, time_ns: int, difference: float, to_gyros: float) -> bool:
+    def _agrees(self, time_ns: int, difference: float, to_gyros: float, reset: bool) -> bool:
         limit = math.radians(self._config.limit_deg) * (_RELEASE_SHARE if self.blocked else 1.0)
         gross = math.radians(self._config.gross_deg)
-        if abs(difference) <= limit:
-            return True
+        near = abs(difference) <= limit
         if abs(difference) > gross or not self._accepted:
-            return False
+            return near
         newest_ns = self._accepted[-1][0]
         gap_s = (time_ns - newest_ns) * 1e-9
         if gap_s > self._config.memory_s:
-            return False
-        recent = [wrap_pi(d - to_gyros) for t, d in self._accepted if newest_ns - t <= _BASELINE_NS]
-        change = abs(statistics.median(recent))
-        return change <= min(limit + _DRIFT_RAD_PER_S * gap_s, gross)
+            return near
+        recent = [entry for entry in self._accepted if newest_ns - entry[0] <= _BASELINE_NS]
+        turned = abs(statistics.median(wrap_pi(to_gyros - entry[1]) for entry in recent))
+        if turned <= min(limit + _DRIFT_RAD_PER_S * gap_s, gross):
+            return True
+        # The gyro heading suffers where ATTITUDE was lost in a turn; the autopilot's yaw does not.
+        against = abs(statistics.median(wrap_pi(difference - entry[2]) for entry in recent))
+        return near and (reset or against <= limit)
