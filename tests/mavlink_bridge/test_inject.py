@@ -245,6 +245,28 @@ def test_frame_that_rotates_in_flight_is_refused_at_once_and_released_when_right
     assert it.counters["fixes_yaw_refused"] == 34  # 30 rotated, 4 on probation
 
 
+def test_frame_that_turns_towards_a_wrong_yaw_of_the_autopilot_is_refused() -> None:
+    it = injector(rate_hz=10, delay_ms=0)
+    where = context(yaw_error_deg=lambda _: 2.5)
+    change = turned_by(lambda t: 5.0 if t >= 3.0 else 0.0)
+    sent = fly(it, seconds=6, fix_hz=10, latency_ms=0, where=where, change=change)
+    assert max(i.estimate.position.time_ns for _, i in sent if i.estimate.fresh) < 3 * SECOND
+    assert it.counters["fixes_yaw_refused"] == 40
+
+
+def test_announced_turn_towards_the_autopilots_yaw_is_taken() -> None:
+    it = injector(rate_hz=10, delay_ms=0)
+
+    def relocalized(f: VisionFix) -> VisionFix:
+        jumps = f.time_ns == 3 * SECOND
+        yaw = math.radians(3.0 if f.time_ns < 3 * SECOND else -1.0)
+        return fix(f.time_ns, yaw_rad=yaw, reset=jumps)
+
+    sent = fly(it, seconds=6, fix_hz=10, latency_ms=0, change=relocalized)
+    assert max(i.estimate.position.time_ns for _, i in sent) > 5.5 * SECOND
+    assert it.counters["fixes_yaw_refused"] == 0
+
+
 @pytest.mark.parametrize(
     "error",
     [
