@@ -1,0 +1,161 @@
+"""A flight controller that goes silent is told in seconds, whatever its link is doing."""
+
+from __future__ import annotations
+
+import socket
+import time
+from dataclasses import replace
+from typing import Any
+
+import pytest
+from pymavlink.dialects.v20 import ardupilotmega as mavlink
+
+from mavlink_bridge import Bridge, BridgeConfig, HealthLevel, VehicleState
+from mavlink_bridge.link import Link, sleep_until
+from mavlink_bridge.transport import Endpoint
+from mavlink_bridge.watch import VehicleWatch
+
+HEARTBEAT = mavlink.MAVLink_heartbeat_message(2, 3, 81, 4, 4, 3)
+
+
+class Ticks:
+    """Handler that counts its ticks and sends something with each."""
+
+    def __init__(self) -> None:
+        self.times: list[float] = []
+        self.sent: list[bool] = []
+
+    def on_open(self, link: Link) -> None: ...
+
+    def on_message(self, link: Link, message: Any, time_ns: int) -> None: ...
+
+    def on_tick(self, link: Link, now_ns: int) -> int:
+        self.times.append(now_ns * 1e-9)
+        self.sent.append(link.send(HEARTBEAT, 191))
+        return now_ns + 100_000_000
+
+
+def test_the_handlers_clock_goes_on_while_the_transport_is_closed() -> None:
+    def refuse(_: Endpoint) -> Any:
+        raise ConnectionRefusedError("nobody there")
+
+    ticks = Ticks()
+    link = Link(Endpoint.parse("tcp:127.0.0.1:9"), ticks, opener=refuse)
+    link.system_id = 1
+    link.start()
+    time.sleep(2.5)  # by then the back-off is at its seconds
+    for _ in range(700):
+        link.send(HEARTBEAT, 191)
+    assert sleep_until(lambda: not link._outbox, 1.0)
+    link.stop()
+    gaps = [b - a for a, b in zip(ticks.times, ticks.times[1:], strict=False)]
+    assert len(gaps) > 8
+    assert max(gaps) < 0.5
+    assert not any(ticks.sent)
+    assert link.counters.tx_dropped >= 700
+
+
+def test_an_unforeseen_error_costs_the_connection_and_not_the_link() -> None:
+    class Broken:
+        stream = True
+
+        def __init__(self) -> None:
+            self.socket, self.other = socket.socketpair()
+            self.other.send(b"x")
+
+        def fileno(self) -> int:
+            return self.socket.fileno()
+
+        def read(self) -> bytes:
+            raise RuntimeError("a driver's bug")
+
+        def write(self, data: bytes) -> int:
+            return len(data)
+
+        def close(self) -> None:
+            self.socket.close()
+            self.other.close()
+
+    link = Link(Endpoint.parse("tcp:127.0.0.1:9"), Ticks(), opener=lambda _: Broken())
+    link.start()
+    assert sleep_until(lambda: link.counters.failures >= 3, 5.0)
+    link.stop()
+
+
+@pytest.mark.parametrize("reconnecting", [False, True])
+def test_loss_is_told_on_the_ground_link_within_seconds(reconnecting: bool) -> None:
+    """reconnecting: the connection attempt itself hangs, as one to a host that is gone does."""
+    with (
+        socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as station,
+        socket.create_server(("127.0.0.1", 0)) as server,
+    ):
+        station.bind(("127.0.0.1", 0))
+        config = BridgeConfig(
+            connection=f"tcp:127.0.0.1:{server.getsockname()[1]}",
+            ground_connection=f"udpout:127.0.0.1:{station.getsockname()[1]}",
+        )
+        codec, texts = mavlink.MAVLink(None, 255, 190), []
+        with Bridge(config, 0.0) as bridge:
+            client, _ = server.accept()
+            assert sleep_until(lambda: bridge._fc_link.connected, 2.0)
+            if reconnecting:
+                bridge._fc_link._open = lambda _: time.sleep(4.0)  # type: ignore[assignment, return-value]
+            client.sendall(HEARTBEAT.pack(mavlink.MAVLink(None, 1, 1)))
+            assert sleep_until(lambda: bridge.state().connected, 2.0)
+            lost_at = time.monotonic()
+            client.close()
+            server.close()
+            station.settimeout(5.0)
+            while not any("lost" in text for text in texts):
+                for m in codec.parse_buffer(station.recv(65536)) or []:
+                    texts += [m.text] if m.get_type() == "STATUSTEXT" else []
+            assert 2.5 < time.monotonic() - lost_at < 3.8
+            time.sleep(0.5)
+            told = [text for text in bridge.texts() if "lost" in text]
+            assert told == ["PiLoT: flight controller lost: no heartbeat for 3 s"]
+
+
+def test_each_change_is_told_once() -> None:
+    told: list[str] = []
+    watch = VehicleWatch(lambda _, text: told.append(text))
+    state = VehicleState()
+    for connected in (False, True, True, False, False, True, False):
+        watch.check(replace(state, connected=connected))
+    assert [text.removeprefix("PiLoT: flight controller ") for text in told] == [
+        "found",
+        "lost: no heartbeat for 3 s",
+        "is back",
+        "lost: no heartbeat for 3 s",
+    ]
+
+
+def test_a_vehicle_that_never_speaks_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("mavlink_bridge.watch._PATIENCE_NS", 0)
+    told: list[str] = []
+    watch = VehicleWatch(lambda _, text: told.append(text))
+    for connected in (False, False, True):
+        watch.check(VehicleState(connected=connected))
+    assert told == [
+        "PiLoT: no heartbeat from the flight controller",
+        "PiLoT: flight controller found",
+    ]
+
+
+def test_what_the_operator_reads_is_logged_and_recorded_once(
+    autopilot: Any, caplog: pytest.LogCaptureFixture
+) -> None:
+    recorded: list[tuple[int, str]] = []
+
+    def record(severity: int, text: str) -> None:
+        recorded.append((severity, text))
+
+    config = BridgeConfig(connection=f"udpout:127.0.0.1:{autopilot.port}")
+    bridge = Bridge(config, 0.0, on_text=record)
+    with caplog.at_level("INFO"):
+        for _ in range(3):
+            bridge.set_health(HealthLevel.DEGRADED, "localization degraded")
+        bridge.set_health(HealthLevel.DEGRADED, "no heartbeat", tell=False)
+    bridge.stop()
+    lines = [r.getMessage() for r in caplog.records if "localization" in r.getMessage()]
+    assert lines == ["PiLoT: localization degraded"]
+    assert recorded == [(mavlink.MAV_SEVERITY_WARNING, "PiLoT: localization degraded")]
