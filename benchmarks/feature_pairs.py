@@ -24,7 +24,7 @@ from localizer.pose import Pose, so3_exp
 from localizer.render.numba_raster import NumbaRenderer
 from localizer.synth.appearance import CONDITIONS, apply_appearance, sample_appearance
 from localizer.training.data import tamed
-from localizer.training.pairs import Pair, SceneConfig
+from localizer.training.pairs import COMBINED, OUTDATED, SEASON, Pair, SceneConfig
 from localizer.training.revisit import coarser, draw_texel, hard_surfaces, regrown
 from localizer.training.shards import PhotoSource, read_shard, shard_path, write_shards
 from localizer.training.worlds import world_pairs
@@ -32,6 +32,7 @@ from localizer.types import Float32, Image, RenderedView
 
 METRES, DEGREES = 5.0, 5.0  # distance of the reference view from the query's true pose
 UNSEEN_GROUPS = ("boruszyn", "garfield_autumn", "neon_sjer_pairs")
+MADE_CONDITIONS = (*CONDITIONS, SEASON, OUTDATED, COMBINED)
 _FIRST_SEED = {"test": 5_000_000, "validation": 4_000_000}
 _SIZE = (320, 240)
 
@@ -40,15 +41,13 @@ _SIZE = (320, 240)
 class TestPair:
     """A rendered reference view, the query image of the same size, and the query's true pose.
 
-    place: pairs of one place are not independent; season: vegetation of another time of the year.
+    place: pairs of one place are not independent.
     """
 
     view: RenderedView
     query: Image
     truth: Pose
     condition: str
-    outdated: bool = False
-    season: bool = False
     place: int = 0
 
 
@@ -73,13 +72,14 @@ class MadePlaces:
     def scenes(self) -> SceneConfig:
         """Size and variety: each place is seen once under every condition."""
         return SceneConfig(
+            cells=768,
             width=_SIZE[0],
             height=_SIZE[1],
             photo_share=0.4,
-            references=len(CONDITIONS),
+            references=len(MADE_CONDITIONS),
             queries_per_light=1,
             cell_m=(0.25, 0.55),
-            conditions=CONDITIONS,
+            conditions=MADE_CONDITIONS,
             motion=(METRES, DEGREES),
             shared_detail=self.shared_detail,
         )
@@ -88,7 +88,7 @@ class MadePlaces:
 def made_pairs(count: int, which: MadePlaces, cache: Path, workers: int = 2) -> list[TestPair]:
     """Pairs of unseen generated places, conditions in equal shares; written to `cache` once."""
     first = _FIRST_SEED[which.split] + 10_000 * which.seed
-    places = range(first, first - (-count // len(CONDITIONS)))
+    places = range(first, first + round(1.1 * count / len(MADE_CONDITIONS)) + 1)
     folder = cache / which.name
     photos = which.textures and PhotoSource(which.textures, UNSEEN_GROUPS, held_out=True)
     for _ in write_shards(folder, places, which.scenes, photos, workers):
@@ -142,9 +142,9 @@ def _degraded(pair: Pair, rng: np.random.Generator, place: int) -> TestPair:
     view = RenderedView(
         pair.reference, pair.reference_depth, pair.world_from_reference, pair.camera
     )
-    return TestPair(
-        view, query, pair.world_from_query, pair.condition, pair.outdated, pair.season, place
-    )
+    kinds = {(True, False): OUTDATED, (False, True): SEASON, (True, True): COMBINED}
+    condition = kinds.get((pair.outdated, pair.season), pair.condition)
+    return TestPair(view, query, pair.world_from_query, condition, place)
 
 
 def _photo_pairs(

@@ -23,8 +23,6 @@ class Outcome:
     pair: int
     place: int
     condition: str
-    outdated: bool
-    season: bool
     metres: float
     degrees: float
     seconds: float
@@ -54,8 +52,6 @@ def read_outcomes(paths: Sequence[Path]) -> list[Outcome]:
                     int(row["pair"]),
                     int(row["place"]),
                     row["condition"],
-                    row["outdated"] == "True",
-                    row["season"] == "True",
                     float(row["metres"]),
                     float(row["degrees"]),
                     float(row["seconds"]),
@@ -92,15 +88,13 @@ def difference(a: Sequence[Outcome], b: Sequence[Outcome]) -> tuple[float, float
 
 
 def groups(outcomes: Sequence[Outcome]) -> dict[str, list[Outcome]]:
-    """All, each seed where there are several, each condition, changed season, outdated map."""
-    kinds = dict.fromkeys([*CONDITIONS, *(o.condition for o in outcomes)])
+    """All, each seed where there are several, each condition."""
+    kinds = dict.fromkeys([*CONDITIONS, *sorted({o.condition for o in outcomes})])
     seeds = sorted({o.seed for o in outcomes})
     found = {"all": list(outcomes)}
     if len(seeds) > 1:
         found |= {f"seed {s}": [o for o in outcomes if o.seed == s] for s in seeds}
     found |= {c: [o for o in outcomes if o.condition == c] for c in kinds}
-    found["other season"] = [o for o in outcomes if o.season]
-    found["outdated map"] = [o for o in outcomes if o.outdated]
     return {name: members for name, members in found.items() if members}
 
 

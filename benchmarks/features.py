@@ -52,8 +52,7 @@ def evaluate(methods: dict[str, Method], pairs: Sequence[TestPair], seed: int) -
             metres, degrees = pose.distance_to(pair.truth)
             outcomes.append(
                 Outcome(
-                    name, seed, k, pair.place, pair.condition, pair.outdated, pair.season,
-                    metres, degrees, seconds,
+                    name, seed, k, pair.place, pair.condition, metres, degrees, seconds,
                 )
             )  # fmt: skip
     return outcomes

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from localizer.camera import Camera
 from localizer.pose import Array, Pose, so3_exp
+from localizer.synth.appearance import CONDITIONS
 from localizer.synth.heightfield import (
     Land,
     Light,
@@ -38,6 +39,7 @@ from localizer.training.land import (
 from localizer.training.revisit import coarse_mesh, draw_texel, plain_walls, regrown, wetted
 from localizer.types import Float32, Image
 
+SEASON, OUTDATED, COMBINED = "season", "outdated map", "combined"
 _PLAIN_WALLS = 0.4  # share of the maps whose facades were not photographed
 _COARSE_MESH = 0.8  # share of the maps on a photogrammetric mesh instead of the true surface
 _OVERLAP = 0.45  # least share of the reference's surface that the query must see
@@ -67,7 +69,8 @@ class Pair:
 class SceneConfig:
     """Size and variety of the scenes and views. light_variety False keeps the map's own light and
     season in the query (the ablation of the paper's Table 4). cell_m: range of the size of a cell,
-    which sets the altitude. conditions: taken in turn when given, else drawn. motion: metres and
+    which sets the altitude. conditions: of each light in turn when given (`visit_of`), as many as
+    there are lights; else drawn. motion: metres and
     degrees between the two views, exactly, instead of the training's mixture. shared_detail: the
     query repeats the map's fine texture and the map is nearly as sharp as the query; no flight is
     like that, it is kept as the easier condition of earlier reports.
@@ -86,6 +89,17 @@ class SceneConfig:
     shared_detail: bool = False
 
 
+@dataclass(frozen=True)
+class Visit:
+    """The day of a flight: weather or light (of `CONDITIONS`), buildings gone and new, vegetation
+    of another season (None: drawn).
+    """
+
+    weather: str
+    outdated: bool
+    season: bool | None
+
+
 def scene_pairs(seed: int, config: SceneConfig, library: PhotoLibrary | None) -> Iterator[Pair]:
     """All pairs of the place that belongs to `seed`."""
     rng = np.random.default_rng(seed)
@@ -98,13 +112,15 @@ def scene_pairs(seed: int, config: SceneConfig, library: PhotoLibrary | None) ->
         place, source = generated_place(rng, n, cell), "generated"
     survey = _survey(rng, place, config)
     lived: LitScene | None = None
-    condition, outdated, season = "day", False, False
+    visit, season = Visit("day", False, None), False
     for k in range(config.references):
         if lived is None or k % config.queries_per_light == 0:
-            condition = draw_condition(rng, config.conditions, k // config.queries_per_light)
-            outdated = bool(rng.random() < 0.4)
+            if config.conditions:
+                visit = visit_of(rng, config.conditions[k // config.queries_per_light])
+            else:
+                visit = Visit(draw_condition(rng), bool(rng.random() < 0.4), None)
             fixed = None if config.light_variety else survey.light
-            lived, season = _lived(rng, place, condition, outdated, fixed, config.shared_detail)
+            lived, season = _lived(rng, place, visit, fixed, config.shared_detail)
         pair = _pair(rng, survey, lived, config)
         if pair is None:
             continue
@@ -114,8 +130,8 @@ def scene_pairs(seed: int, config: SceneConfig, library: PhotoLibrary | None) ->
         if config.shared_detail:
             image = soften(rng, image)
         yield Pair(
-            image, depth, seen, seen_depth, reference, query, camera, condition, outdated, source,
-            season,
+            image, depth, seen, seen_depth, reference, query, camera, visit.weather,
+            visit.outdated, source, season,
         )  # fmt: skip
 
 
@@ -159,8 +175,7 @@ def _survey(rng: np.random.Generator, place: Place, config: SceneConfig) -> LitS
 def _lived(
     rng: np.random.Generator,
     place: Place,
-    condition: str,
-    outdated: bool,
+    visit: Visit,
     light: Light | None,
     shared_detail: bool,
 ) -> tuple[LitScene, bool]:
@@ -168,10 +183,11 @@ def _lived(
     given light also keeps the season.
     """
     land, prisms, season = place.land, list(place.prisms), False
-    if light is None:
+    condition, outdated = visit.weather, visit.outdated
+    if light is None and visit.season is not False:
         season = bool(place.seasons) and rng.random() < 0.6
         albedo = place.seasons[0] if season else land.albedo
-        if rng.random() < 0.7:
+        if rng.random() < 0.7 or (visit.season and not season):
             albedo, season = season_shift(albedo, rng), True
         land = Land(land.height, albedo, land.cell_m)
     if not shared_detail:
@@ -208,12 +224,20 @@ def _sky(rng: np.random.Generator, condition: str) -> tuple[float, float, float]
     return (level * 0.85, level * 0.93, level) if condition == "day" else (level, level, level)
 
 
-def draw_condition(rng: np.random.Generator, wanted: tuple[str, ...], turn: int) -> str:
-    """The condition of a query: the wanted ones in turn, or drawn with the training's shares."""
-    if wanted:
-        return wanted[turn % len(wanted)]
-    conditions = ("day", "dusk", "night", "fog", "rain", "snow")
-    return str(rng.choice(conditions, p=(0.42, 0.15, 0.17, 0.1, 0.08, 0.08)))
+def draw_condition(rng: np.random.Generator) -> str:
+    """The weather or light of a query, with the training's shares."""
+    return str(rng.choice(CONDITIONS, p=(0.42, 0.15, 0.17, 0.1, 0.08, 0.08)))
+
+
+def visit_of(rng: np.random.Generator, condition: str) -> Visit:
+    """The visit of a test condition: a weather alone, `SEASON` or `OUTDATED` on a day, or any
+    weather together with both (`COMBINED`).
+    """
+    if condition == COMBINED:
+        return Visit(str(rng.choice(CONDITIONS)), True, True)
+    if condition in (SEASON, OUTDATED):
+        return Visit("day", condition == OUTDATED, condition == SEASON)
+    return Visit(condition, False, False)
 
 
 def _pair(

@@ -99,7 +99,7 @@ def _pair(
     seen = day.render(query, camera, wait=True)
     if min((view.depth > 0).mean(), (seen.depth > 0).mean()) < 0.75:
         return None
-    condition = draw_condition(rng, (), 0)
+    condition = draw_condition(rng)
     return Pair(
         view.rgb if scenes.shared_detail else coarser(view.rgb, draw_texel(rng)),
         view.depth,
