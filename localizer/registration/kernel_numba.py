@@ -8,38 +8,32 @@ and the retraction are float64; points, features and sums are float32. Threads s
 and hold no GIL. Equations are numbered in docs/registration.md.
 """
 
-# ruff: noqa: PLR0912, PLR0915 (kernels pass arrays and unroll sums, for speed)
+# ruff: noqa: PLR0915 (kernels pass arrays and unroll sums, for speed)
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from functools import lru_cache
-from typing import Any
 
 import numpy as np
 from numba import njit
 
 from localizer.pose import Array
 from localizer.registration.backend import LevelProblem, LMSettings, Refinement
+from localizer.registration.kernel_algebra import JIT, add_prior, prefetch, retract, solve
 from localizer.registration.reference import MIN_DEPTH, minimum_visible
 
-# Reassociation and contraction give SIMD reductions; NaN and infinity keep their meaning.
-_FAST = {"reassoc", "contract", "arcp", "nsz"}
-_JIT: dict[str, Any] = {
-    "cache": True,
-    "nogil": True,
-    "fastmath": _FAST,
-    "error_model": "numpy",
-    "boundscheck": False,
-}
 _F = np.float32
 _HYPOTHESES_PER_THREAD = 8  # fewer finish sooner than another thread wakes up
-_ROWS = 24  # scratch rows of N floats per worker
-_SUMS = 29  # 21 of H (lower triangle), 6 of g, cost, weight
+_ROWS = 17  # scratch rows of N floats per worker
+_SUMS = 27  # 21 of H (lower triangle), 6 of g
+_WORK = 23  # scratch rows of 6: 14 of the prior, then scale, step, L (6) and a trial translation
+_AHEAD = 6  # anchors between asking for features and using them; 4 to 8 measured alike
+_LINE = 16  # floats of a cache line
 
 
-@njit(**_JIT)
+@njit(**JIT)
 def _project(R, t, points, focal, centre, buf):  # type: ignore[no-untyped-def]
     """Equation 1 for all anchors: x, y, z, u, v into rows 0 to 4 of buf."""
     r00, r01, r02, t0 = _F(R[0, 0]), _F(R[0, 1]), _F(R[0, 2]), _F(t[0])
@@ -59,7 +53,7 @@ def _project(R, t, points, focal, centre, buf):  # type: ignore[no-untyped-def]
         bv[j] = fy * y * iz + cy
 
 
-@njit(**_JIT)
+@njit(**JIT)
 def _compact(count, h, w, buf, index):  # type: ignore[no-untyped-def]
     """Of `count` anchors keep those in view: x, y, z, fractions into rows 5 to 9, and into index
     the anchor and the cell; returns how many.
@@ -80,7 +74,7 @@ def _compact(count, h, w, buf, index):  # type: ignore[no-untyped-def]
     return n
 
 
-@njit(**_JIT)
+@njit(**JIT)
 def _weigh(n, w, confidence, anchor_confidence, delta, redescending, buf, index):  # type: ignore[no-untyped-def]
     """Equations 2 and 4: (cost, weight); row 16 gets the anchors' IRLS weights."""
     ka, kb, ke, kw = buf[8], buf[9], buf[15], buf[16]
@@ -111,7 +105,7 @@ def _weigh(n, w, confidence, anchor_confidence, delta, redescending, buf, index)
     return cost, total
 
 
-@njit(**_JIT)
+@njit(**JIT)
 def _accumulate(n, t, focal, buf, sums):  # type: ignore[no-untyped-def]
     """Equations 6 and 7 over the anchors in view: 21 sums of H and 6 of g."""
     fx, fy = _F(focal[0]), _F(focal[1])
@@ -184,121 +178,12 @@ def _accumulate(n, t, focal, buf, sums):  # type: ignore[no-untyped-def]
     sums[15], sums[16], sums[17], sums[18], sums[19], sums[20] = h50, h51, h52, h53, h54, h55
 
 
-@njit(**_JIT)
-def _solve(sums, scale, damping, L, step):  # type: ignore[no-untyped-def]
-    """Equation 8 by Cholesky on the unit-diagonal system; False where it is singular."""
-    k = 0
-    for i in range(6):
-        diagonal = sums[k + i]
-        if not diagonal > 0.0:
-            return False
-        scale[i] = 1.0 / np.sqrt(diagonal)
-        k += i + 1
-    k = 0
-    for i in range(6):
-        for j in range(i + 1):
-            s = sums[k] * scale[i] * scale[j]
-            k += 1
-            if i == j:
-                s += damping
-            for m in range(j):
-                s -= L[i, m] * L[j, m]
-            if i == j:
-                if not s > 0.0:
-                    return False
-                L[i, i] = np.sqrt(s)
-            else:
-                L[i, j] = s / L[j, j]
-    for i in range(6):
-        s = -sums[21 + i] * scale[i]
-        for m in range(i):
-            s -= L[i, m] * step[m]
-        step[i] = s / L[i, i]
-    for i in range(5, -1, -1):
-        s = step[i]
-        for m in range(i + 1, 6):
-            s -= L[m, i] * step[m]
-        step[i] = s / L[i, i]
-    for i in range(6):
-        step[i] *= scale[i]
-    return True
-
-
-@njit(**_JIT)
-def _retract(R, t, step, R_out, t_out):  # type: ignore[no-untyped-def]
-    """Equation 5: ``R_out = exp(phi) R``, ``t_out = t + rho``."""
-    x, y, z = step[3], step[4], step[5]
-    angle2 = x * x + y * y + z * z
-    if angle2 < 1e-12:
-        a, b = 1.0 - angle2 / 6.0, 0.5
-    else:
-        angle = np.sqrt(angle2)
-        a, b = np.sin(angle) / angle, (1.0 - np.cos(angle)) / angle2
-    e00, e01, e02 = 1.0 - b * (y * y + z * z), b * x * y - a * z, b * x * z + a * y
-    e10, e11, e12 = b * x * y + a * z, 1.0 - b * (x * x + z * z), b * y * z - a * x
-    e20, e21, e22 = b * x * z - a * y, b * y * z + a * x, 1.0 - b * (x * x + y * y)
-    for j in range(3):
-        c0, c1, c2 = R[0, j], R[1, j], R[2, j]
-        R_out[0, j] = e00 * c0 + e01 * c1 + e02 * c2
-        R_out[1, j] = e10 * c0 + e11 * c1 + e12 * c2
-        R_out[2, j] = e20 * c0 + e21 * c1 + e22 * c2
-    for i in range(3):
-        t_out[i] = t[i] + step[i]
-
-
-@njit(**_JIT)
-def _log(R, out):  # type: ignore[no-untyped-def]
-    """Rotation vector of R for angles below pi (equation 13)."""
-    c = min(1.0, max(-1.0, 0.5 * (R[0, 0] + R[1, 1] + R[2, 2] - 1.0)))
-    out[0], out[1], out[2] = R[2, 1] - R[1, 2], R[0, 2] - R[2, 0], R[1, 0] - R[0, 1]
-    s = 0.5 * np.sqrt(out[0] ** 2 + out[1] ** 2 + out[2] ** 2)
-    angle = np.arctan2(s, c)
-    factor = 0.5 if s < 1e-12 else 0.5 * angle / s
-    for i in range(3):
-        out[i] *= factor
-
-
-@njit(**_JIT)
-def _add_prior(R, t, R0, t0, information, weight, sums):  # type: ignore[no-untyped-def]
-    """Equation 15: add the quadratic prior to H, g and the score; returns its cost."""
-    d, J = np.empty(6), np.zeros((6, 6))
-    relative = R.T @ R0
-    _log(relative, d[3:])
-    for i in range(3):
-        d[i] = 0.0
-        for k in range(3):
-            d[i] += R0[k, i] * t0[k] - R[k, i] * t[k]
-            J[i, k] = -R[k, i]
-            J[3 + i, 3 + k] = -R[k, i]
-        J[i, 3] = -(R[1, i] * t[2] - R[2, i] * t[1])
-        J[i, 4] = -(R[2, i] * t[0] - R[0, i] * t[2])
-        J[i, 5] = -(R[0, i] * t[1] - R[1, i] * t[0])
-    LJ = information @ J
-    Ld = information @ d
-    k = 0
-    for i in range(6):
-        for j in range(i + 1):
-            s = 0.0
-            for m in range(6):
-                s += J[m, i] * LJ[m, j]
-            sums[k] += weight * s
-            k += 1
-    cost = 0.0
-    for i in range(6):
-        s = 0.0
-        for m in range(6):
-            s += J[m, i] * Ld[m]
-        sums[21 + i] += weight * s
-        cost += d[i] * Ld[i]
-    return weight * cost
-
-
 @lru_cache
 def refine_kernel(channels: int) -> Callable[..., int]:
     """The compiled kernel for feature maps of `channels` channels."""
     C = channels
 
-    @njit(**_JIT)
+    @njit(**JIT)
     def sample(n, w, features, anchor_features, buf, index):  # type: ignore[no-untyped-def]
         """Equations 3 and 7: reduce the channels of each anchor in view to rows 10 to 15."""
         ka, kb = buf[8], buf[9]
@@ -306,6 +191,10 @@ def refine_kernel(channels: int) -> Callable[..., int]:
         anchor, cell = index[0], index[1]
         row = w * C
         for k in range(n):
+            ahead = cell[min(k + _AHEAD, n - 1)] * C
+            for c in range(0, 2 * C, _LINE):
+                prefetch(features, ahead + c)
+                prefetch(features, ahead + row + c)
             a, b = ka[k], kb[k]
             i, j = cell[k] * C, anchor[k] * C
             f00, f01 = features[i : i + C], features[i + C : i + 2 * C]
@@ -328,11 +217,11 @@ def refine_kernel(channels: int) -> Callable[..., int]:
                 e += r * r
             kA[k], kB[k], kD[k], kp[k], kq[k], ke[k] = A, B, D, p, q, e
 
-    @njit(**_JIT)
+    @njit(**JIT)
     def evaluate(  # type: ignore[no-untyped-def]
         R, t, focal, centre, points, features, confidence, anchor_features, anchor_confidence,
         h, w, delta, redescending, min_visible, prior_R, prior_t, information, prior_weight,
-        buf, index, sums,
+        buf, index, work, sums,
     ):  # fmt: skip
         """Score of a pose and the count of anchors in view; sums gets H and g."""
         _project(R, t, points, focal, centre, buf)
@@ -351,39 +240,38 @@ def refine_kernel(channels: int) -> Callable[..., int]:
             sums[i] *= inverse
         score = cost * inverse
         if prior_weight > 0.0:
-            score += _add_prior(R, t, prior_R, prior_t, information, prior_weight, sums)
+            score += add_prior(R, t, prior_R, prior_t, information, prior_weight, sums, work)
         return score, n
 
-    @njit(**_JIT)
+    @njit(**JIT)
     def refine(  # type: ignore[no-untyped-def]
         start, stop, R, t, scores, visible, focal, centre, points, features, confidence,
         anchor_features, anchor_confidence, h, w, iterations, delta, redescending, damping0,
-        down, up, min_visible, prior_R, prior_t, information, prior_weight, buf, index,
+        down, up, min_visible, prior_R, prior_t, information, prior_weight, buf, index, work,
+        sums, best, R_try,
     ):  # fmt: skip
         """Levenberg-Marquardt (equations 8 and 9) on hypotheses start to stop, in place."""
-        sums, best = np.zeros(_SUMS), np.zeros(_SUMS)
-        scale, L, step = np.zeros(6), np.zeros((6, 6)), np.zeros(6)
-        R_try, t_try = np.zeros((3, 3)), np.zeros(3)
+        scale, step, L, t_try = work[14], work[15], work[16:22], work[22, :3]
         evaluations = 0
         for m in range(start, stop):
             damping = damping0
             scores[m], visible[m] = evaluate(
                 R[m], t[m], focal, centre, points, features, confidence, anchor_features,
                 anchor_confidence, h, w, delta, redescending, min_visible, prior_R, prior_t,
-                information, prior_weight, buf, index, best,
+                information, prior_weight, buf, index, work, best,
             )  # fmt: skip
             evaluations += 1
             if not scores[m] < np.inf:
                 scores[m] = np.inf
                 continue
             for _ in range(iterations):
-                if not _solve(best, scale, damping, L, step):
+                if not solve(best, scale, damping, L, step):
                     break
-                _retract(R[m], t[m], step, R_try, t_try)
+                retract(R[m], t[m], step, R_try, t_try)
                 score, n = evaluate(
                     R_try, t_try, focal, centre, points, features, confidence, anchor_features,
                     anchor_confidence, h, w, delta, redescending, min_visible, prior_R, prior_t,
-                    information, prior_weight, buf, index, sums,
+                    information, prior_weight, buf, index, work, sums,
                 )  # fmt: skip
                 evaluations += 1
                 if score < scores[m]:
@@ -406,7 +294,7 @@ class NumbaBackend:
         self.name = f"numba ({threads} thread{'s' if threads > 1 else ''}, float32)"
         self._threads = threads
         self._pool = ThreadPoolExecutor(threads, thread_name_prefix="registration")
-        self._scratch: list[tuple[np.ndarray, np.ndarray]] = []
+        self._scratch: list[tuple[np.ndarray, ...]] = []
 
     def refine(
         self,
@@ -451,10 +339,18 @@ class NumbaBackend:
             evaluations = sum(job.result() for job in jobs)
         return Refinement(R, t, scores, visible / N, int(evaluations))
 
-    def _workspace(self, anchors: int) -> list[tuple[np.ndarray, np.ndarray]]:
+    def _workspace(self, anchors: int) -> list[tuple[np.ndarray, ...]]:
+        """Each worker's scratch, the last arguments of the kernel."""
         if not self._scratch or self._scratch[0][0].shape[1] < anchors:
             self._scratch = [
-                (np.empty((_ROWS, anchors), np.float32), np.empty((2, anchors), np.int64))
+                (
+                    np.empty((_ROWS, anchors), np.float32),
+                    np.empty((2, anchors), np.int64),
+                    np.empty((_WORK, 6)),
+                    np.empty(_SUMS),
+                    np.empty(_SUMS),
+                    np.empty((3, 3)),
+                )
                 for _ in range(self._threads)
             ]
         return self._scratch

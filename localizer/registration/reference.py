@@ -63,8 +63,8 @@ def feature_gradients(features: Float32, u: Array, v: Array) -> tuple[Array, Arr
     x0 = np.clip(np.floor(u).astype(np.int64), 0, w - 2)
     y0 = np.clip(np.floor(v).astype(np.int64), 0, h - 2)
     ax, ay = (u - x0)[:, None], (v - y0)[:, None]
-    f00, f01 = features[y0, x0], features[y0, x0 + 1]
-    f10, f11 = features[y0 + 1, x0], features[y0 + 1, x0 + 1]
+    f00, f01 = (features[y0, x].astype(np.float64) for x in (x0, x0 + 1))
+    f10, f11 = (features[y0 + 1, x].astype(np.float64) for x in (x0, x0 + 1))
     gx = (f01 - f00) * (1 - ay) + (f11 - f10) * ay
     gy = (f10 - f00) * (1 - ax) + (f11 - f01) * ax
     return gx, gy

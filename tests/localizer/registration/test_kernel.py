@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
+import tracemalloc
 from dataclasses import replace
 
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from numba.core.runtime import _nrt_python, rtsys
 
 from localizer.pose import Pose, so3_exp, so3_log
 from localizer.registration.backend import (
@@ -93,6 +97,68 @@ def test_feature_jacobians_are_the_derivative_of_the_residuals(scene, problems):
         minus = linearize(levels[1], *retract(R, t, -step), SETTINGS).residuals
         numeric = (plus - minus)[inside] / (2 * h)
         np.testing.assert_allclose(model.jacobians[inside, :, axis], numeric, atol=1e-5)
+
+
+def test_feature_jacobians_are_autograds(scene, problems):
+    """Equations 1, 3 and 5 written once more, in PyTorch, and differentiated by it."""
+    torch = pytest.importorskip("torch")
+    origin, levels = problems
+    problem = levels[2]
+    R, t = local(scene.reference, origin)
+    model = linearize(problem, R, t, SETTINGS)
+    chosen = np.flatnonzero(model.visible)[::12]
+    points = torch.from_numpy(problem.points.T[chosen].astype(np.float64))
+    features = torch.from_numpy(problem.features.astype(np.float64))
+    focal, centre = (torch.tensor(x, dtype=torch.float64) for x in (problem.focal, problem.centre))
+    R0, t0 = torch.from_numpy(R), torch.from_numpy(t)
+
+    def query_features(xi):
+        zero = torch.zeros((), dtype=torch.float64)
+        a, b, c = xi[3:]
+        turn = torch.stack(
+            [torch.stack([zero, -c, b]), torch.stack([c, zero, -a]), torch.stack([-b, a, zero])]
+        )
+        x = points @ (torch.linalg.matrix_exp(turn) @ R0).T + t0 + xi[:3]
+        u, v = (x[:, :2] / x[:, 2:] * focal + centre).T
+        i, j = u.detach().floor().long(), v.detach().floor().long()
+        p, q = (u - i)[:, None], (v - j)[:, None]
+        top = features[j, i] * (1 - p) + features[j, i + 1] * p
+        low = features[j + 1, i] * (1 - p) + features[j + 1, i + 1] * p
+        return top * (1 - q) + low * q
+
+    start = torch.zeros(6, dtype=torch.float64)
+    jacobian = torch.autograd.functional.jacobian(query_features, start).numpy()
+    assert len(chosen) > 15
+    np.testing.assert_allclose(model.jacobians[chosen], jacobian, atol=1e-9)
+    residuals = query_features(start).numpy() - problem.anchor_features[chosen]
+    np.testing.assert_allclose(model.residuals[chosen], residuals, atol=1e-9)
+
+
+@given(
+    st.lists(st.floats(-3, 3), min_size=6, max_size=6),
+    st.lists(st.floats(-500, 500), min_size=6, max_size=6),
+)
+def test_a_retraction_is_undone_by_its_opposite(xi, places):
+    """exp(-phi) exp(phi) R = R and t + rho - rho = t, for steps of any size below half a turn."""
+    step = np.array(xi)
+    R, t = so3_exp(np.array(places[:3]) / 500), np.array(places[3:])
+    there = retract(R, t, step)
+    back = retract(*there, -step)
+    np.testing.assert_allclose(back[0], R, atol=1e-12)
+    np.testing.assert_allclose(back[1], t, atol=1e-12)
+    np.testing.assert_allclose(there[0] @ there[0].T, np.eye(3), atol=1e-12)
+
+
+@given(
+    st.lists(st.floats(-3, 3), min_size=3, max_size=3),
+    st.lists(st.floats(-1e4, 1e4), min_size=6, max_size=6),
+)
+def test_local_frame_round_trip_anywhere(turn, places):
+    R, centre, origin = so3_exp(np.array(turn)), np.array(places[:3]), np.array(places[3:])
+    there = camera_from_local(R[None], centre[None], origin)
+    rotations, centres = world_from_camera(*there, origin)
+    np.testing.assert_array_equal(rotations[0], R)
+    np.testing.assert_allclose(centres[0], centre, atol=1e-10 * 1e4)
 
 
 @pytest.mark.parametrize(("scale", "redescending"), [(0.02, False), (0.5, False), (0.2, True)])
@@ -197,3 +263,32 @@ def test_points_behind_the_camera_are_out_of_view(scene, problems):
         result = backend.refine(levels[0], R[None], t[None], 2, SETTINGS)
         assert np.isinf(result.scores[0])
         np.testing.assert_array_equal(result.translations[0], t)
+
+
+def test_no_allocation_per_iteration_or_frame(scene, problems, swarm):
+    """Iterations allocate nothing, with a prior too; a frame only its results and arguments."""
+    origin, levels = problems
+    target = Pose(*local(scene.true, origin))
+    problem = replace(levels[2], prior=QuadraticPrior(target, np.eye(6), 1e-4))
+    backend = NumbaBackend(1)
+
+    def allocations(iterations):
+        before = rtsys.get_allocation_stats()
+        backend.refine(problem, *swarm, iterations, SETTINGS)
+        after = rtsys.get_allocation_stats()
+        return after.alloc - before.alloc
+
+    _nrt_python.memsys_enable_stats()
+    try:
+        assert allocations(1) > 0  # else the counters are off and the test means nothing
+        assert allocations(1) == allocations(12)
+    finally:
+        _nrt_python.memsys_disable_stats()
+
+    backend.refine(problem, *swarm, 2, SETTINGS)
+    tracemalloc.start()
+    backend.refine(problem, *swarm, 2, SETTINGS)
+    _, peak = tracemalloc.get_traced_memory()
+    tracemalloc.stop()
+    results = sum(a.nbytes for a in swarm) + 3 * 8 * len(swarm[0])
+    assert peak < results + 10_000
