@@ -48,7 +48,7 @@ class YawGuardConfig(_Model):
         default=60.0, gt=0.0, le=600.0, description="how long the gyros are trusted"
     )
     minimum_samples: int = Field(
-        default=5, ge=1, le=100, description="in a row, to block and to release"
+        default=5, ge=1, le=100, description="their majority blocks, all of them release"
     )
 
     @model_validator(mode="after")

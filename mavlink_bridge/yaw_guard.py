@@ -36,17 +36,17 @@ class YawVerdict:
 
 
 class YawGuard:
-    """Refuses fixes whose yaw turned, and blocks injection when they keep coming.
+    """Refuses fixes whose yaw turned, and blocks injection when most of the last ones did.
 
-    Blocking takes `minimum_samples` refused fixes in a row, releasing as many good ones, held to
-    a tighter limit.
+    Blocking takes the majority of `minimum_samples` fixes, for noise lets some of a turned frame
+    pass; releasing takes as many good ones in a row, held to a tighter limit.
     """
 
     def __init__(self, config: YawGuardConfig) -> None:
         self._config = config
         # (time, vision minus gyro heading, vision minus autopilot)
         self._accepted: deque[tuple[int, float, float]] = deque(maxlen=256)
-        self._in_a_row = 0
+        self._last: deque[bool] = deque(maxlen=config.minimum_samples)
         self.blocked = False
         self.unchecked = 0
         self._unchecked_in_a_row = 0
@@ -59,7 +59,7 @@ class YawGuard:
     def reset(self) -> None:
         """The autopilot started over: its yaw did, too."""
         self._accepted.clear()
-        self._in_a_row = 0
+        self._last.clear()
         self.blocked = False
 
     def check(
@@ -84,18 +84,25 @@ class YawGuard:
         difference = wrap_pi(vision_yaw_rad - autopilot.yaw_rad)
         to_gyros = wrap_pi(vision_yaw_rad - autopilot.gyro_heading_rad)
         good = self._agrees(time_ns, difference, to_gyros, reset)
-        if good != self.blocked:
-            self._in_a_row = 0
-        else:
-            self._in_a_row += 1
-            if self._in_a_row >= self._config.minimum_samples:
-                self.blocked, self._in_a_row = not self.blocked, 0
+        self._note(good)
         accept = good and not self.blocked
         if good and reset:
             self._accepted.clear()  # what follows is held against this fix, not against the past
         if accept:
             self._accepted.append((time_ns, to_gyros, difference))
         return YawVerdict(accept, difference)
+
+    def _note(self, good: bool) -> None:
+        """Block or release by the last verdicts."""
+        last = self._last
+        last.append(good)
+        if self.blocked:
+            change = len(last) == last.maxlen and all(last)
+        else:
+            change = 2 * last.count(False) > self._config.minimum_samples
+        if change:
+            self.blocked = not self.blocked
+            last.clear()
 
     def _agrees(self, time_ns: int, difference: float, to_gyros: float, reset: bool) -> bool:
         limit = math.radians(self._config.limit_deg) * (_RELEASE_SHARE if self.blocked else 1.0)
