@@ -33,6 +33,7 @@ _REPORT_FILES = (
     "frames_report.csv", "overlay-*", "report.json", "tracks.png", "vehicle.csv",
 )  # fmt: skip
 
+_LOG_WIDTH = 200
 _SUITE_KINDS: dict[str, tuple[FlownKind, ...]] = {
     "embedded": ("embedded",),
     "ardupilot": ("ardupilot",),
@@ -116,6 +117,8 @@ def suite(
     if out.exists() and not out.is_dir():
         raise ScenarioError(f"{out}: is a file; give a folder as --out")
     console = Console()
+    if not console.is_terminal:
+        console = Console(width=_LOG_WIDTH)  # a log has no width of its own
     rows = run_suite(cases, _SUITE_KINDS[fc], jobs, seed, lambda row: print_row(console, row))
     print_table(console, rows)
     write_report(rows, out)

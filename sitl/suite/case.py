@@ -183,6 +183,8 @@ def load_case(path: Path) -> Case:
 def load_cases(names: Iterable[str] = (), folder: Path = SCENARIOS) -> tuple[Case, ...]:
     """All scenarios of a folder, or those named; ScenarioError for a name that is not there."""
     files = {path.stem: path for path in sorted(folder.glob("*.yaml"))}
+    if not files:
+        raise ScenarioError(f"{folder}: holds no scenario files (NAME.yaml)")
     chosen = list(names) or list(files)
     unknown = [name for name in chosen if name not in files]
     if unknown:
