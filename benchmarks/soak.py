@@ -414,7 +414,7 @@ def plot(samples: list[Sample], faults: list[Fault], begun: float, path: Path) -
             left, right = ((t - begun) / 60 for t in (fault.begun, fault.ended))
             axis.axvspan(left, right, color="tab:red", alpha=0.15)
     axes[1].plot(minutes, [s.descriptors for s in samples], lw=1)
-    axes[0].set_ylim(bottom=0)
+    axes[0].set_ylim(0.0, 1.2 * max(s.rss_mib for s in samples))
     for fault in faults:
         axes[0].text((fault.begun - begun) / 60, 2, fault.kind, rotation=90, fontsize=7)
     axes[-1].set_xlabel("minutes")

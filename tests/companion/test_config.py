@@ -1,10 +1,14 @@
+from collections.abc import Iterator
 from pathlib import Path
+from typing import get_args
 
 import pytest
 import yaml
+from pydantic import BaseModel
 
 from companion.config import load_config
 from companion.errors import ConfigError
+from mavlink_bridge import BridgeConfig
 
 MODEL = {"width": 640, "height": 480, "fx": 550, "fy": 550, "cx": 320, "cy": 240}
 MINIMAL = {"map": "cache", "camera": {"source": "udp://127.0.0.1:5600", "model": MODEL}}
@@ -33,6 +37,19 @@ def test_minimal_config_and_paths_relative_to_the_file(tmp_path):
         ({"camera": {"source": "udp://x:1", "model": MODEL | {"fx": -1}}}, "camera.model.fx"),
         ({"bridge": {"connection": "carrier-pigeon:1"}}, "bridge.connection"),
         ({"targets": {"detections": "nonsense"}}, "targets.detections"),
+        ({"bridge": {"targets": {"cot_endpoint": "nonsense"}}}, "bridge.targets.cot_endpoint"),
+        ({"bridge": {"targets": {"cot_endpoint": "host:0"}}}, "write host:port"),
+        ({"bridge": {"injection": {"max_sigma_m": float("inf")}}}, "bridge.injection.max_sigma_m"),
+        ({"bridge": {"injection": {"sigma_floor_m": 20}}}, "sigma_floor_m must be below"),
+        ({"bridge": {"injection": {"yaw_guard": {"gross_deg": 1}}}}, "gross_deg must be at least"),
+        ({"bridge": {"switch": {"vision_set": 1}}}, "two different source sets"),
+        ({"bridge": {"rc": {"command": "user_9"}}}, "bridge.rc.command"),
+        ({"bridge": {"camera_component": 197}}, "a component id each"),
+        ({"bridge": {"localizer_component": 1}}, "bridge.localizer_component"),
+        ({"bridge": {"connection": "tcp:h:1", "ground_connection": "tcp:h:1"}}, "leave it empty"),
+        ({"bridge": {"connection": "tcp:host:0"}}, "0 is no port number"),
+        ({"bridge": {"connection": "serial:/dev/ttyS0:99999999999"}}, "no baud rate"),
+        ({"bridge": {"link_timeout_s": 0.01}}, "bridge.link_timeout_s"),
     ],
 )
 def test_every_problem_is_named_by_its_key(tmp_path, change, named):
@@ -52,9 +69,61 @@ def test_missing_file(tmp_path):
         load_config(tmp_path / "none.yaml")
 
 
-def test_the_shipped_deployment_file_is_complete_and_valid():
-    """Every top-level key stands in it, so that an operator sees all there is to set."""
-    path = Path(__file__).parents[2] / "configs" / "deployment.yaml"
-    config = load_config(path)
-    assert set(yaml.safe_load(path.read_text())) == set(type(config).model_fields)
+DEPLOYMENT = Path(__file__).parents[2] / "configs" / "deployment.yaml"
+NOT_FOR_OPERATORS = {"localizer.registration"}
+
+
+def _models(annotation: object) -> list[type[BaseModel]]:
+    if isinstance(annotation, type) and issubclass(annotation, BaseModel):
+        return [annotation]
+    return [m for part in get_args(annotation) for m in _models(part)]
+
+
+def _keys(model: type[BaseModel], where: str = "") -> Iterator[tuple[str, ...]]:
+    """Paths of all keys of a configuration, those of nested and optional models, too."""
+    for name, field in model.model_fields.items():
+        yield (*filter(None, where.split(".")), name)
+        for nested in _models(field.annotation):
+            if f"{where}{name}" not in NOT_FOR_OPERATORS:
+                yield from _keys(nested, f"{where}{name}.")
+
+
+def test_the_shipped_deployment_file_lists_every_key_and_is_valid():
+    text = DEPLOYMENT.read_text()
+    config = load_config(DEPLOYMENT)
     assert config.bridge.mode == "shadow"
+    written = yaml.safe_load(text)
+    for path in _keys(type(config)):
+        place, told = written, True
+        for depth, key in enumerate(path):
+            if place is None:  # an optional part that is off: its keys stand in the comment
+                line = text.split(f" {path[depth - 1]}: null", 1)[1].split("null", 1)[0]
+                told = f"{key}:" in line
+                break
+            told = told and key in place
+            assert told, ".".join(path)
+            place = place[key]
+        assert told, ".".join(path)
+
+
+def test_every_key_of_the_bridge_is_explained_where_it_stands():
+    lines = DEPLOYMENT.read_text().splitlines()
+    begun = lines.index("bridge:")
+    ended = lines.index("targets:")
+    plain = [line for line in lines[begun + 1 : ended] if line.strip() and "#" not in line]
+    assert [line.strip() for line in plain] == [
+        f"{part}:" for part in ("injection", "camera", "targets")
+    ]
+
+
+def test_the_deployment_file_shows_the_defaults_or_says_so():
+    """An operator who deletes a line must know what follows."""
+    config, text = load_config(DEPLOYMENT), DEPLOYMENT.read_text()
+    default = BridgeConfig()
+    for part in ("injection", "switch", "rc", "camera", "targets"):
+        shown, kept = getattr(config.bridge, part), getattr(default, part)
+        for name in type(shown).model_fields:
+            if getattr(shown, name) != getattr(kept, name):
+                assert f"default {getattr(kept, name):g}" in text.split(f" {name}:", 1)[1][:80], (
+                    name
+                )
