@@ -97,7 +97,7 @@ def test_the_shipped_deployment_file_lists_every_key_and_is_valid():
         place, told = written, True
         for depth, key in enumerate(path):
             if place is None:  # an optional part that is off: its keys stand in the comment
-                line = text.split(f" {path[depth - 1]}: null", 1)[1].split("null", 1)[0]
+                line = text.split(f" {path[depth - 1]}: null", 1)[1][:300]
                 told = f"{key}:" in line
                 break
             told = told and key in place
