@@ -1,0 +1,7 @@
+"""The registration on an NVIDIA GPU (docs/gpu.md): kernels compiled at run time, no toolkit."""
+
+from localizer.registration.cuda.backend import CudaBackend
+from localizer.registration.cuda.driver import Device
+from localizer.registration.cuda.errors import CudaError, CudaUnavailableError
+
+__all__ = ["CudaBackend", "CudaError", "CudaUnavailableError", "Device"]

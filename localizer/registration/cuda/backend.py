@@ -1,0 +1,153 @@
+"""The CUDA backend behind the optimizer's interface: one launch refines a level's hypotheses."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable
+
+import numpy as np
+from numpy.typing import NDArray
+
+from localizer.pose import Array
+from localizer.registration.backend import LevelProblem, LMSettings, Refinement
+from localizer.registration.cuda import layout
+from localizer.registration.cuda.compiler import Image, compile_kernels
+from localizer.registration.cuda.driver import Arena, Device, Kernels
+
+FEW = 16  # hypotheses at most for which larger blocks pay: they leave multiprocessors idle anyway
+
+Compile = Callable[[int, bool, tuple[int, int]], Image]
+
+
+class CudaBackend:
+    """Refines hypotheses on the GPU; buffers are kept between calls, and one call runs at a time.
+
+    half: features are stored as float16 on the device (arithmetic stays float32). compile: makes
+    the kernels for (channels, half, architecture).
+    """
+
+    def __init__(
+        self, device: Device, *, half: bool = False, compile: Compile = compile_kernels
+    ) -> None:
+        self.device, self.half = device, half
+        self.name = f"cuda ({device.name}, {'float16' if half else 'float32'} features)"
+        self._compile = compile
+        self._kernels: dict[int, Kernels] = {}
+        self._lock = threading.Lock()
+        self._arena = Arena(device)
+
+    def kernels(self, channels: int) -> Kernels:
+        """The loaded kernels for a channel count; compiling takes seconds, once per machine."""
+        if channels not in self._kernels:
+            image = self._compile(channels, self.half, self.device.architecture)
+            self._kernels[channels] = self.device.load(image.code)
+        return self._kernels[channels]
+
+    @property
+    def memory(self) -> int:
+        """Bytes of device memory held."""
+        return self._arena.size
+
+    def refine(
+        self,
+        problem: LevelProblem,
+        rotations: Array,
+        translations: Array,
+        iterations: int,
+        settings: LMSettings,
+    ) -> Refinement:
+        """Run `iterations` LM steps on each of M poses; 0 only scores them."""
+        M = len(rotations)
+        with self._lock:
+            self.device.activate()
+            kernels = self.kernels(problem.features.shape[-1])
+            arguments = self._arguments(problem, rotations, translations, iterations, settings)
+            name, threads = ("refine_few", 512) if M <= FEW else ("refine_many", 256)
+            kernels.launch(name, M, threads, arguments)
+            R, t = np.empty((M, 3, 3)), np.empty((M, 3))
+            scores, visible = np.empty(M), np.empty(M, dtype=np.int32)
+            state = np.empty((), dtype=layout.STATE)
+            swarm = arguments["swarm"]
+            for array, field in (
+                (R, "rotations"), (t, "translations"), (scores, "scores"), (visible, "visible")
+            ):  # fmt: skip
+                self.device.download(array, int(swarm[field]))
+            self.device.download(state, int(arguments["state"]))
+            self.device.synchronize()
+        return Refinement(
+            R, t, scores, visible / problem.points.shape[1], int(state["evaluations"])
+        )
+
+    def close(self) -> None:
+        """Free the device memory."""
+        with self._lock:
+            self.device.activate()
+            self._arena.close()
+
+    def _arguments(
+        self,
+        problem: LevelProblem,
+        rotations: Array,
+        translations: Array,
+        iterations: int,
+        settings: LMSettings,
+    ) -> NDArray[np.void]:
+        put, M = self._arena.put, len(rotations)
+        level = np.zeros((), dtype=layout.LEVEL)
+        level["features"] = put("features", stored(problem.features, self.half))
+        level["confidence"] = put("confidence", _floats(problem.confidence))
+        level["points"] = put("points", _floats(problem.points))
+        level["anchor_features"] = put(
+            "anchor_features", stored(problem.anchor_features, self.half)
+        )
+        level["anchor_confidence"] = put("anchor_confidence", _floats(problem.anchor_confidence))
+        level["height"], level["width"] = problem.confidence.shape
+        level["total"] = problem.points.shape[1]
+        level["focal"], level["centre"] = problem.focal, problem.centre
+        state = np.zeros((), dtype=layout.STATE)
+        state["count"] = M
+        arguments = np.zeros((), dtype=layout.REFINE)
+        arguments["level"] = put("level", level)
+        arguments["state"] = put("state", state)
+        if problem.prior is not None:
+            arguments["prior"] = put("prior", packed_prior(problem))
+        arguments["swarm"] = (
+            put("rotations", np.ascontiguousarray(rotations, dtype=np.float64)),
+            put("translations", np.ascontiguousarray(translations, dtype=np.float64)),
+            self._arena.buffer("scores", 8 * M),
+            self._arena.buffer("visible", 4 * M),
+        )
+        set_loss(arguments, settings, iterations)
+        arguments["flags"] = layout.COUNT_EVALUATIONS
+        return arguments
+
+
+def set_loss(arguments: NDArray[np.void], settings: LMSettings, iterations: int) -> None:
+    """Fill the LM and loss fields of the refine kernel's arguments."""
+    arguments["damping"] = settings.damping
+    arguments["damping_down"] = settings.damping_down
+    arguments["damping_up"] = settings.damping_up
+    arguments["min_overlap"] = settings.min_overlap
+    arguments["scale"] = settings.scale
+    arguments["redescending"] = settings.redescending
+    arguments["iterations"] = iterations
+
+
+def packed_prior(problem: LevelProblem) -> NDArray[np.void]:
+    """The problem's prior as the kernels read it."""
+    packed = np.zeros((), dtype=layout.PRIOR)
+    if problem.prior is not None:
+        packed["rotation"] = problem.prior.camera_from_local.rotation
+        packed["translation"] = problem.prior.camera_from_local.translation
+        packed["information"] = problem.prior.information
+        packed["weight"] = problem.prior.weight
+    return packed
+
+
+def stored(features: NDArray[np.floating], half: bool) -> NDArray[np.floating]:
+    """Features as the device stores them."""
+    return np.ascontiguousarray(features, dtype=np.float16 if half else np.float32)
+
+
+def _floats(array: NDArray[np.floating]) -> NDArray[np.float32]:
+    return np.ascontiguousarray(array, dtype=np.float32)

@@ -1,0 +1,219 @@
+"""A thin layer over the CUDA driver: one device, its memory, launches, graphs and events.
+
+Only what the registration needs. Calls go through `cuda.bindings.driver`; every failed call raises
+`CudaError` with the driver's own name of the error. The device's primary context is used, so that
+memory of onnxruntime or PyTorch in the same process can be read in place.
+"""
+
+from __future__ import annotations
+
+import ctypes
+from collections.abc import Callable
+from types import ModuleType
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from localizer.registration.cuda.errors import CudaError, CudaUnavailableError
+
+
+class Device:
+    """One CUDA device. Every thread that calls it calls `activate` first."""
+
+    def __init__(self, index: int = 0) -> None:
+        """Raises `CudaUnavailableError` where there is no such device, no driver, no bindings."""
+        self._api = _load_driver()
+        self._handle = self._call(self._api.cuDeviceGet, index)
+        self._context = self._call(self._api.cuDevicePrimaryCtxRetain, self._handle)
+        self.activate()
+        attribute = self._api.CUdevice_attribute
+        self.name: str = (
+            self._call(self._api.cuDeviceGetName, 256, self._handle).split(b"\0")[0].decode()
+        )
+        self.architecture = (
+            self._attribute(attribute.CU_DEVICE_ATTRIBUTE_COMPUTE_CAPABILITY_MAJOR),
+            self._attribute(attribute.CU_DEVICE_ATTRIBUTE_COMPUTE_CAPABILITY_MINOR),
+        )
+        self.multiprocessors = self._attribute(attribute.CU_DEVICE_ATTRIBUTE_MULTIPROCESSOR_COUNT)
+        self.stream = self._call(
+            self._api.cuStreamCreate, self._api.CUstream_flags.CU_STREAM_NON_BLOCKING
+        )
+
+    def activate(self) -> None:
+        """Make the device's context the calling thread's."""
+        self._call(self._api.cuCtxSetCurrent, self._context)
+
+    def load(self, code: bytes) -> Kernels:
+        """Load machine code; `CudaError` where it is not of this device's architecture."""
+        return Kernels(self, self._call(self._api.cuModuleLoadData, code))
+
+    def allocate(self, size: int) -> int:
+        """Address of `size` bytes of device memory (at least 1)."""
+        return int(self._call(self._api.cuMemAlloc, max(size, 1)))
+
+    def free(self, address: int) -> None:
+        """Give back what `allocate` gave."""
+        self._call(self._api.cuMemFree, address)
+
+    def pinned(self, size: int) -> NDArray[np.uint8]:
+        """Page-locked host memory for asynchronous copies; it lives as long as the process."""
+        address = int(self._call(self._api.cuMemAllocHost, max(size, 1)))
+        return np.ctypeslib.as_array((ctypes.c_uint8 * size).from_address(address))
+
+    def upload(self, address: int, array: NDArray[Any]) -> None:
+        """Queue a copy of a C-contiguous array to the device; pageable memory is staged at once."""
+        if not array.flags.c_contiguous:
+            raise ValueError("only C-contiguous arrays can be copied to the device")
+        self._call(
+            self._api.cuMemcpyHtoDAsync, address, array.ctypes.data, array.nbytes, self.stream
+        )
+
+    def download(self, array: NDArray[Any], address: int) -> None:
+        """Queue a copy from the device into a C-contiguous array; valid after `synchronize`."""
+        self._call(
+            self._api.cuMemcpyDtoHAsync, array.ctypes.data, address, array.nbytes, self.stream
+        )
+
+    def copy(self, target: int, source: int, size: int) -> None:
+        """Queue a copy within the device."""
+        self._call(self._api.cuMemcpyDtoDAsync, target, source, size, self.stream)
+
+    def synchronize(self) -> None:
+        """Wait for everything queued; errors of kernels appear here."""
+        self._call(self._api.cuStreamSynchronize, self.stream)
+
+    def capture(self, enqueue: Callable[[], None]) -> Graph:
+        """What `enqueue` queues, as one graph instead of being run."""
+        mode = self._api.CUstreamCaptureMode.CU_STREAM_CAPTURE_MODE_THREAD_LOCAL
+        self._call(self._api.cuStreamBeginCapture, self.stream, mode)
+        try:
+            enqueue()
+        finally:
+            graph = self._call(self._api.cuStreamEndCapture, self.stream)
+        try:
+            return Graph(self, self._call(self._api.cuGraphInstantiate, graph, 0))
+        finally:
+            self._call(self._api.cuGraphDestroy, graph)
+
+    def event(self) -> Any:
+        """A marker in the stream, recorded now, for `elapsed_ms`."""
+        event = self._call(self._api.cuEventCreate, 0)
+        self._call(self._api.cuEventRecord, event, self.stream)
+        return event
+
+    def elapsed_ms(self, start: Any, stop: Any) -> float:
+        """Milliseconds of device time between two events, which are used up."""
+        self._call(self._api.cuEventSynchronize, stop)
+        elapsed = float(self._call(self._api.cuEventElapsedTime, start, stop))
+        for event in (start, stop):
+            self._call(self._api.cuEventDestroy, event)
+        return elapsed
+
+    def _attribute(self, attribute: Any) -> int:
+        return int(self._call(self._api.cuDeviceGetAttribute, attribute, self._handle))
+
+    def _call(self, function: Callable[..., tuple[Any, ...]], *arguments: Any) -> Any:
+        status, *values = function(*arguments)
+        if status != self._api.CUresult.CUDA_SUCCESS:
+            raise CudaError(f"{function.__name__} failed: {status.name}")
+        return values[0] if values else None
+
+
+class Kernels:
+    """The functions of a loaded image."""
+
+    def __init__(self, device: Device, module: Any) -> None:
+        self._device, self._module = device, module
+        self._functions: dict[str, Any] = {}
+
+    def launch(self, name: str, blocks: int, threads: int, arguments: NDArray[Any]) -> None:
+        """Queue a kernel whose only parameter is a structure; arguments: 0-d structured array."""
+        device = self._device
+        api = device._api
+        if name not in self._functions:
+            self._functions[name] = device._call(
+                api.cuModuleGetFunction, self._module, name.encode()
+            )
+        # The driver copies the structure before it returns.
+        pointers = np.array([arguments.ctypes.data], dtype=np.uint64)
+        device._call(
+            api.cuLaunchKernel, self._functions[name], blocks, 1, 1, threads, 1, 1, 0,
+            device.stream, pointers.ctypes.data, 0,
+        )  # fmt: skip
+
+
+class Graph:
+    """An instantiated graph."""
+
+    def __init__(self, device: Device, handle: Any) -> None:
+        self._device, self._handle = device, handle
+
+    def launch(self) -> None:
+        """Queue the whole graph."""
+        self._device._call(self._device._api.cuGraphLaunch, self._handle, self._device.stream)
+
+    def destroy(self) -> None:
+        """Give its memory back."""
+        self._device._call(self._device._api.cuGraphExecDestroy, self._handle)
+
+
+class Arena:
+    """Named device buffers that grow and are kept, so that a frame allocates nothing."""
+
+    def __init__(self, device: Device) -> None:
+        self._device = device
+        self._buffers: dict[str, tuple[int, int]] = {}
+        self.generation = 0  # changes when any address has changed
+
+    def buffer(self, name: str, size: int) -> int:
+        """Address of at least `size` bytes under that name; growing loses the content."""
+        address, have = self._buffers.get(name, (0, 0))
+        if address and have >= size:
+            return address
+        if address:
+            self._device.synchronize()
+            self._device.free(address)
+        self._buffers[name] = (self._device.allocate(size), size)
+        self.generation += 1
+        return self._buffers[name][0]
+
+    def put(self, name: str, array: NDArray[Any]) -> int:
+        """Address of a device copy of a C-contiguous array."""
+        address = self.buffer(name, array.nbytes)
+        self._device.upload(address, array)
+        return address
+
+    @property
+    def size(self) -> int:
+        """Bytes held."""
+        return sum(size for _, size in self._buffers.values())
+
+    def close(self) -> None:
+        """Free everything."""
+        self._device.synchronize()
+        for address, _ in self._buffers.values():
+            self._device.free(address)
+        self._buffers.clear()
+
+
+def _load_driver() -> ModuleType:
+    """The bindings with a started driver and at least one device, or `CudaUnavailableError`."""
+    try:
+        from cuda.bindings import driver
+    except ImportError as error:
+        raise CudaUnavailableError(
+            f"no CUDA bindings ({error}): install the extra `gpu`"
+        ) from error
+    try:
+        status = driver.cuInit(0)[0]
+    except RuntimeError as error:  # the bindings' own error for a library that is not there
+        raise CudaUnavailableError("no NVIDIA driver (libcuda) on this machine") from error
+    if status == driver.CUresult.CUDA_ERROR_NO_DEVICE:
+        raise CudaUnavailableError("the NVIDIA driver sees no GPU")
+    if status != driver.CUresult.CUDA_SUCCESS:
+        raise CudaUnavailableError(f"the NVIDIA driver does not start: {status.name}")
+    status, count = driver.cuDeviceGetCount()
+    if status != driver.CUresult.CUDA_SUCCESS or count == 0:
+        raise CudaUnavailableError("the NVIDIA driver sees no GPU")
+    return driver
