@@ -1,0 +1,192 @@
+"""The bridge's flight-controller side under a simulated clock: minutes of flight in seconds."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+import pytest
+from pymavlink.dialects.v20 import ardupilotmega as mavlink
+
+from mavlink_bridge import BridgeConfig, HealthLevel, VisionFix
+from mavlink_bridge import quaternion as quat
+from mavlink_bridge.clock import SteadyUtc
+from mavlink_bridge.config import InjectionConfig, OriginConfig
+from mavlink_bridge.fc_side import FC_WANTED, FlightControllerSide
+from mavlink_bridge.framing import FrameReader
+from mavlink_bridge.side import Shared
+from mavlink_bridge.transport import Endpoint
+from mavlink_bridge.vehicle import VehicleTracker
+from mavlink_bridge.watch import VehicleWatch
+
+MS = 1_000_000
+SECOND = 1_000 * MS
+HOME = (47.397742, 8.545594)
+METRE = 1.0 / 111318.84502145034
+GEOID = 47.0
+ORIGIN = OriginConfig(latitude_deg=HOME[0], longitude_deg=HOME[1], altitude_amsl_m=488.0)
+TURN_RATE = 0.2  # rad/s of the vehicle's yaw
+
+
+@dataclass
+class SimulatedLink:
+    """What a side sees of a link; `open` false drops as a closed one does."""
+
+    sent: list[tuple[int, Any, int]] = field(default_factory=list)
+    system_id: int = 0
+    open: bool = True
+    endpoint: Endpoint = field(default_factory=lambda: Endpoint.parse("tcp:vehicle:5760"))
+    now_ns: int = 0
+
+    def send(self, message: Any, component: int) -> bool:
+        """Record it if the link is open."""
+        if self.open and self.system_id:
+            self.sent.append((self.now_ns, message, component))
+        return self.open and self.system_id != 0
+
+
+class Flight:
+    """A vehicle that turns at 500 m, its bridge, and a localizer at 10 Hz, 50 ms late.
+
+    boot_ns: its boot time as a function of the simulated time. mangle: what becomes of each frame.
+    """
+
+    def __init__(self, monkeypatch: pytest.MonkeyPatch, **options: Any) -> None:
+        options.setdefault("injection", InjectionConfig(rate_hz=10, delay_ms=100))
+        options.setdefault("origin", ORIGIN)
+        config = BridgeConfig(mode="inject", **options)
+        self.now_ns = 1_000 * SECOND
+        for module in ("fc_side", "watch", "clock"):
+            monkeypatch.setattr(f"mavlink_bridge.{module}.monotonic_ns", lambda: self.now_ns)
+        self.texts: list[str] = []
+        say: Callable[[int, str], None] = lambda _, text: self.texts.append(text)  # noqa: E731
+        shared = Shared(
+            config,
+            GEOID,
+            SteadyUtc(1_790_000_000 * SECOND, self.now_ns),
+            VehicleTracker(None, quat.IDENTITY, True),
+            self.now_ns,
+            lambda: HealthLevel.OK,
+            say,
+            None,
+            VehicleWatch(say),
+            None,
+        )
+        self.side = FlightControllerSide(shared)
+        self.link = SimulatedLink()
+        self.reader = FrameReader(FC_WANTED)
+        self.codec = mavlink.MAVLink(None, 1, 1)
+        self.booted_ns = self.now_ns - 100 * SECOND
+        self.clock_error_ns = 0
+        self.origin: tuple[float, float, float] | None = None
+        self.north_m = 0.0
+        self.reset_next = False
+        self.mangle: Callable[[bytes], bytes] = lambda frame: frame
+        self._answered = 0
+
+    def boot_ns(self, now_ns: int) -> int:
+        """The vehicle's clock."""
+        return now_ns - self.booted_ns + self.clock_error_ns
+
+    def yaw(self, now_ns: int) -> float:
+        """The vehicle's yaw, rad."""
+        return quat.wrap_pi(TURN_RATE * now_ns / SECOND)
+
+    def reboot(self) -> None:
+        """Clock and origin start over."""
+        self.booted_ns, self.clock_error_ns, self.origin = self.now_ns, 0, None
+
+    def run(self, seconds: float) -> None:
+        """Fly on, in steps of 10 ms."""
+        for _ in range(int(seconds * 100)):
+            self.now_ns += 10 * MS
+            self.link.now_ns = self.now_ns
+            step = self.now_ns // (10 * MS)
+            if self.link.open:
+                self._vehicle(step)
+            if step % 10 == 5:
+                self._fix(self.now_ns - 50 * MS)
+            self.side.on_tick(self.link, self.now_ns)  # type: ignore[arg-type]
+
+    def vision(self, since_ns: int = 0) -> list[tuple[int, Any]]:
+        """What was injected: (time, message)."""
+        kinds = ("VISION_POSITION_ESTIMATE", "GPS_INPUT")
+        return [(t, m) for t, m, _ in self.link.sent if m.get_type() in kinds and t > since_ns]
+
+    def _fix(self, exposure_ns: int) -> None:
+        fix = VisionFix(
+            exposure_ns,
+            HOME[0] + self.north_m * METRE,
+            HOME[1],
+            988.0 + GEOID,
+            0.0,
+            0.0,
+            self.yaw(exposure_ns),
+            np.eye(3) * 0.04,
+            reset=self.reset_next,
+        )
+        self.reset_next = False
+        self.side.fixes.put(fix)
+
+    def _vehicle(self, step: int) -> None:
+        boot_ms = self.boot_ns(self.now_ns) // MS
+        if step % 100 == 0:
+            self._say(mavlink.MAVLink_heartbeat_message(2, 3, 81, 4, 4, 3))
+        if step % 4 == 0:
+            yaw = self.yaw(self.now_ns)
+            self._say(mavlink.MAVLink_attitude_message(boot_ms, 0.0, 0.0, yaw, 0.0, 0.0, TURN_RATE))
+            self._say(
+                mavlink.MAVLink_local_position_ned_message(boot_ms, 0.0, 0.0, -500.0, 0, 0, 0)
+            )
+        while self._answered < len(self.link.sent):
+            _, message, _ = self.link.sent[self._answered]
+            self._answered += 1
+            self._answer(message)
+
+    def _answer(self, m: Any) -> None:
+        kind = m.get_type()
+        if kind == "TIMESYNC" and m.tc1 == 0:
+            self._say(mavlink.MAVLink_timesync_message(self.boot_ns(m.ts1 + 4 * MS), m.ts1))
+        elif kind == "SET_GPS_GLOBAL_ORIGIN" and self.origin is None:
+            self.origin = (m.latitude * 1e-7, m.longitude * 1e-7, m.altitude * 1e-3)
+        elif kind == "COMMAND_LONG" and m.command == 512 and m.param1 == 49 and self.origin:
+            lat, lon, alt = self.origin
+            self._say(
+                mavlink.MAVLink_gps_global_origin_message(
+                    round(lat * 1e7), round(lon * 1e7), round(alt * 1e3), 0
+                )
+            )
+
+    def _say(self, message: Any) -> None:
+        frame = bytes(message.pack(self.codec))
+        self.codec.seq = (self.codec.seq + 1) % 256
+        for decoded in self.reader.feed(self.mangle(frame)):
+            self.side.on_message(self.link, decoded, self.now_ns)  # type: ignore[arg-type]
+
+    def waiting(self) -> dict[str, int]:
+        """Lengths of everything that could grow."""
+        side = self.side
+        queues: dict[str, Any] = {
+            "fixes": side.fixes._fixes,
+            "due": side.injector._waiting,
+            "to compare": side._to_compare,
+            "outbound": side.outbound,
+            "timesync": side._sync_sent,
+            "sent": side.loop._sent,
+            "pending": side.loop._pending,
+            "differences": side.loop._differences,
+            "bytes": self.reader._buffer,
+            "sequences": self.reader._sequences,
+            "targets": side.camera._targets,
+        }
+        return {name: len(queue) for name, queue in queues.items()}
+
+    def attitude_error(self, age_ns: int = 200 * MS) -> float:
+        """Error of the interpolated yaw at an exposure, rad; NaN while there is none."""
+        at = self.side.tracker.attitude_at(self.now_ns - age_ns)
+        if at is None:
+            return math.nan
+        return abs(quat.wrap_pi(at.yaw_rad - self.yaw(self.now_ns - age_ns)))

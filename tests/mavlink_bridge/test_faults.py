@@ -1,0 +1,252 @@
+"""Links that break, clocks that step, controllers that reboot, frames that are damaged."""
+
+from __future__ import annotations
+
+import itertools
+import math
+import random
+import time
+from collections.abc import Callable, Iterator
+from typing import Any
+
+import pytest
+from pymavlink.dialects.v20 import ardupilotmega as mavlink
+
+from mavlink_bridge import VisionFix
+from mavlink_bridge.config import InjectionConfig
+from mavlink_bridge.framing import FrameReader
+from mavlink_bridge.inject import FixQueue
+from mavlink_bridge.side import GroundSide
+from tests.mavlink_bridge.simulated import HOME, MS, SECOND, Flight, SimulatedLink
+
+
+@pytest.fixture
+def flight(monkeypatch: pytest.MonkeyPatch) -> Flight:
+    it = Flight(monkeypatch)
+    it.run(15.0)
+    assert len(it.vision()) > 50
+    return it
+
+
+def silence(flight: Flight, seconds: float) -> None:
+    flight.link.open = False
+    flight.run(seconds)
+    flight.link.open = True
+
+
+def test_five_minutes_without_a_link(flight: Flight) -> None:
+    """The localizer jumps meanwhile: the first message after it carries the jump and says so."""
+    before = flight.vision()[-1][1]
+    assert before.reset_counter == 0
+    flight.link.open = False
+    flight.run(100.0)
+    flight.north_m, flight.reset_next = 25.0, True
+    flight.run(200.0)
+    lost_ns = flight.now_ns
+    assert max(flight.waiting().values()) <= 256
+    flight.link.open = True
+    flight.run(10.0)
+    after = flight.vision(lost_ns)
+    assert after[0][0] - lost_ns < 3 * SECOND
+    assert after[0][1].reset_counter == 1
+    assert after[0][1].x == pytest.approx(25.0, abs=0.3)
+    assert {m.reset_counter for _, m in after} == {1}
+    assert [t for t in flight.texts if "lost" in t or "back" in t] == [
+        "PiLoT: flight controller lost: no heartbeat for 3 s",
+        "PiLoT: flight controller is back",
+    ]
+    assert flight.side.counters["reboots"] == 0
+    # Only what is fresh: nothing that waited during the loss.
+    assert all(t - m.usec * 1000 <= 251 * MS for t, m in after)
+    assert max(flight.waiting().values()) <= 256
+
+
+def test_reboot_and_another_origin_during_the_loss(flight: Flight) -> None:
+    """Boot time is behind where it should be; a position relative to the old origin is 1 km off."""
+    flight.link.open = False
+    flight.run(60.0)
+    flight.reboot()
+    flight.run(200.0)  # its clock is ahead of what it last said
+    flight.origin = (HOME[0] + 0.01, HOME[1], 480.0)
+    lost_ns = flight.now_ns
+    flight.link.open = True
+    flight.run(10.0)
+    after = flight.vision(lost_ns)
+    assert after[0][0] - lost_ns < 4 * SECOND
+    assert {round(m.x) for _, m in after} == {-1113}
+    assert {round(m.z) for _, m in after} == {-508}
+    assert flight.attitude_error() < 0.005
+
+
+def test_reboot_in_flight(flight: Flight) -> None:
+    flight.reboot()
+    rebooted_ns = flight.now_ns
+    flight.run(15.0)
+    after = flight.vision(rebooted_ns + 300 * MS)
+    assert after[0][0] - rebooted_ns < 10 * SECOND  # origin asked for, then set again
+    assert len(after) > 40
+    assert {m.reset_counter for _, m in after} == {0}
+    assert flight.side.counters["reboots"] == 1
+    assert sum("rebooted" in t for t in flight.texts) == 1
+    assert flight.attitude_error() < 0.005
+
+
+@pytest.mark.parametrize("step_s", [-0.4, 0.4, 7.0, -40.0])
+def test_step_of_the_vehicles_clock(flight: Flight, step_s: float) -> None:
+    """Up to 1 s back is a step, more is what a reboot looks like; both are followed."""
+    flight.clock_error_ns = int(step_s * SECOND)
+    stepped_ns = flight.now_ns
+    flight.run(15.0)
+    assert flight.attitude_error() < 0.005
+    after = flight.vision(stepped_ns)
+    assert len(after) > (100 if step_s > -1.0 else 60)
+    assert {m.reset_counter for _, m in after} == {0}
+    stamps = [m.usec for _, m in flight.vision()]
+    assert all(b > a for a, b in itertools.pairwise(stamps))
+    assert flight.side.counters["reboots"] == (1 if step_s < -1.0 else 0)
+
+
+@pytest.mark.parametrize("step_s", [3600.0, -3600.0])
+def test_step_of_our_wall_clock_is_in_no_stamp(
+    monkeypatch: pytest.MonkeyPatch, step_s: float
+) -> None:
+    gps = InjectionConfig(message="gps_input", rate_hz=10, delay_ms=100)
+    flight = Flight(monkeypatch, injection=gps)
+    flight.run(10.0)
+    real = time.time_ns
+    monkeypatch.setattr("time.time_ns", lambda: real() + int(step_s * SECOND))
+    flight.run(5.0)
+    times = [m.time_week * 604_800_000 + m.time_week_ms for _, m in flight.vision()]
+    gaps = [b - a for a, b in itertools.pairwise(times)]
+    assert len(gaps) > 80
+    assert all(50 <= gap <= 200 for gap in gaps)
+
+
+def test_reset_counter_wraps_and_every_jump_is_a_change(flight: Flight) -> None:
+    for i in range(300):
+        flight.north_m, flight.reset_next = float(i % 7), True
+        flight.run(0.5)
+    messages = [m for _, m in flight.vision()]
+    counters = [m.reset_counter for m in messages]
+    assert max(counters) == 255
+    assert counters[-1] == 300 % 256
+    jumps = [(a, b) for a, b in itertools.pairwise(messages) if abs(a.x - b.x) > 0.5]
+    assert len(jumps) > 290
+    assert all((a.reset_counter + 1) % 256 == b.reset_counter for a, b in jumps)
+
+
+def test_jump_is_not_lost_with_the_fix_that_carried_it() -> None:
+    queue = FixQueue(4)
+    for i in range(10):
+        queue.put(VisionFix(i + 1, *HOME, 500.0, reset=i == 2))
+    fixes = queue.take()
+    assert [f.time_ns for f in fixes] == [7, 8, 9, 10]
+    assert [f.reset for f in fixes] == [True, False, False, False]
+    assert queue.dropped == 6
+    assert queue.take() == []
+
+
+def test_no_position_from_an_origin_on_another_continent(monkeypatch: pytest.MonkeyPatch) -> None:
+    flight = Flight(monkeypatch, origin=None)
+    flight.origin = (HOME[0], -HOME[1] - 60.0, 480.0)
+    flight.run(15.0)
+    assert flight.vision() == []
+    assert any("the EKF origin is" in t and "km away" in t for t in flight.texts)
+
+
+def test_late_fixes_are_told_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Fixes come 50 ms after exposure here; the parameter says 20."""
+    late = Flight(monkeypatch, injection=InjectionConfig(rate_hz=10, delay_ms=20))
+    late.run(30.0)
+    told = [t for t in late.texts if "ms old" in t]
+    assert told == ["PiLoT: fixes are 50 ms old: raise delay_ms (20) and VISO_DELAY_MS"]
+    fine = Flight(monkeypatch, injection=InjectionConfig(rate_hz=10, delay_ms=60))
+    fine.run(30.0)
+    assert not [t for t in fine.texts if "ms old" in t]
+
+
+# --- damaged input --------------------------------------------------------------------------------
+
+
+def damage(rng: random.Random, share: float) -> Callable[[bytes], bytes]:
+    """Flips, truncates, doubles, delays, swaps and adds noise to a share of the frames."""
+    old: list[bytes] = []
+
+    def mangle(frame: bytes) -> bytes:
+        old.append(frame)
+        del old[:-400]
+        if rng.random() > share:
+            return frame
+        at = rng.randrange(len(frame))
+        return (
+            frame[:at] + bytes([frame[at] ^ 1 << rng.randrange(8)]) + frame[at + 1 :],
+            frame[:at],
+            frame + frame,
+            b"",
+            rng.choice(old) + frame,  # a copy that comes up to half a minute late
+            frame + rng.randbytes(rng.randrange(1, 100)),
+            b"\xfd" * rng.randrange(1, 300) + frame,
+        )[rng.randrange(7)]
+
+    return mangle
+
+
+@pytest.mark.parametrize("seed", range(2))
+def test_damaged_frames_on_the_flight_controllers_link(
+    monkeypatch: pytest.MonkeyPatch, seed: int
+) -> None:
+    flight = Flight(monkeypatch)
+    flight.mangle = damage(random.Random(seed), 0.3)
+    flight.run(90.0)
+    counters = flight.reader.counters
+    assert counters.bad_bytes > 1000
+    assert counters.bad_checksums > 50
+    assert flight.side.counters["reboots"] == 0
+    assert flight.attitude_error() < 0.01
+    assert {m.reset_counter for _, m in flight.vision()} == {0}
+    assert len(flight.vision(flight.now_ns - 60 * SECOND)) > 550
+    assert max(flight.waiting().values()) < 1024
+
+
+def nonsense(rng: random.Random, count: int) -> Iterator[Any]:
+    """Frames with right checksums and random contents, of every message that is listened to."""
+    names = sorted(
+        {"COMMAND_LONG", "COMMAND_INT", "COMMAND_ACK", "TIMESYNC", "GPS_GLOBAL_ORIGIN"}
+        | {"HEARTBEAT", "ATTITUDE", "ATTITUDE_QUATERNION", "LOCAL_POSITION_NED", "STATUSTEXT"}
+        | {"GIMBAL_DEVICE_ATTITUDE_STATUS", "MOUNT_STATUS", "MOUNT_ORIENTATION", "GPS_RAW_INT"}
+        | {"GLOBAL_POSITION_INT", "EKF_STATUS_REPORT", "ESTIMATOR_STATUS", "RC_CHANNELS"}
+        | {"AUTOPILOT_VERSION"}
+    )
+    reader = FrameReader()
+    kinds = {kind.msgname: (number, kind) for number, kind in mavlink.mavlink_map.items()}
+    for _ in range(count):
+        number, kind = kinds[rng.choice(names)]
+        payload = rng.randbytes(kind.unpacker.size)
+        system, component = rng.choice([(1, 1), (1, 1), (255, 190), (0, 0), (2, 1), (1, 197)])
+        header = bytes([0xFD, len(payload), 0, 0, 0, system, component])
+        header += number.to_bytes(3, "little")
+        crc = mavlink.x25crc(header[1:] + payload)
+        crc.accumulate(bytes([kind.crc_extra]))
+        yield from reader.feed(header + payload + crc.crc.to_bytes(2, "little"))
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_nonsense_with_right_checksums_raises_nothing_and_leaves_nothing(
+    flight: Flight, seed: int
+) -> None:
+    ground, link = GroundSide(flight.side.shared), SimulatedLink(system_id=1)
+    for i, message in enumerate(nonsense(random.Random(seed), 4000)):
+        flight.side.on_message(flight.link, message, flight.now_ns)  # type: ignore[arg-type]
+        ground.on_message(link, message, flight.now_ns)  # type: ignore[arg-type]
+        if i % 40 == 0:
+            flight.run(0.05)
+            ground.on_tick(link, flight.now_ns)  # type: ignore[arg-type]
+    assert max(flight.waiting().values()) < 1024
+    # Even a lying autopilot is believed again once it speaks the truth.
+    flight.reboot()
+    flight.run(30.0)
+    assert len(flight.vision(flight.now_ns - 10 * SECOND)) > 90
+    assert flight.attitude_error() < 0.005
+    at = flight.side.tracker.attitude_at(flight.now_ns - 100 * MS)
+    assert at is not None
+    assert math.isfinite(at.yaw_rad)
