@@ -23,15 +23,16 @@ from pathlib import Path
 
 import matplotlib.pyplot as plt
 import numpy as np
-from basin_variants import FULL, Variant, our_rows, paper_rows, unweighted
+from basin_variants import FULL, Variant, our_rows, paper_rows
 from basin_views import View, load_views
 from feature_report import wilson
 
 from localizer.features import load_extractor
+from localizer.features.detail import DetailExtractor
 from localizer.map.cache import TileCache
 from localizer.map.stream import TileStreamer
 from localizer.pose import Array, Pose, so3_exp, so3_log
-from localizer.registration import JNGOConfig, select_anchors
+from localizer.registration import JNGOConfig
 from localizer.render.numba_raster import NumbaRenderer
 from localizer.types import Anchors, PosePrior, RegistrationStatus
 
@@ -120,7 +121,7 @@ def run_views(
 ) -> list[Outcome]:
     """Every variant from every start on the views of one map, numbered from `job`'s index on."""
     first, views = job
-    extractor = load_extractor(model, threads=1)
+    extractor = DetailExtractor(load_extractor(model, threads=1))
     optimizers = [(v, v.optimizer()) for v in variants]
     outcomes = []
     with TileStreamer(TileCache.open(views[0].map_cache)) as streamer:
@@ -137,14 +138,11 @@ def run_views(
                 for variant, optimizer in optimizers:
                     with variant.active():
                         if variant.selection not in chosen:
-                            made = select_anchors(reference, features, variant.anchors, index)
-                            chosen[variant.selection] = (
-                                made if variant.confidence else unweighted(made)
-                            )
+                            chosen[variant.selection] = variant.select(reference, features, index)
                         anchors = chosen[variant.selection]
                         began = time.thread_time()
                         found = optimizer.register(
-                            query, view.camera, anchors, prior,
+                            variant.shown(query), view.camera, anchors, prior,
                             motion=prior if variant.motion else None, seed=index,
                         )  # fmt: skip
                         ms = 1e3 * (time.thread_time() - began)

@@ -18,18 +18,20 @@ from scipy.spatial.transform import Rotation
 from localizer.pose import Array, Pose
 from localizer.registration import anchors as anchor_module
 from localizer.registration import hypotheses as hypothesis_module
+from localizer.registration import select_anchors
 from localizer.registration.backend import Backend, LevelProblem, LMSettings, Refinement
 from localizer.registration.jngo import JNGO, JNGOConfig
-from localizer.types import Anchors, PosePrior
+from localizer.types import Anchors, FeaturePyramid, PosePrior, RenderedView
 
-DEFAULT_ANCHORS = 2000
+DEFAULT_ANCHORS = 4000
 FULL = "ours"
 
 
 @dataclass(frozen=True)
 class Variant:
     """One row. anchors: N; motion: whether the prior serves as the prediction of Eq. 10; patches:
-    (dotted name, replacement); confidence: False takes all confidences as 1; loss: changes the
+    (dotted name, replacement); confidence: False takes all confidences as 1; detail: False leaves
+    the detail level out; loss: changes the
     backend's settings.
     """
 
@@ -38,6 +40,7 @@ class Variant:
     anchors: int = DEFAULT_ANCHORS
     motion: bool = True
     confidence: bool = True
+    detail: bool = True
     patches: tuple[tuple[str, object], ...] = ()
     loss: Callable[[LMSettings], LMSettings] | None = None
 
@@ -52,7 +55,18 @@ class Variant:
     def selection(self) -> tuple[object, ...]:
         """What its anchors depend on; variants with equal ones can share them."""
         own = tuple(p for p in self.patches if p[0].startswith("anchors."))
-        return self.anchors, self.confidence, own
+        return self.anchors, self.confidence, self.detail, own
+
+    def select(self, view: RenderedView, features: FeaturePyramid, seed: int) -> Anchors:
+        """This variant's anchors of a reference view."""
+        anchors = select_anchors(view, self.shown(features), self.anchors, seed)
+        if self.confidence:
+            return anchors
+        return replace(anchors, confidence=tuple(np.ones_like(c) for c in anchors.confidence))
+
+    def shown(self, features: FeaturePyramid) -> FeaturePyramid:
+        """The levels that this variant may see."""
+        return features if self.detail else replace(features, levels=features.levels[:-1])
 
     @contextmanager
     def active(self) -> Iterator[None]:
@@ -88,9 +102,9 @@ def paper_rows() -> list[Variant]:
     theirs = (*_CAMERA_ORIGIN, *_VERTICAL_TURNS)
     swarm = paper.model_copy(update={"hypotheses": 144})
     return [
-        Variant("paper: one hypothesis", paper, 500, motion=False, patches=theirs),
-        Variant("paper: + rotation-aware swarm", swarm, 500, motion=False, patches=theirs),
-        Variant("paper: + motion term", swarm, 500, patches=theirs),
+        Variant("paper: one hypothesis", paper, 500, False, detail=False, patches=theirs),
+        Variant("paper: + rotation-aware swarm", swarm, 500, False, detail=False, patches=theirs),
+        Variant("paper: + motion term", swarm, 500, detail=False, patches=theirs),
     ]
 
 
@@ -109,6 +123,9 @@ def our_rows() -> list[Variant]:
         changed("halving to 16 and 4", keep=(16, 4)),
         changed("survivors may repeat", distinct_px=0.0),
         changed("survivors do not converge", converge=0),
+        Variant("without detail level", detail=False),
+        Variant("without detail level, N = 2000", anchors=2000, detail=False),
+        changed("detail without sharpening before", sharpen_scales=()),
         changed("winner not sharpened", sharpen=0),
         Variant("sharpened under Huber", loss=_huber),
         Variant("redescending loss in the search", loss=_redescending),
@@ -120,14 +137,10 @@ def our_rows() -> list[Variant]:
         Variant("anchors on depth edges too", patches=_DEPTH_EDGES),
         changed("500 coarse anchors, not 250", swarm_anchors=(500, 500, 500)),
         Variant("N = 500", anchors=500),
-        Variant("N = 4000", anchors=4000),
+        Variant("N = 2000", anchors=2000),
+        Variant("N = 8000", anchors=8000),
         Variant("without confidence", confidence=False),
     ]
-
-
-def unweighted(anchors: Anchors) -> Anchors:
-    """The anchors with every confidence 1."""
-    return replace(anchors, confidence=tuple(np.ones_like(c) for c in anchors.confidence))
 
 
 def _huber(settings: LMSettings) -> LMSettings:

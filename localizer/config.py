@@ -27,7 +27,7 @@ class LocalizerConfig(BaseModel):
 
     width: int = Field(320, ge=64, le=2048, description="width of query and reference, pixels")
     model: Path | None = Field(None, description="ONNX feature network; none: the shipped one")
-    anchors: int = Field(2000, ge=50, le=5000, description="geo-anchors per reference view")
+    anchors: int = Field(4000, ge=50, le=8000, description="geo-anchors per reference view")
     threads: int = Field(2, ge=1, description="CPU threads of rendering and optimization")
     feature_threads: int = Field(1, ge=1, description="CPU threads of each feature extraction")
     cache_mib: int = Field(384, ge=16, description="resident tiles, MiB")

@@ -23,7 +23,6 @@ from localizer.registration.backend import (
     camera_from_local,
     level_problems,
     local_origin,
-    sample_bilinear,
     world_from_camera,
 )
 from localizer.registration.covariance import (
@@ -36,13 +35,19 @@ from localizer.registration.covariance import (
 from localizer.registration.hypotheses import generate_hypotheses
 from localizer.registration.kernel_numba import NumbaBackend
 from localizer.registration.priors import PoseConstraint
-from localizer.registration.reference import ReferenceBackend, in_view, project, robust_loss
-from localizer.types import Anchors, FeaturePyramid, Float32, PosePrior, RegistrationStatus
+from localizer.registration.reference import ReferenceBackend
+from localizer.registration.selection import (
+    LEAST_SCORE,
+    distinct,
+    median_residual,
+    mode_probabilities,
+    quality,
+    thinned,
+)
+from localizer.types import Anchors, FeaturePyramid, PosePrior, RegistrationStatus
 
-_PROBES = 12  # anchors whose projections tell hypotheses apart
 _COVARIANCE_ANCHORS = 1000  # enough for a covariance, cheap enough for every frame
 _LEAST_SCALE = 0.02  # of the sharpening loss, where features fit perfectly
-_LEAST_SCORE = 1e-3  # unit of the motion term and priors where features fit perfectly
 
 
 class JNGOConfig(BaseModel):
@@ -62,16 +67,19 @@ class JNGOConfig(BaseModel):
     )
     swarm_anchors: tuple[int, ...] = Field(
         default=(250, 500, 500),
-        description="anchors used per level, spread evenly; all by the winner",
+        description="anchors used per level, spread evenly; all by the winner, on the last level",
     )
     keep: tuple[int, ...] = Field(
         default=(32, 8), description="survivors after each level but the last"
     )
     converge: int = Field(default=6, ge=0, description="further LM steps of the last survivors")
-    sharpen: int = Field(default=6, ge=0, description="the winner's LM steps on all anchors, each")
+    sharpen: int = Field(default=6, ge=0, description="the winner's last LM steps, each")
     sharpen_scales: tuple[float, ...] = Field(
         default=(2.0, 1.0, 0.7),
         description="for each of these Geman-McClure scales, in median residual norms",
+    )
+    detail_scales: tuple[float, ...] = Field(
+        default=(1.0, 0.7), description="likewise on the detail level"
     )
     distinct_px: float = Field(
         default=0.25, ge=0, description="least rms distance of survivors, level px"
@@ -88,7 +96,7 @@ class JNGOConfig(BaseModel):
     prior_weight: float = Field(default=0.02, ge=0, description="weight of a constraint, likewise")
     correlation: float = Field(default=14.0, gt=0, description="covariance factor, calibrated")
     correlation_px: float = Field(
-        default=16.0, gt=0, description="finest-level cell within which residuals may correlate"
+        default=32.0, gt=0, description="image cell within which residuals may correlate"
     )
     covariance_floor: float = Field(
         default=0.05, ge=0, description="least share of the isotropic model"
@@ -154,14 +162,15 @@ class JNGO:
             return _failure(prior, status)
         origin = local_origin(anchors, prior.world_from_camera)
         problems = level_problems(query, camera, anchors, origin)
+        searched = len(self.config.iterations)
         swarm = self._refine(
-            problems, origin, prior, motion=motion, constraint=constraint, seed=seed
+            problems[:searched], origin, prior, motion=motion, constraint=constraint, seed=seed
         )
         if not np.isfinite(swarm.scores[0]):
             return _failure(prior, RegistrationStatus.NO_OVERLAP, swarm.evaluations)
         swarm = self._converge(swarm, origin, motion)
-        full = replace(problems[-1], prior=swarm.problem.prior)
-        return self._result(origin, prior, self._sharpen(replace(swarm, problem=full)))
+        winner = self._sharpen(swarm, problems[searched - 1 :], constraint, origin)
+        return self._result(origin, prior, swarm, winner, query.levels[-1].stride)
 
     def _refine(
         self,
@@ -189,13 +198,13 @@ class JNGO:
         for level, iterations, survivors, anchors in zip(
             problems, c.iterations, keep, c.swarm_anchors, strict=True
         ):
-            problem = self._constrained(_thinned(level, anchors), constraint, R, t, origin)
+            problem = self._constrained(thinned(level, anchors), constraint, R, t, origin)
             result = self.backend.refine(problem, R, t, iterations, c.settings)
             evaluations += result.evaluations
             totals = self._totals(
                 result.rotations, result.translations, result.scores, origin, motion
             )
-            order = _distinct(problem, result.rotations, result.translations, totals, c.distinct_px)
+            order = distinct(problem, result.rotations, result.translations, totals, c.distinct_px)
             order = order[:survivors]
             R, t = result.rotations[order], result.translations[order]
             scores, overlaps = result.scores[order], result.overlaps[order]
@@ -223,23 +232,31 @@ class JNGO:
             swarm.evaluations + result.evaluations,
         )
 
-    def _sharpen(self, swarm: _Swarm) -> _Swarm:
-        """The winner's pose under ever narrower redescending losses; the scores stay Huber's."""
+    def _sharpen(
+        self,
+        swarm: _Swarm,
+        problems: tuple[LevelProblem, ...],
+        constraint: PoseConstraint | None,
+        origin: Array,
+    ) -> _Winner:
+        """The best pose under ever narrower redescending losses; all anchors on the last level."""
         c = self.config
-        if c.sharpen == 0:
-            return swarm
-        R, t = swarm.rotations.copy(), swarm.translations.copy()
-        median = _median_residual(_thinned(swarm.problem, c.swarm_anchors[-1]), R[0], t[0])
-        settings, evaluations = swarm.settings, swarm.evaluations
-        for factor in c.sharpen_scales:
-            scale = max(factor * median, _LEAST_SCALE)
-            settings = replace(c.settings, scale=scale, redescending=True)
-            result = self.backend.refine(swarm.problem, R[:1], t[:1], c.sharpen, settings)
-            R[:1], t[:1] = result.rotations, result.translations
-            evaluations += result.evaluations
-        return replace(
-            swarm, rotations=R, translations=t, settings=settings, evaluations=evaluations
-        )
+        R, t = swarm.rotations[:1].copy(), swarm.translations[:1].copy()
+        problem, settings, evaluations = swarm.problem, swarm.settings, 0
+        scales = (c.sharpen_scales, c.detail_scales)
+        for k, level in enumerate(problems if c.sharpen else ()):
+            last = k == len(problems) - 1
+            problem = self._constrained(
+                level if last else thinned(level, c.swarm_anchors[-1]), constraint, R, t, origin
+            )
+            median = median_residual(thinned(problem, c.swarm_anchors[-1]), R[0], t[0])
+            for factor in scales[k]:
+                scale = max(factor * median, _LEAST_SCALE)
+                settings = replace(c.settings, scale=scale, redescending=True)
+                result = self.backend.refine(problem, R, t, c.sharpen, settings)
+                R, t = result.rotations, result.translations
+                evaluations += result.evaluations
+        return _Winner(problem, settings, R[0], t[0], evaluations)
 
     def _constrained(
         self,
@@ -260,14 +277,14 @@ class JNGO:
             pose.rotation[None], pose.translation[None], origin
         )
         target = Pose(rotation[0], translation[0])
-        weight = self.config.prior_weight * max(float(best), _LEAST_SCORE)
+        weight = self.config.prior_weight * max(float(best), LEAST_SCORE)
         return replace(problem, prior=QuadraticPrior(target, constraint.information, weight))
 
     def _totals(
         self, R: Array, t: Array, scores: Array, origin: Array, motion: PosePrior | None
     ) -> Array:
         """Eq. 10: photometric cost plus the squared Mahalanobis distance to the prediction."""
-        best = max(scores.min(), _LEAST_SCORE)
+        best = max(scores.min(), LEAST_SCORE)
         if motion is None or not np.isfinite(best) or self.config.motion_weight == 0:
             return scores
         information = np.linalg.pinv(motion.covariance, hermitian=True)
@@ -277,31 +294,38 @@ class JNGO:
         totals: Array = scores + self.config.motion_weight * best * squared
         return totals
 
-    def _result(self, origin: Array, prior: PosePrior, swarm: _Swarm) -> Registration:
-        c, problem = self.config, swarm.problem
-        R, t = swarm.rotations[0], swarm.translations[0]
-        sample = _thinned(problem, _COVARIANCE_ANCHORS)
-        model = anchor_model(sample, R, t, swarm.settings, c.correlation_px)
+    def _result(
+        self, origin: Array, prior: PosePrior, swarm: _Swarm, winner: _Winner, stride: int
+    ) -> Registration:
+        c, problem, R, t = self.config, winner.problem, winner.rotation, winner.translation
+        evaluations = swarm.evaluations + winner.evaluations
+        model = anchor_model(
+            thinned(problem, _COVARIANCE_ANCHORS), R, t, winner.settings, c.correlation_px / stride
+        )
         weight = 0.0 if problem.prior is None else problem.prior.weight
         tangent = tangent_covariance(model, c.correlation, c.covariance_floor, weight)
         if tangent is None:
-            return _failure(prior, RegistrationStatus.NO_TEXTURE, swarm.evaluations)
-        rotations, centres = world_from_camera(swarm.rotations, swarm.translations, origin)
+            return _failure(prior, RegistrationStatus.NO_TEXTURE, evaluations)
+        rotations, centres = world_from_camera(
+            np.concatenate([R[None], swarm.rotations[1:]]),
+            np.concatenate([t[None], swarm.translations[1:]]),
+            origin,
+        )
         pose = Pose(rotations[0], centres[0])
-        probabilities = _mode_probabilities(swarm.scores, int(model.cell.max()) + 1)
+        probabilities = mode_probabilities(swarm.scores, int(model.cell.max()) + 1)
         differences = pose_differences(rotations, centres, pose)
         covariance = pose_covariance(tangent, R, t) + mode_spread(differences, probabilities)
         if np.sqrt(np.linalg.eigvalsh(covariance[:3, :3])[-1]) > c.max_sigma_m:
-            return _failure(prior, RegistrationStatus.NO_TEXTURE, swarm.evaluations)
+            return _failure(prior, RegistrationStatus.NO_TEXTURE, evaluations)
         return Registration(
             pose,
             covariance,
             float(swarm.scores[0]),
             float(swarm.overlaps[0]),
-            _quality(_thinned(problem, c.swarm_anchors[-1]), R, t, c.settings),
+            quality(swarm.problem, R, t, c.settings),
             RegistrationStatus.OK,
             int(np.isfinite(swarm.scores).sum()),
-            swarm.evaluations,
+            evaluations,
         )
 
     def warm_up(self, channels: int) -> None:
@@ -322,7 +346,7 @@ class JNGO:
 
 @dataclass(frozen=True)
 class _Swarm:
-    """Survivors, best first, with their level's problem and the loss of the first one's pose."""
+    """Survivors, best first, with the problem and the loss that scored them."""
 
     problem: LevelProblem
     settings: LMSettings
@@ -330,6 +354,17 @@ class _Swarm:
     translations: Array
     scores: Array
     overlaps: Array
+    evaluations: int
+
+
+@dataclass(frozen=True)
+class _Winner:
+    """The sharpened pose, camera_from_local, with the problem and loss of its last steps."""
+
+    problem: LevelProblem
+    settings: LMSettings
+    rotation: Array
+    translation: Array
     evaluations: int
 
 
@@ -346,9 +381,9 @@ def _input_status(
     query: FeaturePyramid, anchors: Anchors, config: JNGOConfig
 ) -> RegistrationStatus:
     levels = len(config.iterations)
-    if len(query.levels) != levels or len(anchors.features) != levels:
+    if len(query.levels) not in (levels, levels + 1) or len(anchors.features) != len(query.levels):
         raise ValueError(
-            f"iterations {config.iterations} need {levels} feature levels, "
+            f"iterations {config.iterations} need {levels} feature levels, or one more for detail; "
             f"query has {len(query.levels)}, anchors have {len(anchors.features)}"
         )
     if len(anchors.points_world) < config.min_anchors:
@@ -370,77 +405,3 @@ def _failure(prior: PosePrior, status: RegistrationStatus, evaluations: int = 0)
     return Registration(
         prior.world_from_camera, prior.covariance, np.inf, 0.0, 0.0, status, 0, evaluations
     )
-
-
-def _mode_probabilities(scores: Array, effective: float) -> Array:
-    """Posterior weight (M,) of each surviving mode, were so many anchors independent."""
-    excess = np.maximum(scores - scores[0], 0.0) / max(scores[0], _LEAST_SCORE)
-    likelihood = np.exp(-0.5 * effective * excess)
-    probabilities: Array = likelihood / likelihood.sum()
-    return probabilities
-
-
-def _thinned(problem: LevelProblem, count: int) -> LevelProblem:
-    """The problem with about `count` of its anchors: every k-th of the Morton order, so spread."""
-    step = problem.points.shape[1] // max(count, 1)
-    if step < 2:
-        return problem
-    return replace(
-        problem,
-        points=np.ascontiguousarray(problem.points[:, ::step]),
-        anchor_features=np.ascontiguousarray(problem.anchor_features[::step]),
-        anchor_confidence=np.ascontiguousarray(problem.anchor_confidence[::step]),
-    )
-
-
-def _distinct(
-    problem: LevelProblem, R: Array, t: Array, totals: Array, distance_px: float
-) -> NDArray[np.int64]:
-    """Indices of finite hypotheses, best first, without those that repeat a better one.
-
-    Distance: rms over probe anchors of the distance between projections, in pixels of the level.
-    Without this the survivors would be many copies of one mode.
-    """
-    order = np.argsort(totals, kind="stable")
-    finite = order[np.isfinite(totals[order])]
-    if len(finite) < 2:
-        return order[:1]
-    probes = problem.points[:, :: max(1, problem.points.shape[1] // _PROBES)].astype(np.float64)
-    x = R[finite] @ probes + t[finite, :, None]
-    z = np.maximum(x[:, 2], 0.1)
-    uv = np.concatenate([problem.focal[0] * x[:, 0] / z, problem.focal[1] * x[:, 1] / z], axis=1)
-    kept: list[int] = []
-    limit = distance_px**2 * uv.shape[1] / 2
-    alive = np.ones(len(finite), dtype=bool)
-    for i in range(len(finite)):
-        if alive[i]:
-            kept.append(i)
-            alive &= ((uv - uv[i]) ** 2).sum(axis=1) > limit
-    return finite[kept]
-
-
-def _sampled(problem: LevelProblem, R: Array, t: Array) -> tuple[Array, Float32, Array]:
-    """Of the anchors in view: query and anchor features (n, C), joint weights (n,)."""
-    x, uv = project(problem, R, t)
-    visible = in_view(problem, x, uv)
-    u, v = uv[visible].T
-    weights = problem.anchor_confidence[visible] * sample_bilinear(problem.confidence, u, v)
-    return sample_bilinear(problem.features, u, v), problem.anchor_features[visible], weights
-
-
-def _quality(problem: LevelProblem, R: Array, t: Array, settings: LMSettings) -> float:
-    """1 - score / score of chance, where chance pairs each anchor with another's query feature."""
-    query, reference, weights = _sampled(problem, R, t)
-    others = np.roll(reference, len(reference) // 2, axis=0)
-    actual, _ = robust_loss(np.linalg.norm(query - reference, axis=1), settings)
-    chance, _ = robust_loss(np.linalg.norm(query - others, axis=1), settings)
-    return float(np.clip(1.0 - float(weights @ actual) / max(float(weights @ chance), 1e-12), 0, 1))
-
-
-def _median_residual(problem: LevelProblem, R: Array, t: Array) -> float:
-    """Weighted median of the residual norms."""
-    query, reference, weights = _sampled(problem, R, t)
-    norms = np.linalg.norm(query - reference, axis=1)
-    order = np.argsort(norms)
-    cumulated = np.cumsum(weights[order])
-    return float(norms[order][np.searchsorted(cumulated, 0.5 * cumulated[-1])])

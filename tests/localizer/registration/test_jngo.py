@@ -18,7 +18,7 @@ from localizer.registration import (
     position_constraint,
     select_anchors,
 )
-from localizer.types import RegistrationStatus
+from localizer.types import FeatureLevel, RegistrationStatus
 
 
 @pytest.fixture(scope="module")
@@ -264,3 +264,35 @@ def test_level_count_mismatch_is_named(jngo, scene, prior):
     short = replace(scene.query, levels=scene.query.levels[:2])
     with pytest.raises(ValueError, match="3 feature levels"):
         jngo.register(short, scene.camera, scene.anchors, prior(scene.reference, 1.0, 1.0))
+
+
+def test_the_detail_level_sharpens_the_winner(jngo, place, camera, scene_factory, prior):
+    """A level more than `iterations`, of stride 1: the search ignores it, the winner ends on it."""
+    found = {"without": [], "with": []}
+    for seed in range(5):
+        scene = scene_factory(500 + seed, 1.0, 1.0)
+        detailed, coarse = (
+            replace(p, levels=(*p.levels, detail_of(place, camera, pose, seed + k)))
+            for k, (p, pose) in enumerate(
+                [(scene.query, scene.true), (place.pyramid(scene.reference, camera, 0.05, seed),
+                                             scene.reference)]
+            )
+        )  # fmt: skip
+        anchors = select_anchors(place.view(scene.reference, camera), coarse, 1500)
+        about = prior(scene.reference, 1.0, 1.0)
+        result = jngo.register(detailed, camera, anchors, about)
+        found["with"].append(result.world_from_camera.distance_to(scene.true)[0])
+        plain = replace(anchors, features=anchors.features[:3], confidence=anchors.confidence[:3])
+        result = jngo.register(scene.query, camera, plain, about)
+        found["without"].append(result.world_from_camera.distance_to(scene.true)[0])
+    assert np.median(found["with"]) < 0.6 * np.median(found["without"])
+
+
+def detail_of(place, camera, pose, seed):
+    """A stride 1 level of the place's finest features, with little noise."""
+    v, u = np.mgrid[0 : camera.height, 0 : camera.width] + 0.5
+    pixels = np.stack([u, v], axis=-1)
+    point = pose.apply(camera.rays(pixels) * place.hit(pose, camera, pixels)[..., None])
+    f = place.features(2, point[..., 0], point[..., 1])
+    f += 0.01 * np.random.default_rng(seed).standard_normal(f.shape)
+    return FeatureLevel(f.astype(np.float32), np.full(f.shape[:2], 0.8, np.float32), 1)

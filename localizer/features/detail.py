@@ -1,0 +1,56 @@
+"""The detail level: what takes the registered pose from half a network cell to a tenth of a pixel.
+
+A network's finest level has a stride of 2 or more and features that are smooth over some pixels.
+Once the pose is known to a pixel, the image itself says more: brightness and its two derivatives
+at full resolution, each divided by the local contrast so that light, exposure and haze cancel.
+"""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+
+from localizer.features.extractor import FeatureExtractor
+from localizer.types import FeatureLevel, FeaturePyramid, Image
+
+_SMOOTH_PX = 0.8  # a rendered texture and a photo differ in their last half pixel
+_CONTRAST_PX = 5.0  # sigma of the window that contrast is measured in
+_CONTRAST_FLOOR = 0.01  # of full brightness: below it is sensor noise
+_CONFIDENT_CONTRAST = 0.02  # contrast that counts half
+_BRIGHTNESS_SHARE = 0.3  # of brightness against derivatives: light changes it more
+
+
+class DetailExtractor:
+    """Another extractor's pyramid with the detail level appended."""
+
+    def __init__(self, base: FeatureExtractor) -> None:
+        self._base = base
+
+    @property
+    def name(self) -> str:
+        """What computes the features, for reports."""
+        return f"{self._base.name} + detail"
+
+    def extract(self, rgb: Image) -> FeaturePyramid:
+        """Pyramid of an (H, W, 3) uint8 RGB image; the last level has stride 1."""
+        pyramid = self._base.extract(rgb)
+        levels = (*pyramid.levels, detail_level(rgb))
+        return FeaturePyramid(levels, pyramid.width, pyramid.height)
+
+
+def detail_level(rgb: Image) -> FeatureLevel:
+    """Contrast-normalised brightness and derivatives (H, W, 4) of an (H, W, 3) uint8 RGB image.
+
+    Not of unit length. The fourth channel is zero: four floats are one SIMD register.
+    """
+    gray = cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY).astype(np.float32) * np.float32(1 / 255)
+    smooth = cv2.GaussianBlur(gray, (0, 0), _SMOOTH_PX)
+    mean = cv2.GaussianBlur(smooth, (0, 0), _CONTRAST_PX)
+    variance = cv2.GaussianBlur(smooth * smooth, (0, 0), _CONTRAST_PX) - mean * mean
+    contrast = np.sqrt(np.maximum(variance, 0.0)) + np.float32(_CONTRAST_FLOOR)
+    features = np.zeros((*gray.shape, 4), np.float32)
+    features[..., 0] = np.float32(_BRIGHTNESS_SHARE) * (smooth - mean) / contrast
+    features[..., 1] = cv2.Sobel(smooth, cv2.CV_32F, 1, 0, scale=1 / 8) / contrast
+    features[..., 2] = cv2.Sobel(smooth, cv2.CV_32F, 0, 1, scale=1 / 8) / contrast
+    confidence = contrast / (contrast + np.float32(_CONFIDENT_CONTRAST))
+    return FeatureLevel(features, confidence, 1)

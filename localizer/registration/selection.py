@@ -1,0 +1,93 @@
+"""What the optimizer asks about its hypotheses between the refinements (docs/registration.md, 7).
+
+Which are distinct, how probable, how good against chance, and how large their residuals are.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from localizer.pose import Array
+from localizer.registration.backend import LevelProblem, LMSettings, sample_bilinear
+from localizer.registration.reference import in_view, project, robust_loss
+from localizer.types import Float32
+
+LEAST_SCORE = 1e-3  # unit of the motion term and of priors where features fit perfectly
+_PROBES = 12  # anchors whose projections tell hypotheses apart
+
+
+def mode_probabilities(scores: Array, effective: float) -> Array:
+    """Posterior weight (M,) of each surviving mode, were so many anchors independent."""
+    excess = np.maximum(scores - scores[0], 0.0) / max(scores[0], LEAST_SCORE)
+    likelihood = np.exp(-0.5 * effective * excess)
+    probabilities: Array = likelihood / likelihood.sum()
+    return probabilities
+
+
+def thinned(problem: LevelProblem, count: int) -> LevelProblem:
+    """The problem with about `count` of its anchors: every k-th of the Morton order, so spread."""
+    step = problem.points.shape[1] // max(count, 1)
+    if step < 2:
+        return problem
+    return replace(
+        problem,
+        points=np.ascontiguousarray(problem.points[:, ::step]),
+        anchor_features=np.ascontiguousarray(problem.anchor_features[::step]),
+        anchor_confidence=np.ascontiguousarray(problem.anchor_confidence[::step]),
+    )
+
+
+def distinct(
+    problem: LevelProblem, R: Array, t: Array, totals: Array, distance_px: float
+) -> NDArray[np.int64]:
+    """Indices of finite hypotheses, best first, without those that repeat a better one.
+
+    Distance: rms over probe anchors of the distance between projections, in pixels of the level.
+    Without this the survivors would be many copies of one mode.
+    """
+    order = np.argsort(totals, kind="stable")
+    finite = order[np.isfinite(totals[order])]
+    if len(finite) < 2:
+        return order[:1]
+    probes = problem.points[:, :: max(1, problem.points.shape[1] // _PROBES)].astype(np.float64)
+    x = R[finite] @ probes + t[finite, :, None]
+    z = np.maximum(x[:, 2], 0.1)
+    uv = np.concatenate([problem.focal[0] * x[:, 0] / z, problem.focal[1] * x[:, 1] / z], axis=1)
+    kept: list[int] = []
+    limit = distance_px**2 * uv.shape[1] / 2
+    alive = np.ones(len(finite), dtype=bool)
+    for i in range(len(finite)):
+        if alive[i]:
+            kept.append(i)
+            alive &= ((uv - uv[i]) ** 2).sum(axis=1) > limit
+    return finite[kept]
+
+
+def _sampled(problem: LevelProblem, R: Array, t: Array) -> tuple[Array, Float32, Array]:
+    """Of the anchors in view: query and anchor features (n, C), joint weights (n,)."""
+    x, uv = project(problem, R, t)
+    visible = in_view(problem, x, uv)
+    u, v = uv[visible].T
+    weights = problem.anchor_confidence[visible] * sample_bilinear(problem.confidence, u, v)
+    return sample_bilinear(problem.features, u, v), problem.anchor_features[visible], weights
+
+
+def quality(problem: LevelProblem, R: Array, t: Array, settings: LMSettings) -> float:
+    """1 - score / score of chance, where chance pairs each anchor with another's query feature."""
+    query, reference, weights = _sampled(problem, R, t)
+    others = np.roll(reference, len(reference) // 2, axis=0)
+    actual, _ = robust_loss(np.linalg.norm(query - reference, axis=1), settings)
+    chance, _ = robust_loss(np.linalg.norm(query - others, axis=1), settings)
+    return float(np.clip(1.0 - float(weights @ actual) / max(float(weights @ chance), 1e-12), 0, 1))
+
+
+def median_residual(problem: LevelProblem, R: Array, t: Array) -> float:
+    """Weighted median of the residual norms."""
+    query, reference, weights = _sampled(problem, R, t)
+    norms = np.linalg.norm(query - reference, axis=1)
+    order = np.argsort(norms)
+    cumulated = np.cumsum(weights[order])
+    return float(norms[order][np.searchsorted(cumulated, 0.5 * cumulated[-1])])
