@@ -31,13 +31,16 @@ def train(
     config: ConfigPath,
     steps: Annotated[int | None, typer.Option(help="Stop after so many more steps.")] = None,
 ) -> None:
-    """Train, from the checkpoint where there is one; shards are generated alongside."""
+    """Train, from the checkpoint where there is one; shards are generated alongside.
+
+    On several GPUs: torchrun --nproc-per-node N -m localizer.training train CONFIG.
+    """
     from localizer.training.train import Trainer
 
     loaded = load_config(config)
     trainer = Trainer(loaded)
-    generator = threading.Thread(target=_generate, args=(loaded,), daemon=True)
-    generator.start()
+    if trainer.workers.rank == 0:
+        threading.Thread(target=_generate, args=(loaded,), daemon=True).start()
     trainer.run(steps)
 
 

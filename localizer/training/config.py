@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 import yaml
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
 from localizer.errors import ModelError
 from localizer.training.model import ModelConfig
@@ -55,6 +55,12 @@ class OptimizerSection(_Frozen):
     lm_iterations: int = Field(gt=0)
     start_error_px: tuple[float, float, float]
     threads: int = Field(gt=0)
+
+    @model_validator(mode="after")
+    def _decay_fits(self) -> OptimizerSection:
+        if self.decay_steps > self.steps:
+            raise ValueError(f"decay_steps {self.decay_steps} exceeds steps {self.steps}")
+        return self
 
 
 class TrainConfig(_Frozen):

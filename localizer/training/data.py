@@ -1,4 +1,4 @@
-"""Batches of augmented crops from shards; what a step sees depends on seed and step alone."""
+"""Batches of augmented crops from shards: what a step sees depends on seed, rank and step alone."""
 
 from __future__ import annotations
 
@@ -61,8 +61,9 @@ class ShardStream:
     still being generated and yet see the same data every time.
     """
 
-    def __init__(self, schedule: Schedule, config: LoaderConfig, seed: int) -> None:
-        self._schedule, self._config, self._seed = schedule, config, seed
+    def __init__(self, schedule: Schedule, config: LoaderConfig, seed: int, rank: int = 0) -> None:
+        self._schedule, self._config = schedule, config
+        self._seed = (seed,) if rank == 0 else (seed, rank)
         self._cache: OrderedDict[Path, list[Pair]] = OrderedDict()
         self._pool = ThreadPoolExecutor(1)
         self._next: tuple[int, Future[Batch]] | None = None
@@ -81,7 +82,7 @@ class ShardStream:
         self._pool.shutdown(wait=False, cancel_futures=True)
 
     def _make(self, step: int) -> Batch:
-        rng = np.random.default_rng((self._seed, step))
+        rng = np.random.default_rng((*self._seed, step))
         samples: list[Sample] = []
         while len(samples) < self._config.batch:
             pairs = self._shard(self._schedule.draw(step, rng))

@@ -13,6 +13,7 @@ from torch import Tensor, nn
 
 from localizer.training.config import DataSection, OptimizerSection, TrainConfig
 from localizer.training.data import LoaderConfig, Schedule, ShardStream
+from localizer.training.distributed import Workers
 from localizer.training.losses import Batch, alignment_loss, contrast_loss, sample, se3_exp
 from localizer.training.model import STRIDES, TinyNet
 from localizer.training.shards import shard_path, world_shard_paths
@@ -22,13 +23,18 @@ logger = logging.getLogger(__name__)
 
 
 class Trainer:
-    """A run that stops and continues at any step with the same result."""
+    """A run that stops and continues at any step with the same result.
+
+    Under torchrun every process takes batches of its own and all take the mean step; the first one
+    writes. Batch statistics stay each process's own, the first one's are kept.
+    """
 
     def __init__(self, config: TrainConfig) -> None:
         self.config = config
         torch.manual_seed(config.seed)
         torch.set_num_threads(config.optimizer.threads)
-        self.device = torch.device("cuda" if torch.cuda.is_available() else "cpu")
+        self.workers = Workers.from_environment()
+        self.device = self.workers.device
         self.model = TinyNet(config.model).to(self.device).train()
         if config.warm_start is not None:
             state = torch.load(config.warm_start, map_location=self.device, weights_only=True)
@@ -60,7 +66,7 @@ class Trainer:
             last = min(last, self.step + steps)
         data, o = self.config.data, self.config.optimizer
         loader = LoaderConfig(o.batch, o.anchors, o.crop, data.appearance)
-        stream = ShardStream(schedule(data), loader, self.config.seed)
+        stream = ShardStream(schedule(data), loader, self.config.seed, self.workers.rank)
         rows: list[dict[str, float]] = []
         began = time.monotonic() - self.seconds
         try:
@@ -84,7 +90,9 @@ class Trainer:
         loss, parts = self._loss(batch)
         self.optimizer.zero_grad()
         loss.backward()
-        norm = nn.utils.clip_grad_norm_([*self.model.parameters(), self.log_scale], 5.0)
+        parameters = [*self.model.parameters(), self.log_scale]
+        self.workers.average_gradients(parameters)
+        norm = nn.utils.clip_grad_norm_(parameters, 5.0)
         if torch.isfinite(norm):
             self.optimizer.step()
             self._update_average()
@@ -133,6 +141,8 @@ class Trainer:
                     mean.copy_(value)
 
     def _save(self) -> None:
+        if self.workers.rank > 0:
+            return
         self.config.output.mkdir(parents=True, exist_ok=True)
         partial = self.checkpoint.with_suffix(".partial")
         torch.save(
@@ -162,6 +172,8 @@ class Trainer:
         logger.info("resumed %s at step %d", self.checkpoint, self.step)
 
     def _log(self, rows: list[dict[str, float]]) -> None:
+        if self.workers.rank > 0:
+            return
         means: dict[str, float] = {k: float(np.mean([r[k] for r in rows])) for k in rows[0]}
         row = {"step": float(self.step), "seconds": round(self.seconds, 1)} | means
         path = self.config.output / f"{self.config.name}.csv"

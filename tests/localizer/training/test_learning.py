@@ -1,8 +1,14 @@
+import os
+import re
+import socket
+import subprocess
+import sys
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
+import yaml
 
 torch = pytest.importorskip("torch")
 
@@ -25,11 +31,25 @@ from localizer.training.model import ModelConfig, TinyNet, fuse  # noqa: E402
 from localizer.training.orientation import OrientationFeatures  # noqa: E402
 from localizer.training.pairs import SceneConfig, scene_pairs  # noqa: E402
 from localizer.training.shards import write_shard  # noqa: E402
-from localizer.training.train import Trainer, perturbed  # noqa: E402
+from localizer.training.train import Trainer, learning_rate, perturbed  # noqa: E402
 
 SHIPPED = Path(__file__).parents[3] / "configs" / "train_tiny.yaml"
 SCENES = SceneConfig(cells=256, width=128, height=96, references=3, queries_per_light=3)
 LOADER = LoaderConfig(batch=2, anchors=64, crop=(96, 64), appearance=True)
+
+
+WORKER = """
+import sys
+from pathlib import Path
+import torch
+from localizer.training.config import load_config
+from localizer.training.train import Trainer
+run = Path(sys.argv[1])
+trainer = Trainer(load_config(run))
+trainer.run(steps=3)
+torch.save([p.data for p in trainer.model.parameters()],
+           run.parent / f"rank{trainer.workers.rank}.pt")
+"""
 
 
 @pytest.fixture(scope="module")
@@ -47,7 +67,8 @@ def config(shards: Path, tmp_path: Path) -> TrainConfig:
                                        "initial_scenes": 2, "scenes_per_step": 0.0,
                                        "worlds": 0})  # fmt: skip
     optimizer = run.optimizer.model_copy(update={"batch": 2, "anchors": 64, "crop": (96, 64),
-                                                 "steps": 6, "threads": 1})  # fmt: skip
+                                                 "steps": 6, "decay_steps": 3,
+                                                 "threads": 1})  # fmt: skip
     model = ModelConfig(channels=16, widths=(8, 8, 16), decoder=(8, 8), dilations=(1, 2))
     return run.model_copy(update={"output": tmp_path, "data": data, "optimizer": optimizer,
                                   "model": model, "checkpoint_steps": 3})  # fmt: skip
@@ -168,8 +189,58 @@ def test_a_run_resumes_exactly(config: TrainConfig, tmp_path: Path) -> None:
     assert plot(tmp_path / "whole" / "tiny.csv").stat().st_size > 1000
 
 
+def test_the_rate_warms_up_stays_and_falls_to_zero(config: TrainConfig) -> None:
+    o = config.optimizer.model_copy(update={"steps": 100, "decay_steps": 40, "warmup_steps": 10})
+    rates = [learning_rate(step, o) for step in range(101)]
+    assert rates[0] == pytest.approx(o.learning_rate / 10)
+    assert rates[10:61] == pytest.approx([o.learning_rate] * 51)
+    assert rates[80] == pytest.approx(o.learning_rate / 2)
+    assert rates[100] == 0.0
+
+
+def test_a_decay_longer_than_the_run_is_refused(tmp_path: Path) -> None:
+    path = tmp_path / "run.yaml"
+    path.write_text(re.sub(r"\n  steps: \d+", "\n  steps: 10", SHIPPED.read_text()))
+    with pytest.raises(ModelError, match="decay_steps"):
+        load_config(path)
+
+
+def test_two_processes_take_the_same_step(config: TrainConfig, tmp_path: Path) -> None:
+    # Two processes as torchrun starts them; importing torch takes most of this test's time.
+    run = tmp_path / "run.yaml"
+    run.write_text(yaml.safe_dump(config.model_dump(mode="json")))
+    script = tmp_path / "worker.py"
+    script.write_text(WORKER)
+    with socket.socket() as free:
+        free.bind(("127.0.0.1", 0))
+        port = free.getsockname()[1]
+    shared = {"WORLD_SIZE": "2", "MASTER_ADDR": "127.0.0.1", "MASTER_PORT": str(port)}
+    workers = [
+        subprocess.Popen(
+            [sys.executable, str(script), str(run)], env=os.environ | shared | {"RANK": str(k)}
+        )
+        for k in range(2)
+    ]
+    try:
+        assert [worker.wait(timeout=200) for worker in workers] == [0, 0]
+    finally:
+        for worker in workers:
+            worker.kill()
+    first, second = (torch.load(tmp_path / f"rank{k}.pt") for k in (0, 1))
+    alone = Trainer(config.model_copy(update={"output": tmp_path / "alone"}))
+    alone.run(steps=3)
+    for a, b in zip(first, second, strict=True):
+        torch.testing.assert_close(a, b, rtol=0, atol=0)
+    # The second process's batches count: one process alone ends elsewhere.
+    assert any(not torch.equal(a, b) for a, b in zip(first, alone.model.parameters(), strict=True))
+    rows = (config.output / "tiny.csv").read_text().splitlines()
+    assert [row.split(",")[0] for row in rows] == ["step", "3"]
+
+
 def test_training_lowers_the_loss(config: TrainConfig) -> None:
-    optimizer = config.optimizer.model_copy(update={"steps": 60, "warmup_steps": 5})
+    optimizer = config.optimizer.model_copy(
+        update={"steps": 60, "decay_steps": 30, "warmup_steps": 5}
+    )
     trainer = Trainer(config.model_copy(update={"optimizer": optimizer}))
     trainer.run()
     rows = (config.output / "tiny.csv").read_text().splitlines()

@@ -8,7 +8,15 @@ import pytest
 from localizer.errors import SequenceError
 from localizer.pose import Pose
 from localizer.training.land import PhotoLibrary
-from localizer.training.pairs import Pair, SceneConfig, scene_pairs, warp_check
+from localizer.training.pairs import (
+    COMBINED,
+    OUTDATED,
+    SEASON,
+    Pair,
+    SceneConfig,
+    scene_pairs,
+    warp_check,
+)
 from localizer.training.shards import read_shard, write_shard, write_shards
 from localizer.training.sheet import contact_sheet
 
@@ -29,8 +37,8 @@ def likeness(pair: Pair) -> float:
 
 
 def test_depth_and_poses_bring_the_query_into_the_reference() -> None:
-    # Same light and season in both views: what is left is geometry (paper, Fig. 14).
-    plain = replace(SMALL, light_variety=False)
+    # Same light, season and fine texture in both views: what is left is geometry (paper, Fig. 14).
+    plain = replace(SMALL, light_variety=False, shared_detail=True)
     for seed in (1003, 1004):
         for pair in scene_pairs(seed, plain, None):
             right = likeness(pair)
@@ -52,6 +60,22 @@ def test_views_overlap_and_motion_is_the_papers(pairs: list[Pair]) -> None:
         assert warp_check(pair)[1].mean() > 0.25
         # The camera looks 20 to 90 degrees down.
         assert np.degrees(np.arcsin(-pair.world_from_reference.rotation[2, 2])) > 19.0
+
+
+def test_the_coarse_map_is_where_the_true_surface_is() -> None:
+    # Off the depth edges, the map's rounded and bumpy mesh stays within its stated error.
+    pair = next(iter(scene_pairs(1006, replace(SMALL, motion=(0.0, 0.0)), None)))
+    error = np.abs(pair.reference_depth - pair.query_depth)[pair.reference_depth > 0]
+    assert 0.0 < np.median(error) < 1.5
+
+
+def test_test_conditions_come_one_at_a_time() -> None:
+    conditions = ("night", SEASON, OUTDATED, COMBINED)
+    config = replace(SMALL, references=4, queries_per_light=1, conditions=conditions)
+    kinds = {(p.condition, p.season, p.outdated) for p in scene_pairs(1007, config, None)}
+    plain = {("night", False, False), ("day", True, False), ("day", False, True)}
+    assert len(kinds) >= 3
+    assert all(k in plain or k[1:] == (True, True) for k in kinds)
 
 
 def test_exact_motion_is_kept() -> None:
@@ -96,6 +120,24 @@ def test_a_broken_shard_is_named(tmp_path: Path) -> None:
     path.write_bytes(b"PK")
     with pytest.raises(SequenceError, match="00001000"):
         read_shard(path)
+
+
+def test_cross_season_plots_are_split_between_training_and_test(tmp_path: Path) -> None:
+    rng = np.random.default_rng(0)
+    for k in range(8):
+        plot = tmp_path / "neon_sjer_pairs" / f"SJER_{k:03d}"
+        plot.mkdir(parents=True)
+        for date in ("2017", "2018"):
+            cv2.imwrite(str(plot / f"{date}.jpg"), np.full((16, 16, 3), 30 * k, np.uint8))
+    seen: dict[bool, set[int]] = {}
+    for held_out in (False, True):
+        library = PhotoLibrary(tmp_path, ("neon_sjer_pairs",), held_out=held_out)
+        layers = [library.sample(rng, 48) for _ in range(6)]
+        assert all(len(dates) == 2 for dates in layers)
+        found = np.concatenate([np.unique(dates[0]) for dates in layers])
+        seen[held_out] = set(np.rint(found / 30).astype(int).tolist())
+    assert seen[True] == {3, 7}
+    assert seen[False] == {0, 1, 2, 4, 5, 6}
 
 
 def test_a_missing_texture_group_is_named(tmp_path: Path) -> None:
