@@ -6,6 +6,7 @@ estimate into its own queue on the localization thread.
 
 from __future__ import annotations
 
+import gc
 import logging
 import threading
 from contextlib import ExitStack
@@ -54,6 +55,10 @@ class Companion:
                 if self._stop.is_set():  # an interrupted compiler raises errors of its own
                     raise KeyboardInterrupt from None
                 raise
+            # What the imports and compilers left is never garbage: searching it for garbage would
+            # stop every thread for a tenth of a second now and then.
+            gc.collect()
+            gc.freeze()
             self._is_up = True
             self._start(up)
             while not self._stop.wait(0.2):  # in slices: signals are handled between them
@@ -128,6 +133,7 @@ class Companion:
         up.callback(feeder.join)
         up.callback(self._source.close)
         self._event("info", f"map {self._config.map}, feed {self._config.camera.source}")
+        self._event("info", f"renderer {self._stack.renderer.name}")
 
     def _feed(self) -> None:
         try:

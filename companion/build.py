@@ -8,13 +8,13 @@ import numpy as np
 
 from localizer.camera import Camera
 from localizer.config import LocalizerConfig
-from localizer.features.detail import DetailExtractor
 from localizer.features.extractor import FeatureExtractor, load_extractor
 from localizer.map.cache import TileCache
 from localizer.map.stream import TileStreamer
 from localizer.pipeline import Localizer, RotationAt, working_camera
 from localizer.registration.jngo import JNGO
-from localizer.render.numba_raster import NumbaRenderer
+from localizer.render.base import MapRenderer
+from localizer.render.select import open_renderer
 
 
 class MapStack:
@@ -23,10 +23,15 @@ class MapStack:
     def __init__(self, path: Path, config: LocalizerConfig) -> None:
         self.cache = TileCache.open(path)
         self.streamer = TileStreamer(self.cache, byte_budget=config.cache_mib * 2**20)
-        self.renderer = NumbaRenderer(self.streamer, threads=config.threads)
+        try:
+            self.renderer = open_renderer(config.renderer, self.streamer, threads=config.threads)
+        except BaseException:
+            self.streamer.close()
+            raise
 
     def close(self) -> None:
-        """Stop the loader thread."""
+        """Release the renderer and stop the loader thread."""
+        self.renderer.close()
         self.streamer.close()
 
 
@@ -37,14 +42,14 @@ def build_localizer(
     rotation_at: RotationAt = lambda _time_ns: None,
 ) -> Localizer:
     """A localizer for one camera over an open map. rotation_at: see `Localizer`."""
-    extractor = DetailExtractor(load_extractor(config.model, threads=config.feature_threads))
+    extractor = load_extractor(config.model, threads=config.feature_threads)
     optimizer = JNGO(config.registration, threads=config.threads)
     _warm_up(stack.renderer, extractor, optimizer, camera, config)
     return Localizer(stack.renderer, extractor, optimizer, camera, config, rotation_at)
 
 
 def _warm_up(
-    renderer: NumbaRenderer,
+    renderer: MapRenderer,
     extractor: FeatureExtractor,
     optimizer: JNGO,
     camera: Camera,
@@ -53,6 +58,5 @@ def _warm_up(
     """Compile and load everything now: the first frame of a flight must not wait ten seconds."""
     size = working_camera(camera, config.width)
     pyramid = extractor.extract(np.zeros((size.height, size.width, 3), np.uint8))
-    for channels in {level.features.shape[-1] for level in pyramid.levels}:
-        optimizer.warm_up(channels)
+    optimizer.warm_up(pyramid.levels[0].features.shape[-1])
     renderer.warm_up()

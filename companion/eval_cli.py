@@ -36,6 +36,7 @@ from localizer.geo import LocalFrame
 from localizer.metrics import LocalizationMetrics
 from localizer.pipeline import Undistorter
 from localizer.render.base import MapRenderer
+from localizer.render.select import Backend
 
 _OVERLAYS = 4
 _PROBLEMS = 5  # texts that are printed
@@ -53,6 +54,9 @@ def evaluate_command(
         float, typer.Option(min=0, max=180, help="prior noise up to, degrees")
     ] = 10.0,
     width: Annotated[int, typer.Option(min=64, max=2048, help="working width, pixels")] = 320,
+    renderer: Annotated[
+        Backend, typer.Option(help="auto: a GPU where there is one, else numba")
+    ] = "auto",
     model: Annotated[Path | None, typer.Option(help="ONNX feature network")] = None,
     limit: Annotated[int | None, typer.Option(min=1, help="only the first N frames")] = None,
 ) -> None:
@@ -61,7 +65,9 @@ def evaluate_command(
         raise ConfigError(f"--prior is first or each, not {prior!r}")
     _prepare(report)
     mode: PriorMode = "first" if prior == "first" else "each"
-    config = LocalizerConfig(width=width, model=model, seed=seed, feature_threads=2)
+    config = LocalizerConfig(
+        width=width, model=model, seed=seed, renderer=renderer, feature_threads=2
+    )
     stack = MapStack(map_cache, config)
     try:
         data = load_sequence(sequence, stack.cache.frame, name)
@@ -80,6 +86,7 @@ def evaluate_command(
             "sequence": str(sequence), "map": str(map_cache), "prior": prior, "seed": seed,
             "noise_m": noise_m, "noise_deg": noise_deg, "width": localizer.camera.width,
             "height": localizer.camera.height, "features": load_extractor(model).name,
+            "renderer": stack.renderer.name,
         }  # fmt: skip
         _print_problems(frames)
         unusable = sum(f.estimate is None for f in frames)

@@ -11,10 +11,14 @@ import typer
 from rich.logging import RichHandler
 
 from companion.config import load_config
+from localizer.render.select import Backend
 
 
 def run_command(
     config: Annotated[Path, typer.Argument(help="deployment YAML, see configs/")],
+    renderer: Annotated[
+        Backend | None, typer.Option(help="instead of the configuration's localizer.renderer")
+    ] = None,
     verbose: Annotated[bool, typer.Option("--verbose", "-v", help="log more")] = False,
 ) -> None:
     """Localize the camera feed and inject positions until interrupted."""
@@ -24,6 +28,9 @@ def run_command(
         handlers=[RichHandler(show_path=False)],
     )
     settings = load_config(config)
+    if renderer is not None:
+        localizer = settings.localizer.model_copy(update={"renderer": renderer})
+        settings = settings.model_copy(update={"localizer": localizer})
     from companion.app import Companion
 
     companion = Companion(settings)

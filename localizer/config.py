@@ -9,6 +9,7 @@ from pydantic import BaseModel, ConfigDict, Field
 from localizer.integrity import IntegrityConfig
 from localizer.motion import MotionConfig
 from localizer.registration.jngo import JNGOConfig
+from localizer.render.select import Backend
 
 
 class AttitudePrior(BaseModel):
@@ -28,6 +29,7 @@ class LocalizerConfig(BaseModel):
     width: int = Field(320, ge=64, le=2048, description="width of query and reference, pixels")
     model: Path | None = Field(None, description="ONNX feature network; none: the shipped one")
     anchors: int = Field(4000, ge=50, le=8000, description="geo-anchors per reference view")
+    renderer: Backend = Field("auto", description="auto: a GPU where there is one, else numba")
     threads: int = Field(2, ge=1, description="CPU threads of rendering and optimization")
     feature_threads: int = Field(1, ge=1, description="CPU threads of each feature extraction")
     cache_mib: int = Field(384, ge=16, description="resident tiles, MiB")

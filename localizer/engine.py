@@ -2,8 +2,9 @@
 
 The localization thread takes the newest frame, registers it against the newest reference and
 publishes the estimate. Each estimate wakes the render thread, which predicts the pose at the next
-exposure and renders the reference for it. Neither waits for a subscriber, and neither dies of an
-error: errors are counted, logged and reported as the engine's health.
+exposure, renders the reference for it and has the map loaded along the way ahead. Neither waits for
+a subscriber, and neither dies of an error: errors are counted, logged and reported as the engine's
+health.
 """
 
 from __future__ import annotations
@@ -31,7 +32,9 @@ PriorProvider = Callable[[int], PosePrior | None]
 
 @dataclass(frozen=True)
 class EngineHealth:
-    """Counters since the start, and the last error's text ("" when none is standing)."""
+    """Counters since the start, the last error's text ("" when none is standing), and which
+    renderer serves.
+    """
 
     frames_in: int = 0
     frames_dropped: int = 0
@@ -40,6 +43,7 @@ class EngineHealth:
     references: int = 0
     errors: int = 0
     last_error: str = ""
+    renderer: str = ""
 
 
 class DualThreadEngine:
@@ -66,7 +70,7 @@ class DualThreadEngine:
         self._interval_ns = _DEFAULT_INTERVAL_NS
         self._last_exposure_ns: int | None = None
         self._reference_ms: dict[str, float] = {}
-        self._health = EngineHealth()
+        self._health = EngineHealth(renderer=localizer.renderer_name)
         self._health_lock = threading.Lock()
         self._stop = threading.Event()
         self._threads = [
@@ -110,14 +114,14 @@ class DualThreadEngine:
 
     def _render_once(self) -> None:
         time_ns = self._render_times.take(_IDLE_S)
-        prior = self._localizer.predict(time_ns) if time_ns is not None else None
-        if prior is None:
+        if time_ns is None or (prior := self._localizer.predict(time_ns)) is None:
             return
         stage_ms: dict[str, float] = {}
         with stopwatch(stage_ms, "reference"):
             bundle = self._localizer.make_reference(prior)
         self._bundle, self._reference_ms = bundle, stage_ms
         self._count(references=1)
+        self._localizer.prefetch(time_ns)  # last: nothing waits for it
 
     def _localize_once(self) -> None:
         frame = self._frames.take(_IDLE_S)

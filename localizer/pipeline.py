@@ -42,6 +42,10 @@ from localizer.types import (
 # The camera's rotation (3, 3), world_from_camera, at a time in ns by another sensor, or None.
 RotationAt = Callable[[int], "Array | None"]
 
+# The map is loaded for where the motion model leads in so many seconds: what comes next, and as far
+# as a turn rate can be believed at all.
+_LOOK_AHEAD_S = (1.0, 3.0)
+
 # A reference view with less of the map in it than this has nothing to register against.
 _MIN_MAP_SHARE = 0.1
 
@@ -128,6 +132,11 @@ class Localizer:
         with self._lock:
             return self._tracker
 
+    @property
+    def renderer_name(self) -> str:
+        """Which renderer draws the references."""
+        return self._renderer.name
+
     def set_prior(self, prior: PosePrior) -> None:
         """Begin (again) from a pose known from outside, e.g. the autopilot's."""
         state = motion.start(prior, self._config.motion)
@@ -163,6 +172,12 @@ class Localizer:
         features = self._extractor.extract(view.rgb)
         anchors = select_anchors(view, features, self._config.anchors, self._config.seed)
         return ReferenceBundle(view, anchors, prior.time_ns)
+
+    def prefetch(self, time_ns: int) -> None:
+        """Have the map loaded along the predicted trajectory after `time_ns`; returns at once."""
+        times = [time_ns + round(s * 1e9) for s in _LOOK_AHEAD_S]
+        ahead = [prior for t in times if (prior := self.predict(t)) is not None]
+        self._renderer.prefetch([prior.world_from_camera for prior in ahead], self.camera)
 
     def extract_query(self, frame: Frame) -> FeaturePyramid:
         """Features of the frame (does not need the reference, so it may run beside it)."""

@@ -55,6 +55,9 @@ class TileSelector:
         radius = _curvature_radius(frame)
         lowest = _lowest_ground(index, radius) - _HORIZON_MARGIN_M
         self._globe = np.array([-radius, radius + lowest])
+        # Compiled now: a first view in flight must not wait for it.
+        nobody = np.zeros(len(index.refine), np.bool_)
+        self.select(Pose.identity(), Camera.from_fov(8, 8, 60.0), nobody, DetailLimits())
 
     def select(
         self,
@@ -117,7 +120,7 @@ def _lowest_ground(index: TileIndex, radius: float) -> float:
     return float(np.linalg.norm(nearest, axis=1).min() - radius)
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True)
 def _outside(low, high, planes):  # type: ignore[no-untyped-def]
     """Whether a box lies wholly on the far side of one plane."""
     for k in range(planes.shape[0]):
@@ -129,7 +132,7 @@ def _outside(low, high, planes):  # type: ignore[no-untyped-def]
     return False
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True)
 def _below_horizon(low, high, eye, globe):  # type: ignore[no-untyped-def]
     """Whether the globe (centre height and radius, on the z axis) hides every corner of a box.
 
@@ -149,7 +152,7 @@ def _below_horizon(low, high, eye, globe):  # type: ignore[no-untyped-def]
     return True
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True)
 def _distance(low, high, eye):  # type: ignore[no-untyped-def]
     """Metres from a point to a box, 0 inside."""
     d2 = 0.0
@@ -159,7 +162,7 @@ def _distance(low, high, eye):  # type: ignore[no-untyped-def]
     return np.sqrt(d2)
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True)
 def _select(  # type: ignore[no-untyped-def]
     box_min,
     box_max,
@@ -181,7 +184,8 @@ def _select(  # type: ignore[no-untyped-def]
 ):
     """Fills nodes with (wanted, shown, requests); returns their counts and whether a hole is left.
 
-    Nodes are in breadth-first order, so passes over the arrays take the place of recursion.
+    Nodes are in breadth-first order, so passes over the arrays take the place of recursion. The GIL
+    is kept: the walk takes a fraction of a millisecond, getting the GIL back may take five.
     """
     n = len(refine)
     state = np.zeros(n, np.uint8)

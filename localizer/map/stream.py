@@ -82,6 +82,7 @@ class TileStreamer:
         self._ahead: list[int] = []  # after those
         self._arrived: list[tuple[int, list[TileMesh]]] = []  # loaded, not yet in use
         self._arrived_bytes = 0
+        self._evicted: list[list[TileMesh]] = []  # for the loader to free
         self._bytes_per_select = bytes_per_select
         self._protected: set[int] = set()  # in the current view
         self._closed = False
@@ -101,10 +102,11 @@ class TileStreamer:
             self._take_in(None if wait else self._bytes_per_select)
             choice = self._choose(world_from_camera, camera, limits)
             while wait and not self._resident[choice.wanted].all():
-                self._queue = choice.wanted[~self._resident[choice.wanted]].tolist()
-                for node in self._queue:
+                missing = choice.wanted[~self._resident[choice.wanted]].tolist()
+                for node in missing:
                     if node in self._failed:
                         raise self._failed[node]
+                self._queue = missing
                 self._lock.notify_all()
                 self._lock.wait()
                 self._take_in(None)
@@ -118,21 +120,28 @@ class TileStreamer:
         with self._lock:
             return list(self._current)
 
-    def prefetch(self, world_from_camera: Pose, camera: Camera) -> None:
-        """Load what a view will need later, after what the current one needs."""
-        limits = self._fitting_limits(world_from_camera, camera)
+    def prefetch(self, views: Sequence[Pose], camera: Camera) -> None:
+        """Load what views (world_from_camera) to come will need, the first one's first, after what
+        the current one needs and as far as the budget reaches.
+        """
+        limits = [self._fitting_limits(view, camera) for view in views]
         with self._lock:
-            ahead = self._selector.select(world_from_camera, camera, self._resident, limits)
             room = self._budget - int(self._node_bytes[list(self._protected)].sum())
+            seen = set(self._protected)
             self._ahead = []
-            for node in ahead.wanted:
-                room -= int(self._node_bytes[node])
-                if room < 0:
-                    break
-                if self._resident[node]:
-                    self._meshes.move_to_end(int(node))
-                elif node not in self._failed:
-                    self._ahead.append(int(node))
+            for view, limit in zip(views, limits, strict=True):
+                choice = self._selector.select(view, camera, self._resident, limit)
+                for node in choice.wanted.tolist():
+                    if node in seen:
+                        continue
+                    seen.add(node)
+                    room -= int(self._node_bytes[node])
+                    if room < 0:
+                        break
+                    if self._resident[node]:
+                        self._meshes.move_to_end(node)
+                    elif node not in self._failed:
+                        self._ahead.append(node)
             self._lock.notify_all()
 
     def counters(self) -> StreamCounters:
@@ -150,6 +159,7 @@ class TileStreamer:
         with self._lock:
             self._meshes.clear()
             self._arrived.clear()
+            self._evicted.clear()
             self._resident[:] = False
             self._bytes = 0
 
@@ -195,11 +205,18 @@ class TileStreamer:
     def _run(self) -> None:
         while True:
             with self._lock:
-                while not self._closed and not self._has_work():
+                while not (self._closed or self._evicted or self._to_load()):
                     self._lock.wait()
                 if self._closed:
                     return
-                node = (self._queue or self._ahead).pop(0)
+                evicted, self._evicted = self._evicted, []
+            # Giving megabytes back to the system takes its time: not the render thread's.
+            del evicted
+            with self._lock:
+                nodes = self._to_load()
+                if not nodes:
+                    continue
+                node = nodes.pop(0)
                 if self._resident[node] or any(node == n for n, _ in self._arrived):
                     continue
             meshes: list[TileMesh] | None = None
@@ -207,7 +224,7 @@ class TileStreamer:
             start = int(self._index.tile_start[node])
             try:
                 tiles = range(start, start + int(self._index.tile_count[node]))
-                meshes = [self.cache.load_tile(t) for t in tiles]
+                meshes = [_ready(self.cache.load_tile(t)) for t in tiles]
             except MapCacheError as error:
                 failure = error
             with self._lock:
@@ -221,10 +238,11 @@ class TileStreamer:
                     self._counts["failures"] += 1
                 self._lock.notify_all()
 
-    def _has_work(self) -> bool:
-        """Whether there is a node to load, and room to put it down."""
-        waiting = self._arrived_bytes >= self._bytes_per_select
-        return bool(self._queue or self._ahead) and not waiting
+    def _to_load(self) -> list[int]:
+        """The nodes to load, in order; empty while there is no room to put them down."""
+        if self._arrived_bytes >= self._bytes_per_select:
+            return []
+        return self._queue or self._ahead
 
     def _take_in(self, limit: int | None) -> None:
         """Bring loaded nodes into use, at most `limit` bytes but at least one. The lock is held."""
@@ -246,10 +264,16 @@ class TileStreamer:
                 return
             if node in self._protected:
                 continue
-            del self._meshes[node]
+            self._evicted.append(self._meshes.pop(node))
             self._resident[node] = False
             self._bytes -= int(self._node_bytes[node])
             self._counts["evicted"] += 1
+
+
+def _ready(mesh: TileMesh) -> TileMesh:
+    """With what drawing asks for computed here, not on the render thread."""
+    _ = mesh.bounds, mesh.texture
+    return mesh
 
 
 def _node_bytes(cache: TileCache) -> NDArray[np.int64]:

@@ -13,16 +13,19 @@ from numpy.typing import NDArray
 from localizer.pose import Array, Pose
 from localizer.types import Float32, Image
 
+_PAIR_BYTES = 8  # two texels are read as one word of this size
 _SMALLEST_MIP = 4  # texels on the longer side; below it a mip holds no more than a mean colour
 
 
 @dataclass(frozen=True, eq=False)
 class PackedTexture:
     """A mip chain in one buffer. texels: (T, 3) uint8 RGB, mip after mip, rows top to bottom;
+    pairs: (T,) uint64, little endian, the six bytes of a texel and its successor (and two more);
     offsets: (L,) int64 first texel of each mip; sizes: (L, 2) int32 (width, height).
     """
 
     texels: Image
+    pairs: NDArray[np.uint64]
     offsets: NDArray[np.int64]
     sizes: NDArray[np.int32]
 
@@ -31,8 +34,13 @@ class PackedTexture:
         """Room for mips of the given (width, height), finest first; texels are not set."""
         counts = [w * h for w, h in sizes]
         offsets = np.concatenate([[0], np.cumsum(counts)]).astype(np.int64)
-        texels = np.empty((int(offsets[-1]), 3), np.uint8)
-        return cls(texels, offsets[:-1].copy(), np.asarray(sizes, np.int32).reshape(-1, 2))
+        total = int(offsets[-1])
+        # The last texel's pair reaches past it. Overlapping words at any address: one load brings
+        # what bilinear filtering needs of a row.
+        buffer = np.zeros(3 * total + _PAIR_BYTES, np.uint8)
+        texels = buffer[: 3 * total].reshape(total, 3)
+        pairs = np.ndarray((total,), np.dtype("<u8"), buffer, strides=(3,))
+        return cls(texels, pairs, offsets[:-1].copy(), np.asarray(sizes, np.int32).reshape(-1, 2))
 
     def mip(self, level: int) -> Image:
         """View (h, w, 3) of one level."""

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Protocol
 
 import numpy as np
+from numpy.typing import NDArray
 
 from localizer.camera import Camera
 from localizer.errors import CameraError
@@ -28,6 +31,10 @@ class TileProvider(Protocol):
         """Meshes to draw for a view."""
         ...
 
+    def prefetch(self, views: Sequence[Pose], camera: Camera) -> None:
+        """Get ready for views (world_from_camera) to come, the next one first."""
+        ...
+
 
 @dataclass(frozen=True)
 class StaticTiles:
@@ -40,7 +47,15 @@ class StaticTiles:
     ) -> Sequence[TileMesh]:
         """See `TileProvider.select`."""
         del wait  # everything is there
-        return [m for m in self.meshes if is_visible(m, world_from_camera, camera)]
+        seen = are_visible(*self._spheres, world_from_camera, camera)
+        return [mesh for mesh, is_seen in zip(self.meshes, seen, strict=True) if is_seen]
+
+    def prefetch(self, views: Sequence[Pose], camera: Camera) -> None:
+        """See `TileProvider.prefetch`: nothing to do."""
+
+    @cached_property
+    def _spheres(self) -> tuple[Array, Array]:
+        return bounding_spheres(self.meshes)
 
 
 class MapRenderer(Protocol):
@@ -63,9 +78,65 @@ class MapRenderer(Protocol):
         """
         ...
 
+    def prefetch(self, views: Sequence[Pose], camera: Camera) -> None:
+        """Have the tiles of views (world_from_camera) to come loaded; returns at once."""
+        ...
+
+    def warm_up(self) -> None:
+        """Compile what drawing needs, so that the first view need not wait for it."""
+        ...
+
     def close(self) -> None:
         """Release threads and devices."""
         ...
+
+
+class TileRenderer(ABC):
+    """What the backends share: a view's tiles come from a provider, then they are drawn."""
+
+    name: str
+
+    def __init__(self, streamer: TileProvider) -> None:
+        self.streamer = streamer
+
+    def render(
+        self,
+        world_from_camera: Pose,
+        camera: Camera,
+        extra: Sequence[TileMesh] = (),
+        *,
+        wait: bool = False,
+    ) -> RenderedView:
+        """See `MapRenderer.render`."""
+        require_pinhole(camera)
+        meshes = list(self.streamer.select(world_from_camera, camera, wait=wait))
+        if extra:
+            seen = are_visible(*bounding_spheres(extra), world_from_camera, camera)
+            meshes += [mesh for mesh, is_seen in zip(extra, seen, strict=True) if is_seen]
+        return self.draw(meshes, world_from_camera, camera)
+
+    @abstractmethod
+    def draw(
+        self, meshes: Sequence[TileMesh], world_from_camera: Pose, camera: Camera
+    ) -> RenderedView:
+        """Draw just these meshes."""
+
+    def prefetch(self, views: Sequence[Pose], camera: Camera) -> None:
+        """See `MapRenderer.prefetch`."""
+        self.streamer.prefetch(views, camera)
+
+    def warm_up(self) -> None:
+        """See `MapRenderer.warm_up`. numba: seconds the first time, then cached on disk."""
+        corners = np.array([[-1, -1, 2], [1, -1, 2], [0, 1, 0.1]], np.float32)
+        white = np.full((8, 8, 3), 255, np.uint8)
+        faces = np.array([[0, 1, 2]], np.int32)
+        uvs = np.zeros((3, 2), np.float32)
+        mesh = TileMesh(corners, uvs, faces, (white,), Pose.identity())
+        self.draw([mesh], Pose.identity(), Camera.from_fov(16, 16, 90.0))
+
+    @abstractmethod
+    def close(self) -> None:
+        """Release threads and devices; the streamer is its owner's."""
 
 
 def require_pinhole(camera: Camera) -> None:
@@ -77,23 +148,30 @@ def require_pinhole(camera: Camera) -> None:
         )
 
 
-def is_visible(mesh: TileMesh, world_from_camera: Pose, camera: Camera) -> bool:
-    """Whether the mesh's bounding sphere meets the view."""
-    low, high = mesh.bounds
-    radius = 0.5 * float(np.linalg.norm(high - low))
-    centre = mesh.world_from_tile.apply(0.5 * (low + high))
-    x, y, z = world_from_camera.inverse.apply(centre)
-    if z < NEAR_M - radius:
-        return False
+def bounding_spheres(meshes: Sequence[TileMesh]) -> tuple[Array, Array]:
+    """World centres (N, 3) and radii (N,) of spheres around meshes."""
+    centres, radii = np.empty((len(meshes), 3)), np.empty(len(meshes))
+    for i, mesh in enumerate(meshes):
+        low, high = mesh.bounds
+        centres[i] = mesh.world_from_tile.apply(0.5 * (low + high))
+        radii[i] = 0.5 * np.linalg.norm(high - low)
+    return centres, radii
+
+
+def are_visible(
+    centres: Array, radii: Array, world_from_camera: Pose, camera: Camera
+) -> NDArray[np.bool_]:
+    """Which spheres, see `bounding_spheres`, meet the view; (N,)."""
+    x, y, z = world_from_camera.inverse.apply(centres).T
+    seen = z >= NEAR_M - radii
     for offset, focal, near_edge, far_edge in (
         (x, camera.fx, -camera.cx, camera.width - camera.cx),
         (y, camera.fy, -camera.cy, camera.height - camera.cy),
     ):
         for edge, sign in ((near_edge, 1.0), (far_edge, -1.0)):
             slope = edge / focal
-            if sign * (offset - slope * z) < -radius * np.hypot(1.0, slope):
-                return False
-    return True
+            seen &= sign * (offset - slope * z) >= -radii * np.hypot(1.0, slope)
+    return np.asarray(seen)
 
 
 def clip_from_camera(camera: Camera) -> Array:

@@ -22,13 +22,7 @@ from localizer.camera import Camera
 from localizer.errors import RenderError
 from localizer.map.tile import TileMesh
 from localizer.pose import Pose
-from localizer.render.base import (
-    SKY,
-    TileProvider,
-    clip_from_camera,
-    is_visible,
-    require_pinhole,
-)
+from localizer.render.base import SKY, TileProvider, TileRenderer, clip_from_camera
 from localizer.types import RenderedView
 
 _EGL: dict[str, Any] = {"backend": "egl"}
@@ -90,7 +84,7 @@ class _Target:
     framebuffer: Any
 
 
-class ModernGLRenderer:
+class ModernGLRenderer(TileRenderer):
     """Draws tiles with OpenGL. Only the thread that made it may use it."""
 
     def __init__(
@@ -100,13 +94,13 @@ class ModernGLRenderer:
         byte_budget: int = 1 << 30,
     ) -> None:
         """Open an EGL context; raises `RenderError` where there is none."""
+        super().__init__(streamer)
         try:
             self._context: Any = moderngl.create_context(330, standalone=True, **_EGL)
         except Exception as error:  # moderngl and glcontext raise bare exceptions
             raise RenderError(f"no OpenGL 3.3 context through EGL: {error}") from error
         self.device = str(self._context.info["GL_RENDERER"])
         self.name = f"moderngl ({self.device})"
-        self.streamer = streamer
         self._owner = threading.get_ident()
         self._finish = _gl_finish()
         self._sky = tuple(c / 255 for c in sky)
@@ -123,21 +117,6 @@ class ModernGLRenderer:
     def is_software(self) -> bool:
         """Whether the driver draws on the CPU (llvmpipe), where the numba renderer is faster."""
         return any(name in self.device.lower() for name in ("llvmpipe", "softpipe", "swrast"))
-
-    def render(
-        self,
-        world_from_camera: Pose,
-        camera: Camera,
-        extra: Sequence[TileMesh] = (),
-        *,
-        wait: bool = False,
-    ) -> RenderedView:
-        """See `MapRenderer.render`."""
-        require_pinhole(camera)
-        self._assert_owner()
-        meshes = self.streamer.select(world_from_camera, camera, wait=wait)
-        meshes = [*meshes, *(m for m in extra if is_visible(m, world_from_camera, camera))]
-        return self.draw(meshes, world_from_camera, camera)
 
     def draw(
         self, meshes: Sequence[TileMesh], world_from_camera: Pose, camera: Camera

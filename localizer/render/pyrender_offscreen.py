@@ -28,13 +28,7 @@ from localizer.camera import Camera
 from localizer.errors import RenderError
 from localizer.map.tile import TileMesh
 from localizer.pose import Array, Pose
-from localizer.render.base import (
-    SKY,
-    TileProvider,
-    clip_from_camera,
-    is_visible,
-    require_pinhole,
-)
+from localizer.render.base import SKY, TileProvider, TileRenderer, clip_from_camera
 from localizer.types import RenderedView
 
 _REPEAT, _CLAMP_TO_EDGE = 10497, 33071
@@ -77,11 +71,12 @@ void main() {
 }"""
 
 
-class PyrenderRenderer:
+class PyrenderRenderer(TileRenderer):
     """Draws tiles with pyrender. Only the thread that made it may use it."""
 
     def __init__(self, streamer: TileProvider, sky: tuple[int, int, int] = SKY) -> None:
         """Open an EGL context; raises `RenderError` where there is none."""
+        super().__init__(streamer)
         try:
             self._offscreen = pyrender.OffscreenRenderer(64, 64)
         except Exception as error:  # pyrender and PyOpenGL raise whatever EGL answers
@@ -92,24 +87,9 @@ class PyrenderRenderer:
         (folder / "flat.frag").write_text(_FRAGMENT_SHADER)
         self._offscreen._renderer = _ExactRenderer(64, 64, str(folder))
         self.name = "pyrender (OpenGL)"
-        self.streamer = streamer
         self._owner = threading.get_ident()
         self._sky = (*(c / 255 for c in sky), 0.0)  # alpha 0 marks what nothing was drawn on
         self._meshes: OrderedDict[int, tuple[TileMesh, Any]] = OrderedDict()
-
-    def render(
-        self,
-        world_from_camera: Pose,
-        camera: Camera,
-        extra: Sequence[TileMesh] = (),
-        *,
-        wait: bool = False,
-    ) -> RenderedView:
-        """See `MapRenderer.render`."""
-        require_pinhole(camera)
-        meshes = self.streamer.select(world_from_camera, camera, wait=wait)
-        meshes = [*meshes, *(m for m in extra if is_visible(m, world_from_camera, camera))]
-        return self.draw(meshes, world_from_camera, camera)
 
     def draw(
         self, meshes: Sequence[TileMesh], world_from_camera: Pose, camera: Camera

@@ -1,17 +1,42 @@
-"""Choosing a renderer backend."""
+"""Choosing a renderer backend, and giving OpenGL the thread that it belongs to."""
 
 from __future__ import annotations
 
 import logging
-from typing import Literal
+from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from typing import Literal, TypeVar
 
+from localizer.camera import Camera
 from localizer.errors import RenderError
+from localizer.map.tile import TileMesh
+from localizer.pose import Pose
 from localizer.render.base import SKY, MapRenderer, TileProvider
 from localizer.render.numba_raster import NumbaRenderer
+from localizer.types import RenderedView
 
 Backend = Literal["auto", "numba", "moderngl", "pyrender"]
+T = TypeVar("T")
 
 _log = logging.getLogger(__name__)
+
+
+def open_renderer(backend: Backend, streamer: TileProvider, *, threads: int = 2) -> MapRenderer:
+    """A renderer that any thread may use, one at a time; see `make_renderer`.
+
+    An OpenGL context belongs to the thread that made it: it is given one, which makes it, draws
+    with it and releases it.
+    """
+    owner = ThreadPoolExecutor(1, "opengl")
+    try:
+        renderer = owner.submit(make_renderer, backend, streamer, threads=threads).result()
+    except BaseException:
+        owner.shutdown()
+        raise
+    if isinstance(renderer, NumbaRenderer):
+        owner.shutdown()
+        return renderer
+    return _OwnedRenderer(renderer, owner)
 
 
 def make_renderer(
@@ -41,6 +66,7 @@ def make_renderer(
     except ImportError as error:
         if backend == "moderngl":
             raise RenderError(f"moderngl is not installed (extra `gpu`): {error}") from error
+        _log.info("no GPU renderer: moderngl is not installed (extra `gpu`)")
     except RenderError as error:
         if backend == "moderngl":
             raise
@@ -48,5 +74,44 @@ def make_renderer(
     else:
         if backend == "moderngl" or not renderer.is_software:
             return renderer
+        _log.info("no GPU renderer: OpenGL runs on the CPU here (%s)", renderer.device)
         renderer.close()
     return NumbaRenderer(streamer, threads, sky)
+
+
+class _OwnedRenderer:
+    """A renderer that lives on a thread of its own; callers wait for that thread."""
+
+    def __init__(self, renderer: MapRenderer, owner: ThreadPoolExecutor) -> None:
+        self.name = renderer.name
+        self._renderer = renderer
+        self._owner = owner
+
+    def render(
+        self,
+        world_from_camera: Pose,
+        camera: Camera,
+        extra: Sequence[TileMesh] = (),
+        *,
+        wait: bool = False,
+    ) -> RenderedView:
+        """See `MapRenderer.render`."""
+        return self._call(
+            lambda: self._renderer.render(world_from_camera, camera, extra, wait=wait)
+        )
+
+    def prefetch(self, views: Sequence[Pose], camera: Camera) -> None:
+        """See `MapRenderer.prefetch`: touches no OpenGL."""
+        self._renderer.prefetch(views, camera)
+
+    def warm_up(self) -> None:
+        """See `MapRenderer.warm_up`."""
+        self._call(self._renderer.warm_up)
+
+    def close(self) -> None:
+        """Release the context on its thread, and end the thread."""
+        self._call(self._renderer.close)
+        self._owner.shutdown()
+
+    def _call(self, function: Callable[[], T]) -> T:
+        return self._owner.submit(function).result()

@@ -11,7 +11,7 @@ import pytest
 from localizer.camera import Camera
 from localizer.config import LocalizerConfig
 from localizer.engine import DualThreadEngine
-from localizer.errors import CameraError, OutsideMapError
+from localizer.errors import CameraError, MapCacheError, OutsideMapError
 from localizer.pipeline import Localizer, Undistorter, working_camera
 from localizer.pose import Pose
 from localizer.registration.jngo import Registration
@@ -36,6 +36,13 @@ class FakeRenderer:
     def __init__(self) -> None:
         self.depth = 100.0
         self.poses: list[Pose] = []
+        self.ahead: list[tuple[str, list[Pose]]] = []
+        self.error: Exception | None = None
+
+    def prefetch(self, views, camera):
+        self.ahead.append((threading.current_thread().name, list(views)))
+        if self.error is not None:
+            raise self.error
 
     def render(self, world_from_camera, camera, extra=(), *, wait=False):
         self.poses.append(world_from_camera)
@@ -137,6 +144,30 @@ def test_reaches_tracking_from_a_prior_and_stops_cleanly(flight):
     assert set(estimate.stage_ms) == {"reference", "extract", "register", "latency"}
     f.engine.stop()
     assert threading.active_count() == before
+
+
+def test_the_map_is_loaded_along_the_way_ahead(flight):
+    renderer = FakeRenderer()
+    localizer = _localizer(renderer)
+    way = np.array([20.0, 0.0, 0.0])  # m/s
+    localizer.predict = lambda t: PosePrior(Pose(NADIR.rotation, way * t * 1e-9), np.eye(6), t)
+    localizer.prefetch(500_000_000)
+    _, views = renderer.ahead.pop()
+    assert [v.translation[0] for v in views] == pytest.approx([30.0, 70.0])
+    f = flight(_localizer(renderer))
+    f.feed_until(lambda: len(f.estimates) >= 5)
+    assert {thread for thread, _ in renderer.ahead} == {"render"}
+    assert len(renderer.ahead) >= 4
+
+
+def test_loading_ahead_that_fails_costs_no_reference(flight):
+    renderer = FakeRenderer()
+    renderer.error = MapCacheError("the disk is gone")
+    f = flight(_localizer(renderer))
+    f.feed_until(lambda: len(f.estimates) >= 5)
+    assert f.engine.health.accepted >= 3
+    assert f.engine.health.errors > 0
+    assert f.engine.health.renderer == "fake"
 
 
 def test_without_a_prior_nothing_is_estimated(flight):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import shutil
 import time
+import weakref
 
 import numpy as np
 import pytest
@@ -126,7 +127,7 @@ def test_a_view_larger_than_the_budget_gets_coarser(cache):
 def test_prefetch_makes_the_next_view_complete(streamer):
     here, there = above(-150, -150, 60), above(150, 150, 60)
     streamer.select(here, CAMERA, wait=True)
-    streamer.prefetch(there, CAMERA)
+    streamer.prefetch([there], CAMERA)
     deadline = time.monotonic() + 5
     count = streamer.counters().loaded
     while streamer.counters().loaded < count + 1 and time.monotonic() < deadline:
@@ -137,6 +138,35 @@ def test_prefetch_makes_the_next_view_complete(streamer):
     after = streamer.counters()
     assert after.misses == before.misses
     assert after.complete == before.complete + 1
+
+
+def test_prefetch_takes_the_views_in_order_and_stays_within_the_budget(cache, monkeypatch):
+    order = []
+    load = cache.load_tile
+    monkeypatch.setattr(cache, "load_tile", lambda i: (order.append(i), load(i))[1])
+    here, soon, later = (above(e, e, 60) for e in (-150, 0, 150))
+    budget = int(cache.index.size.max() * 5)
+    with TileStreamer(cache, byte_budget=budget) as streamer:
+        streamer.select(here, CAMERA, wait=True)
+        del order[:]
+        streamer.prefetch([soon, later], CAMERA)
+        time.sleep(0.3)
+        nearest = [round(np.abs(cache.world_from_tile[i].translation[:2]).max()) for i in order]
+        assert len(order) >= 2
+        assert nearest == sorted(nearest)  # around the origin first
+        assert streamer.counters().resident_bytes <= budget
+
+
+def test_the_loader_frees_what_leaves_memory(cache):
+    with TileStreamer(cache, byte_budget=int(cache.index.size.max() * 2.5)) as streamer:
+        gone = [weakref.ref(m) for m in streamer.select(above(-150, -150, 60), CAMERA, wait=True)]
+        for _ in range(3):
+            streamer.select(above(150, 150, 60), CAMERA, wait=True)
+        streamer.select(above(20, 150, 60), CAMERA, wait=True)
+        deadline = time.monotonic() + 5
+        while all(mesh() is not None for mesh in gone) and time.monotonic() < deadline:
+            time.sleep(0.01)
+        assert any(mesh() is None for mesh in gone)
 
 
 def test_a_damaged_tile_is_named_or_stood_in_for(cache_path, tmp_path):

@@ -12,7 +12,7 @@ from localizer.errors import CameraError
 from localizer.map.pick import cast_rays, pick
 from localizer.map.tile import TileMesh, build_mips
 from localizer.pose import Pose, so3_exp
-from localizer.render.base import NEAR_M, SKY, is_visible
+from localizer.render.base import NEAR_M, SKY, are_visible, bounding_spheres
 from localizer.render.numba_raster import NumbaRenderer
 
 DOWN = np.array([[1.0, 0, 0], [0, -1, 0], [0, 0, -1]])
@@ -266,7 +266,7 @@ def test_distorted_cameras_are_refused(renderer):
 def test_visibility_of_a_bounding_sphere():
     camera = Camera.from_fov(64, 64, 60)
     view = Pose(DOWN, np.array([0.0, 0.0, 50.0]))
-    assert is_visible(quad(4.0), view, camera)
-    assert is_visible(quad(4.0, pose=Pose(np.eye(3), np.array([30.0, 0, 0]))), view, camera)
-    assert not is_visible(quad(4.0, pose=Pose(np.eye(3), np.array([40.0, 0, 0]))), view, camera)
-    assert not is_visible(quad(4.0, pose=Pose(np.eye(3), np.array([0, 0, 60.0]))), view, camera)
+    places = np.array([[0, 0, 0], [30.0, 0, 0], [40.0, 0, 0], [0, 0, 60.0]])
+    meshes = [quad(4.0, pose=Pose(np.eye(3), place)) for place in places]
+    seen = are_visible(*bounding_spheres(meshes), view, camera)
+    assert seen.tolist() == [True, True, False, False]

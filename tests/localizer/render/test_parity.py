@@ -18,7 +18,8 @@ from localizer.map.tile import TileMesh, build_mips
 from localizer.pose import Pose, so3_exp
 from localizer.render.base import StaticTiles
 from localizer.render.numba_raster import NumbaRenderer
-from localizer.render.select import make_renderer
+from localizer.render.select import make_renderer, open_renderer
+from localizer.types import RenderedView
 
 DOWN = np.array([[1.0, 0, 0], [0, -1, 0], [0, 0, -1]])
 CAMERA = Camera(256, 192, 230.0, 235.0, 121.7, 99.2)
@@ -172,10 +173,38 @@ def test_an_opengl_renderer_refuses_other_threads():
     assert "thread" in str(caught[0])
 
 
-def test_auto_never_chooses_software_opengl():
-    renderer = make_renderer("auto", StaticTiles(MESHES))
-    assert "llvmpipe" not in renderer.name
+def test_an_opened_opengl_renderer_may_be_used_by_any_thread():
+    before = threading.active_count()
+    try:
+        renderer = open_renderer("moderngl", StaticTiles(MESHES))
+    except RenderError as error:
+        assert threading.active_count() == before
+        pytest.skip(str(error))
+    assert renderer.name.startswith("moderngl (")
+    views: list[RenderedView] = []
+
+    def use() -> None:
+        renderer.warm_up()
+        views.append(renderer.render(WORLD @ POSES["nadir"], CAMERA))
+
+    for _ in range(2):
+        thread = threading.Thread(target=use)
+        thread.start()
+        thread.join()
+    views.append(renderer.render(WORLD @ POSES["nadir"], CAMERA))
     renderer.close()
+    reference = NumbaRenderer(StaticTiles(MESHES), threads=1)
+    depth = reference.render(WORLD @ POSES["nadir"], CAMERA).depth
+    keep = away_from_silhouettes(depth)
+    for view in views:
+        assert np.abs(view.depth - depth)[keep].max() < 0.02
+
+
+def test_auto_never_chooses_software_opengl():
+    for make in (make_renderer, open_renderer):
+        renderer = make("auto", StaticTiles(MESHES))
+        assert "llvmpipe" not in renderer.name
+        renderer.close()
 
 
 @pytest.mark.gpu
