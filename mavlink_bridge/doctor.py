@@ -11,6 +11,7 @@ from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 
 from mavlink_bridge.bridge import Bridge
+from mavlink_bridge.clock import SteadyUtc, monotonic_ns
 from mavlink_bridge.config import BridgeConfig
 from mavlink_bridge.messages import VehicleState
 from mavlink_bridge.parameters import ParameterClient
@@ -150,6 +151,7 @@ def _vision_rules(config: BridgeConfig, number: int) -> list[Rule]:
             (round(injection.delay_ms),),
             "the age at which the bridge sends; 300 ms unsaid cost 2.4 m",
             tolerance=10.0,
+            reboot=True,  # the EKF sizes its buffers by it at boot
         ),
         Rule(("VISO_SCALE",), (1.0,), "positions are metres", tolerance=1e-3),
     ]
@@ -351,9 +353,20 @@ def _link_findings(
     return findings
 
 
+def check_computer_clock(config: BridgeConfig) -> list[Finding]:
+    """A computer without a battery clock wakes up in the past; some links care."""
+    if config.injection.message != "gps_input" and not (config.signing or config.ground_signing):
+        return []
+    utc = SteadyUtc()
+    year = time.gmtime(utc.utc_ns(monotonic_ns()) * 1e-9).tm_year
+    why = "GPS_INPUT and signatures carry the time; set it by NTP or a battery clock"
+    return [Finding("computer clock", str(year), "the present", why, utc.is_set, True)]
+
+
 def examine(config: BridgeConfig) -> Diagnosis:
     """Connect, measure the link, read the parameters and judge."""
     findings, state = check_link(config)
+    findings += check_computer_clock(config)
     if not findings[0].ok:
         return Diagnosis(tuple(findings))
     with ParameterClient(config) as client:

@@ -522,6 +522,10 @@ class Pilot:
         """Disarm; `force` also in flight."""
         self.command(mavlink.MAV_CMD_COMPONENT_ARM_DISARM, 0, 21196.0 if force else 0.0)
 
+    def reboot(self) -> None:
+        """Reboot the autopilot (disarmed); it is another vehicle's life then: connect anew."""
+        self.command(mavlink.MAV_CMD_PREFLIGHT_REBOOT_SHUTDOWN, 1)
+
     def takeoff(self, height_m: float, timeout_s: float = 120.0) -> None:
         """Take off in GUIDED and wait for the height (above the launch place, in truth)."""
         ground = self.truth.altitude_m

@@ -58,20 +58,27 @@ def main(argv: list[str] | None = None) -> int:
         system_id = int(parameters["SYSID_THISMAV"])
         ports = tuple(arguments.port + offset for offset in SERIAL_OFFSETS)
         _compile(home)
-        server = MavlinkServer(ports, system_id)
+        while True:
+            _run(home, heading_deg, parameters, MavlinkServer(ports, system_id), arguments.seed)
     except VehicleError as error:
         print(error, file=sys.stderr)
         return 1
-    try:
-        vehicle = Vehicle(home, heading_deg, parameters, server, arguments.seed)
-        for number, port in enumerate(ports):
-            print(f"SERIAL{number} on TCP port {port}", flush=True)  # as ArduPilot SITL prints
-        vehicle.run()
     except KeyboardInterrupt:
         return 0
+
+
+def _run(
+    home: Location, heading_deg: float, parameters: Parameters, server: MavlinkServer, seed: int
+) -> None:
+    """From power on until a reboot is ordered; the parameters live on."""
+    try:
+        vehicle = Vehicle(home, heading_deg, parameters, server, seed)
+        for number, link in enumerate(server.links):
+            port = link.listener.getsockname()[1]
+            print(f"SERIAL{number} on TCP port {port}", flush=True)  # as ArduPilot SITL prints
+        vehicle.run()
     finally:
         server.close()
-    return 0
 
 
 def _compile(home: Location) -> None:

@@ -59,6 +59,7 @@ class Commands:
         m = mavlink
         self._commands: dict[int, CommandHandler] = {
             m.MAV_CMD_COMPONENT_ARM_DISARM: self._arm,
+            m.MAV_CMD_PREFLIGHT_REBOOT_SHUTDOWN: self._reboot,
             m.MAV_CMD_NAV_TAKEOFF: self._takeoff,
             m.MAV_CMD_NAV_LAND: lambda _l, _c: self._mode(Mode.LAND),
             m.MAV_CMD_NAV_RETURN_TO_LAUNCH: lambda _l, _c: self._mode(Mode.RTL),
@@ -116,6 +117,12 @@ class Commands:
             return FAILED
         v.modes.arm()
         v.notify(6, "Arming motors")
+        return ACCEPTED
+
+    def _reboot(self, _link: Link, command: Any) -> int:
+        if command.param1 != 1 or self._vehicle.modes.armed:
+            return FAILED
+        self._vehicle.reboot_ordered = True
         return ACCEPTED
 
     def _takeoff(self, _link: Link, command: Any) -> int:

@@ -161,6 +161,7 @@ class Estimator:
         self._cov = np.diag(
             np.repeat([0.02**2, 0.5**2, 0.5**2, 0.005**2, 0.05**2], 3).astype(np.float64)
         )
+        self._delay_ticks = self._longest_delay_ms() // _TICK_MS  # EKF3 sizes its buffers at boot
         self._ring = np.zeros((_MAX_HORIZON_MS // _TICK_MS + 2, 7))
         self._start, self._filled = 0, 0
         self._now_ms = 0
@@ -317,20 +318,20 @@ class Estimator:
         noise = np.array(
             [p["EK3_GYRO_P_NSE"], p["EK3_ACC_P_NSE"], p["EK3_GBIAS_P_NSE"], p["EK3_ABIAS_P_NSE"]]
         )
-        while self._filled > self._delay_ticks():
+        while self._filled > self._delay_ticks:
             nav.predict(self._state, self._cov, self._ring[self._start], noise)
             self._start = (self._start + 1) % size
             self._filled -= 1
             self._fuse_due()
         nav.replay(self._state, self._ring, self._start, self._filled, self.output)
 
-    def _delay_ticks(self) -> int:
+    def _longest_delay_ms(self) -> int:
         delay = _BASE_HORIZON_MS
         if self.parameters["VISO_TYPE"] > 0:
             delay = max(delay, int(self.parameters["VISO_DELAY_MS"]))
         if self.parameters["GPS1_TYPE"] > 0:
             delay = max(delay, int(self.parameters["GPS1_DELAY_MS"]), 200)
-        return min(delay, _MAX_HORIZON_MS) // _TICK_MS
+        return min(delay, _MAX_HORIZON_MS)
 
     def _horizon_ms(self) -> int:
         return self._now_ms - self._filled * _TICK_MS

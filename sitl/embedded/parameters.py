@@ -89,6 +89,8 @@ _DEFAULTS: dict[str, tuple[float, int]] = {
     "RC8_OPTION": (0, INT16),
     "SYSID_THISMAV": (1, INT16),
     "SIM_GPS1_ENABLE": (1, INT8),
+    "SIM_GPS1_GLTCH_X": (0, REAL32),
+    "SIM_GPS1_GLTCH_Y": (0, REAL32),
     "SIM_GPS1_JAM": (0, INT8),
     "SIM_SPEEDUP": (1, REAL32),
     "SIM_WIND_SPD": (2.0, REAL32),

@@ -51,6 +51,7 @@ class Vehicle:
         self.parameters = parameters
         self.server = server
         self.tick = 0
+        self.reboot_ordered = False
         self.truth = dynamics.initial_state(radians(heading_deg))
         self.sensors = Sensors(seed)
         self._rng = np.random.default_rng([seed, 1])
@@ -86,9 +87,9 @@ class Vehicle:
         return round(self.tick * TICK_S * 1000)
 
     def run(self) -> None:
-        """Run at SIM_SPEEDUP times real time until the process is told to stop."""
+        """Run at SIM_SPEEDUP times real time until a reboot is ordered."""
         schedule = time.monotonic()
-        while True:
+        while not self.reboot_ordered:
             self.step()
             schedule += TICK_S / max(self.parameters["SIM_SPEEDUP"], 0.1)
             now = time.monotonic()
@@ -176,8 +177,8 @@ class Vehicle:
             n, e, d = (float(c) for c in sample.velocity)
             self.estimator.add(
                 GpsData(
-                    where.latitude_deg,
-                    where.longitude_deg,
+                    where.latitude_deg + p["SIM_GPS1_GLTCH_X"],  # degrees, as ArduPilot's
+                    where.longitude_deg + p["SIM_GPS1_GLTCH_Y"],
                     where.altitude_m,
                     (n, e),
                     d,

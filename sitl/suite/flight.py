@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import time
+from collections.abc import Sequence
 from contextlib import ExitStack
 from typing import Any
 
@@ -25,6 +26,7 @@ _AUTOPILOT = 1
 _RAW_SPEEDUP = 2.0  # as the reference was flown; our bridge lives in real time
 _GYROS_SETTLED_S = 27.0  # ArduPilot SITL refuses to arm before about 25 s
 _SETTLE_S = 3.0
+_REBOOT_S = 2.0  # until the old ports are gone
 _NEAR_M = 3.0
 _STEP_S = 0.1
 _LONGEST_S = 240.0
@@ -55,6 +57,7 @@ class _CaseFlight:
         side = case.flight.side_m
         self._corners = [(side, 0.0), (side, side), (0.0, side), (0.0, 0.0)] if side else []
         self._waiting = list(case.timeline)
+        self._ticks: list[tuple[float, float]] = []
 
     def run(self) -> Record:
         """Everything from power on to the record."""
@@ -79,6 +82,7 @@ class _CaseFlight:
             self._collect(pilot)
         if self._bridge is not None:
             self._record.counters = self._bridge.counters()
+        self._record.pace = slowest_pace(self._ticks)
         return self._record
 
     # --- before ----------------------------------------------------------------------------------
@@ -94,13 +98,17 @@ class _CaseFlight:
         """What takes simulated time and needs no injection is run fast."""
         pilot, spec = self._pilot, self._case.vehicle
         with pilot.fast_forward():
-            pilot.wait(lambda: pilot.time_s > _GYROS_SETTLED_S, 60.0, "the gyros to settle")
+            self._wait_for_gyros()
             if spec.receiver:
                 pilot.wait_ready()
         if spec.origin_north_m is not None:
             pilot.set_origin(HOME.offset(spec.origin_north_m, 0.0, 0.0))
         elif self._case.raw is not None and not spec.receiver:
             pilot.set_origin(HOME)
+
+    def _wait_for_gyros(self) -> None:
+        pilot = self._pilot
+        pilot.wait(lambda: pilot.time_s > _GYROS_SETTLED_S, 60.0, "the gyros to settle")
 
     def _inject(self) -> None:
         case, endpoint = self._case, self._vehicle.companion_endpoint
@@ -111,6 +119,12 @@ class _CaseFlight:
         config = bridge_config(case, endpoint)
         if case.before.doctor:
             self._record.doctor = consult(config)
+            self._pilot.reboot()
+            self._pilot.close()
+            time.sleep(_REBOOT_S)
+            self._pilot = self._connect()
+            with self._pilot.fast_forward():
+                self._wait_for_gyros()
         self._bridge = Bridge(config, GEOID_M)
         self._bridge.start()
         self._stack.callback(self._bridge.stop)
@@ -171,6 +185,7 @@ class _CaseFlight:
     def _sample(self) -> None:
         pilot = self._pilot
         north, east, _ = HOME.ned_of(pilot.truth.location)
+        self._ticks.append((self._now_s, pilot.time_s))
         counters = self._bridge.counters() if self._bridge is not None else {}
         self._record.samples.append(
             Sample(
@@ -238,6 +253,21 @@ class _CaseFlight:
             record.errors.append((at_s, float(north), float(east)))
             north, east = ekf - true[i - 1]
             record.unpaired.append((at_s, float(north), float(east)))
+
+
+def slowest_pace(ticks: Sequence[tuple[float, float]], span_s: float = 10.0) -> float:
+    """The least of (vehicle's seconds / seconds due) over spans of span_s; ticks: (due, vehicle's).
+
+    A vehicle's clock that runs back was rebooted, and is left out.
+    """
+    paces, first = [1.0], 0
+    for due, own in ticks:
+        while due - ticks[first][0] > span_s:
+            first += 1
+        elapsed = due - ticks[first][0]
+        if elapsed > 0.9 * span_s and own > ticks[first][1]:
+            paces.append((own - ticks[first][1]) / elapsed)
+    return min(paces)
 
 
 def bridge_config(case: Case, connection: str) -> BridgeConfig:

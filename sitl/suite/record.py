@@ -51,6 +51,8 @@ class Record:
 
     unpaired: as errors, against the newest truth that had arrived, as the reference measured.
     refusals: texts of the last refused arming; None when nobody tried or it was accepted.
+    pace: simulated seconds per second that it should have been, at the slowest over ten seconds;
+    below 1 the machine was too slow, and the autopilot's clock ran slow against the bridge's.
     """
 
     errors: list[tuple[float, float, float]] = field(default_factory=list)
@@ -62,6 +64,7 @@ class Record:
     doctor: Doctor | None = None
     counters: dict[str, float | int | str] = field(default_factory=dict)
     closed: bool = False
+    pace: float = 1.0
 
     def horizontal(self, from_s: float = 0.0, to_s: float = np.inf) -> Array:
         """Horizontal EKF errors (N,) in metres within a span of seconds."""

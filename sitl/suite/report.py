@@ -118,11 +118,17 @@ def _three(values: Iterable[float | None]) -> str:
 
 
 def _told(row: Row) -> list[str]:
-    return [f.what if f.ok else f"NOT: {f.what}" for f in row.findings]
+    return [f.what if f.ok else f"NOT: {f.what}" for f in row.findings] + _pace(row)
 
 
 def _broken(row: Row) -> list[str]:
-    return [f.what for f in row.findings if not f.ok]
+    return [f.what for f in row.findings if not f.ok] + _pace(row)
+
+
+def _pace(row: Row) -> list[str]:
+    if row.record is None or not row.slow:
+        return []
+    return [f"machine too slow: the vehicle ran at {row.record.pace:.2f} of its speed"]
 
 
 def _as_data(row: Row) -> dict[str, Any]:
@@ -138,6 +144,7 @@ def _as_data(row: Row) -> dict[str, Any]:
         "measured": row.measured,
         "measured_paired_as_reference": paired,
         "findings": [asdict(f) for f in row.findings],
+        "pace": None if row.record is None else round(row.record.pace, 3),
         "wall_s": round(row.wall_s, 1),
         "record": None if row.record is None else asdict(row.record),
     }

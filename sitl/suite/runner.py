@@ -19,6 +19,7 @@ from sitl.suite.checks import Finding, Reference
 from sitl.suite.flight import fly
 from sitl.suite.record import Array, Record
 
+_PACE_LIMIT = 0.98
 Figures = tuple[float, float, float]
 
 
@@ -46,6 +47,11 @@ class Row:
         if not self.ok:
             return "FAIL"
         return "better" if any(f.better for f in self.findings) else "pass"
+
+    @property
+    def slow(self) -> bool:
+        """Whether the machine could not keep the vehicle in real time, which costs accuracy."""
+        return self.record is not None and self.record.pace < _PACE_LIMIT
 
     @property
     def reference(self) -> Reference | None:
