@@ -1,6 +1,7 @@
 """Convergence of the registration: the paper's Table 4 (ablation), Table 6 and Fig. 10 (basin).
 
     python benchmarks/basin.py ablation FOLDER [--set generated|quito|portugal|caliterra]
+    python benchmarks/basin.py priors FOLDER [--set ...]
     python benchmarks/basin.py axes FOLDER [--set ...] [--plot basin.png]
 
 FOLDER keeps generated worlds, imported maps and query images between runs. Every registration
@@ -23,7 +24,7 @@ from pathlib import Path
 
 import matplotlib.pyplot as plt
 import numpy as np
-from basin_variants import FULL, Variant, our_rows, paper_rows
+from basin_variants import FULL, Variant, our_rows, paper_rows, prior_rows
 from basin_views import View, load_views
 from feature_report import wilson
 
@@ -32,9 +33,15 @@ from localizer.features.detail import DetailExtractor
 from localizer.map.cache import TileCache
 from localizer.map.stream import TileStreamer
 from localizer.pose import Array, Pose, so3_exp, so3_log
-from localizer.registration import JNGOConfig
+from localizer.registration import JNGO, JNGOConfig, Registration
 from localizer.render.numba_raster import NumbaRenderer
-from localizer.types import Anchors, PosePrior, RegistrationStatus
+from localizer.types import (
+    Anchors,
+    FeaturePyramid,
+    PosePrior,
+    RegistrationStatus,
+    RenderedView,
+)
 
 STARTS = (3.0, 5.0, 10.0)  # metres and degrees: the paper's columns
 AXES = ("yaw", "pitch", "roll", "x", "y", "z")  # camera axes; yaw about y, pitch about x
@@ -45,15 +52,17 @@ _LEAST_DEPTH = 0.5  # share of a reference view that must show the map
 
 @dataclass(frozen=True)
 class Outcome:
-    """One registration: who, which view, which start, and its errors; nees: against its own
-    covariance, NaN where it failed.
+    """One registration: who, which view, which start, and its errors; sigma: of the position
+    by its own covariance, m; nees: against that covariance, NaN where it failed.
     """
 
     variant: str
     view: int
     start: str
+    condition: str
     metres: float
     degrees: float
+    sigma: float
     nees: float
     milliseconds: float
 
@@ -133,27 +142,66 @@ def run_views(
                 reference = renderer.render(prior.world_from_camera, view.camera, wait=True)
                 if (reference.depth > 0).mean() < _LEAST_DEPTH:
                     continue  # the start leads off the map: no method could tell
-                features = extractor.extract(reference.rgb)
-                chosen: dict[tuple[object, ...], Anchors] = {}
-                for variant, optimizer in optimizers:
-                    with variant.active():
-                        if variant.selection not in chosen:
-                            chosen[variant.selection] = variant.select(reference, features, index)
-                        anchors = chosen[variant.selection]
-                        began = time.thread_time()
-                        found = optimizer.register(
-                            variant.shown(query), view.camera, anchors, prior,
-                            motion=prior if variant.motion else None, seed=index,
-                        )  # fmt: skip
-                        ms = 1e3 * (time.thread_time() - began)
-                    metres, degrees = found.world_from_camera.distance_to(view.truth)
-                    nees = np.nan
-                    if found.status is RegistrationStatus.OK:
-                        nees = _nees(found.world_from_camera, found.covariance, view.truth)
-                    outcomes.append(
-                        Outcome(variant.name, index, start.label, metres, degrees, nees, ms)
-                    )
+                trial = Trial(index, view, start, prior, query, reference)
+                outcomes += trial.run(optimizers, extractor.extract(reference.rgb))
     return outcomes
+
+
+@dataclass(frozen=True)
+class Trial:
+    """One view from one start, for all variants."""
+
+    index: int
+    view: View
+    start: Start
+    prior: PosePrior
+    query: FeaturePyramid
+    reference: RenderedView
+
+    def run(
+        self, optimizers: list[tuple[Variant, JNGO]], features: FeaturePyramid
+    ) -> Iterator[Outcome]:
+        """Anchors, registration and errors of every variant; equal anchors are selected once."""
+        chosen: dict[tuple[object, ...], Anchors] = {}
+        for variant, optimizer in optimizers:
+            with variant.active():
+                if variant.selection not in chosen:
+                    made = variant.select(self.reference, features, self.index)
+                    chosen[variant.selection] = made
+                began = time.thread_time()
+                found = self._register(variant, optimizer, chosen[variant.selection])
+                ms = 1e3 * (time.thread_time() - began)
+            yield self._outcome(variant.name, found, ms)
+
+    def _register(self, variant: Variant, optimizer: JNGO, anchors: Anchors) -> Registration:
+        constraint = None
+        if variant.constraint is not None:
+            constraint = variant.constraint(self.view.truth, np.random.default_rng((self.index, 5)))
+        return optimizer.register(
+            variant.shown(self.query),
+            self.view.camera,
+            anchors,
+            self.prior,
+            motion=self.prior if variant.motion else None,
+            constraint=constraint,
+            seed=self.index,
+        )
+
+    def _outcome(self, variant: str, found: Registration, ms: float) -> Outcome:
+        pose, truth = found.world_from_camera, self.view.truth
+        metres, degrees = pose.distance_to(truth)
+        ok = found.status is RegistrationStatus.OK
+        return Outcome(
+            variant,
+            self.index,
+            self.start.label,
+            self.view.condition,
+            metres,
+            degrees,
+            float(np.sqrt(np.trace(found.covariance[:3, :3]))),
+            _nees(pose, found.covariance, truth) if ok else np.nan,
+            ms,
+        )
 
 
 def _nees(pose: Pose, covariance: Array, truth: Pose) -> float:
@@ -222,11 +270,11 @@ def groups(outcomes: list[Outcome]) -> Iterator[tuple[str, str, list[Outcome], l
 
 
 def ablation(args: argparse.Namespace) -> list[Outcome]:
-    """Table 4: one row a variant, one column a start."""
+    """Table 4, or the priors: one line a variant and start."""
     views = load_views(args.set, args.folder, args.data, args.pairs)
     if args.set == "caliterra":
         views = views * (-(-args.pairs // len(views)))  # the same photos from other starts
-    rows = paper_rows() + our_rows()
+    rows = prior_rows() if args.what == "priors" else paper_rows() + our_rows()
     if args.only:
         rows = [v for v in rows if any(text in v.name for text in args.only) or v.name == FULL]
     outcomes = run(
@@ -324,7 +372,7 @@ def _unit(axis: str) -> str:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
-    parser.add_argument("what", choices=("ablation", "axes"))
+    parser.add_argument("what", choices=("ablation", "priors", "axes"))
     parser.add_argument("folder", type=Path, help="of worlds, maps and query images")
     parser.add_argument("--set", default="generated")
     parser.add_argument("--data", type=Path, default=Path("../shared/data"))
@@ -336,7 +384,7 @@ def main() -> None:
     parser.add_argument("--plot", type=Path)
     parser.add_argument("--json", type=Path, help="every outcome")
     args = parser.parse_args()
-    outcomes = (ablation if args.what == "ablation" else axes)(args)
+    outcomes = (axes if args.what == "axes" else ablation)(args)
     if args.json:
         args.json.write_text(json.dumps([asdict(o) for o in outcomes]))
 
