@@ -96,6 +96,7 @@ class FlightModes:
     _ekf_ever_good: bool = False
     _ekf_failsafe: bool = False
     _last_warning: float = -1e9
+    _glitching: bool = False
 
     # --- requests ----------------------------------------------------------------------------
 
@@ -257,6 +258,14 @@ class FlightModes:
             if self._ekf_fails >= _CHECKS_TO_FAIL:
                 self._ekf_bad = True
                 self._fail_ekf()
+
+    def check_glitch(self) -> None:
+        """ArduCopter's gpsglitch_check: tells when GNSS leaves the innovation gate, and returns."""
+        if self.estimator.gps_glitching is self._glitching:
+            return
+        self._glitching = not self._glitching
+        text = "GPS Glitch or Compass error" if self._glitching else "Glitch cleared"
+        self.notify(CRITICAL, text)
 
     def _fail_ekf(self) -> None:
         if self._time - self._last_warning > 30.0:

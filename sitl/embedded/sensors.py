@@ -119,23 +119,26 @@ class Sensors:
         yaw = euler(x[ATTITUDE : ATTITUDE + 4])[2]
         return wrap_pi(yaw + self._compass_offset + float(self._rng.normal()) * _COMPASS_NOISE)
 
-    def gps(self, time_s: float, x: Array, jammed: bool) -> GpsSample | None:
-        """The solution that arrives now, if one does; it is `_GPS_LATENCY_S` old."""
+    def gps(self, time_s: float, x: Array, jammed: bool, glitch: Array) -> GpsSample | None:
+        """The solution that arrives now, if one does; it is `_GPS_LATENCY_S` old.
+
+        glitch: (3,) NED metres added to its position.
+        """
         if time_s >= self._gps_next_s:
             self._gps_next_s = time_s + _GPS_PERIOD_S
-            self._gps_pending.append(self._measure(time_s, x, jammed))
+            self._gps_pending.append(self._measure(time_s, x, jammed, glitch))
         if self._gps_pending and time_s >= self._gps_pending[0].time_s + _GPS_LATENCY_S:
             return self._gps_pending.popleft()
         return None
 
-    def _measure(self, time_s: float, x: Array, jammed: bool) -> GpsSample:
+    def _measure(self, time_s: float, x: Array, jammed: bool, glitch: Array) -> GpsSample:
         keep = exp(-_GPS_PERIOD_S / _GPS_WANDER_S)
         draw = self._rng.standard_normal(9)
         step = sqrt(1 - keep**2) * self._gps_sigma * draw[0:3]
         self._gps_wander = keep * self._gps_wander + step
         clean = GpsSample(
             time_s,
-            x[POSITION : POSITION + 3] + self._gps_wander + _GPS_WHITE * draw[3:6],
+            x[POSITION : POSITION + 3] + glitch + self._gps_wander + _GPS_WHITE * draw[3:6],
             x[VELOCITY : VELOCITY + 3] + _GPS_SPEED * draw[6:9],
             horizontal_accuracy=0.5,
             vertical_accuracy=0.8,

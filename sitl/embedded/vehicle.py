@@ -124,6 +124,7 @@ class Vehicle:
         self.gimbal.update(self.estimator.location, vehicle_yaw, TICK_S)
         if self.tick % 10 == 0:
             self.modes.check_ekf()
+            self.modes.check_glitch()
         if self.tick % 3000 == 0 and not self.modes.armed:
             self.report_failures("PreArm")
         self._announce()
@@ -169,7 +170,7 @@ class Vehicle:
             self.estimator.add(Compass(self.sensors.compass(self.truth)), now)
         p = self.parameters
         powered = p["SIM_GPS1_ENABLE"] > 0 and p["GPS1_TYPE"] in _GPS_SIMULATED
-        sample = self.sensors.gps(self.time_s, self.truth, p["SIM_GPS1_JAM"] > 0)
+        sample = self.sensors.gps(self.time_s, self.truth, p["SIM_GPS1_JAM"] > 0, self._glitch())
         started = self.time_s >= _GPS_FIX_AFTER_S
         if powered and started and sample is not None and sample.fix:
             self.gps_sample, self._gps_sample_at = sample, self.time_s
@@ -177,8 +178,8 @@ class Vehicle:
             n, e, d = (float(c) for c in sample.velocity)
             self.estimator.add(
                 GpsData(
-                    where.latitude_deg + p["SIM_GPS1_GLTCH_X"],  # degrees, as ArduPilot's
-                    where.longitude_deg + p["SIM_GPS1_GLTCH_Y"],
+                    where.latitude_deg,
+                    where.longitude_deg,
                     where.altitude_m,
                     (n, e),
                     d,
@@ -189,6 +190,16 @@ class Vehicle:
                 ),
                 round(sample.time_s * 1000),
             )
+
+    def _glitch(self) -> Array:
+        """NED metres by which the receiver is wrong; SIM_GPS1_GLTCH_X and _Y are degrees."""
+        p, here = self.parameters, self.launch
+        wrong = Location(
+            here.latitude_deg + p["SIM_GPS1_GLTCH_X"],
+            here.longitude_deg + p["SIM_GPS1_GLTCH_Y"],
+            here.altitude_m,
+        )
+        return np.array(here.ned_of(wrong))
 
     @property
     def true_location(self) -> Location:

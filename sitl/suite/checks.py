@@ -281,6 +281,8 @@ class Diagnosed(_Expectation):
             return Finding(False, "the doctor was not asked")
         ok = set(d.found) == set(self.finds) and d.exit_before == 2 and d.exit_after == 0
         what = f"found {', '.join(d.found)}; exit {d.exit_before} before, {d.exit_after} after"
+        if d.left:
+            what += f" ({', '.join(d.left)})"
         return Finding(ok, what)
 
 

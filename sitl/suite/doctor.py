@@ -30,7 +30,9 @@ def consult(config: BridgeConfig) -> Doctor:
     before = examine(config)
     found = tuple(f.name for f in before.findings if not f.ok and f.fix is not None)
     _fix(config)
-    return Doctor(found, before.exit_code, examine(config).exit_code)
+    after = examine(config)
+    left = tuple(f"{f.name} {f.found}" for f in after.findings if not f.ok)
+    return Doctor(found, left, before.exit_code, after.exit_code)
 
 
 def _fix(config: BridgeConfig) -> None:

@@ -38,9 +38,10 @@ class Sample:
 
 @dataclass(frozen=True)
 class Doctor:
-    """What `companion doctor` found wrong, and the exit codes before and after its `--fix`."""
+    """What `companion doctor` found wrong and what its `--fix` left, and the exit codes of both."""
 
     found: tuple[str, ...]
+    left: tuple[str, ...]
     exit_before: int
     exit_after: int
 

@@ -215,9 +215,9 @@ def test_arming_and_doctor() -> None:
     diagnosed = expectation(check="doctor", finds=["A", "B"])
     assert not diagnosed.judge(flown).ok
     for doctor, ok in (
-        (Doctor(("B", "A"), 2, 0), True),
-        (Doctor(("A",), 2, 0), False),
-        (Doctor(("A", "B"), 2, 1), False),
+        (Doctor(("B", "A"), (), 2, 0), True),
+        (Doctor(("A",), (), 2, 0), False),
+        (Doctor(("A", "B"), ("clock 40 ms",), 2, 1), False),
     ):
         flown.doctor = doctor
         assert diagnosed.judge(flown).ok == ok
