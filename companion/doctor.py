@@ -6,40 +6,76 @@ import threading
 from collections.abc import Iterable
 from pathlib import Path
 
+import numpy as np
+
 from companion.config import CompanionConfig
+from companion.coverage import check_mission
 from companion.errors import CompanionError
 from companion.sources import SourceSettings, open_source
 from localizer.errors import LocalizerError
 from localizer.features.extractor import load_extractor
 from localizer.geo import LocalFrame
 from localizer.map.cache import TileCache
+from mavlink_bridge.config import OriginConfig
 from mavlink_bridge.doctor import Diagnosis, Finding, examine
+from mavlink_bridge.errors import BridgeError
+from mavlink_bridge.mission import download_mission
 
 _FEED_S = 8.0
 _MIN_RATE_HZ = 5.0
+_ORIGIN_KM = 50.0  # a take-off far from the map is odd, another country is a typing error
+_ORIGIN_HEIGHT_M = 300.0
 _GOVERNOR = Path("/sys/devices/system/cpu/cpu0/cpufreq/scaling_governor")
 
 
 def examine_deployment(config: CompanionConfig, *, vehicle: bool = True) -> Diagnosis:
     """Every check; `vehicle` false leaves out what needs the flight controller."""
-    findings = [_check_map(config), _check_model(config), _check_camera(config), _check_power()]
+    cache, findings = _check_map(config)
+    findings += [_check_model(config), _check_camera(config), _check_power()]
+    if cache is not None and config.bridge.origin is not None:
+        findings.append(_check_origin(config.bridge.origin, cache))
     if vehicle:
-        findings += examine(config.bridge).findings
+        found = examine(config.bridge).findings
+        findings += found
+        if cache is not None and found[0].ok:
+            findings.append(_check_mission(config, cache))
     return Diagnosis(tuple(findings))
 
 
-def _check_map(config: CompanionConfig) -> Finding:
+def _check_map(config: CompanionConfig) -> tuple[TileCache | None, list[Finding]]:
     try:
         cache = TileCache.open(config.map)
     except LocalizerError as error:
-        return _failed("map", "unreadable", "a tile cache", str(error))
+        return None, [_failed("map", "unreadable", "a tile cache", str(error))]
     m = cache.manifest
     origin = m.origin
     found = (
         f"{m.tiles} tiles, {m.gsd_m:.2f} m/px, {_extent_km(m.extent, cache.frame):.2f} km across"
     )
     where = f"about {origin.latitude_deg:.5f} {origin.longitude_deg:.5f}; `companion map verify`"
-    return Finding("map", found, "a tile cache", where, True, True)
+    return cache, [Finding("map", found, "a tile cache", where, True, True)]
+
+
+def _check_origin(origin: OriginConfig, cache: TileCache) -> Finding:
+    """An origin with a wrong digit puts the EKF on another continent or under the ground."""
+    m = cache.manifest
+    ground = origin.altitude_amsl_m + m.geoid_separation_m
+    place = cache.frame.enu_from_geodetic(origin.latitude_deg, origin.longitude_deg, ground)
+    low, high = cache.index.box_min[0, :2], cache.index.box_max[0, :2]
+    away_km = float(np.linalg.norm(np.maximum(low - place[:2], place[:2] - high).clip(0.0))) / 1000
+    bottom, top = m.height_range_m
+    off_m = max(bottom - ground, ground - top, 0.0)
+    good = away_km <= _ORIGIN_KM and off_m <= _ORIGIN_HEIGHT_M
+    found = f"{away_km:.1f} km beside and {off_m:.0f} m above or below the map"
+    needed = f"<= {_ORIGIN_KM:.0f} km and {_ORIGIN_HEIGHT_M:.0f} m"
+    return Finding("bridge.origin", found, needed, "the take-off ground, altitude AMSL", good, True)
+
+
+def _check_mission(config: CompanionConfig, cache: TileCache) -> Finding:
+    try:
+        return check_mission(cache, download_mission(config.bridge))
+    except BridgeError as error:
+        return Finding("mission", "not read", "inside the map", str(error), False, False)
 
 
 def _extent_km(extent: Iterable[tuple[float, float]], frame: LocalFrame) -> float:

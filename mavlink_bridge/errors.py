@@ -15,6 +15,10 @@ class SigningKeyError(BridgeError):
     """A MAVLink signing key file that is missing, malformed or readable by others."""
 
 
+class ConnectionSilentError(BridgeError):
+    """No autopilot is heard where one should be."""
+
+
 class BridgeStateError(BridgeError):
     """A call that the bridge's state does not allow, such as starting it twice."""
 
