@@ -18,7 +18,7 @@ from companion.config import CompanionConfig
 from companion.detections import Detection, DetectionListener
 from companion.fixes import camera_rotation, vehicle_prior, vision_fix
 from companion.health import HealthMonitor
-from companion.recorder import Recorder, fresh_folder
+from companion.recorder import Recorder, fresh_folder, write_manifest
 from companion.sources import StreamState, open_source
 from companion.target_reporter import Target, TargetReporter
 from companion.view_reporter import ViewReporter
@@ -84,8 +84,9 @@ class Companion:
         if record is not None:
             record = record.model_copy(update={"folder": fresh_folder(record.folder)})
         self._recorder = Recorder(record, self._frame) if record else None
-        if self._recorder is not None:
+        if record is not None and self._recorder is not None:
             up.callback(self._recorder.close)
+            write_manifest(record.folder, config)
         self._newest: PoseEstimate | None = None
         self._bridge = Bridge(
             _bridge_config(config),

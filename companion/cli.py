@@ -1,7 +1,8 @@
-"""The command line: ``companion run | eval | map | world | doctor``.
+"""The command line: ``companion run | eval | replay | map | world | doctor``.
 
-Exit codes: 0 done; 1 `doctor` found advice; 2 wrong usage, a named error, or `doctor` found the
-vehicle not fit to fly; 130 interrupted (`run` that was flying ends with 0).
+Exit codes: 0 done; 1 `doctor` found advice, `replay` differs or `map verify` found damage; 2 wrong
+usage, a named error, or `doctor` found the vehicle not fit to fly; 130 interrupted (`run` that was
+flying ends with 0).
 """
 
 from __future__ import annotations
@@ -17,6 +18,7 @@ from companion.doctor_cli import doctor_command
 from companion.errors import CompanionError
 from companion.eval_cli import evaluate_command
 from companion.map_cli import app as map_app
+from companion.replay_cli import replay_command
 from companion.run_cli import run_command
 from companion.versions import versions
 from companion.world_cli import app as world_app
@@ -50,6 +52,7 @@ def _options(
 
 app.command("run")(run_command)
 app.command("eval")(evaluate_command)
+app.command("replay")(replay_command)
 app.command("doctor")(doctor_command)
 app.add_typer(map_app, name="map", help="Build and inspect tile caches.")
 app.add_typer(world_app, name="world", help="Generated worlds for tests and demos.")

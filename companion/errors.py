@@ -31,5 +31,9 @@ class ReportError(CompanionError):
     """A report or record that cannot be written where it was asked for."""
 
 
+class RecordError(CompanionError):
+    """A flight's record that is not one, or that lacks what a replay needs."""
+
+
 class DetectionError(CompanionError):
     """A datagram that is not a pixel detection."""

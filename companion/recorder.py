@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import json
 import logging
 import queue
 import threading
@@ -13,8 +14,9 @@ from typing import Any, TextIO
 
 import cv2
 
-from companion.config import RecordConfig
+from companion.config import CompanionConfig, RecordConfig
 from companion.errors import ReportError
+from companion.versions import versions
 from localizer.geo import LocalFrame
 from localizer.pose import quaternion_from_matrix
 from localizer.types import Frame, PoseEstimate, TargetFix
@@ -22,6 +24,7 @@ from localizer.types import Frame, PoseEstimate, TargetFix
 _log = logging.getLogger(__name__)
 _QUEUE_SIZE = 4096
 _FLUSH_S = 1.0
+MANIFEST_NAME = "record.json"
 
 ESTIMATE_COLUMNS = (
     "exposure_time_ns", "sequence", "east_m", "north_m", "up_m", "qw", "qx", "qy", "qz",
@@ -46,6 +49,23 @@ def fresh_folder(folder: Path) -> Path:
         candidate = folder.with_name(f"{folder.name}-{number}")
         number += 1
     return candidate
+
+
+def write_manifest(folder: Path, config: CompanionConfig) -> None:
+    """``record.json``: settings, versions and what time it was, on both clocks.
+
+    The pair of clocks dates the .tlog (UTC) against everything else (CLOCK_MONOTONIC).
+    """
+    document = {
+        "monotonic_ns": time.monotonic_ns(),
+        "utc_ns": time.time_ns(),
+        "versions": versions(),
+        "config": config.model_dump(mode="json"),
+    }
+    try:
+        (folder / MANIFEST_NAME).write_text(json.dumps(document, indent=1), encoding="utf-8")
+    except OSError as error:
+        raise ReportError(f"record.folder {folder}: cannot be written: {error}") from error
 
 
 class Recorder:

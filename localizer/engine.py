@@ -16,7 +16,6 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 from localizer.errors import LocalizerError
-from localizer.integrity import Integrity
 from localizer.mailbox import Mailbox
 from localizer.pipeline import Localizer, stopwatch
 from localizer.types import Frame, PoseEstimate, PosePrior, ReferenceBundle, TrackingState
@@ -147,7 +146,7 @@ class DualThreadEngine:
         """
         tracker = self._localizer.tracker
         known = tracker.motion is not None
-        if known and not _wants_prior(tracker.integrity):
+        if known and not tracker.integrity.wants_prior:
             return True
         prior = self._prior_provider(time_ns)
         if prior is None:
@@ -184,8 +183,3 @@ class DualThreadEngine:
         with self._health_lock:
             h = self._health
             self._health = replace(h, **{k: getattr(h, k) + n for k, n in increments.items()})
-
-
-def _wants_prior(integrity: Integrity) -> bool:
-    untouched = integrity.accepted_in_row == 0 and integrity.state is TrackingState.INITIALIZING
-    return untouched or integrity.state is TrackingState.LOST

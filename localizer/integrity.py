@@ -43,6 +43,14 @@ class Integrity:
         """Whether the prediction may reject an estimate."""
         return self.state in (TrackingState.TRACKING, TrackingState.DEGRADED)
 
+    @property
+    def wants_prior(self) -> bool:
+        """Whether a pose known outside is better than the prediction: before the first acceptance,
+        and when LOST.
+        """
+        untouched = self.accepted_in_row == 0 and self.state is TrackingState.INITIALIZING
+        return untouched or self.state is TrackingState.LOST
+
 
 def is_acceptable(config: IntegrityConfig, result: Registration, distance_squared: float) -> bool:
     """Whether one registration may be used; distance_squared: Mahalanobis, from the prediction."""

@@ -1,0 +1,260 @@
+"""A recorded flight localized again: the same frames and the same MAVLink, frame after frame.
+
+Without threads, so that a machine of any speed gives the same result: each frame that was localized
+in flight is localized again, with what the autopilot had said by then.
+"""
+
+from __future__ import annotations
+
+import csv
+import json
+import struct
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from pymavlink.dialects.v20 import ardupilotmega as mavlink
+
+from companion.build import MapStack, build_localizer
+from companion.config import CompanionConfig, parse_config
+from companion.errors import RecordError
+from companion.fixes import camera_rotation, vehicle_prior
+from companion.recorder import MANIFEST_NAME
+from companion.sources.base import fitted_camera
+from companion.sources.folder_source import read_image
+from localizer.camera import Camera
+from localizer.errors import OutsideMapError
+from localizer.pipeline import Localizer
+from localizer.pose import Array, Pose, matrix_from_quaternion
+from localizer.types import Frame, PoseEstimate
+from mavlink_bridge import quaternion as quat
+from mavlink_bridge.vehicle import VehicleTracker
+
+_MIN_IMAGES = 0.9  # share of the localized frames
+_FRAME_START = {0xFE: (8, 1), 0xFD: (12, 1)}  # bytes beside the payload, place of its length
+_SIGNATURE_BYTES = 13
+
+
+@dataclass(frozen=True)
+class RecordedEstimate:
+    """One row of ``estimates.csv``. known_ns: when it was published, CLOCK_MONOTONIC."""
+
+    exposure_time_ns: int
+    sequence: int
+    known_ns: int
+    world_from_camera: Pose
+    accepted: bool
+
+
+@dataclass(frozen=True)
+class FlightRecord:
+    """A record's folder, read. start_ns: of the record, CLOCK_MONOTONIC; utc_minus_monotonic_ns: of
+    the machine, then.
+    """
+
+    folder: Path
+    config: CompanionConfig
+    start_ns: int
+    utc_minus_monotonic_ns: int
+    estimates: tuple[RecordedEstimate, ...]
+
+
+@dataclass(frozen=True)
+class ReplayedFrame:
+    """One frame's two outcomes. replayed: None where its prediction left the map, or no prior."""
+
+    recorded: RecordedEstimate
+    replayed: PoseEstimate | None
+
+
+@dataclass(frozen=True)
+class ReplaySummary:
+    """How a replay compares. Differences are over frames accepted both times."""
+
+    frames: int
+    accepted_recorded: int
+    accepted_replayed: int
+    accepted_both: int
+    translation_m: Array
+    rotation_deg: Array
+
+    def agrees(self, tolerance_m: float) -> bool:
+        """Whether at least 95 per cent of what was accepted in flight is accepted again, and 95 per
+        cent of that within `tolerance_m` of where it was.
+        """
+        if self.accepted_recorded == 0:
+            return self.accepted_replayed == 0
+        if self.accepted_both < 0.95 * self.accepted_recorded:
+            return False
+        return bool(np.percentile(self.translation_m, 95) <= tolerance_m)
+
+
+def load_record(folder: Path) -> FlightRecord:
+    """Read a record that `companion run` left. `RecordError` says what it lacks."""
+    try:
+        manifest = json.loads((folder / MANIFEST_NAME).read_text(encoding="utf-8"))
+        start_ns = int(manifest["monotonic_ns"])
+        offset_ns = int(manifest["utc_ns"]) - start_ns
+        config = parse_config(manifest["config"], str(folder / MANIFEST_NAME))
+        with (folder / "estimates.csv").open(newline="", encoding="utf-8") as file:
+            estimates = tuple(_estimate(row) for row in csv.DictReader(file))
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        raise RecordError(f"{folder}: not a flight's record: {error}") from error
+    if not estimates:
+        raise RecordError(f"{folder}: holds no estimate; nothing was localized in that flight")
+    missing = sum(not _image_path(folder, e).is_file() for e in estimates)
+    if missing > (1 - _MIN_IMAGES) * len(estimates):
+        raise RecordError(
+            f"{folder}: {missing} of {len(estimates)} localized frames have no image in snapshots: "
+            "fly with record.snapshot_interval_s 0.001 to keep every frame"
+        )
+    return FlightRecord(folder, config, start_ns, offset_ns, estimates)
+
+
+def _estimate(row: dict[str, str]) -> RecordedEstimate:
+    exposure_ns = int(row["exposure_time_ns"])
+    q = np.array([float(row[k]) for k in ("qw", "qx", "qy", "qz")])
+    t = np.array([float(row[k]) for k in ("east_m", "north_m", "up_m")])
+    return RecordedEstimate(
+        exposure_ns,
+        int(row["sequence"]),
+        exposure_ns + round(1e6 * float(row["latency_ms"])),
+        Pose(matrix_from_quaternion(q), t),
+        row["accepted"] == "1",
+    )
+
+
+def _image_path(folder: Path, estimate: RecordedEstimate) -> Path:
+    return folder / "snapshots" / f"{estimate.exposure_time_ns}.jpg"
+
+
+def read_tlog(path: Path) -> Iterator[tuple[int, Any]]:
+    """(UTC in ns, message) of every frame of a .tlog, in its order; damaged frames are left out."""
+    try:
+        data = path.read_bytes()
+    except OSError as error:
+        raise RecordError(f"{path}: cannot be read: {error.strerror}") from error
+    codec = mavlink.MAVLink(None)
+    codec.robust_parsing = True
+    at = 0
+    while at + 10 <= len(data):
+        (time_us,) = struct.unpack_from(">Q", data, at)
+        size = _frame_size(data, at + 8)
+        frame = data[at + 8 : at + 8 + size]
+        at += 8 + size
+        for message in codec.parse_buffer(frame) or []:
+            if message.get_type() != "BAD_DATA":
+                yield time_us * 1000, message
+    if at == 0:
+        raise RecordError(f"{path}: holds no MAVLink frame")
+
+
+def _frame_size(data: bytes, at: int) -> int:
+    if data[at] not in _FRAME_START:
+        raise RecordError(f"tlog: no MAVLink frame at byte {at}; the file is damaged")
+    overhead, length_at = _FRAME_START[data[at]]
+    is_signed = data[at] == 0xFD and at + 2 < len(data) and data[at + 2] & 1
+    return overhead + data[at + length_at] + (_SIGNATURE_BYTES if is_signed else 0)
+
+
+class _Autopilot:
+    """What the vehicle had said by a time, from the recorded messages."""
+
+    def __init__(self, record: FlightRecord, tlog: Path) -> None:
+        bridge = record.config.bridge
+        mount = quat.from_euler(
+            *np.radians(
+                [
+                    bridge.camera.mount_roll_deg,
+                    bridge.camera.mount_pitch_deg,
+                    bridge.camera.mount_yaw_deg,
+                ]
+            )
+        )
+        self.tracker = VehicleTracker(bridge.system_id, mount, bridge.camera.mount == "fixed")
+        dated = ((utc - record.utc_minus_monotonic_ns, m) for utc, m in read_tlog(tlog))
+        # A .tlog is appended to: earlier flights may stand before this one.
+        self._messages = (item for item in dated if item[0] >= record.start_ns)
+        self._next = next(self._messages, None)
+
+    def advance(self, time_ns: int) -> None:
+        """Take in everything that had arrived by `time_ns`, CLOCK_MONOTONIC."""
+        while self._next is not None and self._next[0] <= time_ns:
+            received_ns, message = self._next
+            if self.tracker.accepts(message):
+                if message.get_type() != "TIMESYNC":
+                    self.tracker.handle(message, received_ns)
+                elif message.tc1 != 0:  # an answer; ts1 is our own time of the question
+                    self.tracker.timesync(message.tc1, message.ts1, received_ns)
+            self._next = next(self._messages, None)
+
+    def rotation_at(self, time_ns: int) -> Array | None:
+        gimbal = self.tracker.gimbal_at(time_ns)
+        return camera_rotation(gimbal) if gimbal is not None else None
+
+
+def replay(
+    record: FlightRecord, tlog: Path, progress: Callable[[], None] = lambda: None
+) -> list[ReplayedFrame]:
+    """Localize the recorded frames again, over the map and with the settings of the record."""
+    config = record.config
+    autopilot = _Autopilot(record, tlog)
+    stack = MapStack(config.map, config.localizer)
+    try:
+        camera = config.camera.model.camera()
+        localizer = build_localizer(stack, camera, config.localizer, autopilot.rotation_at)
+        arm, sigma = np.array(config.camera.lever_arm_m), config.prior
+        sigmas = (sigma.position_sigma_m, float(np.radians(sigma.rotation_sigma_deg)))
+        frames = []
+        for recorded in record.estimates:
+            progress()
+            if not (path := _image_path(record.folder, recorded)).is_file():
+                continue
+            autopilot.advance(recorded.known_ns)
+            time_ns = recorded.exposure_time_ns
+            if localizer.tracker.integrity.wants_prior:
+                tracker = autopilot.tracker
+                prior = vehicle_prior(
+                    tracker.snapshot(recorded.known_ns), tracker.attitude_at(time_ns),
+                    tracker.gimbal_at(time_ns), stack.cache.frame,
+                    stack.cache.manifest.geoid_separation_m, arm, sigmas, time_ns,
+                )  # fmt: skip
+                if prior is not None:
+                    localizer.set_prior(prior)
+            frames.append(ReplayedFrame(recorded, _localize(localizer, camera, recorded, path)))
+        return frames
+    finally:
+        stack.close()
+
+
+def _localize(
+    localizer: Localizer, camera: Camera, recorded: RecordedEstimate, path: Path
+) -> PoseEstimate | None:
+    image = read_image(path)
+    fitted = fitted_camera(image.shape[1], image.shape[0], camera, str(path))
+    frame = Frame(image, recorded.exposure_time_ns, fitted, recorded.sequence)
+    prior = localizer.predict(frame.exposure_time_ns)
+    if prior is None:
+        return None
+    try:
+        bundle = localizer.make_reference(prior, wait=True)
+        return localizer.localize(frame, localizer.extract_query(frame), bundle.anchors)
+    except OutsideMapError:
+        return None
+
+
+def summarize(frames: list[ReplayedFrame]) -> ReplaySummary:
+    """Compare the two outcomes of every frame."""
+    again = [f.replayed is not None and f.replayed.accepted for f in frames]
+    differences = [
+        f.recorded.world_from_camera.distance_to(f.replayed.world_from_camera)
+        for f in frames
+        if f.replayed is not None and f.replayed.accepted and f.recorded.accepted
+    ]
+    values = np.array(differences).reshape(-1, 2)
+    return ReplaySummary(
+        len(frames), sum(f.recorded.accepted for f in frames), sum(again), len(values),
+        values[:, 0], values[:, 1],
+    )  # fmt: skip

@@ -1,0 +1,61 @@
+"""``companion replay``: a recorded flight localized again and compared."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+from typing import Annotated
+
+import numpy as np
+import typer
+from rich.console import Console
+from rich.progress import Progress
+from rich.table import Table
+
+from companion.errors import RecordError
+from localizer.pose import Array
+
+
+def replay_command(
+    record: Annotated[Path, typer.Argument(help="folder that `companion run` recorded")],
+    tlog: Annotated[Path | None, typer.Option(help="instead of the record's bridge.tlog")] = None,
+    map_cache: Annotated[
+        Path | None, typer.Option("--map", help="instead of the record's map")
+    ] = None,
+    tolerance_m: Annotated[
+        float, typer.Option(min=0, help="95 % of the positions must lie so near")
+    ] = 1.0,
+) -> None:
+    """Localize a recorded flight again; exit code 0 if it agrees with the record, else 1."""
+    from companion.replay import load_record, replay, summarize
+
+    loaded = load_record(record)
+    log = tlog or loaded.config.bridge.tlog
+    if log is None:
+        raise RecordError(f"{record}: flown without bridge.tlog; give the log as --tlog")
+    if map_cache is not None:
+        config = loaded.config.model_copy(update={"map": map_cache})
+        loaded = replace(loaded, config=config)
+    with Progress() as bar:
+        task = bar.add_task("localizing", total=len(loaded.estimates))
+        summary = summarize(replay(loaded, log, lambda: bar.advance(task)))
+    table = Table(title=str(record))
+    for column in ("", "median", "p95", "max"):
+        table.add_column(column, justify="right" if column else "left")
+    table.add_row("position differs, m", *_spread(summary.translation_m, 2))
+    table.add_row("rotation differs, °", *_spread(summary.rotation_deg, 3))
+    console = Console()
+    console.print(table)
+    console.print(
+        f"{summary.frames} frames: {summary.accepted_recorded} accepted in flight, "
+        f"{summary.accepted_replayed} in the replay, {summary.accepted_both} in both"
+    )
+    agrees = summary.agrees(tolerance_m)
+    console.print("[green]agrees" if agrees else "[red]differs")
+    raise typer.Exit(0 if agrees else 1)
+
+
+def _spread(values: Array, digits: int) -> tuple[str, ...]:
+    if not len(values):
+        return ("-", "-", "-")
+    return tuple(f"{x:.{digits}f}" for x in (*np.percentile(values, [50, 95]), values.max()))

@@ -1,0 +1,181 @@
+"""A flight of the whole process over recorded images, and the same flight again from its record."""
+
+import csv
+import json
+import socket
+import struct
+import threading
+import time
+
+import numpy as np
+import pytest
+from pymavlink.dialects.v20 import ardupilotmega as mavlink
+from typer.testing import CliRunner
+
+from companion.app import Companion
+from companion.cli import app
+from companion.config import parse_config
+from companion.errors import RecordError
+from companion.geometry import GIMBAL_FROM_CAMERA
+from companion.replay import load_record, read_tlog, replay, summarize
+from localizer.camera import Camera
+from localizer.geo import NED_FROM_ENU
+from localizer.map.cache import TileCache
+from localizer.pose import quaternion_from_matrix
+from localizer.posefile import read_poses, world_from_camera
+from sitl.kinematic import record_scenario
+from sitl.scenario import CameraSpec, Leg, Scenario
+
+FRAMES_AT_LEAST = 6
+
+
+class Autopilot(threading.Thread):
+    """A vehicle that stands in the air where the first image was taken, over UDP."""
+
+    def __init__(self, port, row, pose, geoid_separation_m):
+        super().__init__(daemon=True)
+        self._to = ("127.0.0.1", port)
+        self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+        self._codec = mavlink.MAVLink(None, 1, 1)
+        self._boot_ns = time.monotonic_ns() - 60 * 10**9
+        ned_from_gimbal = NED_FROM_ENU @ pose.rotation @ GIMBAL_FROM_CAMERA.T
+        self._q = quaternion_from_matrix(ned_from_gimbal)
+        p = row.position
+        self._place = (
+            round(p.latitude_deg * 1e7), round(p.longitude_deg * 1e7),
+            round((p.height_m - geoid_separation_m) * 1e3),
+        )  # fmt: skip
+        self._stop_event = threading.Event()
+
+    def run(self):
+        count = 0
+        while not self._stop_event.wait(0.04):
+            ms = (time.monotonic_ns() - self._boot_ns) // 1_000_000
+            if count % 10 == 0:
+                self._send(
+                    mavlink.MAVLink_heartbeat_message(
+                        mavlink.MAV_TYPE_QUADROTOR, mavlink.MAV_AUTOPILOT_ARDUPILOTMEGA, 1, 4, 4, 3
+                    )
+                )
+            self._send(mavlink.MAVLink_attitude_message(ms, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0))
+            self._send(mavlink.MAVLink_global_position_int_message(ms, *self._place, 0, 0, 0, 0, 0))
+            self._send(mavlink.MAVLink_gimbal_device_attitude_status_message(
+                0, 0, ms, mavlink.GIMBAL_DEVICE_FLAGS_YAW_IN_EARTH_FRAME, list(self._q),
+                0.0, 0.0, 0.0, 0))  # fmt: skip
+            count += 1
+
+    def stop(self):
+        self._stop_event.set()
+        self.join()
+        self._socket.close()
+
+    def _send(self, message):
+        self._socket.sendto(message.pack(self._codec), self._to)
+        self._codec.seq = (self._codec.seq + 1) % 256
+
+
+def _free_port():
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as s:
+        s.bind(("127.0.0.1", 0))
+        return s.getsockname()[1]
+
+
+@pytest.fixture(scope="module")
+def record(small_assets, tmp_path_factory):
+    """The folder that a flight of some seconds leaves."""
+    folder = tmp_path_factory.mktemp("flight")
+    leg = Leg(east_m=0, north_m=16, height_m=80, gimbal_pitch_deg=-85)
+    camera = CameraSpec(width=480, height=360, rate_hz=5)
+    scenario = Scenario(takeoff_height_m=80, legs=(leg,), cars=1, people=0, camera=camera)
+    sequence = folder / "sequence"
+    record_scenario(small_assets, scenario, 5, sequence)
+    (sequence / "images" / "timestamps.txt").unlink()  # of another clock
+    cache = TileCache.open(small_assets.map_cache)
+    row = read_poses(sequence / "poses.txt")[0]
+    pose, port = world_from_camera(row, cache.frame), _free_port()
+    model = Camera.from_json(sequence / "camera.json").to_dict()
+    config = parse_config(
+        {
+            "map": str(small_assets.map_cache),
+            "camera": {
+                "source": str(sequence / "images"),
+                "model": model,
+                "settings": {"realtime": True, "rate_hz": 3.0},  # slower: a busy machine keeps up
+            },
+            "localizer": {"width": 256},
+            "bridge": {
+                "connection": f"udpin:127.0.0.1:{port}", "tlog": str(folder / "flight.tlog"),
+            },
+            "record": {"folder": str(folder / "record"), "snapshot_interval_s": 0.001},
+        },
+        "test",
+    )  # fmt: skip
+    autopilot = Autopilot(port, row, pose, cache.manifest.geoid_separation_m)
+    autopilot.start()
+    try:
+        Companion(config).run()  # until the images end
+    finally:
+        autopilot.stop()
+    return folder / "record"
+
+
+def _rows(record):
+    with (record / "estimates.csv").open(newline="") as file:
+        return list(csv.DictReader(file))
+
+
+def test_a_recorded_flight_localizes_again_as_it_did(record):
+    loaded = load_record(record)
+    assert sum(e.accepted for e in loaded.estimates) >= FRAMES_AT_LEAST
+    summary = summarize(replay(loaded, loaded.config.bridge.tlog))
+    assert summary.frames == len(loaded.estimates)
+    assert summary.agrees(tolerance_m=0.5), summary
+    assert np.median(summary.translation_m) < 0.2
+    assert np.median(summary.rotation_deg) < 0.2
+
+
+def test_the_command_tells_a_record_that_agrees_from_one_that_does_not(record, tmp_path):
+    assert CliRunner().invoke(app, ["replay", str(record)]).exit_code == 0
+    moved = tmp_path / "moved"
+    moved.mkdir()
+    for name in ("record.json", "snapshots"):
+        (moved / name).symlink_to(record / name)
+    rows = _rows(record)
+    with (moved / "estimates.csv").open("w", newline="") as file:
+        writer = csv.DictWriter(file, rows[0].keys())
+        writer.writeheader()
+        writer.writerows(r | {"east_m": str(float(r["east_m"]) + 2.0)} for r in rows)
+    result = CliRunner().invoke(app, ["replay", str(moved)])
+    assert result.exit_code == 1
+    assert "differs" in result.output
+
+
+def test_what_a_record_lacks_is_named(record, tmp_path):
+    with pytest.raises(RecordError, match="not a flight's record"):
+        load_record(tmp_path)
+    (tmp_path / "record.json").symlink_to(record / "record.json")
+    (tmp_path / "estimates.csv").symlink_to(record / "estimates.csv")
+    with pytest.raises(RecordError, match=r"have no image.*snapshot_interval_s"):
+        load_record(tmp_path)
+    with pytest.raises(RecordError, match=r"no\.tlog: cannot be read"):
+        list(read_tlog(tmp_path / "no.tlog"))
+
+
+def test_the_manifest_dates_the_tlog_and_says_what_flew(record):
+    manifest = json.loads((record / "record.json").read_text())
+    assert manifest["config"]["localizer"]["width"] == 256
+    assert {"python", "numpy"} <= set(manifest["versions"])
+    loaded = load_record(record)
+    times = [utc - loaded.utc_minus_monotonic_ns for utc, _ in read_tlog(
+        loaded.config.bridge.tlog)]  # fmt: skip
+    exposures = [e.exposure_time_ns for e in loaded.estimates]
+    assert loaded.start_ns <= min(exposures)
+    assert min(times) < min(exposures) < max(exposures) < max(times) + 10**9
+    assert times == sorted(times)
+
+
+def test_a_damaged_tlog_is_told(tmp_path):
+    path = tmp_path / "bad.tlog"
+    path.write_bytes(struct.pack(">Q", 1) + b"no frame at all")
+    with pytest.raises(RecordError, match="damaged"):
+        list(read_tlog(path))
