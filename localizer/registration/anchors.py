@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from localizer.pose import Array
-from localizer.registration.backend import sample_bilinear
+from localizer.registration.sampling import sample_features
 from localizer.types import Anchors, FeatureLevel, FeaturePyramid, Float32, RenderedView
 
 _CANDIDATE_STEP = 2  # px; one candidate per 2 x 2 pixels is finer than the finest feature level
@@ -48,7 +48,9 @@ def select_anchors(
         points,
         pixels.astype(np.float32),
         tuple(_sample(level, level.features, pixels) for level in features.levels),
-        tuple(_sample(level, level.confidence, pixels) for level in features.levels),
+        tuple(
+            _sample(level, level.confidence[..., None], pixels)[:, 0] for level in features.levels
+        ),
     )
 
 
@@ -127,6 +129,6 @@ def _morton(x: NDArray[np.int64], y: NDArray[np.int64]) -> NDArray[np.int64]:
 
 
 def _sample(level: FeatureLevel, values: Float32, pixels: Array) -> Float32:
+    """Values (h, w, C) of a level at pixels (N, 2), as (N, C)."""
     uv = pixels / level.stride - 0.5
-    sampled = sample_bilinear(values, uv[:, 0], uv[:, 1])
-    return np.ascontiguousarray(sampled, dtype=np.float32)
+    return sample_features(values, uv[:, 0], uv[:, 1])

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from localizer.pose import Array
 from localizer.registration.backend import LevelProblem, LMSettings, sample_bilinear
 from localizer.registration.reference import in_view, project, robust_loss
+from localizer.registration.sampling import sample_features
 from localizer.types import Float32
 
 LEAST_SCORE = 1e-3  # unit of the motion term and of priors where features fit perfectly
@@ -66,13 +67,13 @@ def distinct(
     return finite[kept]
 
 
-def _sampled(problem: LevelProblem, R: Array, t: Array) -> tuple[Array, Float32, Array]:
+def _sampled(problem: LevelProblem, R: Array, t: Array) -> tuple[Float32, Float32, Array]:
     """Of the anchors in view: query and anchor features (n, C), joint weights (n,)."""
     x, uv = project(problem, R, t)
     visible = in_view(problem, x, uv)
     u, v = uv[visible].T
     weights = problem.anchor_confidence[visible] * sample_bilinear(problem.confidence, u, v)
-    return sample_bilinear(problem.features, u, v), problem.anchor_features[visible], weights
+    return sample_features(problem.features, u, v), problem.anchor_features[visible], weights
 
 
 def quality(problem: LevelProblem, R: Array, t: Array, settings: LMSettings) -> float:

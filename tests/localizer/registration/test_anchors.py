@@ -6,6 +6,8 @@ import numpy as np
 import pytest
 
 from localizer.registration import select_anchors
+from localizer.registration.backend import sample_bilinear
+from localizer.registration.sampling import sample_features
 
 
 @pytest.fixture(scope="module")
@@ -101,3 +103,11 @@ def test_view_of_nothing_gives_no_anchors(reference):
     view, pyramid = reference
     anchors = select_anchors(replace(view, depth=np.zeros_like(view.depth)), pyramid)
     assert anchors.points_world.shape == (0, 3)
+
+
+def test_compiled_sampling_is_the_references(reference):
+    rng = np.random.default_rng(0)
+    level = reference[1].levels[1]
+    x, y = rng.uniform(-3, 40, 500), rng.uniform(-3, 40, 500)
+    exact = sample_bilinear(level.features, x, y)
+    np.testing.assert_allclose(sample_features(level.features, x, y), exact, atol=1e-6)
