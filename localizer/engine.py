@@ -18,7 +18,7 @@ from dataclasses import dataclass, replace
 from localizer.errors import LocalizerError
 from localizer.mailbox import Mailbox
 from localizer.pipeline import Localizer, stopwatch
-from localizer.types import Frame, PoseEstimate, PosePrior, ReferenceBundle, TrackingState
+from localizer.types import Frame, PoseEstimate, PosePrior, ReferenceBundle
 
 _log = logging.getLogger(__name__)
 _IDLE_S = 0.2
