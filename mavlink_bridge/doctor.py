@@ -1,19 +1,22 @@
-"""What must be right before a flight: parameters for the chosen injection, link, clock, streams.
-
-Every rule below is a refusal or an error that was measured on ArduCopter (docs/bridge.md).
-"""
+"""What must be right before a flight: parameters for the chosen injection, link, clock, streams."""
 
 from __future__ import annotations
 
-import math
 import time
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
 from mavlink_bridge.bridge import Bridge
 from mavlink_bridge.clock import SteadyUtc, monotonic_ns
 from mavlink_bridge.config import BridgeConfig
 from mavlink_bridge.messages import VehicleState
+from mavlink_bridge.parameter_rules import (
+    Read,
+    Rule,
+    ardupilot_rules,
+    find_source_set,
+    px4_rules,
+)
 from mavlink_bridge.parameters import ParameterClient
 from mavlink_bridge.profile import select_profile
 
@@ -21,51 +24,8 @@ _CONNECT_S = 15.0
 _MEASURE_S = 4.0
 _ROUND_TRIP_LIMIT_MS = 30.0
 _RATE_SHARE = 0.7
-_SOURCE_SETS = (1, 2, 3)
 _LOST_SHARE = 0.02
-
-Read = Callable[[str], float | None]
-
-
-@dataclass(frozen=True)
-class Rule:
-    """A parameter's requirement. names: the parameter and its older names, newest first.
-
-    allowed: values that are right, the first being the one to write; None with `minimum` or
-    `maximum` for a bound. required: a flight fails without it; otherwise it is advice.
-    """
-
-    names: tuple[str, ...]
-    allowed: tuple[float, ...]
-    why: str
-    required: bool = True
-    reboot: bool = False
-    tolerance: float = 0.0
-    minimum: float = -math.inf
-    bits: int = 0
-
-    @property
-    def needed(self) -> str:
-        """For the table."""
-        if self.bits:
-            return f"bits {self.bits:#x} set"
-        if math.isfinite(self.minimum):
-            return f">= {self.minimum:g}"
-        return " or ".join(f"{value:g}" for value in self.allowed)
-
-    def holds(self, value: float) -> bool:
-        """Whether a value satisfies it."""
-        if self.bits:
-            return int(value) & self.bits == self.bits
-        if math.isfinite(self.minimum):
-            return value >= self.minimum
-        return any(abs(value - allowed) <= self.tolerance for allowed in self.allowed)
-
-    def fix(self, value: float) -> float:
-        """What to write over a value that does not hold."""
-        if self.bits:
-            return float(int(value) | self.bits)
-        return self.minimum if math.isfinite(self.minimum) else self.allowed[0]
+_PX4_RATE_HZ = 30.0  # its documentation asks for 30 to 50 Hz
 
 
 @dataclass(frozen=True)
@@ -104,130 +64,6 @@ class Diagnosis:
     def fixable(self) -> tuple[Finding, ...]:
         """The lines that writing a parameter puts right."""
         return tuple(f for f in self.findings if not f.ok and f.fix is not None)
-
-
-# --- the rules --------------------------------------------------------------------------------
-
-
-def find_source_set(config: BridgeConfig, read: Read) -> int:
-    """The EK3 source set that takes the injection: the one that does already, or should."""
-    if config.switch.enabled:
-        return config.switch.vision_set
-    wanted = 3.0 if config.injection.message == "gps_input" else 6.0
-    for number in _SOURCE_SETS:
-        if read(f"EK3_SRC{number}_POSXY") == wanted:
-            return number
-    # A vehicle that flies on GNSS keeps doing so: vision goes into the set it is switched to.
-    receiver = read("GPS1_TYPE") or read("GPS_TYPE") or 0.0
-    return config.switch.vision_set if receiver else 1
-
-
-def ardupilot_rules(config: BridgeConfig, source_set: int) -> list[Rule]:
-    """What ArduPilot needs for the configured injection in a source set."""
-    common = [
-        Rule(("AHRS_EKF_TYPE",), (3.0,), "only EKF3 has external navigation sources"),
-        Rule(("EK3_ENABLE",), (1.0,), "only EKF3 has external navigation sources", reboot=True),
-    ]
-    if config.injection.message == "gps_input":
-        return common + _gps_input_rules(config, source_set)
-    return common + _vision_rules(config, source_set)
-
-
-def _vision_rules(config: BridgeConfig, number: int) -> list[Rule]:
-    prefix = f"EK3_SRC{number}_"
-    injection = config.injection
-    odometry = injection.message == "odometry"
-    velocity = (6.0, 0.0) if odometry else (0.0,)
-    why = "the message carries velocity" if odometry else "the message carries no velocity"
-    rules = [
-        Rule(("VISO_TYPE",), (1.0,), "MAVLink vision is ignored otherwise", reboot=True),
-        Rule((prefix + "POSXY",), (6.0,), "horizontal position from external navigation"),
-        Rule((prefix + "VELXY",), velocity, why + " (3: refuses to arm, 'require GPS')"),
-        Rule((prefix + "VELZ",), velocity, why + " (3: refuses to arm, 'require GPS')"),
-        Rule((prefix + "POSZ",), (1.0,), "the barometer is smoother than vision", required=False),
-        Rule((prefix + "YAW",), (1.0,), "a wrong vision yaw is taken unseen", required=False),
-        Rule(
-            ("VISO_DELAY_MS",),
-            (round(injection.delay_ms),),
-            "the age at which the bridge sends; 300 ms unsaid cost 2.4 m",
-            tolerance=10.0,
-            reboot=True,  # the EKF sizes its buffers by it at boot
-        ),
-        Rule(("VISO_SCALE",), (1.0,), "positions are metres", tolerance=1e-3),
-    ]
-    rules += [
-        Rule((f"VISO_POS_{axis}",), (0.0,), "the bridge sends the autopilot's place", False)
-        for axis in "XYZ"
-    ]
-    if odometry:
-        rules.append(
-            Rule(
-                ("VISO_VEL_M_NSE",),
-                (),
-                "velocity derived from positions is no better",
-                required=False,
-                minimum=0.3,
-            )
-        )
-    else:
-        rules.append(
-            Rule(("VISO_QUAL_MIN",), (0.0,), "the message has no quality; > 0 rejects all of it")
-        )
-    if number == 1:
-        rules.append(
-            Rule(
-                ("GPS1_TYPE", "GPS_TYPE"),
-                (0.0,),
-                "an absent receiver blocks arming ('Bad fix')",
-                required=False,
-                reboot=True,
-            )
-        )
-    return rules
-
-
-def _gps_input_rules(config: BridgeConfig, number: int) -> list[Rule]:
-    injection = config.injection
-    gps = injection.gps_id + 1
-    prefix = f"EK3_SRC{number}_"
-    velocity = (3.0, 0.0) if injection.gps_velocity else (0.0,)
-    yaw = (2.0,) if injection.gps_yaw else (1.0,)
-    old_type = "GPS_TYPE" if gps == 1 else f"GPS_TYPE{gps}"
-    old_delay = "GPS_DELAY_MS" if gps == 1 else f"GPS_DELAY_MS{gps}"
-    why = "velocity is sent" if injection.gps_velocity else "no velocity is sent"
-    return [
-        Rule((f"GPS{gps}_TYPE", old_type), (14.0,), "the MAVLink receiver", reboot=True),
-        Rule((prefix + "POSXY",), (3.0,), "horizontal position from GPS"),
-        Rule((prefix + "VELXY",), velocity, why),
-        Rule((prefix + "VELZ",), velocity, why),
-        Rule((prefix + "POSZ",), (1.0,), "the barometer is smoother", required=False),
-        Rule((prefix + "YAW",), yaw, "2 with gps_yaw, else the compass"),
-        Rule(
-            (f"GPS{gps}_DELAY_MS", old_delay),
-            (round(injection.delay_ms),),
-            "the age at which the bridge sends",
-            tolerance=10.0,
-            reboot=True,
-        ),
-    ]
-
-
-def px4_rules(config: BridgeConfig) -> list[Rule]:
-    """What PX4 needs; from its documentation, not flown here."""
-    injection = config.injection
-    if injection.message == "global_position_sensor":
-        return [Rule(("EKF2_AGP_CTRL",), (), "bit 0: horizontal position", bits=1)]
-    bits = 0b0101 if injection.message == "odometry" else 0b0001
-    return [
-        Rule(("EKF2_EV_CTRL",), (), "bit 0: horizontal position, bit 2: velocity", bits=bits),
-        Rule(
-            ("EKF2_EV_DELAY",),
-            (injection.delay_ms,),
-            "the age at which the bridge sends",
-            tolerance=10.0,
-            reboot=True,
-        ),
-    ]
 
 
 # --- examinations -----------------------------------------------------------------------------
@@ -338,6 +174,11 @@ def _link_findings(
             True,
         ),
     ]
+    if state.autopilot == "px4" and message in ("vision_position_estimate", "odometry"):
+        rate = config.injection.rate_hz
+        why = "external vision is not fused at lower rates; set bridge.injection.rate_hz"
+        enough = rate >= _PX4_RATE_HZ
+        findings.append(Finding("rate_hz", f"{rate:g}", ">= 30 for PX4", why, enough, False))
     if config.camera.mount == "gimbal":
         at = bridge.gimbal_at(time.monotonic_ns() - 200_000_000)
         findings.append(

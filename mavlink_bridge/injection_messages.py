@@ -22,6 +22,7 @@ _IGNORE_VELOCITY = (
     | mavlink.GPS_INPUT_IGNORE_FLAG_VEL_VERT
     | mavlink.GPS_INPUT_IGNORE_FLAG_SPEED_ACCURACY
 )
+GLOBAL_SENSOR_ID = 1  # EKF2_AGP0_ID; 0 may stand for "no sensor"
 _CLAIMED_SATELLITES = 12  # ArduPilot refuses to arm below 6, or with hdop ignored
 _CLAIMED_HDOP = 0.8
 _CLAIMED_VDOP = 1.0
@@ -141,13 +142,16 @@ def gps_input(
 
 
 def global_position_sensor(e: Estimate, altitude_amsl_m: float, now_ns: int) -> Any:
-    """GLOBAL_POSITION_SENSOR (296): latitude, longitude and both altitudes."""
+    """GLOBAL_POSITION_SENSOR (296): latitude, longitude and both altitudes.
+
+    Unlike the others it is stamped with its transmission, and says how long ago the exposure was.
+    """
     p = e.position
     return mavlink.MAVLink_global_position_sensor_message(
         0,
         0,
-        0,
-        p.time_ns // 1000,
+        GLOBAL_SENSOR_ID,
+        now_ns // 1000,
         max(0, (now_ns - p.time_ns) // 1000),
         mavlink.GLOBAL_POSITION_SRC_VISION,
         0,

@@ -72,7 +72,7 @@ PX4 = FirmwareProfile(
     max_delay_ms=300.0,
     messages=("vision_position_estimate", "odometry", "global_position_sensor"),
     odometry_frame=mavlink.MAV_FRAME_LOCAL_NED,
-    delay_parameter="EKF2_EV_DELAY",
+    delay_parameter="EKF2_DELAY_MAX",
     gps_delay_parameter="EKF2_GPS_DELAY",
 )
 # The cube-root entry overstates the error in every formula below 3 m, so it is the safe one.

@@ -9,15 +9,9 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from mavlink_bridge import BridgeConfig
 from mavlink_bridge.config import InjectionConfig, OriginConfig
-from mavlink_bridge.doctor import (
-    ardupilot_rules,
-    check_parameters,
-    examine,
-    find_source_set,
-    px4_rules,
-    repair,
-)
+from mavlink_bridge.doctor import check_parameters, examine, repair
 from mavlink_bridge.errors import ParameterError
+from mavlink_bridge.parameter_rules import ardupilot_rules, find_source_set
 from mavlink_bridge.parameters import ParameterClient, decode_value, encode_value
 
 ORIGIN = OriginConfig(latitude_deg=47.0, longitude_deg=8.0, altitude_amsl_m=500.0)
@@ -116,15 +110,6 @@ def test_gps_input_with_old_names_and_another_receiver() -> None:
 def test_odometry_wants_velocity_noise_that_is_true() -> None:
     parameters = {**GOOD, "EK3_SRC1_VELXY": 6.0, "EK3_SRC1_VELZ": 6.0, "VISO_VEL_M_NSE": 0.1}
     assert failures(config(message="odometry"), parameters) == {"VISO_VEL_M_NSE"}
-
-
-def test_px4_bits_are_added_to_what_is_there() -> None:
-    parameters = {"EKF2_EV_CTRL": 8.0, "EKF2_EV_DELAY": 100.0}
-    findings = check_parameters(px4_rules(config()), parameters.get)
-    assert [(f.name, f.ok, f.fix) for f in findings] == [
-        ("EKF2_EV_CTRL", False, 9.0),
-        ("EKF2_EV_DELAY", True, None),
-    ]
 
 
 @pytest.mark.parametrize("kind", [mavlink.MAV_PARAM_TYPE_INT32, mavlink.MAV_PARAM_TYPE_INT8])

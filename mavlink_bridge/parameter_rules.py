@@ -1,0 +1,195 @@
+"""What the flight controller's parameters must be for the chosen injection.
+
+Every rule for ArduPilot is a refusal or an error that was measured (docs/bridge.md); those for PX4
+are from its documentation.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+
+from mavlink_bridge.config import BridgeConfig
+
+_SOURCE_SETS = (1, 2, 3)
+_PX4_LATE_MS = 50.0
+
+Read = Callable[[str], float | None]
+
+
+@dataclass(frozen=True)
+class Rule:
+    """A parameter's requirement. names: the parameter and its older names, newest first.
+
+    allowed: values that are right, the first being the one to write; None with `minimum` or
+    `maximum` for a bound. required: a flight fails without it; otherwise it is advice.
+    """
+
+    names: tuple[str, ...]
+    allowed: tuple[float, ...]
+    why: str
+    required: bool = True
+    reboot: bool = False
+    tolerance: float = 0.0
+    minimum: float = -math.inf
+    bits: int = 0
+
+    @property
+    def needed(self) -> str:
+        """For the table."""
+        if self.bits:
+            return f"bits {self.bits:#x} set"
+        if math.isfinite(self.minimum):
+            return f">= {self.minimum:g}"
+        return " or ".join(f"{value:g}" for value in self.allowed)
+
+    def holds(self, value: float) -> bool:
+        """Whether a value satisfies it."""
+        if self.bits:
+            return int(value) & self.bits == self.bits
+        if math.isfinite(self.minimum):
+            return value >= self.minimum
+        return any(abs(value - allowed) <= self.tolerance for allowed in self.allowed)
+
+    def fix(self, value: float) -> float:
+        """What to write over a value that does not hold."""
+        if self.bits:
+            return float(int(value) | self.bits)
+        return self.minimum if math.isfinite(self.minimum) else self.allowed[0]
+
+
+def find_source_set(config: BridgeConfig, read: Read) -> int:
+    """The EK3 source set that takes the injection: the one that does already, or should."""
+    if config.switch.enabled:
+        return config.switch.vision_set
+    wanted = 3.0 if config.injection.message == "gps_input" else 6.0
+    for number in _SOURCE_SETS:
+        if read(f"EK3_SRC{number}_POSXY") == wanted:
+            return number
+    # A vehicle that flies on GNSS keeps doing so: vision goes into the set it is switched to.
+    receiver = read("GPS1_TYPE") or read("GPS_TYPE") or 0.0
+    return config.switch.vision_set if receiver else 1
+
+
+def ardupilot_rules(config: BridgeConfig, source_set: int) -> list[Rule]:
+    """What ArduPilot needs for the configured injection in a source set."""
+    common = [
+        Rule(("AHRS_EKF_TYPE",), (3.0,), "only EKF3 has external navigation sources"),
+        Rule(("EK3_ENABLE",), (1.0,), "only EKF3 has external navigation sources", reboot=True),
+    ]
+    if config.injection.message == "gps_input":
+        return common + _gps_input_rules(config, source_set)
+    return common + _vision_rules(config, source_set)
+
+
+def _vision_rules(config: BridgeConfig, number: int) -> list[Rule]:
+    prefix = f"EK3_SRC{number}_"
+    injection = config.injection
+    odometry = injection.message == "odometry"
+    velocity = (6.0, 0.0) if odometry else (0.0,)
+    why = "the message carries velocity" if odometry else "the message carries no velocity"
+    rules = [
+        Rule(("VISO_TYPE",), (1.0,), "MAVLink vision is ignored otherwise", reboot=True),
+        Rule((prefix + "POSXY",), (6.0,), "horizontal position from external navigation"),
+        Rule((prefix + "VELXY",), velocity, why + " (3: refuses to arm, 'require GPS')"),
+        Rule((prefix + "VELZ",), velocity, why + " (3: refuses to arm, 'require GPS')"),
+        Rule((prefix + "POSZ",), (1.0,), "the barometer is smoother than vision", required=False),
+        Rule((prefix + "YAW",), (1.0,), "a wrong vision yaw is taken unseen", required=False),
+        Rule(
+            ("VISO_DELAY_MS",),
+            (round(injection.delay_ms),),
+            "the age at which the bridge sends; 300 ms unsaid cost 2.4 m",
+            tolerance=10.0,
+            reboot=True,  # the EKF sizes its buffers by it at boot
+        ),
+        Rule(("VISO_SCALE",), (1.0,), "positions are metres", tolerance=1e-3),
+    ]
+    rules += [
+        Rule((f"VISO_POS_{axis}",), (0.0,), "the bridge sends the autopilot's place", False)
+        for axis in "XYZ"
+    ]
+    if odometry:
+        rules.append(
+            Rule(
+                ("VISO_VEL_M_NSE",),
+                (),
+                "velocity derived from positions is no better",
+                required=False,
+                minimum=0.3,
+            )
+        )
+    else:
+        rules.append(
+            Rule(("VISO_QUAL_MIN",), (0.0,), "the message has no quality; > 0 rejects all of it")
+        )
+    if number == 1:
+        rules.append(
+            Rule(
+                ("GPS1_TYPE", "GPS_TYPE"),
+                (0.0,),
+                "an absent receiver blocks arming ('Bad fix')",
+                required=False,
+                reboot=True,
+            )
+        )
+    return rules
+
+
+def _gps_input_rules(config: BridgeConfig, number: int) -> list[Rule]:
+    injection = config.injection
+    gps = injection.gps_id + 1
+    prefix = f"EK3_SRC{number}_"
+    velocity = (3.0, 0.0) if injection.gps_velocity else (0.0,)
+    yaw = (2.0,) if injection.gps_yaw else (1.0,)
+    old_type = "GPS_TYPE" if gps == 1 else f"GPS_TYPE{gps}"
+    old_delay = "GPS_DELAY_MS" if gps == 1 else f"GPS_DELAY_MS{gps}"
+    why = "velocity is sent" if injection.gps_velocity else "no velocity is sent"
+    return [
+        Rule((f"GPS{gps}_TYPE", old_type), (14.0,), "the MAVLink receiver", reboot=True),
+        Rule((prefix + "POSXY",), (3.0,), "horizontal position from GPS"),
+        Rule((prefix + "VELXY",), velocity, why),
+        Rule((prefix + "VELZ",), velocity, why),
+        Rule((prefix + "POSZ",), (1.0,), "the barometer is smoother", required=False),
+        Rule((prefix + "YAW",), yaw, "2 with gps_yaw, else the compass"),
+        Rule(
+            (f"GPS{gps}_DELAY_MS", old_delay),
+            (round(injection.delay_ms),),
+            "the age at which the bridge sends",
+            tolerance=10.0,
+            reboot=True,
+        ),
+    ]
+
+
+def px4_rules(config: BridgeConfig) -> list[Rule]:
+    """What PX4 needs; from its documentation and parameter definitions, not flown here."""
+    injection = config.injection
+    horizon = Rule(
+        ("EKF2_DELAY_MAX",),
+        (),
+        "older measurements are not fused; 50 ms for late ones",
+        required=False,
+        minimum=injection.delay_ms + _PX4_LATE_MS,
+        reboot=True,
+    )
+    if injection.message == "global_position_sensor":
+        return [
+            Rule(("EKF2_AGP0_CTRL", "EKF2_AGP_CTRL"), (), "bit 0: horizontal position", bits=1),
+            horizon,
+        ]
+    odometry = injection.message == "odometry"
+    stamped = "stamps are exposure times, mapped by TIMESYNC: a delay would count twice"
+    why = "bit 0: horizontal position, bit 2: velocity"
+    rules = [
+        Rule(("EKF2_EV_CTRL",), (), why, bits=0b0101 if odometry else 0b0001),
+        Rule(("EKF2_EV_DELAY",), (0.0,), stamped, tolerance=10.0, reboot=True),
+        Rule(("EKF2_EV_NOISE_MD",), (0.0,), "1 ignores the covariance that is sent", False),
+        horizon,
+    ]
+    if not odometry:
+        rules.append(Rule(("EKF2_EV_QMIN",), (0.0,), "the message has no quality"))
+    return rules + [
+        Rule((f"EKF2_EV_POS_{axis}",), (0.0,), "the bridge sends the autopilot's place", False)
+        for axis in "XYZ"
+    ]

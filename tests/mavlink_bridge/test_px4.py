@@ -1,0 +1,167 @@
+"""What PX4 receives, decoded from the bytes by hand: the fields, ids and units of common.xml.
+
+The meanings are those of PX4's documentation and receiver: position and velocity variances on the
+diagonal, NED frame, FRD body velocity, exposure stamps that TIMESYNC maps.
+"""
+
+from __future__ import annotations
+
+import math
+import struct
+from typing import Any
+
+import numpy as np
+import pytest
+from pymavlink.dialects.v20 import ardupilotmega as mavlink
+
+from mavlink_bridge import BridgeConfig, VisionFix
+from mavlink_bridge.clock import SteadyUtc
+from mavlink_bridge.config import InjectionConfig
+from mavlink_bridge.doctor import check_parameters
+from mavlink_bridge.inject import InjectionContext, Injector
+from mavlink_bridge.messages import Attitude, Origin
+from mavlink_bridge.parameter_rules import px4_rules
+from mavlink_bridge.profile import PX4, select_profile
+from mavlink_bridge.quaternion import from_euler
+
+MS = 1_000_000
+SECOND = 1_000 * MS
+HOME = (47.397742, 8.545594)
+GEOID = 47.0
+YAW = math.radians(90.0)
+P = np.array([[0.25, 0.05, 0.01], [0.05, 0.36, 0.02], [0.01, 0.02, 0.49]])
+
+
+def crc(data: bytes, extra: int) -> int:
+    """X.25 (CRC-16/MCRF4XX) of the frame behind its marker and the message's own byte."""
+    value = 0xFFFF
+    for byte in (*data, extra):
+        value ^= byte
+        for _ in range(8):
+            value = value >> 1 ^ 0x8408 if value & 1 else value >> 1
+    return value
+
+
+def payload(message: Any, message_id: int, extra: int, length: int) -> bytes:
+    """The payload of the packed frame, zeros that MAVLink 2 cuts off put back."""
+    frame = bytes(message.pack(mavlink.MAVLink(None, 1, 197)))
+    marker, size, incompatible, _, _, system, component = frame[:7]
+    assert (marker, incompatible, system, component) == (0xFD, 0, 1, 197)
+    assert int.from_bytes(frame[7:10], "little") == message_id
+    assert int.from_bytes(frame[10 + size : 12 + size], "little") == crc(
+        frame[1 : 10 + size], extra
+    )
+    assert len(frame) == 12 + size
+    return frame[10 : 10 + size].ljust(length, b"\0")
+
+
+def injected(kind: Any, sent_ns: int = 10 * SECOND + 80 * MS) -> Any:
+    """A fix of 10 s, 100 m north of the origin and 60 m above it, nose and flight to the east."""
+
+    def attitude_at(time_ns: int) -> Attitude:
+        return Attitude(time_ns, 0.0, 0.0, YAW, from_euler(0.0, 0.0, YAW))
+
+    config = InjectionConfig(message=kind, rate_hz=30, delay_ms=80, sigma_floor_m=1e-6)
+    injector = Injector(config, GEOID, SteadyUtc())
+    injector.submit(
+        VisionFix(
+            10 * SECOND,
+            HOME[0] + math.degrees(100.0 / 6371000.0),  # on PX4's sphere
+            HOME[1],
+            488.0 + 60.0 + GEOID,
+            0.0,
+            0.0,
+            YAW,
+            P,
+            attitude_sigma_rad=0.03,
+            quality=77,
+            velocity_ned=(0.0, 12.0, -1.0),
+            velocity_sigma_mps=0.2,
+        ),
+        sent_ns,
+    )
+    injection = injector.step(sent_ns, InjectionContext(Origin(*HOME, 488.0), PX4, attitude_at))
+    assert injection is not None
+    return injection.message
+
+
+def test_vision_position_estimate() -> None:
+    raw = payload(injected("vision_position_estimate"), 102, 158, 117)
+    usec, x, y, z, roll, pitch, yaw = struct.unpack_from("<Q6f", raw)
+    covariance = struct.unpack_from("<21f", raw, 32)
+    assert usec == 10_000_000
+    assert (x, y, z) == pytest.approx((100.0, 0.0, -60.0), abs=0.01)
+    assert (roll, pitch, yaw) == pytest.approx((0.0, 0.0, YAW), abs=1e-6)
+    diagonal = [covariance[i] for i in (0, 6, 11, 15, 18, 20)]
+    assert diagonal == pytest.approx([0.25, 0.36, 0.49, 9e-4, 9e-4, 9e-4], rel=1e-3)
+    assert [covariance[i] for i in (1, 2, 7)] == pytest.approx([0.05, 0.01, 0.02], rel=1e-5)
+    assert raw[116] == 0  # reset_counter
+
+
+def test_odometry() -> None:
+    raw = payload(injected("odometry"), 331, 91, 233)
+    usec, x, y, z = struct.unpack_from("<Q3f", raw)
+    q = struct.unpack_from("<4f", raw, 20)
+    velocity = struct.unpack_from("<3f", raw, 36)
+    rates = struct.unpack_from("<3f", raw, 48)
+    pose = struct.unpack_from("<21f", raw, 60)
+    twist = struct.unpack_from("<21f", raw, 144)
+    frame, child, reset, estimator, quality = struct.unpack_from("<4Bb", raw, 228)
+    assert usec == 10_000_000
+    assert (x, y, z) == pytest.approx((100.0, 0.0, -60.0), abs=0.01)
+    assert q == pytest.approx((math.cos(YAW / 2), 0.0, 0.0, math.sin(YAW / 2)), abs=1e-6)
+    # Nose to the east, flying east and climbing: forward and up.
+    assert velocity == pytest.approx((12.0, 0.0, -1.0), abs=1e-5)
+    assert all(math.isnan(rate) for rate in rates)
+    assert [pose[i] for i in (0, 6, 11)] == pytest.approx([0.25, 0.36, 0.49], rel=1e-3)
+    assert [twist[i] for i in (0, 6, 11)] == pytest.approx([0.04] * 3, rel=1e-3)
+    assert (frame, child) == (1, 12)  # MAV_FRAME_LOCAL_NED, MAV_FRAME_BODY_FRD
+    assert (reset, estimator, quality) == (0, 2, 77)  # MAV_ESTIMATOR_TYPE_VISION
+
+
+def test_global_position_sensor_says_when_it_was_sent_and_how_old_it_is() -> None:
+    raw = payload(injected("global_position_sensor"), 296, 158, 41)
+    usec, age, lat, lon, ellipsoid, amsl, eph, epv = struct.unpack_from("<QIii4f", raw)
+    system, component, sensor, source, flags = struct.unpack_from("<5B", raw, 36)
+    assert usec == 10_080_000
+    assert age == 80_000
+    assert lat == round((HOME[0] + math.degrees(100.0 / 6371000.0)) * 1e7)
+    assert lon == round(HOME[1] * 1e7)
+    assert (ellipsoid, amsl) == pytest.approx((595.0, 548.0), abs=1e-3)
+    assert eph == pytest.approx(math.sqrt(np.linalg.eigvalsh(P[:2, :2])[-1]), rel=1e-3)
+    assert epv == pytest.approx(0.7, rel=1e-3)
+    assert (system, component, sensor, source, flags) == (0, 0, 1, 2, 0)
+
+
+def rules(message: Any, parameters: dict[str, float]) -> dict[str, float | None]:
+    config = BridgeConfig(injection=InjectionConfig(message=message, delay_ms=150, rate_hz=30))
+    return {f.name: f.fix for f in check_parameters(px4_rules(config), parameters.get) if not f.ok}
+
+
+GOOD = {"EKF2_EV_CTRL": 5.0, "EKF2_EV_DELAY": 0.0, "EKF2_DELAY_MAX": 200.0, "EKF2_EV_QMIN": 0.0}
+GOOD |= {"EKF2_EV_NOISE_MD": 0.0} | {f"EKF2_EV_POS_{axis}": 0.0 for axis in "XYZ"}
+
+
+def test_parameters_of_external_vision() -> None:
+    assert rules("odometry", GOOD) == {}
+    assert rules("vision_position_estimate", {**GOOD, "EKF2_EV_CTRL": 9.0}) == {}
+    assert rules("odometry", {**GOOD, "EKF2_EV_CTRL": 9.0}) == {"EKF2_EV_CTRL": 13.0}
+    # The stamps are exposure times: a delay as well would count it twice.
+    assert rules("odometry", {**GOOD, "EKF2_EV_DELAY": 150.0}) == {"EKF2_EV_DELAY": 0.0}
+    assert rules("odometry", {**GOOD, "EKF2_DELAY_MAX": 100.0}) == {"EKF2_DELAY_MAX": 200.0}
+    quality = {**GOOD, "EKF2_EV_QMIN": 1.0}
+    assert rules("vision_position_estimate", quality) == {"EKF2_EV_QMIN": 0.0}
+    assert rules("odometry", quality) == {}
+
+
+def test_parameters_of_the_global_sensor_in_old_and_new_names() -> None:
+    for name in ("EKF2_AGP_CTRL", "EKF2_AGP0_CTRL"):
+        assert rules("global_position_sensor", {name: 1.0, "EKF2_DELAY_MAX": 200.0}) == {}
+        found = rules("global_position_sensor", {name: 2.0, "EKF2_DELAY_MAX": 200.0})
+        assert found == {name: 3.0}
+
+
+def test_profile_is_chosen_from_1_15_on() -> None:
+    assert select_profile("px4", (1, 15, 0)) is PX4
+    assert select_profile("px4", (1, 18, 0)) is PX4
+    assert not select_profile("px4", (1, 14, 4)).known
