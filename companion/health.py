@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import json
+import math
 import threading
 import time
 from collections import deque
 from collections.abc import Callable
 from dataclasses import asdict
+from typing import Any
 
 import numpy as np
 
@@ -111,7 +113,7 @@ class HealthMonitor:
         }
         temporary = self._file.with_suffix(".tmp")
         try:
-            temporary.write_text(json.dumps(report, indent=1, default=str))
+            temporary.write_text(json.dumps(_without_nan(report), indent=1, default=str))
             temporary.replace(self._file)
         except OSError as error:  # a full disk must not end the reports to the vehicle
             if not self._write_failed:
@@ -134,3 +136,12 @@ class HealthMonitor:
             }
             for name in sorted(stages)
         }
+
+
+def _without_nan(value: Any) -> Any:
+    """Numbers that are not known as null: JSON has no NaN, and strict readers refuse it."""
+    if isinstance(value, dict):
+        return {k: _without_nan(v) for k, v in value.items()}
+    if isinstance(value, float) and not math.isfinite(value):
+        return None
+    return value

@@ -27,7 +27,7 @@ class FakeBridge:
         self.told.append((level, text))
 
     def counters(self):
-        return {}
+        return {"fix_latency_ms": float("nan")}
 
     def shadow_score(self):
         return SimpleNamespace(line=lambda: "no comparison yet")
@@ -63,6 +63,10 @@ def test_the_worst_thing_is_told(tmp_path, state, connected, level, text):
     assert text in told[-1][1]
     assert events == []  # the bridge logs and records it; once is enough
     written = json.loads((tmp_path / "health.json").read_text())
+    assert set(written) == {
+        "level", "text", "time_ns", "engine", "rate_hz", "stages_ms", "bridge", "shadow"
+    }  # fmt: skip
+    assert written["bridge"]["fix_latency_ms"] is None  # NaN is no JSON
     assert written["level"] == level.value
     assert time.monotonic_ns() - written["time_ns"] < 5e9
 
