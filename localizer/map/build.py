@@ -21,6 +21,7 @@ from localizer.errors import GeoreferenceError, MapSourceError
 from localizer.geo import Geodetic, LocalFrame, geodetic_from_ecef
 from localizer.map.cache import ADD, REPLACE, Manifest, TileIndex, tile_name
 from localizer.map.georeference import Georeference, UpAxis, read_georeference
+from localizer.map.levels import with_levels
 from localizer.map.source import SourceMesh, SourceNode, SourceTree, TileSource, VerticalDatum
 from localizer.map.staging import Record, Staging, StoredTile, publish, staging
 from localizer.map.tiles3d import read_tileset
@@ -147,7 +148,7 @@ def read_source(
     if sources[0].suffix.lower() in _MESHES:
         return _read_mesh(sources[0], georeference, up_axis)
     if sources[0].is_dir() or sources[0].suffix.lower() == ".json":
-        return read_tileset(sources[0])
+        return with_levels(read_tileset(sources[0]))
     raise MapSourceError(f"{sources[0]}: not a source that can be imported: {_IMPORTABLE}")
 
 
@@ -417,7 +418,8 @@ def _graft(root: SourceNode, records: dict[int, Record]) -> _Node:
         keys = list(range(first[id(node)], first[id(node)] + len(node.tiles)))
         children = [built.pop(id(c)) for c in node.children]
         result = _Node(node, keys, [records[k] for k in keys], children)
-        if node.replaces and result.tiles and not all(_covers(c) for c in children):
+        whole = all(_covers(c) for c in children)
+        if node.replaces and node.stands_in and result.tiles and not whole:
             result.children = []
         result.children = [c for c in result.children if c.tiles or c.children]
         built[id(node)] = result

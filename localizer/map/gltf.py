@@ -8,25 +8,29 @@ from __future__ import annotations
 
 import base64
 import binascii
-import io
 import json
 import struct
 from collections.abc import Callable
 from typing import Any
 from urllib.parse import unquote
 
-import cv2
 import DracoPy
 import numpy as np
 from numpy.typing import NDArray
-from PIL import Image as PillowImage
 
 from localizer.errors import MapSourceError
 from localizer.map.source import SourceMesh
+from localizer.map.textures import (
+    decode_image,
+    merged_by_picture,
+    palette_mesh,
+    picture_size,
+    srgb,
+    tinted,
+)
 from localizer.pose import Array, matrix_from_quaternion
 from localizer.types import Image
 
-MAX_TEXTURE_PIXELS = 1 << 27
 MAX_ELEMENTS = 50_000_000  # vertices or indices of one primitive
 MAX_NODE_DEPTH = 64
 
@@ -73,6 +77,14 @@ def read_gltf(data: bytes, read_uri: Reader) -> tuple[list[SourceMesh], Array]:
         raise MapSourceError(f"malformed glTF: {error!r}") from error
 
 
+def gltf_weight(data: bytes, read_uri: Reader) -> tuple[int, int]:
+    """Triangles and texels of a document, from its headers alone; see `read_gltf`."""
+    try:
+        return _Document(data, read_uri).weight()
+    except _MALFORMED as error:
+        raise MapSourceError(f"malformed glTF: {error!r}") from error
+
+
 class _Document:
     def __init__(self, data: bytes, read_uri: Reader) -> None:
         self._read_uri = read_uri
@@ -96,7 +108,20 @@ class _Document:
         parts: list[SourceMesh] = []
         for root in roots:
             self._walk(root, np.eye(4), 0, parts)
-        return _merge(parts)
+        return merged_by_picture(parts)
+
+    def weight(self) -> tuple[int, int]:
+        """Triangles (as if each mesh were used once) and texels."""
+        accessors = self._json.get("accessors", [])
+        corners = 0
+        for mesh in self._json.get("meshes", []):
+            for primitive in mesh.get("primitives", []):
+                index = primitive.get("indices", primitive["attributes"]["POSITION"])
+                corners += self._checked_count(_item(accessors, index, "accessor"))
+        sizes = [
+            picture_size(self._picture(i))[0] for i in range(len(self._json.get("images", [])))
+        ]
+        return corners // 3, sum(width * height for width, height in sizes)
 
     def _walk(self, index: int, parent: Array, depth: int, parts: list[SourceMesh]) -> None:
         if depth > MAX_NODE_DEPTH:
@@ -202,7 +227,7 @@ class _Document:
                 uvs = _transformed_uvs(attributes[name].astype(np.float64), transform)
                 image, jpeg, wraps = self._texture(texture.get("index", -1))
                 if not np.allclose(factor, 1.0, atol=1e-3):
-                    image, jpeg = _tinted(image, factor), None
+                    image, jpeg = tinted(image, factor), None
                 low, high = uvs.min(initial=0.0), uvs.max(initial=1.0)
                 outside = low < -_OUTSIDE_UNIT_SQUARE or high > 1 + _OUTSIDE_UNIT_SQUARE
                 return SourceMesh(
@@ -212,7 +237,7 @@ class _Document:
             linear = attributes["COLOR_0"][:, :3].astype(np.float64)[faces].mean(axis=1) * factor
         else:
             linear = np.broadcast_to(factor, (len(faces), 3))
-        return palette_mesh(positions, faces, _srgb(linear))
+        return palette_mesh(positions, faces, srgb(linear))
 
     def _texture(self, index: int) -> tuple[Image, bytes | None, bool]:
         texture = _item(self._json.get("textures", []), index, "texture")
@@ -230,13 +255,14 @@ class _Document:
             sampler = _item(self._json.get("samplers", []), texture["sampler"], "sampler")
         wraps = sampler.get("wrapS", _WRAP_REPEAT) == _WRAP_REPEAT
         if source not in self._images:
-            image = _item(self._json.get("images", []), source, "image")
-            if "bufferView" in image:
-                data = self._buffer_view(image["bufferView"])[0]
-            else:
-                data = self._uri(image.get("uri", ""))
-            self._images[source] = decode_image(data)
+            self._images[source] = decode_image(self._picture(source))
         return (*self._images[source], wraps)
+
+    def _picture(self, index: int) -> bytes:
+        image = _item(self._json.get("images", []), index, "image")
+        if "bufferView" in image:
+            return self._buffer_view(image["bufferView"])[0]
+        return self._uri(image.get("uri", ""))
 
     def _accessor(self, index: int) -> NDArray[Any]:
         accessor = _item(self._json.get("accessors", []), index, "accessor")
@@ -294,45 +320,6 @@ class _Document:
         return self._read_uri(unquote(uri))
 
 
-def decode_image(data: bytes) -> tuple[Image, bytes | None]:
-    """RGB image (h, w, 3) of JPEG, PNG or WebP bytes, and the bytes again when they are JPEG."""
-    try:
-        with PillowImage.open(io.BytesIO(data)) as header:
-            width, height = header.size
-            kind = header.format
-    except (OSError, ValueError, SyntaxError, PillowImage.DecompressionBombError) as error:
-        raise MapSourceError(f"a texture is not a picture that can be read: {error}") from error
-    if width * height > MAX_TEXTURE_PIXELS:
-        raise MapSourceError(f"a texture of {width}x{height} pixels is too large")
-    image = cv2.imdecode(
-        np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION
-    )
-    if image is None:
-        raise MapSourceError(f"a {kind} texture cannot be decoded")
-    rgb = cv2.cvtColor(image, cv2.COLOR_BGR2RGB).astype(np.uint8, copy=False)
-    return rgb, data if kind == "JPEG" else None
-
-
-def palette_mesh(positions: Array, faces: NDArray[np.int32], colours: Image) -> SourceMesh:
-    """A mesh of flat-coloured faces. colours: (F, 3) uint8; they become blocks of a texture."""
-    unique, which = np.unique(colours.reshape(-1, 3), axis=0, return_inverse=True)
-    if len(unique) > 65536:
-        unique, which = np.unique(colours & 0xF8, axis=0, return_inverse=True)
-    columns = int(np.ceil(np.sqrt(len(unique))))
-    rows = -(-len(unique) // columns)
-    grid = np.zeros((rows * columns, 3), np.uint8)
-    grid[: len(unique)] = unique
-    image = grid.reshape(rows, columns, 3).repeat(_BLOCK, axis=0).repeat(_BLOCK, axis=1)
-    which = which.ravel()
-    centre = np.stack([which % columns + 0.5, which // columns + 0.5], axis=-1)
-    uvs = (centre / (columns, rows)).astype(np.float32).repeat(3, axis=0)
-    apart = np.arange(3 * len(faces), dtype=np.int32).reshape(-1, 3)
-    return SourceMesh(positions[faces.ravel()], uvs, apart, image, palette=True)
-
-
-_BLOCK = 4  # texels per colour of a palette, so that bilinear look-up at its centre mixes nothing
-
-
 def _split_glb(data: bytes) -> tuple[dict[str, Any], bytes | None]:
     binary: bytes | None = None
     text = data
@@ -366,45 +353,6 @@ def _glb_chunks(data: bytes) -> dict[bytes, bytes]:
         chunks.setdefault(kind, data[at + 8 : at + 8 + length])
         at += 8 + length + (-length) % 4
     return chunks
-
-
-def _merge(parts: list[SourceMesh]) -> list[SourceMesh]:
-    """One mesh per image; all palettes become one."""
-    groups: dict[tuple[int, bool], list[SourceMesh]] = {}
-    palettes = [p for p in parts if p.palette]
-    for part in parts:
-        if not part.palette:
-            groups.setdefault((id(part.image), part.repeat), []).append(part)
-    merged = [_concatenated(group) for group in groups.values()]
-    if palettes:
-        positions = np.concatenate([p.positions for p in palettes])
-        colours = np.concatenate([_face_colours(p) for p in palettes])
-        faces = np.arange(len(positions), dtype=np.int32).reshape(-1, 3)
-        merged.append(palette_mesh(positions, faces, colours))
-    return merged
-
-
-def _face_colours(part: SourceMesh) -> Image:
-    h, w = part.image.shape[:2]
-    first = part.uvs[part.faces[:, 0]] * (w, h)
-    x, y = first.astype(np.int64).T
-    return part.image[y, x]
-
-
-def _concatenated(group: list[SourceMesh]) -> SourceMesh:
-    if len(group) == 1:
-        return group[0]
-    starts = np.cumsum([0, *(len(p.positions) for p in group)])
-    return SourceMesh(
-        np.concatenate([p.positions for p in group]),
-        np.concatenate([p.uvs for p in group]),
-        np.concatenate(
-            [p.faces + np.int32(s) for p, s in zip(group, starts[:-1], strict=True)]
-        ).astype(np.int32),
-        group[0].image,
-        group[0].jpeg,
-        group[0].repeat,
-    )
 
 
 def _with_positions(part: SourceMesh, positions: Array) -> SourceMesh:
@@ -452,19 +400,6 @@ def _transformed_uvs(uvs: Array, transform: dict[str, Any]) -> Array:
     angle = float(transform.get("rotation", 0.0))
     c, s = np.cos(angle), np.sin(angle)
     return np.asarray((uvs * scale) @ np.array([[c, -s], [s, c]]) + offset)
-
-
-def _srgb(linear: Array) -> Image:
-    x = np.clip(linear, 0.0, 1.0)
-    encoded = np.where(x <= 0.0031308, 12.92 * x, 1.055 * x ** (1 / 2.4) - 0.055)
-    return np.rint(255 * encoded).astype(np.uint8)
-
-
-def _tinted(image: Image, factor: Array) -> Image:
-    levels = np.arange(256) / 255
-    linear = np.where(levels <= 0.04045, levels / 12.92, ((levels + 0.055) / 1.055) ** 2.4)
-    table = _srgb(linear[:, None] * factor)
-    return np.stack([table[image[..., c], c] for c in range(3)], axis=-1)
 
 
 def _vector(values: Any, length: int, what: str) -> Array:

@@ -49,12 +49,17 @@ class TileSource(Protocol):
 
 @dataclass(frozen=True, eq=False)
 class SourceNode:
-    """One node of the tile tree. geometric_error in metres; replaces: REPLACE, else ADD."""
+    """One node of the tile tree. geometric_error in metres; replaces: REPLACE, else ADD; corners:
+    (8, 3) ECEF metres of a box that holds its tiles, as far as the source tells; stands_in: its
+    surface has what is missing of its children.
+    """
 
     geometric_error: float
     replaces: bool
     tiles: Sequence[TileSource]
     children: list[SourceNode] = field(default_factory=list)
+    corners: Array | None = None
+    stands_in: bool = True
 
     def walk(self) -> Iterator[SourceNode]:
         """This node and everything below it, parents first."""

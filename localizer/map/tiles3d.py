@@ -13,7 +13,7 @@ import numpy as np
 
 from localizer.errors import MapSourceError
 from localizer.geo import ecef_from_geodetic
-from localizer.map.gltf import read_gltf
+from localizer.map.gltf import gltf_weight, read_gltf
 from localizer.map.source import SourceMesh, SourceNode, SourceTree
 from localizer.pose import Array
 
@@ -43,24 +43,40 @@ class ContentFile:
         """How errors name it."""
         return str(self.path.relative_to(self.folder))
 
+    def size_bytes(self) -> int:
+        """Of the file; 0 where it cannot be read."""
+        try:
+            return self.path.stat().st_size
+        except OSError:
+            return 0
+
+    def weight(self) -> tuple[int, int]:
+        """Triangles and texels by the file's headers."""
+        return gltf_weight(self._gltf()[0], self._beside)
+
     def load(self) -> list[SourceMesh]:
         """Meshes with positions in ECEF metres (float64)."""
-        data = read_file(self.path)
-        rtc = np.zeros(3)
-        if data[:4] == b"b3dm":
-            data, rtc = _unwrap_b3dm(data)
-        elif data[:4] in (b"i3dm", b"pnts", b"cmpt"):
-            raise MapSourceError(f"content of type {data[:4].decode()} is not supported")
-        elif data[:4] != b"glTF" and data.lstrip()[:1] != b"{":
-            raise MapSourceError(f"content starts with {data[:4]!r}: neither b3dm nor glTF")
-        meshes, gltf_rtc = read_gltf(
-            data, lambda uri: read_file(inside(self.folder, self.path.parent, uri))
-        )
+        data, rtc = self._gltf()
+        meshes, gltf_rtc = read_gltf(data, self._beside)
         # Tile transform, then RTC_CENTER (in z-up axes), then the turn of the glTF's up axis.
         centred = np.eye(4)
         centred[:3, 3] = rtc + gltf_rtc
         T = self.ecef_from_tile @ centred @ _Z_UP[self.up_axis]
         return [replace(m, positions=m.positions @ T[:3, :3].T + T[:3, 3]) for m in meshes]
+
+    def _gltf(self) -> tuple[bytes, Array]:
+        """The glTF or GLB of the content, and the centre (3,) that it is relative to."""
+        data = read_file(self.path)
+        if data[:4] == b"b3dm":
+            return _unwrap_b3dm(data)
+        if data[:4] in (b"i3dm", b"pnts", b"cmpt"):
+            raise MapSourceError(f"content of type {data[:4].decode()} is not supported")
+        if data[:4] != b"glTF" and data.lstrip()[:1] != b"{":
+            raise MapSourceError(f"content starts with {data[:4]!r}: neither b3dm nor glTF")
+        return data, np.zeros(3)
+
+    def _beside(self, uri: str) -> bytes:
+        return read_file(inside(self.folder, self.path.parent, uri))
 
 
 def read_tileset(path: Path) -> SourceTree:
@@ -179,7 +195,8 @@ class _Reader:
             children.append(self._node(child, T, refine == "REPLACE", up, path, depth + 1))
         error = _number(data.get("geometricError", 0.0), f"{path}: geometricError")
         scale = float(np.linalg.norm(T[:3, :3], axis=0).max())
-        return SourceNode(error * scale, refine == "REPLACE", tuple(tiles), children)
+        corners = _corners(data.get("boundingVolume"), T)
+        return SourceNode(error * scale, refine == "REPLACE", tuple(tiles), children, corners)
 
 
 def _content_uris(data: dict[str, Any], path: Path) -> list[str]:
@@ -245,6 +262,29 @@ def _centre(root: dict[str, Any], where: str) -> Array:
     key = "box" if "box" in volume else "sphere"
     centre = _numbers(volume.get(key), 12 if key == "box" else 4, where)[:3]
     return np.asarray(T[:3, :3] @ centre + T[:3, 3])
+
+
+def _corners(volume: Any, T: Array) -> Array | None:
+    """(8, 3) ECEF corners of a box that holds a bounding volume; None where that says nothing."""
+    if not isinstance(volume, dict):
+        return None
+    signs = np.array([[a, b, c] for a in (-1, 1) for b in (-1, 1) for c in (-1, 1)], np.float64)
+    try:
+        if "region" in volume:
+            west, south, east, north, low, high = np.asarray(volume["region"], np.float64)
+            middle = np.array([south + north, west + east, low + high]) / 2
+            half = np.array([north - south, east - west, high - low]) / 2
+            lat, lon, h = (middle + signs * half).T
+            corners = ecef_from_geodetic(np.degrees(lat), np.degrees(lon), h)
+        elif "box" in volume:
+            box = np.asarray(volume["box"], np.float64).reshape(4, 3)
+            corners = (box[0] + signs @ box[1:]) @ T[:3, :3].T + T[:3, 3]
+        else:
+            x, y, z, radius = np.asarray(volume.get("sphere"), np.float64)
+            corners = (np.array([x, y, z]) + signs * radius) @ T[:3, :3].T + T[:3, 3]
+    except (TypeError, ValueError):
+        return None
+    return corners if np.isfinite(corners).all() else None
 
 
 def _numbers(values: Any, length: int, where: str) -> Array:

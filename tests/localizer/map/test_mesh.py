@@ -11,8 +11,8 @@ import pytest
 from localizer.camera import Camera
 from localizer.errors import GeoreferenceError, MapSourceError
 from localizer.geo import Geodetic, LocalFrame
+from localizer.map.cutting import shelves
 from localizer.map.georeference import Georeference, ecef_from_crs, read_georeference
-from localizer.map.mesh import _shelves
 from localizer.map.stream import TileStreamer
 from localizer.pose import Pose
 from localizer.render.numba_raster import NumbaRenderer
@@ -146,7 +146,7 @@ def test_broken_meshes_are_named(tmp_path, make, build):
 
 def test_packed_rectangles_do_not_overlap():
     sizes = np.random.default_rng(0).integers(1, 60, (300, 2))
-    places, (width, height) = _shelves(sizes)
+    places, (width, height) = shelves(sizes)
     canvas = np.zeros((height, width), int)
     for (x, y), (w, h) in zip(places, sizes, strict=True):
         canvas[y : y + h, x : x + w] += 1
