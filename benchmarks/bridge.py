@@ -6,14 +6,21 @@ An autopilot (a process of its own, UDP loopback) streams LOAD times what the br
 fixes are submitted at 20 Hz (more than 50 Hz ArduPilot drops). Latency is from `Bridge.submit` to
 the arrival of VISION_POSITION_ESTIMATE in the autopilot's process, on the same clock. CPU is that
 of the bridge's process alone.
+
+The last rows have a neighbour in the bridge's own process that computes in Python without a pause,
+as a localizer may: whoever wakes up waits for the interpreter lock for as long as
+`sys.setswitchinterval` says. The companion sets it to 0.2 ms, Python's default is 5 ms.
 """
 
 from __future__ import annotations
 
 import argparse
+import logging
 import multiprocessing
 import select
 import socket
+import sys
+import threading
 import time
 from collections import Counter
 from typing import Any
@@ -27,6 +34,7 @@ from mavlink_bridge.framing import FrameReader
 
 HOME = (47.397742, 8.545594)
 FIX_HZ = 20.0
+COMPANION_SWITCH_MS = 0.2
 # Hz of what the bridge asks for in its default configuration.
 TRAFFIC = {"ATTITUDE": 50, "LOCAL_POSITION_NED": 10, "GLOBAL_POSITION_INT": 5, "GPS_RAW_INT": 5,
            "EKF_STATUS_REPORT": 2, "GIMBAL_DEVICE_ATTITUDE_STATUS": 25}  # fmt: skip
@@ -92,10 +100,34 @@ def autopilot(connection: Any, load: float) -> None:
     connection.send((arrivals, sum(sent.values())))
 
 
-def run(load: float, seconds: float) -> dict[str, float]:
-    """One measurement."""
+def compute(stop: threading.Event) -> None:
+    """A neighbour that never lets go of the interpreter by itself."""
+    total = 0
+    while not stop.is_set():
+        for i in range(1000):
+            total += i * i
+
+
+def run(load: float, seconds: float, switch_ms: float | None = None) -> dict[str, float]:
+    """One measurement. switch_ms: with a computing neighbour, at that switch interval."""
+    stop = threading.Event()
+    if switch_ms is not None:
+        sys.setswitchinterval(switch_ms * 1e-3)
+        threading.Thread(target=compute, args=(stop,), daemon=True).start()
+    try:
+        return measure(load, seconds)
+    finally:
+        stop.set()
+        sys.setswitchinterval(0.005)
+
+
+def measure(load: float, seconds: float) -> dict[str, float]:
+    """Submit and count."""
     here, there = multiprocessing.Pipe()
-    process = multiprocessing.Process(target=autopilot, args=(there, load), daemon=True)
+    # Not forked: a copy of the computing neighbour's locks would be a copy of its state.
+    process = multiprocessing.get_context("spawn").Process(
+        target=autopilot, args=(there, load), daemon=True
+    )
     process.start()
     config = BridgeConfig(
         connection=f"udpout:127.0.0.1:{here.recv()}",
@@ -137,16 +169,21 @@ def run(load: float, seconds: float) -> dict[str, float]:
 
 def main() -> None:
     """Print the table."""
+    logging.basicConfig(level=logging.ERROR)
     parser = argparse.ArgumentParser(description=__doc__.split("\n", maxsplit=1)[0])
     parser.add_argument("--seconds", type=float, default=10.0)
     parser.add_argument("--load", type=float, nargs="*", default=[1.0, 5.0, 10.0])
     arguments = parser.parse_args()
     print("  load  messages/s in  fixes/s  CPU (cores)  estimate to socket ms p50 / p99   lost")
-    for load in arguments.load:
-        r = run(load, arguments.seconds)
+    rows: list[tuple[float, float | None]] = [(load, None) for load in arguments.load]
+    rows += [(max(arguments.load), interval) for interval in (5.0, COMPANION_SWITCH_MS)]
+    for load, interval in rows:
+        r = run(load, arguments.seconds, interval)
+        what = "" if interval is None else f"  neighbour, switch interval {interval:g} ms"
         print(
             f"{load:5.0f}x {r['received']:14.0f} {r['fixes']:8.0f} {r['cpu']:12.2f}"
-            f" {r['p50']:22.2f} / {r['p99']:.2f} {r['lost']:10.0f}"
+            f" {r['p50']:22.2f} / {r['p99']:.2f} {r['lost']:10.0f}{what}",
+            flush=True,
         )
 
 

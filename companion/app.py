@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import gc
 import logging
+import sys
 import threading
 from contextlib import ExitStack
 
@@ -31,6 +32,9 @@ from mavlink_bridge.config import BridgeConfig
 from mavlink_bridge.messages import TargetReport, TrackRequest
 
 _log = logging.getLogger(__name__)
+# How long a thread may keep the interpreter from another that woke up. Python's 5 ms, several times
+# between an estimate and the autopilot, would be 10 ms in the median (benchmarks/bridge.py).
+_SWITCH_S = 0.0002
 _WARNING = 4  # MAV_SEVERITY_WARNING; lower is worse
 
 
@@ -48,6 +52,7 @@ class Companion:
         Whatever fails on the way up, what was already up is shut down: a part's thread that stayed
         behind would keep the process from ending.
         """
+        sys.setswitchinterval(_SWITCH_S)
         with ExitStack() as up:
             try:
                 self._build(self._config, up)

@@ -31,6 +31,7 @@ _IDLE_NS = 100_000_000
 _REFERENCE_WAIT_NS = 500_000_000
 _VISION_GOOD_NS = SECOND_NS
 _RELIEF_SHARE = 0.9  # of a limit, below which its warning ends
+_DELAY_SLACK_MS = 10.0
 
 
 def message_id(name: str) -> int:
@@ -155,6 +156,7 @@ class FlightControllerSide(Side):
             # Behind UDP an autopilot answers whoever spoke first. A signing one that does not know
             # the time signs with an old stamp until it has heard a newer one. So we speak first.
             link.system_id = _FIRST_GUESS
+        due_ns = self._inject(link, state, now_ns)  # before anything that can wait
         if link.system_id:
             self.heartbeat(link, now_ns)
         if state.connected:
@@ -163,7 +165,7 @@ class FlightControllerSide(Side):
             self._keep_origin(link, now_ns)
             if self.config.ground_connection is None and self.config.camera.announce:
                 self.serve_camera(link, state, now_ns)
-        return self._inject(link, state, now_ns)
+        return due_ns
 
     def _watch(self, state: VehicleState) -> None:
         self.shared.watch.check(state)
@@ -324,7 +326,7 @@ class FlightControllerSide(Side):
             return (
                 f"fixes are {latency:.0f} ms old, over the {profile.max_delay_ms:.0f} ms of {name}"
             )
-        if latency > share * delay:
+        if latency > share * (delay + _DELAY_SLACK_MS):
             return f"fixes are {latency:.0f} ms old: raise delay_ms ({delay:.0f}) and {name}"
         return ""
 

@@ -216,8 +216,6 @@ class Link:
             wait_s = min(max(deadline_ns - monotonic_ns(), 0) * 1e-9, _LONGEST_WAIT_S)
             poller.modify(transport, select.POLLIN | (select.POLLOUT if self._unsent else 0))
             ready = dict(poller.poll(wait_s * 1e3))
-            if self._wake_read in ready:
-                os.read(self._wake_read, 4096)
             events = ready.get(transport.fileno(), 0)
             if events & ~select.POLLOUT and self._receive(transport):
                 last_rx_ns = monotonic_ns()
@@ -227,6 +225,11 @@ class Link:
             now_ns = monotonic_ns()
             due = self._guard(self._handler.on_tick, self, now_ns)
             deadline_ns = due if due is not None else now_ns + int(_LONGEST_WAIT_S * 1e9)
+            if self._wake_read in ready:
+                # Only now: a read may have to wait for the interpreter lock, and what woke us
+                # should be on its way first. What came meanwhile has its turn at once.
+                os.read(self._wake_read, 4096)
+                deadline_ns = 0
             if transport.stream and now_ns - last_rx_ns > self._timeout_ns:
                 self.counters.timeouts += 1
                 raise TimeoutError(f"nothing received for {self._timeout_ns * 1e-9:.1f} s")
