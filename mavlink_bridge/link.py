@@ -104,6 +104,7 @@ class Link:
         self._last_sent_ns: dict[tuple[int, int], int] = {}
         self._outbox: deque[tuple[Any, int]] = deque(maxlen=_OUTBOX)
         self._unsent = bytearray()
+        self._broken: OSError | None = None
         self._stop = threading.Event()
         self._thread: threading.Thread | None = None
         self._transport: Transport | None = None
@@ -205,6 +206,7 @@ class Link:
     def _serve(self, transport: Transport) -> None:
         self._reader.reset()
         self._unsent.clear()
+        self._broken = None
         self._guard(self._handler.on_open, self)
         # poll, not select: a process of many files has descriptors that select refuses.
         poller = select.poll()
@@ -224,6 +226,8 @@ class Link:
             self._empty_outbox()
             now_ns = monotonic_ns()
             due = self._guard(self._handler.on_tick, self, now_ns)
+            if self._broken is not None:
+                raise self._broken
             deadline_ns = due if due is not None else now_ns + int(_LONGEST_WAIT_S * 1e9)
             if self._wake_read in ready:
                 # Only now: a read may have to wait for the interpreter lock, and what woke us
@@ -313,7 +317,7 @@ class Link:
         if self._transport.stream:
             self._unsent += frame
             self._flush()
-        elif self._transport.write(frame) == 0:
+        elif self._put(frame) == 0:
             self.counters.tx_dropped += 1
             return False
         self.counters.tx_messages += 1
@@ -324,9 +328,17 @@ class Link:
 
     def _flush(self) -> None:
         """Send what is left over of a stream."""
-        assert self._transport is not None
         if self._unsent:
-            del self._unsent[: self._transport.write(bytes(self._unsent))]
+            del self._unsent[: self._put(bytes(self._unsent))]
+
+    def _put(self, data: bytes) -> int:
+        """Write to the transport; that it is gone is the link's affair, not its handler's."""
+        assert self._transport is not None
+        try:
+            return self._transport.write(data)
+        except OSError as error:
+            self._broken = error
+            return 0
 
 
 def sleep_until(predicate: Callable[[], bool], timeout_s: float, step_s: float = 0.01) -> bool:

@@ -82,6 +82,37 @@ def test_an_unforeseen_error_costs_the_connection_and_not_the_link() -> None:
     link.stop()
 
 
+def test_a_write_that_fails_reconnects_at_once_and_is_no_error_of_the_handler() -> None:
+    class Deaf:
+        """Readable never, writable never: a connection that was reset."""
+
+        stream = True
+
+        def __init__(self) -> None:
+            self.socket, self.other = socket.socketpair()
+
+        def fileno(self) -> int:
+            return self.socket.fileno()
+
+        def read(self) -> bytes:
+            return b""
+
+        def write(self, data: bytes) -> int:
+            raise ConnectionResetError("reset by peer")
+
+        def close(self) -> None:
+            self.socket.close()
+            self.other.close()
+
+    link = Link(Endpoint.parse("tcp:127.0.0.1:9"), Ticks(), opener=lambda _: Deaf())
+    link.system_id = 1
+    link.start()
+    assert sleep_until(lambda: link.counters.opened >= 3, 3.0)
+    link.stop()
+    assert link.counters.handler_errors == 0
+    assert link.counters.failures == 0
+
+
 @pytest.mark.parametrize("reconnecting", [False, True])
 def test_loss_is_told_on_the_ground_link_within_seconds(reconnecting: bool) -> None:
     """reconnecting: the connection attempt itself hangs, as one to a host that is gone does."""
