@@ -84,6 +84,7 @@ class Flight:
         self.origin: tuple[float, float, float] | None = None
         self.north_m = 0.0
         self.reset_next = False
+        self.vision_yaw: float | None = None  # None: the vehicle's
         self.mangle: Callable[[bytes], bytes] = lambda frame: frame
         self._answered = 0
 
@@ -124,7 +125,7 @@ class Flight:
             988.0 + GEOID,
             0.0,
             0.0,
-            self.yaw(exposure_ns),
+            self.yaw(exposure_ns) if self.vision_yaw is None else self.vision_yaw,
             np.eye(3) * 0.04,
             reset=self.reset_next,
         )

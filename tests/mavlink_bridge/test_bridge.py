@@ -457,6 +457,44 @@ def test_signed_link(make_autopilot: Any, run: Callable[..., Bridge], tmp_path: 
     assert sleep_until(lambda: bridge.counters()["fc_unsigned"] == 1, 2.0)
 
 
+def test_signing_vehicle_that_does_not_know_the_time(
+    make_autopilot: Any, run: Callable[..., Bridge], tmp_path: Path
+) -> None:
+    """Without GNSS it signs with last year's stamps, until it has heard newer ones: from us."""
+    key = create_key(tmp_path / "key")
+    vehicle = make_autopilot(key=key)
+    vehicle._codec.signing.timestamp -= 365 * 86_400 * 100_000
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as free:
+        free.bind(("127.0.0.1", 0))
+        port = free.getsockname()[1]
+    settings = BridgeConfig(
+        connection=f"udpin:127.0.0.1:{port}", signing=SigningConfig(key_file=tmp_path / "key")
+    )
+    vehicle.peer = ("127.0.0.1", port)
+    bridge = run(settings, vehicle)
+    assert bridge.counters()["fc_bad_signatures"] > 0
+    assert bridge.state().system_id == 1
+    assert sleep_until(lambda: bridge.attitude_at(time.monotonic_ns()) is not None, 3.0)
+
+
+@pytest.mark.parametrize("noise", [b"GET / HTTP/1.1", b"\x00" * 20])
+def test_a_stray_datagram_does_not_take_the_vehicles_place(
+    noise: bytes, autopilot: Any, run: Callable[..., Bridge]
+) -> None:
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as stranger:
+        stranger.bind(("127.0.0.1", 0))
+        port = stranger.getsockname()[1]
+        settings = BridgeConfig(connection=f"udpin:127.0.0.1:{port + 1 if port < 65535 else 1025}")
+        autopilot.peer = ("127.0.0.1", int(settings.connection.split(":")[2]))
+        bridge = run(settings, autopilot)
+        autopilot.streaming = False
+        time.sleep(0.1)
+        stranger.sendto(noise, autopilot.peer)
+        before = len(autopilot.of("HEARTBEAT"))
+        assert sleep_until(lambda: len(autopilot.of("HEARTBEAT")) > before, 3.0)
+        assert bridge.counters()["fc_bad_bytes"] >= len(noise)
+
+
 def test_threads_end_with_the_bridge(autopilot: Any, run: Callable[..., Bridge]) -> None:
     before = threading.active_count()
     bridge = run(config(autopilot.port), autopilot)

@@ -7,14 +7,16 @@ import math
 import random
 import time
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from typing import Any
 
 import pytest
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from mavlink_bridge import VisionFix
-from mavlink_bridge.config import InjectionConfig
+from mavlink_bridge.config import InjectionConfig, RcGateConfig, SourceSwitchConfig
 from mavlink_bridge.framing import FrameReader
+from mavlink_bridge.gate import InjectionGate
 from mavlink_bridge.inject import FixQueue
 from mavlink_bridge.side import GroundSide
 from tests.mavlink_bridge.simulated import HOME, MS, SECOND, Flight, SimulatedLink
@@ -250,3 +252,61 @@ def test_nonsense_with_right_checksums_raises_nothing_and_leaves_nothing(
     at = flight.side.tracker.attitude_at(flight.now_ns - 100 * MS)
     assert at is not None
     assert math.isfinite(at.yaw_rad)
+
+
+# --- what else an operator must be told -----------------------------------------------------------
+
+
+def test_a_blind_yaw_guard_is_told_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    flight = Flight(monkeypatch)
+    monkeypatch.setattr(flight, "yaw", lambda _: 0.0)
+    flight.run(10.0)
+    assert not [t for t in flight.texts if "not checked" in t]
+    flight.vision_yaw = math.nan
+    flight.run(10.0)
+    told = [t for t in flight.texts if "not checked" in t]
+    assert told == ["PiLoT: vision yaw is not checked: no attitude or no gimbal angles"]
+    flight.vision_yaw = None
+    flight.run(5.0)
+    assert flight.texts[-1] == "PiLoT: vision yaw is checked"
+
+
+def test_an_order_that_is_not_acknowledged_is_repeated_and_told_once(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    flight = Flight(monkeypatch, switch=SourceSwitchConfig(enabled=True))
+    flight.run(30.0)
+    orders = [m for _, m, _ in flight.link.sent if getattr(m, "command", 0) == 42007]
+    assert len(orders) > 10
+    assert {m.param1 for m in orders} == {2.0}
+    told = [t for t in flight.texts if "source set" in t]
+    assert told == ["PiLoT: EKF source set 2: GNSS lost"]
+
+
+@pytest.mark.parametrize(
+    ("system", "component", "ours"),
+    [(1, 191, True), (0, 0, True), (255, 190, False), (1, 100, False)],
+)
+def test_answers_to_others_commands_are_not_ours(
+    monkeypatch: pytest.MonkeyPatch, system: int, component: int, ours: bool
+) -> None:
+    """A ground station's refused order must not look like ours."""
+    flight = Flight(monkeypatch)
+    flight.run(5.0)
+    ack = mavlink.MAVLink_command_ack_message(42007, 4, 0, 0, system, component)
+    flight._say(ack)
+    assert flight.side.counters["commands_refused"] == (1 if ours else 0)
+    assert bool([t for t in flight.texts if "source switch refused" in t]) is ours
+
+
+def test_no_origin_is_set_while_the_gate_is_closed(monkeypatch: pytest.MonkeyPatch) -> None:
+    flight = Flight(monkeypatch)
+    opened: list[str] = []
+    gate = InjectionGate(RcGateConfig(), opened.append)
+    flight.side.shared = replace(flight.side.shared, gate=gate)
+    flight.run(15.0)
+    assert flight.origin is None
+    assert gate.command(mavlink.MAV_CMD_USER_1, 1.0) == mavlink.MAV_RESULT_ACCEPTED
+    flight.run(10.0)
+    assert flight.origin is not None
+    assert flight.vision()

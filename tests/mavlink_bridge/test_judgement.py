@@ -92,6 +92,21 @@ def test_bad_vision_is_a_no_go_with_its_reason(options: dict[str, float], reason
     assert score.line().startswith("no-go: ")
 
 
+@pytest.mark.parametrize(("altitude", "go"), [(493.0, True), (547.0, False), (406.0, False)])
+def test_a_wrong_geoid_is_seen_in_the_heights(altitude: float, go: bool) -> None:
+    """Fixes at 600 m above the ellipsoid, 100 m of geoid: 500 m AMSL, whatever the autopilot has.
+
+    With the separation's sign turned they would be 200 m off, without it 100 m.
+    """
+    scorer = ShadowScorer(100.0)
+    for i in range(100):
+        scorer.compare(position(i * 100 * MS), (*HOME, altitude))
+    score = scorer.score(10 * SECOND, 0.0, False)
+    assert score.height_m == pytest.approx(500.0 - altitude)
+    assert score.go is go
+    assert any("check geoid" in reason for reason in score.reasons) is not go
+
+
 def test_nothing_compared_is_a_no_go() -> None:
     score = ShadowScorer(100.0).score(SECOND, 0.0, False)
     assert not score.go
