@@ -8,10 +8,12 @@ import numpy as np
 
 from localizer.camera import Camera
 from localizer.config import LocalizerConfig
+from localizer.features.detail import DetailExtractor
 from localizer.features.extractor import FeatureExtractor, load_extractor
 from localizer.map.cache import TileCache
 from localizer.map.stream import TileStreamer
 from localizer.pipeline import Localizer, RotationAt, working_camera
+from localizer.registration.devices import open_backend
 from localizer.registration.jngo import JNGO
 from localizer.render.base import MapRenderer
 from localizer.render.select import open_renderer
@@ -42,8 +44,10 @@ def build_localizer(
     rotation_at: RotationAt = lambda _time_ns: None,
 ) -> Localizer:
     """A localizer for one camera over an open map. rotation_at: see `Localizer`."""
-    extractor = load_extractor(config.model, threads=config.feature_threads)
-    optimizer = JNGO(config.registration, threads=config.threads)
+    extractor = DetailExtractor(load_extractor(config.model, threads=config.feature_threads))
+    optimizer = JNGO(
+        config.registration, open_backend(config.device, config.threads), config.threads
+    )
     _warm_up(stack.renderer, extractor, optimizer, camera, config)
     return Localizer(stack.renderer, extractor, optimizer, camera, config, rotation_at)
 
@@ -58,5 +62,6 @@ def _warm_up(
     """Compile and load everything now: the first frame of a flight must not wait ten seconds."""
     size = working_camera(camera, config.width)
     pyramid = extractor.extract(np.zeros((size.height, size.width, 3), np.uint8))
-    optimizer.warm_up(pyramid.levels[0].features.shape[-1])
+    for channels in {level.features.shape[-1] for level in pyramid.levels}:
+        optimizer.warm_up(channels)
     renderer.warm_up()

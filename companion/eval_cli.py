@@ -35,6 +35,7 @@ from localizer.features.extractor import load_extractor
 from localizer.geo import LocalFrame
 from localizer.metrics import LocalizationMetrics
 from localizer.pipeline import Undistorter
+from localizer.registration.devices import DeviceChoice
 from localizer.render.base import MapRenderer
 from localizer.render.select import Backend
 
@@ -57,6 +58,9 @@ def evaluate_command(
     renderer: Annotated[
         Backend, typer.Option(help="auto: a GPU where there is one, else numba")
     ] = "auto",
+    device: Annotated[
+        DeviceChoice, typer.Option(help="of the optimizer; auto, cuda: a GPU that works, else CPU")
+    ] = "auto",
     model: Annotated[Path | None, typer.Option(help="ONNX feature network")] = None,
     limit: Annotated[int | None, typer.Option(min=1, help="only the first N frames")] = None,
 ) -> None:
@@ -66,7 +70,8 @@ def evaluate_command(
     _prepare(report)
     mode: PriorMode = "first" if prior == "first" else "each"
     config = LocalizerConfig(
-        width=width, model=model, seed=seed, renderer=renderer, feature_threads=2
+        width=width, model=model, seed=seed, renderer=renderer, device=device,
+        feature_threads=2
     )
     stack = MapStack(map_cache, config)
     try:
@@ -86,7 +91,7 @@ def evaluate_command(
             "sequence": str(sequence), "map": str(map_cache), "prior": prior, "seed": seed,
             "noise_m": noise_m, "noise_deg": noise_deg, "width": localizer.camera.width,
             "height": localizer.camera.height, "features": load_extractor(model).name,
-            "renderer": stack.renderer.name,
+            "renderer": stack.renderer.name, "optimizer": localizer.optimizer_name,
         }  # fmt: skip
         _print_problems(frames)
         unusable = sum(f.estimate is None for f in frames)

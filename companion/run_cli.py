@@ -11,6 +11,7 @@ import typer
 from rich.logging import RichHandler
 
 from companion.config import load_config
+from localizer.registration.devices import DeviceChoice
 from localizer.render.select import Backend
 
 
@@ -18,6 +19,9 @@ def run_command(
     config: Annotated[Path, typer.Argument(help="deployment YAML, see configs/")],
     renderer: Annotated[
         Backend | None, typer.Option(help="instead of the configuration's localizer.renderer")
+    ] = None,
+    device: Annotated[
+        DeviceChoice | None, typer.Option(help="instead of the configuration's localizer.device")
     ] = None,
     verbose: Annotated[bool, typer.Option("--verbose", "-v", help="log more")] = False,
 ) -> None:
@@ -28,9 +32,10 @@ def run_command(
         handlers=[RichHandler(show_path=False)],
     )
     settings = load_config(config)
-    if renderer is not None:
-        localizer = settings.localizer.model_copy(update={"renderer": renderer})
-        settings = settings.model_copy(update={"localizer": localizer})
+    given = {"renderer": renderer, "device": device}
+    changes = {key: value for key, value in given.items() if value is not None}
+    localizer = settings.localizer.model_copy(update=changes)
+    settings = settings.model_copy(update={"localizer": localizer})
     from companion.app import Companion
 
     companion = Companion(settings)

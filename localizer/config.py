@@ -8,6 +8,7 @@ from pydantic import BaseModel, ConfigDict, Field
 
 from localizer.integrity import IntegrityConfig
 from localizer.motion import MotionConfig
+from localizer.registration.devices import DeviceChoice
 from localizer.registration.jngo import JNGOConfig
 from localizer.render.select import Backend
 
@@ -30,6 +31,9 @@ class LocalizerConfig(BaseModel):
     model: Path | None = Field(None, description="ONNX feature network; none: the shipped one")
     anchors: int = Field(4000, ge=50, le=8000, description="geo-anchors per reference view")
     renderer: Backend = Field("auto", description="auto: a GPU where there is one, else numba")
+    device: DeviceChoice = Field(
+        "auto", description="of the optimizer; auto, cuda: a GPU that works, else the CPU"
+    )
     threads: int = Field(2, ge=1, description="CPU threads of rendering and optimization")
     feature_threads: int = Field(1, ge=1, description="CPU threads of each feature extraction")
     cache_mib: int = Field(384, ge=16, description="resident tiles, MiB")

@@ -127,6 +127,11 @@ class Localizer:
         self._tracker = TrackerState()
 
     @property
+    def optimizer_name(self) -> str:
+        """What registers now, for reports: the CPU takes over where a GPU fails."""
+        return self._optimizer.backend.name
+
+    @property
     def tracker(self) -> TrackerState:
         """The current motion state and integrity."""
         with self._lock:

@@ -82,8 +82,53 @@ def _cells(u: Array, v: Array, side: float) -> NDArray[np.int64]:
     return number
 
 
+@dataclass(frozen=True)
+class CovarianceSums:
+    """What equation 11 adds up over the anchors in view. hessian: Σ ŵ JᵀSJ, without the prior;
+    meat: Σ_cells G Gᵀ; isotropic: Σ ŵ² σ_r² JᵀSJ, all (6, 6); cells: how many are occupied;
+    prior_hessian: (6, 6).
+    """
+
+    hessian: Array
+    meat: Array
+    isotropic: Array
+    cells: int
+    prior_hessian: Array
+
+
+def covariance_sums(model: AnchorModel) -> CovarianceSums | None:
+    """The sums of an anchor model, None where no anchor has weight."""
+    scale = model.weights * model.robust
+    total = model.weights.sum()
+    if not total > 0:
+        return None
+    J = model.projection
+    share = (scale / total)[:, None, None]
+    information = J.transpose(0, 2, 1) @ (share * model.structure) @ J
+    per_anchor = (J.transpose(0, 2, 1) @ (share * model.slope[:, :, None]))[:, :, 0]
+    cells = int(model.cell.max()) + 1
+    per_cell = np.zeros((cells, 6))
+    np.add.at(per_cell, model.cell, per_anchor)
+    variance = scale @ model.squares / max(scale.sum(), 1e-12) / model.channels
+    return CovarianceSums(
+        information.sum(axis=0),
+        per_cell.T @ per_cell,
+        variance * (share * information).sum(axis=0),
+        cells,
+        model.prior_hessian,
+    )
+
+
 def tangent_covariance(
     model: AnchorModel, correlation: float, floor: float, prior_weight: float = 0.0
+) -> Array | None:
+    """`sandwich_covariance` of an anchor model."""
+    sums = covariance_sums(model)
+    return None if sums is None else sandwich_covariance(sums, correlation, floor, prior_weight)
+
+
+def sandwich_covariance(
+    sums: CovarianceSums, correlation: float, floor: float, prior_weight: float = 0.0
 ) -> Array | None:
     """Covariance (6, 6) of xi = (rho, phi) at the optimum, None where H is singular.
 
@@ -92,14 +137,7 @@ def tangent_covariance(
     it cannot see. floor: least share of the isotropic model, so that a perfect fit does not claim
     perfect knowledge. A prior of weight `prior_weight` adds its own noise.
     """
-    scale = model.weights * model.robust
-    total = model.weights.sum()
-    if not total > 0:
-        return None
-    J = model.projection
-    share = (scale / total)[:, None, None]
-    information = J.transpose(0, 2, 1) @ (share * model.structure) @ J
-    hessian = information.sum(axis=0) + model.prior_hessian
+    hessian = sums.hessian + sums.prior_hessian
     diagonal = np.diag(hessian)
     if not np.all(diagonal > 0):
         return None
@@ -108,17 +146,11 @@ def tangent_covariance(
     if np.linalg.eigvalsh(scaled)[0] < 1e-9:
         return None
     inverse = np.linalg.inv(scaled) * np.outer(spread, spread)
-    per_anchor = (J.transpose(0, 2, 1) @ (share * model.slope[:, :, None]))[:, :, 0]
-    cells = int(model.cell.max()) + 1
-    if cells <= 6:
+    if sums.cells <= 6:
         return None
-    per_cell = np.zeros((cells, 6))
-    np.add.at(per_cell, model.cell, per_anchor)
-    meat = per_cell.T @ per_cell * (cells / (cells - 6))
-    variance = scale @ model.squares / max(scale.sum(), 1e-12) / model.channels
-    isotropic = variance * (share * information).sum(axis=0)
-    noise = correlation * (meat + floor * isotropic)
-    covariance: Array = inverse @ (noise + prior_weight * model.prior_hessian) @ inverse
+    meat = sums.meat * (sums.cells / (sums.cells - 6))
+    noise = correlation * (meat + floor * sums.isotropic)
+    covariance: Array = inverse @ (noise + prior_weight * sums.prior_hessian) @ inverse
     return 0.5 * (covariance + covariance.T)
 
 

@@ -7,6 +7,7 @@ docs/registration.md is the specification.
 
 from __future__ import annotations
 
+import logging
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -32,6 +33,12 @@ from localizer.registration.covariance import (
     pose_differences,
     tangent_covariance,
 )
+from localizer.registration.cuda.arrays import DeviceArray
+from localizer.registration.cuda.backend import CudaBackend
+from localizer.registration.cuda.errors import CudaError
+from localizer.registration.cuda.registration import register_on_device
+from localizer.registration.cuda.schedule import CudaSchedule
+from localizer.registration.devices import trial
 from localizer.registration.hypotheses import generate_hypotheses
 from localizer.registration.kernel_numba import NumbaBackend
 from localizer.registration.priors import PoseConstraint
@@ -45,6 +52,8 @@ from localizer.registration.selection import (
     thinned,
 )
 from localizer.types import Anchors, FeaturePyramid, PosePrior, RegistrationStatus
+
+logger = logging.getLogger(__name__)
 
 _COVARIANCE_ANCHORS = 1000  # enough for a covariance, cheap enough for every frame
 _LEAST_SCALE = 0.02  # of the sharpening loss, where features fit perfectly
@@ -135,10 +144,18 @@ class JNGO:
     """The optimizer. Keeps its worker threads and scratch memory between frames."""
 
     def __init__(
-        self, config: JNGOConfig | None = None, backend: str = "numba", threads: int = 2
+        self,
+        config: JNGOConfig | None = None,
+        backend: str | Backend = "numba",
+        threads: int = 2,
     ) -> None:
+        """backend: one, or the name of one (`make_backend`)."""
         self.config = config or JNGOConfig()
-        self.backend = make_backend(backend, threads)
+        self.backend = make_backend(backend, threads) if isinstance(backend, str) else backend
+        self._threads = threads
+        self._schedule = (
+            CudaSchedule(self.backend) if isinstance(self.backend, CudaBackend) else None
+        )
 
     def register(
         self,
@@ -155,11 +172,25 @@ class JNGO:
 
         prior: centre and spread of the swarm. motion: the Kalman prediction of Eq. 10, None before
         there is one. constraint: attitude, height or position knowledge (`priors`). Deterministic
-        for a seed.
+        for a seed. On a GPU the query's features may be `DeviceArray`s. If the GPU fails, the CPU
+        takes over for good, and the log says so.
         """
         status = _input_status(query, anchors, self.config)
         if status is not RegistrationStatus.OK:
             return _failure(prior, status)
+        if self._schedule is not None:
+            try:
+                return register_on_device(
+                    self._schedule, self.config, query, camera, anchors, prior,
+                    motion=motion, constraint=constraint, seed=seed,
+                )  # fmt: skip
+            except CudaError as error:
+                if any(isinstance(level.features, DeviceArray) for level in query.levels):
+                    raise  # the CPU cannot read them
+                logger.error("registration continues on the CPU: %s", error)
+                self.backend, self._schedule = NumbaBackend(self._threads), None
+        if not _all_finite(query, anchors):
+            return _failure(prior, RegistrationStatus.BAD_FEATURES)
         origin = local_origin(anchors, prior.world_from_camera)
         problems = level_problems(query, camera, anchors, origin)
         searched = len(self.config.iterations)
@@ -201,10 +232,9 @@ class JNGO:
             problem = self._constrained(thinned(level, anchors), constraint, R, t, origin)
             result = self.backend.refine(problem, R, t, iterations, c.settings)
             evaluations += result.evaluations
-            totals = self._totals(
-                result.rotations, result.translations, result.scores, origin, motion
+            order = distinct(
+                problem, result.rotations, result.translations, result.scores, c.distinct_px
             )
-            order = distinct(problem, result.rotations, result.translations, totals, c.distinct_px)
             order = order[:survivors]
             R, t = result.rotations[order], result.translations[order]
             scores, overlaps = result.scores[order], result.overlaps[order]
@@ -214,11 +244,8 @@ class JNGO:
 
     def _converge(self, swarm: _Swarm, origin: Array, motion: PosePrior | None) -> _Swarm:
         """More finest-level steps on the survivors, and their final order."""
-        steps = self.config.converge
-        if steps == 0:
-            return swarm
         result = self.backend.refine(
-            swarm.problem, swarm.rotations, swarm.translations, steps, swarm.settings
+            swarm.problem, swarm.rotations, swarm.translations, self.config.converge, swarm.settings
         )
         R, t = result.rotations, result.translations
         order = np.argsort(self._totals(R, t, result.scores, origin, motion), kind="stable")
@@ -329,19 +356,8 @@ class JNGO:
         )
 
     def warm_up(self, channels: int) -> None:
-        """Compile (or load from numba's cache) the kernel for feature maps of `channels`."""
-        rng = np.random.default_rng(0)
-        problem = LevelProblem(
-            rng.standard_normal((8, 8, channels)).astype(np.float32),
-            np.ones((8, 8), np.float32),
-            (4.0, 4.0),
-            (4.0, 4.0),
-            rng.uniform(-1, 1, (3, 20)).astype(np.float32),
-            rng.standard_normal((20, channels)).astype(np.float32),
-            np.ones(20, np.float32),
-        )
-        pose = np.eye(3)[None], np.array([[0.0, 0.0, 4.0]])
-        self.backend.refine(problem, *pose, 1, self.config.settings)
+        """Compile (or load from the cache) the kernel for feature maps of `channels`."""
+        trial(self.backend, channels)
 
 
 @dataclass(frozen=True)
@@ -388,6 +404,10 @@ def _input_status(
         )
     if len(anchors.points_world) < config.min_anchors:
         return RegistrationStatus.TOO_FEW_ANCHORS
+    return RegistrationStatus.OK
+
+
+def _all_finite(query: FeaturePyramid, anchors: Anchors) -> bool:
     arrays: list[NDArray[np.floating]] = [
         anchors.points_world,
         *anchors.features,
@@ -396,9 +416,7 @@ def _input_status(
     for level in query.levels:
         arrays += [level.features, level.confidence]
     # A sum is not finite when any term is not, and costs a tenth of isfinite().all().
-    if not all(np.isfinite(a.sum(dtype=np.float32)) for a in arrays):
-        return RegistrationStatus.BAD_FEATURES
-    return RegistrationStatus.OK
+    return all(bool(np.isfinite(a.sum(dtype=np.float32))) for a in arrays)
 
 
 def _failure(prior: PosePrior, status: RegistrationStatus, evaluations: int = 0) -> Registration:

@@ -33,8 +33,8 @@ class CudaBackend:
         self.name = f"cuda ({device.name}, {'float16' if half else 'float32'} features)"
         self._compile = compile
         self._kernels: dict[int, Kernels] = {}
-        self._lock = threading.Lock()
-        self._arena = Arena(device)
+        self.lock = threading.Lock()
+        self.arena = Arena(device)
 
     def kernels(self, channels: int) -> Kernels:
         """The loaded kernels for a channel count; compiling takes seconds, once per machine."""
@@ -46,7 +46,7 @@ class CudaBackend:
     @property
     def memory(self) -> int:
         """Bytes of device memory held."""
-        return self._arena.size
+        return self.arena.size
 
     def refine(
         self,
@@ -58,7 +58,7 @@ class CudaBackend:
     ) -> Refinement:
         """Run `iterations` LM steps on each of M poses; 0 only scores them."""
         M = len(rotations)
-        with self._lock:
+        with self.lock:
             self.device.activate()
             kernels = self.kernels(problem.features.shape[-1])
             arguments = self._arguments(problem, rotations, translations, iterations, settings)
@@ -80,9 +80,9 @@ class CudaBackend:
 
     def close(self) -> None:
         """Free the device memory."""
-        with self._lock:
+        with self.lock:
             self.device.activate()
-            self._arena.close()
+            self.arena.close()
 
     def _arguments(
         self,
@@ -92,7 +92,7 @@ class CudaBackend:
         iterations: int,
         settings: LMSettings,
     ) -> NDArray[np.void]:
-        put, M = self._arena.put, len(rotations)
+        put, M = self.arena.put, len(rotations)
         level = np.zeros((), dtype=layout.LEVEL)
         level["features"] = put("features", stored(problem.features, self.half))
         level["confidence"] = put("confidence", _floats(problem.confidence))
@@ -114,11 +114,11 @@ class CudaBackend:
         arguments["swarm"] = (
             put("rotations", np.ascontiguousarray(rotations, dtype=np.float64)),
             put("translations", np.ascontiguousarray(translations, dtype=np.float64)),
-            self._arena.buffer("scores", 8 * M),
-            self._arena.buffer("visible", 4 * M),
+            self.arena.buffer("scores", 8 * M),
+            self.arena.buffer("visible", 4 * M),
         )
         set_loss(arguments, settings, iterations)
-        arguments["flags"] = layout.COUNT_EVALUATIONS
+        arguments["counted"] = True
         return arguments
 
 

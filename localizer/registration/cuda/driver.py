@@ -8,7 +8,7 @@ memory of onnxruntime or PyTorch in the same process can be read in place.
 from __future__ import annotations
 
 import ctypes
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from types import ModuleType
 from typing import Any
 
@@ -129,18 +129,38 @@ class Kernels:
 
     def launch(self, name: str, blocks: int, threads: int, arguments: NDArray[Any]) -> None:
         """Queue a kernel whose only parameter is a structure; arguments: 0-d structured array."""
-        device = self._device
-        api = device._api
-        if name not in self._functions:
-            self._functions[name] = device._call(
-                api.cuModuleGetFunction, self._module, name.encode()
-            )
         # The driver copies the structure before it returns.
         pointers = np.array([arguments.ctypes.data], dtype=np.uint64)
-        device._call(
-            api.cuLaunchKernel, self._functions[name], blocks, 1, 1, threads, 1, 1, 0,
-            device.stream, pointers.ctypes.data, 0,
+        self._device._call(
+            self._device._api.cuLaunchKernel, self._function(name), blocks, 1, 1, threads, 1, 1, 0,
+            self._device.stream, pointers.ctypes.data, 0,
         )  # fmt: skip
+
+    def load_all(self, names: Iterable[str]) -> None:
+        """Look the functions up now: some drivers load them lazily, which a capture forbids."""
+        for name in names:
+            self._function(name)
+
+    def resources(self, name: str) -> dict[str, int]:
+        """Registers per thread, shared and local bytes of a kernel, as the driver reports them."""
+        attribute = self._device._api.CUfunction_attribute
+        wanted = {
+            "registers": attribute.CU_FUNC_ATTRIBUTE_NUM_REGS,
+            "shared": attribute.CU_FUNC_ATTRIBUTE_SHARED_SIZE_BYTES,
+            "local": attribute.CU_FUNC_ATTRIBUTE_LOCAL_SIZE_BYTES,
+        }
+        call, api = self._device._call, self._device._api
+        return {
+            key: int(call(api.cuFuncGetAttribute, which, self._function(name)))
+            for key, which in wanted.items()
+        }
+
+    def _function(self, name: str) -> Any:
+        if name not in self._functions:
+            self._functions[name] = self._device._call(
+                self._device._api.cuModuleGetFunction, self._module, name.encode()
+            )
+        return self._functions[name]
 
 
 class Graph:

@@ -46,7 +46,7 @@ struct Swarm {
 
 // What kernels of one registration tell each other, and in the end the host.
 struct State {
-    double median, scale;  // residual norm of the winner; last scale of its loss
+    double median, scale;  // residual norm of the winner; last scale that followed from it
     int count;             // hypotheses alive; 0: no overlap
     int evaluations;
     int not_finite;  // features, confidences or points hold NaN or infinity
@@ -59,17 +59,15 @@ struct State {
     float unused;
 };
 
-enum RefineFlags { COUNT_EVALUATIONS = 1, KEEP_SCORES = 2 };
-
 struct RefineArguments {
     const Level* level;
     const Prior* prior;  // null: none
-    State* state;        // null: every hypothesis of the grid is alive, nothing is counted
+    State* state;
     Swarm swarm;
     double damping, damping_down, damping_up, min_overlap;
-    double scale;          // of the loss; if factor > 0: max(factor * median, scale)
+    double scale;   // of the loss; if factor > 0 it is max(factor * state->median, scale)
     double factor;
-    int redescending, iterations, wanted, flags;  // wanted: about so many anchors; 0: all
+    int redescending, iterations, wanted, counted;  // wanted: about so many anchors; 0: all
 };
 
 struct SelectArguments {
@@ -91,24 +89,22 @@ struct PriorWeightArguments {
     const State* state;
     const double* scores;
     double share, least_score;
+    int limit, unused;  // of the hypotheses alive, the first so many
 };
 
-struct FinishArguments {
+struct WinnerArguments {
     const Level* level;
     State* state;
-    Swarm swarm;
+    Swarm swarm;     // the winner is its first
     float* scratch;  // 8 floats per anchor that takes part
-    double scale, factor;
-    float cell;  // px
-    int redescending, wanted, quality_wanted;
-    double huber;
+    double scale;    // of the loss, unless redescending: then it is state->scale
+    float cell;      // array index units
+    int redescending, wanted, unused;
 };
 
 struct FiniteArguments {
-    const void* values;
+    const Level* level;
     State* state;
-    long long count;
-    int half, unused;
 };
 
 #define SAME_SIZE(name) static_assert(sizeof(name) == BYTES_OF_##name, "layout.py differs: " #name)
@@ -119,5 +115,5 @@ SAME_SIZE(State);
 SAME_SIZE(RefineArguments);
 SAME_SIZE(SelectArguments);
 SAME_SIZE(PriorWeightArguments);
-SAME_SIZE(FinishArguments);
+SAME_SIZE(WinnerArguments);
 SAME_SIZE(FiniteArguments);

@@ -73,7 +73,7 @@ REFINE = _structure(
     ("redescending", np.int32),
     ("iterations", np.int32),
     ("wanted", np.int32),
-    ("flags", np.int32),
+    ("counted", np.int32),
 )
 SELECT = _structure(
     ("level", _POINTER),
@@ -96,32 +96,24 @@ PRIOR_WEIGHT = _structure(
     ("scores", _POINTER),
     ("share", np.float64),
     ("least_score", np.float64),
+    ("limit", np.int32),
+    ("unused", np.int32),
 )
-FINISH = _structure(
+WINNER = _structure(
     ("level", _POINTER),
     ("state", _POINTER),
     ("swarm", SWARM),
     ("scratch", _POINTER),
     ("scale", np.float64),
-    ("factor", np.float64),
     ("cell", np.float32),
     ("redescending", np.int32),
     ("wanted", np.int32),
-    ("quality_wanted", np.int32),
-    ("huber", np.float64),
-)
-FINITE = _structure(
-    ("values", _POINTER),
-    ("state", _POINTER),
-    ("count", np.int64),
-    ("half", np.int32),
     ("unused", np.int32),
 )
+FINITE = _structure(("level", _POINTER), ("state", _POINTER))
 
-COUNT_EVALUATIONS = 1  # RefineFlags
-KEEP_SCORES = 2
-PROBE_FLOATS = 48  # 2 * MAX_PROBES of schedule.cuh
-FINISH_FLOATS = 8  # scratch per anchor of the finish kernel
+PROBE_FLOATS = 48  # scratch per hypothesis of the select kernel: 2 * MAX_PROBES of schedule.cuh
+WINNER_FLOATS = 8  # scratch per anchor of the kernels that look at the winner
 
 _NAMES = {
     "Level": LEVEL,
@@ -131,7 +123,7 @@ _NAMES = {
     "RefineArguments": REFINE,
     "SelectArguments": SELECT,
     "PriorWeightArguments": PRIOR_WEIGHT,
-    "FinishArguments": FINISH,
+    "WinnerArguments": WINNER,
     "FiniteArguments": FINITE,
 }
 

@@ -123,7 +123,7 @@ __device__ inline bool advance(const RefineArguments& a, int least, int iteratio
 template <int WARPS>
 __device__ inline void refine_hypothesis(const RefineArguments& a, RefineScratch<WARPS>& s) {
     const int m = blockIdx.x;
-    if (a.state && m >= a.state->count) return;
+    if (m >= a.state->count) return;
     const Level level = *a.level;
     const int step = step_for(level.total, a.wanted), count = (level.total + step - 1) / step;
     const int least = max(6, (int)ceil(a.min_overlap * (double)count));
@@ -150,11 +150,10 @@ __device__ inline void refine_hypothesis(const RefineArguments& a, RefineScratch
     if (!first) return;
     for (int i = 0; i < 9; ++i) a.swarm.rotations[9 * m + i] = s.R[i];
     for (int i = 0; i < 3; ++i) a.swarm.translations[3 * m + i] = s.t[i];
-    if (!(a.flags & KEEP_SCORES)) {
-        a.swarm.scores[m] = s.score;
-        a.swarm.visible[m] = s.visible;
-    }
-    if (a.state && (a.flags & COUNT_EVALUATIONS)) atomicAdd(&a.state->evaluations, evaluations);
+    a.swarm.scores[m] = s.score;
+    a.swarm.visible[m] = s.visible;
+    if (a.counted) atomicAdd(&a.state->evaluations, evaluations);
+    if (m == 0 && a.factor > 0.0) a.state->scale = scale;
 }
 
 // Many hypotheses: two blocks of 256 threads per multiprocessor.

@@ -123,14 +123,15 @@ extern "C" __global__ void __launch_bounds__(256) select_hypotheses(const Select
 extern "C" __global__ void __launch_bounds__(256) weigh_prior(const PriorWeightArguments a) {
     __shared__ double slots[8];
     double mine = infinity();
-    for (int m = threadIdx.x; m < a.state->count; m += blockDim.x) mine = fmin(mine, a.scores[m]);
+    const int count = min(a.state->count, a.limit);
+    for (int m = threadIdx.x; m < count; m += blockDim.x) mine = fmin(mine, a.scores[m]);
     const double best = block_least(mine, slots);
     if (threadIdx.x == 0)
         a.prior->weight = best < infinity() ? a.share * fmax(best, a.least_score) : 0.0;
 }
 
 // Weighted median residual norm of the winner: the least norm up to which half the weight lies.
-extern "C" __global__ void __launch_bounds__(512, 1) median_residual(const FinishArguments a) {
+extern "C" __global__ void __launch_bounds__(512, 1) median_residual(const WinnerArguments a) {
     __shared__ BlockScratch<16> scratch;
     __shared__ double slots[16], half;
     if (a.state->count == 0) return;
@@ -167,9 +168,12 @@ extern "C" __global__ void __launch_bounds__(512, 1) median_residual(const Finis
 }
 
 // The sums of equation 11 at the winner's pose, under the loss of its last steps.
-__device__ inline void covariance_sums(const FinishArguments& a, const Level& level,
-                                       const PoseF& pose, float delta,
-                                       BlockScratch<16>& scratch) {
+extern "C" __global__ void __launch_bounds__(512, 1) covariance_sums(const WinnerArguments a) {
+    __shared__ BlockScratch<16> scratch;
+    if (a.state->count == 0) return;
+    const Level level = *a.level;
+    const PoseF pose = pose_of(a.swarm.rotations, a.swarm.translations);
+    const float delta = (float)(a.redescending ? a.state->scale : a.scale);
     const int step = step_for(level.total, a.wanted), count = (level.total + step - 1) / step;
     const int across = (int)((float)(level.width - 1) / a.cell) + 1;
     const int cells = across * ((int)((float)(level.height - 1) / a.cell) + 1);
@@ -228,13 +232,16 @@ __device__ inline void covariance_sums(const FinishArguments& a, const Level& le
         for (int i = 0; i < 21; ++i) a.state->meat[i] = (float)scratch.sums[i];
         a.state->cells = (int)scratch.sums[21];
     }
-    __syncthreads();
 }
 
 // 1 - cost / cost of chance, which pairs each anchor in view with another's features.
-__device__ inline void quality(const FinishArguments& a, const Level& level, const PoseF& pose,
-                               BlockScratch<16>& scratch, int* in_warp) {
-    const int step = step_for(level.total, a.quality_wanted);
+extern "C" __global__ void __launch_bounds__(512, 1) quality(const WinnerArguments a) {
+    __shared__ BlockScratch<16> scratch;
+    __shared__ int in_warp[16];
+    if (a.state->count == 0) return;
+    const Level level = *a.level;
+    const PoseF pose = pose_of(a.swarm.rotations, a.swarm.translations);
+    const int step = step_for(level.total, a.wanted);
     const int count = (level.total + step - 1) / step;
     const int lane = threadIdx.x % WARP, warp = threadIdx.x / WARP;
     int* list = reinterpret_cast<int*>(a.scratch);
@@ -262,9 +269,9 @@ __device__ inline void quality(const FinishArguments& a, const Level& level, con
         // As np.roll by half the list.
         const int other = valid ? list[(index + visible - visible / 2) % visible] : 0;
         Terms k = anchor_terms(level, pose, valid, anchor, anchor, scratch.warps[warp]);
-        sums[0] += k.weight * robust(k.e, (float)a.huber, false).cost;
+        sums[0] += k.weight * robust(k.e, (float)a.scale, false).cost;
         k = anchor_terms(level, pose, valid, anchor, other, scratch.warps[warp]);
-        sums[1] += k.weight * robust(k.e, (float)a.huber, false).cost;
+        sums[1] += k.weight * robust(k.e, (float)a.scale, false).cost;
     }
     block_sum(sums, scratch);
     if (threadIdx.x == 0) {
@@ -273,33 +280,30 @@ __device__ inline void quality(const FinishArguments& a, const Level& level, con
     }
 }
 
-// What the host needs of the winner besides its pose.
-extern "C" __global__ void __launch_bounds__(512, 1) finish(const FinishArguments a) {
-    __shared__ BlockScratch<16> scratch;
-    __shared__ int in_warp[16];
-    if (a.state->count == 0) return;
-    const Level level = *a.level;
-    const PoseF pose = pose_of(a.swarm.rotations, a.swarm.translations);
-    const double scale = a.factor > 0.0 ? fmax(a.factor * a.state->median, a.scale) : a.scale;
-    covariance_sums(a, level, pose, (float)scale, scratch);
-    __syncthreads();
-    quality(a, level, pose, scratch, in_warp);
-    if (threadIdx.x == 0) a.state->scale = scale;
+// Whether one of `count` values is NaN or infinite: all exponent bits are set.
+template <class Bits>
+__device__ inline bool any_not_finite(const void* values, size_t count, Bits exponent) {
+    const Bits* bits = static_cast<const Bits*>(values);
+    bool bad = false;
+    for (size_t i = (size_t)blockIdx.x * blockDim.x + threadIdx.x; i < count;
+         i += (size_t)gridDim.x * blockDim.x)
+        bad |= (__ldg(bits + i) & exponent) == exponent;
+    return bad;
 }
 
-// Raises state->not_finite where a value is NaN or infinite.
+// Raises state->not_finite where anything of a level is NaN or infinite.
 extern "C" __global__ void __launch_bounds__(256) all_finite(const FiniteArguments a) {
-    const long long first = (long long)blockIdx.x * blockDim.x + threadIdx.x;
-    const long long stride = (long long)gridDim.x * blockDim.x;
-    bool bad = false;
-    if (a.half) {
-        const unsigned short* values = static_cast<const unsigned short*>(a.values);
-        for (long long i = first; i < a.count; i += stride)
-            bad |= (values[i] & 0x7c00u) == 0x7c00u;
-    } else {
-        const unsigned* values = static_cast<const unsigned*>(a.values);
-        for (long long i = first; i < a.count; i += stride)
-            bad |= (values[i] & 0x7f800000u) == 0x7f800000u;
-    }
+    const Level& level = *a.level;
+    const size_t cells = (size_t)level.height * level.width, anchors = level.total;
+#if HALF_FEATURES
+    const unsigned short exponent = 0x7c00u;
+#else
+    const unsigned exponent = 0x7f800000u;
+#endif
+    bool bad = any_not_finite(level.features, cells * CHANNELS, exponent);
+    bad |= any_not_finite(level.anchor_features, anchors * CHANNELS, exponent);
+    bad |= any_not_finite(level.confidence, cells, 0x7f800000u);
+    bad |= any_not_finite(level.anchor_confidence, anchors, 0x7f800000u);
+    bad |= any_not_finite(level.points, 3 * anchors, 0x7f800000u);
     if (bad) a.state->not_finite = 1;
 }

@@ -23,8 +23,9 @@
     KERNEL(refine_few, RefineArguments)                 \
     KERNEL(select_hypotheses, SelectArguments)          \
     KERNEL(weigh_prior, PriorWeightArguments)           \
-    KERNEL(median_residual, FinishArguments)            \
-    KERNEL(finish, FinishArguments)                     \
+    KERNEL(median_residual, WinnerArguments)            \
+    KERNEL(covariance_sums, WinnerArguments)            \
+    KERNEL(quality, WinnerArguments)                    \
     KERNEL(all_finite, FiniteArguments)
 #endif
 KERNELS

@@ -1,0 +1,52 @@
+"""Arrays that lie on the device already, such as a network's outputs, for use in place."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import DTypeLike
+
+from localizer.registration.cuda.errors import CudaError
+
+
+@dataclass(frozen=True)
+class DeviceArray:
+    """A C-contiguous array in device memory. owner: what keeps the memory alive."""
+
+    address: int
+    shape: tuple[int, ...]
+    dtype: np.dtype
+    owner: Any = None
+
+    @classmethod
+    def of(cls, other: Any) -> DeviceArray:
+        """From anything with ``__cuda_array_interface__`` (CuPy, PyTorch, numba).
+
+        The producer must have finished: the registration's stream does not wait for others.
+        """
+        interface = other.__cuda_array_interface__
+        if interface.get("strides") is not None:
+            raise CudaError("a device array with strides: make it C-contiguous first")
+        return cls(
+            int(interface["data"][0]), tuple(interface["shape"]), np.dtype(interface["typestr"]),
+            other,
+        )  # fmt: skip
+
+    def reshaped(self, *shape: int) -> DeviceArray:
+        """The same memory under another shape of the same size."""
+        if int(np.prod(shape)) != int(np.prod(self.shape)):
+            raise CudaError(f"a device array of shape {self.shape} cannot be {shape}")
+        return DeviceArray(self.address, shape, self.dtype, self.owner)
+
+    def checked_address(self, dtype: DTypeLike) -> int:
+        """The address, after checks of type and alignment that the kernels rely on."""
+        if self.dtype != np.dtype(dtype):
+            raise CudaError(
+                f"device features are {self.dtype}, the kernels were asked for {np.dtype(dtype)}: "
+                "export the network in that precision or choose the other"
+            )
+        if self.address % 16:
+            raise CudaError(f"device array at {self.address:#x} is not aligned to 16 bytes")
+        return self.address

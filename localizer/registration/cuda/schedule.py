@@ -1,0 +1,464 @@
+"""The whole registration on the device: one graph from the swarm to the winner's covariance sums.
+
+The kernels read everything that changes from frame to frame (level descriptions with the addresses
+of the features, poses, priors) from device memory, so the graph is captured once per configuration
+and launched for every frame. What comes back is about one kilobyte: the surviving poses with their
+scores, the sums of equation 11, and the quality.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from localizer.camera import Camera
+from localizer.pose import Array
+from localizer.registration.backend import LMSettings, QuadraticPrior, level_intrinsics
+from localizer.registration.cuda import layout
+from localizer.registration.cuda.arrays import DeviceArray
+from localizer.registration.cuda.backend import FEW, CudaBackend, set_loss, stored
+from localizer.registration.cuda.driver import Graph
+from localizer.registration.selection import LEAST_SCORE
+from localizer.types import Anchors, FeatureLevel, FeaturePyramid, PosePrior
+
+if TYPE_CHECKING:
+    from localizer.registration.jngo import JNGOConfig
+
+COVARIANCE_ANCHORS = 1000
+LEAST_SCALE = 0.02
+_MANY_THREADS, _FEW_THREADS, _SMALL_THREADS = 256, 512, 256
+_FINITE_BLOCKS_PER_MULTIPROCESSOR = 4
+
+
+@dataclass(frozen=True)
+class Search:
+    """What the device found. rotations (K, 3, 3), translations (K, 3): the survivors, camera from
+    local, best first, the first one sharpened; scores (K,) before that, and overlaps (K,); K is 0
+    without overlap. hessian, meat, isotropic: (6, 6) sums of `CovarianceSums`, without the prior;
+    finite: False where features, confidences or points are not.
+    """
+
+    rotations: Array
+    translations: Array
+    scores: Array
+    overlaps: Array
+    hessian: Array
+    meat: Array
+    isotropic: Array
+    cells: int
+    prior_weight: float
+    quality: float
+    evaluations: int
+    finite: bool
+
+
+@dataclass(frozen=True)
+class _Shape:
+    """What a captured graph depends on."""
+
+    config: JNGOConfig
+    hypotheses: int
+    channels: tuple[int, ...]
+    constrained: bool
+    cell_px: float
+    generation: int
+
+
+class CudaSchedule:
+    """Runs `JNGO`'s schedule on a `CudaBackend`, whose device, kernels and lock it shares."""
+
+    def __init__(self, backend: CudaBackend) -> None:
+        self._backend, self._device = backend, backend.device
+        self._graph: tuple[_Shape, Graph] | None = None
+
+    def run(
+        self,
+        query: FeaturePyramid,
+        camera: Camera,
+        anchors: Anchors,
+        origin: Array,
+        swarm: tuple[Array, Array],
+        config: JNGOConfig,
+        motion: PosePrior | None = None,
+        constraint: QuadraticPrior | None = None,
+    ) -> Search:
+        """Refine, prune and sharpen a swarm (rotations, translations), camera_from_local.
+
+        The query's features may be `DeviceArray`s, which are read in place. constraint: its weight
+        is the share of the level's best score (`JNGOConfig.prior_weight`).
+        """
+        backend = self._backend
+        with backend.lock:
+            self._device.activate()
+            channels = tuple(level.features.shape[-1] for level in query.levels)
+            memory = self._memory(len(channels), len(swarm[0]), config, len(anchors.points_world))
+            self._upload(memory, query, camera, anchors, origin, swarm, config, motion, constraint)
+            cell_px = config.correlation_px / query.levels[-1].stride
+            shape = _Shape(
+                config, len(swarm[0]), channels, constraint is not None, cell_px,
+                backend.arena.generation,
+            )  # fmt: skip
+            self._captured(shape, memory).launch()
+            last = len(channels) - 1 if config.sharpen else len(config.iterations) - 1
+            return self._collect(memory, config, len(anchors.points_world), channels[last])
+
+    def _captured(self, shape: _Shape, memory: _Memory) -> Graph:
+        if self._graph is not None and self._graph[0] == shape:
+            return self._graph[1]
+        if self._graph is not None:
+            self._graph[1].destroy()
+            self._graph = None
+        for channels in set(shape.channels):  # loading a module is not allowed during a capture
+            self._backend.kernels(channels).load_all(KERNELS)
+        graph = self._device.capture(lambda: self._enqueue(shape, memory))
+        self._graph = shape, graph
+        return graph
+
+    def _enqueue(self, shape: _Shape, memory: _Memory) -> None:
+        for step in _steps(shape, memory, self._device.multiprocessors):
+            kernels = self._backend.kernels(shape.channels[step.level])
+            kernels.launch(step.kernel, step.blocks, step.threads, step.arguments)
+
+    def _memory(self, levels: int, count: int, config: JNGOConfig, anchors: int) -> _Memory:
+        finish = _taking_part(anchors, COVARIANCE_ANCHORS)
+        finish = max(finish, _taking_part(anchors, config.swarm_anchors[-1]))
+        return _Memory.of(
+            self._backend.arena.buffer, levels, count, _survivors(config, count), finish
+        )
+
+    def _upload(
+        self,
+        memory: _Memory,
+        query: FeaturePyramid,
+        camera: Camera,
+        anchors: Anchors,
+        origin: Array,
+        swarm: tuple[Array, Array],
+        config: JNGOConfig,
+        motion: PosePrior | None,
+        constraint: QuadraticPrior | None,
+    ) -> None:
+        put = self._backend.arena.put
+        frame = np.zeros(memory.upload_size, np.uint8)
+        points = np.ascontiguousarray((anchors.points_world - origin).T, dtype=np.float32)
+        address = put("points", points)
+        for k, level in enumerate(query.levels):
+            packed = self._level(k, level, camera, anchors)
+            packed["points"], packed["total"] = address, points.shape[1]
+            memory.write(frame, memory.level(k), packed)
+        if motion is not None and config.motion_weight > 0:
+            memory.write(frame, memory.motion, _packed_motion(motion, origin, config))
+        if constraint is not None:
+            packed = np.zeros((), dtype=layout.PRIOR)
+            packed["rotation"] = constraint.camera_from_local.rotation
+            packed["translation"] = constraint.camera_from_local.translation
+            packed["information"] = constraint.information
+            memory.write(frame, memory.prior, packed)
+        state = np.zeros((), dtype=layout.STATE)
+        state["count"] = len(swarm[0])
+        memory.write(frame, memory.state, state)
+        first = memory.swarms[0]
+        memory.write(frame, int(first["rotations"]), np.ascontiguousarray(swarm[0]))
+        memory.write(frame, int(first["translations"]), np.ascontiguousarray(swarm[1]))
+        self._device.upload(memory.base, frame)
+
+    def _level(
+        self, k: int, level: FeatureLevel, camera: Camera, anchors: Anchors
+    ) -> NDArray[np.void]:
+        put, half = self._backend.arena.put, self._backend.half
+        packed = np.zeros((), dtype=layout.LEVEL)
+        packed["features"] = self._query_address(f"features {k}", level.features, half)
+        packed["confidence"] = self._query_address(f"confidence {k}", level.confidence, False)
+        packed["anchor_features"] = put(f"anchor features {k}", stored(anchors.features[k], half))
+        packed["anchor_confidence"] = put(
+            f"anchor confidence {k}", stored(anchors.confidence[k], False)
+        )
+        packed["height"], packed["width"] = level.confidence.shape
+        packed["focal"], packed["centre"] = level_intrinsics(camera, level)
+        return packed
+
+    def _query_address(self, name: str, values: object, half: bool) -> int:
+        """Where the device finds them: in place if they are there already, else a copy."""
+        if isinstance(values, DeviceArray):
+            return values.checked_address(np.float16 if half else np.float32)
+        return self._backend.arena.put(name, stored(np.asarray(values), half))
+
+    def _collect(self, memory: _Memory, config: JNGOConfig, anchors: int, channels: int) -> Search:
+        block = np.empty(memory.result_size, np.uint8)
+        self._device.download(block, memory.prior)
+        self._device.synchronize()
+
+        def read(address: int, dtype: object, shape: tuple[int, ...] = ()) -> np.ndarray:
+            kind = np.dtype(dtype)  # type: ignore[call-overload]
+            start = address - memory.prior
+            stop = start + kind.itemsize * int(np.prod(shape, dtype=np.int64))
+            return block[start:stop].view(kind).reshape(shape)
+
+        state = read(memory.state, layout.STATE)
+        count, swarm = int(state["count"]), memory.swarms[-1]
+        taking_part = _taking_part(anchors, config.swarm_anchors[-1])
+        weight = read(memory.prior, layout.PRIOR)["weight"]
+        total = max(float(state["total"]), 1e-30)
+        variance = float(state["square_sum"]) / max(float(state["scale_sum"]), 1e-12) / channels
+        return Search(
+            read(int(swarm["rotations"]), np.float64, (count, 3, 3)).copy(),
+            read(int(swarm["translations"]), np.float64, (count, 3)).copy(),
+            read(int(swarm["scores"]), np.float64, (count,)).copy(),
+            read(int(swarm["visible"]), np.int32, (count,)) / taking_part,
+            _symmetric(state["hessian"]) / total,
+            _symmetric(state["meat"]) / total**2,
+            _symmetric(state["isotropic"]) / total**2 * variance,
+            int(state["cells"]),
+            float(weight),
+            float(state["quality"]),
+            int(state["evaluations"]),
+            not int(state["not_finite"]),
+        )
+
+
+KERNELS = (
+    "all_finite", "refine_many", "refine_few", "select_hypotheses", "weigh_prior",
+    "median_residual", "covariance_sums", "quality",
+)  # fmt: skip
+
+
+@dataclass(frozen=True)
+class _Step:
+    """One launch of the graph; level: whose channels it is compiled for."""
+
+    kernel: str
+    level: int
+    blocks: int
+    threads: int
+    arguments: NDArray[np.void]
+
+
+@dataclass(frozen=True)
+class _Memory:
+    """Addresses within the frame's block: levels, motion, first swarm | prior, state, last swarm;
+    the first part and the state are uploaded, the last part comes back. Then scratch.
+    """
+
+    base: int
+    levels: int
+    motion: int
+    prior: int
+    state: int
+    swarms: tuple[NDArray[np.void], ...]
+    trial: tuple[int, int]
+    totals: int
+    order: int
+    alive: int
+    projected: int
+    finish: int
+    upload_size: int
+    result_size: int
+
+    @classmethod
+    def of(
+        cls,
+        buffer: Callable[[str, int], int],
+        levels: int,
+        count: int,
+        survivors: int,
+        anchors: int,
+    ) -> _Memory:
+        sizes = [
+            ("level", layout.LEVEL.itemsize * levels),
+            ("motion", layout.MOTION.itemsize),
+            ("R0", 72 * count), ("t0", 24 * count),
+            ("prior", layout.PRIOR.itemsize), ("state", layout.STATE.itemsize),
+            ("R2", 72 * survivors), ("t2", 24 * survivors),
+            ("s2", 8 * survivors), ("v2", 4 * survivors),
+            ("s0", 8 * count), ("v0", 4 * count),
+            ("R1", 72 * count), ("t1", 24 * count), ("s1", 8 * count), ("v1", 4 * count),
+            ("trial score", 8), ("trial visible", 4),
+            ("totals", 8 * count), ("order", 4 * count), ("alive", 4 * count),
+            ("projected", 4 * layout.PROBE_FLOATS * count),
+            ("finish", 4 * layout.WINNER_FLOATS * anchors),
+        ]  # fmt: skip
+        offsets, end = {}, 0
+        for name, size in sizes:
+            offsets[name] = end
+            end += -(-size // 16) * 16
+        base = buffer("frame", end)
+        at = {name: base + offset for name, offset in offsets.items()}
+        swarms = []
+        for k in range(3):
+            swarm = np.zeros((), dtype=layout.SWARM)
+            for field, key in zip(
+                ("rotations", "translations", "scores", "visible"), "Rtsv", strict=True
+            ):
+                swarm[field] = at[f"{key}{k}"]
+            swarms.append(swarm)
+        return cls(
+            base, at["level"], at["motion"], at["prior"], at["state"], tuple(swarms),
+            (at["trial score"], at["trial visible"]), at["totals"], at["order"], at["alive"],
+            at["projected"], at["finish"], offsets["R2"], offsets["s0"] - offsets["prior"],
+        )  # fmt: skip
+
+    def level(self, k: int) -> int:
+        """Address of the k-th level's description."""
+        return self.levels + k * layout.LEVEL.itemsize
+
+    def write(self, frame: NDArray[np.uint8], address: int, value: NDArray) -> None:
+        """Put a value into the host's copy of the block."""
+        start = address - self.base
+        frame[start : start + value.nbytes] = value.reshape(-1).view(np.uint8)
+
+    def winner(self, swarm: NDArray[np.void]) -> NDArray[np.void]:
+        """The swarm, with scores going elsewhere: sharpening does not change the ranking."""
+        out = swarm.copy()
+        out["scores"], out["visible"] = self.trial
+        return out
+
+
+def _steps(shape: _Shape, memory: _Memory, multiprocessors: int) -> Iterator[_Step]:
+    """The launches, in order (docs/registration.md, section 7)."""
+    c, searched = shape.config, len(shape.config.iterations)
+    levels = len(shape.channels)
+    for k in range(levels):
+        finite = np.zeros((), dtype=layout.FINITE)
+        finite["level"], finite["state"] = memory.level(k), memory.state
+        blocks = _FINITE_BLOCKS_PER_MULTIPROCESSOR * multiprocessors
+        yield _Step("all_finite", k, blocks, _SMALL_THREADS, finite)
+    alive, source = shape.hypotheses, 0
+    keep = (*c.keep[: searched - 1], c.hypotheses)
+    for k in range(searched):
+        swarm, wanted = memory.swarms[source], c.swarm_anchors[k]
+        last = k == searched - 1 and c.converge == 0
+        target = 2 if last else 1 - source
+        if shape.constrained:
+            yield from _weighing(shape, memory, k, swarm, alive, wanted)
+        yield _refining(shape, memory, k, swarm, alive, wanted, c.settings, c.iterations[k])
+        yield _selecting(shape, memory, k, source, target, keep[k], c.distinct_px)
+        alive, source = min(alive, keep[k]), target
+    if c.converge:
+        k, wanted = searched - 1, c.swarm_anchors[-1]
+        swarm = memory.swarms[source]
+        yield _refining(shape, memory, k, swarm, alive, wanted, c.settings, c.converge)
+        yield _selecting(shape, memory, k, source, 2, alive, -1.0)
+    yield from _sharpening(shape, memory)
+
+
+def _sharpening(shape: _Shape, memory: _Memory) -> Iterator[_Step]:
+    """The winner's last steps and the sums at its pose."""
+    c, searched, levels = shape.config, len(shape.config.iterations), len(shape.channels)
+    final, wanted = memory.swarms[2], c.swarm_anchors[-1]
+    winner, scales = memory.winner(final), (c.sharpen_scales, c.detail_scales)
+    finish = np.zeros((), dtype=layout.WINNER)
+    finish["state"], finish["swarm"], finish["scratch"] = memory.state, final, memory.finish
+    finish["scale"], finish["cell"], finish["wanted"] = c.huber, shape.cell_px, wanted
+    used = range(searched - 1, levels) if c.sharpen else range(0)
+    redescending = False
+    for k in used:
+        anchors = 0 if k == levels - 1 else wanted
+        if shape.constrained:
+            yield from _weighing(shape, memory, k, winner, 1, anchors)
+        median = finish.copy()
+        median["level"], median["wanted"] = memory.level(k), wanted
+        yield _Step("median_residual", k, 1, _FEW_THREADS, median)
+        for factor in scales[k - searched + 1]:
+            settings = replace(c.settings, scale=LEAST_SCALE, redescending=True)
+            yield _refining(
+                shape, memory, k, winner, 1, anchors, settings, c.sharpen, factor=factor
+            )
+            redescending = True
+    last = levels - 1 if c.sharpen else searched - 1
+    sums, quality = finish.copy(), finish
+    sums["level"], sums["redescending"] = memory.level(last), redescending
+    if c.sharpen:
+        sums["wanted"] = COVARIANCE_ANCHORS
+    yield _Step("covariance_sums", last, 1, _FEW_THREADS, sums)
+    quality["level"] = memory.level(searched - 1)
+    yield _Step("quality", searched - 1, 1, _FEW_THREADS, quality)
+
+
+def _refining(
+    shape: _Shape,
+    memory: _Memory,
+    level: int,
+    swarm: NDArray[np.void],
+    alive: int,
+    wanted: int,
+    settings: LMSettings,
+    iterations: int,
+    *,
+    factor: float = 0.0,
+    free: bool = False,
+) -> _Step:
+    """Launch of the LM kernel; free: without the prior and not counted."""
+    arguments = np.zeros((), dtype=layout.REFINE)
+    arguments["level"], arguments["state"] = memory.level(level), memory.state
+    arguments["prior"] = memory.prior if shape.constrained and not free else 0
+    arguments["swarm"], arguments["wanted"] = swarm, wanted
+    set_loss(arguments, settings, iterations)
+    arguments["factor"], arguments["counted"] = factor, not free
+    name, threads = ("refine_few", _FEW_THREADS) if alive <= FEW else ("refine_many", _MANY_THREADS)
+    return _Step(name, level, alive, threads, arguments)
+
+
+def _weighing(
+    shape: _Shape, memory: _Memory, level: int, swarm: NDArray[np.void], alive: int, wanted: int
+) -> Iterator[_Step]:
+    """Score without the prior, then weigh it by the best score."""
+    c = shape.config
+    yield _refining(shape, memory, level, swarm, alive, wanted, c.settings, 0, free=True)
+    arguments = np.zeros((), dtype=layout.PRIOR_WEIGHT)
+    arguments["prior"], arguments["state"] = memory.prior, memory.state
+    arguments["scores"] = swarm["scores"]
+    arguments["share"], arguments["least_score"] = c.prior_weight, LEAST_SCORE
+    arguments["limit"] = alive
+    yield _Step("weigh_prior", level, 1, _SMALL_THREADS, arguments)
+
+
+def _selecting(
+    shape: _Shape,
+    memory: _Memory,
+    level: int,
+    source: int,
+    target: int,
+    keep: int,
+    distinct_px: float,
+) -> _Step:
+    arguments = np.zeros((), dtype=layout.SELECT)
+    arguments["level"], arguments["state"] = memory.level(level), memory.state
+    arguments["motion"] = memory.motion
+    arguments["source"], arguments["target"] = memory.swarms[source], memory.swarms[target]
+    arguments["totals"], arguments["order"] = memory.totals, memory.order
+    arguments["alive"], arguments["projected"] = memory.alive, memory.projected
+    arguments["distinct"], arguments["least_score"] = distinct_px, LEAST_SCORE
+    arguments["wanted"], arguments["keep"] = shape.config.swarm_anchors[level], keep
+    return _Step("select_hypotheses", level, 1, _SMALL_THREADS, arguments)
+
+
+def _survivors(config: JNGOConfig, count: int) -> int:
+    """Hypotheses at most after the last level."""
+    return min([count, *config.keep[: len(config.iterations) - 1]])
+
+
+def _taking_part(total: int, wanted: int) -> int:
+    """Anchors that `thinned` leaves."""
+    step = max(1, total // wanted)
+    return -(-total // step)
+
+
+def _packed_motion(motion: PosePrior, origin: Array, config: JNGOConfig) -> NDArray[np.void]:
+    packed = np.zeros((), dtype=layout.MOTION)
+    packed["rotation"] = motion.world_from_camera.rotation
+    packed["centre"] = motion.world_from_camera.translation
+    packed["information"] = np.linalg.pinv(motion.covariance, hermitian=True)
+    packed["origin"] = origin
+    packed["weight"] = config.motion_weight
+    return packed
+
+
+def _symmetric(triangle: NDArray[np.float32]) -> Array:
+    """(6, 6) of a lower triangle stored by rows."""
+    out = np.zeros((6, 6))
+    out[np.tril_indices(6)] = triangle
+    return out + np.tril(out, -1).T

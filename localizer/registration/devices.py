@@ -1,0 +1,56 @@
+"""Which backend registers: the GPU where there is one that works, else the CPU."""
+
+from __future__ import annotations
+
+import logging
+from typing import Literal
+
+import numpy as np
+
+from localizer.registration.backend import Backend, LevelProblem, LMSettings
+from localizer.registration.cuda.backend import CudaBackend
+from localizer.registration.cuda.driver import Device
+from localizer.registration.cuda.errors import CudaError, CudaUnavailableError
+from localizer.registration.kernel_numba import NumbaBackend
+
+logger = logging.getLogger(__name__)
+
+DeviceChoice = Literal["auto", "cpu", "cuda"]
+_TRIAL_CHANNELS = 32  # the networks'
+
+
+def open_backend(device: DeviceChoice = "auto", threads: int = 2) -> Backend:
+    """The backend for a choice of device; it always gives one.
+
+    A GPU is tried: driver, run-time compiler, and a small problem. Where anything of that fails the
+    CPU takes over, and one log line says why: a warning if the GPU was asked for or is there but
+    does not work, else an information.
+    """
+    if device == "cpu":
+        return NumbaBackend(threads)
+    try:
+        backend = CudaBackend(Device())
+        trial(backend, _TRIAL_CHANNELS)
+    except CudaError as error:
+        expected = device == "auto" and isinstance(error, CudaUnavailableError)
+        text = str(error).split("\n")[0]
+        logger.log(
+            logging.INFO if expected else logging.WARNING, "registration on the CPU: %s", text
+        )
+        return NumbaBackend(threads)
+    return backend
+
+
+def trial(backend: Backend, channels: int) -> None:
+    """One step on a small random problem: compiles or loads what `channels` needs."""
+    rng = np.random.default_rng(0)
+    problem = LevelProblem(
+        rng.standard_normal((8, 8, channels)).astype(np.float32),
+        np.ones((8, 8), np.float32),
+        (4.0, 4.0),
+        (4.0, 4.0),
+        rng.uniform(-1, 1, (3, 20)).astype(np.float32),
+        rng.standard_normal((20, channels)).astype(np.float32),
+        np.ones(20, np.float32),
+    )
+    backend.refine(problem, np.eye(3)[None], np.array([[0.0, 0.0, 4.0]]), 1, LMSettings())
