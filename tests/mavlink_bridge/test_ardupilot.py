@@ -6,7 +6,6 @@ bridge on serial1, the origin, the messages. Limits are the table of docs/bridge
 
 from __future__ import annotations
 
-import json
 import math
 import threading
 import time
@@ -16,14 +15,10 @@ from typing import Any
 
 import numpy as np
 import pytest
-from mavsdk import ComponentType, Configuration, Mavsdk
-from mavsdk.plugins.camera import Camera
-from mavsdk.plugins.mavlink_direct import MavlinkDirect
 
-from mavlink_bridge import Bridge, BridgeConfig, TargetReport, TrackRequest, VisionFix
+from mavlink_bridge import Bridge, BridgeConfig, VisionFix
 from mavlink_bridge.config import InjectionConfig, OriginConfig, SourceSwitchConfig
 from mavlink_bridge.doctor import examine, repair
-from mavlink_bridge.link import sleep_until
 from mavlink_bridge.origin import METRES_PER_DEGREE
 from sitl.ardupilot import ArduPilotSitl, find_arducopter
 from sitl.embedded.geodesy import Location
@@ -337,44 +332,3 @@ def test_doctor_finds_and_fixes_what_is_wrong() -> None:
         repair(config, before.fixable)
         after = examine(config)
         assert after.exit_code == 0, [f for f in after.findings if not f.ok]
-
-
-def test_mavsdk_sees_camera_and_target_through_ardupilots_routing() -> None:
-    asked: list[TrackRequest] = []
-    with ArduPilotSitl(HOME, parameters=GIMBAL) as vehicle:
-        config = BridgeConfig(connection=vehicle.companion_endpoint, mode="shadow")
-        with Bridge(config, GEOID, on_track=asked.append) as bridge:
-            assert sleep_until(lambda: bridge.state().connected, 20.0)
-            station = Mavsdk(Configuration.create_with_component_type(ComponentType.GROUND_STATION))
-            station.add_any_connection(vehicle.spare_endpoint.replace("tcp:", "tcpout://"))
-            system = station.first_autopilot(20.0)
-            assert system is not None
-            received: list[dict[str, Any]] = []
-            direct, camera = MavlinkDirect(system), Camera(system)
-            direct.subscribe_message(
-                "CAMERA_TRACKING_GEO_STATUS",
-                lambda message, _: received.append(json.loads(message.fields_json)),
-            )
-
-            def report() -> bool:
-                bridge.report(
-                    TargetReport(time.monotonic_ns(), 47.398, 8.546, 535.3, h_accuracy_m=2.0)
-                )
-                return bool(received and camera.camera_list().cameras)
-
-            assert sleep_until(report, 20.0, step_s=0.2)
-            geo = received[-1]
-            assert (geo["lat"], geo["lon"], geo["h_acc"]) == (473980000, 85460000, 2.0)
-            assert geo["alt"] == pytest.approx(535.3 - GEOID, abs=0.01)
-            (information,) = camera.camera_list().cameras
-            assert (information.component_id, information.model_name) == (100, "map camera")
-            camera.track_point(100, 0.25, 0.75, 0.1)
-            assert sleep_until(lambda: len(asked) == 1, 5.0)
-            assert asked[0].coordinates == pytest.approx((0.25, 0.75))
-
-            def gimbal() -> Any:
-                return bridge.gimbal_at(time.monotonic_ns() - 200_000_000)
-
-            assert sleep_until(lambda: gimbal() is not None, 15.0)
-            assert gimbal().source == "GIMBAL_DEVICE_ATTITUDE_STATUS"
-            station.destroy()
