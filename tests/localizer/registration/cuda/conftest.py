@@ -20,7 +20,7 @@ import pytest
 
 from localizer.registration.cuda.backend import CudaBackend
 from localizer.registration.cuda.compiler import SOURCES, Image, compile_kernels
-from localizer.registration.cuda.driver import Device
+from localizer.registration.cuda.driver import Device, Kernels
 from localizer.registration.cuda.errors import CudaError
 from localizer.registration.cuda.layout import macros
 
@@ -137,6 +137,14 @@ def emulator(_emulator: Emulator) -> Iterator[Emulator]:
     _emulator.order(0)
     _emulator.enable(False)
     assert _emulator.problem() == ""
+
+
+@pytest.fixture
+def faulty(emulator: Emulator) -> Kernels:
+    """The kernels of emulation/faulty.cu, loaded on the emulated device."""
+    source = f'-DKERNEL_SOURCE="{EMULATION / "faulty.cu"}"'
+    library = build(EMULATION / "kernels.cpp", source, "-DFAULTY")
+    return emulator.device.load(f"emulated:{library}".encode())
 
 
 @pytest.fixture

@@ -17,7 +17,15 @@
         return text.empty() ? 0 : 1;                                                         \
     }
 
-#ifndef KERNELS
+#ifdef FAULTY
+#define KERNELS                         \
+    KERNEL(no_barrier, Arguments)       \
+    KERNEL(with_barrier, Arguments)     \
+    KERNEL(divergent_barrier, Arguments) \
+    KERNEL(missing_lanes, Arguments)    \
+    KERNEL(beyond_the_end, Arguments)   \
+    KERNEL(uninitialised, Arguments)
+#else
 #define KERNELS                                         \
     KERNEL(refine_many, RefineArguments)                \
     KERNEL(refine_few, RefineArguments)                 \

@@ -1,0 +1,122 @@
+"""The kernels as machine code: they compile for every supported chip, and use what they should."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass
+
+import pytest
+
+from localizer.registration.cuda import compiler
+from localizer.registration.cuda.compiler import cache_directory, compile_kernels
+from localizer.registration.cuda.errors import CudaError, CudaUnavailableError
+from localizer.registration.cuda.schedule import KERNELS
+
+HOT = ("refine_many", "refine_few")
+MOST_REGISTERS = 128  # two blocks of 256 threads fill the 65536 registers of a multiprocessor
+MOST_SHARED = 48 * 1024  # static, on every architecture
+
+
+@dataclass(frozen=True)
+class Resources:
+    registers: int
+    stack: int
+    spilled: int
+    shared: int
+
+
+def resources(log: str) -> dict[str, Resources]:
+    """Per kernel, what the assembler reports."""
+    found = {}
+    for part in log.split("Compiling entry function '")[1:]:
+        name = part.split("'")[0]
+        stack, stores, loads = map(int, re.search(
+            r"(\d+) bytes stack frame, (\d+) bytes spill stores, (\d+) bytes spill loads", part
+        ).groups())  # fmt: skip
+        registers = int(re.search(r"Used (\d+) registers", part)[1])
+        shared = re.search(r"(\d+) bytes smem", part)
+        found[name] = Resources(registers, stack, stores + loads, int(shared[1]) if shared else 0)
+    return found
+
+
+@pytest.fixture(scope="module")
+def _compiler():
+    try:
+        compiler._nvrtc()
+    except CudaUnavailableError as error:
+        pytest.skip(str(error))
+
+
+# Six seconds each, which is what the assembler takes.
+@pytest.mark.parametrize(
+    ("architecture", "half"), [((8, 7), False), ((8, 9), False), ((9, 0), False), ((9, 0), True)]
+)
+@pytest.mark.usefixtures("_compiler")
+def test_machine_code_and_its_resources(tmp_path, architecture, half):
+    image = compile_kernels(32, half, architecture, tmp_path)
+    assert image.code[:4] == b"\x7fELF"
+    found = resources(image.log)
+    assert set(found) == set(KERNELS)
+    for name, used in found.items():
+        assert used.registers <= MOST_REGISTERS
+        assert used.shared <= MOST_SHARED
+        # The winner's kernels run once a frame; the hot ones must not touch local memory.
+        assert used.spilled <= (0 if name in HOT else 64), name
+        assert used.stack <= (0 if name in HOT else 64), name
+
+
+@pytest.mark.usefixtures("_compiler")
+def test_the_cache_is_used_and_told_apart(tmp_path, monkeypatch):
+    first = compile_kernels(4, False, (8, 7), tmp_path)
+    assert [path.suffix for path in tmp_path.iterdir()] == [".cubin"]
+
+    def refuse(*_):
+        raise AssertionError("compiled again")
+
+    monkeypatch.setattr(compiler, "_compile", refuse)
+    assert compile_kernels(4, False, (8, 7), tmp_path).code == first.code
+    for other in ((8, False, (8, 7)), (4, True, (8, 7)), (4, False, (8, 9))):
+        with pytest.raises(AssertionError, match="compiled again"):
+            compile_kernels(*other, tmp_path)
+    monkeypatch.setattr(compiler, "macros", lambda *_: {"CHANNELS": 4, "IN_FLIGHT": 1})
+    with pytest.raises(AssertionError, match="compiled again"):
+        compile_kernels(4, False, (8, 7), tmp_path)
+
+
+@pytest.mark.usefixtures("_compiler")
+def test_a_disk_that_refuses_costs_only_time(tmp_path):
+    blocked = tmp_path / "file"
+    blocked.write_text("not a folder")
+    assert compile_kernels(4, False, (8, 7), blocked / "cache").code[:4] == b"\x7fELF"
+
+
+@pytest.mark.usefixtures("_compiler")
+def test_layouts_that_differ_do_not_compile(tmp_path, monkeypatch):
+    wrong = compiler.macros(4, False) | {"BYTES_OF_State": 8}
+    monkeypatch.setattr(compiler, "macros", lambda *_: wrong)
+    with pytest.raises(CudaError, match=r"layout\.py differs: State"):
+        compile_kernels(4, False, (8, 7), tmp_path)
+
+
+@pytest.mark.usefixtures("_compiler")
+def test_an_unknown_architecture_is_an_error(tmp_path):
+    with pytest.raises(CudaError, match="sm_11"):
+        compile_kernels(4, False, (1, 1), tmp_path)
+
+
+def test_where_images_are_kept(monkeypatch, tmp_path):
+    monkeypatch.setenv("PILOT_CACHE", str(tmp_path))
+    assert cache_directory() == tmp_path / "cuda"
+    monkeypatch.delenv("PILOT_CACHE")
+    monkeypatch.setenv("XDG_CACHE_HOME", "/elsewhere")
+    assert str(cache_directory()) == "/elsewhere/pilot/cuda"
+
+
+def test_the_sources_are_shipped():
+    """Package data: what the compiler reads must be in the wheel."""
+    from importlib.resources import files
+
+    names = {file.name for file in files("localizer.registration.cuda").iterdir()}
+    assert {"jngo.cu", "layout.cuh", "pose.cuh", "anchors.cuh", "refine.cuh", "schedule.cuh"} <= (
+        names
+    )
