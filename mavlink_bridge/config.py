@@ -79,6 +79,12 @@ class InjectionConfig(_Model):
         le=10.0,
         description="longest gap bridged by propagation; the EKF's own inertial one is better",
     )
+    overdue_intervals: float = Field(
+        default=2.0,
+        ge=1.0,
+        le=1000.0,
+        description="nothing is sent once no fix came for so many of their usual intervals",
+    )
     acceleration_sigma_mps2: float = Field(default=2.0, gt=0.0, le=50.0)
     send_attitude: bool = True
     covariance: Literal["profile", "cbrt", "sqrt", "variance"] = "profile"

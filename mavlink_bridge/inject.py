@@ -40,6 +40,7 @@ _QUEUE = 32
 _LATENCIES = 50
 _FARTHEST_M = 100_000.0  # from the origin: farther, one of the two is wrong
 _FUTURE_SLACK_NS = 20_000_000
+_INTERVALS, _INTERVALS_KNOWN = 10, 3
 _STALE_NS = 3_000_000_000
 
 
@@ -119,6 +120,8 @@ class Injector:
         self._last_slot_ns = 0
         self._last_stamp_ns = 0
         self._last_was_fill = False
+        self._intervals_ns: deque[int] = deque(maxlen=_INTERVALS)
+        self._taken_ns = 0
         self.yaw_difference_rad = NAN
         self.reason = NO_FIX_YET
         self.counters: Counter[str] = Counter()
@@ -207,10 +210,23 @@ class Injector:
             if not verdict.accept:
                 self.counters["fixes_yaw_refused"] += 1
                 continue
+            self._note_interval(fix, now_ns)
             self._propagator.update(fix)
             if self._fresh is not None:
                 self.counters["fixes_superseded"] += 1
             self._fresh = fix
+
+    def _note_interval(self, fix: VisionFix, now_ns: int) -> None:
+        last, self._taken_ns = self._propagator.fix, now_ns
+        if last is not None and fix.time_ns - last.time_ns < _STALE_NS:
+            self._intervals_ns.append(fix.time_ns - last.time_ns)
+
+    def _overdue(self, now_ns: int) -> bool:
+        """Whether the next fix should have come by now, judged by the usual interval."""
+        if len(self._intervals_ns) < _INTERVALS_KNOWN:
+            return False
+        usual = statistics.median(self._intervals_ns)
+        return now_ns - self._taken_ns > self._config.overdue_intervals * usual
 
     def _keep_reset(self, fix: VisionFix) -> None:
         """A jump must be told even when the fix that carried it is not sent itself."""
@@ -253,7 +269,8 @@ class Injector:
         position = self._propagator.at(time_ns)
         if fix is None or position is None or time_ns <= self._last_stamp_ns:
             return None
-        if (time_ns - fix.time_ns) * 1e-9 > self._config.max_extrapolation_s:
+        too_far = (time_ns - fix.time_ns) * 1e-9 > self._config.max_extrapolation_s
+        if too_far or (not fresh and self._overdue(now_ns)):
             return Withheld("no fresh fix", "withheld_stale")
         sigma = position.horizontal_sigma_m
         if sigma > self._config.max_sigma_m:

@@ -154,7 +154,9 @@ def test_fix_too_old_to_fuse_is_propagated() -> None:
 
 
 def test_covariance_grows_between_fixes_and_sending_ends_at_the_bound() -> None:
-    it = injector(rate_hz=20, delay_ms=0, max_sigma_m=2.0, max_extrapolation_s=5.0)
+    it = injector(
+        rate_hz=20, delay_ms=0, max_sigma_m=2.0, max_extrapolation_s=5.0, overdue_intervals=1000.0
+    )
     for k in range(20):
         it.submit(fix(SECOND + k * 100 * MS), SECOND + k * 100 * MS)
         it.step(SECOND + k * 100 * MS, context())
@@ -169,6 +171,19 @@ def test_covariance_grows_between_fixes_and_sending_ends_at_the_bound() -> None:
     assert 1.5 < sigmas[-1] <= 2.0
     assert it.counters["withheld_covariance"] > 10
     assert "covariance" in it.reason or "fresh" in it.reason
+
+
+@pytest.mark.parametrize(("fix_hz", "silent_after_s"), [(10, 0.2), (5, 0.4), (1, 0.5)])
+def test_sending_ends_when_the_next_fix_is_overdue(fix_hz: float, silent_after_s: float) -> None:
+    it = injector(rate_hz=20, delay_ms=0)
+
+    def until_6_s(f: VisionFix) -> VisionFix | None:
+        return f if f.time_ns <= 6 * SECOND else None
+
+    sent = fly(it, seconds=9, fix_hz=fix_hz, latency_ms=0, change=until_6_s)
+    last = max(t for t, _ in sent) / SECOND
+    assert 6.0 + silent_after_s - 0.06 <= last <= 6.0 + silent_after_s
+    assert it.reason == "no fresh fix"
 
 
 @pytest.mark.parametrize("profile", [ARDUPILOT, ARDUPILOT_SQRT, PX4])
