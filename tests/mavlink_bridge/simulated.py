@@ -62,7 +62,10 @@ class Flight:
         for module in ("fc_side", "watch", "clock"):
             monkeypatch.setattr(f"mavlink_bridge.{module}.monotonic_ns", lambda: self.now_ns)
         self.texts: list[str] = []
-        say: Callable[[int, str], None] = lambda _, text: self.texts.append(text)  # noqa: E731
+
+        def say(_: int, text: str) -> None:
+            self.texts.append(text)
+
         shared = Shared(
             config,
             GEOID,

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import json
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -63,11 +63,10 @@ class Station:
         self.direct.send_message(
             MavlinkMessage("COMMAND_LONG", 245, 190, 1, component, json.dumps(fields))
         )
-        answers: Callable[[], list[dict[str, Any]]] = (
-            lambda: [  # noqa: E731
-                m for m in self.heard["COMMAND_ACK"][before:] if m["command"] == command
-            ]
-        )
+
+        def answers() -> list[dict[str, Any]]:
+            return [m for m in self.heard["COMMAND_ACK"][before:] if m["command"] == command]
+
         sleep_until(lambda: bool(answers()), 3.0)
         return int(answers()[-1]["result"]) if answers() else -1
 
