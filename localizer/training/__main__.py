@@ -57,6 +57,34 @@ def export(
 
 
 @app.command()
+def quantize(
+    model: Annotated[Path, typer.Argument(help="ONNX model in float32.")],
+    out: Annotated[Path, typer.Argument(help="ONNX file to write; its JSON goes beside it.")],
+    shards: Annotated[list[Path], typer.Argument(help="Shards (.npz) to calibrate on.")],
+) -> None:
+    """Write the int8 form of a model. Compare both with benchmarks/features.py before using it."""
+    from localizer.training.quantize import quantize as write
+
+    typer.echo(f"{out}: mean cosine to the float features {write(model, out, shards):.4f}")
+
+
+@app.command()
+def unfuse(
+    model: Annotated[Path, typer.Argument(help="Published ONNX model of this network.")],
+    out: Annotated[Path, typer.Argument(help="Checkpoint to write, for a run's warm_start.")],
+    shards: Annotated[list[Path], typer.Argument(help="Shards (.npz) to take statistics on.")],
+) -> None:
+    """Make a published model trainable again."""
+    import torch
+
+    from localizer.training.quantize import calibration_images
+    from localizer.training.unfuse import unfuse as load
+
+    out.parent.mkdir(parents=True, exist_ok=True)
+    torch.save({"average": load(model, list(calibration_images(shards))).state_dict()}, out)
+
+
+@app.command()
 def curves(log: Annotated[Path, typer.Argument(help="CSV that a run wrote.")]) -> None:
     """Plot a run's metrics beside its CSV."""
     from localizer.training.curves import plot

@@ -11,6 +11,7 @@ import pytest
 import yaml
 
 torch = pytest.importorskip("torch")
+onnx = pytest.importorskip("onnx")
 
 from localizer.errors import ModelError  # noqa: E402
 from localizer.features import GradientExtractor, OnnxExtractor  # noqa: E402
@@ -30,8 +31,10 @@ from localizer.training.losses import (  # noqa: E402
 from localizer.training.model import ModelConfig, TinyNet, fuse  # noqa: E402
 from localizer.training.orientation import OrientationFeatures  # noqa: E402
 from localizer.training.pairs import SceneConfig, scene_pairs  # noqa: E402
+from localizer.training.quantize import quantize  # noqa: E402
 from localizer.training.shards import write_shard  # noqa: E402
 from localizer.training.train import Trainer, learning_rate, perturbed  # noqa: E402
+from localizer.training.unfuse import unfuse  # noqa: E402
 
 SHIPPED = Path(__file__).parents[3] / "configs" / "train_tiny.yaml"
 SCENES = SceneConfig(cells=256, width=128, height=96, references=3, queries_per_light=3)
@@ -258,6 +261,39 @@ def test_export_is_checked_against_torch(config: TrainConfig, tmp_path: Path) ->
     assert [level.stride for level in extractor.info.levels] == [8, 4, 2]
     text = model.with_suffix(".json").read_text()
     assert str(config.data.shards) not in text
+
+
+def test_a_published_model_becomes_trainable_again(config: TrainConfig, tmp_path: Path) -> None:
+    trainer = Trainer(config)
+    trainer.run(steps=3)
+    model = tmp_path / "model" / "tiny.onnx"
+    export(trainer.checkpoint, model)
+    rng = np.random.default_rng(0)
+    images = [rng.integers(0, 256, (64, 96, 3), dtype=np.uint8) for _ in range(4)]
+    network = unfuse(model, images)
+    tensor = torch.from_numpy(np.stack(images).transpose(0, 3, 1, 2)).float() / 255.0
+    with torch.no_grad():
+        restored = network(tensor)
+        expected = trainer.average(tensor)
+        trained = network.train()(tensor)
+    for k, (features, confidence) in enumerate(restored):
+        torch.testing.assert_close(features, expected[k][0], atol=1e-3, rtol=0)
+        torch.testing.assert_close(confidence, expected[k][1], atol=1e-4, rtol=0)
+        # Batch statistics of the same images: about the same function.
+        assert float((features * trained[k][0]).sum(1).mean()) > 0.98
+
+
+def test_int8_keeps_the_features(config: TrainConfig, shards: Path, tmp_path: Path) -> None:
+    trainer = Trainer(config)
+    trainer.run(steps=3)
+    model, small = tmp_path / "model" / "tiny.onnx", tmp_path / "model" / "tiny8.onnx"
+    export(trainer.checkpoint, model)
+    assert quantize(model, small, sorted(shards.glob("*.npz"))) > 0.97
+    operators = {node.op_type for node in onnx.load(small).graph.node}
+    assert "QuantizeLinear" in operators
+    assert OnnxExtractor(small).info.name == "tiny-int8"
+    with pytest.raises(ModelError, match="calibrate"):
+        quantize(model, small, [])
 
 
 def test_unknown_keys_are_named(tmp_path: Path) -> None:
