@@ -45,6 +45,28 @@ def train(
 
 
 @app.command()
+def ablation(
+    config: ConfigPath,
+    steps: Annotated[int, typer.Option(help="Steps of each run.")] = 1000,
+) -> None:
+    """Repeat the paper's training-data ablation (Table 4): three runs, exported for the benchmark.
+
+    Compare them with: python benchmarks/features.py --baselines --models RUN/tiny.onnx ...
+    """
+    from localizer.training.ablation import ablations
+    from localizer.training.export import export as write
+    from localizer.training.train import Trainer
+
+    for name, run in ablations(load_config(config), steps).items():
+        _generate(run)
+        trainer = Trainer(run)
+        trainer.run()
+        model = run.output / f"{run.name}.onnx"
+        write(trainer.checkpoint, model)
+        typer.echo(f"{name}: {model}")
+
+
+@app.command()
 def export(
     checkpoint: Annotated[Path, typer.Argument(help="Checkpoint (.pt) of a run.")],
     model: Annotated[Path, typer.Argument(help="ONNX file to write; its JSON goes beside it.")],

@@ -16,6 +16,7 @@ onnx = pytest.importorskip("onnx")
 from localizer.errors import ModelError  # noqa: E402
 from localizer.features import GradientExtractor, OnnxExtractor  # noqa: E402
 from localizer.pose import Pose  # noqa: E402
+from localizer.training.ablation import ablations  # noqa: E402
 from localizer.training.config import TrainConfig, load_config  # noqa: E402
 from localizer.training.curves import plot  # noqa: E402
 from localizer.training.data import LoaderConfig, collate, crop_pair, mirrored  # noqa: E402
@@ -294,6 +295,19 @@ def test_int8_keeps_the_features(config: TrainConfig, shards: Path, tmp_path: Pa
     assert OnnxExtractor(small).info.name == "tiny-int8"
     with pytest.raises(ModelError, match="calibrate"):
         quantize(model, small, [])
+
+
+def test_ablations_differ_in_their_data_alone(config: TrainConfig) -> None:
+    runs = ablations(config, 40)
+    assert set(runs) == {"plain", "generated", "full"}
+    assert len({run.output for run in runs.values()}) == 3
+    assert len({run.data.shards for run in runs.values()}) == 3
+    assert all(run.model == config.model and run.seed == config.seed for run in runs.values())
+    assert {run.optimizer.steps for run in runs.values()} == {40}
+    shown = {n: (r.data.light_variety, r.data.appearance, r.data.photos) for n, r in runs.items()}
+    photos = config.data.photos
+    assert shown == {"plain": (False, False, photos), "generated": (True, True, None),
+                     "full": (True, True, photos)}  # fmt: skip
 
 
 def test_unknown_keys_are_named(tmp_path: Path) -> None:
