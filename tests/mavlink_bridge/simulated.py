@@ -49,7 +49,7 @@ class SimulatedLink:
 
 
 class Flight:
-    """A vehicle that turns at 500 m, its bridge, and a localizer at 10 Hz, 50 ms late.
+    """A vehicle that turns at 500 m, its bridge, and a localizer at 10 Hz.
 
     boot_ns: its boot time as a function of the simulated time. mangle: what becomes of each frame.
     """
@@ -87,6 +87,7 @@ class Flight:
         self.origin: tuple[float, float, float] | None = None
         self.north_m = 0.0
         self.reset_next = False
+        self.latency_ms = 50
         self.vision_yaw: float | None = None  # None: the vehicle's
         self.mangle: Callable[[bytes], bytes] = lambda frame: frame
         self._answered = 0
@@ -112,7 +113,7 @@ class Flight:
             if self.link.open:
                 self._vehicle(step)
             if step % 10 == 5:
-                self._fix(self.now_ns - 50 * MS)
+                self._fix(self.now_ns - self.latency_ms * MS)
             self.side.on_tick(self.link, self.now_ns)  # type: ignore[arg-type]
 
     def vision(self, since_ns: int = 0) -> list[tuple[int, Any]]:

@@ -167,6 +167,21 @@ def test_late_fixes_are_told_once(monkeypatch: pytest.MonkeyPatch) -> None:
     assert not [t for t in fine.texts if "ms old" in t]
 
 
+def test_fixes_older_than_the_autopilot_can_fuse_are_told_and_their_end_too(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    flight = Flight(monkeypatch, injection=InjectionConfig(rate_hz=10, delay_ms=250))
+    flight.latency_ms = 320
+    flight.run(30.0)
+    flight.latency_ms = 240  # below the limit, and not enough below it to say so
+    flight.run(20.0)
+    told = [t for t in flight.texts if "ms old" in t or "in time" in t]
+    assert told == ["PiLoT: fixes are 320 ms old, over the 250 ms of VISO_DELAY_MS"]
+    flight.latency_ms = 150
+    flight.run(20.0)
+    assert flight.texts[-1] == "PiLoT: fixes are in time again"
+
+
 # --- damaged input --------------------------------------------------------------------------------
 
 
