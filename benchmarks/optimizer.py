@@ -18,6 +18,7 @@ from functools import partial
 
 import cv2
 import numpy as np
+from optimizer_gpu import print_tables
 from rich.console import Console
 from rich.table import Table
 
@@ -117,19 +118,22 @@ def make_swarm(count: int = HYPOTHESES) -> Poses:
     return rotations, rotations @ np.array([0.0, 0.0, 110.0]) + rng.normal(0, 1, (count, 3))
 
 
-def naive_torch(problem: LevelProblem, swarm: Poses, threads: int) -> Callable[[], object]:
+def naive_torch(
+    problem: LevelProblem, swarm: Poses, threads: int, device: str = "cpu"
+) -> Callable[[], object]:
     """One batched Gauss-Newton iteration with explicit Jacobians."""
     import torch
     from torch.nn.functional import grid_sample
 
     torch.set_num_threads(threads)
     h, w, _ = problem.features.shape
-    maps = torch.from_numpy(problem.features).permute(2, 0, 1)[None].contiguous()
-    confidence = torch.from_numpy(problem.confidence)[None, None]
-    points, anchors = torch.from_numpy(problem.points.T.copy()), problem.anchor_features
-    reference = torch.from_numpy(anchors)[None]
-    weights = torch.from_numpy(problem.anchor_confidence)[None]
-    R, t = (torch.from_numpy(x).float() for x in swarm)
+    on = lambda x: torch.from_numpy(x).to(device)  # noqa: E731
+    maps = on(problem.features).permute(2, 0, 1)[None].contiguous()
+    confidence = on(problem.confidence)[None, None]
+    points, anchors = on(problem.points.T.copy()), problem.anchor_features
+    reference = on(anchors)[None]
+    weights = on(problem.anchor_confidence)[None]
+    R, t = (on(x).float() for x in swarm)
     fx, fy = problem.focal
     cx, cy = problem.centre
 
@@ -137,6 +141,8 @@ def naive_torch(problem: LevelProblem, swarm: Poses, threads: int) -> Callable[[
         grid = torch.stack([2 * u / (w - 1) - 1, 2 * v / (h - 1) - 1], -1)[:, :, None]
         image = image.expand(len(u), -1, -1, -1)
         return grid_sample(image, grid, align_corners=True)[..., 0].transpose(1, 2)
+
+    eye = torch.eye(6, device=device)
 
     def step() -> object:
         with torch.no_grad():
@@ -158,7 +164,7 @@ def naive_torch(problem: LevelProblem, swarm: Poses, threads: int) -> Callable[[
             weight = weight * (0.5 / norm.clamp(min=0.5))
             H = torch.einsum("mn,mnci,mncj->mij", weight, J, J)
             g = torch.einsum("mn,mnci,mnc->mi", weight, J, r)
-            H = H + 0.03 * torch.diag_embed(torch.diagonal(H, dim1=1, dim2=2)) + 1e-9 * torch.eye(6)
+            H = H + 0.03 * torch.diag_embed(torch.diagonal(H, dim1=1, dim2=2)) + 1e-9 * eye
             return torch.linalg.solve(H, -g)
 
     return step
@@ -267,6 +273,8 @@ def main() -> None:
         found = [whole_registration(threads, sigma, repeats) for sigma in (1.0, 8.0)]
         table.add_row(str(threads), *(f"{ms:.1f} ({n} evaluations)" for ms, n in found))
     console.print(table)
+
+    print_tables(console, problems, swarm)
 
 
 if __name__ == "__main__":

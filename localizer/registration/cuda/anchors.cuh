@@ -206,7 +206,7 @@ __device__ inline Terms anchor_terms(const Level& level, const PoseF& pose, bool
         terms.q = high.x;
         terms.e = high.y;
     }
-    __syncwarp();  // the scratch may be written again
+    // No barrier here: the next call writes the scratch behind its own ballot and barrier.
     return terms;
 }
 

@@ -61,7 +61,7 @@ class CudaBackend:
         with self.lock:
             self.device.activate()
             kernels = self.kernels(problem.features.shape[-1])
-            arguments = self._arguments(problem, rotations, translations, iterations, settings)
+            arguments = self.arguments(problem, rotations, translations, iterations, settings)
             name, threads = ("refine_few", 512) if M <= FEW else ("refine_many", 256)
             kernels.launch(name, M, threads, arguments)
             R, t = np.empty((M, 3, 3)), np.empty((M, 3))
@@ -84,7 +84,7 @@ class CudaBackend:
             self.device.activate()
             self.arena.close()
 
-    def _arguments(
+    def arguments(
         self,
         problem: LevelProblem,
         rotations: Array,
@@ -92,6 +92,7 @@ class CudaBackend:
         iterations: int,
         settings: LMSettings,
     ) -> NDArray[np.void]:
+        """Upload a problem; the structure for `refine_many` or `refine_few`. Not under the lock."""
         put, M = self.arena.put, len(rotations)
         level = np.zeros((), dtype=layout.LEVEL)
         level["features"] = put("features", stored(problem.features, self.half))

@@ -48,16 +48,27 @@ def compile_kernels(
     An unwritable cache costs the compilation at every start and is no error. Raises
     `CudaUnavailableError` without NVRTC, `CudaError` where it refuses the source.
     """
+    sources = {path.name: path.read_text() for path in sorted(SOURCES.glob("*.cu*"))}
+    return compile_sources(sources, _MAIN, macros(channels, half), architecture, cache)
+
+
+def compile_sources(
+    sources: Mapping[str, str],
+    main: str,
+    defined: Mapping[str, int],
+    architecture: tuple[int, int],
+    cache: Path | None = None,
+) -> Image:
+    """As `compile_kernels`, for any sources by name, of which `main` includes the others."""
     nvrtc = _nvrtc()
     options = [f"--gpu-architecture=sm_{architecture[0]}{architecture[1]}", *_OPTIONS]
-    options += [f"-D{name}={value}" for name, value in macros(channels, half).items()]
-    sources = {path.name: path.read_text() for path in sorted(SOURCES.glob("*.cu*"))}
+    options += [f"-D{name}={value}" for name, value in defined.items()]
     version = _checked(nvrtc, nvrtc.nvrtcVersion())
     path = (cache or cache_directory()) / f"{_digest(sources, options, version)}.cubin"
     try:
         return Image(path.read_bytes(), "")
     except OSError:
-        image = _compile(nvrtc, sources, options)
+        image = _compile(nvrtc, sources, main, options)
     _store(path, image.code)
     return image
 
@@ -78,13 +89,13 @@ def _store(path: Path, code: bytes) -> None:
         return
 
 
-def _compile(nvrtc: ModuleType, sources: Mapping[str, str], options: list[str]) -> Image:
-    headers = {name: text for name, text in sources.items() if name != _MAIN}
+def _compile(nvrtc: ModuleType, sources: Mapping[str, str], main: str, options: list[str]) -> Image:
+    headers = {name: text for name, text in sources.items() if name != main}
     program = _checked(
         nvrtc,
         nvrtc.nvrtcCreateProgram(
-            sources[_MAIN].encode(),
-            _MAIN.encode(),
+            sources[main].encode(),
+            main.encode(),
             len(headers),
             [text.encode() for text in headers.values()],
             [name.encode() for name in headers],

@@ -36,6 +36,7 @@ class Device:
             self._attribute(attribute.CU_DEVICE_ATTRIBUTE_COMPUTE_CAPABILITY_MINOR),
         )
         self.multiprocessors = self._attribute(attribute.CU_DEVICE_ATTRIBUTE_MULTIPROCESSOR_COUNT)
+        self.clock_hz = 1e3 * self._attribute(attribute.CU_DEVICE_ATTRIBUTE_CLOCK_RATE)
         self.stream = self._call(
             self._api.cuStreamCreate, self._api.CUstream_flags.CU_STREAM_NON_BLOCKING
         )
@@ -97,18 +98,17 @@ class Device:
             self._call(self._api.cuGraphDestroy, graph)
 
     def event(self) -> Any:
-        """A marker in the stream, recorded now, for `elapsed_ms`."""
+        """A marker in the stream, recorded now, for `elapsed_ms`; it lives as long as the device:
+        for measurements.
+        """
         event = self._call(self._api.cuEventCreate, 0)
         self._call(self._api.cuEventRecord, event, self.stream)
         return event
 
     def elapsed_ms(self, start: Any, stop: Any) -> float:
-        """Milliseconds of device time between two events, which are used up."""
+        """Milliseconds of device time between two events."""
         self._call(self._api.cuEventSynchronize, stop)
-        elapsed = float(self._call(self._api.cuEventElapsedTime, start, stop))
-        for event in (start, stop):
-            self._call(self._api.cuEventDestroy, event)
-        return elapsed
+        return float(self._call(self._api.cuEventElapsedTime, start, stop))
 
     def _attribute(self, attribute: Any) -> int:
         return int(self._call(self._api.cuDeviceGetAttribute, attribute, self._handle))

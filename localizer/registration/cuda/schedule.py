@@ -39,7 +39,8 @@ class Search:
     """What the device found. rotations (K, 3, 3), translations (K, 3): the survivors, camera from
     local, best first, the first one sharpened; scores (K,) before that, and overlaps (K,); K is 0
     without overlap. hessian, meat, isotropic: (6, 6) sums of `CovarianceSums`, without the prior;
-    finite: False where features, confidences or points are not.
+    finite: False where features, confidences or points are not. upload_ms, graph_ms: device time,
+    0 unless the schedule is timed.
     """
 
     rotations: Array
@@ -54,6 +55,8 @@ class Search:
     quality: float
     evaluations: int
     finite: bool
+    upload_ms: float
+    graph_ms: float
 
 
 @dataclass(frozen=True)
@@ -71,8 +74,9 @@ class _Shape:
 class CudaSchedule:
     """Runs `JNGO`'s schedule on a `CudaBackend`, whose device, kernels and lock it shares."""
 
-    def __init__(self, backend: CudaBackend) -> None:
+    def __init__(self, backend: CudaBackend, *, timed: bool = False) -> None:
         self._backend, self._device = backend, backend.device
+        self._timed = timed
         self._graph: tuple[_Shape, Graph] | None = None
 
     def run(
@@ -95,6 +99,7 @@ class CudaSchedule:
         with backend.lock:
             self._device.activate()
             channels = tuple(level.features.shape[-1] for level in query.levels)
+            events = [self._device.event()] if self._timed else []
             memory = self._memory(len(channels), len(swarm[0]), config, len(anchors.points_world))
             self._upload(memory, query, camera, anchors, origin, swarm, config, motion, constraint)
             cell_px = config.correlation_px / query.levels[-1].stride
@@ -102,9 +107,18 @@ class CudaSchedule:
                 config, len(swarm[0]), channels, constraint is not None, cell_px,
                 backend.arena.generation,
             )  # fmt: skip
-            self._captured(shape, memory).launch()
+            graph = self._captured(shape, memory)
+            if self._timed:
+                events.append(self._device.event())
+            graph.launch()
+            if self._timed:
+                events.append(self._device.event())
             last = len(channels) - 1 if config.sharpen else len(config.iterations) - 1
-            return self._collect(memory, config, len(anchors.points_world), channels[last])
+            found = self._collect(memory, config, len(anchors.points_world), channels[last])
+            if not self._timed:
+                return found
+            upload, run = (self._device.elapsed_ms(*events[k : k + 2]) for k in (0, 1))
+            return replace(found, upload_ms=upload, graph_ms=run)
 
     def _captured(self, shape: _Shape, memory: _Memory) -> Graph:
         if self._graph is not None and self._graph[0] == shape:
@@ -217,6 +231,8 @@ class CudaSchedule:
             float(state["quality"]),
             int(state["evaluations"]),
             not int(state["not_finite"]),
+            0.0,
+            0.0,
         )
 
 

@@ -14,6 +14,7 @@ import subprocess
 import tempfile
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 import pytest
@@ -36,10 +37,12 @@ _FLAGS = [
 ]
 
 
-def build(source: Path, *options: str) -> Path:
-    """The shared library of a source file; kept in the temporary folder by content."""
+def build(source: Path, *options: str, reads: tuple[Path, ...] = ()) -> Path:
+    """The shared library of a source file that includes `reads`; kept in the temporary folder by
+    content.
+    """
     digest = hashlib.sha256(repr((options, _FLAGS)).encode())
-    for file in sorted([*SOURCES.glob("*.cu*"), *EMULATION.glob("*"), source]):
+    for file in sorted([*SOURCES.glob("*.cu*"), *EMULATION.glob("*"), *reads]):
         digest.update(file.read_bytes())
     folder = Path(tempfile.gettempdir()) / "pilot-cuda-emulation"
     folder.mkdir(exist_ok=True)
@@ -145,6 +148,21 @@ def faulty(emulator: Emulator) -> Kernels:
     source = f'-DKERNEL_SOURCE="{EMULATION / "faulty.cu"}"'
     library = build(EMULATION / "kernels.cpp", source, "-DFAULTY")
     return emulator.device.load(f"emulated:{library}".encode())
+
+
+@pytest.fixture
+def unfused(emulator: Emulator) -> Kernels:
+    """The benchmark's plain port, loaded on the emulated device."""
+    source = Path(__file__).resolve().parents[4] / "benchmarks" / "unfused.cu"
+    options = (f'-DKERNEL_SOURCE="{source}"', "-DUNFUSED", "-DCHANNELS=32")
+    library = build(EMULATION / "kernels.cpp", *options, reads=(source,))
+    return emulator.device.load(f"emulated:{library}".encode())
+
+
+@pytest.fixture
+def make_emulated() -> Callable[..., CudaBackend]:
+    """In place of `CudaBackend`: a backend whose kernels are compiled for the emulation."""
+    return partial(CudaBackend, compile=emulated_kernels)
 
 
 @pytest.fixture

@@ -205,6 +205,8 @@ inline bool release_block() {
     throw Failure(text);
 }
 
+static char present __attribute__((section("emulated_shared"), used));  // in every library
+
 extern "C" char __start_emulated_shared[], __stop_emulated_shared[];
 
 // order: 0 ascending, 1 descending, else a seed for a new random order in every round.

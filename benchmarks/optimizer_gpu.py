@@ -1,0 +1,348 @@
+"""The GPU's part of the optimizer benchmark, beside the paper's Table 7; '-' where there is none.
+
+    python benchmarks/optimizer_gpu.py
+
+Device events, median of many after warm-up. One iteration is (7 iterations - 1) / 6 of a launch,
+which starts from the same poses each time.
+"unfused" is unfused.cu, one kernel a step; before it is timed, its step is compared with the
+reference's. Roofline shares are of the float32 peak (multiprocessors x 128 lanes x 2 x clock)
+and of the bandwidth of a device copy measured here.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from rich.console import Console
+from rich.table import Table
+
+from localizer.camera import Camera
+from localizer.pose import Pose
+from localizer.registration.backend import (
+    LevelProblem,
+    LMSettings,
+    sample_bilinear,
+    world_from_camera,
+)
+from localizer.registration.cuda.backend import CudaBackend
+from localizer.registration.cuda.compiler import compile_sources
+from localizer.registration.cuda.driver import Arena, Device, Kernels
+from localizer.registration.cuda.errors import CudaError
+from localizer.registration.cuda.schedule import CudaSchedule
+from localizer.registration.jngo import JNGOConfig
+from localizer.registration.reference import damped_step, in_view, linearize, project
+from localizer.types import Anchors, FeatureLevel, FeaturePyramid
+
+REPEATS, WARM_UP = 50, 5
+SETTINGS = LMSettings(min_overlap=0.01)
+_SEARCH = JNGOConfig(
+    converge=0, sharpen=0, swarm_anchors=(500, 500, 500), min_overlap=0.01, distinct_px=0.0
+)
+SCHEDULES = (  # label, settings, anchors
+    ("2/3/4, 144 -> 32 -> 8, N=500", _SEARCH, 500),
+    ("as flown, N=4000 at the end", JNGOConfig(min_overlap=0.01), 4000),
+)
+Poses = tuple[np.ndarray, np.ndarray]
+_POINTERS = (
+    "features", "confidence", "points", "anchor_features", "anchor_confidence", "rotations",
+    "translations", "camera_points", "pixels", "residuals", "gradients", "jacobians", "weights",
+    "sums", "steps",
+)  # fmt: skip
+UNFUSED = np.dtype(
+    [(name, np.uint64) for name in _POINTERS]
+    + [(name, np.int32) for name in ("height", "width", "anchors", "hypotheses")]
+    + [(name, np.float32) for name in ("fx", "fy", "cx", "cy", "huber", "damping")],
+    align=True,
+)
+UNFUSED_STEPS = ("project", "sample", "jacobian", "accumulate", "solve")
+
+
+@dataclass(frozen=True)
+class Work:
+    """Of one evaluation of the swarm. flops: float32 operations; requested: bytes that the lanes
+    load; unique: bytes that must come from memory at least once.
+    """
+
+    flops: float
+    requested: float
+    unique: float
+
+
+def count_work(problem: LevelProblem, swarm: Poses, bytes_per_value: int) -> Work:
+    """Counted from the kernel's source: 25 operations a channel and about 220 besides."""
+    h, w, C = problem.features.shape
+    touched = np.zeros((h, w), dtype=bool)
+    visible = 0
+    for R, t in zip(*swarm, strict=True):
+        x, uv = project(problem, R, t)
+        seen = in_view(problem, x, uv)
+        column, row = uv[seen].astype(int).T
+        visible += int(seen.sum())
+        for dy in (0, 1):
+            for dx in (0, 1):
+                touched[row + dy, column + dx] = True
+    anchors = problem.points.shape[1]
+    per_anchor = 5 * C * bytes_per_value + 4 * 4 + 4
+    everything = visible * per_anchor + 12 * anchors * len(swarm[0])
+    once = touched.sum() * (C * bytes_per_value + 4) + anchors * (C * bytes_per_value + 16)
+    return Work(visible * (25.0 * C + 220.0), float(everything), float(once))
+
+
+def median_ms(device: Device, prepare: Callable[[], None], run: Callable[[], None]) -> float:
+    """Device time of `run`; `prepare` is outside the events."""
+    times = []
+    for k in range(WARM_UP + REPEATS):
+        prepare()
+        start = device.event()
+        run()
+        stop = device.event()
+        if k >= WARM_UP:
+            times.append(device.elapsed_ms(start, stop))
+    return float(np.median(times))
+
+
+def fused_ms(backend: CudaBackend, problem: LevelProblem, swarm: Poses) -> float:
+    """Milliseconds of one LM iteration of the fused kernel."""
+    device, M = backend.device, len(swarm[0])
+    kernels = backend.kernels(problem.features.shape[-1])
+    found = []
+    for iterations in (1, 7):
+        arguments = backend.arguments(problem, *swarm, iterations, SETTINGS)
+        target = arguments["swarm"]
+        fresh = [backend.arena.put(name, np.ascontiguousarray(x)) for name, x in
+                 (("fresh R", swarm[0]), ("fresh t", swarm[1]))]  # fmt: skip
+
+        def reset(target: np.ndarray = target, fresh: list[int] = fresh) -> None:
+            device.copy(int(target["rotations"]), fresh[0], 72 * M)
+            device.copy(int(target["translations"]), fresh[1], 24 * M)
+
+        found.append(
+            median_ms(device, reset, lambda a=arguments: kernels.launch("refine_many", M, 256, a))
+        )
+    return (found[1] - found[0]) / 6
+
+
+class Unfused:
+    """The plain port, with its intermediates on the device."""
+
+    def __init__(self, device: Device, kernels: Kernels, problem: LevelProblem, swarm: Poses):
+        self.device, self._kernels = device, kernels
+        self._arena = Arena(device)
+        (h, w, C), M, N = problem.features.shape, len(swarm[0]), problem.points.shape[1]
+        a = np.zeros((), dtype=UNFUSED)
+        uploads = {
+            "features": problem.features, "confidence": problem.confidence,
+            "points": problem.points, "anchor_features": problem.anchor_features,
+            "anchor_confidence": problem.anchor_confidence,
+            "rotations": swarm[0].astype(np.float32), "translations": swarm[1].astype(np.float32),
+        }  # fmt: skip
+        for name, values in uploads.items():
+            a[name] = self._arena.put(name, np.ascontiguousarray(values))
+        sizes = {
+            "camera_points": 3, "pixels": 2, "residuals": C, "gradients": 2 * C,
+            "jacobians": 6 * C, "weights": 1,
+        }  # fmt: skip
+        for name, size in sizes.items():
+            a[name] = self._arena.buffer(name, 4 * size * M * N)
+        a["sums"], a["steps"] = (
+            self._arena.buffer("sums", 4 * 28 * M),
+            self._arena.buffer("steps", 24 * M),
+        )
+        a["height"], a["width"], a["anchors"], a["hypotheses"] = h, w, N, M
+        (a["fx"], a["fy"]), (a["cx"], a["cy"]) = problem.focal, problem.centre
+        a["huber"], a["damping"] = SETTINGS.scale, SETTINGS.damping
+        self._arguments, self._problem, self._swarm = a, problem, swarm
+
+    def run(self) -> None:
+        """Queue one iteration."""
+        M, N, C = len(self._swarm[0]), *self._problem.anchor_features.shape
+        for name, count in zip(UNFUSED_STEPS, (M * N, M * N * C, M * N * C, M * N, M), strict=True):
+            self._kernels.launch(f"unfused_{name}", -(-count // 256), 256, self._arguments)
+
+    def check(self) -> None:
+        """Its first step against the reference's; a wrong port must not be timed."""
+        self.run()
+        M = len(self._swarm[0])
+        steps = np.empty((M, 6), np.float32)
+        self.device.download(steps, int(self._arguments["steps"]))
+        self.device.synchronize()
+        for m in range(min(M, 4)):
+            model = linearize(self._problem, self._swarm[0][m], self._swarm[1][m], SETTINGS)
+            step = damped_step(model.hessian, model.gradient, SETTINGS.damping)
+            if step is not None:
+                np.testing.assert_allclose(steps[m], step, rtol=0.02, atol=1e-3 * abs(step).max())
+
+    def close(self) -> None:
+        """Free its memory."""
+        self._arena.close()
+
+
+def unfused_kernels(device: Device, channels: int) -> Kernels:
+    source = Path(__file__).with_name("unfused.cu")
+    image = compile_sources(
+        {source.name: source.read_text()}, source.name, {"CHANNELS": channels}, device.architecture
+    )
+    return device.load(image.code)
+
+
+def torch_ms(problem: LevelProblem, swarm: Poses) -> float:
+    """The naive batched PyTorch on the same GPU; NaN without a PyTorch that sees it."""
+    try:
+        import torch
+    except ImportError:
+        return np.nan
+    if not torch.cuda.is_available():
+        return np.nan
+    from optimizer import naive_torch
+
+    step = naive_torch(problem, swarm, 1, "cuda")
+    times = []
+    for k in range(WARM_UP + REPEATS):
+        start, stop = (torch.cuda.Event(enable_timing=True) for _ in range(2))
+        start.record()
+        step()
+        stop.record()
+        torch.cuda.synchronize()
+        if k >= WARM_UP:
+            times.append(start.elapsed_time(stop))
+    return float(np.median(times))
+
+
+def copy_bandwidth(device: Device, size: int = 2**30) -> float:
+    """Bytes per second read and written by a copy of `size` bytes within the device."""
+    addresses = [device.allocate(size) for _ in range(2)]
+    ms = median_ms(device, lambda: None, lambda: device.copy(*addresses, size))
+    for address in addresses:
+        device.free(address)
+    return 2 * size / ms * 1e3
+
+
+def pyramid_problem(
+    swarm: Poses, channels: int, anchors: int = 500
+) -> tuple[FeaturePyramid, Camera, Anchors, np.ndarray]:
+    """One place at 512 px seen at strides 4, 2 and 1: pyramid, camera, anchors, local origin."""
+    from optimizer import make_problem
+
+    full = make_problem(512, channels=channels)
+    camera = Camera(512, 512, *full.focal, full.centre[0] + 0.5, full.centre[1] + 0.5)
+    rng = np.random.default_rng(0)
+    picked = rng.integers(0, full.points.shape[1], anchors)
+    points = full.points.T[np.sort(picked)].astype(np.float64)
+    x = points @ np.eye(3) + [0.0, 0.0, 110.0]
+    uv = x[:, :2] / x[:, 2:] * full.focal + np.asarray(full.centre) + 0.5
+    levels, features, confidence = [], [], []
+    for stride in (4, 2, 1):
+        level = make_problem(512 // stride, channels=channels)
+        levels.append(FeatureLevel(level.features, level.confidence, stride))
+        at = uv / stride - 0.5
+        features.append(sample_bilinear(level.features, *at.T).astype(np.float32))
+        confidence.append(np.ones(anchors, np.float32))
+    pyramid = FeaturePyramid(tuple(levels), 512, 512)
+    return (
+        pyramid, camera,
+        Anchors(points, uv.astype(np.float32), tuple(features), tuple(confidence)), np.zeros(3),
+    )  # fmt: skip
+
+
+def schedule_ms(backend: CudaBackend, swarm: Poses, config: JNGOConfig, anchors: int = 500):
+    """(upload, graph) device milliseconds of a whole schedule, and the winner's distance (m)."""
+    query, camera, reference, origin = pyramid_problem(swarm, 32, anchors)
+    schedule = CudaSchedule(backend, timed=True)
+    found = [
+        schedule.run(query, camera, reference, origin, swarm, config)
+        for _ in range(WARM_UP + REPEATS)
+    ][WARM_UP:]
+    R, c = world_from_camera(found[-1].rotations, found[-1].translations, origin)
+    truth = Pose(np.eye(3), np.array([0.0, 0.0, -110.0]))
+    error = Pose(R[0], c[0]).distance_to(truth)[0] if len(R) else np.inf
+    return (
+        float(np.median([f.upload_ms for f in found])),
+        float(np.median([f.graph_ms for f in found])),
+        float(error),
+    )
+
+
+def print_tables(console: Console, problems: dict[int, LevelProblem], swarm: Poses) -> None:
+    """The GPU tables; without a GPU the same tables with '-' and the reason."""
+    sizes = tuple(problems)
+    rows: dict[str, list[float]] = {
+        name: [np.nan] * len(sizes)
+        for name in ("naive PyTorch", "unfused kernels", "fused float32", "fused float16")
+    }
+    notes, schedules = ["GPU: -"], []
+    try:
+        device = Device()
+    except CudaError as error:
+        notes = [f"no GPU column: {error}"]
+    else:
+        notes = [f"GPU: {device.name}, {device.multiprocessors} multiprocessors"]
+        measure(device, problems, swarm, rows, notes, schedules)
+    table = Table(title="GPU: ms per LM iteration, device events, median")
+    for heading in ("backend", *(f"{s} x {s}" for s in sizes)):
+        table.add_column(heading, justify="right")
+    for name, values in rows.items():
+        table.add_row(name, *(f"{v:.4f}" if np.isfinite(v) else "-" for v in values))
+    table.add_row("paper: CUDA port (RTX)", "5.21", "5.24", "5.72")
+    table.add_row("paper: CUDA fused kernel (RTX)", "0.44", "0.47", "0.49")
+    console.print(table)
+    table = Table(title="GPU: ms per schedule at 128/256/512 px, M=144, C=32")
+    for heading in ("schedule", "features", "upload", "graph", "off by m"):
+        table.add_column(heading, justify="right")
+    for row in schedules or [("2/3/4, 144 -> 32 -> 8, N=500", "-", "-", "-", "-")]:
+        table.add_row(*row)
+    console.print(table)
+    for note in notes:
+        console.print(note)
+
+
+def measure(
+    device: Device,
+    problems: dict[int, LevelProblem],
+    swarm: Poses,
+    rows: dict[str, list[float]],
+    notes: list[str],
+    schedules: list[tuple[str, ...]],
+) -> None:
+    """Fill the tables."""
+    bandwidth = copy_bandwidth(device)
+    peak = device.multiprocessors * 128 * 2 * device.clock_hz
+    notes.append(f"copy {bandwidth / 1e12:.2f} TB/s, float32 peak {peak / 1e12:.1f} TFLOP/s")
+    plain = unfused_kernels(device, 32)
+    for k, problem in enumerate(problems.values()):
+        rows["naive PyTorch"][k] = torch_ms(problem, swarm)
+        port = Unfused(device, plain, problem, swarm)
+        port.check()
+        rows["unfused kernels"][k] = median_ms(device, lambda: None, port.run)
+        port.close()
+    for half in (False, True):
+        backend = CudaBackend(device, half=half)
+        kind = "float16" if half else "float32"
+        notes.append(f"{kind}: {backend.kernels(32).resources('refine_many')}")
+        for k, problem in enumerate(problems.values()):
+            ms = fused_ms(backend, problem, swarm)
+            rows[f"fused {kind}"][k] = ms
+            work = count_work(problem, swarm, 2 if half else 4)
+            notes.append(
+                f"{kind}, {problem.features.shape[0]} px: {work.flops / ms / 1e9:.2f} TFLOP/s "
+                f"({100 * work.flops / ms * 1e3 / peak:.1f} % of the peak), loads "
+                f"{work.requested / ms / 1e9:.2f} TB/s, must come from memory "
+                f"{work.unique / 1e6:.1f} MB ({100 * work.unique / ms * 1e3 / bandwidth:.1f} % of "
+                "the copy's bandwidth)"
+            )
+        for label, config, anchors in SCHEDULES:
+            upload, graph, error = schedule_ms(backend, swarm, config, anchors)
+            schedules.append((label, kind, f"{upload:.3f}", f"{graph:.3f}", f"{error:.3f}"))
+        backend.close()
+
+
+def main() -> None:
+    from optimizer import SIZES, make_problem, make_swarm
+
+    print_tables(Console(), {size: make_problem(size) for size in SIZES}, make_swarm())
+
+
+if __name__ == "__main__":
+    main()
