@@ -121,7 +121,7 @@ class Injector:
         self._last_stamp_ns = 0
         self._last_was_fill = False
         self._intervals_ns: deque[int] = deque(maxlen=_INTERVALS)
-        self._taken_ns = 0
+        self._taken_ns = self._sent_fix_ns = 0
         self.yaw_difference_rad = NAN
         self.reason = NO_FIX_YET
         self.counters: Counter[str] = Counter()
@@ -277,10 +277,19 @@ class Injector:
             return Withheld(f"covariance too large ({sigma:.1f} m)", "withheld_covariance")
         attitude = self._attitude(fix, time_ns, context)
         counter = (self._reset_counter + self._reset_pending) % 256
-        estimate = Estimate(position, attitude, fix.attitude_sigma_rad, fix.quality, counter, fresh)
+        estimate = Estimate(
+            position,
+            attitude,
+            fix.attitude_sigma_rad,
+            fix.quality,
+            counter,
+            fresh,
+            repeated=fix.time_ns == self._sent_fix_ns,
+        )
         outcome = self._message(estimate, now_ns, context)
         if isinstance(outcome, Injection):
             self._reset_counter, self._reset_pending = counter, False
+            self._sent_fix_ns = fix.time_ns
         return outcome
 
     def _attitude(

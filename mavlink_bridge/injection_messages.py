@@ -32,7 +32,8 @@ _CLAIMED_VDOP = 1.0
 class Estimate:
     """What is about to be sent. position: as propagated; attitude: (roll, pitch, yaw), NaN unknown.
 
-    fresh: a fix as it came, not propagated. quality: 0..100.
+    fresh: a fix as it came, not propagated. quality: 0..100. repeated: the fix was sent before, at
+    another time: its velocity is no new measurement.
     """
 
     position: PropagatedFix
@@ -41,6 +42,7 @@ class Estimate:
     quality: int
     reset_counter: int
     fresh: bool
+    repeated: bool = False
 
 
 def pose_covariance(
@@ -80,7 +82,10 @@ def odometry(
     formula: CovarianceFormula,
     frame: int,
 ) -> Any:
-    """ODOMETRY (331): position NED, velocity in the body frame by the message's own quaternion."""
+    """ODOMETRY (331): position NED, velocity in the body frame by the message's own quaternion.
+
+    A repeated velocity is NaN, "unknown": the EKF would take its error for an independent one.
+    """
     q = quat.from_euler(*e.attitude)
     vn, ve, vd = (float(v) for v in e.position.velocity_ned)
     body = quat.rotate(quat.conjugate(q), (vn, ve, vd))
@@ -90,6 +95,8 @@ def odometry(
     velocity_covariance = [NAN] * 21
     for k, i in enumerate(DIAGONAL[:3]):
         velocity_covariance[i] = float(Pv[k, k])
+    if e.repeated:
+        body, velocity_covariance = (NAN, NAN, NAN), [NAN] * 21
     return mavlink.MAVLink_odometry_message(
         e.position.time_ns // 1000,
         frame,

@@ -353,6 +353,17 @@ def test_unknown_attitude_is_sent_as_nan() -> None:
     assert it.guard.unchecked == 1
 
 
+@pytest.mark.parametrize("latency_ms", [0, 400])
+def test_each_velocity_is_sent_once(latency_ms: float) -> None:
+    """Also of fixes that are too old to be sent as they are."""
+    it = injector(message="odometry", rate_hz=20, delay_ms=0)
+    sent = fly(it, seconds=4, fix_hz=10, latency_ms=latency_ms, speed=5.0)
+    known = [math.isfinite(i.message.vx) for _, i in sent]
+    assert known.count(True) == pytest.approx(40 - latency_ms // 100, abs=2)
+    assert known.count(False) >= 25
+    assert not any(i.message.vx == 0.0 for t, i in sent if t > 2 * SECOND)
+
+
 def test_odometry_has_the_frames_ardupilot_accepts_and_body_velocity() -> None:
     it = injector(message="odometry", rate_hz=10, delay_ms=0)
     east = math.radians(90.0)
