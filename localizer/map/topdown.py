@@ -8,7 +8,9 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 
+import cv2
 import numpy as np
+from numpy.typing import NDArray
 
 from localizer.camera import Camera
 from localizer.map.heightmesh import ERROR_PER_STEP, height_mesh
@@ -21,6 +23,9 @@ from localizer.types import Float32, Image
 
 TEXELS = 512  # of a tile's side
 CELLS = 128  # of a tile's side
+# Cells by which a surface goes on beyond its border: one that the border crosses, and one that
+# simplification may take away there. Else cracks are seen between neighbours.
+_GROWN = 2
 _EYE_M = 50_000.0  # height of the camera: rays all but parallel
 _DOWN = np.array([[1.0, 0, 0], [0, -1, 0], [0, 0, -1]])  # camera axes: x east, y south
 
@@ -57,17 +62,42 @@ def seen_from_above(
         z = _height(depth, base)
         higher = z > surface
         image[higher], surface[higher] = rgb[higher], z[higher]
-    known = np.isfinite(heights)
-    if not known.any():
+    if not np.isfinite(heights).any():
         return []
+    for _ in range(_GROWN):
+        heights = _grown(heights)
+    image, shown = _grown_picture(image, np.isfinite(surface))
+    known = np.isfinite(heights)
     lowest = heights[known].min()
     z = np.ma.masked_array(np.where(known, heights - lowest, 0.0), ~known)
-    made = height_mesh(z, np.isfinite(surface), (step, step), lossless=False)
+    made = height_mesh(z, shown, (step, step), lossless=False)
     if made is None:
         return []
     local, faces = made
     uvs = (local[:, :2] * (1, -1) / size).astype(np.float32)
     return [SourceMesh(local + np.array([left, top, lowest]), uvs, faces, image)]
+
+
+def _grown(heights: Array) -> Array:
+    """With the vertices around the known ones, at the mean of those."""
+    known = np.isfinite(heights)
+    share = cv2.blur(known.astype(np.float64), (3, 3), borderType=cv2.BORDER_CONSTANT)
+    total = cv2.blur(np.where(known, heights, 0.0), (3, 3), borderType=cv2.BORDER_CONSTANT)
+    near = ~known & (share > 1e-6)
+    return np.where(near, total / np.maximum(share, 1e-6), heights)
+
+
+def _grown_picture(image: Image, shown: NDArray[np.bool_]) -> tuple[Image, NDArray[np.bool_]]:
+    """A picture whose border texels go on for some more than `_GROWN` cells, and where it shows."""
+    if shown.all():
+        return image, shown
+    away, label = cv2.distanceTransformWithLabels(
+        (~shown).astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_5, labelType=cv2.DIST_LABEL_PIXEL
+    )
+    rows, columns = np.nonzero(shown)
+    nearest = np.zeros((int(label.max()) + 1, 3), np.uint8)
+    nearest[label[rows, columns]] = image[rows, columns]
+    return nearest[label], np.asarray(away) <= (_GROWN + 0.5) * TEXELS / CELLS
 
 
 def _height(depth: Float32, base: float) -> Array:

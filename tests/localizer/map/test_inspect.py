@@ -122,7 +122,7 @@ def test_dask_builds_the_same_cache(source, cache, tmp_path):
     from localizer.map.build import build_cache
 
     with distributed.LocalCluster(
-        n_workers=1, threads_per_worker=2, processes=False, dashboard_address=None
+        n_workers=2, threads_per_worker=1, processes=True, dashboard_address=None
     ) as cluster:
         manifest = build_cache(
             source, tmp_path / "c", scheduler=cluster.scheduler_address, progress=False

@@ -14,6 +14,7 @@ from localizer.map import levels, quadtree
 from localizer.map.inspect import verify
 from localizer.map.stream import TileStreamer
 from localizer.pose import Pose
+from localizer.render.numba_raster import NumbaRenderer
 
 DOWN = np.array([[1.0, 0, 0], [0, -1, 0], [0, 0, -1]])
 
@@ -74,6 +75,12 @@ def test_a_tileset_of_one_level_gets_coarser_ones(flat, make, build):
     error = root[:, 2] - make.height(root[:, 0], root[:, 1])
     assert np.median(np.abs(error)) < 0.5
     assert verify(cache).holes == ()
+    with TileStreamer(cache, max_error_px=4, max_texel_px=300) as coarse:
+        renderer = NumbaRenderer(coarse, threads=1)
+        pose = Pose(DOWN, np.array([0.0, 0.0, 320.0]))
+        view = renderer.render(pose, Camera.from_fov(320, 320, 60), wait=True)
+        assert 1 < len(coarse.current()) < 16
+    assert (view.depth > 0).all()  # no crack between what is made
     with TileStreamer(cache) as streamer:
         far = streamer.select(Pose(DOWN, np.array([0, 0, 30e3])), Camera.from_fov(64, 64, 60),
                               wait=True)  # fmt: skip

@@ -12,7 +12,6 @@ import pytest
 
 from localizer.errors import GeoreferenceError, MapCacheError, MapSourceError
 from localizer.map.build import build_cache
-from localizer.map.cache import TileCache
 from localizer.map.gltf import read_gltf
 from localizer.map.tiles3d import read_tileset
 from localizer.pose import Pose
@@ -279,6 +278,14 @@ def test_hostile_tilesets_are_named_errors(tmp_path, name):
         read_tileset(path)
 
 
+def test_external_tilesets_in_a_cycle_are_named(tmp_path):
+    for name, other in (("tileset", "b"), ("b", "c"), ("c", "b")):
+        document = {"asset": {"version": "1.1"}, "root": {"content": {"uri": f"{other}.json"}}}
+        (tmp_path / f"{name}.json").write_text(json.dumps(document))
+    with pytest.raises(MapSourceError, match=r"b\.json: external tilesets refer .* cycle"):
+        read_tileset(tmp_path)
+
+
 def test_symbolic_link_out_of_the_folder_is_refused(tmp_path, make):
     outside = tmp_path / "outside.glb"
     outside.write_bytes(b"glTF")
@@ -359,6 +366,40 @@ def test_texture_bomb_is_refused_unread(tmp_path, make, build):
         build(single_tile(make, tmp_path / "s", content))
 
 
+KTX2 = b"\xabKTX 20\xbb\r\n\x1a\n" + bytes(68)
+
+
+def test_what_cannot_be_decoded_is_named_tile_by_tile_or_left_out(tmp_path, make, build):
+    folder = tmp_path / "s"
+    source = make.tileset(folder)
+    positions, uvs, faces = make.patch(-50, -50, 100, 2)
+    ktx2 = make.glb(make.y_up(positions), uvs, faces, KTX2, "image/ktx2")
+    leaves = sorted(folder.glob("2_*.glb"))
+    leaves[0].write_bytes(edited(ktx2, basisu))
+    leaves[1].write_bytes(edited(leaves[1].read_bytes(), HOSTILE_EDITS["meshopt"]))
+    leaves[2].write_bytes(ktx2)
+    with pytest.raises(MapSourceError) as caught:
+        build(source)
+    lines = str(caught.value).splitlines()
+    assert "3 tiles cannot be imported" in lines[0]
+    for leaf, reason in zip(leaves, ("basisu", "EXT_meshopt_compression", "picture"), strict=False):
+        assert any(leaf.name in line and reason in line for line in lines[1:])
+    assert not (tmp_path / "cache").exists()
+    cache = build(source, skip_bad_tiles=True)
+    assert sorted(cache.manifest.skipped) == [leaf.name for leaf in leaves[:3]]
+
+
+def basisu(document):
+    document["extensionsRequired"] = ["KHR_texture_basisu"]
+    document["textures"] = [{"extensions": {"KHR_texture_basisu": {"source": 0}}}]
+
+
+def test_an_absurd_count_is_refused_before_memory_is_asked_for(make, tmp_path, build):
+    content = edited(flat_patch(make)[1], lambda d: d["accessors"][0].update(count=10**9))
+    with pytest.raises(MapSourceError, match="1000000000 elements"):
+        build(single_tile(make, tmp_path / "s", content))
+
+
 def test_not_finite_positions_are_refused(make):
     positions, uvs, faces = make.patch(-50, -50, 100, 2)
     positions[3, 1] = np.nan
@@ -373,16 +414,6 @@ def test_truncated_content_is_a_named_error(tmp_path, make, build, keep):
         source = single_tile(make, tmp_path / "s", data[:keep], name)
         with pytest.raises(MapSourceError, match=name):
             build(source)
-
-
-@pytest.mark.real
-def test_quito_imports_whole(tmp_path, real_data):
-    source = real_data("quito")
-    build_cache(source, tmp_path / "c", geoid_separation_m=25.0, progress=False, workers=1)
-    cache = TileCache.open(tmp_path / "c")
-    assert (cache.manifest.tiles, cache.manifest.skipped) == (637, {})
-    low, high = cache.manifest.height_range_m
-    assert (low, high) == pytest.approx((0.0, 38.06), abs=0.05)  # the data set's description
 
 
 @pytest.mark.real
