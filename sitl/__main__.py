@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 import shutil
+import signal
 import sys
 from pathlib import Path
 from typing import Annotated
@@ -143,6 +144,8 @@ def _clear(out: Path) -> None:
 def main() -> None:
     """Entry point: named errors become one clear line and exit code 2."""
     logging.basicConfig(level=logging.WARNING)
+    # As an exception, so that a flight that is ended takes its processes with it.
+    signal.signal(signal.SIGTERM, lambda *_: sys.exit(128 + signal.SIGTERM))
     try:
         app()
     # OSError: of a disk or a folder, which the program cannot help and which names its path.

@@ -53,6 +53,7 @@ from sitl.vehicles import (
 _TRUTH_PERIOD_S = 0.02
 _TRACKING_TIMEOUT_S = 60.0
 _LEG_MARGIN_S = 60.0
+_COMPANION_START_S = 300.0
 _COMPANION_STOP_S = 20.0
 
 Progress = Callable[[str, float], None]
@@ -157,6 +158,8 @@ class _Run:
     def fly(self) -> tuple[int, int]:
         """Returns the span without GNSS, CLOCK_MONOTONIC ns."""
         pilot, scenario = self._pilot, self._scenario
+        self._progress("starting the companion", 0.0)
+        self._await_companion()
         steps = mission(scenario, self._home)
         pilot.upload_mission(steps)
         pilot.point_gimbal(scenario.legs[0].gimbal_pitch_deg, 0.0)
@@ -207,13 +210,30 @@ class _Run:
             self._pilot.sleep(0.5)
         self._progress("returned on vision alone", 1.0)
 
+    def _await_companion(self) -> None:
+        """On the ground: its first start on a machine compiles for a minute or more."""
+        started = time.monotonic()
+        while self._health() is None:
+            self._require_companion()
+            if time.monotonic() - started > _COMPANION_START_S:
+                raise FlightError(
+                    f"the companion is not up after {_COMPANION_START_S:.0f} s; "
+                    f"{self._folder / 'companion.log'}"
+                )
+            time.sleep(0.2)
+
     def _tracking(self) -> bool:
         self._require_companion()
+        health = self._health()
+        return health is not None and health["text"] == "localization tracking"
+
+    def _health(self) -> dict[str, Any] | None:
+        """What the companion says of itself; None while it is not up."""
         try:
             health = json.loads((self._folder / "companion" / "health.json").read_text())
         except (OSError, ValueError):
-            return False
-        return bool(health["text"] == "localization tracking")
+            return None
+        return dict(health)
 
     def _require_companion(self) -> None:
         code = self._companion.poll()
