@@ -38,7 +38,7 @@ class IntensityExtractor:
 
 
 class Direct:
-    """Feature-metric registration with one extractor."""
+    """Feature-metric registration with one extractor, as the product does it."""
 
     def __init__(self, extractor: FeatureExtractor) -> None:
         self._extractor, self._optimizer = extractor, JNGO()

