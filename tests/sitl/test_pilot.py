@@ -171,21 +171,6 @@ def _check_gimbal(pilot):
     assert pilot.truth_at(newest.time_ns - 50_000_000) is not None
 
 
-def test_without_positions_the_vehicle_is_lost(kind):
-    with open_vehicle(kind, HOME, 0.0, {**SPEEDS, "SIM_WIND_SPD": 3}, speedup=SPEEDUP) as vehicle:
-        pilot = Pilot(vehicle.gcs_endpoint, SPEEDUP, vehicle.check)
-        with pilot:
-            pilot.wait_ready()
-            pilot.arm()
-            pilot.takeoff(80.0)
-            pilot.sleep(2)
-            here, denied = pilot.truth.location, time.monotonic_ns()
-            pilot.gps(on=False)
-            pilot.sleep(60)
-            assert pilot.has_text("EKF Failsafe: changed to LAND Mode", denied)
-            assert horizontal(here, pilot.truth.location) > 10.0
-
-
 def test_a_vehicle_comes_back_on_its_ports(kind):
     with open_vehicle(kind, HOME, 0.0, {}, speedup=SPEEDUP) as vehicle:
         endpoint = vehicle.gcs_endpoint
@@ -196,6 +181,19 @@ def test_a_vehicle_comes_back_on_its_ports(kind):
         assert vehicle.gcs_endpoint == endpoint
         with Pilot(endpoint, SPEEDUP, vehicle.check) as pilot:
             assert 0 < pilot.time_s < before + 5
+
+
+def test_a_reboot_by_command_keeps_the_parameters(kind):
+    with open_vehicle(kind, HOME, 0.0, {}, speedup=SPEEDUP) as vehicle:
+        with Pilot(vehicle.gcs_endpoint, SPEEDUP, vehicle.check) as pilot:
+            pilot.set_parameter("VISO_TYPE", 1)
+            pilot.sleep(5)
+            before = pilot.time_s
+            pilot.reboot()
+        time.sleep(2.0)
+        with Pilot(vehicle.gcs_endpoint, SPEEDUP, vehicle.check) as pilot:
+            assert 0 < pilot.time_s < before + 10
+            assert pilot.parameter("VISO_TYPE") == 1
 
 
 def test_waiting_for_a_vehicle_that_died_ends_at_once():

@@ -87,6 +87,21 @@ def test_a_jammed_gps_fails_the_filter_within_seconds(bench, seed):
     assert b.time_of("EKF Failsafe: changed to LAND Mode") - jammed < 9.0
 
 
+def test_a_wrong_receiver_is_told_and_does_not_drag_the_vehicle_at_once(bench):
+    b = bench({})
+    b.take_off(40.0)
+    b.run(5)
+    here, since = b.truth, b.vehicle.time_s
+    b.vehicle.parameters.set("SIM_GPS1_GLTCH_X", 0.0003)  # 33 m
+    b.run(4)
+    assert 0.5 < b.time_of("GPS Glitch or Compass error") - since < 2.5
+    assert np.hypot(*(b.truth - here)[:2]) < 3.0
+    assert b.vehicle.gps_sample.position[0] == pytest.approx(b.truth[0] + 33.4, abs=3.0)
+    b.vehicle.parameters.set("SIM_GPS1_GLTCH_X", 0.0)
+    b.run(12)
+    assert b.said("Glitch cleared")
+
+
 def test_vision_only_flight_reaches_the_reference_accuracy(bench, vision_only, home):
     """ardupilot.md: 10 Hz, sigma 0.5 m, 100 ms, VISO_DELAY_MS 100: 0.23 / 0.50 / 0.89 m."""
     b = bench({**vision_only, "SIM_WIND_SPD": 0, "SIM_WIND_TURB": 0})

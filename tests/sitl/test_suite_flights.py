@@ -1,0 +1,57 @@
+"""The scenario suite flown: a few on every run (embedded, and ArduPilot where it is), all if long.
+
+The whole suite as a report: `python -m sitl suite --fc both`.
+"""
+
+from __future__ import annotations
+
+from functools import cache
+
+import pytest
+
+from sitl.ardupilot import find_arducopter
+from sitl.process import VehicleKind
+from sitl.suite.case import load_cases
+from sitl.suite.runner import Row, run_case, run_suite
+
+CASES = load_cases()
+FEW = [case for case in CASES if case.ci]
+REST = [case for case in CASES if not case.ci]
+KINDS = [
+    "embedded",
+    pytest.param(
+        "ardupilot",
+        marks=[
+            pytest.mark.sitl,
+            pytest.mark.skipif(find_arducopter() is None, reason="no arducopter binary"),
+        ],
+    ),
+]
+
+
+@cache
+def flown(kind: VehicleKind, few: bool) -> dict[str, Row]:
+    """All of them side by side, once: they fly in real time and need little of a processor."""
+    rows = run_suite(FEW if few else REST, [kind], jobs=len(FEW))
+    return {row.case.name: row for row in rows}
+
+
+def check(row: Row) -> None:
+    if row.slow and not row.ok:
+        # The vehicle fell behind real time beside others: what it did then says nothing.
+        row = run_case(row.case, row.vehicle, seed=1)
+    pace = row.record.pace if row.record else 0.0
+    assert row.ok, f"{row.error or [f.what for f in row.findings if not f.ok]} (pace {pace:.2f})"
+
+
+@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("name", [case.name for case in FEW])
+def test_scenario(kind: VehicleKind, name: str) -> None:
+    check(flown(kind, True)[name])
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("name", [case.name for case in REST])
+def test_every_other_scenario(kind: VehicleKind, name: str) -> None:
+    check(flown(kind, False)[name])
