@@ -2,8 +2,15 @@ import numpy as np
 import pytest
 
 from localizer.camera import Camera
+from localizer.map.tile import TileMesh
 from localizer.pose import Pose, so3_exp
-from localizer.targets import SurfacePoint, TargetFilter, ray_in_world, target_covariance
+from localizer.targets import (
+    SurfacePoint,
+    TargetFilter,
+    cast_ray,
+    ray_in_world,
+    target_covariance,
+)
 from localizer.types import PoseEstimate, RegistrationStatus, TargetFix, TrackingState
 
 CAMERA = Camera(640, 480, 550.0, 550.0, 322.0, 238.0, (-0.1, 0.02, 0.001, -0.001, 0.0))
@@ -27,6 +34,29 @@ def test_ray_meets_the_point_that_projects_to_the_pixel():
     pixel, inside = CAMERA.project(NADIR.inverse.apply(point))
     assert inside
     np.testing.assert_allclose(_ground_hit(NADIR, tuple(pixel)), point, atol=1e-4)
+
+
+def _square(side: float, height: float) -> TileMesh:
+    """A horizontal square about the origin, with a plain texture."""
+    corners = np.array([[-1, -1], [1, -1], [-1, 1], [1, 1]]) * side / 2
+    return TileMesh(
+        np.column_stack([corners, np.full(4, height)]).astype(np.float32),
+        np.zeros((4, 2), np.float32),
+        np.array([[0, 1, 2], [1, 3, 2]], np.int32),
+        (np.zeros((4, 4, 3), np.uint8),),
+        Pose.identity(),
+    )
+
+
+def test_a_ray_beside_a_roofs_edge_meets_the_ground_and_one_inside_it_the_roof():
+    meshes = [_square(400.0, 0.0), _square(20.0, 8.0)]
+    eye = np.array([40.0, 5.0, 120.0])
+    for east, height in ((9.98, 8.0), (10.02, 0.0)):
+        direction = np.array([east, 3.0, 8.0]) - eye
+        hit = cast_ray(meshes, eye, direction / np.linalg.norm(direction))
+        assert hit is not None
+        # A pixel there covers 0.2 m: depth interpolated in an image would hang in between.
+        assert hit.position[2] == pytest.approx(height, abs=1e-4)
 
 
 @pytest.mark.parametrize("tilt_deg", [0.0, 45.0])
