@@ -11,6 +11,8 @@ import bisect
 import contextlib
 import math
 import queue
+import select
+import socket
 import threading
 import time
 from collections import deque
@@ -775,16 +777,29 @@ class Pilot:
                 next_heartbeat = now + _HEARTBEAT_S
                 self._beat()
             try:
-                message = self._link.recv_match(blocking=True, timeout=0.1)
-            except (OSError, TypeError):  # pymavlink raises TypeError on a socket being closed
+                messages = self._receive()
+            except OSError:  # the socket is being closed, or the vehicle died
                 if not self._stop.is_set():
                     time.sleep(0.05)
                 continue
-            if message is None:
-                continue
-            self._take(message, time.monotonic_ns())
-            with self._changed:
-                self._changed.notify_all()
+            for message in messages:
+                self._take(message, time.monotonic_ns())
+            if messages:
+                with self._changed:
+                    self._changed.notify_all()
+
+    def _receive(self) -> list[Any]:
+        """What has come, after waiting for up to 0.1 s."""
+        port = self._link.port
+        if port.fileno() < 0 or not select.select([port], [], [], 0.1)[0]:
+            return []
+        if not port.recv(1, socket.MSG_PEEK):
+            time.sleep(0.05)  # closed by the vehicle; pymavlink would report that in a tight loop
+            return []
+        messages = []
+        while (message := self._link.recv_msg()) is not None:
+            messages.append(message)
+        return messages
 
     def _beat(self) -> None:
         with contextlib.suppress(OSError):

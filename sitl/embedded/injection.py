@@ -106,8 +106,11 @@ class Injection:
             return False
         scale = p["VISO_SCALE"]
         reset = self._reset_counter is not None and message.reset_counter != self._reset_counter
+        # VISO_POS is where the camera sits, forward, right, down of the IMU.
+        camera = matrix(self._estimator.output[0:4]) @ [p[f"VISO_POS_{axis}"] for axis in "XYZ"]
+        north, east, down = scale * np.array([message.x, message.y, message.z]) - camera
         fix = ExternalPosition(
-            (message.x * scale, message.y * scale, message.z * scale),
+            (float(north), float(east), float(down)),
             min(max(errors[0], p["VISO_POS_M_NSE"]), 100.0),
             yaw,
             min(max(errors[1], p["VISO_YAW_M_NSE"], radians(5.0)), 1.5),
