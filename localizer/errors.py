@@ -45,3 +45,7 @@ class ModelError(LocalizerError):
 
 class SequenceError(LocalizerError):
     """An evaluation sequence that lacks a part or contradicts itself."""
+
+
+class DeviceArrayError(LocalizerError):
+    """An array in GPU memory that the kernels cannot read in place."""

@@ -19,7 +19,7 @@ from localizer import motion
 from localizer.camera import Camera
 from localizer.config import LocalizerConfig
 from localizer.errors import CameraError, OutsideMapError
-from localizer.features.extractor import FeatureExtractor
+from localizer.features.extractor import DeviceExtractor, FeatureExtractor
 from localizer.integrity import Integrity, is_acceptable, judge
 from localizer.motion import MotionState
 from localizer.pose import Array
@@ -185,10 +185,16 @@ class Localizer:
         self._renderer.prefetch([prior.world_from_camera for prior in ahead], self.camera)
 
     def extract_query(self, frame: Frame) -> FeaturePyramid:
-        """Features of the frame (does not need the reference, so it may run beside it)."""
+        """Features of the frame (does not need the reference, so it may run beside it).
+
+        They may be on the GPU, and are then valid until the next call.
+        """
         if frame.camera != self._undistorter.source:  # the stream changed its size in flight
             self._undistorter = Undistorter(frame.camera, self.camera)
-        return self._extractor.extract(self._undistorter(frame))
+        image = self._undistorter(frame)
+        if self._optimizer.on_gpu and isinstance(self._extractor, DeviceExtractor):
+            return self._extractor.extract_on_device(image)
+        return self._extractor.extract(image)
 
     def localize(self, frame: Frame, query: FeaturePyramid, anchors: Anchors) -> PoseEstimate:
         """Register the frame against the anchors, judge the result and update the filter."""

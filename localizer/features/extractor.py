@@ -11,13 +11,14 @@ from __future__ import annotations
 import hashlib
 import logging
 from pathlib import Path
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 import numpy as np
 import onnxruntime as ort
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from localizer.errors import ModelError
+from localizer.features.bound_session import BoundSession
 from localizer.features.gradient import GradientExtractor
 from localizer.features.image import check_image
 from localizer.types import FeatureLevel, FeaturePyramid, Image
@@ -37,6 +38,16 @@ class FeatureExtractor(Protocol):
 
     def extract(self, rgb: Image) -> FeaturePyramid:
         """Pyramid of an (H, W, 3) uint8 RGB image, H and W divisible by 8."""
+
+
+@runtime_checkable
+class DeviceExtractor(Protocol):
+    """An extractor that can leave its features on the GPU."""
+
+    def extract_on_device(self, rgb: Image) -> FeaturePyramid:
+        """As `FeatureExtractor.extract`, with `DeviceArray`s where the network runs on a GPU. They
+        are valid until the next call.
+        """
 
 
 class LevelInfo(BaseModel):
@@ -104,6 +115,9 @@ class OnnxExtractor:
             for k in range(len(self.info.levels))
             for kind in ("features", "confidence")
         ]
+        self._bound = (
+            None if self.provider == "CPU" else BoundSession(self._session, self._outputs, "cuda")
+        )
         self._check_graph(model)
 
     @property
@@ -126,6 +140,24 @@ class OnnxExtractor:
             for k, level in enumerate(self.info.levels)
         )
         return FeaturePyramid(levels, rgb.shape[1], rgb.shape[0])
+
+    def extract_on_device(self, rgb: Image) -> FeaturePyramid:
+        """As `extract`, without the copy to the host; on a CPU it is `extract`."""
+        if self._bound is None:
+            return self.extract(rgb)
+        check_image(rgb, self._multiple)
+        arrays = self._bound.run(np.ascontiguousarray(rgb)[None])
+        levels = []
+        for k, level in enumerate(self.info.levels):
+            features, confidence = arrays[2 * k], arrays[2 * k + 1]
+            levels.append(
+                FeatureLevel(
+                    features.reshaped(*features.shape[1:]),  # type: ignore[arg-type]
+                    confidence.reshaped(*confidence.shape[1:]),  # type: ignore[arg-type]
+                    level.stride,
+                )
+            )
+        return FeaturePyramid(tuple(levels), rgb.shape[1], rgb.shape[0])
 
     def _check_graph(self, model: Path) -> None:
         """Run once on a small image: it warms up, and a wrong graph fails here, not in flight."""

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field
 
 from localizer.camera import Camera
+from localizer.device_array import DeviceArray
 from localizer.pose import Array, Pose
 from localizer.registration.backend import (
     Backend,
@@ -33,7 +34,6 @@ from localizer.registration.covariance import (
     pose_differences,
     tangent_covariance,
 )
-from localizer.registration.cuda.arrays import DeviceArray
 from localizer.registration.cuda.backend import CudaBackend
 from localizer.registration.cuda.errors import CudaError
 from localizer.registration.cuda.registration import register_on_device
@@ -157,6 +157,11 @@ class JNGO:
             CudaSchedule(self.backend) if isinstance(self.backend, CudaBackend) else None
         )
 
+    @property
+    def on_gpu(self) -> bool:
+        """Whether features may be on the device now: not any more after the GPU has failed."""
+        return self._schedule is not None
+
     def register(
         self,
         query: FeaturePyramid,
@@ -185,10 +190,10 @@ class JNGO:
                     motion=motion, constraint=constraint, seed=seed,
                 )  # fmt: skip
             except CudaError as error:
-                if any(isinstance(level.features, DeviceArray) for level in query.levels):
-                    raise  # the CPU cannot read them
                 logger.error("registration continues on the CPU: %s", error)
                 self.backend, self._schedule = NumbaBackend(self._threads), None
+                if any(isinstance(level.features, DeviceArray) for level in query.levels):
+                    raise  # this frame's features are where the CPU cannot read them
         if not _all_finite(query, anchors):
             return _failure(prior, RegistrationStatus.BAD_FEATURES)
         origin = local_origin(anchors, prior.world_from_camera)

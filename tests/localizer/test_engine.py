@@ -71,6 +71,8 @@ class FakeExtractor:
 class FakeOptimizer:
     """Finds the camera where `truth` says it is, 1 cm off; or raises what `error` holds."""
 
+    on_gpu = False
+
     def __init__(self) -> None:
         self.error: Exception | None = None
         self.status = RegistrationStatus.OK

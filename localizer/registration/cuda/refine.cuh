@@ -71,7 +71,6 @@ __device__ inline double conclude(const Prior* prior, int least, RefineScratch<W
     const double weight = sums[WEIGHT], visible = sums[VISIBLE];
     if (!(visible >= (double)least) || !(weight > 0.0)) return infinite;
     const double score = sums[COST] / weight;
-    __syncwarp();
     if (lane < 27) sums[lane] /= weight;
     __syncwarp();
     double total = score;

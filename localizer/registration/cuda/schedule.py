@@ -16,10 +16,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from localizer.camera import Camera
+from localizer.device_array import DeviceArray
 from localizer.pose import Array
 from localizer.registration.backend import LMSettings, QuadraticPrior, level_intrinsics
 from localizer.registration.cuda import layout
-from localizer.registration.cuda.arrays import DeviceArray
 from localizer.registration.cuda.backend import FEW, CudaBackend, set_loss, stored
 from localizer.registration.cuda.driver import Graph
 from localizer.registration.selection import LEAST_SCORE

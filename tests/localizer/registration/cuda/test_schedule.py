@@ -7,6 +7,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from localizer.device_array import DeviceArray
+from localizer.errors import DeviceArrayError
 from localizer.pose import so3_exp
 from localizer.registration import (
     JNGO,
@@ -16,8 +18,6 @@ from localizer.registration import (
     height_constraint,
     select_anchors,
 )
-from localizer.registration.cuda.arrays import DeviceArray
-from localizer.registration.cuda.errors import CudaError
 from localizer.types import FeatureLevel, FeaturePyramid, PosePrior, RegistrationStatus
 
 CONFIG = JNGOConfig(hypotheses=16, keep=(6, 3), swarm_anchors=(100, 150, 150))
@@ -222,7 +222,7 @@ def test_features_on_the_device_are_used_in_place(emulator, registered, scene, p
     np.testing.assert_array_equal(found.world_from_camera.matrix, expected.world_from_camera.matrix)
     assert sent < scene.query.levels[-1].features.nbytes
     half = changed(query, 0, features=replace(query.levels[0].features, dtype=np.dtype(np.float16)))
-    with pytest.raises(CudaError, match="float16"):
+    with pytest.raises(DeviceArrayError, match="float16"):
         register(half, scene.camera, scene.anchors, about)
     for address in held:
         emulator.device.free(address)

@@ -1,4 +1,4 @@
-"""Arrays that lie on the device already, such as a network's outputs, for use in place."""
+"""Arrays that lie on a GPU already, such as a network's outputs, for use in place."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import DTypeLike
 
-from localizer.registration.cuda.errors import CudaError
+from localizer.errors import DeviceArrayError
 
 
 @dataclass(frozen=True)
@@ -28,7 +28,7 @@ class DeviceArray:
         """
         interface = other.__cuda_array_interface__
         if interface.get("strides") is not None:
-            raise CudaError("a device array with strides: make it C-contiguous first")
+            raise DeviceArrayError("a device array with strides: make it C-contiguous first")
         return cls(
             int(interface["data"][0]), tuple(interface["shape"]), np.dtype(interface["typestr"]),
             other,
@@ -37,16 +37,16 @@ class DeviceArray:
     def reshaped(self, *shape: int) -> DeviceArray:
         """The same memory under another shape of the same size."""
         if int(np.prod(shape)) != int(np.prod(self.shape)):
-            raise CudaError(f"a device array of shape {self.shape} cannot be {shape}")
+            raise DeviceArrayError(f"a device array of shape {self.shape} cannot be {shape}")
         return DeviceArray(self.address, shape, self.dtype, self.owner)
 
     def checked_address(self, dtype: DTypeLike) -> int:
         """The address, after checks of type and alignment that the kernels rely on."""
         if self.dtype != np.dtype(dtype):
-            raise CudaError(
+            raise DeviceArrayError(
                 f"device features are {self.dtype}, the kernels were asked for {np.dtype(dtype)}: "
                 "export the network in that precision or choose the other"
             )
         if self.address % 16:
-            raise CudaError(f"device array at {self.address:#x} is not aligned to 16 bytes")
+            raise DeviceArrayError(f"device array at {self.address:#x} is not aligned to 16 bytes")
         return self.address

@@ -1,0 +1,123 @@
+"""Everything that waits for a GPU, in one command and at most ten minutes, into one report.
+
+    python benchmarks/gpu_checklist.py [--sequence SEQ --map CACHE] [--report gpu-report.md]
+
+Steps: what the machine is; the tests marked gpu; the same under compute-sanitizer (memcheck, then
+racecheck), where it is installed; the optimizer benchmark's GPU tables; `companion eval` of a
+recorded sequence on the GPU and on the CPU. A step that fails or runs out of time is reported and
+the next one runs. The exit code is 1 if a step failed, 2 if there is no GPU.
+"""
+
+from __future__ import annotations
+
+import argparse
+import shutil
+import subprocess
+import sys
+import time
+from dataclasses import dataclass
+from pathlib import Path
+
+from localizer.registration.cuda import CudaError, Device
+
+ROOT = Path(__file__).resolve().parent.parent
+TESTS = "tests/localizer/registration/cuda"
+_TAIL = 60  # lines of a step's output that are kept
+_LAST_S = 5.0  # with less time than this left nothing is started
+
+
+@dataclass(frozen=True)
+class Step:
+    """A command and the seconds it may take."""
+
+    title: str
+    command: tuple[str, ...]
+    limit_s: float
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """What became of a step: ok, failed, out of time, or skipped with the reason."""
+
+    step: Step
+    verdict: str
+    seconds: float
+    output: str
+
+
+def steps(sequence: Path | None, cache: Path | None, report: Path) -> list[Step]:
+    python = sys.executable
+    tests = (python, "-m", "pytest", "-q", "-rs", "-m", "gpu", TESTS)
+    found = [
+        Step("machine", ("nvidia-smi",), 20),
+        Step("tests marked gpu", tests, 150),
+    ]
+    for tool in ("memcheck", "racecheck"):
+        sanitizer = ("compute-sanitizer", "--tool", tool, "--error-exitcode", "9",
+                     "--target-processes", "all")  # fmt: skip
+        command = (*sanitizer, *tests, "-k", "agrees_with_the_reference or agrees_with_the_cpu")
+        found.append(Step(f"compute-sanitizer {tool}", command, 90))
+    found.append(Step("optimizer", (python, "benchmarks/optimizer_gpu.py"), 150))
+    if sequence is not None and cache is not None:
+        for device in ("cuda", "cpu"):
+            command = (
+                python, "-m", "companion", "eval", str(sequence), "--map", str(cache),
+                "--device", device, "--limit", "100", "--report", str(report) + f".{device}",
+            )  # fmt: skip
+            found.append(Step(f"companion eval --device {device}", command, 90))
+    return found
+
+
+def run(step: Step, limit_s: float) -> Outcome:
+    """Run one step within a limit."""
+    if shutil.which(step.command[0]) is None:
+        return Outcome(step, f"skipped: no {step.command[0]} here", 0.0, "")
+    if limit_s < _LAST_S:
+        return Outcome(step, "skipped: no time left", 0.0, "")
+    started = time.monotonic()
+    try:
+        done = subprocess.run(
+            step.command, cwd=ROOT, capture_output=True, text=True, timeout=limit_s, check=False
+        )
+        verdict = "ok" if done.returncode == 0 else f"failed ({done.returncode})"
+        output = done.stdout + done.stderr
+    except subprocess.TimeoutExpired as error:
+        verdict = f"out of time ({limit_s:.0f} s)"
+        output = error.stdout.decode(errors="replace") if isinstance(error.stdout, bytes) else ""
+    return Outcome(step, verdict, time.monotonic() - started, output)
+
+
+def text_of(outcomes: list[Outcome]) -> str:
+    """The report, as Markdown."""
+    lines = ["# GPU checklist", "", "| step | result | s |", "|---|---|---|"]
+    lines += [f"| {o.step.title} | {o.verdict} | {o.seconds:.0f} |" for o in outcomes]
+    for o in outcomes:
+        tail = "\n".join(o.output.splitlines()[-_TAIL:])
+        lines += ["", f"## {o.step.title}", "", f"`{' '.join(o.step.command)}`", "", "```", tail,
+                  "```"]  # fmt: skip
+    return "\n".join(lines) + "\n"
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
+    parser.add_argument("--sequence", type=Path, help="recorded sequence for companion eval")
+    parser.add_argument("--map", type=Path, help="its tile cache")
+    parser.add_argument("--report", type=Path, default=Path("gpu-report.md"))
+    parser.add_argument("--minutes", type=float, default=10.0, help="for everything")
+    arguments = parser.parse_args()
+    try:
+        print(f"GPU: {Device().name}")
+    except CudaError as error:
+        print(f"nothing to do: {error}")
+        return 2
+    deadline = time.monotonic() + 60 * arguments.minutes
+    outcomes: list[Outcome] = []
+    for step in steps(arguments.sequence, arguments.map, arguments.report.resolve()):
+        outcomes.append(run(step, min(step.limit_s, deadline - time.monotonic())))
+        print(f"{step.title}: {outcomes[-1].verdict}", flush=True)
+        arguments.report.write_text(text_of(outcomes))  # after each: a lease may end early
+    return int(any(o.verdict.startswith(("failed", "out of")) for o in outcomes))
+
+
+if __name__ == "__main__":
+    sys.exit(main())
