@@ -15,6 +15,7 @@ _WINDOW_NS = 30_000_000_000
 _MAX_SAMPLES = 128
 _RUN_BACK_NS = 1_000_000_000
 _RUN_BACK_CONFIRMATIONS = 3
+_SILENCE_NS = 3_000_000_000
 _MAX_ROUND_TRIP_NS = 500_000_000
 _STAMP_GRAIN_NS = 1_000_000  # boot times are whole milliseconds in most messages
 _DRIFT = 200e-6  # of two crystals against each other, at worst
@@ -88,7 +89,7 @@ class BootClock:
     ``monotonic = middle + (boot - boot of that middle) / rate``, from the fastest round trip of
     30 s. Two answers whose round trips cannot both be true show that the clock stepped, or that it
     runs at another rate: a third answer tells which (a simulation at N times real speed runs at
-    rate N). A boot time that runs back, or a clock that stepped behind, is a reboot.
+    rate N). A boot time that runs back, or a clock that is behind after a silence, is a reboot.
     """
 
     def __init__(self) -> None:
@@ -177,8 +178,11 @@ class BootClock:
             return False
         self.steps += 1
         behind = last.boot_ns + self.rate * elapsed - sample.boot_ns
-        # A simulation that cannot keep its speed falls behind without a reboot.
-        rebooted = behind > _RUN_BACK_NS + max(self.rate - 1.0, 0.0) * elapsed
+        # Only after a silence: a reboot between two answers shows in stamps that run back, and a
+        # simulation that is starved falls behind without one.
+        rebooted = elapsed > _SILENCE_NS and behind > (
+            _RUN_BACK_NS + max(self.rate - 1.0, 0.0) * elapsed
+        )
         if rebooted:
             self._restart()
             self._newest_boot_ns = sample.boot_ns

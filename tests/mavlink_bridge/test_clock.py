@@ -79,6 +79,17 @@ def test_reboot_while_the_link_was_lost_is_seen_although_boot_time_is_greater() 
     maps(clock, 201.0, 411.0)
 
 
+def test_a_starved_simulation_that_falls_behind_is_no_reboot() -> None:
+    clock = BootClock()
+    boot_s = 10.0
+    for second in range(100, 130):
+        boot_s += 0.0 if second % 5 == 0 else 1.0  # it stands for 2 s now and then
+        assert not any(answers(clock, range(second, second + 1), boot_s))
+    assert clock.reboots == 0
+    assert clock.steps > 0
+    maps(clock, boot_s, 129.0)
+
+
 def test_old_frames_that_come_late_are_no_reboot() -> None:
     clock = BootClock()
     for i in range(100):

@@ -1,0 +1,55 @@
+"""The whole process, wired: an embedded vehicle, a feed of grey pictures, a record."""
+
+import csv
+import itertools
+import logging
+import threading
+import time
+
+import cv2
+import numpy as np
+
+from companion.app import Companion
+from companion.config import parse_config
+from sitl.embedded.geodesy import Location
+from sitl.vehicles import GIMBAL, EmbeddedSitl, vision_parameters
+
+HOME = Location(47.397742, 8.545594, 488.0)
+MODEL = {"width": 160, "height": 120, "fx": 140, "fy": 140, "cx": 80, "cy": 60}
+
+
+def test_what_happens_is_logged_and_recorded_once_and_every_thread_ends(
+    small_assets, tmp_path, caplog
+):
+    for i in range(40):
+        cv2.imwrite(str(tmp_path / f"{i:02}.png"), np.full((120, 160, 3), 3 * i, np.uint8))
+    threads = threading.active_count()
+    with EmbeddedSitl(HOME, parameters={**vision_parameters(), **GIMBAL}) as vehicle:
+        settings = {"rate_hz": 5.0, "realtime": True}
+        config = parse_config(
+            {
+                "map": str(small_assets.map_cache),
+                "camera": {"source": str(tmp_path), "model": MODEL, "settings": settings},
+                "bridge": {
+                    "connection": vehicle.companion_endpoint,
+                    "tlog": str(tmp_path / "flight.tlog"),
+                },
+                "record": {"folder": str(tmp_path / "record"), "snapshot_interval_s": None},
+            },
+            "test",
+        )
+        with caplog.at_level(logging.INFO):
+            Companion(config).run()
+    time.sleep(0.2)
+    assert threading.active_count() == threads
+    with (tmp_path / "record" / "events.csv").open() as file:
+        recorded = [row["text"] for row in csv.DictReader(file)]
+    logged = [r.getMessage() for r in caplog.records]
+    for text in ("PiLoT: flight controller found", "PiLoT: waiting for video and a pose prior"):
+        assert recorded.count(text) <= 1, recorded
+        assert logged.count(text) == recorded.count(text), logged
+    assert "PiLoT: flight controller found" in recorded
+    # Nothing is told twice in a row, by two parts in two wordings included.
+    plain = [text.removeprefix("PiLoT: ") for text in recorded]
+    assert all(a != b for a, b in itertools.pairwise(plain)), recorded
+    assert (tmp_path / "flight.tlog").stat().st_size > 10_000
