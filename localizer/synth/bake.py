@@ -24,9 +24,9 @@ from localizer.synth.buildings import (
 )
 from localizer.synth.config import BLOCK_M, LEAF_GSD_M, LEAF_M, TERRAIN_SPACING_M, TOP_M, Look
 from localizer.synth.ground import Shape, rasterize, shape_bounds
-from localizer.synth.layout import Hedge, WorldPlan
 from localizer.synth.lighting import DSM_GSD_M, make_light, raise_surface
 from localizer.synth.mesh import ChartedMesh, pack
+from localizer.synth.plan import Hedge, WorldPlan
 from localizer.synth.props import CAR_COLOURS, PropShape, car_image, car_shape
 from localizer.synth.terrain import Terrain
 from localizer.synth.textures import Cover, Light, new_image, paint_ground, paint_surface

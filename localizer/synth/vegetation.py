@@ -8,8 +8,8 @@ from numpy.typing import NDArray
 from localizer.pose import Array
 from localizer.synth.buildings import LEAF, MID, TOP
 from localizer.synth.config import Look
-from localizer.synth.layout import Hedge, Trees
 from localizer.synth.mesh import ChartedMesh
+from localizer.synth.plan import Hedge, Trees
 from localizer.synth.textures import Light, new_image, paint_crown
 from localizer.types import Image
 

@@ -30,7 +30,8 @@ from localizer.synth.bake import (
     start_worker,
 )
 from localizer.synth.config import BLOCK_M, TOP_M, Look, Variant, WorldConfig, look_of
-from localizer.synth.layout import Target, WorldPlan, plan_world
+from localizer.synth.layout import plan_world
+from localizer.synth.plan import Target, WorldPlan
 from localizer.synth.terrain import River, Terrain
 from localizer.synth.tiles import write_tileset
 

@@ -10,7 +10,8 @@ from scipy.sparse.csgraph import connected_components
 from localizer.synth.buildings import Kind, build
 from localizer.synth.config import WorldConfig
 from localizer.synth.ground import Material
-from localizer.synth.layout import URBAN, WorldPlan, _zones, plan_world
+from localizer.synth.layout import assign_zones, plan_world
+from localizer.synth.plan import URBAN, WorldPlan
 from localizer.synth.streets import make_lattice, make_streets
 from localizer.synth.terrain import make_terrain
 
@@ -84,7 +85,7 @@ def test_cars_have_minutes_of_road(plan):
 def test_streets_are_one_net():
     config = WorldConfig(3)
     terrain, lattice = make_terrain(config), make_lattice(config)
-    zones = _zones(config, lattice, terrain)
+    zones = assign_zones(config, lattice, terrain)
     net = make_streets(config, terrain, {c: z in URBAN for c, z in zones.items()}, lattice)
     a, b = (np.array([getattr(s, end) for s in net.streets]) for end in "ab")
     n = len(net.nodes)
