@@ -107,7 +107,10 @@ def plot_errors(
         axes = figure.add_subplot(len(panels), 1, row)
         for s in (s for s in series if s.panel == panel):
             colour = f"C{labels.index(s.label)}"
-            axes.plot(s.time_s, s.error, linewidth=0.9, label=s.label, color=colour)
+            # The dots show what stands alone between gaps, which a line would not.
+            axes.plot(
+                s.time_s, s.error, ".-", color=colour, label=s.label, linewidth=0.9, markersize=2.5
+            )
         for begin, end, name in shaded:
             axes.axvspan(begin, end, color="tab:gray", alpha=0.15, label=name)
         axes.set(xlabel=abscissa, ylabel=panel)

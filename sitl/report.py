@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import csv
 import json
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
@@ -50,7 +50,7 @@ from sitl.flight import FlightRecord
 from sitl.scenario import Scenario
 
 _OVERLAYS = 4
-_MAP_PICTURE_M = 900.0
+_MAP_MARGIN_M = 90.0
 _MAP_PICTURE_PX = 900
 
 
@@ -215,7 +215,8 @@ def _plot(
         }
         fixed = (t for t in record.targets if isinstance(t, FixedPoint))
         marks = {t.name: t.position_at(start) for t in fixed}
-        plot_tracks(folder / "tracks.png", tracks, _map_picture(renderer), marks)
+        picture = _map_picture(renderer, tracks.values())
+        plot_tracks(folder / "tracks.png", tracks, picture, marks)
         _overlays(folder, estimates, renderer, config)
     finally:
         streamer.close()
@@ -229,10 +230,10 @@ def _track(columns: Columns, prefix: str) -> Array:
     return np.column_stack([columns[f"{prefix}{k}_m"] for k in ("east", "north", "up")])
 
 
-def _map_picture(renderer: NumbaRenderer) -> MapPicture:
-    """The map from high above through a long lens: nearly an orthophoto."""
+def _map_picture(renderer: NumbaRenderer, tracks: Iterable[Array]) -> MapPicture:
+    """The map about the tracks from high above through a long lens: nearly an orthophoto."""
     height = 6000.0
-    size = _MAP_PICTURE_M
+    size = max(float(np.abs(t[:, :2]).max()) for t in tracks if len(t)) + _MAP_MARGIN_M
     fov = float(np.degrees(2 * np.arctan(size / height)))
     camera = Camera.from_fov(_MAP_PICTURE_PX, _MAP_PICTURE_PX, fov)
     pose = Pose(np.diag([1.0, -1.0, -1.0]), np.array([0.0, 0.0, height]))
