@@ -71,8 +71,7 @@ __device__ inline double conclude(const Prior* prior, int least, RefineScratch<W
     const double weight = sums[WEIGHT], visible = sums[VISIBLE];
     if (!(visible >= (double)least) || !(weight > 0.0)) return infinite;
     const double score = sums[COST] / weight;
-    if (lane < 27) sums[lane] /= weight;
-    __syncwarp();
+    if (lane < 27) sums[lane] /= weight;  // read again by the same lane
     double total = score;
     if (prior && prior->weight > 0.0) {
         add_prior(*prior, s.R_trial, s.t_trial, sums, s.prior);
