@@ -28,6 +28,7 @@ from mavlink_bridge.messages import (
     TrackRequest,
     VehicleState,
     VisionFix,
+    without_figures,
 )
 from mavlink_bridge.recorder import TlogRecorder
 from mavlink_bridge.shadow import ShadowScore
@@ -185,15 +186,14 @@ class Bridge:
         self._ground_link.wake()
 
     def set_health(self, level: HealthLevel, text: str = "", *, tell: bool = True) -> None:
-        """The localizer's health; a change of level or text is told to the operator once.
+        """The localizer's health; a change of level or text (but for its figures) is told once.
 
         tell: false for what the bridge tells by itself.
         """
         with self._health_lock:
-            if (level, text) == self._health:
-                return
-            self._health = (level, text)
-        if tell:
+            news = (level, without_figures(text)) != self._health
+            self._health = (level, without_figures(text))
+        if news and tell:
             self.say(_SEVERITY[level], f"PiLoT: {text or level.value}")
 
     def say(self, severity: int, text: str) -> None:

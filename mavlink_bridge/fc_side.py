@@ -12,7 +12,7 @@ from mavlink_bridge.clock import monotonic_ns
 from mavlink_bridge.closed_loop import ClosedLoopCheck, LoopVerdict
 from mavlink_bridge.inject import NO_FIX_YET, FixQueue, Injection, InjectionContext, Injector
 from mavlink_bridge.link import Link
-from mavlink_bridge.messages import VehicleState
+from mavlink_bridge.messages import VehicleState, without_figures
 from mavlink_bridge.origin import OriginKeeper, north_east
 from mavlink_bridge.profile import FirmwareProfile, select_profile
 from mavlink_bridge.propagate import PropagatedFix
@@ -335,7 +335,7 @@ class FlightControllerSide(Side):
 
         prefix: part of what is compared, not of what is said.
         """
-        plain = f"{prefix if not problem else ''}{_plain(problem)}"
+        plain = f"{prefix if not problem else ''}{without_figures(problem)}"
         if plain == self._told.get(topic, ""):
             return
         known = topic in self._told
@@ -344,7 +344,3 @@ class FlightControllerSide(Side):
             self.shared.say(mavlink.MAV_SEVERITY_WARNING, f"PiLoT: {problem}")
         elif relief and known and prefix in ("", "inject"):
             self.shared.say(mavlink.MAV_SEVERITY_INFO, f"PiLoT: {relief}")
-
-
-def _plain(text: str) -> str:
-    return "".join(c for c in text if not c.isdigit() and c not in "+-.")

@@ -28,6 +28,11 @@ class HealthLevel(enum.Enum):
     FAILED = "failed"
 
 
+def without_figures(text: str) -> str:
+    """A line for the operator without its numbers: what changes in them only is no news."""
+    return "".join(c for c in text if not c.isdigit() and c not in "+-.")
+
+
 def _check_position(what: str, latitude_deg: float, longitude_deg: float, height_m: float) -> None:
     if not (abs(latitude_deg) <= 90.0 and abs(longitude_deg) <= 180.0 and abs(height_m) < 2e4):
         raise FixError(

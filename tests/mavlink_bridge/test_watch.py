@@ -185,8 +185,13 @@ def test_what_the_operator_reads_is_logged_and_recorded_once(
     with caplog.at_level("INFO"):
         for _ in range(3):
             bridge.set_health(HealthLevel.DEGRADED, "localization degraded")
+        for i in range(3):
+            bridge.set_health(HealthLevel.DEGRADED, f"no map at north {-9590.3 + i:.1f} m")
         bridge.set_health(HealthLevel.DEGRADED, "no heartbeat", tell=False)
     bridge.stop()
     lines = [r.getMessage() for r in caplog.records if "localization" in r.getMessage()]
     assert lines == ["PiLoT: localization degraded"]
-    assert recorded == [(mavlink.MAV_SEVERITY_WARNING, "PiLoT: localization degraded")]
+    assert recorded == [
+        (mavlink.MAV_SEVERITY_WARNING, "PiLoT: localization degraded"),
+        (mavlink.MAV_SEVERITY_WARNING, "PiLoT: no map at north -9590.3 m"),
+    ]
