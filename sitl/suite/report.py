@@ -20,6 +20,7 @@ from rich.table import Table
 from sitl.suite.runner import Figures, Row, figures
 
 _COLOURS = {"pass": "green", "better": "cyan", "FAIL": "red", "ERROR": "red"}
+_GAP_S = 1.0  # in which the EKF reported no position
 _COLUMNS = ("scenario", "vehicle", "by", "reference", "measured", "what was checked", "verdict")
 
 
@@ -79,7 +80,14 @@ def plot(row: Row, path: Path) -> None:
     t = np.array([e[0] for e in record.errors])
     error = np.array([np.hypot(n, e) for _, n, e in record.errors])
     figure, axes = plt.subplots(figsize=(9, 3.6), layout="constrained")
-    axes.plot(t, error, lw=0.9, color="tab:blue", label="EKF error")
+    gaps = np.flatnonzero(np.diff(t) > _GAP_S) + 1
+    axes.plot(
+        np.insert(t, gaps, np.nan),
+        np.insert(error, gaps, np.nan),
+        lw=0.9,
+        color="tab:blue",
+        label="EKF error",
+    )
     if row.reference is not None:
         axes.axhline(row.reference.median, color="tab:green", ls="--", lw=1, label="reference")
         axes.axhline(row.measured[0] if row.measured else 0, color="tab:blue", ls=":", lw=1)
