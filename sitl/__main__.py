@@ -7,7 +7,7 @@ import shutil
 import signal
 import sys
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, get_args
 
 import typer
 from rich.console import Console
@@ -23,7 +23,14 @@ from sitl.flight import fly
 from sitl.kinematic import record_scenario
 from sitl.process import VehicleKind as FlownKind
 from sitl.report import make_report, print_report
-from sitl.scenario import Scenario, ScenarioError, VehicleKind, check_inside, load_scenario
+from sitl.scenario import (
+    Injection,
+    Scenario,
+    ScenarioError,
+    VehicleKind,
+    check_inside,
+    load_scenario,
+)
 from sitl.suite.case import SCENARIOS, load_cases
 from sitl.suite.report import print_row, print_table, write_report
 from sitl.suite.runner import run_suite
@@ -54,6 +61,7 @@ def demo(
     seed: Annotated[int, typer.Option(min=0, help="world, traffic, light and noise")] = 0,
     fc: Annotated[str, typer.Option(help="auto, ardupilot or embedded")] = "auto",
     scenario: Annotated[Path | None, typer.Option(help="scenario YAML; none: the default")] = None,
+    injection: Annotated[str | None, typer.Option(help="MAVLink message instead of its")] = None,
     out: Annotated[Path, typer.Option(help="folder of the report")] = Path("report"),
     worlds: Annotated[Path | None, typer.Option(help="folder of generated worlds")] = None,
 ) -> None:
@@ -64,6 +72,11 @@ def demo(
     if fc not in kinds:
         raise ScenarioError(f"--fc is auto, ardupilot or embedded, not {fc!r}")
     script = load_scenario(scenario) if scenario else Scenario()
+    if injection is not None:
+        if injection not in get_args(Injection):
+            known = ", ".join(get_args(Injection))
+            raise ScenarioError(f"--injection is one of {known}, not {injection!r}")
+        script = Scenario.model_validate(script.model_dump() | {"injection": injection})
     console = Console()
     assets = prepare(seed, worlds, lambda text: console.print(f"[dim]{text}[/]"))
     check_inside(script, assets.world.size_m)

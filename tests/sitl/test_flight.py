@@ -1,12 +1,17 @@
 """The product's main job, end to end, on a small world: every process, real video, real MAVLink."""
 
 import json
+from types import SimpleNamespace
+from typing import get_args
 
 import pytest
 
+from companion.config import load_config
+from mavlink_bridge.parameter_rules import ardupilot_rules, find_source_set
+from sitl import flight
 from sitl.flight import fly
 from sitl.report import make_report, print_report
-from sitl.scenario import CameraSpec, Leg, Scenario
+from sitl.scenario import CameraSpec, Injection, Leg, Scenario
 
 # Light, because it flies in real time on what may be two cores.
 SCENARIO = Scenario(
@@ -23,6 +28,28 @@ SCENARIO = Scenario(
     camera=CameraSpec(width=480, height=360, rate_hz=8),
     localizer_width=256,
 )
+
+
+@pytest.mark.parametrize("injection", get_args(Injection))
+def test_the_vehicles_parameters_suit_what_the_companion_sends(tmp_path, injection):
+    """By the doctor's own rules, which are measured refusals of ArduPilot."""
+    scenario = Scenario(injection=injection)
+    parameters = flight._parameters(scenario)
+    path = flight._write_companion_config(
+        tmp_path,
+        SimpleNamespace(map_cache=tmp_path),
+        scenario,
+        SimpleNamespace(companion_endpoint="tcp:127.0.0.1:5762"),
+        flight._Ports(5600, 5601),
+    )
+    config = load_config(path).bridge
+    assert config.injection.message == injection
+    source_set = find_source_set(config, parameters.get)
+    assert source_set == (1 if injection == "gps_input" else 2)
+    rules = [r for r in ardupilot_rules(config, source_set) if r.required]
+    given = {name: rule for rule in rules for name in rule.names if name in parameters}
+    assert len(given) >= 5
+    assert [n for n, rule in given.items() if not rule.holds(parameters[n])] == []
 
 
 @pytest.mark.usefixtures("real_time")

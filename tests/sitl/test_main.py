@@ -53,3 +53,13 @@ def test_an_earlier_report_is_replaced(tmp_path):
     with pytest.raises(RuntimeError, match="flying"):
         _run("demo", "--out", tmp_path / "report")
     assert not (tmp_path / "report").exists()
+
+
+def test_the_injection_is_named_and_reaches_the_flight(tmp_path, monkeypatch):
+    flown = []
+    monkeypatch.setattr(cli, "fly", lambda _, script, *__: flown.append(script) or 1 / 0)
+    with pytest.raises(ScenarioError, match="--injection is one of .*odometry.*'vision'"):
+        _run("demo", "--injection", "vision")
+    with pytest.raises(ZeroDivisionError):
+        _run("demo", "--injection", "odometry", "--out", tmp_path / "report")
+    assert flown[0].injection == "odometry"
