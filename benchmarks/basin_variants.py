@@ -108,11 +108,20 @@ def paper_rows() -> list[Variant]:
         hypotheses=1, keep=(144, 144), converge=0, sharpen=0, swarm_anchors=(500, 500, 500),
         distinct_px=0.0, motion_weight=0.02,
     )  # fmt: skip
-    theirs = (*_CAMERA_ORIGIN, *_VERTICAL_TURNS)
-    swarm = paper.model_copy(update={"hypotheses": 144})
+    swarm, theirs = (
+        paper.model_copy(update={"hypotheses": 144}),
+        (*_CAMERA_ORIGIN, *_VERTICAL_TURNS),
+    )
     return [
         Variant("paper: one hypothesis", paper, 500, False, detail=False, patches=theirs),
-        Variant("paper: + rotation-aware swarm", swarm, 500, False, detail=False, patches=theirs),
+        Variant(
+            "paper: + rotation-aware swarm",
+            swarm,
+            500,
+            False,
+            detail=False,
+            patches=_VERTICAL_TURNS,
+        ),
         Variant("paper: + motion term", swarm, 500, detail=False, patches=theirs),
     ]
 
@@ -140,7 +149,6 @@ def our_rows() -> list[Variant]:
         Variant("redescending loss in the search", loss=_redescending),
         Variant("turns about the vertical", patches=_VERTICAL_TURNS),
         Variant("origin at the camera (Eq. 9)", patches=_CAMERA_ORIGIN),
-        Variant("origin at the plain centroid", patches=_PLAIN_CENTROID),
         Variant("fixed phase of candidates", patches=_FIXED_PHASE),
         Variant("anchors anywhere (no importance)", patches=_NO_IMPORTANCE),
         Variant("anchors on depth edges too", patches=_DEPTH_EDGES),
@@ -200,10 +208,6 @@ def _camera_origin(_anchors: Anchors, world_from_camera: Pose) -> Array:
     return np.array(world_from_camera.translation)
 
 
-def _plain_centroid(anchors: Anchors, _world_from_camera: Pose) -> Array:
-    return np.asarray(anchors.points_world.mean(axis=0))
-
-
 def _vertical_turns(prior: PosePrior, *arguments: Any, **values: Any) -> tuple[Array, Array]:
     """The same swarm with yaw about the world's vertical and pitch about the horizontal x axis."""
     R = prior.world_from_camera.rotation
@@ -237,7 +241,6 @@ def _flat_importance(_features: object, shape: tuple[int, ...]) -> np.ndarray:
 
 
 _CAMERA_ORIGIN = (("jngo.local_origin", _camera_origin),)
-_PLAIN_CENTROID = (("jngo.local_origin", _plain_centroid),)
 _VERTICAL_TURNS = (("jngo.generate_hypotheses", _vertical_turns),)
 _FIXED_PHASE = (("anchors._candidates", _fixed_candidates),)
 _NO_IMPORTANCE = (("anchors._importance", _flat_importance),)

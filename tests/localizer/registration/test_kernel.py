@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from numba.core.runtime import _nrt_python, rtsys
 
@@ -32,6 +32,8 @@ from localizer.registration.reference import (
 )
 
 SETTINGS = LMSettings()
+# A busy machine is no reason to fail.
+patient = settings(deadline=None, suppress_health_check=[HealthCheck.too_slow])
 
 
 @pytest.fixture(scope="module")
@@ -134,6 +136,7 @@ def test_feature_jacobians_are_autograds(scene, problems):
     np.testing.assert_allclose(model.residuals[chosen], residuals, atol=1e-9)
 
 
+@patient
 @given(
     st.lists(st.floats(-3, 3), min_size=6, max_size=6),
     st.lists(st.floats(-500, 500), min_size=6, max_size=6),
@@ -149,6 +152,7 @@ def test_a_retraction_is_undone_by_its_opposite(xi, places):
     np.testing.assert_allclose(there[0] @ there[0].T, np.eye(3), atol=1e-12)
 
 
+@patient
 @given(
     st.lists(st.floats(-3, 3), min_size=3, max_size=3),
     st.lists(st.floats(-1e4, 1e4), min_size=6, max_size=6),
