@@ -58,7 +58,7 @@ def test_an_earlier_report_is_replaced(tmp_path):
 def test_the_injection_is_named_and_reaches_the_flight(tmp_path, monkeypatch):
     flown = []
     monkeypatch.setattr(cli, "fly", lambda _, script, *__: flown.append(script) or 1 / 0)
-    with pytest.raises(ScenarioError, match="--injection is one of .*odometry.*'vision'"):
+    with pytest.raises(ScenarioError, match=r"--injection is one of .*odometry.*'vision'"):
         _run("demo", "--injection", "vision")
     with pytest.raises(ZeroDivisionError):
         _run("demo", "--injection", "odometry", "--out", tmp_path / "report")
