@@ -145,8 +145,8 @@ def _compare(watch: Watch, sender: PacedSender, skip: int = 0) -> tuple[np.ndarr
 
 
 def test_exposure_times_by_misp_stamps_are_exact_and_latency_is_low(url: str) -> None:
-    with Watch(url) as watch, PacedSender(url, delay_s=0.02) as sender:
-        watch.wait_for(40)
+    with Watch(url) as watch, PacedSender(url, rate_hz=10.0, delay_s=0.02) as sender:
+        watch.wait_for(25)
     error, latency = _compare(watch, sender)
     print(
         f"\nglass to glass, ms: median {np.median(latency):.1f}"
@@ -154,8 +154,8 @@ def test_exposure_times_by_misp_stamps_are_exact_and_latency_is_low(url: str) ->
         f" exposure error max {np.abs(error).max():.4f}"
     )
     assert np.abs(error).max() < 0.1
-    # One frame period is 50 ms: a receiver that held pictures back until the next one fails here.
-    assert np.median(latency) < 20 + 40
+    # One frame period is 100 ms: a receiver that held pictures back until the next one fails here.
+    assert np.median(latency) < 20 + 80
     counters = watch.source.counters
     assert counters.delivered == len(watch.frames)
     assert counters.received - counters.delivered - counters.dropped in (0, 1)
@@ -206,7 +206,7 @@ def test_a_consumer_that_is_slow_gets_the_newest_frame_and_the_rest_are_counted(
             time.sleep(0.25)
         counters = source.counters
         source.close()
-    assert max(ages[1:]) < 100  # a queue would make them grow by 250 ms a frame
+    assert max(ages[1:]) < 200  # a queue would make them grow by 250 ms a frame
     assert counters.delivered == 6
     assert counters.dropped >= 20
 
