@@ -1,0 +1,193 @@
+"""The `s0` network: the paper's own (Sec. A.1, Table 5), for machines with a GPU.
+
+The first three stages of MobileOne-S0 as encoder (Vasu et al. 2023, Table 2: one block of 48
+channels at stride 2, two of 48 at stride 4, eight of 128 at stride 8, four branches each), a U-Net
+decoder of 128, 64 and 32 channels with two skips, and heads at strides 4, 2 and 1: a 3 x 3
+projection to C channels, made unit length, and a 1 x 1 uncertainty through a sigmoid. As everywhere
+here, the second output is the confidence, the uncertainty's complement.
+"""
+
+from __future__ import annotations
+
+import torch
+from pydantic import BaseModel, ConfigDict, Field
+from torch import Tensor, nn
+from torch.nn import functional as F  # noqa: N812 (torch's own name for it)
+
+STRIDES = (4, 2, 1)
+_WIDTHS, _BLOCKS = (48, 48, 128), (1, 2, 8)
+_DECODER = (128, 64, 32)
+
+
+class S0Config(BaseModel):
+    """Shape of the network. channels: C of each level; branches: of each encoder block."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+    channels: int = Field(default=32, gt=0)
+    branches: int = Field(default=4, gt=0)
+
+
+class BranchedBlock(nn.Module):
+    """MobileOne's block (its Fig. 3): parallel branches in training, one convolution afterwards.
+
+    Branches: `branches` k x k convolutions, one 1 x 1 for k > 1, and a batch normalisation of the
+    input where shapes allow.
+    """
+
+    def __init__(
+        self,
+        inputs: int,
+        outputs: int,
+        size: int,
+        branches: int,
+        *,
+        stride: int = 1,
+        groups: int = 1,
+    ) -> None:
+        super().__init__()
+        self.shape = (inputs, outputs, size, stride, groups)
+
+        def branch(k: int) -> nn.Sequential:
+            conv = nn.Conv2d(inputs, outputs, k, stride, k // 2, groups=groups, bias=False)
+            return nn.Sequential(conv, nn.BatchNorm2d(outputs))
+
+        self.convolutions = nn.ModuleList(branch(size) for _ in range(branches))
+        self.point = branch(1) if size > 1 else None
+        self.skip = nn.BatchNorm2d(inputs) if inputs == outputs and stride == 1 else None
+
+    def forward(self, x: Tensor) -> Tensor:
+        """(B, inputs, H, W) to (B, outputs, H/stride, W/stride)."""
+        total: Tensor = sum(branch(x) for branch in self.convolutions)
+        if self.point is not None:
+            total = total + self.point(x)
+        if self.skip is not None:
+            total = total + self.skip(x)
+        return F.relu(total)
+
+    def fused(self) -> nn.Sequential:
+        """The same function, with the evaluation's statistics, as one convolution and a ReLU."""
+        inputs, outputs, size, stride, groups = self.shape
+        conv = nn.Conv2d(inputs, outputs, size, stride, size // 2, groups=groups)
+        weight, bias = torch.zeros_like(conv.weight), torch.zeros(outputs)
+        for branch in (*self.convolutions, *([self.point] if self.point is not None else [])):
+            gain, shift = _affine(branch[1])
+            folded = branch[0].weight * gain[:, None, None, None]
+            margin = (size - folded.shape[-1]) // 2
+            weight = weight + F.pad(folded, (margin, margin, margin, margin))
+            bias = bias + shift
+        if self.skip is not None:
+            gain, shift = _affine(self.skip)
+            index = torch.arange(outputs)
+            identity = torch.zeros_like(weight)
+            identity[index, index % (inputs // groups), size // 2, size // 2] = gain
+            weight, bias = weight + identity, bias + shift
+        conv.weight = nn.Parameter(weight.detach().clone())
+        conv.bias = nn.Parameter(bias.detach().clone())
+        return nn.Sequential(conv, nn.ReLU())
+
+
+class S0Net(nn.Module):
+    """Image (B, 3, H, W) in 0..1, H and W divisible by 8, to three (features, confidence) levels.
+
+    Level k is at stride `STRIDES[k]`: features (B, C, h, w) of unit length, confidence (B, h, w).
+    """
+
+    def __init__(self, config: S0Config) -> None:
+        super().__init__()
+        stages, inputs = [], 3
+        for stage, (width, count) in enumerate(zip(_WIDTHS, _BLOCKS, strict=True)):
+            blocks: list[nn.Module] = []
+            for k in range(count):
+                stride = 2 if k == 0 else 1
+                if stage == 0:
+                    blocks.append(BranchedBlock(inputs, width, 3, config.branches, stride=stride))
+                else:
+                    blocks += _unit(inputs, width, config.branches, stride)
+                inputs = width
+            stages.append(nn.Sequential(*blocks))
+        self.encoder = nn.ModuleList(stages)
+        e1, e2, e3 = _WIDTHS
+        d1, d2, d3 = _DECODER
+        self.decoder = nn.ModuleList(
+            [_convolution(e3 + e2, d1), _convolution(d1 + e1, d2), _convolution(d2, d3)]
+        )
+        self.projections = nn.ModuleList(
+            nn.Conv2d(width, config.channels, 3, padding=1) for width in _DECODER
+        )
+        self.uncertainties = nn.ModuleList(nn.Conv2d(width, 1, 1) for width in _DECODER)
+
+    def forward(self, image: Tensor) -> list[tuple[Tensor, Tensor]]:
+        """See the class."""
+        skips, x = [], (image - 0.45) / 0.25
+        for stage in self.encoder:
+            x = stage(x)
+            skips.append(x)
+        levels = []
+        for k, (block, project, doubt) in enumerate(
+            zip(self.decoder, self.projections, self.uncertainties, strict=True)
+        ):
+            x = F.interpolate(x, scale_factor=2.0, mode="bilinear", align_corners=False)
+            if k < 2:
+                x = torch.cat([x, skips[1 - k]], 1)
+            x = block(x)
+            # The sum of squares overflows nothing and loses little in float32.
+            f = project(x).float()
+            unit = f * torch.rsqrt((f * f).sum(1, keepdim=True) + 1e-8)
+            levels.append((unit, 1.0 - torch.sigmoid(doubt(x).float())[:, 0]))
+        return levels
+
+
+def fuse(model: nn.Module) -> nn.Module:
+    """Fold branches and batch normalisations into single convolutions, in place."""
+    for name, child in model.named_children():
+        if isinstance(child, BranchedBlock):
+            setattr(model, name, child.fused())
+        else:
+            fuse(child)
+    if isinstance(model, nn.Sequential) and len(model) > 1 and isinstance(model[1], nn.BatchNorm2d):
+        conv, bn = model[0], model[1]
+        assert isinstance(conv, nn.Conv2d)
+        gain, shift = _affine(bn)
+        folded = nn.Conv2d(conv.in_channels, conv.out_channels, 3, padding=1)
+        folded.weight = nn.Parameter((conv.weight * gain[:, None, None, None]).detach().clone())
+        folded.bias = nn.Parameter(shift.detach().clone())
+        model[0], model[1] = folded, nn.Identity()
+    return model
+
+
+def multiply_adds(model: nn.Module, height: int, width: int) -> int:
+    """Multiply-adds of the convolutions for one image."""
+    total = 0
+
+    def count(module: nn.Module, _inputs: object, output: Tensor) -> None:
+        nonlocal total
+        if isinstance(module, nn.Conv2d):
+            total += output[0].numel() * module.weight[0].numel()
+
+    hooks = [m.register_forward_hook(count) for m in model.modules() if isinstance(m, nn.Conv2d)]
+    with torch.no_grad():
+        model(torch.zeros(1, 3, height, width))
+    for hook in hooks:
+        hook.remove()
+    return total
+
+
+def _unit(inputs: int, outputs: int, branches: int, stride: int) -> list[nn.Module]:
+    """Depthwise 3 x 3, then pointwise."""
+    return [
+        BranchedBlock(inputs, inputs, 3, branches, stride=stride, groups=inputs),
+        BranchedBlock(inputs, outputs, 1, branches),
+    ]
+
+
+def _convolution(inputs: int, outputs: int) -> nn.Sequential:
+    conv = nn.Conv2d(inputs, outputs, 3, padding=1, bias=False)
+    return nn.Sequential(conv, nn.BatchNorm2d(outputs), nn.ReLU())
+
+
+def _affine(bn: nn.BatchNorm2d) -> tuple[Tensor, Tensor]:
+    """Gain and shift (C,) that a batch normalisation applies in evaluation."""
+    assert bn.running_var is not None
+    assert bn.running_mean is not None
+    gain = bn.weight / torch.sqrt(bn.running_var + bn.eps)
+    return gain, bn.bias - bn.running_mean * gain

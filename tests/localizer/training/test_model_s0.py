@@ -1,0 +1,103 @@
+"""The paper's network: shapes of Table 5, one function before and after fusing, export, float16."""
+
+from __future__ import annotations
+
+import copy
+
+import numpy as np
+import onnxruntime as ort
+import pytest
+
+torch = pytest.importorskip("torch", reason="needs the extra `train`")
+from localizer.training.export import OPSET, Deployed  # noqa: E402
+from localizer.training.model import parameter_count  # noqa: E402
+from localizer.training.model_s0 import (  # noqa: E402
+    STRIDES,
+    BranchedBlock,
+    S0Config,
+    S0Net,
+    fuse,
+    multiply_adds,
+)
+
+
+@pytest.fixture(scope="module")
+def trained():
+    """Statistics and gains that are neither one nor zero, and keep activations in range."""
+    torch.manual_seed(0)
+    network = S0Net(S0Config())
+    for module in network.modules():
+        if isinstance(module, torch.nn.BatchNorm2d):
+            torch.nn.init.uniform_(module.weight, 0.2, 0.5)
+            torch.nn.init.uniform_(module.bias, -0.3, 0.3)
+            module.running_mean.uniform_(-0.3, 0.3)
+            module.running_var.uniform_(0.5, 2.0)
+    return network.eval()
+
+
+@pytest.fixture(scope="module")
+def fused(trained):
+    return fuse(copy.deepcopy(trained)).eval()
+
+
+def test_levels_are_those_of_table_5(fused):
+    with torch.no_grad():
+        levels = fused(torch.rand(2, 3, 64, 96))
+    for (features, confidence), stride in zip(levels, STRIDES, strict=True):
+        assert features.shape == (2, 32, 64 // stride, 96 // stride)
+        assert confidence.shape == (2, 64 // stride, 96 // stride)
+        np.testing.assert_allclose(features.norm(dim=1), 1.0, atol=1e-4)
+        assert 0 < confidence.min() < confidence.max() < 1
+
+
+def test_fused_is_the_same_function(trained, fused):
+    assert any(isinstance(m, BranchedBlock) for m in trained.modules())
+    assert not any(isinstance(m, (BranchedBlock, torch.nn.BatchNorm2d)) for m in fused.modules())
+    image = torch.rand(1, 3, 64, 64)
+    with torch.no_grad():
+        for before, after in zip(trained(image), fused(image), strict=True):
+            for a, b in zip(before, after, strict=True):
+                np.testing.assert_allclose(a, b, atol=1e-5)
+
+
+def test_size(trained, fused):
+    """The figures of docs/gpu.md; the paper's Table 5 gives shapes only."""
+    assert parameter_count(trained) == 957_123
+    assert parameter_count(fused) == 525_923
+    assert multiply_adds(fused, 512, 512) == pytest.approx(19.74e9, rel=1e-3)
+
+
+def test_gradients_reach_every_parameter(trained):
+    network = copy.deepcopy(trained).train()
+    features = network(torch.rand(2, 3, 32, 32))
+    sum((f * f.roll(1, 0)).sum() + c.sum() for f, c in features).backward()
+    assert all(p.grad is not None and torch.isfinite(p.grad).all() for p in network.parameters())
+
+
+def test_exported_graph_takes_any_size(fused, tmp_path):
+    names = [f"{kind}_{k}" for k in range(3) for kind in ("features", "confidence")]
+    axes = {"image": {1: "height", 2: "width"}}
+    axes |= {name: {1: f"h{name[-1]}", 2: f"w{name[-1]}"} for name in names}
+    deployed, path = Deployed(fused).eval(), tmp_path / "s0.onnx"
+    torch.onnx.export(
+        deployed, (torch.zeros(1, 64, 96, 3, dtype=torch.uint8),), str(path),
+        input_names=["image"], output_names=names, dynamic_axes=axes, opset_version=OPSET,
+        dynamo=False,
+    )  # fmt: skip
+    session = ort.InferenceSession(str(path), providers=["CPUExecutionProvider"])
+    rng = np.random.default_rng(0)
+    for size in ((64, 96), (40, 56)):
+        image = rng.integers(0, 256, (1, *size, 3), dtype=np.uint8)
+        with torch.no_grad():
+            expected = deployed(torch.from_numpy(image))
+        for found, value in zip(session.run(names, {"image": image}), expected, strict=True):
+            np.testing.assert_allclose(found, value.numpy(), atol=2e-4)
+
+
+def test_float16_changes_little(fused):
+    image = torch.rand(1, 3, 64, 64)
+    with torch.no_grad():
+        exact, half = fused(image), copy.deepcopy(fused).half()(image.half())
+    for (f, c), (g, d) in zip(exact, half, strict=True):
+        assert (1.0 - (f * g).sum(1)).max() < 1e-3
+        np.testing.assert_allclose(c, d, atol=5e-3)
