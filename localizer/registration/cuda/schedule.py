@@ -8,7 +8,7 @@ scores, the sums of equation 11, and the quality.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
@@ -22,6 +22,7 @@ from localizer.registration.backend import LMSettings, QuadraticPrior, level_int
 from localizer.registration.cuda import layout
 from localizer.registration.cuda.backend import FEW, CudaBackend, set_loss, stored
 from localizer.registration.cuda.driver import Graph
+from localizer.registration.cuda.memory import FrameMemory
 from localizer.registration.selection import LEAST_SCORE
 from localizer.types import Anchors, FeatureLevel, FeaturePyramid, PosePrior
 
@@ -120,7 +121,7 @@ class CudaSchedule:
             upload, run = (self._device.elapsed_ms(*events[k : k + 2]) for k in (0, 1))
             return replace(found, upload_ms=upload, graph_ms=run)
 
-    def _captured(self, shape: _Shape, memory: _Memory) -> Graph:
+    def _captured(self, shape: _Shape, memory: FrameMemory) -> Graph:
         if self._graph is not None and self._graph[0] == shape:
             return self._graph[1]
         if self._graph is not None:
@@ -132,21 +133,21 @@ class CudaSchedule:
         self._graph = shape, graph
         return graph
 
-    def _enqueue(self, shape: _Shape, memory: _Memory) -> None:
+    def _enqueue(self, shape: _Shape, memory: FrameMemory) -> None:
         for step in _steps(shape, memory, self._device.multiprocessors):
             kernels = self._backend.kernels(shape.channels[step.level])
             kernels.launch(step.kernel, step.blocks, step.threads, step.arguments)
 
-    def _memory(self, levels: int, count: int, config: JNGOConfig, anchors: int) -> _Memory:
+    def _memory(self, levels: int, count: int, config: JNGOConfig, anchors: int) -> FrameMemory:
         finish = _taking_part(anchors, COVARIANCE_ANCHORS)
         finish = max(finish, _taking_part(anchors, config.swarm_anchors[-1]))
-        return _Memory.of(
+        return FrameMemory.of(
             self._backend.arena.buffer, levels, count, _survivors(config, count), finish
         )
 
     def _upload(
         self,
-        memory: _Memory,
+        memory: FrameMemory,
         query: FeaturePyramid,
         camera: Camera,
         anchors: Anchors,
@@ -201,7 +202,9 @@ class CudaSchedule:
             return values.checked_address(np.float16 if half else np.float32)
         return self._backend.arena.put(name, stored(np.asarray(values), half))
 
-    def _collect(self, memory: _Memory, config: JNGOConfig, anchors: int, channels: int) -> Search:
+    def _collect(
+        self, memory: FrameMemory, config: JNGOConfig, anchors: int, channels: int
+    ) -> Search:
         block = np.empty(memory.result_size, np.uint8)
         self._device.download(block, memory.prior)
         self._device.synchronize()
@@ -253,87 +256,7 @@ class _Step:
     arguments: NDArray[np.void]
 
 
-@dataclass(frozen=True)
-class _Memory:
-    """Addresses within the frame's block: levels, motion, first swarm | prior, state, last swarm;
-    the first part and the state are uploaded, the last part comes back. Then scratch.
-    """
-
-    base: int
-    levels: int
-    motion: int
-    prior: int
-    state: int
-    swarms: tuple[NDArray[np.void], ...]
-    trial: tuple[int, int]
-    totals: int
-    order: int
-    alive: int
-    projected: int
-    finish: int
-    upload_size: int
-    result_size: int
-
-    @classmethod
-    def of(
-        cls,
-        buffer: Callable[[str, int], int],
-        levels: int,
-        count: int,
-        survivors: int,
-        anchors: int,
-    ) -> _Memory:
-        sizes = [
-            ("level", layout.LEVEL.itemsize * levels),
-            ("motion", layout.MOTION.itemsize),
-            ("R0", 72 * count), ("t0", 24 * count),
-            ("prior", layout.PRIOR.itemsize), ("state", layout.STATE.itemsize),
-            ("R2", 72 * survivors), ("t2", 24 * survivors),
-            ("s2", 8 * survivors), ("v2", 4 * survivors),
-            ("s0", 8 * count), ("v0", 4 * count),
-            ("R1", 72 * count), ("t1", 24 * count), ("s1", 8 * count), ("v1", 4 * count),
-            ("trial score", 8), ("trial visible", 4),
-            ("totals", 8 * count), ("order", 4 * count), ("alive", 4 * count),
-            ("projected", 4 * layout.PROBE_FLOATS * count),
-            ("finish", 4 * layout.WINNER_FLOATS * anchors),
-        ]  # fmt: skip
-        offsets, end = {}, 0
-        for name, size in sizes:
-            offsets[name] = end
-            end += -(-size // 16) * 16
-        base = buffer("frame", end)
-        at = {name: base + offset for name, offset in offsets.items()}
-        swarms = []
-        for k in range(3):
-            swarm = np.zeros((), dtype=layout.SWARM)
-            for field, key in zip(
-                ("rotations", "translations", "scores", "visible"), "Rtsv", strict=True
-            ):
-                swarm[field] = at[f"{key}{k}"]
-            swarms.append(swarm)
-        return cls(
-            base, at["level"], at["motion"], at["prior"], at["state"], tuple(swarms),
-            (at["trial score"], at["trial visible"]), at["totals"], at["order"], at["alive"],
-            at["projected"], at["finish"], offsets["R2"], offsets["s0"] - offsets["prior"],
-        )  # fmt: skip
-
-    def level(self, k: int) -> int:
-        """Address of the k-th level's description."""
-        return self.levels + k * layout.LEVEL.itemsize
-
-    def write(self, frame: NDArray[np.uint8], address: int, value: NDArray) -> None:
-        """Put a value into the host's copy of the block."""
-        start = address - self.base
-        frame[start : start + value.nbytes] = value.reshape(-1).view(np.uint8)
-
-    def winner(self, swarm: NDArray[np.void]) -> NDArray[np.void]:
-        """The swarm, with scores going elsewhere: sharpening does not change the ranking."""
-        out = swarm.copy()
-        out["scores"], out["visible"] = self.trial
-        return out
-
-
-def _steps(shape: _Shape, memory: _Memory, multiprocessors: int) -> Iterator[_Step]:
+def _steps(shape: _Shape, memory: FrameMemory, multiprocessors: int) -> Iterator[_Step]:
     """The launches, in order (docs/registration.md, section 7)."""
     c, searched = shape.config, len(shape.config.iterations)
     levels = len(shape.channels)
@@ -361,7 +284,7 @@ def _steps(shape: _Shape, memory: _Memory, multiprocessors: int) -> Iterator[_St
     yield from _sharpening(shape, memory)
 
 
-def _sharpening(shape: _Shape, memory: _Memory) -> Iterator[_Step]:
+def _sharpening(shape: _Shape, memory: FrameMemory) -> Iterator[_Step]:
     """The winner's last steps and the sums at its pose."""
     c, searched, levels = shape.config, len(shape.config.iterations), len(shape.channels)
     final, wanted = memory.swarms[2], c.swarm_anchors[-1]
@@ -396,7 +319,7 @@ def _sharpening(shape: _Shape, memory: _Memory) -> Iterator[_Step]:
 
 def _refining(
     shape: _Shape,
-    memory: _Memory,
+    memory: FrameMemory,
     level: int,
     swarm: NDArray[np.void],
     alive: int,
@@ -419,7 +342,7 @@ def _refining(
 
 
 def _weighing(
-    shape: _Shape, memory: _Memory, level: int, swarm: NDArray[np.void], alive: int, wanted: int
+    shape: _Shape, memory: FrameMemory, level: int, swarm: NDArray[np.void], alive: int, wanted: int
 ) -> Iterator[_Step]:
     """Score without the prior, then weigh it by the best score."""
     c = shape.config
@@ -434,7 +357,7 @@ def _weighing(
 
 def _selecting(
     shape: _Shape,
-    memory: _Memory,
+    memory: FrameMemory,
     level: int,
     source: int,
     target: int,
