@@ -41,8 +41,8 @@ class FrameMemory:
         survivors: int,
         anchors: int,
     ) -> FrameMemory:
-        """The layout for so many levels and hypotheses, of which `survivors` at most are left at the
-        end, and `anchors` at most in the sums. buffer: gives device memory by name and size.
+        """The layout for so many levels and hypotheses, of which `survivors` at most are left at
+        the end, and `anchors` at most in the sums. buffer: gives device memory by name and size.
         """
         sizes = [
             ("level", layout.LEVEL.itemsize * levels),
