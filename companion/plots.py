@@ -98,7 +98,8 @@ def plot_errors(
 ) -> None:
     """Errors over time, one row per panel; `shaded` marks spans (begin, end, name).
 
-    A label has the same colour in every panel; a curve is broken where its error is NaN.
+    Each axis reaches as far as the errors in the spans: a start that was wrong outside of them would
+    flatten all else. A label has the same colour in every panel; a curve is broken where its error is NaN.
     """
     panels = list(dict.fromkeys(s.panel for s in series))
     labels = list(dict.fromkeys(s.label for s in series))
@@ -114,7 +115,19 @@ def plot_errors(
         for begin, end, name in shaded:
             axes.axvspan(begin, end, color="tab:gray", alpha=0.15, label=name)
         axes.set(xlabel=abscissa, ylabel=panel)
-        axes.set_ylim(bottom=0)
+        axes.set_ylim(0, _limit([s for s in series if s.panel == panel], shaded))
         axes.grid(alpha=0.3)
         axes.legend(loc="upper right", fontsize="small")
     figure.savefig(path, dpi=110)
+
+
+def _limit(
+    series: Sequence[ErrorSeries], spans: Sequence[tuple[float, float, str]]
+) -> float | None:
+    """Top of an axis: a little over the largest error within the spans; None leaves it open."""
+    inside = [
+        s.error[(s.time_s >= begin) & (s.time_s <= end)] for s in series for begin, end, _ in spans
+    ]
+    values = np.concatenate([*inside, np.empty(0)])
+    largest = values[np.isfinite(values)].max(initial=0.0)
+    return 1.15 * float(largest) if largest > 0 else None
