@@ -98,8 +98,9 @@ def plot_errors(
 ) -> None:
     """Errors over time, one row per panel; `shaded` marks spans (begin, end, name).
 
-    Each axis reaches as far as the errors in the spans: a start that was wrong outside of them would
-    flatten all else. A label has the same colour in every panel; a curve is broken where its error is NaN.
+    Each axis reaches as far as the errors in the spans: a start that was wrong outside of them
+    would flatten all else. A label has the same colour in every panel; a curve is broken where its
+    error is NaN.
     """
     panels = list(dict.fromkeys(s.panel for s in series))
     labels = list(dict.fromkeys(s.label for s in series))

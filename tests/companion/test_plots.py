@@ -1,0 +1,35 @@
+import cv2
+import numpy as np
+import pytest
+
+from companion.plots import ErrorSeries, checkerboard, plot_errors
+
+TIME = np.linspace(-5.0, 10.0, 60)
+
+
+def _height_of_curve(path):
+    """Rows (of the figure) that the curve in the first colour spans."""
+    image = cv2.imread(str(path)).astype(int)
+    blue = (np.abs(image - (180, 119, 31)).max(axis=-1) < 40).any(axis=1)  # C0, BGR
+    return int(np.flatnonzero(blue)[-1] - np.flatnonzero(blue)[0])
+
+
+@pytest.mark.parametrize("spans", [(), ((0.0, 8.0, "denied"),)])
+def test_an_outlier_outside_the_spans_does_not_flatten_the_curve(tmp_path, spans):
+    error = 1.0 + 0.8 * np.sin(TIME)
+    plot_errors(tmp_path / "a.png", [ErrorSeries("x", TIME, error, "m")], spans)
+    error[3] = 500.0  # before the span
+    error[30] = np.nan
+    plot_errors(tmp_path / "b.png", [ErrorSeries("x", TIME, error, "m")], spans)
+    gone = ErrorSeries("x", TIME, np.full(60, np.nan), "m")
+    plot_errors(tmp_path / "c.png", [gone], spans)
+    if spans:
+        assert _height_of_curve(tmp_path / "b.png") >= 0.9 * _height_of_curve(tmp_path / "a.png")
+
+
+def test_a_checkerboard_alternates():
+    board = checkerboard(np.zeros((40, 80, 3), np.uint8), np.full((40, 80, 3), 255, np.uint8))
+    assert board[5, 5, 0] == 0
+    assert board[5, 15, 0] == 255
+    assert board[15, 5, 0] == 255
+    assert board.mean() == pytest.approx(127.5)
