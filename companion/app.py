@@ -33,7 +33,7 @@ from mavlink_bridge.messages import TargetReport, TrackRequest
 
 _log = logging.getLogger(__name__)
 # How long a thread may keep the interpreter from another that woke up. Python's 5 ms, several times
-# between an estimate and the autopilot, would be 10 ms in the median (benchmarks/bridge.py).
+# between an estimate and the autopilot, would be 7 ms in the median (benchmarks/bridge.py).
 _SWITCH_S = 0.0002
 _WARNING = 4  # MAV_SEVERITY_WARNING; lower is worse
 
