@@ -2,8 +2,8 @@
 
     python benchmarks/map_streaming.py [--km 10] [--seconds 40] [--budget-mb 384] [--keep DIR]
 
-First, regions of growing size are built: tiles a second, processor time a tile, and that both stay
-as they are (regions that are in DIR already are not built again). Then an aircraft flies over the
+First, regions of growing size are built: tiles a second, and that they
+stay as they are (regions that are in DIR already are not built again). Then an aircraft flies over the
 largest at 25 m/s, at 120 and at 400 m, ten views a second in real time, with and without loading
 ahead, every time with a cold page cache. Reported after a warm-up of 5 s: how long `select` and
 `prefetch` took (nothing else of the cache runs on the render thread), how much of it was work of
@@ -95,23 +95,16 @@ def region(km: float) -> SourceTree:
 
 def build(km: float, out: Path) -> list[str]:
     """Build a region; a row of the table."""
-    wall, cpu = time.perf_counter(), _cpu_seconds()
+    begin = time.perf_counter()
     manifest = build_tree(region(km), out, name=f"generated {km} km")
-    wall, cpu = time.perf_counter() - wall, _cpu_seconds() - cpu
+    wall = time.perf_counter() - begin
     return [
         f"{km:g} x {km:g} km",
         str(manifest.tiles),
         f"{manifest.bytes / 1e9:.2f}",
         f"{wall:.1f}",
         f"{manifest.tiles / wall:.1f}",
-        f"{1e3 * cpu / manifest.tiles:.1f}",
     ]
-
-
-def _cpu_seconds() -> float:
-    """Of this process and of its children that have ended."""
-    usages = (resource.getrusage(who) for who in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN))
-    return sum(usage.ru_utime + usage.ru_stime for usage in usages)
 
 
 def _forget(cache: TileCache) -> None:
@@ -188,7 +181,7 @@ def main() -> None:
     console = Console(width=160)
     with tempfile.TemporaryDirectory() as temporary:
         folder = options.keep or Path(temporary)
-        table = Table("region", "tiles", "GB", "seconds", "tiles / s", "processor ms / tile")
+        table = Table("region", "tiles", "GB", "seconds", "tiles / s")
         for km in (options.km / 4, options.km / 2, options.km):
             out = folder / f"region{km:g}"
             if not out.exists():
