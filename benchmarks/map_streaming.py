@@ -2,12 +2,12 @@
 
     python benchmarks/map_streaming.py [--km 10] [--seconds 40] [--budget-mb 384] [--keep DIR]
 
-First, regions of growing size are built: tiles a second, and that they
-stay as they are (regions that are in DIR already are not built again). Then an aircraft flies over the
-largest at 25 m/s, at 120 and at 400 m, ten views a second in real time, with and without loading
-ahead, every time with a cold page cache. Reported after a warm-up of 5 s: how long `select` and
-`prefetch` took (nothing else of the cache runs on the render thread), how much of it was work of
-that thread, how many frames were at the wanted detail, and memory.
+First, regions of growing size are built: tiles a second, and that they stay as they are (regions
+that are in DIR already are not built again). Then an aircraft flies over the largest at 25 m/s, at
+120 and at 400 m, ten views a second in real time, with and without loading ahead, every time with
+a cold page cache. Reported after a warm-up of 5 s: how long `select` and `prefetch` took (nothing
+else of the cache runs on the render thread), how much of it was work of that thread, how many
+frames were at the wanted detail, and memory.
 """
 
 from __future__ import annotations
