@@ -68,7 +68,7 @@ def wilson(hits: int, count: int) -> tuple[float, float]:
     z, p = 1.96, hits / count
     middle = (p + z * z / (2 * count)) / (1 + z * z / count)
     half = z / (1 + z * z / count) * np.sqrt(p * (1 - p) / count + z * z / (4 * count**2))
-    return 100 * (middle - half), 100 * (middle + half)
+    return 100 * max(middle - half, 0.0), 100 * min(middle + half, 1.0)
 
 
 def difference(a: Sequence[Outcome], b: Sequence[Outcome]) -> tuple[float, float, float]:
