@@ -37,7 +37,9 @@ def cache_directory() -> Path:
     base = os.environ.get("PILOT_CACHE")
     if base:
         return Path(base) / "cuda"
-    return Path(os.environ.get("XDG_CACHE_HOME", "~/.cache")).expanduser() / "pilot" / "cuda"
+    return (
+        Path(os.environ.get("XDG_CACHE_HOME", "~/.cache")).expanduser() / "pilot-companion" / "cuda"
+    )
 
 
 def compile_kernels(

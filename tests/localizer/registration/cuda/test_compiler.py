@@ -109,7 +109,7 @@ def test_where_images_are_kept(monkeypatch, tmp_path):
     assert cache_directory() == tmp_path / "cuda"
     monkeypatch.delenv("PILOT_CACHE")
     monkeypatch.setenv("XDG_CACHE_HOME", "/elsewhere")
-    assert str(cache_directory()) == "/elsewhere/pilot/cuda"
+    assert str(cache_directory()) == "/elsewhere/pilot-companion/cuda"
 
 
 def test_the_sources_are_shipped():
