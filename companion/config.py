@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import yaml
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator
@@ -18,7 +18,7 @@ from mavlink_bridge.config import BridgeConfig
 
 
 class _Model(BaseModel):
-    model_config = ConfigDict(frozen=True, extra="forbid")
+    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
 
 
 class CameraModel(_Model):
@@ -39,12 +39,15 @@ class CameraModel(_Model):
         return Camera(self.width, self.height, self.fx, self.fy, self.cx, self.cy, self.distortion)
 
 
+Arm = Annotated[float, Field(ge=-20.0, le=20.0)]  # metres; larger ones were given in cm or mm
+
+
 class FeedConfig(_Model):
     """Where the video comes from. How the camera is mounted stands under ``bridge.camera``."""
 
     source: str = Field(description="udp://, rtsp://, /dev/videoN, a video file or a folder")
     model: CameraModel
-    lever_arm_m: tuple[float, float, float] = Field(
+    lever_arm_m: tuple[Arm, Arm, Arm] = Field(
         (0.0, 0.0, 0.0), description="camera from the autopilot, body axes: forward right down"
     )
     settings: SourceSettings = SourceSettings()
@@ -103,7 +106,8 @@ def load_config(path: Path) -> CompanionConfig:
         data = yaml.safe_load(path.read_text(encoding="utf-8"))
     except OSError as error:
         raise ConfigError(f"{path}: cannot be read: {error.strerror}") from error
-    except (yaml.YAMLError, UnicodeDecodeError) as error:
+    # ValueError: no UTF-8, or a date that does not exist; RecursionError: endless nesting.
+    except (yaml.YAMLError, ValueError, RecursionError) as error:
         raise ConfigError(f"{path}: not valid YAML: {error}") from error
     if not isinstance(data, dict):
         raise ConfigError(f"{path}: expected a mapping of settings at the top")

@@ -8,18 +8,19 @@ from __future__ import annotations
 
 import csv
 import json
+import logging
 import struct
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, TextIO
 
 import numpy as np
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from companion.build import MapStack, build_localizer
 from companion.config import CompanionConfig, parse_config
-from companion.errors import RecordError
+from companion.errors import RecordError, StreamDecodeError
 from companion.fixes import camera_rotation, vehicle_prior
 from companion.recorder import MANIFEST_NAME
 from companion.sources.base import fitted_camera
@@ -32,6 +33,7 @@ from localizer.types import Frame, PoseEstimate
 from mavlink_bridge import quaternion as quat
 from mavlink_bridge.vehicle import VehicleTracker
 
+_log = logging.getLogger(__name__)
 _MIN_IMAGES = 0.9  # share of the localized frames
 _FRAME_START = {0xFE: (8, 1), 0xFD: (12, 1)}  # bytes beside the payload, place of its length
 _SIGNATURE_BYTES = 13
@@ -99,8 +101,8 @@ def load_record(folder: Path) -> FlightRecord:
         offset_ns = int(manifest["utc_ns"]) - start_ns
         config = parse_config(manifest["config"], str(folder / MANIFEST_NAME))
         with (folder / "estimates.csv").open(newline="", encoding="utf-8") as file:
-            estimates = tuple(_estimate(row) for row in csv.DictReader(file))
-    except (OSError, ValueError, KeyError, TypeError) as error:
+            estimates = tuple(_estimate(row) for row in _whole_rows(file))
+    except (OSError, ValueError, KeyError, TypeError, ArithmeticError, csv.Error) as error:
         raise RecordError(f"{folder}: not a flight's record: {error}") from error
     if not estimates:
         raise RecordError(f"{folder}: holds no estimate; nothing was localized in that flight")
@@ -113,10 +115,20 @@ def load_record(folder: Path) -> FlightRecord:
     return FlightRecord(folder, config, start_ns, offset_ns, estimates)
 
 
+def _whole_rows(file: TextIO) -> Iterator[dict[str, str]]:
+    """The rows, without a last one that a loss of power cut short."""
+    lines = file.readlines()
+    if lines and not lines[-1].endswith("\n"):
+        lines.pop()
+    return csv.DictReader(lines)
+
+
 def _estimate(row: dict[str, str]) -> RecordedEstimate:
     exposure_ns = int(row["exposure_time_ns"])
     q = np.array([float(row[k]) for k in ("qw", "qx", "qy", "qz")])
     t = np.array([float(row[k]) for k in ("east_m", "north_m", "up_m")])
+    if not np.isfinite([*q, *t]).all() or not np.any(q):
+        raise ValueError(f"estimates.csv: the estimate at {exposure_ns} is no pose")
     return RecordedEstimate(
         exposure_ns,
         int(row["sequence"]),
@@ -223,7 +235,17 @@ def replay(
                 )  # fmt: skip
                 if prior is not None:
                     localizer.set_prior(prior)
-            frames.append(ReplayedFrame(recorded, _localize(localizer, camera, recorded, path)))
+            try:
+                again = _localize(localizer, camera, recorded, path)
+            except StreamDecodeError as error:  # power may have gone while it was written
+                _log.warning("left out: %s", error)
+                continue
+            frames.append(ReplayedFrame(recorded, again))
+        if len(frames) < _MIN_IMAGES * len(record.estimates):
+            raise RecordError(
+                f"{record.folder}: only {len(frames)} of {len(record.estimates)} images in "
+                "snapshots can be read; nothing can be said about this flight"
+            )
         return frames
     finally:
         stack.close()

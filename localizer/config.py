@@ -16,7 +16,7 @@ from localizer.render.select import Backend
 class AttitudePrior(BaseModel):
     """How well the autopilot's attitude and the gimbal's angles tell the camera's rotation."""
 
-    model_config = ConfigDict(frozen=True, extra="forbid")
+    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
 
     tilt_sigma_deg: float = Field(0.7, gt=0, description="roll and pitch, which gravity shows")
     heading_sigma_deg: float = Field(4.0, gt=0, description="yaw, by the compass")
@@ -25,7 +25,7 @@ class AttitudePrior(BaseModel):
 class LocalizerConfig(BaseModel):
     """What the dual-thread engine needs to know."""
 
-    model_config = ConfigDict(frozen=True, extra="forbid")
+    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
 
     width: int = Field(320, ge=64, le=2048, description="width of query and reference, pixels")
     model: Path | None = Field(None, description="ONNX feature network; none: the shipped one")
@@ -34,9 +34,11 @@ class LocalizerConfig(BaseModel):
     device: DeviceChoice = Field(
         "auto", description="of the optimizer; auto, cuda: a GPU that works, else the CPU"
     )
-    threads: int = Field(2, ge=1, description="CPU threads of rendering and optimization")
-    feature_threads: int = Field(1, ge=1, description="CPU threads of each feature extraction")
-    cache_mib: int = Field(384, ge=16, description="resident tiles, MiB")
+    threads: int = Field(2, ge=1, le=256, description="CPU threads of rendering and optimization")
+    feature_threads: int = Field(
+        1, ge=1, le=256, description="CPU threads of each feature extraction"
+    )
+    cache_mib: int = Field(384, ge=16, le=1 << 20, description="resident tiles, MiB")
     seed: int = Field(0, ge=0, description="seed of anchors and hypotheses")
     registration: JNGOConfig = JNGOConfig()
     # Off: a gimbal that is half a degree off pulls the position by a metre at 120 m, while vision

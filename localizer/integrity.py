@@ -19,7 +19,7 @@ from localizer.types import RegistrationStatus, TrackingState
 class IntegrityConfig(BaseModel):
     """Thresholds of the acceptance test and of the state machine."""
 
-    model_config = ConfigDict(frozen=True, extra="forbid")
+    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
 
     min_overlap: float = Field(0.35, ge=0, le=1, description="share of anchors in view")
     min_quality: float = Field(0.15, ge=0, le=1, description="registration quality")

@@ -27,7 +27,7 @@ _H = np.hstack([np.eye(6), np.zeros((6, 6))])
 class MotionConfig(BaseModel):
     """Process noise of the constant-velocity model, as white accelerations."""
 
-    model_config = ConfigDict(frozen=True, extra="forbid")
+    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
 
     acceleration_sigma: float = Field(3.0, gt=0, description="m/s²")
     angular_acceleration_sigma: float = Field(1.0, gt=0, description="rad/s²")

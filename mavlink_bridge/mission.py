@@ -5,6 +5,7 @@ https://mavlink.io/en/services/mission.html
 
 from __future__ import annotations
 
+import time
 from dataclasses import dataclass
 from typing import Any
 
@@ -16,6 +17,8 @@ from mavlink_bridge.errors import MissionError
 
 _RETRIES = 5
 _ANSWER_S = 1.0
+_LONGEST_S = 120.0  # for all items
+_POLE = 900_000_000  # 1e-7 degrees
 _WANTED = (
     mavlink.MAVLINK_MSG_ID_MISSION_COUNT,
     mavlink.MAVLINK_MSG_ID_MISSION_ITEM_INT,
@@ -60,14 +63,21 @@ class MissionClient(VehicleClient):
             lambda: self._count is not None,
             "the number of items",
         )
-        for number in range(self._count or 0):
+        # Once: a count that a ground station asks for meanwhile must not change ours.
+        count, ends_s = self._count or 0, time.monotonic() + _LONGEST_S
+        for number in range(count):
+            if time.monotonic() > ends_s:
+                raise MissionError(
+                    f"the flight controller gave {number} of {count} items of its mission in "
+                    f"{_LONGEST_S:.0f} s; check the link's rate, or the mission in the vehicle"
+                )
             self._repeat(
                 mavlink.MAVLink_mission_request_int_message(self.system, self.component, number, 0),
                 lambda number=number: number in self._items,
                 f"item {number}",
             )
         self.ask(mavlink.MAVLink_mission_ack_message(self.system, self.component, 0))
-        items = [self._items[number] for number in range(self._count or 0)]
+        items = [self._items[number] for number in range(count)]
         return [
             Waypoint(item.seq, item.x * 1e-7, item.y * 1e-7) for item in items if _is_place(item)
         ]
@@ -97,7 +107,14 @@ class MissionClient(VehicleClient):
 def _is_place(item: Any) -> bool:
     """Whether the item is flown to; 0, 0 means where the vehicle is."""
     flown = item.seq == 0 or item.command <= mavlink.MAV_CMD_NAV_LAST
-    return flown and item.frame in _GLOBAL_FRAMES and (item.x != 0 or item.y != 0)
+    if not flown or item.frame not in _GLOBAL_FRAMES or (item.x, item.y) == (0, 0):
+        return False
+    if abs(item.x) > _POLE or abs(item.y) > 2 * _POLE:
+        raise MissionError(
+            f"item {item.seq} of the mission lies at {item.x * 1e-7:g}, {item.y * 1e-7:g} degrees, "
+            "which is no place on Earth; load the mission into the vehicle again"
+        )
+    return True
 
 
 def download_mission(config: BridgeConfig) -> list[Waypoint]:

@@ -40,7 +40,7 @@ class FixModel(BaseModel):
     frame (positions and yaw) about the origin, yaw_error_deg the yaw alone.
     """
 
-    model_config = ConfigDict(frozen=True, extra="forbid")
+    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
 
     rate_hz: float = Field(10.0, gt=0, le=50)
     sigma_m: float = Field(0.5, ge=0, description="1 sigma of each position axis")
@@ -56,7 +56,7 @@ class FixModel(BaseModel):
 class RawMessage(BaseModel):
     """What `TruthFeed` sends. claimed_sigma_m: None sends NaN covariance."""
 
-    model_config = ConfigDict(frozen=True, extra="forbid")
+    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
 
     message: Literal["vision_position_estimate", "odometry", "gps_input"] = (
         "vision_position_estimate"

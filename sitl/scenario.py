@@ -20,7 +20,7 @@ class ScenarioError(SimulationError):
 
 
 class _Model(BaseModel):
-    model_config = ConfigDict(frozen=True, extra="forbid")
+    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
 
 
 class Leg(_Model):
@@ -84,13 +84,14 @@ def load_scenario(path: Path) -> Scenario:
         return Scenario.model_validate(data)
     except OSError as error:
         raise ScenarioError(f"{path}: cannot be read: {error.strerror}") from error
-    except (yaml.YAMLError, UnicodeDecodeError) as error:
-        raise ScenarioError(f"{path}: not valid YAML: {error}") from error
     except ValidationError as error:
         problems = "\n".join(
             f"  {'.'.join(str(p) for p in e['loc'])}: {e['msg']}" for e in error.errors()
         )
         raise ScenarioError(f"{path}:\n{problems}") from error
+    # ValueError: no UTF-8, or a date that does not exist; RecursionError: endless nesting.
+    except (yaml.YAMLError, ValueError, RecursionError) as error:
+        raise ScenarioError(f"{path}: not valid YAML: {error}") from error
 
 
 def check_inside(scenario: Scenario, size_m: float) -> None:

@@ -58,7 +58,7 @@ class SourceCounters:
 class SourceSettings(BaseModel):
     """The keys of a camera feed in a deployment's configuration."""
 
-    model_config = ConfigDict(frozen=True, extra="forbid")
+    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
 
     latency_ms: float = Field(
         default=0.0,

@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 import yaml
-from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from localizer.errors import ModelError
 from localizer.training.model import ModelConfig
@@ -82,5 +82,6 @@ def load_config(path: Path) -> TrainConfig:
         return TrainConfig.model_validate(yaml.safe_load(path.read_text()))
     except OSError as error:
         raise ModelError(f"{path}: cannot be read: {error.strerror}") from error
-    except (ValidationError, yaml.YAMLError) as error:
+    # ValueError: no UTF-8, or a value that does not hold; RecursionError: endless nesting.
+    except (yaml.YAMLError, ValueError, RecursionError) as error:
         raise ModelError(f"{path}: {error}") from error

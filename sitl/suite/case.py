@@ -25,7 +25,7 @@ SCENARIOS = Path(__file__).parents[1] / "scenarios"
 
 
 class _Model(BaseModel):
-    model_config = ConfigDict(frozen=True, extra="forbid")
+    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
 
 
 class VehicleSpec(_Model):
@@ -151,6 +151,9 @@ class Case(_Model):
             raise ValueError("`before` needs the bridge")
         if list(self.timeline) != sorted(self.timeline, key=lambda e: e.at_s):
             raise ValueError("timeline: events must be in the order of at_s")
+        ends_s = self.flight.seconds
+        if ends_s is not None and any(event.at_s >= ends_s for event in self.timeline):
+            raise ValueError(f"timeline: an event comes after the flight's end at {ends_s:g} s")
         for event in self.timeline:
             self.changed(self.fixes, event)
         return self
@@ -167,10 +170,13 @@ def load_case(path: Path) -> Case:
         data = yaml.safe_load(path.read_text(encoding="utf-8"))
     except OSError as error:
         raise ScenarioError(f"{path}: cannot be read: {error.strerror}") from error
-    except (yaml.YAMLError, UnicodeDecodeError) as error:
+    # ValueError: no UTF-8, or a date that does not exist; RecursionError: endless nesting.
+    except (yaml.YAMLError, ValueError, RecursionError) as error:
         raise ScenarioError(f"{path}: not valid YAML: {error}") from error
     if not isinstance(data, dict):
         raise ScenarioError(f"{path}: expected a mapping of settings at the top")
+    if "name" in data:
+        raise ScenarioError(f"{path}: name: a scenario is named by its file, leave it out")
     try:
         return Case.model_validate({"name": path.stem, **data})
     except ValidationError as error:

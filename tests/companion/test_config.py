@@ -11,7 +11,8 @@ from companion.errors import ConfigError
 from mavlink_bridge import BridgeConfig
 
 MODEL = {"width": 640, "height": 480, "fx": 550, "fy": 550, "cx": 320, "cy": 240}
-MINIMAL = {"map": "cache", "camera": {"source": "udp://127.0.0.1:5600", "model": MODEL}}
+CAMERA = {"source": "udp://127.0.0.1:5600", "model": MODEL}
+MINIMAL = {"map": "cache", "camera": CAMERA}
 
 
 def _write(tmp_path: Path, data: object) -> Path:
@@ -50,6 +51,13 @@ def test_minimal_config_and_paths_relative_to_the_file(tmp_path):
         ({"bridge": {"connection": "tcp:host:0"}}, "0 is no port number"),
         ({"bridge": {"connection": "serial:/dev/ttyS0:99999999999"}}, "no baud rate"),
         ({"bridge": {"link_timeout_s": 0.01}}, "bridge.link_timeout_s"),
+        ({"localizer": {"threads": 10**9}}, "localizer.threads"),
+        ({"localizer": {"cache_mib": 10**9}}, "localizer.cache_mib"),
+        ({"localizer": {"integrity": {"gate": float("inf")}}}, "localizer.integrity.gate"),
+        ({"localizer": {"motion": {"turn_sigma": float("inf")}}}, "localizer.motion.turn_sigma"),
+        ({"prior": {"position_sigma_m": float("inf")}}, "prior.position_sigma_m"),
+        ({"camera": CAMERA | {"lever_arm_m": [0, float("nan"), 0]}}, "camera.lever_arm_m.1"),
+        ({"camera": CAMERA | {"lever_arm_m": [120, 0, 0]}}, "camera.lever_arm_m.0"),
     ],
 )
 def test_every_problem_is_named_by_its_key(tmp_path, change, named):
@@ -58,7 +66,9 @@ def test_every_problem_is_named_by_its_key(tmp_path, change, named):
     assert "config.yaml" in str(caught.value)
 
 
-@pytest.mark.parametrize("text", ["", "- a\n- b\n", "map: [", "\x00"])
+@pytest.mark.parametrize(
+    "text", ["", "- a\n- b\n", "map: [", "\x00", "map: 2026-13-41", "map: " + 2000 * "["]
+)
 def test_files_that_are_no_mapping(tmp_path, text):
     with pytest.raises(ConfigError):
         load_config(_write(tmp_path, text))

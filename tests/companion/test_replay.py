@@ -174,6 +174,48 @@ def test_the_manifest_dates_the_tlog_and_says_what_flew(record):
     assert times == sorted(times)
 
 
+def _copy_of(record, tmp_path):
+    folder = tmp_path / "copy"
+    (folder / "snapshots").mkdir(parents=True)
+    for name in ("record.json", "estimates.csv"):
+        (folder / name).write_bytes((record / name).read_bytes())
+    for image in (record / "snapshots").iterdir():
+        (folder / "snapshots" / image.name).symlink_to(image)
+    return folder
+
+
+def test_a_row_that_a_loss_of_power_cut_short_is_left_out(record, tmp_path):
+    folder = _copy_of(record, tmp_path)
+    whole = load_record(folder).estimates
+    text = (folder / "estimates.csv").read_text()
+    (folder / "estimates.csv").write_text(text[: len(text) - 40])
+    assert [e.sequence for e in load_record(folder).estimates] == [e.sequence for e in whole[:-1]]
+
+
+@pytest.mark.parametrize(
+    ("column", "value"), [("latency_ms", "inf"), ("qw", "nan"), ("east_m", "x"), ("sequence", "")]
+)
+def test_a_row_that_is_no_estimate_is_named(record, tmp_path, column, value):
+    folder = _copy_of(record, tmp_path)
+    rows = _rows(record)
+    with (folder / "estimates.csv").open("w", newline="") as file:
+        writer = csv.DictWriter(file, rows[0].keys())
+        writer.writeheader()
+        writer.writerows([*rows, rows[0] | {column: value}])
+    with pytest.raises(RecordError, match="not a flight's record"):
+        load_record(folder)
+
+
+def test_damaged_images_are_no_agreement(record, tmp_path):
+    folder = _copy_of(record, tmp_path)
+    for image in (folder / "snapshots").iterdir():
+        image.unlink()
+        image.touch()
+    loaded = load_record(folder)
+    with pytest.raises(RecordError, match=r"only 0 of \d+ images in snapshots can be read"):
+        replay(loaded, loaded.config.bridge.tlog)
+
+
 def test_a_damaged_tlog_is_told(tmp_path):
     path = tmp_path / "bad.tlog"
     path.write_bytes(struct.pack(">Q", 1) + b"no frame at all")

@@ -107,6 +107,37 @@ def test_refusal_and_silence_are_named(
         download_mission(config(f"udpout:127.0.0.1:{vehicle.port}"))
 
 
+def test_a_count_that_changes_meanwhile_is_not_ours(with_mission: Callable[..., Any]) -> None:
+    vehicle = with_mission()
+    answer = vehicle._answer
+
+    def interrupted(message: Any) -> None:
+        if message.get_type() == "MISSION_REQUEST_INT":
+            vehicle.send(mavlink.MAVLink_mission_count_message(1, 191, 50, 0))
+        answer(message)
+
+    vehicle._answer = interrupted
+    same(download_mission(config(f"udpout:127.0.0.1:{vehicle.port}")), PLACES)
+
+
+def test_a_place_that_is_not_on_earth_is_named(
+    with_mission: Callable[..., Any], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(f"{__name__}.ITEMS", [*ITEMS[:2], (16, RELATIVE, 1_740_000_000, 85455940)])
+    vehicle = with_mission()
+    with pytest.raises(MissionError, match=r"item 2 .* 174, 8\.54559 degrees"):
+        download_mission(config(f"udpout:127.0.0.1:{vehicle.port}"))
+
+
+def test_a_mission_that_never_ends_is_given_up(
+    with_mission: Callable[..., Any], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("mavlink_bridge.mission._LONGEST_S", 0.0)
+    vehicle = with_mission()
+    with pytest.raises(MissionError, match="gave 0 of 6 items"):
+        download_mission(config(f"udpout:127.0.0.1:{vehicle.port}"))
+
+
 def test_nobody_there(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("mavlink_bridge.client._CONNECT_S", 0.2)
     with pytest.raises(ConnectionSilentError, match="no autopilot heartbeat at udpout"):

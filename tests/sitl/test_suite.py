@@ -67,6 +67,11 @@ def case_text(**changes: str) -> str:
         ({"flight": "{side_m: 0}"}, "needs `seconds`"),
         ({"bridge": "", "raw": "{}", "before": "{reboot: true}"}, "needs the bridge"),
         ({"title": "["}, "not valid YAML"),
+        ({"title": "2026-13-41"}, "not valid YAML"),
+        ({"name": "../../elsewhere"}, "named by its file"),
+        ({"fixes": "{offset_north_m: .nan}"}, "fixes.offset_north_m"),
+        ({"vehicle": "{sources: vision, parameters: {A: .nan}}"}, "vehicle.parameters.A"),
+        ({"flight": "{seconds: 5}", "timeline": "[{at_s: 9, reboot: true}]"}, "flight's end"),
     ],
 )
 def test_a_bad_file_is_a_named_error(tmp_path: Path, changes: dict[str, str], named: str) -> None:
