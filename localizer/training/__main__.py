@@ -3,19 +3,24 @@
 from __future__ import annotations
 
 import logging
+import sys
 import threading
+from concurrent.futures import Future
 from itertools import chain
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
+from localizer.errors import LocalizerError
 from localizer.training.config import TrainConfig, load_config
 from localizer.training.pairs import SceneConfig
 from localizer.training.shards import PhotoSource, write_shards, write_world_shards
 from localizer.training.worlds import FIRST_SEED
 
-app = typer.Typer(help=__doc__, no_args_is_help=True, add_completion=False)
+app = typer.Typer(
+    help=__doc__, no_args_is_help=True, add_completion=False, pretty_exceptions_enable=False
+)
 
 ConfigPath = Annotated[Path, typer.Argument(help="YAML file of the run, see configs/.")]
 
@@ -39,9 +44,7 @@ def train(
 
     loaded = load_config(config)
     trainer = Trainer(loaded)
-    if trainer.workers.rank == 0:
-        threading.Thread(target=_generate, args=(loaded,), daemon=True).start()
-    trainer.run(steps)
+    trainer.run(steps, _generating(loaded) if trainer.workers.rank == 0 else None)
 
 
 @app.command()
@@ -132,6 +135,22 @@ def scene_config(config: TrainConfig) -> SceneConfig:
     return SceneConfig(photo_share=config.data.photo_share, light_variety=config.data.light_variety)
 
 
+def _generating(config: TrainConfig) -> Future[None]:
+    """Generation on a thread that ends with the process."""
+    done: Future[None] = Future()
+
+    def generate() -> None:
+        try:
+            _generate(config)
+        except Exception as error:
+            done.set_exception(error)
+        else:
+            done.set_result(None)
+
+    threading.Thread(target=generate, daemon=True).start()
+    return done
+
+
 def _generate(config: TrainConfig) -> None:
     """In the order in which training asks: first scenes, mesh worlds, the other scenes."""
     data = config.data
@@ -148,6 +167,16 @@ def _generate(config: TrainConfig) -> None:
         logging.getLogger(__name__).debug("%s", path)
 
 
-if __name__ == "__main__":
+def main() -> None:
+    """Entry point: named errors become one clear line and exit code 2."""
     logging.basicConfig(level=logging.INFO, format="%(asctime)s %(message)s")
-    app()
+    try:
+        app()
+    # OSError: of a disk or a folder, which the program cannot help and which names its path.
+    except (LocalizerError, OSError) as error:
+        typer.echo(f"{type(error).__name__}: {error}", err=True)
+        sys.exit(2)
+
+
+if __name__ == "__main__":
+    main()

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import time
+import threading
 from collections import OrderedDict
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, replace
@@ -12,12 +12,14 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from localizer.errors import SequenceError
 from localizer.synth.appearance import Appearance, apply_appearance, sample_appearance
 from localizer.training.losses import Batch
 from localizer.training.pairs import Pair, relative_pose
 from localizer.training.shards import read_shard
 from localizer.types import Float32, Image
 
+_POLL_S = 0.5  # between looks for a shard that is still being generated
 _DENSEST_HAZE = 2.0  # optical depth at the scene's median distance; beyond it nothing is left
 
 
@@ -61,8 +63,17 @@ class ShardStream:
     still being generated and yet see the same data every time.
     """
 
-    def __init__(self, schedule: Schedule, config: LoaderConfig, seed: int, rank: int = 0) -> None:
+    def __init__(
+        self,
+        schedule: Schedule,
+        config: LoaderConfig,
+        seed: int,
+        rank: int = 0,
+        generating: Future[None] | None = None,
+    ) -> None:
         self._schedule, self._config = schedule, config
+        self._generating = generating
+        self._closed = threading.Event()
         self._seed = (seed,) if rank == 0 else (seed, rank)
         self._cache: OrderedDict[Path, list[Pair]] = OrderedDict()
         self._pool = ThreadPoolExecutor(1)
@@ -79,6 +90,7 @@ class ShardStream:
 
     def close(self) -> None:
         """Stop preparing batches."""
+        self._closed.set()
         self._pool.shutdown(wait=False, cancel_futures=True)
 
     def _make(self, step: int) -> Batch:
@@ -97,12 +109,19 @@ class ShardStream:
         if path in self._cache:
             self._cache.move_to_end(path)
             return self._cache[path]
-        while not path.exists():
-            time.sleep(0.5)
+        self._await(path)
         self._cache[path] = read_shard(path)
         if len(self._cache) > self._config.cached_shards:
             self._cache.popitem(last=False)
         return self._cache[path]
+
+    def _await(self, path: Path) -> None:
+        while not path.exists():
+            if self._generating is not None and self._generating.done() and not path.exists():
+                self._generating.result()  # its error, if that is why
+                raise SequenceError(f"{path}: was not generated; run `generate` again")
+            if self._closed.wait(_POLL_S):
+                raise SequenceError(f"{path}: is not there yet, and the run has ended")
 
 
 @dataclass(frozen=True)

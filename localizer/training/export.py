@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import hashlib
 import json
-import pickle
 from pathlib import Path
 
 import numpy as np
@@ -14,6 +13,7 @@ from torch import Tensor, nn
 
 from localizer.errors import ModelError
 from localizer.features.extractor import OnnxExtractor
+from localizer.training.checkpoint import fill, read_checkpoint
 from localizer.training.config import TrainConfig
 from localizer.training.model import STRIDES, TinyNet, fuse, parameter_count
 
@@ -36,17 +36,16 @@ class Deployed(nn.Module):
 
 def load_network(checkpoint: Path) -> tuple[TinyNet, TrainConfig, dict[str, object]]:
     """The averaged network of a checkpoint in evaluation mode, its configuration, its progress."""
-    try:
-        state = torch.load(checkpoint, map_location="cpu", weights_only=True)
-    except (OSError, RuntimeError, EOFError, pickle.UnpicklingError) as error:
-        raise ModelError(f"{checkpoint}: not a readable checkpoint: {error}") from error
+    state = read_checkpoint(checkpoint)
     try:
         config = TrainConfig.model_validate(state["config"])
+        progress: dict[str, object] = {"steps": state["step"], "seconds": round(state["seconds"])}
+    except KeyError as error:
+        raise ModelError(f"{checkpoint}: holds weights alone, no {error}: not a run's") from error
     except ValidationError as error:
         raise ModelError(f"{checkpoint}: of another version of the training: {error}") from error
     network = TinyNet(config.model)
-    network.load_state_dict(state["average"])
-    progress = {"steps": state["step"], "seconds": round(state["seconds"])}
+    fill(network, state["average"], checkpoint)
     return network.eval(), config, progress
 
 

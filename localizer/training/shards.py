@@ -6,8 +6,10 @@ A shard's content depends on its seed and the scene configuration alone.
 from __future__ import annotations
 
 import os
+import zipfile
+from collections import deque
 from collections.abc import Iterator
-from concurrent.futures import ProcessPoolExecutor
+from concurrent.futures import Future, ProcessPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -46,9 +48,13 @@ def write_shards(
     out.mkdir(parents=True, exist_ok=True)
     missing = [seed for seed in seeds if not shard_path(out, seed).exists()]
     with ProcessPoolExecutor(workers, initializer=os.nice, initargs=(5,)) as pool:
-        tasks = (pool.submit(write_shard, out, seed, scenes, photos) for seed in missing)
-        # All are submitted at once; results are awaited in order.
-        for task in list(tasks):
+        tasks: deque[Future[Path]] = deque()
+        for seed in missing:
+            tasks.append(pool.submit(write_shard, out, seed, scenes, photos))
+            # Few at a time: a process that is to end still makes all that was submitted.
+            if len(tasks) > 2 * workers:
+                yield tasks.popleft().result()
+        for task in tasks:
             yield task.result()
 
 
@@ -106,8 +112,9 @@ def read_shard(path: Path) -> list[Pair]:
     try:
         with np.load(path) as data:
             z = {key: data[key] for key in data.files}
-    except (OSError, ValueError) as error:
-        raise SequenceError(f"{path}: cannot be read as a shard: {error}") from error
+    except (OSError, ValueError, EOFError, AttributeError, zipfile.BadZipFile) as error:
+        why = str(error).split("\n")[0]
+        raise SequenceError(f"{path}: cannot be read as a shard: {why}; remove it") from error
     count, height, width = z["reference"].shape[:3]
     return [
         Pair(

@@ -5,12 +5,14 @@ from __future__ import annotations
 import csv
 import logging
 import time
+from concurrent.futures import Future
 from pathlib import Path
 
 import numpy as np
 import torch
 from torch import Tensor, nn
 
+from localizer.training.checkpoint import fill, read_checkpoint
 from localizer.training.config import DataSection, OptimizerSection, TrainConfig
 from localizer.training.data import LoaderConfig, Schedule, ShardStream
 from localizer.training.distributed import Workers
@@ -37,8 +39,8 @@ class Trainer:
         self.device = self.workers.device
         self.model = TinyNet(config.model).to(self.device).train()
         if config.warm_start is not None:
-            state = torch.load(config.warm_start, map_location=self.device, weights_only=True)
-            self.model.load_state_dict(state["average"])
+            first = read_checkpoint(config.warm_start, self.device)
+            fill(self.model, first["average"], config.warm_start)
         self.average = TinyNet(config.model).to(self.device).eval()
         self.average.load_state_dict(self.model.state_dict())
         self.log_scale = nn.Parameter(torch.full((3,), 3.2, device=self.device))
@@ -59,14 +61,19 @@ class Trainer:
         """The newest state of this run."""
         return self.config.output / f"{self.config.name}.pt"
 
-    def run(self, steps: int | None = None) -> None:
-        """Train up to the configured number of steps, or `steps` more."""
+    def run(self, steps: int | None = None, generating: Future[None] | None = None) -> None:
+        """Train up to the configured number of steps, or `steps` more.
+
+        generating: what writes the shards alongside; its failure ends the run.
+        """
         last = self.config.optimizer.steps
         if steps is not None:
             last = min(last, self.step + steps)
         data, o = self.config.data, self.config.optimizer
         loader = LoaderConfig(o.batch, o.anchors, o.crop, data.appearance)
-        stream = ShardStream(schedule(data), loader, self.config.seed, self.workers.rank)
+        stream = ShardStream(
+            schedule(data), loader, self.config.seed, self.workers.rank, generating
+        )
         rows: list[dict[str, float]] = []
         began = time.monotonic() - self.seconds
         try:
@@ -162,9 +169,9 @@ class Trainer:
     def _resume(self) -> None:
         if not self.checkpoint.exists():
             return
-        state = torch.load(self.checkpoint, map_location=self.device, weights_only=True)
-        self.model.load_state_dict(state["model"])
-        self.average.load_state_dict(state["average"])
+        state = read_checkpoint(self.checkpoint, self.device)
+        fill(self.model, state["model"], self.checkpoint)
+        fill(self.average, state["average"], self.checkpoint)
         with torch.no_grad():
             self.log_scale.copy_(state["log_scale"])
         self.optimizer.load_state_dict(state["optimizer"])

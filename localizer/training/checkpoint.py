@@ -1,0 +1,36 @@
+"""Reading what a run has saved."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import nn
+
+from localizer.errors import ModelError
+
+
+def read_checkpoint(path: Path, device: torch.device | str = "cpu") -> dict[str, Any]:
+    """The state that `Trainer` saved; ModelError when the file is not one."""
+    try:
+        state = torch.load(path, map_location=device, weights_only=True)
+    except OSError as error:
+        raise ModelError(f"{path}: cannot be read: {error.strerror or error}") from error
+    except Exception as error:  # pickle's and zip's errors are many
+        why = str(error).split("\n")[0]
+        raise ModelError(f"{path}: not a readable checkpoint: {why}") from error
+    if not isinstance(state, dict) or not isinstance(state.get("average"), dict):
+        raise ModelError(f"{path}: not a checkpoint of this training: holds no averaged weights")
+    return state
+
+
+def fill(network: nn.Module, weights: Mapping[str, Any], path: Path) -> None:
+    """Load `weights` of the checkpoint `path`; ModelError when they are another network's."""
+    try:
+        network.load_state_dict(weights)
+    except (RuntimeError, TypeError, AttributeError) as error:
+        raise ModelError(
+            f"{path}: its weights are of another network than the configuration's `model`"
+        ) from error
