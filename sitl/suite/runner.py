@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import multiprocessing
 import os
+import signal
+import sys
 import time
 from collections.abc import Callable, Iterable
 from concurrent.futures import Future, ProcessPoolExecutor, as_completed
@@ -20,6 +22,7 @@ from sitl.suite.flight import fly
 from sitl.suite.record import Array, Record
 
 _PACE_LIMIT = 0.98
+_LANDING_S = 15.0  # in which an interrupted flight ends its vehicle
 Figures = tuple[float, float, float]
 
 
@@ -108,16 +111,39 @@ def run_suite(
     longest_first = sorted(wanted, key=lambda w: -_expected_s(w[0]))
     rows: dict[tuple[str, str], Row] = {}
     context = multiprocessing.get_context("spawn")
-    with ProcessPoolExecutor(jobs or default_jobs(), mp_context=context) as pool:
+    with ProcessPoolExecutor(jobs or default_jobs(), context, _end_on_sigterm) as pool:
         futures = {
-            pool.submit(run_case, case, kind, seed): (case, kind) for case, kind in longest_first
+            pool.submit(_fly_in_worker, case, kind, seed): (case, kind)
+            for case, kind in longest_first
         }
-        for future in as_completed(futures):
-            case, kind = futures[future]
-            row = _row(future, case, kind)
-            rows[case.name, kind] = row
-            landed(row)
+        try:
+            for future in as_completed(futures):
+                case, kind = futures[future]
+                row = _row(future, case, kind)
+                rows[case.name, kind] = row
+                landed(row)
+        except BaseException:  # interrupted: the flights that wait are not wanted any more
+            pool.shutdown(wait=False, cancel_futures=True)
+            workers = multiprocessing.active_children()
+            for worker in workers:
+                worker.terminate()
+            for worker in workers:
+                worker.join(_LANDING_S)
+            raise
     return [rows[case.name, kind] for case, kind in wanted]
+
+
+def _end_on_sigterm() -> None:
+    # As an exception, so that a flight that is ended takes its vehicle with it.
+    signal.signal(signal.SIGTERM, lambda *_: sys.exit(128 + signal.SIGTERM))
+
+
+def _fly_in_worker(case: Case, kind: VehicleKind, seed: int) -> Row:
+    """`run_case`; one that is interrupted ends its process, which would else take the next case."""
+    try:
+        return run_case(case, kind, seed)
+    except (KeyboardInterrupt, SystemExit):
+        os._exit(128 + signal.SIGTERM)
 
 
 def default_jobs() -> int:

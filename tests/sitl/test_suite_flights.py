@@ -5,6 +5,11 @@ The whole suite as a report: `python -m sitl suite --fc both`.
 
 from __future__ import annotations
 
+import multiprocessing
+import os
+import signal
+import threading
+import time
 from functools import cache
 
 import pytest
@@ -48,6 +53,18 @@ def check(row: Row) -> None:
 @pytest.mark.parametrize("name", [case.name for case in FEW])
 def test_scenario(kind: VehicleKind, name: str) -> None:
     check(flown(kind, True)[name])
+
+
+def test_an_interrupted_suite_ends_and_flies_no_more() -> None:
+    """Each of its flights takes a minute."""
+    start = time.monotonic()
+    timer = threading.Timer(4.0, os.kill, (os.getpid(), signal.SIGINT))
+    timer.start()
+    with pytest.raises(KeyboardInterrupt):
+        run_suite(FEW, ["embedded"], jobs=1)
+    timer.join()
+    assert time.monotonic() - start < 25.0
+    assert not multiprocessing.active_children()
 
 
 @pytest.mark.long
