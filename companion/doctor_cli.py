@@ -43,7 +43,7 @@ def doctor_command(
 def _print(console: Console, diagnosis: Diagnosis) -> None:
     table = Table(title="fit to fly" if diagnosis.ok else "NOT fit to fly")
     for column in ("", "what", "found", "needed", "why"):
-        table.add_column(column)
+        table.add_column(column, overflow="fold")  # never hide the end of a name
     for f in diagnosis.findings:
         mark = "[green]ok" if f.ok else ("[red]wrong" if f.required else "[yellow]advice")
         table.add_row(mark, f.name, f.found, f.needed, f.why)
