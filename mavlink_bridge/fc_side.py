@@ -10,7 +10,14 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from mavlink_bridge.clock import monotonic_ns
 from mavlink_bridge.closed_loop import ClosedLoopCheck, LoopVerdict
-from mavlink_bridge.inject import NO_FIX_YET, FixQueue, Injection, InjectionContext, Injector
+from mavlink_bridge.inject import (
+    NO_FIX_YET,
+    NO_FRESH_FIX,
+    FixQueue,
+    Injection,
+    InjectionContext,
+    Injector,
+)
 from mavlink_bridge.link import Link
 from mavlink_bridge.messages import VehicleState, without_figures
 from mavlink_bridge.origin import OriginKeeper, north_east
@@ -28,6 +35,7 @@ _QUEUE = 64
 _TIMESYNC_PENDING = 8
 _FIRST_GUESS = 1  # the system id that vehicles are delivered with
 _IDLE_NS = 100_000_000
+_NEWS_AFTER_NS = 1_000_000_000  # a gap in the fixes that is told
 _REFERENCE_WAIT_NS = 500_000_000
 _VISION_GOOD_NS = SECOND_NS
 _RELIEF_SHARE = 0.9  # of a limit, below which its warning ends
@@ -254,7 +262,9 @@ class FlightControllerSide(Side):
             self.vision = injection.estimate.position
             self._deliver(link, mode, injection, now_ns)
         reason = self.injector.reason
-        if reason != NO_FIX_YET:
+        # A late fix or two is no news: the texts would follow every hiccup of a busy computer.
+        brief = reason == NO_FRESH_FIX and now_ns - self._delivered_ns < _NEWS_AFTER_NS
+        if reason != NO_FIX_YET and not brief:
             problem = f"not sent: {reason}" if reason else ""
             self._tell("inject", problem, "injecting", prefix=mode)
         if now_ns >= self._next_check_ns:
@@ -321,13 +331,17 @@ class FlightControllerSide(Side):
             return ""
         gps = self.config.injection.message == "gps_input"
         name = profile.gps_delay_parameter if gps else profile.delay_parameter
-        share = _RELIEF_SHARE if self._told.get("latency") else 1.0
-        if latency > share * profile.max_delay_ms:
-            return (
-                f"fixes are {latency:.0f} ms old, over the {profile.max_delay_ms:.0f} ms of {name}"
-            )
-        if latency > share * (delay + _DELAY_SLACK_MS):
-            return f"fixes are {latency:.0f} ms old: raise delay_ms ({delay:.0f}) and {name}"
+        told = self._told.get("latency", "")
+        late = f"fixes are {latency:.0f} ms old: raise delay_ms ({delay:.0f}) and {name}"
+        over = f"fixes are {latency:.0f} ms old, over the {profile.max_delay_ms:.0f} ms of {name}"
+        over_is_told = told == without_figures(over)
+        if latency > profile.max_delay_ms * (_RELIEF_SHARE if over_is_told else 1.0):
+            return over
+        limit = delay + _DELAY_SLACK_MS
+        if latency > limit:
+            return late
+        if told and latency > _RELIEF_SHARE * limit:  # not yet over, but nothing new to say
+            return over if over_is_told else late
         return ""
 
     def _tell(self, topic: str, problem: str, relief: str = "", *, prefix: str = "") -> None:

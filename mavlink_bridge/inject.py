@@ -36,6 +36,7 @@ from mavlink_bridge.yaw_guard import YawGuard
 
 NAN = math.nan
 NO_FIX_YET = "no fix yet"
+NO_FRESH_FIX = "no fresh fix"
 _QUEUE = 32
 _LATENCIES = 50
 _FARTHEST_M = 100_000.0  # from the origin: farther, one of the two is wrong
@@ -271,7 +272,7 @@ class Injector:
             return None
         too_far = (time_ns - fix.time_ns) * 1e-9 > self._config.max_extrapolation_s
         if too_far or (not fresh and self._overdue(now_ns)):
-            return Withheld("no fresh fix", "withheld_stale")
+            return Withheld(NO_FRESH_FIX, "withheld_stale")
         sigma = position.horizontal_sigma_m
         if sigma > self._config.max_sigma_m:
             return Withheld(f"covariance too large ({sigma:.1f} m)", "withheld_covariance")

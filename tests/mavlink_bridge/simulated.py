@@ -88,6 +88,7 @@ class Flight:
         self.north_m = 0.0
         self.reset_next = False
         self.latency_ms = 50
+        self.sees = True
         self.vision_yaw: float | None = None  # None: the vehicle's
         self.mangle: Callable[[bytes], bytes] = lambda frame: frame
         self._answered = 0
@@ -112,7 +113,7 @@ class Flight:
             step = self.now_ns // (10 * MS)
             if self.link.open:
                 self._vehicle(step)
-            if step % 10 == 5:
+            if self.sees and step % 10 == 5:
                 self._fix(self.now_ns - self.latency_ms * MS)
             self.side.on_tick(self.link, self.now_ns)  # type: ignore[arg-type]
 

@@ -93,6 +93,23 @@ def test_reboot_in_flight(flight: Flight) -> None:
     assert flight.attitude_error() < 0.005
 
 
+def test_only_a_gap_of_a_second_is_told(flight: Flight) -> None:
+    """A busy computer drops a few fixes now and then: nobody wants two texts for each."""
+
+    def blind(seconds: float) -> list[str]:
+        before = len(flight.texts)
+        withheld = flight.side.injector.counters["withheld_stale"]
+        flight.sees = False
+        flight.run(seconds)
+        flight.sees = True
+        flight.run(2.0)
+        assert flight.side.injector.counters["withheld_stale"] > withheld
+        return [t for t in flight.texts[before:] if "sent" in t or "injecting" in t]
+
+    assert blind(0.8) == []
+    assert blind(3.0) == ["PiLoT: not sent: no fresh fix", "PiLoT: injecting"]
+
+
 @pytest.mark.parametrize("step_s", [-0.4, 0.4, 7.0, -40.0])
 def test_step_of_the_vehicles_clock(flight: Flight, step_s: float) -> None:
     """Up to 1 s back is a step, more is what a reboot looks like; both are followed."""
