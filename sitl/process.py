@@ -181,7 +181,11 @@ class VehicleProcess(ABC):
             self._process.wait()
 
     def __enter__(self: _Self) -> _Self:
-        self.start()
+        try:
+            self.start()
+        except (KeyboardInterrupt, SystemExit):  # between its launch and `__exit__`
+            self.stop()
+            raise
         return self
 
     def __exit__(
