@@ -199,6 +199,24 @@ def test_fixes_older_than_the_autopilot_can_fuse_are_told_and_their_end_too(
     assert flight.texts[-1] == "PiLoT: fixes are in time again"
 
 
+def test_a_latency_text_never_names_a_figure_within_its_limit(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """220 ms are told; a latency that wanders about both limits says nothing untrue."""
+    flight = Flight(monkeypatch, injection=InjectionConfig(rate_hz=10, delay_ms=220))
+    for latency_ms in (240, 215, 245, 215):  # above delay_ms + 10, then a little below it
+        flight.latency_ms = latency_ms
+        flight.run(10.0)
+    told = [t for t in flight.texts if "ms old" in t or "in time" in t]
+    assert told == ["PiLoT: fixes are 240 ms old: raise delay_ms (220) and VISO_DELAY_MS"]
+    flight.latency_ms = 260
+    flight.run(10.0)
+    flight.latency_ms = 215
+    flight.run(10.0)
+    told = [t for t in flight.texts if "ms old" in t or "in time" in t]
+    assert told[1:] == ["PiLoT: fixes are 260 ms old, over the 250 ms of VISO_DELAY_MS"]
+
+
 # --- damaged input --------------------------------------------------------------------------------
 
 
