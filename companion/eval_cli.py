@@ -70,8 +70,7 @@ def evaluate_command(
     _prepare(report)
     mode: PriorMode = "first" if prior == "first" else "each"
     config = LocalizerConfig(
-        width=width, model=model, seed=seed, renderer=renderer, device=device,
-        feature_threads=2
+        width=width, model=model, seed=seed, renderer=renderer, device=device, feature_threads=2
     )
     stack = MapStack(map_cache, config)
     try:

@@ -102,7 +102,9 @@ class JNGOConfig(BaseModel):
     motion_weight: float = Field(
         default=0.02, ge=0, description="lambda of Eq. 10, in best costs per d²"
     )
-    prior_weight: float = Field(default=0.02, ge=0, description="weight of a constraint, likewise")
+    prior_weight: float = Field(
+        default=0.0001, ge=0, description="weight of a constraint, likewise"
+    )
     correlation: float = Field(default=14.0, gt=0, description="covariance factor, calibrated")
     correlation_px: float = Field(
         default=32.0, gt=0, description="image cell within which residuals may correlate"
