@@ -99,7 +99,9 @@ def info(cache: CachePath) -> None:
         "triangles": f"{m.triangles} at the finest level",
         "left out": f"{len(m.skipped)} source tiles",
     }
-    table = Table("", str(cache), show_lines=False)
+    table = Table(show_lines=False)
+    for column in ("", str(cache)):
+        table.add_column(column, overflow="fold")  # paths are read from their end
     for name, value in facts.items():
         table.add_row(name, value)
     Console().print(table)

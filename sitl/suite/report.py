@@ -21,7 +21,15 @@ from sitl.suite.runner import Figures, Row, figures
 
 _COLOURS = {"pass": "green", "better": "cyan", "FAIL": "red", "ERROR": "red"}
 _GAP_S = 1.0  # in which the EKF reported no position
-_COLUMNS = ("scenario", "vehicle", "by", "reference", "measured", "what was checked", "verdict")
+_COLUMNS = (
+    "scenario",
+    "vehicle",
+    "by",
+    "reference, m",
+    "measured, m",
+    "what was checked",
+    "verdict",
+)
 
 
 def print_row(console: Console, row: Row) -> None:
