@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import logging
 from dataclasses import dataclass, replace
+from typing import Annotated
 
 import numpy as np
 from numpy.typing import NDArray
@@ -58,36 +59,43 @@ logger = logging.getLogger(__name__)
 _COVARIANCE_ANCHORS = 1000  # enough for a covariance, cheap enough for every frame
 _LEAST_SCALE = 0.02  # of the sharpening loss, where features fit perfectly
 
+_Steps = Annotated[int, Field(ge=0, le=1000)]
+_Count = Annotated[int, Field(ge=1)]
+_Scale = Annotated[float, Field(gt=0)]
+
 
 class JNGOConfig(BaseModel):
     """The optimizer's settings; the defaults are the paper's where it gives them."""
 
-    model_config = ConfigDict(frozen=True, extra="forbid")
+    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
 
-    hypotheses: int = Field(default=144, ge=1, description="largest size M of the swarm")
+    hypotheses: int = Field(default=144, ge=1, le=4096, description="largest size M of the swarm")
     box_deg: float = Field(default=11.0, gt=0, description="largest pitch and yaw perturbation")
     step_deg: float = Field(default=2.0, gt=0, description="largest step of the pitch and yaw grid")
     translation_sigma_m: float = Field(
         default=1.0, ge=0, description="largest sigma of the perturbation"
     )
     spread_sigmas: float = Field(default=2.2, gt=0, description="grid half-width in prior sigmas")
-    iterations: tuple[int, ...] = Field(
-        default=(2, 3, 4), description="LM steps per level, coarse to fine"
+    iterations: tuple[_Steps, ...] = Field(
+        default=(2, 3, 4), min_length=1, description="LM steps per level, coarse to fine"
     )
-    swarm_anchors: tuple[int, ...] = Field(
+    swarm_anchors: tuple[_Count, ...] = Field(
         default=(250, 500, 500),
+        min_length=1,
         description="anchors used per level, spread evenly; all by the winner, on the last level",
     )
-    keep: tuple[int, ...] = Field(
+    keep: tuple[_Count, ...] = Field(
         default=(32, 8), description="survivors after each level but the last"
     )
-    converge: int = Field(default=6, ge=0, description="further LM steps of the last survivors")
-    sharpen: int = Field(default=6, ge=0, description="the winner's last LM steps, each")
-    sharpen_scales: tuple[float, ...] = Field(
+    converge: int = Field(
+        default=6, ge=0, le=1000, description="further LM steps of the last survivors"
+    )
+    sharpen: int = Field(default=6, ge=0, le=1000, description="the winner's last LM steps, each")
+    sharpen_scales: tuple[_Scale, ...] = Field(
         default=(2.0, 1.0, 0.7),
         description="for each of these Geman-McClure scales, in median residual norms",
     )
-    detail_scales: tuple[float, ...] = Field(
+    detail_scales: tuple[_Scale, ...] = Field(
         default=(1.0, 0.7), description="likewise on the detail level"
     )
     distinct_px: float = Field(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -253,6 +254,23 @@ def test_config_rejects_unknown_keys_and_values():
         JNGOConfig(hypothesis_count=3)
     with pytest.raises(ValidationError, match="min_overlap"):
         JNGOConfig(min_overlap=1.5)
+
+
+@pytest.mark.parametrize(
+    "bad",
+    [
+        {"hypotheses": 10**30},
+        {"iterations": ()},
+        {"iterations": (2, -1, 4)},
+        {"swarm_anchors": (0, 500, 500)},
+        {"keep": (32, 0)},
+        {"sharpen_scales": (float("nan"),)},
+        {"huber": float("inf")},
+    ],
+)
+def test_settings_without_a_meaning_are_refused(bad: dict[str, Any]) -> None:
+    with pytest.raises(ValidationError, match=next(iter(bad))):
+        JNGOConfig(**bad)
 
 
 def test_unknown_backend_is_named():
