@@ -202,7 +202,9 @@ def _plot(
         ErrorSeries("localizer", exposed_s, all_errors.rotation_deg, "rotation error, °"),
     ]
     end = (record.denied_ns[1] - start) * 1e-9
-    plot_errors(folder / "errors.png", series, [(0.0, end, "GNSS denied")])
+    plot_errors(
+        folder / "errors.png", series, [(0.0, end, "GNSS denied")], "time since GNSS went off, s"
+    )
     cache = TileCache.open(config.map)
     streamer = TileStreamer(cache)
     try:
@@ -215,9 +217,11 @@ def _plot(
         }
         fixed = (t for t in record.targets if isinstance(t, FixedPoint))
         marks = {t.name: t.position_at(start) for t in fixed}
+        denied = min(int(np.searchsorted(vehicle["time_ns"], start)), len(tracks["truth"]) - 1)
+        marks["GNSS off"] = tracks["truth"][denied]
         picture = _map_picture(renderer, tracks.values())
         plot_tracks(folder / "tracks.png", tracks, picture, marks)
-        _overlays(folder, estimates, renderer, config)
+        _overlays(folder, estimates, renderer, config, start)
     finally:
         streamer.close()
 
@@ -242,9 +246,9 @@ def _map_picture(renderer: NumbaRenderer, tracks: Iterable[Array]) -> MapPicture
 
 
 def _overlays(
-    folder: Path, estimates: Columns, renderer: NumbaRenderer, config: CompanionConfig
+    folder: Path, estimates: Columns, renderer: NumbaRenderer, config: CompanionConfig, start: int
 ) -> None:
-    """Recorded video frames against the map rendered at their estimated poses."""
+    """Recorded video frames against the map rendered at their estimated poses; times from start."""
     stamps = np.asarray(estimates["exposure_time_ns"])
     accepted = np.asarray(estimates["accepted"]) > 0
     estimated = poses(estimates)
@@ -263,7 +267,8 @@ def _overlays(
         image = cv2.cvtColor(cv2.imread(str(path)), cv2.COLOR_BGR2RGB).astype(np.uint8)
         video = undistort(Frame(image, int(path.stem), camera, 0))
         view = renderer.render(estimated[k], target, wait=True)
-        caption = f"video | map at the estimated pose | checkerboard   t = {path.stem} ns"
+        time_s = (int(path.stem) - start) * 1e-9
+        caption = f"video | map at the estimated pose | checkerboard   t = {time_s:.1f} s"
         save_image(folder / f"overlay-{number}.png", overlay_sheet(video, view.rgb, caption))
 
 

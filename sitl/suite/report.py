@@ -106,7 +106,8 @@ def plot(row: Row, path: Path) -> None:
     landing = [s.at_s for s in record.samples if s.mode == "LAND"]
     if landing:
         axes.axvspan(landing[0], max(landing), color="tab:orange", alpha=0.15, label="LAND")
-    axes.set(xlabel="s", ylabel="m", ylim=(0, top), title=f"{row.vehicle}: {row.case.title}")
+    axes.set(xlabel="time since the scenario began, s", ylabel="horizontal EKF error, m")
+    axes.set(ylim=(0, top), title=f"{row.vehicle}: {row.case.title}")
     axes.legend(loc="upper right", fontsize=7)
     figure.savefig(path, dpi=110)
     plt.close(figure)
