@@ -247,12 +247,16 @@ class LiveVideoSource:
             yield Frame(image, exposure_ns, camera, sequence)
 
     def close(self) -> None:
-        """Ends `frames`; waits for the reader, at most about the open time-out."""
+        """Ends `frames`; waits for the reader, at most about two open time-outs.
+
+        FFmpeg's opening and its probing have one each. A reader still in them when the interpreter
+        ends would call back into it: a segmentation fault.
+        """
         self._closing.set()
         self._slot.close()
         reader = self._reader
         if reader is not None and reader is not threading.current_thread():
-            reader.join(_OPEN_TIMEOUT_S + self._settings.stall_timeout_s + 1.0)
+            reader.join(2 * _OPEN_TIMEOUT_S + self._settings.stall_timeout_s + 2.0)
         if self._state is not StreamState.CLOSED:
             self._report(StreamState.CLOSED, f"{self._location}: closed")
 
