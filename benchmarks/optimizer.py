@@ -127,7 +127,10 @@ def naive_torch(
 
     torch.set_num_threads(threads)
     h, w, _ = problem.features.shape
-    on = lambda x: torch.from_numpy(x).to(device)  # noqa: E731
+
+    def on(array: np.ndarray) -> torch.Tensor:
+        return torch.from_numpy(array).to(device)
+
     maps = on(problem.features).permute(2, 0, 1)[None].contiguous()
     confidence = on(problem.confidence)[None, None]
     points, anchors = on(problem.points.T.copy()), problem.anchor_features

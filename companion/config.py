@@ -5,11 +5,11 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Annotated, Any
 
-import yaml
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator
 
 from companion.detections import parse_host_port
 from companion.errors import ConfigError
+from companion.settings_file import problems, read_settings
 from companion.sources.base import SourceSettings
 from localizer.camera import Camera
 from localizer.config import LocalizerConfig
@@ -102,16 +102,7 @@ class CompanionConfig(_Model):
 
 def load_config(path: Path) -> CompanionConfig:
     """Read and check a configuration file; relative paths are relative to that file."""
-    try:
-        data = yaml.safe_load(path.read_text(encoding="utf-8"))
-    except OSError as error:
-        raise ConfigError(f"{path}: cannot be read: {error.strerror}") from error
-    # ValueError: no UTF-8, or a date that does not exist; RecursionError: endless nesting.
-    except (yaml.YAMLError, ValueError, RecursionError) as error:
-        raise ConfigError(f"{path}: not valid YAML: {error}") from error
-    if not isinstance(data, dict):
-        raise ConfigError(f"{path}: expected a mapping of settings at the top")
-    config = parse_config(data, str(path))
+    config = parse_config(read_settings(path, ConfigError), str(path))
     return _resolve(config, path.parent)
 
 
@@ -121,19 +112,11 @@ def parse_config(data: dict[str, Any], where: str) -> CompanionConfig:
         config = CompanionConfig.model_validate(data)
         config.camera.model.camera()
     except ValidationError as error:
-        lines = [
-            f"  {'.'.join(str(p) for p in e['loc'])}: {e['msg']} (got {_short(e['input'])})"
-            for e in error.errors()
-        ]
+        lines = problems(error)
         raise ConfigError(f"{where}: {len(lines)} problem(s)\n" + "\n".join(lines)) from error
     except CameraError as error:
         raise ConfigError(f"{where}: camera.model: {error}") from error
     return config
-
-
-def _short(value: object) -> str:
-    text = repr(value)
-    return text if len(text) <= 60 else text[:57] + "..."
 
 
 def _resolve(config: CompanionConfig, folder: Path) -> CompanionConfig:

@@ -5,9 +5,9 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Literal
 
-import yaml
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
+from companion.settings_file import problems, read_settings
 from localizer.camera import Camera
 from sitl.errors import SimulationError
 
@@ -80,18 +80,9 @@ class Scenario(_Model):
 def load_scenario(path: Path) -> Scenario:
     """Read a scenario file; unknown keys and bad values are named."""
     try:
-        data = yaml.safe_load(path.read_text(encoding="utf-8")) or {}
-        return Scenario.model_validate(data)
-    except OSError as error:
-        raise ScenarioError(f"{path}: cannot be read: {error.strerror}") from error
+        return Scenario.model_validate(read_settings(path, ScenarioError))
     except ValidationError as error:
-        problems = "\n".join(
-            f"  {'.'.join(str(p) for p in e['loc'])}: {e['msg']}" for e in error.errors()
-        )
-        raise ScenarioError(f"{path}:\n{problems}") from error
-    # ValueError: no UTF-8, or a date that does not exist; RecursionError: endless nesting.
-    except (yaml.YAMLError, ValueError, RecursionError) as error:
-        raise ScenarioError(f"{path}: not valid YAML: {error}") from error
+        raise ScenarioError("\n".join([f"{path}:", *problems(error)])) from error
 
 
 def check_inside(scenario: Scenario, size_m: float) -> None:

@@ -6,9 +6,9 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-import yaml
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
+from companion.settings_file import problems, read_settings
 from mavlink_bridge import BridgeConfig
 from sitl.feed import FixModel, RawMessage
 from sitl.scenario import ScenarioError
@@ -166,24 +166,13 @@ class Case(_Model):
 
 def load_case(path: Path) -> Case:
     """Read a scenario file; ScenarioError names the file and every problem in it."""
-    try:
-        data = yaml.safe_load(path.read_text(encoding="utf-8"))
-    except OSError as error:
-        raise ScenarioError(f"{path}: cannot be read: {error.strerror}") from error
-    # ValueError: no UTF-8, or a date that does not exist; RecursionError: endless nesting.
-    except (yaml.YAMLError, ValueError, RecursionError) as error:
-        raise ScenarioError(f"{path}: not valid YAML: {error}") from error
-    if not isinstance(data, dict):
-        raise ScenarioError(f"{path}: expected a mapping of settings at the top")
+    data = read_settings(path, ScenarioError)
     if "name" in data:
         raise ScenarioError(f"{path}: name: a scenario is named by its file, leave it out")
     try:
         return Case.model_validate({"name": path.stem, **data})
     except ValidationError as error:
-        problems = "\n".join(
-            f"  {'.'.join(str(p) for p in e['loc'])}: {e['msg']}" for e in error.errors()
-        )
-        raise ScenarioError(f"{path}:\n{problems}") from error
+        raise ScenarioError("\n".join([f"{path}:", *problems(error)])) from error
 
 
 def load_cases(names: Iterable[str] = (), folder: Path = SCENARIOS) -> tuple[Case, ...]:
