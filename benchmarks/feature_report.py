@@ -16,9 +16,10 @@ _DRAWS = 2000  # of the bootstrap
 
 @dataclass(frozen=True)
 class Outcome:
-    """One method on one pair: errors (metres, degrees) and the pair's kind."""
+    """One method on one pair of the set `source`: errors (metres, degrees) and the pair's kind."""
 
     method: str
+    source: str
     seed: int
     pair: int
     place: int
@@ -48,6 +49,7 @@ def read_outcomes(paths: Sequence[Path]) -> list[Outcome]:
             found += [
                 Outcome(
                     row["method"],
+                    row["source"],
                     int(row["seed"]),
                     int(row["pair"]),
                     int(row["place"]),
@@ -76,7 +78,7 @@ def difference(a: Sequence[Outcome], b: Sequence[Outcome]) -> tuple[float, float
     places, because the pairs of a place are alike. Both must be of the same pairs in order.
     """
     gain = np.array([x.within(1) - float(y.within(1)) for x, y in zip(a, b, strict=True)])
-    names = [(x.seed, x.place) for x in a]
+    names = [(x.source, x.seed, x.place) for x in a]
     index = {name: k for k, name in enumerate(dict.fromkeys(names))}
     group = np.array([index[name] for name in names])
     totals = np.bincount(group, gain, len(index))
@@ -88,19 +90,34 @@ def difference(a: Sequence[Outcome], b: Sequence[Outcome]) -> tuple[float, float
 
 
 def groups(outcomes: Sequence[Outcome]) -> dict[str, list[Outcome]]:
-    """All, each seed where there are several, each condition."""
+    """All, each set and each seed of a set where there are several, each condition over all sets,
+    and where there are several sets each condition in each.
+    """
+    sources = list(dict.fromkeys(o.source for o in outcomes))
     kinds = dict.fromkeys([*CONDITIONS, *sorted({o.condition for o in outcomes})])
-    seeds = sorted({o.seed for o in outcomes})
     found = {"all": list(outcomes)}
-    if len(seeds) > 1:
-        found |= {f"seed {s}": [o for o in outcomes if o.seed == s] for s in seeds}
-    found |= {c: [o for o in outcomes if o.condition == c] for c in kinds}
+    for source in sources:
+        mine = [o for o in outcomes if o.source == source]
+        name = f"{source}: " if len(sources) > 1 else ""
+        if name:
+            found[f"{name}all"] = mine
+        seeds = sorted({o.seed for o in mine})
+        if len(seeds) > 1:
+            found |= {f"{name}seed {s}": [o for o in mine if o.seed == s] for s in seeds}
+    for condition in kinds:
+        mine = [o for o in outcomes if o.condition == condition]
+        where = dict.fromkeys(o.source for o in mine)
+        found[condition] = mine
+        if len(where) > 1:
+            for source in where:
+                found[f"{source}: {condition}"] = [o for o in mine if o.source == source]
     return {name: members for name, members in found.items() if members}
 
 
 def report(outcomes: Sequence[Outcome]) -> str:
-    """Markdown table: per group and method the share within 1 m / 1 deg with Wilson's interval and
-    within 3 m / 3 deg, the medians; then the last method's lead over each other one.
+    """Markdown tables. First, per group and method the share within 1 m / 1 deg with Wilson's
+    interval and within 3 m / 3 deg, and the medians; then, per group, the last method's lead over
+    each other one at 1 m / 1 deg, and where it is behind.
     """
     by_method = {
         m: [o for o in outcomes if o.method == m] for m in dict.fromkeys(o.method for o in outcomes)
@@ -113,13 +130,27 @@ def report(outcomes: Sequence[Outcome]) -> str:
         lines.append(f"| {name} | {len(members)} | " + " | ".join(cells) + " |")
     medians = [_medians(mine) for mine in by_method.values()]
     lines.append("| median error | | " + " | ".join(medians) + " |")
-    last = methods[-1]
-    for other in methods[:-1]:
-        gain, low, high = difference(by_method[last], by_method[other])
-        lines.append(
-            f"\n{last} - {other} at 1 m/1 deg: {gain:+.1f} [{low:+.1f}, {high:+.1f}] points"
-        )
-    return "\n".join(lines)
+    return "\n".join(lines + (_leads(split) if len(methods) > 1 else []))
+
+
+def _leads(split: dict[str, dict[str, list[Outcome]]]) -> list[str]:
+    *others, last = split
+    lines = ["", f"Points by which {last} leads at 1 m / 1 deg:", ""]
+    lines += ["| pairs | n | " + " | ".join(others) + " |", "|---" * (len(others) + 2) + "|"]
+    behind = []
+    for name, mine in split[last].items():
+        cells = []
+        for other in others:
+            gain, low, high = difference(mine, split[other][name])
+            mark = " **behind**" if high < 0 else " behind" if gain < 0 else ""
+            cells.append(f"{gain:+.1f} [{low:+.1f}, {high:+.1f}]{mark}")
+            if mark:
+                certain = "significant" if high < 0 else "not significant"
+                behind.append(
+                    f"- {name}: {other}, {gain:+.1f} [{low:+.1f}, {high:+.1f}], {certain}"
+                )
+        lines.append(f"| {name} | {len(mine)} | " + " | ".join(cells) + " |")
+    return [*lines, "", f"{last} is behind in {len(behind)} of these cells:", *behind]
 
 
 def _cell(members: Sequence[Outcome]) -> str:

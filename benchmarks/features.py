@@ -1,16 +1,18 @@
 """Features side by side, by condition: intensity, gradient, SIFT and XFeat with PnP, the network.
 
-    python benchmarks/features.py --pairs 600 --seed 0 --out seed0.csv
-    python benchmarks/features.py --report seed0.csv seed1.csv seed2.csv
-    python benchmarks/features.py --real ../shared/data/caliterra    (real photos)
-    python benchmarks/features.py --real ../shared/data/quito        (real mesh, made weather)
+    python benchmarks/features.py --pairs 200 --seed 0 --out seed0.csv
+    python benchmarks/features.py --report seed0.csv seed1.csv quito.csv   (pooled, and each set)
+    python benchmarks/features.py --real ../shared/data/caliterra --pairs 320   (real photos)
+    python benchmarks/features.py --real ../shared/data/quito --pairs 280       (real mesh)
+    python benchmarks/features.py --real ../shared/data/textures/neon_sjer_pairs --pairs 80
     python benchmarks/features.py --speed
 
 Every pair shows a place that no training run has seen, its query under its own light, weather and
-season. The reference is rendered 5 m and 5 deg from the query's true pose. The direct methods go
-through the same `JNGO`, gradient and network with the fixed detail level as in flight; the matchers
-go through PnP-RANSAC on the rendered depth. Generated pairs are kept below --cache. A checkpoint is
-chosen on `--split validation`; `test` is for the final report.
+season (feature_real.py says what the real sets are). The reference is rendered 5 m and 5 deg from
+the query's true pose. The direct methods go through the same `JNGO`, gradient and network with the
+fixed detail level as in flight; the matchers go through PnP-RANSAC on the rendered depth. Generated
+pairs and real maps are kept below --cache. A checkpoint is chosen on `--split validation`; `test`
+is for the final report.
 """
 
 from __future__ import annotations
@@ -30,8 +32,8 @@ from feature_pairs import (
     TestPair,
     made_pairs,
     mesh_pairs,
-    real_pairs,
 )
+from feature_real import real_pairs
 from feature_report import Outcome, read_outcomes, report, write_outcomes
 
 from localizer.features import FeatureExtractor, GradientExtractor, load_extractor
@@ -41,8 +43,10 @@ from localizer.types import PosePrior
 logger = logging.getLogger(__name__)
 
 
-def evaluate(methods: dict[str, Method], pairs: Sequence[TestPair], seed: int) -> list[Outcome]:
-    """Every method on every pair."""
+def evaluate(
+    methods: dict[str, Method], pairs: Sequence[TestPair], source: str, seed: int
+) -> list[Outcome]:
+    """Every method on every pair of the set `source`."""
     axes = np.diag([METRES**2 / 3] * 3 + [np.radians(DEGREES) ** 2 / 3] * 3)
     outcomes = []
     for name, method in methods.items():
@@ -54,7 +58,7 @@ def evaluate(methods: dict[str, Method], pairs: Sequence[TestPair], seed: int) -
             metres, degrees = pose.distance_to(pair.truth)
             outcomes.append(
                 Outcome(
-                    name, seed, k, pair.place, pair.condition, metres, degrees, seconds,
+                    name, source, seed, k, pair.place, pair.condition, metres, degrees, seconds,
                 )
             )  # fmt: skip
     return outcomes
@@ -126,10 +130,13 @@ def main() -> None:
     if args.report:
         print(report(read_outcomes(args.report)))
         return
+    source = "mesh world" if args.mesh else "generated" if args.real is None else args.real.name
     if args.mesh:
         pairs = mesh_pairs(args.pairs, args.seed, shared_detail=args.shared_detail)
     elif args.real is not None:
-        pairs = real_pairs(args.real, args.pairs, args.seed, shared_detail=args.shared_detail)
+        pairs = real_pairs(
+            args.real, args.pairs, args.seed, args.cache, shared_detail=args.shared_detail
+        )
     else:
         textures = args.textures if args.textures.is_dir() else None
         if textures is None:
@@ -137,7 +144,7 @@ def main() -> None:
         which = MadePlaces(args.split, args.seed, args.shared_detail, textures)
         pairs = made_pairs(args.pairs, which, args.cache)
     methods = build_methods(args.baselines, args.models)
-    outcomes = evaluate(methods, pairs, args.seed)
+    outcomes = evaluate(methods, pairs, source, args.seed)
     if args.out:
         write_outcomes(outcomes, args.out)
     print(report(outcomes))

@@ -18,9 +18,9 @@ from feature_report import (
 )
 
 
-def outcomes(method: str, metres: list[float]) -> list[Outcome]:
+def outcomes(method: str, metres: list[float], source: str = "made") -> list[Outcome]:
     return [
-        Outcome(method, 0, k, k // 4, "day" if k % 2 else "night", m, 0.1, 0.02)
+        Outcome(method, source, 0, k, k // 4, "day" if k % 2 else "night", m, 0.1, 0.02)
         for k, m in enumerate(metres)
     ]
 
@@ -50,4 +50,17 @@ def test_outcomes_survive_the_file_and_make_a_table(tmp_path: Path) -> None:
     text = report(made)
     assert "| all | 4 | 50 [15, 85], 75 | 75 [30, 95], 75 |" in text
     assert "| night | 2 | 100 " in text
-    assert "b - a at 1 m/1 deg: +25.0" in text
+    assert "| all | 4 | +25.0 [" in text
+
+
+def test_where_a_method_is_behind_is_said_with_its_certainty() -> None:
+    # Set x: b misses all that a finds. Set y: as good, but for one place of many.
+    near, far, mixed = [0.5] * 40, [2.0] * 40, [2.0] + [0.5] * 39
+    made = outcomes("a", near, "x") + outcomes("a", near, "y")
+    text = report(made + outcomes("b", far, "x") + outcomes("b", mixed, "y"))
+    assert "| x: all | 40 | -100.0 [-100.0, -100.0] **behind** |" in text
+    assert "- x: day: a, -100.0 [-100.0, -100.0], significant" in text
+    assert "- y: all: a, -2.5 [-7.5, +0.0], not significant" in text
+    assert "y: day: a" not in text
+    assert "in 0 of" not in text
+    assert "b is behind in 0 of these cells" in report(outcomes("a", near) + outcomes("b", near))

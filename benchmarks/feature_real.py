@@ -1,0 +1,231 @@
+"""Real test pairs for the feature benchmark: photos, real maps, the same ground in two seasons.
+
+What kind of set a folder holds is seen from its content:
+
+- own photos (`queries/`): each as it is, on a coarser map, on an older map (coarser, and its soft
+  ground with another fine texture), and as it is under made dusk, night, fog, rain and snow;
+- plots photographed at two dates (`PLOT/*.jpg`): one date is the map, the other the flight. Flat,
+  since the orthophotos come without heights; only plots that no training run has seen;
+- else a map: queries are its own renders under made weather and season. Vegetation and soil get new
+  fine texture and the map's view is coarser than the query, unless detail is shared.
+"""
+
+from __future__ import annotations
+
+import json
+import shutil
+from pathlib import Path
+
+import cv2
+import numpy as np
+from feature_pairs import DEGREES, METRES, SIZE, TestPair
+
+from localizer.camera import Camera
+from localizer.geo import Geodetic
+from localizer.map.build import build_cache
+from localizer.map.cache import TileCache
+from localizer.map.stream import TileStreamer
+from localizer.pose import Pose
+from localizer.render.numba_raster import NumbaRenderer
+from localizer.synth.appearance import CONDITIONS, apply_appearance, sample_appearance
+from localizer.training.data import tamed
+from localizer.training.land import season_shift
+from localizer.training.pairs import SEASON, look_at, moved
+from localizer.training.revisit import coarser, draw_texel, hard_surfaces, regrown
+from localizer.types import Float32, Image, RenderedView
+
+PHOTO, COARSE_MAP, OLDER_MAP = "photo", "photo, coarser map", "photo, older map"
+_PLOT_TEXEL_M = 0.1
+_MADE = tuple(c for c in CONDITIONS if c != "day")
+
+
+def real_pairs(
+    folder: Path, count: int, seed: int, cache: Path, *, shared_detail: bool
+) -> list[TestPair]:
+    """Pairs of the real set in `folder`, conditions in turn; its map is built in `cache` once."""
+    if (folder / "offsets.csv").exists():
+        return _season_pairs(folder, count, seed)
+    photos = folder / "queries"
+    origin = _origin(folder / "georef.json") if photos.exists() else None
+    with TileStreamer(TileCache.open(_map(folder, cache, origin))) as streamer:
+        renderer = NumbaRenderer(streamer)
+        if photos.exists():
+            return _photo_pairs(renderer, photos, count, seed)
+        return _rendered_pairs(renderer, count, seed, shared_detail=shared_detail)
+
+
+def _map(folder: Path, cache: Path, origin: Geodetic | None) -> Path:
+    built = cache / f"map-{folder.name}"
+    if not built.exists():
+        partial = built.with_suffix(".partial")
+        shutil.rmtree(partial, ignore_errors=True)
+        layers = [folder / "dsm.tif", folder / "ortho.tif"]
+        # Heights only need to agree between map and poses here, so the separation does not matter.
+        build_cache(
+            layers if layers[0].exists() else folder,
+            partial,
+            geoid_separation_m=0.0,
+            vertical_datum="ellipsoidal",
+            origin=origin,
+            progress=False,
+        )
+        partial.rename(built)
+    return built
+
+
+def _photo_pairs(renderer: NumbaRenderer, photos: Path, count: int, seed: int) -> list[TestPair]:
+    camera = Camera.from_json(photos / "camera.json").resized(*SIZE)
+    poses = json.loads((photos / "poses.json").read_text())
+    names = sorted(p.name for p in (photos / "images").iterdir())
+    kinds = (PHOTO, COARSE_MAP, OLDER_MAP, *_MADE)
+    pairs = []
+    for k in range(count):
+        rng = np.random.default_rng((seed, k))
+        condition, photo = kinds[k % len(kinds)], k // len(kinds) % len(names)
+        truth = Pose.from_matrix(poses[names[photo]]["T_enu_from_cam"])
+        image = cv2.imread(str(photos / "images" / names[photo]))
+        query = cv2.resize(
+            cv2.cvtColor(image, cv2.COLOR_BGR2RGB), SIZE, interpolation=cv2.INTER_AREA
+        )
+        if condition in _MADE:
+            depth = renderer.render(truth, camera, wait=True).depth
+            query = apply_appearance(
+                query, depth, tamed(sample_appearance(rng, condition), depth), rng
+            )
+        view = renderer.render(moved(rng, truth, np.inf, (METRES, DEGREES)), camera, wait=True)
+        if condition in (COARSE_MAP, OLDER_MAP):
+            view = _surveyed(view, rng, repainted=condition == OLDER_MAP)
+        pairs.append(TestPair(view, query, truth, condition, place=photo))
+    return pairs
+
+
+def _surveyed(view: RenderedView, rng: np.random.Generator, *, repainted: bool) -> RenderedView:
+    """The map's view from a coarser survey, or also an older one: other texture on soft ground."""
+    rgb = _regrown_image(view, rng) if repainted else view.rgb
+    return RenderedView(
+        coarser(rgb, draw_texel(rng)), view.depth, view.world_from_camera, view.camera
+    )
+
+
+def _rendered_pairs(
+    renderer: NumbaRenderer, count: int, seed: int, *, shared_detail: bool
+) -> list[TestPair]:
+    """Views of the map itself, 80 to 200 m up, under every condition in turn."""
+    kinds = (*CONDITIONS, SEASON)
+    rng = np.random.default_rng((seed, 1))
+    pairs: list[TestPair] = []
+    while len(pairs) < count:
+        camera = Camera.from_fov(*SIZE, rng.uniform(40, 75))
+        truth = _view(rng)
+        start = moved(rng, truth, np.inf, (METRES, DEGREES))
+        view, seen = (renderer.render(pose, camera, wait=True) for pose in (start, truth))
+        if min((view.depth > 0).mean(), (seen.depth > 0).mean()) < 0.8:
+            continue
+        condition = kinds[len(pairs) % len(kinds)]
+        query = seen.rgb
+        if not shared_detail:
+            query = _regrown_image(seen, rng)
+            view = _surveyed(view, rng, repainted=False)
+        if condition == SEASON:
+            query = _image(season_shift(_squared(query), rng), query.shape)
+        look = sample_appearance(rng, "day" if condition == SEASON else condition)
+        query = apply_appearance(query, seen.depth, tamed(look, seen.depth), rng)
+        pairs.append(TestPair(view, query, truth, condition, place=len(pairs)))
+    return pairs
+
+
+def _regrown_image(view: RenderedView, rng: np.random.Generator) -> Image:
+    """New fine texture on the soft ground of a view; its pixels stand for ground cells."""
+    pixel_m = float(np.median(view.depth[view.depth > 0])) / view.camera.fx
+    albedo = _squared(view.rgb)
+    hard = hard_surfaces((albedo * 255).astype(np.uint8))
+    return _image(regrown(albedo, hard, pixel_m, rng), view.rgb.shape)
+
+
+def _squared(rgb: Image) -> Float32:
+    """An image wider than high as a square albedo, mirrored below."""
+    below = max(rgb.shape[1] - rgb.shape[0], 0)
+    square = cv2.copyMakeBorder(rgb, 0, below, 0, 0, cv2.BORDER_REFLECT)
+    return square.astype(np.float32) / 255.0
+
+
+def _image(albedo: Float32, shape: tuple[int, ...]) -> Image:
+    return (np.clip(albedo[: shape[0], : shape[1]], 0, 1) * 255 + 0.5).astype(np.uint8)
+
+
+def _view(rng: np.random.Generator) -> Pose:
+    pitch = np.radians(rng.uniform(45, 90))
+    target = np.array([rng.uniform(-220, 220), rng.uniform(-130, 130), 0.0])
+    return look_at(target, rng.uniform(80, 200) / np.sin(pitch), pitch, rng)
+
+
+def _season_pairs(folder: Path, count: int, seed: int) -> list[TestPair]:
+    """A plot at one date as the map and at the other as the flight, 25 to 40 m above it."""
+    plots = sorted(p for p in folder.iterdir() if p.is_dir())[3::4]
+    pairs: list[TestPair] = []
+    for k in range(count):
+        rng = np.random.default_rng((seed, 3, k))
+        plot, dry_map = plots[k // 2 % len(plots)], bool(k % 2)
+        dates = [cv2.cvtColor(cv2.imread(str(p)), cv2.COLOR_BGR2RGB) for p in _dates(plot)]
+        surveyed, flown = dates[:: -1 if dry_map else 1]
+        view, query, truth = _plot_pair(surveyed, flown, rng)
+        seen = np.full(query.shape[:2], truth.translation[2], np.float32)
+        query = apply_appearance(query, seen, tamed(sample_appearance(rng, "day"), seen), rng)
+        condition = "dry map, green flight" if dry_map else "green map, dry flight"
+        pairs.append(TestPair(view, query, truth, condition, place=k // 2 % len(plots)))
+    return pairs
+
+
+def _dates(plot: Path) -> list[Path]:
+    """The green date, then the dry one."""
+
+    def green(path: Path) -> float:
+        blue_green_red = cv2.imread(str(path)).reshape(-1, 3).mean(0)
+        return float(blue_green_red[2] - blue_green_red[1])
+
+    return sorted(plot.glob("*.jpg"), key=green)
+
+
+def _plot_pair(
+    surveyed: Image, flown: Image, rng: np.random.Generator
+) -> tuple[RenderedView, Image, Pose]:
+    """Two views of flat ground: all of the query and four fifths of the map's view lie on it."""
+    while True:
+        camera = Camera.from_fov(*SIZE, rng.uniform(35, 50))
+        pitch = np.radians(rng.uniform(65, 90))
+        at = rng.uniform(-12, 12, 2)
+        truth = look_at(np.array([*at, 0.0]), rng.uniform(25, 40) / np.sin(pitch), pitch, rng)
+        start = moved(rng, truth, np.inf, (METRES, DEGREES))
+        query, depth = _plane_view(flown, truth, camera)
+        if not (depth > 0).all():
+            continue
+        reference, depth = _plane_view(surveyed, start, camera)
+        if (depth > 0).mean() >= 0.8:
+            return RenderedView(reference, depth, start, camera), query, truth
+
+
+def _plane_view(ortho: Image, pose: Pose, camera: Camera) -> tuple[Image, Float32]:
+    """View of a square orthophoto lying at z = 0 around the origin; black, depth 0 beside it."""
+    v, u = np.mgrid[0 : camera.height, 0 : camera.width] + 0.5
+    rays = camera.rays(np.stack([u, v], -1))
+    along = rays @ pose.rotation[2]
+    depth = np.where(along < 0, -pose.translation[2] / np.minimum(along, -1e-9), 0.0)
+    ground = pose.apply(rays * depth[..., None])
+    side = ortho.shape[0]
+    col = side / 2 + ground[..., 0] / _PLOT_TEXEL_M
+    row = side / 2 - ground[..., 1] / _PLOT_TEXEL_M
+    on = (along < 0) & (np.abs(col - side / 2) < side / 2) & (np.abs(row - side / 2) < side / 2)
+    image = cv2.remap(
+        ortho,
+        (col - 0.5).astype(np.float32),
+        (row - 0.5).astype(np.float32),
+        cv2.INTER_LINEAR,
+        borderMode=cv2.BORDER_REPLICATE,
+    )
+    image[~on] = 0
+    return image, np.where(on, depth, 0.0).astype(np.float32)
+
+
+def _origin(georef: Path) -> Geodetic:
+    origin = json.loads(georef.read_text())["origin"]
+    return Geodetic(origin["lat"], origin["lon"], origin["height"])
