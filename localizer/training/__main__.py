@@ -51,6 +51,7 @@ def train(
 def ablation(
     config: ConfigPath,
     steps: Annotated[int, typer.Option(help="Steps of each run.")] = 1000,
+    scenes: Annotated[int, typer.Option(help="Places of each run.")] = 80,
 ) -> None:
     """Repeat the paper's training-data ablation (Table 4): three runs, exported for the benchmark.
 
@@ -60,7 +61,7 @@ def ablation(
     from localizer.training.export import export as write
     from localizer.training.train import Trainer
 
-    for name, run in ablations(load_config(config), steps).items():
+    for name, run in ablations(load_config(config), steps, scenes).items():
         _generate(run)
         trainer = Trainer(run)
         trainer.run()

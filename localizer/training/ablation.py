@@ -5,24 +5,27 @@ from __future__ import annotations
 from localizer.training.config import TrainConfig
 
 
-def ablations(config: TrainConfig, steps: int) -> dict[str, TrainConfig]:
-    """Three runs of `steps` steps that differ in their data alone, by name.
+def ablations(config: TrainConfig, steps: int, scenes: int) -> dict[str, TrainConfig]:
+    """Three runs of `steps` steps on `scenes` places that differ in their data alone, by name.
 
-    "plain": the query keeps the map's light and season and gets no weather or sensor. "generated":
-    no real textures. "full": as configured. Each has its own output and, because scenes differ,
-    its own shards beside the configured ones; mesh worlds, which always change their light, are
-    left out of all three.
+    "full": as configured; its places are the configured run's first ones, so their shards are
+    shared. "plain": the query keeps the map's light and season and gets no weather or sensor.
+    "generated": no real textures. The last two have shards of their own beside the configured ones.
+    Each has its own output. Mesh worlds, which always change their light, are left out of all.
     """
     changes: dict[str, dict[str, object]] = {
+        "full": {},
         "plain": {"light_variety": False, "appearance": False},
         "generated": {"photos": None, "photo_groups": ()},
-        "full": {},
     }
     optimizer = config.optimizer.model_copy(update={"steps": steps, "decay_steps": steps // 2})
+    equal = {"worlds": 0, "scenes": scenes, "initial_scenes": scenes}
     runs = {}
     for name, change in changes.items():
-        shards = config.data.shards.with_name(f"{config.data.shards.name}-{name}")
-        data = config.data.model_copy(update={**change, "shards": shards, "worlds": 0})
+        if change:
+            folder = config.data.shards
+            change["shards"] = folder.with_name(f"{folder.name}-{name}")
+        data = config.data.model_copy(update={**equal, **change})
         runs[name] = config.model_copy(
             update={
                 "output": config.output.with_name(f"{config.output.name}-{name}"),

@@ -298,12 +298,16 @@ def test_int8_keeps_the_features(config: TrainConfig, shards: Path, tmp_path: Pa
 
 
 def test_ablations_differ_in_their_data_alone(config: TrainConfig) -> None:
-    runs = ablations(config, 40)
+    runs = ablations(config, 40, 6)
     assert set(runs) == {"plain", "generated", "full"}
     assert len({run.output for run in runs.values()}) == 3
     assert len({run.data.shards for run in runs.values()}) == 3
     assert all(run.model == config.model and run.seed == config.seed for run in runs.values())
+    assert runs["full"].data.shards == config.data.shards
     assert {run.optimizer.steps for run in runs.values()} == {40}
+    assert {(r.data.scenes, r.data.initial_scenes, r.data.worlds) for r in runs.values()} == {
+        (6, 6, 0)
+    }
     shown = {n: (r.data.light_variety, r.data.appearance, r.data.photos) for n, r in runs.items()}
     photos = config.data.photos
     assert shown == {"plain": (False, False, photos), "generated": (True, True, None),
