@@ -1,9 +1,9 @@
 """Feature extractors: the shipped network through onnxruntime, or the labelled fallback.
 
 A model is two files: ``NAME.onnx`` and ``NAME.json``. The graph takes ``image`` (1, H, W, 3) uint8
-RGB with H and W divisible by the coarsest stride, and gives for each level, coarse to fine,
-``features_K`` (1, h, w, C) float32 of unit length per pixel and ``confidence_K`` (1, h, w) float32
-in (0, 1). The JSON file names the levels and carries the SHA-256 of the graph.
+RGB with H and W divisible by the description's `multiple`, and gives for each level, coarse to
+fine, ``features_K`` (1, h, w, C) float32 of unit length per pixel and ``confidence_K`` (1, h, w)
+float32 in (0, 1). The JSON file names the levels and carries the SHA-256 of the graph.
 """
 
 from __future__ import annotations
@@ -59,13 +59,14 @@ class LevelInfo(BaseModel):
 
 
 class ModelInfo(BaseModel):
-    """Content of the JSON file beside a model."""
+    """Content of the JSON file beside a model. multiple: what image sides must be divisible by."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
     name: str
     sha256: str = Field(pattern="^[0-9a-f]{64}$")
     levels: tuple[LevelInfo, ...] = Field(min_length=1)
     parameters: int = Field(gt=0)
+    multiple: int = Field(default=8, gt=0)
     training: dict[str, object] = {}
 
 
@@ -109,7 +110,7 @@ class OnnxExtractor:
             )
         except Exception as error:  # onnxruntime raises its own untyped exceptions
             raise ModelError(f"{model}: onnxruntime cannot load it: {error}") from error
-        self._multiple = max(level.stride for level in self.info.levels)
+        self._multiple = self.info.multiple
         self._outputs = [
             f"{kind}_{k}"
             for k in range(len(self.info.levels))
@@ -132,7 +133,7 @@ class OnnxExtractor:
         return f"{self.info.name} (onnxruntime, {self.provider})"
 
     def extract(self, rgb: Image) -> FeaturePyramid:
-        """Pyramid of an (H, W, 3) uint8 RGB image, H and W divisible by the coarsest stride."""
+        """Pyramid of an (H, W, 3) uint8 RGB image, H and W divisible by `info.multiple`."""
         check_image(rgb, self._multiple)
         arrays = self._session.run(self._outputs, {"image": np.ascontiguousarray(rgb)[None]})
         levels = tuple(

@@ -74,12 +74,16 @@ def ablation(
 def export(
     checkpoint: Annotated[Path, typer.Argument(help="Checkpoint (.pt) of a run.")],
     model: Annotated[Path, typer.Argument(help="ONNX file to write; its JSON goes beside it.")],
+    float16: Annotated[bool, typer.Option("--float16", help="Half precision; s0 only.")] = False,
 ) -> None:
     """Write a checkpoint's averaged weights as an ONNX model with its description."""
     from localizer.training.export import export as write
 
-    difference = write(checkpoint, model)
-    typer.echo(f"{model}: largest difference to torch {difference:.2g}")
+    parity = write(checkpoint, model, half=float16)
+    typer.echo(
+        f"{model}: largest difference to torch in float32 {parity.difference:.2g}, "
+        f"least mean cosine {parity.cosine:.6f}"
+    )
 
 
 @app.command()

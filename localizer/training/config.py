@@ -8,7 +8,7 @@ import yaml
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from localizer.errors import ModelError
-from localizer.training.model import ModelConfig
+from localizer.training.networks import NetworkConfig
 
 
 class _Frozen(BaseModel):
@@ -36,7 +36,9 @@ class DataSection(_Frozen):
 
 class OptimizerSection(_Frozen):
     """Steps and step sizes. The rate warms up, stays, and falls to zero as a cosine over the last
-    `decay_steps`, so that a run can be made longer or shorter until its decay begins.
+    `decay_steps`, so that a run can be made longer or shorter until its decay begins. Eq. 3 comes
+    in at `alignment_first_step`. Levels of at most `whole_map_cells` are searched whole by the
+    contrast.
     """
 
     steps: int = Field(gt=0)
@@ -52,6 +54,8 @@ class OptimizerSection(_Frozen):
     contrast_weight: float
     alignment_weight: float
     alignment_ramp_steps: int = Field(ge=1)
+    alignment_first_step: int = Field(default=0, ge=0)
+    whole_map_cells: int = Field(default=1200, ge=0)
     lm_iterations: int = Field(gt=0)
     start_error_px: tuple[float, float, float]
     threads: int = Field(gt=0)
@@ -71,7 +75,7 @@ class TrainConfig(_Frozen):
     output: Path
     checkpoint_steps: int = Field(gt=0)
     warm_start: Path | None = None
-    model: ModelConfig
+    model: NetworkConfig
     data: DataSection
     optimizer: OptimizerSection
 

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import copy
 import hashlib
 import json
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -15,26 +17,42 @@ from localizer.errors import ModelError
 from localizer.features.extractor import OnnxExtractor
 from localizer.training.checkpoint import fill, read_checkpoint
 from localizer.training.config import TrainConfig
-from localizer.training.model import STRIDES, TinyNet, fuse, parameter_count
+from localizer.training.model import parameter_count
+from localizer.training.model_s0 import S0Net
+from localizer.training.networks import Network, build, fuse
 
 OPSET = 17
 _TOLERANCE = 2e-4  # largest difference of a feature between torch and onnxruntime
+_HALF_COSINE = 0.999  # least mean cosine of float16 features to the float32 ones
+
+
+@dataclass(frozen=True)
+class Parity:
+    """A model against torch in float32: largest difference of any output, and the mean cosine of
+    the features on the level where it is least.
+    """
+
+    difference: float
+    cosine: float
 
 
 class Deployed(nn.Module):
-    """The network as the flight path sees it: uint8 channels-last in, channels-last out."""
+    """The network as the flight path sees it: uint8 channels-last in, channels-last out. half: it
+    computes in float16; what comes out is float32 in any case.
+    """
 
-    def __init__(self, network: nn.Module) -> None:
+    def __init__(self, network: nn.Module, *, half: bool = False) -> None:
         super().__init__()
-        self.network = network
+        self.network = network.half() if half else network
+        self._kind = torch.float16 if half else torch.float32
 
     def forward(self, image: Tensor) -> tuple[Tensor, ...]:
         """(1, H, W, 3) uint8 to features (1, h, w, C) and confidence (1, h, w) per level."""
-        levels = self.network(image.permute(0, 3, 1, 2).float() / 255.0)
+        levels = self.network(image.permute(0, 3, 1, 2).to(self._kind) / 255.0)
         return tuple(t for f, c in levels for t in (f.permute(0, 2, 3, 1), c))
 
 
-def load_network(checkpoint: Path) -> tuple[TinyNet, TrainConfig, dict[str, object]]:
+def load_network(checkpoint: Path) -> tuple[Network, TrainConfig, dict[str, object]]:
     """The averaged network of a checkpoint in evaluation mode, its configuration, its progress."""
     state = read_checkpoint(checkpoint)
     try:
@@ -44,16 +62,24 @@ def load_network(checkpoint: Path) -> tuple[TinyNet, TrainConfig, dict[str, obje
         raise ModelError(f"{checkpoint}: holds weights alone, no {error}: not a run's") from error
     except ValidationError as error:
         raise ModelError(f"{checkpoint}: of another version of the training: {error}") from error
-    network = TinyNet(config.model)
+    network = build(config.model)
     fill(network, state["average"], checkpoint)
     return network.eval(), config, progress
 
 
-def export(checkpoint: Path, model: Path) -> float:
-    """Write `model` (ONNX) and its JSON; returns the largest difference to torch, checked."""
+def export(checkpoint: Path, model: Path, *, half: bool = False) -> Parity:
+    """Write `model` (ONNX) and its JSON; returns how it compares with torch in float32, checked.
+
+    half: float16 inside, for GPUs. `tiny` is refused: its fixed channels need float32.
+    """
     network, config, progress = load_network(checkpoint)
-    deployed = Deployed(fuse(network)).eval()
-    names = [f"{kind}_{k}" for k in range(len(STRIDES)) for kind in ("features", "confidence")]
+    if half and not isinstance(network, S0Net):
+        raise ModelError(f"{checkpoint}: float16 is for s0; tiny's fixed channels need float32")
+    exact = Deployed(fuse(network)).eval()
+    deployed = Deployed(copy.deepcopy(network), half=True).eval() if half else exact
+    names = [
+        f"{kind}_{k}" for k in range(len(network.strides)) for kind in ("features", "confidence")
+    ]
     axes = {"image": {1: "height", 2: "width"}}
     axes |= {name: {1: f"h{name[-1]}", 2: f"w{name[-1]}"} for name in names}
     model.parent.mkdir(parents=True, exist_ok=True)
@@ -68,9 +94,9 @@ def export(checkpoint: Path, model: Path) -> float:
         dynamo=False,
     )
     description = {
-        "name": config.name,
+        "name": f"{config.name}-float16" if half else config.name,
         "sha256": hashlib.sha256(model.read_bytes()).hexdigest(),
-        "levels": [{"stride": s, "channels": config.model.channels} for s in STRIDES],
+        "levels": [{"stride": s, "channels": config.model.channels} for s in network.strides],
         "parameters": parameter_count(network),
         "training": {
             "seed": config.seed,
@@ -83,19 +109,28 @@ def export(checkpoint: Path, model: Path) -> float:
         },
     }
     model.with_suffix(".json").write_text(json.dumps(description, indent=2) + "\n")
-    return check_parity(deployed, model)
+    return check_parity(exact, model, half=half)
 
 
-def check_parity(deployed: Deployed, model: Path) -> float:
-    """Largest difference between torch and onnxruntime on an image of another size."""
+def check_parity(deployed: Deployed, model: Path, *, half: bool = False) -> Parity:
+    """Compare onnxruntime with torch in float32 on an image of another size; ModelError if they
+    differ by more than rounding explains.
+    """
     image = np.random.default_rng(0).integers(0, 256, (120, 168, 3), dtype=np.uint8)
     pyramid = OnnxExtractor(model, threads=1).extract(image)
     with torch.no_grad():
-        expected = deployed(torch.from_numpy(image[None]))
-    worst = 0.0
-    for k, level in enumerate(pyramid.levels):
-        worst = max(worst, float(np.abs(level.features - expected[2 * k][0].numpy()).max()))
-        worst = max(worst, float(np.abs(level.confidence - expected[2 * k + 1][0].numpy()).max()))
-    if worst > _TOLERANCE:
-        raise ModelError(f"{model}: differs from torch by {worst:.2g}, more than {_TOLERANCE}")
-    return worst
+        expected = [value[0].numpy() for value in deployed(torch.from_numpy(image[None]))]
+    worst, cosines = 0.0, []
+    for level, features, confidence in zip(
+        pyramid.levels, expected[::2], expected[1::2], strict=True
+    ):
+        worst = max(worst, float(np.abs(level.features - features).max()))
+        worst = max(worst, float(np.abs(level.confidence - confidence).max()))
+        cosines.append(float((level.features * features).sum(-1).mean()))
+    parity = Parity(worst, min(cosines))
+    if (parity.cosine < _HALF_COSINE) if half else (worst > _TOLERANCE):
+        raise ModelError(
+            f"{model}: differs from torch by {worst:.2g}, mean cosine {parity.cosine:.5f}; "
+            f"allowed are {f'a cosine from {_HALF_COSINE} on' if half else _TOLERANCE}"
+        )
+    return parity

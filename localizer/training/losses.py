@@ -13,7 +13,6 @@ from torch import Tensor
 from torch.nn import functional as F  # noqa: N812 (torch's own name for it)
 
 _WINDOW = 5  # half side, in cells, of the neighbourhood that gives the hard negatives
-_COARSE_CELLS = 1200  # up to here the whole level is the set of negatives
 
 
 @dataclass(frozen=True)
@@ -41,14 +40,21 @@ def sample(feature: Tensor, pixels: Tensor) -> Tensor:
 
 
 def contrast_loss(
-    reference: Tensor, query: Tensor, truth: Tensor, visible: Tensor, scale: Tensor, count: int
+    reference: Tensor,
+    query: Tensor,
+    truth: Tensor,
+    visible: Tensor,
+    scale: Tensor,
+    count: int,
+    whole_map_cells: int,
 ) -> Tensor:
     """Cross entropy of finding each anchor's true place (B, N, 2, level pixels) in the query.
 
-    reference: (B, N, C) anchor features. Coarse levels are searched whole; on finer ones the
-    negatives are the neighbourhood, which decides the basin, for `count` of the anchors.
+    reference: (B, N, C) anchor features. Levels of at most `whole_map_cells` are searched whole;
+    on finer ones the negatives are the neighbourhood, which decides the basin, for `count` of the
+    anchors.
     """
-    if query.shape[2] * query.shape[3] <= _COARSE_CELLS:
+    if query.shape[2] * query.shape[3] <= whole_map_cells:
         loss = _whole_map(reference, query, truth, scale)
         return _mean(loss, visible)
     chosen = slice(0, count)

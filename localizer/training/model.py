@@ -12,6 +12,8 @@ of view costs next to nothing.
 
 from __future__ import annotations
 
+from typing import ClassVar, Literal
+
 import torch
 from pydantic import BaseModel, ConfigDict, Field
 from torch import Tensor, nn
@@ -28,6 +30,7 @@ class ModelConfig(BaseModel):
     """
 
     model_config = ConfigDict(frozen=True, extra="forbid")
+    network: Literal["tiny"] = "tiny"
     channels: int = Field(default=32, gt=CHANNELS)
     widths: tuple[int, int, int] = (24, 48, 96)
     decoder: tuple[int, int] = (48, 32)
@@ -91,6 +94,8 @@ class TinyNet(nn.Module):
 
     Level k is at stride `STRIDES[k]`: features (B, C, h, w) of unit length, confidence (B, h, w).
     """
+
+    strides: ClassVar[tuple[int, ...]] = STRIDES
 
     def __init__(self, config: ModelConfig) -> None:
         super().__init__()

@@ -9,6 +9,8 @@ here, the second output is the confidence, the uncertainty's complement.
 
 from __future__ import annotations
 
+from typing import ClassVar, Literal
+
 import torch
 from pydantic import BaseModel, ConfigDict, Field
 from torch import Tensor, nn
@@ -23,6 +25,7 @@ class S0Config(BaseModel):
     """Shape of the network. channels: C of each level; branches: of each encoder block."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
+    network: Literal["s0"] = "s0"
     channels: int = Field(default=32, gt=0)
     branches: int = Field(default=4, gt=0)
 
@@ -91,6 +94,8 @@ class S0Net(nn.Module):
 
     Level k is at stride `STRIDES[k]`: features (B, C, h, w) of unit length, confidence (B, h, w).
     """
+
+    strides: ClassVar[tuple[int, ...]] = STRIDES
 
     def __init__(self, config: S0Config) -> None:
         super().__init__()

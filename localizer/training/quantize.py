@@ -27,6 +27,7 @@ from localizer.training.shards import read_shard
 from localizer.types import Image
 
 _FIXED = "orientation"  # in the names of the fixed channels' nodes, which stay float
+_HEADS = ("features", "share", "projections", "uncertainties")  # of both networks
 
 
 def quantize(model: Path, out: Path, shards: Sequence[Path]) -> float:
@@ -61,7 +62,7 @@ def quantize(model: Path, out: Path, shards: Sequence[Path]) -> float:
 
 
 def _stays_float(node: str) -> bool:
-    return _FIXED in node or "/features." in node or "/share." in node
+    return _FIXED in node or any(f"/{head}." in node for head in _HEADS)
 
 
 class _Calibration(CalibrationDataReader):

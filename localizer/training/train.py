@@ -17,7 +17,7 @@ from localizer.training.config import DataSection, OptimizerSection, TrainConfig
 from localizer.training.data import LoaderConfig, Schedule, ShardStream
 from localizer.training.distributed import Workers
 from localizer.training.losses import Batch, alignment_loss, contrast_loss, sample, se3_exp
-from localizer.training.model import STRIDES, TinyNet
+from localizer.training.networks import build
 from localizer.training.shards import shard_path, world_shard_paths
 from localizer.training.worlds import FIRST_SEED
 
@@ -37,13 +37,15 @@ class Trainer:
         torch.set_num_threads(config.optimizer.threads)
         self.workers = Workers.from_environment()
         self.device = self.workers.device
-        self.model = TinyNet(config.model).to(self.device).train()
+        self.model = build(config.model).to(self.device).train()
         if config.warm_start is not None:
             first = read_checkpoint(config.warm_start, self.device)
             fill(self.model, first["average"], config.warm_start)
-        self.average = TinyNet(config.model).to(self.device).eval()
+        self.average = build(config.model).to(self.device).eval()
         self.average.load_state_dict(self.model.state_dict())
-        self.log_scale = nn.Parameter(torch.full((3,), 3.2, device=self.device))
+        self.log_scale = nn.Parameter(
+            torch.full((len(self.model.strides),), 3.2, device=self.device)
+        )
         self.optimizer = torch.optim.AdamW(
             [
                 {"params": list(self.model.parameters())},
@@ -112,17 +114,18 @@ class Trainer:
         pairs = batch.points.shape[0]
         with torch.autocast(self.device.type, torch.bfloat16, enabled=o.mixed_precision):
             levels = self.model(batch.images.contiguous())
-        ramp = min(1.0, self.step / o.alignment_ramp_steps)
+        ramp = alignment_ramp(self.step, o)
         generator = torch.Generator().manual_seed(self.config.seed * 1_000_003 + self.step)
         total, parts = batch.points.new_zeros(()), {}
-        for k, ((features, confidence), stride) in enumerate(zip(levels, STRIDES, strict=True)):
+        strides = self.model.strides
+        for k, ((features, confidence), stride) in enumerate(zip(levels, strides, strict=True)):
             at = batch.reference_pixels / stride
             anchors = sample(features[:pairs], at)
             trust = sample(confidence[:pairs, None], at)[..., 0]
             query = features[pairs:]
             contrast = contrast_loss(
                 anchors, query, batch.query_pixels / stride, batch.visible,
-                self.log_scale[k].exp(), 64,
+                self.log_scale[k].exp(), 64, o.whole_map_cells,
             )  # fmt: skip
             start = perturbed(batch, o.start_error_px[k], generator)
             alignment, error = alignment_loss(
@@ -214,6 +217,12 @@ def learning_rate(step: int, o: OptimizerSection) -> float:
     warm = min(1.0, (step + 1) / max(o.warmup_steps, 1))
     left = min(1.0, (o.steps - step) / o.decay_steps)
     return float(o.learning_rate * warm * 0.5 * (1 - np.cos(np.pi * left)))
+
+
+def alignment_ramp(step: int, o: OptimizerSection) -> float:
+    """Share of Eq. 3's weight at a step: none before its first one, then rising to all of it."""
+    since = max(step - o.alignment_first_step, 0)
+    return min(1.0, since / o.alignment_ramp_steps)
 
 
 def perturbed(batch: Batch, error_px: float, generator: torch.Generator) -> Tensor:

@@ -1,0 +1,156 @@
+"""The paper's network through the whole training: schedule, resumption, export, int8, float16."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+torch = pytest.importorskip("torch", reason="needs the extra `train`")
+onnx = pytest.importorskip("onnx")
+
+from localizer.errors import ModelError  # noqa: E402
+from localizer.features import OnnxExtractor  # noqa: E402
+from localizer.training.config import TrainConfig, load_config  # noqa: E402
+from localizer.training.export import export  # noqa: E402
+from localizer.training.model_s0 import S0Config, S0Net  # noqa: E402
+from localizer.training.pairs import SceneConfig  # noqa: E402
+from localizer.training.quantize import quantize  # noqa: E402
+from localizer.training.shards import write_shard  # noqa: E402
+from localizer.training.train import Trainer, alignment_ramp  # noqa: E402
+from localizer.training.unfuse import unfuse  # noqa: E402
+
+CONFIGS = Path(__file__).parents[3] / "configs"
+SCENES = SceneConfig(cells=256, width=128, height=96, references=3, queries_per_light=3)
+
+
+@pytest.fixture(scope="module")
+def shards(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("shards")
+    write_shard(folder, 2000, SCENES, None)
+    return folder
+
+
+@pytest.fixture(scope="module")
+def config(shards: Path, tmp_path_factory: pytest.TempPathFactory) -> TrainConfig:
+    run = load_config(CONFIGS / "train_s0_cpu.yaml")
+    data = run.data.model_copy(update={"shards": shards, "first_seed": 2000, "scenes": 1,
+                                       "initial_scenes": 1, "worlds": 0})  # fmt: skip
+    optimizer = run.optimizer.model_copy(update={
+        "batch": 2, "anchors": 64, "crop": (64, 48), "steps": 4, "decay_steps": 2,
+        "warmup_steps": 1, "alignment_first_step": 1, "alignment_ramp_steps": 2,
+        "mixed_precision": False,
+    })  # fmt: skip
+    return run.model_copy(update={"output": tmp_path_factory.mktemp("run"), "data": data,
+                                  "model": S0Config(channels=8, branches=2),
+                                  "optimizer": optimizer, "checkpoint_steps": 2})  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def trainer(config: TrainConfig) -> Trainer:
+    trained = Trainer(config)
+    trained.run()
+    return trained
+
+
+@pytest.fixture(scope="module")
+def model(trainer: Trainer, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("model") / "s0.onnx"
+    export(trainer.checkpoint, path)
+    return path
+
+
+def test_the_yaml_names_the_network(tmp_path: Path) -> None:
+    text = (CONFIGS / "train_s0_cpu.yaml").read_text()
+    path = tmp_path / "run.yaml"
+    for wrong, why in (("network: s1", "s1"), ("network: s0\n  widths: [1, 2, 3]", "widths")):
+        path.write_text(text.replace("network: s0", wrong, 1))
+        with pytest.raises(ModelError, match=why):
+            load_config(path)
+
+
+def test_a_run_trains_resumes_and_writes_its_curve(
+    config: TrainConfig, trainer: Trainer, tmp_path: Path
+) -> None:
+    assert isinstance(trainer.model, S0Net)
+    assert trainer.model.strides == (4, 2, 1)
+    parts = config.model_copy(update={"output": tmp_path})
+    Trainer(parts).run(steps=2)
+    second = Trainer(parts)
+    second.run()
+    for a, b in zip(
+        trainer.average.state_dict().values(), second.average.state_dict().values(), strict=True
+    ):
+        torch.testing.assert_close(a, b, rtol=0, atol=0)
+    header = (tmp_path / "s0.csv").read_text().splitlines()[0].split(",")
+    assert {"contrast_2", "alignment_2", "error_px_2"} <= set(header)
+
+
+def test_confidence_is_learned_once_eq_3_has_come_in(config: TrainConfig, tmp_path: Path) -> None:
+    run = Trainer(config.model_copy(update={"output": tmp_path}))
+    heads = [head.weight.detach().clone() for head in run.model.uncertainties]
+    o = run.config.optimizer
+    assert [alignment_ramp(step, o) for step in range(5)] == [0.0, 0.0, 0.5, 1.0, 1.0]
+    run.run(steps=1)  # the correspondence loss alone says nothing about confidence
+    decay = 1 - o.learning_rate * o.weight_decay
+    for head, first in zip(run.model.uncertainties, heads, strict=True):
+        torch.testing.assert_close(head.weight, first * decay)
+    run.run(steps=3)
+    assert all(
+        not torch.allclose(head.weight, first, atol=1e-4)
+        for head, first in zip(run.model.uncertainties, heads, strict=True)
+    )
+
+
+def test_the_exported_model_runs_at_sizes_divisible_by_eight(model: Path) -> None:
+    extractor = OnnxExtractor(model, threads=1)
+    assert [level.stride for level in extractor.info.levels] == [4, 2, 1]
+    pyramid = extractor.extract(np.zeros((40, 56, 3), np.uint8))
+    assert [level.features.shape for level in pyramid.levels] == [
+        (10, 14, 8), (20, 28, 8), (40, 56, 8),
+    ]  # fmt: skip
+    # The encoder goes down to stride 8 although the coarsest level is at 4.
+    with pytest.raises(ModelError, match="divisible by 8"):
+        extractor.extract(np.zeros((36, 56, 3), np.uint8))
+
+
+def test_float16_is_close_and_says_so(trainer: Trainer, tmp_path: Path) -> None:
+    path = tmp_path / "s0.onnx"
+    parity = export(trainer.checkpoint, path, half=True)
+    assert 0.9995 < parity.cosine < 1.0
+    assert 1e-6 < parity.difference < 0.05
+    kinds = {i.data_type for i in onnx.load(path).graph.initializer if len(i.dims) == 4}
+    assert kinds == {onnx.TensorProto.FLOAT16}
+    assert OnnxExtractor(path).info.name == "s0-float16"
+
+
+def test_int8_keeps_heads_in_float(model: Path, shards: Path, tmp_path: Path) -> None:
+    small = tmp_path / "s0-int8.onnx"
+    assert quantize(model, small, sorted(shards.glob("*.npz"))) > 0.9
+    graph = onnx.load(small).graph
+    assert any(node.op_type == "QuantizeLinear" for node in graph.node)
+    heads = [n for n in graph.node if n.op_type == "Conv" and "uncertainties" in n.name]
+    weights = {i.name for i in graph.initializer}
+    assert len(heads) == 3
+    assert all(head.input[1] in weights for head in heads)
+
+
+def test_a_published_model_becomes_trainable_again(trainer: Trainer, model: Path) -> None:
+    rng = np.random.default_rng(0)
+    images = [rng.integers(0, 256, (64, 64, 3), dtype=np.uint8) for _ in range(4)]
+    network = unfuse(model, images)
+    tensor = torch.from_numpy(np.stack(images).transpose(0, 3, 1, 2)).float() / 255.0
+    with torch.no_grad():
+        restored, expected = network(tensor), trainer.average(tensor)
+    for (f, c), (g, d) in zip(restored, expected, strict=True):
+        torch.testing.assert_close(f, g, atol=1e-3, rtol=0)
+        torch.testing.assert_close(c, d, atol=1e-4, rtol=0)
+    levels = network.train()(tensor)
+    for (f, _), (g, _) in zip(levels, expected, strict=True):
+        assert float((f * g).sum(1).mean().detach()) > 0.95
+    sum((f * f.roll(1, 0)).sum() for f, _ in levels).backward()
+    # Silent branches are not dead: their gains get gradients.
+    silent = network.encoder[0][0].convolutions[1][1]
+    assert float(silent.weight.abs().max()) == 0.0
+    assert float(silent.weight.grad.abs().max()) > 0.0
