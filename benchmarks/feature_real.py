@@ -13,7 +13,6 @@ What kind of set a folder holds is seen from its content:
 from __future__ import annotations
 
 import json
-import shutil
 from pathlib import Path
 
 import cv2
@@ -57,19 +56,16 @@ def real_pairs(
 def _map(folder: Path, cache: Path, origin: Geodetic | None) -> Path:
     built = cache / f"map-{folder.name}"
     if not built.exists():
-        partial = built.with_suffix(".partial")
-        shutil.rmtree(partial, ignore_errors=True)
         layers = [folder / "dsm.tif", folder / "ortho.tif"]
         # Heights only need to agree between map and poses here, so the separation does not matter.
         build_cache(
             layers if layers[0].exists() else folder,
-            partial,
+            built,
             geoid_separation_m=0.0,
             vertical_datum="ellipsoidal",
             origin=origin,
             progress=False,
         )
-        partial.rename(built)
     return built
 
 
