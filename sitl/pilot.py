@@ -48,8 +48,11 @@ _STREAMS = {  # message id -> Hz
 _CLOCK_WINDOW = 25  # samples over which the least latency is taken
 _SECONDS_KEPT = 60 * 60
 _WALL_MARGIN_S = 30.0
-_ACK_TIMEOUT_S = 5.0  # wall time
-_RETRIES = 3
+# Wall time. A busy machine may let one of the two wait for seconds: an answer that comes costs
+# nothing, and only a vehicle that is alive and silent takes that long.
+_REPEAT_S = 1.5
+_TRIES = 20
+_SHOWN_S = 30.0  # simulated, until the next heartbeat shows what was accepted
 _GUIDED_POSITION = 0xDF8  # position only
 _GIMBAL_YAW_LOCK = 16.0
 
@@ -290,7 +293,7 @@ class Pilot:
 
     # --- life --------------------------------------------------------------------------------
 
-    def connect(self, timeout_s: float = 30.0) -> None:
+    def connect(self, timeout_s: float = 90.0) -> None:
         """Connect, wait for the autopilot's heartbeat and ask for its streams."""
         deadline = time.monotonic() + timeout_s
         while self._link is None:
@@ -506,7 +509,7 @@ class Pilot:
     def set_mode(self, name: str) -> None:
         """Change mode and wait until the heartbeat says so."""
         self.command(mavlink.MAV_CMD_DO_SET_MODE, 1, MODES[name])
-        self.wait(lambda: self.mode == name, 5.0, f"mode {name}")
+        self.wait(lambda: self.mode == name, _SHOWN_S, f"mode {name}")
 
     def arm(self, timeout_s: float = 60.0) -> None:
         """Arm, asking again until the checks pass; PilotError with the refusals otherwise."""
@@ -518,7 +521,7 @@ class Pilot:
                 reasons = {t.text for t in self.texts if t.time_ns > start_ns and "rm: " in t.text}
                 raise PilotError(f"not armed in {timeout_s:g} s: {'; '.join(sorted(reasons))}")
             self.sleep(1.0)
-        self.wait(lambda: self.armed, 5.0, "the armed heartbeat")
+        self.wait(lambda: self.armed, _SHOWN_S, "the armed heartbeat")
 
     def disarm(self, *, force: bool = False) -> None:
         """Disarm; `force` also in flight."""
@@ -598,7 +601,7 @@ class Pilot:
                 round(origin.altitude_m * 1000),
             )
         )
-        if not self._wait_wall(lambda: self.read_origin() is not None, 10.0):
+        if not self._wait_wall(lambda: self.read_origin() is not None, 60.0):
             raise PilotError("the vehicle took no EKF origin")
 
     def read_origin(self) -> Location | None:
@@ -676,7 +679,7 @@ class Pilot:
     def set_parameter(self, name: str, value: float) -> None:
         """Set a parameter and wait until the vehicle confirms it."""
         with self._expect("PARAM_VALUE") as box:
-            for _ in range(_RETRIES):
+            for _ in range(_TRIES):
                 self._send(
                     mavlink.MAVLink_param_set_message(
                         _VEHICLE, _AUTOPILOT, name.encode(), value, mavlink.MAV_PARAM_TYPE_REAL32
@@ -686,10 +689,10 @@ class Pilot:
                     return
         raise PilotError(f"the vehicle did not confirm {name} = {value:g}; does it know it?")
 
-    def parameter(self, name: str) -> float:
-        """Read a parameter."""
+    def parameter(self, name: str, tries: int = _TRIES) -> float:
+        """Read a parameter, asking so many times: a vehicle does not answer for one it lacks."""
         with self._expect("PARAM_VALUE") as box:
-            for _ in range(_RETRIES):
+            for _ in range(tries):
                 self._send(
                     mavlink.MAVLink_param_request_read_message(
                         _VEHICLE, _AUTOPILOT, name.encode(), -1
@@ -701,12 +704,18 @@ class Pilot:
         raise PilotError(f"the vehicle has no parameter {name}")
 
     def _parameter_from(self, box: queue.SimpleQueue[Any], name: str) -> float | None:
-        deadline = time.monotonic() + 1.0
+        answer = self._answer(box, lambda m: bool(m.param_id == name))
+        return None if answer is None else float(answer.param_value)
+
+    def _answer(self, box: queue.SimpleQueue[Any], fits: Callable[[Any], bool]) -> Any | None:
+        """The first message that fits; None after `_REPEAT_S`."""
+        self._alive()
+        deadline = time.monotonic() + _REPEAT_S
         while (left := deadline - time.monotonic()) > 0:
             with contextlib.suppress(queue.Empty):
                 message = box.get(timeout=left)
-                if message.param_id == name:
-                    return float(message.param_value)
+                if fits(message):
+                    return message
         return None
 
     def _set_speed(self, speedup: float) -> None:
@@ -728,18 +737,15 @@ class Pilot:
         """COMMAND_LONG; its MAV_RESULT, or None without an answer."""
         filled = [*parameters, *([0.0] * (7 - len(parameters)))]
         with self._expect("COMMAND_ACK") as box:
-            for attempt in range(_RETRIES):
+            for attempt in range(_TRIES):
                 self._send(
                     mavlink.MAVLink_command_long_message(
                         _VEHICLE, _AUTOPILOT, number, attempt, *filled
                     )
                 )
-                deadline = time.monotonic() + _ACK_TIMEOUT_S / _RETRIES
-                while (left := deadline - time.monotonic()) > 0:
-                    with contextlib.suppress(queue.Empty):
-                        message = box.get(timeout=left)
-                        if message.command == number:
-                            return int(message.result)
+                answer = self._answer(box, lambda m: bool(m.command == number))
+                if answer is not None:
+                    return int(answer.result)
         return None
 
     def _request_stream(self, message_id: int, hertz: float) -> None:
@@ -758,7 +764,7 @@ class Pilot:
 
     def _next(self, box: queue.SimpleQueue[Any], what: str) -> Any:
         try:
-            return box.get(timeout=_ACK_TIMEOUT_S)
+            return box.get(timeout=_TRIES * _REPEAT_S)
         except queue.Empty:
             self._alive()
             raise PilotError(f"the vehicle was silent during {what}") from None

@@ -83,6 +83,7 @@ class _CaseFlight:
         if self._bridge is not None:
             self._record.counters = self._bridge.counters()
         self._record.pace = slowest_pace(self._ticks)
+        self._record.stall_s = longest_stall(self._ticks)
         return self._record
 
     # --- before ----------------------------------------------------------------------------------
@@ -268,6 +269,17 @@ def slowest_pace(ticks: Sequence[tuple[float, float]], span_s: float = 10.0) -> 
         if elapsed > 0.9 * span_s and own > ticks[first][1]:
             paces.append((own - ticks[first][1]) / elapsed)
     return min(paces)
+
+
+def longest_stall(ticks: Sequence[tuple[float, float]], span_s: float = 1.0) -> float:
+    """The most seconds that a vehicle fell behind within span_s; ticks as for `slowest_pace`."""
+    worst, first = 0.0, 0
+    for due, own in ticks:
+        while due - ticks[first][0] > span_s:
+            first += 1
+        if own >= ticks[first][1]:
+            worst = max(worst, (due - ticks[first][0]) - (own - ticks[first][1]))
+    return worst
 
 
 def bridge_config(case: Case, connection: str) -> BridgeConfig:

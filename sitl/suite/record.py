@@ -54,6 +54,7 @@ class Record:
     refusals: texts of the last refused arming; None when nobody tried or it was accepted.
     pace: simulated seconds per second that it should have been, at the slowest over ten seconds;
     below 1 the machine was too slow, and the autopilot's clock ran slow against the bridge's.
+    stall_s: what the vehicle fell behind, at most, within one second.
     """
 
     errors: list[tuple[float, float, float]] = field(default_factory=list)
@@ -66,6 +67,12 @@ class Record:
     counters: dict[str, float | int | str] = field(default_factory=dict)
     closed: bool = False
     pace: float = 1.0
+    stall_s: float = 0.0
+
+    @property
+    def starved(self) -> str:
+        """How far the vehicle was from real time, in words."""
+        return f"{self.pace:.2f} of real time over 10 s, {self.stall_s:.2f} s lost within a second"
 
     def horizontal(self, from_s: float = 0.0, to_s: float = np.inf) -> Array:
         """Horizontal EKF errors (N,) in metres within a span of seconds."""

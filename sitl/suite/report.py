@@ -145,7 +145,7 @@ def _broken(row: Row) -> list[str]:
 def _pace(row: Row) -> list[str]:
     if row.record is None or not row.slow:
         return []
-    return [f"machine too slow: the vehicle ran at {row.record.pace:.2f} of its speed"]
+    return [f"machine too slow: {row.record.starved}"]
 
 
 def _as_data(row: Row) -> dict[str, Any]:
@@ -162,6 +162,7 @@ def _as_data(row: Row) -> dict[str, Any]:
         "measured_paired_as_reference": paired,
         "findings": [asdict(f) for f in row.findings],
         "pace": None if row.record is None else round(row.record.pace, 3),
+        "stall_s": None if row.record is None else round(row.record.stall_s, 3),
         "wall_s": round(row.wall_s, 1),
         "record": None if row.record is None else asdict(row.record),
     }

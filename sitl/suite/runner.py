@@ -22,6 +22,7 @@ from sitl.suite.flight import fly
 from sitl.suite.record import Array, Record
 
 _PACE_LIMIT = 0.98
+_STALL_LIMIT_S = 0.05  # on a machine with room it is below 0.01 s
 _LANDING_S = 15.0  # in which an interrupted flight ends its vehicle
 Figures = tuple[float, float, float]
 
@@ -54,7 +55,8 @@ class Row:
     @property
     def slow(self) -> bool:
         """Whether the machine could not keep the vehicle in real time, which costs accuracy."""
-        return self.record is not None and self.record.pace < _PACE_LIMIT
+        r = self.record
+        return r is not None and (r.pace < _PACE_LIMIT or r.stall_s > _STALL_LIMIT_S)
 
     @property
     def reference(self) -> Reference | None:

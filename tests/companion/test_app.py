@@ -4,13 +4,13 @@ import csv
 import itertools
 import logging
 import threading
-import time
 
 import cv2
 import numpy as np
 
 from companion.app import Companion
 from companion.config import parse_config
+from mavlink_bridge.link import sleep_until
 from mavlink_bridge.messages import without_figures
 from sitl.embedded.geodesy import Location
 from sitl.vehicles import GIMBAL, EmbeddedSitl, vision_parameters
@@ -41,8 +41,7 @@ def test_what_happens_is_logged_and_recorded_once_and_every_thread_ends(
         )
         with caplog.at_level(logging.INFO):
             Companion(config).run()
-    time.sleep(0.2)
-    assert set(threading.enumerate()) <= threads
+    assert sleep_until(lambda: set(threading.enumerate()) <= threads, 30.0), threading.enumerate()
     with (tmp_path / "record" / "events.csv").open() as file:
         recorded = [row["text"] for row in csv.DictReader(file)]
     logged = [r.getMessage() for r in caplog.records]

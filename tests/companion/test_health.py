@@ -68,7 +68,7 @@ def test_the_worst_thing_is_told(tmp_path, state, connected, level, text):
     }  # fmt: skip
     assert written["bridge"]["fix_latency_ms"] is None  # NaN is no JSON
     assert written["level"] == level.value
-    assert time.monotonic_ns() - written["time_ns"] < 5e9
+    assert time.monotonic_ns() - written["time_ns"] < 60e9
 
 
 def test_scaled_video_is_told_beside_what_localization_makes_of_it(tmp_path):

@@ -115,7 +115,7 @@ class Flight:
         self.sequence = 0
         self.engine.start()
 
-    def feed_until(self, condition, timeout_s=10.0):
+    def feed_until(self, condition, timeout_s=60.0):
         deadline = time.monotonic() + timeout_s
         while not condition():
             assert time.monotonic() < deadline, self.engine.health
@@ -157,18 +157,15 @@ def test_the_map_is_loaded_along_the_way_ahead(flight):
     _, views = renderer.ahead.pop()
     assert [v.translation[0] for v in views] == pytest.approx([30.0, 70.0])
     f = flight(_localizer(renderer))
-    f.feed_until(lambda: len(f.estimates) >= 5)
+    f.feed_until(lambda: len(f.estimates) >= 5 and len(renderer.ahead) >= 4)
     assert {thread for thread, _ in renderer.ahead} == {"render"}
-    assert len(renderer.ahead) >= 4
 
 
 def test_loading_ahead_that_fails_costs_no_reference(flight):
     renderer = FakeRenderer()
     renderer.error = MapCacheError("the disk is gone")
     f = flight(_localizer(renderer))
-    f.feed_until(lambda: len(f.estimates) >= 5)
-    assert f.engine.health.accepted >= 3
-    assert f.engine.health.errors > 0
+    f.feed_until(lambda: f.engine.health.accepted >= 3 and f.engine.health.errors > 0)
     assert f.engine.health.renderer == "fake"
 
 

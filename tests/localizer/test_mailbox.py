@@ -18,5 +18,5 @@ def test_close_wakes_a_waiting_reader():
     reader = threading.Thread(target=lambda: got.append(box.take()))
     reader.start()
     box.close()
-    reader.join(timeout=5)
+    reader.join(timeout=60)
     assert got == [None]

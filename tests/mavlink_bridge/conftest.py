@@ -69,7 +69,7 @@ class FakeAutopilot:
             if m.get_type() == name and component in (None, m.get_srcComponent())
         ]
 
-    def wait_for(self, name: str, count: int = 1, timeout_s: float = 5.0) -> list[Any]:
+    def wait_for(self, name: str, count: int = 1, timeout_s: float = 30.0) -> list[Any]:
         end = time.monotonic() + timeout_s
         while len(self.of(name)) < count:
             if time.monotonic() > end:

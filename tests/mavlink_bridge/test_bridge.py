@@ -85,7 +85,7 @@ def run() -> Iterator[Callable[..., Bridge]]:
         bridge = Bridge(settings, GEOID, **options)
         made.append(bridge)
         bridge.start()
-        assert sleep_until(lambda: bridge.state().connected, 3.0)
+        assert sleep_until(lambda: bridge.state().connected, 30.0)
         return bridge
 
     yield start
@@ -116,7 +116,7 @@ def make_fix(**options: Any) -> VisionFix:
 
 def test_identity_origin_and_injection(autopilot: Any, run: Callable[..., Bridge]) -> None:
     bridge = run(config(autopilot.port), autopilot)
-    assert sleep_until(lambda: bridge.state().origin is not None, 8.0)
+    assert sleep_until(lambda: bridge.state().origin is not None, 30.0)
     feed(bridge, 1.0)
     vision = autopilot.wait_for("VISION_POSITION_ESTIMATE", 10)
     assert {m.get_srcSystem() for m in vision} == {1}
@@ -138,7 +138,7 @@ def test_identity_origin_and_injection(autopilot: Any, run: Callable[..., Bridge
 def test_second_origin_is_never_sent(autopilot: Any, run: Callable[..., Bridge]) -> None:
     autopilot.origin = (HOME[0] + 0.001, HOME[1], 480.0)
     bridge = run(config(autopilot.port), autopilot)
-    assert sleep_until(lambda: bridge.state().origin is not None, 5.0)
+    assert sleep_until(lambda: bridge.state().origin is not None, 30.0)
     feed(bridge, 0.5)
     vision = autopilot.wait_for("VISION_POSITION_ESTIMATE", 3)
     assert vision[-1].x == pytest.approx(-111.3, abs=0.1)
@@ -150,7 +150,7 @@ def test_second_origin_is_never_sent(autopilot: Any, run: Callable[..., Bridge])
 def test_shadow_and_off_send_nothing(autopilot: Any, run: Callable[..., Bridge]) -> None:
     autopilot.origin = (*HOME, 488.0)
     bridge = run(config(autopilot.port, mode="shadow"), autopilot)
-    assert sleep_until(lambda: bridge.state().origin is not None, 5.0)
+    assert sleep_until(lambda: bridge.state().origin is not None, 30.0)
     feed(bridge, 0.7)
     assert autopilot.of("VISION_POSITION_ESTIMATE") == []
     assert bridge.counters()["bridge_shadowed"] > 5
@@ -160,11 +160,11 @@ def test_rc_channel_gates_injection(autopilot: Any, run: Callable[..., Bridge]) 
     autopilot.origin = (*HOME, 488.0)
     autopilot.rc = {9: 1100}
     bridge = run(config(autopilot.port, mode="rc"), autopilot)
-    assert sleep_until(lambda: bridge.state().origin is not None, 5.0)
+    assert sleep_until(lambda: bridge.state().origin is not None, 30.0)
     feed(bridge, 0.6)
     assert autopilot.of("VISION_POSITION_ESTIMATE") == []
     autopilot.rc = {9: 1900}
-    assert sleep_until(lambda: bridge.injecting, 2.0)
+    assert sleep_until(lambda: bridge.injecting, 30.0)
     feed(bridge, 0.4)
     assert len(autopilot.of("VISION_POSITION_ESTIMATE")) > 3
     # A receiver that falls silent takes no position away; the switch does.
@@ -172,7 +172,7 @@ def test_rc_channel_gates_injection(autopilot: Any, run: Callable[..., Bridge]) 
     feed(bridge, 1.5)
     assert bridge.injecting
     autopilot.rc = {9: 1100}
-    assert sleep_until(lambda: not bridge.injecting, 2.0)
+    assert sleep_until(lambda: not bridge.injecting, 30.0)
     told = [text for text in bridge.texts() if "injection o" in text]
     assert told == ["PiLoT: injection on (channel 9)", "PiLoT: injection off, shadow (channel 9)"]
 
@@ -184,9 +184,9 @@ def test_command_gates_injection(
     autopilot.origin = (*HOME, 488.0)
     connection = f"udpout:127.0.0.1:{ground.port}" if over_ground else None
     bridge = run(config(autopilot.port, mode="rc", ground_connection=connection), autopilot)
-    assert sleep_until(lambda: bridge.state().origin is not None, 5.0)
+    assert sleep_until(lambda: bridge.state().origin is not None, 30.0)
     station: Any = ground if over_ground else autopilot
-    assert sleep_until(lambda: not over_ground or ground.peer is not None, 3.0)
+    assert sleep_until(lambda: not over_ground or ground.peer is not None, 30.0)
 
     def ask(command: int, wanted: float, *, system: int = 1, component: int = 197) -> int:
         before = len(station.of("COMMAND_ACK"))
@@ -197,7 +197,8 @@ def test_command_gates_injection(
             ground.send(message)
         else:
             autopilot.send(message, component=190, system=255)
-        if not sleep_until(lambda: len(station.of("COMMAND_ACK")) > before, 1.0):
+        patience_s = 1.0 if system == 2 else 30.0  # nobody answers for another vehicle
+        if not sleep_until(lambda: len(station.of("COMMAND_ACK")) > before, patience_s):
             return -1
         ack = station.of("COMMAND_ACK")[-1]
         assert (ack.command, ack.get_srcComponent(), ack.target_system) == (command, 197, 255)
@@ -222,7 +223,7 @@ def test_command_gates_injection(
 def test_rotated_frame_is_refused_and_told_once(autopilot: Any, run: Callable[..., Bridge]) -> None:
     autopilot.origin = (*HOME, 488.0)
     bridge = run(config(autopilot.port), autopilot)
-    assert sleep_until(lambda: bridge.state().origin is not None, 5.0)
+    assert sleep_until(lambda: bridge.state().origin is not None, 30.0)
     feed(bridge, 1.0, yaw_rad=math.radians(5.0))
     before = len(autopilot.of("VISION_POSITION_ESTIMATE"))
     feed(bridge, 1.0, yaw_rad=math.radians(5.0))
@@ -272,11 +273,11 @@ def test_streams_are_asked_for_until_they_come(autopilot: Any, run: Callable[...
 
 def test_reboot_in_flight_is_survived(autopilot: Any, run: Callable[..., Bridge]) -> None:
     bridge = run(config(autopilot.port), autopilot)
-    assert sleep_until(lambda: bridge.state().origin is not None, 8.0)
+    assert sleep_until(lambda: bridge.state().origin is not None, 30.0)
     feed(bridge, 0.3)
     autopilot.reboot()
-    assert sleep_until(lambda: bridge.state().reboots == 1, 3.0)
-    assert sleep_until(lambda: bridge.state().origin is not None, 8.0)
+    assert sleep_until(lambda: bridge.state().reboots == 1, 30.0)
+    assert sleep_until(lambda: bridge.state().origin is not None, 30.0)
     before = len(autopilot.of("VISION_POSITION_ESTIMATE"))
     feed(bridge, 0.5)
     assert len(autopilot.of("VISION_POSITION_ESTIMATE")) > before + 4
@@ -288,11 +289,11 @@ def test_silence_is_a_lost_vehicle_and_injection_resumes(
 ) -> None:
     autopilot.origin = (*HOME, 488.0)
     bridge = run(config(autopilot.port), autopilot)
-    assert sleep_until(lambda: bridge.state().origin is not None, 5.0)
+    assert sleep_until(lambda: bridge.state().origin is not None, 30.0)
     autopilot.streaming = False
-    assert sleep_until(lambda: not bridge.state().connected, 5.0)
+    assert sleep_until(lambda: not bridge.state().connected, 30.0)
     autopilot.streaming = True
-    assert sleep_until(lambda: bridge.state().connected, 3.0)
+    assert sleep_until(lambda: bridge.state().connected, 30.0)
     feed(bridge, 0.5)
     autopilot.wait_for("VISION_POSITION_ESTIMATE", 4)
 
@@ -303,7 +304,7 @@ def test_noise_on_the_link_does_not_stop_it(autopilot: Any, run: Callable[..., B
     rng = np.random.default_rng(6)
     for _ in range(300):
         autopilot.send_bytes(rng.bytes(int(rng.integers(1, 300))))
-    assert sleep_until(lambda: bridge.state().origin is not None, 5.0)
+    assert sleep_until(lambda: bridge.state().origin is not None, 30.0)
     feed(bridge, 0.4)
     autopilot.wait_for("VISION_POSITION_ESTIMATE", 4)
     assert bridge.counters()["fc_bad_bytes"] > 10_000
@@ -347,7 +348,7 @@ def test_targets_go_to_the_ground_link_and_not_to_the_flight_controller(
     for _ in range(20):
         bridge.report(report(velocity_ned=(3.0, 4.0, 0.0), target_id=3))
         time.sleep(0.05)
-    assert sleep_until(lambda: len(ground.of("CAMERA_TRACKING_GEO_STATUS")) > 2, 3.0)
+    assert sleep_until(lambda: len(ground.of("CAMERA_TRACKING_GEO_STATUS")) > 2, 30.0)
     m = ground.of("CAMERA_TRACKING_GEO_STATUS")[-1]
     assert m.get_srcComponent() == 100
     assert m.get_srcSystem() == 1
@@ -378,25 +379,25 @@ def test_camera_protocol(autopilot: Any, ground: GroundStation, run: Callable[..
     asked: list[TrackRequest] = []
     settings = config(autopilot.port, ground_connection=f"udpout:127.0.0.1:{ground.port}")
     run(settings, autopilot, on_track=asked.append)
-    assert sleep_until(lambda: ground.peer is not None, 3.0)
+    assert sleep_until(lambda: ground.peer is not None, 30.0)
 
     def command(number: int, *parameters: float, component: int = 100) -> None:
         padded = [*parameters, *([0.0] * (7 - len(parameters)))]
         ground.send(mavlink.MAVLink_command_long_message(1, component, number, 0, *padded))
 
     command(mavlink.MAV_CMD_REQUEST_MESSAGE, 259)
-    assert sleep_until(lambda: len(ground.of("CAMERA_INFORMATION")) == 1, 2.0)
+    assert sleep_until(lambda: len(ground.of("CAMERA_INFORMATION")) == 1, 30.0)
     information = ground.of("CAMERA_INFORMATION")[0]
     assert information.flags & mavlink.CAMERA_CAP_FLAGS_HAS_TRACKING_GEO_STATUS
     assert bytes(information.model_name).rstrip(b"\0") == b"map camera"
     command(mavlink.MAV_CMD_REQUEST_VIDEO_STREAM_INFORMATION, 1)
-    assert sleep_until(lambda: len(ground.of("VIDEO_STREAM_INFORMATION")) == 1, 2.0)
+    assert sleep_until(lambda: len(ground.of("VIDEO_STREAM_INFORMATION")) == 1, 30.0)
     command(mavlink.MAV_CMD_CAMERA_TRACK_POINT, 0.25, 0.75, 0.1)
     command(mavlink.MAV_CMD_CAMERA_TRACK_RECTANGLE, 0.1, 0.2, 0.3, 0.4)
     command(mavlink.MAV_CMD_CAMERA_STOP_TRACKING)
     command(mavlink.MAV_CMD_CAMERA_TRACK_POINT, 1.5, math.nan)  # outside the picture
     command(mavlink.MAV_CMD_CAMERA_TRACK_POINT, 0.5, 0.5, component=1)  # not for the camera
-    assert sleep_until(lambda: len(ground.of("COMMAND_ACK")) == 6, 2.0)
+    assert sleep_until(lambda: len(ground.of("COMMAND_ACK")) == 6, 30.0)
     assert [r.kind for r in asked] == ["point", "rectangle", "stop"]
     assert asked[0].coordinates == pytest.approx((0.25, 0.75))
     results = [m.result for m in ground.of("COMMAND_ACK")]
@@ -409,7 +410,7 @@ def test_cursor_on_target(autopilot: Any, run: Callable[..., Bridge]) -> None:
 
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as listener:
         listener.bind(("127.0.0.1", 0))
-        listener.settimeout(2.0)
+        listener.settimeout(30.0)
         targets = TargetsConfig(cot_endpoint=f"127.0.0.1:{listener.getsockname()[1]}")
         bridge = run(config(autopilot.port, targets=targets), autopilot)
         bridge.report(report(target_id=9))
@@ -429,7 +430,7 @@ def test_tlog_is_read_by_pymavlinks_own_tools(
     autopilot.origin = (*HOME, 488.0)
     path = tmp_path / "flight.tlog"
     bridge = run(config(autopilot.port, tlog=path), autopilot)
-    assert sleep_until(lambda: bridge.state().origin is not None, 5.0)
+    assert sleep_until(lambda: bridge.state().origin is not None, 30.0)
     feed(bridge, 0.4)
     bridge.stop()
     log = mavutil.mavlink_connection(str(path))
@@ -454,7 +455,7 @@ def test_signed_link(make_autopilot: Any, run: Callable[..., Bridge], tmp_path: 
     unsigned = mavlink.MAVLink(None, 1, 1)
     attitude = mavlink.MAVLink_attitude_message(signed.boot_ms, 0.0, 0.0, 3.0, 0.0, 0.0, 0.0)
     signed.send_bytes(attitude.pack(unsigned))
-    assert sleep_until(lambda: bridge.counters()["fc_unsigned"] == 1, 2.0)
+    assert sleep_until(lambda: bridge.counters()["fc_unsigned"] == 1, 30.0)
 
 
 def test_signing_vehicle_that_does_not_know_the_time(
@@ -474,7 +475,7 @@ def test_signing_vehicle_that_does_not_know_the_time(
     bridge = run(settings, vehicle)
     assert bridge.counters()["fc_bad_signatures"] > 0
     assert bridge.state().system_id == 1
-    assert sleep_until(lambda: bridge.attitude_at(time.monotonic_ns()) is not None, 3.0)
+    assert sleep_until(lambda: bridge.attitude_at(time.monotonic_ns()) is not None, 30.0)
 
 
 @pytest.mark.parametrize("noise", [b"GET / HTTP/1.1", b"\x00" * 20])
@@ -491,16 +492,16 @@ def test_a_stray_datagram_does_not_take_the_vehicles_place(
         time.sleep(0.1)
         stranger.sendto(noise, autopilot.peer)
         before = len(autopilot.of("HEARTBEAT"))
-        assert sleep_until(lambda: len(autopilot.of("HEARTBEAT")) > before, 3.0)
+        assert sleep_until(lambda: len(autopilot.of("HEARTBEAT")) > before, 30.0)
         assert bridge.counters()["fc_bad_bytes"] >= len(noise)
 
 
 def test_threads_end_with_the_bridge(autopilot: Any, run: Callable[..., Bridge]) -> None:
-    before = threading.active_count()
+    before = set(threading.enumerate())
     bridge = run(config(autopilot.port), autopilot)
-    assert threading.active_count() == before + 1
+    assert len(set(threading.enumerate()) - before) == 1
     bridge.stop()
-    assert threading.active_count() == before
+    assert set(threading.enumerate()) <= before
     with pytest.raises(BridgeStateError, match="already started"):
         bridge.start()
 

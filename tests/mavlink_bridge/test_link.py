@@ -75,7 +75,7 @@ def listen(port: int = 0) -> socket.socket:
     server.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
     server.bind(("127.0.0.1", port))
     server.listen(4)
-    server.settimeout(8.0)
+    server.settimeout(30.0)
     return server
 
 
@@ -125,15 +125,15 @@ def test_tcp_is_reopened_when_the_server_goes_and_comes_back(
     link, handler = start(f"tcp:127.0.0.1:{port}")
     first, _ = server.accept()
     first.sendall(packed())
-    assert sleep_until(lambda: len(handler.messages) == 1, 3.0)
+    assert sleep_until(lambda: len(handler.messages) == 1, 30.0)
     first.close()
     server.close()
-    assert sleep_until(lambda: link.counters.open_failures > 0, 5.0)
+    assert sleep_until(lambda: link.counters.open_failures > 0, 30.0)
     assert not link.connected
     server = listen(port)
     second, _ = server.accept()
     second.sendall(packed())
-    assert sleep_until(lambda: len(handler.messages) == 2, 5.0)
+    assert sleep_until(lambda: len(handler.messages) == 2, 30.0)
     assert handler.opened == 2
     second.close()
     server.close()
@@ -160,7 +160,7 @@ def test_half_a_frame_before_a_break_does_not_spoil_the_next(
         first.close()
         second, _ = server.accept()
         second.sendall(packed())
-        assert sleep_until(lambda: len(handler.messages) == 1, 3.0)
+        assert sleep_until(lambda: len(handler.messages) == 1, 30.0)
         second.close()
 
 
@@ -176,8 +176,8 @@ def test_peer_that_does_not_read_costs_messages_not_memory_or_time(
             for _ in range(400):
                 link.send(text, 191)
             time.sleep(0.002)
-        assert time.monotonic() - begun < 10.0
-        assert sleep_until(lambda: link.counters.tx_dropped > 1000, 3.0)
+        assert time.monotonic() - begun < 60.0  # a send that blocked once would never end
+        assert sleep_until(lambda: link.counters.tx_dropped > 1000, 30.0)
         assert len(link._unsent) < 128 * 1024
         deaf.close()
 
@@ -187,7 +187,7 @@ def test_tcp_server_takes_a_client(start: Callable[..., tuple[Link, Recorder]]) 
         port = probe.getsockname()[1]
     _, handler = start(f"tcpin:127.0.0.1:{port}")
     client = None
-    end = time.monotonic() + 5.0
+    end = time.monotonic() + 30.0
     while client is None and time.monotonic() < end:
         try:
             client = socket.create_connection(("127.0.0.1", port), timeout=1.0)
@@ -195,7 +195,7 @@ def test_tcp_server_takes_a_client(start: Callable[..., tuple[Link, Recorder]]) 
             time.sleep(0.05)
     assert client is not None
     client.sendall(packed())
-    assert sleep_until(lambda: len(handler.messages) == 1, 3.0)
+    assert sleep_until(lambda: len(handler.messages) == 1, 30.0)
     client.close()
 
 
@@ -205,16 +205,16 @@ def test_serial_port_both_ways_and_unplugged(
     master, slave = pty.openpty()
     tty.setraw(slave)
     link, handler = start(f"serial:{os.ttyname(slave)}:115200")
-    assert sleep_until(lambda: link.connected, 3.0)
+    assert sleep_until(lambda: link.connected, 30.0)
     os.write(master, packed())
-    assert sleep_until(lambda: len(handler.messages) == 1, 3.0)
+    assert sleep_until(lambda: len(handler.messages) == 1, 30.0)
     link.send(HEARTBEAT, 191)
     codec = mavlink.MAVLink(None)
     (message,) = codec.parse_buffer(os.read(master, 4096))
     assert (message.get_srcSystem(), message.get_srcComponent()) == (1, 191)
     os.close(slave)
     os.close(master)
-    assert sleep_until(lambda: link.counters.open_failures > 0, 5.0)
+    assert sleep_until(lambda: link.counters.open_failures > 0, 30.0)
 
 
 def test_rate_limit_is_per_message_and_component(
@@ -226,14 +226,16 @@ def test_rate_limit_is_per_message_and_component(
             f"udpout:127.0.0.1:{peer.getsockname()[1]}",
             min_interval_ns={mavlink.MAVLINK_MSG_ID_HEARTBEAT: SECOND // 5},
         )
-        assert sleep_until(lambda: link.connected, 3.0)
+        assert sleep_until(lambda: link.connected, 30.0)
+        begun = time.monotonic()
         for _ in range(50):
             link.send(HEARTBEAT, 191)
             link.send(HEARTBEAT, 197)
             link.send(mavlink.MAVLink_timesync_message(0, 1), 191)
             time.sleep(0.01)
-        assert sleep_until(lambda: link.counters.tx_rate_limited > 80, 2.0)
-        assert 50 + 2 * 2 <= link.counters.tx_messages <= 50 + 2 * 6
+        assert sleep_until(lambda: link.counters.tx_rate_limited > 80, 30.0)
+        most = 5.0 * (time.monotonic() - begun) + 2
+        assert 50 + 2 * 2 <= link.counters.tx_messages <= 50 + 2 * most
 
 
 def test_failing_handler_is_counted_and_the_link_lives(
@@ -244,10 +246,10 @@ def test_failing_handler_is_counted_and_the_link_lives(
         client, _ = server.accept()
         handler.fail = True
         client.sendall(packed() * 3)
-        assert sleep_until(lambda: link.counters.handler_errors == 3, 3.0)
+        assert sleep_until(lambda: link.counters.handler_errors == 3, 30.0)
         handler.fail = False
         client.sendall(packed())
-        assert sleep_until(lambda: len(handler.messages) == 4, 3.0)
+        assert sleep_until(lambda: len(handler.messages) == 4, 30.0)
         client.close()
 
 
@@ -258,9 +260,9 @@ def test_nothing_is_sent_before_the_vehicles_id_is_known(
         peer.bind(("127.0.0.1", 0))
         link, _ = start(f"udpout:127.0.0.1:{peer.getsockname()[1]}")
         link.system_id = 0
-        assert sleep_until(lambda: link.connected, 3.0)
+        assert sleep_until(lambda: link.connected, 30.0)
         link.send(HEARTBEAT, 191)
-        assert sleep_until(lambda: link.counters.tx_dropped == 1, 2.0)
+        assert sleep_until(lambda: link.counters.tx_dropped == 1, 30.0)
         assert link.counters.tx_messages == 0
 
 
@@ -269,13 +271,13 @@ def test_neither_threads_nor_descriptors_leak() -> None:
         return len(os.listdir("/proc/self/fd"))
 
     gc.collect()  # what earlier tests left behind must not close in between
-    threads, before = threading.active_count(), descriptors()
+    threads, before = set(threading.enumerate()), descriptors()
     for _ in range(20):
         link = Link(Endpoint.parse("udpin:127.0.0.1:0"), Recorder())
         link.start()
-        assert sleep_until(lambda link=link: link.connected, 2.0)  # type: ignore[misc]
+        assert sleep_until(lambda link=link: link.connected, 30.0)  # type: ignore[misc]
         link.stop()
-    assert threading.active_count() == threads
+    assert set(threading.enumerate()) <= threads
     assert descriptors() == before
     with pytest.raises(BridgeStateError, match="already started"):
         link.start()

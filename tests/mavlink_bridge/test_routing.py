@@ -92,7 +92,7 @@ def test_an_independent_client_through_the_autopilots_routing(vehicle: Any, tmp_
 
 
 def converse(vehicle: Any, bridge: Bridge, sdk: Any, asked: list[TrackRequest]) -> None:
-    assert sleep_until(lambda: bridge.state().connected, 20.0)
+    assert sleep_until(lambda: bridge.state().connected, 30.0)
     sdk.add_any_connection(vehicle.spare_endpoint.replace("tcp:", "tcpout://"))
     station = Station(sdk)
     camera = Camera(station.system)
@@ -118,7 +118,7 @@ def converse(vehicle: Any, bridge: Bridge, sdk: Any, asked: list[TrackRequest]) 
     (information,) = camera.camera_list().cameras
     assert (information.component_id, information.model_name) == (100, "map camera")
     camera.track_point(100, 0.25, 0.75, 0.1)
-    assert sleep_until(lambda: len(asked) == 1, 5.0)
+    assert sleep_until(lambda: len(asked) == 1, 30.0)
     assert asked[0].coordinates == pytest.approx((0.25, 0.75))
 
     # The gate of mode rc, by a command to the localizer's component.
@@ -132,11 +132,11 @@ def converse(vehicle: Any, bridge: Bridge, sdk: Any, asked: list[TrackRequest]) 
     def texts() -> list[str]:
         return [m["text"] for m in station.heard["STATUSTEXT"] if "injection" in m["text"]]
 
-    assert sleep_until(lambda: len(texts()) == 2, 3.0), station.heard["STATUSTEXT"]
+    assert sleep_until(lambda: len(texts()) == 2, 30.0), station.heard["STATUSTEXT"]
     assert texts() == ["PiLoT: injection on (command)", "PiLoT: injection off, shadow (command)"]
 
     def gimbal() -> Any:
         return bridge.gimbal_at(time.monotonic_ns() - 200_000_000)
 
-    assert sleep_until(lambda: gimbal() is not None, 15.0)
+    assert sleep_until(lambda: gimbal() is not None, 30.0)
     assert gimbal().source == "GIMBAL_DEVICE_ATTITUDE_STATUS"

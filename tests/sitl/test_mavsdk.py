@@ -24,7 +24,7 @@ def system():
         sdk = Mavsdk(Configuration.create_with_component_type(ComponentType.GROUND_STATION))
         sdk.add_any_connection(vehicle.gcs_endpoint.replace("tcp:", "tcpout://"))
         try:
-            yield sdk.first_autopilot(20.0)
+            yield sdk.first_autopilot(60.0)
         finally:
             sdk.destroy()
 
@@ -51,7 +51,7 @@ def test_mavsdk_reads_version_parameters_missions_and_telemetry(system):
 
     telemetry = Telemetry(system)
     telemetry.set_rate_attitude_euler(10.0)
-    deadline = time.monotonic() + 10.0
+    deadline = time.monotonic() + 60.0
     while math.isnan(telemetry.attitude_euler().yaw_deg) and time.monotonic() < deadline:
         time.sleep(0.1)
     assert telemetry.attitude_euler().yaw_deg == pytest.approx(40.0, abs=5.0)

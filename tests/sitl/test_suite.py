@@ -16,7 +16,7 @@ from sitl import __main__ as cli
 from sitl.scenario import ScenarioError
 from sitl.suite.case import SCENARIOS, Case, load_case, load_cases
 from sitl.suite.checks import Check
-from sitl.suite.flight import bridge_config
+from sitl.suite.flight import bridge_config, longest_stall, slowest_pace
 from sitl.suite.record import Doctor, Record, Sample, Text
 from sitl.suite.report import markdown, summary, write_report
 from sitl.suite.runner import Row, judge
@@ -290,3 +290,21 @@ def test_bad_arguments_of_the_command_are_named(tmp_path: Path) -> None:
 
 def test_infinite_spans_reach_to_the_end() -> None:
     assert math.isinf(expectation(check="max_error", at_most=1).to_s)
+
+
+def test_a_vehicle_that_fell_behind_is_marked() -> None:
+    """By its pace over ten seconds, and by what it lost within one."""
+    steady = [(0.1 * i, 40.0 + 0.1 * i) for i in range(200)]
+    late = [(t, own if t < 5.0 else own - 0.2) for t, own in steady]
+    slow = [(t, 40.0 + 0.97 * t) for t, _ in steady]
+    rebooted = [(t, own if t < 5.0 else t - 5.0) for t, own in steady]
+    for ticks, pace, stall_s in (
+        (steady, 1.0, 0.0),
+        (late, 0.979, 0.2),
+        (slow, 0.97, 0.03),
+        (rebooted, 1.0, 0.0),
+    ):
+        assert slowest_pace(ticks) == pytest.approx(pace, abs=3e-3)
+        assert longest_stall(ticks) == pytest.approx(stall_s, abs=5e-3)
+        flown = replace(record(), pace=slowest_pace(ticks), stall_s=longest_stall(ticks))
+        assert row("vpe", flown).slow == (ticks in (late, slow))

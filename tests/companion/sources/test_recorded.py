@@ -72,7 +72,7 @@ def test_realtime_plays_at_the_recorded_pace(kind: str, request: pytest.FixtureR
     path = request.getfixturevalue(kind)
     start = time.monotonic()
     list(open_source(path, CAMERA, SourceSettings(rate_hz=20, realtime=True)).frames())
-    assert 0.5 < time.monotonic() - start < 5.0
+    assert 0.5 < time.monotonic() - start < 30.0  # COUNT / 20 Hz, and the opening
 
 
 @pytest.mark.parametrize("kind", ["video", "folder"])

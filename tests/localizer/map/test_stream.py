@@ -28,13 +28,27 @@ def above(east, north, height) -> Pose:
 
 def loaded(streamer: TileStreamer, pose: Pose, camera: Camera = CAMERA):
     """Selections until nothing is missing."""
-    for _ in range(500):
+    for _ in range(12_000):
         before = streamer.counters().misses
         meshes = streamer.select(pose, camera)
         if streamer.counters().misses == before:
             return meshes
         time.sleep(0.005)
     raise AssertionError("the wanted tiles never came")
+
+
+def until(condition) -> None:
+    """Waits, patiently: only a defect takes that long."""
+    deadline = time.monotonic() + 60
+    while not condition():
+        assert time.monotonic() < deadline
+        time.sleep(0.01)
+
+
+def idle(streamer: TileStreamer) -> bool:
+    """Whether the loader waits for work and has none."""
+    with streamer._lock:
+        return bool(streamer._lock._waiters) and not streamer._to_load()
 
 
 def footprint(meshes):
@@ -76,7 +90,7 @@ def test_coarse_parents_stand_in_while_children_load(cache, monkeypatch):
         streamer.select(above(0, 0, 20_000), CAMERA, wait=True)  # the root is there
         camera = Camera.from_fov(320, 320, 80)
         areas = []
-        for _ in range(200):
+        for _ in range(6000):
             meshes = streamer.select(above(0, 0, 300), camera)
             areas.append(footprint(meshes))
             if len(meshes) == 16:
@@ -99,12 +113,12 @@ def test_a_cold_start_counts_its_hole(streamer):
 
 def test_select_does_not_wait_for_the_disk(cache, monkeypatch):
     slow = cache.load_tile
-    monkeypatch.setattr(cache, "load_tile", lambda i: (time.sleep(0.3), slow(i))[1])
+    monkeypatch.setattr(cache, "load_tile", lambda i: (time.sleep(1.0), slow(i))[1])
     with TileStreamer(cache) as streamer:
         streamer.select(above(0, 0, 100), CAMERA)
         start = time.perf_counter()
         streamer.select(above(0, 0, 100), CAMERA)
-        assert time.perf_counter() - start < 0.1
+        assert time.perf_counter() - start < 0.5
 
 
 def test_memory_stays_within_the_budget(cache):
@@ -128,11 +142,7 @@ def test_prefetch_makes_the_next_view_complete(streamer):
     here, there = above(-150, -150, 60), above(150, 150, 60)
     streamer.select(here, CAMERA, wait=True)
     streamer.prefetch([there], CAMERA)
-    deadline = time.monotonic() + 5
-    count = streamer.counters().loaded
-    while streamer.counters().loaded < count + 1 and time.monotonic() < deadline:
-        time.sleep(0.01)
-    time.sleep(0.2)
+    until(lambda: idle(streamer))
     before = streamer.counters()
     streamer.select(there, CAMERA)
     after = streamer.counters()
@@ -150,7 +160,7 @@ def test_prefetch_takes_the_views_in_order_and_stays_within_the_budget(cache, mo
         streamer.select(here, CAMERA, wait=True)
         del order[:]
         streamer.prefetch([soon, later], CAMERA)
-        time.sleep(0.3)
+        until(lambda: idle(streamer))
         nearest = [round(np.abs(cache.world_from_tile[i].translation[:2]).max()) for i in order]
         assert len(order) >= 2
         assert nearest == sorted(nearest)  # around the origin first
@@ -163,10 +173,7 @@ def test_the_loader_frees_what_leaves_memory(cache):
         for _ in range(3):
             streamer.select(above(150, 150, 60), CAMERA, wait=True)
         streamer.select(above(20, 150, 60), CAMERA, wait=True)
-        deadline = time.monotonic() + 5
-        while all(mesh() is not None for mesh in gone) and time.monotonic() < deadline:
-            time.sleep(0.01)
-        assert any(mesh() is None for mesh in gone)
+        until(lambda: any(mesh() is None for mesh in gone))
 
 
 def test_a_damaged_tile_is_named_or_stood_in_for(cache_path, tmp_path):
