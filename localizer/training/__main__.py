@@ -13,9 +13,8 @@ from typing import Annotated
 import typer
 
 from localizer.errors import LocalizerError
-from localizer.training.config import TrainConfig, load_config
-from localizer.training.pairs import SceneConfig
-from localizer.training.shards import PhotoSource, write_shards, write_world_shards
+from localizer.training.config import LiveSection, TrainConfig, load_config
+from localizer.training.shards import write_shards, write_world_shards
 from localizer.training.worlds import FIRST_SEED
 
 app = typer.Typer(
@@ -135,11 +134,6 @@ def sheet(
     typer.echo(contact_sheet([p for s in shards for p in read_shard(s)[:pairs]], out))
 
 
-def scene_config(config: TrainConfig) -> SceneConfig:
-    """What the generator needs of a run's configuration."""
-    return SceneConfig(photo_share=config.data.photo_share, light_variety=config.data.light_variety)
-
-
 def _generating(config: TrainConfig) -> Future[None]:
     """Generation on a thread that ends with the process."""
     done: Future[None] = Future()
@@ -159,8 +153,11 @@ def _generating(config: TrainConfig) -> Future[None]:
 def _generate(config: TrainConfig) -> None:
     """In the order in which training asks: first scenes, mesh worlds, the other scenes."""
     data = config.data
-    photos = None if data.photos is None else PhotoSource(data.photos, data.photo_groups)
-    scenes = scene_config(config)
+    if isinstance(data, LiveSection):
+        return  # it makes its pairs while it trains
+    from localizer.training.streams import photo_source, scene_config
+
+    photos, scenes = photo_source(data), scene_config(data)
     first = range(data.first_seed, data.first_seed + min(data.initial_scenes, data.scenes))
     rest = range(first.stop, data.first_seed + data.scenes)
     worlds = range(FIRST_SEED, FIRST_SEED + data.worlds)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from localizer.training.config import TrainConfig
+from localizer.training.config import DataSection, TrainConfig
 
 
 def ablations(config: TrainConfig, steps: int, scenes: int) -> dict[str, TrainConfig]:
@@ -19,10 +19,12 @@ def ablations(config: TrainConfig, steps: int, scenes: int) -> dict[str, TrainCo
         "generated": {"photos": None, "photo_groups": ()},
     }
     optimizer = config.optimizer.model_copy(update={"steps": steps, "decay_steps": steps // 2})
-    equal = {"worlds": 0, "scenes": scenes, "initial_scenes": scenes}
+    equal: dict[str, object] = {"scenes": scenes}
+    if isinstance(config.data, DataSection):
+        equal |= {"worlds": 0, "initial_scenes": scenes}
     runs = {}
     for name, change in changes.items():
-        if change:
+        if change and isinstance(config.data, DataSection):
             folder = config.data.shards
             change["shards"] = folder.with_name(f"{folder.name}-{name}")
         data = config.data.model_copy(update={**equal, **change})

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Annotated, Literal
 
 import yaml
-from pydantic import BaseModel, ConfigDict, Field, model_validator
+from pydantic import BaseModel, ConfigDict, Discriminator, Field, Tag, model_validator
 
 from localizer.errors import ModelError
+from localizer.synth.heightfield import BLOCK
 from localizer.training.networks import NetworkConfig
 
 
@@ -15,23 +17,59 @@ class _Frozen(BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid")
 
 
-class DataSection(_Frozen):
-    """Where pairs come from. Shards are generated in the order of their seeds."""
+class _PlacesSection(_Frozen):
+    """What every place and visit is made of. workers: processes that make them."""
 
-    shards: Path
     first_seed: int = Field(ge=1000)
     scenes: int = Field(gt=0)
-    initial_scenes: int = Field(gt=0)
-    scenes_per_step: float = Field(ge=0.0)
     photos: Path | None
     photo_groups: tuple[str, ...]
     photo_share: float = Field(ge=0.0, le=1.0)
-    worlds: int = Field(ge=0)
-    world_share: float = Field(ge=0.0, le=1.0)
-    world_first_step: int = Field(ge=0)
     light_variety: bool
     appearance: bool
     workers: int = Field(gt=0)
+
+
+class DataSection(_PlacesSection):
+    """Pairs on disk. Shards are generated in the order of their seeds."""
+
+    shards: Path
+    initial_scenes: int = Field(gt=0)
+    scenes_per_step: float = Field(ge=0.0)
+    worlds: int = Field(ge=0)
+    world_share: float = Field(ge=0.0, le=1.0)
+    world_first_step: int = Field(ge=0)
+
+
+class LiveSection(_PlacesSection):
+    """Pairs rendered while training (`localizer.training.live`). image: width, height of a view;
+    cells: side of a place; active: places that a step draws from, of which one is replaced every
+    `steps_per_scene` steps; visits: days of flight at each place.
+    """
+
+    live: Literal[True]
+    image: tuple[int, int]
+    cells: int = Field(gt=0, multiple_of=BLOCK)
+    active: int = Field(gt=0)
+    steps_per_scene: int = Field(gt=0)
+    visits: int = Field(gt=0)
+
+    @model_validator(mode="after")
+    def _places_suffice(self) -> LiveSection:
+        if self.scenes < self.active:
+            raise ValueError(f"scenes {self.scenes} are fewer than active {self.active}")
+        return self
+
+
+def _kind(data: object) -> str:
+    live = data.get("live", False) if isinstance(data, dict) else isinstance(data, LiveSection)
+    return "live" if live else "shards"
+
+
+Data = Annotated[
+    Annotated[DataSection, Tag("shards")] | Annotated[LiveSection, Tag("live")],
+    Discriminator(_kind),
+]
 
 
 class OptimizerSection(_Frozen):
@@ -76,8 +114,18 @@ class TrainConfig(_Frozen):
     checkpoint_steps: int = Field(gt=0)
     warm_start: Path | None = None
     model: NetworkConfig
-    data: DataSection
+    data: Data
     optimizer: OptimizerSection
+
+    @model_validator(mode="after")
+    def _crop_fits(self) -> TrainConfig:
+        crop = self.optimizer.crop
+        if any(side % 8 for side in crop):
+            raise ValueError(f"crop {crop} has a side that is not divisible by 8")
+        image = self.data.image if isinstance(self.data, LiveSection) else crop
+        if crop[0] > image[0] or crop[1] > image[1]:
+            raise ValueError(f"crop {crop} exceeds the image {image}")
+        return self
 
 
 def load_config(path: Path) -> TrainConfig:

@@ -140,17 +140,20 @@ class Sample:
 
 def crop_pair(pair: Pair, config: LoaderConfig, rng: np.random.Generator) -> Sample | None:
     """Weather on the query, windows that see the same ground, anchors; None without overlap."""
-    width, height = config.crop
-    camera = pair.camera
     query, reference = pair.query, pair.reference
     if config.appearance:
         look = tamed(sample_appearance(rng, pair.condition), pair.query_depth)
         query = apply_appearance(query, pair.query_depth, look, rng)
-        if rng.random() < 0.5:
-            survey = replace(
-                sample_appearance(rng, "day"), motion_blur_px=0.0, extinction_per_m=0.0
-            )
+        survey = survey_appearance(rng)
+        if survey is not None:
             reference = apply_appearance(reference, pair.reference_depth, survey, rng)
+    return window_pair(replace(pair, reference=reference, query=query), config, rng)
+
+
+def window_pair(pair: Pair, config: LoaderConfig, rng: np.random.Generator) -> Sample | None:
+    """Windows of a degraded pair that see the same ground, with anchors; None without overlap."""
+    width, height = config.crop
+    camera, reference, query = pair.camera, pair.reference, pair.query
     T = relative_pose(pair)
     rx = int(rng.integers(0, camera.width - width + 1))
     ry = int(rng.integers(0, camera.height - height + 1))
@@ -187,6 +190,13 @@ def crop_pair(pair: Pair, config: LoaderConfig, rng: np.random.Generator) -> Sam
         np.array([camera.fx, camera.fy, camera.cx - qx, camera.cy - qy], np.float32),
     )
     return mirrored(sample) if rng.random() < 0.5 else sample
+
+
+def survey_appearance(rng: np.random.Generator) -> Appearance | None:
+    """The map's own sensor and light, on half of the references; None on the others."""
+    if rng.random() >= 0.5:
+        return None
+    return replace(sample_appearance(rng, "day"), motion_blur_px=0.0, extinction_per_m=0.0)
 
 
 def mirrored(sample: Sample) -> Sample:

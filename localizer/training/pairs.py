@@ -103,14 +103,8 @@ class Visit:
 def scene_pairs(seed: int, config: SceneConfig, library: PhotoLibrary | None) -> Iterator[Pair]:
     """All pairs of the place that belongs to `seed`."""
     rng = np.random.default_rng(seed)
-    n = config.cells
-    cell = float(np.exp(rng.uniform(*np.log(config.cell_m))))
-    if library is not None and rng.random() < config.photo_share:
-        cell = min(cell, 0.8)
-        place, source = photo_place(rng, n, cell, library.sample(rng, n)), "photo"
-    else:
-        place, source = generated_place(rng, n, cell), "generated"
-    survey = _survey(rng, place, config)
+    place, source = draw_place(rng, config, library)
+    survey = survey_scene(rng, place, config)
     lived: LitScene | None = None
     visit, season = Visit("day", False, None), False
     for k in range(config.references):
@@ -118,10 +112,10 @@ def scene_pairs(seed: int, config: SceneConfig, library: PhotoLibrary | None) ->
             if config.conditions:
                 visit = visit_of(rng, config.conditions[k // config.queries_per_light])
             else:
-                visit = Visit(draw_condition(rng), bool(rng.random() < 0.4), None)
+                visit = draw_visit(rng)
             fixed = None if config.light_variety else survey.light
-            lived, season = _lived(rng, place, visit, fixed, config.shared_detail)
-        pair = _pair(rng, survey, lived, config)
+            lived, season = lived_scene(rng, place, visit, fixed, config.shared_detail)
+        pair = draw_views(rng, survey, lived, config)
         if pair is None:
             continue
         reference, query, camera = pair
@@ -133,6 +127,22 @@ def scene_pairs(seed: int, config: SceneConfig, library: PhotoLibrary | None) ->
             image, depth, seen, seen_depth, reference, query, camera, visit.weather,
             visit.outdated, source, season,
         )  # fmt: skip
+
+
+def draw_place(
+    rng: np.random.Generator, config: SceneConfig, library: PhotoLibrary | None
+) -> tuple[Place, str]:
+    """A place, and where its ground is from: "photo" or "generated"."""
+    n = config.cells
+    cell = float(np.exp(rng.uniform(*np.log(config.cell_m))))
+    if library is not None and rng.random() < config.photo_share:
+        return photo_place(rng, n, min(cell, 0.8), library.sample(rng, n)), "photo"
+    return generated_place(rng, n, cell), "generated"
+
+
+def draw_visit(rng: np.random.Generator) -> Visit:
+    """The day of a training flight."""
+    return Visit(draw_condition(rng), bool(rng.random() < 0.4), None)
 
 
 def warp_check(pair: Pair) -> tuple[Float32, NDArray[np.bool_]]:
@@ -155,7 +165,7 @@ def warp_check(pair: Pair) -> tuple[Float32, NDArray[np.bool_]]:
     return warped, inside & same & (pair.reference_depth > 0)
 
 
-def _survey(rng: np.random.Generator, place: Place, config: SceneConfig) -> LitScene:
+def survey_scene(rng: np.random.Generator, place: Place, config: SceneConfig) -> LitScene:
     """The map: the place on the day of the survey, as a baked texture on a coarse mesh."""
     prisms = [*place.prisms, *parked_cars(rng, place, _car_count(rng, place))]
     if not config.shared_detail:
@@ -172,7 +182,7 @@ def _survey(rng: np.random.Generator, place: Place, config: SceneConfig) -> LitS
     return light_scene(scene, light, _sky(rng, "day"))
 
 
-def _lived(
+def lived_scene(
     rng: np.random.Generator,
     place: Place,
     visit: Visit,
@@ -240,7 +250,7 @@ def visit_of(rng: np.random.Generator, condition: str) -> Visit:
     return Visit(condition, False, False)
 
 
-def _pair(
+def draw_views(
     rng: np.random.Generator, survey: LitScene, lived: LitScene, config: SceneConfig
 ) -> tuple[Pose, Pose, Camera] | None:
     """Poses of a pair with enough common view; None when chance offers none in a few tries."""

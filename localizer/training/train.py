@@ -13,13 +13,11 @@ import torch
 from torch import Tensor, nn
 
 from localizer.training.checkpoint import fill, read_checkpoint
-from localizer.training.config import DataSection, OptimizerSection, TrainConfig
-from localizer.training.data import LoaderConfig, Schedule, ShardStream
+from localizer.training.config import OptimizerSection, TrainConfig
 from localizer.training.distributed import Workers
 from localizer.training.losses import Batch, alignment_loss, contrast_loss, sample, se3_exp
 from localizer.training.networks import build
-from localizer.training.shards import shard_path, world_shard_paths
-from localizer.training.worlds import FIRST_SEED
+from localizer.training.streams import open_stream
 
 logger = logging.getLogger(__name__)
 
@@ -71,11 +69,7 @@ class Trainer:
         last = self.config.optimizer.steps
         if steps is not None:
             last = min(last, self.step + steps)
-        data, o = self.config.data, self.config.optimizer
-        loader = LoaderConfig(o.batch, o.anchors, o.crop, data.appearance)
-        stream = ShardStream(
-            schedule(data), loader, self.config.seed, self.workers.rank, generating
-        )
+        stream = open_stream(self.config, self.workers, generating)
         rows: list[dict[str, float]] = []
         began = time.monotonic() - self.seconds
         try:
@@ -196,20 +190,6 @@ class Trainer:
             writer.writerow({k: f"{v:.5g}" for k, v in row.items()})
         shown = " ".join(f"{k} {v:.3g}" for k, v in row.items())
         logger.info("%s", shown)
-
-
-def schedule(data: DataSection) -> Schedule:
-    """The shards of a run."""
-    seeds = range(data.first_seed, data.first_seed + data.scenes)
-    worlds = range(FIRST_SEED, FIRST_SEED + data.worlds)
-    return Schedule(
-        tuple(shard_path(data.shards, seed) for seed in seeds),
-        data.initial_scenes,
-        data.scenes_per_step,
-        tuple(path for seed in worlds for path in world_shard_paths(data.shards, seed)),
-        data.world_share,
-        data.world_first_step,
-    )
 
 
 def learning_rate(step: int, o: OptimizerSection) -> float:

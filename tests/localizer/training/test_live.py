@@ -1,0 +1,124 @@
+"""Pairs that are rendered while training: geometry, determinism, resumption, configuration."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+torch = pytest.importorskip("torch", reason="needs the extra `train`")
+
+from localizer.errors import ModelError  # noqa: E402
+from localizer.training.config import LiveSection, TrainConfig, load_config  # noqa: E402
+from localizer.training.data import LoaderConfig  # noqa: E402
+from localizer.training.live import LivePlan, LiveStream  # noqa: E402
+from localizer.training.losses import project  # noqa: E402
+from localizer.training.model_s0 import S0Config  # noqa: E402
+from localizer.training.pairs import Pair, SceneConfig, warp_check  # noqa: E402
+from localizer.training.train import Trainer  # noqa: E402
+
+SHIPPED = Path(__file__).parents[3] / "configs" / "train_s0.yaml"
+SCENES = SceneConfig(cells=256, width=128, height=96)
+LOADER = LoaderConfig(batch=3, anchors=64, crop=(96, 64), appearance=True)
+PLAN = LivePlan(first_seed=3000, places=50, active=2, steps_per_place=2, visits=2)
+
+
+def opened(loader: LoaderConfig = LOADER, **changes: int) -> LiveStream:
+    return LiveStream(PLAN, SCENES, None, loader, 5, torch.device("cpu"), **changes)
+
+
+@pytest.fixture(scope="module")
+def stream():
+    made = opened()
+    yield made
+    made.close()
+
+
+def test_anchors_project_where_the_query_shows_them(stream: LiveStream) -> None:
+    batch = stream.batch(0)
+    assert batch.images.shape == (6, 3, 64, 96)
+    pixels, _ = project(batch.query_from_reference, batch.points, batch.K_query)
+    error = (pixels - batch.query_pixels).norm(dim=-1)[batch.visible > 0]
+    assert float(error.max()) < 0.02
+    assert float(batch.visible.mean()) > 0.25
+
+
+def test_depth_and_poses_bring_the_query_into_the_reference(stream: LiveStream) -> None:
+    clear = opened(LoaderConfig(3, 64, (96, 64), appearance=False))
+    clear._places, clear._pool = stream._places, stream._pool  # the same places, no processes
+    stream.batch(0)
+    noise = torch.Generator()
+    pairs = list(clear.pairs(0, 6, np.random.default_rng(0), noise))
+    clear.close()
+    assert len(pairs) >= 4
+    good = [_likeness(pair) for pair in pairs]
+    # Another pair's query on the same geometry: what agreement without registration is.
+    wrong = [
+        _likeness(Pair(**{**vars(pair), "query": other.query}))
+        for pair, other in zip(pairs, pairs[1:] + pairs[:1], strict=True)
+    ]
+    assert np.median(good) > np.median(wrong) + 0.15
+
+
+def _likeness(pair: Pair) -> float:
+    warped, mask = warp_check(pair)
+    a, b = pair.reference.astype(np.float32).mean(-1), warped.mean(-1)
+    return float(np.corrcoef(a[mask], b[mask])[0, 1])
+
+
+def test_a_step_sees_the_same_wherever_the_run_was_resumed(stream: LiveStream) -> None:
+    stream.batch(0)
+    stream.batch(1)
+    third = stream.batch(2)  # one place of two has been replaced
+    later = opened()
+    again = later.batch(2)
+    later.close()
+    for a, b in zip(vars(third).values(), vars(again).values(), strict=True):
+        torch.testing.assert_close(a, b, rtol=0, atol=0)
+    assert not torch.equal(third.images, stream.batch(3).images)
+
+
+def test_places_come_one_at_a_time_and_differ_between_processes() -> None:
+    windows = [list(PLAN.window(step)) for step in range(5)]
+    assert windows == [[0, 1], [0, 1], [1, 2], [1, 2], [2, 3]]
+    seeds = {rank: [PLAN.seed(k, rank, 2) for k in range(4)] for rank in (0, 1)}
+    assert seeds == {0: [3000, 3002, 3004, 3006], 1: [3001, 3003, 3005, 3007]}
+
+
+def test_the_shipped_run_trains_a_small_s0(tmp_path: Path) -> None:
+    run = load_config(SHIPPED)
+    assert isinstance(run.data, LiveSection)
+    data = run.data.model_copy(update={
+        "image": (128, 96), "cells": 256, "active": 2, "steps_per_scene": 2, "visits": 1,
+        "photos": None, "workers": 1,
+    })  # fmt: skip
+    optimizer = run.optimizer.model_copy(update={
+        "batch": 2, "anchors": 64, "crop": (96, 64), "steps": 2, "decay_steps": 1, "threads": 1,
+    })  # fmt: skip
+    small: TrainConfig = run.model_copy(update={
+        "output": tmp_path, "data": data, "optimizer": optimizer, "model": S0Config(channels=8),
+    })  # fmt: skip
+    trainer = Trainer(small)
+    trainer.run()
+    assert trainer.checkpoint.exists()
+    assert trainer.step == 2
+
+
+@pytest.mark.parametrize(
+    ("line", "wrong", "why"),
+    [
+        ("crop: [512, 512]", "crop: [512, 516]", "divisible by 8"),
+        ("crop: [512, 512]", "crop: [768, 512]", "exceeds the image"),
+        ("active: 16 ", "active: 9000 ", "fewer than active"),
+        ("cells: 1536", "cells: 1500", "cells"),
+        ("live: true", "live: true\n  shards: here", "shards"),
+    ],
+)
+def test_a_wrong_value_is_named(tmp_path: Path, line: str, wrong: str, why: str) -> None:
+    text = SHIPPED.read_text()
+    assert line in text
+    path = tmp_path / "run.yaml"
+    path.write_text(text.replace(line, wrong, 1))
+    with pytest.raises(ModelError, match=why):
+        load_config(path)
