@@ -105,6 +105,13 @@ class OptimizerSection(_Frozen):
         return self
 
 
+class DistillSection(_Frozen):
+    """A teacher beside the losses: its run's checkpoint, and the weight of its term a level."""
+
+    teacher: Path
+    weight: float = Field(gt=0.0)
+
+
 class TrainConfig(_Frozen):
     """A whole run. warm_start: checkpoint whose averaged weights are the first ones."""
 
@@ -116,6 +123,7 @@ class TrainConfig(_Frozen):
     model: NetworkConfig
     data: Data
     optimizer: OptimizerSection
+    distill: DistillSection | None = None
 
     @model_validator(mode="after")
     def _crop_fits(self) -> TrainConfig:

@@ -89,6 +89,11 @@ class LiveStream:
         self._thread = ThreadPoolExecutor(1)
         self._next: tuple[int, Future[Batch]] | None = None
 
+    @property
+    def device(self) -> torch.device:
+        """Where the pairs are rendered."""
+        return self._pool.device
+
     def batch(self, step: int) -> Batch:
         """The batch of a step; the next one is prepared meanwhile."""
         if self._next is not None and self._next[0] == step:
@@ -130,11 +135,14 @@ class LiveStream:
         self._places = {k: v for k, v in self._places.items() if k in window}
         for number in window:
             if number not in self._places:
-                place = self._coming.pop(number).result()
-                self._places[number] = place
-                first = number % self._plan.active * self._views
-                for k, scene in enumerate((place.survey, *(day[0] for day in place.days))):
-                    self._pool.put(first + k, scene)
+                self.take(number, self._coming.pop(number).result())
+
+    def take(self, number: int, place: PlaceVisits) -> None:
+        """Put the place of a running number into its slot."""
+        self._places[number] = place
+        first = number % self._plan.active * self._views
+        for k, scene in enumerate((place.survey, *(day[0] for day in place.days))):
+            self._pool.put(first + k, scene)
 
     def pairs(
         self, step: int, count: int, rng: np.random.Generator, noise: torch.Generator

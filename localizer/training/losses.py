@@ -209,7 +209,17 @@ def _whole_map(reference: Tensor, query: Tensor, truth: Tensor, scale: Tensor) -
 
 
 def _neighbourhood(reference: Tensor, query: Tensor, truth: Tensor, scale: Tensor) -> Tensor:
-    """The window's centre lies exactly on the true place; the target is a narrow bell there.
+    """The window's centre lies exactly on the true place; the target is a narrow bell there."""
+    similarity = window_similarity(reference, query, truth)
+    reach = torch.arange(-_WINDOW, _WINDOW + 1, device=query.device, dtype=query.dtype)
+    squared = (reach[:, None] ** 2 + reach[None] ** 2).flatten()
+    target = torch.softmax(-squared / (2 * 0.5**2), 0)
+    return -(F.log_softmax(similarity * scale, -1) * target).sum(-1)
+
+
+def window_similarity(reference: Tensor, query: Tensor, truth: Tensor) -> Tensor:
+    """Products (B, N, k) of anchor features (B, N, C) with the map (B, C, h, w) at the places of a
+    square window about `truth` (B, N, 2, level pixels), row by row.
 
     All places of a window have the same fraction of a cell, and the similarity is linear in the
     features, so that it is taken at whole cells and interpolated afterwards.
@@ -226,11 +236,7 @@ def _neighbourhood(reference: Tensor, query: Tensor, truth: Tensor, scale: Tenso
     cells = torch.stack(_cells(query, index), 2)
     whole = (cells @ reference[..., None])[..., 0].unflatten(2, (side + 1, side + 1))
     across = whole[..., :-1] + ax * (whole[..., 1:] - whole[..., :-1])
-    similarity = (across[..., :-1, :] + ay * (across[..., 1:, :] - across[..., :-1, :])).flatten(2)
-    reach = torch.arange(-_WINDOW, _WINDOW + 1, device=query.device, dtype=query.dtype)
-    squared = (reach[:, None] ** 2 + reach[None] ** 2).flatten()
-    target = torch.softmax(-squared / (2 * 0.5**2), 0)
-    return -(F.log_softmax(similarity * scale, -1) * target).sum(-1)
+    return (across[..., :-1, :] + ay * (across[..., 1:, :] - across[..., :-1, :])).flatten(2)
 
 
 def _mean(values: Tensor, mask: Tensor, cap: float | None = None) -> Tensor:

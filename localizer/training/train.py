@@ -14,6 +14,7 @@ from torch import Tensor, nn
 
 from localizer.training.checkpoint import fill, read_checkpoint
 from localizer.training.config import OptimizerSection, TrainConfig
+from localizer.training.distill import Teacher, distillation_loss
 from localizer.training.distributed import Workers
 from localizer.training.losses import Batch, alignment_loss, contrast_loss, sample, se3_exp
 from localizer.training.networks import build
@@ -52,6 +53,9 @@ class Trainer:
             lr=config.optimizer.learning_rate,
             weight_decay=config.optimizer.weight_decay,
         )
+        self.teacher = None
+        if config.distill is not None:
+            self.teacher = Teacher(config.distill.teacher, self.model.strides, self.device)
         self.step = 0
         self.seconds = 0.0
         self._resume()
@@ -108,6 +112,7 @@ class Trainer:
         pairs = batch.points.shape[0]
         with torch.autocast(self.device.type, torch.bfloat16, enabled=o.mixed_precision):
             levels = self.model(batch.images.contiguous())
+            taught = None if self.teacher is None else self.teacher.levels(batch.images)
         ramp = alignment_ramp(self.step, o)
         generator = torch.Generator().manual_seed(self.config.seed * 1_000_003 + self.step)
         total, parts = batch.points.new_zeros(()), {}
@@ -128,6 +133,13 @@ class Trainer:
             )  # fmt: skip
             total = total + o.contrast_weight * contrast
             total = total + ramp * o.alignment_weight * alignment
+            if taught is not None and self.config.distill is not None:
+                lesson = distillation_loss(
+                    (features, confidence), self.log_scale[k].exp(), taught[k], at,
+                    batch.query_pixels / stride, batch.visible,
+                )  # fmt: skip
+                total = total + self.config.distill.weight * lesson
+                parts[f"distill_{k}"] = float(lesson.detach())
             parts[f"contrast_{k}"] = float(contrast.detach())
             parts[f"alignment_{k}"] = float(alignment.detach())
             parts[f"error_px_{k}"] = float(error)

@@ -1,0 +1,96 @@
+"""How fast training pairs are made: places in processes, pairs on a device and on the CPU.
+
+    python benchmarks/pairs.py configs/train_s0.yaml --pairs 4
+
+One process, one thread, places of the run's own size. "torch" is what `localizer.training.live`
+does (views, appearance, windows), on a GPU where there is one; "NumPy" makes pairs of the same
+places by the CPU's renderer, as the shards are made.
+"""
+
+from __future__ import annotations
+
+import argparse
+import time
+from pathlib import Path
+
+import cv2
+import numpy as np
+import torch
+
+from localizer.synth.heightfield import render
+from localizer.training.config import LiveSection, load_config
+from localizer.training.data import LoaderConfig, crop_pair, window_pair
+from localizer.training.live import LivePlan, LiveStream
+from localizer.training.pairs import Pair, SceneConfig, draw_views
+from localizer.training.streams import photo_source, scene_config
+from localizer.training.visits import PlaceVisits, make_place
+
+
+def numpy_pairs(
+    place: PlaceVisits, scenes: SceneConfig, loader: LoaderConfig, count: int
+) -> tuple[int, float]:
+    """Pairs made and the seconds that took, by the CPU's renderer and appearance."""
+    rng = np.random.default_rng(0)
+    made, began = 0, time.perf_counter()
+    while made < count:
+        lit, visit, season = place.days[made % len(place.days)]
+        views = draw_views(rng, place.survey, lit, scenes)
+        if views is None:
+            continue
+        reference, query, camera = views
+        image, depth = render(place.survey, reference, camera)
+        seen, seen_depth = render(lit, query, camera, supersample=2)
+        pair = Pair(image, depth, seen, seen_depth, reference, query, camera, visit.weather,
+                    visit.outdated, place.source, season)  # fmt: skip
+        crop_pair(pair, loader, rng)
+        made += 1
+    return made, time.perf_counter() - began
+
+
+def device_pairs(stream: LiveStream, loader: LoaderConfig, count: int) -> tuple[int, float]:
+    """Pairs made and the seconds that took, on the stream's device."""
+    rng, noise = np.random.default_rng(0), torch.Generator(stream.device)
+    began, made = time.perf_counter(), 0
+    for pair in stream.pairs(0, count, rng, noise):
+        window_pair(pair, loader, rng)
+        made += 1
+    return made, time.perf_counter() - began
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
+    parser.add_argument("config", type=Path)
+    parser.add_argument("--pairs", type=int, default=4, help="in one batch on the device")
+    parser.add_argument("--no-photos", action="store_true", help="generated ground alone")
+    args = parser.parse_args()
+    torch.set_num_threads(1)
+    cv2.setNumThreads(1)
+    run = load_config(args.config)
+    if not isinstance(run.data, LiveSection):
+        parser.error("the configuration has no live pairs")
+    data, o = run.data, run.optimizer
+    scenes, photos = scene_config(data), None if args.no_photos else photo_source(data)
+    loader = LoaderConfig(o.batch, o.anchors, o.crop, data.appearance)
+    make_place(data.first_seed, scenes, photos, 1)  # compiles
+    began = time.perf_counter()
+    places = [make_place(data.first_seed + k, scenes, photos, data.visits) for k in (1, 2)]
+    each = (time.perf_counter() - began) / len(places)
+    print(f"place of {data.cells} cells with {data.visits} visits: {each:.2f} s on one core")
+    numpy_pairs(places[0], scenes, loader, 1)
+    made, seconds = numpy_pairs(places[0], scenes, loader, args.pairs)
+    print(f"NumPy, one core: {made / seconds:.2f} pairs/s")
+    device = torch.device("cuda" if torch.cuda.is_available() else "cpu")
+    plan = LivePlan(data.first_seed, data.scenes, 2, 1, data.visits)
+    stream = LiveStream(plan, scenes, photos, loader, run.seed, device)
+    try:
+        stream.take(0, places[0])
+        stream.take(1, places[1])
+        device_pairs(stream, loader, 1)
+        made, seconds = device_pairs(stream, loader, args.pairs)
+    finally:
+        stream.close()
+    print(f"torch on {device}: {made / seconds:.2f} pairs/s")
+
+
+if __name__ == "__main__":
+    main()
