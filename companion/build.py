@@ -9,7 +9,7 @@ import numpy as np
 from localizer.camera import Camera
 from localizer.config import LocalizerConfig
 from localizer.features.detail import DetailExtractor
-from localizer.features.extractor import FeatureExtractor, load_extractor
+from localizer.features.extractor import DeviceExtractor, FeatureExtractor, load_extractor
 from localizer.map.cache import TileCache
 from localizer.map.stream import TileStreamer
 from localizer.pipeline import Localizer, RotationAt, working_camera
@@ -44,7 +44,14 @@ def build_localizer(
     rotation_at: RotationAt = lambda _time_ns: None,
 ) -> Localizer:
     """A localizer for one camera over an open map. rotation_at: see `Localizer`."""
-    extractor = DetailExtractor(load_extractor(config.model, threads=config.feature_threads))
+    size = working_camera(camera, config.width)
+    features = load_extractor(
+        config.model,
+        threads=config.feature_threads,
+        size=(size.width, size.height),
+        half=config.feature_half,
+    )
+    extractor = DetailExtractor(features)
     optimizer = JNGO(
         config.registration, open_backend(config.device, config.threads), config.threads
     )
@@ -61,7 +68,10 @@ def _warm_up(
 ) -> None:
     """Compile and load everything now: the first frame of a flight must not wait ten seconds."""
     size = working_camera(camera, config.width)
-    pyramid = extractor.extract(np.zeros((size.height, size.width, 3), np.uint8))
+    black = np.zeros((size.height, size.width, 3), np.uint8)
+    pyramid = extractor.extract(black)
+    if isinstance(extractor, DeviceExtractor):
+        extractor.extract_on_device(black)  # allocates the outputs there
     for channels in {level.features.shape[-1] for level in pyramid.levels}:
         optimizer.warm_up(channels)
     renderer.warm_up()

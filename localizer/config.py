@@ -38,6 +38,7 @@ class LocalizerConfig(BaseModel):
     feature_threads: int = Field(
         1, ge=1, le=256, description="CPU threads of each feature extraction"
     )
+    feature_half: bool = Field(False, description="TensorRT computes features in float16")
     cache_mib: int = Field(384, ge=16, le=1 << 20, description="resident tiles, MiB")
     seed: int = Field(0, ge=0, description="seed of anchors and hypotheses")
     registration: JNGOConfig = JNGOConfig()

@@ -21,12 +21,12 @@ from localizer.errors import ModelError
 from localizer.features.bound_session import BoundSession
 from localizer.features.gradient import GradientExtractor
 from localizer.features.image import check_image
+from localizer.features.providers import Expected, provider_of, start_session
 from localizer.types import FeatureLevel, FeaturePyramid, Image
 
 logger = logging.getLogger(__name__)
 
 SHIPPED_MODEL = Path(__file__).parent / "weights" / "tiny.onnx"
-_PROVIDERS = ("TensorrtExecutionProvider", "CUDAExecutionProvider", "CPUExecutionProvider")
 
 
 class FeatureExtractor(Protocol):
@@ -94,38 +94,46 @@ def read_model_info(model: Path) -> ModelInfo:
 
 
 class OnnxExtractor:
-    """A network in onnxruntime, on the best execution provider that starts."""
+    """A network in onnxruntime, on the best execution provider that starts.
 
-    def __init__(self, model: Path, *, threads: int = 2) -> None:
+    size: width and height of the images to come, for which it is warmed up. half: TensorRT may
+    compute in float16.
+    """
+
+    def __init__(
+        self,
+        model: Path,
+        *,
+        threads: int = 2,
+        size: tuple[int, int] | None = None,
+        half: bool = False,
+    ) -> None:
         self.info = read_model_info(model)
         options = ort.SessionOptions()
         options.intra_op_num_threads = threads
         options.log_severity_level = 3
         # Spinning worker threads would starve the optimizer and the renderer on a small computer.
         options.add_session_config_entry("session.intra_op.allow_spinning", "0")
-        available = ort.get_available_providers()
-        try:
-            self._session = ort.InferenceSession(
-                str(model), options, providers=[p for p in _PROVIDERS if p in available]
-            )
-        except Exception as error:  # onnxruntime raises its own untyped exceptions
-            raise ModelError(f"{model}: onnxruntime cannot load it: {error}") from error
         self._multiple = self.info.multiple
         self._outputs = [
             f"{kind}_{k}"
             for k in range(len(self.info.levels))
             for kind in ("features", "confidence")
         ]
+        width, height = size or (4 * self._multiple, 4 * self._multiple)
+        expected = Expected(width, height, self._multiple, half, self.info.sha256)
+        self._session = start_session(
+            model, options, expected, lambda session: self._check(session, model, width, height)
+        )
         self._bound = (
             None if self.provider == "CPU" else BoundSession(self._session, self._outputs, "cuda")
         )
-        self._check_graph(model)
+        logger.info("features: %s", self.name)
 
     @property
     def provider(self) -> str:
         """Short name of the execution provider in use: TensorRT, CUDA or CPU."""
-        name = str(self._session.get_providers()[0]).removesuffix("ExecutionProvider")
-        return "TensorRT" if name == "Tensorrt" else name
+        return provider_of(self._session)
 
     @property
     def name(self) -> str:
@@ -135,12 +143,14 @@ class OnnxExtractor:
     def extract(self, rgb: Image) -> FeaturePyramid:
         """Pyramid of an (H, W, 3) uint8 RGB image, H and W divisible by `info.multiple`."""
         check_image(rgb, self._multiple)
-        arrays = self._session.run(self._outputs, {"image": np.ascontiguousarray(rgb)[None]})
-        levels = tuple(
+        return FeaturePyramid(self._run(self._session, rgb), rgb.shape[1], rgb.shape[0])
+
+    def _run(self, session: ort.InferenceSession, rgb: Image) -> tuple[FeatureLevel, ...]:
+        arrays = session.run(self._outputs, {"image": np.ascontiguousarray(rgb)[None]})
+        return tuple(
             FeatureLevel(arrays[2 * k][0], arrays[2 * k + 1][0], level.stride)
             for k, level in enumerate(self.info.levels)
         )
-        return FeaturePyramid(levels, rgb.shape[1], rgb.shape[0])
 
     def extract_on_device(self, rgb: Image) -> FeaturePyramid:
         """As `extract`, without the copy to the host; on a CPU it is `extract`."""
@@ -160,15 +170,16 @@ class OnnxExtractor:
             )
         return FeaturePyramid(tuple(levels), rgb.shape[1], rgb.shape[0])
 
-    def _check_graph(self, model: Path) -> None:
-        """Run once on a small image: it warms up, and a wrong graph fails here, not in flight."""
-        side = 4 * self._multiple
+    def _check(self, session: ort.InferenceSession, model: Path, width: int, height: int) -> None:
+        """Run once: it warms up, and a wrong graph fails here, not in flight."""
         try:
-            pyramid = self.extract(np.zeros((side, side, 3), np.uint8))
+            levels = self._run(session, np.zeros((height, width, 3), np.uint8))
         except Exception as error:
-            raise ModelError(f"{model}: does not run on a {side}x{side} image: {error}") from error
-        for level, expected in zip(pyramid.levels, self.info.levels, strict=True):
-            shape = (side // expected.stride, side // expected.stride, expected.channels)
+            raise ModelError(
+                f"{model}: does not run on a {width}x{height} image: {error}"
+            ) from error
+        for level, expected in zip(levels, self.info.levels, strict=True):
+            shape = (height // expected.stride, width // expected.stride, expected.channels)
             if level.features.shape != shape or level.confidence.shape != shape[:2]:
                 raise ModelError(
                     f"{model}: level of stride {expected.stride} gives {level.features.shape}, "
@@ -176,8 +187,14 @@ class OnnxExtractor:
                 )
 
 
-def load_extractor(model: Path | None = None, *, threads: int = 2) -> FeatureExtractor:
-    """The extractor for `model`; None takes the shipped weights.
+def load_extractor(
+    model: Path | None = None,
+    *,
+    threads: int = 2,
+    size: tuple[int, int] | None = None,
+    half: bool = False,
+) -> FeatureExtractor:
+    """The extractor for `model`; None takes the shipped weights. Options: see `OnnxExtractor`.
 
     Without shipped weights it is the gradient fallback, which says so in its name and in a warning.
     A model that was asked for by path and is missing or corrupt raises `ModelError`.
@@ -189,4 +206,4 @@ def load_extractor(model: Path | None = None, *, threads: int = 2) -> FeatureExt
         model = SHIPPED_MODEL
     if not model.exists():
         raise ModelError(f"{model}: no such model file; leave it out to use the shipped weights")
-    return OnnxExtractor(model, threads=threads)
+    return OnnxExtractor(model, threads=threads, size=size, half=half)

@@ -6,7 +6,6 @@ No nvcc, no toolkit headers: the packages `cuda-bindings` and NVRTC's own wheel 
 from __future__ import annotations
 
 import hashlib
-import os
 import tempfile
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -14,6 +13,7 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any
 
+from localizer.caches import cache_folder
 from localizer.registration.cuda.errors import CudaError, CudaUnavailableError
 from localizer.registration.cuda.layout import macros
 
@@ -34,12 +34,7 @@ class Image:
 
 def cache_directory() -> Path:
     """Where images are kept: `PILOT_CACHE`, else the user's cache directory."""
-    base = os.environ.get("PILOT_CACHE")
-    if base:
-        return Path(base) / "cuda"
-    return (
-        Path(os.environ.get("XDG_CACHE_HOME", "~/.cache")).expanduser() / "pilot-companion" / "cuda"
-    )
+    return cache_folder("cuda")
 
 
 def compile_kernels(

@@ -3,12 +3,10 @@
 from __future__ import annotations
 
 import numpy as np
-import onnxruntime as ort
 import pytest
 
 from localizer.device_array import DeviceArray
 from localizer.errors import DeviceArrayError
-from localizer.features import extractor
 from localizer.features.bound_session import BoundSession
 from localizer.features.detail import DetailExtractor
 from localizer.features.extractor import SHIPPED_MODEL, DeviceExtractor, OnnxExtractor
@@ -66,21 +64,6 @@ def test_on_a_cpu_nothing_is_bound():
     assert isinstance(plain, DeviceExtractor)
     levels = plain.extract_on_device(image(64, 64)).levels
     assert all(isinstance(level.features, np.ndarray) for level in levels)
-
-
-def test_providers_are_tried_from_the_fastest(monkeypatch):
-    asked = []
-
-    class Session(ort.InferenceSession):
-        def __init__(self, path, options, providers):
-            asked.append(providers)
-            super().__init__(path, options, providers=["CPUExecutionProvider"])
-
-    there = ["CPUExecutionProvider", "CUDAExecutionProvider", "TensorrtExecutionProvider"]
-    monkeypatch.setattr(extractor.ort, "get_available_providers", lambda: there)
-    monkeypatch.setattr(extractor.ort, "InferenceSession", Session)
-    OnnxExtractor(SHIPPED_MODEL, threads=1)
-    assert asked == [there[::-1]]
 
 
 def test_arrays_of_other_libraries():

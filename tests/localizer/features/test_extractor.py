@@ -91,33 +91,6 @@ def test_shipped_weights_run_at_sizes_divisible_by_eight(image: np.ndarray) -> N
         loaded.extract(np.ascontiguousarray(image[:, :300]))
 
 
-@pytest.mark.parametrize(
-    ("installed", "wanted"),
-    [
-        (["CPU"], ["CPU"]),
-        (["CPU", "CUDA"], ["CUDA", "CPU"]),
-        (["Azure", "CPU", "CUDA", "Tensorrt"], ["Tensorrt", "CUDA", "CPU"]),
-    ],
-)
-def test_the_best_installed_provider_is_asked_for_first(
-    installed: list[str], wanted: list[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    asked: list[list[str]] = []
-    start = extractor.ort.InferenceSession
-
-    def session(path: str, options: object, providers: list[str]) -> object:
-        asked.append([name.removesuffix("ExecutionProvider") for name in providers])
-        return start(path, options, providers=["CPUExecutionProvider"])
-
-    names = [f"{name}ExecutionProvider" for name in installed]
-    monkeypatch.setattr(extractor.ort, "get_available_providers", lambda: names)
-    monkeypatch.setattr(extractor.ort, "InferenceSession", session)
-    loaded = OnnxExtractor(extractor.SHIPPED_MODEL)
-    assert asked == [wanted]
-    # What is reported is what started, not what was asked for.
-    assert loaded.name == "tiny (onnxruntime, CPU)"
-
-
 def test_a_model_asked_for_by_path_must_exist(tmp_path: Path) -> None:
     with pytest.raises(ModelError, match="no such model file"):
         load_extractor(tmp_path / "other.onnx")

@@ -1,0 +1,15 @@
+"""Where things are kept that are made once and may be deleted at any time."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+
+def cache_folder(kind: str) -> Path:
+    """The folder of one kind of thing: below `PILOT_CACHE`, else below the user's cache folder."""
+    base = os.environ.get("PILOT_CACHE")
+    if base:
+        return Path(base) / kind
+    user = os.environ.get("XDG_CACHE_HOME", "~/.cache")
+    return Path(user).expanduser() / "pilot-companion" / kind
