@@ -3,9 +3,10 @@
     python benchmarks/gpu_checklist.py [--sequence SEQ --map CACHE] [--report gpu-report.md]
 
 Steps: what the machine is; the tests marked gpu; the same under compute-sanitizer (memcheck, then
-racecheck), where it is installed; the optimizer benchmark's GPU tables; `companion eval` of a
-recorded sequence on the GPU and on the CPU. A step that fails or runs out of time is reported and
-the next one runs. The exit code is 1 if a step failed, 2 if there is no GPU.
+racecheck), where it is installed; the time of both networks on every execution provider; how fast
+training pairs are rendered; the optimizer benchmark's GPU tables; `companion eval` of a recorded
+sequence on the GPU and on the CPU. A step that fails or runs out of time is reported and the next
+one runs. The exit code is 1 if a step failed, 2 if there is no GPU.
 """
 
 from __future__ import annotations
@@ -57,6 +58,10 @@ def steps(sequence: Path | None, cache: Path | None, report: Path) -> list[Step]
                      "--target-processes", "all")  # fmt: skip
         command = (*sanitizer, *tests, "-k", "agrees_with_the_reference or agrees_with_the_cpu")
         found.append(Step(f"compute-sanitizer {tool}", command, 90))
+    speed = (python, "benchmarks/network_speed.py")
+    found.append(Step("networks: s0 and tiny on every provider", speed, 120))
+    found.append(Step("pairs while training", (python, "benchmarks/pairs.py",
+                      "configs/train_s0.yaml", "--pairs", "32", "--no-photos"), 90))  # fmt: skip
     found.append(Step("optimizer", (python, "benchmarks/optimizer_gpu.py"), 150))
     if sequence is not None and cache is not None:
         for device in ("cuda", "cpu"):

@@ -97,7 +97,7 @@ class OnnxExtractor:
     """A network in onnxruntime, on the best execution provider that starts.
 
     size: width and height of the images to come, for which it is warmed up. half: TensorRT may
-    compute in float16.
+    compute in float16. only: TensorRT, CUDA or CPU, instead of the best.
     """
 
     def __init__(
@@ -107,6 +107,7 @@ class OnnxExtractor:
         threads: int = 2,
         size: tuple[int, int] | None = None,
         half: bool = False,
+        only: str | None = None,
     ) -> None:
         self.info = read_model_info(model)
         options = ort.SessionOptions()
@@ -123,7 +124,11 @@ class OnnxExtractor:
         width, height = size or (4 * self._multiple, 4 * self._multiple)
         expected = Expected(width, height, self._multiple, half, self.info.sha256)
         self._session = start_session(
-            model, options, expected, lambda session: self._check(session, model, width, height)
+            model,
+            options,
+            expected,
+            lambda session: self._check(session, model, width, height),
+            only,
         )
         self._bound = (
             None if self.provider == "CPU" else BoundSession(self._session, self._outputs, "cuda")

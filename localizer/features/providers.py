@@ -15,7 +15,7 @@ from localizer.errors import ModelError
 logger = logging.getLogger(__name__)
 
 _TENSORRT, _CUDA, _CPU = (f"{n}ExecutionProvider" for n in ("Tensorrt", "CUDA", "CPU"))
-_SHORT = {_TENSORRT: "TensorRT", _CUDA: "CUDA", _CPU: "CPU"}
+SHORT_NAMES = {_TENSORRT: "TensorRT", _CUDA: "CUDA", _CPU: "CPU"}
 
 Provider = str | tuple[str, dict[str, str]]
 
@@ -38,14 +38,18 @@ def start_session(
     options: ort.SessionOptions,
     expected: Expected,
     check: Callable[[ort.InferenceSession], None],
+    only: str | None = None,
 ) -> ort.InferenceSession:
     """A session on the best installed provider that starts and passes `check`, which runs the model
     once: engines are built and algorithms chosen there, not at the first frame.
 
-    Each provider that does not is one warning. Raises `ModelError` when none does.
+    only: short name of the provider to use instead of the best. Each provider that does not run the
+    model is one warning. Raises `ModelError` when none does.
     """
     available = ort.get_available_providers()
     names = [name for name in (_TENSORRT, _CUDA, _CPU) if name in available]
+    if only is not None:
+        names = [name for name in names if SHORT_NAMES[name] == only]
     for k, name in enumerate(names):
         # What a provider cannot compute goes to the ones after it.
         providers = [_configured(n, expected) for n in names[k:]]
@@ -63,17 +67,19 @@ def start_session(
                 raise ModelError(f"{model}: onnxruntime cannot load it: {error}") from error
             logger.warning(
                 "features: %s does not run %s, trying %s: %s",
-                _SHORT[name], model.name, _SHORT[names[k + 1]], str(error).split("\n")[0],
+                SHORT_NAMES[name], model.name, SHORT_NAMES[names[k + 1]], str(error).split("\n")[0],
             )  # fmt: skip
         else:
             return session
-    raise ModelError(f"{model}: this onnxruntime has no provider that can run it: {available}")
+    raise ModelError(
+        f"{model}: this onnxruntime has no {only or 'provider'} that can run it: {available}"
+    )
 
 
 def provider_of(session: ort.InferenceSession) -> str:
     """Short name of the provider that serves: TensorRT, CUDA or CPU."""
     name = str(session.get_providers()[0])
-    return _SHORT.get(name, name.removesuffix("ExecutionProvider"))
+    return SHORT_NAMES.get(name, name.removesuffix("ExecutionProvider"))
 
 
 def _configured(name: str, expected: Expected) -> Provider:

@@ -128,6 +128,15 @@ def test_down_to_the_cpu_and_no_further(
         OnnxExtractor(SHIPPED_MODEL)
 
 
+def test_one_provider_can_be_asked_for(install: Callable[..., Asked]) -> None:
+    asked = install(["TensorRT", "CUDA", "CPU"])
+    assert OnnxExtractor(SHIPPED_MODEL, only="CUDA").provider == "CUDA"
+    assert [names(providers) for providers in asked] == [["CUDA"]]
+    install(["CPU"])
+    with pytest.raises(ModelError, match="has no CUDA"):
+        OnnxExtractor(SHIPPED_MODEL, only="CUDA")
+
+
 def test_it_is_warmed_up_at_the_size_of_the_flight(install: Callable[..., Asked]) -> None:
     install(["CUDA", "CPU"])
     loaded = OnnxExtractor(SHIPPED_MODEL, size=(96, 72))

@@ -1,0 +1,118 @@
+"""Time of feature extraction: `tiny` and `s0` on every execution provider there is, in one table.
+
+    python benchmarks/network_speed.py [--s0 MODEL.onnx] [--threads 2]
+
+Without a model of `s0` an untrained one is exported (extra `train`): weights do not change its
+time. "to host" is what `extract` takes, with every feature copied back; "on device" leaves them on
+the GPU, as in flight. Medians; the first calls, in which engines are built, are not counted.
+"""
+
+from __future__ import annotations
+
+import argparse
+import tempfile
+import time
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import onnxruntime as ort
+
+from localizer.errors import ModelError
+from localizer.features import OnnxExtractor
+from localizer.features.extractor import SHIPPED_MODEL
+from localizer.features.providers import SHORT_NAMES
+from localizer.types import Image
+
+ROOT = Path(__file__).resolve().parent.parent
+SIZES = ((320, 240), (512, 512))
+
+
+@dataclass(frozen=True)
+class Row:
+    """One cell's worth of times, milliseconds; on_device: None on a CPU."""
+
+    model: str
+    provider: str
+    size: tuple[int, int]
+    to_host: float
+    on_device: float | None
+
+
+def untrained_s0(folder: Path) -> list[Path]:
+    """`s0` in float32 and float16 with random weights."""
+    import torch
+
+    from localizer.training.config import load_config
+    from localizer.training.export import export
+    from localizer.training.networks import build
+
+    run = load_config(ROOT / "configs" / "train_s0.yaml")
+    checkpoint = folder / "s0.pt"
+    torch.manual_seed(0)
+    state = {"average": build(run.model).state_dict(), "config": run.model_dump(mode="json"),
+             "step": 0, "seconds": 0.0}  # fmt: skip
+    torch.save(state, checkpoint)
+    models = [folder / "s0.onnx", folder / "s0-float16.onnx"]
+    for model in models:
+        export(checkpoint, model, half=model is models[1])
+    return models
+
+
+def median_ms(call: Callable[[Image], object], image: Image, count: int) -> float:
+    """Median milliseconds of `count` calls after some that are not counted."""
+    times = []
+    for _ in range(count + 3):
+        began = time.perf_counter()
+        call(image)
+        times.append(time.perf_counter() - began)
+    return 1e3 * float(np.median(times[3:]))
+
+
+def measure(
+    models: Sequence[Path], sizes: Sequence[tuple[int, int]], threads: int, count: int
+) -> Iterator[Row]:
+    """Every model at every size on every installed provider that runs it."""
+    installed = [SHORT_NAMES[n] for n in ort.get_available_providers() if n in SHORT_NAMES]
+    for model in models:
+        for provider in installed:
+            for size in sizes:
+                image = np.random.default_rng(0).integers(
+                    0, 256, (size[1], size[0], 3), dtype=np.uint8
+                )
+                try:
+                    extractor = OnnxExtractor(model, threads=threads, size=size, only=provider)
+                except ModelError as error:
+                    print(f"left out: {error}")
+                    continue
+                host = median_ms(extractor.extract, image, count)
+                device = None
+                if provider != "CPU":
+                    device = median_ms(extractor.extract_on_device, image, count)
+                yield Row(extractor.info.name, provider, size, host, device)
+
+
+def table(rows: Sequence[Row]) -> str:
+    """As Markdown."""
+    lines = ["| network | provider | size | to host, ms | on device, ms |", "|---|---|---|---|---|"]
+    for r in rows:
+        device = "" if r.on_device is None else f"{r.on_device:.2f}"
+        size = f"{r.size[0]} x {r.size[1]}"
+        lines.append(f"| {r.model} | {r.provider} | {size} | {r.to_host:.2f} | {device} |")
+    return "\n".join(lines)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
+    parser.add_argument("--s0", type=Path, nargs="*", help="models of s0, instead of untrained")
+    parser.add_argument("--threads", type=int, default=2, help="on the CPU")
+    parser.add_argument("--count", type=int, default=30, help="calls that are counted")
+    args = parser.parse_args()
+    with tempfile.TemporaryDirectory() as folder:
+        models = [SHIPPED_MODEL, *(args.s0 or untrained_s0(Path(folder)))]
+        print(table(list(measure(models, SIZES, args.threads, args.count))))
+
+
+if __name__ == "__main__":
+    main()
