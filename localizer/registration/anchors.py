@@ -14,29 +14,25 @@ _CANDIDATE_STEP = 2  # px; one candidate per 2 x 2 pixels is finer than the fine
 _BORDER_SHARE = 0.02  # of the image's shorter side, where features see the padding
 _MAX_CURVATURE = 0.01  # second difference of 1/depth relative to 1/depth; 0 on any plane
 _EDGE_RADIUS = 2  # px around a depth edge or hole
-_GRADIENT_FLOOR = 0.05  # of the view's largest gradient: flat pixels stay possible
 
 
 def select_anchors(
     view: RenderedView, features: FeaturePyramid, count: int = 500, seed: int = 0
 ) -> Anchors:
-    """At most `count` anchors: confident, textured, spread over the image, off depth edges.
+    """At most `count` anchors: spread evenly over the image, off depth edges and holes.
 
-    They are drawn by importance (confidence times feature gradient) within equal cells, so that
-    every part of the view is represented, and come in Morton order, so that neighbours in the list
-    are neighbours in every feature map. The same seed gives the same anchors. A view without
-    usable depth gives fewer or none; `JNGO` then says TOO_FEW_ANCHORS.
+    They are drawn at random within equal cells, so that every part of the view is represented, and
+    come in Morton order, so that neighbours in the list are neighbours in every feature map. The
+    same seed gives the same anchors. A view without usable depth gives fewer or none; `JNGO` then
+    says TOO_FEW_ANCHORS.
     """
     rng = np.random.default_rng(seed)
     rows, columns = _candidates(view.depth, rng)
-    importance = _importance(features, view.depth.shape)[rows, columns]
-    usable = np.isfinite(importance) & (importance > 0)
-    rows, columns, importance = rows[usable], columns[usable], importance[usable]
     side = np.sqrt(view.depth.size / max(count, 1))
     cell = (rows // side).astype(np.int64) * view.depth.shape[1] + (columns // side).astype(
         np.int64
     )
-    picked = _stratified(cell, importance, count, rng)
+    picked = _stratified(cell, count, rng)
     rows, columns = rows[picked], columns[picked]
     order = np.argsort(_morton(columns, rows), kind="stable")
     rows, columns = rows[order], columns[order]
@@ -84,34 +80,10 @@ def _candidates(
     return rows[good], columns[good]
 
 
-def _importance(features: FeaturePyramid, shape: tuple[int, ...]) -> Array:
-    """Product over levels of confidence and gradient norm, geometric mean, at every pixel."""
-    total = np.zeros(shape, dtype=np.float32)
-    for level in features.levels:
-        f = level.features
-        dx, dy = f[:, 2:] - f[:, :-2], f[2:] - f[:-2]
-        norm2 = np.zeros(f.shape[:2], dtype=np.float32)
-        norm2[:, 1:-1] += np.einsum("hwc,hwc->hw", dx, dx)
-        norm2[1:-1] += np.einsum("hwc,hwc->hw", dy, dy)
-        gradient = np.sqrt(norm2)
-        value = level.confidence * (gradient + _GRADIENT_FLOOR * gradient.max())
-        log = np.log(np.maximum(value, 1e-12)).astype(np.float32)
-        total += cv2.resize(log, (shape[1], shape[0]), interpolation=cv2.INTER_LINEAR)
-    importance: Array = np.exp(total / len(features.levels))
-    return importance
-
-
-def _stratified(
-    cell: NDArray[np.int64], importance: Array, count: int, rng: np.random.Generator
-) -> NDArray[np.int64]:
-    """Indices of `count` candidates: every cell's first draw, then every cell's second, and so on.
-
-    Within a cell the draws are an exponential race: without replacement, in proportion to
-    importance (Efraimidis and Spirakis 2006).
-    """
-    time = rng.exponential(size=len(importance)) / importance
-    place = time / (time + np.median(time)) if len(time) else time  # order kept, below 1
-    order = np.argsort(cell + np.minimum(place, 0.999999))
+def _stratified(cell: NDArray[np.int64], count: int, rng: np.random.Generator) -> NDArray[np.int64]:
+    """Indices of `count` candidates: every cell's first draw, then every cell's second, ..."""
+    place = rng.random(len(cell))
+    order = np.argsort(cell + place)
     cells = cell[order]
     first = np.r_[0, np.flatnonzero(np.diff(cells)) + 1] if len(cells) else np.zeros(0, np.int64)
     lengths = np.diff(np.r_[first, len(cells)])

@@ -77,7 +77,7 @@ class JNGOConfig(BaseModel):
     )
     spread_sigmas: float = Field(default=2.2, gt=0, description="grid half-width in prior sigmas")
     iterations: tuple[_Steps, ...] = Field(
-        default=(2, 3, 4), min_length=1, description="LM steps per level, coarse to fine"
+        default=(2, 3, 10), min_length=1, description="LM steps per level, coarse to fine"
     )
     swarm_anchors: tuple[_Count, ...] = Field(
         default=(250, 500, 500),
@@ -85,12 +85,10 @@ class JNGOConfig(BaseModel):
         description="anchors used per level, spread evenly; all by the winner, on the last level",
     )
     keep: tuple[_Count, ...] = Field(
-        default=(32, 8), description="survivors after each level but the last"
-    )
-    converge: int = Field(
-        default=6, ge=0, le=1000, description="further LM steps of the last survivors"
+        default=(64, 16), description="survivors after each level but the last"
     )
     sharpen: int = Field(default=6, ge=0, le=1000, description="the winner's last LM steps, each")
+    sharpen_damping: float = Field(default=0.003, gt=0, description="their first Marquardt factor")
     sharpen_scales: tuple[_Scale, ...] = Field(
         default=(2.0, 1.0, 0.7),
         description="for each of these Geman-McClure scales, in median residual norms",
@@ -113,7 +111,7 @@ class JNGOConfig(BaseModel):
     prior_weight: float = Field(
         default=0.0001, ge=0, description="weight of a constraint, likewise"
     )
-    correlation: float = Field(default=14.0, gt=0, description="covariance factor, calibrated")
+    correlation: float = Field(default=12.0, gt=0, description="covariance factor, calibrated")
     correlation_px: float = Field(
         default=32.0, gt=0, description="image cell within which residuals may correlate"
     )
@@ -214,7 +212,6 @@ class JNGO:
         )
         if not np.isfinite(swarm.scores[0]):
             return _failure(prior, RegistrationStatus.NO_OVERLAP, swarm.evaluations)
-        swarm = self._converge(swarm, origin, motion)
         winner = self._sharpen(swarm, problems[searched - 1 :], constraint, origin)
         return self._result(origin, prior, swarm, winner, query.levels[-1].stride)
 
@@ -245,34 +242,17 @@ class JNGO:
             problems, c.iterations, keep, c.swarm_anchors, strict=True
         ):
             problem = self._constrained(thinned(level, anchors), constraint, R, t, origin)
-            result = self.backend.refine(problem, R, t, iterations, c.settings)
-            evaluations += result.evaluations
-            order = distinct(
-                problem, result.rotations, result.translations, result.scores, c.distinct_px
-            )
-            order = order[:survivors]
-            R, t = result.rotations[order], result.translations[order]
-            scores, overlaps = result.scores[order], result.overlaps[order]
+            found = self.backend.refine(problem, R, t, iterations, c.settings)
+            evaluations += found.evaluations
+            R, t, totals = found.rotations, found.translations, found.scores
+            if level is problems[-1]:
+                totals = self._totals(R, t, totals, origin, motion)
+            order = distinct(problem, R, t, totals, c.distinct_px)[:survivors]
+            R, t = R[order], t[order]
+            scores, overlaps = found.scores[order], found.overlaps[order]
             if not np.isfinite(scores[0]):
                 break
         return _Swarm(problem, c.settings, R, t, scores, overlaps, evaluations)
-
-    def _converge(self, swarm: _Swarm, origin: Array, motion: PosePrior | None) -> _Swarm:
-        """More finest-level steps on the survivors, and their final order."""
-        result = self.backend.refine(
-            swarm.problem, swarm.rotations, swarm.translations, self.config.converge, swarm.settings
-        )
-        R, t = result.rotations, result.translations
-        order = np.argsort(self._totals(R, t, result.scores, origin, motion), kind="stable")
-        return _Swarm(
-            swarm.problem,
-            swarm.settings,
-            R[order],
-            t[order],
-            result.scores[order],
-            result.overlaps[order],
-            swarm.evaluations + result.evaluations,
-        )
 
     def _sharpen(
         self,
@@ -294,7 +274,9 @@ class JNGO:
             median = median_residual(thinned(problem, c.swarm_anchors[-1]), R[0], t[0])
             for factor in scales[k]:
                 scale = max(factor * median, _LEAST_SCALE)
-                settings = replace(c.settings, scale=scale, redescending=True)
+                settings = replace(
+                    c.settings, scale=scale, redescending=True, damping=c.sharpen_damping
+                )
                 result = self.backend.refine(problem, R, t, c.sharpen, settings)
                 R, t = result.rotations, result.translations
                 evaluations += result.evaluations

@@ -44,22 +44,56 @@ def prefetch(_context, array, _index):  # type: ignore[no-untyped-def]
 
 
 @njit(**JIT)
-def solve(sums, scale, damping, L, step):  # type: ignore[no-untyped-def]
-    """Equation 8 by Cholesky on the unit-diagonal system; False where it is singular."""
-    k = 0
-    for i in range(6):
-        diagonal = sums[k + i]
-        if not diagonal > 0.0:
-            return False
-        scale[i] = 1.0 / np.sqrt(diagonal)
-        k += i + 1
+def damp(sums, t, damping, M):  # type: ignore[no-untyped-def]
+    """The left side of equation 8 into the lower triangle of M; False where H's diagonal is not
+    positive.
+    """
     k = 0
     for i in range(6):
         for j in range(i + 1):
-            s = sums[k] * scale[i] * scale[j]
+            M[i, j] = sums[k]
             k += 1
-            if i == j:
-                s += damping
+        if not M[i, i] > 0.0:
+            return False
+    x, y, z = t[0], t[1], t[2]
+    # What a turn about the camera's centre is worth: the diagonal of equation 8a.
+    turn0 = M[3, 3] + z * z * M[1, 1] + y * y * M[2, 2]
+    turn0 += 2.0 * (y * M[3, 2] - z * M[3, 1] - y * z * M[2, 1])
+    turn1 = M[4, 4] + z * z * M[0, 0] + x * x * M[2, 2]
+    turn1 += 2.0 * (z * M[4, 0] - x * M[4, 2] - x * z * M[2, 0])
+    turn2 = M[5, 5] + y * y * M[0, 0] + x * x * M[1, 1]
+    turn2 += 2.0 * (x * M[5, 1] - y * M[5, 0] - x * y * M[1, 0])
+    a, b, c = damping * M[0, 0], damping * M[1, 1], damping * M[2, 2]
+    M[0, 0] += a
+    M[1, 1] += b
+    M[2, 2] += c
+    M[3, 1] += b * z
+    M[3, 2] -= c * y
+    M[4, 0] -= a * z
+    M[4, 2] += c * x
+    M[5, 0] += a * y
+    M[5, 1] -= b * x
+    M[3, 3] += damping * turn0 + b * z * z + c * y * y
+    M[4, 4] += damping * turn1 + a * z * z + c * x * x
+    M[5, 5] += damping * turn2 + a * y * y + b * x * x
+    M[4, 3] -= c * x * y
+    M[5, 3] -= b * x * z
+    M[5, 4] -= a * y * z
+    return True
+
+
+@njit(**JIT)
+def solve(sums, t, damping, M, scale, L, step):  # type: ignore[no-untyped-def]
+    """Equation 8 by Cholesky on the unit-diagonal system; False where it is singular."""
+    if not damp(sums, t, damping, M):
+        return False
+    for i in range(6):
+        if not M[i, i] > 0.0:
+            return False
+        scale[i] = 1.0 / np.sqrt(M[i, i])
+    for i in range(6):
+        for j in range(i + 1):
+            s = M[i, j] * scale[i] * scale[j]
             for m in range(j):
                 s -= L[i, m] * L[j, m]
             if i == j:

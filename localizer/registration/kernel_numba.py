@@ -28,7 +28,7 @@ _F = np.float32
 _HYPOTHESES_PER_THREAD = 8  # fewer finish sooner than another thread wakes up
 _ROWS = 17  # scratch rows of N floats per worker
 _SUMS = 27  # 21 of H (lower triangle), 6 of g
-_WORK = 23  # scratch rows of 6: 14 of the prior, then scale, step, L (6) and a trial translation
+_WORK = 23  # scratch rows of 6: 14 of a prior or a damped system, scale, step, L (6), a translation
 _AHEAD = 6  # anchors between asking for features and using them; 4 to 8 measured alike
 _LINE = 16  # floats of a cache line
 
@@ -265,7 +265,7 @@ def refine_kernel(channels: int) -> Callable[..., int]:
                 scores[m] = np.inf
                 continue
             for _ in range(iterations):
-                if not solve(best, scale, damping, L, step):
+                if not solve(best, t[m], damping, work, scale, L, step):
                     break
                 retract(R[m], t[m], step, R_try, t_try)
                 score, n = evaluate(

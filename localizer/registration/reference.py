@@ -163,15 +163,20 @@ def retract(rotation: Array, translation: Array, step: Array) -> tuple[Array, Ar
     return so3_exp(step[3:]) @ rotation, translation + step[:3]
 
 
-def damped_step(hessian: Array, gradient: Array, damping: float) -> Array | None:
+def damped_step(
+    hessian: Array, gradient: Array, translation: Array, damping: float
+) -> Array | None:
     """Solution (6,) of the damped normal equations (8), None where they are singular."""
-    diagonal = np.diag(hessian)
-    if not np.all(diagonal > 0):
+    if not np.all(np.diag(hessian) > 0):
         return None
-    scale = 1.0 / np.sqrt(diagonal)
-    H = hessian * np.outer(scale, scale) + damping * np.eye(6)
+    about_camera = np.eye(6)  # of equation 8a: updates about the camera's centre
+    about_camera[:3, 3:] = hat(translation)
+    back = np.linalg.inv(about_camera)
+    metric = np.diag(np.diag(back.T @ hessian @ back))
+    H = hessian + damping * about_camera.T @ metric @ about_camera
+    scale = 1.0 / np.sqrt(np.diag(H))
     try:
-        L = np.linalg.cholesky(H)
+        L = np.linalg.cholesky(H * np.outer(scale, scale))
     except np.linalg.LinAlgError:
         return None
     step: Array = -scale * np.linalg.solve(L.T, np.linalg.solve(L, scale * gradient))
@@ -208,7 +213,7 @@ def _refine_one(
     best = linearize(problem, R, t, settings)
     damping, evaluations = settings.damping, 1
     for _ in range(iterations):
-        step = damped_step(best.hessian, best.gradient, damping)
+        step = damped_step(best.hessian, best.gradient, t, damping)
         if step is None:
             break
         R_trial, t_trial = retract(R, t, step)

@@ -5,19 +5,54 @@
 // Index of (row, column), row >= column, in a lower triangle stored by rows.
 __device__ constexpr int triangle(int row, int column) { return row * (row + 1) / 2 + column; }
 
+// The left side of equation 8, by one thread, into the lower triangle M; sums: 21 of H, then g.
+__device__ inline void damp(const double* sums, const double* t, double damping, double* M) {
+    const double x = t[0], y = t[1], z = t[2];
+#pragma unroll
+    for (int k = 0; k < 21; ++k) M[k] = sums[k];
+    // What a turn about the camera's centre is worth: the diagonal of equation 8a.
+    const double turn0 = M[9] + z * z * M[2] + y * y * M[5] +
+                         2.0 * (y * M[8] - z * M[7] - y * z * M[4]);
+    const double turn1 = M[14] + z * z * M[0] + x * x * M[5] +
+                         2.0 * (z * M[10] - x * M[12] - x * z * M[3]);
+    const double turn2 = M[20] + y * y * M[0] + x * x * M[2] +
+                         2.0 * (x * M[16] - y * M[15] - x * y * M[1]);
+    const double a = damping * M[0], b = damping * M[2], c = damping * M[5];
+    M[0] += a;
+    M[2] += b;
+    M[5] += c;
+    M[7] += b * z;
+    M[8] -= c * y;
+    M[10] -= a * z;
+    M[12] += c * x;
+    M[15] += a * y;
+    M[16] -= b * x;
+    M[9] += damping * turn0 + b * z * z + c * y * y;
+    M[14] += damping * turn1 + a * z * z + c * x * x;
+    M[20] += damping * turn2 + a * y * y + b * x * x;
+    M[13] -= c * x * y;
+    M[18] -= b * x * z;
+    M[19] -= a * y * z;
+}
+
 // Equation 8, by one warp: lane i < 6 holds row i of the unit-diagonal system and eliminates. The
 // pivots are the squares of Cholesky's diagonal, so the system is positive definite where they are
-// positive; false elsewhere. sums: 21 of H, then 6 of g. All lanes return component i (lane % 8 < 6).
-__device__ inline bool damped_step(const double* sums, double damping, double& component) {
+// positive; false elsewhere. sums: 21 of H, then 6 of g; M: scratch of 21. All lanes return
+// component i (lane % 8 < 6).
+__device__ inline bool damped_step(const double* sums, const double* t, double damping, double* M,
+                                   double& component) {
     const int i = min((int)threadIdx.x % 8, 5);
-    const double diagonal = sums[triangle(i, i)];
+    if (__ballot_sync(ALL, !(sums[triangle(i, i)] > 0.0))) return false;
+    if (threadIdx.x % WARP == 0) damp(sums, t, damping, M);
+    __syncwarp();
+    const double diagonal = M[triangle(i, i)];
     if (__ballot_sync(ALL, !(diagonal > 0.0))) return false;
     const double scale = 1.0 / sqrt(diagonal);
     double row[6], right = -sums[21 + i] * scale;
 #pragma unroll
     for (int j = 0; j < 6; ++j) {
-        const double entry = sums[i > j ? triangle(i, j) : triangle(j, i)];
-        row[j] = entry * scale * __shfl_sync(ALL, scale, j) + (i == j ? damping : 0.0);
+        const double entry = M[i > j ? triangle(i, j) : triangle(j, i)];
+        row[j] = entry * scale * __shfl_sync(ALL, scale, j);
     }
 #pragma unroll
     for (int k = 0; k < 6; ++k) {

@@ -34,7 +34,7 @@ template <int WARPS>
 struct RefineScratch {
     BlockScratch<WARPS> block;
     PoseF pose;  // the trial pose as the anchors need it
-    double R[9], t[3], R_trial[9], t_trial[3], best[27], step[6];
+    double R[9], t[3], R_trial[9], t_trial[3], best[27], step[6], damped[21];
     PriorScratch prior;
     double score, damping;
     int visible, go;
@@ -107,7 +107,8 @@ __device__ inline bool advance(const RefineArguments& a, int least, int iteratio
     if (better) accept(s, score);
     if (iteration == 0 && !(score < __longlong_as_double(0x7ff0000000000000LL))) return false;
     double component;
-    if (iteration == a.iterations || !damped_step(s.best, damping, component)) return false;
+    if (iteration == a.iterations || !damped_step(s.best, s.t, damping, s.damped, component))
+        return false;
     if (lane < 6) s.step[lane] = component;
     __syncwarp();
     if (lane == 0) {

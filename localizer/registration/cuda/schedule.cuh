@@ -52,7 +52,7 @@ extern "C" __global__ void __launch_bounds__(256) select_hypotheses(const Select
     if (first == 0) kept = finite = 0;
     for (int m = first; m < count; m += stride) {
         double total = a.from.scores[m];
-        if (a.motion->weight > 0.0 && total < infinity())
+        if (a.motion && a.motion->weight > 0.0 && total < infinity())
             total += a.motion->weight * best *
                      motion_distance(*a.motion, a.from.rotations + 9 * m,
                                      a.from.translations + 3 * m);
@@ -75,32 +75,30 @@ extern "C" __global__ void __launch_bounds__(256) select_hypotheses(const Select
     const int step = step_for(level.total, a.wanted), anchors = (level.total + step - 1) / step;
     const int every = max(1, anchors / PROBES) * step;
     const int probes = min(MAX_PROBES, (level.total + every - 1) / every);
-    if (a.distinct >= 0.0) {
-        for (int i = first; i < finite * probes; i += stride) {
-            const int rank = i / probes, probe = i % probes, m = a.order[rank];
-            Terms at;
-            const PoseF pose = pose_of(a.from.rotations + 9 * m, a.from.translations + 3 * m);
-            project(level, pose, probe * every, at);
-            a.projected[2 * MAX_PROBES * rank + 2 * probe] = at.u;
-            a.projected[2 * MAX_PROBES * rank + 2 * probe + 1] = at.v;
+    for (int i = first; i < finite * probes; i += stride) {
+        const int rank = i / probes, probe = i % probes, m = a.order[rank];
+        Terms at;
+        const PoseF pose = pose_of(a.from.rotations + 9 * m, a.from.translations + 3 * m);
+        project(level, pose, probe * every, at);
+        a.projected[2 * MAX_PROBES * rank + 2 * probe] = at.u;
+        a.projected[2 * MAX_PROBES * rank + 2 * probe + 1] = at.v;
+    }
+    __syncthreads();
+    const float limit = (float)(a.distinct * a.distinct) * (float)probes;
+    int survivors = 0;
+    for (int i = 0; i < finite && survivors < a.keep; ++i) {
+        if (!a.alive[i]) continue;  // the same for all threads: written before a barrier
+        ++survivors;
+        for (int j = i + 1 + first; j < finite; j += stride) {
+            float distance = 0.0f;
+            for (int k = 0; k < 2 * probes; ++k) {
+                const float d = a.projected[2 * MAX_PROBES * j + k] -
+                                a.projected[2 * MAX_PROBES * i + k];
+                distance += d * d;
+            }
+            if (!(distance > limit)) a.alive[j] = 0;
         }
         __syncthreads();
-        const float limit = (float)(a.distinct * a.distinct) * (float)probes;
-        int survivors = 0;
-        for (int i = 0; i < finite && survivors < a.keep; ++i) {
-            if (!a.alive[i]) continue;  // the same for all threads: written before a barrier
-            ++survivors;
-            for (int j = i + 1 + first; j < finite; j += stride) {
-                float distance = 0.0f;
-                for (int k = 0; k < 2 * probes; ++k) {
-                    const float d = a.projected[2 * MAX_PROBES * j + k] -
-                                    a.projected[2 * MAX_PROBES * i + k];
-                    distance += d * d;
-                }
-                if (!(distance > limit)) a.alive[j] = 0;
-            }
-            __syncthreads();
-        }
     }
     for (int i = first; i < finite; i += stride) {
         if (!a.alive[i]) continue;

@@ -269,18 +269,12 @@ def _steps(shape: _Shape, memory: FrameMemory, multiprocessors: int) -> Iterator
     keep = (*c.keep[: searched - 1], c.hypotheses)
     for k in range(searched):
         swarm, wanted = memory.swarms[source], c.swarm_anchors[k]
-        last = k == searched - 1 and c.converge == 0
-        target = 2 if last else 1 - source
+        target = 2 if k == searched - 1 else 1 - source
         if shape.constrained:
             yield from _weighing(shape, memory, k, swarm, alive, wanted)
         yield _refining(shape, memory, k, swarm, alive, wanted, c.settings, c.iterations[k])
-        yield _selecting(shape, memory, k, source, target, keep[k], c.distinct_px)
+        yield _selecting(shape, memory, k, source, target, keep[k])
         alive, source = min(alive, keep[k]), target
-    if c.converge:
-        k, wanted = searched - 1, c.swarm_anchors[-1]
-        swarm = memory.swarms[source]
-        yield _refining(shape, memory, k, swarm, alive, wanted, c.settings, c.converge)
-        yield _selecting(shape, memory, k, source, 2, alive, -1.0)
     yield from _sharpening(shape, memory)
 
 
@@ -302,7 +296,9 @@ def _sharpening(shape: _Shape, memory: FrameMemory) -> Iterator[_Step]:
         median["level"], median["wanted"] = memory.level(k), wanted
         yield _Step("median_residual", k, 1, _FEW_THREADS, median)
         for factor in scales[k - searched + 1]:
-            settings = replace(c.settings, scale=LEAST_SCALE, redescending=True)
+            settings = replace(
+                c.settings, scale=LEAST_SCALE, redescending=True, damping=c.sharpen_damping
+            )
             yield _refining(
                 shape, memory, k, winner, 1, anchors, settings, c.sharpen, factor=factor
             )
@@ -362,15 +358,16 @@ def _selecting(
     source: int,
     target: int,
     keep: int,
-    distinct_px: float,
 ) -> _Step:
+    """Order and prune; the prediction has a say in the last order only."""
+    last = level == len(shape.config.iterations) - 1
     arguments = np.zeros((), dtype=layout.SELECT)
     arguments["level"], arguments["state"] = memory.level(level), memory.state
-    arguments["motion"] = memory.motion
+    arguments["motion"] = memory.motion if last else 0
     arguments["source"], arguments["target"] = memory.swarms[source], memory.swarms[target]
     arguments["totals"], arguments["order"] = memory.totals, memory.order
     arguments["alive"], arguments["projected"] = memory.alive, memory.projected
-    arguments["distinct"], arguments["least_score"] = distinct_px, LEAST_SCORE
+    arguments["distinct"], arguments["least_score"] = shape.config.distinct_px, LEAST_SCORE
     arguments["wanted"], arguments["keep"] = shape.config.swarm_anchors[level], keep
     return _Step("select_hypotheses", level, 1, _SMALL_THREADS, arguments)
 

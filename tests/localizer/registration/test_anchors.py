@@ -73,19 +73,6 @@ def test_a_steep_plane_is_no_depth_edge(camera, scene, reference):
     assert top < horizon + 8
 
 
-def test_confident_and_textured_places_are_preferred(reference):
-    view, pyramid = reference
-    levels = []
-    for level in pyramid.levels:
-        confidence = level.confidence.copy()
-        confidence[:, ::2] *= 0.02
-        levels.append(replace(level, confidence=confidence))
-    fine = levels[-1]
-    anchors = select_anchors(view, replace(pyramid, levels=(*pyramid.levels[:2], fine)))
-    column = (anchors.pixels[:, 0] / fine.stride).astype(int)
-    assert np.mean(column % 2 == 1) > 0.65
-
-
 def test_deterministic_by_seed(reference):
     a, b, c = (select_anchors(*reference, count=100, seed=s) for s in (4, 4, 5))
     np.testing.assert_array_equal(a.pixels, b.pixels)

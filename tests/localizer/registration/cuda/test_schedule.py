@@ -55,7 +55,7 @@ def check(device, cpu, metres=3e-3, degrees=3e-3, rtol=0.02):
     "changes",
     [
         {},
-        {"converge": 0},
+        {"iterations": (3, 1, 2)},
         {"sharpen": 0},
         {"hypotheses": 1, "keep": (1, 1)},
         {"keep": (16, 16), "distinct_px": 0.02},
@@ -88,6 +88,18 @@ def test_agrees_with_a_prediction_and_a_constraint(registered, scene, prior):
         assert expected.world_from_camera.distance_to(plain.world_from_camera)[0] > 1e-4 or (
             "constraint" not in extra
         )
+
+
+def test_the_prediction_does_not_prune(registered, scene, prior):
+    """One survivor a level, and a prediction that would rather keep a hypothesis that is worse."""
+    config = CONFIG.model_copy(update={"keep": (1, 1), "motion_weight": 100.0})
+    about = prior(scene.reference, 1.0, 3.0)
+    arguments = (scene.query, scene.camera, scene.anchors, about)
+    far = replace(scene.true, rotation=so3_exp([0.0, 0.1, 0.0]) @ scene.true.rotation)
+    motion = PosePrior(far, np.diag([0.5] * 3 + [1e-4] * 3), 0)
+    found, plain = registered(config)(*arguments, motion=motion), registered(config)(*arguments)
+    check(found, JNGO(config).register(*arguments, motion=motion))
+    np.testing.assert_array_equal(found.world_from_camera.matrix, plain.world_from_camera.matrix)
 
 
 def with_detail(pyramid, channels=4):
