@@ -27,6 +27,9 @@ class Stand:
         self._session, self._name, self._fails = session, name, fails
         self.sizes: list[tuple[int, ...]] = []
 
+    def __getattr__(self, name: str) -> object:
+        return getattr(self._session, name)
+
     def get_providers(self) -> list[str]:
         return [self._name, "CPUExecutionProvider"]
 
