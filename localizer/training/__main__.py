@@ -14,8 +14,7 @@ import typer
 
 from localizer.errors import LocalizerError
 from localizer.training.config import LiveSection, TrainConfig, load_config
-from localizer.training.shards import write_shards, write_world_shards
-from localizer.training.worlds import FIRST_SEED
+from localizer.training.shards import FIRST_WORLD_SEED, write_shards, write_world_shards
 
 app = typer.Typer(
     help=__doc__, no_args_is_help=True, add_completion=False, pretty_exceptions_enable=False
@@ -160,7 +159,7 @@ def _generate(config: TrainConfig) -> None:
     photos, scenes = photo_source(data), scene_config(data)
     first = range(data.first_seed, data.first_seed + min(data.initial_scenes, data.scenes))
     rest = range(first.stop, data.first_seed + data.scenes)
-    worlds = range(FIRST_SEED, FIRST_SEED + data.worlds)
+    worlds = range(FIRST_WORLD_SEED, FIRST_WORLD_SEED + data.worlds)
     for path in chain(
         write_shards(data.shards, first, scenes, photos, data.workers),
         write_world_shards(data.shards, worlds, scenes),

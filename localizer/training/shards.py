@@ -20,8 +20,8 @@ from localizer.errors import SequenceError
 from localizer.pose import Pose
 from localizer.training.land import PhotoLibrary
 from localizer.training.pairs import Pair, SceneConfig, scene_pairs
-from localizer.training.worlds import world_pairs
 
+FIRST_WORLD_SEED = 1000  # seeds below belong to demos and tests
 WORLD_SHARDS = 8  # per mesh world
 WORLD_SHARD_PAIRS = 10
 
@@ -60,6 +60,9 @@ def write_shards(
 
 def write_world_shards(out: Path, seeds: range, scenes: SceneConfig) -> Iterator[Path]:
     """Generate the mesh worlds of `seeds` whose shards are not all on disk yet."""
+    # The map's importers (GDAL, pyproj, trimesh) are not needed on a machine that only trains.
+    from localizer.training.worlds import world_pairs
+
     for seed in seeds:
         paths = world_shard_paths(out, seed)
         if all(path.exists() for path in paths):

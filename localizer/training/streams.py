@@ -10,8 +10,12 @@ from localizer.training.data import LoaderConfig, Schedule, ShardStream
 from localizer.training.distributed import Workers
 from localizer.training.live import LivePlan, LiveStream
 from localizer.training.pairs import SceneConfig
-from localizer.training.shards import PhotoSource, shard_path, world_shard_paths
-from localizer.training.worlds import FIRST_SEED
+from localizer.training.shards import (
+    FIRST_WORLD_SEED,
+    PhotoSource,
+    shard_path,
+    world_shard_paths,
+)
 
 
 def open_stream(
@@ -32,7 +36,7 @@ def open_stream(
 def schedule(data: DataSection) -> Schedule:
     """The shards of a run."""
     seeds = range(data.first_seed, data.first_seed + data.scenes)
-    worlds = range(FIRST_SEED, FIRST_SEED + data.worlds)
+    worlds = range(FIRST_WORLD_SEED, FIRST_WORLD_SEED + data.worlds)
     return Schedule(
         tuple(shard_path(data.shards, seed) for seed in seeds),
         data.initial_scenes,

@@ -1,7 +1,7 @@
 """Pairs from generated mesh worlds, rendered by the product's own renderer from its own tile cache.
 
 They look like what the localizer flies over: tiles at several levels of detail, textured meshes,
-facades. Seeds below 1000 belong to demos and tests and are never used here.
+facades. Seeds below `FIRST_WORLD_SEED` belong to demos and tests and are never used here.
 """
 
 from __future__ import annotations
@@ -29,16 +29,15 @@ from localizer.training.pairs import (
     moved,
 )
 from localizer.training.revisit import coarser, draw_texel
-
-FIRST_SEED = 1000
+from localizer.training.shards import FIRST_WORLD_SEED
 
 
 def world_pairs(
     seed: int, scenes: SceneConfig, *, count: int, size_m: float = 800.0, visits: int = 2
 ) -> Iterator[Pair]:
     """`count` pairs of the world of `seed`: surveyed once, seen again on other days."""
-    if seed < FIRST_SEED:
-        raise MapSourceError(f"training worlds have seeds from {FIRST_SEED} on, got {seed}")
+    if seed < FIRST_WORLD_SEED:
+        raise MapSourceError(f"training worlds have seeds from {FIRST_WORLD_SEED} on, got {seed}")
     rng = np.random.default_rng((seed, 7))
     with tempfile.TemporaryDirectory() as temporary, ExitStack() as stack:
         root = Path(temporary)
