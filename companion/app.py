@@ -11,6 +11,7 @@ import logging
 import sys
 import threading
 from contextlib import ExitStack
+from pathlib import Path
 
 import numpy as np
 
@@ -19,7 +20,7 @@ from companion.config import CompanionConfig
 from companion.detections import Detection, DetectionListener
 from companion.fixes import camera_rotation, vehicle_prior, vision_fix
 from companion.health import HealthMonitor
-from companion.recorder import Recorder, fresh_folder, write_manifest
+from companion.recorder import Recorder, fresh_folder, remove_empty, write_manifest
 from companion.sources import StreamState, open_source
 from companion.target_reporter import Target, TargetReporter
 from companion.view_reporter import ViewReporter
@@ -45,6 +46,7 @@ class Companion:
         self._config = config
         self._stop = threading.Event()
         self._is_up = False
+        self._record_folder: Path | None = None
 
     def run(self) -> None:
         """Fly until stopped. Raises what ended the feed, after everything is shut down.
@@ -56,9 +58,12 @@ class Companion:
         with ExitStack() as up:
             try:
                 self._build(self._config, up)
-            except Exception:
-                if self._stop.is_set():  # an interrupted compiler raises errors of its own
-                    raise KeyboardInterrupt from None
+            except BaseException as error:
+                up.close()
+                if self._record_folder is not None:
+                    remove_empty(self._record_folder)
+                if isinstance(error, Exception) and self._stop.is_set():
+                    raise KeyboardInterrupt from None  # an interrupted compiler raises its own
                 raise
             # What the imports and compilers left is never garbage: searching it for garbage would
             # stop every thread for a tenth of a second now and then.
@@ -88,6 +93,7 @@ class Companion:
         record = config.record
         if record is not None:
             record = record.model_copy(update={"folder": fresh_folder(record.folder)})
+            self._record_folder = record.folder
         self._recorder = Recorder(record, self._frame) if record else None
         if record is not None and self._recorder is not None:
             up.callback(self._recorder.close)
@@ -104,6 +110,7 @@ class Companion:
         self._source = open_source(
             config.camera.source, self._camera, config.camera.settings, self._on_feed_state
         )
+        _log.info("making the localizer ready; the first start on a machine compiles its kernels")
         localizer = build_localizer(self._stack, self._camera, config.localizer, self._rotation_at)
         self._engine = DualThreadEngine(localizer, (self._on_estimate,), self._vehicle_prior)
         self._targets = TargetReporter(config.targets, self._cast_ray, self._on_target)

@@ -5,11 +5,11 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Annotated, Any
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator
+from pydantic import BaseModel, ConfigDict, Field, field_validator
 
 from companion.detections import parse_host_port
 from companion.errors import ConfigError
-from companion.settings_file import problems, read_settings
+from companion.settings_file import SettingsError, read_settings, validated
 from companion.sources.base import SourceSettings
 from localizer.camera import Camera
 from localizer.config import LocalizerConfig
@@ -109,11 +109,11 @@ def load_config(path: Path) -> CompanionConfig:
 def parse_config(data: dict[str, Any], where: str) -> CompanionConfig:
     """Check a configuration given as plain data; `where` names it in errors."""
     try:
-        config = CompanionConfig.model_validate(data)
+        config = validated(CompanionConfig, data)
         config.camera.model.camera()
-    except ValidationError as error:
-        lines = problems(error)
-        raise ConfigError(f"{where}: {len(lines)} problem(s)\n" + "\n".join(lines)) from error
+    except SettingsError as error:
+        count = len(str(error).splitlines())
+        raise ConfigError(f"{where}: {count} problem(s)\n{error}") from error
     except CameraError as error:
         raise ConfigError(f"{where}: camera.model: {error}") from error
     return config

@@ -50,7 +50,8 @@ def _check_map(config: CompanionConfig) -> tuple[TileCache | None, list[Finding]
     m = cache.manifest
     origin = m.origin
     found = (
-        f"{m.tiles} tiles, {m.gsd_m:.2f} m/px, {_extent_km(m.extent, cache.frame):.2f} km across"
+        f"{m.tiles} tiles, {m.gsd_m:.2f} m/px, "
+        f"{_extent_km(m.extent, cache.frame):.2f} km from corner to corner"
     )
     where = f"about {origin.latitude_deg:.5f} {origin.longitude_deg:.5f}; `companion map verify`"
     return cache, [Finding("map", found, "a tile cache", where, True, True)]

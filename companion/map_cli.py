@@ -114,7 +114,11 @@ def info(cache: CachePath) -> None:
 
 @app.command("verify")
 def verify(cache: CachePath) -> None:
-    """Check every tile's hash and look for holes in the surface; exit 1 when a tile is damaged."""
+    """Check every tile's hash and look for holes in the surface; exit 1 when a tile is damaged.
+
+    Holes may be in the source, as under a bridge's parapet or at a ragged edge: they are listed,
+    and do not count as damage.
+    """
     from localizer.map.cache import TileCache
     from localizer.map.inspect import verify as check
 

@@ -16,6 +16,8 @@ from localizer.types import Image
 
 mpl.use("Agg")
 
+TRACK_STYLES = ((7.0, "white"), (3.5, "tab:orange"), (1.2, "black"))  # points; innermost last
+
 
 def checkerboard(video: Image, render: Image, cells: int = 8) -> Image:
     """Video and render, both (H, W, 3), in alternating cells: edges run on where poses are right.
@@ -60,15 +62,18 @@ def plot_tracks(
     background: MapPicture | None,
     marks: Mapping[str, Array],
 ) -> None:
-    """Tracks (N, 2+) in ENU metres and named marks (2+,) over the map."""
+    """Tracks (N, 2+) in ENU metres and named marks (2+,) over the map.
+
+    Each is thinner than the one before: tracks that coincide are seen, one inside the other.
+    """
     figure = Figure(figsize=(9, 9), layout="constrained")
     axes = figure.add_subplot()
     if background is not None:
         b = background
         axes.imshow(b.rgb, extent=(b.west, b.east, b.south, b.north), alpha=0.75)
-    styles = ("-", "--", ":", "-.")
-    for (name, track), style in zip(tracks.items(), styles, strict=False):
-        axes.plot(track[:, 0], track[:, 1], style, linewidth=1.8, label=name)
+    for i, (name, track) in enumerate(tracks.items()):
+        width, colour = TRACK_STYLES[min(i, len(TRACK_STYLES) - 1)]
+        axes.plot(track[:, 0], track[:, 1], color=colour, linewidth=width, label=name)
     for name, mark in marks.items():
         axes.plot(mark[0], mark[1], "k+", markersize=9)
         axes.annotate(name, (mark[0], mark[1]), textcoords="offset points", xytext=(5, 5))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import csv
 import json
 import logging
@@ -49,6 +50,18 @@ def fresh_folder(folder: Path) -> Path:
         candidate = folder.with_name(f"{folder.name}-{number}")
         number += 1
     return candidate
+
+
+def remove_empty(folder: Path) -> None:
+    """Remove the record of a start that failed: nothing but column names stands in it."""
+    names = {"estimates.csv": 1, "targets.csv": 1, "events.csv": 1}
+    with contextlib.suppress(OSError):
+        if any(len((folder / n).read_text().splitlines()) > most for n, most in names.items()):
+            return
+        for name in (*names, MANIFEST_NAME):
+            (folder / name).unlink(missing_ok=True)
+        (folder / "snapshots").rmdir()
+        folder.rmdir()  # it stays if anything else is in it
 
 
 def write_manifest(folder: Path, config: CompanionConfig) -> None:

@@ -2,11 +2,18 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Iterator
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import yaml
-from pydantic import ValidationError
+from pydantic import BaseModel, ValidationError
+
+_ModelT = TypeVar("_ModelT", bound=BaseModel)
+
+
+class SettingsError(ValueError):
+    """Settings that do not fit their model; its text has a line for each that is wrong."""
 
 
 def read_settings(path: Path, error_type: type[Exception]) -> dict[str, Any]:
@@ -25,12 +32,36 @@ def read_settings(path: Path, error_type: type[Exception]) -> dict[str, Any]:
     return data
 
 
-def problems(error: ValidationError) -> list[str]:
-    """One line for each setting that is wrong: where, what, and what was given."""
-    return [
-        f"  {'.'.join(str(p) for p in e['loc'])}: {e['msg']} (got {_short(e['input'])})"
-        for e in error.errors()
-    ]
+def validated(model: type[_ModelT], data: dict[str, Any]) -> _ModelT:
+    """The settings as their model; SettingsError lists where, what, and what was given."""
+    try:
+        settings = model.model_validate(data)
+    except ValidationError as error:
+        lines = [_line(e["loc"], e["msg"], e["input"]) for e in error.errors()]
+        raise SettingsError("\n".join(lines)) from error
+    # YAML's yes, on and true would else be the number 1.
+    if lines := [_line(where, "Input should not be a boolean", value)
+                 for where, value in _misread(data, settings)]:  # fmt: skip
+        raise SettingsError("\n".join(lines))
+    return settings
+
+
+def _misread(given: Any, taken: Any, where: tuple[str | int, ...] = ()) -> Iterator[Any]:
+    """(where, value) of the booleans that the model took for something else."""
+    if isinstance(given, bool):
+        if not isinstance(taken, bool):
+            yield where, given
+    elif isinstance(given, dict):
+        for name, value in given.items():
+            inner = taken.get(name) if isinstance(taken, dict) else getattr(taken, name, value)
+            yield from _misread(value, inner, (*where, name))
+    elif isinstance(given, list) and isinstance(taken, list | tuple):
+        for i, (value, inner) in enumerate(zip(given, taken, strict=False)):
+            yield from _misread(value, inner, (*where, i))
+
+
+def _line(where: Iterable[str | int], what: str, given: object) -> str:
+    return f"  {'.'.join(str(p) for p in where)}: {what} (got {_short(given)})"
 
 
 def _short(value: object) -> str:

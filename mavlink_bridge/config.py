@@ -67,7 +67,7 @@ class InjectionConfig(_Model):
         default=100.0,
         ge=0.0,
         le=250.0,
-        description="age at which a fix is sent: VISO_DELAY_MS or GPS1_DELAY_MS",
+        description="age at which a fix is sent: VISO_DELAY_MS or GPSn_DELAY_MS, n = gps_id + 1",
     )
     sigma_floor_m: float = Field(default=0.1, gt=0.0, le=100.0)
     max_sigma_m: float = Field(

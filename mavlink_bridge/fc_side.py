@@ -329,8 +329,9 @@ class FlightControllerSide(Side):
         latency, delay = self.injector.latency_ms, self.config.injection.delay_ms
         if not self.injector.latency_is_known:
             return ""
-        gps = self.config.injection.message == "gps_input"
-        name = profile.gps_delay_parameter if gps else profile.delay_parameter
+        injection, name = self.config.injection, profile.delay_parameter
+        if injection.message == "gps_input":
+            name = profile.gps_delay_parameter.format(n=injection.gps_id + 1)
         told = self._told.get("latency", "")
         late = f"fixes are {latency:.0f} ms old: raise delay_ms ({delay:.0f}) and {name}"
         over = f"fixes are {latency:.0f} ms old, over the {profile.max_delay_ms:.0f} ms of {name}"

@@ -1,7 +1,7 @@
 """From vision fixes to the messages that a flight controller fuses.
 
 Timing. A fix is sent when its age reaches `delay_ms`, the value that ArduPilot is told
-(VISO_DELAY_MS, GPS1_DELAY_MS), so the least latency it sees is exactly that; a late fix goes out at
+(VISO_DELAY_MS, GPSn_DELAY_MS), so the least latency it sees is exactly that; a late fix goes out at
 once with its own exposure time, and the jitter is removed by the flight controller. PX4 maps the
 exposure time by TIMESYNC and needs no such value.
 Between fixes, and for fixes older than it can fuse, the newest fix is propagated to ``now -

@@ -34,7 +34,7 @@ class FirmwareProfile:
     messages: tuple[InjectionMessage, ...]
     odometry_frame: int
     delay_parameter: str
-    gps_delay_parameter: str
+    gps_delay_parameter: str  # {n}: the receiver, gps_id + 1
     known: bool = True
 
 
@@ -52,7 +52,7 @@ ARDUPILOT = FirmwareProfile(
     messages=_ARDUPILOT_MESSAGES,
     odometry_frame=mavlink.MAV_FRAME_LOCAL_FRD,
     delay_parameter="VISO_DELAY_MS",
-    gps_delay_parameter="GPS1_DELAY_MS",
+    gps_delay_parameter="GPS{n}_DELAY_MS",
 )
 # Pull request 32084 (merged February 2026) replaced the cube root.
 ARDUPILOT_SQRT = FirmwareProfile(
@@ -63,7 +63,7 @@ ARDUPILOT_SQRT = FirmwareProfile(
     messages=_ARDUPILOT_MESSAGES,
     odometry_frame=mavlink.MAV_FRAME_LOCAL_FRD,
     delay_parameter="VISO_DELAY_MS",
-    gps_delay_parameter="GPS1_DELAY_MS",
+    gps_delay_parameter="GPS{n}_DELAY_MS",
 )
 PX4 = FirmwareProfile(
     name="PX4 1.15+",
@@ -84,7 +84,7 @@ GENERIC = FirmwareProfile(
     messages=("vision_position_estimate",),
     odometry_frame=mavlink.MAV_FRAME_LOCAL_FRD,
     delay_parameter="VISO_DELAY_MS",
-    gps_delay_parameter="GPS1_DELAY_MS",
+    gps_delay_parameter="GPS{n}_DELAY_MS",
     known=False,
 )
 

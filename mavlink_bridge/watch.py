@@ -27,18 +27,20 @@ class VehicleWatch:
     def __init__(self, say: Callable[[int, str], None]) -> None:
         self._say = say
         self._lock = threading.Lock()
-        self._begun_ns = monotonic_ns()
+        # Of the first tick: an application may compile for minutes before it starts the bridge.
+        self._begun_ns: int | None = None
         self._known = "nothing"
 
     def check(self, state: VehicleState) -> None:
         """Tell what changed since the last call."""
+        now_ns = monotonic_ns()
         with self._lock:
-            before = self._known
+            before, self._begun_ns = self._known, self._begun_ns or now_ns
             if state.connected:
                 self._known = "there"
             elif before == "there":
                 self._known = "lost"
-            elif before == "nothing" and monotonic_ns() - self._begun_ns > _PATIENCE_NS:
+            elif before == "nothing" and now_ns - self._begun_ns > _PATIENCE_NS:
                 self._known = "silent"
             if self._known == before:
                 return

@@ -12,7 +12,6 @@ from typing import Annotated, get_args
 import typer
 from rich.console import Console
 from rich.markup import escape
-from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 
 from companion.errors import CompanionError
 from localizer.errors import LocalizerError
@@ -22,6 +21,7 @@ from sitl.errors import SimulationError
 from sitl.flight import fly
 from sitl.kinematic import record_scenario
 from sitl.process import VehicleKind as FlownKind
+from sitl.progress import shown_progress
 from sitl.report import make_report, print_report
 from sitl.scenario import (
     Injection,
@@ -81,13 +81,8 @@ def demo(
     assets = prepare(seed, worlds, lambda text: console.print(f"[dim]{text}[/]"))
     check_inside(script, assets.world.size_m)
     _clear(out)
-    columns = (TextColumn("{task.description}"), BarColumn(), TimeElapsedColumn())
-    with Progress(*columns, console=console) as bar:
-        task = bar.add_task("", total=1.0)
-        record = fly(
-            assets, script, kinds[fc], seed, out,
-            lambda phase, share: bar.update(task, description=phase, completed=share),
-        )  # fmt: skip
+    with shown_progress(console) as progress:
+        record = fly(assets, script, kinds[fc], seed, out, progress)
     print_report(make_report(record, script, seed), out)
 
 

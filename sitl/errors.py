@@ -9,3 +9,7 @@ class SimulationError(Exception):
 
 class WorldCameraError(SimulationError):
     """A world camera that could not start, or whose process died."""
+
+
+class PilotError(SimulationError):
+    """The vehicle refused, or did not do in time, what the pilot asked."""

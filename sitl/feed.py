@@ -22,7 +22,8 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 from mavlink_bridge import Bridge, VisionFix
 from sitl.embedded.geodesy import Location
 from sitl.embedded.rotation import matrix, quaternion
-from sitl.pilot import Pilot, Truth
+from sitl.pilot import Pilot
+from sitl.tracks import Truth
 
 _COMPONENT = 197
 _GPS_EPOCH_S = 1.4e9  # an arbitrary GPS time at boot

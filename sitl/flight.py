@@ -34,8 +34,9 @@ from sitl.detector import Observed
 from sitl.embedded.geodesy import Location
 from sitl.errors import SimulationError
 from sitl.gimbal_error import GimbalError
+from sitl.mission_steps import MissionStep, gimbal_step, speed_step, waypoint_step
 from sitl.moving import Mover
-from sitl.pilot import MissionStep, Pilot, gimbal_step, speed_step, waypoint_step
+from sitl.pilot import Pilot
 from sitl.process import VehicleProcess
 from sitl.scenario import Scenario, VehicleKind
 from sitl.targets import observed_targets
@@ -220,6 +221,7 @@ class _Run:
                     f"the companion is not up after {_COMPANION_START_S:.0f} s; "
                     f"{self._folder / 'companion.log'}"
                 )
+            self._progress("starting the companion", 0.0)
             time.sleep(0.2)
 
     def _tracking(self) -> bool:

@@ -49,6 +49,7 @@ class VehicleProcess(ABC):
         self.log_path = self.folder / "vehicle.log"
         self._instance = -1
         self._process: subprocess.Popen[bytes] | None = None
+        self._lifeline: subprocess.Popen[bytes] | None = None
 
     @abstractmethod
     def command(self, instance: int) -> list[str]:
@@ -129,6 +130,7 @@ class VehicleProcess(ABC):
                 )
             except OSError as error:
                 raise VehicleProcessError(f"cannot run {command[0]}: {error}") from error
+        self._lifeline = _end_with_us(self._process.pid)
 
     def _wait_listening(self) -> bool:
         deadline = time.monotonic() + self.start_timeout_s
@@ -170,6 +172,10 @@ class VehicleProcess(ABC):
             shutil.rmtree(self.folder, ignore_errors=True)
 
     def _end(self) -> None:
+        if self._lifeline is not None:  # first: later its number may be another process's
+            self._lifeline.kill()
+            self._lifeline.communicate()
+            self._lifeline = None
         if self._process is None:
             return
         with contextlib.suppress(ProcessLookupError):
@@ -201,6 +207,20 @@ def write_parameters(path: Path, parameters: dict[str, float]) -> None:
     """An ArduPilot .parm file."""
     lines = [f"{name} {value:.9g}\n" for name, value in parameters.items()]
     path.write_text("".join(lines), encoding="utf-8")
+
+
+def _end_with_us(pid: int) -> subprocess.Popen[bytes]:
+    """A shell that ends the process once we are gone, however that came: its input ends then.
+
+    A parent-death signal would come with the end of the thread that started the process.
+    """
+    return subprocess.Popen(
+        ["/bin/sh", "-c", f"read -r _; kill {pid}"],
+        stdin=subprocess.PIPE,
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.DEVNULL,
+        start_new_session=True,
+    )
 
 
 def _search_path() -> str:

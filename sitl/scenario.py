@@ -5,9 +5,9 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Literal
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic import BaseModel, ConfigDict, Field
 
-from companion.settings_file import problems, read_settings
+from companion.settings_file import SettingsError, read_settings, validated
 from localizer.camera import Camera
 from sitl.errors import SimulationError
 
@@ -80,9 +80,9 @@ class Scenario(_Model):
 def load_scenario(path: Path) -> Scenario:
     """Read a scenario file; unknown keys and bad values are named."""
     try:
-        return Scenario.model_validate(read_settings(path, ScenarioError))
-    except ValidationError as error:
-        raise ScenarioError("\n".join([f"{path}:", *problems(error)])) from error
+        return validated(Scenario, read_settings(path, ScenarioError))
+    except SettingsError as error:
+        raise ScenarioError(f"{path}:\n{error}") from error
 
 
 def check_inside(scenario: Scenario, size_m: float) -> None:

@@ -183,6 +183,12 @@ class OnnxExtractor:
             raise ModelError(
                 f"{model}: does not run on a {width}x{height} image: {error}"
             ) from error
+        given = len(session.get_outputs())
+        if given != len(self._outputs):
+            raise ModelError(
+                f"{model}: the graph has {given} outputs, its description names "
+                f"{len(self.info.levels)} levels of features and confidence"
+            )
         for level, expected in zip(levels, self.info.levels, strict=True):
             shape = (height // expected.stride, width // expected.stride, expected.channels)
             if level.features.shape != shape or level.confidence.shape != shape[:2]:

@@ -57,6 +57,7 @@ def main(argv: list[str] | None = None) -> int:
         parameters.set("SIM_SPEEDUP", arguments.speedup)
         system_id = int(parameters["SYSID_THISMAV"])
         ports = tuple(arguments.port + offset for offset in SERIAL_OFFSETS)
+        print("compiling kernels, if this is the first start; the ports open then", flush=True)
         _compile(home)
         while True:
             _run(home, heading_deg, parameters, MavlinkServer(ports, system_id), arguments.seed)

@@ -4,17 +4,16 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from math import isnan, radians
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
+from sitl.embedded.aircraft import Aircraft
 from sitl.embedded.geodesy import Location
 from sitl.embedded.mavlink_server import Link
 from sitl.embedded.modes import Mode, RcInput
 from sitl.embedded.parameters import type_of
-
-if TYPE_CHECKING:
-    from sitl.embedded.vehicle import Vehicle
+from sitl.embedded.telemetry import Telemetry
 
 ACCEPTED, TEMPORARILY_REJECTED, DENIED, UNSUPPORTED, FAILED = 0, 1, 2, 3, 4  # MAV_RESULT
 _FORCE_ARM = 21196.0
@@ -33,8 +32,8 @@ CommandHandler = Callable[[Link, Any], int]
 class Commands:
     """Dispatch of incoming messages and commands."""
 
-    def __init__(self, vehicle: Vehicle) -> None:
-        self._vehicle = vehicle
+    def __init__(self, vehicle: Aircraft, telemetry: Telemetry) -> None:
+        self._vehicle, self._telemetry = vehicle, telemetry
         self._rc8: int | None = None
         self._messages: dict[str, Handler] = {
             "COMMAND_LONG": self._command,
@@ -149,7 +148,7 @@ class Commands:
 
     def _set_interval(self, link: Link, command: Any) -> int:
         message_id, interval_us = int(command.param1), command.param2
-        if not self._vehicle.telemetry.knows(message_id):
+        if not self._telemetry.knows(message_id):
             return FAILED
         if interval_us < 0:
             link.set_interval(message_id, None)
@@ -158,11 +157,11 @@ class Commands:
         return ACCEPTED
 
     def _request_message(self, link: Link, command: Any) -> int:
-        sent = self._vehicle.telemetry.send(link, int(command.param1))
+        sent = self._telemetry.send(link, int(command.param1))
         return ACCEPTED if sent else FAILED
 
     def _request_version(self, link: Link, _command: Any) -> int:
-        self._vehicle.telemetry.send(link, mavlink.MAVLINK_MSG_ID_AUTOPILOT_VERSION)
+        self._telemetry.send(link, mavlink.MAVLINK_MSG_ID_AUTOPILOT_VERSION)
         return ACCEPTED
 
     # --- navigation --------------------------------------------------------------------------

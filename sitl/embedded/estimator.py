@@ -10,17 +10,25 @@ from __future__ import annotations
 
 import heapq
 from collections.abc import Callable
-from dataclasses import dataclass, field
 from enum import IntEnum, IntFlag
 from itertools import count
-from math import hypot, isfinite, radians, sqrt
+from math import isfinite, radians, sqrt
 
 import numpy as np
 
 from sitl.embedded import navigation as nav
+from sitl.embedded.gated_filter import GatedFilter
 from sitl.embedded.geodesy import Location, north_east
+from sitl.embedded.measurements import (
+    Baro,
+    Compass,
+    ExternalPosition,
+    ExternalVelocity,
+    GpsData,
+    Measurement,
+)
 from sitl.embedded.parameters import Parameters
-from sitl.embedded.rotation import Array, euler, rotate_world, wrap_pi
+from sitl.embedded.rotation import Array
 
 _MAX_HORIZON_MS = 250
 _BASE_HORIZON_MS = 110
@@ -62,123 +70,29 @@ class EkfFlags(IntFlag):
     GPS_GLITCHING = 32768
 
 
-@dataclass(frozen=True)
-class GpsData:
-    """A GNSS solution for the filter. velocity: NED m/s; None where the receiver gives none."""
+class Estimator(GatedFilter):
+    """The vehicle's navigation filter. `notify(severity, text)` sends a STATUSTEXT.
 
-    latitude_deg: float
-    longitude_deg: float
-    altitude_m: float
-    horizontal_velocity: tuple[float, float] | None
-    vertical_velocity: float | None
-    horizontal_accuracy: float
-    speed_accuracy: float
-    satellites: int
-    hdop: float
-    yaw_rad: float | None = None
+    output: the nominal state (16,) at the present, see `navigation`.
+    """
 
-
-@dataclass(frozen=True)
-class ExternalPosition:
-    """A position from the companion: NED metres about the EKF origin, sigma in metres."""
-
-    position: tuple[float, float, float]
-    sigma: float
-    yaw_rad: float | None
-    yaw_sigma: float
-    reset: bool
-
-
-@dataclass(frozen=True)
-class ExternalVelocity:
-    """A velocity from the companion: NED m/s."""
-
-    velocity: tuple[float, float, float]
-    sigma: float
-
-
-@dataclass(frozen=True)
-class Baro:
-    """Height above the home plane in metres."""
-
-    height: float
-
-
-@dataclass(frozen=True)
-class Compass:
-    """Heading from true north in radians."""
-
-    yaw: float
-
-
-Measurement = GpsData | ExternalPosition | ExternalVelocity | Baro | Compass
-
-
-@dataclass
-class TestRatios:
-    """Squared innovation over gate; 1 is the limit."""
-
-    velocity: float = 0.0
-    position: float = 0.0
-    height: float = 0.0
-    yaw: float = 0.0
-
-
-@dataclass
-class _Clock:
-    """When things last happened, in ms since boot; None is never."""
-
-    position_pass: int = -1_000_000
-    velocity_pass: int = -1_000_000
-    gps_received: int = -1_000_000
-    gps_bad: int = 0
-    external_stamp: int = -1_000_000
-    external_velocity_stamp: int = -1_000_000
-    external_received: int = -1_000_000
-    innovation_pass: int = 0
-    innovation_fail: int = -1_000_000
-
-
-@dataclass
-class Estimator:
-    """The vehicle's navigation filter. `notify(severity, text)` sends a STATUSTEXT."""
-
-    parameters: Parameters
-    notify: Callable[[int, str], None]
-    output: Array = field(default_factory=lambda: np.zeros(nav.NOMINAL_SIZE))
-    origin: Location | None = None
-    aiding: Aiding = Aiding.NONE
-    source_set: int = 1
-    ratios: TestRatios = field(default_factory=TestRatios)
-    armed: bool = False
-    position_reset_ne: tuple[float, float] = (0.0, 0.0)
-    position_resets: int = 0
-
-    def __post_init__(self) -> None:
-        self._state = np.zeros(nav.NOMINAL_SIZE)
-        self._state[nav.Q] = 1.0
-        self.output[nav.Q] = 1.0
-        self._cov = np.diag(
-            np.repeat([0.02**2, 0.5**2, 0.5**2, 0.005**2, 0.05**2], 3).astype(np.float64)
-        )
+    def __init__(self, parameters: Parameters, notify: Callable[[int, str], None]) -> None:
+        super().__init__(parameters)
+        self.notify = notify
+        self.output: Array = self._state.copy()
+        self.origin: Location | None = None
+        self.aiding = Aiding.NONE
+        self.source_set = 1
+        self.armed = False
         self._delay_ticks = self._longest_delay_ms() // _TICK_MS  # EKF3 sizes its buffers at boot
         self._ring = np.zeros((_MAX_HORIZON_MS // _TICK_MS + 2, 7))
         self._start, self._filled = 0, 0
-        self._now_ms = 0
         self._queue: list[tuple[int, int, Measurement]] = []
         self._sequence = count()
-        self._clock = _Clock()
-        self._position_timeout = True
-        self._velocity_timeout = True
-        self._velocity_aiding = False
-        self._innovations_good = True
         self._last_known_ne = (0.0, 0.0)
         self._aligned = False
-        self._gps_fix_good = False
         self._last_position_source = -1
-        self._source_reset = False
         self._last_yaw_source = -1
-        self._yaw_reset = False
 
     # --- input -------------------------------------------------------------------------------
 
@@ -489,63 +403,6 @@ class Estimator:
         horizontal = (observed.velocity[0], observed.velocity[1])
         self._fuse_velocity(horizontal, vertical, observed.sigma, observed.sigma)
 
-    def _fuse_position(
-        self,
-        position: tuple[float, float],
-        sigma: float,
-        velocity: tuple[float, float] | None,
-    ) -> None:
-        p = self.parameters
-        innovation = [position[i] - float(self._state[nav.P + i]) for i in range(2)]
-        variance = self._cov[6, 6] + self._cov[7, 7]
-        gate = max(0.01 * p["EK3_POS_I_GATE"], 1.0) ** 2
-        ratio = (innovation[0] ** 2 + innovation[1] ** 2) / (gate * (variance + 2 * sigma**2))
-        self.ratios.position = ratio
-        passed = ratio < 1.0
-        if passed:
-            self._clock.position_pass = self._now_ms
-        if not (passed or self._position_timeout):
-            return
-        radius = p["EK3_GLITCH_RAD"]
-        lost = self._position_timeout or variance > radius**2
-        if lost and (not self._velocity_aiding or self._gps_fix_good):
-            self._reset_position(*position, (0.5 * radius) ** 2)
-            self._position_timeout = False
-            self._clock.position_pass = self._now_ms
-            self.ratios.position = 0.0
-            if self._velocity_timeout:
-                self._reset_velocity(velocity or (0.0, 0.0), 0.5**2 if velocity else 25.0**2)
-            return
-        for i in range(2):
-            residual = position[i] - self._state[nav.P + i]
-            nav.fuse(self._state, self._cov, 6 + i, residual, sigma**2)
-
-    def _fuse_velocity(
-        self,
-        horizontal: tuple[float, float],
-        vertical: float | None,
-        sigma: float,
-        gate_sigma: float,
-    ) -> None:
-        observed = [*horizontal] if vertical is None else [*horizontal, vertical]
-        squared, variance = 0.0, 0.0
-        for i, value in enumerate(observed):
-            squared += (value - float(self._state[nav.V + i])) ** 2
-            variance += self._cov[3 + i, 3 + i] + gate_sigma**2
-        gate = max(0.01 * self.parameters["EK3_VEL_I_GATE"], 1.0) ** 2
-        self.ratios.velocity = squared / (gate * variance)
-        passed = self.ratios.velocity < 1.0
-        if passed:
-            self._clock.velocity_pass = self._now_ms
-        elif self._velocity_timeout:
-            self._reset_velocity(horizontal, sigma**2)
-            self.ratios.velocity = 0.0
-            return
-        else:
-            return
-        for i, value in enumerate(observed):
-            nav.fuse(self._state, self._cov, 3 + i, value - self._state[nav.V + i], sigma**2)
-
     def _fuse_baro(self, height: float) -> None:
         source = self._source("POSZ")
         external_fresh = (
@@ -564,56 +421,3 @@ class Estimator:
             for i in range(2):
                 residual = self._last_known_ne[i] - self._state[nav.P + i]
                 nav.fuse(self._state, self._cov, 6 + i, residual, sigma**2)
-
-    def _fuse_height(self, height: float, sigma: float) -> None:
-        innovation = -height - float(self._state[nav.P + 2])
-        variance = self._cov[8, 8] + sigma**2
-        gate = max(0.01 * self.parameters["EK3_HGT_I_GATE"], 1.0) ** 2
-        self.ratios.height = innovation**2 / (gate * variance)
-        if self.ratios.height < 1.0:
-            nav.fuse(self._state, self._cov, 8, innovation, sigma**2)
-
-    def _fuse_yaw(self, yaw_rad: float, sigma: float) -> None:
-        innovation = wrap_pi(yaw_rad - euler(self._state[nav.Q : nav.Q + 4])[2])
-        variance = self._cov[2, 2] + sigma**2
-        gate = max(0.01 * self.parameters["EK3_YAW_I_GATE"], 1.0) ** 2
-        self.ratios.yaw = innovation**2 / (gate * variance)
-        if self.ratios.yaw < 1.0:
-            nav.fuse(self._state, self._cov, 2, innovation, sigma**2)
-
-    def _rotate_to(self, yaw_rad: float, sigma: float) -> None:
-        self._yaw_reset = False
-        change = wrap_pi(yaw_rad - euler(self._state[nav.Q : nav.Q + 4])[2])
-        rotate_world(self._state[nav.Q : nav.Q + 4], 0.0, 0.0, change)
-        nav.reset_error(self._cov, 2, 1, sigma**2)
-
-    def _reset_position(self, north: float, east: float, variance: float | None) -> None:
-        """Jump to a position; variance None keeps the covariance, as EKF3's announced reset."""
-        self._source_reset = False
-        change = (north - float(self._state[nav.P]), east - float(self._state[nav.P + 1]))
-        self._state[nav.P : nav.P + 2] = (north, east)
-        if variance is not None:
-            nav.reset_error(self._cov, 6, 2, variance)
-            self._clock.position_pass = self._now_ms
-            self._position_timeout = False
-        self.position_reset_ne = change
-        if hypot(*change) > 0.0:
-            self.position_resets += 1
-
-    def _reset_velocity(self, horizontal: tuple[float, float], variance: float) -> None:
-        self._state[nav.V : nav.V + 2] = horizontal
-        nav.reset_error(self._cov, 3, 2, variance)
-        self._velocity_timeout = False
-        self._clock.velocity_pass = self._now_ms
-
-    def _note_innovations(self) -> None:
-        """GNSS glitch logic: bad after 1 s out of gate, good again after 10 s inside."""
-        clock, now = self._clock, self._now_ms
-        if self.ratios.position < 1.0 and self.ratios.velocity < 1.0:
-            clock.innovation_pass = now
-        else:
-            clock.innovation_fail = now
-        if now - clock.innovation_pass > 1000:
-            self._innovations_good = False
-        elif now - clock.innovation_fail > 10000:
-            self._innovations_good = True

@@ -8,7 +8,8 @@ from typing import Any
 
 import numpy as np
 
-from sitl.embedded.estimator import Estimator, ExternalPosition, ExternalVelocity, GpsData
+from sitl.embedded.estimator import Estimator
+from sitl.embedded.measurements import ExternalPosition, ExternalVelocity, GpsData
 from sitl.embedded.parameters import Parameters
 from sitl.embedded.rotation import euler, matrix, quaternion
 from sitl.embedded.timesync import JitterCorrection

@@ -4,16 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from math import degrees, nan, pi
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
+from sitl.embedded.aircraft import Aircraft
 from sitl.embedded.estimator import EkfFlags
 from sitl.embedded.mavlink_server import Link
 from sitl.embedded.rotation import euler
-
-if TYPE_CHECKING:
-    from sitl.embedded.vehicle import Vehicle
 
 FIRMWARE_VERSION = (4, 7, 0, 0)  # major, minor, patch, FIRMWARE_VERSION_TYPE_DEV
 _TYPE_QUADROTOR, _AUTOPILOT_ARDUPILOT = 2, 3
@@ -30,7 +28,7 @@ DEFAULT_STREAMS = {mavlink.MAVLINK_MSG_ID_HEARTBEAT: 1.0}
 class Telemetry:
     """Builds messages from the vehicle's present state."""
 
-    def __init__(self, vehicle: Vehicle) -> None:
+    def __init__(self, vehicle: Aircraft) -> None:
         self._vehicle = vehicle
         m = mavlink
         self._builders: dict[int, Callable[[], Any]] = {

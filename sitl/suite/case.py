@@ -6,9 +6,9 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+from pydantic import BaseModel, ConfigDict, Field, model_validator
 
-from companion.settings_file import problems, read_settings
+from companion.settings_file import SettingsError, read_settings, validated
 from mavlink_bridge import BridgeConfig
 from sitl.feed import FixModel, RawMessage
 from sitl.scenario import ScenarioError
@@ -170,9 +170,9 @@ def load_case(path: Path) -> Case:
     if "name" in data:
         raise ScenarioError(f"{path}: name: a scenario is named by its file, leave it out")
     try:
-        return Case.model_validate({"name": path.stem, **data})
-    except ValidationError as error:
-        raise ScenarioError("\n".join([f"{path}:", *problems(error)])) from error
+        return validated(Case, {"name": path.stem, **data})
+    except SettingsError as error:
+        raise ScenarioError(f"{path}:\n{error}") from error
 
 
 def load_cases(names: Iterable[str] = (), folder: Path = SCENARIOS) -> tuple[Case, ...]:

@@ -219,7 +219,11 @@ class Moved(_Span):
 
 
 class Injected(_Span):
-    """How many messages our bridge injected within the span."""
+    """How many messages our bridge injected within the span.
+
+    at_least is for a vehicle in real time: one whose clock ran slow gave fewer fixes, and owes as
+    many messages less.
+    """
 
     check: Literal["injected"]
     at_least: int = 0
@@ -227,12 +231,17 @@ class Injected(_Span):
 
     def judge(self, record: Record) -> Finding:
         """See `_Expectation.judge`."""
-        counts = [s.injected for s in record.samples if self.from_s <= s.at_s <= self.to_s]
-        if not counts:
+        inside = [s for s in record.samples if self.from_s <= s.at_s <= self.to_s]
+        if not inside:
             return Finding(False, "no samples")
         # A counter that falls has started anew with the bridge; ours lives as long as the case.
-        sent = counts[-1] - counts[0]
-        return Finding(self.at_least <= sent <= self.at_most, f"{sent} injected")
+        first, last = inside[0], inside[-1]
+        sent, due_s = last.injected - first.injected, last.at_s - first.at_s
+        lived_s = last.vehicle_s - first.vehicle_s  # negative after a reboot
+        share = min(lived_s / due_s, 1.0) if lived_s > 0 and due_s > 0 else 1.0
+        ok = share * self.at_least <= sent <= self.at_most
+        what = f"{sent} injected"
+        return Finding(ok, what if share > 0.99 else f"{what} at {share:.2f} of real time")
 
 
 class SourceSet(_Expectation):

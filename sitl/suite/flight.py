@@ -12,8 +12,9 @@ import numpy as np
 
 from mavlink_bridge import Bridge, BridgeConfig
 from sitl.embedded.geodesy import Location
+from sitl.errors import PilotError
 from sitl.feed import BridgeFeed, FixModel, TruthFeed
-from sitl.pilot import Pilot, PilotError
+from sitl.pilot import Pilot
 from sitl.process import VehicleKind, VehicleProcess
 from sitl.suite.case import Case, Event
 from sitl.suite.doctor import consult
@@ -197,6 +198,7 @@ class _CaseFlight:
                 pilot.armed,
                 int(counters.get("bridge_injected", 0)),
                 int(counters.get("ekf_source_set", 0)),
+                pilot.time_s,
             )
         )
 

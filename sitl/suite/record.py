@@ -25,7 +25,9 @@ class Text:
 
 @dataclass(frozen=True)
 class Sample:
-    """The flight's state, ten times a second. north, east: true metres from home."""
+    """The flight's state, ten times a second. north, east: true metres from home; vehicle_s: the
+    vehicle's own clock since its boot.
+    """
 
     at_s: float
     north_m: float
@@ -34,6 +36,7 @@ class Sample:
     armed: bool
     injected: int
     source_set: int
+    vehicle_s: float
 
 
 @dataclass(frozen=True)

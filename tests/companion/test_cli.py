@@ -48,6 +48,7 @@ def test_a_part_that_fails_on_the_way_up_leaves_no_thread_behind(map_cache, tmp_
     assert code == 2
     assert text.startswith("StreamOpenError: ")
     assert len(text.splitlines()) == 1
+    assert not (tmp_path / "record").exists()
 
 
 def test_markup_in_a_message_is_shown_as_it_is(tmp_path):
@@ -66,6 +67,8 @@ def test_an_interrupt_ends_it_cleanly_at_any_moment(map_cache, tmp_path, ready):
     process.send_signal(signal.SIGINT)
     code, _ = _ended(process)
     assert code in ((0,) if ready.endswith("json") else (0, 130))
+    if code == 130:
+        assert not (tmp_path / "record").exists()
 
 
 def test_a_folder_that_cannot_be_made_is_one_line(map_cache, tmp_path):

@@ -34,6 +34,8 @@ def test_minimal_config_and_paths_relative_to_the_file(tmp_path):
     [
         ({"mapp": "x"}, "mapp"),
         ({"localizer": {"width": "wide"}}, "localizer.width"),
+        ({"targets": {"rate_hz": True}}, "targets.rate_hz: Input should not be a boolean"),
+        ({"camera": CAMERA | {"lever_arm_m": [0, True, 0]}}, r"camera.lever_arm_m.1.*\(got True"),
         ({"localizer": {"motion": {"acceleration_sigma": -1}}}, "acceleration_sigma"),
         ({"camera": {"source": "udp://x:1", "model": MODEL | {"fx": -1}}}, "camera.model.fx"),
         ({"bridge": {"connection": "carrier-pigeon:1"}}, "bridge.connection"),

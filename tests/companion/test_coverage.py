@@ -10,7 +10,8 @@ from companion.doctor import examine_deployment
 from localizer.map.cache import TileCache
 from mavlink_bridge.mission import Waypoint
 from sitl.embedded.geodesy import Location
-from sitl.pilot import Pilot, takeoff_step, waypoint_step
+from sitl.mission_steps import takeoff_step, waypoint_step
+from sitl.pilot import Pilot
 from sitl.vehicles import GIMBAL, EmbeddedSitl, vision_only_parameters
 
 

@@ -2,7 +2,7 @@ import cv2
 import numpy as np
 import pytest
 
-from companion.plots import ErrorSeries, checkerboard, plot_errors
+from companion.plots import ErrorSeries, MapPicture, checkerboard, plot_errors, plot_tracks
 
 TIME = np.linspace(-5.0, 10.0, 60)
 
@@ -25,6 +25,19 @@ def test_an_outlier_outside_the_spans_does_not_flatten_the_curve(tmp_path, spans
     plot_errors(tmp_path / "c.png", [gone], spans)
     if spans:
         assert _height_of_curve(tmp_path / "b.png") >= 0.9 * _height_of_curve(tmp_path / "a.png")
+
+
+def test_tracks_that_coincide_are_all_seen(tmp_path):
+    way = np.column_stack([np.linspace(0, 300, 200), 80 * np.sin(np.linspace(0, 6, 200))])
+    path = tmp_path / "tracks.png"
+    colours = {"w": (255, 255, 255), "tab:orange": (14, 127, 255), "k": (0, 0, 0)}  # BGR
+    grey = MapPicture(np.full((8, 8, 3), 120, np.uint8), -100, 400, -200, 200)
+    plot_tracks(path, {"truth": way, "EKF": way, "localizer": way}, grey, {})
+    image = cv2.imread(str(path)).astype(int)
+    height, width = image.shape[:2]
+    inside = image[height // 3 : 2 * height // 3, width // 5 : 4 * width // 5]
+    for name, colour in colours.items():
+        assert (np.abs(inside - colour).max(axis=-1) < 30).sum() > 300, name
 
 
 def test_a_checkerboard_alternates():

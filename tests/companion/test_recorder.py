@@ -8,7 +8,7 @@ import pytest
 
 from companion.config import RecordConfig
 from companion.errors import ReportError
-from companion.recorder import ESTIMATE_COLUMNS, Recorder, fresh_folder
+from companion.recorder import ESTIMATE_COLUMNS, Recorder, fresh_folder, remove_empty
 from localizer.camera import Camera
 from localizer.geo import Geodetic, LocalFrame
 from localizer.pose import Pose, so3_exp
@@ -72,3 +72,19 @@ def test_a_restart_spares_the_earlier_record(tmp_path):
         chosen = fresh_folder(folder)
         assert chosen.name == expected
         Recorder(RecordConfig(folder=chosen), FRAME).close()
+
+
+def test_only_a_record_without_a_row_is_removed(tmp_path):
+    """Of a start that failed; what else lies in its folder is left alone."""
+    kinds = ("empty", "told", "shared")
+    for kind in kinds:
+        recorder = Recorder(RecordConfig(folder=tmp_path / kind), FRAME)
+        if kind == "told":
+            recorder.event("info", "something happened")
+        recorder.close()
+    (tmp_path / "shared" / "notes.txt").write_text("mine")
+    for kind in (*kinds, "absent"):
+        remove_empty(tmp_path / kind)
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["shared", "told"]
+    assert [p.name for p in (tmp_path / "shared").iterdir()] == ["notes.txt"]
+    assert "something happened" in (tmp_path / "told" / "events.csv").read_text()

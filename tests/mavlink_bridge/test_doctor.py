@@ -128,7 +128,10 @@ def gimbal(fake: Any, boot_ms: int) -> list[Any]:
     ]
 
 
-def test_examination_and_repair(autopilot: Any) -> None:
+def test_examination_and_repair(autopilot: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    # What a busy machine does to the line between two threads is not the subject here.
+    for name, loose in (("_ROUND_TRIP_LIMIT_MS", 1e4), ("_RATE_SHARE", 0.05), ("_LOST_SHARE", 0.9)):
+        monkeypatch.setattr(f"mavlink_bridge.doctor.{name}", loose)
     autopilot.parameters = {**GOOD, "EK3_SRC1_VELXY": 3.0, "VISO_DELAY_MS": 10.0}
     autopilot.extra = gimbal
     settings = config(autopilot.port)

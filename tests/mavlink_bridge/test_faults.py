@@ -217,6 +217,18 @@ def test_a_latency_text_never_names_a_figure_within_its_limit(
     assert told[1:] == ["PiLoT: fixes are 260 ms old, over the 250 ms of VISO_DELAY_MS"]
 
 
+@pytest.mark.parametrize("gps_id", [0, 1])
+def test_a_latency_text_names_the_receivers_own_delay(
+    monkeypatch: pytest.MonkeyPatch, gps_id: int
+) -> None:
+    """GPS_INPUT counts receivers from 0, ArduPilot's parameters from 1."""
+    injection = InjectionConfig(message="gps_input", gps_id=gps_id, rate_hz=10, delay_ms=20)
+    flight = Flight(monkeypatch, injection=injection)
+    flight.run(10.0)
+    told = [t for t in flight.texts if "ms old" in t]
+    assert told == [f"PiLoT: fixes are 50 ms old: raise delay_ms (20) and GPS{gps_id + 1}_DELAY_MS"]
+
+
 # --- damaged input --------------------------------------------------------------------------------
 
 

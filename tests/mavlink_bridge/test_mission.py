@@ -13,7 +13,8 @@ from mavlink_bridge.errors import ConnectionSilentError, MissionError
 from mavlink_bridge.mission import Waypoint, download_mission
 from sitl.ardupilot import ArduPilotSitl, find_arducopter
 from sitl.embedded.geodesy import Location
-from sitl.pilot import MissionStep, Pilot, takeoff_step, waypoint_step
+from sitl.mission_steps import MissionStep, takeoff_step, waypoint_step
+from sitl.pilot import Pilot
 from sitl.vehicles import EmbeddedSitl
 
 HOME = Location(47.397742, 8.545594, 488.0)

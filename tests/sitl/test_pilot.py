@@ -3,28 +3,32 @@
 from __future__ import annotations
 
 import math
+import shutil
+import subprocess
+import sys
 import time
+from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
+from mavlink_bridge.link import sleep_until
 from sitl import ardupilot
 from sitl.ardupilot import ArduPilotNotFoundError, ArduPilotSitl, find_arducopter
 from sitl.embedded.geodesy import Location
+from sitl.errors import PilotError
 from sitl.feed import FixModel, TruthFeed
-from sitl.pilot import (
-    BootClock,
-    Pilot,
-    PilotError,
-    Track,
+from sitl.mission_steps import (
     gimbal_step,
     return_step,
     speed_step,
     takeoff_step,
     waypoint_step,
 )
-from sitl.process import VehicleProcessError
+from sitl.pilot import Pilot
+from sitl.process import VehicleProcess, VehicleProcessError
+from sitl.tracks import BootClock, Track
 from sitl.vehicles import (
     GIMBAL,
     SPEEDS,
@@ -62,6 +66,48 @@ def test_a_vehicle_that_dies_at_once_is_reported_with_its_log():
     vehicle.command = lambda _instance: ["/bin/sh", "-c", "echo out of propellers; exit 3"]
     with pytest.raises(VehicleProcessError, match="out of propellers"):
         vehicle.start()
+
+
+class _Idle(VehicleProcess):
+    """A vehicle that listens, as its log says, and does nothing."""
+
+    kind = "embedded"
+    start_timeout_s = 60.0
+
+    def command(self, instance: int) -> list[str]:
+        return ["/bin/sh", "-c", f"echo SERIAL2 on TCP port {5763 + 10 * instance}; sleep 600"]
+
+
+def test_a_vehicle_does_not_outlive_a_killed_parent():
+    script = (
+        "import time; from tests.sitl.test_pilot import _Idle; v = _Idle(); v.start();"
+        "print(v._process.pid, v.folder, flush=True); time.sleep(600)"
+    )
+    root = Path(__file__).resolve().parents[2]
+    parent = subprocess.Popen(
+        [sys.executable, "-c", script], stdout=subprocess.PIPE, text=True, cwd=root
+    )
+    pid, folder = parent.stdout.readline().split()
+    assert Path(f"/proc/{pid}").exists()
+    parent.kill()
+    parent.communicate()
+    assert sleep_until(lambda: _ended(pid), 30.0)
+    shutil.rmtree(folder)
+
+
+def _ended(pid: str) -> bool:
+    """Gone, or a zombie that nobody waits for."""
+    try:
+        return Path(f"/proc/{pid}/stat").read_text().rsplit(")", 1)[1].split()[0] == "Z"
+    except OSError:
+        return True
+
+
+def test_a_stopped_vehicle_leaves_no_process_behind():
+    with _Idle() as vehicle:
+        children = [vehicle._process, vehicle._lifeline]
+        assert [c.poll() for c in children] == [None, None]
+    assert None not in [c.poll() for c in children]
 
 
 def test_no_endpoint_before_the_start():

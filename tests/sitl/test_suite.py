@@ -31,7 +31,9 @@ def expectation(**fields: Any) -> Any:
 def record(error: float = 0.2, seconds: float = 20.0) -> Record:
     """Errors to the north at 25 Hz, hovering in GUIDED on source set 1."""
     times = [i / 25 for i in range(int(25 * seconds))]
-    samples = [Sample(i / 10, 0.0, 0.0, "GUIDED", True, i, 1) for i in range(int(10 * seconds))]
+    samples = [
+        Sample(i / 10, 0.0, 0.0, "GUIDED", True, i, 1, i / 10) for i in range(int(10 * seconds))
+    ]
     errors = [(t, error, 0.0) for t in times]
     return Record(errors=errors, unpaired=errors, samples=samples)
 
@@ -55,6 +57,7 @@ def case_text(**changes: str) -> str:
         ({"vehicle": "{sources: magic}"}, "vehicle.sources"),
         ({"fixes": "{rate_hz: -1}"}, "fixes.rate_hz"),
         ({"fixes": "{colour: red}"}, "fixes.colour"),
+        ({"fixes": "{sigma_m: yes}"}, "fixes.sigma_m: Input should not be a boolean"),
         ({"bridge": "{injection: {rate_hz: 99}}"}, "rate_hz"),
         ({"bridge": ""}, "exactly one of `bridge` and `raw`"),
         ({"raw": "{}"}, "exactly one of `bridge` and `raw`"),
@@ -207,6 +210,22 @@ def test_modes_counts_and_source_sets() -> None:
     assert not expectation(check="source_set", number=3, from_s=5, by_s=7).judge(flown).ok
     assert expectation(check="injected", from_s=2, to_s=4, at_least=20, at_most=20).judge(flown).ok
     assert not expectation(check="injected", at_most=0).judge(flown).ok
+
+
+def test_a_vehicle_whose_clock_ran_slow_owes_fewer_messages() -> None:
+    wanted = expectation(check="injected", at_least=180)
+    slow, idle = record(), record()
+    slow.samples = [
+        replace(s, injected=int(0.9 * s.injected), vehicle_s=0.9 * s.vehicle_s)
+        for s in slow.samples
+    ]
+    idle.samples = [replace(s, injected=int(0.5 * s.injected)) for s in idle.samples]
+    assert wanted.judge(record()).ok
+    assert wanted.judge(slow).ok
+    assert "0.90 of real time" in wanted.judge(slow).what
+    assert not wanted.judge(idle).ok
+    slow.samples = [replace(s, injected=s.injected // 2) for s in slow.samples]
+    assert not wanted.judge(slow).ok
 
 
 def test_arming_and_doctor() -> None:

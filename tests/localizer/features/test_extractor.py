@@ -121,6 +121,16 @@ def test_a_description_that_lies_about_levels_is_found(tmp_path: Path) -> None:
         load_extractor(model)
 
 
+def test_a_description_that_leaves_a_level_out_is_found(tmp_path: Path) -> None:
+    model = copied_model(tmp_path)
+    path = model.with_suffix(".json")
+    description = json.loads(path.read_text())
+    del description["levels"][-1]
+    path.write_text(json.dumps(description))
+    with pytest.raises(ModelError, match="outputs, its description names"):
+        load_extractor(model)
+
+
 def test_a_file_that_is_no_graph_is_found(tmp_path: Path) -> None:
     model = copied_model(tmp_path)
     model.write_bytes(b"not a graph")

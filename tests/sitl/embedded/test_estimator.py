@@ -9,16 +9,9 @@ import pytest
 
 from sitl.embedded import navigation as nav
 from sitl.embedded.dynamics import GRAVITY
-from sitl.embedded.estimator import (
-    Aiding,
-    Baro,
-    EkfFlags,
-    Estimator,
-    ExternalPosition,
-    ExternalVelocity,
-    GpsData,
-)
+from sitl.embedded.estimator import Aiding, EkfFlags, Estimator
 from sitl.embedded.geodesy import METRES_PER_DEGREE, Location, north_east
+from sitl.embedded.measurements import Baro, ExternalPosition, ExternalVelocity, GpsData
 from sitl.embedded.parameters import Parameters
 from sitl.embedded.rotation import euler, quaternion, rotate_world
 from sitl.embedded.timesync import JitterCorrection

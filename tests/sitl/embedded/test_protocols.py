@@ -2,8 +2,12 @@
 
 from __future__ import annotations
 
+import contextlib
+import fcntl
 import math
 import socket
+import struct
+import termios
 import time
 
 import numpy as np
@@ -212,11 +216,19 @@ class Client:
         self.socket.sendall(message.pack(self.mav))
 
     def received(self):
-        try:
-            data = self.socket.recv(1 << 20)
-        except BlockingIOError:
-            return []
-        return self.mav.parse_buffer(data) or []
+        data = bytearray()
+        with contextlib.suppress(BlockingIOError):
+            while chunk := self.socket.recv(1 << 20):
+                data += chunk
+        return self.mav.parse_buffer(bytes(data)) or []
+
+
+def delivered(socket_):
+    """Wait until all that was sent lies in the receiver's buffer: nothing is unacknowledged."""
+    until = time.monotonic() + 30.0
+    while struct.unpack("i", fcntl.ioctl(socket_, termios.TIOCOUTQ, b"\0\0\0\0"))[0]:
+        assert time.monotonic() < until
+        time.sleep(0.001)
 
 
 def free_port():
@@ -233,10 +245,13 @@ def linked():
     gcs, companion = Client(ports[0], 255, 190), Client(ports[1], 1, 191)
 
     def run(ticks=30):
-        time.sleep(0.02)  # what was sent must have arrived: simulated time does not wait
+        for client in (gcs, companion):  # simulated time does not wait
+            delivered(client.socket)
         for _ in range(ticks):
             vehicle.step()
-        time.sleep(0.02)
+        for link in server.links:
+            if link.client is not None:
+                delivered(link.client)
         return gcs.received(), companion.received()
 
     run(3)

@@ -1,0 +1,181 @@
+"""The aircraft: its parts, what is true of it and what it knows, in simulated time."""
+
+from __future__ import annotations
+
+from math import cos, exp, radians, sin, sqrt
+
+import numpy as np
+from pymavlink.dialects.v20 import ardupilotmega as mavlink
+
+from sitl.embedded import dynamics
+from sitl.embedded.arming import ArmingContext, arming_failures
+from sitl.embedded.estimator import CRITICAL, Estimator
+from sitl.embedded.geodesy import Location
+from sitl.embedded.gimbal import Gimbal
+from sitl.embedded.injection import Injection
+from sitl.embedded.loop import TICK_S
+from sitl.embedded.mavlink_server import MavlinkServer
+from sitl.embedded.measurements import Baro, Compass, GpsData
+from sitl.embedded.mission import MissionStore
+from sitl.embedded.modes import FlightModes
+from sitl.embedded.parameters import Parameters
+from sitl.embedded.rotation import Array
+from sitl.embedded.sensors import GpsSample, Sensors
+
+_GPS_FIX_AFTER_S = 30.0  # a cold start; with the filter's 10 s of checks ArduPilot's 42 s
+GPS_SIMULATED = (1, 2)  # GPS1_TYPE auto and u-blox read the simulated receiver
+_GUST_CORRELATION_S = 3.0
+
+
+class Aircraft:
+    """A quadrotor at `home` (AMSL), heading `heading_deg`, and the autopilot's parts in it."""
+
+    def __init__(
+        self,
+        home: Location,
+        heading_deg: float,
+        parameters: Parameters,
+        server: MavlinkServer,
+        seed: int = 0,
+    ) -> None:
+        self.launch = home
+        self.parameters = parameters
+        self.server = server
+        self.tick = 0
+        self.reboot_ordered = False
+        self.truth = dynamics.initial_state(radians(heading_deg))
+        self.sensors = Sensors(seed)
+        self._rng = np.random.default_rng([seed, 1])
+        self._gust = np.zeros(3)
+        self.estimator = Estimator(parameters, self.notify)
+        self.gimbal = Gimbal(parameters)
+        self.mission = MissionStore()
+        self.modes = FlightModes(
+            parameters, self.estimator, self.gimbal, self.mission, self.notify, self._reached
+        )
+        self.injection = Injection(parameters, self.estimator)
+        self.gps_sample: GpsSample | None = None
+        self._gps_sample_at = -1e9
+        self._integrator = np.zeros(3)
+        self._increment = np.zeros(7)
+
+    # --- clock -------------------------------------------------------------------------------
+
+    @property
+    def time_s(self) -> float:
+        """Simulated seconds since boot."""
+        return self.tick * TICK_S
+
+    @property
+    def time_ms(self) -> int:
+        """Simulated milliseconds since boot."""
+        return round(self.tick * TICK_S * 1000)
+
+    # --- physics and sensors -----------------------------------------------------------------
+
+    def wind(self) -> Array:
+        """Mean wind (from SIM_WIND_DIR) weakened near the ground, plus first-order gusts."""
+        p = self.parameters
+        keep = exp(-TICK_S / _GUST_CORRELATION_S)
+        self._gust *= keep
+        self._gust += p["SIM_WIND_TURB"] * sqrt(1 - keep**2) * self._rng.standard_normal(3)
+        height = max(-float(self.truth[2]), 0.0)
+        profile = min(1.0, sqrt(height / 60.0))  # ArduPilot's square law up to 60 m
+        speed, source = p["SIM_WIND_SPD"], radians(p["SIM_WIND_DIR"])
+        mean = np.array([-speed * cos(source), -speed * sin(source), 0.0])
+        return (mean + self._gust * np.array([1.0, 1.0, 0.4])) * profile
+
+    def sense(self) -> None:
+        """Read the sensors that are due, and hand the filter what they gave."""
+        now = self.time_ms
+        if self.tick == 1:
+            self.estimator.align(self.sensors.compass(self.truth))
+        if self.tick % 10 == 0:
+            self.estimator.add(Baro(self.sensors.barometer(self.truth, 0.1)), now)
+        if self.tick % 10 == 5:
+            self.estimator.add(Compass(self.sensors.compass(self.truth)), now)
+        p = self.parameters
+        powered = p["SIM_GPS1_ENABLE"] > 0 and p["GPS1_TYPE"] in GPS_SIMULATED
+        sample = self.sensors.gps(self.time_s, self.truth, p["SIM_GPS1_JAM"] > 0, self._glitch())
+        started = self.time_s >= _GPS_FIX_AFTER_S
+        if powered and started and sample is not None and sample.fix:
+            self.gps_sample, self._gps_sample_at = sample, self.time_s
+            where = self.launch.offset(*(float(c) for c in sample.position))
+            n, e, d = (float(c) for c in sample.velocity)
+            self.estimator.add(
+                GpsData(
+                    where.latitude_deg,
+                    where.longitude_deg,
+                    where.altitude_m,
+                    (n, e),
+                    d,
+                    sample.horizontal_accuracy,
+                    sample.speed_accuracy,
+                    sample.satellites,
+                    hdop=1.2,
+                ),
+                round(sample.time_s * 1000),
+            )
+
+    def _glitch(self) -> Array:
+        """NED metres by which the receiver is wrong; SIM_GPS1_GLTCH_X and _Y are degrees."""
+        p, here = self.parameters, self.launch
+        wrong = Location(
+            here.latitude_deg + p["SIM_GPS1_GLTCH_X"],
+            here.longitude_deg + p["SIM_GPS1_GLTCH_Y"],
+            here.altitude_m,
+        )
+        return np.array(here.ned_of(wrong))
+
+    @property
+    def true_location(self) -> Location:
+        """Where the vehicle really is."""
+        return self.launch.offset(*(float(c) for c in self.truth[0:3]))
+
+    @property
+    def gps_has_fix(self) -> bool:
+        """Whether the receiver (simulated, or GPS_INPUT) has a 3D fix."""
+        kind = self.parameters["GPS1_TYPE"]
+        if kind in GPS_SIMULATED:
+            return self.time_s - self._gps_sample_at < 1.0
+        return self.injection.gps_fix(self.time_ms)
+
+    @property
+    def gps_healthy(self) -> bool:
+        """Whether fixes come at 5 Hz or nearly so."""
+        if self.parameters["GPS1_TYPE"] in GPS_SIMULATED:
+            return self.gps_has_fix
+        return self.injection.gps_healthy(self.time_ms)
+
+    # --- autopilot ---------------------------------------------------------------------------
+
+    def notify(self, severity: int, text: str) -> None:
+        """STATUSTEXT on every link."""
+        self.server.broadcast(mavlink.MAVLink_statustext_message(severity, text.encode()[:50]))
+
+    def arming_failures(self) -> list[str]:
+        """Texts of the failing arming checks."""
+        return arming_failures(
+            ArmingContext(
+                self.time_s,
+                self.parameters,
+                self.estimator,
+                self.modes.mode.name,
+                self.modes.mode.armable,
+                self.modes.mode.needs_position,
+                self.modes.home is not None,
+                self.gps_has_fix,
+                self.gps_healthy,
+                self.injection.healthy(self.time_ms),
+            )
+        )
+
+    def report_failures(self, prefix: str) -> bool:
+        """Send each failing check as a STATUSTEXT; True when there are any."""
+        failures = self.arming_failures()
+        for text in failures:
+            self.notify(CRITICAL, f"{prefix}: {text}")
+        return bool(failures)
+
+    def _reached(self, index: int) -> None:
+        self.server.broadcast(mavlink.MAVLink_mission_item_reached_message(index))

@@ -1,0 +1,57 @@
+"""What the filter is given, each at the time at which it was true."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+
+@dataclass(frozen=True)
+class GpsData:
+    """A GNSS solution for the filter. velocity: NED m/s; None where the receiver gives none."""
+
+    latitude_deg: float
+    longitude_deg: float
+    altitude_m: float
+    horizontal_velocity: tuple[float, float] | None
+    vertical_velocity: float | None
+    horizontal_accuracy: float
+    speed_accuracy: float
+    satellites: int
+    hdop: float
+    yaw_rad: float | None = None
+
+
+@dataclass(frozen=True)
+class ExternalPosition:
+    """A position from the companion: NED metres about the EKF origin, sigma in metres."""
+
+    position: tuple[float, float, float]
+    sigma: float
+    yaw_rad: float | None
+    yaw_sigma: float
+    reset: bool
+
+
+@dataclass(frozen=True)
+class ExternalVelocity:
+    """A velocity from the companion: NED m/s."""
+
+    velocity: tuple[float, float, float]
+    sigma: float
+
+
+@dataclass(frozen=True)
+class Baro:
+    """Height above the home plane in metres."""
+
+    height: float
+
+
+@dataclass(frozen=True)
+class Compass:
+    """Heading from true north in radians."""
+
+    yaw: float
+
+
+Measurement = GpsData | ExternalPosition | ExternalVelocity | Baro | Compass
