@@ -27,7 +27,8 @@ from localizer.registration import (
 )
 from localizer.registration import hypotheses as hypothesis_module
 from localizer.registration.backend import Backend, LevelProblem, LMSettings, Refinement
-from localizer.registration.jngo import JNGO, JNGOConfig
+from localizer.registration.config import JNGOConfig
+from localizer.registration.jngo import JNGO
 from localizer.types import Anchors, FeaturePyramid, PosePrior, RenderedView
 
 DEFAULT_ANCHORS = 4000
@@ -207,5 +208,5 @@ def _vertical_turns(prior: PosePrior, *arguments: Any, **values: Any) -> tuple[A
     return np.asarray((yaw * pitch * roll).as_matrix() @ R), centres
 
 
-_VERTICAL_TURNS = (("jngo.generate_hypotheses", _vertical_turns),)
+_VERTICAL_TURNS = (("config.generate_hypotheses", _vertical_turns),)
 _DEPTH_EDGES = (("anchors._MAX_CURVATURE", np.inf),)

@@ -27,20 +27,18 @@ from localizer.registration.backend import (
     sample_bilinear,
     world_from_camera,
 )
+from localizer.registration.config import JNGOConfig
 from localizer.registration.cuda.backend import CudaBackend
 from localizer.registration.cuda.compiler import compile_sources
 from localizer.registration.cuda.driver import Arena, Device, Kernels
 from localizer.registration.cuda.errors import CudaError
 from localizer.registration.cuda.schedule import CudaSchedule
-from localizer.registration.jngo import JNGOConfig
 from localizer.registration.reference import in_view, linearize, project
 from localizer.types import Anchors, FeatureLevel, FeaturePyramid
 
 REPEATS, WARM_UP = 50, 5
 SETTINGS = LMSettings(min_overlap=0.01)
-_SEARCH = JNGOConfig(
-    sharpen=0, swarm_anchors=(500, 500, 500), min_overlap=0.01, distinct_px=0.0
-)
+_SEARCH = JNGOConfig(sharpen=0, swarm_anchors=(500, 500, 500), min_overlap=0.01, distinct_px=0.0)
 SCHEDULES = (  # label, settings, anchors
     ("2/3/4, 144 -> 32 -> 8, N=500", _SEARCH, 500),
     ("as flown, N=4000 at the end", JNGOConfig(min_overlap=0.01), 4000),

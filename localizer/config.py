@@ -8,8 +8,8 @@ from pydantic import BaseModel, ConfigDict, Field
 
 from localizer.integrity import IntegrityConfig
 from localizer.motion import MotionConfig
+from localizer.registration.config import JNGOConfig
 from localizer.registration.devices import DeviceChoice
-from localizer.registration.jngo import JNGOConfig
 from localizer.render.select import Backend
 
 

@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 
 from pydantic import BaseModel, ConfigDict, Field
 
-from localizer.registration.jngo import Registration
+from localizer.registration.result import Registration
 from localizer.types import RegistrationStatus, TrackingState
 
 

@@ -24,8 +24,9 @@ from localizer.integrity import Integrity, is_acceptable, judge
 from localizer.motion import MotionState
 from localizer.pose import Array
 from localizer.registration.anchors import select_anchors
-from localizer.registration.jngo import JNGO, Registration
+from localizer.registration.jngo import JNGO
 from localizer.registration.priors import PoseConstraint, attitude_constraint
+from localizer.registration.result import Registration
 from localizer.render.base import MapRenderer
 from localizer.types import (
     Anchors,

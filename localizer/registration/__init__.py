@@ -1,7 +1,8 @@
 """Registration: geo-anchors, pose hypotheses and the JNGO optimizer (docs/registration.md)."""
 
 from localizer.registration.anchors import select_anchors
-from localizer.registration.jngo import JNGO, JNGOConfig, Registration
+from localizer.registration.config import JNGOConfig
+from localizer.registration.jngo import JNGO
 from localizer.registration.priors import (
     PoseConstraint,
     attitude_constraint,
@@ -9,6 +10,7 @@ from localizer.registration.priors import (
     height_constraint,
     position_constraint,
 )
+from localizer.registration.result import Registration
 
 __all__ = [
     "JNGO",

@@ -119,14 +119,6 @@ def covariance_sums(model: AnchorModel) -> CovarianceSums | None:
     )
 
 
-def tangent_covariance(
-    model: AnchorModel, correlation: float, floor: float, prior_weight: float = 0.0
-) -> Array | None:
-    """`sandwich_covariance` of an anchor model."""
-    sums = covariance_sums(model)
-    return None if sums is None else sandwich_covariance(sums, correlation, floor, prior_weight)
-
-
 def sandwich_covariance(
     sums: CovarianceSums, correlation: float, floor: float, prior_weight: float = 0.0
 ) -> Array | None:

@@ -9,11 +9,9 @@ from __future__ import annotations
 
 import logging
 from dataclasses import dataclass, replace
-from typing import Annotated
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import BaseModel, ConfigDict, Field
 
 from localizer.camera import Camera
 from localizer.device_array import DeviceArray
@@ -28,27 +26,21 @@ from localizer.registration.backend import (
     local_origin,
     world_from_camera,
 )
-from localizer.registration.covariance import (
-    anchor_model,
-    mode_spread,
-    pose_covariance,
-    pose_differences,
-    tangent_covariance,
-)
+from localizer.registration.config import JNGOConfig
+from localizer.registration.covariance import anchor_model, covariance_sums, pose_differences
 from localizer.registration.cuda.backend import CudaBackend
 from localizer.registration.cuda.errors import CudaError
 from localizer.registration.cuda.registration import register_on_device
 from localizer.registration.cuda.schedule import CudaSchedule
 from localizer.registration.devices import trial
-from localizer.registration.hypotheses import generate_hypotheses
 from localizer.registration.kernel_numba import NumbaBackend
 from localizer.registration.priors import PoseConstraint
 from localizer.registration.reference import ReferenceBackend
+from localizer.registration.result import Found, Registration, failure, registration
 from localizer.registration.selection import (
     LEAST_SCORE,
     distinct,
     median_residual,
-    mode_probabilities,
     quality,
     thinned,
 )
@@ -58,94 +50,6 @@ logger = logging.getLogger(__name__)
 
 _COVARIANCE_ANCHORS = 1000  # enough for a covariance, cheap enough for every frame
 _LEAST_SCALE = 0.02  # of the sharpening loss, where features fit perfectly
-
-_Steps = Annotated[int, Field(ge=0, le=1000)]
-_Count = Annotated[int, Field(ge=1)]
-_Scale = Annotated[float, Field(gt=0)]
-
-
-class JNGOConfig(BaseModel):
-    """The optimizer's settings; the defaults are the paper's where it gives them."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
-
-    hypotheses: int = Field(default=144, ge=1, le=4096, description="largest size M of the swarm")
-    box_deg: float = Field(default=11.0, gt=0, description="largest pitch and yaw perturbation")
-    step_deg: float = Field(default=2.0, gt=0, description="largest step of the pitch and yaw grid")
-    translation_sigma_m: float = Field(
-        default=1.0, ge=0, description="largest sigma of the perturbation"
-    )
-    spread_sigmas: float = Field(default=2.2, gt=0, description="grid half-width in prior sigmas")
-    iterations: tuple[_Steps, ...] = Field(
-        default=(2, 3, 10), min_length=1, description="LM steps per level, coarse to fine"
-    )
-    swarm_anchors: tuple[_Count, ...] = Field(
-        default=(250, 500, 500),
-        min_length=1,
-        description="anchors used per level, spread evenly; all by the winner, on the last level",
-    )
-    keep: tuple[_Count, ...] = Field(
-        default=(64, 16), description="survivors after each level but the last"
-    )
-    sharpen: int = Field(default=6, ge=0, le=1000, description="the winner's last LM steps, each")
-    sharpen_damping: float = Field(default=0.003, gt=0, description="their first Marquardt factor")
-    sharpen_scales: tuple[_Scale, ...] = Field(
-        default=(2.0, 1.0, 0.7),
-        description="for each of these Geman-McClure scales, in median residual norms",
-    )
-    detail_scales: tuple[_Scale, ...] = Field(
-        default=(1.0, 0.7), description="likewise on the detail level"
-    )
-    distinct_px: float = Field(
-        default=0.25, ge=0, description="least rms distance of survivors, level px"
-    )
-    huber: float = Field(default=0.5, gt=0, description="Huber threshold on the residual norm")
-    damping: float = Field(default=0.03, gt=0, description="first Marquardt factor")
-    min_overlap: float = Field(
-        default=0.25, gt=0, le=1, description="least share of anchors in view"
-    )
-    min_anchors: int = Field(default=50, ge=6, description="anchors below which nothing is tried")
-    motion_weight: float = Field(
-        default=0.02, ge=0, description="lambda of Eq. 10, in best costs per d²"
-    )
-    prior_weight: float = Field(
-        default=0.0001, ge=0, description="weight of a constraint, likewise"
-    )
-    correlation: float = Field(default=12.0, gt=0, description="covariance factor, calibrated")
-    correlation_px: float = Field(
-        default=32.0, gt=0, description="image cell within which residuals may correlate"
-    )
-    covariance_floor: float = Field(
-        default=0.05, ge=0, description="least share of the isotropic model"
-    )
-    max_sigma_m: float = Field(
-        default=50.0, gt=0, description="position sigma that counts as no texture"
-    )
-
-    @property
-    def settings(self) -> LMSettings:
-        """What the backends need of it."""
-        return LMSettings(self.huber, damping=self.damping, min_overlap=self.min_overlap)
-
-
-@dataclass(frozen=True)
-class Registration:
-    """A registered pose, or the prior's with the reason why not.
-
-    covariance: (6, 6) as `PosePrior`'s. score: mean Huber cost, lower is
-    better, inf on failure.
-    overlap: share of the anchors in view. quality: 0 (no better than chance) to 1. modes: distinct
-    surviving poses. evaluations: cost evaluations spent.
-    """
-
-    world_from_camera: Pose
-    covariance: Array
-    score: float
-    overlap: float
-    quality: float
-    status: RegistrationStatus
-    modes: int
-    evaluations: int
 
 
 class JNGO:
@@ -190,7 +94,7 @@ class JNGO:
         """
         status = _input_status(query, anchors, self.config)
         if status is not RegistrationStatus.OK:
-            return _failure(prior, status)
+            return failure(prior, status)
         if self._schedule is not None:
             try:
                 return register_on_device(
@@ -203,7 +107,7 @@ class JNGO:
                 if any(isinstance(level.features, DeviceArray) for level in query.levels):
                     raise  # this frame's features are where the CPU cannot read them
         if not _all_finite(query, anchors):
-            return _failure(prior, RegistrationStatus.BAD_FEATURES)
+            return failure(prior, RegistrationStatus.BAD_FEATURES)
         origin = local_origin(anchors, prior.world_from_camera)
         problems = level_problems(query, camera, anchors, origin)
         searched = len(self.config.iterations)
@@ -211,9 +115,10 @@ class JNGO:
             problems[:searched], origin, prior, motion=motion, constraint=constraint, seed=seed
         )
         if not np.isfinite(swarm.scores[0]):
-            return _failure(prior, RegistrationStatus.NO_OVERLAP, swarm.evaluations)
+            return failure(prior, RegistrationStatus.NO_OVERLAP, swarm.evaluations)
         winner = self._sharpen(swarm, problems[searched - 1 :], constraint, origin)
-        return self._result(origin, prior, swarm, winner, query.levels[-1].stride)
+        found = self._found(swarm, winner, query.levels[-1].stride)
+        return registration(found, self.config, prior, origin)
 
     def _refine(
         self,
@@ -226,16 +131,7 @@ class JNGO:
         seed: int,
     ) -> _Swarm:
         c = self.config
-        rotations, centres = generate_hypotheses(
-            prior,
-            c.hypotheses,
-            box_deg=c.box_deg,
-            step_deg=c.step_deg,
-            translation_limit_m=c.translation_sigma_m,
-            reach=c.spread_sigmas,
-            seed=seed,
-        )
-        R, t = camera_from_local(rotations, centres, origin)
+        R, t = camera_from_local(*c.swarm(prior, seed), origin)
         keep = (*c.keep[: len(problems) - 1], c.hypotheses)
         evaluations = 0
         for level, iterations, survivors, anchors in zip(
@@ -318,38 +214,21 @@ class JNGO:
         totals: Array = scores + self.config.motion_weight * best * squared
         return totals
 
-    def _result(
-        self, origin: Array, prior: PosePrior, swarm: _Swarm, winner: _Winner, stride: int
-    ) -> Registration:
+    def _found(self, swarm: _Swarm, winner: _Winner, stride: int) -> Found:
+        """The survivors with the winner in the first's place, and the sums at its pose."""
         c, problem, R, t = self.config, winner.problem, winner.rotation, winner.translation
-        evaluations = swarm.evaluations + winner.evaluations
         model = anchor_model(
             thinned(problem, _COVARIANCE_ANCHORS), R, t, winner.settings, c.correlation_px / stride
         )
-        weight = 0.0 if problem.prior is None else problem.prior.weight
-        tangent = tangent_covariance(model, c.correlation, c.covariance_floor, weight)
-        if tangent is None:
-            return _failure(prior, RegistrationStatus.NO_TEXTURE, evaluations)
-        rotations, centres = world_from_camera(
+        return Found(
             np.concatenate([R[None], swarm.rotations[1:]]),
             np.concatenate([t[None], swarm.translations[1:]]),
-            origin,
-        )
-        pose = Pose(rotations[0], centres[0])
-        probabilities = mode_probabilities(swarm.scores, int(model.cell.max()) + 1)
-        differences = pose_differences(rotations, centres, pose)
-        covariance = pose_covariance(tangent, R, t) + mode_spread(differences, probabilities)
-        if np.sqrt(np.linalg.eigvalsh(covariance[:3, :3])[-1]) > c.max_sigma_m:
-            return _failure(prior, RegistrationStatus.NO_TEXTURE, evaluations)
-        return Registration(
-            pose,
-            covariance,
-            float(swarm.scores[0]),
-            float(swarm.overlaps[0]),
+            swarm.scores,
+            swarm.overlaps,
+            covariance_sums(model),
+            0.0 if problem.prior is None else problem.prior.weight,
             quality(swarm.problem, R, t, c.settings),
-            RegistrationStatus.OK,
-            int(np.isfinite(swarm.scores).sum()),
-            evaluations,
+            swarm.evaluations + winner.evaluations,
         )
 
     def warm_up(self, channels: int) -> None:
@@ -414,9 +293,3 @@ def _all_finite(query: FeaturePyramid, anchors: Anchors) -> bool:
         arrays += [level.features, level.confidence]
     # A sum is not finite when any term is not, and costs a tenth of isfinite().all().
     return all(bool(np.isfinite(a.sum(dtype=np.float32))) for a in arrays)
-
-
-def _failure(prior: PosePrior, status: RegistrationStatus, evaluations: int = 0) -> Registration:
-    return Registration(
-        prior.world_from_camera, prior.covariance, np.inf, 0.0, 0.0, status, 0, evaluations
-    )

@@ -14,7 +14,7 @@ from localizer.engine import DualThreadEngine
 from localizer.errors import CameraError, MapCacheError, OutsideMapError
 from localizer.pipeline import Localizer, Undistorter, working_camera
 from localizer.pose import Pose
-from localizer.registration.jngo import Registration
+from localizer.registration.result import Registration
 from localizer.types import (
     FeatureLevel,
     FeaturePyramid,

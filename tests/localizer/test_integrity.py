@@ -5,7 +5,7 @@ import pytest
 
 from localizer.integrity import Integrity, IntegrityConfig, is_acceptable, judge
 from localizer.pose import Pose
-from localizer.registration.jngo import Registration
+from localizer.registration.result import Registration
 from localizer.types import RegistrationStatus, TrackingState
 
 CONFIG = IntegrityConfig(confirmations=3, degraded_after=2, lost_after=5)

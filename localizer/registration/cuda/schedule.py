@@ -10,7 +10,6 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,15 +18,13 @@ from localizer.camera import Camera
 from localizer.device_array import DeviceArray
 from localizer.pose import Array
 from localizer.registration.backend import LMSettings, QuadraticPrior, level_intrinsics
+from localizer.registration.config import JNGOConfig
 from localizer.registration.cuda import layout
 from localizer.registration.cuda.backend import FEW, CudaBackend, set_loss, stored
 from localizer.registration.cuda.driver import Graph
 from localizer.registration.cuda.memory import FrameMemory
 from localizer.registration.selection import LEAST_SCORE
 from localizer.types import Anchors, FeatureLevel, FeaturePyramid, PosePrior
-
-if TYPE_CHECKING:
-    from localizer.registration.jngo import JNGOConfig
 
 COVARIANCE_ANCHORS = 1000
 LEAST_SCALE = 0.02

@@ -1,0 +1,92 @@
+"""The optimizer's settings."""
+
+from __future__ import annotations
+
+from typing import Annotated
+
+from pydantic import BaseModel, ConfigDict, Field
+
+from localizer.pose import Array
+from localizer.registration.backend import LMSettings
+from localizer.registration.hypotheses import generate_hypotheses
+from localizer.types import PosePrior
+
+_Steps = Annotated[int, Field(ge=0, le=1000)]
+_Count = Annotated[int, Field(ge=1)]
+_Scale = Annotated[float, Field(gt=0)]
+
+
+class JNGOConfig(BaseModel):
+    """The optimizer's settings; the defaults are the paper's where it gives them."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
+
+    hypotheses: int = Field(default=144, ge=1, le=4096, description="largest size M of the swarm")
+    box_deg: float = Field(default=11.0, gt=0, description="largest pitch and yaw perturbation")
+    step_deg: float = Field(default=2.0, gt=0, description="largest step of the pitch and yaw grid")
+    translation_sigma_m: float = Field(
+        default=1.0, ge=0, description="largest sigma of the perturbation"
+    )
+    spread_sigmas: float = Field(default=2.2, gt=0, description="grid half-width in prior sigmas")
+    iterations: tuple[_Steps, ...] = Field(
+        default=(2, 3, 10), min_length=1, description="LM steps per level, coarse to fine"
+    )
+    swarm_anchors: tuple[_Count, ...] = Field(
+        default=(250, 500, 500),
+        min_length=1,
+        description="anchors used per level, spread evenly; all by the winner, on the last level",
+    )
+    keep: tuple[_Count, ...] = Field(
+        default=(64, 16), description="survivors after each level but the last"
+    )
+    sharpen: int = Field(default=6, ge=0, le=1000, description="the winner's last LM steps, each")
+    sharpen_damping: float = Field(default=0.003, gt=0, description="their first Marquardt factor")
+    sharpen_scales: tuple[_Scale, ...] = Field(
+        default=(2.0, 1.0, 0.7),
+        description="for each of these Geman-McClure scales, in median residual norms",
+    )
+    detail_scales: tuple[_Scale, ...] = Field(
+        default=(1.0, 0.7), description="likewise on the detail level"
+    )
+    distinct_px: float = Field(
+        default=0.25, ge=0, description="least rms distance of survivors, level px"
+    )
+    huber: float = Field(default=0.5, gt=0, description="Huber threshold on the residual norm")
+    damping: float = Field(default=0.03, gt=0, description="first Marquardt factor")
+    min_overlap: float = Field(
+        default=0.25, gt=0, le=1, description="least share of anchors in view"
+    )
+    min_anchors: int = Field(default=50, ge=6, description="anchors below which nothing is tried")
+    motion_weight: float = Field(
+        default=0.02, ge=0, description="lambda of Eq. 10, in best costs per d²"
+    )
+    prior_weight: float = Field(
+        default=0.0001, ge=0, description="weight of a constraint, likewise"
+    )
+    correlation: float = Field(default=12.0, gt=0, description="covariance factor, calibrated")
+    correlation_px: float = Field(
+        default=32.0, gt=0, description="image cell within which residuals may correlate"
+    )
+    covariance_floor: float = Field(
+        default=0.05, ge=0, description="least share of the isotropic model"
+    )
+    max_sigma_m: float = Field(
+        default=50.0, gt=0, description="position sigma that counts as no texture"
+    )
+
+    @property
+    def settings(self) -> LMSettings:
+        """What the backends need of it."""
+        return LMSettings(self.huber, damping=self.damping, min_overlap=self.min_overlap)
+
+    def swarm(self, prior: PosePrior, seed: int) -> tuple[Array, Array]:
+        """Rotations (M, 3, 3) and centres (M, 3) of the hypotheses about a prior."""
+        return generate_hypotheses(
+            prior,
+            self.hypotheses,
+            box_deg=self.box_deg,
+            step_deg=self.step_deg,
+            translation_limit_m=self.translation_sigma_m,
+            reach=self.spread_sigmas,
+            seed=seed,
+        )

@@ -1,0 +1,93 @@
+"""What a registration gives back, and how it follows from the poses that were found."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from localizer.pose import Array, Pose
+from localizer.registration.backend import world_from_camera
+from localizer.registration.config import JNGOConfig
+from localizer.registration.covariance import (
+    CovarianceSums,
+    mode_spread,
+    pose_covariance,
+    pose_differences,
+    sandwich_covariance,
+)
+from localizer.registration.selection import mode_probabilities
+from localizer.types import PosePrior, RegistrationStatus
+
+
+@dataclass(frozen=True)
+class Registration:
+    """A registered pose, or the prior's with the reason why not.
+
+    covariance: (6, 6) as `PosePrior`'s. score: mean Huber cost, lower is
+    better, inf on failure.
+    overlap: share of the anchors in view. quality: 0 (no better than chance) to 1. modes: distinct
+    surviving poses. evaluations: cost evaluations spent.
+    """
+
+    world_from_camera: Pose
+    covariance: Array
+    score: float
+    overlap: float
+    quality: float
+    status: RegistrationStatus
+    modes: int
+    evaluations: int
+
+
+@dataclass(frozen=True)
+class Found:
+    """What a search ends with. rotations (K, 3, 3), translations (K, 3): the survivors,
+    camera_from_local, best first, the first one sharpened; scores and overlaps (K,): as the search
+    left them; sums: of equation 11 at the first one, None where no anchor has weight;
+    prior_weight: of a constraint, 0 without.
+    """
+
+    rotations: Array
+    translations: Array
+    scores: Array
+    overlaps: Array
+    sums: CovarianceSums | None
+    prior_weight: float
+    quality: float
+    evaluations: int
+
+
+def registration(found: Found, config: JNGOConfig, prior: PosePrior, origin: Array) -> Registration:
+    """The chosen pose with its covariance (equations 11 to 14), or NO_TEXTURE."""
+    tangent = None
+    if found.sums is not None:
+        tangent = sandwich_covariance(
+            found.sums, config.correlation, config.covariance_floor, found.prior_weight
+        )
+    if found.sums is None or tangent is None:
+        return failure(prior, RegistrationStatus.NO_TEXTURE, found.evaluations)
+    rotations, centres = world_from_camera(found.rotations, found.translations, origin)
+    pose = Pose(rotations[0], centres[0])
+    probabilities = mode_probabilities(found.scores, found.sums.cells)
+    spread = mode_spread(pose_differences(rotations, centres, pose), probabilities)
+    covariance = pose_covariance(tangent, found.rotations[0], found.translations[0]) + spread
+    if np.sqrt(np.linalg.eigvalsh(covariance[:3, :3])[-1]) > config.max_sigma_m:
+        return failure(prior, RegistrationStatus.NO_TEXTURE, found.evaluations)
+    return Registration(
+        pose,
+        covariance,
+        float(found.scores[0]),
+        float(found.overlaps[0]),
+        found.quality,
+        RegistrationStatus.OK,
+        int(np.isfinite(found.scores).sum()),
+        found.evaluations,
+    )
+
+
+def failure(prior: PosePrior, status: RegistrationStatus, evaluations: int = 0) -> Registration:
+    """The prior, with the reason why there is nothing better."""
+    return Registration(
+        prior.world_from_camera, prior.covariance, np.inf, 0.0, 0.0, status, 0, evaluations
+    )
