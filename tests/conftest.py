@@ -6,13 +6,15 @@ import os
 import shutil
 import subprocess
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import AbstractContextManager, contextmanager
 from pathlib import Path
 
 import hypothesis
 import pytest
 
 from sitl.assets import FlightAssets, prepare
+from sitl.errors import SimulationError
 
 # A busy machine takes its time over an example; what is slow shows in the suite's durations.
 hypothesis.settings.register_profile("patient", deadline=None)
@@ -41,16 +43,31 @@ def small_assets(tmp_path_factory: pytest.TempPathFactory) -> FlightAssets:
 
 
 @pytest.fixture
-def real_time() -> None:
-    """Skip, with what was measured, where a flight in real time has no processor to fly on.
+def real_time() -> Callable[[], AbstractContextManager[None]]:
+    """``with real_time():`` around a flight that needs two processors for as long as it takes.
 
-    A starved companion lands its vehicle, as it should: that says nothing of the code. Measured
-    before the flight, so a flight that fails is a failure.
+    A starved companion lands its vehicle, as it should: that says nothing of the code. So it skips,
+    with what was measured, where other work leaves no time before the flight, or none after one
+    that failed; a flight that fails on a machine with room is a failure.
     """
+
+    @contextmanager
+    def flight() -> Iterator[None]:
+        _skip_if_starved("before the flight")
+        try:
+            yield
+        except (AssertionError, SimulationError) as error:
+            _skip_if_starved(f"after a flight that failed ({error})")
+            raise
+
+    return flight
+
+
+def _skip_if_starved(when: str) -> None:
     share = _processor_share(workers=2)
     if share < 0.65:
         pytest.skip(
-            f"two processes got {100 * share:.0f} % of two cores: other work (load average "
+            f"two processes got {100 * share:.0f} % of two cores {when}: other work (load average "
             f"{os.getloadavg()[0]:.0f}) leaves no time for a flight in real time"
         )
 
