@@ -63,7 +63,7 @@ class JNGOConfig(BaseModel):
     prior_weight: float = Field(
         default=0.0001, ge=0, description="weight of a constraint, likewise"
     )
-    correlation: float = Field(default=12.0, gt=0, description="covariance factor, calibrated")
+    correlation: float = Field(default=11.0, gt=0, description="covariance factor, calibrated")
     correlation_px: float = Field(
         default=32.0, gt=0, description="image cell within which residuals may correlate"
     )

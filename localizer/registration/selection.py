@@ -17,14 +17,13 @@ from localizer.registration.sampling import sample_features
 from localizer.types import Float32
 
 LEAST_SCORE = 1e-3  # unit of the motion term and of priors where features fit perfectly
-_PER_CELL = 4.0  # independent observations that an image cell is worth when modes are compared
 _PROBES = 12  # anchors whose projections tell hypotheses apart
 
 
 def mode_probabilities(scores: Array, cells: int) -> Array:
     """Posterior weight (M,) of each surviving mode, seen in so many image cells (equation 14)."""
     excess = np.maximum(scores - scores[0], 0.0) / max(scores[0], LEAST_SCORE)
-    likelihood = np.exp(-0.5 * _PER_CELL * cells * excess)
+    likelihood = np.exp(-0.5 * cells * excess)
     probabilities: Array = likelihood / likelihood.sum()
     return probabilities
 
