@@ -38,9 +38,12 @@ from localizer.types import Anchors, FeatureLevel, FeaturePyramid
 
 REPEATS, WARM_UP = 50, 5
 SETTINGS = LMSettings(min_overlap=0.01)
-_SEARCH = JNGOConfig(sharpen=0, swarm_anchors=(500, 500, 500), min_overlap=0.01, distinct_px=0.0)
+_SEARCH = JNGOConfig(
+    iterations=(2, 3, 4), sharpen=0, swarm_anchors=(500, 500, 500), min_overlap=0.01,
+    distinct_px=0.0,
+)  # fmt: skip
 SCHEDULES = (  # label, settings, anchors
-    ("2/3/4, 144 -> 32 -> 8, N=500", _SEARCH, 500),
+    ("2/3/4, 144 -> 64 -> 16, N=500", _SEARCH, 500),
     ("as flown, N=4000 at the end", JNGOConfig(min_overlap=0.01), 4000),
 )
 Poses = tuple[np.ndarray, np.ndarray]
@@ -289,7 +292,7 @@ def print_tables(console: Console, problems: dict[int, LevelProblem], swarm: Pos
     table = Table(title="GPU: ms per schedule at 128/256/512 px, M=144, C=32")
     for heading in ("schedule", "features", "upload", "graph", "off by m"):
         table.add_column(heading, justify="right")
-    for row in schedules or [("2/3/4, 144 -> 32 -> 8, N=500", "-", "-", "-", "-")]:
+    for row in schedules or [("2/3/4, 144 -> 64 -> 16, N=500", "-", "-", "-", "-")]:
         table.add_row(*row)
     console.print(table)
     for note in notes:
