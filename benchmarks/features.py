@@ -10,9 +10,9 @@
 Every pair shows a place that no training run has seen, its query under its own light, weather and
 season (feature_real.py says what the real sets are). The reference is rendered 5 m and 5 deg from
 the query's true pose. The direct methods go through the same `JNGO`, gradient and network with the
-fixed detail level as in flight; the matchers go through PnP-RANSAC on the rendered depth. Generated
-pairs and real maps are kept below --cache. A checkpoint is chosen on `--split validation`; `test`
-is for the final report.
+fixed detail level and the number of anchors as in flight; the matchers go through PnP-RANSAC on the
+rendered depth. Generated pairs and real maps are kept below --cache. A checkpoint is chosen on
+`--split validation`; `test` is for the final report.
 """
 
 from __future__ import annotations
@@ -36,6 +36,7 @@ from feature_pairs import (
 from feature_real import real_pairs
 from feature_report import Outcome, read_outcomes, report, write_outcomes
 
+from localizer.config import LocalizerConfig
 from localizer.features import FeatureExtractor, GradientExtractor, load_extractor
 from localizer.features.detail import DetailExtractor
 from localizer.types import PosePrior
@@ -115,7 +116,12 @@ def main() -> None:
     parser.add_argument("--shared-detail", action="store_true", help="the easier pairs")
     parser.add_argument("--textures", type=Path, default=Path("../shared/data/textures"))
     parser.add_argument("--cache", type=Path, default=Path(".cache/benchmark"))
-    parser.add_argument("--anchors", type=int, default=500, help="direct methods'; 4000 in flight")
+    parser.add_argument(
+        "--anchors",
+        type=int,
+        default=LocalizerConfig().anchors,
+        help="of the direct methods; default as in flight, the paper has 500",
+    )
     parser.add_argument("--baselines", nargs="*", choices=BASELINES, default=list(BASELINES))
     parser.add_argument("--models", nargs="*", type=Path, default=[Path("shipped")])
     parser.add_argument("--real", type=Path, help="folder of a real set, instead of made places")
