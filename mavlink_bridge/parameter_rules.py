@@ -159,6 +159,26 @@ def _gps_input_rules(config: BridgeConfig, number: int) -> list[Rule]:
             tolerance=10.0,
             reboot=True,
         ),
+        *(_horizon_rules(injection.delay_ms) if gps > 1 else ()),
+    ]
+
+
+def _horizon_rules(delay_ms: float) -> list[Rule]:
+    """EKF3 sizes its buffer of measurements when it starts, by the delay of the first receiver and
+    of vision. Older positions of another receiver are fused late, by the difference: 1 m behind
+    at 8 m/s and 220 ms. Vision's delay makes room, although no vision message is sent.
+    """
+    why = "room in the EKF's buffer for a second receiver; or let GPS_INPUT be the first, gps_id 0"
+    return [
+        Rule(("VISO_TYPE",), (1.0,), why, required=False, reboot=True),
+        Rule(
+            ("VISO_DELAY_MS",),
+            (),
+            why,
+            required=False,
+            minimum=round(delay_ms),
+            reboot=True,
+        ),
     ]
 
 

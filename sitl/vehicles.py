@@ -69,6 +69,10 @@ def gps_input_parameters(*, delay_ms: float = 100.0) -> dict[str, float]:
     return {
         "GPS2_TYPE": 14,
         "GPS2_DELAY_MS": delay_ms,
+        # The EKF's buffer, which the delay of the first receiver or of vision sizes, must reach
+        # back to what the second receiver says.
+        "VISO_TYPE": 1,
+        "VISO_DELAY_MS": delay_ms,
         "GPS_AUTO_SWITCH": 1,
         **_sources(1, position=3, velocity=0, climb=0),
         "ARMING_CHECK": _CHECK_ALL_BUT_VISION & ~(1 << 3),  # nor does the second receiver arm

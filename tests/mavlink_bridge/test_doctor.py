@@ -92,6 +92,8 @@ def test_gps_input_with_old_names_and_another_receiver() -> None:
         "EK3_ENABLE": 1.0,
         "GPS_TYPE2": 1.0,
         "GPS_DELAY_MS2": 100.0,
+        "VISO_TYPE": 1.0,
+        "VISO_DELAY_MS": 100.0,
         "EK3_SRC1_POSXY": 3.0,
         "EK3_SRC1_VELXY": 3.0,
         "EK3_SRC1_VELZ": 3.0,
@@ -105,6 +107,16 @@ def test_gps_input_with_old_names_and_another_receiver() -> None:
         "EK3_SRC1_VELXY",
         "EK3_SRC1_VELZ",
     }
+
+
+@pytest.mark.parametrize(("gps_id", "asked"), [(0, False), (1, True)])
+def test_a_second_receiver_needs_room_in_the_ekfs_buffer(gps_id: int, asked: bool) -> None:
+    parameters = {"VISO_TYPE": 0.0, "VISO_DELAY_MS": 10.0}
+    settings = config(message="gps_input", gps_id=gps_id)
+    findings = check_parameters(ardupilot_rules(settings, 1), parameters.get)
+    advice = {f.name: f.fix for f in findings if f.name.startswith("VISO") and not f.ok}
+    assert advice == ({"VISO_TYPE": 1.0, "VISO_DELAY_MS": 100.0} if asked else {})
+    assert not any(f.required for f in findings if f.name in advice)
 
 
 def test_odometry_wants_velocity_noise_that_is_true() -> None:
