@@ -37,7 +37,7 @@ def validated(model: type[_ModelT], data: dict[str, Any]) -> _ModelT:
     try:
         settings = model.model_validate(data)
     except ValidationError as error:
-        lines = [_line(e["loc"], e["msg"], e["input"]) for e in error.errors()]
+        lines = [_line(e["loc"], _reason(e["type"], e["msg"]), e["input"]) for e in error.errors()]
         raise SettingsError("\n".join(lines)) from error
     # YAML's yes, on and true would else be the number 1.
     if lines := [_line(where, "Input should not be a boolean", value)
@@ -62,6 +62,10 @@ def _misread(given: Any, taken: Any, where: tuple[str | int, ...] = ()) -> Itera
 
 def _line(where: Iterable[str | int], what: str, given: object) -> str:
     return f"  {'.'.join(str(p) for p in where)}: {what} (got {_short(given)})"
+
+
+def _reason(kind: str, text: str) -> str:
+    return "no such setting" if kind == "extra_forbidden" else text
 
 
 def _short(value: object) -> str:

@@ -168,7 +168,10 @@ def _told_apart(paths: Sequence[Path]) -> tuple[Path, Path]:
         found[kind] = path
     for kind in ("DSM", "orthophoto"):
         if kind not in found:
-            raise MapSourceError(f"a map of rasters needs a {kind} too, of the same ground")
+            raise MapSourceError(
+                "a map of rasters needs a DSM and an orthophoto of the same ground: "
+                f"the {kind} is missing"
+            )
     return found["DSM"], found["orthophoto"]
 
 

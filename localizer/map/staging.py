@@ -106,7 +106,9 @@ def staging(out: Path, parameters: dict[str, Any], *, overwrite: bool) -> Iterat
     left there is kept. On an exception it stays for the next try, `out` is not touched.
     """
     if out.exists() and not overwrite:
-        raise MapCacheError(f"{out} exists already; choose another folder or ask to overwrite it")
+        raise MapCacheError(
+            f"{out} exists already; choose another folder, or replace it (--overwrite)"
+        )
     if out.exists() and not (out / MANIFEST_NAME).is_file() and not _is_empty(out):
         raise MapCacheError(f"{out} is no tile cache and is not overwritten; choose another folder")
     folder = out.with_name(out.name + ".building")

@@ -32,7 +32,7 @@ def test_minimal_config_and_paths_relative_to_the_file(tmp_path):
 @pytest.mark.parametrize(
     ("change", "named"),
     [
-        ({"mapp": "x"}, "mapp"),
+        ({"mapp": "x"}, r"mapp: no such setting \(got 'x'\)"),
         ({"localizer": {"width": "wide"}}, "localizer.width"),
         ({"targets": {"rate_hz": True}}, "targets.rate_hz: Input should not be a boolean"),
         ({"camera": CAMERA | {"lever_arm_m": [0, True, 0]}}, r"camera.lever_arm_m.1.*\(got True"),

@@ -243,7 +243,7 @@ def test_a_tileset_that_is_not_on_earth_is_an_error(tmp_path, make, build):
 
 
 def test_existing_cache_is_kept_unless_told(source, cache_path):
-    with pytest.raises(MapCacheError, match="exists already"):
+    with pytest.raises(MapCacheError, match=r"exists already.*--overwrite"):
         build_cache(source, cache_path, workers=1, progress=False)
 
 
