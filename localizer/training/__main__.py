@@ -103,13 +103,12 @@ def unfuse(
     shards: Annotated[list[Path], typer.Argument(help="Shards (.npz) to take statistics on.")],
 ) -> None:
     """Make a published model trainable again."""
-    import torch
-
+    from localizer.training.checkpoint import write_checkpoint
     from localizer.training.quantize import calibration_images
     from localizer.training.unfuse import unfuse as load
 
-    out.parent.mkdir(parents=True, exist_ok=True)
-    torch.save({"average": load(model, list(calibration_images(shards))).state_dict()}, out)
+    network = load(model, list(calibration_images(shards)))
+    write_checkpoint(out, {"average": network.state_dict()})
 
 
 @app.command()

@@ -1,4 +1,4 @@
-"""Reading what a run has saved."""
+"""Writing and reading what a run saves."""
 
 from __future__ import annotations
 
@@ -10,6 +10,21 @@ import torch
 from torch import nn
 
 from localizer.errors import ModelError
+
+
+def write_checkpoint(path: Path, state: Mapping[str, Any]) -> None:
+    """Replace the checkpoint `path`; ModelError when that fails, with the older one untouched."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    partial = path.with_suffix(".partial")
+    try:
+        torch.save(dict(state), partial)
+        partial.replace(path)
+    except (OSError, RuntimeError) as error:  # torch's own of a full disk
+        partial.unlink(missing_ok=True)
+        why = str(error).split("\n")[0]
+        raise ModelError(
+            f"{path}: cannot be written, is the disk full? {why}; an older one is kept"
+        ) from error
 
 
 def read_checkpoint(path: Path, device: torch.device | str = "cpu") -> dict[str, Any]:

@@ -6,28 +6,39 @@ from pathlib import Path
 from typing import Annotated, Literal
 
 import yaml
-from pydantic import BaseModel, ConfigDict, Discriminator, Field, Tag, model_validator
+from pydantic import (
+    BaseModel,
+    ConfigDict,
+    Discriminator,
+    Field,
+    PositiveInt,
+    Tag,
+    ValidationError,
+    model_validator,
+)
 
 from localizer.errors import ModelError
 from localizer.synth.heightfield import BLOCK
 from localizer.training.networks import NetworkConfig
 
+_MOST_WORKERS = 1024  # processes or threads
+
 
 class _Frozen(BaseModel):
-    model_config = ConfigDict(frozen=True, extra="forbid")
+    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
 
 
 class _PlacesSection(_Frozen):
     """What every place and visit is made of. workers: processes that make them."""
 
-    first_seed: int = Field(ge=1000)
-    scenes: int = Field(gt=0)
+    first_seed: int = Field(ge=1000, lt=2**31)
+    scenes: int = Field(gt=0, lt=2**31)
     photos: Path | None
     photo_groups: tuple[str, ...]
     photo_share: float = Field(ge=0.0, le=1.0)
     light_variety: bool
     appearance: bool
-    workers: int = Field(gt=0)
+    workers: int = Field(gt=0, le=_MOST_WORKERS)
 
 
 class DataSection(_PlacesSection):
@@ -48,7 +59,7 @@ class LiveSection(_PlacesSection):
     """
 
     live: Literal[True]
-    image: tuple[int, int]
+    image: tuple[PositiveInt, PositiveInt]
     cells: int = Field(gt=0, multiple_of=BLOCK)
     active: int = Field(gt=0)
     steps_per_scene: int = Field(gt=0)
@@ -83,7 +94,7 @@ class OptimizerSection(_Frozen):
     decay_steps: int = Field(gt=0)
     mixed_precision: bool
     batch: int = Field(gt=0)
-    crop: tuple[int, int]
+    crop: tuple[PositiveInt, PositiveInt]
     anchors: int = Field(ge=32)
     learning_rate: float = Field(gt=0.0)
     warmup_steps: int = Field(ge=0)
@@ -96,12 +107,14 @@ class OptimizerSection(_Frozen):
     whole_map_cells: int = Field(default=1200, ge=0)
     lm_iterations: int = Field(gt=0)
     start_error_px: tuple[float, float, float]
-    threads: int = Field(gt=0)
+    threads: int = Field(gt=0, le=_MOST_WORKERS)
 
     @model_validator(mode="after")
     def _decay_fits(self) -> OptimizerSection:
         if self.decay_steps > self.steps:
             raise ValueError(f"decay_steps {self.decay_steps} exceeds steps {self.steps}")
+        if self.crop[0] * self.crop[1] < 2 * self.anchors:
+            raise ValueError(f"crop {self.crop} has too few pixels for {self.anchors} anchors")
         return self
 
 
@@ -115,8 +128,8 @@ class DistillSection(_Frozen):
 class TrainConfig(_Frozen):
     """A whole run. warm_start: checkpoint whose averaged weights are the first ones."""
 
-    name: str
-    seed: int
+    name: str = Field(pattern=r"^\w[\w.-]*$")  # of files
+    seed: int = Field(ge=0)
     output: Path
     checkpoint_steps: int = Field(gt=0)
     warm_start: Path | None = None
@@ -142,6 +155,9 @@ def load_config(path: Path) -> TrainConfig:
         return TrainConfig.model_validate(yaml.safe_load(path.read_text()))
     except OSError as error:
         raise ModelError(f"{path}: cannot be read: {error.strerror}") from error
+    except ValidationError as error:
+        wrong = [f"{'.'.join(map(str, e['loc']))}: {e['msg']}" for e in error.errors()]
+        raise ModelError(f"{path}: {'; '.join(wrong)}") from error
     # ValueError: no UTF-8, or a value that does not hold; RecursionError: endless nesting.
     except (yaml.YAMLError, ValueError, RecursionError) as error:
-        raise ModelError(f"{path}: {error}") from error
+        raise ModelError(f"{path}: {' '.join(str(error).split())}") from error

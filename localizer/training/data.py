@@ -20,6 +20,7 @@ from localizer.training.shards import read_shard
 from localizer.types import Float32, Image
 
 _POLL_S = 0.5  # between looks for a shard that is still being generated
+_MOST_DRAWS = 200  # for one sample; most pairs give one
 _DENSEST_HAZE = 2.0  # optical depth at the scene's median distance; beyond it nothing is left
 
 
@@ -96,21 +97,31 @@ class ShardStream:
     def _make(self, step: int) -> Batch:
         rng = np.random.default_rng((*self._seed, step))
         samples: list[Sample] = []
-        while len(samples) < self._config.batch:
+        for _ in range(_MOST_DRAWS * self._config.batch):
             pairs = self._shard(self._schedule.draw(step, rng))
             if not pairs:
                 continue
             made = crop_pair(pairs[int(rng.integers(len(pairs)))], self._config, rng)
             if made is not None:
                 samples.append(made)
-        return collate(samples)
+            if len(samples) == self._config.batch:
+                return collate(samples)
+        raise SequenceError(
+            f"step {step}: hardly a pair of the run's shards has {self._config.anchors} anchors "
+            f"in a crop of {self._config.crop}: enlarge `crop`, or look at them with `sheet`"
+        )
 
     def _shard(self, path: Path) -> list[Pair]:
         if path in self._cache:
             self._cache.move_to_end(path)
             return self._cache[path]
         self._await(path)
-        self._cache[path] = read_shard(path)
+        pairs = read_shard(path)
+        width, height = self._config.crop
+        if pairs and (pairs[0].camera.width < width or pairs[0].camera.height < height):
+            size = f"{pairs[0].camera.width}x{pairs[0].camera.height}"
+            raise SequenceError(f"{path}: its images are {size}, less than `crop` {width}x{height}")
+        self._cache[path] = pairs
         if len(self._cache) > self._config.cached_shards:
             self._cache.popitem(last=False)
         return self._cache[path]

@@ -83,34 +83,45 @@ def export(checkpoint: Path, model: Path, *, half: bool = False) -> Parity:
     axes = {"image": {1: "height", 2: "width"}}
     axes |= {name: {1: f"h{name[-1]}", 2: f"w{name[-1]}"} for name in names}
     model.parent.mkdir(parents=True, exist_ok=True)
-    torch.onnx.export(
-        deployed,
-        (torch.zeros(1, 64, 96, 3, dtype=torch.uint8),),
-        str(model),
-        input_names=["image"],
-        output_names=names,
-        dynamic_axes=axes,
-        opset_version=OPSET,
-        dynamo=False,
-    )
-    description = {
-        "name": f"{config.name}-float16" if half else config.name,
-        "sha256": hashlib.sha256(model.read_bytes()).hexdigest(),
-        "levels": [{"stride": s, "channels": config.model.channels} for s in network.strides],
-        "parameters": parameter_count(network),
-        "training": {
-            "seed": config.seed,
-            **progress,
-            "model": config.model.model_dump(mode="json"),
-            "optimizer": config.optimizer.model_dump(mode="json"),
-            # Paths are of one machine; what decides the weights is the rest.
-            "warm_start": config.warm_start is not None,
-            "distilled": config.distill is not None,
-            "data": config.data.model_dump(mode="json", exclude={"shards", "photos", "workers"}),
-        },
-    }
-    model.with_suffix(".json").write_text(json.dumps(description, indent=2) + "\n")
-    return check_parity(exact, model, half=half)
+    # A good model of that name stays until the new one has passed.
+    made = model.with_name(f".{model.stem}-unchecked.onnx")
+    try:
+        torch.onnx.export(
+            deployed,
+            (torch.zeros(1, 64, 96, 3, dtype=torch.uint8),),
+            str(made),
+            input_names=["image"],
+            output_names=names,
+            dynamic_axes=axes,
+            opset_version=OPSET,
+            dynamo=False,
+        )
+        description = {
+            "name": f"{config.name}-float16" if half else config.name,
+            "sha256": hashlib.sha256(made.read_bytes()).hexdigest(),
+            "levels": [{"stride": s, "channels": config.model.channels} for s in network.strides],
+            "parameters": parameter_count(network),
+            "training": {
+                "seed": config.seed,
+                **progress,
+                "model": config.model.model_dump(mode="json"),
+                "optimizer": config.optimizer.model_dump(mode="json"),
+                # Paths are of one machine; what decides the weights is the rest.
+                "warm_start": config.warm_start is not None,
+                "distilled": config.distill is not None,
+                "data": config.data.model_dump(
+                    mode="json", exclude={"shards", "photos", "workers"}
+                ),
+            },
+        }
+        made.with_suffix(".json").write_text(json.dumps(description, indent=2) + "\n")
+        parity = check_parity(exact, made, half=half)
+        made.replace(model)
+        made.with_suffix(".json").replace(model.with_suffix(".json"))
+    finally:
+        for left in (made, made.with_suffix(".json")):
+            left.unlink(missing_ok=True)
+    return parity
 
 
 def check_parity(deployed: Deployed, model: Path, *, half: bool = False) -> Parity:

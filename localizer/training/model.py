@@ -12,7 +12,7 @@ of view costs next to nothing.
 
 from __future__ import annotations
 
-from typing import ClassVar, Literal
+from typing import Annotated, ClassVar, Literal
 
 import torch
 from pydantic import BaseModel, ConfigDict, Field
@@ -23,6 +23,9 @@ from localizer.training.orientation import CHANNELS, OrientationFeatures
 
 STRIDES = (8, 4, 2)
 
+_Width = Annotated[int, Field(gt=0, le=4096)]  # channels
+_Dilation = Annotated[int, Field(gt=0, le=64)]
+
 
 class ModelConfig(BaseModel):
     """Shape of the network. widths: encoder channels at strides 2, 4, 8; decoder: at 4 and 2;
@@ -31,10 +34,10 @@ class ModelConfig(BaseModel):
 
     model_config = ConfigDict(frozen=True, extra="forbid")
     network: Literal["tiny"] = "tiny"
-    channels: int = Field(default=32, gt=CHANNELS)
-    widths: tuple[int, int, int] = (24, 48, 96)
-    decoder: tuple[int, int] = (48, 32)
-    dilations: tuple[int, ...] = (1, 1, 2, 1, 4, 2)
+    channels: int = Field(default=32, gt=CHANNELS, le=4096)
+    widths: tuple[_Width, _Width, _Width] = (24, 48, 96)
+    decoder: tuple[_Width, _Width] = (48, 32)
+    dilations: tuple[_Dilation, ...] = Field(default=(1, 1, 2, 1, 4, 2), min_length=1)
 
 
 class MobileOneBlock(nn.Module):

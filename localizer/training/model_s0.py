@@ -26,8 +26,8 @@ class S0Config(BaseModel):
 
     model_config = ConfigDict(frozen=True, extra="forbid")
     network: Literal["s0"] = "s0"
-    channels: int = Field(default=32, gt=0)
-    branches: int = Field(default=4, gt=0)
+    channels: int = Field(default=32, gt=0, le=4096)
+    branches: int = Field(default=4, gt=0, le=64)
 
 
 class BranchedBlock(nn.Module):

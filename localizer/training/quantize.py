@@ -34,6 +34,7 @@ def quantize(model: Path, out: Path, shards: Sequence[Path]) -> float:
     """Write the int8 form of `model` and its JSON; returns the mean cosine between the features of
     both on the calibration images. Heads and fixed channels stay float.
     """
+    OnnxExtractor(model)  # its errors now, not after minutes
     images = list(calibration_images(shards))
     if not images:
         raise ModelError("quantisation needs training pairs to calibrate on, got no shard with any")

@@ -16,7 +16,7 @@ from pathlib import Path
 import numpy as np
 
 from localizer.camera import Camera
-from localizer.errors import SequenceError
+from localizer.errors import LocalizerError, SequenceError
 from localizer.pose import Pose
 from localizer.training.land import PhotoLibrary
 from localizer.training.pairs import Pair, SceneConfig, scene_pairs
@@ -118,6 +118,15 @@ def read_shard(path: Path) -> list[Pair]:
     except (OSError, ValueError, EOFError, AttributeError, zipfile.BadZipFile) as error:
         why = str(error).split("\n")[0]
         raise SequenceError(f"{path}: cannot be read as a shard: {why}; remove it") from error
+    try:
+        return _pairs(z)
+    # Of another program, or of another version of this one.
+    except (KeyError, IndexError, ValueError, TypeError, LocalizerError) as error:
+        why = str(error).split("\n")[0]
+        raise SequenceError(f"{path}: holds no training pairs: {why}; remove it") from error
+
+
+def _pairs(z: dict[str, np.ndarray]) -> list[Pair]:
     count, height, width = z["reference"].shape[:3]
     return [
         Pair(

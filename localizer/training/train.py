@@ -12,7 +12,8 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from localizer.training.checkpoint import fill, read_checkpoint
+from localizer.errors import ModelError
+from localizer.training.checkpoint import fill, read_checkpoint, write_checkpoint
 from localizer.training.config import OptimizerSection, TrainConfig
 from localizer.training.distill import Teacher, distillation_loss
 from localizer.training.distributed import Workers
@@ -73,6 +74,7 @@ class Trainer:
         last = self.config.optimizer.steps
         if steps is not None:
             last = min(last, self.step + steps)
+        self.config.output.mkdir(parents=True, exist_ok=True)  # its error now, not after hours
         stream = open_stream(self.config, self.workers, generating)
         rows: list[dict[str, float]] = []
         began = time.monotonic() - self.seconds
@@ -159,9 +161,8 @@ class Trainer:
     def _save(self) -> None:
         if self.workers.rank > 0:
             return
-        self.config.output.mkdir(parents=True, exist_ok=True)
-        partial = self.checkpoint.with_suffix(".partial")
-        torch.save(
+        write_checkpoint(
+            self.checkpoint,
             {
                 "model": self.model.state_dict(),
                 "average": self.average.state_dict(),
@@ -171,20 +172,24 @@ class Trainer:
                 "seconds": self.seconds,
                 "config": self.config.model_dump(mode="json"),
             },
-            partial,
         )
-        partial.rename(self.checkpoint)
 
     def _resume(self) -> None:
         if not self.checkpoint.exists():
             return
         state = read_checkpoint(self.checkpoint, self.device)
-        fill(self.model, state["model"], self.checkpoint)
-        fill(self.average, state["average"], self.checkpoint)
-        with torch.no_grad():
-            self.log_scale.copy_(state["log_scale"])
-        self.optimizer.load_state_dict(state["optimizer"])
-        self.step, self.seconds = state["step"], state["seconds"]
+        try:
+            fill(self.model, state["model"], self.checkpoint)
+            fill(self.average, state["average"], self.checkpoint)
+            with torch.no_grad():
+                self.log_scale.copy_(state["log_scale"])
+            self.optimizer.load_state_dict(state["optimizer"])
+            self.step, self.seconds = int(state["step"]), float(state["seconds"])
+        except (KeyError, RuntimeError, TypeError, ValueError, AttributeError) as error:
+            raise ModelError(
+                f"{self.checkpoint}: no state to continue from ({type(error).__name__}: {error}); "
+                "weights alone go into `warm_start`"
+            ) from error
         logger.info("resumed %s at step %d", self.checkpoint, self.step)
 
     def _log(self, rows: list[dict[str, float]]) -> None:

@@ -31,8 +31,15 @@ def unfuse(model: Path, images: list[Image]) -> Network:
     gain of zero. A `tiny` whose share of the fixed channels is one number a level gets it as the
     bias of the share at every pixel.
     """
+    if not images:
+        raise ModelError(
+            "unfusing needs training pairs to take statistics on, got no shard with any"
+        )
     network = build(_config(model)).eval()
-    values = {i.name: numpy_helper.to_array(i) for i in onnx.load(str(model)).graph.initializer}
+    try:
+        values = {i.name: numpy_helper.to_array(i) for i in onnx.load(str(model)).graph.initializer}
+    except Exception as error:  # protobuf's and onnx's own
+        raise ModelError(f"{model}: not an ONNX model: {error}") from error
     weights = {
         k.removeprefix("network."): torch.tensor(v.astype(np.float32))
         for k, v in values.items()

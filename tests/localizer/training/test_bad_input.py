@@ -5,17 +5,28 @@ from __future__ import annotations
 from concurrent.futures import Future
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 torch = pytest.importorskip("torch")
 pytest.importorskip("onnx")
 
 from localizer.errors import ModelError, SequenceError  # noqa: E402
+from localizer.features.extractor import SHIPPED_MODEL  # noqa: E402
 from localizer.training import __main__ as cli  # noqa: E402
+from localizer.training.checkpoint import read_checkpoint, write_checkpoint  # noqa: E402
+from localizer.training.config import load_config  # noqa: E402
 from localizer.training.curves import plot  # noqa: E402
 from localizer.training.data import LoaderConfig, Schedule, ShardStream  # noqa: E402
-from localizer.training.export import load_network  # noqa: E402
-from localizer.training.shards import read_shard  # noqa: E402
+from localizer.training.export import export, load_network  # noqa: E402
+from localizer.training.networks import build  # noqa: E402
+from localizer.training.pairs import SceneConfig  # noqa: E402
+from localizer.training.quantize import quantize  # noqa: E402
+from localizer.training.shards import read_shard, store  # noqa: E402
+from localizer.training.train import Trainer  # noqa: E402
+from localizer.training.unfuse import unfuse  # noqa: E402
+
+SHIPPED = Path(__file__).parents[3] / "configs" / "train_tiny.yaml"
 
 
 @pytest.mark.parametrize("content", [b"", b"junk", b"\x80\x02}q\x00.", b"PK\x03\x04"])
@@ -76,3 +87,100 @@ def test_the_command_says_it_in_a_line(
             cli.main()
         assert ended.value.code == 2
         assert f"ModelError: {path}: " in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("left", [[], ["reference"], ["reference", "query", "focal_px"]])
+def test_a_foreign_archive_is_no_shard(tmp_path: Path, left: list[str]) -> None:
+    path = tmp_path / "1.npz"
+    np.savez(path, **{name: np.zeros((1, 4, 4, 3)) for name in left})
+    with pytest.raises(SequenceError, match=r"1\.npz: holds no training pairs"):
+        read_shard(path)
+
+
+def test_shards_that_give_no_sample_end_the_run(tmp_path: Path) -> None:
+    path = store(tmp_path / "1.npz", [], SceneConfig(width=64, height=48))
+    loader = LoaderConfig(batch=1, anchors=32, crop=(64, 48), appearance=False)
+    stream = ShardStream(Schedule((path,), 1, 0.0, (), 0.0), loader, 0)
+    with pytest.raises(SequenceError, match="hardly a pair"):
+        stream.batch(0)
+    stream.close()
+
+
+@pytest.mark.parametrize(
+    ("line", "wrong"),
+    [
+        ("name: tiny", "name: ../tiny"),
+        ("seed: 1", "seed: -1"),
+        ("channels: 32 ", "channels: 1000000000 "),
+        ("dilations: [1, 1, 2, 1, 4, 2]", "dilations: []"),
+        ("dilations: [1, 1, 2, 1, 4, 2]", "dilations: [0]"),
+        ("widths: [24, 48, 96]", "widths: [24, 48, 0]"),
+        ("crop: [160, 128]", "crop: [0, 0]"),
+        ("crop: [160, 128]", "crop: [8, 8]"),
+        ("learning_rate: 2.0e-3", "learning_rate: .inf"),
+        ("contrast_weight: 0.3", "contrast_weight: .nan"),
+        ("threads: 1", "threads: 100000000000"),
+    ],
+)
+def test_a_value_that_cannot_train_is_named_in_a_line(
+    tmp_path: Path, line: str, wrong: str
+) -> None:
+    text = SHIPPED.read_text()
+    assert line in text
+    path = tmp_path / "run.yaml"
+    path.write_text(text.replace(line, wrong, 1))
+    with pytest.raises(ModelError, match=wrong.partition(":")[0]) as refused:
+        load_config(path)
+    assert "\n" not in str(refused.value)
+
+
+def test_a_checkpoint_that_cannot_be_written_leaves_the_older_one(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = tmp_path / "run.pt"
+    write_checkpoint(path, {"average": {"step": 1}})
+
+    def full(_: object, partial: Path) -> None:
+        partial.write_bytes(b"PK")
+        raise RuntimeError("[enforce fail at inline_container.cc:815] . unexpected pos 64 vs 0")
+
+    monkeypatch.setattr(torch, "save", full)
+    with pytest.raises(ModelError, match=r"run\.pt: cannot be written"):
+        write_checkpoint(path, {"average": {"step": 2}})
+    assert read_checkpoint(path)["average"] == {"step": 1}
+    assert list(tmp_path.iterdir()) == [path]
+
+
+def test_weights_alone_cannot_be_continued(tmp_path: Path) -> None:
+    config = load_config(SHIPPED).model_copy(update={"output": tmp_path})
+    write_checkpoint(tmp_path / "tiny.pt", {"average": build(config.model).state_dict()})
+    with pytest.raises(ModelError, match=r"tiny\.pt: no state to continue from"):
+        Trainer(config)
+
+
+def test_a_model_that_gives_no_numbers_is_not_exported(tmp_path: Path) -> None:
+    config = load_config(SHIPPED)
+    weights = build(config.model).state_dict()
+    for value in weights.values():
+        if value.is_floating_point():
+            value.fill_(torch.nan)
+    state = {"average": weights, "config": config.model_dump(mode="json"), "step": 1, "seconds": 1}
+    write_checkpoint(tmp_path / "run.pt", state)
+    model = tmp_path / "tiny.onnx"
+    model.write_bytes(b"the good one")
+    with pytest.raises(ModelError, match="not finite"):
+        export(tmp_path / "run.pt", model)
+    assert model.read_bytes() == b"the good one"
+    assert {p.name for p in tmp_path.iterdir()} == {"run.pt", "tiny.onnx"}
+
+
+def test_a_model_is_tried_before_it_is_quantised(tmp_path: Path) -> None:
+    model = tmp_path / "tiny.onnx"
+    model.write_bytes(b"junk")
+    with pytest.raises(ModelError, match=r"tiny\.json: cannot be read"):
+        quantize(model, tmp_path / "int8.onnx", [tmp_path / "1.npz"])
+
+
+def test_unfusing_needs_pairs() -> None:
+    with pytest.raises(ModelError, match="needs training pairs"):
+        unfuse(SHIPPED_MODEL, [])
