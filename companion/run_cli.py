@@ -14,6 +14,17 @@ from companion.config import load_config
 from localizer.registration.devices import DeviceChoice
 from localizer.render.select import Backend
 
+OURS = ("companion", "localizer", "mavlink_bridge")
+
+
+def log_to_console(verbose: bool) -> None:
+    """Log to the console; `verbose` holds for our packages, because numba's own log is endless."""
+    logging.basicConfig(
+        level=logging.INFO, format="%(message)s", handlers=[RichHandler(show_path=False)]
+    )
+    for name in OURS:
+        logging.getLogger(name).setLevel(logging.DEBUG if verbose else logging.NOTSET)
+
 
 def run_command(
     config: Annotated[Path, typer.Argument(help="deployment YAML, see configs/")],
@@ -26,11 +37,7 @@ def run_command(
     verbose: Annotated[bool, typer.Option("--verbose", "-v", help="log more")] = False,
 ) -> None:
     """Localize the camera feed and inject positions until interrupted."""
-    logging.basicConfig(
-        level=logging.DEBUG if verbose else logging.INFO,
-        format="%(message)s",
-        handlers=[RichHandler(show_path=False)],
-    )
+    log_to_console(verbose)
     settings = load_config(config)
     given = {"renderer": renderer, "device": device}
     changes = {key: value for key, value in given.items() if value is not None}
