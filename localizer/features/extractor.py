@@ -15,7 +15,7 @@ from typing import Protocol, runtime_checkable
 
 import numpy as np
 import onnxruntime as ort
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
 from localizer.errors import ModelError
 from localizer.features.bound_session import BoundSession
@@ -66,8 +66,17 @@ class ModelInfo(BaseModel):
     sha256: str = Field(pattern="^[0-9a-f]{64}$")
     levels: tuple[LevelInfo, ...] = Field(min_length=1)
     parameters: int = Field(gt=0)
-    multiple: int = Field(default=8, gt=0)
+    multiple: int = Field(default=8, gt=0, le=64)
     training: dict[str, object] = {}
+
+    @model_validator(mode="after")
+    def _is_a_pyramid(self) -> ModelInfo:
+        strides = [level.stride for level in self.levels]
+        if strides != sorted(set(strides), reverse=True):
+            raise ValueError(f"levels must go from coarse to fine, got strides {strides}")
+        if any(self.multiple % stride for stride in strides):
+            raise ValueError(f"multiple {self.multiple} is not divisible by the strides {strides}")
+        return self
 
 
 def read_model_info(model: Path) -> ModelInfo:
@@ -79,7 +88,10 @@ def read_model_info(model: Path) -> ModelInfo:
         raise ModelError(
             f"{path}: cannot be read ({error.strerror}); every model needs its JSON file beside it"
         ) from error
-    except (ValidationError, ValueError) as error:
+    except ValidationError as error:
+        wrong = [f"{'.'.join(map(str, e['loc'])) or 'all'}: {e['msg']}" for e in error.errors()]
+        raise ModelError(f"{path}: not a valid model description: {'; '.join(wrong)}") from error
+    except ValueError as error:  # no UTF-8
         raise ModelError(f"{path}: not a valid model description: {error}") from error
     try:
         digest = hashlib.sha256(model.read_bytes()).hexdigest()
@@ -196,6 +208,12 @@ class OnnxExtractor:
                     f"{model}: level of stride {expected.stride} gives {level.features.shape}, "
                     f"its description says {shape}"
                 )
+            for values in (level.features, level.confidence):
+                if values.dtype != np.float32 or not np.isfinite(values).all():
+                    raise ModelError(
+                        f"{model}: level of stride {expected.stride} gives {values.dtype} or "
+                        "values that are not finite: export it again, from a sound checkpoint"
+                    )
 
 
 def load_extractor(

@@ -131,6 +131,27 @@ def test_a_description_that_leaves_a_level_out_is_found(tmp_path: Path) -> None:
         load_extractor(model)
 
 
+@pytest.mark.parametrize(
+    ("change", "why"),
+    [
+        ({"levels": [{"stride": 2, "channels": 32}, {"stride": 4, "channels": 32}]}, "coarse to"),
+        ({"multiple": 12}, "not divisible by the strides"),
+        ({"multiple": 4096}, "multiple"),
+        ({"levels": []}, "levels"),
+    ],
+)
+def test_a_description_of_no_pyramid_is_found(
+    tmp_path: Path, change: dict[str, object], why: str
+) -> None:
+    model = tmp_path / "tiny.onnx"
+    model.write_bytes(extractor.SHIPPED_MODEL.read_bytes())
+    description = json.loads(extractor.SHIPPED_MODEL.with_suffix(".json").read_text()) | change
+    model.with_suffix(".json").write_text(json.dumps(description))
+    with pytest.raises(ModelError, match=why) as refused:
+        OnnxExtractor(model)
+    assert "\n" not in str(refused.value)
+
+
 def test_a_file_that_is_no_graph_is_found(tmp_path: Path) -> None:
     model = copied_model(tmp_path)
     model.write_bytes(b"not a graph")
