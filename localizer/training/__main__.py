@@ -13,8 +13,15 @@ from typing import Annotated
 import typer
 
 from localizer.errors import LocalizerError
-from localizer.training.config import LiveSection, TrainConfig, load_config
-from localizer.training.shards import FIRST_WORLD_SEED, write_shards, write_world_shards
+
+try:
+    from localizer.training.config import LiveSection, TrainConfig, load_config
+    from localizer.training.shards import FIRST_WORLD_SEED, write_shards, write_world_shards
+except ModuleNotFoundError as error:
+    if error.name != "torch":
+        raise
+    typer.echo("training needs PyTorch: pip install '.[train]' in the source folder", err=True)
+    sys.exit(2)
 
 app = typer.Typer(
     help=__doc__, no_args_is_help=True, add_completion=False, pretty_exceptions_enable=False
