@@ -8,6 +8,7 @@ import numpy as np
 
 from localizer.camera import Camera
 from localizer.config import LocalizerConfig
+from localizer.errors import ModelError
 from localizer.features.detail import DetailExtractor
 from localizer.features.extractor import DeviceExtractor, FeatureExtractor, load_extractor
 from localizer.map.cache import TileCache
@@ -70,6 +71,12 @@ def _warm_up(
     size = working_camera(camera, config.width)
     black = np.zeros((size.height, size.width, 3), np.uint8)
     pyramid = extractor.extract(black)
+    given, wanted = len(pyramid.levels) - 1, len(config.registration.iterations)
+    if given != wanted:  # every frame would be refused, or the detail taken for the finest level
+        raise ModelError(
+            f"{extractor.name}: the model has {given} levels of features, "
+            f"localizer.registration.iterations {config.registration.iterations} need {wanted}"
+        )
     if isinstance(extractor, DeviceExtractor):
         extractor.extract_on_device(black)  # allocates the outputs there
     for channels in {level.features.shape[-1] for level in pyramid.levels}:

@@ -4,9 +4,11 @@ import threading
 
 import pytest
 
-from companion.build import MapStack
+from companion.build import MapStack, build_localizer
+from localizer.camera import Camera
 from localizer.config import LocalizerConfig
-from localizer.errors import RenderError
+from localizer.errors import ModelError, RenderError
+from localizer.registration.config import JNGOConfig
 from localizer.render import select
 
 
@@ -35,3 +37,13 @@ def test_a_renderer_that_is_not_there_is_named_and_leaves_no_thread(small_assets
     with pytest.raises(RenderError, match="not installed"):
         MapStack(small_assets.map_cache, LocalizerConfig(renderer="moderngl"))
     assert threading.active_count() == before
+
+
+@pytest.mark.parametrize("iterations", [(4, 4), (4, 4, 4, 4)])
+def test_a_model_of_another_number_of_levels_ends_the_start(small_assets, iterations):
+    registration = JNGOConfig().model_copy(update={"iterations": iterations})
+    config = LocalizerConfig(renderer="numba", threads=1, registration=registration)
+    stack = MapStack(small_assets.map_cache, config)
+    with pytest.raises(ModelError, match="the model has 3 levels"):
+        build_localizer(stack, Camera(64, 48, 60.0, 60.0, 32.0, 24.0), config)
+    stack.close()
