@@ -22,6 +22,7 @@ import basin_axes
 from basin_run import Outcome, Start, groups, random_start, run, summary
 from basin_variants import FULL, our_rows, paper_rows, prior_rows
 from basin_views import View, load_views
+from named_errors import named_errors
 
 STARTS = (5.0, 10.0)  # metres and degrees: the paper's columns but the easiest
 
@@ -96,4 +97,5 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    with named_errors():
+        main()

@@ -26,6 +26,7 @@ from collections import Counter
 from typing import Any
 
 import numpy as np
+from named_errors import named_errors
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from mavlink_bridge import Bridge, BridgeConfig, VisionFix
@@ -188,4 +189,5 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    with named_errors():
+        main()

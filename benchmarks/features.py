@@ -35,6 +35,7 @@ from feature_pairs import (
 )
 from feature_real import real_pairs
 from feature_report import Outcome, read_outcomes, report, write_outcomes
+from named_errors import named_errors
 
 from localizer.config import LocalizerConfig
 from localizer.features import FeatureExtractor, GradientExtractor, load_extractor
@@ -160,4 +161,5 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    with named_errors():
+        main()

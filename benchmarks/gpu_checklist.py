@@ -19,6 +19,8 @@ import time
 from dataclasses import dataclass
 from pathlib import Path
 
+from named_errors import named_errors
+
 from localizer.registration.cuda import CudaError, Device
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -125,4 +127,5 @@ def main() -> int:
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    with named_errors():
+        sys.exit(main())

@@ -23,6 +23,7 @@ from pathlib import Path
 
 import cv2
 import numpy as np
+from named_errors import named_errors
 from rich.console import Console
 from rich.table import Table
 
@@ -209,4 +210,5 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    with named_errors():
+        main()

@@ -18,6 +18,7 @@ from pathlib import Path
 
 import numpy as np
 import onnxruntime as ort
+from named_errors import named_errors
 
 from localizer.errors import ModelError
 from localizer.features import OnnxExtractor
@@ -115,4 +116,5 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    with named_errors():
+        main()

@@ -18,6 +18,7 @@ from functools import partial
 
 import cv2
 import numpy as np
+from named_errors import named_errors
 from optimizer_gpu import print_tables
 from rich.console import Console
 from rich.table import Table
@@ -281,4 +282,5 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    with named_errors():
+        main()

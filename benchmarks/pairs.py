@@ -16,6 +16,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import torch
+from named_errors import named_errors
 
 from localizer.synth.heightfield import render
 from localizer.training.config import LiveSection, load_config
@@ -93,4 +94,5 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    with named_errors():
+        main()

@@ -14,6 +14,7 @@ import time
 
 import cv2
 import numpy as np
+from named_errors import named_errors
 from rich.console import Console
 from rich.table import Table
 
@@ -154,4 +155,5 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    with named_errors():
+        main()
