@@ -16,9 +16,12 @@ import pytest
 from sitl.assets import FlightAssets, prepare
 from sitl.errors import SimulationError
 
-# A busy machine takes its time over an example; what is slow shows in the suite's durations.
-hypothesis.settings.register_profile("patient", deadline=None)
-hypothesis.settings.load_profile("patient")
+# The suite tries the same examples every time, so that a failure belongs to the change it is seen
+# on; `pytest --hypothesis-profile=explore` draws new ones. No deadline: a busy machine takes its
+# time over an example, and what is slow shows in the suite's durations.
+hypothesis.settings.register_profile("repeatable", deadline=None, derandomize=True)
+hypothesis.settings.register_profile("explore", deadline=None)
+hypothesis.settings.load_profile("repeatable")
 
 ROOT = Path(__file__).resolve().parent.parent
 

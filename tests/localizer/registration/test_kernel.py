@@ -33,7 +33,7 @@ from localizer.registration.reference import (
 
 SETTINGS = LMSettings()
 # A busy machine is no reason to fail.
-patient = settings(deadline=None, suppress_health_check=[HealthCheck.too_slow])
+patient = settings(suppress_health_check=[HealthCheck.too_slow])
 
 
 @pytest.fixture(scope="module")
