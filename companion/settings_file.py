@@ -9,6 +9,8 @@ from typing import Any, TypeVar
 import yaml
 from pydantic import BaseModel, ValidationError
 
+from localizer.strict_yaml import load_yaml
+
 _ModelT = TypeVar("_ModelT", bound=BaseModel)
 
 
@@ -19,7 +21,7 @@ class SettingsError(ValueError):
 def read_settings(path: Path, error_type: type[Exception]) -> dict[str, Any]:
     """The mapping in a YAML file, empty for an empty file; `error_type` names file and fault."""
     try:
-        data = yaml.safe_load(path.read_text(encoding="utf-8"))
+        data = load_yaml(path.read_text(encoding="utf-8"))
     except OSError as error:
         raise error_type(f"{path}: cannot be read: {error.strerror}") from error
     # ValueError: no UTF-8, or a date that does not exist; RecursionError: endless nesting.
