@@ -46,7 +46,6 @@ def _stop(_signal: int, _frame: FrameType | None) -> None:
 def main(argv: list[str] | None = None) -> int:
     """Run the vehicle; returns the exit status."""
     arguments = _arguments(argv)
-    signal.signal(signal.SIGTERM, _stop)
     home, heading_deg = arguments.home
     try:
         parameters = Parameters()
@@ -91,4 +90,5 @@ def _compile(home: Location) -> None:
 
 
 if __name__ == "__main__":
+    signal.signal(signal.SIGTERM, _stop)
     sys.exit(main())

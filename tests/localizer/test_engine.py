@@ -138,14 +138,14 @@ def flight(request):
 
 
 def test_reaches_tracking_from_a_prior_and_stops_cleanly(flight):
-    before = threading.active_count()
+    before = set(threading.enumerate())
     f = flight(_localizer())
     f.feed_until(lambda: f.estimates and f.estimates[-1].state is TrackingState.TRACKING)
     estimate = f.estimates[-1]
     assert estimate.accepted
     assert set(estimate.stage_ms) == {"reference", "extract", "register", "latency"}
     f.engine.stop()
-    assert threading.active_count() == before
+    assert not set(threading.enumerate()) - before
 
 
 def test_the_map_is_loaded_along_the_way_ahead(flight):
@@ -199,12 +199,15 @@ def test_leaving_the_map_is_named_and_survived(flight):
 
 
 def test_a_lost_tracker_asks_outside_and_comes_back(flight):
-    optimizer = FakeOptimizer()
-    f = flight(_localizer(optimizer=optimizer))
+    optimizer, asked = FakeOptimizer(), []
+    f = flight(_localizer(optimizer=optimizer), lambda t: asked.append(t) or _prior(t))
     f.feed_until(lambda: f.estimates and f.estimates[-1].state is TrackingState.TRACKING)
+    before = len(asked)
     optimizer.status = RegistrationStatus.NO_OVERLAP
-    f.feed_until(lambda: f.estimates[-1].state is TrackingState.LOST)
-    assert not f.estimates[-1].accepted
+    # A single estimate says LOST: the next frame begins anew from the pose asked for.
+    f.feed_until(lambda: any(e.state is TrackingState.LOST for e in f.estimates))
+    assert not next(e for e in f.estimates if e.state is TrackingState.LOST).accepted
+    f.feed_until(lambda: len(asked) > before)
     optimizer.status = RegistrationStatus.OK
     f.feed_until(lambda: f.estimates[-1].state is TrackingState.TRACKING)
 
