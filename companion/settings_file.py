@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any, TypeVar
 
 import yaml
 from pydantic import BaseModel, ValidationError
 
-from localizer.strict_yaml import load_yaml
+from localizer.strict_yaml import load_yaml, misread_booleans
 
 _ModelT = TypeVar("_ModelT", bound=BaseModel)
 
@@ -41,25 +41,10 @@ def validated(model: type[_ModelT], data: dict[str, Any]) -> _ModelT:
     except ValidationError as error:
         lines = [_line(e["loc"], _reason(e["type"], e["msg"]), e["input"]) for e in error.errors()]
         raise SettingsError("\n".join(lines)) from error
-    # YAML's yes, on and true would else be the number 1.
     if lines := [_line(where, "Input should not be a boolean", value)
-                 for where, value in _misread(data, settings)]:  # fmt: skip
+                 for where, value in misread_booleans(data, settings)]:  # fmt: skip
         raise SettingsError("\n".join(lines))
     return settings
-
-
-def _misread(given: Any, taken: Any, where: tuple[str | int, ...] = ()) -> Iterator[Any]:
-    """(where, value) of the booleans that the model took for something else."""
-    if isinstance(given, bool):
-        if not isinstance(taken, bool):
-            yield where, given
-    elif isinstance(given, dict):
-        for name, value in given.items():
-            inner = taken.get(name) if isinstance(taken, dict) else getattr(taken, name, value)
-            yield from _misread(value, inner, (*where, name))
-    elif isinstance(given, list) and isinstance(taken, list | tuple):
-        for i, (value, inner) in enumerate(zip(given, taken, strict=False)):
-            yield from _misread(value, inner, (*where, i))
 
 
 def _line(where: Iterable[str | int], what: str, given: object) -> str:

@@ -1,8 +1,8 @@
-"""YAML as settings need it: safe types, and no key twice in one mapping."""
+"""YAML as settings need it: plain types, no key twice, no `yes` where a number belongs."""
 
 from __future__ import annotations
 
-from collections.abc import Hashable
+from collections.abc import Hashable, Iterator
 from typing import Any
 
 import yaml
@@ -33,3 +33,21 @@ def load_yaml(text: str) -> Any:
     As with `yaml.safe_load`, ValueError for an impossible date, RecursionError for endless nesting.
     """
     return yaml.load(text, Loader=_StrictLoader)
+
+
+def misread_booleans(
+    given: Any, taken: Any, where: tuple[str | int, ...] = ()
+) -> Iterator[tuple[tuple[str | int, ...], bool]]:
+    """(where, value) of the booleans in the data `given` that its model `taken` took for something
+    else: pydantic makes YAML's yes, on and true the number 1.
+    """
+    if isinstance(given, bool):
+        if not isinstance(taken, bool):
+            yield where, given
+    elif isinstance(given, dict):
+        for name, value in given.items():
+            inner = taken.get(name) if isinstance(taken, dict) else getattr(taken, name, value)
+            yield from misread_booleans(value, inner, (*where, name))
+    elif isinstance(given, list) and isinstance(taken, list | tuple):
+        for i, (value, inner) in enumerate(zip(given, taken, strict=False)):
+            yield from misread_booleans(value, inner, (*where, i))

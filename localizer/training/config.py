@@ -18,6 +18,7 @@ from pydantic import (
 )
 
 from localizer.errors import ModelError
+from localizer.strict_yaml import load_yaml, misread_booleans
 from localizer.synth.heightfield import BLOCK
 from localizer.training.networks import NetworkConfig
 
@@ -152,7 +153,8 @@ class TrainConfig(_Frozen):
 def load_config(path: Path) -> TrainConfig:
     """Read a YAML file; unknown keys and bad values raise `ModelError` with their names."""
     try:
-        return TrainConfig.model_validate(yaml.safe_load(path.read_text()))
+        data = load_yaml(path.read_text(encoding="utf-8"))
+        config = TrainConfig.model_validate(data)
     except OSError as error:
         raise ModelError(f"{path}: cannot be read: {error.strerror}") from error
     except ValidationError as error:
@@ -161,3 +163,7 @@ def load_config(path: Path) -> TrainConfig:
     # ValueError: no UTF-8, or a value that does not hold; RecursionError: endless nesting.
     except (yaml.YAMLError, ValueError, RecursionError) as error:
         raise ModelError(f"{path}: {' '.join(str(error).split())}") from error
+    if wrong := [f"{'.'.join(map(str, where))}: is {str(value).lower()}, not a number or a text"
+                 for where, value in misread_booleans(data, config)]:  # fmt: skip
+        raise ModelError(f"{path}: {'; '.join(wrong)}")
+    return config

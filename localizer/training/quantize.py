@@ -32,34 +32,44 @@ _HEADS = ("features", "share", "projections", "uncertainties")  # of both networ
 
 def quantize(model: Path, out: Path, shards: Sequence[Path]) -> float:
     """Write the int8 form of `model` and its JSON; returns the mean cosine between the features of
-    both on the calibration images. Heads and fixed channels stay float.
+    both on the calibration images. Heads and fixed channels stay float. `out` may be `model`: what
+    stands there is replaced when the new model is whole.
     """
     OnnxExtractor(model)  # its errors now, not after minutes
     images = list(calibration_images(shards))
     if not images:
         raise ModelError("quantisation needs training pairs to calibrate on, got no shard with any")
     out.parent.mkdir(parents=True, exist_ok=True)
-    with tempfile.TemporaryDirectory() as temporary:
-        prepared = Path(temporary) / "prepared.onnx"
-        quant_pre_process(str(model), str(prepared), skip_symbolic_shape=True)
-        graph = onnx.load(str(prepared)).graph
-        quantize_static(
-            str(prepared),
-            str(out),
-            _Calibration(images),
-            quant_format=QuantFormat.QDQ,
-            op_types_to_quantize=["Conv", "Add", "Relu", "Resize"],
-            per_channel=True,
-            activation_type=QuantType.QUInt8,
-            weight_type=QuantType.QInt8,
-            nodes_to_exclude=[n.name for n in graph.node if _stays_float(n.name)],
-            calibrate_method=CalibrationMethod.Entropy,
-        )
-    description = json.loads(model.with_suffix(".json").read_text())
-    description["name"] += "-int8"
-    description["sha256"] = hashlib.sha256(out.read_bytes()).hexdigest()
-    out.with_suffix(".json").write_text(json.dumps(description, indent=2) + "\n")
-    return _likeness(model, out, images[:8])
+    # Beside `out`, since a file is only replaced at once on its own disk.
+    with tempfile.TemporaryDirectory(dir=out.parent, prefix=f".{out.stem}-") as temporary:
+        made = Path(temporary) / out.name
+        _write_int8(model, made, images)
+        description = json.loads(model.with_suffix(".json").read_text())
+        description["name"] += "-int8"
+        description["sha256"] = hashlib.sha256(made.read_bytes()).hexdigest()
+        made.with_suffix(".json").write_text(json.dumps(description, indent=2) + "\n")
+        likeness = _likeness(model, made, images[:8])
+        made.replace(out)
+        made.with_suffix(".json").replace(out.with_suffix(".json"))
+    return likeness
+
+
+def _write_int8(model: Path, out: Path, images: Sequence[Image]) -> None:
+    prepared = out.with_name(f"prepared-{out.name}")
+    quant_pre_process(str(model), str(prepared), skip_symbolic_shape=True)
+    graph = onnx.load(str(prepared)).graph
+    quantize_static(
+        str(prepared),
+        str(out),
+        _Calibration(images),
+        quant_format=QuantFormat.QDQ,
+        op_types_to_quantize=["Conv", "Add", "Relu", "Resize"],
+        per_channel=True,
+        activation_type=QuantType.QUInt8,
+        weight_type=QuantType.QInt8,
+        nodes_to_exclude=[n.name for n in graph.node if _stays_float(n.name)],
+        calibrate_method=CalibrationMethod.Entropy,
+    )
 
 
 def _stays_float(node: str) -> bool:

@@ -90,23 +90,26 @@ def write_shard(out: Path, seed: int, scenes: SceneConfig, photos: PhotoSource |
 
 
 def store(path: Path, pairs: list[Pair], scenes: SceneConfig) -> Path:
-    """Write a shard; a reader never sees half a file."""
+    """Write a shard; a reader never sees half a file, and a stopped run leaves none."""
     partial = path.with_suffix(".partial.npz")
-    np.savez(
-        partial,
-        reference=_stack([p.reference for p in pairs], scenes, np.uint8),
-        query=_stack([p.query for p in pairs], scenes, np.uint8),
-        reference_depth=_stack([p.reference_depth for p in pairs], scenes, np.float16),
-        query_depth=_stack([p.query_depth for p in pairs], scenes, np.float16),
-        world_from_reference=np.array([p.world_from_reference.matrix for p in pairs]),
-        world_from_query=np.array([p.world_from_query.matrix for p in pairs]),
-        focal_px=np.array([p.camera.fx for p in pairs]),
-        condition=np.array([p.condition for p in pairs]),
-        outdated=np.array([p.outdated for p in pairs]),
-        source=np.array([p.source for p in pairs]),
-        season=np.array([p.season for p in pairs]),
-    )
-    partial.rename(path)
+    try:
+        np.savez(
+            partial,
+            reference=_stack([p.reference for p in pairs], scenes, np.uint8),
+            query=_stack([p.query for p in pairs], scenes, np.uint8),
+            reference_depth=_stack([p.reference_depth for p in pairs], scenes, np.float16),
+            query_depth=_stack([p.query_depth for p in pairs], scenes, np.float16),
+            world_from_reference=np.array([p.world_from_reference.matrix for p in pairs]),
+            world_from_query=np.array([p.world_from_query.matrix for p in pairs]),
+            focal_px=np.array([p.camera.fx for p in pairs]),
+            condition=np.array([p.condition for p in pairs]),
+            outdated=np.array([p.outdated for p in pairs]),
+            source=np.array([p.source for p in pairs]),
+            season=np.array([p.season for p in pairs]),
+        )
+        partial.replace(path)
+    finally:
+        partial.unlink(missing_ok=True)
     return path
 
 

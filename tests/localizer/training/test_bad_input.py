@@ -14,6 +14,7 @@ pytest.importorskip("onnx")
 from localizer.errors import ModelError, SequenceError  # noqa: E402
 from localizer.features.extractor import SHIPPED_MODEL  # noqa: E402
 from localizer.training import __main__ as cli  # noqa: E402
+from localizer.training import quantize as quantization  # noqa: E402
 from localizer.training.checkpoint import read_checkpoint, write_checkpoint  # noqa: E402
 from localizer.training.config import load_config  # noqa: E402
 from localizer.training.curves import plot  # noqa: E402
@@ -120,6 +121,9 @@ def test_shards_that_give_no_sample_end_the_run(tmp_path: Path) -> None:
         ("learning_rate: 2.0e-3", "learning_rate: .inf"),
         ("contrast_weight: 0.3", "contrast_weight: .nan"),
         ("threads: 1", "threads: 100000000000"),
+        ("seed: 1", "seed: true"),
+        ("widths: [24, 48, 96]", "widths: [24, 48, yes]"),
+        ("seed: 1", "seed: 1\nseed: 2"),
     ],
 )
 def test_a_value_that_cannot_train_is_named_in_a_line(
@@ -172,6 +176,40 @@ def test_a_model_that_gives_no_numbers_is_not_exported(tmp_path: Path) -> None:
         export(tmp_path / "run.pt", model)
     assert model.read_bytes() == b"the good one"
     assert {p.name for p in tmp_path.iterdir()} == {"run.pt", "tiny.onnx"}
+
+
+def test_a_quantisation_that_fails_leaves_the_older_model(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    model, described = tmp_path / "tiny.onnx", tmp_path / "tiny.json"
+    model.write_bytes(SHIPPED_MODEL.read_bytes())
+    described.write_bytes(SHIPPED_MODEL.with_suffix(".json").read_bytes())
+    before = model.read_bytes(), described.read_bytes()
+
+    def stopped(_: object, out: str, *_args: object, **_options: object) -> None:
+        Path(out).write_bytes(b"half")
+        raise KeyboardInterrupt
+
+    image = np.zeros((64, 64, 3), np.uint8)
+    monkeypatch.setattr(quantization, "calibration_images", lambda _: [image])
+    monkeypatch.setattr(quantization, "quantize_static", stopped)
+    with pytest.raises(KeyboardInterrupt):
+        quantize(model, model, [])
+    assert (model.read_bytes(), described.read_bytes()) == before
+    assert set(tmp_path.iterdir()) == {model, described}
+
+
+def test_a_stopped_generation_leaves_no_half_shard(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def stopped(path: Path, **_: object) -> None:
+        path.write_bytes(b"PK")
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(np, "savez", stopped)
+    with pytest.raises(KeyboardInterrupt):
+        store(tmp_path / "1.npz", [], SceneConfig(width=64, height=48))
+    assert not list(tmp_path.iterdir())
 
 
 def test_a_model_is_tried_before_it_is_quantised(tmp_path: Path) -> None:
