@@ -16,6 +16,12 @@ def test_the_shipped_demo_file_says_what_the_defaults_are():
     assert load_scenario(CONFIGS / "demo.yaml") == Scenario()
 
 
+def test_the_short_flight_ends_at_home_and_is_short():
+    short = load_scenario(CONFIGS / "demo_short.yaml")
+    assert (short.legs[-1].east_m, short.legs[-1].north_m) == (0, 0)
+    check_inside(short, 400.0)
+
+
 @pytest.mark.parametrize(
     ("text", "named"),
     [
