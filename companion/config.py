@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
 from typing import Annotated, Any
 
-from pydantic import BaseModel, ConfigDict, Field, field_validator
+from pydantic import BaseModel, ConfigDict, Field, field_validator, model_validator
 
 from companion.detections import parse_host_port
 from companion.errors import ConfigError
@@ -15,6 +16,11 @@ from localizer.camera import Camera
 from localizer.config import LocalizerConfig
 from localizer.errors import CameraError
 from mavlink_bridge.config import BridgeConfig
+
+
+_FIELDS_OF_VIEW_DEG = (1.0, 170.0)
+_CENTRAL = (0.1, 0.9)  # share of the picture in which the principal point must lie
+_MOST_BENT = 0.7  # of a corner's distance from the principal point
 
 
 class _Model(BaseModel):
@@ -33,6 +39,41 @@ class CameraModel(_Model):
     distortion: tuple[float, float, float, float, float] = Field(
         (0.0, 0.0, 0.0, 0.0, 0.0), description="Brown: k1 k2 p1 p2 k3"
     )
+
+    @model_validator(mode="after")
+    def _is_a_lens(self) -> CameraModel:
+        """Intrinsics in millimetres, in shares of the width, or of a typing error are none."""
+        low, high = _FIELDS_OF_VIEW_DEG
+        for name, side, f in (("fx", self.width, self.fx), ("fy", self.height, self.fy)):
+            fov_deg = math.degrees(2.0 * math.atan(0.5 * side / f))
+            if not low <= fov_deg <= high:
+                raise ValueError(
+                    f"{name} {f:g} on {side} pixels is a field of view of {fov_deg:.3g} degrees; "
+                    "give the focal length in pixels"
+                )
+        for name, side, c in (("cx", self.width, self.cx), ("cy", self.height, self.cy)):
+            if not _CENTRAL[0] * side <= c <= _CENTRAL[1] * side:
+                raise ValueError(
+                    f"{name} {c:g} is far from the middle of {side} pixels; give the principal "
+                    "point in pixels"
+                )
+        bent = max(self._bent(u, v) for u in (0, self.width) for v in (0, self.height))
+        if bent > _MOST_BENT:
+            raise ValueError(
+                f"the distortion moves a corner by {bent:.3g} of its distance from the middle; "
+                "give Brown's k1 k2 p1 p2 k3 in this order"
+            )
+        return self
+
+    def _bent(self, u: float, v: float) -> float:
+        """How far Brown's model moves the pinhole's pixel, as a share of its radius."""
+        k1, k2, p1, p2, k3 = self.distortion
+        x, y = (u - self.cx) / self.fx, (v - self.cy) / self.fy
+        r2 = x * x + y * y
+        radial = r2 * (k1 + r2 * (k2 + r2 * k3))
+        dx = x * radial + 2.0 * p1 * x * y + p2 * (r2 + 2.0 * x * x)
+        dy = y * radial + p1 * (r2 + 2.0 * y * y) + 2.0 * p2 * x * y
+        return math.hypot(dx, dy) / math.sqrt(r2)
 
     def camera(self) -> Camera:
         """As the geometry type."""
@@ -58,8 +99,10 @@ class TargetConfig(_Model):
 
     detections: str | None = Field(None, description="host:port where pixel detections arrive")
     rate_hz: float = Field(5.0, gt=0, le=30, description="reports per second and target")
-    pixel_sigma: float = Field(1.5, gt=0, description="error of a detection, pixels")
-    map_sigma_m: float = Field(0.3, gt=0, description="error of the map's surface, metres")
+    pixel_sigma: float = Field(1.5, ge=0.01, le=1000, description="error of a detection, pixels")
+    map_sigma_m: float = Field(
+        0.3, ge=0.001, le=100, description="error of the map's surface, metres"
+    )
 
     @field_validator("detections")
     @classmethod
@@ -75,8 +118,8 @@ class TargetConfig(_Model):
 class PriorConfig(_Model):
     """How well the autopilot's own position is believed when tracking (re)starts from it."""
 
-    position_sigma_m: float = Field(5.0, gt=0)
-    rotation_sigma_deg: float = Field(4.0, gt=0)
+    position_sigma_m: float = Field(5.0, ge=0.01, le=1000)
+    rotation_sigma_deg: float = Field(4.0, ge=0.01, le=180)
 
 
 class RecordConfig(_Model):
@@ -103,7 +146,10 @@ class CompanionConfig(_Model):
 def load_config(path: Path) -> CompanionConfig:
     """Read and check a configuration file; relative paths are relative to that file."""
     config = parse_config(read_settings(path, ConfigError), str(path))
-    return _resolve(config, path.parent)
+    try:
+        return _resolve(config, path.parent)
+    except ValueError as error:
+        raise ConfigError(f"{path}: {error}") from error
 
 
 def parse_config(data: dict[str, Any], where: str) -> CompanionConfig:
@@ -122,15 +168,18 @@ def parse_config(data: dict[str, Any], where: str) -> CompanionConfig:
 def _resolve(config: CompanionConfig, folder: Path) -> CompanionConfig:
     localizer = config.localizer
     if localizer.model is not None:
-        localizer = localizer.model_copy(update={"model": folder / localizer.model})
+        model = _path(folder, localizer.model, "localizer.model")
+        localizer = localizer.model_copy(update={"model": model})
     record = config.record
     if record is not None:
-        record = record.model_copy(update={"folder": folder / record.folder})
+        place = _path(folder, record.folder, "record.folder")
+        record = record.model_copy(update={"folder": place})
     camera = config.camera
     if "://" not in camera.source:  # a device, a file or a folder
-        camera = camera.model_copy(update={"source": str(folder / camera.source)})
+        source = _path(folder, Path(camera.source), "camera.source")
+        camera = camera.model_copy(update={"source": str(source)})
     update = {
-        "map": folder / config.map,
+        "map": _path(folder, config.map, "map"),
         "camera": camera,
         "localizer": localizer,
         "bridge": _resolve_bridge(config.bridge, folder),
@@ -142,10 +191,17 @@ def _resolve(config: CompanionConfig, folder: Path) -> CompanionConfig:
 def _resolve_bridge(bridge: BridgeConfig, folder: Path) -> BridgeConfig:
     update: dict[str, Any] = {}
     if bridge.tlog is not None:
-        update["tlog"] = folder / bridge.tlog
+        update["tlog"] = _path(folder, bridge.tlog, "bridge.tlog")
     for name in ("signing", "ground_signing"):
         signing = getattr(bridge, name)
         if signing is not None:
-            key_file = folder / signing.key_file
+            key_file = _path(folder, signing.key_file, f"bridge.{name}.key_file")
             update[name] = signing.model_copy(update={"key_file": key_file})
     return bridge.model_copy(update=update)
+
+
+def _path(folder: Path, given: Path, key: str) -> Path:
+    """A setting's path; ValueError for none, which would be the deployment's own folder."""
+    if given == Path() or "\0" in str(given):
+        raise ValueError(f"{key}: {str(given)!r} names no file and no folder")
+    return folder / given

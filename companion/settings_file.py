@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import reprlib
 from collections.abc import Iterable
 from pathlib import Path
 from typing import Any, TypeVar
@@ -12,6 +13,8 @@ from pydantic import BaseModel, ValidationError
 from localizer.strict_yaml import load_yaml, misread_booleans
 
 _ModelT = TypeVar("_ModelT", bound=BaseModel)
+_MAX_BYTES = 1 << 20  # settings are a few kilobytes; a log or a device given by mistake has no end
+_SHORT = 60
 
 
 class SettingsError(ValueError):
@@ -21,7 +24,11 @@ class SettingsError(ValueError):
 def read_settings(path: Path, error_type: type[Exception]) -> dict[str, Any]:
     """The mapping in a YAML file, empty for an empty file; `error_type` names file and fault."""
     try:
-        data = load_yaml(path.read_text(encoding="utf-8"))
+        with path.open("rb") as file:
+            raw = file.read(_MAX_BYTES + 1)
+        if len(raw) > _MAX_BYTES:
+            raise error_type(f"{path}: over {_MAX_BYTES >> 20} MiB; that is no file of settings")
+        data = load_yaml(raw.decode("utf-8"))
     except OSError as error:
         raise error_type(f"{path}: cannot be read: {error.strerror}") from error
     # ValueError: no UTF-8, or a date that does not exist; RecursionError: endless nesting.
@@ -56,5 +63,10 @@ def _reason(kind: str, text: str) -> str:
 
 
 def _short(value: object) -> str:
-    text = repr(value)
-    return text if len(text) <= 60 else text[:57] + "..."
+    # reprlib: aliases (*name) can make a mapping of a few lines endless.
+    text = _REPR.repr(value)
+    return text if len(text) <= _SHORT else text[: _SHORT - 3] + "..."
+
+
+_REPR = reprlib.Repr()
+_REPR.maxstring = _REPR.maxother = _REPR.maxlong = _SHORT

@@ -38,11 +38,11 @@ def load_yaml(text: str) -> Any:
 def misread_booleans(
     given: Any, taken: Any, where: tuple[str | int, ...] = ()
 ) -> Iterator[tuple[tuple[str | int, ...], bool]]:
-    """(where, value) of the booleans in the data `given` that its model `taken` took for something
-    else: pydantic makes YAML's yes, on and true the number 1.
+    """(where, value) of the booleans in the data `given` that its model `taken` took for numbers:
+    pydantic makes YAML's yes, on and true the number 1.
     """
     if isinstance(given, bool):
-        if not isinstance(taken, bool):
+        if isinstance(taken, int | float) and not isinstance(taken, bool):
             yield where, given
     elif isinstance(given, dict):
         for name, value in given.items():

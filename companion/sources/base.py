@@ -72,7 +72,7 @@ class SourceSettings(BaseModel):
     )
     stall_timeout_s: float = Field(
         default=1.0,
-        gt=0,
+        ge=0.1,
         le=60,
         description="a live stream without a picture for so long is stalled",
     )

@@ -60,6 +60,19 @@ def test_minimal_config_and_paths_relative_to_the_file(tmp_path):
         ({"prior": {"position_sigma_m": float("inf")}}, "prior.position_sigma_m"),
         ({"camera": CAMERA | {"lever_arm_m": [0, float("nan"), 0]}}, "camera.lever_arm_m.1"),
         ({"camera": CAMERA | {"lever_arm_m": [120, 0, 0]}}, "camera.lever_arm_m.0"),
+        ({"camera": CAMERA | {"model": MODEL | {"fx": 0.86}}}, "camera.model: .*fx 0.86 on 640"),
+        ({"camera": CAMERA | {"model": MODEL | {"fy": 550e3}}}, "give the focal length in pixels"),
+        ({"camera": CAMERA | {"model": MODEL | {"cx": 0.5}}}, "camera.model: .*cx 0.5 is far"),
+        ({"camera": CAMERA | {"model": MODEL | {"cy": 3600}}}, "principal point in pixels"),
+        ({"camera": CAMERA | {"model": MODEL | {"distortion": [9, 0, 0, 0, 0]}}}, "this order"),
+        ({"camera": CAMERA | {"model": MODEL | {"distortion": [0, 0, 9, 0, 0]}}}, "this order"),
+        ({"camera": CAMERA | {"settings": {"stall_timeout_s": 1e-9}}}, "stall_timeout_s"),
+        ({"prior": {"position_sigma_m": 1e300}}, "prior.position_sigma_m"),
+        ({"targets": {"pixel_sigma": 1e-300}}, "targets.pixel_sigma"),
+        ({"map": ""}, "map: '.' names no file"),
+        ({"record": {"folder": ""}}, "record.folder: '.' names no file"),
+        ({"bridge": {"tlog": "a\0b"}}, "bridge.tlog: 'a.x00b' names no file"),
+        ({"bridge": {"signing": {"key_file": ""}}}, "bridge.signing.key_file: '.' names no file"),
     ],
 )
 def test_every_problem_is_named_by_its_key(tmp_path, change, named):
@@ -74,6 +87,28 @@ def test_every_problem_is_named_by_its_key(tmp_path, change, named):
 def test_files_that_are_no_mapping(tmp_path, text):
     with pytest.raises(ConfigError):
         load_config(_write(tmp_path, text))
+
+
+def test_a_file_without_end_is_not_read_to_its_end():
+    with pytest.raises(ConfigError, match="over 1 MiB; that is no file of settings"):
+        load_config(Path("/dev/zero"))
+
+
+def test_aliases_that_multiply_do_not_multiply_the_error(tmp_path):
+    """Printed in full, the last line would be 9^9 words."""
+    lines = ["a0: &a0 [x, x, x, x, x, x, x, x, x]"]
+    lines += [f"a{i}: &a{i} [{', '.join(9 * [f'*a{i - 1}'])}]" for i in range(1, 10)]
+    with pytest.raises(ConfigError, match="a9: no such setting") as caught:
+        load_config(_write(tmp_path, "\n".join(lines)))
+    assert len(str(caught.value)) < 2000
+
+
+def test_the_mode_off_needs_no_quotes(tmp_path):
+    """YAML reads off as false."""
+    text = yaml.safe_dump(MINIMAL) + "bridge:\n  mode: off\n"
+    assert load_config(_write(tmp_path, text)).bridge.mode == "off"
+    with pytest.raises(ConfigError, match="bridge.mode"):
+        load_config(_write(tmp_path, text.replace("off", "on")))
 
 
 def test_missing_file(tmp_path):
