@@ -2,16 +2,12 @@ from pathlib import Path
 
 import pytest
 
-from localizer.synth.config import LIVE, SURVEY, WorldConfig
-from localizer.synth.world import WorldInfo, build_visits
-
-SMALL = WorldConfig(seed=5, size_m=400.0, town_radius_m=260.0)
+from localizer.synth.world import WorldInfo
+from sitl.assets import FlightAssets
 
 
 @pytest.fixture(scope="session")
-def small_world(tmp_path_factory: pytest.TempPathFactory) -> dict[str, tuple[Path, WorldInfo]]:
-    """Survey and live visit to one 400 m world, painted in this process."""
-    folder = tmp_path_factory.mktemp("world")
-    visits = {folder / "survey": ("survey", SURVEY), folder / "live": ("live", LIVE)}
-    infos = build_visits(SMALL, visits, processes=1)
-    return {info.variant: (path, info) for path, info in zip(visits, infos, strict=True)}
+def small_world(small_assets: FlightAssets) -> dict[str, tuple[Path, WorldInfo]]:
+    """Tilesets of the survey and of the live visit to the tests' 400 m world."""
+    home = small_assets.map_cache.parent
+    return {visit: (home / visit, WorldInfo.load(home / visit)) for visit in ("survey", "live")}
