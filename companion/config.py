@@ -17,7 +17,6 @@ from localizer.config import LocalizerConfig
 from localizer.errors import CameraError
 from mavlink_bridge.config import BridgeConfig
 
-
 _FIELDS_OF_VIEW_DEG = (1.0, 170.0)
 _CENTRAL = (0.1, 0.9)  # share of the picture in which the principal point must lie
 _MOST_BENT = 0.7  # of a corner's distance from the principal point

@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
+from companion.build import MapStack, build_localizer
 from companion.config import CompanionConfig
 from companion.coverage import check_mission
 from companion.errors import CompanionError
@@ -31,7 +32,7 @@ _GOVERNOR = Path("/sys/devices/system/cpu/cpu0/cpufreq/scaling_governor")
 def examine_deployment(config: CompanionConfig, *, vehicle: bool = True) -> Diagnosis:
     """Every check; `vehicle` false leaves out what needs the flight controller."""
     cache, findings = _check_map(config)
-    findings += [_check_model(config), _check_camera(config), _check_power()]
+    findings += [_check_localizer(config, cache is not None), _check_camera(config), _check_power()]
     if cache is not None and config.bridge.origin is not None:
         findings.append(_check_origin(config.bridge.origin, cache))
     if vehicle:
@@ -51,10 +52,10 @@ def _check_map(config: CompanionConfig) -> tuple[TileCache | None, list[Finding]
     origin = m.origin
     found = (
         f"{m.tiles} tiles, {m.gsd_m:.2f} m/px, "
-        f"{_extent_km(m.extent, cache.frame):.2f} km from corner to corner"
+        f"{_extent_km(m.extent, cache.frame):.2f} km from corner to corner "
+        f"about {origin.latitude_deg:.5f} {origin.longitude_deg:.5f}"
     )
-    where = f"about {origin.latitude_deg:.5f} {origin.longitude_deg:.5f}; `companion map verify`"
-    return cache, [Finding("map", found, "a tile cache", where, True, True)]
+    return cache, [Finding("map", found, "a tile cache", "", True, True)]
 
 
 def _check_origin(origin: OriginConfig, cache: TileCache) -> Finding:
@@ -86,13 +87,27 @@ def _extent_km(extent: Iterable[tuple[float, float]], frame: LocalFrame) -> floa
     return max(distances, default=0.0) / 1000
 
 
-def _check_model(config: CompanionConfig) -> Finding:
+def _check_localizer(config: CompanionConfig, has_map: bool) -> Finding:
+    """Make the localizer as a flight does, with its model, renderer and device."""
+    needed = "a feature network"
     try:
-        name = load_extractor(config.localizer.model).name
+        if has_map:
+            name = _localizer_name(config)
+        else:
+            name = load_extractor(config.localizer.model).name
     except LocalizerError as error:
-        return _failed("model", "unreadable", "a feature network", str(error))
-    trained = "fallback" not in name
-    return Finding("model", name, "a feature network", "", trained, False)
+        return _failed("localizer", "cannot be made", needed, str(error))
+    why = "features without training: fetch the shipped weights again"
+    return Finding("localizer", name, needed, why, "fallback" not in name, False)
+
+
+def _localizer_name(config: CompanionConfig) -> str:
+    stack = MapStack(config.map, config.localizer)
+    try:
+        localizer = build_localizer(stack, config.camera.model.camera(), config.localizer)
+        return f"{localizer.features_name}; {stack.renderer.name}; {localizer.optimizer_name}"
+    finally:
+        stack.close()
 
 
 def _check_camera(config: CompanionConfig) -> Finding:

@@ -6,11 +6,14 @@ from pathlib import Path
 from typing import Annotated
 
 import typer
+from rich.box import SIMPLE_HEAD
 from rich.console import Console
+from rich.markup import escape
 from rich.table import Table
+from rich.text import Text
 
 from companion.config import load_config
-from mavlink_bridge.doctor import Diagnosis
+from mavlink_bridge.doctor import Diagnosis, Finding
 
 
 def doctor_command(
@@ -29,22 +32,32 @@ def doctor_command(
     console = Console()
     with console.status("examining"):
         diagnosis = examine_deployment(settings, vehicle=vehicle)
-    _print(console, diagnosis)
+    print_diagnosis(console, diagnosis)
     if fix and diagnosis.fixable:
         names = ", ".join(f"{f.name} = {f.fix:g}" for f in diagnosis.fixable if f.fix is not None)
         if yes or typer.confirm(f"Write {names}?"):
             reboot = repair(settings.bridge, diagnosis.fixable)
             console.print("written" + ("; reboot the flight controller" if reboot else ""))
             diagnosis = examine_deployment(settings, vehicle=vehicle)
-            _print(console, diagnosis)
+            print_diagnosis(console, diagnosis)
     raise typer.Exit(diagnosis.exit_code)
 
 
-def _print(console: Console, diagnosis: Diagnosis) -> None:
-    table = Table(title="fit to fly" if diagnosis.ok else "NOT fit to fly")
-    for column in ("", "what", "found", "needed", "why"):
+def print_diagnosis(console: Console, diagnosis: Diagnosis) -> None:
+    """A table that fits 80 columns, then a line or two for each thing that is not right."""
+    table = Table(title="fit to fly" if diagnosis.ok else "NOT fit to fly", box=SIMPLE_HEAD)
+    for column in ("", "what", "found", "needed"):
         table.add_column(column, overflow="fold")  # never hide the end of a name
     for f in diagnosis.findings:
-        mark = "[green]ok" if f.ok else ("[red]wrong" if f.required else "[yellow]advice")
-        table.add_row(mark, f.name, f.found, f.needed, f.why)
+        table.add_row(_mark(f), *(escape(text) for text in (f.name, f.found, f.needed)))
     console.print(table)
+    for f in diagnosis.findings:
+        if not f.ok:
+            line = Text.from_markup(f"{_mark(f)} {escape(f.name)}: {escape(f.why)}")
+            console.print(line, highlight=False)
+
+
+def _mark(finding: Finding) -> str:
+    if finding.ok:
+        return "[green]ok[/]"
+    return "[red]wrong[/]" if finding.required else "[yellow]advice[/]"

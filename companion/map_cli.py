@@ -145,12 +145,16 @@ def render(
     height: Annotated[float, typer.Option(help="metres above the ellipsoid")],
     heading: Annotated[float, typer.Option(help="degrees clockwise from north")] = 0.0,
     pitch: Annotated[float, typer.Option(help="degrees above the horizon")] = -90.0,
-    width: Annotated[int, typer.Option(help="pixels")] = 1280,
-    image_height: Annotated[int, typer.Option(help="pixels")] = 960,
-    fov: Annotated[float, typer.Option(help="horizontal field of view, degrees")] = 60.0,
+    width: Annotated[int, typer.Option(min=8, max=8192, help="pixels")] = 1280,
+    image_height: Annotated[int, typer.Option(min=8, max=8192, help="pixels")] = 960,
+    fov: Annotated[
+        float, typer.Option(min=1, max=170, help="horizontal field of view, degrees")
+    ] = 60.0,
     out: Annotated[Path, typer.Option(help="PNG; the depth goes beside it")] = Path("view.png"),
 ) -> None:
     """A picture of the map and of its depth from a pose."""
+    if out.suffix.lower() != ".png":
+        raise typer.BadParameter(f"--out {out}: give a name that ends in .png")
     from localizer.camera import Camera
     from localizer.map import inspect
     from localizer.map.cache import TileCache
@@ -169,9 +173,13 @@ def render(
 def export(
     cache: CachePath,
     out: Annotated[Path, typer.Option(help="GLB to write")],
-    level: Annotated[int | None, typer.Option(help="depth of the tile tree; the finest")] = None,
+    level: Annotated[
+        int | None, typer.Option(min=0, help="depth of the tile tree; the finest")
+    ] = None,
 ) -> None:
     """The map's surface as one GLB (y up, metres about the cache's origin)."""
+    if not out.parent.is_dir():  # told before the minutes that it takes
+        raise typer.BadParameter(f"--out {out}: no such folder")
     from localizer.map.cache import TileCache
     from localizer.map.inspect import export_glb
 

@@ -32,7 +32,7 @@ PriorProvider = Callable[[int], PosePrior | None]
 @dataclass(frozen=True)
 class EngineHealth:
     """Counters since the start, the last error's text ("" when none is standing), and which
-    renderer serves.
+    renderer, feature network and optimizer serve.
     """
 
     frames_in: int = 0
@@ -43,6 +43,8 @@ class EngineHealth:
     errors: int = 0
     last_error: str = ""
     renderer: str = ""
+    features: str = ""
+    optimizer: str = ""
 
 
 class DualThreadEngine:
@@ -69,7 +71,9 @@ class DualThreadEngine:
         self._interval_ns = _DEFAULT_INTERVAL_NS
         self._last_exposure_ns: int | None = None
         self._reference_ms: dict[str, float] = {}
-        self._health = EngineHealth(renderer=localizer.renderer_name)
+        self._health = EngineHealth(
+            renderer=localizer.renderer_name, features=localizer.features_name
+        )
         self._health_lock = threading.Lock()
         self._stop = threading.Event()
         self._threads = [
@@ -99,7 +103,11 @@ class DualThreadEngine:
     def health(self) -> EngineHealth:
         """A snapshot of the counters."""
         with self._health_lock:
-            return replace(self._health, frames_dropped=self._frames.dropped)
+            return replace(
+                self._health,
+                frames_dropped=self._frames.dropped,
+                optimizer=self._localizer.optimizer_name,
+            )
 
     def _run(self, once: Callable[[], None]) -> None:
         while not self._stop.is_set():

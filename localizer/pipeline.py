@@ -128,6 +128,11 @@ class Localizer:
         self._tracker = TrackerState()
 
     @property
+    def features_name(self) -> str:
+        """Which model computes the features, and on what."""
+        return self._extractor.name
+
+    @property
     def optimizer_name(self) -> str:
         """What registers now, for reports: the CPU takes over where a GPU fails."""
         return self._optimizer.backend.name

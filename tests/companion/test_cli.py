@@ -98,3 +98,14 @@ def test_the_version_is_that_of_the_package():
     result = CliRunner().invoke(app, ["--version"])
     assert result.exit_code == 0
     assert result.output.strip() == f"companion {metadata.version('pilot-companion')}"
+
+
+@pytest.mark.parametrize(
+    "options",
+    [("--out", "view"), ("--width", "0"), ("--image-height", "1000000"), ("--fov", "200")],
+)
+def test_a_picture_of_the_map_that_cannot_be_made_is_wrong_usage(map_cache, options):
+    place = ("--latitude", "47.5", "--longitude", "8.5", "--height", "500")
+    result = CliRunner().invoke(app, ["map", "render", str(map_cache), *place, *options])
+    assert result.exit_code == 2
+    assert options[0] in result.output

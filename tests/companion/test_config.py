@@ -107,7 +107,7 @@ def test_the_mode_off_needs_no_quotes(tmp_path):
     """YAML reads off as false."""
     text = yaml.safe_dump(MINIMAL) + "bridge:\n  mode: off\n"
     assert load_config(_write(tmp_path, text)).bridge.mode == "off"
-    with pytest.raises(ConfigError, match="bridge.mode"):
+    with pytest.raises(ConfigError, match=r"bridge\.mode: "):
         load_config(_write(tmp_path, text.replace("off", "on")))
 
 

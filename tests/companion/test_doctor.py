@@ -1,11 +1,16 @@
 """The companion's own checks of a deployment; the flight controller's are the bridge's."""
 
+import sys
+
 import cv2
 import numpy as np
 import pytest
+from rich.console import Console
 
 from companion.config import parse_config
 from companion.doctor import examine_deployment
+from companion.doctor_cli import print_diagnosis
+from mavlink_bridge.doctor import Diagnosis, Finding
 
 SIZE = (160, 120)
 MODEL = {"width": 160, "height": 120, "fx": 140, "fy": 140, "cx": 80, "cy": 60}
@@ -26,16 +31,18 @@ def feed(tmp_path):
     return folder
 
 
-def _findings(map_cache, source, model=MODEL, rate_hz=20.0):
+def _findings(map_cache, source, model=MODEL, rate_hz=20.0, **settings):
     camera = {"source": str(source), "model": model, "settings": {"rate_hz": rate_hz}}
-    config = parse_config({"map": str(map_cache), "camera": camera}, "test")
+    config = parse_config({"map": str(map_cache), "camera": camera} | settings, "test")
     return {f.name: f for f in examine_deployment(config, vehicle=False).findings}
 
 
 def test_a_good_deployment(map_cache, feed):
     findings = _findings(map_cache, feed)
-    assert set(findings) == {"map", "model", "camera", "power mode"}
-    assert all(findings[name].ok for name in ("map", "model", "camera"))
+    assert set(findings) == {"map", "localizer", "camera", "power mode"}
+    assert all(findings[name].ok for name in ("map", "localizer", "camera"))
+    assert findings["localizer"].found.startswith("tiny (onnxruntime, ")
+    assert "numba" in findings["localizer"].found
     assert findings["camera"].found == "160x120, 20.0 Hz"
     assert "tiles" in findings["map"].found
 
@@ -57,3 +64,38 @@ def test_what_is_missing_is_named(tmp_path, feed):
     for name in ("map", "camera"):
         assert (findings[name].ok, findings[name].required) == (False, True)
         assert f"no-{'map' if name == 'map' else 'feed.mp4'}" in findings[name].why
+
+
+@pytest.mark.parametrize(
+    ("localizer", "why"),
+    [
+        ({"model": "no.onnx"}, "no.onnx: no such model file"),
+        ({"renderer": "pyrender"}, "pyrender is not installed"),
+        ({"registration": {"iterations": [1]}}, "levels of features"),
+    ],
+)
+def test_a_localizer_that_a_flight_could_not_make_is_wrong(
+    map_cache, feed, monkeypatch, localizer, why
+):
+    monkeypatch.setitem(sys.modules, "localizer.render.pyrender_offscreen", None)  # not installed
+    findings = _findings(map_cache, feed, localizer=localizer)
+    assert (findings["localizer"].ok, findings["localizer"].required) == (False, True)
+    assert why in findings["localizer"].why
+
+
+def test_the_table_fits_a_terminal_of_80_columns_and_reasons_come_last(capsys):
+    why = "no position by vision on 40 % of the way: build a larger map or move it"
+    diagnosis = Diagnosis(
+        (
+            Finding("localizer", "tiny (onnxruntime, CPU) + detail; numba", "a net", "", True, True),
+            Finding("GIMBAL_[MANAGER]_X", "silent", "GIMBAL_DEVICE_ATTITUDE_STATUS", why, False,
+                    True),
+        )
+    )  # fmt: skip
+    print_diagnosis(Console(width=80, force_terminal=False), diagnosis)
+    lines = capsys.readouterr().out.splitlines()
+    assert max(map(len, lines)) <= 80
+    assert "NOT fit to fly" in lines[0]
+    shown = " ".join(" ".join(lines).split())
+    assert "GIMBAL_DEVICE_ATTITUDE_STATUS" in shown.replace(" ", "")
+    assert shown.endswith(f"wrong GIMBAL_[MANAGER]_X: {why}")

@@ -72,6 +72,7 @@ class FakeOptimizer:
     """Finds the camera where `truth` says it is, 1 cm off; or raises what `error` holds."""
 
     on_gpu = False
+    backend = SimpleNamespace(name="fake")
 
     def __init__(self) -> None:
         self.error: Exception | None = None
@@ -166,7 +167,8 @@ def test_loading_ahead_that_fails_costs_no_reference(flight):
     renderer.error = MapCacheError("the disk is gone")
     f = flight(_localizer(renderer))
     f.feed_until(lambda: f.engine.health.accepted >= 3 and f.engine.health.errors > 0)
-    assert f.engine.health.renderer == "fake"
+    health = f.engine.health
+    assert (health.renderer, health.features, health.optimizer) == ("fake", "fake", "fake")
 
 
 def test_without_a_prior_nothing_is_estimated(flight):
