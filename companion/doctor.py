@@ -91,10 +91,8 @@ def _check_localizer(config: CompanionConfig, has_map: bool) -> Finding:
     """Make the localizer as a flight does, with its model, renderer and device."""
     needed = "a feature network"
     try:
-        if has_map:
-            name = _localizer_name(config)
-        else:
-            name = load_extractor(config.localizer.model).name
+        model = config.localizer.model
+        name = _localizer_name(config) if has_map else load_extractor(model).name
     except LocalizerError as error:
         return _failed("localizer", "cannot be made", needed, str(error))
     why = "features without training: fetch the shipped weights again"

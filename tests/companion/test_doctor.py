@@ -87,7 +87,7 @@ def test_the_table_fits_a_terminal_of_80_columns_and_reasons_come_last(capsys):
     why = "no position by vision on 40 % of the way: build a larger map or move it"
     diagnosis = Diagnosis(
         (
-            Finding("localizer", "tiny (onnxruntime, CPU) + detail; numba", "a net", "", True, True),
+            Finding("localizer", "tiny (onnxruntime, CPU); numba", "a net", "", True, True),
             Finding("GIMBAL_[MANAGER]_X", "silent", "GIMBAL_DEVICE_ATTITUDE_STATUS", why, False,
                     True),
         )
