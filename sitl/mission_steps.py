@@ -54,8 +54,3 @@ def gimbal_step(pitch_deg: float, yaw_deg: float) -> MissionStep:
 def return_step() -> MissionStep:
     """Return to launch and land."""
     return MissionStep(mavlink.MAV_CMD_NAV_RETURN_TO_LAUNCH)
-
-
-def land_step() -> MissionStep:
-    """Land where the vehicle is."""
-    return MissionStep(mavlink.MAV_CMD_NAV_LAND)

@@ -107,27 +107,6 @@ class Pilot(GroundLink):
             )
         )
 
-    def fly_to(
-        self,
-        latitude_deg: float,
-        longitude_deg: float,
-        height_m: float,
-        *,
-        within_m: float = 3.0,
-        timeout_s: float = 120.0,
-    ) -> None:
-        """As `go_to`, and wait until the EKF says that the vehicle is there."""
-        self.go_to(latitude_deg, longitude_deg, height_m)
-
-        def there() -> bool:
-            where = self.ekf.location if self.ekf else None
-            if where is None:
-                return False
-            north, east, _ = where.ned_of(Location(latitude_deg, longitude_deg, 0.0))
-            return math.hypot(north, east) < within_m
-
-        self.wait(there, timeout_s, "the guided target")
-
     def land(self, timeout_s: float = 180.0) -> None:
         """Land and wait until the vehicle has disarmed."""
         self.set_mode("LAND")

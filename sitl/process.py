@@ -158,13 +158,6 @@ class VehicleProcess(ABC):
                 f"its log {self.log_path} ends:\n{self.log_tail()}"
             )
 
-    def cpu_seconds(self) -> float:
-        """Processor time the vehicle has used so far."""
-        if self._process is None:
-            return 0.0
-        fields = Path(f"/proc/{self._process.pid}/stat").read_text().rsplit(")", 1)[1].split()
-        return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
-
     def stop(self, *, keep_log: bool = False) -> None:
         """End the process and remove its folder, unless its log is to be kept."""
         self._end()

@@ -9,7 +9,7 @@ from sitl.ardupilot import ArduPilotSitl, find_arducopter
 from sitl.embedded.geodesy import Location
 from sitl.process import BASE_PORT, PORTS_PER_INSTANCE, VehicleProcess, write_parameters
 
-GPS_SOURCE, VISION_SOURCE = 1, 2  # MAV_CMD_SET_EKF_SOURCE_SET
+VISION_SOURCE = 2  # MAV_CMD_SET_EKF_SOURCE_SET
 
 # A self-stabilising gimbal (MNT1_TYPE 7). Type 1 looks the same but reports servo angles, from
 # which the vehicle's lean is subtracted, under flags that claim the earth frame: its reports are

@@ -11,7 +11,7 @@ World axes: x along columns, y along rows, z up, metres; camera axes are OpenCV'
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import cv2
 import numpy as np
@@ -169,12 +169,6 @@ def render(
 def without(prisms: Sequence[Prism], rng: np.random.Generator, share: float) -> list[Prism]:
     """The objects with a random share of them gone."""
     return [p for p in prisms if rng.random() >= share]
-
-
-def recolored(prism: Prism, rng: np.random.Generator) -> Prism:
-    """The same object, repainted."""
-    roof, wall = rng.uniform(0.1, 0.85, 3), rng.uniform(0.25, 0.85) * rng.uniform(0.85, 1.1, 3)
-    return replace(prism, roof=tuple(roof.tolist()), wall=tuple(wall.tolist()))
 
 
 def height_at(scene: LitScene, x_m: float, y_m: float) -> float:

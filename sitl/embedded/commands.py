@@ -15,7 +15,7 @@ from sitl.embedded.modes import Mode, RcInput
 from sitl.embedded.parameters import type_of
 from sitl.embedded.telemetry import Telemetry
 
-ACCEPTED, TEMPORARILY_REJECTED, DENIED, UNSUPPORTED, FAILED = 0, 1, 2, 3, 4  # MAV_RESULT
+ACCEPTED, DENIED, UNSUPPORTED, FAILED = 0, 2, 3, 4  # MAV_RESULT
 _FORCE_ARM = 21196.0
 _IGNORE_POSITION, _IGNORE_VELOCITY, _IGNORE_YAW, _IGNORE_YAW_RATE = 7, 7 << 3, 1 << 10, 1 << 11
 _GLOBAL_FRAMES_RELATIVE = (3, 6)

@@ -42,7 +42,7 @@ _HEIGHT_FRESH_MS = 500
 _COMPASS_SIGMA = 0.25  # rad per sample; what EKF3's 0.05 gauss per axis amounts to in heading
 
 # EK3_SRCn_* values
-GPS, BARO, COMPASS, EXTERNAL = 3, 1, 1, 6
+GPS, COMPASS, EXTERNAL = 3, 1, 6
 
 CRITICAL, WARNING, INFO = 2, 4, 6  # MAV_SEVERITY
 

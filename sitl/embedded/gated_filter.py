@@ -7,7 +7,6 @@ reset to it.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from math import hypot
 
 import numpy as np
 
@@ -47,8 +46,6 @@ class GatedFilter:
     def __init__(self, parameters: Parameters) -> None:
         self.parameters = parameters
         self.ratios = TestRatios()
-        self.position_reset_ne = (0.0, 0.0)
-        self.position_resets = 0
         self._state = np.zeros(nav.NOMINAL_SIZE)
         self._state[nav.Q] = 1.0
         self._cov = np.diag(
@@ -146,15 +143,11 @@ class GatedFilter:
     def _reset_position(self, north: float, east: float, variance: float | None) -> None:
         """Jump to a position; variance None keeps the covariance, as EKF3's announced reset."""
         self._source_reset = False
-        change = (north - float(self._state[nav.P]), east - float(self._state[nav.P + 1]))
         self._state[nav.P : nav.P + 2] = (north, east)
         if variance is not None:
             nav.reset_error(self._cov, 6, 2, variance)
             self._clock.position_pass = self._now_ms
             self._position_timeout = False
-        self.position_reset_ne = change
-        if hypot(*change) > 0.0:
-            self.position_resets += 1
 
     def _reset_velocity(self, horizontal: tuple[float, float], variance: float) -> None:
         self._state[nav.V : nav.V + 2] = horizontal

@@ -39,7 +39,6 @@ class Injection:
         self._estimator = estimator
         self._last_vision_ms = -1_000_000
         self._reset_counter: int | None = None
-        self._quality = 0
         self._gps_times: deque[int] = deque(maxlen=10)
         self._gps_fix_type = 0
         self.gps: GpsData | None = None

@@ -35,7 +35,6 @@ class GpsSample:
     position: Array
     velocity: Array
     horizontal_accuracy: float
-    vertical_accuracy: float
     speed_accuracy: float
     satellites: int = 10
     fix: bool = True
@@ -141,7 +140,6 @@ class Sensors:
             x[POSITION : POSITION + 3] + glitch + self._gps_wander + _GPS_WHITE * draw[3:6],
             x[VELOCITY : VELOCITY + 3] + _GPS_SPEED * draw[6:9],
             horizontal_accuracy=0.5,
-            vertical_accuracy=0.8,
             speed_accuracy=0.3,
         )
         if not jammed:
