@@ -90,16 +90,6 @@ class EkfSample:
         return self.origin.offset(*self.position_ned) if self.origin else None
 
 
-@dataclass(frozen=True)
-class StatusText:
-    """A STATUSTEXT of any component."""
-
-    time_ns: int
-    severity: int
-    text: str
-    component: int
-
-
 class BootClock:
     """Maps the vehicle's boot time to CLOCK_MONOTONIC by the least latency lately seen."""
 

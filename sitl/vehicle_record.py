@@ -11,12 +11,12 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from sitl.embedded.geodesy import Location
 from sitl.errors import PilotError
+from sitl.texts import StatusText, TextLog
 from sitl.tracks import (
     Array,
     BootClock,
     EkfSample,
     GimbalState,
-    StatusText,
     Track,
     Truth,
     share,
@@ -45,12 +45,17 @@ class VehicleRecord:
         self._ekf = Track(_SECONDS_KEPT * 25)
         self.origin: Location | None = None
         self.latest: dict[str, Any] = {}
-        self.texts: list[StatusText] = []
+        self._text_log = TextLog()
         self.reached: list[int] = []
         self.mode: str | None = None
         self.armed = False
 
     # --- what is known -----------------------------------------------------------------------
+
+    @property
+    def texts(self) -> list[StatusText]:
+        """The status texts of every component, oldest first."""
+        return self._text_log.lines
 
     @property
     def time_s(self) -> float:
@@ -145,18 +150,12 @@ class VehicleRecord:
         """Call back with every new true state, from the reading thread: be quick."""
         self._subscribers.append(callback)
 
-    def has_text(self, part: str, since_ns: int = 0) -> bool:
-        """Whether a status text containing `part` has come since a CLOCK_MONOTONIC time."""
-        return any(part in t.text for t in list(self.texts) if t.time_ns >= since_ns)
-
     # --- messages ----------------------------------------------------------------------------
 
     def _take(self, message: Any, received_ns: int) -> None:
         kind = message.get_type()
         if kind == "STATUSTEXT":
-            self.texts.append(
-                StatusText(received_ns, message.severity, message.text, message.get_srcComponent())
-            )
+            self._text_log.take(message, received_ns)
         if message.get_srcSystem() != _VEHICLE or message.get_srcComponent() != _AUTOPILOT:
             return
         self.latest[kind] = message

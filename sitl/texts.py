@@ -1,0 +1,42 @@
+"""STATUSTEXT (253) as lines: what is longer than 50 characters comes in chunks under one id."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Any
+
+
+@dataclass(frozen=True)
+class StatusText:
+    """A status text of any component, as far as its chunks have come."""
+
+    time_ns: int
+    severity: int
+    text: str
+    component: int
+
+
+class TextLog:
+    """The lines in the order of their first chunks; one thread takes, any may read `lines`.
+
+    A chunk that is missing leaves three dots. An id may be used again for another line.
+    """
+
+    def __init__(self) -> None:
+        self.lines: list[StatusText] = []
+        self._open: dict[tuple[int, int], tuple[int, int, int]] = {}
+
+    def take(self, message: Any, received_ns: int) -> None:
+        """Take in one STATUSTEXT."""
+        source = (message.get_srcSystem(), message.get_srcComponent())
+        number, chunk = message.id, message.chunk_seq
+        line = StatusText(received_ns, message.severity, message.text, source[1])
+        open_id, place, expected = self._open.get(source, (0, 0, 0))
+        if number and number == open_id and chunk >= expected:
+            gap = "..." if chunk > expected else ""
+            begun = self.lines[place]
+            self.lines[place] = replace(begun, text=begun.text + gap + line.text)
+        else:
+            place = len(self.lines)
+            self.lines.append(replace(line, text="..." + line.text) if chunk else line)
+        self._open[source] = (number, place, chunk + 1)
