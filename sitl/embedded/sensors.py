@@ -35,6 +35,7 @@ class GpsSample:
     position: Array
     velocity: Array
     horizontal_accuracy: float
+    vertical_accuracy: float
     speed_accuracy: float
     satellites: int = 10
     fix: bool = True
@@ -140,6 +141,7 @@ class Sensors:
             x[POSITION : POSITION + 3] + glitch + self._gps_wander + _GPS_WHITE * draw[3:6],
             x[VELOCITY : VELOCITY + 3] + _GPS_SPEED * draw[6:9],
             horizontal_accuracy=0.5,
+            vertical_accuracy=0.8,
             speed_accuracy=0.3,
         )
         if not jammed:
