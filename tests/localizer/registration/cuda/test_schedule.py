@@ -151,6 +151,7 @@ def changed(query: FeaturePyramid, level: int, **changes) -> FeaturePyramid:
     return replace(query, levels=tuple(levels))
 
 
+@pytest.mark.filterwarnings("ignore:invalid value encountered in matmul")  # of the infinite point
 @pytest.mark.parametrize("kind", ["features", "confidence", "anchors", "points"])
 @pytest.mark.parametrize("half", [False, True])
 def test_one_value_that_is_not_finite_is_seen(registered, scene, prior, kind, half):
