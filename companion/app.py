@@ -25,8 +25,8 @@ from companion.sources import StreamState, open_source
 from companion.target_reporter import Target, TargetReporter
 from companion.view_reporter import ViewReporter
 from localizer.engine import DualThreadEngine
+from localizer.map.surface import MapSurface
 from localizer.pose import Array
-from localizer.targets import SurfacePoint, cast_ray
 from localizer.types import PoseEstimate, PosePrior, ReferenceBundle, TrackingState
 from mavlink_bridge.bridge import Bridge
 from mavlink_bridge.config import BridgeConfig
@@ -113,9 +113,10 @@ class Companion:
         _log.info("making the localizer ready; the first start on a machine compiles its kernels")
         localizer = build_localizer(self._stack, self._camera, config.localizer, self._rotation_at)
         self._engine = DualThreadEngine(localizer, (self._on_estimate,), self._vehicle_prior)
-        self._targets = TargetReporter(config.targets, self._cast_ray, self._on_target)
+        surface = MapSurface(self._stack.cache)
+        self._targets = TargetReporter(config.targets, surface.cast, self._on_target)
         self._view = ViewReporter(
-            config.bridge.targets.rate_hz, self._frame, self._cast_ray, self._bridge.look
+            config.bridge.targets.rate_hz, self._frame, surface.cast, self._bridge.look
         )
         self._health = HealthMonitor(
             self._engine, self._bridge, lambda: self._source.state, self._event, record
@@ -220,9 +221,6 @@ class Companion:
             )
         )
 
-    def _cast_ray(self, origin: Array, direction: Array) -> SurfacePoint | None:
-        return cast_ray(self._stack.streamer.current(), origin, direction)
-
     def _on_target(self, target: Target) -> None:
         fix = target.fix
         if self._recorder is not None:
@@ -241,6 +239,7 @@ class Companion:
                 v_accuracy_m=float(np.sqrt(fix.covariance[2, 2])),
                 pixel=(fix.pixel[0] / camera.width, fix.pixel[1] / camera.height),
                 target_id=self._target_number(fix.target_id),
+                elsewhere=fix.elsewhere,
             )
         )
 

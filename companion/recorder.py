@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import Any, TextIO
 
 import cv2
+import numpy as np
 
 from companion.config import CompanionConfig, RecordConfig
 from companion.errors import ReportError
@@ -37,6 +38,7 @@ TARGET_COLUMNS = (
     "exposure_time_ns", "target_id", "east_m", "north_m", "up_m",
     "latitude_deg", "longitude_deg", "height_m", "sigma_horizontal_m", "sigma_up_m",
     "velocity_east", "velocity_north", "velocity_up", "u", "v",
+    "cov_ee", "cov_en", "cov_eu", "cov_nn", "cov_nu", "cov_uu", "elsewhere",
 )  # fmt: skip
 EVENT_COLUMNS = ("time_ns", "level", "text")
 
@@ -138,6 +140,7 @@ class Recorder:
             f"{position.latitude_deg:.9f}", f"{position.longitude_deg:.9f}",
             f"{position.height_m:.4f}", f"{horizontal:.3f}", f"{fix.covariance[2, 2] ** 0.5:.3f}",
             *(f"{x:.3f}" for x in velocity), *(f"{x:.2f}" for x in fix.pixel),
+            *(f"{x:.5f}" for x in fix.covariance[np.triu_indices(3)]), f"{fix.elsewhere:.3f}",
         )  # fmt: skip
         self._put("targets", row)
 

@@ -11,14 +11,13 @@ from dataclasses import dataclass
 from companion.config import TargetConfig
 from companion.detections import Detection
 from localizer.pose import Array
-from localizer.targets import SurfacePoint, TargetFilter, ray_in_world, target_covariance
-from localizer.types import PoseEstimate, TargetFix
+from localizer.target_filter import TargetFilter
+from localizer.targets import RayCaster, locate
+from localizer.types import PoseEstimate, TargetFix, TargetSighting
 
 _log = logging.getLogger(__name__)
 _KEPT = 64
 _MATCH_NS = 5_000_000  # detection and estimate must be of the same frame
-
-RayCaster = Callable[[Array, Array], "SurfacePoint | None"]
 
 
 @dataclass(frozen=True)
@@ -31,9 +30,10 @@ class Target:
 
 
 class TargetReporter:
-    """Pairs detections with accepted estimates, casts the ray, filters, and hands the target on.
+    """Pairs detections with accepted estimates, casts the rays, filters, and hands the target on.
 
-    cast: origin (3,), unit direction (3,) in the map frame to the surface point, or None.
+    missed counts detections that show no map: beside the picture, or in the sky; failed what
+    raised an error, of which the first is logged.
     """
 
     def __init__(
@@ -49,6 +49,7 @@ class TargetReporter:
         self._condition = threading.Condition()
         self._stopping = False
         self.missed = 0
+        self.failed = 0
         self._thread = threading.Thread(target=self._run, name="targets")
 
     def start(self) -> None:
@@ -88,7 +89,9 @@ class TargetReporter:
                 try:
                     self._locate(detection, estimate)
                 except Exception:  # a target must not end the flight
-                    _log.exception("target %s could not be located", detection.target_id)
+                    self.failed += 1
+                    if self.failed == 1:
+                        _log.exception("target %s could not be located", detection.target_id)
 
     def _take_pairs(self) -> list[tuple[Detection, PoseEstimate]]:
         """Detections whose frame has an estimate; the rest wait until newer frames pass them."""
@@ -115,16 +118,14 @@ class TargetReporter:
         if last is not None and estimate.exposure_time_ns - last < wait_ns:
             return
         pixel = (detection.u, detection.v)
-        hit = self._cast(*ray_in_world(estimate, pixel))
-        if hit is None:
+        sigmas = self._config.pixel_sigma, self._config.map_sigma_m
+        inside = 0 <= pixel[0] <= estimate.camera.width and 0 <= pixel[1] <= estimate.camera.height
+        surfaces = locate(estimate, pixel, self._cast, *sigmas) if inside else ()
+        if not surfaces:
             self.missed += 1
             return
-        self._reported_ns[detection.target_id] = estimate.exposure_time_ns
-        covariance = target_covariance(
-            estimate, hit, self._config.pixel_sigma, self._config.map_sigma_m
-        )
         time_ns = estimate.exposure_time_ns
-        raw = TargetFix(detection.target_id, hit.position, covariance, pixel, time_ns)
+        self._reported_ns[detection.target_id] = time_ns
         target_filter = self._filters.setdefault(detection.target_id, TargetFilter())
-        fix = target_filter.update(raw)
+        fix = target_filter.update(TargetSighting(detection.target_id, surfaces, pixel, time_ns))
         self._on_target(Target(fix, target_filter.velocity, estimate))

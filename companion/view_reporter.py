@@ -8,10 +8,9 @@ import threading
 from collections.abc import Callable
 
 from companion.geometry import GIMBAL_FROM_CAMERA, ned_from_world
-from companion.target_reporter import RayCaster
 from localizer.geo import LocalFrame
 from localizer.pose import quaternion_from_matrix
-from localizer.targets import ray_in_world
+from localizer.targets import RayCaster, ray_in_world
 from localizer.types import PoseEstimate
 from mavlink_bridge.messages import CameraView
 
@@ -24,10 +23,11 @@ def camera_view(estimate: PoseEstimate, frame: LocalFrame, cast: RayCaster) -> C
     position = frame.position(pose.translation)
     ned_from_camera = ned_from_world(frame, position) @ pose.rotation
     w, x, y, z = quaternion_from_matrix(ned_from_camera @ GIMBAL_FROM_CAMERA.T)
-    hit = cast(*ray_in_world(estimate, (camera.width / 2.0, camera.height / 2.0)))
+    eye, direction = ray_in_world(estimate, (camera.width / 2.0, camera.height / 2.0))
+    distance = float(cast(eye, direction[None, :]).distances[0])
     ground = (math.nan, math.nan, math.nan)
-    if hit is not None:
-        seen = frame.position(hit.position)
+    if math.isfinite(distance):
+        seen = frame.position(eye + distance * direction)
         ground = (seen.latitude_deg, seen.longitude_deg, seen.height_m)
     return CameraView(
         estimate.exposure_time_ns,
@@ -42,7 +42,6 @@ def camera_view(estimate: PoseEstimate, frame: LocalFrame, cast: RayCaster) -> C
 class ViewReporter:
     """Casts the ray on a thread of its own, at most `rate_hz` times a second.
 
-    cast: origin (3,), unit direction (3,) in the map frame to the surface point, or None.
     look: takes the view; must not block.
     """
 

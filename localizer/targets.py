@@ -1,32 +1,42 @@
-"""Pixels to places: ray casting from the estimated pose, with covariance, and a target filter.
+"""Pixels to places: rays from the estimated pose, with covariance and every surface in reach.
 
-Paper, Sec. 3.3.2 (end): a query pixel is mapped to the map by a ray from the estimated pose.
+Paper, Sec. 3.3.2 (end): a query pixel is mapped to the map by a ray from the estimated pose. At a
+roof's edge the errors of pose and pixel decide which surface that ray meets. So a bundle of rays is
+cast that samples these errors, and every surface that it meets is told with its probability.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
-from filterpy.common import Q_discrete_white_noise
-from filterpy.kalman import predict as kalman_predict
-from filterpy.kalman import update as kalman_update
 
-from localizer.map.pick import cast_rays
-from localizer.map.tile import TileMesh
+from localizer.map.pick import BundleHits
 from localizer.pose import Array, hat
-from localizer.types import PoseEstimate, TargetFix
+from localizer.types import PoseEstimate, TargetSurface
 
-_NORMAL_ANGLE = 4e-3  # rad: half a metre at 120 m
+RayCaster = Callable[[Array, Array], BundleHits]
+"""Origin (3,) and unit directions (N, 3), close about one, in the map frame, to what they meet."""
+
+_ORDER = 5  # Gauss-Hermite nodes per axis of the bundle: out to 2.86 sigma
+_STEP_SIGMA = 1.5  # the widest gap between neighbouring nodes
+# Neighbouring rays of one surface differ in distance by their spacing times the tangent of the
+# incidence: 4 stands for 76 degrees.
+_STEEPNESS = 4.0
+_SMALLEST_STEP_M = 1.0
+# At grazing incidence the plane model explodes: 3 degrees is where we stop believing it.
+_MIN_COSINE = 0.05
 
 
 @dataclass(frozen=True)
-class SurfacePoint:
-    """Where a ray meets the map. position: (3,) world metres; normal: (3,) unit."""
+class RaySpread:
+    """Uncertainty of a ray's direction. sideways: (2, 3) unit vectors across the ray; covariance:
+    (2, 2) rad² along them, of pose and pixel together, for a point at the given distance.
+    """
 
-    position: Array
-    normal: Array
+    sideways: Array
+    covariance: Array
 
 
 def ray_in_world(estimate: PoseEstimate, pixel: tuple[float, float]) -> tuple[Array, Array]:
@@ -35,104 +45,98 @@ def ray_in_world(estimate: PoseEstimate, pixel: tuple[float, float]) -> tuple[Ar
     return estimate.world_from_camera.translation, direction / np.linalg.norm(direction)
 
 
-def cast_ray(meshes: Sequence[TileMesh], origin: Array, direction: Array) -> SurfacePoint | None:
-    """Where a ray (origin (3,), unit direction (3,), world) first meets the map; None if nowhere.
+def ray_spread(
+    estimate: PoseEstimate, pixel: tuple[float, float], pixel_sigma: float, distance: float
+) -> RaySpread:
+    """How far off the ray of a pixel may be, first order.
 
-    The normal is that of the plane through three neighbouring hits, so that a single triangle of a
-    rough mesh does not decide it.
+    A point at ``s d`` from the camera moves across the ray by ``dC + s [phi]x d``; a pixel's error
+    turns the ray by the camera model's own derivative.
     """
-    sideways = np.linalg.svd(direction[None, :])[2][1:]
-    offsets = _NORMAL_ANGLE * np.array([[0.0, 0.0], [1.0, 0.0], [-0.5, 0.9], [-0.5, -0.9]])
-    directions = direction + offsets @ sideways
-    t = cast_rays(meshes, origin, directions)
-    if not np.isfinite(t[0]):
-        return None
-    points = origin + directions * t[:, None]
-    normal = np.cross(points[2] - points[1], points[3] - points[1])
-    length = float(np.linalg.norm(normal))
-    if not np.isfinite(length) or length == 0.0:
-        normal, length = -direction, 1.0  # at the map's border: as if it faced the camera
-    return SurfacePoint(points[0], normal / length)
+    _, d = ray_in_world(estimate, pixel)
+    sideways = np.linalg.svd(d[None, :])[2][1:]
+    from_pose = np.hstack([sideways / distance, -sideways @ hat(d)])
+    moved = [ray_in_world(estimate, (pixel[0] + du, pixel[1] + 1 - du))[1] for du in (1, 0)]
+    from_pixel = pixel_sigma * sideways @ (np.array(moved) - d).T
+    covariance = from_pose @ estimate.covariance @ from_pose.T + from_pixel @ from_pixel.T
+    return RaySpread(sideways, covariance)
 
 
-def target_covariance(
-    estimate: PoseEstimate, hit: SurfacePoint, pixel_sigma: float, map_sigma_m: float
+def surface_covariance(
+    offset: Array, normal: Array, spread: RaySpread, map_sigma_m: float
 ) -> Array:
-    """Covariance (3, 3) in m², world axes, of a ray's meeting point with the surface.
+    """Covariance (3, 3) in m², world axes, of a ray's meeting point with a surface.
 
-    First order about the tangent plane with normal n: for a ray ``C + s d`` the point moves by
-    ``M dC`` and by ``M s [phi]x d`` with ``M = I - d n' / (n' d)``. A pixel's error is a rotation
-    of the ray by ``pixel_sigma / f``; the map's own error adds along the normal.
+    offset: (3,) from the camera to the point. First order about the tangent plane with normal n
+    (3,): what moves the ray across by e moves the point by ``M e``, ``M = I - d n' / (n' d)``. The
+    map's own error adds along the ray.
     """
-    centre = estimate.world_from_camera.translation
-    offset = hit.position - centre
     distance = float(np.linalg.norm(offset))
-    d, n = offset / distance, hit.normal
-    # At grazing incidence the plane model explodes: 3 degrees is where we stop believing it.
-    cosine = float(n @ d)
-    cosine = np.copysign(max(abs(cosine), 0.05), cosine or -1.0)
-    M = np.eye(3) - np.outer(d, n) / cosine
-    J = np.hstack([M, -M @ hat(offset)])
-    pixel_angle = pixel_sigma / estimate.camera.fx
-    across = np.eye(3) - np.outer(d, d)
-    P = J @ estimate.covariance @ J.T
-    P += M @ across @ M.T * (distance * pixel_angle) ** 2
-    P += np.outer(d, d) * (map_sigma_m / cosine) ** 2
-    return 0.5 * (P + P.T)
+    d = offset / distance
+    cosine = float(normal @ d)
+    cosine = np.copysign(max(abs(cosine), _MIN_COSINE), cosine or -1.0)
+    M = (np.eye(3) - np.outer(d, normal) / cosine) @ spread.sideways.T * distance
+    P = M @ spread.covariance @ M.T + np.outer(d, d) * (map_sigma_m / cosine) ** 2
+    return np.asarray(0.5 * (P + P.T))
 
 
-class TargetFilter:
-    """Constant-velocity Kalman filter of one target's position (filterpy)."""
+def locate(
+    estimate: PoseEstimate,
+    pixel: tuple[float, float],
+    cast: RayCaster,
+    pixel_sigma: float,
+    map_sigma_m: float,
+) -> tuple[TargetSurface, ...]:
+    """The surfaces that a pixel may show, the most probable one first; none if it shows no map.
 
-    def __init__(self, acceleration_sigma: float = 1.5, gate: float = 25.0) -> None:
-        self._acceleration_sigma = acceleration_sigma
-        self._gate = gate
-        self._mean: Array | None = None
-        self._covariance: Array = np.eye(6)
-        self._time_ns = 0
-        self._rejected = 0
+    Where the whole bundle meets one surface, its position is the exact hit of the pixel's ray; else
+    a surface's is the mean of its own hits.
+    """
+    eye, d = ray_in_world(estimate, pixel)
+    distance = float(cast(eye, d[None, :]).distances[0])
+    if not np.isfinite(distance):
+        return ()
+    spread = ray_spread(estimate, pixel, pixel_sigma, distance)
+    nodes, weights = _nodes()
+    offsets = nodes @ np.linalg.cholesky(spread.covariance).T @ spread.sideways
+    directions = d + offsets
+    directions /= np.linalg.norm(directions, axis=1)[:, None]
+    hits = cast(eye, directions)
+    centre = int(np.argmax(weights))
+    step = _STEEPNESS * _STEP_SIGMA * distance * float(np.sqrt(spread.covariance.trace()))
+    groups = _surfaces(hits.distances, max(step, _SMALLEST_STEP_M))
+    surfaces = []
+    for group in groups:
+        share = weights[group] / weights[group].sum()
+        points = directions[group] * hits.distances[group, None]
+        exact = len(groups) == 1 and centre in group
+        offset = points[group == centre][0] if exact else share @ points
+        normal = share @ hits.normals[group]
+        normal = normal / max(float(np.linalg.norm(normal)), 1e-9)
+        own = ray_spread(estimate, pixel, pixel_sigma, float(np.linalg.norm(offset)))
+        covariance = surface_covariance(offset, normal, own, map_sigma_m)
+        covariance += _roughness(points - offset, share, normal, d)
+        surfaces.append(TargetSurface(float(weights[group].sum()), eye + offset, covariance))
+    total = sum(s.probability for s in surfaces)
+    found = (TargetSurface(s.probability / total, s.position, s.covariance) for s in surfaces)
+    return tuple(sorted(found, key=lambda s: -s.probability))
 
-    @property
-    def velocity(self) -> Array:
-        """Velocity (3,) in m/s, world axes; zero before the second fix."""
-        return np.zeros(3) if self._mean is None else self._mean[3:].copy()
 
-    def update(self, fix: TargetFix) -> TargetFix:
-        """Fuse a fix; returns it smoothed. Three outliers in a row restart the filter."""
-        if self._mean is None or self._rejected >= 3:
-            self._restart(fix)
-            return fix
-        mean, P = self._predict(fix.exposure_time_ns)
-        H = np.hstack([np.eye(3), np.zeros((3, 3))])
-        innovation = fix.position_world - mean[:3]
-        distance = innovation @ np.linalg.solve(P[:3, :3] + fix.covariance, innovation)
-        if distance > self._gate:
-            self._rejected += 1
-        else:
-            self._rejected = 0
-            mean, P = kalman_update(mean, P, fix.position_world, fix.covariance, H)
-        self._mean, self._covariance = np.asarray(mean), np.asarray(P)
-        self._time_ns = fix.exposure_time_ns
-        return TargetFix(
-            fix.target_id,
-            self._mean[:3].copy(),
-            self._covariance[:3, :3].copy(),
-            fix.pixel,
-            fix.exposure_time_ns,
-        )
+def _nodes() -> tuple[Array, Array]:
+    """Gauss-Hermite quadrature of the plane's standard normal: nodes (N, 2), weights (N,)."""
+    x, w = np.polynomial.hermite_e.hermegauss(_ORDER)
+    grid = np.stack(np.meshgrid(x, x), axis=-1).reshape(-1, 2)
+    return grid, np.outer(w, w).ravel() / w.sum() ** 2
 
-    def _restart(self, fix: TargetFix) -> None:
-        self._mean = np.concatenate([fix.position_world, np.zeros(3)])
-        self._covariance = np.zeros((6, 6))
-        self._covariance[:3, :3] = fix.covariance
-        self._covariance[3:, 3:] = np.eye(3) * 10.0**2
-        self._time_ns, self._rejected = fix.exposure_time_ns, 0
 
-    def _predict(self, time_ns: int) -> tuple[Array, Array]:
-        dt = max((time_ns - self._time_ns) * 1e-9, 1e-3)
-        F = np.eye(6)
-        F[:3, 3:] = np.eye(3) * dt
-        q = Q_discrete_white_noise(2, dt, self._acceleration_sigma**2)
-        Q = np.kron(q, np.eye(3))
-        mean, P = kalman_predict(self._mean, self._covariance, F, Q)
-        return np.asarray(mean), np.asarray(P)
+def _surfaces(distances: Array, step: float) -> list[np.ndarray]:
+    """Indices of the hits, grouped where sorted distances (N,) leap by more than `step`."""
+    order = np.argsort(distances)
+    order = order[np.isfinite(distances[order])]
+    return np.split(order, np.flatnonzero(np.diff(distances[order]) > step) + 1)
+
+
+def _roughness(offsets: Array, share: Array, normal: Array, d: Array) -> Array:
+    """What a surface's hits, (N, 3) from its point, stray from the tangent plane: (3, 3) m²."""
+    cosine = max(abs(float(normal @ d)), _MIN_COSINE)
+    return np.outer(d, d) * float(share @ (offsets @ normal) ** 2) / cosine**2

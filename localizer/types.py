@@ -139,11 +139,36 @@ class PoseEstimate:
 
 
 @dataclass(frozen=True)
+class TargetSurface:
+    """A surface that a target's pixel may show. probability: 0 to 1; position: (3,) world metres;
+    covariance: (3, 3) m², world axes, if it is this one.
+    """
+
+    probability: float
+    position: Array
+    covariance: Array
+
+
+@dataclass(frozen=True)
+class TargetSighting:
+    """A pixel with the surfaces (at least one) that it may show; time_ns is the exposure's."""
+
+    target_id: str
+    surfaces: tuple[TargetSurface, ...]
+    pixel: tuple[float, float]
+    time_ns: int
+
+
+@dataclass(frozen=True)
 class TargetFix:
-    """A pixel's place on Earth. position_world: (3,) metres; covariance: (3, 3) m², world axes."""
+    """A pixel's place on Earth. position_world: (3,) metres; covariance: (3, 3) m², world axes, the
+    mean square about the position, other surfaces included. elsewhere: the probability, 0 to 1,
+    that the target is on another surface than the reported one.
+    """
 
     target_id: str
     position_world: Array
     covariance: Array
     pixel: tuple[float, float]
     exposure_time_ns: int
+    elsewhere: float = 0.0

@@ -95,7 +95,11 @@ class VisionFix:
 
 @dataclass(frozen=True)
 class TargetReport:
-    """A target's position for the ground station. pixel: (x, y), normalised 0..1, or None."""
+    """A target's position for the ground station. pixel: (x, y), normalised 0..1, or None.
+
+    elsewhere: the probability that the target is on another surface than the one reported (a roof's
+    edge, say); the accuracies include it.
+    """
 
     time_ns: int
     latitude_deg: float
@@ -106,6 +110,7 @@ class TargetReport:
     v_accuracy_m: float = NAN
     pixel: tuple[float, float] | None = None
     target_id: int = 0
+    elsewhere: float = 0.0
     rectangle: tuple[float, float, float, float] | None = None
     """Left, top, right, bottom, normalised 0..1."""
 

@@ -35,6 +35,7 @@ _ADSB_FLAGS = (
 )
 _ICAO_BASE = 0xF00000  # unassigned block; the low bits carry the target's number
 _COT_TYPE = "a-u-G"  # atom, unknown affiliation, ground
+_TOLD_ELSEWHERE = 0.05  # from here on a target's other surface is worth a remark
 
 
 def _text(value: str, length: int) -> list[int]:
@@ -228,6 +229,9 @@ def cursor_on_target(report: TargetReport, config: TargetsConfig, utc: SteadyUtc
     )
     detail = ElementTree.SubElement(event, "detail")
     ElementTree.SubElement(detail, "contact", callsign=f"TGT{report.target_id:04d}")
+    if report.elsewhere >= _TOLD_ELSEWHERE:
+        remarks = ElementTree.SubElement(detail, "remarks")
+        remarks.text = f"{report.elsewhere:.0%} likely on another surface (edge in the picture)"
     if report.velocity_ned is not None:
         north, east, _ = report.velocity_ned
         course = math.degrees(math.atan2(east, north)) % 360.0

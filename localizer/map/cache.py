@@ -169,6 +169,13 @@ class TileCache:
 
     def load_tile(self, tile_id: int) -> TileMesh:
         """Read, verify and decode one tile; raises `MapCacheError` that names it."""
+        return self._load(tile_id, textured=True)
+
+    def load_geometry(self, tile_id: int) -> TileMesh:
+        """The same without its texture, in a fraction of the time: for casting rays."""
+        return self._load(tile_id, textured=False)
+
+    def _load(self, tile_id: int, *, textured: bool) -> TileMesh:
         if not 0 <= tile_id < len(self.index.size):
             raise MapCacheError(f"{self.path}: no tile {tile_id}; the index has {self.tile_ids}")
         path = self.tile_path(tile_id)
@@ -182,7 +189,7 @@ class TileCache:
                 "build the cache again"
             )
         try:
-            return decode_tile(data, self.world_from_tile[tile_id])
+            return decode_tile(data, self.world_from_tile[tile_id], textured=textured)
         except MapCacheError as error:
             raise MapCacheError(f"tile {tile_id}, {path}: {error}") from error
 
@@ -214,21 +221,23 @@ def encode_tile(
     return bytes(safetensors.numpy.save(arrays))
 
 
-def decode_tile(data: bytes, world_from_tile: Pose) -> TileMesh:
-    """Inverse of `encode_tile`."""
+def decode_tile(data: bytes, world_from_tile: Pose, *, textured: bool = True) -> TileMesh:
+    """Inverse of `encode_tile`. textured: False leaves the mips out."""
     try:
         arrays = safetensors.numpy.load(data)
         positions, uvs, faces = (arrays[k] for k in ("positions", "uvs", "faces"))
-        images = [_decode_image(arrays[k]) for k in sorted(arrays) if k.startswith("mip")]
+        mips = [k for k in sorted(arrays) if k.startswith("mip")]
+        images = [_decode_image(arrays[k]) for k in mips] if textured else []
     except (safetensors.SafetensorError, KeyError) as error:
         raise MapCacheError(f"not a tile file: {error}") from error
+    faces = faces.view(np.int32)
+    if not textured:
+        return TileMesh(positions, uvs, faces, (), world_from_tile)
     texture = PackedTexture.empty([(i.shape[1], i.shape[0]) for i in images])
     for level, image in enumerate(images):
         cv2.cvtColor(image, cv2.COLOR_BGR2RGB, dst=texture.mip(level))
     repeat = bool(arrays["repeat"][0]) if "repeat" in arrays else False
-    return TileMesh.from_packed(
-        positions, uvs, faces.view(np.int32), texture, world_from_tile, repeat=repeat
-    )
+    return TileMesh.from_packed(positions, uvs, faces, texture, world_from_tile, repeat=repeat)
 
 
 def _encode_image(image: Image) -> bytes:

@@ -7,8 +7,8 @@ from companion.config import TargetConfig
 from companion.detections import Detection
 from companion.target_reporter import TargetReporter
 from localizer.camera import Camera
+from localizer.map.pick import BundleHits
 from localizer.pose import Pose
-from localizer.targets import SurfacePoint
 from localizer.types import PoseEstimate, RegistrationStatus, TrackingState
 from mavlink_bridge.link import sleep_until
 
@@ -24,9 +24,12 @@ def _estimate(time_ns: int, accepted: bool = True) -> PoseEstimate:
     )  # fmt: skip
 
 
-def _ground(origin, direction):
-    hit = origin - direction * origin[2] / direction[2]
-    return SurfacePoint(hit, np.array([0.0, 0.0, 1.0]))
+def _ground(origin, directions):
+    return BundleHits(-origin[2] / directions[:, 2], np.tile([0.0, 0.0, 1.0], (len(directions), 1)))
+
+
+def _sky(_, directions):
+    return BundleHits(np.full(len(directions), np.nan), np.zeros((len(directions), 3)))
 
 
 class Session:
@@ -70,8 +73,16 @@ def test_rejected_estimates_and_other_frames_are_not_used():
 
 
 def test_a_ray_into_the_sky_is_counted():
-    with Session(cast=lambda *_: None) as s:
+    with Session(cast=_sky) as s:
         s.reporter.add_detection(Detection("a", 50 * MS, 320.0, 240.0))
+        s.reporter.add_estimate(_estimate(50 * MS))
+        assert sleep_until(lambda: s.reporter.missed == 1, 30.0)
+        assert not s.targets
+
+
+def test_a_pixel_beside_the_picture_is_counted_as_missed():
+    with Session() as s:
+        s.reporter.add_detection(Detection("a", 50 * MS, 5000.0, 240.0))
         s.reporter.add_estimate(_estimate(50 * MS))
         assert sleep_until(lambda: s.reporter.missed == 1, 30.0)
         assert not s.targets
@@ -80,11 +91,11 @@ def test_a_ray_into_the_sky_is_counted():
 def test_reports_keep_their_rate_and_a_failing_cast_does_not_end_them():
     calls = []
 
-    def cast(origin, direction):
+    def cast(origin, directions):
         calls.append(1)
         if len(calls) == 1:
             raise RuntimeError("boom")
-        return _ground(origin, direction)
+        return _ground(origin, directions)
 
     with Session(cast=cast, rate_hz=5.0) as s:
         for k in range(21):
@@ -93,4 +104,5 @@ def test_reports_keep_their_rate_and_a_failing_cast_does_not_end_them():
             time.sleep(0.01)
         assert sleep_until(lambda: len(s.targets) >= 4, 30.0)
         time.sleep(0.3)
+        assert s.reporter.failed == 1
     assert 4 <= len(s.targets) <= 6  # 1 s at 5 Hz

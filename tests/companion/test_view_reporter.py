@@ -9,8 +9,8 @@ import pytest
 from companion.view_reporter import ViewReporter, camera_view
 from localizer.camera import Camera
 from localizer.geo import Geodetic, LocalFrame
+from localizer.map.pick import BundleHits
 from localizer.pose import Pose, matrix_from_euler
-from localizer.targets import SurfacePoint
 from localizer.types import PoseEstimate, RegistrationStatus, TrackingState
 
 FRAME = LocalFrame(Geodetic(47.0, 8.0, 500.0))
@@ -28,10 +28,9 @@ def estimate(pitch_deg: float, *, accepted: bool = True, time_ns: int = 5) -> Po
     )  # fmt: skip
 
 
-def flat(origin, direction):
-    if direction[2] >= 0.0:
-        return None
-    return SurfacePoint(origin - direction * origin[2] / direction[2], np.array([0.0, 0.0, 1.0]))
+def flat(origin, directions):
+    distances = np.where(directions[:, 2] < 0.0, -origin[2] / directions[:, 2], np.nan)
+    return BundleHits(distances, np.tile([0.0, 0.0, 1.0], (len(directions), 1)))
 
 
 def test_the_picture_s_centre_falls_on_the_ground():

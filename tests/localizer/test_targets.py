@@ -2,19 +2,15 @@ import numpy as np
 import pytest
 
 from localizer.camera import Camera
+from localizer.map.pick import BundleHits, cast_bundle
 from localizer.map.tile import TileMesh
 from localizer.pose import Pose, so3_exp
-from localizer.targets import (
-    SurfacePoint,
-    TargetFilter,
-    cast_ray,
-    ray_in_world,
-    target_covariance,
-)
-from localizer.types import PoseEstimate, RegistrationStatus, TargetFix, TrackingState
+from localizer.targets import locate, ray_in_world, ray_spread, surface_covariance
+from localizer.types import PoseEstimate, RegistrationStatus, TrackingState
 
 CAMERA = Camera(640, 480, 550.0, 550.0, 322.0, 238.0, (-0.1, 0.02, 0.001, -0.001, 0.0))
 NADIR = Pose(np.diag([1.0, -1.0, -1.0]), np.array([10.0, 20.0, 120.0]))
+EXACT = np.eye(6) * 1e-12
 
 
 def _estimate(pose: Pose, covariance=None) -> PoseEstimate:
@@ -29,13 +25,6 @@ def _ground_hit(pose: Pose, pixel) -> np.ndarray:
     return origin - direction * origin[2] / direction[2]
 
 
-def test_ray_meets_the_point_that_projects_to_the_pixel():
-    point = np.array([25.0, 5.0, 0.0])
-    pixel, inside = CAMERA.project(NADIR.inverse.apply(point))
-    assert inside
-    np.testing.assert_allclose(_ground_hit(NADIR, tuple(pixel)), point, atol=1e-4)
-
-
 def _square(side: float, height: float) -> TileMesh:
     """A horizontal square about the origin, with a plain texture."""
     corners = np.array([[-1, -1], [1, -1], [-1, 1], [1, 1]]) * side / 2
@@ -48,15 +37,69 @@ def _square(side: float, height: float) -> TileMesh:
     )
 
 
-def test_a_ray_beside_a_roofs_edge_meets_the_ground_and_one_inside_it_the_roof():
-    meshes = [_square(400.0, 0.0), _square(20.0, 8.0)]
-    eye = np.array([40.0, 5.0, 120.0])
-    for east, height in ((9.98, 8.0), (10.02, 0.0)):
-        direction = np.array([east, 3.0, 8.0]) - eye
-        hit = cast_ray(meshes, eye, direction / np.linalg.norm(direction))
-        assert hit is not None
-        # A pixel there covers 0.2 m: depth interpolated in an image would hang in between.
-        assert hit.position[2] == pytest.approx(height, abs=1e-4)
+MESHES = [_square(400.0, 0.0), _square(20.0, 8.0)]
+
+
+def _cast(origin, directions) -> BundleHits:
+    return cast_bundle(MESHES, origin, directions)
+
+
+def _pixel_of(pose: Pose, point) -> tuple[float, float]:
+    u, v = CAMERA.project(pose.inverse.apply(np.array(point)))[0]
+    return float(u), float(v)
+
+
+def test_ray_meets_the_point_that_projects_to_the_pixel():
+    point = np.array([25.0, 5.0, 0.0])
+    np.testing.assert_allclose(_ground_hit(NADIR, _pixel_of(NADIR, point)), point, atol=1e-4)
+
+
+def test_a_pixel_on_one_surface_is_placed_exactly():
+    point = np.array([25.0, 5.0, 0.0])
+    surfaces = locate(_estimate(NADIR), _pixel_of(NADIR, point), _cast, 1.5, 0.3)
+    assert [s.probability for s in surfaces] == [1.0]
+    np.testing.assert_allclose(surfaces[0].position, point, atol=1e-4)
+
+
+def test_at_a_roof_s_edge_both_surfaces_are_told_with_what_is_likely():
+    seen = []
+    for east in (9.0, 9.9, 10.0, 10.1, 11.0):
+        pixel = _pixel_of(NADIR, (east, 3.0, 8.0))
+        surfaces = locate(_estimate(NADIR, EXACT), pixel, _cast, 1.5, 0.3)
+        for s in surfaces:
+            height = round(float(s.position[2]))
+            assert height in (0, 8)  # and nothing in mid-air
+            assert s.position[2] == pytest.approx(height, abs=1e-6)
+        seen.append(sum(s.probability for s in surfaces if s.position[2] > 4.0))
+    # A pixel covers 0.2 m of the roof, its error 1.5 pixels (0.3 m).
+    assert seen == sorted(seen, reverse=True)
+    assert seen[0] == 1.0
+    assert seen[-1] == 0.0
+    assert seen[2] == pytest.approx(0.5, abs=0.3)  # the middle node of the bundle is on one side
+
+
+def test_the_shares_of_an_edge_are_those_of_monte_carlo():
+    rng = np.random.default_rng(1)
+    estimate = _estimate(NADIR)
+    pixel = _pixel_of(NADIR, (9.6, 3.0, 8.0))
+    sigma = np.sqrt(estimate.covariance.diagonal())
+    heights = []
+    for _ in range(2000):
+        e = rng.normal(0, sigma)
+        moved = Pose(so3_exp(e[3:]) @ NADIR.rotation, NADIR.translation + e[:3])
+        at = (pixel[0] + rng.normal(0, 1.5), pixel[1] + rng.normal(0, 1.5))
+        origin, direction = ray_in_world(_estimate(moved), at)
+        heights.append(origin[2] + direction[2] * _cast(origin, direction[None, :]).distances[0])
+    roof = float(np.mean(np.array(heights) > 4.0))
+    surfaces = locate(estimate, pixel, _cast, 1.5, 0.3)
+    found = next(s for s in surfaces if s.position[2] > 4.0)
+    assert 0.6 < roof < 0.9
+    assert found.probability == pytest.approx(roof, abs=0.15)
+
+
+def test_a_pixel_in_the_sky_shows_no_surface():
+    up = Pose(np.eye(3), np.array([0.0, 0.0, 50.0]))  # looks along +z
+    assert locate(_estimate(up), (320.0, 240.0), _cast, 1.5, 0.3) == ()
 
 
 @pytest.mark.parametrize("tilt_deg", [0.0, 45.0])
@@ -64,8 +107,9 @@ def test_covariance_agrees_with_monte_carlo(tilt_deg):
     pose = Pose(so3_exp([np.radians(tilt_deg), 0, 0]) @ NADIR.rotation, NADIR.translation)
     pixel = (200.0, 300.0)
     estimate = _estimate(pose)
-    hit = SurfacePoint(_ground_hit(pose, pixel), np.array([0.0, 0.0, 1.0]))
-    P = target_covariance(estimate, hit, pixel_sigma=2.0, map_sigma_m=1e-9)
+    offset = _ground_hit(pose, pixel) - pose.translation
+    spread = ray_spread(estimate, pixel, 2.0, float(np.linalg.norm(offset)))
+    P = surface_covariance(offset, np.array([0.0, 0.0, 1.0]), spread, map_sigma_m=1e-9)
     rng = np.random.default_rng(0)
     sigma = np.sqrt(estimate.covariance.diagonal())
     hits = []
@@ -77,22 +121,16 @@ def test_covariance_agrees_with_monte_carlo(tilt_deg):
     np.testing.assert_allclose(P[:2, :2], sampled[:2, :2], rtol=0.12, atol=0.02)
 
 
-def test_filter_follows_a_moving_target_and_survives_an_outlier():
-    rng = np.random.default_rng(3)
-    target = TargetFilter()
-    velocity = np.array([6.0, -2.0, 0.0])
-    for k in range(60):
-        truth = velocity * k * 0.2
-        noise = rng.normal(0, 1.0, 3) + (30.0 if k == 40 else 0.0)
-        fix = TargetFix("car", truth + noise, np.eye(3), (0.0, 0.0), round(k * 0.2e9))
-        out = target.update(fix)
-    assert np.linalg.norm(out.position_world - truth) < 1.5
-    np.testing.assert_allclose(target.velocity, velocity, atol=1.0)
+def test_what_strays_from_the_tangent_plane_widens_the_covariance():
+    def steps(origin, directions):
+        """Ground with steps of 0.7 m, too low to be told apart as surfaces."""
+        hits = _cast(origin, directions)
+        east = (origin + directions * hits.distances[:, None])[:, 0]
+        down = -directions[:, 2]
+        return BundleHits(hits.distances + 0.7 * (np.floor(east * 4) % 2) / down, hits.normals)
 
-
-def test_filter_restarts_on_a_target_that_really_moved():
-    target = TargetFilter()
-    for k in range(20):
-        position = np.zeros(3) if k < 10 else np.array([200.0, 0.0, 0.0])
-        out = target.update(TargetFix("t", position, np.eye(3) * 0.1, (0, 0), round(k * 0.2e9)))
-    np.testing.assert_allclose(out.position_world, [200.0, 0.0, 0.0], atol=1.0)
+    pixel = _pixel_of(NADIR, (30.0, 5.0, 0.0))
+    flat = locate(_estimate(NADIR, EXACT), pixel, _cast, 1.5, 0.1)
+    rough = locate(_estimate(NADIR, EXACT), pixel, steps, 1.5, 0.1)
+    assert len(flat) == len(rough) == 1
+    assert rough[0].covariance[2, 2] > flat[0].covariance[2, 2] + 0.2**2
