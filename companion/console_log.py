@@ -1,0 +1,92 @@
+"""The console's log, written on a thread of its own.
+
+A terminal may be stopped (Ctrl-S), hung up with its radio link, or a pipe whose reader ends; a log
+file's disk may be full. A thread that flies must neither wait for it nor end with it: rich, for
+one, answers a closed pipe with SystemExit in whatever thread was logging.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import logging
+import os
+import queue
+import sys
+import threading
+from collections.abc import Iterator
+from logging.handlers import QueueHandler
+
+from rich.console import Console
+from rich.logging import RichHandler
+
+OURS = ("companion", "localizer", "mavlink_bridge")
+_WAITING = 1000
+_LAST_WORDS_S = 2.0
+
+
+class Descriptor:
+    """Text to a file descriptor, without buffers; what it does not take is lost."""
+
+    def __init__(self, number: int) -> None:
+        self._number = number
+        self.encoding = getattr(sys.stdout, "encoding", None) or "utf-8"
+
+    def write(self, text: str) -> int:
+        """Write all of it, or what can be written."""
+        data = text.encode(self.encoding, "replace")
+        with contextlib.suppress(OSError):
+            while data:
+                data = data[os.write(self._number, data) :]
+        return len(text)
+
+    def flush(self) -> None:
+        """Nothing waits here."""
+
+    def isatty(self) -> bool:
+        """Whether it is a terminal."""
+        return os.isatty(self._number)
+
+    def fileno(self) -> int:
+        """The descriptor."""
+        return self._number
+
+
+class _Queue(QueueHandler):
+    """Hands records on; those beyond the bound are lost."""
+
+    def enqueue(self, record: logging.LogRecord) -> None:
+        with contextlib.suppress(queue.Full):
+            self.queue.put_nowait(record)
+
+
+@contextlib.contextmanager
+def console_log(verbose: bool, descriptor: int = 1) -> Iterator[None]:
+    """Log to a descriptor, standard output, for as long as this lasts.
+
+    verbose: of our own packages, because numba's own log is endless.
+    """
+    waiting: queue.Queue[logging.LogRecord | None] = queue.Queue(_WAITING)
+    console = Console(file=Descriptor(descriptor))  # type: ignore[arg-type]
+    writer = RichHandler(show_path=False, console=console)
+
+    def write() -> None:
+        while (record := waiting.get()) is not None:
+            writer.handle(record)
+
+    # A daemon: one that waits for a stopped terminal must not keep the process.
+    thread = threading.Thread(target=write, name="console", daemon=True)
+    thread.start()
+    handler, root = _Queue(waiting), logging.getLogger()
+    before = root.level
+    root.addHandler(handler)
+    root.setLevel(logging.INFO)
+    for name in OURS:
+        logging.getLogger(name).setLevel(logging.DEBUG if verbose else logging.NOTSET)
+    try:
+        yield
+    finally:
+        root.removeHandler(handler)
+        root.setLevel(before)
+        with contextlib.suppress(queue.Full):
+            waiting.put_nowait(None)
+        thread.join(_LAST_WORDS_S)

@@ -1,0 +1,84 @@
+"""The console's log never stops and never ends a thread that logs."""
+
+import logging
+import os
+import threading
+import time
+from contextlib import contextmanager, suppress
+
+import pytest
+
+from companion.console_log import _WAITING, OURS, console_log
+
+_log = logging.getLogger("companion.test")
+
+
+@pytest.fixture(autouse=True)
+def levels():
+    """Put back what the process-wide loggers had."""
+    loggers = [logging.getLogger(name) for name in ("", *OURS)]
+    before = [logger.level for logger in loggers]
+    yield
+    for logger, level in zip(loggers, before, strict=True):
+        logger.setLevel(level)
+
+
+@contextmanager
+def _pipe():
+    read, write = os.pipe()
+    try:
+        yield read, write
+    finally:
+        for number in (read, write):
+            with suppress(OSError):
+                os.close(number)
+
+
+@pytest.mark.parametrize("verbose", [False, True])
+def test_verbose_holds_for_our_packages_only(verbose):
+    with _pipe() as (read, write):
+        with console_log(verbose, write):
+            assert logging.getLogger("mavlink_bridge.bridge").isEnabledFor(logging.DEBUG) == verbose
+            assert not logging.getLogger("numba.core.ssa").isEnabledFor(logging.DEBUG)
+            assert logging.getLogger("numba.core.ssa").isEnabledFor(logging.INFO)
+            _log.warning("[/red] 5 of %d", 7)
+        assert "[/red] 5 of 7" in os.read(read, 4096).decode()
+
+
+def _logs(lines):
+    """A thread that logs so many lines; True if it came to its end."""
+    done = threading.Event()
+
+    def log():
+        for i in range(lines):
+            _log.info("line %d", i)
+        done.set()
+
+    thread = threading.Thread(target=log)
+    thread.start()
+    thread.join(20.0)
+    return done.is_set()
+
+
+def test_a_reader_that_ends_ends_nobody():
+    """`companion run | tee log`, and tee is gone; rich would raise SystemExit in the thread."""
+    with _pipe() as (read, write), console_log(False, write):
+        assert _logs(1)
+        assert os.read(read, 1)
+        os.close(read)
+        assert _logs(3)
+
+
+def test_a_stopped_terminal_stops_nobody_and_the_end_is_not_waited_for():
+    with _pipe() as (_, write):
+        with console_log(False, write):
+            assert _logs(2 * _WAITING)  # far more than a pipe and the queue hold
+            began = time.monotonic()
+        assert time.monotonic() - began < 5.0
+
+
+def test_a_full_disk_stops_nobody():
+    full = os.open("/dev/full", os.O_WRONLY)
+    with console_log(False, full):
+        assert _logs(10)
+    os.close(full)
