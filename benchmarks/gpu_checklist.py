@@ -11,7 +11,6 @@ one runs. The exit code is 1 if a step failed, 2 if there is no GPU.
 
 from __future__ import annotations
 
-import argparse
 import shutil
 import subprocess
 import sys
@@ -19,6 +18,7 @@ import time
 from dataclasses import dataclass
 from pathlib import Path
 
+from arguments import Parser, existing, number, output
 from named_errors import named_errors
 
 from localizer.registration.cuda import CudaError, Device
@@ -106,11 +106,13 @@ def text_of(outcomes: list[Outcome]) -> str:
 
 
 def main() -> int:
-    parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
-    parser.add_argument("--sequence", type=Path, help="recorded sequence for companion eval")
-    parser.add_argument("--map", type=Path, help="its tile cache")
-    parser.add_argument("--report", type=Path, default=Path("gpu-report.md"))
-    parser.add_argument("--minutes", type=float, default=10.0, help="for everything")
+    parser = Parser(__doc__)
+    parser.add_argument("--sequence", type=existing, help="recorded sequence for companion eval")
+    parser.add_argument("--map", type=existing, help="its tile cache")
+    parser.add_argument(
+        "--report", type=output, default=Path("gpu-report.md"), help="Markdown to write"
+    )
+    parser.add_argument("--minutes", type=number(0.1, 600), default=10.0, help="for everything")
     arguments = parser.parse_args()
     try:
         print(f"GPU: {Device().name}")

@@ -12,7 +12,6 @@ frames were at the wanted detail, and memory.
 
 from __future__ import annotations
 
-import argparse
 import gc
 import os
 import resource
@@ -23,6 +22,7 @@ from pathlib import Path
 
 import cv2
 import numpy as np
+from arguments import Parser, number, whole
 from named_errors import named_errors
 from rich.console import Console
 from rich.table import Table
@@ -173,10 +173,14 @@ def fly(
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--km", type=float, default=10.0)
-    parser.add_argument("--seconds", type=float, default=40.0, help="of every flight; 0: none")
-    parser.add_argument("--budget-mb", type=int, default=384)
+    parser = Parser(__doc__)
+    parser.add_argument("--km", type=number(0.5, 100), default=10.0, help="side of the region")
+    parser.add_argument(
+        "--seconds", type=number(0, 3600), default=40.0, help="of every flight; 0: none"
+    )
+    parser.add_argument(
+        "--budget-mb", type=whole(16, 1 << 16), default=384, help="for tiles in memory, MiB"
+    )
     parser.add_argument("--keep", type=Path, help="folder for the caches; else a temporary one")
     options = parser.parse_args()
     console = Console(width=160)

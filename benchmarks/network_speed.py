@@ -9,7 +9,6 @@ the GPU, as in flight. Medians; the first calls, in which engines are built, are
 
 from __future__ import annotations
 
-import argparse
 import tempfile
 import time
 from collections.abc import Callable, Iterator, Sequence
@@ -18,6 +17,7 @@ from pathlib import Path
 
 import numpy as np
 import onnxruntime as ort
+from arguments import Parser, existing, whole
 from named_errors import named_errors
 
 from localizer.errors import ModelError
@@ -43,11 +43,16 @@ class Row:
 
 def untrained_s0(folder: Path) -> list[Path]:
     """`s0` in float32 and float16 with random weights."""
-    import torch
+    try:
+        import torch
 
-    from localizer.training.config import load_config
-    from localizer.training.export import export
-    from localizer.training.networks import build
+        from localizer.training.config import load_config
+        from localizer.training.export import export
+        from localizer.training.networks import build
+    except ModuleNotFoundError as error:
+        raise ModelError(
+            f"an untrained s0 needs {error.name}: pip install '.[train]', or give --s0 MODEL.onnx"
+        ) from error
 
     run = load_config(ROOT / "configs" / "train_s0.yaml")
     checkpoint = folder / "s0.pt"
@@ -105,10 +110,12 @@ def table(rows: Sequence[Row]) -> str:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
-    parser.add_argument("--s0", type=Path, nargs="*", help="models of s0, instead of untrained")
-    parser.add_argument("--threads", type=int, default=2, help="on the CPU")
-    parser.add_argument("--count", type=int, default=30, help="calls that are counted")
+    parser = Parser(__doc__)
+    parser.add_argument("--s0", type=existing, nargs="*", help="models of s0, instead of untrained")
+    parser.add_argument("--threads", type=whole(1, 256), default=2, help="on the CPU")
+    parser.add_argument(
+        "--count", type=whole(1, 100_000), default=30, help="calls that are counted"
+    )
     args = parser.parse_args()
     with tempfile.TemporaryDirectory() as folder:
         models = [SHIPPED_MODEL, *(args.s0 or untrained_s0(Path(folder)))]

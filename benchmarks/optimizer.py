@@ -10,7 +10,6 @@ its normal equations and one 6x6 solution; a registration counts iterations + 1 
 
 from __future__ import annotations
 
-import argparse
 import os
 import time
 from collections.abc import Callable
@@ -18,6 +17,7 @@ from functools import partial
 
 import cv2
 import numpy as np
+from arguments import Parser, whole
 from named_errors import named_errors
 from optimizer_gpu import print_tables
 from rich.console import Console
@@ -210,8 +210,10 @@ def schedule(
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
-    parser.add_argument("--threads", type=int, default=min(2, os.cpu_count() or 1))
+    parser = Parser(__doc__)
+    parser.add_argument(
+        "--threads", type=whole(1, 256), default=min(2, os.cpu_count() or 1), help="beside one"
+    )
     parser.add_argument("--quick", action="store_true", help="fewer repeats, 256 px only for naive")
     arguments = parser.parse_args()
     repeats = 5 if arguments.quick else 15

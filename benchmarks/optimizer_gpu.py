@@ -16,6 +16,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+from arguments import Parser
 from named_errors import named_errors
 from rich.console import Console
 from rich.table import Table
@@ -343,6 +344,7 @@ def measure(
 def main() -> None:
     from optimizer import SIZES, make_problem, make_swarm
 
+    Parser(__doc__).parse_args()
     print_tables(Console(), {size: make_problem(size) for size in SIZES}, make_swarm())
 
 

@@ -9,13 +9,12 @@ places by the CPU's renderer, as the shards are made.
 
 from __future__ import annotations
 
-import argparse
 import time
-from pathlib import Path
 
 import cv2
 import numpy as np
 import torch
+from arguments import Parser, existing, whole
 from named_errors import named_errors
 
 from localizer.synth.heightfield import render
@@ -59,9 +58,11 @@ def device_pairs(stream: LiveStream, loader: LoaderConfig, count: int) -> tuple[
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
-    parser.add_argument("config", type=Path)
-    parser.add_argument("--pairs", type=int, default=4, help="in one batch on the device")
+    parser = Parser(__doc__)
+    parser.add_argument("config", type=existing, help="YAML of a run with live pairs")
+    parser.add_argument(
+        "--pairs", type=whole(1, 10_000), default=4, help="in one batch on the device"
+    )
     parser.add_argument("--no-photos", action="store_true", help="generated ground alone")
     args = parser.parse_args()
     torch.set_num_threads(1)

@@ -14,6 +14,7 @@ import time
 
 import cv2
 import numpy as np
+from arguments import Parser, number, whole
 from named_errors import named_errors
 from rich.console import Console
 from rich.table import Table
@@ -115,15 +116,25 @@ def depth_error(renderer: MapRenderer, meshes: list[TileMesh], camera: Camera) -
     return np.concatenate(errors)
 
 
+def size(text: str) -> tuple[int, int]:
+    """Width and height of WIDTHxHEIGHT."""
+    width, _, height = text.partition("x")
+    try:
+        return whole(16, 8192)(width), whole(16, 8192)(height)
+    except argparse.ArgumentTypeError as error:
+        raise argparse.ArgumentTypeError(f"{text!r} is not WIDTHxHEIGHT: {error}") from error
+
+
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--triangles", nargs="+", type=float, default=[0.3, 1.0, 2.0])
-    parser.add_argument("--size", default="512x384")
-    parser.add_argument("--frames", type=int, default=20)
-    parser.add_argument("--threads", type=int, default=2)
+    parser = Parser(__doc__)
+    parser.add_argument(
+        "--triangles", nargs="+", type=number(0.01, 20), default=[0.3, 1.0, 2.0], help="millions"
+    )
+    parser.add_argument("--size", type=size, default="512x384", help="of the image, pixels")
+    parser.add_argument("--frames", type=whole(1, 10_000), default=20, help="poses measured")
+    parser.add_argument("--threads", type=whole(1, 256), default=2, help="of numba")
     options = parser.parse_args()
-    width, height = (int(n) for n in options.size.split("x"))
-    camera = Camera.from_fov(width, height, 60.0)
+    camera = Camera.from_fov(*options.size, 60.0)
     table = Table(
         "backend", "M triangles", "CPU ms", "wall ms", "CPU / numba", "depth median", "depth p99.9"
     )

@@ -12,7 +12,6 @@ each second. Exit code 1 when a bound is passed or injection does not come back 
 
 from __future__ import annotations
 
-import argparse
 import logging
 import multiprocessing
 import os
@@ -29,6 +28,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from arguments import Parser, number, output, whole
 from named_errors import named_errors
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
@@ -425,11 +425,11 @@ def plot(samples: list[Sample], faults: list[Fault], begun: float, path: Path) -
 
 def main() -> int:
     """Run, print, plot."""
-    parser = argparse.ArgumentParser(description=__doc__.split("\n", maxsplit=1)[0])
-    parser.add_argument("--minutes", type=float, default=30.0)
-    parser.add_argument("--seed", type=int, default=1)
-    parser.add_argument("--plot", type=Path)
-    parser.add_argument("--trace", action="store_true")
+    parser = Parser(__doc__)
+    parser.add_argument("--minutes", type=number(1, 1440), default=30.0, help="faults are as long")
+    parser.add_argument("--seed", type=whole(0, 1 << 31), default=1, help="of the damage")
+    parser.add_argument("--plot", type=output, help="PNG of the curves over time")
+    parser.add_argument("--trace", action="store_true", help="where memory grew; slower")
     arguments = parser.parse_args()
     logging.basicConfig(level=logging.ERROR)
     samples, faults, counters = fly(arguments.minutes, arguments.seed, arguments.trace)

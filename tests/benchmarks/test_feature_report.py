@@ -17,6 +17,8 @@ from feature_report import (
     write_outcomes,
 )
 
+from localizer.errors import SequenceError
+
 
 def outcomes(method: str, metres: list[float], source: str = "made") -> list[Outcome]:
     return [
@@ -64,3 +66,11 @@ def test_where_a_method_is_behind_is_said_with_its_certainty() -> None:
     assert "y: day: a" not in text
     assert "in 0 of" not in text
     assert "b is behind in 0 of these cells" in report(outcomes("a", near) + outcomes("b", near))
+
+
+@pytest.mark.parametrize("text", ["", "a,b\n1,2\n", "method,source\nours,made\n"])
+def test_a_file_that_is_no_report_is_named(tmp_path: Path, text: str) -> None:
+    path = tmp_path / "seed0.csv"
+    path.write_text(text)
+    with pytest.raises(SequenceError, match=r"seed0\.csv: "):
+        read_outcomes([path])
