@@ -99,8 +99,12 @@ def check_link(config: BridgeConfig) -> tuple[list[Finding], VehicleState]:
             time.sleep(0.05)
         if not bridge.state().connected:
             needed = f"heartbeats at {config.connection}"
-            why = "wiring, port, SERIALn_PROTOCOL=2, signing key"
-            return [Finding("connection", "silence", needed, why, False, True)], bridge.state()
+            found, why = "silence", "wiring, port, SERIALn_PROTOCOL=2, signing key"
+            counters = bridge.counters()
+            if counters["fc_open_failures"] and not counters["fc_opened"]:
+                found = "cannot be opened"
+                why = "nothing there, no permission, or in use: is the companion running?"
+            return [Finding("connection", found, needed, why, False, True)], bridge.state()
         time.sleep(_MEASURE_S / 2)
         before = bridge.counters()
         time.sleep(_MEASURE_S)

@@ -86,6 +86,7 @@ class FlightControllerSide(Side):
             self.command(link, message, time_ns)
             return
         if not self.tracker.accepts(message):
+            self._stranger(link, message)
             return
         self.streams.seen(kind, time_ns)
         if kind == "TIMESYNC":
@@ -98,6 +99,21 @@ class FlightControllerSide(Side):
             self._rebooted()
         elif kind == "RC_CHANNELS" and self.shared.gate is not None:
             self.shared.gate.channels(self.tracker.snapshot(time_ns).rc_channels_us)
+
+    def _stranger(self, link: Link, message: Any) -> None:
+        """Heartbeats that mean a wiring or a start by mistake: a second vehicle, a second us."""
+        if message.get_type() != "HEARTBEAT" or not link.system_id:
+            return
+        system, component = message.get_srcSystem(), message.get_srcComponent()
+        config = self.config
+        ours = (config.localizer_component, config.companion_component, config.camera_component)
+        if system == link.system_id and component in ours:
+            self._tell("twin", f"another companion speaks as component {component}: stop one")
+        elif config.system_id is None and self.tracker.is_autopilot(message):
+            self._tell(
+                "others",
+                f"autopilot {system} is heard, {link.system_id} is followed: set bridge.system_id",
+            )
 
     def _timesync(self, link: Link, message: Any, time_ns: int) -> None:
         if message.tc1 == 0:

@@ -43,7 +43,10 @@ class Endpoint:
         """From ``kind:address:number``, such as ``udpin:0.0.0.0:14550``; EndpointError if not."""
         kind, _, rest = text.partition(":")
         address, _, number = rest.rpartition(":")
-        if kind not in _KINDS or not address or not number.isdigit():
+        networked = kind in _KINDS and kind != "serial"
+        # IPv4 and names only; a blank or a second colon would be tried for ever.
+        unnamed = networked and not set(address).isdisjoint(" :[]/")
+        if kind not in _KINDS or not address or not number.isdigit() or unnamed:
             raise EndpointError(
                 f"{text!r} is no endpoint; write udpin:HOST:PORT, udpout:HOST:PORT, tcp:HOST:PORT, "
                 "tcpin:HOST:PORT or serial:DEVICE:BAUD"
@@ -90,7 +93,7 @@ class UdpTransport:
         self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 1 << 20)
         self._socket.setblocking(False)
         if local is not None:
-            self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+            # No SO_REUSEADDR: a second process on the port (doctor, in flight) would take it over.
             try:
                 self._socket.bind(local)
             except OSError:

@@ -116,10 +116,11 @@ class VehicleTracker:
                 return False
             # Gimbals of other vendors are components of their own.
             return component == self._state.component_id or message.get_type() in GIMBAL_SOURCES
-        return self._is_autopilot(message) and self._wanted_id in (None, system)
+        return self.is_autopilot(message) and self._wanted_id in (None, system)
 
     @staticmethod
-    def _is_autopilot(message: Any) -> bool:
+    def is_autopilot(message: Any) -> bool:
+        """Whether it is an autopilot's heartbeat: no ground station's, camera's or companion's."""
         return (
             message.get_type() == "HEARTBEAT"
             and message.autopilot != mavlink.MAV_AUTOPILOT_INVALID
@@ -166,7 +167,7 @@ class VehicleTracker:
     # --- one method per message, under the lock --------------------------------------------------
 
     def _heartbeat(self, m: Any, time_ns: int) -> None:
-        if not self._is_autopilot(m):
+        if not self.is_autopilot(m):
             return
         self._heartbeat_ns = time_ns
         autopilot = autopilot_name(m.autopilot)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import socket
 from typing import Any
 
 import pytest
@@ -144,6 +145,7 @@ def test_examination_and_repair(autopilot: Any, monkeypatch: pytest.MonkeyPatch)
     # What a busy machine does to the line between two threads is not the subject here.
     for name, loose in (("_ROUND_TRIP_LIMIT_MS", 1e4), ("_RATE_SHARE", 0.05), ("_LOST_SHARE", 0.9)):
         monkeypatch.setattr(f"mavlink_bridge.doctor.{name}", loose)
+    monkeypatch.setattr("mavlink_bridge.doctor._MEASURE_S", 2.0)
     autopilot.parameters = {**GOOD, "EK3_SRC1_VELXY": 3.0, "VISO_DELAY_MS": 10.0}
     autopilot.extra = gimbal
     settings = config(autopilot.port)
@@ -167,7 +169,20 @@ def test_silence_is_one_required_failure(monkeypatch: pytest.MonkeyPatch) -> Non
     assert [f.name for f in diagnosis.findings] == ["connection"]
 
 
-def test_unknown_parameter_cannot_be_written(autopilot: Any) -> None:
+def test_a_port_that_is_taken_is_told_as_that(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("mavlink_bridge.doctor._CONNECT_S", 0.3)
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as taken:
+        taken.bind(("127.0.0.1", 0))
+        endpoint = f"udpin:127.0.0.1:{taken.getsockname()[1]}"
+        (finding,) = examine(BridgeConfig(connection=endpoint)).findings
+    assert finding.found == "cannot be opened"
+    assert "is the companion running" in finding.why
+
+
+def test_unknown_parameter_cannot_be_written(
+    autopilot: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("mavlink_bridge.parameters._ANSWER_S", 0.2)
     autopilot.parameters = {"A": 1.0}
     with ParameterClient(config(autopilot.port)) as client:
         assert client.read("NO_SUCH") is None

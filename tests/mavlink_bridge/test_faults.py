@@ -5,6 +5,7 @@ from __future__ import annotations
 import itertools
 import math
 import random
+import struct
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import replace
@@ -15,6 +16,7 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from mavlink_bridge import VisionFix
 from mavlink_bridge.config import InjectionConfig, RcGateConfig, SourceSwitchConfig
+from mavlink_bridge.fc_side import FC_WANTED
 from mavlink_bridge.framing import FrameReader
 from mavlink_bridge.gate import InjectionGate
 from mavlink_bridge.inject import FixQueue
@@ -316,7 +318,91 @@ def test_nonsense_with_right_checksums_raises_nothing_and_leaves_nothing(
     assert math.isfinite(at.yaw_rad)
 
 
+_EXTREMES: dict[str, tuple[float, ...]] = {
+    "f": (math.nan, math.inf, -math.inf, 3e38, -3e38, 1e-40, 0.0),
+    "d": (math.nan, math.inf, -math.inf, 1e308, -1e308, 5e-324, 0.0),
+}
+
+
+def _extremes(code: str) -> tuple[float, ...]:
+    if code in _EXTREMES:
+        return _EXTREMES[code]
+    bits = 8 * struct.calcsize(f"<{code}")
+    return (0, 2**bits - 1) if code.isupper() or code == "c" else (-(2 ** (bits - 1)), -1)
+
+
+def _payload(kind: Any, values: list[float]) -> bytes:
+    packed = bytearray()
+    codes = kind.native_format.decode().lstrip("<")
+    for code, count, value in zip(codes, kind.array_lengths, values, strict=True):
+        one = bytes([int(value)]) if code == "c" else struct.pack(f"<{code}", value)
+        packed += one * max(count, 1)
+    return bytes(packed)
+
+
+def extreme_messages() -> Iterator[Any]:
+    """Every message that is listened to, with each field at each of its extremes, and all at once:
+    from the vehicle, from a ground station.
+    """
+    reader = FrameReader()
+    for number in sorted(FC_WANTED):
+        kind = mavlink.mavlink_map[number]
+        codes = kind.native_format.decode().lstrip("<")
+        plain = [0.5 if code in _EXTREMES else 1 for code in codes]
+        cases = [[*plain[:i], v, *plain[i + 1 :]]
+                 for i, code in enumerate(codes) for v in _extremes(code)]  # fmt: skip
+        cases += [[_extremes(c)[k % len(_extremes(c))] for c in codes] for k in range(7)]
+        for values in cases:
+            payload = _payload(kind, values)
+            for system, component in ((1, 1), (255, 190)):
+                header = bytes([0xFD, len(payload), 0, 0, 0, system, component])
+                header += number.to_bytes(3, "little")
+                crc = mavlink.x25crc(header[1:] + payload)
+                crc.accumulate(bytes([kind.crc_extra]))
+                yield from reader.feed(header + payload + crc.crc.to_bytes(2, "little"))
+
+
+def test_every_field_of_every_message_at_its_extremes_raises_nothing(flight: Flight) -> None:
+    ground, link = GroundSide(flight.side.shared), SimulatedLink(system_id=1)
+    count = 0
+    for message in extreme_messages():
+        count += 1
+        flight.side.on_message(flight.link, message, flight.now_ns)  # type: ignore[arg-type]
+        ground.on_message(link, message, flight.now_ns)  # type: ignore[arg-type]
+        if count % 8 == 0:
+            flight.run(0.02)
+            ground.on_tick(link, flight.now_ns)  # type: ignore[arg-type]
+    assert count > 1000
+    flight.reboot()
+    flight.run(30.0)
+    assert len(flight.vision(flight.now_ns - 10 * SECOND)) > 90
+    assert flight.attitude_error() < 0.005
+
+
 # --- what else an operator must be told -----------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("system", "component", "autopilot", "said"),
+    [
+        (2, 1, 3, "autopilot 2 is heard, 1 is followed: set bridge.system_id"),
+        (1, 197, 8, "another companion speaks as component 197: stop one"),
+        (255, 190, 8, None),  # a ground station
+        (1, 154, 8, None),  # a gimbal
+    ],
+)
+def test_a_second_vehicle_and_a_second_companion_are_told_once(
+    flight: Flight, system: int, component: int, autopilot: int, said: str | None
+) -> None:
+    stranger = mavlink.MAVLink(None, system, component)
+    beat = mavlink.MAVLink_heartbeat_message(2, autopilot, 81, 4, 4, 3).pack(stranger)
+    flight.texts.clear()
+    for _ in range(3):
+        for message in flight.reader.feed(beat):
+            flight.side.on_message(flight.link, message, flight.now_ns)  # type: ignore[arg-type]
+        flight.run(1.0)
+    assert flight.texts == ([f"PiLoT: {said}"] if said else [])
+    assert flight.side.tracker.snapshot(flight.now_ns).system_id == 1
 
 
 def test_a_blind_yaw_guard_is_told_once(monkeypatch: pytest.MonkeyPatch) -> None:

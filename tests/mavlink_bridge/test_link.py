@@ -21,7 +21,7 @@ from mavlink_bridge.config import InjectionConfig, TargetsConfig
 from mavlink_bridge.errors import BridgeStateError, EndpointError
 from mavlink_bridge.link import Link, sleep_until
 from mavlink_bridge.streams import StreamKeeper, wanted_streams
-from mavlink_bridge.transport import Endpoint
+from mavlink_bridge.transport import Endpoint, UdpTransport, open_transport
 
 SECOND = 1_000_000_000
 HEARTBEAT = mavlink.MAVLink_heartbeat_message(2, 3, 81, 4, 4, 3)
@@ -94,12 +94,25 @@ def test_endpoints(text: str, kind: str, address: str, number: int) -> None:
     assert str(endpoint) == text
 
 
-@pytest.mark.parametrize("text", ["", "tcp", "tcp:host", "ftp:host:1", "tcp:host:port", "tcp::1"])
+@pytest.mark.parametrize(
+    "text",
+    ["", "tcp", "tcp:host", "ftp:host:1", "tcp:host:port", "tcp::1", "udpin: 0.0.0.0:14550",
+     "tcp:[::1]:5760", "udpin:::1:14550", "udpout://10.0.0.1:14550"],
+)  # fmt: skip
 def test_wrong_endpoints_say_what_is_wanted(text: str) -> None:
     with pytest.raises(EndpointError, match="udpin:HOST:PORT"):
         Endpoint.parse(text)
     with pytest.raises(ValidationError, match="is no endpoint"):
         BridgeConfig(connection=text)
+
+
+def test_a_second_process_cannot_take_a_udp_port_over() -> None:
+    """As `companion doctor` would in flight: the last socket bound gets the datagrams."""
+    first = open_transport(Endpoint.parse("udpin:127.0.0.1:0"))
+    assert isinstance(first, UdpTransport)
+    with pytest.raises(OSError, match="in use"):
+        open_transport(Endpoint.parse(f"udpin:127.0.0.1:{first.port}"))
+    first.close()
 
 
 def test_port_out_of_range() -> None:
