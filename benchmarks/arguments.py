@@ -9,8 +9,16 @@ from pathlib import Path
 from typing import NoReturn
 
 
-class _Help(argparse.RawDescriptionHelpFormatter, argparse.ArgumentDefaultsHelpFormatter):
-    pass
+class _Help(argparse.RawDescriptionHelpFormatter):
+    """Keeps the docstring's lines, and tells the defaults that say something."""
+
+    def _get_help_string(self, action: argparse.Action) -> str | None:
+        default = action.default
+        if isinstance(default, list | tuple):
+            default = " ".join(str(item) for item in default)
+        told = isinstance(default, str | int | float | Path) and not isinstance(default, bool)
+        shown = told and default != argparse.SUPPRESS
+        return f"{action.help} (default: {default})" if shown else action.help
 
 
 class Parser(argparse.ArgumentParser):

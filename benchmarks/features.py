@@ -127,7 +127,11 @@ def parser() -> Parser:
         help="of the direct methods; default as in flight, the paper has 500",
     )
     p.add_argument(
-        "--baselines", nargs="*", choices=BASELINES, default=list(BASELINES), help="none: no names"
+        "--baselines",
+        nargs="*",
+        choices=BASELINES,
+        default=list(BASELINES),
+        help="none after it: only models",
     )
     p.add_argument(
         "--models", nargs="*", type=_model, default=[SHIPPED], help="ONNX files, or `shipped`"

@@ -426,7 +426,9 @@ def plot(samples: list[Sample], faults: list[Fault], begun: float, path: Path) -
 def main() -> int:
     """Run, print, plot."""
     parser = Parser(__doc__)
-    parser.add_argument("--minutes", type=number(1, 1440), default=30.0, help="faults are as long")
+    parser.add_argument(
+        "--minutes", type=number(1, 1440), default=30.0, help="of the run; faults shrink with it"
+    )
     parser.add_argument("--seed", type=whole(0, 1 << 31), default=1, help="of the damage")
     parser.add_argument("--plot", type=output, help="PNG of the curves over time")
     parser.add_argument("--trace", action="store_true", help="where memory grew; slower")
