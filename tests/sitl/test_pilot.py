@@ -169,6 +169,7 @@ def horizontal(a: Location, b: Location) -> float:
     return math.hypot(*a.ned_of(b)[:2])
 
 
+@pytest.mark.flight
 def test_flies_a_mission_on_gps_and_then_on_vision(kind):
     parameters = {**vision_parameters(), **GIMBAL, **SPEEDS}
     with open_vehicle(kind, HOME, 30.0, parameters, speedup=SPEEDUP) as vehicle:

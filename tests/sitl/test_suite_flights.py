@@ -19,6 +19,7 @@ from sitl.process import VehicleKind
 from sitl.suite.case import load_cases
 from sitl.suite.runner import Row, run_case, run_suite
 
+pytestmark = pytest.mark.flight
 CASES = load_cases()
 FEW = [case for case in CASES if case.ci]
 REST = [case for case in CASES if not case.ci]
@@ -36,8 +37,8 @@ KINDS = [
 
 @cache
 def flown(kind: VehicleKind, few: bool) -> dict[str, Row]:
-    """All of them, some side by side, once: they fly in real time; starting takes a processor."""
-    rows = run_suite(FEW if few else REST, [kind], jobs=3)
+    """All of them side by side, once: a flight in real time takes 0.15 of a processor."""
+    rows = run_suite(FEW if few else REST, [kind], jobs=len(FEW))
     return {row.case.name: row for row in rows}
 
 
