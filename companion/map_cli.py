@@ -7,6 +7,7 @@ from typing import Annotated, Literal
 
 import typer
 from rich.console import Console
+from rich.markup import escape
 from rich.table import Table
 
 app = typer.Typer(no_args_is_help=True)
@@ -24,8 +25,8 @@ def build(
     source: Annotated[
         list[Path],
         typer.Argument(
-            help="3D Tiles (tileset.json or its folder), a mesh (.glb, .gltf, .obj) with a "
-            "georeference, or a DSM and an orthophoto (GeoTIFF)"
+            help="3D Tiles (tileset.json or its folder), an OpenDroneMap result folder, a mesh "
+            "(.glb, .gltf, .obj) with a georeference, or a DSM and an orthophoto (GeoTIFF)"
         ),
     ],
     out: Annotated[Path, typer.Option(help="folder of the cache to make")],
@@ -70,8 +71,9 @@ def build(
         scheduler=scheduler,
     )
     Console().print(
-        f"[green]{out}[/]: {manifest.tiles} tiles, {manifest.triangles} triangles, "
-        f"{manifest.gsd_m:.3f} m texels, {manifest.bytes / 1e6:.1f} MB"
+        f"[green]{escape(str(out))}[/] from {escape(manifest.source)}: {manifest.tiles} tiles, "
+        f"{manifest.triangles} triangles, {manifest.gsd_m:.3f} m texels, "
+        f"{manifest.bytes / 1e6:.1f} MB"
     )
     if manifest.skipped:
         Console().print(f"[yellow]{len(manifest.skipped)} source tiles were left out")

@@ -15,7 +15,7 @@ from localizer.map.assembly import assemble
 from localizer.map.cache import Manifest
 from localizer.map.georeference import Georeference, UpAxis
 from localizer.map.importing import ImportJob, import_all, tiles_of
-from localizer.map.reading import read_source
+from localizer.map.reading import find_source, read_source
 from localizer.map.source import SourceNode, SourceTree, VerticalDatum
 from localizer.map.staging import Record, publish, staging
 
@@ -40,7 +40,8 @@ def build_cache(
 ) -> Manifest:
     """Import a map source into a tile cache at `out`.
 
-    source: a `tileset.json` or its folder, a mesh (glTF, GLB, OBJ), or a DSM and an orthophoto.
+    source: a `tileset.json`, a mesh (glTF, GLB, OBJ), a DSM and an orthophoto, or a folder that
+    holds one of these.
     geoid_separation_m: height of the geoid above the ellipsoid at the map (MAVLink altitudes are
     above the geoid); needed unless the source carries it. vertical_datum: what the source's heights
     are; "amsl" ones are lifted by the separation; needed unless the source's format fixes it.
@@ -51,7 +52,8 @@ def build_cache(
     Dask scheduler whose workers share the file system, instead of local processes. An interrupted
     build goes on where it stopped.
     """
-    sources = [Path(source)] if isinstance(source, str | Path) else [Path(s) for s in source]
+    given = [Path(source)] if isinstance(source, str | Path) else [Path(s) for s in source]
+    sources, georeference = find_source(given, georeference)
     named = " ".join(map(str, sources))
     return build_tree(
         read_source(sources, georeference, up_axis),
