@@ -63,9 +63,15 @@ class JNGOConfig(BaseModel):
     prior_weight: float = Field(
         default=0.0001, ge=0, description="weight of a constraint, likewise"
     )
-    correlation: float = Field(default=11.0, gt=0, description="covariance factor, calibrated")
+    correlation: float = Field(default=1.1, gt=0, description="covariance factor, calibrated")
     correlation_px: float = Field(
         default=32.0, gt=0, description="image cell within which residuals may correlate"
+    )
+    curvature_px: float = Field(
+        default=0.15, gt=0, description="distance at which the cost's curvature is measured, px"
+    )
+    mode_px: float = Field(
+        default=5.0, ge=0, description="least distance of another mode from the winner, level px"
     )
     covariance_floor: float = Field(
         default=0.05, ge=0, description="least share of the isotropic model"

@@ -20,6 +20,8 @@ from localizer.registration.reference import (
     robust_loss,
 )
 
+_LEAST_CURVATURE = 0.03
+
 
 @dataclass(frozen=True)
 class AnchorModel:
@@ -86,7 +88,8 @@ def _cells(u: Array, v: Array, side: float) -> NDArray[np.int64]:
 class CovarianceSums:
     """What equation 11 adds up over the anchors in view. hessian: Σ ŵ JᵀSJ, without the prior;
     meat: Σ_cells G Gᵀ; isotropic: Σ ŵ² σ_r² JᵀSJ, all (6, 6); cells: how many are occupied;
-    prior_hessian: (6, 6).
+    prior_hessian: (6, 6); motion: (6, 6), mean of JᵀJ, so that xi moves the image by
+    sqrt(xi' motion xi) level px, rms; curvature: equation 11a.
     """
 
     hessian: Array
@@ -94,6 +97,8 @@ class CovarianceSums:
     isotropic: Array
     cells: int
     prior_hessian: Array
+    motion: Array
+    curvature: float = 1.0
 
 
 def covariance_sums(model: AnchorModel) -> CovarianceSums | None:
@@ -116,7 +121,32 @@ def covariance_sums(model: AnchorModel) -> CovarianceSums | None:
         variance * (share * information).sum(axis=0),
         cells,
         model.prior_hessian,
+        mean_motion(J),
     )
+
+
+def mean_motion(projection: Array) -> Array:
+    """Mean of JᵀJ (6, 6) of the rows (N, 2, 6) of equation 6, in px²."""
+    motion: Array = np.einsum("nai,naj->ij", projection, projection) / max(len(projection), 1)
+    return motion
+
+
+def curvature_steps(motion: Array, distance_px: float) -> Array:
+    """(13, 6) values of xi: none, then each axis to and fro by what moves the image so far."""
+    reach = np.diag(distance_px / np.sqrt(np.maximum(np.diag(motion), 1e-12)))
+    return np.concatenate([np.zeros((1, 6)), reach, -reach])
+
+
+def curvature_ratio(scores: Array, steps: Array, hessian: Array) -> float:
+    """Curvature of the cost over what H says of it, mean over the axes (equation 11a).
+
+    scores: (13,) at `curvature_steps`, without a prior; axes along which the overlap ends are left
+    out. At least `_LEAST_CURVATURE`: where the cost is flat its noise alone is measured.
+    """
+    rise = scores[1:7] + scores[7:] - 2.0 * scores[0]
+    expected = 2.0 * np.einsum("ki,ij,kj->k", steps[1:7], hessian, steps[1:7])
+    ratios = rise[np.isfinite(rise)] / np.maximum(expected[np.isfinite(rise)], 1e-30)
+    return max(float(ratios.mean()), _LEAST_CURVATURE) if len(ratios) else _LEAST_CURVATURE
 
 
 def sandwich_covariance(
@@ -129,7 +159,7 @@ def sandwich_covariance(
     it cannot see. floor: least share of the isotropic model, so that a perfect fit does not claim
     perfect knowledge. A prior of weight `prior_weight` adds its own noise.
     """
-    hessian = sums.hessian + sums.prior_hessian
+    hessian = sums.curvature * sums.hessian + sums.prior_hessian
     diagonal = np.diag(hessian)
     if not np.all(diagonal > 0):
         return None
@@ -160,6 +190,15 @@ def pose_differences(rotations: Array, centres: Array, other: Pose) -> Array:
     """
     turn = Rotation.from_matrix(rotations @ other.rotation.T).as_rotvec()
     return np.concatenate([centres - other.translation, turn], axis=1)
+
+
+def apart_px(differences: Array, rotation: Array, translation: Array, motion: Array) -> Array:
+    """(M,) rms distances, in px of the level of `motion`, at which the image lies for poses that
+    differ by `differences` (M, 6) from the pose camera_from_local, to first order.
+    """
+    steps = np.linalg.solve(pose_tangent_map(rotation, translation), differences.T)
+    distances: Array = np.sqrt(np.einsum("im,ij,jm->m", steps, motion, steps))
+    return distances
 
 
 def mode_spread(differences: Array, probabilities: Array) -> Array:

@@ -27,7 +27,14 @@ from localizer.registration.backend import (
     world_from_camera,
 )
 from localizer.registration.config import JNGOConfig
-from localizer.registration.covariance import anchor_model, covariance_sums, pose_differences
+from localizer.registration.covariance import (
+    CovarianceSums,
+    anchor_model,
+    covariance_sums,
+    curvature_ratio,
+    curvature_steps,
+    pose_differences,
+)
 from localizer.registration.cuda.backend import CudaBackend
 from localizer.registration.cuda.errors import CudaError
 from localizer.registration.cuda.registration import register_on_device
@@ -35,7 +42,7 @@ from localizer.registration.cuda.schedule import CudaSchedule
 from localizer.registration.devices import trial
 from localizer.registration.kernel_numba import NumbaBackend
 from localizer.registration.priors import PoseConstraint
-from localizer.registration.reference import ReferenceBackend
+from localizer.registration.reference import ReferenceBackend, retractions
 from localizer.registration.result import Found, Registration, failure, registration
 from localizer.registration.selection import (
     LEAST_SCORE,
@@ -217,19 +224,29 @@ class JNGO:
     def _found(self, swarm: _Swarm, winner: _Winner, stride: int) -> Found:
         """The survivors with the winner in the first's place, and the sums at its pose."""
         c, problem, R, t = self.config, winner.problem, winner.rotation, winner.translation
-        model = anchor_model(
-            thinned(problem, _COVARIANCE_ANCHORS), R, t, winner.settings, c.correlation_px / stride
-        )
         return Found(
             np.concatenate([R[None], swarm.rotations[1:]]),
             np.concatenate([t[None], swarm.translations[1:]]),
             swarm.scores,
             swarm.overlaps,
-            covariance_sums(model),
+            self._sums(winner, c.correlation_px / stride),
             0.0 if problem.prior is None else problem.prior.weight,
             quality(swarm.problem, R, t, c.settings),
             swarm.evaluations + winner.evaluations,
         )
+
+    def _sums(self, winner: _Winner, cell_px: float) -> CovarianceSums | None:
+        """Equation 11's sums, of some of the anchors, and 11a's curvature, of all."""
+        R, t, settings = winner.rotation, winner.translation, winner.settings
+        few = thinned(winner.problem, _COVARIANCE_ANCHORS)
+        sums = covariance_sums(anchor_model(few, R, t, settings, cell_px))
+        if sums is None:
+            return None
+        steps = curvature_steps(sums.motion, self.config.curvature_px)
+        rotations, translations = retractions(R, t, steps)
+        free = replace(winner.problem, prior=None)
+        scores = self.backend.refine(free, rotations, translations, 0, settings).scores
+        return replace(sums, curvature=curvature_ratio(scores, steps, sums.hessian))
 
     def warm_up(self, channels: int) -> None:
         """Compile (or load from the cache) the kernel for feature maps of `channels`."""

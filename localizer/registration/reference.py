@@ -9,6 +9,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
 from localizer.pose import Array, hat, so3_exp, so3_log
 from localizer.registration.backend import (
@@ -161,6 +162,12 @@ def prior_terms(
 def retract(rotation: Array, translation: Array, step: Array) -> tuple[Array, Array]:
     """Equation 5: rotate about the local origin, then translate; both in camera axes."""
     return so3_exp(step[3:]) @ rotation, translation + step[:3]
+
+
+def retractions(rotation: Array, translation: Array, steps: Array) -> tuple[Array, Array]:
+    """Rotations (M, 3, 3) and translations (M, 3) after each of the steps (M, 6)."""
+    turns = Rotation.from_rotvec(steps[:, 3:]).as_matrix()
+    return np.asarray(turns @ rotation), translation + steps[:, :3]
 
 
 def damped_step(

@@ -11,6 +11,7 @@ from localizer.registration.backend import world_from_camera
 from localizer.registration.config import JNGOConfig
 from localizer.registration.covariance import (
     CovarianceSums,
+    apart_px,
     mode_spread,
     pose_covariance,
     pose_differences,
@@ -69,9 +70,12 @@ def registration(found: Found, config: JNGOConfig, prior: PosePrior, origin: Arr
         return failure(prior, RegistrationStatus.NO_TEXTURE, found.evaluations)
     rotations, centres = world_from_camera(found.rotations, found.translations, origin)
     pose = Pose(rotations[0], centres[0])
-    probabilities = mode_probabilities(found.scores, found.sums.cells)
-    spread = mode_spread(pose_differences(rotations, centres, pose), probabilities)
-    covariance = pose_covariance(tangent, found.rotations[0], found.translations[0]) + spread
+    differences = pose_differences(rotations, centres, pose)
+    R, t = found.rotations[0], found.translations[0]
+    other = apart_px(differences, R, t, found.sums.motion) > config.mode_px
+    probabilities = mode_probabilities(found.scores, found.sums.cells, other)
+    spread = mode_spread(differences, probabilities)
+    covariance = pose_covariance(tangent, R, t) + spread
     if np.sqrt(np.linalg.eigvalsh(covariance[:3, :3])[-1]) > config.max_sigma_m:
         return failure(prior, RegistrationStatus.NO_TEXTURE, found.evaluations)
     return Registration(

@@ -20,10 +20,14 @@ LEAST_SCORE = 1e-3  # unit of the motion term and of priors where features fit p
 _PROBES = 12  # anchors whose projections tell hypotheses apart
 
 
-def mode_probabilities(scores: Array, cells: int) -> Array:
-    """Posterior weight (M,) of each surviving mode, seen in so many image cells (equation 14)."""
+def mode_probabilities(scores: Array, cells: int, other: NDArray[np.bool_]) -> Array:
+    """Posterior weight (M,) of each surviving mode, seen in so many image cells (equation 14).
+
+    other: (M,) which of them are other modes than the first, and not on the way to it.
+    """
     excess = np.maximum(scores - scores[0], 0.0) / max(scores[0], LEAST_SCORE)
-    likelihood = np.exp(-0.5 * cells * excess)
+    likelihood = np.exp(-0.5 * cells * excess) * other
+    likelihood[0] = 1.0
     probabilities: Array = likelihood / likelihood.sum()
     return probabilities
 

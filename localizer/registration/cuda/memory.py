@@ -10,6 +10,8 @@ from numpy.typing import NDArray
 
 from localizer.registration.cuda import layout
 
+PROBES = 13  # poses at which the curvature is measured: `curvature_steps`
+
 
 @dataclass(frozen=True)
 class FrameMemory:
@@ -29,6 +31,8 @@ class FrameMemory:
     alive: int
     projected: int
     finish: int
+    probes: NDArray[np.void]
+    probe_state: int
     upload_size: int
     result_size: int
 
@@ -57,6 +61,8 @@ class FrameMemory:
             ("totals", 8 * count), ("order", 4 * count), ("alive", 4 * count),
             ("projected", 4 * layout.PROBE_FLOATS * count),
             ("finish", 4 * layout.WINNER_FLOATS * anchors),
+            ("R3", 72 * PROBES), ("t3", 24 * PROBES), ("s3", 8 * PROBES), ("v3", 4 * PROBES),
+            ("probe state", layout.STATE.itemsize),
         ]  # fmt: skip
         offsets, end = {}, 0
         for name, size in sizes:
@@ -65,7 +71,7 @@ class FrameMemory:
         base = buffer("frame", end)
         at = {name: base + offset for name, offset in offsets.items()}
         swarms = []
-        for k in range(3):
+        for k in range(4):
             swarm = np.zeros((), dtype=layout.SWARM)
             for field, key in zip(
                 ("rotations", "translations", "scores", "visible"), "Rtsv", strict=True
@@ -73,9 +79,10 @@ class FrameMemory:
                 swarm[field] = at[f"{key}{k}"]
             swarms.append(swarm)
         return cls(
-            base, at["level"], at["motion"], at["prior"], at["state"], tuple(swarms),
+            base, at["level"], at["motion"], at["prior"], at["state"], tuple(swarms[:3]),
             (at["trial score"], at["trial visible"]), at["totals"], at["order"], at["alive"],
-            at["projected"], at["finish"], offsets["R2"], offsets["s0"] - offsets["prior"],
+            at["projected"], at["finish"], swarms[3], at["probe state"], offsets["R2"],
+            offsets["s0"] - offsets["prior"],
         )  # fmt: skip
 
     def level(self, k: int) -> int:

@@ -59,8 +59,9 @@ def _found(search: Search, constraint: QuadraticPrior | None) -> Found:
         R, t = search.rotations[0], search.translations[0]
         prior_hessian = weight * prior_terms(constraint, R, t)[1]
     sums = CovarianceSums(
-        search.hessian, search.meat, search.isotropic, search.cells, prior_hessian
-    )
+        search.hessian, search.meat, search.isotropic, search.cells, prior_hessian,
+        search.motion, search.curvature,
+    )  # fmt: skip
     return Found(
         search.rotations,
         search.translations,

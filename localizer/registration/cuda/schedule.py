@@ -17,12 +17,23 @@ from numpy.typing import NDArray
 from localizer.camera import Camera
 from localizer.device_array import DeviceArray
 from localizer.pose import Array
-from localizer.registration.backend import LMSettings, QuadraticPrior, level_intrinsics
+from localizer.registration.backend import (
+    LevelProblem,
+    LMSettings,
+    QuadraticPrior,
+    level_intrinsics,
+)
 from localizer.registration.config import JNGOConfig
 from localizer.registration.cuda import layout
 from localizer.registration.cuda.backend import FEW, CudaBackend, set_loss, stored
+from localizer.registration.cuda.curvature import (
+    geometry,
+    last_settings,
+    winner_curvature,
+    winner_motion,
+)
 from localizer.registration.cuda.driver import Graph
-from localizer.registration.cuda.memory import FrameMemory
+from localizer.registration.cuda.memory import PROBES, FrameMemory
 from localizer.registration.selection import LEAST_SCORE
 from localizer.types import Anchors, FeatureLevel, FeaturePyramid, PosePrior
 
@@ -36,7 +47,7 @@ _FINITE_BLOCKS_PER_MULTIPROCESSOR = 4
 class Search:
     """What the device found. rotations (K, 3, 3), translations (K, 3): the survivors, camera from
     local, best first, the first one sharpened; scores (K,) before that, and overlaps (K,); K is 0
-    without overlap. hessian, meat, isotropic: (6, 6) sums of `CovarianceSums`, without the prior;
+    without overlap. hessian, meat, isotropic, motion, curvature: as in `CovarianceSums`;
     finite: False where features, confidences or points are not. upload_ms, graph_ms: device time,
     0 unless the schedule is timed.
     """
@@ -49,6 +60,8 @@ class Search:
     meat: Array
     isotropic: Array
     cells: int
+    motion: Array
+    curvature: float
     prior_weight: float
     quality: float
     evaluations: int
@@ -112,11 +125,42 @@ class CudaSchedule:
             if self._timed:
                 events.append(self._device.event())
             last = len(channels) - 1 if config.sharpen else len(config.iterations) - 1
-            found = self._collect(memory, config, len(anchors.points_world), channels[last])
+            found, scale = self._collect(memory, config, len(anchors.points_world), channels[last])
+            if len(found.scores) > 0 and found.finite:
+                points = np.ascontiguousarray((anchors.points_world - origin).T, dtype=np.float32)
+                level = query.levels[last]
+                seen = geometry(points, *level_intrinsics(camera, level), level.confidence.shape)
+                found = self._with_curvature(found, shape, memory, last, seen, scale)
             if not self._timed:
                 return found
             upload, run = (self._device.elapsed_ms(*events[k : k + 2]) for k in (0, 1))
             return replace(found, upload_ms=upload, graph_ms=run)
+
+    def _with_curvature(
+        self,
+        found: Search,
+        shape: _Shape,
+        memory: FrameMemory,
+        level: int,
+        seen: LevelProblem,
+        scale: float,
+    ) -> Search:
+        """The result with motion and curvature. seen: the level's geometry; scale: of its loss."""
+        c = shape.config
+        wanted = COVARIANCE_ANCHORS if c.sharpen else c.swarm_anchors[-1]
+        few = replace(seen, points=seen.points[:, :: max(1, seen.points.shape[1] // wanted)])
+        pose = found.rotations[0], found.translations[0]
+        motion = winner_motion(few, *pose)
+        settings = last_settings(c.settings, scale)
+        step = _refining(
+            shape, memory, level, memory.probes, PROBES, 0 if c.sharpen else wanted, settings, 0,
+            free=True,
+        )  # fmt: skip
+        curvature = winner_curvature(
+            self._backend, memory, step.arguments, shape.channels[level], pose, motion,
+            found.hessian, settings, c.curvature_px,
+        )  # fmt: skip
+        return replace(found, motion=motion, curvature=curvature)
 
     def _captured(self, shape: _Shape, memory: FrameMemory) -> Graph:
         if self._graph is not None and self._graph[0] == shape:
@@ -201,7 +245,8 @@ class CudaSchedule:
 
     def _collect(
         self, memory: FrameMemory, config: JNGOConfig, anchors: int, channels: int
-    ) -> Search:
+    ) -> tuple[Search, float]:
+        """What came back, without motion and curvature; the scale of the winner's last loss."""
         block = np.empty(memory.result_size, np.uint8)
         self._device.download(block, memory.prior)
         self._device.synchronize()
@@ -218,7 +263,7 @@ class CudaSchedule:
         weight = read(memory.prior, layout.PRIOR)["weight"]
         total = max(float(state["total"]), 1e-30)
         variance = float(state["square_sum"]) / max(float(state["scale_sum"]), 1e-12) / channels
-        return Search(
+        search = Search(
             read(int(swarm["rotations"]), np.float64, (count, 3, 3)).copy(),
             read(int(swarm["translations"]), np.float64, (count, 3)).copy(),
             read(int(swarm["scores"]), np.float64, (count,)).copy(),
@@ -227,6 +272,8 @@ class CudaSchedule:
             _symmetric(state["meat"]) / total**2,
             _symmetric(state["isotropic"]) / total**2 * variance,
             int(state["cells"]),
+            np.zeros((6, 6)),
+            1.0,
             float(weight),
             float(state["quality"]),
             int(state["evaluations"]),
@@ -234,6 +281,7 @@ class CudaSchedule:
             0.0,
             0.0,
         )
+        return search, float(state["scale"])
 
 
 KERNELS = (

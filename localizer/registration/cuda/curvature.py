@@ -1,0 +1,77 @@
+"""How sharp the cost is about the winner (equation 11a), scored on the device after its graph."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from localizer.pose import Array
+from localizer.registration.backend import LevelProblem, LMSettings
+from localizer.registration.covariance import curvature_ratio, curvature_steps, mean_motion
+from localizer.registration.cuda import layout
+from localizer.registration.cuda.backend import FEW, CudaBackend, set_loss
+from localizer.registration.cuda.memory import PROBES, FrameMemory
+from localizer.registration.reference import in_view, project, projection_jacobian, retractions
+from localizer.types import Float32
+
+
+def geometry(
+    points: Float32,
+    focal: tuple[float, float],
+    centre: tuple[float, float],
+    shape: tuple[int, ...],
+) -> LevelProblem:
+    """A level of (h, w) and its points (3, N) in the local frame, without features."""
+    none = np.zeros((0, 0, 0), np.float32)
+    blank = np.broadcast_to(np.float32(0), shape)
+    return LevelProblem(none, blank, focal, centre, points, none, none)
+
+
+def winner_motion(problem: LevelProblem, rotation: Array, translation: Array) -> Array:
+    """`CovarianceSums.motion` of a level's geometry."""
+    x, uv = project(problem, rotation, translation)
+    visible = in_view(problem, x, uv)
+    return mean_motion(projection_jacobian(problem, x[visible], translation))
+
+
+def winner_curvature(
+    backend: CudaBackend,
+    memory: FrameMemory,
+    refining: NDArray[np.void],
+    channels: int,
+    pose: tuple[Array, Array],
+    motion: Array,
+    hessian: Array,
+    settings: LMSettings,
+    distance_px: float,
+) -> float:
+    """Equation 11a about a pose camera_from_local (rotation, translation), with the frame that
+    `memory` holds. refining: arguments of the LM kernel on the winner's level. Under the
+    backend's lock.
+    """
+    device, steps = backend.device, curvature_steps(motion, distance_px)
+    rotations, translations = retractions(*pose, steps)
+    state = np.zeros((), dtype=layout.STATE)
+    state["count"] = PROBES
+    for address, values in (
+        (int(memory.probes["rotations"]), np.ascontiguousarray(rotations)),
+        (int(memory.probes["translations"]), np.ascontiguousarray(translations)),
+        (memory.probe_state, state),
+    ):
+        device.upload(address, values)
+    arguments = refining.copy()
+    arguments["swarm"], arguments["state"] = memory.probes, memory.probe_state
+    set_loss(arguments, settings, 0)
+    name, threads = ("refine_few", 512) if PROBES <= FEW else ("refine_many", 256)
+    backend.kernels(channels).launch(name, PROBES, threads, arguments)
+    scores = np.empty(PROBES)
+    device.download(scores, int(memory.probes["scores"]))
+    device.synchronize()
+    return curvature_ratio(scores, steps, hessian)
+
+
+def last_settings(settings: LMSettings, scale: float) -> LMSettings:
+    """The loss of the winner's last steps; scale: 0 where it was not sharpened."""
+    return replace(settings, scale=scale, redescending=True) if scale > 0 else settings
