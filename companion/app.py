@@ -90,15 +90,8 @@ class Companion:
         manifest = self._stack.cache.manifest
         self._frame = self._stack.cache.frame
         self._geoid_separation_m = manifest.geoid_separation_m
-        record = config.record
-        if record is not None:
-            record = record.model_copy(update={"folder": fresh_folder(record.folder)})
-            self._record_folder = record.folder
-        self._recorder = Recorder(record, self._frame) if record else None
-        if record is not None and self._recorder is not None:
-            up.callback(self._recorder.close)
-            write_manifest(record.folder, config)
         self._newest: PoseEstimate | None = None
+        self._recorder: Recorder | None = None
         self._bridge = Bridge(
             _bridge_config(config),
             manifest.geoid_separation_m,
@@ -106,6 +99,13 @@ class Companion:
             on_text=self._on_text,
         )
         up.callback(self._bridge.stop)
+        record = config.record
+        if record is not None:
+            record = record.model_copy(update={"folder": fresh_folder(record.folder)})
+            self._record_folder = record.folder
+            self._recorder = Recorder(record, self._frame, self._record_failed)
+            up.callback(self._recorder.close)
+            write_manifest(record.folder, config)
         # Before the localizer, whose compilation takes its time: a wrong source is told at once.
         self._source = open_source(
             config.camera.source, self._camera, config.camera.settings, self._on_feed_state
@@ -246,6 +246,9 @@ class Companion:
     def _target_number(self, name: str) -> int:
         """A small stable number for a target's name, as MAVLink wants it."""
         return self._target_numbers.setdefault(name, len(self._target_numbers))
+
+    def _record_failed(self, why: str) -> None:
+        self._bridge.say(_WARNING, f"PiLoT: record is incomplete: {why}")
 
     def _on_text(self, severity: int, text: str) -> None:
         """What the operator was told belongs in the record; the bridge has logged it."""

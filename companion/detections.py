@@ -19,6 +19,7 @@ from companion.errors import ConfigError, DetectionError
 _log = logging.getLogger(__name__)
 _MAX_DATAGRAM = 2048
 _MAX_NAME = 64
+_PAUSE_S = 0.001  # at most a thousand detections a second: a flood must not take the interpreter
 
 
 @dataclass(frozen=True)
@@ -45,8 +46,9 @@ def parse_detection(data: bytes) -> Detection:
         raise DetectionError(f"not a detection: {type(error).__name__} {error}") from error
     if not (isfinite(detection.u) and isfinite(detection.v)):
         raise DetectionError("pixel must be finite")
-    if not 0 < len(detection.target_id) <= _MAX_NAME:
-        raise DetectionError(f"target_id must have 1 to {_MAX_NAME} characters")
+    name = detection.target_id
+    if not 0 < len(name) <= _MAX_NAME or not name.isprintable():
+        raise DetectionError(f"target_id must have 1 to {_MAX_NAME} printable characters")
     return detection
 
 
@@ -93,6 +95,7 @@ class DetectionListener:
                 data = self._socket.recv(_MAX_DATAGRAM)
             except TimeoutError:
                 continue
+            self._stop.wait(_PAUSE_S)
             try:
                 detection = parse_detection(data)
             except DetectionError as error:

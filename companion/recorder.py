@@ -26,6 +26,7 @@ from localizer.types import Frame, PoseEstimate, TargetFix
 _log = logging.getLogger(__name__)
 _QUEUE_SIZE = 4096
 _FLUSH_S = 1.0
+_CLOSE_S = 5.0
 MANIFEST_NAME = "record.json"
 
 ESTIMATE_COLUMNS = (
@@ -87,10 +88,16 @@ class Recorder:
     """Writes ``estimates.csv``, ``targets.csv`` and ``events.csv`` in a folder.
 
     Nothing here blocks its callers: rows beyond a bounded queue are dropped and counted. So is what
-    the disk does not take (full, gone): the flight goes on without its record.
+    the disk does not take (full, gone): the flight goes on without its record, and on_failure is
+    called once, in the recorder's thread, with the reason.
     """
 
-    def __init__(self, config: RecordConfig, frame: LocalFrame) -> None:
+    def __init__(
+        self,
+        config: RecordConfig,
+        frame: LocalFrame,
+        on_failure: Callable[[str], None] = lambda _: None,
+    ) -> None:
         folder = config.folder
         self._snapshots = folder / "snapshots"
         self._interval_ns = (config.snapshot_interval_s or 0.0) * 1e9
@@ -98,6 +105,7 @@ class Recorder:
         self._frame = frame
         self._rows: queue.Queue[tuple[str, Iterable[Any]] | None] = queue.Queue(_QUEUE_SIZE)
         self.dropped = 0
+        self._on_failure = on_failure
         self._failed = False
         self._files: dict[str, TextIO] = {}
         try:
@@ -109,7 +117,8 @@ class Recorder:
             }
         except OSError as error:
             raise ReportError(f"record.folder {folder}: cannot be written: {error}") from error
-        self._thread = threading.Thread(target=self._run, name="recorder")
+        # A daemon: a disk that stands still must not keep the process from ending.
+        self._thread = threading.Thread(target=self._run, name="recorder", daemon=True)
         self._thread.start()
 
     def estimate(self, estimate: PoseEstimate) -> None:
@@ -155,9 +164,13 @@ class Recorder:
             self._put("snapshot", (frame,))
 
     def close(self) -> None:
-        """Write what is queued and close the files."""
-        self._rows.put(None)
-        self._thread.join()
+        """Write what is queued and close the files; a disk that stands still is left after 10 s."""
+        with contextlib.suppress(queue.Full):
+            self._rows.put(None, timeout=_CLOSE_S)
+        self._thread.join(_CLOSE_S)
+        if self._thread.is_alive():
+            _log.warning("the record is incomplete, its disk does not answer")
+            return
         for file in self._files.values():
             self._guarded(file.close)
 
@@ -202,8 +215,9 @@ class Recorder:
     def _guarded(self, write: Callable[..., None], *arguments: Any) -> None:
         try:
             write(*arguments)
-        except OSError as error:
+        except Exception as error:  # OpenCV has its own, and text that is no UTF-8 another
             self.dropped += 1
             if not self._failed:
                 self._failed = True
-                _log.warning("the record is incomplete, its disk fails: %s", error)
+                _log.warning("the record is incomplete: %s", error)
+                self._on_failure(getattr(error, "strerror", None) or str(error))

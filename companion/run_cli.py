@@ -38,4 +38,8 @@ def run_command(
     # The terminal may be a radio link that the aircraft flies away from.
     signal.signal(signal.SIGHUP, signal.SIG_IGN)
     with console_log(verbose):
-        companion.run()
+        try:
+            companion.run()
+        finally:  # what is down needs no second order; the interpreter's own end would die of one
+            for number in (signal.SIGINT, signal.SIGTERM):
+                signal.signal(number, signal.SIG_IGN)

@@ -18,6 +18,10 @@ from localizer.types import PoseEstimate, TargetFix, TargetSighting
 _log = logging.getLogger(__name__)
 _KEPT = 64
 _MATCH_NS = 5_000_000  # detection and estimate must be of the same frame
+_MAX_TARGETS = (
+    32  # at a time: what a telemetry link bears; one that is gone for so long makes room:
+)
+_GONE_NS = 10_000_000_000
 
 
 @dataclass(frozen=True)
@@ -33,7 +37,7 @@ class TargetReporter:
     """Pairs detections with accepted estimates, casts the rays, filters, and hands the target on.
 
     missed counts detections that show no map: beside the picture, or in the sky; failed what
-    raised an error, of which the first is logged.
+    raised an error, of which the first is logged; refused those of targets beyond the 32nd.
     """
 
     def __init__(
@@ -50,6 +54,7 @@ class TargetReporter:
         self._stopping = False
         self.missed = 0
         self.failed = 0
+        self.refused = 0
         self._thread = threading.Thread(target=self._run, name="targets")
 
     def start(self) -> None:
@@ -125,7 +130,22 @@ class TargetReporter:
             self.missed += 1
             return
         time_ns = estimate.exposure_time_ns
+        if last is None and not self._has_room(time_ns):
+            return
         self._reported_ns[detection.target_id] = time_ns
         target_filter = self._filters.setdefault(detection.target_id, TargetFilter())
         fix = target_filter.update(TargetSighting(detection.target_id, surfaces, pixel, time_ns))
         self._on_target(Target(fix, target_filter.velocity, estimate))
+
+    def _has_room(self, now_ns: int) -> bool:
+        """Whether one more target can be followed, once those that are gone are forgotten."""
+        if len(self._reported_ns) < _MAX_TARGETS:
+            return True
+        for name in [n for n, t in self._reported_ns.items() if now_ns - t > _GONE_NS]:
+            del self._reported_ns[name], self._filters[name]
+        if len(self._reported_ns) < _MAX_TARGETS:
+            return True
+        self.refused += 1
+        if self.refused == 1:
+            _log.warning("more than %d targets at a time: the newest are left out", _MAX_TARGETS)
+        return False

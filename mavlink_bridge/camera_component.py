@@ -42,6 +42,7 @@ _OLD_REQUESTS = {
     ),
 }
 _MIN_INTERVAL_US = 20_000
+_PER_TICK = 4  # targets: more in one go would fill a slow port, and positions wait behind them
 
 
 class CameraComponent:
@@ -83,10 +84,11 @@ class CameraComponent:
         ]:
             del self._targets[target_id]
             self._sent_ns.pop(target_id, None)
-        for target_id, target in self._targets.items():
-            if now_ns - self._sent_ns.get(target_id, 0) >= min(self._geo_ns, self._image_ns):
-                self._sent_ns[target_id] = now_ns
-                self._send_target(target, vehicle, send)
+        sent = {target_id: self._sent_ns.get(target_id, 0) for target_id in self._targets}
+        due = [i for i, t in sent.items() if now_ns - t >= min(self._geo_ns, self._image_ns)]
+        for target_id in sorted(due, key=lambda i: sent[i])[:_PER_TICK]:
+            self._sent_ns[target_id] = now_ns
+            self._send_target(self._targets[target_id], vehicle, send)
         if not self._targets and now_ns - self._idle_ns >= _IDLE_PERIOD_NS:
             self._idle_ns = now_ns
             send(tracking_image_status(None), self._component)

@@ -30,6 +30,7 @@ log = logging.getLogger(__name__)
 
 _OUTBOX = 512
 _MAX_UNSENT = 4096  # bytes; more would wait so long on a slow port that it is worthless
+_CONGESTED = _MAX_UNSENT // 8
 _IDLE_TICK_S = 0.2
 _BACKOFF_S = (0.1, 5.0)
 _LONGEST_WAIT_S = 0.5
@@ -116,6 +117,14 @@ class Link:
     def connected(self) -> bool:
         """Whether the transport is open (UDP: always, once bound)."""
         return self._transport is not None
+
+    @property
+    def congested(self) -> bool:
+        """Whether so much waits for a slow port that only positions should be added.
+
+        To be asked in the owner thread.
+        """
+        return len(self._unsent) > _CONGESTED
 
     def start(self) -> None:
         """Start the owner thread; the first connection attempt happens in it."""

@@ -99,7 +99,9 @@ class Side:
             link.send(message, component)
 
     def serve_camera(self, link: Link, state: VehicleState, now_ns: int) -> None:
-        """Targets and camera pose to the ground."""
+        """Targets and camera pose to the ground, where the link has room for them."""
+        if link.congested:
+            return
         while self.outbound:
             item = self.outbound.popleft()
             if isinstance(item, TargetReport):
@@ -112,7 +114,13 @@ class Side:
         self.camera.tick(now_ns, position, self.shared.uptime_ms(now_ns), link.send)
 
     def command(self, link: Link, message: Any, time_ns: int) -> None:
-        """A command of a ground station to one of our components."""
+        """A command of a ground station to one of our components.
+
+        While the link is congested it is left unanswered, as if lost: the sender repeats it, and
+        a flood of commands costs no position its place.
+        """
+        if link.congested:
+            return
         localizer = self.config.localizer_component
         if (message.target_system, message.target_component) == (link.system_id, localizer):
             self._localizer_command(link, message)

@@ -31,6 +31,8 @@ def test_round_trip():
         b'{"target_id": "", "time_ns": 1, "u": 1, "v": 2}',
         b'{"target_id": "' + b"a" * 100 + b'", "time_ns": 1, "u": 1, "v": 2}',
         b"[" * 1500,
+        b'{"target_id": "\\ud800", "time_ns": 1, "u": 1, "v": 2}',  # half a surrogate pair
+        b'{"target_id": "a\\nb", "time_ns": 1, "u": 1, "v": 2}',
     ],
 )
 def test_bad_datagrams_are_named(data):

@@ -1,6 +1,8 @@
 import csv
 import logging
 import os
+import threading
+import time
 from pathlib import Path
 
 import numpy as np
@@ -54,13 +56,15 @@ def test_a_file_in_the_folders_place_is_a_named_error(tmp_path):
 @pytest.mark.skipif(not os.path.exists("/dev/full"), reason="no /dev/full here")
 def test_a_full_disk_costs_rows_and_not_the_recorder(tmp_path, caplog):
     (tmp_path / "events.csv").symlink_to("/dev/full")
-    recorder = Recorder(RecordConfig(folder=tmp_path), FRAME)
+    told = []
+    recorder = Recorder(RecordConfig(folder=tmp_path), FRAME, told.append)
     with caplog.at_level(logging.WARNING):
         for _ in range(2000):  # more than a file's buffer holds
             recorder.event("info", "x" * 100)
         recorder.target(TargetFix("car", np.zeros(3), np.eye(3), (3.0, 4.0), 5), (1.0, 2.0, 0.0))
         recorder.close()
     assert recorder.dropped > 0
+    assert told == ["No space left on device"]
     assert sum("record is incomplete" in r.message for r in caplog.records) == 1
     assert Path(tmp_path / "targets.csv").read_text().count("car") == 1
 
@@ -88,3 +92,29 @@ def test_only_a_record_without_a_row_is_removed(tmp_path):
     assert sorted(p.name for p in tmp_path.iterdir()) == ["shared", "told"]
     assert [p.name for p in (tmp_path / "shared").iterdir()] == ["notes.txt"]
     assert "something happened" in (tmp_path / "told" / "events.csv").read_text()
+
+
+def test_what_cannot_be_written_costs_itself_only(tmp_path):
+    """No UTF-8 for half a surrogate pair, no picture of nothing: neither is the disk's fault."""
+    told = []
+    recorder = Recorder(RecordConfig(folder=tmp_path, snapshot_interval_s=1.0), FRAME, told.append)
+    recorder.event("info", "\ud800")
+    recorder.snapshot(Frame(np.zeros((0, 0, 3), np.uint8), 10**9, CAMERA, 0))
+    recorder.event("info", "afterwards")
+    recorder.close()
+    assert recorder.dropped == 2
+    assert len(told) == 1
+    assert "afterwards" in (tmp_path / "events.csv").read_text()
+
+
+def test_a_disk_that_stands_still_is_left_behind(tmp_path, monkeypatch):
+    monkeypatch.setattr("companion.recorder._CLOSE_S", 0.2)
+    recorder = Recorder(RecordConfig(folder=tmp_path), FRAME)
+    still = threading.Event()
+    monkeypatch.setattr(recorder, "_write", lambda *_: still.wait(30.0))
+    for _ in range(5000):  # more than the queue holds
+        recorder.event("info", "x")
+    began = time.monotonic()
+    recorder.close()
+    assert time.monotonic() - began < 5.0
+    still.set()

@@ -106,3 +106,21 @@ def test_reports_keep_their_rate_and_a_failing_cast_does_not_end_them():
         time.sleep(0.3)
         assert s.reporter.failed == 1
     assert 4 <= len(s.targets) <= 6  # 1 s at 5 Hz
+
+
+def test_a_flood_of_names_is_bounded_and_room_comes_back(caplog):
+    with Session(rate_hz=30.0) as s:
+
+        def seen(names, time_ns):
+            s.reporter.add_estimate(_estimate(time_ns))
+            for name in names:
+                s.reporter.add_detection(Detection(name, time_ns, 320.0, 240.0))
+
+        seen([f"car {i}" for i in range(40)], 10**9)
+        assert sleep_until(lambda: s.reporter.refused == 8, 30.0)
+        seen(["car 3", "late"], 5 * 10**9)
+        assert sleep_until(lambda: s.reporter.refused == 9, 30.0)
+        seen(["late"], 12 * 10**9)  # all but car 3 are gone for more than 10 s
+        assert sleep_until(lambda: len(s.targets) == 34, 30.0)
+        assert s.targets[-1].fix.target_id == "late"
+    assert sum("more than 32 targets" in r.message for r in caplog.records) == 1

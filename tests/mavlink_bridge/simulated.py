@@ -38,6 +38,7 @@ class SimulatedLink:
     sent: list[tuple[int, Any, int]] = field(default_factory=list)
     system_id: int = 0
     open: bool = True
+    congested: bool = False
     endpoint: Endpoint = field(default_factory=lambda: Endpoint.parse("tcp:vehicle:5760"))
     now_ns: int = 0
 

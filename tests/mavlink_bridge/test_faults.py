@@ -14,7 +14,7 @@ from typing import Any
 import pytest
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
-from mavlink_bridge import VisionFix
+from mavlink_bridge import TargetReport, VisionFix
 from mavlink_bridge.config import InjectionConfig, RcGateConfig, SourceSwitchConfig
 from mavlink_bridge.fc_side import FC_WANTED
 from mavlink_bridge.framing import FrameReader
@@ -377,6 +377,36 @@ def test_every_field_of_every_message_at_its_extremes_raises_nothing(flight: Fli
     flight.run(30.0)
     assert len(flight.vision(flight.now_ns - 10 * SECOND)) > 90
     assert flight.attitude_error() < 0.005
+
+
+def test_a_flood_of_targets_and_commands_leaves_a_slow_link_to_positions(flight: Flight) -> None:
+    """A hundred targets at once, and a ground station that orders without end."""
+    for i in range(100):
+        report = TargetReport(flight.now_ns, *HOME, 500.0, target_id=i, pixel=(0.5, 0.5))
+        flight.side.outbound.append(report)
+    told: dict[int, int] = {}
+    begun_ns = flight.now_ns
+    flight.run(1.0)
+    for time_ns, message, _ in flight.link.sent:
+        if time_ns > begun_ns and message.get_type() == "CAMERA_TRACKING_GEO_STATUS":
+            told[time_ns] = told.get(time_ns, 0) + 1
+    assert told
+    assert max(told.values()) <= 4
+    flight.link.congested = True
+    begun_ns = flight.now_ns
+    order = mavlink.MAVLink_command_long_message(1, 100, 2004, 0, 0.5, 0.5, 0, 0, 0, 0, 0)
+    station = mavlink.MAVLink(None, 255, 190)
+    for _ in range(50):
+        for message in flight.reader.feed(order.pack(station)):
+            flight.side.on_message(flight.link, message, flight.now_ns)  # type: ignore[arg-type]
+        flight.run(0.1)
+    kinds = {m.get_type() for t, m, _ in flight.link.sent if t > begun_ns}
+    assert "VISION_POSITION_ESTIMATE" in kinds
+    assert not kinds & {"COMMAND_ACK", "CAMERA_TRACKING_GEO_STATUS"}
+    flight.link.congested = False
+    for message in flight.reader.feed(order.pack(station)):
+        flight.side.on_message(flight.link, message, flight.now_ns)  # type: ignore[arg-type]
+    assert flight.link.sent[-1][1].get_type() == "COMMAND_ACK"
 
 
 # --- what else an operator must be told -----------------------------------------------------------
