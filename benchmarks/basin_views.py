@@ -9,6 +9,7 @@ reference views are rendered from the map when they are needed, at whatever pose
 from __future__ import annotations
 
 import json
+import os
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
@@ -29,12 +30,14 @@ from localizer.synth.world import build_visits
 from localizer.training.data import tamed
 from localizer.training.pairs import look_at, soften
 from localizer.training.worlds import random_look
-from localizer.types import Image
+from localizer.types import Image, RenderedView
 
 SIZE = (320, 240)
 WORLD_SEED = 2_000_000  # training and the feature benchmark stay below
 VIEWS_PER_WORLD = 40
 _WORLD_M = 800.0
+_PLAIN_FROM = 8  # candidates for each view of the set "plain"
+_DULL = ("fog", "dusk", "night")
 _LEAST_MAP = 0.9  # share of the true view that shows the map
 
 
@@ -53,9 +56,12 @@ class View:
 def load_views(name: str, folder: Path, data: Path, count: int) -> list[View]:
     """At least `count` views of a set, where it has so many, made on the first call.
 
-    name: "generated", or a folder of `data` ("quito", "portugal", "caliterra").
+    name: "generated"; "plain", generated views of ground with little texture in fog, at dusk and at
+    night; or a folder of `data` ("quito", "portugal", "caliterra").
     """
     home = folder / name
+    if name == "plain":
+        return _plain_views(load_views("generated", folder, data, count), home, count)
     if name == "generated":
         places = [home / f"{WORLD_SEED + k}" for k in range(-(-count // VIEWS_PER_WORLD))]
         with ProcessPoolExecutor(2) as pool:
@@ -79,6 +85,52 @@ def _make_world(home: Path) -> None:
     half = 0.36 * _WORLD_M
     _store_renders(home, home / "survey.cache", home / "day.cache", (half, half), rng,
                    VIEWS_PER_WORLD)  # fmt: skip
+
+
+def _plain_views(views: list[View], home: Path, count: int) -> list[View]:
+    """Views of the generated worlds' plainest ground: of random poses in each world, those whose
+    reference view has the least contrast.
+    """
+    if not (home / "views.npz").exists():
+        home.mkdir(parents=True, exist_ok=True)
+        worlds = list(dict.fromkeys(v.map_cache.parent for v in views))
+        share = -(-count // len(worlds))
+        made = [v for k, world in enumerate(worlds) for v in _plain_of(world, share, 10 + k)]
+        _store(home, made)
+    return _load(home)[:count]
+
+
+def _plain_of(world: Path, count: int, seed: int) -> list[View]:
+    rng = np.random.default_rng(seed)
+    half = 0.36 * _WORLD_M
+    with (
+        TileStreamer(TileCache.open(world / "survey.cache")) as survey,
+        TileStreamer(TileCache.open(world / "day.cache")) as day,
+    ):
+        map_renderer, day_renderer = NumbaRenderer(survey, 1), NumbaRenderer(day, 1)
+        candidates: list[tuple[float, Pose, Camera, float]] = []
+        while len(candidates) < _PLAIN_FROM * count:
+            truth, camera, height = _random_pose(map_renderer, (half, half), rng)
+            view = map_renderer.render(truth, camera, wait=True)
+            if (view.depth > 0).mean() >= _LEAST_MAP:
+                candidates.append((contrast(view.rgb), truth, camera, height))
+        views: list[View] = []
+        for k, (_, truth, camera, height) in enumerate(sorted(candidates, key=lambda c: c[0])):
+            seen = day_renderer.render(truth, camera, wait=True)
+            if (seen.depth > 0).mean() < _LEAST_MAP or len(views) == count:
+                continue
+            condition = _DULL[k % len(_DULL)]
+            query = _weathered(seen, condition, rng)
+            views.append(View(world / "survey.cache", query, truth, camera, condition, height))
+    return views
+
+
+def contrast(image: Image) -> float:
+    """Median over 16 px blocks of the standard deviation of the grey value, 0 to 255."""
+    grey = image.astype(np.float32).mean(axis=2)
+    h, w = (16 * (n // 16) for n in grey.shape)
+    blocks = grey[:h, :w].reshape(h // 16, 16, w // 16, 16)
+    return float(np.median(blocks.std(axis=(1, 3))))
 
 
 def _make_real(source: Path, home: Path, count: int) -> None:
@@ -133,21 +185,32 @@ def _store_renders(
     ):
         map_renderer, day_renderer = NumbaRenderer(survey, 1), NumbaRenderer(day, 1)
         while len(views) < count:
-            camera = Camera.from_fov(*SIZE, float(rng.uniform(40, 85)))
-            target = np.array([*rng.uniform(-1, 1, 2) * half, 0.0])
-            target[2] = ground_height(map_renderer, target)
-            pitch = np.radians(90 - 60 * rng.random() ** 1.4)
-            height = float(np.exp(rng.uniform(np.log(55), np.log(220))))
-            truth = look_at(target, height / np.sin(pitch), pitch, rng)
+            truth, camera, height = _random_pose(map_renderer, half, rng)
             view = map_renderer.render(truth, camera, wait=True)
             seen = day_renderer.render(truth, camera, wait=True)
             if min((view.depth > 0).mean(), (seen.depth > 0).mean()) < _LEAST_MAP:
                 continue
             condition = CONDITIONS[len(views) % len(CONDITIONS)]
-            look = tamed(sample_appearance(rng, condition), seen.depth)
-            query = apply_appearance(soften(rng, seen.rgb), seen.depth, look, rng)
+            query = _weathered(seen, condition, rng)
             views.append(View(map_cache, query, truth, camera, condition, height))
     _store(home, views)
+
+
+def _random_pose(
+    renderer: NumbaRenderer, half: tuple[float, float], rng: np.random.Generator
+) -> tuple[Pose, Camera, float]:
+    """A pose world_from_camera, its camera and its height above the ground that it looks at, m."""
+    camera = Camera.from_fov(*SIZE, float(rng.uniform(40, 85)))
+    target = np.array([*rng.uniform(-1, 1, 2) * half, 0.0])
+    target[2] = ground_height(renderer, target)
+    pitch = np.radians(90 - 60 * rng.random() ** 1.4)
+    height = float(np.exp(rng.uniform(np.log(55), np.log(220))))
+    return look_at(target, height / np.sin(pitch), pitch, rng), camera, height
+
+
+def _weathered(seen: RenderedView, condition: str, rng: np.random.Generator) -> Image:
+    look = tamed(sample_appearance(rng, condition), seen.depth)
+    return apply_appearance(soften(rng, seen.rgb), seen.depth, look, rng)
 
 
 def ground_height(renderer: NumbaRenderer, target: np.ndarray) -> float:
@@ -160,7 +223,7 @@ def ground_height(renderer: NumbaRenderer, target: np.ndarray) -> float:
 def _store(home: Path, views: list[View]) -> None:
     np.savez(
         home / "views.npz",
-        map_cache=np.array([str(v.map_cache.relative_to(home)) for v in views]),
+        map_cache=np.array([os.path.relpath(v.map_cache, home) for v in views]),
         query=np.stack([v.query for v in views]),
         truth=np.stack([v.truth.matrix for v in views]),
         camera=np.array([json.dumps(v.camera.to_dict()) for v in views]),
@@ -172,8 +235,8 @@ def _store(home: Path, views: list[View]) -> None:
 def _load(home: Path) -> list[View]:
     with np.load(home / "views.npz") as f:
         return [
-            View(home / str(m), q, Pose.from_matrix(t), Camera.from_dict(json.loads(str(c))),
-                 str(k), float(h))
+            View((home / str(m)).resolve(), q, Pose.from_matrix(t),
+                 Camera.from_dict(json.loads(str(c))), str(k), float(h))
             for m, q, t, c, k, h in zip(
                 f["map_cache"], f["query"], f["truth"], f["camera"], f["condition"], f["height"],
                 strict=True,

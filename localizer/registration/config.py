@@ -29,7 +29,7 @@ class JNGOConfig(BaseModel):
     )
     spread_sigmas: float = Field(default=2.2, gt=0, description="grid half-width in prior sigmas")
     iterations: tuple[_Steps, ...] = Field(
-        default=(2, 3, 10), min_length=1, description="LM steps per level, coarse to fine"
+        default=(2, 3, 4), min_length=1, description="LM steps per level, coarse to fine"
     )
     swarm_anchors: tuple[_Count, ...] = Field(
         default=(250, 500, 500),

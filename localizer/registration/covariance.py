@@ -143,6 +143,8 @@ def curvature_ratio(scores: Array, steps: Array, hessian: Array) -> float:
     scores: (13,) at `curvature_steps`, without a prior; axes along which the overlap ends are left
     out. At least `_LEAST_CURVATURE`: where the cost is flat its noise alone is measured.
     """
+    if not np.isfinite(scores[0]):
+        return _LEAST_CURVATURE
     rise = scores[1:7] + scores[7:] - 2.0 * scores[0]
     expected = 2.0 * np.einsum("ki,ij,kj->k", steps[1:7], hessian, steps[1:7])
     ratios = rise[np.isfinite(rise)] / np.maximum(expected[np.isfinite(rise)], 1e-30)

@@ -1,0 +1,132 @@
+"""Curvature of the cost, competing modes, and the sandwich made of them (section 8)."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from localizer.pose import Pose, so3_exp
+from localizer.registration.backend import LMSettings, level_problems, local_origin
+from localizer.registration.covariance import (
+    anchor_model,
+    apart_px,
+    covariance_sums,
+    curvature_ratio,
+    curvature_steps,
+    mean_motion,
+    pose_differences,
+    sandwich_covariance,
+)
+from localizer.registration.reference import (
+    ReferenceBackend,
+    project,
+    projection_jacobian,
+    retractions,
+)
+from localizer.registration.selection import mode_probabilities
+
+SETTINGS = LMSettings(scale=10.0)  # least squares, so that only noise acts
+
+
+@pytest.fixture
+def problem(scene):
+    origin = local_origin(scene.anchors, scene.true)
+    return level_problems(scene.query, scene.camera, scene.anchors, origin)[2], origin
+
+
+@pytest.fixture
+def pose(scene, problem):
+    R = scene.true.rotation.T
+    return R, R @ (problem[1] - scene.true.translation)
+
+
+def quadratic(steps, hessian, gradient=None):
+    """Scores whose half has this Hessian."""
+    slope = np.zeros(6) if gradient is None else gradient
+    return 0.7 + steps @ slope + np.einsum("ki,ij,kj->k", steps, hessian, steps)
+
+
+@pytest.fixture
+def hessian():
+    half = np.random.default_rng(0).standard_normal((6, 6))
+    return half @ half.T + np.eye(6)
+
+
+def test_a_quadratic_cost_has_the_curvature_of_its_hessian(hessian):
+    steps = curvature_steps(np.diag([4.0, 1.0, 9.0, 1.0, 2.0, 3.0]), 0.1)
+    assert curvature_ratio(quadratic(steps, hessian), steps, hessian) == pytest.approx(1.0)
+    sloped = quadratic(steps, 0.3 * hessian, np.arange(6.0))
+    assert curvature_ratio(sloped, steps, hessian) == pytest.approx(0.3)
+
+
+def test_axes_that_lose_the_overlap_are_left_out_and_a_flat_cost_has_a_least_curvature(hessian):
+    steps = curvature_steps(np.eye(6), 0.1)
+    scores = quadratic(steps, 0.5 * hessian)
+    scores[[3, 9]] = np.inf
+    assert curvature_ratio(scores, steps, hessian) == pytest.approx(0.5)
+    assert curvature_ratio(np.full(13, 0.4), steps, hessian) == pytest.approx(0.03)
+    assert curvature_ratio(np.full(13, np.inf), steps, hessian) == pytest.approx(0.03)
+
+
+def test_each_step_moves_the_image_by_the_wanted_distance(problem, pose):
+    level, _ = problem
+    x, before = project(level, *pose)
+    steps = curvature_steps(mean_motion(projection_jacobian(level, x, pose[1])), 0.15)
+    for R, t in zip(*(a[1:] for a in retractions(*pose, steps)), strict=True):
+        moved = project(level, R, t)[1] - before
+        assert np.sqrt((moved**2).sum(axis=1).mean()) == pytest.approx(0.15, rel=0.01)
+
+
+def measured(problem, pose, noise):
+    """Curvature at the true pose with noise on the query."""
+    level, _ = problem
+    rng = np.random.default_rng(3)
+    noisy = level.features + noise * rng.standard_normal(level.features.shape).astype(np.float32)
+    level = replace(level, features=noisy)
+    sums = covariance_sums(anchor_model(level, *pose, SETTINGS, 16.0))
+    assert sums is not None
+    steps = curvature_steps(sums.motion, 0.15)
+    scores = ReferenceBackend().refine(level, *retractions(*pose, steps), 0, SETTINGS).scores
+    return sums, curvature_ratio(scores, steps, sums.hessian)
+
+
+def test_noise_that_inflates_the_hessian_lowers_the_curvature(problem, pose):
+    """Gauss-Newton takes the noise's gradients for texture; the cost does not get steeper."""
+    clean, noisy = measured(problem, pose, 0.0), measured(problem, pose, 0.15)
+    assert noisy[0].hessian.trace() > clean[0].hessian.trace()
+    assert noisy[1] < 0.7 * clean[1]
+
+
+def test_half_the_curvature_is_four_times_the_covariance(problem, pose):
+    sums, _ = measured(problem, pose, 0.05)
+    full = sandwich_covariance(sums, 1.0, 0.05)
+    half = sandwich_covariance(replace(sums, curvature=0.5), 1.0, 0.05)
+    assert full is not None
+    np.testing.assert_allclose(half, 4.0 * full, rtol=1e-9)
+
+
+def test_distances_between_poses_are_those_of_the_image(scene, problem, pose):
+    level, _ = problem
+    x, before = project(level, *pose)
+    motion = mean_motion(projection_jacobian(level, x, pose[1]))
+    true = scene.true
+    shift = np.array([1.0, -0.5, 0.8])
+    other = Pose(so3_exp([0.01, -0.02, 0.015]) @ true.rotation, true.translation + shift)
+    differences = pose_differences(other.rotation[None], other.translation[None], true)
+    R = other.rotation.T
+    after = project(level, R, R @ (problem[1] - other.translation))[1]
+    expected = np.sqrt(((after - before) ** 2).sum(axis=1).mean())
+    assert apart_px(differences, *pose, motion)[0] == pytest.approx(expected, rel=0.05)
+
+
+def test_only_other_modes_share_the_probability():
+    scores = np.array([0.30, 0.30, 0.31, 0.90])
+    everything = mode_probabilities(scores, 60, np.array([False, True, True, True]))
+    assert everything[0] == pytest.approx(everything[1])
+    assert everything[1] > everything[2] > everything[3]
+    assert everything.sum() == pytest.approx(1.0)
+    near = mode_probabilities(scores, 60, np.array([False, False, True, True]))
+    assert near[1] == 0.0
+    assert near.sum() == pytest.approx(1.0)
