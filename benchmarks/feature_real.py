@@ -28,9 +28,9 @@ from localizer.pose import Pose
 from localizer.render.numba_raster import NumbaRenderer
 from localizer.synth.appearance import CONDITIONS, apply_appearance, sample_appearance
 from localizer.training.data import tamed
-from localizer.training.land import season_shift
 from localizer.training.pairs import SEASON, look_at, moved
 from localizer.training.revisit import coarser, draw_texel, hard_surfaces, regrown
+from localizer.training.seasons import season_shift
 from localizer.types import Float32, Image, RenderedView
 
 PHOTO, COARSE_MAP, OLDER_MAP = "photo", "photo, coarser map", "photo, older map"

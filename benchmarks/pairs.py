@@ -17,7 +17,7 @@ import torch
 from arguments import Parser, existing, whole
 from named_errors import named_errors
 
-from localizer.synth.heightfield import render
+from localizer.synth.heightfield_render import render
 from localizer.training.config import LiveSection, load_config
 from localizer.training.data import LoaderConfig, crop_pair, window_pair
 from localizer.training.live import LivePlan, LiveStream

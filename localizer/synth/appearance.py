@@ -140,6 +140,8 @@ def apply_appearance(
     out: Image = (np.clip(image, 0.0, 1.0) * 255.0 + 0.5).astype(np.uint8)
     if a.jpeg_quality < 100:
         options = [cv2.IMWRITE_JPEG_QUALITY, a.jpeg_quality]
+        # OpenCV takes its images for BGR, so the chroma of red and blue is coded with the other's
+        # weights. It stays until the next training: the published pairs were made so.
         coded = cv2.imencode(".jpg", out, options)[1]
         return np.asarray(cv2.imdecode(coded, cv2.IMREAD_UNCHANGED), np.uint8)
     return out

@@ -1,4 +1,4 @@
-"""Painting and writing tiles: a block of 200 m at a time, then the coarse tiles above them."""
+"""Painting and writing tiles, a block of 200 m at a time."""
 
 from __future__ import annotations
 
@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from localizer.pose import Array
+from localizer.synth.building_kinds import build
 from localizer.synth.buildings import (
     LEAF,
     MID,
@@ -20,21 +21,21 @@ from localizer.synth.buildings import (
     TOP,
     Building,
     Surface,
-    build,
 )
-from localizer.synth.config import BLOCK_M, LEAF_GSD_M, LEAF_M, TERRAIN_SPACING_M, TOP_M, Look
+from localizer.synth.config import BLOCK_M, LEAF_GSD_M, LEAF_M, TOP_M
 from localizer.synth.ground import Shape, rasterize, shape_bounds
-from localizer.synth.lighting import DSM_GSD_M, make_light, raise_surface
+from localizer.synth.lighting import DSM_GSD_M, make_light
 from localizer.synth.mesh import ChartedMesh, pack
-from localizer.synth.plan import Hedge, WorldPlan
-from localizer.synth.props import CAR_COLOURS, PropShape, car_image, car_shape
-from localizer.synth.terrain import Terrain
-from localizer.synth.textures import Cover, Light, new_image, paint_ground, paint_surface
+from localizer.synth.props import CAR_COLOURS, car_image, car_shape
+from localizer.synth.scene import Scene, car_positions, hedge_quads
+from localizer.synth.terrain_mesh import terrain_mesh
+from localizer.synth.texture_buildings import paint_surface
+from localizer.synth.texture_ground import paint_ground
+from localizer.synth.textures import Cover, Light, new_image
 from localizer.synth.tiles import TileNode, glb_bytes
-from localizer.synth.vegetation import crown_images, hedge_corners, tree_meshes
+from localizer.synth.vegetation import crown_images, tree_meshes
 from localizer.types import Image
 
-_DSM_MARGIN_M = 20.0
 _LIGHT_MARGIN_M = 60.0  # objects belong to the tile of their middle and reach out of it
 _GUTTER_PX, _PAD_PX = 16, 4
 _MAX_CHART_PX = 800
@@ -42,23 +43,6 @@ _CAR_PX_PER_M = 16
 _GRID = {LEAF: 1, MID: 2, TOP: 4, ROOT: 8}  # terrain cells merged per side
 _NAMES = {LEAF: "leaf", MID: "mid", TOP: "top", ROOT: "root"}
 _SIDE_M = {LEAF: LEAF_M, MID: BLOCK_M, TOP: TOP_M}
-
-
-@dataclass(frozen=True)
-class Scene:
-    """One visit to a planned world: what stands there, and the surface model that throws shadows.
-
-    cars: (C, 4) x, y, heading, seed; dsm, ground: (H, W) float32 heights, row 0 = north.
-    """
-
-    plan: WorldPlan
-    look: Look
-    buildings: list[Building]
-    cars: Array
-    dsm: NDArray[np.float32]
-    ground: NDArray[np.float32]
-    west: float
-    north: float
 
 
 @dataclass(frozen=True)
@@ -72,75 +56,6 @@ class Part:
     mesh: ChartedMesh
     west: float
     north: float
-
-
-def make_scene(plan: WorldPlan, look: Look) -> Scene:
-    """Fill parking places, take away changed buildings, and model the surface."""
-    rng = plan.config.rng(40, look.parking_seed)
-    buildings = plan.buildings
-    if look.changed_buildings > 0:
-        gone = rng.random(len(buildings)) < look.changed_buildings
-        buildings = [b for b, g in zip(buildings, gone, strict=True) if not g]
-    taken = rng.random(len(plan.slots)) < plan.slots[:, 3] * (look.occupancy / 0.6)
-    cars = plan.slots[taken].copy()
-    if len(cars):
-        cars[:, :2] += rng.normal(0, 0.12, (len(cars), 2))
-        cars[:, 2] += rng.normal(0, 0.025, len(cars)) + np.pi * rng.integers(0, 2, len(cars))
-        cars[:, 3] = rng.integers(0, 1 << 20, len(cars))
-
-    half = plan.config.half_m + _DSM_MARGIN_M
-    n = round(2 * half / DSM_GSD_M)
-    axis = (np.arange(n) + 0.5) * DSM_GSD_M - half
-    index = ((axis + plan.terrain.half_m) / TERRAIN_SPACING_M).astype(np.float32)
-    u, v = np.meshgrid(index, index[::-1])
-    heights = plan.terrain.heights
-    ground = cv2.remap(heights, u, v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
-    ground = np.asarray(ground, np.float32)
-    dsm = ground.copy()
-    triangles = [_fan(s.polygon) for b in buildings for s in build(b) if s.levels & MID]
-    triangles += [_fan(q) for h in plan.hedges for q in _hedge_quads(plan.terrain, h)]
-    if triangles:
-        raise_surface(dsm, np.concatenate(triangles), -half, half, DSM_GSD_M)
-    trees = plan.trees
-    if len(trees.xy):
-        every = np.arange(len(trees.xy))
-        z = plan.terrain.height(trees.xy[:, 0], trees.xy[:, 1])
-        crowns = tree_meshes(trees, every, z, np.zeros(len(every), bool), [], (LEAF,))
-        raise_surface(dsm, crowns.positions[crowns.faces], -half, half, DSM_GSD_M)
-    if len(cars):
-        shape = car_shape()
-        body = _car_positions(plan.terrain, cars, shape)[:, shape.faces].reshape(-1, 3, 3)
-        raise_surface(dsm, body, -half, half, DSM_GSD_M)
-    return Scene(plan, look, buildings, cars, dsm, ground, -half, half)
-
-
-def _fan(polygon: Array) -> Array:
-    n = len(polygon)
-    return np.stack([polygon[[0, k, k + 1]] for k in range(1, n - 1)])
-
-
-def _hedge_quads(terrain: Terrain, hedge: Hedge) -> list[Array]:
-    za, zb = (float(terrain.height(p[0], p[1])) for p in (hedge.a, hedge.b))
-    return hedge_corners(hedge, za, zb)
-
-
-def _car_positions(terrain: Terrain, cars: Array, shape: PropShape) -> Array:
-    """(C, V, 3) vertices of cars that stand on the slope below them."""
-    c, s = np.cos(cars[:, 2]), np.sin(cars[:, 2])
-
-    def height(forward: float, left: float) -> Array:
-        return terrain.height(
-            cars[:, 0] + c * forward - s * left, cars[:, 1] + s * forward + c * left
-        )
-
-    pitch = (height(1.3, 0) - height(-1.3, 0)) / 2.6
-    roll = (height(0, 0.8) - height(0, -0.8)) / 1.6
-    x, y, z = shape.positions.T
-    out = np.empty((len(cars), len(x), 3))
-    out[..., 0] = cars[:, :1] + np.outer(c, x) - np.outer(s, y)
-    out[..., 1] = cars[:, 1:2] + np.outer(s, x) + np.outer(c, y)
-    out[..., 2] = height(0, 0)[:, None] + z + np.outer(pitch, x) + np.outer(roll, y)
-    return out
 
 
 @dataclass
@@ -181,12 +96,12 @@ class Baker:
                 leaf_west, leaf_north = west + dx * LEAF_M, south + (dy + 1) * LEAF_M
                 leaves.append(self.write(LEAF, leaf, leaf_west, leaf_north, image, mesh))
                 meshes.append(mesh)
-        image = _half(ground)
+        image = half_size(ground)
         mesh = ChartedMesh.merged(meshes)
         mesh = mesh.at_level(MID | TOP | ROOT).halved()
         middle = self.write(MID, (column, row), west, north, image, mesh)
         middle.children = leaves
-        return Part([middle], _half(image), mesh.at_level(TOP | ROOT).halved(), west, north)
+        return Part([middle], half_size(image), mesh.at_level(TOP | ROOT).halved(), west, north)
 
     def write(
         self, level: int, place: tuple[int, int], west: float, north: float, ground: Image,
@@ -296,7 +211,7 @@ class Baker:
                 continue
             rng = np.random.default_rng(hedge.seed)
             colour = np.array([84.0, 98.0, 56.0]) * rng.normal(1, 0.12)
-            for quad in _hedge_quads(self.scene.plan.terrain, hedge):
+            for quad in hedge_quads(self.scene.plan.terrain, hedge):
                 normal = np.cross(quad[1] - quad[0], quad[3] - quad[0])
                 normal /= max(float(np.linalg.norm(normal)), 1e-9)
                 right = quad[1] - quad[0]
@@ -352,95 +267,16 @@ class Baker:
         st = np.broadcast_to(shape.st * _CAR_PX_PER_M * 5 / 8, (n, m, 2)).reshape(-1, 2)
         faces = (shape.faces[None] + (np.arange(n) * m)[:, None, None]).reshape(-1, 3)
         return ChartedMesh(
-            _car_positions(self.scene.plan.terrain, cars, shape).reshape(-1, 3),
+            car_positions(self.scene.plan.terrain, cars, shape).reshape(-1, 3),
             np.repeat(chart.reshape(-1), m).astype(np.int64), st.copy(), faces.astype(np.int64),
             np.full(len(faces), NEAR_LEVELS, np.uint8), tuple(images),
         )  # fmt: skip
 
 
-def _half(image: Image) -> Image:
+def half_size(image: Image) -> Image:
+    """The image at half its width and height."""
     size = (image.shape[1] // 2, image.shape[0] // 2)
     return np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA), np.uint8)
-
-
-def terrain_mesh(
-    terrain: Terrain, west: float, north: float, side: float, step: int
-) -> tuple[Array, Array, NDArray[np.int64], float]:
-    """Terrain of a square tile from every `step`-th grid node, with a skirt.
-
-    Returns positions (V, 3), place in the tile (V, 2) as a share of its side (right, down), faces
-    (F, 3), and the largest vertical deviation from the full grid in metres.
-    """
-    spacing, half = terrain.spacing_m, terrain.half_m
-    c0, r0 = round((west + half) / spacing), round((north - side + half) / spacing)
-    cells = round(side / spacing)
-    fine = terrain.heights[r0 : r0 + cells + 1, c0 : c0 + cells + 1].astype(np.float64)
-    grid = fine[::step, ::step]
-    coarse = Terrain(grid.astype(np.float32), spacing * step, terrain.river)
-    axis = np.linspace(-side / 2, side / 2, cells + 1)
-    fx, fy = np.meshgrid(axis, axis)
-    error = float(np.abs(coarse.height(fx, fy) - fine).max())
-
-    n = grid.shape[0]
-    x, y = np.meshgrid(np.linspace(0, 1, n), np.linspace(0, 1, n))
-    top = np.stack([west + x * side, north - side + y * side, grid], -1).reshape(-1, 3)
-    share = np.stack([x, 1 - y], -1).reshape(-1, 2)
-    index = np.arange(n * n).reshape(n, n)
-    sw, se, nw, ne = index[:-1, :-1], index[:-1, 1:], index[1:, :-1], index[1:, 1:]
-    lower, upper = np.stack([sw, se, ne], -1), np.stack([sw, ne, nw], -1)
-    faces = [lower.reshape(-1, 3), upper.reshape(-1, 3)]
-
-    # Neighbours of another level may lie lower by both their errors.
-    depth = 1.0 + 0.05 * spacing * step + 2 * error
-    ring = np.concatenate([index[0, :-1], index[:-1, -1], index[-1, :0:-1], index[:0:-1, 0]])
-    skirt = top[ring] - [0, 0, depth]
-    a, b = ring, np.roll(ring, -1)
-    low_a = n * n + np.arange(len(ring))
-    low_b = np.roll(low_a, -1)
-    faces += [np.stack([a, low_a, low_b], -1), np.stack([a, low_b, b], -1)]
-    return (
-        np.concatenate([top, skirt]),
-        np.concatenate([share, share[ring]]),
-        np.concatenate(faces).astype(np.int64),
-        error,
-    )
-
-
-def assemble_top(baker: Baker, column: int, row: int, parts: list[Part]) -> Part:
-    """Write the 400 m tile over four blocks."""
-    half = baker.scene.plan.config.half_m
-    west, north = column * TOP_M - half, (row + 1) * TOP_M - half
-    n = parts[0].ground.shape[0]
-    image = new_image(2 * n, 2 * n)
-    for part in parts:
-        i, j = round((north - part.north) / BLOCK_M) * n, round((part.west - west) / BLOCK_M) * n
-        image[i : i + n, j : j + n] = part.ground
-    mesh = ChartedMesh.merged([p.mesh for p in parts])
-    node = baker.write(TOP, (column, row), west, north, image, mesh)
-    node.children = [child for p in parts for child in p.nodes]
-    return Part([node], _half(_half(image)), mesh.at_level(ROOT).halved(2), west, north)
-
-
-def assemble_root(baker: Baker, parts: list[Part]) -> TileNode:
-    """Write the tile over the whole world, with trees painted on its ground."""
-    half = baker.scene.plan.config.half_m
-    n = parts[0].ground.shape[0]
-    side = round(2 * half / TOP_M) * n
-    image = new_image(side, side)
-    for part in parts:
-        i, j = round((half - part.north) / TOP_M) * n, round((part.west + half) / TOP_M) * n
-        image[i : i + n, j : j + n] = part.ground
-    gsd = 2 * half / side
-    trees = baker.scene.plan.trees
-    for (x, y), radius, seed in zip(trees.xy, trees.radius, trees.seed, strict=True):
-        tone = 0.8 + 0.4 * ((int(seed) * 7919) % 101) / 101
-        centre = (round((x + half) / gsd * 16 - 8), round((half - y) / gsd * 16 - 8))
-        colour = (74 * tone, 88 * tone, 50 * tone)
-        cv2.circle(image, centre, round(radius / gsd * 16), colour, -1, cv2.LINE_AA, 4)
-    mesh = ChartedMesh.merged([p.mesh for p in parts])
-    node = baker.write(ROOT, (0, 0), -half, half, image, mesh)
-    node.children = [child for p in parts for child in p.nodes]
-    return node
 
 
 _baker: list[Baker] = []  # the baker of a worker process, set once by `start_worker`

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
@@ -91,19 +91,3 @@ LIVE = Look(
 def look_of(variant: Variant) -> Look:
     """The default look of a variant."""
     return {"survey": SURVEY, "live": LIVE}[variant]
-
-
-def random_look(rng: np.random.Generator) -> Look:
-    """A random visit, for training pairs."""
-    warm = rng.uniform(0.0, 1.0)
-    return replace(
-        SURVEY,
-        sun_azimuth_deg=float(rng.uniform(80, 280)),
-        sun_elevation_deg=float(rng.uniform(22, 62)),
-        sun_rgb=(0.9 + 0.15 * warm, 0.88 + 0.04 * warm, 0.84 - 0.1 * warm),
-        dryness=float(rng.uniform(0, 0.8)),
-        crop=float(rng.uniform(0, 1)),
-        leaf=float(rng.uniform(0, 0.9)),
-        occupancy=float(rng.uniform(0.2, 0.8)),
-        parking_seed=int(rng.integers(1, 2**31)),
-    )

@@ -16,7 +16,7 @@ _SHIFT = 4  # fractional bits of OpenCV's fixed-point vertices
 
 
 class Material(IntEnum):
-    """What covers the ground. The painter in `textures` knows each by this number."""
+    """What covers the ground. The painter in `texture_ground` knows each by this number."""
 
     MEADOW = 0
     LAWN = 1

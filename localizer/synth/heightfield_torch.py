@@ -1,4 +1,4 @@
-"""`heightfield.render` for many views at once on any torch device.
+"""`heightfield_render.render` for many views at once on any torch device.
 
 It walks the same rays over the same samples as the CPU's kernel, all rays in step: the depths are
 equal but for float32 rounding, which now and then moves a silhouette by a pixel.

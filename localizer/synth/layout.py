@@ -8,7 +8,8 @@ import cv2
 import numpy as np
 
 from localizer.pose import Array
-from localizer.synth.buildings import Building, Kind, Surface, build, rectangle
+from localizer.synth.building_kinds import build
+from localizer.synth.buildings import Building, Kind, Surface, rectangle
 from localizer.synth.config import WorldConfig
 from localizer.synth.country import (
     hedgerow,

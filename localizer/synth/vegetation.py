@@ -10,7 +10,8 @@ from localizer.synth.buildings import LEAF, MID, TOP
 from localizer.synth.config import Look
 from localizer.synth.mesh import ChartedMesh
 from localizer.synth.plan import Hedge, Trees
-from localizer.synth.textures import Light, new_image, paint_crown
+from localizer.synth.texture_crowns import paint_crown
+from localizer.synth.textures import Light, new_image
 from localizer.types import Image
 
 _VARIANTS = 14  # crown textures of a tile

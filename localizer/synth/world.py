@@ -19,19 +19,12 @@ from numpy.typing import ArrayLike
 from localizer.errors import MapSourceError
 from localizer.geo import Geodetic, LocalFrame
 from localizer.pose import Array
-from localizer.synth.bake import (
-    Baker,
-    Part,
-    Scene,
-    assemble_root,
-    assemble_top,
-    bake_block,
-    make_scene,
-    start_worker,
-)
+from localizer.synth.bake import Baker, Part, bake_block, start_worker
+from localizer.synth.coarse_tiles import assemble_root, assemble_top
 from localizer.synth.config import BLOCK_M, TOP_M, Look, Variant, WorldConfig, look_of
 from localizer.synth.layout import plan_world
 from localizer.synth.plan import Target, WorldPlan
+from localizer.synth.scene import Scene, make_scene
 from localizer.synth.terrain import River, Terrain
 from localizer.synth.tiles import write_tileset
 

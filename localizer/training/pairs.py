@@ -24,19 +24,15 @@ from localizer.synth.heightfield import (
     compose,
     height_at,
     light_scene,
-    render,
     without,
 )
-from localizer.training.land import (
-    PhotoLibrary,
-    Place,
-    generated_place,
-    new_buildings,
-    parked_cars,
-    photo_place,
-    season_shift,
-)
+from localizer.synth.heightfield_render import render
+from localizer.training.land import generated_place, photo_place
+from localizer.training.objects import new_buildings, parked_cars
+from localizer.training.photos import PhotoLibrary
+from localizer.training.place import Place
 from localizer.training.revisit import coarse_mesh, draw_texel, plain_walls, regrown, wetted
+from localizer.training.seasons import season_shift
 from localizer.types import Float32, Image
 
 SEASON, OUTDATED, COMBINED = "season", "outdated map", "combined"

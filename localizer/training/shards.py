@@ -18,8 +18,8 @@ import numpy as np
 from localizer.camera import Camera
 from localizer.errors import LocalizerError, SequenceError
 from localizer.pose import Pose
-from localizer.training.land import PhotoLibrary
 from localizer.training.pairs import Pair, SceneConfig, scene_pairs
+from localizer.training.photos import PhotoLibrary
 
 FIRST_WORLD_SEED = 1000  # seeds below belong to demos and tests
 WORLD_SHARDS = 8  # per mesh world

@@ -3,7 +3,8 @@ import pytest
 
 from localizer.camera import Camera
 from localizer.pose import Pose
-from localizer.synth.heightfield import Land, Light, LitScene, Prism, compose, light_scene, render
+from localizer.synth.heightfield import Land, Light, LitScene, Prism, compose, light_scene
+from localizer.synth.heightfield_render import render
 
 N, CELL = 128, 0.5
 NADIR = np.diag([1.0, -1.0, -1.0])

@@ -7,7 +7,8 @@ import pytest
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 
-from localizer.synth.buildings import Kind, build
+from localizer.synth.building_kinds import build
+from localizer.synth.buildings import Kind
 from localizer.synth.config import WorldConfig
 from localizer.synth.ground import Material
 from localizer.synth.layout import assign_zones, plan_world

@@ -26,8 +26,8 @@ from localizer.synth.heightfield import (  # noqa: E402
     Prism,
     compose,
     light_scene,
-    render,
 )
+from localizer.synth.heightfield_render import render  # noqa: E402
 
 N = 128
 

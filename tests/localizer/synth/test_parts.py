@@ -2,12 +2,12 @@
 
 import numpy as np
 
-from localizer.synth.bake import terrain_mesh
-from localizer.synth.config import SURVEY, Look, WorldConfig, random_look
+from localizer.synth.config import SURVEY, Look, WorldConfig
 from localizer.synth.lighting import DSM_GSD_M, make_light, raise_surface
 from localizer.synth.mesh import ChartedMesh, pack
 from localizer.synth.props import CAR_HEIGHT_M, CAR_LENGTH_M, car_mesh, person_mesh
 from localizer.synth.terrain import River, Terrain, make_terrain
+from localizer.synth.terrain_mesh import terrain_mesh
 
 
 def flat_light(look: Look):
@@ -142,10 +142,3 @@ def test_a_person_stands_on_the_ground():
     a, b, c = (p[person.faces[:, k]] for k in range(3))
     outward = ((a + b + c) / 3) * [1, 1, 0]
     assert (np.cross(b - a, c - a) * outward).sum(axis=1).min() >= -1e-9
-
-
-def test_random_looks_differ_and_are_repeatable():
-    looks = [random_look(np.random.default_rng(k)) for k in (0, 0, 1)]
-    assert looks[0] == looks[1]
-    assert looks[0] != looks[2]
-    assert all(0 < look.sun_elevation_deg < 90 for look in looks)

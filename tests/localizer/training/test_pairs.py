@@ -7,7 +7,6 @@ import pytest
 
 from localizer.errors import SequenceError
 from localizer.pose import Pose
-from localizer.training.land import PhotoLibrary
 from localizer.training.pairs import (
     COMBINED,
     OUTDATED,
@@ -17,6 +16,7 @@ from localizer.training.pairs import (
     scene_pairs,
     warp_check,
 )
+from localizer.training.photos import PhotoLibrary
 from localizer.training.shards import read_shard, write_shard, write_shards
 from localizer.training.sheet import contact_sheet
 
