@@ -20,6 +20,10 @@ _SLACK_M = 2.0
 _MINIMUM_HZ = 4.0
 _GPS_MINIMUM_HZ = 4.65  # an average gap over 215 ms makes ArduPilot's receiver unhealthy
 _VARIANCE_LIMIT = 1.0  # the innovation test's own threshold
+_TAKES_NS = 200_000_000  # from arrival to where the EKF's output shows a jump
+_JUMP_SAMPLES = 3
+_JUMP_SIGMAS, _JUMP_SLACK_M = 3.0, 1.0  # to announce it once too often costs nothing
+_MOST_REPEATS = 5
 
 _SOURCE = {
     "vision_position_estimate": "VISO_TYPE=1 and EK3_SRCn_POSXY=6",
@@ -48,11 +52,25 @@ class ClosedLoopCheck:
         self._message = message
         self._sent: deque[tuple[int, float, float, float]] = deque(maxlen=256)
         self._pending: deque[tuple[int, float, float, float]] = deque(maxlen=256)
-        self._differences: deque[tuple[int, float, float]] = deque(maxlen=256)
+        self._differences: deque[tuple[int, float, float, int]] = deque(maxlen=256)
         self._began_ns: int | None = None
+        self._reset_counter: int | None = None
+        self._jump_ns: int | None = None
+        self._repeats = 0
 
-    def sent(self, stamp_ns: int, now_ns: int, north: float, east: float, sigma_m: float) -> None:
+    def sent(
+        self,
+        stamp_ns: int,
+        now_ns: int,
+        north: float,
+        east: float,
+        sigma_m: float,
+        reset_counter: int = 0,
+    ) -> None:
         """A position went out: valid at stamp_ns, NE metres from the EKF origin."""
+        if self._reset_counter not in (None, reset_counter):
+            self._jump_ns = now_ns + _TAKES_NS
+        self._reset_counter = reset_counter
         if not self._sent or now_ns - self._sent[-1][0] > _SETTLE_NS:
             self._began_ns = now_ns
         self._sent.append((now_ns, north, east, sigma_m))
@@ -69,12 +87,32 @@ class ClosedLoopCheck:
         recent = [s for s in self._sent if now_ns - s[0] < _WINDOW_NS]
         if not recent or self._began_ns is None or now_ns - self._began_ns < _SETTLE_NS:
             return None
-        differences = sorted(d for t, d, _ in self._differences if now_ns - t < _WINDOW_NS)
+        differences = sorted(d for t, d, *_ in self._differences if now_ns - t < _WINDOW_NS)
         difference = differences[len(differences) // 2] if differences else math.nan
         span_s = (recent[-1][0] - recent[0][0]) * 1e-9
         rate = (len(recent) - 1) / span_s if span_s > 0.0 else 0.0
         reason = self._reason(rate, state, difference, recent[-1][3])
         return LoopVerdict(not reason, reason, difference)
+
+    def jump_missed(self) -> bool:
+        """Whether an announced jump must be announced again, because the EKF is still elsewhere.
+
+        ArduPilot's EKF takes the newest measurement of each of its steps: of two that arrive
+        together it never sees the first, nor that it was the one with the new reset_counter. It
+        then refuses all positions, for 7 s (VISION_POSITION_ESTIMATE) or for ever (ODOMETRY).
+        """
+        if self._jump_ns is None:
+            return False
+        after = [(d, sigma) for _, d, sigma, stamp in self._differences if stamp >= self._jump_ns]
+        if len(after) < _JUMP_SAMPLES:
+            return False
+        self._jump_ns = None
+        distance, sigma = sorted(after)[len(after) // 2]
+        if distance <= _JUMP_SIGMAS * sigma + _JUMP_SLACK_M:
+            self._repeats = 0
+            return False
+        self._repeats += 1
+        return self._repeats <= _MOST_REPEATS
 
     def _compare(self, now_ns: int, local_at: Callable[[int], tuple[float, ...] | None]) -> None:
         """Hold each sent position against the EKF's at the same time, once that has come."""
@@ -83,7 +121,7 @@ class ClosedLoopCheck:
             local = local_at(stamp_ns)
             if local is not None:
                 distance = math.hypot(local[0] - north, local[1] - east)
-                self._differences.append((now_ns, distance, sigma))
+                self._differences.append((now_ns, distance, sigma, stamp_ns))
 
     def _reason(self, rate: float, state: VehicleState, difference: float, sigma: float) -> str:
         wanted = _GPS_MINIMUM_HZ if self._message == "gps_input" else _MINIMUM_HZ

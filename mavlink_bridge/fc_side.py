@@ -309,7 +309,8 @@ class FlightControllerSide(Side):
                 position.longitude_deg,
             )
             sigma = position.horizontal_sigma_m
-            self.loop.sent(position.time_ns, now_ns, north, east, sigma)
+            counter = injection.estimate.reset_counter
+            self.loop.sent(position.time_ns, now_ns, north, east, sigma, counter)
 
     def _check(self, link: Link, state: VehicleState, now_ns: int) -> None:
         """What came of it, ten times a second: score, verdict, source switch."""
@@ -322,6 +323,12 @@ class FlightControllerSide(Side):
         self.verdict = self.loop.verdict(now_ns, state, self.tracker.local_at)
         if self.verdict is not None:
             self._tell("loop", self.verdict.reason, "the EKF follows")
+        if self.loop.jump_missed():
+            self.counters["jumps_repeated"] += 1
+            self.injector.announce_jump()
+            self.shared.say(
+                mavlink.MAV_SEVERITY_NOTICE, "PiLoT: the EKF missed a jump: announced again"
+            )
         good = not self.injector.guard.blocked and now_ns - self._delivered_ns < _VISION_GOOD_NS
         good = good and self.mode() == "inject"
         order = self.switch.decide(now_ns, state, self.vision, good)

@@ -164,6 +164,10 @@ class Injector:
             self.counters["fixes_overflowed"] += 1
             self._keep_reset(self._waiting.popleft())
 
+    def announce_jump(self) -> None:
+        """Raise the reset counter with the next message."""
+        self._reset_pending = True
+
     def skip(self) -> None:
         """Nothing can be sent now: forget what waits, but not that the position jumped."""
         while self._waiting:

@@ -87,6 +87,7 @@ class Flight:
         self.clock_error_ns = 0
         self.origin: tuple[float, float, float] | None = None
         self.north_m = 0.0
+        self.ekf_north_m = 0.0
         self.reset_next = False
         self.latency_ms = 50
         self.sees = True
@@ -146,7 +147,9 @@ class Flight:
             yaw = self.yaw(self.now_ns)
             self._say(mavlink.MAVLink_attitude_message(boot_ms, 0.0, 0.0, yaw, 0.0, 0.0, TURN_RATE))
             self._say(
-                mavlink.MAVLink_local_position_ned_message(boot_ms, 0.0, 0.0, -500.0, 0, 0, 0)
+                mavlink.MAVLink_local_position_ned_message(
+                    boot_ms, self.ekf_north_m, 0.0, -500.0, 0, 0, 0
+                )
             )
         while self._answered < len(self.link.sent):
             _, message, _ = self.link.sent[self._answered]

@@ -44,7 +44,7 @@ def test_five_minutes_without_a_link(flight: Flight) -> None:
     assert before.reset_counter == 0
     flight.link.open = False
     flight.run(100.0)
-    flight.north_m, flight.reset_next = 25.0, True
+    flight.north_m, flight.ekf_north_m, flight.reset_next = 25.0, 25.0, True
     flight.run(200.0)
     lost_ns = flight.now_ns
     assert max(flight.waiting().values()) <= 256
@@ -377,6 +377,25 @@ def test_every_field_of_every_message_at_its_extremes_raises_nothing(flight: Fli
     flight.run(30.0)
     assert len(flight.vision(flight.now_ns - 10 * SECOND)) > 90
     assert flight.attitude_error() < 0.005
+
+
+@pytest.mark.parametrize("taken_at", [1, 2, 4, None])
+def test_a_jump_that_the_ekf_missed_is_announced_again(
+    flight: Flight, taken_at: int | None
+) -> None:
+    """ArduPilot's EKF misses the new reset_counter where two messages arrive in one of its steps.
+
+    taken_at: the value of the counter at which this one takes it; None: never.
+    """
+    flight.north_m, flight.reset_next = 10.0, True
+    for _ in range(200):
+        flight.run(0.1)
+        counters = {m.reset_counter for _, m in flight.vision()}
+        if taken_at in counters:
+            flight.ekf_north_m = 10.0
+    assert counters == set(range((taken_at or 6) + 1))  # six: announced, and five times again
+    again = [t for t in flight.texts if "missed a jump" in t]
+    assert len(again) == flight.side.counters["jumps_repeated"] == (taken_at or 6) - 1
 
 
 def test_a_flood_of_targets_and_commands_leaves_a_slow_link_to_positions(flight: Flight) -> None:
