@@ -5,7 +5,7 @@ import pytest
 
 from localizer.pose import so3_log
 from sitl.embedded.geodesy import Location
-from sitl.flight import mission
+from sitl.flight_script import mission
 from sitl.kinematic import camera_path
 from sitl.scenario import Leg, Scenario, ScenarioError, check_inside, load_scenario
 
