@@ -17,7 +17,9 @@ import numpy as np
 
 from companion.build import MapStack, build_localizer
 from companion.config import CompanionConfig
+from companion.coverage import check_origin
 from companion.detections import Detection, DetectionListener
+from companion.errors import ConfigError
 from companion.fixes import camera_rotation, vehicle_prior, vision_fix
 from companion.health import HealthMonitor
 from companion.recorder import Recorder, fresh_folder, remove_empty, write_manifest
@@ -25,6 +27,7 @@ from companion.sources import StreamState, open_source
 from companion.target_reporter import Target, TargetReporter
 from companion.view_reporter import ViewReporter
 from localizer.engine import DualThreadEngine
+from localizer.map.cache import TileCache
 from localizer.map.surface import MapSurface
 from localizer.pose import Array
 from localizer.types import PoseEstimate, PosePrior, ReferenceBundle, TrackingState
@@ -87,6 +90,7 @@ class Companion:
         self._lever_arm = np.array(config.camera.lever_arm_m)
         self._stack = MapStack(config.map, config.localizer)
         up.callback(self._stack.close)
+        _require_origin_at_map(config, self._stack.cache)
         manifest = self._stack.cache.manifest
         self._frame = self._stack.cache.frame
         self._geoid_separation_m = manifest.geoid_separation_m
@@ -259,6 +263,14 @@ class Companion:
         _log.log(logging.WARNING if level == "warning" else logging.INFO, "%s", text)
         if self._recorder is not None:
             self._recorder.event(level, text)
+
+
+def _require_origin_at_map(config: CompanionConfig, cache: TileCache) -> None:
+    """The vehicle keeps an origin until it is switched off: a wrong one must never be sent."""
+    if config.bridge.origin is not None:
+        finding = check_origin(config.bridge.origin, cache)
+        if not finding.ok:
+            raise ConfigError(f"bridge.origin: {finding.found} (needed {finding.needed})")
 
 
 def _bridge_config(config: CompanionConfig) -> BridgeConfig:

@@ -1,4 +1,4 @@
-"""Is there a map under the mission? Its places and the straight ways between them."""
+"""Is there a map under the mission, its places and straight ways, and under the EKF's origin?"""
 
 from __future__ import annotations
 
@@ -10,11 +10,14 @@ import numpy as np
 from localizer.geo import LocalFrame
 from localizer.map.cache import TileCache
 from localizer.pose import Array
+from mavlink_bridge.config import OriginConfig
 from mavlink_bridge.doctor import Finding
 from mavlink_bridge.mission import Waypoint
 
 _STEP_M = 25.0
 _NAME = "mission"
+_ORIGIN_KM = 50.0  # a take-off far from the map is odd, another country is a typing error
+_ORIGIN_HEIGHT_M = 300.0
 _NEEDED = "inside the map"
 
 
@@ -69,3 +72,20 @@ def _listed(numbers: Sequence[int]) -> str:
     """A list that fits the table."""
     shown = ", ".join(str(n) for n in numbers[:8])
     return shown if len(numbers) <= 8 else f"{shown} and {len(numbers) - 8} more"
+
+
+def check_origin(origin: OriginConfig, cache: TileCache) -> Finding:
+    """An origin with a wrong digit puts the EKF on another continent or under the ground, and the
+    vehicle takes no second one.
+    """
+    m = cache.manifest
+    ground = origin.altitude_amsl_m + m.geoid_separation_m
+    place = cache.frame.enu_from_geodetic(origin.latitude_deg, origin.longitude_deg, ground)
+    low, high = cache.index.box_min[0, :2], cache.index.box_max[0, :2]
+    away_km = float(np.linalg.norm(np.maximum(low - place[:2], place[:2] - high).clip(0.0))) / 1000
+    bottom, top = m.height_range_m
+    off_m = max(bottom - ground, ground - top, 0.0)
+    good = away_km <= _ORIGIN_KM and off_m <= _ORIGIN_HEIGHT_M
+    found = f"{away_km:.1f} km beside and {off_m:.0f} m above or below the map"
+    needed = f"<= {_ORIGIN_KM:.0f} km and {_ORIGIN_HEIGHT_M:.0f} m"
+    return Finding("bridge.origin", found, needed, "the take-off ground, altitude AMSL", good, True)

@@ -6,26 +6,21 @@ import threading
 from collections.abc import Iterable
 from pathlib import Path
 
-import numpy as np
-
 from companion.build import MapStack, build_localizer
 from companion.config import CompanionConfig
-from companion.coverage import check_mission
+from companion.coverage import check_mission, check_origin
 from companion.errors import CompanionError
 from companion.sources import SourceSettings, open_source
 from localizer.errors import LocalizerError
 from localizer.features.extractor import load_extractor
 from localizer.geo import LocalFrame
 from localizer.map.cache import TileCache
-from mavlink_bridge.config import OriginConfig
 from mavlink_bridge.doctor import Diagnosis, Finding, examine
 from mavlink_bridge.errors import BridgeError
 from mavlink_bridge.mission import download_mission
 
 _FEED_S = 8.0
 _MIN_RATE_HZ = 5.0
-_ORIGIN_KM = 50.0  # a take-off far from the map is odd, another country is a typing error
-_ORIGIN_HEIGHT_M = 300.0
 _GOVERNOR = Path("/sys/devices/system/cpu/cpu0/cpufreq/scaling_governor")
 
 
@@ -34,7 +29,7 @@ def examine_deployment(config: CompanionConfig, *, vehicle: bool = True) -> Diag
     cache, findings = _check_map(config)
     findings += [_check_localizer(config, cache is not None), _check_camera(config), _check_power()]
     if cache is not None and config.bridge.origin is not None:
-        findings.append(_check_origin(config.bridge.origin, cache))
+        findings.append(check_origin(config.bridge.origin, cache))
     if vehicle:
         found = examine(config.bridge).findings
         findings += found
@@ -56,21 +51,6 @@ def _check_map(config: CompanionConfig) -> tuple[TileCache | None, list[Finding]
         f"about {origin.latitude_deg:.5f} {origin.longitude_deg:.5f}"
     )
     return cache, [Finding("map", found, "a tile cache", "", True, True)]
-
-
-def _check_origin(origin: OriginConfig, cache: TileCache) -> Finding:
-    """An origin with a wrong digit puts the EKF on another continent or under the ground."""
-    m = cache.manifest
-    ground = origin.altitude_amsl_m + m.geoid_separation_m
-    place = cache.frame.enu_from_geodetic(origin.latitude_deg, origin.longitude_deg, ground)
-    low, high = cache.index.box_min[0, :2], cache.index.box_max[0, :2]
-    away_km = float(np.linalg.norm(np.maximum(low - place[:2], place[:2] - high).clip(0.0))) / 1000
-    bottom, top = m.height_range_m
-    off_m = max(bottom - ground, ground - top, 0.0)
-    good = away_km <= _ORIGIN_KM and off_m <= _ORIGIN_HEIGHT_M
-    found = f"{away_km:.1f} km beside and {off_m:.0f} m above or below the map"
-    needed = f"<= {_ORIGIN_KM:.0f} km and {_ORIGIN_HEIGHT_M:.0f} m"
-    return Finding("bridge.origin", found, needed, "the take-off ground, altitude AMSL", good, True)
 
 
 def _check_mission(config: CompanionConfig, cache: TileCache) -> Finding:

@@ -7,9 +7,11 @@ import threading
 
 import cv2
 import numpy as np
+import pytest
 
 from companion.app import Companion
 from companion.config import parse_config
+from companion.errors import ConfigError
 from mavlink_bridge.link import sleep_until
 from mavlink_bridge.messages import without_figures
 from sitl.embedded.geodesy import Location
@@ -17,6 +19,21 @@ from sitl.vehicles import GIMBAL, EmbeddedSitl, vision_parameters
 
 HOME = Location(47.397742, 8.545594, 488.0)
 MODEL = {"width": 160, "height": 120, "fx": 140, "fy": 140, "cx": 80, "cy": 60}
+
+
+def test_an_origin_far_from_the_map_is_never_sent(small_assets, tmp_path):
+    """0, 0 or a wrong digit: the vehicle would keep it until it is switched off."""
+    origin = {"latitude_deg": 0.0, "longitude_deg": 0.0, "altitude_amsl_m": 0.0}
+    config = parse_config(
+        {
+            "map": str(small_assets.map_cache),
+            "camera": {"source": "udp://127.0.0.1:5", "model": MODEL},
+            "bridge": {"connection": "tcp:127.0.0.1:9", "origin": origin},
+        },
+        "test",
+    )
+    with pytest.raises(ConfigError, match=r"bridge\.origin: \d+\.\d km beside"):
+        Companion(config).run()
 
 
 def test_what_happens_is_logged_and_recorded_once_and_every_thread_ends(
