@@ -9,7 +9,7 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from sitl.embedded import dynamics
 from sitl.embedded.arming import ArmingContext, arming_failures
-from sitl.embedded.estimator import CRITICAL, Estimator
+from sitl.embedded.estimator import Estimator
 from sitl.embedded.geodesy import Location
 from sitl.embedded.gimbal import Gimbal
 from sitl.embedded.injection import Injection
@@ -21,6 +21,7 @@ from sitl.embedded.modes import FlightModes
 from sitl.embedded.parameters import Parameters
 from sitl.embedded.rotation import Array
 from sitl.embedded.sensors import GpsSample, Sensors
+from sitl.embedded.severity import CRITICAL
 
 _GPS_FIX_AFTER_S = 30.0  # a cold start; with the filter's 10 s of checks ArduPilot's 42 s
 GPS_SIMULATED = (1, 2)  # GPS1_TYPE auto and u-blox read the simulated receiver

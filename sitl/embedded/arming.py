@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from sitl.embedded.estimator import EXTERNAL, GPS, Estimator
+from sitl.embedded.aided_filter import EXTERNAL, GPS
+from sitl.embedded.estimator import Estimator
 from sitl.embedded.parameters import Parameters
 
 _ALL, _GPS_CHECK, _INS, _VISION = 1, 1 << 3, 1 << 4, 1 << 18  # ARMING_CHECK

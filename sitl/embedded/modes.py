@@ -12,12 +12,13 @@ import numpy as np
 from sitl.embedded import mission as mis
 from sitl.embedded.controller import Carrot, Limits, PositionController, Vector
 from sitl.embedded.dynamics import GRAVITY, MASS, MOTOR_MAX
-from sitl.embedded.estimator import CRITICAL, INFO, Estimator
+from sitl.embedded.estimator import Estimator
 from sitl.embedded.geodesy import Location
 from sitl.embedded.gimbal import Gimbal
 from sitl.embedded.loop import TICK_S
 from sitl.embedded.parameters import Parameters
 from sitl.embedded.rotation import Array, euler, quaternion, wrap_pi
+from sitl.embedded.severity import CRITICAL, INFO
 
 _LAND_FINAL_HEIGHT = 10.0  # m; below it LAND_SPEED
 _CHECKS_TO_FAIL = 10  # consecutive 10 Hz checks before the EKF failsafe (ekf_check)

@@ -8,8 +8,9 @@ import numpy as np
 import pytest
 
 from sitl.embedded import navigation as nav
+from sitl.embedded.aided_filter import Aiding
 from sitl.embedded.dynamics import GRAVITY
-from sitl.embedded.estimator import Aiding, EkfFlags, Estimator
+from sitl.embedded.estimator import EkfFlags, Estimator
 from sitl.embedded.geodesy import METRES_PER_DEGREE, Location, north_east
 from sitl.embedded.measurements import Baro, ExternalPosition, ExternalVelocity, GpsData
 from sitl.embedded.parameters import Parameters

@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 
 from sitl.embedded import mission as mis
-from sitl.embedded.estimator import Aiding, EkfFlags
+from sitl.embedded.aided_filter import Aiding
+from sitl.embedded.estimator import EkfFlags
 from sitl.embedded.mission import MissionItem
 from sitl.embedded.modes import Mode
 
