@@ -49,7 +49,7 @@ def build(
         bool, typer.Option(help="leave out tiles that cannot be imported instead of failing")
     ] = False,
     overwrite: Annotated[bool, typer.Option(help="replace a cache that is there")] = False,
-    workers: Annotated[int | None, typer.Option(help="processes; one per core")] = None,
+    workers: Annotated[int | None, typer.Option(min=1, help="processes; one per core")] = None,
     scheduler: Annotated[
         str | None, typer.Option(help="address of a Dask scheduler that shares the file system")
     ] = None,
@@ -73,7 +73,8 @@ def build(
     Console().print(
         f"[green]{escape(str(out))}[/] from {escape(manifest.source)}: {manifest.tiles} tiles, "
         f"{manifest.triangles} triangles, {manifest.gsd_m:.3f} m texels, "
-        f"{manifest.bytes / 1e6:.1f} MB"
+        f"{manifest.bytes / 1e6:.1f} MB",
+        soft_wrap=True,
     )
     if manifest.skipped:
         Console().print(f"[yellow]{len(manifest.skipped)} source tiles were left out")

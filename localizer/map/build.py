@@ -12,7 +12,7 @@ import numpy as np
 from localizer.errors import GeoreferenceError, MapSourceError
 from localizer.geo import Geodetic, LocalFrame, geodetic_from_ecef
 from localizer.map.assembly import assemble
-from localizer.map.cache import Manifest
+from localizer.map.cache import HIGHEST_GEOID_M, LOWEST_GEOID_M, Manifest
 from localizer.map.georeference import Georeference, UpAxis
 from localizer.map.importing import ImportJob, import_all, tiles_of
 from localizer.map.reading import find_source, read_source
@@ -144,7 +144,7 @@ def _geoid_separation(tree: SourceTree, given: float | None, source: str) -> flo
             f"{source} does not say how high the geoid is above the WGS84 ellipsoid there; give "
             "the geoid separation in metres (e.g. from an EGM96 or EGM2008 calculator)"
         )
-    if not -120 <= value <= 100:
+    if not LOWEST_GEOID_M <= value <= HIGHEST_GEOID_M:
         raise GeoreferenceError(f"a geoid separation of {value} m does not occur on Earth")
     return value
 

@@ -14,7 +14,7 @@ import numpy as np
 import safetensors
 import safetensors.numpy
 from numpy.typing import NDArray
-from pydantic import BaseModel, ConfigDict, ValidationError
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from localizer.errors import GeoreferenceError, MapCacheError
 from localizer.geo import Geodetic, LocalFrame
@@ -25,6 +25,9 @@ from localizer.types import Float32, Image
 FORMAT_VERSION = 1
 MANIFEST_NAME = "manifest.json"
 INDEX_NAME = "index.safetensors"
+# The geoid lies -107 to 86 m above the WGS84 ellipsoid (EGM2008).
+LOWEST_GEOID_M, HIGHEST_GEOID_M = -120.0, 100.0
+_PLACE_M = 1.0  # by which a tile's middle may lie outside its node's box: rounding is less
 _JPEG_QUALITY = 92
 _LOSSLESS_BELOW = 64  # texels; small palettes are stored as PNG, JPEG would smear them
 
@@ -39,12 +42,12 @@ class Manifest(BaseModel):
     with the reason; index_sha256: hash of the index, which holds the tiles' hashes.
     """
 
-    model_config = ConfigDict(frozen=True, extra="forbid")
+    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
 
     format_version: int = FORMAT_VERSION
     origin: Geodetic
     vertical_datum: Literal["ellipsoidal", "amsl"]
-    geoid_separation_m: float
+    geoid_separation_m: float = Field(ge=LOWEST_GEOID_M, le=HIGHEST_GEOID_M)
     source: str
     attribution: str
     gsd_m: float
@@ -145,6 +148,7 @@ class TileCache:
             index = TileIndex(**safetensors.numpy.load(data))
         except (safetensors.SafetensorError, TypeError, ValueError) as error:
             raise MapCacheError(f"{path / INDEX_NAME}: not a tile index: {error}") from error
+        _check_together(path / MANIFEST_NAME, manifest, index)
         return cls(path, manifest, index)
 
     @cached_property
@@ -273,5 +277,28 @@ def _read_manifest(path: Path) -> Manifest:
         )
     try:
         return Manifest.model_validate(data)
-    except (ValidationError, GeoreferenceError) as error:
+    except ValidationError as error:
+        faults = [f"{'.'.join(map(str, e['loc']))}: {e['msg']}" for e in error.errors()]
+        raise MapCacheError(f"{where}: not a manifest: {'; '.join(faults)}") from error
+    except GeoreferenceError as error:
         raise MapCacheError(f"{where}: not a manifest: {error}") from error
+
+
+def _check_together(where: Path, manifest: Manifest, index: TileIndex) -> None:
+    """Whether the manifest is the index's own: nothing else guards it against an edit, and boxes
+    about another origin would let the view lose its tiles.
+    """
+    if manifest.tiles != len(index.size):
+        raise MapCacheError(
+            f"{where}: {manifest.tiles} tiles, the index has {len(index.size)}; build it again"
+        )
+    node = np.repeat(np.arange(len(index.tile_count)), index.tile_count)
+    first = np.cumsum(index.tile_count) - index.tile_count
+    tile = index.tile_start[node] + np.arange(len(node)) - first[node]
+    frame = LocalFrame(manifest.origin)
+    middle = frame.ecef_from_enu.inverse.apply(index.ecef_from_tile[tile, :3, 3])
+    low, high = index.box_min[node] - _PLACE_M, index.box_max[node] + _PLACE_M
+    if not ((low <= middle) & (middle <= high)).all():
+        raise MapCacheError(
+            f"{where}: its origin is not the one that the index was made about; build it again"
+        )

@@ -112,7 +112,10 @@ def staging(out: Path, parameters: dict[str, Any], *, overwrite: bool) -> Iterat
     if out.exists() and not (out / MANIFEST_NAME).is_file() and not _is_empty(out):
         raise MapCacheError(f"{out} is no tile cache and is not overwritten; choose another folder")
     folder = out.with_name(out.name + ".building")
-    folder.mkdir(parents=True, exist_ok=True)
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise MapCacheError(f"{folder}: cannot be made: {error.strerror}") from error
     with (folder / "lock").open("w") as lock:
         try:
             fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
