@@ -12,7 +12,8 @@ test: $(VENV)/.dev
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
-	$(BIN)/pytest $(ARGS)
+	OMP_NUM_THREADS=1 $(BIN)/pytest -n auto --dist loadfile -m "not alone and not long"
+	$(BIN)/pytest -m "alone and not long"
 
 setup: $(VENV)/.dev
 

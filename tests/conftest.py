@@ -63,23 +63,23 @@ def small_assets(tmp_path_factory: pytest.TempPathFactory) -> FlightAssets:
 
 @pytest.fixture
 def real_time() -> Callable[[], AbstractContextManager[None]]:
-    """``with real_time():`` around a flight that needs two processors for as long as it takes.
+    """``with real_time():`` around what needs two processors while it runs (a test `alone`).
 
-    A starved companion lands its vehicle, as it should: that says nothing of the code. So it skips,
-    with what was measured, where other work leaves no time before the flight, or none after one
-    that failed; a flight that fails on a machine with room is a failure.
+    A starved companion lands its vehicle, as it should, and a starved receiver is late: that says
+    nothing of the code. So it skips, with what was measured, where other work leaves no time before
+    it, or none after it failed; a failure on a machine with room is a failure.
     """
 
     @contextmanager
-    def flight() -> Iterator[None]:
-        _skip_if_starved("before the flight")
+    def guarded() -> Iterator[None]:
+        _skip_if_starved("before the test")
         try:
             yield
         except (AssertionError, SimulationError) as error:
-            _skip_if_starved(f"after a flight that failed ({error})")
+            _skip_if_starved(f"after it failed ({error})")
             raise
 
-    return flight
+    return guarded
 
 
 def _skip_if_starved(when: str) -> None:
@@ -87,7 +87,7 @@ def _skip_if_starved(when: str) -> None:
     if share < 0.65:
         pytest.skip(
             f"two processes got {100 * share:.0f} % of two cores {when}: other work (load average "
-            f"{os.getloadavg()[0]:.0f}) leaves no time for a flight in real time"
+            f"{os.getloadavg()[0]:.0f}) leaves no time for what runs in real time"
         )
 
 

@@ -169,10 +169,13 @@ def horizontal(a: Location, b: Location) -> float:
     return math.hypot(*a.ned_of(b)[:2])
 
 
-@pytest.mark.flight
-def test_flies_a_mission_on_gps_and_then_on_vision(kind):
+@pytest.mark.alone
+def test_flies_a_mission_on_gps_and_then_on_vision(real_time, kind):
     parameters = {**vision_parameters(), **GIMBAL, **SPEEDS}
-    with open_vehicle(kind, HOME, 30.0, parameters, speedup=SPEEDUP) as vehicle:
+    with (
+        real_time(),
+        open_vehicle(kind, HOME, 30.0, parameters, speedup=SPEEDUP) as vehicle,
+    ):
         pilot = Pilot(vehicle.gcs_endpoint, SPEEDUP, vehicle.check)
         with pilot:
             feed = TruthFeed(pilot, vehicle.companion_endpoint, FixModel(sigma_m=0.3))

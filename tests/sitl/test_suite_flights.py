@@ -19,7 +19,7 @@ from sitl.process import VehicleKind
 from sitl.suite.case import load_cases
 from sitl.suite.runner import Row, run_case, run_suite
 
-pytestmark = pytest.mark.flight
+pytestmark = pytest.mark.alone
 CASES = load_cases()
 FEW = [case for case in CASES if case.ci]
 REST = [case for case in CASES if not case.ci]
