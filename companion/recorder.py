@@ -190,10 +190,9 @@ class Recorder:
     def _write(self, name: str, row: Iterable[Any]) -> None:
         if name == "snapshot":
             (frame,) = row
-            bgr = cv2.cvtColor(frame.image, cv2.COLOR_RGB2BGR)
-            path = self._snapshots / f"{frame.exposure_time_ns}.jpg"
-            if not cv2.imwrite(str(path), bgr):
-                raise OSError(f"{path} was not written")
+            # Not imwrite, which does not tell why it could not.
+            _, jpeg = cv2.imencode(".jpg", cv2.cvtColor(frame.image, cv2.COLOR_RGB2BGR))
+            (self._snapshots / f"{frame.exposure_time_ns}.jpg").write_bytes(jpeg.tobytes())
         elif name:
             self._writers[name].writerow(row)
 

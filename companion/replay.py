@@ -102,7 +102,10 @@ def load_record(folder: Path) -> FlightRecord:
         config = parse_config(manifest["config"], str(folder / MANIFEST_NAME))
         with (folder / "estimates.csv").open(newline="", encoding="utf-8") as file:
             estimates = tuple(_estimate(row) for row in _whole_rows(file))
-    except (OSError, ValueError, KeyError, TypeError, ArithmeticError, csv.Error) as error:
+    # RecursionError: endless nesting.
+    except (
+        OSError, ValueError, KeyError, TypeError, ArithmeticError, RecursionError, csv.Error
+    ) as error:  # fmt: skip
         raise RecordError(f"{folder}: not a flight's record: {error}") from error
     if not estimates:
         raise RecordError(f"{folder}: holds no estimate; nothing was localized in that flight")
@@ -127,7 +130,7 @@ def _estimate(row: dict[str, str]) -> RecordedEstimate:
     exposure_ns = int(row["exposure_time_ns"])
     q = np.array([float(row[k]) for k in ("qw", "qx", "qy", "qz")])
     t = np.array([float(row[k]) for k in ("east_m", "north_m", "up_m")])
-    if not np.isfinite([*q, *t]).all() or not np.any(q):
+    if not np.isfinite([*q, *t]).all() or not np.any(q) or not 0 <= exposure_ns < 1 << 63:
         raise ValueError(f"estimates.csv: the estimate at {exposure_ns} is no pose")
     return RecordedEstimate(
         exposure_ns,

@@ -161,6 +161,12 @@ def test_what_a_record_lacks_is_named(record, tmp_path):
         list(read_tlog(tmp_path / "no.tlog"))
 
 
+def test_a_manifest_that_nests_without_end_is_named(tmp_path):
+    (tmp_path / "record.json").write_text(100_000 * "[")
+    with pytest.raises(RecordError, match="not a flight's record"):
+        load_record(tmp_path)
+
+
 def test_the_manifest_dates_the_tlog_and_says_what_flew(record):
     manifest = json.loads((record / "record.json").read_text())
     assert manifest["config"]["localizer"]["width"] == 256
@@ -193,8 +199,10 @@ def test_a_row_that_a_loss_of_power_cut_short_is_left_out(record, tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("column", "value"), [("latency_ms", "inf"), ("qw", "nan"), ("east_m", "x"), ("sequence", "")]
-)
+    ("column", "value"),
+    [("latency_ms", "inf"), ("qw", "nan"), ("east_m", "x"), ("sequence", ""),
+     ("exposure_time_ns", 400 * "9"), ("exposure_time_ns", "-1")],
+)  # fmt: skip
 def test_a_row_that_is_no_estimate_is_named(record, tmp_path, column, value):
     folder = _copy_of(record, tmp_path)
     rows = _rows(record)
