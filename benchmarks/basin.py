@@ -1,7 +1,7 @@
 """Convergence of the registration: the paper's Table 4 (ablation), Table 6 and Fig. 10 (basin).
 
-    python benchmarks/basin.py ablation FOLDER [--set generated|quito|portugal|caliterra]
-    python benchmarks/basin.py priors FOLDER [--set ...]
+    python benchmarks/basin.py ablation FOLDER [--set generated|plain|quito|portugal|caliterra]
+    python benchmarks/basin.py priors FOLDER [--set ...] [--anchors N]
     python benchmarks/basin.py axes FOLDER [--set ...] [--plot basin.png]
 
 FOLDER keeps generated worlds, imported maps and query images between runs. Every registration
@@ -21,7 +21,7 @@ from pathlib import Path
 import basin_axes
 from arguments import Parser, existing, number, output, whole
 from basin_run import Outcome, Start, groups, random_start, run, summary
-from basin_variants import FULL, our_rows, paper_rows, prior_rows
+from basin_variants import DEFAULT_ANCHORS, FULL, our_rows, paper_rows, prior_rows
 from basin_views import View, load_views
 from named_errors import named_errors
 
@@ -44,7 +44,7 @@ def views_of(args: argparse.Namespace) -> list[View]:
 def ablation(args: argparse.Namespace) -> list[Outcome]:
     """Table 4, or the priors: one line a variant and start."""
     views = views_of(args)
-    rows = prior_rows() if args.what == "priors" else paper_rows() + our_rows()
+    rows = prior_rows(args.anchors) if args.what == "priors" else paper_rows() + our_rows()
     if args.only:
         rows = [v for v in rows if any(text in v.name for text in args.only) or v.name == FULL]
     outcomes = run(
@@ -92,6 +92,7 @@ def main() -> None:
     parser.add_argument(
         "--starts", nargs="+", type=number(0.01, 90), default=STARTS, help="m and degrees"
     )
+    parser.add_argument("--anchors", type=int, default=DEFAULT_ANCHORS, help="N of `priors`")
     parser.add_argument("--only", nargs="*", help="variants whose name contains one of these")
     parser.add_argument("--plot", type=output, help="PNG of the axes' curves")
     parser.add_argument("--json", type=output, help="every outcome")

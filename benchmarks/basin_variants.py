@@ -106,7 +106,7 @@ def paper_rows() -> list[Variant]:
     """Table 4's system rows: the paper's optimizer, without anything of ours."""
     paper = JNGOConfig(
         hypotheses=1, keep=(144, 144), iterations=(2, 3, 4), sharpen=0,
-        swarm_anchors=(500, 500, 500), distinct_px=0.0,
+        swarm_anchors=(500, 500, 500),
     )  # fmt: skip
     swarm = paper.model_copy(update={"hypotheses": 144})
 
@@ -133,7 +133,6 @@ def our_rows() -> list[Variant]:
         Variant("without motion term", motion=False),
         changed("no halving: all 144 to the end", keep=(144, 144)),
         changed("halving to 32 and 8", keep=(32, 8)),
-        changed("survivors may repeat", distinct_px=0.0),
         changed("10 iterations at the end, not 4", iterations=(2, 3, 10)),
         Variant("without detail level", detail=False),
         Variant("without detail level, N = 2000", anchors=2000, detail=False),
@@ -151,17 +150,19 @@ def our_rows() -> list[Variant]:
     ]
 
 
-def prior_rows() -> list[Variant]:
+def prior_rows(anchors: int = DEFAULT_ANCHORS) -> list[Variant]:
     """Priors as residuals (section 9 of the specification), with the noise that they claim."""
-    return [
+    rows = [
         Variant(FULL),
         Variant("attitude 0.2° tilt, 1° heading", constraint=partial(_attitude, 0.2, 1.0)),
         Variant("attitude 0.7° tilt, 4° heading", constraint=partial(_attitude, 0.7, 4.0)),
         Variant("height 1 m", constraint=partial(_height, 1.0)),
         Variant("height 5 m", constraint=partial(_height, 5.0)),
+        Variant("position 0.5 m", constraint=partial(_position, 0.5)),
         Variant("position 2 m", constraint=partial(_position, 2.0)),
         Variant("all: 0.7° 4° 5 m 2 m", constraint=_everything),
     ]
+    return [replace(row, anchors=anchors) for row in rows]
 
 
 def _attitude(

@@ -27,8 +27,8 @@ class Registration:
 
     covariance: (6, 6) as `PosePrior`'s. score: mean Huber cost, lower is
     better, inf on failure.
-    overlap: share of the anchors in view. quality: 0 (no better than chance) to 1. modes: distinct
-    surviving poses. evaluations: cost evaluations spent.
+    overlap: share of the anchors in view. quality: 0 (no better than chance) to 1.
+    evaluations: cost evaluations spent.
     """
 
     world_from_camera: Pose
@@ -37,7 +37,6 @@ class Registration:
     overlap: float
     quality: float
     status: RegistrationStatus
-    modes: int
     evaluations: int
 
 
@@ -85,7 +84,6 @@ def registration(found: Found, config: JNGOConfig, prior: PosePrior, origin: Arr
         float(found.overlaps[0]),
         found.quality,
         RegistrationStatus.OK,
-        int(np.isfinite(found.scores).sum()),
         found.evaluations,
     )
 
@@ -93,5 +91,5 @@ def registration(found: Found, config: JNGOConfig, prior: PosePrior, origin: Arr
 def failure(prior: PosePrior, status: RegistrationStatus, evaluations: int = 0) -> Registration:
     """The prior, with the reason why there is nothing better."""
     return Registration(
-        prior.world_from_camera, prior.covariance, np.inf, 0.0, 0.0, status, 0, evaluations
+        prior.world_from_camera, prior.covariance, np.inf, 0.0, 0.0, status, evaluations
     )
