@@ -5,14 +5,14 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from localizer.pose import Array
 from localizer.registration.backend import LevelProblem, LMSettings
 from localizer.registration.covariance import curvature_ratio, curvature_steps, mean_motion
 from localizer.registration.cuda import layout
-from localizer.registration.cuda.backend import FEW, CudaBackend, set_loss
+from localizer.registration.cuda.backend import CudaBackend
 from localizer.registration.cuda.memory import PROBES, FrameMemory
+from localizer.registration.cuda.steps import Step
 from localizer.registration.reference import in_view, project, projection_jacobian, retractions
 from localizer.types import Float32
 
@@ -39,17 +39,15 @@ def winner_motion(problem: LevelProblem, rotation: Array, translation: Array) ->
 def winner_curvature(
     backend: CudaBackend,
     memory: FrameMemory,
-    refining: NDArray[np.void],
+    refining: Step,
     channels: int,
     pose: tuple[Array, Array],
     motion: Array,
     hessian: Array,
-    settings: LMSettings,
     distance_px: float,
 ) -> float:
     """Equation 11a about a pose camera_from_local (rotation, translation), with the frame that
-    `memory` holds. refining: arguments of the LM kernel on the winner's level. Under the
-    backend's lock.
+    `memory` holds. refining: the launch that scores `memory.probes`. Under the backend's lock.
     """
     device, steps = backend.device, curvature_steps(motion, distance_px)
     rotations, translations = retractions(*pose, steps)
@@ -61,11 +59,9 @@ def winner_curvature(
         (memory.probe_state, state),
     ):
         device.upload(address, values)
-    arguments = refining.copy()
-    arguments["swarm"], arguments["state"] = memory.probes, memory.probe_state
-    set_loss(arguments, settings, 0)
-    name, threads = ("refine_few", 512) if PROBES <= FEW else ("refine_many", 256)
-    backend.kernels(channels).launch(name, PROBES, threads, arguments)
+    arguments = refining.arguments.copy()
+    arguments["state"] = memory.probe_state
+    backend.kernels(channels).launch(refining.kernel, PROBES, refining.threads, arguments)
     scores = np.empty(PROBES)
     device.download(scores, int(memory.probes["scores"]))
     device.synchronize()

@@ -8,7 +8,6 @@ scores, the sums of equation 11, and the quality.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -19,13 +18,12 @@ from localizer.device_array import DeviceArray
 from localizer.pose import Array
 from localizer.registration.backend import (
     LevelProblem,
-    LMSettings,
     QuadraticPrior,
     level_intrinsics,
 )
 from localizer.registration.config import JNGOConfig
 from localizer.registration.cuda import layout
-from localizer.registration.cuda.backend import FEW, CudaBackend, set_loss, stored
+from localizer.registration.cuda.backend import CudaBackend, stored
 from localizer.registration.cuda.curvature import (
     geometry,
     last_settings,
@@ -34,13 +32,14 @@ from localizer.registration.cuda.curvature import (
 )
 from localizer.registration.cuda.driver import Graph
 from localizer.registration.cuda.memory import PROBES, FrameMemory
-from localizer.registration.selection import LEAST_SCORE
+from localizer.registration.cuda.steps import (
+    COVARIANCE_ANCHORS,
+    KERNELS,
+    Shape,
+    launches,
+    refining,
+)
 from localizer.types import Anchors, FeatureLevel, FeaturePyramid, PosePrior
-
-COVARIANCE_ANCHORS = 1000
-LEAST_SCALE = 0.02
-_MANY_THREADS, _FEW_THREADS, _SMALL_THREADS = 256, 512, 256
-_FINITE_BLOCKS_PER_MULTIPROCESSOR = 4
 
 
 @dataclass(frozen=True)
@@ -70,25 +69,13 @@ class Search:
     graph_ms: float
 
 
-@dataclass(frozen=True)
-class _Shape:
-    """What a captured graph depends on."""
-
-    config: JNGOConfig
-    hypotheses: int
-    channels: tuple[int, ...]
-    constrained: bool
-    cell_px: float
-    generation: int
-
-
 class CudaSchedule:
     """Runs `JNGO`'s schedule on a `CudaBackend`, whose device, kernels and lock it shares."""
 
     def __init__(self, backend: CudaBackend, *, timed: bool = False) -> None:
         self._backend, self._device = backend, backend.device
         self._timed = timed
-        self._graph: tuple[_Shape, Graph] | None = None
+        self._graph: tuple[Shape, Graph] | None = None
 
     def run(
         self,
@@ -114,7 +101,7 @@ class CudaSchedule:
             memory = self._memory(len(channels), len(swarm[0]), config, len(anchors.points_world))
             self._upload(memory, query, camera, anchors, origin, swarm, config, motion, constraint)
             cell_px = config.correlation_px / query.levels[-1].stride
-            shape = _Shape(
+            shape = Shape(
                 config, len(swarm[0]), channels, constraint is not None, cell_px,
                 backend.arena.generation,
             )  # fmt: skip
@@ -139,7 +126,7 @@ class CudaSchedule:
     def _with_curvature(
         self,
         found: Search,
-        shape: _Shape,
+        shape: Shape,
         memory: FrameMemory,
         level: int,
         seen: LevelProblem,
@@ -152,17 +139,17 @@ class CudaSchedule:
         pose = found.rotations[0], found.translations[0]
         motion = winner_motion(few, *pose)
         settings = last_settings(c.settings, scale)
-        step = _refining(
+        step = refining(
             shape, memory, level, memory.probes, PROBES, 0 if c.sharpen else wanted, settings, 0,
             free=True,
         )  # fmt: skip
         curvature = winner_curvature(
-            self._backend, memory, step.arguments, shape.channels[level], pose, motion,
-            found.hessian, settings, c.curvature_px,
+            self._backend, memory, step, shape.channels[level], pose, motion, found.hessian,
+            c.curvature_px,
         )  # fmt: skip
         return replace(found, motion=motion, curvature=curvature)
 
-    def _captured(self, shape: _Shape, memory: FrameMemory) -> Graph:
+    def _captured(self, shape: Shape, memory: FrameMemory) -> Graph:
         if self._graph is not None and self._graph[0] == shape:
             return self._graph[1]
         if self._graph is not None:
@@ -174,8 +161,8 @@ class CudaSchedule:
         self._graph = shape, graph
         return graph
 
-    def _enqueue(self, shape: _Shape, memory: FrameMemory) -> None:
-        for step in _steps(shape, memory, self._device.multiprocessors):
+    def _enqueue(self, shape: Shape, memory: FrameMemory) -> None:
+        for step in launches(shape, memory, self._device.multiprocessors):
             kernels = self._backend.kernels(shape.channels[step.level])
             kernels.launch(step.kernel, step.blocks, step.threads, step.arguments)
 
@@ -282,137 +269,6 @@ class CudaSchedule:
             0.0,
         )
         return search, float(state["scale"])
-
-
-KERNELS = (
-    "all_finite", "refine_many", "refine_few", "select_hypotheses", "weigh_prior",
-    "median_residual", "covariance_sums", "quality",
-)  # fmt: skip
-
-
-@dataclass(frozen=True)
-class _Step:
-    """One launch of the graph; level: whose channels it is compiled for."""
-
-    kernel: str
-    level: int
-    blocks: int
-    threads: int
-    arguments: NDArray[np.void]
-
-
-def _steps(shape: _Shape, memory: FrameMemory, multiprocessors: int) -> Iterator[_Step]:
-    """The launches, in order (docs/registration.md, section 7)."""
-    c, searched = shape.config, len(shape.config.iterations)
-    levels = len(shape.channels)
-    for k in range(levels):
-        finite = np.zeros((), dtype=layout.FINITE)
-        finite["level"], finite["state"] = memory.level(k), memory.state
-        blocks = _FINITE_BLOCKS_PER_MULTIPROCESSOR * multiprocessors
-        yield _Step("all_finite", k, blocks, _SMALL_THREADS, finite)
-    alive, source = shape.hypotheses, 0
-    keep = (*c.keep[: searched - 1], c.hypotheses)
-    for k in range(searched):
-        swarm, wanted = memory.swarms[source], c.swarm_anchors[k]
-        target = 2 if k == searched - 1 else 1 - source
-        if shape.constrained:
-            yield from _weighing(shape, memory, k, swarm, alive, wanted)
-        yield _refining(shape, memory, k, swarm, alive, wanted, c.settings, c.iterations[k])
-        yield _selecting(shape, memory, k, source, target, keep[k])
-        alive, source = min(alive, keep[k]), target
-    yield from _sharpening(shape, memory)
-
-
-def _sharpening(shape: _Shape, memory: FrameMemory) -> Iterator[_Step]:
-    """The winner's last steps and the sums at its pose."""
-    c, searched, levels = shape.config, len(shape.config.iterations), len(shape.channels)
-    final, wanted = memory.swarms[2], c.swarm_anchors[-1]
-    winner, scales = memory.winner(final), (c.sharpen_scales, c.detail_scales)
-    finish = np.zeros((), dtype=layout.WINNER)
-    finish["state"], finish["swarm"], finish["scratch"] = memory.state, final, memory.finish
-    finish["scale"], finish["cell"], finish["wanted"] = c.huber, shape.cell_px, wanted
-    used = range(searched - 1, levels) if c.sharpen else range(0)
-    redescending = False
-    for k in used:
-        anchors = 0 if k == levels - 1 else wanted
-        if shape.constrained:
-            yield from _weighing(shape, memory, k, winner, 1, anchors)
-        median = finish.copy()
-        median["level"], median["wanted"] = memory.level(k), wanted
-        yield _Step("median_residual", k, 1, _FEW_THREADS, median)
-        for factor in scales[k - searched + 1]:
-            settings = replace(
-                c.settings, scale=LEAST_SCALE, redescending=True, damping=c.sharpen_damping
-            )
-            yield _refining(
-                shape, memory, k, winner, 1, anchors, settings, c.sharpen, factor=factor
-            )
-            redescending = True
-    last = levels - 1 if c.sharpen else searched - 1
-    sums, quality = finish.copy(), finish
-    sums["level"], sums["redescending"] = memory.level(last), redescending
-    if c.sharpen:
-        sums["wanted"] = COVARIANCE_ANCHORS
-    yield _Step("covariance_sums", last, 1, _FEW_THREADS, sums)
-    quality["level"] = memory.level(searched - 1)
-    yield _Step("quality", searched - 1, 1, _FEW_THREADS, quality)
-
-
-def _refining(
-    shape: _Shape,
-    memory: FrameMemory,
-    level: int,
-    swarm: NDArray[np.void],
-    alive: int,
-    wanted: int,
-    settings: LMSettings,
-    iterations: int,
-    *,
-    factor: float = 0.0,
-    free: bool = False,
-) -> _Step:
-    """Launch of the LM kernel; free: without the prior and not counted."""
-    arguments = np.zeros((), dtype=layout.REFINE)
-    arguments["level"], arguments["state"] = memory.level(level), memory.state
-    arguments["prior"] = memory.prior if shape.constrained and not free else 0
-    arguments["swarm"], arguments["wanted"] = swarm, wanted
-    set_loss(arguments, settings, iterations)
-    arguments["factor"], arguments["counted"] = factor, not free
-    name, threads = ("refine_few", _FEW_THREADS) if alive <= FEW else ("refine_many", _MANY_THREADS)
-    return _Step(name, level, alive, threads, arguments)
-
-
-def _weighing(
-    shape: _Shape, memory: FrameMemory, level: int, swarm: NDArray[np.void], alive: int, wanted: int
-) -> Iterator[_Step]:
-    """Score without the prior, then weigh it by the best score."""
-    c = shape.config
-    yield _refining(shape, memory, level, swarm, alive, wanted, c.settings, 0, free=True)
-    arguments = np.zeros((), dtype=layout.PRIOR_WEIGHT)
-    arguments["prior"], arguments["state"] = memory.prior, memory.state
-    arguments["scores"] = swarm["scores"]
-    arguments["share"], arguments["least_score"] = c.prior_weight, LEAST_SCORE
-    arguments["limit"] = alive
-    yield _Step("weigh_prior", level, 1, _SMALL_THREADS, arguments)
-
-
-def _selecting(
-    shape: _Shape,
-    memory: FrameMemory,
-    level: int,
-    source: int,
-    target: int,
-    keep: int,
-) -> _Step:
-    """Order and prune; the prediction has a say in the last order only."""
-    last = level == len(shape.config.iterations) - 1
-    arguments = np.zeros((), dtype=layout.SELECT)
-    arguments["state"] = memory.state
-    arguments["motion"] = memory.motion if last else 0
-    arguments["source"], arguments["target"] = memory.swarms[source], memory.swarms[target]
-    arguments["totals"], arguments["least_score"] = memory.totals, LEAST_SCORE
-    arguments["keep"] = keep
-    return _Step("select_hypotheses", level, 1, _SMALL_THREADS, arguments)
 
 
 def _survivors(config: JNGOConfig, count: int) -> int:

@@ -10,7 +10,7 @@ import pytest
 from localizer.registration.cuda import compiler
 from localizer.registration.cuda.compiler import cache_directory, compile_kernels
 from localizer.registration.cuda.errors import CudaError, CudaUnavailableError
-from localizer.registration.cuda.schedule import KERNELS
+from localizer.registration.cuda.steps import KERNELS
 
 HOT = ("refine_many", "refine_few")
 MOST_REGISTERS = 128  # two blocks of 256 threads fill the 65536 registers of a multiprocessor
