@@ -21,7 +21,7 @@ from sitl.embedded.modes import FlightModes
 from sitl.embedded.parameters import Parameters
 from sitl.embedded.rotation import Array
 from sitl.embedded.sensors import GpsSample, Sensors
-from sitl.embedded.severity import CRITICAL
+from sitl.embedded.severity import CRITICAL, INFO
 
 _GPS_FIX_AFTER_S = 30.0  # a cold start; with the filter's 10 s of checks ArduPilot's 42 s
 GPS_SIMULATED = (1, 2)  # GPS1_TYPE auto and u-blox read the simulated receiver
@@ -153,6 +153,12 @@ class Aircraft:
     def notify(self, severity: int, text: str) -> None:
         """STATUSTEXT on every link."""
         self.server.broadcast(mavlink.MAVLink_statustext_message(severity, text.encode()[:50]))
+
+    def use_source(self, source: int) -> None:
+        """Switch the filter to a source set, 1 to 3."""
+        if self.estimator.source_set != source:
+            self.estimator.source_set = source
+            self.notify(INFO, f"Using EKF Source Set {source}")
 
     def arming_failures(self) -> list[str]:
         """Texts of the failing arming checks."""

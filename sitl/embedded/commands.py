@@ -2,31 +2,22 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from math import isnan, radians
 from typing import Any
 
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from sitl.embedded.aircraft import Aircraft
-from sitl.embedded.geodesy import Location
+from sitl.embedded.gimbal_commands import GimbalCommands
+from sitl.embedded.handling import ACCEPTED, FAILED, UNSUPPORTED, CommandHandler, Handler
 from sitl.embedded.mavlink_server import Link
 from sitl.embedded.modes import Mode, RcInput
-from sitl.embedded.parameters import type_of
+from sitl.embedded.navigation_commands import NavigationCommands
+from sitl.embedded.parameter_commands import ParameterCommands
+from sitl.embedded.severity import INFO, WARNING
 from sitl.embedded.telemetry import Telemetry
 
-ACCEPTED, DENIED, UNSUPPORTED, FAILED = 0, 2, 3, 4  # MAV_RESULT
 _FORCE_ARM = 21196.0
-_IGNORE_POSITION, _IGNORE_VELOCITY, _IGNORE_YAW, _IGNORE_YAW_RATE = 7, 7 << 3, 1 << 10, 1 << 11
-_GLOBAL_FRAMES_RELATIVE = (3, 6)
-_GLOBAL_FRAMES = (0, 5, *_GLOBAL_FRAMES_RELATIVE)
-_LOCAL_NED, _LOCAL_OFFSET_NED = 1, 7
-_YAW_LOCK = 16  # GIMBAL_MANAGER_FLAGS
 _EKF_SOURCE_SET_OPTION = 90
-_SET_GLOBAL_ORIGIN = 611  # MAV_CMD_DO_SET_GLOBAL_ORIGIN, newer than pymavlink's dialect
-
-Handler = Callable[[Link, Any], None]
-CommandHandler = Callable[[Link, Any], int]
 
 
 class Commands:
@@ -35,51 +26,34 @@ class Commands:
     def __init__(self, vehicle: Aircraft, telemetry: Telemetry) -> None:
         self._vehicle, self._telemetry = vehicle, telemetry
         self._rc8: int | None = None
+        navigation, gimbal = NavigationCommands(vehicle), GimbalCommands(vehicle)
         self._messages: dict[str, Handler] = {
+            **navigation.messages,
+            **gimbal.messages,
+            **ParameterCommands(vehicle).messages,
             "COMMAND_LONG": self._command,
             "COMMAND_INT": self._command,
             "SET_MODE": self._set_mode_message,
-            "PARAM_REQUEST_LIST": self._param_list,
-            "PARAM_REQUEST_READ": self._param_read,
-            "PARAM_SET": self._param_set,
             "VISION_POSITION_ESTIMATE": self._vision,
             "GLOBAL_VISION_POSITION_ESTIMATE": self._vision,
             "ODOMETRY": self._odometry,
             "GPS_INPUT": self._gps_input,
-            "SET_GPS_GLOBAL_ORIGIN": self._set_origin_message,
-            "SET_POSITION_TARGET_LOCAL_NED": self._target_local,
-            "SET_POSITION_TARGET_GLOBAL_INT": self._target_global,
             "TIMESYNC": self._timesync,
             "RC_CHANNELS_OVERRIDE": self._rc,
-            "MISSION_SET_CURRENT": self._mission_set_current,
-            "GIMBAL_MANAGER_SET_PITCHYAW": self._gimbal_pitchyaw_message,
             "REQUEST_DATA_STREAM": self._data_stream,
         }
         m = mavlink
         self._commands: dict[int, CommandHandler] = {
+            **navigation.commands,
+            **gimbal.commands,
             m.MAV_CMD_COMPONENT_ARM_DISARM: self._arm,
             m.MAV_CMD_PREFLIGHT_REBOOT_SHUTDOWN: self._reboot,
-            m.MAV_CMD_NAV_TAKEOFF: self._takeoff,
             m.MAV_CMD_NAV_LAND: lambda _l, _c: self._mode(Mode.LAND),
             m.MAV_CMD_NAV_RETURN_TO_LAUNCH: lambda _l, _c: self._mode(Mode.RTL),
             m.MAV_CMD_DO_SET_MODE: self._set_mode,
             m.MAV_CMD_SET_MESSAGE_INTERVAL: self._set_interval,
             m.MAV_CMD_REQUEST_MESSAGE: self._request_message,
             m.MAV_CMD_REQUEST_AUTOPILOT_CAPABILITIES: self._request_version,
-            _SET_GLOBAL_ORIGIN: self._set_origin,
-            m.MAV_CMD_DO_SET_HOME: self._set_home,
-            m.MAV_CMD_SET_EKF_SOURCE_SET: self._set_source,
-            m.MAV_CMD_EXTERNAL_POSITION_ESTIMATE: self._external_position,
-            m.MAV_CMD_MISSION_START: self._mission_start,
-            m.MAV_CMD_DO_SET_MISSION_CURRENT: self._set_current,
-            m.MAV_CMD_CONDITION_YAW: self._condition_yaw,
-            m.MAV_CMD_DO_CHANGE_SPEED: self._change_speed,
-            m.MAV_CMD_DO_REPOSITION: self._reposition,
-            m.MAV_CMD_DO_MOUNT_CONTROL: self._mount_control,
-            m.MAV_CMD_DO_GIMBAL_MANAGER_PITCHYAW: self._gimbal_pitchyaw,
-            m.MAV_CMD_DO_SET_ROI_LOCATION: self._roi,
-            m.MAV_CMD_DO_SET_ROI: self._roi,
-            m.MAV_CMD_DO_SET_ROI_NONE: self._roi_none,
         }
 
     def handle(self, link: Link, message: Any) -> None:
@@ -115,7 +89,7 @@ class Commands:
         if not forced and v.report_failures("Arm"):
             return FAILED
         v.modes.arm()
-        v.notify(6, "Arming motors")
+        v.notify(INFO, "Arming motors")
         return ACCEPTED
 
     def _reboot(self, _link: Link, command: Any) -> int:
@@ -123,10 +97,6 @@ class Commands:
             return FAILED
         self._vehicle.reboot_ordered = True
         return ACCEPTED
-
-    def _takeoff(self, _link: Link, command: Any) -> int:
-        height = command.z if command.get_type() == "COMMAND_INT" else command.param7
-        return ACCEPTED if self._vehicle.modes.takeoff(height) else FAILED
 
     def _mode(self, mode: Mode) -> int:
         return ACCEPTED if self._vehicle.modes.set_mode(mode) else FAILED
@@ -142,7 +112,7 @@ class Commands:
         try:
             mode = Mode(message.custom_mode)
         except ValueError:
-            self._vehicle.notify(4, f"No such mode {message.custom_mode}")
+            self._vehicle.notify(WARNING, f"No such mode {message.custom_mode}")
             return
         self._mode(mode)
 
@@ -164,185 +134,6 @@ class Commands:
         self._telemetry.send(link, mavlink.MAVLINK_MSG_ID_AUTOPILOT_VERSION)
         return ACCEPTED
 
-    # --- navigation --------------------------------------------------------------------------
-
-    def _set_origin(self, _link: Link, command: Any) -> int:
-        if command.get_type() != "COMMAND_INT":
-            return UNSUPPORTED
-        return self._new_origin(command.x, command.y, command.z)
-
-    def _set_origin_message(self, _link: Link, message: Any) -> None:
-        self._new_origin(message.latitude, message.longitude, message.altitude / 1000.0)
-
-    def _new_origin(self, latitude_e7: int, longitude_e7: int, altitude_m: float) -> int:
-        if not (abs(latitude_e7) <= 900_000_000 and abs(longitude_e7) <= 1_800_000_000):
-            return DENIED
-        location = Location(latitude_e7 / 1e7, longitude_e7 / 1e7, altitude_m)
-        return ACCEPTED if self._vehicle.estimator.set_origin(location) else FAILED
-
-    def _set_home(self, _link: Link, command: Any) -> int:
-        v = self._vehicle
-        if v.estimator.origin is None:
-            return FAILED
-        if command.param1 == 1:
-            if v.estimator.location is None:
-                return FAILED
-            v.modes.home = v.estimator.location
-        elif command.get_type() == "COMMAND_INT":
-            v.modes.home = Location(command.x / 1e7, command.y / 1e7, command.z)
-        else:
-            return UNSUPPORTED
-        return ACCEPTED
-
-    def _set_source(self, _link: Link, command: Any) -> int:
-        source = int(command.param1)
-        if source not in (1, 2, 3):
-            return DENIED
-        self._use_source(source)
-        return ACCEPTED
-
-    def _use_source(self, source: int) -> None:
-        v = self._vehicle
-        if v.estimator.source_set != source:
-            v.estimator.source_set = source
-            v.notify(6, f"Using EKF Source Set {source}")
-
-    def _external_position(self, _link: Link, command: Any) -> int:
-        v = self._vehicle
-        if command.get_type() != "COMMAND_INT" or v.estimator.origin is None:
-            return FAILED
-        north, east, _ = v.estimator.origin.ned_of(Location(command.x / 1e7, command.y / 1e7, 0.0))
-        sigma = command.param3 if command.param3 > 0 else 10.0
-        return ACCEPTED if v.estimator.force_position(north, east, sigma) else FAILED
-
-    def _mission_start(self, _link: Link, _command: Any) -> int:
-        return ACCEPTED if self._vehicle.modes.start_mission() else FAILED
-
-    def _set_current(self, _link: Link, command: Any) -> int:
-        return ACCEPTED if self._vehicle.modes.start_mission(int(command.param1)) else FAILED
-
-    def _mission_set_current(self, _link: Link, message: Any) -> None:
-        self._vehicle.modes.start_mission(message.seq)
-
-    def _condition_yaw(self, _link: Link, command: Any) -> int:
-        self._vehicle.modes.condition_yaw(command.param1, command.param3, bool(command.param4))
-        return ACCEPTED
-
-    def _change_speed(self, _link: Link, command: Any) -> int:
-        return ACCEPTED if self._vehicle.modes.change_speed(command.param2) else FAILED
-
-    def _reposition(self, _link: Link, command: Any) -> int:
-        if command.get_type() != "COMMAND_INT":
-            return UNSUPPORTED
-        location = self._location(command.frame, command.x, command.y, command.z)
-        if location is None:
-            return DENIED
-        v = self._vehicle
-        if v.modes.mode is not Mode.GUIDED and not (
-            int(command.param2) & 1 and v.modes.set_mode(Mode.GUIDED)
-        ):
-            return DENIED
-        yaw = None if isnan(command.param4) else radians(command.param4)
-        return ACCEPTED if v.modes.go_to(location, yaw) else DENIED
-
-    def _location(self, frame: int, x: int, y: int, altitude: float) -> Location | None:
-        home = self._vehicle.modes.home
-        if frame not in _GLOBAL_FRAMES or home is None:
-            return None
-        base = home.altitude_m if frame in _GLOBAL_FRAMES_RELATIVE else 0.0
-        return Location(x / 1e7, y / 1e7, base + altitude)
-
-    def _target_local(self, _link: Link, message: Any) -> None:
-        modes, here = self._vehicle.modes, self._vehicle.estimator.position
-        if message.coordinate_frame not in (_LOCAL_NED, _LOCAL_OFFSET_NED):
-            return
-        target = (message.x, message.y, message.z)
-        if message.coordinate_frame == _LOCAL_OFFSET_NED:
-            target = (here[0] + message.x, here[1] + message.y, here[2] + message.z)
-        yaw, rate = self._yaw_of(message)
-        if not message.type_mask & _IGNORE_POSITION:
-            modes.go_to_local(target, yaw)
-        elif not message.type_mask & _IGNORE_VELOCITY:
-            modes.fly_velocity((message.vx, message.vy, message.vz), yaw, rate)
-
-    def _target_global(self, _link: Link, message: Any) -> None:
-        modes = self._vehicle.modes
-        yaw, rate = self._yaw_of(message)
-        if not message.type_mask & _IGNORE_POSITION:
-            location = self._location(
-                message.coordinate_frame, message.lat_int, message.lon_int, message.alt
-            )
-            if location is not None:
-                modes.go_to(location, yaw)
-        elif not message.type_mask & _IGNORE_VELOCITY:
-            modes.fly_velocity((message.vx, message.vy, message.vz), yaw, rate)
-
-    @staticmethod
-    def _yaw_of(message: Any) -> tuple[float | None, float | None]:
-        yaw = None if message.type_mask & _IGNORE_YAW else message.yaw
-        rate = None if message.type_mask & _IGNORE_YAW_RATE else message.yaw_rate
-        return yaw, rate
-
-    # --- gimbal ------------------------------------------------------------------------------
-
-    def _mount_control(self, _link: Link, command: Any) -> int:
-        gimbal = self._vehicle.gimbal
-        mode = int(command.z if command.get_type() == "COMMAND_INT" else command.param7)
-        if not gimbal.fitted:
-            return FAILED
-        if mode == 2:  # MAV_MOUNT_MODE_MAVLINK_TARGETING
-            gimbal.point(command.param1, command.param3, yaw_locked=False)
-        elif mode in (0, 1):
-            gimbal.neutral()
-        else:
-            return FAILED
-        return ACCEPTED
-
-    def _gimbal_pitchyaw(self, _link: Link, command: Any) -> int:
-        flags = int(command.x if command.get_type() == "COMMAND_INT" else command.param5)
-        return self._point(command.param1, command.param2, command.param3, command.param4, flags)
-
-    def _gimbal_pitchyaw_message(self, _link: Link, message: Any) -> None:
-        degrees_per_radian = 57.29577951308232
-        self._point(
-            message.pitch * degrees_per_radian,
-            message.yaw * degrees_per_radian,
-            message.pitch_rate * degrees_per_radian,
-            message.yaw_rate * degrees_per_radian,
-            message.flags,
-        )
-
-    def _point(
-        self, pitch: float, yaw: float, pitch_rate: float, yaw_rate: float, flags: int
-    ) -> int:
-        gimbal = self._vehicle.gimbal
-        if not gimbal.fitted:
-            return FAILED
-        locked = bool(flags & _YAW_LOCK)
-        if flags & 2:  # GIMBAL_MANAGER_FLAGS_NEUTRAL
-            gimbal.neutral()
-        elif not (isnan(pitch) or isnan(yaw)):
-            gimbal.point(pitch, yaw, yaw_locked=locked)
-        elif not (isnan(pitch_rate) or isnan(yaw_rate)):
-            gimbal.rotate(pitch_rate, yaw_rate, yaw_locked=locked)
-        else:
-            return FAILED
-        return ACCEPTED
-
-    def _roi(self, _link: Link, command: Any) -> int:
-        v = self._vehicle
-        if not v.gimbal.fitted or command.get_type() != "COMMAND_INT":
-            return FAILED
-        location = self._location(command.frame, command.x, command.y, command.z)
-        if location is None:
-            return FAILED
-        v.gimbal.look_at(location)
-        return ACCEPTED
-
-    def _roi_none(self, _link: Link, _command: Any) -> int:
-        self._vehicle.gimbal.look_at(None)
-        return ACCEPTED
-
     # --- injection ---------------------------------------------------------------------------
 
     def _vision(self, link: Link, message: Any) -> None:
@@ -360,31 +151,7 @@ class Commands:
                 mavlink.MAVLink_timesync_message(self._vehicle.time_ms * 1_000_000, message.ts1)
             )
 
-    # --- parameters, RC, streams -------------------------------------------------------------
-
-    def _param_value(self, name: str, index: int) -> Any:
-        p = self._vehicle.parameters
-        return mavlink.MAVLink_param_value_message(
-            name.encode(), p[name], type_of(name), len(p), index
-        )
-
-    def _param_list(self, link: Link, _message: Any) -> None:
-        for index, name in enumerate(self._vehicle.parameters):
-            link.send(self._param_value(name, index))
-
-    def _param_read(self, link: Link, message: Any) -> None:
-        p = self._vehicle.parameters
-        name = _text(message.param_id)
-        found = name if message.param_index < 0 else p.name_at(message.param_index)
-        if found is not None and found in p:
-            link.send(self._param_value(found, p.index_of(found)))
-
-    def _param_set(self, _link: Link, message: Any) -> None:
-        v = self._vehicle
-        name = _text(message.param_id)
-        if v.parameters.set(name, message.param_value):
-            # ArduPilot tells every link of a change, with an index of 65535.
-            v.server.broadcast(self._param_value(name, 65535))
+    # --- RC, streams -------------------------------------------------------------------------
 
     def _rc(self, _link: Link, message: Any) -> None:
         v = self._vehicle
@@ -405,7 +172,7 @@ class Commands:
         position = 1 if channel < 1200 else 3 if channel > 1800 else 2
         if position != self._rc8:
             self._rc8 = position
-            self._use_source(position)
+            self._vehicle.use_source(position)
 
     def _data_stream(self, link: Link, message: Any) -> None:
         """REQUEST_DATA_STREAM, the old way: the attitude and position groups."""
@@ -426,8 +193,3 @@ class Commands:
         for group in wanted:
             for message_id in group:
                 link.set_interval(message_id, 1.0 / rate if rate > 0 else None)
-
-
-def _text(value: str | bytes) -> str:
-    text = value.decode("ascii", "replace") if isinstance(value, bytes) else value
-    return text.rstrip("\0")

@@ -15,7 +15,7 @@ from sitl.embedded.geodesy import Location
 from sitl.embedded.parameters import Parameters
 from sitl.embedded.rotation import Array, quaternion, wrap_pi
 
-FLAG_RETRACT, FLAG_NEUTRAL, FLAG_ROLL_LOCK, FLAG_PITCH_LOCK, FLAG_YAW_LOCK = 1, 2, 4, 8, 16
+FLAG_NEUTRAL, FLAG_ROLL_LOCK, FLAG_PITCH_LOCK, FLAG_YAW_LOCK = 2, 4, 8, 16
 FLAG_YAW_IN_VEHICLE_FRAME = 32
 _SERVO = 1  # MNT1_TYPE
 _SLEW = radians(60.0)  # rad/s of the motors

@@ -1,0 +1,172 @@
+"""Every command and guided message does what ArduPilot does with it: result codes and effects."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+from pymavlink.dialects.v20 import ardupilotmega as mavlink
+
+from sitl.embedded.modes import Mode
+
+ACCEPTED, DENIED, UNSUPPORTED, FAILED = 0, 2, 3, 4
+RELATIVE, NO_FRAME = mavlink.MAV_FRAME_GLOBAL_RELATIVE_ALT_INT, mavlink.MAV_FRAME_MISSION
+PLACE = (473981000, 85460000)  # north-east of home, degrees * 1e7
+NAN = math.nan
+
+
+class Link:
+    """What a handler needs of a link."""
+
+    def __init__(self):
+        self.sent, self.intervals = [], {}
+
+    def send(self, message):
+        self.sent.append(message)
+
+    def set_interval(self, message_id, seconds):
+        self.intervals[message_id] = seconds
+
+
+@pytest.fixture
+def flying(bench):
+    b = bench({"MNT1_TYPE": 7}, seed=3)
+    b.take_off(20.0)
+    return b
+
+
+@pytest.fixture
+def grounded(bench):
+    b = bench({"MNT1_TYPE": 7}, seed=3)
+    assert b.run(60, lambda: b.vehicle.tick % 50 == 0 and not b.failures())
+    return b
+
+
+def told(bench, message):
+    """The link after the vehicle has handled the message."""
+    message._header.srcSystem, message._header.srcComponent = 255, 190
+    link = Link()
+    bench.vehicle.commands.handle(link, message)
+    return link
+
+
+def result(bench, number, *parameters, frame=None, x=0, y=0):
+    """MAV_RESULT of a COMMAND_LONG, or of a COMMAND_INT where there is a frame."""
+    p = [*parameters, *[0.0] * (7 - len(parameters))]
+    if frame is None:
+        message = mavlink.MAVLink_command_long_message(1, 1, number, 0, *p)
+    else:
+        message = mavlink.MAVLink_command_int_message(1, 1, frame, number, 0, 0, *p[:4], x, y, p[6])
+    (ack,) = [m for m in told(bench, message).sent if m.get_type() == "COMMAND_ACK"]
+    assert (ack.command, ack.target_system, ack.target_component) == (number, 255, 190)
+    return ack.result
+
+
+def test_commands_in_flight(flying):
+    m = mavlink
+    v = flying.vehicle
+    reposition = (-1.0, 0.0, 0.0, NAN, 0.0, 0.0, 40.0)
+    assert result(flying, m.MAV_CMD_DO_REPOSITION, *reposition) == UNSUPPORTED
+    for frame, code in ((NO_FRAME, DENIED), (RELATIVE, ACCEPTED)):
+        place = {"frame": frame, "x": PLACE[0], "y": PLACE[1]}
+        assert result(flying, m.MAV_CMD_DO_REPOSITION, *reposition, **place) == code
+    here, goal = v.estimator.position, v.modes.target
+    assert goal[0] > here[0] + 20
+    assert goal[1] > here[1] + 20
+    assert goal[2] < here[2] - 15
+    assert result(flying, m.MAV_CMD_NAV_TAKEOFF, *[0.0] * 6, 30.0) == FAILED  # it flies already
+    assert result(flying, m.MAV_CMD_PREFLIGHT_REBOOT_SHUTDOWN, 1) == FAILED
+    assert result(flying, m.MAV_CMD_COMPONENT_ARM_DISARM, 0) == FAILED
+    assert result(flying, m.MAV_CMD_DO_CHANGE_SPEED, 1, 3.0) == ACCEPTED
+    assert v.modes.limits.speed == 3.0
+    assert result(flying, m.MAV_CMD_DO_CHANGE_SPEED, 1, 0.0) == FAILED
+    assert result(flying, m.MAV_CMD_CONDITION_YAW, 90, 0, 1, 0) == ACCEPTED
+    assert result(flying, m.MAV_CMD_MISSION_START) == FAILED  # there is none
+    assert result(flying, m.MAV_CMD_DO_SET_MISSION_CURRENT, 1) == FAILED
+    assert result(flying, m.MAV_CMD_DO_SET_MODE, 1, 77) == FAILED
+    assert result(flying, m.MAV_CMD_DO_SET_MODE, 1, int(Mode.STABILIZE)) == ACCEPTED
+    assert v.modes.mode is Mode.STABILIZE
+    assert result(flying, m.MAV_CMD_DO_REPOSITION, *reposition, **place) == DENIED
+    change = (-1.0, 1.0, *reposition[2:])  # MAV_DO_REPOSITION_FLAGS_CHANGE_MODE
+    assert result(flying, m.MAV_CMD_DO_REPOSITION, *change, **place) == ACCEPTED
+    assert v.modes.mode is Mode.GUIDED
+    assert result(flying, m.MAV_CMD_NAV_RETURN_TO_LAUNCH) == ACCEPTED
+    assert v.modes.mode is Mode.RTL
+    assert result(flying, m.MAV_CMD_NAV_LAND) == ACCEPTED
+    assert v.modes.mode is Mode.LAND
+
+
+def test_commands_on_the_ground(grounded):
+    m = mavlink
+    v = grounded.vehicle
+    assert result(grounded, m.MAV_CMD_SET_EKF_SOURCE_SET, 4) == DENIED
+    assert result(grounded, m.MAV_CMD_SET_EKF_SOURCE_SET, 2) == ACCEPTED
+    assert v.estimator.source_set == 2
+    assert grounded.said("Using EKF Source Set 2")
+    assert result(grounded, m.MAV_CMD_SET_EKF_SOURCE_SET, 1) == ACCEPTED
+    origin = {"frame": 0, "x": PLACE[0], "y": PLACE[1]}
+    assert result(grounded, 611, **origin) == FAILED  # GNSS has set one
+    assert result(grounded, 611, frame=0, x=910_000_000) == DENIED
+    assert result(grounded, 611) == UNSUPPORTED
+    assert result(grounded, m.MAV_CMD_DO_SET_HOME, 0, 0, 0, 0, 0, 0, 500.0, **origin) == ACCEPTED
+    assert v.modes.home.latitude_deg == pytest.approx(47.3981)
+    assert result(grounded, m.MAV_CMD_DO_SET_HOME, 0) == UNSUPPORTED
+    assert result(grounded, m.MAV_CMD_DO_SET_HOME, 1) == ACCEPTED
+    external = m.MAV_CMD_EXTERNAL_POSITION_ESTIMATE
+    assert result(grounded, external, 0, 0, 5, 0, **origin) == FAILED  # it is aided
+    assert result(grounded, m.MAV_CMD_NAV_TAKEOFF, *[0.0] * 6, 30.0) == FAILED
+    assert result(grounded, m.MAV_CMD_DO_SET_MODE, 1, int(Mode.GUIDED)) == ACCEPTED
+    assert result(grounded, m.MAV_CMD_COMPONENT_ARM_DISARM, 1) == ACCEPTED
+    assert result(grounded, m.MAV_CMD_NAV_TAKEOFF, *[0.0] * 6, 30.0) == ACCEPTED
+    assert result(grounded, m.MAV_CMD_COMPONENT_ARM_DISARM, 0) == ACCEPTED
+    assert not v.modes.armed
+    assert result(grounded, m.MAV_CMD_PREFLIGHT_REBOOT_SHUTDOWN, 1) == ACCEPTED
+    assert v.reboot_ordered
+
+
+def test_the_gimbals_commands(grounded):
+    m = mavlink
+    gimbal = grounded.vehicle.gimbal
+    place = {"frame": RELATIVE, "x": PLACE[0], "y": PLACE[1]}
+    pitchyaw = m.MAV_CMD_DO_GIMBAL_MANAGER_PITCHYAW
+    assert result(grounded, pitchyaw, -45, 10, NAN, NAN) == ACCEPTED
+    grounded.run(3)
+    assert math.degrees(gimbal.pitch_rad) == pytest.approx(-45, abs=1)
+    assert math.degrees(gimbal.yaw_rad) == pytest.approx(10, abs=1)
+    assert result(grounded, pitchyaw, NAN, NAN, -5, 0) == ACCEPTED
+    assert result(grounded, pitchyaw, NAN, NAN, NAN, NAN) == FAILED
+    assert result(grounded, pitchyaw, 0, 0, 0, 0, 2) == ACCEPTED  # neutral
+    assert result(grounded, m.MAV_CMD_DO_SET_ROI_LOCATION, **place) == ACCEPTED
+    assert result(grounded, m.MAV_CMD_DO_SET_ROI_LOCATION) == FAILED
+    assert result(grounded, m.MAV_CMD_DO_SET_ROI_LOCATION, frame=NO_FRAME) == FAILED
+    assert result(grounded, m.MAV_CMD_DO_SET_ROI_NONE) == ACCEPTED
+    for mode, code in ((2, ACCEPTED), (1, ACCEPTED), (5, FAILED)):
+        assert result(grounded, m.MAV_CMD_DO_MOUNT_CONTROL, -30, 0, 0, 0, 0, 0, mode) == code
+
+
+def test_guided_targets(flying):
+    v = flying.vehicle
+    n, e, d = v.estimator.position
+    velocity_only, position_only = 0b111111000111, 0b110111111000
+    local = mavlink.MAVLink_set_position_target_local_ned_message
+    told(flying, local(0, 1, 1, 7, position_only, 5, 6, -7, *[0.0] * 8))
+    assert v.modes.target == pytest.approx((n + 5, e + 6, d - 7))
+    told(flying, local(0, 1, 1, 9, position_only, 50, 6, -7, *[0.0] * 8))  # a frame it has not
+    assert v.modes.target == pytest.approx((n + 5, e + 6, d - 7))
+    told(flying, local(0, 1, 1, 1, velocity_only, 0, 0, 0, 2.0, 0.0, 0.0, *[0.0] * 5))
+    flying.run(4)
+    assert v.estimator.velocity[0] == pytest.approx(2.0, abs=0.3)
+    over_home = mavlink.MAVLink_set_position_target_global_int_message(
+        0, 1, 1, RELATIVE, position_only, *PLACE, 50.0, *[0.0] * 8
+    )
+    told(flying, over_home)
+    assert v.modes.target[2] < d - 20
+
+
+def test_a_data_stream_is_asked_for_and_ended(grounded):
+    for start, interval in ((1, 0.25), (0, None)):
+        link = told(grounded, mavlink.MAVLink_request_data_stream_message(1, 1, 10, 4, start))
+        assert link.intervals == {
+            mavlink.MAVLINK_MSG_ID_ATTITUDE: interval,
+            mavlink.MAVLINK_MSG_ID_SIM_STATE: interval,
+        }
