@@ -18,7 +18,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from localizer.errors import GeoreferenceError, MapCacheError
 from localizer.geo import Geodetic, LocalFrame
-from localizer.map.tile import PackedTexture, TileMesh
+from localizer.map.tile import PackedTexture, TileMesh, mesh_fault
 from localizer.pose import Array, Pose
 from localizer.types import Float32, Image
 
@@ -234,6 +234,9 @@ def decode_tile(data: bytes, world_from_tile: Pose, *, textured: bool = True) ->
         images = [_decode_image(arrays[k]) for k in mips] if textured else []
     except (safetensors.SafetensorError, KeyError) as error:
         raise MapCacheError(f"not a tile file: {error}") from error
+    fault = mesh_fault(positions, uvs, faces)
+    if fault is not None:
+        raise MapCacheError(f"not a tile file: {fault}")
     faces = faces.view(np.int32)
     if not textured:
         return TileMesh(positions, uvs, faces, (), world_from_tile)

@@ -17,6 +17,7 @@ from localizer.errors import MapSourceError
 from localizer.geo import LocalFrame, geodetic_from_ecef
 from localizer.map.source import SourceMesh, SourceNode, TileSource
 from localizer.map.staging import Record, Staging
+from localizer.map.tile import mesh_fault
 
 
 @dataclass(frozen=True)
@@ -39,12 +40,15 @@ class ImportJob:
 
     def _to_enu(self, mesh: SourceMesh) -> SourceMesh:
         positions = mesh.positions
+        fault = mesh_fault(positions, mesh.uvs, mesh.faces)
+        if fault is not None:
+            raise MapSourceError(fault)
         if self.lift_m:
             lat, lon, _ = np.radians(geodetic_from_ecef(positions.mean(axis=0)))
             up = np.array([np.cos(lat) * np.cos(lon), np.cos(lat) * np.sin(lon), np.sin(lat)])
             positions = positions + self.lift_m * up
         enu = self.frame.ecef_from_enu.inverse.apply(positions)
-        if np.abs(enu).max() > 1e6:
+        if not np.abs(enu).max() <= 1e6:
             raise MapSourceError("lies more than 1000 km from the map's origin")
         return replace(mesh, positions=enu)
 

@@ -15,6 +15,7 @@ from localizer.map.gltf import read_gltf
 from localizer.map.quadtree import bounds, quadtree
 from localizer.map.source import SourceMesh, SourceTree
 from localizer.map.textures import palette_mesh
+from localizer.map.tile import mesh_fault
 from localizer.map.tiles3d import inside, read_file
 from localizer.pose import Array
 
@@ -46,6 +47,10 @@ class MeshFile:
         meshes = [m for m in meshes if len(m.faces)]
         if not meshes:
             raise MapSourceError(f"{self.path}: holds no triangles")
+        for mesh in meshes:
+            fault = mesh_fault(mesh.positions, mesh.uvs, mesh.faces)
+            if fault is not None:
+                raise MapSourceError(f"{self.path}: {fault}")
         if self.up_axis == "y":
             meshes = [replace(m, positions=m.positions @ _Z_UP_FROM_Y_UP.T) for m in meshes]
         return meshes

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Any
 
 import cv2
 import numpy as np
@@ -13,6 +14,7 @@ from numpy.typing import NDArray
 from localizer.pose import Array, Pose
 from localizer.types import Float32, Image
 
+_LARGEST_UV = 1e6
 _PAIR_BYTES = 8  # two texels are read as one word of this size
 _SMALLEST_MIP = 4  # texels on the longer side; below it a mip holds no more than a mean colour
 
@@ -116,6 +118,28 @@ class TileMesh:
             world_from_tile,
             repeat=self.repeat,
         )
+
+
+def mesh_fault(
+    positions: NDArray[np.floating[Any]],
+    uvs: NDArray[np.floating[Any]],
+    faces: NDArray[np.integer[Any]],
+) -> str | None:
+    """What a renderer's kernels, which check no index, must never be given; None for a sound mesh.
+
+    positions: (V, 3); uvs: (V, 2); faces: (F, 3).
+    """
+    if positions.ndim != 2 or positions.shape[1] != 3 or faces.ndim != 2 or faces.shape[1] != 3:
+        return "positions or faces are not rows of three"
+    if uvs.shape != (len(positions), 2):
+        return "there is not one texture coordinate for each vertex"
+    if not np.isfinite(positions).all():
+        return "a position is not finite"
+    if not (np.abs(uvs) <= _LARGEST_UV).all():
+        return "a texture coordinate is not finite or beyond all measure"
+    if len(faces) and not (faces.min() >= 0 and faces.max() < len(positions)):
+        return "a face names a vertex that is not there"
+    return None
 
 
 def mip_sizes(width: int, height: int) -> list[tuple[int, int]]:

@@ -31,6 +31,7 @@ from localizer.render.raster_kernels import (
 )
 from localizer.types import Float32, RenderedView
 
+_FARTHEST_M = 1e9
 _STRIPS_PER_THREAD = 2  # more than one, so that a crowded strip does not leave a thread idle
 
 
@@ -117,6 +118,8 @@ class NumbaRenderer(TileRenderer):
             mesh = meshes[i]
             # Composed in float64, so that only small numbers meet the float32 kernels.
             camera_from_tile = camera_from_world @ mesh.world_from_tile
+            if not (np.abs(camera_from_tile.matrix) < _FARTHEST_M).all():
+                return []  # a pose beyond all measure: float32 would overflow in the kernels
             T = np.ascontiguousarray(camera_from_tile.matrix[:3], np.float32)
             screen = self._vertices[vertices[i] : vertices[i + 1]]
             listed = self._listed[:, faces[i] : faces[i + 1]]

@@ -70,6 +70,9 @@ def test_damaged_index_is_found(copy):
     [
         ({"format_version": 99}, "format 99"),
         ({"geoid_separation_m": "high"}, "geoid_separation_m"),
+        ({"geoid_separation_m": 1e5}, "geoid_separation_m"),
+        ({"geoid_separation_m": float("nan")}, "geoid_separation_m"),
+        ({"extent": [[float("inf"), 0.0]]}, "extent"),
         ({"surprise": 1}, "surprise"),
         ({"origin": {"latitude_deg": 200, "longitude_deg": 0, "height_m": 0}}, "out of range"),
     ],
@@ -79,6 +82,20 @@ def test_bad_manifest_is_named(copy, change, message):
     path.write_text(json.dumps(json.loads(path.read_text()) | change))
     with pytest.raises(MapCacheError, match=message):
         TileCache.open(copy)
+
+
+def test_a_manifest_of_another_index_is_refused(copy):
+    """Boxes about another origin would let the view lose its tiles in flight."""
+    path = copy / "manifest.json"
+    manifest = json.loads(path.read_text())
+    for change in (
+        {"origin": manifest["origin"] | {"latitude_deg": 47.21}},
+        {"origin": manifest["origin"] | {"height_m": 1e12}},
+        {"tiles": manifest["tiles"] + 1},
+    ):
+        path.write_text(json.dumps(manifest | change))
+        with pytest.raises(MapCacheError, match="build it again"):
+            TileCache.open(copy)
 
 
 def test_manifest_that_is_not_json(copy):
@@ -102,6 +119,28 @@ def test_tile_round_trip():
     assert [m.shape[:2] for m in mesh.mips[:3]] == [(100, 80), (50, 40), (25, 20)]
     assert all(np.abs(m.astype(int) - (200, 100, 50)).max() <= 3 for m in mesh.mips)
     assert np.array_equal(mesh.texture.mip(1), mesh.mips[1])
+
+
+@pytest.mark.parametrize(
+    ("array", "value", "told"),
+    [
+        ("positions", np.nan, "position"),
+        ("uvs", np.inf, "texture coordinate"),
+        ("uvs", 1e30, "texture coordinate"),
+        ("faces", 3, "vertex that is not there"),
+    ],
+)
+def test_a_tile_that_would_lead_kernels_astray_is_refused(array, value, told):
+    arrays = {
+        "positions": np.eye(3, dtype=np.float32),
+        "uvs": np.zeros((3, 2), np.float32),
+        "faces": np.array([[0, 1, 2]], np.int32),
+    }
+    arrays[array][0, 1] = value
+    data = encode_tile(**arrays, mips=build_mips(np.zeros((8, 8, 3), np.uint8)))
+    for textured in (True, False):
+        with pytest.raises(MapCacheError, match=told):
+            decode_tile(data, Pose.identity(), textured=textured)
 
 
 @pytest.mark.parametrize("keep", [0, 7, 8, 50, 500])

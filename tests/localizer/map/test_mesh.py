@@ -144,6 +144,26 @@ def test_broken_meshes_are_named(tmp_path, make, build):
             build(path, georeference=reference, **DATUM)
 
 
+@pytest.mark.parametrize(
+    ("vertex", "texture", "told"),
+    [
+        ("v nan 0 0", "vt 0 0", "m.obj: a position is not finite"),
+        ("v 0 0 0", "vt nan 0", "m.obj: a texture coordinate"),
+        ("v 0 0 0", "vt 1e30 0", "m.obj: a texture coordinate"),
+    ],
+)
+def test_numbers_that_would_lead_kernels_astray_are_named(
+    tmp_path, make, build, vertex, texture, told
+):
+    cv2.imwrite(str(tmp_path / "m.png"), picture(16))
+    (tmp_path / "m.mtl").write_text("newmtl a\nmap_Kd m.png\n")
+    lines = ["mtllib m.mtl", "usemtl a", vertex, "v 10 0 0", "v 0 10 0", texture]
+    lines += ["vt 1 0", "vt 0 1", "f 1/1 2/2 3/3"]
+    (tmp_path / "m.obj").write_text("\n".join(lines))
+    with pytest.raises(MapSourceError, match=told):
+        build(tmp_path / "m.obj", georeference=Georeference(origin=make.origin), **DATUM)
+
+
 def test_packed_rectangles_do_not_overlap():
     sizes = np.random.default_rng(0).integers(1, 60, (300, 2))
     places, (width, height) = shelves(sizes)

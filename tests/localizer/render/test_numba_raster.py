@@ -257,6 +257,20 @@ def test_results_belong_to_the_caller(renderer):
     assert np.array_equal(first.depth, kept)
 
 
+@pytest.mark.filterwarnings("ignore:invalid value:RuntimeWarning")
+@pytest.mark.parametrize("value", [1e12, 1e38, 1e39, 1e308, np.inf, np.nan])
+def test_a_pose_beyond_all_measure_shows_nothing_and_harms_nothing(renderer, value):
+    """float32 overflows there, and compiled loops do not check their indices."""
+    mesh = quad(10.0, 5.0)
+    with np.errstate(all="ignore"):
+        for pose in (
+            Pose(np.eye(3), np.array([value, 0.0, 0.0])),
+            Pose(np.eye(3) * value, np.zeros(3)),
+        ):
+            view = renderer.draw([mesh], pose, Camera.from_fov(64, 48, 60.0))
+            assert not (view.depth > 0).any()
+
+
 def test_distorted_cameras_are_refused(renderer):
     camera = Camera(64, 64, 60.0, 60.0, 32.0, 32.0, (0.1, 0, 0, 0, 0))
     with pytest.raises(CameraError, match="pinhole"):
