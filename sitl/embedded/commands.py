@@ -10,7 +10,7 @@ from sitl.embedded.aircraft import Aircraft
 from sitl.embedded.gimbal_commands import GimbalCommands
 from sitl.embedded.handling import ACCEPTED, FAILED, UNSUPPORTED, CommandHandler, Handler
 from sitl.embedded.mavlink_server import Link
-from sitl.embedded.modes import Mode, RcInput
+from sitl.embedded.mode import Mode, RcInput
 from sitl.embedded.navigation_commands import NavigationCommands
 from sitl.embedded.parameter_commands import ParameterCommands
 from sitl.embedded.severity import INFO, WARNING

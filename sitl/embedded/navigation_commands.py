@@ -19,7 +19,7 @@ from sitl.embedded.handling import (
     location_of,
 )
 from sitl.embedded.mavlink_server import Link
-from sitl.embedded.modes import Mode
+from sitl.embedded.mode import Mode
 
 _IGNORE_POSITION, _IGNORE_VELOCITY, _IGNORE_YAW, _IGNORE_YAW_RATE = 7, 7 << 3, 1 << 10, 1 << 11
 _LOCAL_NED, _LOCAL_OFFSET_NED = 1, 7

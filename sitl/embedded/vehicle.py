@@ -75,7 +75,6 @@ class Vehicle(Aircraft):
         self.gimbal.update(self.estimator.location, vehicle_yaw, TICK_S)
         if self.tick % 10 == 0:
             self.modes.check_ekf()
-            self.modes.check_glitch()
         if self.tick % 3000 == 0 and not self.modes.armed:
             self.report_failures("PreArm")
         self._announce()

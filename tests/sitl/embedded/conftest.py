@@ -12,7 +12,7 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from sitl.embedded.geodesy import Location
 from sitl.embedded.mavlink_server import MavlinkServer
-from sitl.embedded.modes import Mode
+from sitl.embedded.mode import Mode
 from sitl.embedded.parameters import Parameters
 from sitl.embedded.rotation import euler
 from sitl.embedded.timesync import JitterCorrection
@@ -71,6 +71,7 @@ class Bench:
         self.texts: list[tuple[float, str]] = []
         v = self.vehicle
         v.notify = v.estimator.notify = v.modes.notify = self._note  # type: ignore[method-assign]
+        v.modes.ekf_check.notify = self._note
         self.each_tick: list[Callable[[], None]] = []
 
     def _note(self, _severity: int, text: str) -> None:

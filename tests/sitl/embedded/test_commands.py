@@ -7,7 +7,7 @@ import math
 import pytest
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
-from sitl.embedded.modes import Mode
+from sitl.embedded.mode import Mode
 
 ACCEPTED, DENIED, UNSUPPORTED, FAILED = 0, 2, 3, 4
 RELATIVE, NO_FRAME = mavlink.MAV_FRAME_GLOBAL_RELATIVE_ALT_INT, mavlink.MAV_FRAME_MISSION
@@ -78,7 +78,7 @@ def test_commands_in_flight(flying):
     assert result(flying, m.MAV_CMD_PREFLIGHT_REBOOT_SHUTDOWN, 1) == FAILED
     assert result(flying, m.MAV_CMD_COMPONENT_ARM_DISARM, 0) == FAILED
     assert result(flying, m.MAV_CMD_DO_CHANGE_SPEED, 1, 3.0) == ACCEPTED
-    assert v.modes.limits.speed == 3.0
+    assert v.modes.speed_limit == 3.0
     assert result(flying, m.MAV_CMD_DO_CHANGE_SPEED, 1, 0.0) == FAILED
     assert result(flying, m.MAV_CMD_CONDITION_YAW, 90, 0, 1, 0) == ACCEPTED
     assert result(flying, m.MAV_CMD_MISSION_START) == FAILED  # there is none

@@ -11,7 +11,7 @@ from sitl.embedded import mission as mis
 from sitl.embedded.aided_filter import Aiding
 from sitl.embedded.estimator import EkfFlags
 from sitl.embedded.mission import MissionItem
-from sitl.embedded.modes import Mode
+from sitl.embedded.mode import Mode
 
 
 def test_takes_off_on_gps_and_hovers(bench):
