@@ -16,7 +16,8 @@ from localizer.errors import LocalizerError
 
 try:
     from localizer.training.config import LiveSection, TrainConfig, load_config
-    from localizer.training.shards import FIRST_WORLD_SEED, write_shards, write_world_shards
+    from localizer.training.seeds import FIRST_WORLD_SEED
+    from localizer.training.shards import write_shards, write_world_shards
 except ModuleNotFoundError as error:
     if error.name != "torch":
         raise

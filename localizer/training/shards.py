@@ -21,7 +21,6 @@ from localizer.pose import Pose
 from localizer.training.pairs import Pair, SceneConfig, scene_pairs
 from localizer.training.photos import PhotoLibrary
 
-FIRST_WORLD_SEED = 1000  # seeds below belong to demos and tests
 WORLD_SHARDS = 8  # per mesh world
 WORLD_SHARD_PAIRS = 10
 

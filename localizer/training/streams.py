@@ -10,8 +10,8 @@ from localizer.training.data import LoaderConfig, Schedule, ShardStream
 from localizer.training.distributed import Workers
 from localizer.training.live import LivePlan, LiveStream
 from localizer.training.pairs import SceneConfig
+from localizer.training.seeds import FIRST_WORLD_SEED
 from localizer.training.shards import (
-    FIRST_WORLD_SEED,
     PhotoSource,
     shard_path,
     world_shard_paths,

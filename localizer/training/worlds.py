@@ -29,7 +29,7 @@ from localizer.training.pairs import (
     moved,
 )
 from localizer.training.revisit import coarser, draw_texel
-from localizer.training.shards import FIRST_WORLD_SEED
+from localizer.training.seeds import FIRST_WORLD_SEED
 
 
 def world_pairs(
