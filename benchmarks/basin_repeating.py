@@ -8,13 +8,14 @@ The prior lies between the true place and its copy one period away. What decides
 
 from __future__ import annotations
 
-import argparse
 from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
+from arguments import Parser, whole
 from basin_variants import FULL, Variant
 from feature_report import wilson
+from named_errors import named_errors
 
 from localizer.camera import Camera
 from localizer.pose import Array, Pose
@@ -127,8 +128,8 @@ def _covariance(metres: float, degrees: float) -> Array:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
-    parser.add_argument("--pairs", type=int, default=60)
+    parser = Parser(__doc__)
+    parser.add_argument("--pairs", type=whole(1, 100_000), default=60, help="of places")
     outcomes = list(trials(parser.parse_args().pairs))
     for name in (v.name for v in rows()):
         mine = np.array([o[1:] for o in outcomes if o[0] == name])
@@ -139,4 +140,5 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    with named_errors():
+        main()
