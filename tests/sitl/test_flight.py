@@ -9,6 +9,7 @@ import pytest
 from companion.config import load_config
 from mavlink_bridge.parameter_rules import ardupilot_rules, find_source_set
 from sitl import flight
+from sitl.companion_process import Ports, write_deployment
 from sitl.flight import fly
 from sitl.report import make_report, print_report
 from sitl.scenario import CameraSpec, Injection, Leg, Scenario
@@ -35,12 +36,12 @@ def test_the_vehicles_parameters_suit_what_the_companion_sends(tmp_path, injecti
     """By the doctor's own rules, which are measured refusals of ArduPilot."""
     scenario = Scenario(injection=injection)
     parameters = flight._parameters(scenario)
-    path = flight._write_companion_config(
+    path = write_deployment(
         tmp_path,
         SimpleNamespace(map_cache=tmp_path),
         scenario,
         SimpleNamespace(companion_endpoint="tcp:127.0.0.1:5762"),
-        flight._Ports(5600, 5601),
+        Ports(5600, 5601),
     )
     config = load_config(path).bridge
     assert config.injection.message == injection
