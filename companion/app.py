@@ -16,10 +16,10 @@ from pathlib import Path
 import numpy as np
 
 from companion.build import MapStack, build_localizer
-from companion.config import CompanionConfig
+from companion.config import CompanionConfig, RecordConfig
 from companion.coverage import check_origin
 from companion.detections import Detection, DetectionListener
-from companion.errors import ConfigError
+from companion.errors import ConfigError, DiskFaultError
 from companion.fixes import camera_rotation, vehicle_prior, vision_fix
 from companion.health import HealthMonitor
 from companion.recorder import Recorder, fresh_folder, remove_empty, write_manifest
@@ -50,6 +50,7 @@ class Companion:
         self._stop = threading.Event()
         self._is_up = False
         self._record_folder: Path | None = None
+        self._is_recorded = True
 
     def run(self) -> None:
         """Fly until stopped. Raises what ended the feed, after everything is shut down.
@@ -105,11 +106,7 @@ class Companion:
         up.callback(self._bridge.stop)
         record = config.record
         if record is not None:
-            record = record.model_copy(update={"folder": fresh_folder(record.folder)})
-            self._record_folder = record.folder
-            self._recorder = Recorder(record, self._frame, self._record_failed)
-            up.callback(self._recorder.close)
-            write_manifest(record.folder, config)
+            record = self._open_record(record, up)
         # Before the localizer, whose compilation takes its time: a wrong source is told at once.
         self._source = open_source(
             config.camera.source, self._camera, config.camera.settings, self._on_feed_state
@@ -123,11 +120,31 @@ class Companion:
             config.bridge.targets.rate_hz, self._frame, surface.cast, self._bridge.look
         )
         self._health = HealthMonitor(
-            self._engine, self._bridge, lambda: self._source.state, self._event, record
+            self._engine,
+            self._bridge,
+            lambda: self._source.state,
+            self._event,
+            record,
+            lambda: self._is_recorded,
         )
         self._was_tracking = False
         self._target_numbers: dict[str, int] = {}
         self._feed_error: Exception | None = None
+
+    def _open_record(self, record: RecordConfig, up: ExitStack) -> RecordConfig | None:
+        """The record that is written, in a folder of its own; None while the disk takes none: this
+        may be a restart in the air.
+        """
+        try:
+            record = record.model_copy(update={"folder": fresh_folder(record.folder)})
+            self._record_folder = record.folder
+            self._recorder = Recorder(record, self._frame, self._record_failed)
+            up.callback(self._recorder.close)
+            write_manifest(record.folder, self._config)
+        except DiskFaultError as error:
+            self._record_failed(str(error.__cause__))
+            return None if self._recorder is None else record
+        return record
 
     def _start(self, up: ExitStack) -> None:
         """Start every part; `up` stops them in the reverse order, the feed first."""
@@ -252,6 +269,7 @@ class Companion:
         return self._target_numbers.setdefault(name, len(self._target_numbers))
 
     def _record_failed(self, why: str) -> None:
+        self._is_recorded = False
         self._bridge.say(_WARNING, f"PiLoT: record is incomplete: {why}")
 
     def _on_text(self, severity: int, text: str) -> None:

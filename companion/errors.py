@@ -31,6 +31,10 @@ class ReportError(CompanionError):
     """A report or record that cannot be written where it was asked for."""
 
 
+class DiskFaultError(ReportError):
+    """A record that cannot be written because the disk is full or failing."""
+
+
 class RecordError(CompanionError):
     """A flight's record that is not one, or that lacks what a replay needs."""
 

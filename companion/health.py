@@ -48,11 +48,13 @@ class HealthMonitor:
         feed_state: Callable[[], StreamState],
         event: Callable[[str, str], None],
         record: RecordConfig | None,
+        is_recorded: Callable[[], bool] = lambda: True,
     ) -> None:
         self._engine = engine
         self._bridge = bridge
         self._feed_state = feed_state
         self._event = event
+        self._is_recorded = is_recorded
         self._file = record.folder / "health.json" if record else None
         self._estimates: deque[tuple[float, PoseEstimate]] = deque(maxlen=_WINDOW)
         self._write_failed = False
@@ -96,7 +98,8 @@ class HealthMonitor:
         if time.monotonic() - arrived > _STALE_S:
             return HealthLevel.DEGRADED, error or "no frame is being localized"
         level, text = _OF_STATE[estimate.state]
-        return level, text + (", video scaled" if feed is StreamState.SCALED else "")
+        text += ", video scaled" if feed is StreamState.SCALED else ""
+        return level, text + ("" if self._is_recorded() else ", record incomplete")
 
     def _write(self, level: HealthLevel, text: str) -> None:
         if self._file is None:

@@ -17,11 +17,12 @@ import cv2
 import numpy as np
 
 from companion.config import CompanionConfig, RecordConfig
-from companion.errors import ReportError
+from companion.errors import DiskFaultError, ReportError
 from companion.versions import versions
 from localizer.geo import LocalFrame
 from localizer.pose import quaternion_from_matrix
 from localizer.types import Frame, PoseEstimate, TargetFix
+from mavlink_bridge.recorder import is_disk_fault
 
 _log = logging.getLogger(__name__)
 _QUEUE_SIZE = 4096
@@ -81,7 +82,12 @@ def write_manifest(folder: Path, config: CompanionConfig) -> None:
     try:
         (folder / MANIFEST_NAME).write_text(json.dumps(document, indent=1), encoding="utf-8")
     except OSError as error:
-        raise ReportError(f"record.folder {folder}: cannot be written: {error}") from error
+        raise _unwritable(folder, error) from error
+
+
+def _unwritable(folder: Path, error: OSError) -> ReportError:
+    kind = DiskFaultError if is_disk_fault(error) else ReportError
+    return kind(f"record.folder {folder}: cannot be written: {error}")
 
 
 class Recorder:
@@ -116,7 +122,7 @@ class Recorder:
                 "events": self._open(folder / "events.csv", EVENT_COLUMNS),
             }
         except OSError as error:
-            raise ReportError(f"record.folder {folder}: cannot be written: {error}") from error
+            raise _unwritable(folder, error) from error
         # A daemon: a disk that stands still must not keep the process from ending.
         self._thread = threading.Thread(target=self._run, name="recorder", daemon=True)
         self._thread.start()

@@ -89,6 +89,8 @@ class FlightControllerSide(Side):
             self._stranger(link, message)
             return
         self.streams.seen(kind, time_ns)
+        if kind == "HEARTBEAT":
+            link.keep_peer()
         if kind == "TIMESYNC":
             self._timesync(link, message, time_ns)
         elif kind == "GPS_GLOBAL_ORIGIN":

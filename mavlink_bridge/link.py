@@ -24,7 +24,7 @@ from mavlink_bridge.clock import monotonic_ns, utc_us
 from mavlink_bridge.errors import BridgeStateError, EndpointError
 from mavlink_bridge.framing import FrameReader
 from mavlink_bridge.recorder import TlogRecorder
-from mavlink_bridge.transport import Endpoint, Transport, open_transport
+from mavlink_bridge.transport import Endpoint, Transport, UdpTransport, open_transport
 
 log = logging.getLogger(__name__)
 
@@ -125,6 +125,11 @@ class Link:
         To be asked in the owner thread.
         """
         return len(self._unsent) > _CONGESTED
+
+    def keep_peer(self) -> None:
+        """Answer who sent the message that is being handled, whoever else speaks on the port."""
+        if isinstance(self._transport, UdpTransport):
+            self._transport.keep_peer()
 
     def start(self) -> None:
         """Start the owner thread; the first connection attempt happens in it."""

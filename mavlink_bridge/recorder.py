@@ -5,11 +5,13 @@ Writing has a thread of its own: a memory card that stalls for a second must not
 
 from __future__ import annotations
 
+import errno
 import logging
 import struct
 import threading
 from collections import deque
 from collections.abc import Callable
+from io import FileIO
 from pathlib import Path
 
 from mavlink_bridge.errors import RecordError
@@ -21,11 +23,22 @@ _MAX_WAITING = 8192  # frames: 10 s of five times the usual traffic
 _WRITE_EVERY_S = 0.2
 
 
+_DISK_FAULTS = (errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.EIO)
+
+
+def is_disk_fault(error: OSError) -> bool:
+    """Whether the disk is full or failing, as one may become in flight. Then a start, which may be
+    a restart in the air, goes on without a record; a wrong path or right is an error.
+    """
+    return error.errno in _DISK_FAULTS
+
+
 class TlogRecorder:
     """Appends frames to a .tlog file: 8 bytes of big-endian microseconds UTC, then the frame.
 
-    Raises `RecordError` when the file cannot be opened. Later, what the disk does not take is
-    dropped and counted, and on_failure (called once, in the recorder's thread) is told why.
+    Raises `RecordError` when the file cannot be opened, unless the disk is full or failing. What
+    the disk does not take is dropped and counted, and on_failure (called once, in the recorder's
+    thread) is told why.
     """
 
     def __init__(
@@ -34,14 +47,18 @@ class TlogRecorder:
         on_failure: Callable[[str], None] = lambda _: None,
         max_bytes: int = _MAX_BYTES,
     ) -> None:
+        self._file: FileIO | None = None
+        self._refusal = ""
         try:
             path.parent.mkdir(parents=True, exist_ok=True)
             self._file = path.open("ab", buffering=0)
         except OSError as error:
-            raise RecordError(
-                f"bridge.tlog {path}: cannot be written ({error.strerror}); choose another file "
-                "or leave tlog empty"
-            ) from error
+            self._refusal = error.strerror or str(error)
+            if not is_disk_fault(error):
+                raise RecordError(
+                    f"bridge.tlog {path}: cannot be written ({error.strerror}); choose another "
+                    "file or leave tlog empty"
+                ) from error
         self._path = path
         self._on_failure = on_failure
         self._left = max_bytes
@@ -68,10 +85,11 @@ class TlogRecorder:
         self._stop.set()
         if self._thread is not None:
             self._thread.join(timeout=5.0)
-        try:
-            self._file.close()
-        except OSError as error:
-            self._fail(str(error))
+        if self._file is not None:
+            try:
+                self._file.close()
+            except OSError as error:
+                self._fail(str(error))
 
     def _run(self) -> None:
         while not self._stop.wait(_WRITE_EVERY_S):
@@ -86,6 +104,10 @@ class TlogRecorder:
             time_us, frame = self._waiting.popleft()
             records += struct.pack(">Q", time_us) + frame
         if not records:
+            return
+        if self._file is None:
+            self.dropped += count
+            self._fail(self._refusal)
             return
         if len(records) > self._left:
             self.dropped += count

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import os
 import socket
+import time
 from dataclasses import dataclass
 from typing import Any, Literal, Protocol
 
@@ -15,6 +16,7 @@ from mavlink_bridge.errors import EndpointError
 
 Kind = Literal["udpin", "udpout", "tcp", "tcpin", "serial"]
 _CONNECT_TIMEOUT_S = 2.0
+_KEPT_S = 5.0
 _READ_SIZE = 65536
 _MARKERS = (b"\xfd", b"\xfe")  # of MAVLink 2 and 1
 _HIGHEST_BAUD = 12_000_000
@@ -83,7 +85,9 @@ class Transport(Protocol):
 
 
 class UdpTransport:
-    """A UDP socket. With `remote` None it listens and answers whoever spoke last."""
+    """A UDP socket. With `remote` None it listens and answers whoever spoke last, or, while that
+    one speaks, whom `keep_peer` chose.
+    """
 
     stream = False
 
@@ -100,6 +104,8 @@ class UdpTransport:
                 self._socket.close()
                 raise
         self._learn = remote is None
+        self._sender = remote
+        self._kept_until_s = 0.0
 
     @property
     def port(self) -> int:
@@ -117,9 +123,15 @@ class UdpTransport:
         except (BlockingIOError, ConnectionRefusedError):
             # Refused: an ICMP answer to something sent before the peer listened; UDP goes on.
             return b""
-        if self._learn and data[:1] in _MARKERS:
+        self._sender = sender
+        if self._learn and data[:1] in _MARKERS and time.monotonic() > self._kept_until_s:
             self._remote = sender
         return data
+
+    def keep_peer(self) -> None:
+        """The sender of what was read last is the one to answer, for the next seconds at least."""
+        if self._learn:
+            self._remote, self._kept_until_s = self._sender, time.monotonic() + _KEPT_S
 
     def write(self, data: bytes) -> int:
         """One datagram to the peer."""

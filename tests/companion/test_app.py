@@ -1,9 +1,12 @@
 """The whole process, wired: an embedded vehicle, a feed of grey pictures, a record."""
 
 import csv
+import errno
 import itertools
 import logging
+import os
 import threading
+from pathlib import Path
 
 import cv2
 import numpy as np
@@ -11,7 +14,7 @@ import pytest
 
 from companion.app import Companion
 from companion.config import parse_config
-from companion.errors import ConfigError
+from companion.errors import ConfigError, StreamOpenError
 from mavlink_bridge.link import sleep_until
 from mavlink_bridge.messages import without_figures
 from sitl.embedded.geodesy import Location
@@ -34,6 +37,29 @@ def test_an_origin_far_from_the_map_is_never_sent(small_assets, tmp_path):
     )
     with pytest.raises(ConfigError, match=r"bridge\.origin: \d+\.\d km beside"):
         Companion(config).run()
+
+
+def test_a_restart_on_a_full_disk_goes_on_without_a_record(small_assets, tmp_path, monkeypatch):
+    """In the air a position is worth more than a record. The feed's error ends the start here."""
+    (tmp_path / "image.png").touch()
+    config = parse_config(
+        {
+            "map": str(small_assets.map_cache),
+            "camera": {"source": str(tmp_path / "no.mp4"), "model": MODEL},
+            "bridge": {"connection": "tcp:127.0.0.1:9", "tlog": str(tmp_path / "a" / "a.tlog")},
+            "record": {"folder": str(tmp_path / "record")},
+        },
+        "test",
+    )
+
+    def refuse(*_, **__):
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    monkeypatch.setattr(Path, "mkdir", refuse)
+    companion = Companion(config)
+    with pytest.raises(StreamOpenError):
+        companion.run()
+    assert any("record is incomplete: [Errno 28]" in text for text in companion._bridge.texts())
 
 
 def test_what_happens_is_logged_and_recorded_once_and_every_thread_ends(

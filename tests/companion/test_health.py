@@ -33,13 +33,14 @@ class FakeBridge:
         return SimpleNamespace(line=lambda: "no comparison yet")
 
 
-def _one_report(folder, state, connected, tracking=None):
+def _one_report(folder, state, connected, tracking=None, **options):
     """What the bridge is told, and the events, of a monitor that is started and stopped."""
     bridge, events = FakeBridge(connected), []
     engine = SimpleNamespace(health=EngineHealth())
     monitor = HealthMonitor(
-        engine, bridge, lambda: state, lambda *e: events.append(e), RecordConfig(folder=folder)
-    )
+        engine, bridge, lambda: state, lambda *e: events.append(e), RecordConfig(folder=folder),
+        **options,
+    )  # fmt: skip
     if tracking is not None:
         monitor.add_estimate(SimpleNamespace(state=tracking, stage_ms={}))
     monitor.start()
@@ -80,3 +81,10 @@ def test_a_file_that_cannot_be_written_is_an_event_and_the_bridge_is_still_told(
     told, events = _one_report(tmp_path / "gone", StreamState.LIVE, True)
     assert told
     assert any("cannot be written" in text for _, text in events)
+
+
+def test_a_record_that_fails_is_told_as_long_as_it_does(tmp_path):
+    told, _ = _one_report(
+        tmp_path, StreamState.LIVE, True, TrackingState.TRACKING, is_recorded=lambda: False
+    )
+    assert told[-1] == (HealthLevel.OK, "localization tracking, record incomplete")

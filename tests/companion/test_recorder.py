@@ -1,4 +1,5 @@
 import csv
+import errno
 import logging
 import os
 import threading
@@ -9,7 +10,7 @@ import numpy as np
 import pytest
 
 from companion.config import RecordConfig
-from companion.errors import ReportError
+from companion.errors import DiskFaultError, ReportError
 from companion.recorder import ESTIMATE_COLUMNS, Recorder, fresh_folder, remove_empty
 from localizer.camera import Camera
 from localizer.geo import Geodetic, LocalFrame
@@ -45,6 +46,22 @@ def test_what_is_recorded_can_be_read_back(tmp_path):
         assert next(iter(csv.DictReader(file)))["text"] == 'a, "quoted" text\nof two lines'
     names = sorted(p.stem for p in (tmp_path / "snapshots").glob("*.jpg"))
     assert names == ["1000000000", "2000000000"]
+
+
+@pytest.mark.parametrize(
+    ("number", "kind"),
+    [(errno.ENOSPC, DiskFaultError), (errno.EROFS, DiskFaultError), (errno.EACCES, ReportError)],
+)
+def test_a_disk_that_fails_is_told_from_a_wrong_folder(tmp_path, monkeypatch, number, kind):
+    """The one may come in flight, and a restart must not fail of it."""
+
+    def refuse(*_, **__):
+        raise OSError(number, os.strerror(number))
+
+    monkeypatch.setattr(Path, "mkdir", refuse)
+    with pytest.raises(ReportError, match=r"record\.folder") as caught:
+        Recorder(RecordConfig(folder=tmp_path / "flight"), FRAME)
+    assert type(caught.value) is kind
 
 
 def test_a_file_in_the_folders_place_is_a_named_error(tmp_path):

@@ -39,8 +39,13 @@ class SimulatedLink:
     system_id: int = 0
     open: bool = True
     congested: bool = False
+    kept: int = 0
     endpoint: Endpoint = field(default_factory=lambda: Endpoint.parse("tcp:vehicle:5760"))
     now_ns: int = 0
+
+    def keep_peer(self) -> None:
+        """Count it."""
+        self.kept += 1
 
     def send(self, message: Any, component: int) -> bool:
         """Record it if the link is open."""

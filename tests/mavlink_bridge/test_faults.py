@@ -447,9 +447,12 @@ def test_a_second_vehicle_and_a_second_companion_are_told_once(
     beat = mavlink.MAVLink_heartbeat_message(2, autopilot, 81, 4, 4, 3).pack(stranger)
     flight.texts.clear()
     for _ in range(3):
+        kept = flight.link.kept
         for message in flight.reader.feed(beat):
             flight.side.on_message(flight.link, message, flight.now_ns)  # type: ignore[arg-type]
+        assert flight.link.kept == kept
         flight.run(1.0)
+        assert flight.link.kept == kept + 1  # by the vehicle's own heartbeat
     assert flight.texts == ([f"PiLoT: {said}"] if said else [])
     assert flight.side.tracker.snapshot(flight.now_ns).system_id == 1
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import gc
 import os
 import pty
@@ -104,6 +105,36 @@ def test_wrong_endpoints_say_what_is_wanted(text: str) -> None:
         Endpoint.parse(text)
     with pytest.raises(ValidationError, match="is no endpoint"):
         BridgeConfig(connection=text)
+
+
+def test_the_kept_peer_is_answered_whoever_else_speaks(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A ground station that sends to the same port must not get the positions."""
+    ours = open_transport(Endpoint.parse("udpin:127.0.0.1:0"))
+    assert isinstance(ours, UdpTransport)
+    with (
+        socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as vehicle,
+        socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as station,
+    ):
+
+        def answered(*speakers: socket.socket) -> list[bool]:
+            for speaker in speakers:
+                speaker.sendto(packed(), ("127.0.0.1", ours.port))
+                assert sleep_until(lambda: bool(ours.read()), 10.0)
+                if speaker is vehicle:
+                    ours.keep_peer()
+            ours.write(b"position")
+            heard = []
+            for s in (vehicle, station):
+                s.settimeout(0.2)
+                with contextlib.suppress(TimeoutError):
+                    heard.append(s.recv(100) == b"position" and s is vehicle)
+            return heard
+
+        assert answered(station) == [False]  # the first who speaks
+        assert answered(vehicle, station, station) == [True]
+        monkeypatch.setattr("mavlink_bridge.transport.time.monotonic", lambda: 1e12)
+        assert answered(station) == [False]  # the vehicle is silent for long
+    ours.close()
 
 
 def test_a_second_process_cannot_take_a_udp_port_over() -> None:

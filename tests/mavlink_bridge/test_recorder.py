@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import errno
+import os
 import subprocess
 import sys
 import time
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -48,6 +51,30 @@ def test_a_full_disk_is_told_once_and_costs_the_record_only(autopilot: Any) -> N
             "PiLoT: tlog is incomplete: No space left on device"
         ]
         assert bridge.counters()["fc_handler_errors"] == 0
+
+
+def test_a_start_on_a_failing_disk_goes_on_without_a_tlog(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """As after a restart in the air; a wrong path is an error all the same."""
+
+    def refuse(number: int) -> Callable[..., None]:
+        def mkdir(*_: object, **__: object) -> None:
+            raise OSError(number, os.strerror(number))
+
+        return mkdir
+
+    monkeypatch.setattr(Path, "mkdir", refuse(errno.EACCES))
+    with pytest.raises(RecordError):
+        TlogRecorder(tmp_path / "x" / "a.tlog")
+    monkeypatch.setattr(Path, "mkdir", refuse(errno.EROFS))
+    told: list[str] = []
+    recorder = TlogRecorder(tmp_path / "x" / "a.tlog", told.append)
+    recorder.start()
+    recorder.write(frame(1), 1)
+    recorder.close()
+    assert told == ["Read-only file system"]
+    assert recorder.dropped == 1
 
 
 def test_greatest_size_and_bounded_queue(tmp_path: Path) -> None:
