@@ -26,6 +26,8 @@ _WINDOW_NS = 10_000_000_000  # the smallest lag is forgotten after one to two wi
 _DISCONTINUITY_NS = 2_000_000_000
 _MAX_AGE_NS = 500_000_000  # no absolute stamp is believed that makes a frame older than this
 _MAX_AHEAD_NS = 5_000_000  # nor one this far in the future
+_READINGS, _CLOSE_NS = 5, 100_000
+_STEP_NS = 20_000_000  # what a clock that is only slewed does not do between two frames
 
 
 @dataclass
@@ -79,6 +81,7 @@ class ExposureClock:
         self._by_pts = MinimumLag(latency_ns)
         self._by_misp = MinimumLag(latency_ns)
         self._warned = False
+        self._wall_clock_ns: int | None = None
 
     def exposure_time(self, stamps: Stamps, arrival_ns: int) -> int:
         """CLOCK_MONOTONIC nanoseconds of the exposure of a frame that arrived at `arrival_ns`."""
@@ -92,7 +95,8 @@ class ExposureClock:
 
     def _from_misp(self, misp: MispTime, arrival_ns: int) -> int:
         # Both clocks are read anew for each frame, because NTP may step the system's clock.
-        system_minus_monotonic = time.time_ns() - time.monotonic_ns()
+        system_minus_monotonic = _system_minus_monotonic()
+        self._watch_wall_clock(system_minus_monotonic)
         monotonic = misp.time_us * 1000 - system_minus_monotonic
         relative = self._by_misp.map(misp.time_us * 1000, arrival_ns)
         if misp.locked and _plausible(monotonic, arrival_ns):
@@ -106,6 +110,29 @@ class ExposureClock:
                 (arrival_ns - monotonic) / 1e9,
             )
         return relative
+
+    def _watch_wall_clock(self, system_minus_monotonic: int) -> None:
+        """A step moves all exposure times with it: right if it was set right, and else unseen."""
+        before, self._wall_clock_ns = self._wall_clock_ns, system_minus_monotonic
+        if before is not None and abs(system_minus_monotonic - before) > _STEP_NS:
+            _log.warning(
+                "this computer's clock was stepped by %+.3f s: the exposure times of the camera's "
+                "MISP clock moved against it; let NTP slew in flight, not step",
+                (system_minus_monotonic - before) / 1e9,
+            )
+
+
+def _system_minus_monotonic() -> int:
+    """Difference of the two clocks, ns, from the closest of a few pairs of readings: another thread
+    may have its turn between two readings.
+    """
+    pairs = []
+    for _ in range(_READINGS):
+        before, system, after = time.monotonic_ns(), time.time_ns(), time.monotonic_ns()
+        pairs.append((after - before, system - (before + after) // 2))
+        if after - before < _CLOSE_NS:
+            break
+    return min(pairs)[1]
 
 
 def _plausible(stamp_ns: int, arrival_ns: int) -> bool:

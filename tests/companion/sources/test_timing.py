@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from companion.sources.misp import UUID, MispTime, parse_message, sei_nal
-from companion.sources.timing import ExposureClock, MinimumLag, Stamps
+from companion.sources.timing import ExposureClock, MinimumLag, Stamps, _system_minus_monotonic
 
 MS = 1_000_000
 
@@ -102,3 +102,43 @@ def test_device_stamps_on_the_monotonic_clock_are_exposure_times() -> None:
 def test_without_any_stamp_the_arrival_less_the_latency_is_left() -> None:
     clock = ExposureClock(latency_ns=30 * MS)
     assert clock.exposure_time(Stamps(None, None), 10**12) == 10**12 - 30 * MS
+
+
+@pytest.mark.parametrize("step_s", [0.0, 0.3, -0.1])
+def test_a_step_of_the_wall_clock_is_told(
+    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture, step_s: float
+) -> None:
+    clock, offset_ns = ExposureClock(0), 1_790_000_000 * 10**9
+    stepped_ns = 0
+    monkeypatch.setattr(
+        "companion.sources.timing.time.time_ns",
+        lambda: time.monotonic_ns() + offset_ns + stepped_ns,
+    )
+
+    def seen() -> int:
+        """Age of a frame that was exposed 0.12 s ago by the camera's clock, ns."""
+        now = time.monotonic_ns()
+        stamp = MispTime((now - 120_000_000 + offset_ns) // 1000, locked=True)
+        return now - clock.exposure_time(Stamps(None, stamp), now)
+
+    assert seen() == pytest.approx(120e6, abs=5e6)
+    stepped_ns = round(step_s * 1e9)
+    assert seen() == pytest.approx(120e6 + stepped_ns, abs=5e6)
+    seen()
+    told = [r.getMessage() for r in caplog.records if "clock was stepped" in r.getMessage()]
+    assert len(told) == (1 if step_s else 0)
+    assert all(f"{step_s:+.1f}" in text for text in told)
+
+
+def test_another_thread_between_two_readings_of_the_clocks_costs_nothing(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    truth, readings = time.time_ns() - time.monotonic_ns(), iter((50, 0))
+
+    def slowly() -> int:
+        now = time.monotonic_ns() + truth
+        time.sleep(next(readings, 0) * 1e-3)
+        return now
+
+    monkeypatch.setattr("companion.sources.timing.time.time_ns", slowly)
+    assert _system_minus_monotonic() == pytest.approx(truth, abs=2e6)
