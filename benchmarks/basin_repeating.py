@@ -96,6 +96,7 @@ def rows() -> list[Variant]:
     return [
         Variant(FULL),
         Variant("without motion term", motion=False),
+        changed("survivors may repeat", distinct_px=0.0),
         changed("halving to 32 and 8", keep=(32, 8)),
         changed("10 iterations at the end, not 4", iterations=(2, 3, 10)),
     ]

@@ -106,7 +106,7 @@ def paper_rows() -> list[Variant]:
     """Table 4's system rows: the paper's optimizer, without anything of ours."""
     paper = JNGOConfig(
         hypotheses=1, keep=(144, 144), iterations=(2, 3, 4), sharpen=0,
-        swarm_anchors=(500, 500, 500),
+        swarm_anchors=(500, 500, 500), distinct_px=0.0,
     )  # fmt: skip
     swarm = paper.model_copy(update={"hypotheses": 144})
 
@@ -133,6 +133,7 @@ def our_rows() -> list[Variant]:
         Variant("without motion term", motion=False),
         changed("no halving: all 144 to the end", keep=(144, 144)),
         changed("halving to 32 and 8", keep=(32, 8)),
+        changed("survivors may repeat", distinct_px=0.0),
         changed("10 iterations at the end, not 4", iterations=(2, 3, 10)),
         Variant("without detail level", detail=False),
         Variant("without detail level, N = 2000", anchors=2000, detail=False),

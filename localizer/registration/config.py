@@ -48,6 +48,9 @@ class JNGOConfig(BaseModel):
     detail_scales: tuple[_Scale, ...] = Field(
         default=(1.0, 0.7), description="likewise on the detail level"
     )
+    distinct_px: float = Field(
+        default=0.25, ge=0, description="least rms distance of survivors, level px"
+    )
     huber: float = Field(default=0.5, gt=0, description="Huber threshold on the residual norm")
     damping: float = Field(default=0.03, gt=0, description="first Marquardt factor")
     min_overlap: float = Field(

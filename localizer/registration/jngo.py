@@ -46,7 +46,7 @@ from localizer.registration.reference import ReferenceBackend, retractions
 from localizer.registration.result import Found, Registration, failure, registration
 from localizer.registration.selection import (
     LEAST_SCORE,
-    best_first,
+    distinct,
     median_residual,
     quality,
     thinned,
@@ -150,7 +150,7 @@ class JNGO:
             R, t, totals = found.rotations, found.translations, found.scores
             if level is problems[-1]:
                 totals = self._totals(R, t, totals, origin, motion)
-            order = best_first(totals)[:survivors]
+            order = distinct(problem, R, t, totals, c.distinct_px)[:survivors]
             R, t = R[order], t[order]
             scores, overlaps = found.scores[order], found.overlaps[order]
             if not np.isfinite(scores[0]):

@@ -1,6 +1,6 @@
 """What the optimizer asks about its hypotheses between the refinements (docs/registration.md, 7).
 
-Their order, how probable they are, how good against chance, and how large their residuals are.
+Which are distinct, how probable, how good against chance, and how large their residuals are.
 """
 
 from __future__ import annotations
@@ -17,6 +17,7 @@ from localizer.registration.sampling import sample_features
 from localizer.types import Float32
 
 LEAST_SCORE = 1e-3  # unit of the motion term and of priors where features fit perfectly
+_PROBES = 12  # anchors whose projections tell hypotheses apart
 
 
 def mode_probabilities(scores: Array, cells: int, other: NDArray[np.bool_]) -> Array:
@@ -44,11 +45,30 @@ def thinned(problem: LevelProblem, count: int) -> LevelProblem:
     )
 
 
-def best_first(totals: Array) -> NDArray[np.int64]:
-    """Indices of the hypotheses with finite totals, best first; one where none is finite."""
+def distinct(
+    problem: LevelProblem, R: Array, t: Array, totals: Array, distance_px: float
+) -> NDArray[np.int64]:
+    """Indices of finite hypotheses, best first, without those that repeat a better one.
+
+    Distance: rms over probe anchors of the distance between projections, in pixels of the level.
+    Without this the survivors would be many copies of one mode.
+    """
     order = np.argsort(totals, kind="stable")
     finite = order[np.isfinite(totals[order])]
-    return finite if len(finite) else order[:1]
+    if len(finite) < 2:
+        return order[:1]
+    probes = problem.points[:, :: max(1, problem.points.shape[1] // _PROBES)].astype(np.float64)
+    x = R[finite] @ probes + t[finite, :, None]
+    z = np.maximum(x[:, 2], 0.1)
+    uv = np.concatenate([problem.focal[0] * x[:, 0] / z, problem.focal[1] * x[:, 1] / z], axis=1)
+    kept: list[int] = []
+    limit = distance_px**2 * uv.shape[1] / 2
+    alive = np.ones(len(finite), dtype=bool)
+    for i in range(len(finite)):
+        if alive[i]:
+            kept.append(i)
+            alive &= ((uv - uv[i]) ** 2).sum(axis=1) > limit
+    return finite[kept]
 
 
 def _sampled(problem: LevelProblem, R: Array, t: Array) -> tuple[Float32, Float32, Array]:

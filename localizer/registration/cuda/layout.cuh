@@ -71,12 +71,17 @@ struct RefineArguments {
 };
 
 struct SelectArguments {
+    const Level* level;
     const Motion* motion;  // null: ordered by the cost alone
     State* state;
     Swarm from, to;
     double* totals;    // scratch (from's size)
+    int* order;        // scratch, likewise
+    int* alive;        // scratch, likewise
+    float* projected;  // scratch, 2 * MAX_PROBES per hypothesis
+    double distinct;   // px
     double least_score;
-    int keep, unused;
+    int wanted, keep;
 };
 
 struct PriorWeightArguments {

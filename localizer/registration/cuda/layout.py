@@ -76,14 +76,19 @@ REFINE = _structure(
     ("counted", np.int32),
 )
 SELECT = _structure(
+    ("level", _POINTER),
     ("motion", _POINTER),
     ("state", _POINTER),
     ("source", SWARM),
     ("target", SWARM),
     ("totals", _POINTER),
+    ("order", _POINTER),
+    ("alive", _POINTER),
+    ("projected", _POINTER),
+    ("distinct", np.float64),
     ("least_score", np.float64),
+    ("wanted", np.int32),
     ("keep", np.int32),
-    ("unused", np.int32),
 )
 PRIOR_WEIGHT = _structure(
     ("prior", _POINTER),
@@ -107,6 +112,7 @@ WINNER = _structure(
 )
 FINITE = _structure(("level", _POINTER), ("state", _POINTER))
 
+PROBE_FLOATS = 48  # scratch per hypothesis of the select kernel: 2 * MAX_PROBES of schedule.cuh
 WINNER_FLOATS = 8  # scratch per anchor of the kernels that look at the winner
 
 _NAMES = {

@@ -27,6 +27,9 @@ class FrameMemory:
     swarms: tuple[NDArray[np.void], ...]
     trial: tuple[int, int]
     totals: int
+    order: int
+    alive: int
+    projected: int
     finish: int
     probes: NDArray[np.void]
     probe_state: int
@@ -55,7 +58,8 @@ class FrameMemory:
             ("s0", 8 * count), ("v0", 4 * count),
             ("R1", 72 * count), ("t1", 24 * count), ("s1", 8 * count), ("v1", 4 * count),
             ("trial score", 8), ("trial visible", 4),
-            ("totals", 8 * count),
+            ("totals", 8 * count), ("order", 4 * count), ("alive", 4 * count),
+            ("projected", 4 * layout.PROBE_FLOATS * count),
             ("finish", 4 * layout.WINNER_FLOATS * anchors),
             ("R3", 72 * PROBES), ("t3", 24 * PROBES), ("s3", 8 * PROBES), ("v3", 4 * PROBES),
             ("probe state", layout.STATE.itemsize),
@@ -76,8 +80,9 @@ class FrameMemory:
             swarms.append(swarm)
         return cls(
             base, at["level"], at["motion"], at["prior"], at["state"], tuple(swarms[:3]),
-            (at["trial score"], at["trial visible"]), at["totals"], at["finish"], swarms[3],
-            at["probe state"], offsets["R2"], offsets["s0"] - offsets["prior"],
+            (at["trial score"], at["trial visible"]), at["totals"], at["order"], at["alive"],
+            at["projected"], at["finish"], swarms[3], at["probe state"], offsets["R2"],
+            offsets["s0"] - offsets["prior"],
         )  # fmt: skip
 
     def level(self, k: int) -> int:

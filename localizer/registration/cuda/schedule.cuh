@@ -4,6 +4,8 @@
 #pragma once
 #include "refine.cuh"
 
+constexpr int PROBES = 12, MAX_PROBES = 2 * PROBES;
+
 __device__ inline double infinity() { return __longlong_as_double(0x7ff0000000000000LL); }
 
 // Least of the block's values, for every thread. `slots`: one double per warp.
@@ -38,15 +40,16 @@ __device__ inline double motion_distance(const Motion& motion, const double* R, 
     return squared;
 }
 
-// Orders the hypotheses by total cost (equation 10); the best finite ones go to `to`.
+// Orders the hypotheses by total cost (equation 10) and keeps the best distinct ones: of two whose
+// probe anchors project closer than `distinct` (rms) the better one. Survivors go to `to`.
 extern "C" __global__ void __launch_bounds__(256) select_hypotheses(const SelectArguments a) {
     __shared__ double slots[8];
-    __shared__ int kept;
+    __shared__ int kept, finite;
     const int count = a.state->count, first = threadIdx.x, stride = blockDim.x;
     double mine = infinity();
     for (int m = first; m < count; m += stride) mine = fmin(mine, a.from.scores[m]);
     const double best = fmax(block_least(mine, slots), a.least_score);
-    if (first == 0) kept = 0;
+    if (first == 0) kept = finite = 0;
     for (int m = first; m < count; m += stride) {
         double total = a.from.scores[m];
         if (a.motion && a.motion->weight > 0.0 && total < infinity())
@@ -63,13 +66,52 @@ extern "C" __global__ void __launch_bounds__(256) select_hypotheses(const Select
             const double other = a.totals[k];
             rank += other < total || (other == total && k < m);
         }
-        if (rank >= a.keep || !(total < infinity())) continue;
-        for (int k = 0; k < 9; ++k) a.to.rotations[9 * rank + k] = a.from.rotations[9 * m + k];
+        a.order[rank] = m;
+        a.alive[rank] = total < infinity();
+        if (total < infinity()) atomicAdd(&finite, 1);  // in shared memory; a count
+    }
+    __syncthreads();
+    const Level& level = *a.level;
+    const int step = step_for(level.total, a.wanted), anchors = (level.total + step - 1) / step;
+    const int every = max(1, anchors / PROBES) * step;
+    const int probes = min(MAX_PROBES, (level.total + every - 1) / every);
+    for (int i = first; i < finite * probes; i += stride) {
+        const int rank = i / probes, probe = i % probes, m = a.order[rank];
+        Terms at;
+        const PoseF pose = pose_of(a.from.rotations + 9 * m, a.from.translations + 3 * m);
+        project(level, pose, probe * every, at);
+        a.projected[2 * MAX_PROBES * rank + 2 * probe] = at.u;
+        a.projected[2 * MAX_PROBES * rank + 2 * probe + 1] = at.v;
+    }
+    __syncthreads();
+    const float limit = (float)(a.distinct * a.distinct) * (float)probes;
+    int survivors = 0;
+    for (int i = 0; i < finite && survivors < a.keep; ++i) {
+        if (!a.alive[i]) continue;  // the same for all threads: written before a barrier
+        ++survivors;
+        for (int j = i + 1 + first; j < finite; j += stride) {
+            float distance = 0.0f;
+            for (int k = 0; k < 2 * probes; ++k) {
+                const float d = a.projected[2 * MAX_PROBES * j + k] -
+                                a.projected[2 * MAX_PROBES * i + k];
+                distance += d * d;
+            }
+            if (!(distance > limit)) a.alive[j] = 0;
+        }
+        __syncthreads();
+    }
+    for (int i = first; i < finite; i += stride) {
+        if (!a.alive[i]) continue;
+        int place = 0;
+        for (int k = 0; k < i; ++k) place += a.alive[k];
+        if (place >= a.keep) continue;
+        const int m = a.order[i];
+        for (int k = 0; k < 9; ++k) a.to.rotations[9 * place + k] = a.from.rotations[9 * m + k];
         for (int k = 0; k < 3; ++k)
-            a.to.translations[3 * rank + k] = a.from.translations[3 * m + k];
-        a.to.scores[rank] = a.from.scores[m];
-        a.to.visible[rank] = a.from.visible[m];
-        atomicAdd(&kept, 1);  // in shared memory; a count
+            a.to.translations[3 * place + k] = a.from.translations[3 * m + k];
+        a.to.scores[place] = a.from.scores[m];
+        a.to.visible[place] = a.from.visible[m];
+        atomicAdd(&kept, 1);
     }
     __syncthreads();
     if (first == 0) a.state->count = kept;

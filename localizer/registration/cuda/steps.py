@@ -154,9 +154,11 @@ def _selecting(
     """Order and prune; the prediction has a say in the last order only."""
     last = level == len(shape.config.iterations) - 1
     arguments = np.zeros((), dtype=layout.SELECT)
-    arguments["state"] = memory.state
+    arguments["level"], arguments["state"] = memory.level(level), memory.state
     arguments["motion"] = memory.motion if last else 0
     arguments["source"], arguments["target"] = memory.swarms[source], memory.swarms[target]
-    arguments["totals"], arguments["least_score"] = memory.totals, LEAST_SCORE
-    arguments["keep"] = keep
+    arguments["totals"], arguments["order"] = memory.totals, memory.order
+    arguments["alive"], arguments["projected"] = memory.alive, memory.projected
+    arguments["distinct"], arguments["least_score"] = shape.config.distinct_px, LEAST_SCORE
+    arguments["wanted"], arguments["keep"] = shape.config.swarm_anchors[level], keep
     return Step("select_hypotheses", level, 1, _SMALL_THREADS, arguments)
