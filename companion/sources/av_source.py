@@ -284,6 +284,9 @@ class LiveVideoSource:
                 reason = f"nothing came within {_OPEN_TIMEOUT_S:g} s; is the camera sending there?"
             except av.error.FFmpegError as error:
                 reason = f"cannot connect: {error}"
+            except Exception as error:  # whatever a stream may contain, the next try may be well
+                _log.exception("%s: unexpected error", self._location)
+                reason = f"unexpected {type(error).__name__}: {error}"
             if self._closing.is_set():
                 return
             wait_s = _RETRY_FIRST_S if self._counters.received > received else wait_s

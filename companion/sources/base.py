@@ -12,6 +12,7 @@ from pydantic import BaseModel, ConfigDict, Field
 from companion.errors import StreamSizeError
 from companion.sources.timing import Timing
 from localizer.camera import Camera
+from localizer.errors import CameraError
 from localizer.types import Frame
 
 # Relative difference of width / height that rounding to even sizes makes; 1080 padded to 1088
@@ -129,7 +130,10 @@ def fitted_camera(width: int, height: int, camera: Camera, where: str) -> Camera
             f"{camera.width}x{camera.height}: set the stream to the calibrated size, or give the "
             f"camera model of {width}x{height} (intrinsics do not carry over to a cropped size)"
         )
-    return camera.resized(width, height)
+    try:
+        return camera.resized(width, height)
+    except CameraError as error:
+        raise StreamSizeError(f"{where} delivers {width}x{height}: {error}") from error
 
 
 def scaling_text(width: int, height: int, camera: Camera, where: str) -> str:

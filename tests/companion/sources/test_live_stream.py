@@ -12,6 +12,7 @@ import pytest
 
 from companion.errors import StreamOpenError, StreamSizeError
 from companion.sources import FrameSource, SourceSettings, StreamState, open_source
+from companion.sources.base import fitted_camera
 from localizer.camera import Camera
 from localizer.types import Frame, Image
 from sitl.stream import VideoSender
@@ -305,3 +306,27 @@ def test_an_rtsp_server_that_is_not_there_is_reported_and_kept_trying() -> None:
 def test_an_address_without_a_possible_port_is_named(url):
     with pytest.raises(StreamOpenError, match="HOST:PORT"):
         open_source(url, CAMERA)
+
+
+def test_an_unexpected_error_in_the_reader_is_a_stall_and_tried_again(
+    url: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The reader's thread is the only one that can bring the video back."""
+
+    def decoder(*_: Any) -> None:
+        raise ValueError("no such enumeration value")
+
+    with Watch(url, retry_max_s=0.3) as watch:
+        with monkeypatch.context() as patch:
+            patch.setattr("companion.sources.av_source._Decoder", decoder)
+            watch.wait_until(lambda: StreamState.STALLED in watch.states)
+            assert "unexpected ValueError" in watch.texts[watch.states.index(StreamState.STALLED)]
+        with PacedSender(url):
+            watch.wait_for(3)
+    assert watch.error is None
+
+
+@pytest.mark.parametrize("size", [(4, 3), (1, 1), (8, 6)])
+def test_pictures_too_small_for_a_camera_are_misfits(size: tuple[int, int]) -> None:
+    with pytest.raises(StreamSizeError, match=f"delivers {size[0]}x{size[1]}"):
+        fitted_camera(*size, CAMERA, "udp://x:1")
