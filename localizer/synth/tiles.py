@@ -79,8 +79,31 @@ def glb_bytes(
         views.append(view)
         binary += chunk
     binary += b"\0" * (-len(binary) % 4)
-    count = len(positions)
-    document = {
+    text = json.dumps(_document(y_up, faces, views, len(binary)), separators=(",", ":")).encode()
+    text += b" " * (-len(text) % 4)
+    total = 12 + 8 + len(text) + 8 + len(binary)
+    return b"".join(
+        [
+            struct.pack("<4sII", b"glTF", 2, total),
+            struct.pack("<I4s", len(text), b"JSON"),
+            text,
+            struct.pack("<I4s", len(binary), b"BIN\0"),
+            binary,
+        ]
+    )
+
+
+def _document(
+    y_up: NDArray[np.float32],
+    faces: NDArray[np.int64],
+    views: list[dict[str, Any]],
+    binary_length: int,
+) -> dict[str, Any]:
+    """The JSON of `glb_bytes`: buffer views 0 to 3 are positions, texture coordinates, indices and
+    the image.
+    """
+    count = len(y_up)
+    return {
         "asset": {"version": "2.0", "generator": "pilot-companion synth"},
         "extensionsUsed": ["KHR_materials_unlit"],
         "scene": 0,
@@ -118,7 +141,7 @@ def glb_bytes(
             }
         ],
         "images": [{"bufferView": 3, "mimeType": "image/jpeg"}],
-        "buffers": [{"byteLength": len(binary)}],
+        "buffers": [{"byteLength": binary_length}],
         "bufferViews": views,
         "accessors": [
             {
@@ -138,18 +161,6 @@ def glb_bytes(
             },
         ],
     }
-    text = json.dumps(document, separators=(",", ":")).encode()
-    text += b" " * (-len(text) % 4)
-    total = 12 + 8 + len(text) + 8 + len(binary)
-    return b"".join(
-        [
-            struct.pack("<4sII", b"glTF", 2, total),
-            struct.pack("<I4s", len(text), b"JSON"),
-            text,
-            struct.pack("<I4s", len(binary), b"BIN\0"),
-            binary,
-        ]
-    )
 
 
 def write_tileset(path: Path, root: TileNode, ecef_from_enu: Pose, extras: dict[str, Any]) -> None:
