@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import logging
 import math
 import threading
 import time
@@ -20,6 +21,7 @@ from localizer.types import PoseEstimate, TrackingState
 from mavlink_bridge.bridge import Bridge
 from mavlink_bridge.messages import HealthLevel
 
+_log = logging.getLogger(__name__)
 _PERIOD_S = 1.0
 _WINDOW = 200
 _STALE_S = 2.0
@@ -58,6 +60,7 @@ class HealthMonitor:
         self._file = record.folder / "health.json" if record else None
         self._estimates: deque[tuple[float, PoseEstimate]] = deque(maxlen=_WINDOW)
         self._write_failed = False
+        self._failures = 0
         self._stop = threading.Event()
         self._thread = threading.Thread(target=self._run, name="health")
 
@@ -77,12 +80,20 @@ class HealthMonitor:
     def _run(self) -> None:
         while True:
             stopping = self._stop.wait(_PERIOD_S)
-            level, text = self._assess()
-            # The bridge logs and records what it tells; a silent vehicle it tells by itself.
-            self._bridge.set_health(level, text, tell=text != _SILENT_VEHICLE)
-            self._write(level, text)
+            try:
+                self._report()
+            except Exception:  # or the heartbeats would go on with the last level for ever
+                if not self._failures:
+                    _log.exception("the health could not be reported")
+                self._failures += 1
             if stopping:
                 return
+
+    def _report(self) -> None:
+        level, text = self._assess()
+        # The bridge logs and records what it tells; a silent vehicle it tells by itself.
+        self._bridge.set_health(level, text, tell=text != _SILENT_VEHICLE)
+        self._write(level, text)
 
     def _assess(self) -> tuple[HealthLevel, str]:
         """The worst thing that is true now, in one line."""

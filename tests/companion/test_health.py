@@ -11,6 +11,7 @@ from companion.health import HealthMonitor
 from companion.sources import StreamState
 from localizer.engine import EngineHealth
 from localizer.types import TrackingState
+from mavlink_bridge.link import sleep_until
 from mavlink_bridge.messages import HealthLevel
 
 
@@ -88,3 +89,22 @@ def test_a_record_that_fails_is_told_as_long_as_it_does(tmp_path):
         tmp_path, StreamState.LIVE, True, TrackingState.TRACKING, is_recorded=lambda: False
     )
     assert told[-1] == (HealthLevel.OK, "localization tracking, record incomplete")
+
+
+def test_a_report_that_fails_is_not_the_last(tmp_path, monkeypatch, caplog):
+    monkeypatch.setattr("companion.health._PERIOD_S", 0.05)
+    states = iter([RuntimeError("boom"), RuntimeError("boom")])
+
+    def state():
+        error = next(states, None)
+        if error is not None:
+            raise error
+        return StreamState.LIVE
+
+    bridge = FakeBridge(True)
+    engine = SimpleNamespace(health=EngineHealth())
+    monitor = HealthMonitor(engine, bridge, state, lambda *_: None, RecordConfig(folder=tmp_path))
+    monitor.start()
+    assert sleep_until(lambda: bool(bridge.told), 10.0)
+    monitor.stop()
+    assert sum("could not be reported" in r.message for r in caplog.records) == 1
