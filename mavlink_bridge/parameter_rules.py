@@ -45,7 +45,9 @@ class Rule:
         return " or ".join(f"{value:g}" for value in self.allowed)
 
     def holds(self, value: float) -> bool:
-        """Whether a value satisfies it."""
+        """Whether a value satisfies it; one that is not finite satisfies none."""
+        if not math.isfinite(value):
+            return False
         if self.bits:
             return int(value) & self.bits == self.bits
         if math.isfinite(self.minimum):
@@ -55,7 +57,7 @@ class Rule:
     def fix(self, value: float) -> float:
         """What to write over a value that does not hold."""
         if self.bits:
-            return float(int(value) | self.bits)
+            return float((int(value) if math.isfinite(value) else 0) | self.bits)
         return self.minimum if math.isfinite(self.minimum) else self.allowed[0]
 
 

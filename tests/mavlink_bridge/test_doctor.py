@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import socket
 from typing import Any
 
@@ -12,7 +13,7 @@ from mavlink_bridge import BridgeConfig
 from mavlink_bridge.config import InjectionConfig, OriginConfig
 from mavlink_bridge.doctor import check_parameters, examine, repair
 from mavlink_bridge.errors import ParameterError
-from mavlink_bridge.parameter_rules import ardupilot_rules, find_source_set
+from mavlink_bridge.parameter_rules import ardupilot_rules, find_source_set, px4_rules
 from mavlink_bridge.parameters import ParameterClient, decode_value, encode_value
 
 ORIGIN = OriginConfig(latitude_deg=47.0, longitude_deg=8.0, altitude_amsl_m=500.0)
@@ -160,6 +161,22 @@ def test_examination_and_repair(autopilot: Any, monkeypatch: pytest.MonkeyPatch)
     assert repair(settings, diagnosis.fixable)  # VISO_DELAY_MS is read at the start
     assert autopilot.parameters["VISO_DELAY_MS"] == 100.0
     assert examine(settings).exit_code == 0
+
+
+@pytest.mark.parametrize("value", [math.nan, math.inf, -math.inf])
+@pytest.mark.parametrize(
+    "message", ["vision_position_estimate", "odometry", "gps_input", "global_position_sensor"]
+)
+def test_parameters_that_are_no_numbers_are_wrong_and_can_be_written(
+    message: Any, value: float
+) -> None:
+    config = BridgeConfig(injection=InjectionConfig(message=message))
+    for rules in (ardupilot_rules(config, find_source_set(config, lambda _: value)),
+                  px4_rules(config)):  # fmt: skip
+        for finding in check_parameters(rules, lambda _: value):
+            assert not finding.ok
+            assert finding.fix is not None
+            assert math.isfinite(finding.fix)
 
 
 def test_silence_is_one_required_failure(monkeypatch: pytest.MonkeyPatch) -> None:
