@@ -12,19 +12,29 @@ from __future__ import annotations
 
 import os
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import partial
 
-import cv2
 import numpy as np
 from arguments import Parser, whole
 from named_errors import named_errors
 from optimizer_gpu import print_tables
+from optimizer_problem import (
+    ANCHORS,
+    CHANNELS,
+    HYPOTHESES,
+    SIZES,
+    Poses,
+    make_problem,
+    make_swarm,
+    naive_torch,
+    smooth_features,
+)
 from rich.console import Console
 from rich.table import Table
 
 from localizer.camera import Camera
-from localizer.pose import Pose, so3_exp
+from localizer.pose import Pose
 from localizer.registration import JNGO
 from localizer.registration import anchors as anchors_module
 from localizer.registration.backend import Backend, LevelProblem, LMSettings, sample_bilinear
@@ -32,45 +42,13 @@ from localizer.registration.kernel_numba import NumbaBackend
 from localizer.registration.reference import ReferenceBackend
 from localizer.types import Anchors, FeatureLevel, FeaturePyramid, PosePrior
 
-HYPOTHESES, ANCHORS, CHANNELS = 144, 500, 32
-SIZES = (128, 256, 512)
 PAPER_TABLE_7 = {
     "paper: ONNX Runtime (RTX)": (8.8, 10.4, 14.9),
     "paper: CUDA fused kernel (RTX)": (0.44, 0.47, 0.49),
 }
-Poses = tuple[np.ndarray, np.ndarray]
 
 
-def make_problem(size: int, width: int | None = None, channels: int = CHANNELS) -> LevelProblem:
-    """Smooth random unit features; anchors at 80 to 160 m; the truth is the identity rotation."""
-    width = width or size
-    rng = np.random.default_rng(size)
-    f = smooth_features(rng, size, width, channels)
-    uv = rng.uniform([0.05 * width, 0.05 * size], [0.95 * width, 0.95 * size], (ANCHORS, 2))
-    # Morton-like order: the anchors of a real view come sorted along the Z curve.
-    cell = (uv * 32 / width).astype(int)
-    code = sum(((cell[:, i] >> b) & 1) << (2 * b + i) for b in range(5) for i in (0, 1))
-    uv = uv[np.argsort(code)]
-    depth = rng.uniform(80, 160, ANCHORS)
-    focal, centre = float(width), (width / 2 - 0.5, size / 2 - 0.5)
-    points = np.column_stack([(uv - centre) / focal * depth[:, None], depth])
-    points[:, 2] -= 110.0
-    return LevelProblem(
-        f,
-        rng.uniform(0.3, 1, (size, width)).astype(np.float32),
-        (focal, focal),
-        centre,
-        np.ascontiguousarray(points.T, dtype=np.float32),
-        sample_bilinear(f, uv[:, 0], uv[:, 1]).astype(np.float32),
-        rng.uniform(0.3, 1, ANCHORS).astype(np.float32),
-    )
-
-
-def smooth_features(rng: np.random.Generator, h: int, w: int, channels: int) -> np.ndarray:
-    """Unit features (h, w, C) with structure of four pixels."""
-    coarse = rng.standard_normal((channels, max(h // 4, 3), max(w // 4, 3))).astype(np.float32)
-    f = np.dstack([cv2.resize(c, (w, h), interpolation=cv2.INTER_CUBIC) for c in coarse])
-    return np.ascontiguousarray(f / (np.linalg.norm(f, axis=-1, keepdims=True) + 1e-6))
+Problems = dict[int, LevelProblem]
 
 
 def whole_registration(threads: int, sigma_deg: float, repeats: int) -> tuple[float, int]:
@@ -110,70 +88,6 @@ def whole_registration(threads: int, sigma_deg: float, repeats: int) -> tuple[fl
     return milliseconds(run, repeats), found.evaluations
 
 
-def make_swarm(count: int = HYPOTHESES) -> Poses:
-    """The paper's box of rotations about the camera and N(0, 1 m)."""
-    rng = np.random.default_rng(0)
-    turns = np.radians(np.column_stack([rng.uniform(-11, 11, (count, 2)), rng.normal(0, 1, count)]))
-    rotations = np.stack([so3_exp(t) for t in turns])
-    # The camera turns about its own centre, 110 m above the local origin.
-    return rotations, rotations @ np.array([0.0, 0.0, 110.0]) + rng.normal(0, 1, (count, 3))
-
-
-def naive_torch(
-    problem: LevelProblem, swarm: Poses, threads: int, device: str = "cpu"
-) -> Callable[[], object]:
-    """One batched Gauss-Newton iteration with explicit Jacobians."""
-    import torch
-    from torch.nn.functional import grid_sample
-
-    torch.set_num_threads(threads)
-    h, w, _ = problem.features.shape
-
-    def on(array: np.ndarray) -> torch.Tensor:
-        return torch.from_numpy(array).to(device)
-
-    maps = on(problem.features).permute(2, 0, 1)[None].contiguous()
-    confidence = on(problem.confidence)[None, None]
-    points, anchors = on(problem.points.T.copy()), problem.anchor_features
-    reference = on(anchors)[None]
-    weights = on(problem.anchor_confidence)[None]
-    R, t = (on(x).float() for x in swarm)
-    fx, fy = problem.focal
-    cx, cy = problem.centre
-
-    def sample(image: torch.Tensor, u: torch.Tensor, v: torch.Tensor) -> torch.Tensor:
-        grid = torch.stack([2 * u / (w - 1) - 1, 2 * v / (h - 1) - 1], -1)[:, :, None]
-        image = image.expand(len(u), -1, -1, -1)
-        return grid_sample(image, grid, align_corners=True)[..., 0].transpose(1, 2)
-
-    eye = torch.eye(6, device=device)
-
-    def step() -> object:
-        with torch.no_grad():
-            x = points[None] @ R.transpose(1, 2) + t[:, None]
-            z = x[..., 2].clamp(min=0.1)
-            u, v = fx * x[..., 0] / z + cx, fy * x[..., 1] / z + cy
-            r = sample(maps, u, v) - reference
-            gx = 0.5 * (sample(maps, u + 1, v) - sample(maps, u - 1, v))
-            gy = 0.5 * (sample(maps, u, v + 1) - sample(maps, u, v - 1))
-            zero, arm = torch.zeros_like(z), x - t[:, None]
-            a, b, c, d = fx / z, -fx * x[..., 0] / z**2, fy / z, -fy * x[..., 1] / z**2
-            X, Y, Z = arm.unbind(-1)
-            Ju = torch.stack([a, zero, b, b * Y, a * Z - b * X, -a * Y], -1)
-            Jv = torch.stack([zero, c, d, d * Y - c * Z, -d * X, c * X], -1)
-            J = gx[..., None] * Ju[:, :, None] + gy[..., None] * Jv[:, :, None]
-            norm = r.norm(dim=-1)
-            inside = (u >= 0) & (u < w - 1) & (v >= 0) & (v < h - 1)
-            weight = weights * sample(confidence, u, v)[..., 0] * inside
-            weight = weight * (0.5 / norm.clamp(min=0.5))
-            H = torch.einsum("mn,mnci,mncj->mij", weight, J, J)
-            g = torch.einsum("mn,mnci,mnc->mi", weight, J, r)
-            H = H + 0.03 * torch.diag_embed(torch.diagonal(H, dim1=1, dim2=2)) + 1e-9 * eye
-            return torch.linalg.solve(H, -g)
-
-    return step
-
-
 def milliseconds(run: Callable[[], object], repeats: int) -> float:
     """Fastest wall time of several, after one call to warm up: the least disturbed one."""
     run()
@@ -209,55 +123,54 @@ def schedule(
     return milliseconds(run, repeats)
 
 
-def main() -> None:
-    parser = Parser(__doc__)
-    parser.add_argument(
-        "--threads", type=whole(1, 256), default=min(2, os.cpu_count() or 1), help="beside one"
-    )
-    parser.add_argument("--quick", action="store_true", help="fewer repeats, 256 px only for naive")
-    arguments = parser.parse_args()
-    repeats = 5 if arguments.quick else 15
-    problems = {size: make_problem(size) for size in SIZES}
-    swarm = make_swarm()
-    few = tuple(x[:4] for x in swarm)
-    counts = sorted({1, arguments.threads})
-    console = Console()
-    load = os.getloadavg()[0]
-    console.print(
-        f"{os.cpu_count()} cores, load average {load:.1f} at the start: idle is below 0.5"
-    )
-
+def iteration_table(problems: Problems, counts: Sequence[int], *, quick: bool) -> Table:
+    """Milliseconds per LM iteration of every backend, beside the paper's."""
     table = Table(title=f"ms per LM iteration, M={HYPOTHESES} N={ANCHORS} C={CHANNELS}")
     for heading in ("backend", *(f"{s} x {s}" for s in SIZES), "times faster than naive at 256"):
         table.add_column(heading, justify="right")
-    rows: dict[str, list[float]] = {}
-    for threads in counts:
-        name = f"naive PyTorch ({threads} thread{'s' if threads > 1 else ''})"
-        sizes = (256,) if arguments.quick else SIZES
-        try:
-            rows[name] = [
-                milliseconds(naive_torch(problems[s], swarm, threads), 3) if s in sizes else np.nan
-                for s in SIZES
-            ]
-        except ImportError:
-            console.print("PyTorch is not installed (extra `train`): the naive row is left out")
-            break
+    swarm = make_swarm()
+    rows = naive_rows(problems, counts, sizes=(256,) if quick else SIZES)
+    baseline = list(rows.values())[-1] if rows else None
+    few = tuple(x[:4] for x in swarm)
     reference = ReferenceBackend()
     rows[reference.name] = [
         per_iteration(reference, problems[s], few, 3) * HYPOTHESES / len(few[0]) for s in SIZES
     ]
     for threads in counts:
         backend = NumbaBackend(threads)
-        rows[backend.name] = [per_iteration(backend, problems[s], swarm, repeats) for s in SIZES]
-    naive = {t: rows.get(f"naive PyTorch ({t} thread{'s' if t > 1 else ''})") for t in counts}
-    baseline = naive[counts[-1]]
+        rows[backend.name] = [
+            per_iteration(backend, problems[s], swarm, repeats_of(quick)) for s in SIZES
+        ]
     for name, values in rows.items():
         ratio = f"{baseline[1] / values[1]:.0f}" if baseline else "-"
         table.add_row(name, *(f"{v:.2f}" if np.isfinite(v) else "-" for v in values), ratio)
     for name, values in PAPER_TABLE_7.items():
         table.add_row(name, *(f"{v:.2f}" for v in values), "-")
-    console.print(table)
+    return table
 
+
+def naive_rows(
+    problems: Problems, counts: Sequence[int], sizes: Sequence[int]
+) -> dict[str, list[float]]:
+    """Milliseconds of one naive iteration by threads and size; none without PyTorch."""
+    rows: dict[str, list[float]] = {}
+    for threads in counts:
+        name = f"naive PyTorch ({threads} thread{'s' if threads > 1 else ''})"
+        try:
+            rows[name] = [
+                milliseconds(naive_torch(problems[s], make_swarm(), threads), 3)
+                if s in sizes
+                else np.nan
+                for s in SIZES
+            ]
+        except ImportError:
+            print("PyTorch is not installed (extra `train`): the naive row is left out")
+            break
+    return rows
+
+
+def schedule_table(problems: Problems, counts: Sequence[int], repeats: int) -> Table:
+    """Milliseconds of the whole schedule at the paper's sizes and at the flight's."""
     table = Table(title="ms per registration, LM iterations 2 / 3 / 4 coarse to fine")
     for heading in ("backend", "levels", "C", "144 kept", "144 -> 64 -> 16"):
         table.add_column(heading, justify="right")
@@ -270,17 +183,44 @@ def main() -> None:
             full = schedule(backend, levels, (144, 144), repeats)
             halved = schedule(backend, levels, (64, 16), repeats)
             table.add_row(backend.name, label, str(channels), f"{full:.1f}", f"{halved:.1f}")
-    console.print(table)
+    return table
 
+
+def registration_table(counts: Sequence[int], repeats: int) -> Table:
+    """Milliseconds of `JNGO.register`, tracking and at the start."""
     table = Table(title="ms per JNGO.register, 320 x 240, 4000 anchors, detail level, one image")
     for heading in ("threads", "prior 1 m, 1° (tracking)", "prior 1 m, 8° (start)"):
         table.add_column(heading, justify="right")
     for threads in counts:
         found = [whole_registration(threads, sigma, repeats) for sigma in (1.0, 8.0)]
         table.add_row(str(threads), *(f"{ms:.1f} ({n} evaluations)" for ms, n in found))
-    console.print(table)
+    return table
 
-    print_tables(console, problems, swarm)
+
+def repeats_of(quick: bool) -> int:
+    """Runs of which the least counts."""
+    return 5 if quick else 15
+
+
+def main() -> None:
+    parser = Parser(__doc__)
+    parser.add_argument(
+        "--threads", type=whole(1, 256), default=min(2, os.cpu_count() or 1), help="beside one"
+    )
+    parser.add_argument("--quick", action="store_true", help="fewer repeats, 256 px only for naive")
+    arguments = parser.parse_args()
+    problems = {size: make_problem(size) for size in SIZES}
+    counts = sorted({1, arguments.threads})
+    console = Console()
+    load = os.getloadavg()[0]
+    console.print(
+        f"{os.cpu_count()} cores, load average {load:.1f} at the start: idle is below 0.5"
+    )
+    repeats = repeats_of(arguments.quick)
+    console.print(iteration_table(problems, counts, quick=arguments.quick))
+    console.print(schedule_table(problems, counts, repeats))
+    console.print(registration_table(counts, repeats))
+    print_tables(console, problems, make_swarm())
 
 
 if __name__ == "__main__":

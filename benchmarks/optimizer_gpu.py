@@ -18,6 +18,7 @@ from pathlib import Path
 import numpy as np
 from arguments import Parser
 from named_errors import named_errors
+from optimizer_problem import SIZES, make_problem, make_swarm, naive_torch
 from rich.console import Console
 from rich.table import Table
 
@@ -199,7 +200,6 @@ def torch_ms(problem: LevelProblem, swarm: Poses) -> float:
         return np.nan
     if not torch.cuda.is_available():
         return np.nan
-    from optimizer import naive_torch
 
     step = naive_torch(problem, swarm, 1, "cuda")
     times = []
@@ -227,7 +227,6 @@ def pyramid_problem(
     swarm: Poses, channels: int, anchors: int = 500
 ) -> tuple[FeaturePyramid, Camera, Anchors, np.ndarray]:
     """One place at 512 px seen at strides 4, 2 and 1: pyramid, camera, anchors, local origin."""
-    from optimizer import make_problem
 
     full = make_problem(512, channels=channels)
     camera = Camera(512, 512, *full.focal, full.centre[0] + 0.5, full.centre[1] + 0.5)
@@ -342,8 +341,6 @@ def measure(
 
 
 def main() -> None:
-    from optimizer import SIZES, make_problem, make_swarm
-
     Parser(__doc__).parse_args()
     print_tables(Console(), {size: make_problem(size) for size in SIZES}, make_swarm())
 

@@ -15,18 +15,18 @@ BENCHMARKS = Path(__file__).resolve().parents[4] / "benchmarks"
 @pytest.fixture
 def benchmark(monkeypatch):
     monkeypatch.syspath_prepend(str(BENCHMARKS))
-    import optimizer
     import optimizer_gpu
+    import optimizer_problem
 
     monkeypatch.setattr(optimizer_gpu, "REPEATS", 1)
     monkeypatch.setattr(optimizer_gpu, "WARM_UP", 0)
-    monkeypatch.setattr(optimizer, "ANCHORS", 40)
+    monkeypatch.setattr(optimizer_problem, "ANCHORS", 40)
     few = tuple((label, config, 60) for label, config, _ in optimizer_gpu.SCHEDULES)
     monkeypatch.setattr(optimizer_gpu, "SCHEDULES", few)
     monkeypatch.setattr(optimizer_gpu, "torch_ms", lambda *_: np.nan)
     small = partial(optimizer_gpu.copy_bandwidth, size=2**16)
     monkeypatch.setattr(optimizer_gpu, "copy_bandwidth", small)
-    return optimizer, optimizer_gpu
+    return optimizer_problem, optimizer_gpu
 
 
 def printed(gpu, problems, swarm):
@@ -37,13 +37,13 @@ def printed(gpu, problems, swarm):
 
 def test_every_cell_is_filled_on_a_device(emulator, benchmark, make_emulated, unfused, monkeypatch):
     """The unfused port is compared with the reference before it is timed, here as there."""
-    optimizer, gpu = benchmark
+    problem, gpu = benchmark
     monkeypatch.setattr(gpu, "CudaBackend", make_emulated)
     monkeypatch.setattr(gpu, "unfused_kernels", lambda *_: unfused)
     monkeypatch.setattr(gpu, "Device", lambda: emulator.device)
-    tiny = partial(optimizer.make_problem)
-    monkeypatch.setattr(optimizer, "make_problem", lambda size, **k: tiny(min(size, 32), **k))
-    swarm = optimizer.make_swarm(2)
+    tiny = partial(problem.make_problem)
+    monkeypatch.setattr(gpu, "make_problem", lambda size, **k: tiny(min(size, 32), **k))
+    swarm = problem.make_swarm(2)
     text = printed(gpu, {size: tiny(size) for size in (24, 32)}, swarm)
     assert "fused float16" in text
     for line in text.splitlines():
@@ -53,12 +53,12 @@ def test_every_cell_is_filled_on_a_device(emulator, benchmark, make_emulated, un
 
 
 def test_without_a_device_there_are_dashes_and_a_reason(benchmark, monkeypatch):
-    optimizer, gpu = benchmark
+    problem, gpu = benchmark
 
     def none():
         raise gpu.CudaError("no such thing")
 
     monkeypatch.setattr(gpu, "Device", none)
-    text = printed(gpu, {32: optimizer.make_problem(32)}, optimizer.make_swarm(2))
+    text = printed(gpu, {32: problem.make_problem(32)}, problem.make_swarm(2))
     assert "no GPU column: no such thing" in text
     assert "fused float32 │" in text
