@@ -203,5 +203,11 @@ def _triple(v: Array) -> tuple[float, float, float]:
 
 def _write(path: Path, data: bytes) -> None:
     temporary = path.with_name(path.name + ".tmp")
-    temporary.write_bytes(data)
-    os.replace(temporary, path)
+    try:
+        temporary.write_bytes(data)
+        os.replace(temporary, path)
+    except OSError as error:
+        raise MapCacheError(
+            f"{path}: cannot be written: {error.strerror}; once that is mended, the same command "
+            "goes on where this one stopped"
+        ) from error

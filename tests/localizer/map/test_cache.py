@@ -214,6 +214,61 @@ def test_build_goes_on_after_kill(source, cache, tmp_path, monkeypatch):
     assert not out.with_name("cache.building").exists()
 
 
+FULL = """
+import resource, signal, sys
+from pathlib import Path
+from localizer.errors import MapCacheError
+from localizer.map.build import build_cache
+signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
+resource.setrlimit(resource.RLIMIT_FSIZE, (5000, 5000))
+try:
+    build_cache(Path(sys.argv[1]), Path(sys.argv[2]), workers=1, progress=False)
+except MapCacheError as error:
+    sys.exit(f"named: {error}")
+"""
+
+
+def test_a_full_disk_is_named_and_the_build_goes_on_after_it(source, cache, tmp_path):
+    out = tmp_path / "cache"
+    command = [sys.executable, "-c", FULL, str(source), str(out)]
+    run = subprocess.run(command, check=False, capture_output=True, text=True)
+    assert run.stderr.startswith("named: ")
+    assert "cannot be written: File too large" in run.stderr
+    assert not out.exists()
+    assert build_cache(source, out, workers=1, progress=False) == cache.manifest
+
+
+ORPHANS = """
+import os, signal, time
+from localizer.map.importing import _pool
+if __name__ == "__main__":
+    pool = _pool(2)
+    print(*{pool.submit(os.getpid).result() for _ in range(8)}, *pool._processes, flush=True)
+    os.kill(os.getpid(), signal.SIGKILL)
+"""
+
+
+def _runs(pid: int) -> bool:
+    try:
+        return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] != "Z"
+    except OSError:
+        return False
+
+
+def test_workers_end_with_a_build_that_was_killed(tmp_path):
+    script = tmp_path / "orphans.py"
+    script.write_text(ORPHANS)
+    # To a file: what outlives its parent would hold a pipe open.
+    with (tmp_path / "pids").open("w") as file:
+        subprocess.run([sys.executable, str(script)], stdout=file, check=False)
+    workers = {int(pid) for pid in (tmp_path / "pids").read_text().split()}
+    assert workers
+    deadline = time.monotonic() + 20
+    while any(_runs(pid) for pid in workers):
+        assert time.monotonic() < deadline, "workers stayed behind"
+        time.sleep(0.05)
+
+
 def test_a_changed_source_is_not_mixed_with_an_old_build(make, tmp_path):
     source = make.tileset(tmp_path / "s")
     out = tmp_path / "cache"
