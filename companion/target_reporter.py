@@ -122,6 +122,8 @@ class TargetReporter:
         wait_ns = 0.9e9 / self._config.rate_hz  # frames do not fall on the period exactly
         if last is not None and estimate.exposure_time_ns - last < wait_ns:
             return
+        if last is None and not self._has_room(estimate.exposure_time_ns):
+            return  # before the work: a flood of names must cost next to nothing
         pixel = (detection.u, detection.v)
         sigmas = self._config.pixel_sigma, self._config.map_sigma_m
         inside = 0 <= pixel[0] <= estimate.camera.width and 0 <= pixel[1] <= estimate.camera.height
@@ -130,8 +132,6 @@ class TargetReporter:
             self.missed += 1
             return
         time_ns = estimate.exposure_time_ns
-        if last is None and not self._has_room(time_ns):
-            return
         self._reported_ns[detection.target_id] = time_ns
         target_filter = self._filters.setdefault(detection.target_id, TargetFilter())
         fix = target_filter.update(TargetSighting(detection.target_id, surfaces, pixel, time_ns))
