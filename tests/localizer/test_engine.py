@@ -83,7 +83,7 @@ class FakeOptimizer:
         if self.error is not None:
             raise self.error
         pose = Pose(NADIR.rotation, NADIR.translation + 0.01 + self.offset)
-        return Registration(pose, np.eye(6) * 0.01, 0.1, 0.9, 0.8, self.status, 1, 1)
+        return Registration(pose, np.eye(6) * 0.01, 0.1, 0.9, 0.8, self.status, 1)
 
 
 def _localizer(renderer=None, optimizer=None) -> Localizer:
