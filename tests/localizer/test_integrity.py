@@ -39,7 +39,7 @@ def test_lost_recovers_only_by_confirmations():
 
 
 def _registration(**change) -> Registration:
-    good = Registration(Pose.identity(), np.eye(6), 0.1, 0.9, 0.9, RegistrationStatus.OK, 1, 1)
+    good = Registration(Pose.identity(), np.eye(6), 0.1, 0.9, 0.9, RegistrationStatus.OK, 1)
     return replace(good, **change)
 
 
