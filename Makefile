@@ -12,8 +12,7 @@ test: $(VENV)/.dev
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
-	OMP_NUM_THREADS=1 $(BIN)/pytest -n auto --dist loadfile -m "not alone and not long"
-	$(BIN)/pytest -m "alone and not long"
+	$(BIN)/pytest $(ARGS)
 
 setup: $(VENV)/.dev
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import fcntl
 import os
 import shutil
 import signal
@@ -52,18 +51,13 @@ def real_data() -> Callable[[str], Path]:
 
 @pytest.fixture(scope="session")
 def small_assets(tmp_path_factory: pytest.TempPathFactory) -> FlightAssets:
-    """A 400 m world with both caches: 12 s of processor, so all tests and all workers share it."""
-    folder = tmp_path_factory.getbasetemp()
-    if "PYTEST_XDIST_WORKER" in os.environ:
-        folder = folder.parent
-    with (folder / "world.lock").open("w") as lock:
-        fcntl.flock(lock, fcntl.LOCK_EX)
-        return prepare(5, folder, size_m=400.0)
+    """A 400 m world with both caches: 12 s of processor, so all tests share it."""
+    return prepare(5, tmp_path_factory.mktemp("worlds"), size_m=400.0)
 
 
 @pytest.fixture
 def real_time() -> Callable[[], AbstractContextManager[None]]:
-    """``with real_time():`` around what needs two processors while it runs (a test `alone`).
+    """``with real_time():`` around what needs two processors while it runs.
 
     A starved companion lands its vehicle, as it should, and a starved receiver is late: that says
     nothing of the code. So it skips, with what was measured, where other work leaves no time before

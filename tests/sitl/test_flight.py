@@ -53,7 +53,6 @@ def test_the_vehicles_parameters_suit_what_the_companion_sends(tmp_path, injecti
     assert [n for n, rule in given.items() if not rule.holds(parameters[n])] == []
 
 
-@pytest.mark.alone
 @pytest.mark.parametrize("kind", ["embedded", pytest.param("ardupilot", marks=pytest.mark.sitl)])
 def test_a_short_flight_without_gnss_comes_home(real_time, small_assets, tmp_path, kind):
     folder = tmp_path / "report"

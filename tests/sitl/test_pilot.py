@@ -169,7 +169,6 @@ def horizontal(a: Location, b: Location) -> float:
     return math.hypot(*a.ned_of(b)[:2])
 
 
-@pytest.mark.alone
 def test_flies_a_mission_on_gps_and_then_on_vision(real_time, kind):
     parameters = {**vision_parameters(), **GIMBAL, **SPEEDS}
     with (

@@ -20,7 +20,6 @@ from sitl.process import VehicleKind
 from sitl.suite.case import load_cases
 from sitl.suite.runner import Row, run_case, run_suite
 
-pytestmark = pytest.mark.alone
 CASES = load_cases()
 FEW = [case for case in CASES if case.ci]
 REST = [case for case in CASES if not case.ci]

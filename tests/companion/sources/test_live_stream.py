@@ -146,7 +146,6 @@ def _compare(watch: Watch, sender: PacedSender, skip: int = 0) -> tuple[np.ndarr
     return error, latency
 
 
-@pytest.mark.alone
 def test_exposure_times_by_misp_stamps_are_exact_and_latency_is_low(
     real_time: Any, url: str
 ) -> None:
@@ -169,7 +168,6 @@ def test_exposure_times_by_misp_stamps_are_exact_and_latency_is_low(
     assert sequences == sorted(set(sequences))
 
 
-@pytest.mark.alone
 def test_exposure_times_by_presentation_times_need_the_fixed_latency_only(
     real_time: Any, url: str
 ) -> None:
@@ -207,7 +205,6 @@ def test_a_stream_that_stops_is_reported_and_taken_up_again(url: str) -> None:
     assert 0 < np.median(ages) < 0.3e9
 
 
-@pytest.mark.alone
 def test_a_consumer_that_is_slow_gets_the_newest_frame_and_the_rest_are_counted(
     real_time: Any, url: str
 ) -> None:

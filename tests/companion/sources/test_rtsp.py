@@ -11,7 +11,6 @@ from typing import Any
 
 import av
 import numpy as np
-import pytest
 
 from companion.sources import SourceSettings, StreamState, open_source
 from localizer.camera import Camera
@@ -120,7 +119,6 @@ class _RtspCamera:
                 client.sendall(b"$\0" + len(packet).to_bytes(2, "big") + packet)
 
 
-@pytest.mark.alone
 def test_an_rtsp_camera_is_received_and_taken_up_again_when_it_hangs_up(real_time: Any) -> None:
     with real_time():
         server = _RtspCamera()
