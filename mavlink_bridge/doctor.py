@@ -14,6 +14,7 @@ from mavlink_bridge.parameter_rules import (
     Read,
     Rule,
     ardupilot_rules,
+    arming_rules,
     find_source_set,
     px4_rules,
 )
@@ -84,7 +85,7 @@ def check_parameters(rules: Iterable[Rule], read: Read) -> list[Finding]:
             ok = rule.holds(value)
             fix = None if ok else rule.fix(value)
             finding = Finding(
-                name, f"{value:g}", rule.needed, rule.why, ok, rule.required, fix, rule.reboot
+                name, f"{value:.7g}", rule.needed, rule.why, ok, rule.required, fix, rule.reboot
             )
         findings.append(finding)
     return findings
@@ -173,7 +174,7 @@ def _link_findings(
             "EKF origin",
             "read" if state.origin else ("configured" if config.origin else "none"),
             "read or configured",
-            "without one: 'AHRS: waiting for home'; set bridge.origin",
+            "without one: 'AHRS: waiting for home'; wait for a GNSS fix, or set bridge.origin",
             state.origin is not None or config.origin is not None or message == "gps_input",
             True,
         ),
@@ -218,7 +219,11 @@ def examine(config: BridgeConfig) -> Diagnosis:
         if state.autopilot == "px4":
             rules: Sequence[Rule] = px4_rules(config)
         else:
-            rules = ardupilot_rules(config, find_source_set(config, client.read))
+            source_set = find_source_set(config, client.read)
+            rules = [
+                *ardupilot_rules(config, source_set),
+                *arming_rules(config, source_set, client.read),
+            ]
         findings += check_parameters(rules, client.read)
     return Diagnosis(tuple(findings))
 

@@ -14,6 +14,9 @@ from mavlink_bridge.config import BridgeConfig
 
 _SOURCE_SETS = (1, 2, 3)
 _PX4_LATE_MS = 50.0
+_ALL_CHECKS = 1  # bit 0 of ARMING_CHECK, whatever the other bits say
+_EVERY_CHECK = (1 << 21) - 2  # bits 1 to 20, the last is OSD
+_VISION_CHECK = 1 << 18
 
 Read = Callable[[str], float | None]
 
@@ -42,7 +45,7 @@ class Rule:
             return f"bits {self.bits:#x} set"
         if math.isfinite(self.minimum):
             return f">= {self.minimum:g}"
-        return " or ".join(f"{value:g}" for value in self.allowed)
+        return " or ".join(f"{value:.7g}" for value in self.allowed)
 
     def holds(self, value: float) -> bool:
         """Whether a value satisfies it; one that is not finite satisfies none."""
@@ -83,6 +86,26 @@ def ardupilot_rules(config: BridgeConfig, source_set: int) -> list[Rule]:
     if config.injection.message == "gps_input":
         return common + _gps_input_rules(config, source_set)
     return common + _vision_rules(config, source_set)
+
+
+def arming_rules(config: BridgeConfig, source_set: int, read: Read) -> list[Rule]:
+    """What lets a vehicle take off on GNSS while VISO_TYPE is set and no vision flows yet.
+
+    ArduPilot refuses to arm then ('VisOdom: not healthy'), so in shadow mode always. A vehicle that
+    takes off on vision (source set 1) keeps the check. ARMING_CHECK names the checks to do,
+    ARMING_SKIPCHK (4.7 and later) those to leave out.
+    """
+    gps_input = config.injection.message == "gps_input"
+    if config.injection.gps_id == 0 if gps_input else source_set == 1:
+        return []
+    required = not gps_input and config.mode != "inject"
+    why = "no vision on the ground: 'VisOdom: not healthy' refuses to arm (bit 18)"
+    checks = read("ARMING_CHECK")
+    if checks is None:
+        return [Rule(("ARMING_SKIPCHK",), (), why, required, bits=_VISION_CHECK)]
+    listed = int(checks) if math.isfinite(checks) else _ALL_CHECKS
+    done = _EVERY_CHECK if listed & _ALL_CHECKS else listed
+    return [Rule(("ARMING_CHECK",), (float(done & ~_VISION_CHECK),), why, required)]
 
 
 def _vision_rules(config: BridgeConfig, number: int) -> list[Rule]:

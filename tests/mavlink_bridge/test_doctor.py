@@ -13,7 +13,12 @@ from mavlink_bridge import BridgeConfig
 from mavlink_bridge.config import InjectionConfig, OriginConfig
 from mavlink_bridge.doctor import check_parameters, examine, repair
 from mavlink_bridge.errors import ParameterError
-from mavlink_bridge.parameter_rules import ardupilot_rules, find_source_set, px4_rules
+from mavlink_bridge.parameter_rules import (
+    ardupilot_rules,
+    arming_rules,
+    find_source_set,
+    px4_rules,
+)
 from mavlink_bridge.parameters import ParameterClient, decode_value, encode_value
 
 ORIGIN = OriginConfig(latitude_deg=47.0, longitude_deg=8.0, altitude_amsl_m=500.0)
@@ -119,6 +124,27 @@ def test_a_second_receiver_needs_room_in_the_ekfs_buffer(gps_id: int, asked: boo
     advice = {f.name: f.fix for f in findings if f.name.startswith("VISO") and not f.ok}
     assert advice == ({"VISO_TYPE": 1.0, "VISO_DELAY_MS": 100.0} if asked else {})
     assert not any(f.required for f in findings if f.name in advice)
+
+
+@pytest.mark.parametrize(
+    ("parameters", "fixed"),
+    [
+        ({"ARMING_CHECK": 1.0}, {"ARMING_CHECK": float((1 << 21) - 2 - (1 << 18))}),
+        ({"ARMING_CHECK": 0.0}, {}),
+        ({"ARMING_CHECK": float((1 << 18) + 8)}, {"ARMING_CHECK": 8.0}),
+        ({"ARMING_CHECK": 8.0}, {}),
+        ({"ARMING_SKIPCHK": 2.0}, {"ARMING_SKIPCHK": float((1 << 18) + 2)}),
+        ({"ARMING_SKIPCHK": -1.0}, {}),
+    ],
+)
+def test_a_vehicle_on_gnss_arms_without_vision(
+    parameters: dict[str, float], fixed: dict[str, float]
+) -> None:
+    shadow = BridgeConfig(connection="udpout:127.0.0.1:1", mode="shadow")
+    found = check_parameters(arming_rules(shadow, 2, parameters.get), parameters.get)
+    assert {f.name: f.fix for f in found if not f.ok} == fixed
+    assert all(f.required for f in found)
+    assert arming_rules(shadow, 1, parameters.get) == []  # takes off on vision: keeps the check
 
 
 def test_odometry_wants_velocity_noise_that_is_true() -> None:
