@@ -36,7 +36,9 @@ def build(
     ] = None,
     vertical_datum: Annotated[
         Literal["ellipsoidal", "amsl"] | None,
-        typer.Option(help="of the source's heights: ellipsoidal or amsl"),
+        typer.Option(
+            help="what the source's heights are above: the WGS84 ellipsoid or the geoid (amsl)"
+        ),
     ] = None,
     georeference: Annotated[
         Path | None, typer.Option(help="georeference of a mesh: JSON, or ODM's offset file")

@@ -61,7 +61,12 @@ def demo(
     seed: Annotated[int, typer.Option(min=0, help="world, traffic, light and noise")] = 0,
     fc: Annotated[str, typer.Option(help="auto, ardupilot or embedded")] = "auto",
     scenario: Annotated[Path | None, typer.Option(help="scenario YAML; none: the default")] = None,
-    injection: Annotated[str | None, typer.Option(help="MAVLink message instead of its")] = None,
+    injection: Annotated[
+        str | None,
+        typer.Option(
+            help="MAVLink message instead of the scenario's: " + ", ".join(get_args(Injection))
+        ),
+    ] = None,
     out: Annotated[Path, typer.Option(help="folder of the report")] = Path("report"),
     worlds: Annotated[Path | None, typer.Option(help="folder of generated worlds")] = None,
 ) -> None:
@@ -91,7 +96,10 @@ def sequence(
     out: Annotated[Path, typer.Argument(help="folder of the sequence")],
     seed: Annotated[int, typer.Option(min=0, help="world, traffic, light and noise")] = 0,
     scenario: Annotated[Path | None, typer.Option(help="scenario YAML; none: the default")] = None,
-    condition: Annotated[str | None, typer.Option(help="light and weather instead of its")] = None,
+    condition: Annotated[
+        str | None,
+        typer.Option(help="light and weather instead of the scenario's: " + ", ".join(CONDITIONS)),
+    ] = None,
     worlds: Annotated[Path | None, typer.Option(help="folder of generated worlds")] = None,
 ) -> None:
     """Record the scenario's path, flown without dynamics, as a sequence for `companion eval`."""

@@ -87,8 +87,7 @@ def build_tree(
     scheduler: str | None = None,
 ) -> Manifest:
     """Build a cache from any importer's tree; see `build_cache`. name: of the source."""
-    separation = _geoid_separation(tree, geoid_separation_m, name)
-    datum = _vertical_datum(tree, vertical_datum, name)
+    separation, datum = _heights(tree, geoid_separation_m, vertical_datum, name)
     lift = separation if datum == "amsl" else 0.0
     frame = LocalFrame(origin or _origin(tree, lift))
     parameters = {
@@ -130,35 +129,40 @@ def _failure_text(source: str, failures: dict[str, str]) -> str:
     more = len(failures) - len(lines)
     return "\n  ".join(
         [
-            f"{source}: {len(failures)} tiles cannot be imported; repair them or ask to skip them",
+            f"{source}: {len(failures)} tiles cannot be imported; repair them or leave "
+            "them out (--skip-bad-tiles)",
             *lines,
             *([f"and {more} more"] if more else []),
         ]
     )
 
 
-def _geoid_separation(tree: SourceTree, given: float | None, source: str) -> float:
-    value = tree.geoid_separation_m if given is None else given
-    if value is None:
-        raise GeoreferenceError(
-            f"{source} does not say how high the geoid is above the WGS84 ellipsoid there; give "
-            "the geoid separation in metres (e.g. from an EGM96 or EGM2008 calculator)"
-        )
-    if not LOWEST_GEOID_M <= value <= HIGHEST_GEOID_M:
-        raise GeoreferenceError(f"a geoid separation of {value} m does not occur on Earth")
-    return value
-
-
-def _vertical_datum(tree: SourceTree, given: VerticalDatum | None, source: str) -> VerticalDatum:
-    if given not in (None, "ellipsoidal", "amsl"):
-        raise GeoreferenceError(f"vertical datum {given!r}: ellipsoidal and amsl are known")
-    datum = given or tree.vertical_datum
+def _heights(
+    tree: SourceTree, separation_m: float | None, datum: VerticalDatum | None, source: str
+) -> tuple[float, VerticalDatum]:
+    """Geoid separation and vertical datum, as given or as the source says; all that is missing is
+    named at once.
+    """
+    if datum not in (None, "ellipsoidal", "amsl"):
+        raise GeoreferenceError(f"vertical datum {datum!r}: ellipsoidal and amsl are known")
+    separation_m = tree.geoid_separation_m if separation_m is None else separation_m
+    datum = datum or tree.vertical_datum
+    missing = []
     if datum is None:
-        raise GeoreferenceError(
-            f"{source} does not say what its heights are; give the vertical datum: ellipsoidal "
-            "(WGS84) or amsl (above the geoid)"
+        missing.append(
+            "what its heights are above: give the vertical datum (--vertical-datum), ellipsoidal "
+            "(WGS84) or amsl (the geoid)"
         )
-    return datum
+    if separation_m is None:
+        missing.append(
+            "how high the geoid is above the WGS84 ellipsoid there: give the geoid separation in "
+            "metres (--geoid-separation), from an EGM96 or EGM2008 calculator"
+        )
+    if datum is None or separation_m is None:
+        raise GeoreferenceError(f"{source} does not say " + "; nor ".join(missing))
+    if not LOWEST_GEOID_M <= separation_m <= HIGHEST_GEOID_M:
+        raise GeoreferenceError(f"a geoid separation of {separation_m} m does not occur on Earth")
+    return separation_m, datum
 
 
 def _origin(tree: SourceTree, lift: float) -> Geodetic:

@@ -55,7 +55,8 @@ def _read_mesh(
 ) -> SourceTree:
     if georeference is None:
         raise GeoreferenceError(
-            f"{source}: a mesh does not say where on Earth it stands; give a georeference file"
+            f"{source}: a mesh does not say where on Earth it stands; give a georeference "
+            "file (--georeference)"
         )
     if isinstance(georeference, Path):
         georeference = read_georeference(georeference)
