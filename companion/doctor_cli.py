@@ -34,7 +34,7 @@ def doctor_command(
         diagnosis = examine_deployment(settings, vehicle=vehicle)
     print_diagnosis(console, diagnosis)
     if fix and diagnosis.fixable:
-        names = ", ".join(f"{f.name} = {f.fix:g}" for f in diagnosis.fixable if f.fix is not None)
+        names = ", ".join(f"{f.name} = {f.fix:.7g}" for f in diagnosis.fixable if f.fix is not None)
         if yes or typer.confirm(f"Write {names}?"):
             reboot = repair(settings.bridge, diagnosis.fixable)
             console.print("written" + ("; reboot the flight controller" if reboot else ""))

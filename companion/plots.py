@@ -32,9 +32,10 @@ def checkerboard(video: Image, render: Image, cells: int = 8) -> Image:
 
 
 def overlay_sheet(video: Image, render: Image, caption: str) -> Image:
-    """Video, render and their checkerboard side by side under a caption."""
+    """Video, render and their checkerboard side by side, under what they are and a caption."""
     sheet = np.hstack([video, render, checkerboard(video, render)])
     bar = np.zeros((22, sheet.shape[1], 3), np.uint8)
+    caption = f"video | map at the estimated pose | checkerboard   {caption}"
     cv2.putText(bar, caption, (6, 16), cv2.FONT_HERSHEY_SIMPLEX, 0.45, (255, 255, 255), 1)
     return np.vstack([bar, sheet])
 

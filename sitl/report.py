@@ -268,7 +268,7 @@ def _overlays(
         video = undistort(Frame(image, int(path.stem), camera, 0))
         view = renderer.render(estimated[k], target, wait=True)
         time_s = (int(path.stem) - start) * 1e-9
-        caption = f"video | map at the estimated pose | checkerboard   t = {time_s:.1f} s"
+        caption = f"t = {time_s:.1f} s"
         save_image(folder / f"overlay-{number}.png", overlay_sheet(video, view.rgb, caption))
 
 
