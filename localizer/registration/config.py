@@ -63,7 +63,14 @@ class JNGOConfig(BaseModel):
     prior_weight: float = Field(
         default=0.0001, ge=0, description="weight of a constraint, likewise"
     )
-    correlation: float = Field(default=1.1, gt=0, description="covariance factor, calibrated")
+    correlation: float = Field(
+        default=4.4,
+        gt=0,
+        description="covariance factor of the sums over all anchors, calibrated",
+    )
+    few_anchors: float = Field(
+        default=150.0, ge=0, description="anchors in view with which the covariance doubles"
+    )
     correlation_px: float = Field(
         default=32.0, gt=0, description="image cell within which residuals may correlate"
     )

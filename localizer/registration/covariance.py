@@ -89,7 +89,8 @@ class CovarianceSums:
     """What equation 11 adds up over the anchors in view. hessian: Σ ŵ JᵀSJ, without the prior;
     meat: Σ_cells G Gᵀ; isotropic: Σ ŵ² σ_r² JᵀSJ, all (6, 6); cells: how many are occupied;
     prior_hessian: (6, 6); motion: (6, 6), mean of JᵀJ, so that xi moves the image by
-    sqrt(xi' motion xi) level px, rms; curvature: equation 11a.
+    sqrt(xi' motion xi) level px, rms; anchors: how many are in view, of all that the pose was
+    fitted to; share: of those, that were added up; curvature: equation 11a.
     """
 
     hessian: Array
@@ -98,6 +99,8 @@ class CovarianceSums:
     cells: int
     prior_hessian: Array
     motion: Array
+    anchors: int
+    share: float = 1.0
     curvature: float = 1.0
 
 
@@ -122,6 +125,7 @@ def covariance_sums(model: AnchorModel) -> CovarianceSums | None:
         cells,
         model.prior_hessian,
         mean_motion(J),
+        len(J),
     )
 
 
@@ -152,14 +156,19 @@ def curvature_ratio(scores: Array, steps: Array, hessian: Array) -> float:
 
 
 def sandwich_covariance(
-    sums: CovarianceSums, correlation: float, floor: float, prior_weight: float = 0.0
+    sums: CovarianceSums,
+    correlation: float,
+    floor: float,
+    few_anchors: float = 0.0,
+    prior_weight: float = 0.0,
 ) -> Array | None:
     """Covariance (6, 6) of xi = (rho, phi) at the optimum, None where H is singular.
 
     The sandwich of equation 11 takes the residuals' variance, and their correlation between
     channels and within a cell of the image, from the data. correlation: variance factor for what
     it cannot see. floor: least share of the isotropic model, so that a perfect fit does not claim
-    perfect knowledge. A prior of weight `prior_weight` adds its own noise.
+    perfect knowledge. few_anchors: anchors in view with which the noise counts twice (11b). A prior
+    of weight `prior_weight` adds its own noise.
     """
     hessian = sums.curvature * sums.hessian + sums.prior_hessian
     diagonal = np.diag(hessian)
@@ -173,7 +182,8 @@ def sandwich_covariance(
     if sums.cells <= 6:
         return None
     meat = sums.meat * (sums.cells / (sums.cells - 6))
-    noise = correlation * (meat + floor * sums.isotropic)
+    factor = correlation * sums.share * (1.0 + few_anchors / max(sums.anchors, 1))
+    noise = factor * (meat + floor * sums.isotropic)
     covariance: Array = inverse @ (noise + prior_weight * sums.prior_hessian) @ inverse
     return 0.5 * (covariance + covariance.T)
 

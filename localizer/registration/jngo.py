@@ -42,7 +42,7 @@ from localizer.registration.cuda.schedule import CudaSchedule
 from localizer.registration.devices import trial
 from localizer.registration.kernel_numba import NumbaBackend
 from localizer.registration.priors import PoseConstraint
-from localizer.registration.reference import ReferenceBackend, retractions
+from localizer.registration.reference import ReferenceBackend, count_in_view, retractions
 from localizer.registration.result import Found, Registration, failure, registration
 from localizer.registration.selection import (
     LEAST_SCORE,
@@ -246,7 +246,12 @@ class JNGO:
         rotations, translations = retractions(R, t, steps)
         free = replace(winner.problem, prior=None)
         scores = self.backend.refine(free, rotations, translations, 0, settings).scores
-        return replace(sums, curvature=curvature_ratio(scores, steps, sums.hessian))
+        return replace(
+            sums,
+            anchors=count_in_view(winner.problem, R, t),
+            share=few.points.shape[1] / winner.problem.points.shape[1],
+            curvature=curvature_ratio(scores, steps, sums.hessian),
+        )
 
     def warm_up(self, channels: int) -> None:
         """Compile (or load from the cache) the kernel for feature maps of `channels`."""

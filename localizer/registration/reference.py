@@ -58,6 +58,11 @@ def in_view(problem: LevelProblem, x: Array, uv: Array) -> NDArray[np.bool_]:
     return inside & (x[:, 2] > MIN_DEPTH)
 
 
+def count_in_view(problem: LevelProblem, rotation: Array, translation: Array) -> int:
+    """How many anchors are in view from the pose camera_from_local."""
+    return int(in_view(problem, *project(problem, rotation, translation)).sum())
+
+
 def feature_gradients(features: Float32, u: Array, v: Array) -> tuple[Array, Array]:
     """Derivatives (N, C) of the bilinear interpolation along x and y, exact within a cell."""
     h, w = features.shape[:2]

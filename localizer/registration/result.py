@@ -63,7 +63,11 @@ def registration(found: Found, config: JNGOConfig, prior: PosePrior, origin: Arr
     tangent = None
     if found.sums is not None:
         tangent = sandwich_covariance(
-            found.sums, config.correlation, config.covariance_floor, found.prior_weight
+            found.sums,
+            config.correlation,
+            config.covariance_floor,
+            config.few_anchors,
+            found.prior_weight,
         )
     if found.sums is None or tangent is None:
         return failure(prior, RegistrationStatus.NO_TEXTURE, found.evaluations)

@@ -60,7 +60,7 @@ def _found(search: Search, constraint: QuadraticPrior | None) -> Found:
         prior_hessian = weight * prior_terms(constraint, R, t)[1]
     sums = CovarianceSums(
         search.hessian, search.meat, search.isotropic, search.cells, prior_hessian,
-        search.motion, search.curvature,
+        search.motion, search.anchors, search.share, search.curvature,
     )  # fmt: skip
     return Found(
         search.rotations,

@@ -39,6 +39,7 @@ from localizer.registration.cuda.steps import (
     launches,
     refining,
 )
+from localizer.registration.reference import count_in_view
 from localizer.types import Anchors, FeatureLevel, FeaturePyramid, PosePrior
 
 
@@ -46,7 +47,7 @@ from localizer.types import Anchors, FeatureLevel, FeaturePyramid, PosePrior
 class Search:
     """What the device found. rotations (K, 3, 3), translations (K, 3): the survivors, camera from
     local, best first, the first one sharpened; scores (K,) before that, and overlaps (K,); K is 0
-    without overlap. hessian, meat, isotropic, motion, curvature: as in `CovarianceSums`;
+    without overlap. hessian to curvature: as in `CovarianceSums`;
     finite: False where features, confidences or points are not. upload_ms, graph_ms: device time,
     0 unless the schedule is timed.
     """
@@ -60,6 +61,8 @@ class Search:
     isotropic: Array
     cells: int
     motion: Array
+    anchors: int
+    share: float
     curvature: float
     prior_weight: float
     quality: float
@@ -132,7 +135,9 @@ class CudaSchedule:
         seen: LevelProblem,
         scale: float,
     ) -> Search:
-        """The result with motion and curvature. seen: the level's geometry; scale: of its loss."""
+        """The result with motion, counts and curvature. seen: the level's geometry; scale: of its
+        loss.
+        """
         c = shape.config
         wanted = COVARIANCE_ANCHORS if c.sharpen else c.swarm_anchors[-1]
         few = replace(seen, points=seen.points[:, :: max(1, seen.points.shape[1] // wanted)])
@@ -147,7 +152,14 @@ class CudaSchedule:
             self._backend, memory, step, shape.channels[level], pose, motion, found.hessian,
             c.curvature_px,
         )  # fmt: skip
-        return replace(found, motion=motion, curvature=curvature)
+        fitted = seen if c.sharpen else few
+        return replace(
+            found,
+            motion=motion,
+            anchors=count_in_view(fitted, *pose),
+            share=few.points.shape[1] / fitted.points.shape[1],
+            curvature=curvature,
+        )
 
     def _captured(self, shape: Shape, memory: FrameMemory) -> Graph:
         if self._graph is not None and self._graph[0] == shape:
@@ -233,7 +245,7 @@ class CudaSchedule:
     def _collect(
         self, memory: FrameMemory, config: JNGOConfig, anchors: int, channels: int
     ) -> tuple[Search, float]:
-        """What came back, without motion and curvature; the scale of the winner's last loss."""
+        """What came back, without motion, counts and curvature; the scale of the last loss."""
         block = np.empty(memory.result_size, np.uint8)
         self._device.download(block, memory.prior)
         self._device.synchronize()
@@ -260,6 +272,8 @@ class CudaSchedule:
             _symmetric(state["isotropic"]) / total**2 * variance,
             int(state["cells"]),
             np.zeros((6, 6)),
+            0,
+            1.0,
             1.0,
             float(weight),
             float(state["quality"]),

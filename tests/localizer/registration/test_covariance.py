@@ -25,7 +25,7 @@ from localizer.registration.reference import (
     projection_jacobian,
     retractions,
 )
-from localizer.registration.selection import mode_probabilities
+from localizer.registration.selection import mode_probabilities, thinned
 
 SETTINGS = LMSettings(scale=10.0)  # least squares, so that only noise acts
 
@@ -105,6 +105,40 @@ def test_half_the_curvature_is_four_times_the_covariance(problem, pose):
     half = sandwich_covariance(replace(sums, curvature=0.5), 1.0, 0.05)
     assert full is not None
     np.testing.assert_allclose(half, 4.0 * full, rtol=1e-9)
+
+
+def summed(level, pose, count):
+    """Sums over about `count` of the level's anchors, as `JNGO` makes them."""
+    few, total = thinned(level, count), level.points.shape[1]
+    sums = covariance_sums(anchor_model(few, *pose, SETTINGS, 16.0))
+    assert sums is not None
+    return replace(sums, anchors=total, share=few.points.shape[1] / total)
+
+
+def test_adding_up_fewer_anchors_does_not_change_the_covariance(problem, pose):
+    """Noise that is independent between anchors; the reference's anchors have all of it."""
+    level, _ = problem
+    rng = np.random.default_rng(5)
+    ratios = []
+    for _ in range(30):
+        noise = 0.1 * rng.standard_normal(level.anchor_features.shape).astype(np.float32)
+        noisy = replace(level, anchor_features=level.anchor_features + noise)
+        every = sandwich_covariance(summed(noisy, pose, noisy.points.shape[1]), 1.0, 0.05)
+        third = sandwich_covariance(summed(noisy, pose, noisy.points.shape[1] // 3), 1.0, 0.05)
+        assert every is not None
+        assert third is not None
+        ratios.append(np.exp(np.linalg.slogdet(third)[1] / 6 - np.linalg.slogdet(every)[1] / 6))
+    assert 0.7 < np.median(ratios) < 1.4
+
+
+def test_few_anchors_count_for_less_than_their_noise_says(problem, pose):
+    sums = summed(problem[0], pose, 10_000)
+    many, few = (
+        sandwich_covariance(replace(sums, anchors=n), 1.0, 0.05, few_anchors=150.0)
+        for n in (1_500_000, 150)
+    )
+    assert many is not None
+    np.testing.assert_allclose(few, 2.0 * many, rtol=1e-3)
 
 
 def test_distances_between_poses_are_those_of_the_image(scene, problem, pose):

@@ -100,8 +100,11 @@ def test_same_seed_same_bits(jngo, scene, prior):
 
 
 def test_covariance_matches_the_errors(scene_factory, prior):
-    """Normalised estimation error squared: 6 if calibrated; most runs within its 95 % bound."""
-    jngo = JNGO()
+    """Normalised estimation error squared: 6 if calibrated; most runs within its 95 % bound.
+
+    The noise of the 300 anchors is independent here, so nothing is left for the factors.
+    """
+    jngo = JNGO(JNGOConfig(correlation=1.0, few_anchors=0.0))
     nees = []
     for seed in range(40):
         scene = scene_factory(200 + seed, 1.0, 1.0)
@@ -112,6 +115,28 @@ def test_covariance_matches_the_errors(scene_factory, prior):
         nees.append(d @ np.linalg.solve(result.covariance, d))
     assert 3.0 < np.mean(nees) < 9.0
     assert np.mean(np.array(nees) < 12.59) > 0.85
+
+
+def test_the_covariance_knows_how_many_anchors_were_used(scene, prior):
+    about = prior(scene.reference, 1.0, 1.0)
+
+    def covariance(few_anchors):
+        jngo = JNGO(JNGOConfig(few_anchors=few_anchors))
+        return jngo.register(scene.query, scene.camera, scene.anchors, about).covariance
+
+    growth = np.trace(covariance(300.0)) / np.trace(covariance(0.0))
+    used = 300.0 / (growth - 1.0)
+    assert 0.7 * len(scene.anchors.points_world) < used <= len(scene.anchors.points_world) + 1e-6
+
+
+def test_sums_over_fewer_anchors_do_not_change_the_covariance(scene, prior, jngo, monkeypatch):
+    about = prior(scene.reference, 1.0, 1.0)
+    arguments = (scene.query, scene.camera, scene.anchors, about)
+    every = jngo.register(*arguments).covariance
+    monkeypatch.setattr("localizer.registration.jngo._COVARIANCE_ANCHORS", 75)
+    fourth = jngo.register(*arguments).covariance
+    ratio = np.exp((np.linalg.slogdet(fourth)[1] - np.linalg.slogdet(every)[1]) / 6)
+    assert 0.5 < ratio < 2.0  # 4 if a fourth of the noise were taken for all of it
 
 
 def failed(result, about, status):
