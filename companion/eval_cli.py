@@ -48,7 +48,10 @@ def evaluate_command(
     map_cache: Annotated[Path, typer.Option("--map", help="tile cache")],
     report: Annotated[Path, typer.Option(help="folder of the report")] = Path("eval-report"),
     name: Annotated[str | None, typer.Option(help="which sequence of a PiLoT data set")] = None,
-    prior: Annotated[str, typer.Option(help="first: one prior; each: one per frame")] = "first",
+    prior: Annotated[
+        str,
+        typer.Option(help="first: one prior, for video; each: one per frame, for single photos"),
+    ] = "first",
     seed: Annotated[int, typer.Option(min=0, help="seed of the prior's noise")] = 0,
     noise_m: Annotated[float, typer.Option(min=0, max=1e6, help="prior noise up to, m")] = 10.0,
     noise_deg: Annotated[
@@ -116,7 +119,8 @@ def _print_problems(frames: list[EvaluatedFrame]) -> None:
 
 def print_metrics(metrics: LocalizationMetrics, unusable: int, title: str) -> None:
     """The columns of the paper's Table 2, and how many images could not be used."""
-    table = Table(title=title)
+    caption = "medians of localized frames; recalls and completeness of all"
+    table = Table(title=title, caption=caption)
     for column in ("frames", "unusable", "Med m", "Med °", "R@1", "R@3", "R@5", "Comp. %", "FPS"):
         table.add_column(column, justify="right")
     m = metrics
@@ -171,7 +175,8 @@ def _write_overlays(
         i, f, estimate = usable[k]
         view = renderer.render(estimate.world_from_camera, camera, wait=True)
         video = undistort(data.frame(i))
-        caption = f"{f.name}: {f.translation_error_m:.2f} m {f.rotation_error_deg:.2f} deg"
+        error = f"{f.translation_error_m:.2f} m {f.rotation_error_deg:.2f} deg"
+        caption = f"{f.name}: {error if np.isfinite(f.translation_error_m) else 'rejected'}"
         save_image(folder / f"overlay-{i:04d}.png", overlay_sheet(video, view.rgb, caption))
     number = np.arange(len(frames), dtype=np.float64)
     position = np.array([f.translation_error_m for f in frames])
