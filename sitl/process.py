@@ -88,21 +88,21 @@ class VehicleProcess(ABC):
         """Start on free ports and wait until it listens; VehicleProcessError when it does not."""
         # Instances are tried from a place of this process's own, so that vehicles that start at
         # the same time do not reach for the same ports.
-        first = os.getpid() * 7 % len(_INSTANCES)
+        first, fault = os.getpid() * 7 % len(_INSTANCES), "no ports are free"
         for step in _INSTANCES:
             instance = (first + step) % len(_INSTANCES)
             if not _free(instance):
                 continue
             self._instance = instance
             self._launch()
-            if self._wait_listening():
+            if not (fault := self._wait_listening()):
                 return
             if "in use" not in self.log_tail().lower():
                 break
         tail = self.log_tail()
         self.stop(keep_log=True)
         raise VehicleProcessError(
-            f"the {self.kind} vehicle did not start; its log {self.log_path} ends:\n{tail}"
+            f"the {self.kind} vehicle did not start: {fault}; its log {self.log_path} ends:\n{tail}"
         )
 
     def restart(self) -> None:
@@ -132,16 +132,20 @@ class VehicleProcess(ABC):
                 raise VehicleProcessError(f"cannot run {command[0]}: {error}") from error
         self._lifeline = _end_with_us(self._process.pid)
 
-    def _wait_listening(self) -> bool:
+    def _wait_listening(self) -> str:
+        """Why it does not listen, "" when it does."""
         deadline = time.monotonic() + self.start_timeout_s
         marker = f"SERIAL2 on TCP port {_port(self._instance, _SPARE_OFFSET)}"
         while time.monotonic() < deadline and self.alive:
             # The log is watched, as a probing connection would take the port's only client slot.
             if marker in self.log_tail(100_000):
-                return True
+                return ""
             time.sleep(_POLL_S)
+        status = None if self._process is None else self._process.poll()
         self._end()
-        return False
+        if status is None:
+            return f"nothing listened within {self.start_timeout_s:g} s"
+        return f"it ended with status {status}"
 
     def log_tail(self, characters: int = _LOG_TAIL) -> str:
         """The end of what the process has printed."""

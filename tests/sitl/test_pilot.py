@@ -64,7 +64,7 @@ def test_track_brackets_a_time_and_forgets_the_oldest():
 def test_a_vehicle_that_dies_at_once_is_reported_with_its_log():
     vehicle = EmbeddedSitl(HOME, parameters={})
     vehicle.command = lambda _instance: ["/bin/sh", "-c", "echo out of propellers; exit 3"]
-    with pytest.raises(VehicleProcessError, match="out of propellers"):
+    with pytest.raises(VehicleProcessError, match=r"(?s)ended with status.*out of propellers"):
         vehicle.start()
 
 
