@@ -60,6 +60,7 @@ class _Decoder:
             self._container.close()
             raise StreamOpenError(f"{source.url}: has no video stream; give a video")
         self.stream = self._container.streams.video[0]
+        self.late = 0  # pictures that packets before theirs held back (B-frames)
         context = self.stream.codec_context
         context.thread_count = 1
         if read_timeout_s is not None:
@@ -74,6 +75,7 @@ class _Decoder:
             except av.error.InvalidDataError:
                 pictures = []
             whole = [p for p in pictures if not p.is_corrupt]
+            self.late += max(0, len(whole) - (1 if packet.size else 0))
             for picture in whole:
                 yield picture, arrival_ns
             if not whole and packet.size:
@@ -155,7 +157,10 @@ class VideoFileSource:
             yield frame
         if not self._counters.delivered:
             raise StreamDecodeError(f"{self._path}: no picture in it can be decoded; replace it")
-        self._report(StreamState.ENDED, f"{self._path}: end of file, {self._counters}")
+        lost = max(0, self._counters.undecodable - decoder.late)
+        self._counters = replace(self._counters, undecodable=lost)
+        text = f"{self._path}: end of file, {self._delivered} pictures"
+        self._report(StreamState.ENDED, text + (f", {lost} undecodable" if lost else ""))
 
     def _tell_scaling(self, camera: Camera) -> None:
         if camera is not self._camera and self._state is not StreamState.SCALED:

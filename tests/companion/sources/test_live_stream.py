@@ -313,11 +313,11 @@ def test_an_unexpected_error_in_the_reader_is_a_stall_and_tried_again(
     def decoder(*_: Any) -> None:
         raise ValueError("no such enumeration value")
 
+    monkeypatch.setattr("companion.sources.av_source._Decoder", decoder)
     with Watch(url, retry_max_s=0.3) as watch:
-        with monkeypatch.context() as patch:
-            patch.setattr("companion.sources.av_source._Decoder", decoder)
-            watch.wait_until(lambda: StreamState.STALLED in watch.states)
-            assert "unexpected ValueError" in watch.texts[watch.states.index(StreamState.STALLED)]
+        watch.wait_until(lambda: StreamState.STALLED in watch.states)
+        assert "unexpected ValueError" in watch.texts[watch.states.index(StreamState.STALLED)]
+        monkeypatch.undo()
         with PacedSender(url):
             watch.wait_for(3)
     assert watch.error is None
