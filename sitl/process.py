@@ -109,10 +109,10 @@ class VehicleProcess(ABC):
         """End the vehicle and start it anew on the same ports, as after a power loss."""
         self._end()
         self._launch()
-        if not self._wait_listening():
+        if fault := self._wait_listening():
             raise VehicleProcessError(
-                f"the {self.kind} vehicle did not come back; its log {self.log_path} ends:\n"
-                f"{self.log_tail()}"
+                f"the {self.kind} vehicle did not come back: {fault}; its log {self.log_path} "
+                f"ends:\n{self.log_tail()}"
             )
 
     def _launch(self) -> None:
