@@ -287,7 +287,12 @@ def print_report(report: FlightReport, folder: Path) -> None:
     _add(table, "localizer rotation, °", report.localizer_deg,
          f"completeness {m.completeness:.1f} % ({report.completeness_sent:.1f} % of sent)",
          )  # fmt: skip
-    _add(table, "EKF horizontal, m", report.ekf_horizontal_m, f"home {report.home_error_m:.1f} m")
+    _add(
+        table,
+        "EKF horizontal, m",
+        report.ekf_horizontal_m,
+        f"{report.home_error_m:.1f} m from home at end",
+    )
     _add(table, "EKF vertical, m", report.ekf_vertical_m, "")
     _add(table, "fixed targets, m", report.fixed_targets_m, "3-D")
     _add(table, "moving targets, m", report.moving_targets_m, "3-D, every car seen")
