@@ -68,9 +68,10 @@ def console_log(verbose: bool, descriptor: int = 1) -> Iterator[None]:
     waiting: queue.Queue[logging.LogRecord | None] = queue.Queue(_WAITING)
     console = Console(file=Descriptor(descriptor))  # type: ignore[arg-type]
     writer = RichHandler(show_path=False, console=console)
+    over = threading.Event()  # the descriptor's number may soon be another file's
 
     def write() -> None:
-        while (record := waiting.get()) is not None:
+        while (record := waiting.get()) is not None and not over.is_set():
             writer.handle(record)
 
     # A daemon: one that waits for a stopped terminal must not keep the process.
@@ -90,3 +91,4 @@ def console_log(verbose: bool, descriptor: int = 1) -> Iterator[None]:
         with contextlib.suppress(queue.Full):
             waiting.put_nowait(None)
         thread.join(_LAST_WORDS_S)
+        over.set()

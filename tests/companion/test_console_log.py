@@ -4,7 +4,7 @@ import logging
 import os
 import threading
 import time
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 
 import pytest
 
@@ -25,24 +25,26 @@ def levels():
 
 @contextmanager
 def _pipe():
+    """A pipe's two files. No console thread may write any more when their numbers get free."""
     read, write = os.pipe()
-    try:
-        yield read, write
-    finally:
-        for number in (read, write):
-            with suppress(OSError):
-                os.close(number)
+    with os.fdopen(write, "wb", 0) as writer:
+        with os.fdopen(read, "rb", 0) as reader:
+            yield reader, writer
+        for thread in threading.enumerate():
+            if thread.name == "console":
+                thread.join(20.0)
+                assert not thread.is_alive()
 
 
 @pytest.mark.parametrize("verbose", [False, True])
 def test_verbose_holds_for_our_packages_only(verbose):
     with _pipe() as (read, write):
-        with console_log(verbose, write):
+        with console_log(verbose, write.fileno()):
             assert logging.getLogger("mavlink_bridge.bridge").isEnabledFor(logging.DEBUG) == verbose
             assert not logging.getLogger("numba.core.ssa").isEnabledFor(logging.DEBUG)
             assert logging.getLogger("numba.core.ssa").isEnabledFor(logging.INFO)
             _log.warning("[/red] 5 of %d", 7)
-        assert "[/red] 5 of 7" in os.read(read, 4096).decode()
+        assert "[/red] 5 of 7" in read.read(4096).decode()
 
 
 def _logs(lines):
@@ -62,16 +64,16 @@ def _logs(lines):
 
 def test_a_reader_that_ends_ends_nobody():
     """`companion run | tee log`, and tee is gone; rich would raise SystemExit in the thread."""
-    with _pipe() as (read, write), console_log(False, write):
+    with _pipe() as (read, write), console_log(False, write.fileno()):
         assert _logs(1)
-        assert os.read(read, 1)
-        os.close(read)
+        assert read.read(1)
+        read.close()
         assert _logs(3)
 
 
 def test_a_stopped_terminal_stops_nobody_and_the_end_is_not_waited_for():
     with _pipe() as (_, write):
-        with console_log(False, write):
+        with console_log(False, write.fileno()):
             assert _logs(2 * _WAITING)  # far more than a pipe and the queue hold
             began = time.monotonic()
         assert time.monotonic() - began < 5.0
