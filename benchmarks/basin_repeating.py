@@ -13,14 +13,13 @@ from dataclasses import dataclass
 
 import numpy as np
 from arguments import Parser, whole
-from basin_variants import FULL, Variant
+from basin_variants import FULL, Variant, changed
 from feature_report import wilson
 from named_errors import named_errors
 
 from localizer.camera import Camera
 from localizer.pose import Array, Pose
 from localizer.registration import select_anchors
-from localizer.registration.config import JNGOConfig
 from localizer.training.pairs import look_at
 from localizer.types import FeatureLevel, FeaturePyramid, PosePrior, RenderedView
 
@@ -88,11 +87,6 @@ class Ground:
 
 def rows() -> list[Variant]:
     """The choices that only matter where modes compete."""
-    c = JNGOConfig()
-
-    def changed(name: str, **values: object) -> Variant:
-        return Variant(name, c.model_copy(update=values))
-
     return [
         Variant(FULL),
         Variant("without motion term", motion=False),

@@ -120,13 +120,13 @@ def paper_rows() -> list[Variant]:
     ]
 
 
+def changed(name: str, **values: object) -> Variant:
+    """The default configuration with other values."""
+    return Variant(name, JNGOConfig().model_copy(update=values))
+
+
 def our_rows() -> list[Variant]:
     """The default, and the default with one thing changed at a time."""
-    c = JNGOConfig()
-
-    def changed(name: str, **values: object) -> Variant:
-        return Variant(name, c.model_copy(update=values))
-
     return [
         Variant(FULL),
         changed("one hypothesis", hypotheses=1),

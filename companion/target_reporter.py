@@ -18,9 +18,8 @@ from localizer.types import PoseEstimate, TargetFix, TargetSighting
 _log = logging.getLogger(__name__)
 _KEPT = 64
 _MATCH_NS = 5_000_000  # detection and estimate must be of the same frame
-_MAX_TARGETS = (
-    32  # at a time: what a telemetry link bears; one that is gone for so long makes room:
-)
+_MAX_TARGETS = 32  # at a time: what a telemetry link bears
+# A target unseen for so long makes room for another.
 _GONE_NS = 10_000_000_000
 
 
