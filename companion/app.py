@@ -62,6 +62,11 @@ class Companion:
         with ExitStack() as up:
             try:
                 self._build(self._config, up)
+                # What the imports and compilers left is never garbage: searching it for garbage
+                # would stop every thread for a tenth of a second now and then.
+                gc.collect()
+                gc.freeze()
+                self._is_up = True  # `interrupt` raises no more
             except BaseException as error:
                 up.close()
                 if self._record_folder is not None:
@@ -69,11 +74,6 @@ class Companion:
                 if isinstance(error, Exception) and self._stop.is_set():
                     raise KeyboardInterrupt from None  # an interrupted compiler raises its own
                 raise
-            # What the imports and compilers left is never garbage: searching it for garbage would
-            # stop every thread for a tenth of a second now and then.
-            gc.collect()
-            gc.freeze()
-            self._is_up = True
             self._start(up)
             while not self._stop.wait(0.2):  # in slices: signals are handled between them
                 pass

@@ -57,14 +57,19 @@ def fresh_folder(folder: Path) -> Path:
 
 
 def remove_empty(folder: Path) -> None:
-    """Remove the record of a start that failed: nothing but column names stands in it."""
-    names = {"estimates.csv": 1, "targets.csv": 1, "events.csv": 1}
+    """Remove the record of a start that failed: at most column names stand in it.
+
+    The start may have ended between any two of its steps, so none of this need exist.
+    """
+    tables = [folder / name for name in ("estimates.csv", "targets.csv", "events.csv")]
+    snapshots = folder / "snapshots"
     with contextlib.suppress(OSError):
-        if any(len((folder / n).read_text().splitlines()) > most for n, most in names.items()):
+        if any(len(t.read_text().splitlines()) > 1 for t in tables if t.exists()):
             return
-        for name in (*names, MANIFEST_NAME):
-            (folder / name).unlink(missing_ok=True)
-        (folder / "snapshots").rmdir()
+        for path in (*tables, folder / MANIFEST_NAME):
+            path.unlink(missing_ok=True)
+        if snapshots.exists():
+            snapshots.rmdir()
         folder.rmdir()  # it stays if anything else is in it
 
 

@@ -1,7 +1,9 @@
 import csv
 import errno
+import itertools
 import logging
 import os
+import sys
 import threading
 import time
 from pathlib import Path
@@ -109,6 +111,40 @@ def test_only_a_record_without_a_row_is_removed(tmp_path):
     assert sorted(p.name for p in tmp_path.iterdir()) == ["shared", "told"]
     assert [p.name for p in (tmp_path / "shared").iterdir()] == ["notes.txt"]
     assert "something happened" in (tmp_path / "told" / "events.csv").read_text()
+
+
+def _interrupted_at(step, start):
+    """Whether `start` came so far as to be interrupted at its step-th line, here or in pathlib."""
+    lines = itertools.count()
+    files = (Recorder.__init__.__code__.co_filename, Path.mkdir.__code__.co_filename)
+
+    def trace(frame, event, _):
+        if frame.f_code.co_filename not in files:
+            return None
+        if event == "line" and next(lines) == step:
+            raise KeyboardInterrupt
+        return trace
+
+    before = sys.gettrace()
+    sys.settrace(trace)
+    try:
+        start()
+    except KeyboardInterrupt:
+        return True
+    finally:
+        sys.settrace(before)
+    return False
+
+
+def test_a_start_that_is_interrupted_anywhere_leaves_nothing(tmp_path, monkeypatch):
+    monkeypatch.setattr(Recorder, "_run", lambda _: None)  # its thread would outlive the test
+    folder = tmp_path / "flight"
+    for step in itertools.count():
+        if not _interrupted_at(step, lambda: Recorder(RecordConfig(folder=folder), FRAME)):
+            break
+        remove_empty(folder)
+        assert not folder.exists(), f"after {step} lines"
+    assert step > 20
 
 
 def test_what_cannot_be_written_costs_itself_only(tmp_path):
