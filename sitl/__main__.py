@@ -39,6 +39,7 @@ from sitl.suite.runner import run_suite
 _REPORT_FILES = (
     "companion", "companion.log", "companion.yaml", "errors.png", "frames.csv",
     "frames_report.csv", "overlay-*", "report.json", "tracks.png", "vehicle.csv",
+    "vehicle.log",
 )  # fmt: skip
 
 _LOG_WIDTH = 200

@@ -7,7 +7,7 @@ import shutil
 from pathlib import Path
 
 from sitl.embedded.geodesy import Location
-from sitl.process import VehicleProcess, VehicleProcessError, write_parameters
+from sitl.process import PARAMETERS, VehicleProcess, VehicleProcessError
 
 # Where a binary and its default parameters lie below ARDUPILOT_HOME: an install folder, or an
 # ArduPilot source tree that was built with `waf copter`.
@@ -59,6 +59,7 @@ class ArduPilotSitl(VehicleProcess):
         heading_deg: float = 0.0,
         parameters: dict[str, float] | None = None,
         speedup: float = 1.0,
+        log: Path | None = None,
     ) -> None:
         binary = find_arducopter()
         if binary is None:
@@ -67,10 +68,8 @@ class ArduPilotSitl(VehicleProcess):
                 "`./waf configure --board sitl && ./waf copter`, or fly the embedded vehicle"
             )
         self._binary, self._defaults = binary, find_defaults(binary)
-        super().__init__(speedup)
+        super().__init__(parameters, speedup, log)
         self._home = f"{home.latitude_deg},{home.longitude_deg},{home.altitude_m},{heading_deg}"
-        self._parameters = self.folder / "extra.parm"
-        write_parameters(self._parameters, parameters or {})
 
     def command(self, instance: int) -> list[str]:
         """See `VehicleProcess.command`; -w forgets parameters of earlier runs."""
@@ -80,7 +79,7 @@ class ArduPilotSitl(VehicleProcess):
             f"--speedup={self.speedup:g}",
             f"-I{instance}",
             f"--home={self._home}",
-            f"--defaults={self._defaults},{self._parameters}",
+            f"--defaults={self._defaults},{PARAMETERS}",
             "--serial0=tcp:0",
             "-w",
         ]

@@ -68,7 +68,9 @@ def fly(
     with ExitStack() as stack:
         progress("starting the vehicle", 0.0)
         vehicle = stack.enter_context(
-            open_vehicle(kind, home, 0.0, _parameters(scenario), seed=seed)
+            open_vehicle(
+                kind, home, 0.0, _parameters(scenario), seed=seed, log=folder / "vehicle.log"
+            )
         )
         pilot = stack.enter_context(Pilot(vehicle.gcs_endpoint, alive=vehicle.check))
         progress("waiting for GNSS and the EKF", 0.0)

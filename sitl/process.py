@@ -25,6 +25,7 @@ _INSTANCES = range(200)
 _POLL_S = 0.05
 _STOP_TIMEOUT_S = 5.0
 _LOG_TAIL = 1500  # characters of the process's log quoted in an error
+PARAMETERS = "extra.parm"  # file of what is set over the vehicle's defaults
 
 _Self = TypeVar("_Self", bound="VehicleProcess")
 
@@ -38,22 +39,31 @@ class VehicleProcess(ABC):
 
     gcs_endpoint and companion_endpoint ("tcp:127.0.0.1:PORT") are its first two serial ports;
     spare_endpoint is a third, free for an independent observer.
+
+    It runs in a temporary folder that is removed with its end, however that came. What it prints
+    goes to a file there, or to `log`, which stays; errors quote the end of it.
     """
 
     kind: VehicleKind
     start_timeout_s: float
 
-    def __init__(self, speedup: float = 1.0) -> None:
+    def __init__(
+        self,
+        parameters: dict[str, float] | None = None,
+        speedup: float = 1.0,
+        log: Path | None = None,
+    ) -> None:
         self.speedup = speedup
-        self.folder = Path(tempfile.mkdtemp(prefix=f"{self.kind}-"))
-        self.log_path = self.folder / "vehicle.log"
+        self._parameters = parameters or {}
+        self._log = log
+        self._folder: Path | None = None
         self._instance = -1
         self._process: subprocess.Popen[bytes] | None = None
         self._lifeline: subprocess.Popen[bytes] | None = None
 
     @abstractmethod
     def command(self, instance: int) -> list[str]:
-        """The command line of an instance; it runs in `folder`."""
+        """The command line of an instance; `PARAMETERS` lies in the folder in which it runs."""
 
     # --- where it listens --------------------------------------------------------------------
 
@@ -86,6 +96,19 @@ class VehicleProcess(ABC):
 
     def start(self) -> None:
         """Start on free ports and wait until it listens; VehicleProcessError when it does not."""
+        try:
+            self._folder = Path(tempfile.mkdtemp(prefix=f"{self.kind}-"))
+            _write_parameters(self._folder / PARAMETERS, self._parameters)
+            if fault := self._start_on_free_ports():
+                raise VehicleProcessError(
+                    f"the {self.kind} vehicle did not start: {fault}; {self._log_end()}"
+                )
+        except BaseException:  # interrupted too: there is no `__exit__` yet
+            self.stop()
+            raise
+
+    def _start_on_free_ports(self) -> str:
+        """Why it does not listen, "" when it does."""
         # Instances are tried from a place of this process's own, so that vehicles that start at
         # the same time do not reach for the same ports.
         first, fault = os.getpid() * 7 % len(_INSTANCES), "no ports are free"
@@ -95,15 +118,10 @@ class VehicleProcess(ABC):
                 continue
             self._instance = instance
             self._launch()
-            if not (fault := self._wait_listening()):
-                return
-            if "in use" not in self.log_tail().lower():
+            fault = self._wait_listening()
+            if not fault or "in use" not in self.log_tail().lower():
                 break
-        tail = self.log_tail()
-        self.stop(keep_log=True)
-        raise VehicleProcessError(
-            f"the {self.kind} vehicle did not start: {fault}; its log {self.log_path} ends:\n{tail}"
-        )
+        return fault
 
     def restart(self) -> None:
         """End the vehicle and start it anew on the same ports, as after a power loss."""
@@ -111,17 +129,16 @@ class VehicleProcess(ABC):
         self._launch()
         if fault := self._wait_listening():
             raise VehicleProcessError(
-                f"the {self.kind} vehicle did not come back: {fault}; its log {self.log_path} "
-                f"ends:\n{self.log_tail()}"
+                f"the {self.kind} vehicle did not come back: {fault}; {self._log_end()}"
             )
 
     def _launch(self) -> None:
         command = self.command(self._instance)
-        with self.log_path.open("wb") as log:
+        with self._log_path.open("wb") as log:
             try:
                 self._process = subprocess.Popen(
                     command,
-                    cwd=self.folder,
+                    cwd=self._folder,
                     env={**os.environ, "PYTHONPATH": _search_path()},
                     stdin=subprocess.DEVNULL,
                     stdout=log,
@@ -147,26 +164,36 @@ class VehicleProcess(ABC):
             return f"nothing listened within {self.start_timeout_s:g} s"
         return f"it ended with status {status}"
 
+    @property
+    def _log_path(self) -> Path:
+        return self._log or (self._folder or Path()) / "vehicle.log"
+
     def log_tail(self, characters: int = _LOG_TAIL) -> str:
         """The end of what the process has printed."""
         try:
-            return self.log_path.read_text("utf-8", "replace")[-characters:]
+            return self._log_path.read_text("utf-8", "replace")[-characters:]
         except FileNotFoundError:
             return ""
+
+    def _log_end(self) -> str:
+        where = f"its log {self._log}" if self._log else "its log"
+        return f"{where} ends:\n{self.log_tail()}"
 
     def check(self) -> None:
         """VehicleProcessError if the process has died."""
         if self._process is not None and not self.alive:
             raise VehicleProcessError(
                 f"the {self.kind} vehicle died (status {self._process.returncode}); "
-                f"its log {self.log_path} ends:\n{self.log_tail()}"
+                f"{self._log_end()}"
             )
 
-    def stop(self, *, keep_log: bool = False) -> None:
-        """End the process and remove its folder, unless its log is to be kept."""
-        self._end()
-        if not keep_log:
-            shutil.rmtree(self.folder, ignore_errors=True)
+    def stop(self) -> None:
+        """End the process and remove its folder; harmless when it does not run."""
+        try:
+            self._end()
+        finally:
+            if self._folder is not None:
+                shutil.rmtree(self._folder, ignore_errors=True)
 
     def _end(self) -> None:
         if self._lifeline is not None:  # first: later its number may be another process's
@@ -184,11 +211,7 @@ class VehicleProcess(ABC):
             self._process.wait()
 
     def __enter__(self: _Self) -> _Self:
-        try:
-            self.start()
-        except (KeyboardInterrupt, SystemExit):  # between its launch and `__exit__`
-            self.stop()
-            raise
+        self.start()
         return self
 
     def __exit__(
@@ -197,10 +220,10 @@ class VehicleProcess(ABC):
         error: BaseException | None,
         traceback: TracebackType | None,
     ) -> None:
-        self.stop(keep_log=kind is not None)
+        self.stop()
 
 
-def write_parameters(path: Path, parameters: dict[str, float]) -> None:
+def _write_parameters(path: Path, parameters: dict[str, float]) -> None:
     """An ArduPilot .parm file."""
     lines = [f"{name} {value:.9g}\n" for name, value in parameters.items()]
     path.write_text("".join(lines), encoding="utf-8")

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import sys
+from pathlib import Path
 from typing import Literal
 
 from sitl.ardupilot import ArduPilotSitl, find_arducopter
 from sitl.embedded.geodesy import Location
-from sitl.process import BASE_PORT, PORTS_PER_INSTANCE, VehicleProcess, write_parameters
+from sitl.process import BASE_PORT, PARAMETERS, PORTS_PER_INSTANCE, VehicleProcess
 
 VISION_SOURCE = 2  # MAV_CMD_SET_EKF_SOURCE_SET
 
@@ -113,12 +114,11 @@ class EmbeddedSitl(VehicleProcess):
         parameters: dict[str, float] | None = None,
         speedup: float = 1.0,
         seed: int = 0,
+        log: Path | None = None,
     ) -> None:
-        super().__init__(speedup)
+        super().__init__(parameters, speedup, log)
         self._home = f"{home.latitude_deg},{home.longitude_deg},{home.altitude_m},{heading_deg}"
         self._seed = seed
-        self._parameters = self.folder / "extra.parm"
-        write_parameters(self._parameters, parameters or {})
 
     def command(self, instance: int) -> list[str]:
         """See `VehicleProcess.command`."""
@@ -128,7 +128,7 @@ class EmbeddedSitl(VehicleProcess):
             "sitl.embedded",
             f"--home={self._home}",
             f"--port={BASE_PORT + PORTS_PER_INSTANCE * instance}",
-            f"--params={self._parameters}",
+            f"--params={PARAMETERS}",
             f"--speedup={self.speedup:g}",
             f"--seed={self._seed}",
         ]
@@ -142,11 +142,13 @@ def open_vehicle(
     *,
     speedup: float = 1.0,
     seed: int = 0,
+    log: Path | None = None,
 ) -> VehicleProcess:
     """A vehicle that is not started yet; "auto" is ArduPilot where its binary is found.
 
-    home: altitude AMSL. The seed is for the embedded vehicle; ArduPilot draws its own noise.
+    home: altitude AMSL. The seed is for the embedded vehicle; ArduPilot draws its own noise. log:
+    where what it prints is kept.
     """
     if kind == "ardupilot" or (kind == "auto" and find_arducopter() is not None):
-        return ArduPilotSitl(home, heading_deg, parameters, speedup)
-    return EmbeddedSitl(home, heading_deg, parameters, speedup, seed)
+        return ArduPilotSitl(home, heading_deg, parameters, speedup, log)
+    return EmbeddedSitl(home, heading_deg, parameters, speedup, seed, log)

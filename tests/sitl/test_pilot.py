@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import contextlib
 import math
 import shutil
 import subprocess
 import sys
+import tempfile
 import time
 from pathlib import Path
 from types import SimpleNamespace
@@ -61,11 +63,14 @@ def test_track_brackets_a_time_and_forgets_the_oldest():
     assert track.newest.time_ns == 990
 
 
-def test_a_vehicle_that_dies_at_once_is_reported_with_its_log():
-    vehicle = EmbeddedSitl(HOME, parameters={})
-    vehicle.command = lambda _instance: ["/bin/sh", "-c", "echo out of propellers; exit 3"]
-    with pytest.raises(VehicleProcessError, match=r"(?s)ended with status.*out of propellers"):
-        vehicle.start()
+def test_a_vehicle_that_dies_at_once_is_reported_with_its_log(folders, tmp_path):
+    for log in (None, tmp_path / "vehicle.log"):
+        vehicle = EmbeddedSitl(HOME, parameters={}, log=log)
+        vehicle.command = lambda _instance: ["/bin/sh", "-c", "echo out of propellers; exit 3"]
+        with pytest.raises(VehicleProcessError, match=r"(?s)ended with status.*out of propellers"):
+            vehicle.start()
+    assert log.read_text() == "out of propellers\n"
+    assert not list(folders.iterdir())
 
 
 class _Idle(VehicleProcess):
@@ -78,10 +83,40 @@ class _Idle(VehicleProcess):
         return ["/bin/sh", "-c", f"echo SERIAL2 on TCP port {5763 + 10 * instance}; sleep 600"]
 
 
+@pytest.fixture
+def folders(monkeypatch, tmp_path):
+    """Where the folders of vehicles are made."""
+    (tmp_path / "temporary").mkdir()
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path / "temporary"))
+    return tmp_path / "temporary"
+
+
+@pytest.mark.parametrize("end", [None, PilotError("not armed"), KeyboardInterrupt(), SystemExit(1)])
+def test_a_vehicles_folder_goes_with_its_end(folders, end):
+    with pytest.raises(type(end)) if end else contextlib.nullcontext(), _Idle() as vehicle:
+        assert len(list(folders.iterdir())) == 1
+        assert "SERIAL2" in vehicle.log_tail()
+        if end:
+            raise end
+    assert not list(folders.iterdir())
+
+
+def test_an_interrupted_start_leaves_neither_process_nor_folder(folders, monkeypatch):
+    def interrupted(_self):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(_Idle, "_wait_listening", interrupted)
+    vehicle = _Idle()
+    with pytest.raises(KeyboardInterrupt):
+        vehicle.start()
+    assert not vehicle.alive
+    assert not list(folders.iterdir())
+
+
 def test_a_vehicle_does_not_outlive_a_killed_parent():
     script = (
         "import time; from tests.sitl.test_pilot import _Idle; v = _Idle(); v.start();"
-        "print(v._process.pid, v.folder, flush=True); time.sleep(600)"
+        "print(v._process.pid, v._folder, flush=True); time.sleep(600)"
     )
     root = Path(__file__).resolve().parents[2]
     parent = subprocess.Popen(
@@ -114,7 +149,6 @@ def test_no_endpoint_before_the_start():
     vehicle = EmbeddedSitl(HOME)
     with pytest.raises(VehicleProcessError, match="before it is started"):
         _ = vehicle.gcs_endpoint
-    vehicle.stop()
 
 
 def test_no_vehicle_at_the_endpoint():
@@ -249,7 +283,7 @@ def test_waiting_for_a_vehicle_that_died_ends_at_once():
     with open_vehicle("embedded", HOME, 0.0, {}, speedup=SPEEDUP) as vehicle:
         pilot = Pilot(vehicle.gcs_endpoint, SPEEDUP, vehicle.check)
         with pilot:
-            vehicle.stop(keep_log=True)
+            vehicle.stop()
             start = time.monotonic()
             with pytest.raises(VehicleProcessError, match="died"):
                 pilot.sleep(600)
