@@ -24,6 +24,7 @@ _GCS_OFFSET, _COMPANION_OFFSET, _SPARE_OFFSET = 0, 2, 3
 _INSTANCES = range(200)
 _POLL_S = 0.05
 _STOP_TIMEOUT_S = 5.0
+_WHOLE_LOG = 1 << 20
 _LOG_TAIL = 1500  # characters of the process's log quoted in an error
 PARAMETERS = "extra.parm"  # file of what is set over the vehicle's defaults
 
@@ -94,6 +95,13 @@ class VehicleProcess(ABC):
         """Whether the process runs."""
         return self._process is not None and self._process.poll() is None
 
+    @property
+    def boots(self) -> int:
+        """How often it has opened its ports since it was launched: once more after a reboot."""
+        # The log is watched, as a probing connection would take the port's only client slot.
+        marker = f"SERIAL2 on TCP port {_port(self._instance, _SPARE_OFFSET)}"
+        return self.log_tail(_WHOLE_LOG).count(marker)
+
     def start(self) -> None:
         """Start on free ports and wait until it listens; VehicleProcessError when it does not."""
         try:
@@ -152,10 +160,8 @@ class VehicleProcess(ABC):
     def _wait_listening(self) -> str:
         """Why it does not listen, "" when it does."""
         deadline = time.monotonic() + self.start_timeout_s
-        marker = f"SERIAL2 on TCP port {_port(self._instance, _SPARE_OFFSET)}"
         while time.monotonic() < deadline and self.alive:
-            # The log is watched, as a probing connection would take the port's only client slot.
-            if marker in self.log_tail(100_000):
+            if self.boots > 0:
                 return ""
             time.sleep(_POLL_S)
         status = None if self._process is None else self._process.poll()

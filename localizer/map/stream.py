@@ -217,7 +217,8 @@ class TileStreamer:
                 if not nodes:
                     continue
                 node = nodes.pop(0)
-                if self._resident[node] or any(node == n for n, _ in self._arrived):
+                # A node may have been asked for again while it was being loaded.
+                if node in self._failed or self._resident[node] or self._has_arrived(node):
                     continue
             meshes: list[TileMesh] | None = None
             failure: MapCacheError | None = None
@@ -237,6 +238,9 @@ class TileStreamer:
                     self._failed[node] = failure
                     self._counts["failures"] += 1
                 self._lock.notify_all()
+
+    def _has_arrived(self, node: int) -> bool:
+        return any(node == arrived for arrived, _ in self._arrived)
 
     def _to_load(self) -> list[int]:
         """The nodes to load, in order; empty while there is no room to put them down."""

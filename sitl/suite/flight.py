@@ -11,11 +11,12 @@ from typing import Any
 import numpy as np
 
 from mavlink_bridge import Bridge, BridgeConfig
+from mavlink_bridge.link import sleep_until
 from sitl.embedded.geodesy import Location
 from sitl.errors import PilotError
 from sitl.feed import BridgeFeed, FixModel, TruthFeed
 from sitl.pilot import Pilot
-from sitl.process import VehicleKind, VehicleProcess
+from sitl.process import VehicleKind, VehicleProcess, VehicleProcessError
 from sitl.suite.case import Case, Event
 from sitl.suite.doctor import consult
 from sitl.suite.record import Record, Sample, Text
@@ -27,7 +28,7 @@ _AUTOPILOT = 1
 _RAW_SPEEDUP = 2.0  # as the reference was flown; our bridge lives in real time
 _GYROS_SETTLED_S = 27.0  # ArduPilot SITL refuses to arm before about 25 s
 _SETTLE_S = 3.0
-_REBOOT_S = 2.0  # until the old ports are gone
+_REBOOT_S = 60.0  # within which the ports of the next boot are open; a tenth of a second is usual
 _NEAR_M = 3.0
 _STEP_S = 0.1
 _LONGEST_S = 240.0
@@ -121,9 +122,11 @@ class _CaseFlight:
         config = bridge_config(case, endpoint)
         if case.before.doctor:
             self._record.doctor = consult(config)
+            boots = self._vehicle.boots
             self._pilot.reboot()
             self._pilot.close()
-            time.sleep(_REBOOT_S)
+            if not sleep_until(lambda: self._vehicle.boots > boots, _REBOOT_S):
+                raise VehicleProcessError(f"the vehicle did not reboot in {_REBOOT_S:g} s")
             self._pilot = self._connect()
             with self._pilot.fast_forward():
                 self._wait_for_gyros()

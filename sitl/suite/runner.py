@@ -114,11 +114,11 @@ def run_suite(
     rows: dict[tuple[str, str], Row] = {}
     context = multiprocessing.get_context("spawn")
     with ProcessPoolExecutor(jobs or default_jobs(), context, _end_on_sigterm) as pool:
-        futures = {
-            pool.submit(_fly_in_worker, case, kind, seed): (case, kind)
-            for case, kind in longest_first
-        }
         try:
+            futures = {
+                pool.submit(_fly_in_worker, case, kind, seed): (case, kind)
+                for case, kind in longest_first
+            }
             for future in as_completed(futures):
                 case, kind = futures[future]
                 row = _row(future, case, kind)

@@ -141,7 +141,8 @@ def test_streams_what_the_true_pose_sees_and_stops_and_resumes(cache: Path, tmp_
         process.resume()
         wait_for(source.counters.delivered + 8)
     source.close()
-    watcher.join(10)
+    watcher.join(120)
+    assert not watcher.is_alive()
 
     statistics = process.statistics
     assert statistics is not None
@@ -150,8 +151,10 @@ def test_streams_what_the_true_pose_sees_and_stops_and_resumes(cache: Path, tmp_
     true_poses = poses(truth)
     times = truth["exposure_time_ns"]
     assert len(times) == statistics.frames >= len(received)
-    steps = np.diff(times)
-    assert np.median(steps) == pytest.approx(1e9 / RATE_HZ, rel=1e-6)
+    # At the configured rate; what the pause or a busy machine costs are whole exposures.
+    periods = np.diff(times) / (1e9 / RATE_HZ)
+    assert periods.min() == 1
+    np.testing.assert_array_equal(periods, np.rint(periods))
 
     # Every received picture belongs to a logged exposure, and shows what the map shows from there.
     streamer = TileStreamer(TileCache.open(cache))

@@ -273,7 +273,7 @@ def test_a_reboot_by_command_keeps_the_parameters(kind):
             pilot.sleep(5)
             before = pilot.time_s
             pilot.reboot()
-        time.sleep(2.0)
+        assert sleep_until(lambda: vehicle.boots == 2, 60.0)
         with Pilot(vehicle.gcs_endpoint, SPEEDUP, vehicle.check) as pilot:
             assert 0 < pilot.time_s < before + 10
             assert pilot.parameter("VISO_TYPE") == 1

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import shutil
+import threading
 import time
 import weakref
 
@@ -112,13 +113,13 @@ def test_a_cold_start_counts_its_hole(streamer):
 
 
 def test_select_does_not_wait_for_the_disk(cache, monkeypatch):
-    slow = cache.load_tile
-    monkeypatch.setattr(cache, "load_tile", lambda i: (time.sleep(1.0), slow(i))[1])
+    load, disk = cache.load_tile, threading.Event()
+    monkeypatch.setattr(cache, "load_tile", lambda i: (disk.wait(60), load(i))[1])
     with TileStreamer(cache) as streamer:
-        streamer.select(above(0, 0, 100), CAMERA)
-        start = time.perf_counter()
-        streamer.select(above(0, 0, 100), CAMERA)
-        assert time.perf_counter() - start < 0.5
+        for _ in range(3):
+            assert streamer.select(above(0, 0, 100), CAMERA) == []
+        assert streamer.counters().loaded == 0
+        disk.set()
 
 
 def test_memory_stays_within_the_budget(cache):
@@ -189,6 +190,25 @@ def test_a_damaged_tile_is_named_or_stood_in_for(cache_path, tmp_path):
         meshes = streamer.select(pose, CAMERA)
         assert footprint(meshes) > 0
         assert streamer.counters().failures == 1
+
+
+def test_a_tile_that_is_asked_for_again_while_it_fails_is_read_once(cache, monkeypatch):
+    load, leaf, read = cache.load_tile, int(np.flatnonzero(cache.index.child_count == 0)[0]), []
+    centre = cache.world_from_tile[int(cache.index.tile_start[leaf])].translation
+    pose = above(centre[0], centre[1], 60)
+
+    def damaged(tile):
+        if tile != cache.index.tile_start[leaf]:
+            return load(tile)
+        read.append(tile)
+        streamer.select(pose, CAMERA)
+        raise MapCacheError("damaged")
+
+    monkeypatch.setattr(cache, "load_tile", damaged)
+    with TileStreamer(cache) as streamer:
+        streamer.select(pose, CAMERA)
+        until(lambda: streamer.counters().failures and idle(streamer))
+        assert len(read) == streamer.counters().failures == 1
 
 
 def test_a_closed_streamer_says_so(cache):

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import ctypes
 import hashlib
+import os
 import shutil
 import subprocess
 import tempfile
@@ -44,7 +45,7 @@ def build(source: Path, *options: str, reads: tuple[Path, ...] = ()) -> Path:
     digest = hashlib.sha256(repr((options, _FLAGS)).encode())
     for file in sorted([*SOURCES.glob("*.cu*"), *EMULATION.glob("*"), *reads]):
         digest.update(file.read_bytes())
-    folder = Path(tempfile.gettempdir()) / "pilot-cuda-emulation"
+    folder = Path(tempfile.gettempdir()) / f"pilot-cuda-emulation-{os.getuid()}"
     folder.mkdir(exist_ok=True)
     library = folder / f"{source.stem}-{digest.hexdigest()[:24]}.so"
     if not library.exists():
