@@ -80,7 +80,7 @@ class CameraComponent:
     def tick(self, now_ns: int, vehicle: Origin | None, uptime_ms: int, send: Send) -> None:
         """Send what is due."""
         for target_id in [
-            i for i, t in self._targets.items() if now_ns - t.time_ns > _TARGET_AGE_NS
+            i for i, t in self._targets.items() if abs(now_ns - t.time_ns) > _TARGET_AGE_NS
         ]:
             del self._targets[target_id]
             self._sent_ns.pop(target_id, None)

@@ -14,6 +14,7 @@ from mavlink_bridge.errors import ConnectionSilentError
 from mavlink_bridge.link import Link
 from mavlink_bridge.signing import load_key
 from mavlink_bridge.transport import Endpoint
+from mavlink_bridge.vehicle import VehicleTracker
 
 _CONNECT_S = 15.0
 _FIRST_GUESS = 1
@@ -85,16 +86,18 @@ class VehicleClient:
         """The autopilot's heartbeat, or an answer of it."""
         system = message.get_srcSystem()
         if message.get_type() == "HEARTBEAT":
-            if message.autopilot == mavlink.MAV_AUTOPILOT_INVALID or (
-                self.config.system_id not in (None, system)
-            ):
+            # The first one decides: a second vehicle on the link must not be given what was asked
+            # of, or written for, the first.
+            if self.system or self.config.system_id not in (None, system):
+                return
+            if not VehicleTracker.is_autopilot(message):
                 return
             link.system_id = system
             with self._changed:
                 self.system, self.component = system, message.get_srcComponent()
                 self.autopilot = message.autopilot
                 self._changed.notify_all()
-        elif system == self.system:
+        elif (system, message.get_srcComponent()) == (self.system, self.component):
             with self._changed:
                 self.take(message)
                 self._changed.notify_all()

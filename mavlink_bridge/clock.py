@@ -95,6 +95,7 @@ class BootClock:
     def __init__(self) -> None:
         self.reboots = 0
         self.steps = 0
+        self.strays = 0
         self.rate = 1.0
         self.source = "none"
         self.round_trip_ns: int | None = None
@@ -155,6 +156,7 @@ class BootClock:
         One alone may be an old frame that was duplicated or came late.
         """
         if self._newest_boot_ns - boot_ns <= _RUN_BACK_NS:
+            self.strays += bool(self._behind)
             self._behind.clear()
             return False
         if self._behind and boot_ns < self._behind[-1]:

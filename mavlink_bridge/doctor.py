@@ -163,6 +163,14 @@ def _link_findings(
             True,
         ),
         Finding(
+            "vehicles",
+            "several" if after.get("bridge_other_autopilots") else "one",
+            "one, or bridge.system_id",
+            "positions and parameters must not go to another vehicle",
+            not after.get("bridge_other_autopilots"),
+            True,
+        ),
+        Finding(
             "lost messages",
             f"{100 * lost:.1f} %",
             f"<= {100 * _LOST_SHARE:.0f} %",
@@ -213,7 +221,7 @@ def examine(config: BridgeConfig) -> Diagnosis:
     """Connect, measure the link, read the parameters and judge."""
     findings, state = check_link(config)
     findings += check_computer_clock(config)
-    if not findings[0].ok:
+    if not findings[0].ok or any(f.name == "vehicles" and not f.ok for f in findings):
         return Diagnosis(tuple(findings))
     with ParameterClient(config) as client:
         if state.autopilot == "px4":

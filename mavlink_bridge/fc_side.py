@@ -28,6 +28,7 @@ from mavlink_bridge.side import COMMANDS_IN, SECOND_NS, Shared, Side
 from mavlink_bridge.streams import StreamKeeper, wanted_streams
 from mavlink_bridge.switching import SourceSwitch
 from mavlink_bridge.vehicle import MESSAGES_IN
+from mavlink_bridge.watch import TwinWatch
 
 log = logging.getLogger(__name__)
 
@@ -74,6 +75,7 @@ class FlightControllerSide(Side):
         self._next_version_ns = 0
         self._next_check_ns = 0
         self._delivered_ns = 0
+        self._twins = TwinWatch()
         self._connected = False
         self._told: dict[str, str] = {"inject": "nothing yet"}
 
@@ -111,7 +113,11 @@ class FlightControllerSide(Side):
         ours = (config.localizer_component, config.companion_component, config.camera_component)
         if system == link.system_id and component in ours:
             self._tell("twin", f"another companion speaks as component {component}: stop one")
+        elif system == link.system_id and self.tracker.is_autopilot(message):
+            self.counters["other_autopilots"] += 1
+            self._tell("twins", f"another autopilot is system {system}, too: give it another id")
         elif config.system_id is None and self.tracker.is_autopilot(message):
+            self.counters["other_autopilots"] += 1
             self._tell(
                 "others",
                 f"autopilot {system} is heard, {link.system_id} is followed: set bridge.system_id",
@@ -322,6 +328,9 @@ class FlightControllerSide(Side):
             on_gnss = self.switch.current == self.config.switch.gnss_set
             if reference is not None and on_gnss and gnss_healthy(state, now_ns):
                 self.shadow.compare(fix, reference)
+        clock = self.tracker.clock
+        if self._twins.two(now_ns, clock.strays + clock.reboots):
+            self._tell("twins", f"two autopilots speak as system {link.system_id}: change one's id")
         self.verdict = self.loop.verdict(now_ns, state, self.tracker.local_at)
         if self.verdict is not None:
             self._tell("loop", self.verdict.reason, "the EKF follows")

@@ -19,6 +19,8 @@ _RETRIES = 5
 _ANSWER_S = 1.0
 _LONGEST_S = 120.0  # for all items
 _POLE = 900_000_000  # 1e-7 degrees
+# INT32_MAX stands for "not set" in a whole number, as NaN does in a float (MAVLink, commands).
+_HERE = ((0, 0), (0x7FFFFFFF, 0x7FFFFFFF))
 _WANTED = (
     mavlink.MAVLINK_MSG_ID_MISSION_COUNT,
     mavlink.MAVLINK_MSG_ID_MISSION_ITEM_INT,
@@ -105,9 +107,9 @@ class MissionClient(VehicleClient):
 
 
 def _is_place(item: Any) -> bool:
-    """Whether the item is flown to; 0, 0 means where the vehicle is."""
+    """Whether the item is flown to; 0, 0 and the unset value mean where the vehicle is."""
     flown = item.seq == 0 or item.command <= mavlink.MAV_CMD_NAV_LAST
-    if not flown or item.frame not in _GLOBAL_FRAMES or (item.x, item.y) == (0, 0):
+    if not flown or item.frame not in _GLOBAL_FRAMES or (item.x, item.y) in _HERE:
         return False
     if abs(item.x) > _POLE or abs(item.y) > 2 * _POLE:
         raise MissionError(

@@ -11,6 +11,8 @@ from mavlink_bridge.clock import monotonic_ns
 from mavlink_bridge.messages import VehicleState
 
 _PATIENCE_NS = 5_000_000_000
+_TWIN_WINDOW_NS = 5_000_000_000
+_TWIN_SWITCHES = 20  # in a window: damaged or doubled frames are not old by a second so often
 _TEXTS = {
     "there": (mavlink.MAV_SEVERITY_INFO, "flight controller found"),
     "lost": (mavlink.MAV_SEVERITY_WARNING, "flight controller lost: no heartbeat for 3 s"),
@@ -48,3 +50,18 @@ class VehicleWatch:
         if before == "lost":
             text = "flight controller is back"
         self._say(severity, f"PiLoT: {text}")
+
+
+class TwinWatch:
+    """Notices two vehicles of the same ids on one link: boot time runs back again and again."""
+
+    def __init__(self) -> None:
+        self._begun_ns = 0
+        self._count = 0
+
+    def two(self, now_ns: int, ran_back: int) -> bool:
+        """Whether there are two. ran_back: how often boot time ran back so far."""
+        many = ran_back - self._count >= _TWIN_SWITCHES
+        if many or now_ns - self._begun_ns >= _TWIN_WINDOW_NS:
+            self._begun_ns, self._count = now_ns, ran_back
+        return many

@@ -231,3 +231,48 @@ def test_unknown_parameter_cannot_be_written(
         assert client.read("NO_SUCH") is None
         with pytest.raises(ParameterError, match="no such parameter"):
             client.write("NO_SUCH", 1.0)
+
+
+def test_parameters_are_asked_of_one_vehicle_and_taken_from_its_autopilot(autopilot: Any) -> None:
+    """A second vehicle and a gimbal on the same link answer, too."""
+    autopilot.parameters = {"A": 1.0}
+    answer = autopilot._parameter
+
+    def everybody(name: str) -> None:
+        other = mavlink.MAVLink_param_value_message(b"A", 9.0, mavlink.MAV_PARAM_TYPE_REAL32, 1, 0)
+        beat = mavlink.MAVLink_heartbeat_message(2, 3, 81, 4, 4, 3)
+        autopilot.send(beat, component=1, system=2)
+        autopilot.send(other, component=1, system=2)
+        autopilot.send(other, component=154, system=1)
+        answer(name)
+
+    autopilot._parameter = everybody
+    with ParameterClient(config(autopilot.port)) as client:
+        for _ in range(3):
+            assert client.read("A") == 1.0
+        assert client.system == 1
+        client.write("A", 2.0)
+    sets = autopilot.of("PARAM_SET")
+    assert {m.target_system for m in sets} == {1}
+
+
+def test_two_vehicles_on_the_link_are_a_required_failure(
+    autopilot: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """No parameter may be read, judged or written while nobody said of which vehicle."""
+    monkeypatch.setattr("mavlink_bridge.doctor._MEASURE_S", 0.6)
+    autopilot.parameters = dict(GOOD)
+    slow = autopilot._slow
+
+    def both() -> None:
+        slow()
+        autopilot.send(mavlink.MAVLink_heartbeat_message(2, 3, 81, 4, 4, 3), component=1, system=2)
+
+    autopilot._slow = both
+    diagnosis = examine(config(autopilot.port))
+    assert diagnosis.exit_code == 2
+    (vehicles,) = (f for f in diagnosis.findings if f.name == "vehicles")
+    assert (vehicles.found, vehicles.ok, vehicles.required) == ("several", False, True)
+    assert not autopilot.of("PARAM_REQUEST_READ")
+    chosen = examine(config(autopilot.port).model_copy(update={"system_id": 1}))
+    assert next(f for f in chosen.findings if f.name == "vehicles").ok

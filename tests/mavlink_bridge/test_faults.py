@@ -436,6 +436,7 @@ def test_a_flood_of_targets_and_commands_leaves_a_slow_link_to_positions(flight:
     [
         (2, 1, 3, "autopilot 2 is heard, 1 is followed: set bridge.system_id"),
         (1, 197, 8, "another companion speaks as component 197: stop one"),
+        (1, 2, 3, "another autopilot is system 1, too: give it another id"),
         (255, 190, 8, None),  # a ground station
         (1, 154, 8, None),  # a gimbal
     ],
@@ -455,6 +456,31 @@ def test_a_second_vehicle_and_a_second_companion_are_told_once(
         assert flight.link.kept == kept + 1  # by the vehicle's own heartbeat
     assert flight.texts == ([f"PiLoT: {said}"] if said else [])
     assert flight.side.tracker.snapshot(flight.now_ns).system_id == 1
+
+
+@pytest.mark.parametrize("ahead_s", [-50, 500])
+def test_two_vehicles_of_the_same_ids_are_told_once(flight: Flight, ahead_s: int) -> None:
+    """Only their boot times tell them apart. Nothing of the other's attitude may be injected."""
+    other = mavlink.MAVLink(None, 1, 1)
+    flight.texts.clear()
+    for step in range(1000):
+        flight.run(0.01)
+        if step % 4 == 1:
+            boot_ms = flight.boot_ns(flight.now_ns) // MS + ahead_s * 1000
+            attitude = mavlink.MAVLink_attitude_message(boot_ms, 0.0, 0.0, -1.0, 0.0, 0.0, 0.0)
+            for message in flight.reader.feed(attitude.pack(other)):
+                flight.side.on_message(flight.link, message, flight.now_ns)  # type: ignore[arg-type]
+    told = [t for t in flight.texts if "two autopilots" in t]
+    assert told == ["PiLoT: two autopilots speak as system 1: change one's id"]
+    assert {m.yaw for _, m in flight.vision()}.isdisjoint({-1.0})
+
+
+def test_a_target_from_the_future_is_not_reported_for_ever(flight: Flight) -> None:
+    hour = 3600 * SECOND
+    flight.side.outbound.append(TargetReport(flight.now_ns + hour, *HOME, 500.0))
+    flight.run(1.0)
+    assert flight.waiting()["targets"] == 0
+    assert not [m for _, m, _ in flight.link.sent if m.get_type() == "CAMERA_TRACKING_GEO_STATUS"]
 
 
 def test_a_blind_yaw_guard_is_told_once(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -130,6 +130,15 @@ def test_a_place_that_is_not_on_earth_is_named(
         download_mission(config(f"udpout:127.0.0.1:{vehicle.port}"))
 
 
+def test_a_place_that_is_not_set_is_where_the_vehicle_is(
+    with_mission: Callable[..., Any], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    unset = (21, RELATIVE, 0x7FFFFFFF, 0x7FFFFFFF)  # land here
+    monkeypatch.setattr(f"{__name__}.ITEMS", [*ITEMS, unset])
+    vehicle = with_mission()
+    same(download_mission(config(f"udpout:127.0.0.1:{vehicle.port}")), PLACES)
+
+
 def test_a_mission_that_never_ends_is_given_up(
     with_mission: Callable[..., Any], monkeypatch: pytest.MonkeyPatch
 ) -> None:
