@@ -17,6 +17,9 @@ from mavlink_bridge.errors import FixError
 
 Array = NDArray[np.float64]
 NAN = math.nan
+_FASTEST_MPS = 1000.0
+_LEAST_KNOWN_M = 1e5  # of a sigma or an accuracy: beyond it nothing is known, and floats overflow
+_LARGEST_SIGMA = 1e3  # of an angle or a speed
 
 
 class HealthLevel(enum.Enum):
@@ -41,8 +44,16 @@ def _check_position(what: str, latitude_deg: float, longitude_deg: float, height
         )
 
 
+def _check_velocity(what: str, velocity_ned: tuple[float, float, float] | None) -> None:
+    if velocity_ned is not None and not all(abs(v) <= _FASTEST_MPS for v in velocity_ned):
+        raise FixError(
+            f"{what}: velocity {velocity_ned} is not finite or above {_FASTEST_MPS:.0f} m/s; give "
+            "m/s, or None where it is unknown"
+        )
+
+
 def _is_covariance(P: Array) -> bool:
-    if P.shape != (3, 3) or not np.all(np.isfinite(P)):
+    if P.shape != (3, 3) or not np.all(np.abs(P) <= _LEAST_KNOWN_M**2):
         return False
     scale = max(float(np.abs(P).max()), 1e-12)
     symmetric = bool(np.abs(P - P.T).max() <= 1e-6 * scale)
@@ -77,20 +88,22 @@ class VisionFix:
         P = np.asarray(self.position_covariance_ned, dtype=np.float64)
         if not _is_covariance(P):
             raise FixError(
-                "vision fix: covariance must be (3, 3), finite, symmetric and not negative; got "
-                f"{P.tolist()}"
+                "vision fix: covariance must be (3, 3), symmetric, not negative and at most "
+                f"{_LEAST_KNOWN_M**2:g} m^2; got {P.tolist()}"
             )
         object.__setattr__(self, "position_covariance_ned", P)
         if not 0 <= self.quality <= 100:
             raise FixError(f"vision fix: quality must be 0..100, got {self.quality}")
-        if self.velocity_ned is not None and not all(math.isfinite(v) for v in self.velocity_ned):
-            raise FixError(f"vision fix: velocity {self.velocity_ned} is not finite; give None")
+        _check_velocity("vision fix", self.velocity_ned)
         angles = (self.roll_rad, self.pitch_rad, self.yaw_rad)
         if any(math.isinf(angle) for angle in angles):
             raise FixError(f"vision fix: attitude {angles} is infinite; give NaN where unknown")
         sigmas = (self.attitude_sigma_rad, self.velocity_sigma_mps)
-        if not all(math.isfinite(sigma) and sigma >= 0.0 for sigma in sigmas):
-            raise FixError(f"vision fix: attitude and velocity sigma must be >= 0, got {sigmas}")
+        if not all(0.0 <= sigma <= _LARGEST_SIGMA for sigma in sigmas):
+            raise FixError(
+                f"vision fix: attitude and velocity sigma must be 0 to {_LARGEST_SIGMA:g}, got "
+                f"{sigmas}"
+            )
 
 
 @dataclass(frozen=True)
@@ -116,6 +129,19 @@ class TargetReport:
 
     def __post_init__(self) -> None:
         _check_position("target report", self.latitude_deg, self.longitude_deg, self.height_m)
+        _check_velocity("target report", self.velocity_ned)
+        accuracies = (self.h_accuracy_m, self.v_accuracy_m)
+        if not all(math.isnan(a) or 0.0 <= a <= _LEAST_KNOWN_M for a in accuracies):
+            raise FixError(
+                f"target report: accuracies must be 0 to {_LEAST_KNOWN_M:g} m, NaN where unknown; "
+                f"got {accuracies}"
+            )
+        for place in (self.pixel, self.rectangle):
+            if place is not None and not all(0.0 <= c <= 1.0 for c in place):
+                raise FixError(
+                    f"target report: {place} is not inside the picture; give shares of its width "
+                    "and height, 0 to 1"
+                )
 
 
 @dataclass(frozen=True)
@@ -134,6 +160,14 @@ class CameraView:
     image_latitude_deg: float = NAN
     image_longitude_deg: float = NAN
     image_height_m: float = NAN
+
+    def __post_init__(self) -> None:
+        _check_position("camera view", self.latitude_deg, self.longitude_deg, self.height_m)
+        image = (self.image_latitude_deg, self.image_longitude_deg, self.image_height_m)
+        if all(math.isfinite(value) for value in image):
+            _check_position("camera view's picture", *image)
+        if not all(abs(q) <= 1.001 for q in self.quaternion_ned):
+            raise FixError(f"camera view: {self.quaternion_ned} is no rotation")
 
 
 @dataclass(frozen=True)

@@ -231,8 +231,8 @@ class VehicleTracker:
     def _global_position(self, m: Any, time_ns: int) -> None:
         if m.lat == 0 and m.lon == 0:
             return  # what firmwares send before they have a position
-        if abs(m.lat) > 900_000_000:
-            raise ValueError(f"latitude {m.lat}")
+        if abs(m.lat) > 900_000_000 or abs(m.lon) > 1_800_000_000:
+            raise ValueError(f"no place on Earth: {m.lat}, {m.lon}")
         self._globals.add(time_ns, (m.lat * 1e-7, m.lon * 1e-7, m.alt * 1e-3))
         self._state = replace(
             self._state,

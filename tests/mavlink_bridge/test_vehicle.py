@@ -206,6 +206,15 @@ def test_position_at_null_island_is_no_position() -> None:
         assert math.isfinite(it.snapshot(SECOND).latitude_deg) is (lat != 0)
 
 
+@pytest.mark.parametrize("place", [(910_000_000, 0), (1, 1_800_000_001), (1, -(2**31))])
+def test_position_that_is_not_on_earth_is_no_position(place: tuple[int, int]) -> None:
+    it = tracker()
+    message = mavlink.MAVLink_global_position_int_message(1, *place, 500000, 0, 0, 0, 0, 0)
+    it.handle(sent(message), 10 * SECOND)
+    assert math.isnan(it.snapshot(SECOND).latitude_deg)
+    assert it.global_at(10 * SECOND) is None
+
+
 def test_heartbeat_age_and_connection() -> None:
     it = tracker()
     assert it.snapshot(2 * SECOND).connected
