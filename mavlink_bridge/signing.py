@@ -15,13 +15,17 @@ from mavlink_bridge.errors import SigningKeyError
 
 _SIGNING_EPOCH_S = 1420070400  # 2015-01-01 UTC
 _TICKS_PER_S = 100_000  # time stamps count 10 microseconds
+_LONGEST_TEXT = 1024
 
 
 def load_key(path: Path) -> bytes:
     """The 32-byte key of a file of 64 hexadecimal digits that only its owner can read."""
     try:
         mode = path.stat().st_mode
-        text = path.read_text(encoding="ascii").strip()
+        if not stat.S_ISREG(mode):  # a pipe would be waited for without end
+            raise SigningKeyError(f"{path}: signing key is no file")
+        with path.open(encoding="ascii") as file:
+            text = file.read(_LONGEST_TEXT).strip()
     except (OSError, UnicodeDecodeError) as error:
         raise SigningKeyError(f"{path}: signing key cannot be read ({error})") from error
     if stat.S_IMODE(mode) & 0o077:
@@ -32,6 +36,10 @@ def load_key(path: Path) -> bytes:
         raise SigningKeyError(f"{path}: signing key must be 64 hexadecimal digits") from error
     if len(key) != 32:
         raise SigningKeyError(f"{path}: signing key has {len(key)} bytes, needs 32")
+    if not any(key):
+        raise SigningKeyError(
+            f"{path}: signing key is zero, which ArduPilot takes for no signing; make a random one"
+        )
     return key
 
 

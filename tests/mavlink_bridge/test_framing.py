@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import random
 import time
 from collections import deque
@@ -170,5 +171,12 @@ def test_key_files(tmp_path: Path) -> None:
     path.write_text("ab" * 31)
     with pytest.raises(SigningKeyError, match="31 bytes"):
         load_key(path)
+    path.write_text("00" * 32)
+    with pytest.raises(SigningKeyError, match="no signing"):
+        load_key(path)
     with pytest.raises(SigningKeyError, match="cannot be read"):
         load_key(tmp_path / "missing")
+    os.mkfifo(tmp_path / "pipe")
+    for place in (tmp_path / "pipe", tmp_path):
+        with pytest.raises(SigningKeyError, match="no file"):
+            load_key(place)

@@ -11,16 +11,19 @@ import threading
 import time
 import tty
 from collections.abc import Callable, Iterator
+from pathlib import Path
 from typing import Any
 
 import pytest
 from pydantic import ValidationError
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
-from mavlink_bridge import BridgeConfig
-from mavlink_bridge.config import InjectionConfig, TargetsConfig
+from mavlink_bridge import Bridge, BridgeConfig
+from mavlink_bridge.config import InjectionConfig, SigningConfig, TargetsConfig
 from mavlink_bridge.errors import BridgeStateError, EndpointError
+from mavlink_bridge.framing import FrameReader
 from mavlink_bridge.link import Link, sleep_until
+from mavlink_bridge.signing import create_key
 from mavlink_bridge.streams import StreamKeeper, wanted_streams
 from mavlink_bridge.transport import Endpoint, UdpTransport, open_transport
 
@@ -360,3 +363,43 @@ def test_rc_channels_and_estimator_by_configuration() -> None:
     wanted = {s.name for s in wanted_streams(BridgeConfig(mode="rc"), "px4")}
     assert {"RC_CHANNELS", "ESTIMATOR_STATUS"} <= wanted
     assert "EKF_STATUS_REPORT" not in wanted
+
+
+def heard(server: socket.socket, reader: FrameReader) -> set[str]:
+    """Accepts one connection, listens until a message passes, and closes it."""
+    connection, _ = server.accept()
+    with connection:
+        connection.settimeout(30.0)
+        while not (messages := reader.feed(connection.recv(4096))):
+            pass
+    return {m.get_type() for m in messages}
+
+
+def replace(path: Path) -> None:
+    path.unlink()
+    create_key(path)
+
+
+@pytest.mark.parametrize(
+    "fate",
+    [Path.unlink, replace, lambda path: path.write_text("ab"), lambda path: path.chmod(0o644)],
+    ids=["removed", "replaced", "truncated", "readable"],
+)
+def test_a_key_file_that_changes_while_the_link_runs_changes_nothing(
+    fate: Callable[[Path], Any], tmp_path: Path
+) -> None:
+    """The key counts that was read at the start, over every reconnection, until the next start."""
+    path = tmp_path / "key"
+    reader = FrameReader(key=create_key(path))
+    with listen() as server:
+        settings = BridgeConfig(
+            connection=f"tcp:127.0.0.1:{server.getsockname()[1]}",
+            system_id=1,
+            signing=SigningConfig(key_file=path),
+        )
+        with Bridge(settings, 0.0) as bridge:
+            assert "HEARTBEAT" in heard(server, reader)
+            fate(path)
+            assert heard(server, reader)
+            assert bridge.counters()["fc_opened"] >= 2
+    assert reader.counters.bad_signatures == 0
