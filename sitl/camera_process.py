@@ -35,8 +35,8 @@ from sitl.world_camera import FrameLog, WorldCamera
 
 Command = Literal["pause", "resume", "stop"]
 
-_START_S = 120.0  # numba compiles on the first run
-_STOP_S = 10.0
+_START_S = 300.0  # numba compiles on the first run, a minute where there is room
+_STOP_S = 60.0
 _MAX_BEHIND = 2  # frame periods after which exposures are skipped instead of made late
 
 
@@ -90,6 +90,8 @@ class WorldCameraProcess:
             target=_run, args=(config, child), name="world-camera", daemon=True
         )
         self._child = child
+        # One thread at a time on the pipe: flights stop the camera while their truth is still sent.
+        self._lock = threading.Lock()
         self.statistics: CameraStatistics | None = None
 
     def start(self) -> None:
@@ -117,9 +119,10 @@ class WorldCameraProcess:
         if self._process.pid is None:
             return
         try:
-            self._connection.send("stop")
-            if self._connection.poll(_STOP_S):
-                self._receive()
+            with self._lock:
+                self._connection.send("stop")
+                if self._connection.poll(_STOP_S):
+                    self._receive()
         except (OSError, EOFError, WorldCameraError):
             pass  # it is gone already, which is what is wanted
         self._process.join(_STOP_S)
@@ -143,12 +146,13 @@ class WorldCameraProcess:
         self.stop()
 
     def _send(self, message: TruthSample | Command) -> None:
-        if self._connection.poll():
-            self._receive()
-        try:
-            self._connection.send(message)
-        except OSError as error:
-            raise WorldCameraError("the world camera's process has died") from error
+        with self._lock:
+            if self._connection.poll():
+                self._receive()
+            try:
+                self._connection.send(message)
+            except OSError as error:
+                raise WorldCameraError("the world camera's process has died") from error
 
     def _receive(self) -> None:
         try:

@@ -99,8 +99,11 @@ class GroundLink(VehicleRecord):
     def close(self) -> None:
         """Stop reading and disconnect."""
         self._stop.set()
+        if self._link is not None:
+            with contextlib.suppress(OSError):  # the vehicle may have closed it
+                self._link.port.shutdown(socket.SHUT_RDWR)  # ends what the thread waits for
         if self._thread is not None:
-            self._thread.join(timeout=2.0)
+            self._thread.join()
         if self._link is not None:
             self._link.close()
 
