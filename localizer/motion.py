@@ -21,6 +21,7 @@ from localizer.types import PosePrior
 
 _MAX_SIGMA_M = 10.0  # beyond it nothing is gained: the swarm's own limits are reached
 _MAX_SIGMA_RAD = float(np.radians(8.0))
+_LONGEST_S = 10.0  # a camera's clock that jumped, or a gap that no velocity bridges
 _H = np.hstack([np.eye(6), np.zeros((6, 6))])
 
 
@@ -78,12 +79,15 @@ def predict(
 ) -> MotionState:
     """The state moved to `time_ns`; a time before the state's own moves it back the same way.
 
+    Over more than 10 s it is `kept`.
     turn: rotation (3, 3) of the camera since the state's time in world axes (new = turn @ old), if
     something measured it; else the angular rate is taken as constant.
     """
     dt = (time_ns - state.time_ns) * 1e-9
     if dt == 0.0:
         return state
+    if abs(dt) > _LONGEST_S:
+        return kept(state, time_ns, config, turn)
     F = np.eye(12)
     F[:6, 6:] = np.eye(6) * dt
     Q = _process_noise(abs(dt), config)
@@ -113,12 +117,8 @@ def inflated(state: MotionState, config: MotionConfig) -> MotionState:
     that the constant-velocity model did not foresee, or a wrong measurement. Doubling sigma lets
     the former in after a frame or two, while the latter would have to repeat itself.
     """
-    limit = np.repeat(
-        [_MAX_SIGMA_M, _MAX_SIGMA_RAD, config.initial_velocity_sigma,
-         config.initial_angular_rate_sigma], 3,
-    )  # fmt: skip
     sigma = np.sqrt(state.covariance.diagonal())
-    scale = np.clip(limit / sigma, 1.0, 2.0)
+    scale = np.clip(_limits(config) / sigma, 1.0, 2.0)
     return replace(state, covariance=state.covariance * np.outer(scale, scale))
 
 
@@ -135,6 +135,25 @@ def mahalanobis_squared(prior: PosePrior, pose: Pose, extra: Array | float = 0.0
 def pose_difference(a: Pose, b: Pose) -> Array:
     """``b - a`` as (position, left rotation vector), shape (6,), world axes."""
     return np.concatenate([b.translation - a.translation, so3_log(b.rotation @ a.rotation.T)])
+
+
+def kept(state: MotionState, time_ns: int, config: MotionConfig, turn: Array | None) -> MotionState:
+    """The state's pose at another time, with the sigmas of a search about it; its motion unknown.
+
+    For a camera whose clock jumped: pictures still follow each other, times do not. turn: as in
+    `predict`.
+    """
+    mean = np.concatenate([state.mean[:3], np.zeros(9)])
+    rotation = state.rotation if turn is None else turn @ state.rotation
+    return MotionState(mean, np.diag(_limits(config) ** 2), rotation, time_ns)
+
+
+def _limits(config: MotionConfig) -> Array:
+    """Sigmas (12,) of a state of which nothing is known but about where it is."""
+    return np.repeat(
+        [_MAX_SIGMA_M, _MAX_SIGMA_RAD, config.initial_velocity_sigma,
+         config.initial_angular_rate_sigma], 3,
+    )  # fmt: skip
 
 
 def _fold_rotation(mean: Array, P: Array, rotation: Array, time_ns: int) -> MotionState:

@@ -160,9 +160,19 @@ class Localizer:
         return self._ahead(state, time_ns).prior if state else None
 
     def _ahead(self, state: MotionState, time_ns: int) -> MotionState:
-        begin, end = self._rotation_at(state.time_ns), self._rotation_at(time_ns)
-        turn = end @ begin.T if begin is not None and end is not None else None
+        turn = self._turn(state.time_ns, time_ns)
         return motion.predict(state, time_ns, self._config.motion, turn)
+
+    def _turn(self, begin_ns: int, end_ns: int) -> Array | None:
+        begin, end = self._rotation_at(begin_ns), self._rotation_at(end_ns)
+        return end @ begin.T if begin is not None and end is not None else None
+
+    def _at_frame(self, state: MotionState, time_ns: int) -> MotionState:
+        if time_ns >= state.time_ns:
+            return self._ahead(state, time_ns)
+        # The camera's clock jumped: by its velocity the state would be moved the wrong way.
+        turn = self._turn(state.time_ns, time_ns)
+        return motion.kept(state, time_ns, self._config.motion, turn)
 
     def _attitude(self, time_ns: int) -> PoseConstraint | None:
         sigma, rotation = self._config.attitude, self._rotation_at(time_ns)
@@ -208,7 +218,7 @@ class Localizer:
         if tracker.motion is None:
             raise OutsideMapError("no pose prior yet: call set_prior before localizing")
         config = self._config
-        ahead = self._ahead(tracker.motion, frame.exposure_time_ns)
+        ahead = self._at_frame(tracker.motion, frame.exposure_time_ns)
         started = time.perf_counter()
         result = self._optimizer.register(
             query,

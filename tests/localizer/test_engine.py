@@ -280,3 +280,41 @@ def test_undistorted_image_agrees_with_the_projection(size):
     centroid = np.array([(columns * seen).sum(), (rows * seen).sum()]) / seen.sum()
     expected, _ = target.project(point)
     np.testing.assert_allclose(centroid, expected, atol=0.15)
+
+
+class NearOptimizer(FakeOptimizer):
+    """Finds a camera that flies at 10 m/s, if the prior is within 12 m of it."""
+
+    true_ns = 0
+
+    def register(self, query, camera, anchors, prior, *, motion=None, constraint=None, seed=0):
+        self.offset = np.array([10.0, 0.0, 0.0]) * (self.true_ns - 10**13) * 1e-9
+        away = prior.world_from_camera.translation - NADIR.translation - self.offset
+        far = np.linalg.norm(away) > 12.0
+        self.status = RegistrationStatus.NO_OVERLAP if far else RegistrationStatus.OK
+        return super().register(query, camera, anchors, prior)
+
+
+@pytest.mark.parametrize("jump_s", [4e9, 3 * 3600.0, -3 * 3600.0, 20.0, 1.0, -1.0, -0.15])
+@pytest.mark.parametrize("frames", [1, 3, 100])
+def test_frames_of_a_wrong_time_are_got_over(jump_s, frames):
+    """Camera times that run back or leap ahead, for some frames or for good; no help outside."""
+    optimizer = NearOptimizer()
+    localizer = _localizer(optimizer=optimizer)
+    start, step_ns = 10**13, 10**8
+    localizer.set_prior(PosePrior(NADIR, np.eye(6), start, np.array([10.0, 0.0, 0.0])))
+    anchors = localizer.make_reference(_prior(start)).anchors
+    estimates = {}
+    for k in range(1, 40):
+        optimizer.true_ns = start + k * step_ns
+        wrong = 10 <= k < 10 + frames
+        told = optimizer.true_ns + (round(jump_s * 1e9) if wrong else 0)
+        frame = Frame(np.zeros((480, 640, 3), np.uint8), told, CAMERA, k)
+        estimates[k] = localizer.localize(frame, localizer.extract_query(frame), anchors)
+        assert estimates[k].exposure_time_ns == told
+    assert all(estimates[k].accepted for k in range(1, 10))
+    assert all(estimates[k].accepted for k in range(30, 40))
+    assert estimates[39].state is TrackingState.TRACKING
+    state = localizer.tracker.motion
+    assert state.velocity[0] == pytest.approx(10.0, abs=1.0)
+    assert np.sqrt(state.covariance[0, 0]) < 0.2

@@ -8,7 +8,13 @@ import numpy as np
 import pytest
 
 from companion.sources.misp import UUID, MispTime, parse_message, sei_nal
-from companion.sources.timing import ExposureClock, MinimumLag, Stamps, _system_minus_monotonic
+from companion.sources.timing import (
+    ExposureClock,
+    MinimumLag,
+    Stamps,
+    Timing,
+    _system_minus_monotonic,
+)
 
 MS = 1_000_000
 
@@ -142,3 +148,36 @@ def test_another_thread_between_two_readings_of_the_clocks_costs_nothing(
 
     monkeypatch.setattr("companion.sources.timing.time.time_ns", slowly)
     assert _system_minus_monotonic() == pytest.approx(truth, abs=2e6)
+
+
+@pytest.mark.parametrize("device", [False, True])
+@pytest.mark.parametrize("timing", ["auto", "pts"])
+def test_no_stamp_whatever_it_says_makes_a_frame_of_the_future_or_of_long_ago(
+    timing: Timing, device: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Stamps that repeat, run back, leap by hours and stop, and a wall clock that is stepped."""
+    rng = np.random.default_rng(5)
+    wall_ns = [10**18]
+    monkeypatch.setattr("companion.sources.timing._system_minus_monotonic", lambda: wall_ns[0])
+    clock = ExposureClock(30 * MS, timing, device=device)
+    leaps = [0, 0, 0, 1, -1, 40 * MS, -40 * MS, 10**9, -(10**9), 3600 * 10**9, -3600 * 10**9]
+    arrival, pts, misp = 10**13, 10**13, 10**13
+    good = []
+    for k in range(3000):
+        restless = k < 2000
+        arrival += 50 * MS
+        pts, misp = pts + 50 * MS, misp + 50 * MS
+        if restless:
+            pts += int(rng.choice(leaps))
+            misp += int(rng.choice(leaps))
+            wall_ns[0] += int(rng.choice(leaps)) if rng.random() < 0.05 else 0
+        stamp = MispTime(max(misp + 10**18, 0) // 1000, locked=bool(rng.random() < 0.8))
+        stamps = Stamps(
+            None if restless and rng.random() < 0.1 else pts,
+            None if restless and rng.random() < 0.2 else stamp,
+        )
+        late = int(rng.exponential(10 * MS))
+        exposed = clock.exposure_time(stamps, arrival + late)
+        assert -4 * 10**9 <= exposed - (arrival + late) <= 5 * MS
+        good.append(exposed - arrival)
+    assert np.ptp(good[2500:]) < 5 * MS  # steady again within half a minute
