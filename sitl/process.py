@@ -9,8 +9,10 @@ import signal
 import socket
 import subprocess
 import tempfile
+import threading
 import time
 from abc import ABC, abstractmethod
+from collections.abc import Iterator
 from pathlib import Path
 from types import TracebackType
 from typing import Literal, TypeVar
@@ -105,7 +107,8 @@ class VehicleProcess(ABC):
     def start(self) -> None:
         """Start on free ports and wait until it listens; VehicleProcessError when it does not."""
         try:
-            self._folder = Path(tempfile.mkdtemp(prefix=f"{self.kind}-"))
+            with _signals_wait():
+                self._folder = Path(tempfile.mkdtemp(prefix=f"{self.kind}-"))
             _write_parameters(self._folder / PARAMETERS, self._parameters)
             if fault := self._start_on_free_ports():
                 raise VehicleProcessError(
@@ -142,7 +145,7 @@ class VehicleProcess(ABC):
 
     def _launch(self) -> None:
         command = self.command(self._instance)
-        with self._log_path.open("wb") as log:
+        with self._log_path.open("wb") as log, _signals_wait():
             try:
                 self._process = subprocess.Popen(
                     command,
@@ -155,7 +158,7 @@ class VehicleProcess(ABC):
                 )
             except OSError as error:
                 raise VehicleProcessError(f"cannot run {command[0]}: {error}") from error
-        self._lifeline = _end_with_us(self._process.pid)
+            self._lifeline = _end_with_us(self._process.pid)
 
     def _wait_listening(self) -> str:
         """Why it does not listen, "" when it does."""
@@ -227,6 +230,28 @@ class VehicleProcess(ABC):
         traceback: TracebackType | None,
     ) -> None:
         self.stop()
+
+
+@contextlib.contextmanager
+def _signals_wait() -> Iterator[None]:
+    """Interrupts come after the block: in the middle of it they would leave what nobody knows of.
+
+    They are raised on the main thread alone; their blocking would be inherited by the vehicle.
+    """
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    late: list[signal.Signals] = []
+    before = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
+    for number in before:
+        signal.signal(number, lambda taken, _frame: late.append(signal.Signals(taken)))
+    try:
+        yield
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+        for number in late:
+            signal.raise_signal(number)
 
 
 def _write_parameters(path: Path, parameters: dict[str, float]) -> None:

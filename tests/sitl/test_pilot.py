@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import math
 import shutil
+import signal
 import subprocess
 import sys
 import tempfile
@@ -16,7 +17,7 @@ import numpy as np
 import pytest
 
 from mavlink_bridge.link import sleep_until
-from sitl import ardupilot
+from sitl import ardupilot, process
 from sitl.ardupilot import ArduPilotNotFoundError, ArduPilotSitl, find_arducopter
 from sitl.embedded.geodesy import Location
 from sitl.errors import PilotError
@@ -101,15 +102,32 @@ def test_a_vehicles_folder_goes_with_its_end(folders, end):
     assert not list(folders.iterdir())
 
 
-def test_an_interrupted_start_leaves_neither_process_nor_folder(folders, monkeypatch):
-    def interrupted(_self):
-        raise KeyboardInterrupt
+@pytest.mark.parametrize("step", ["mkdtemp", "Popen", "_end_with_us", "_wait_listening"])
+def test_a_start_that_is_interrupted_leaves_neither_process_nor_folder(folders, monkeypatch, step):
+    """In the middle of each of its steps, when that has happened and nobody has been told."""
+    where = {"mkdtemp": tempfile, "Popen": subprocess, "_wait_listening": _Idle}.get(step, process)
+    real, started, popen = getattr(where, step), [], subprocess.Popen
 
-    monkeypatch.setattr(_Idle, "_wait_listening", interrupted)
-    vehicle = _Idle()
-    with pytest.raises(KeyboardInterrupt):
-        vehicle.start()
-    assert not vehicle.alive
+    def interrupted(*arguments, **more):
+        result = real(*arguments, **more)
+        signal.raise_signal(signal.SIGINT)
+        return result
+
+    def noted(*arguments, **more):
+        started.append(popen(*arguments, **more))
+        return started[-1]
+
+    monkeypatch.setattr(subprocess, "Popen", noted)
+    if step == "Popen":
+        real = noted
+    monkeypatch.setattr(where, step, interrupted)
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    try:
+        with pytest.raises(KeyboardInterrupt):
+            _Idle().start()
+    finally:
+        signal.signal(signal.SIGINT, before)
+    assert None not in [child.poll() for child in started]
     assert not list(folders.iterdir())
 
 

@@ -10,13 +10,17 @@ import os
 import signal
 import threading
 import time
+from concurrent.futures import ProcessPoolExecutor
 from functools import cache
+from pathlib import Path
+from typing import Any
 
 import pytest
 
 from mavlink_bridge.link import sleep_until
 from sitl.ardupilot import find_arducopter
 from sitl.process import VehicleKind
+from sitl.suite import runner
 from sitl.suite.case import load_cases
 from sitl.suite.runner import Row, run_case, run_suite
 
@@ -58,20 +62,57 @@ def test_scenario(kind: VehicleKind, name: str) -> None:
     check(flown(kind, True)[name])
 
 
-def test_an_interrupted_suite_ends_and_flies_no_more() -> None:
+@pytest.fixture
+def folders(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Path:
+    """Where the workers' vehicles make their folders."""
+    monkeypatch.setenv("TMPDIR", str(tmp_path))
+    return tmp_path
+
+
+def test_an_interrupted_suite_ends_and_flies_no_more(folders: Path) -> None:
     """Each of its flights takes a minute."""
     # A shell starts what it puts into the background with the interrupt ignored.
     before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    interrupted: list[float] = []
+
+    def interrupt() -> None:
+        if sleep_until(lambda: any(folders.glob("embedded-*")), 300.0):  # it flies
+            interrupted.append(time.monotonic())
+            os.kill(os.getpid(), signal.SIGINT)
+
+    pilot = threading.Thread(target=interrupt)
+    pilot.start()
+    try:
+        with pytest.raises(KeyboardInterrupt):
+            run_suite(FEW, ["embedded"], jobs=1)
+    finally:
+        pilot.join()
+        signal.signal(signal.SIGINT, before)
+    assert time.monotonic() - interrupted[0] < 30.0 * len(FEW)
+    _all_is_over(folders)
+
+
+def test_a_suite_that_is_interrupted_while_it_starts_ends_too(
+    folders: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    class Interrupted(ProcessPoolExecutor):
+        def submit(self, *arguments: Any, **more: Any) -> Any:
+            if self._processes:
+                raise KeyboardInterrupt
+            return super().submit(*arguments, **more)
+
+    monkeypatch.setattr(runner, "ProcessPoolExecutor", Interrupted)
     start = time.monotonic()
-    timer = threading.Timer(4.0, os.kill, (os.getpid(), signal.SIGINT))
-    timer.start()
     with pytest.raises(KeyboardInterrupt):
-        run_suite(FEW, ["embedded"], jobs=1)
-    timer.join()
-    signal.signal(signal.SIGINT, before)
-    assert time.monotonic() - start < 50.0
+        run_suite(FEW, ["embedded"], jobs=2)
+    assert time.monotonic() - start < 30.0
+    _all_is_over(folders)
+
+
+def _all_is_over(folders: Path) -> None:
     # Whether this thread or the pool's takes an ended worker's status first is a race.
-    assert sleep_until(lambda: not multiprocessing.active_children(), 10.0)
+    assert sleep_until(lambda: not multiprocessing.active_children(), 60.0)
+    assert not list(folders.glob("embedded-*"))
 
 
 @pytest.mark.long
