@@ -10,6 +10,7 @@ import numpy as np
 import trimesh
 
 from localizer.errors import MapSourceError
+from localizer.map.beside import files_beside
 from localizer.map.georeference import Georeference, UpAxis
 from localizer.map.gltf import read_gltf
 from localizer.map.quadtree import bounds, quadtree
@@ -69,7 +70,8 @@ def read_mesh(path: Path, georeference: Georeference, up_axis: UpAxis | None) ->
     middle = [*(0.5 * (low + high))[:2], low[2]] if georeference.origin is None else [0.0, 0.0, 0.0]
     centre = georeference.ecef(np.array([middle]))[0]
     options = f"{georeference} {axis}"
-    return SourceTree(quadtree(model), centre, None, "", (path,), options=options)
+    files = (path, *files_beside(path))
+    return SourceTree(quadtree(model), centre, None, "", files, options=options)
 
 
 def _read_obj(path: Path) -> list[SourceMesh]:

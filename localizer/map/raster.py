@@ -132,9 +132,10 @@ def read_rasters(paths: Sequence[Path]) -> SourceTree:
         grid = _grid(heights, colours)
         centre = ecef_from_crs(grid.crs, np.array([[*_centre(heights, grid.crs), 0.0]]))[0]
         bounds = rasterio.warp.transform_bounds(heights.crs, grid.crs, *heights.bounds)
-    return SourceTree(
-        _node(RasterTile(dsm, ortho, grid, 0, 0, 0), bounds), centre, None, "", (dsm, ortho)
-    )
+        # With what lies beside them: world files, statistics, overviews, masks, a mosaic's parts.
+        beside = {Path(name) for data in (heights, colours) for name in data.files}
+    files = (dsm, ortho, *sorted(beside - {dsm, ortho}))
+    return SourceTree(_node(RasterTile(dsm, ortho, grid, 0, 0, 0), bounds), centre, None, "", files)
 
 
 def _node(tile: RasterTile, bounds: tuple[float, float, float, float]) -> SourceNode:

@@ -13,6 +13,7 @@ import numpy as np
 
 from localizer.errors import MapSourceError
 from localizer.geo import ecef_from_geodetic
+from localizer.map.beside import files_beside
 from localizer.map.gltf import gltf_weight, read_gltf
 from localizer.map.source import SourceMesh, SourceNode, SourceTree
 from localizer.pose import Array
@@ -189,7 +190,7 @@ class _Reader:
                 children.append(self.tileset(file, T, depth + 1, replaces=refine == "REPLACE"))
             else:
                 tiles.append(ContentFile(file, self.folder, T, up))
-                self.files.append(file)
+                self.files += [file, *files_beside(file)]
         for item in data.get("children", []):
             child = _object(item, f"{path}: a child")
             children.append(self._node(child, T, refine == "REPLACE", up, path, depth + 1))

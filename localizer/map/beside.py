@@ -1,0 +1,85 @@
+"""The files that a mesh or a tile's content refers to: its source has changed when they have.
+
+They are found by the names in headers alone and never raise: what is wrong with them is told by the
+importer that reads them.
+"""
+
+from __future__ import annotations
+
+import json
+import mmap
+import re
+import struct
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+from urllib.parse import unquote, urlsplit
+
+_LONGEST_JSON = 1 << 30
+_B3DM_HEADER = 28
+_LIBRARY = re.compile(rb"^[ \t]*mtllib[ \t]+([^\r\n]+)", re.MULTILINE)
+_PICTURE = re.compile(rb"^[ \t]*(?:map_\w+|bump|disp|decal|norm|refl)[ \t]+([^\r\n]+)",
+                      re.MULTILINE | re.IGNORECASE)  # fmt: skip
+
+
+def files_beside(path: Path) -> tuple[Path, ...]:
+    """What an OBJ, glTF, GLB or b3dm file refers to, each once, in order of name."""
+    try:
+        found = set(_of_obj(path) if path.suffix.lower() == ".obj" else _of_gltf(path))
+    except (OSError, ValueError, RecursionError, struct.error):
+        return ()
+    return tuple(sorted(found))
+
+
+def _of_obj(path: Path) -> Iterator[Path]:
+    """Its material libraries, and their pictures."""
+    if path.stat().st_size == 0:  # which cannot be mapped
+        return
+    with path.open("rb") as file, mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as text:
+        libraries = [match[1] for match in _LIBRARY.finditer(text)]
+    for names in libraries:
+        for library in _named(path.parent, names):
+            yield library
+            if library.is_file():
+                for match in _PICTURE.finditer(library.read_bytes()):
+                    yield from _named(path.parent, match[1])
+
+
+def _named(folder: Path, text: bytes) -> Iterator[Path]:
+    """The file of the whole line, which may have blanks, and that of its last word: before it may
+    stand options.
+    """
+    line = text.decode("utf-8", "replace").strip()
+    for name in {line, line.split()[-1]} if line else ():
+        yield folder / name.replace("\\", "/")
+
+
+def _of_gltf(path: Path) -> Iterator[Path]:
+    """Its buffers and pictures that are not inside it."""
+    document = _gltf_json(path)
+    for kind in ("buffers", "images"):
+        entries = document.get(kind)
+        for entry in entries if isinstance(entries, list) else ():
+            uri = entry.get("uri") if isinstance(entry, dict) else None
+            if isinstance(uri, str) and not uri.startswith("data:"):
+                name = unquote(urlsplit(uri).path)
+                if name and "\0" not in name:
+                    yield path.parent / name
+
+
+def _gltf_json(path: Path) -> dict[str, Any]:
+    """The JSON of a glTF, or that in the header of a GLB or a b3dm."""
+    with path.open("rb") as file:
+        start = file.read(_B3DM_HEADER)
+        begin = 0
+        if start[:4] == b"b3dm":
+            begin = _B3DM_HEADER + sum(struct.unpack_from("<4I", start, 12))
+            file.seek(begin)
+            start = file.read(20)
+        length = _LONGEST_JSON
+        if start[:4] == b"glTF":
+            length = min(struct.unpack_from("<I", start, 12)[0], _LONGEST_JSON)
+            begin += 20
+        file.seek(begin)
+        document = json.loads(file.read(length))
+    return document if isinstance(document, dict) else {}
