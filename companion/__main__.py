@@ -2,19 +2,16 @@
 
 from __future__ import annotations
 
-import os
 import signal
 
-INTERRUPTED = 130  # the shell's convention: 128 + SIGINT
+from companion.interrupts import end_at_once
 
 
 def main() -> None:
     """Entry point. The imports take seconds, in which an operator may think better of it."""
-    # A handler that raised would do so inside the imports, some of which catch it or print it.
-    signal.signal(signal.SIGINT, lambda *_: os._exit(INTERRUPTED))
+    signal.signal(signal.SIGINT, end_at_once)
     from companion.cli import main as command_line
 
-    signal.signal(signal.SIGINT, signal.default_int_handler)
     command_line()
 
 

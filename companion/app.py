@@ -43,11 +43,12 @@ _WARNING = 4  # MAV_SEVERITY_WARNING; lower is worse
 
 
 class Companion:
-    """One deployment. `run` blocks until `interrupt` is called or the feed ends."""
+    """One deployment. `run` blocks until `stop` is called or the feed ends."""
 
     def __init__(self, config: CompanionConfig) -> None:
         self._config = config
-        self._stop = threading.Event()
+        self._feed_ended = threading.Event()
+        self._is_stopping = False
         self._is_up = False
         self._record_folder: Path | None = None
         self._is_recorded = True
@@ -66,25 +67,30 @@ class Companion:
                 # would stop every thread for a tenth of a second now and then.
                 gc.collect()
                 gc.freeze()
-                self._is_up = True  # `interrupt` raises no more
-            except BaseException as error:
+                self._is_up = True
+            except BaseException:
                 up.close()
-                if self._record_folder is not None:
-                    remove_empty(self._record_folder)
-                if isinstance(error, Exception) and self._stop.is_set():
-                    raise KeyboardInterrupt from None  # an interrupted compiler raises its own
+                self.discard_record()
                 raise
             self._start(up)
-            while not self._stop.wait(0.2):  # in slices: signals are handled between them
+            # In slices: signals are handled between them.
+            while not (self._is_stopping or self._feed_ended.wait(0.2)):
                 pass
         if self._feed_error is not None:
             raise self._feed_error
 
-    def interrupt(self) -> None:
-        """End `run`; for a signal handler. The way up takes seconds and is not waited for."""
-        self._stop.set()
-        if not self._is_up:
-            raise KeyboardInterrupt
+    def stop(self) -> bool:
+        """End `run` in order, soon. False on the way up, which goes on.
+
+        For a signal handler: it takes no lock, since what it interrupts may hold that one.
+        """
+        self._is_stopping = True
+        return self._is_up
+
+    def discard_record(self) -> None:
+        """Remove the record of a start that comes to nothing. It may be at any of its steps."""
+        if self._record_folder is not None:
+            remove_empty(self._record_folder)
 
     def _build(self, config: CompanionConfig, up: ExitStack) -> None:
         self._camera = config.camera.model.camera()
@@ -103,19 +109,23 @@ class Companion:
             on_track=self._on_track,
             on_text=self._on_text,
         )
-        up.callback(self._bridge.stop)
+        up.callback(self._bridge.stop)  # of one that was never started: it has files open
         record = config.record
         if record is not None:
             record = self._open_record(record, up)
-        # Before the localizer, whose compilation takes its time: a wrong source is told at once.
+        # Before the localizer, whose compilation takes its time: a wrong source, or a port in use,
+        # is told at once.
         self._source = open_source(
             config.camera.source, self._camera, config.camera.settings, self._on_feed_state
         )
+        surface = MapSurface(self._stack.cache)
+        self._targets = TargetReporter(config.targets, surface.cast, self._on_target)
+        if config.targets.detections is not None:
+            listener = DetectionListener(config.targets.detections, self._targets.add_detection)
+            up.callback(listener.close)
         _log.info("making the localizer ready; the first start on a machine compiles its kernels")
         localizer = build_localizer(self._stack, self._camera, config.localizer, self._rotation_at)
         self._engine = DualThreadEngine(localizer, (self._on_estimate,), self._vehicle_prior)
-        surface = MapSurface(self._stack.cache)
-        self._targets = TargetReporter(config.targets, surface.cast, self._on_target)
         self._view = ViewReporter(
             config.bridge.targets.rate_hz, self._frame, surface.cast, self._bridge.look
         )
@@ -149,6 +159,7 @@ class Companion:
     def _start(self, up: ExitStack) -> None:
         """Start every part; `up` stops them in the reverse order, the feed first."""
         self._bridge.start()
+        up.callback(self._bridge.stop)  # before the record closes, which holds what is told
         self._health.start()
         up.callback(self._health.stop)
         self._targets.start()
@@ -156,11 +167,6 @@ class Companion:
         if self._config.bridge.camera.announce:
             self._view.start()
             up.callback(self._view.stop)
-        if self._config.targets.detections is not None:
-            listener = DetectionListener(
-                self._config.targets.detections, self._targets.add_detection
-            )
-            up.callback(listener.close)
         self._engine.start()
         up.callback(self._engine.stop)
         feeder = threading.Thread(target=self._feed, name="feed")
@@ -178,7 +184,7 @@ class Companion:
                     self._recorder.snapshot(frame)
         except Exception as error:
             self._feed_error = error
-        self._stop.set()
+        self._feed_ended.set()
 
     def _on_feed_state(self, state: StreamState, text: str) -> None:
         bad = state in (

@@ -7,6 +7,7 @@ flying ends with 0).
 
 from __future__ import annotations
 
+import signal
 import sys
 from typing import Annotated
 
@@ -17,6 +18,7 @@ from rich.markup import escape
 from companion.doctor_cli import doctor_command
 from companion.errors import CompanionError
 from companion.eval_cli import evaluate_command
+from companion.interrupts import INTERRUPTED
 from companion.map_cli import app as map_app
 from companion.replay_cli import replay_command
 from companion.run_cli import run_command
@@ -61,7 +63,10 @@ app.add_typer(world_app, name="world", help="Generated worlds for tests and demo
 def main() -> None:
     """Entry point: named errors become one clear line and exit code 2."""
     try:
+        signal.signal(signal.SIGINT, signal.default_int_handler)  # the imports are over
         app()
+    except KeyboardInterrupt:
+        sys.exit(INTERRUPTED)
     # OSError: of a disk or a folder, which the program cannot help and which names its path.
     except (CompanionError, LocalizerError, BridgeError, OSError) as error:
         # Escaped: a path or a value in the text may look like the console's markup.

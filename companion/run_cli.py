@@ -10,8 +10,11 @@ import typer
 
 from companion.config import load_config
 from companion.console_log import console_log
+from companion.interrupts import end_at_once
 from localizer.registration.devices import DeviceChoice
 from localizer.render.select import Backend
+
+ENDING = (signal.SIGINT, signal.SIGTERM)
 
 
 def run_command(
@@ -25,6 +28,9 @@ def run_command(
     verbose: Annotated[bool, typer.Option("--verbose", "-v", help="log more")] = False,
 ) -> None:
     """Localize the camera feed and inject positions until interrupted."""
+    # Whatever is imported or read until there is something to put away.
+    for number in ENDING:
+        signal.signal(number, end_at_once)
     settings = load_config(config)
     given = {"renderer": renderer, "device": device}
     changes = {key: value for key, value in given.items() if value is not None}
@@ -33,13 +39,19 @@ def run_command(
     from companion.app import Companion
 
     companion = Companion(settings)
-    for number in (signal.SIGINT, signal.SIGTERM):
-        signal.signal(number, lambda *_: companion.interrupt())
+
+    def interrupt(*_: object) -> None:
+        if not companion.stop():  # the way up takes seconds, and is not waited for
+            companion.discard_record()
+            end_at_once()
+
+    for number in ENDING:
+        signal.signal(number, interrupt)
     # The terminal may be a radio link that the aircraft flies away from.
     signal.signal(signal.SIGHUP, signal.SIG_IGN)
     with console_log(verbose):
         try:
             companion.run()
         finally:  # what is down needs no second order; the interpreter's own end would die of one
-            for number in (signal.SIGINT, signal.SIGTERM):
+            for number in ENDING:
                 signal.signal(number, signal.SIG_IGN)

@@ -257,9 +257,10 @@ class LiveVideoSource:
         FFmpeg's opening and its probing have one each. A reader still in them when the interpreter
         ends would call back into it: a segmentation fault.
         """
-        self._closing.set()
+        with self._lock:  # a reader that is being started is started
+            self._closing.set()
+            reader = self._reader
         self._slot.close()
-        reader = self._reader
         if reader is not None and reader is not threading.current_thread():
             reader.join(2 * _OPEN_TIMEOUT_S + self._settings.stall_timeout_s + 2.0)
         if self._state is not StreamState.CLOSED:
@@ -338,7 +339,8 @@ class LiveVideoSource:
             return
         stamps = Stamps(_pts_ns(picture), _misp_time(picture))
         exposure_ns = clock.exposure_time(stamps, arrival_ns)
-        self._slot.put((picture, camera, exposure_ns, self._counters.received))
+        if not self._slot.put((picture, camera, exposure_ns, self._counters.received)):
+            return  # closed meanwhile
         self._count(received=1)
         width, height = camera.width, camera.height
         if camera is self._camera:

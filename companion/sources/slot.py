@@ -24,15 +24,16 @@ class NewestSlot(Generic[T]):
         with self._changed:
             return self._dropped
 
-    def put(self, item: T) -> None:
-        """Stores the item, over an older one if nobody fetched it; never waits."""
+    def put(self, item: T) -> bool:
+        """Stores the item, over an older one if nobody fetched it; never waits. False if closed."""
         with self._changed:
             if self._closed:
-                return
+                return False
             if self._item is not None:
                 self._dropped += 1
             self._item = item
             self._changed.notify()
+            return True
 
     def get(self) -> T | None:
         """Waits for an item; None once the slot is closed; raises what the producer failed with."""

@@ -15,6 +15,7 @@ import pytest
 from companion.app import Companion
 from companion.config import parse_config
 from companion.errors import ConfigError, StreamOpenError
+from mavlink_bridge.bridge import Bridge
 from mavlink_bridge.link import sleep_until
 from mavlink_bridge.messages import without_figures
 from sitl.embedded.geodesy import Location
@@ -62,9 +63,32 @@ def test_a_restart_on_a_full_disk_goes_on_without_a_record(small_assets, tmp_pat
     assert any("record is incomplete: [Errno 28]" in text for text in companion._bridge.texts())
 
 
+def test_the_order_to_stop_takes_no_lock():
+    """It comes from a signal handler, which may interrupt the very lines that hold the lock."""
+    config = parse_config({"map": "m", "camera": {"source": "s", "model": MODEL}}, "test")
+    companion = Companion(config)
+    ordered = threading.Event()
+
+    def order():
+        companion.stop()
+        ordered.set()
+
+    with companion._feed_ended._cond:
+        threading.Thread(target=order, daemon=True).start()
+        assert ordered.wait(30.0)
+
+
 def test_what_happens_is_logged_and_recorded_once_and_every_thread_ends(
-    small_assets, tmp_path, caplog
+    small_assets, tmp_path, caplog, monkeypatch
 ):
+    stop, last = Bridge.stop, iter(["PiLoT: last words"])
+
+    def stop_with_last_words(bridge):
+        for text in last:
+            bridge.say(6, text)
+        stop(bridge)
+
+    monkeypatch.setattr(Bridge, "stop", stop_with_last_words)
     for i in range(40):
         cv2.imwrite(str(tmp_path / f"{i:02}.png"), np.full((120, 160, 3), 3 * i, np.uint8))
     threads = set(threading.enumerate())
@@ -87,6 +111,7 @@ def test_what_happens_is_logged_and_recorded_once_and_every_thread_ends(
     assert sleep_until(lambda: set(threading.enumerate()) <= threads, 30.0), threading.enumerate()
     with (tmp_path / "record" / "events.csv").open() as file:
         recorded = [row["text"] for row in csv.DictReader(file)]
+    assert recorded[-1] == "PiLoT: last words"  # the record is closed after all that could tell
     logged = [r.getMessage() for r in caplog.records]
     assert recorded.count("PiLoT: flight controller found") == 1, recorded
     for text in set(recorded):

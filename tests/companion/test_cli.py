@@ -1,9 +1,9 @@
 """The command line as a process: what an operator sees of wrong input and of an interrupt."""
 
 import signal
+import socket
 import subprocess
 import sys
-import time
 from importlib import metadata
 
 import pytest
@@ -11,9 +11,10 @@ import yaml
 from typer.testing import CliRunner
 
 from companion.cli import app
+from mavlink_bridge.link import sleep_until
 
 MODEL = {"width": 640, "height": 480, "fx": 550, "fy": 550, "cx": 320, "cy": 240}
-START_S = 120  # of a process, on a machine that compiles everything anew
+START_S = 400.0  # of a process, on a busy machine that compiles everything anew
 
 
 @pytest.fixture
@@ -21,7 +22,26 @@ def map_cache(small_assets):
     return small_assets.map_cache
 
 
-def _start(tmp_path, **changes):
+# A part that is being made when the operator interrupts, inside a callback that C calls: there an
+# exception would be printed and lost.
+INTERRUPTED_IN_A_CALLBACK = """
+import ctypes, os, signal, sys
+import companion.app
+from companion.cli import main
+
+number, part = getattr(signal, sys.argv.pop()), sys.argv.pop()
+
+def make(*_):
+    ctypes.CFUNCTYPE(None)(lambda: os.kill(os.getpid(), number))()
+    print("went on", flush=True)
+    raise SystemExit(1)
+
+setattr(companion.app, part, make)
+main()
+"""
+
+
+def _config(tmp_path, **changes):
     config = {
         "camera": {"source": "udp://127.0.0.1:5", "model": MODEL},
         "bridge": {"connection": "tcp:127.0.0.1:9"},
@@ -29,10 +49,17 @@ def _start(tmp_path, **changes):
     }
     path = tmp_path / "companion.yaml"
     path.write_text(yaml.safe_dump(config | changes))
+    return str(path)
+
+
+def _process(*arguments):
     return subprocess.Popen(
-        [sys.executable, "-m", "companion", "run", str(path)],
-        stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
-    )  # fmt: skip
+        [sys.executable, *arguments], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+    )
+
+
+def _start(tmp_path, **changes):
+    return _process("-m", "companion", "run", _config(tmp_path, **changes))
 
 
 def _ended(process):
@@ -61,14 +88,36 @@ def test_markup_in_a_message_is_shown_as_it_is(tmp_path):
 def test_an_interrupt_ends_it_cleanly_at_any_moment(map_cache, tmp_path, ready):
     """On the way up (the record's folder is made before compilation), and when it runs."""
     process = _start(tmp_path, map=str(map_cache))
-    deadline = time.monotonic() + START_S
-    while not (tmp_path / ready).exists() and time.monotonic() < deadline:
-        time.sleep(0.02)
+    assert sleep_until((tmp_path / ready).exists, START_S)
     process.send_signal(signal.SIGINT)
     code, _ = _ended(process)
     assert code in ((0,) if ready.endswith("json") else (0, 130))
     if code == 130:
         assert not (tmp_path / "record").exists()
+
+
+@pytest.mark.parametrize(
+    ("number", "part"), [("SIGINT", "build_localizer"), ("SIGTERM", "write_manifest")]
+)
+def test_an_interrupt_is_not_lost_in_a_callback_of_the_way_up(map_cache, tmp_path, number, part):
+    path = _config(tmp_path, map=str(map_cache))
+    process = _process("-c", INTERRUPTED_IN_A_CALLBACK, "run", path, part, number)
+    out, err = process.communicate(timeout=START_S)
+    assert (process.returncode, err) == (130, "")
+    assert "went on" not in out
+    assert not (tmp_path / "record").exists()
+
+
+def test_a_port_in_use_is_told_before_anything_is_compiled(map_cache, tmp_path):
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as taken:
+        taken.bind(("127.0.0.1", 0))
+        targets = {"detections": f"127.0.0.1:{taken.getsockname()[1]}"}
+        process = _start(tmp_path, map=str(map_cache), targets=targets)
+        out, err = process.communicate(timeout=START_S)
+    assert process.returncode == 2
+    assert err.startswith("ConfigError: targets.detections")
+    assert "making the localizer ready" not in out
+    assert not (tmp_path / "record").exists()
 
 
 def test_a_folder_that_cannot_be_made_is_one_line(map_cache, tmp_path):
@@ -81,11 +130,9 @@ def test_a_folder_that_cannot_be_made_is_one_line(map_cache, tmp_path):
 
 
 def test_an_interrupt_during_the_imports_ends_it_without_a_word():
-    process = subprocess.Popen(
-        [sys.executable, "-X", "importtime", "-m", "companion", "--help"],
-        stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
-    )  # fmt: skip
+    process = _process("-X", "importtime", "-m", "companion", "--help")
     assert process.stderr is not None
+    # What follows is more than a pipe holds: it is in its imports until this reads on.
     before = next(line for line in process.stderr if "numpy" in line)
     process.send_signal(signal.SIGINT)
     out, err = process.communicate(timeout=START_S)

@@ -93,8 +93,7 @@ class Watch:
 
     def __init__(self, url: str, camera: Camera = CAMERA, **settings: object) -> None:
         self.frames: list[tuple[Frame, int]] = []
-        self.states: list[StreamState] = []
-        self.texts: list[str] = []
+        self.told: list[tuple[StreamState, str]] = []
         self.error: Exception | None = None
         self.source: FrameSource = open_source(
             url, camera, SourceSettings.model_validate(settings), self._on_state
@@ -110,13 +109,21 @@ class Watch:
         self._thread.join(60.0)
         assert not self._thread.is_alive()
 
+    @property
+    def states(self) -> list[StreamState]:
+        return [state for state, _ in list(self.told)]
+
+    def text(self, state: StreamState) -> str:
+        """What was told first with a state."""
+        return next(text for s, text in list(self.told) if s is state)
+
     def wait_for(self, count: int, timeout_s: float = 60.0) -> None:
         self.wait_until(lambda: len(self.frames) >= count, timeout_s)
 
     def wait_until(self, condition: object, timeout_s: float = 60.0) -> None:
         deadline = time.monotonic() + timeout_s
         while not condition():  # type: ignore[operator]
-            assert time.monotonic() < deadline, (len(self.frames), self.states, self.texts)
+            assert time.monotonic() < deadline, (len(self.frames), self.told)
             time.sleep(0.02)
 
     def _run(self) -> None:
@@ -127,8 +134,7 @@ class Watch:
             self.error = error
 
     def _on_state(self, state: StreamState, text: str) -> None:
-        self.states.append(state)
-        self.texts.append(text)
+        self.told.append((state, text))
 
 
 @pytest.fixture
@@ -179,7 +185,7 @@ def test_exposure_times_by_presentation_times_need_the_fixed_latency_only(
         ):
             watch.wait_for(40)
         # The smallest lag takes some frames to find: the first came in a burst after the probing.
-        error, _ = _compare(watch, sender, skip=10)
+        error, _ = _compare(watch, sender, skip=25)
         print(f"\nexposure error by pts, ms: {error.min():.2f} to {error.max():.2f}")
         assert error.min() > -1.0
         assert error.max() < 5.0
@@ -192,17 +198,26 @@ def test_a_stream_that_stops_is_reported_and_taken_up_again(url: str) -> None:
         with PacedSender(url):
             watch.wait_for(10)
         watch.wait_until(lambda: StreamState.STALLED in watch.states)
-        assert url in watch.texts[watch.states.index(StreamState.STALLED)]
+        assert url in watch.text(StreamState.STALLED)
         before = len(watch.frames)
         with PacedSender(url, first=500) as second:
             watch.wait_for(before + 10)
-    states = [s for s in watch.states if s is not StreamState.CONNECTING]
-    assert states == [StreamState.LIVE, StreamState.STALLED, StreamState.LIVE, StreamState.CLOSED]
+    *states, last = [s for s in watch.states if s is not StreamState.CONNECTING]
+    assert last is StreamState.CLOSED
+    # Live, stalled, live; more often where the sender itself was kept waiting.
+    assert len(states) >= 3
+    assert set(states[::2]) == {StreamState.LIVE}
+    assert set(states[1::2]) == {StreamState.STALLED}
     assert watch.error is None
     assert watch.source.counters.reconnects >= 1
-    assert read_counter(watch.frames[-1][0].image) in second.exposed
-    ages = [seen - f.exposure_time_ns for f, seen in watch.frames[before:]]
-    assert 0 < np.median(ages) < 0.3e9
+    errors = []
+    for frame, _ in watch.frames[before:]:
+        number = read_counter(frame.image)
+        if number >= 500:  # one picture of the first stream may have been left
+            errors.append(frame.exposure_time_ns - second.exposed[number])
+    assert len(errors) >= 9
+    # By its own stamps, not by the first connection's clock.
+    assert np.abs(errors).max() < 0.5e6
 
 
 def test_a_consumer_that_is_slow_gets_the_newest_frame_and_the_rest_are_counted(
@@ -218,8 +233,8 @@ def test_a_consumer_that_is_slow_gets_the_newest_frame_and_the_rest_are_counted(
             counters = source.counters
             source.close()
         assert np.median(ages[1:]) < 200  # a queue would make them grow by 200 ms a frame
+        assert counters.dropped > counters.received / 2
     assert counters.delivered == 6
-    assert counters.dropped > counters.received / 2
 
 
 def test_a_stream_of_another_shape_is_an_error_that_names_both(url: str) -> None:
@@ -242,7 +257,7 @@ def test_a_stream_that_changes_its_size_in_flight_goes_on_with_the_scaled_camera
     frame, _ = watch.frames[-1]
     assert frame.image.shape == (120, 160, 3)
     assert watch.frames[0][0].camera == CAMERA
-    text = watch.texts[watch.states.index(StreamState.SCALED)]
+    text = watch.text(StreamState.SCALED)
     assert "160x120" in text
     assert "320x240" in text
     assert watch.error is None
@@ -255,7 +270,7 @@ def test_a_stream_that_changes_its_shape_in_flight_is_reported_until_it_fits(url
             watch.wait_for(5)
         with PacedSender(url, camera=wide):
             watch.wait_until(lambda: watch.states[-1] is StreamState.MISFIT)
-            text = watch.texts[-1]
+            text = watch.text(StreamState.MISFIT)
             assert "320x180" in text
             assert "320x240" in text
         with PacedSender(url, first=500):
@@ -275,13 +290,55 @@ def test_closing_ends_the_iteration_before_any_frame_came(url: str) -> None:
     assert watch.states[-1] is StreamState.CLOSED
 
 
+def test_closing_waits_for_a_reader_that_is_just_being_started(
+    url: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The feed's first line and the order to stop come from two threads."""
+
+    def decoder(*_: Any) -> None:
+        raise ValueError("nothing comes")
+
+    monkeypatch.setattr("companion.sources.av_source._Decoder", decoder)
+    source = open_source(url, CAMERA)
+    begun, go_on = threading.Event(), threading.Event()
+    start = threading.Thread.start
+
+    def slow_start(thread: threading.Thread) -> None:
+        if thread.name == "video":
+            begun.set()
+            go_on.wait(30.0)
+        start(thread)
+
+    monkeypatch.setattr(threading.Thread, "start", slow_start)
+    feed = threading.Thread(target=lambda: list(source.frames()))
+    feed.start()
+    assert begun.wait(30.0)
+    errors: list[Exception] = []
+
+    def close() -> None:
+        try:
+            source.close()
+        except Exception as error:
+            errors.append(error)
+
+    closing = threading.Thread(target=close)
+    closing.start()
+    closing.join(0.3)  # as far as it comes
+    go_on.set()
+    for thread in (closing, feed):
+        thread.join(60.0)
+        assert not thread.is_alive()
+    assert errors == []
+    assert "video" not in {thread.name for thread in threading.enumerate()}
+
+
 def test_a_port_in_use_is_reported_and_kept_trying(url: str) -> None:
     port = int(url.rsplit(":", 1)[1])
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as holder:
         holder.bind(("127.0.0.1", port))
         with Watch(url, retry_max_s=0.3) as watch:
             watch.wait_until(lambda: StreamState.STALLED in watch.states)
-            assert "in use" in watch.texts[-1]
+            assert "in use" in watch.text(StreamState.STALLED)
             holder.close()
             with PacedSender(url):
                 watch.wait_for(3)
@@ -295,7 +352,7 @@ def test_a_missing_video_device_is_named() -> None:
 def test_an_rtsp_server_that_is_not_there_is_reported_and_kept_trying() -> None:
     with Watch("rtsp://127.0.0.1:9/none", retry_max_s=0.3) as watch:
         watch.wait_until(lambda: StreamState.STALLED in watch.states)
-        assert "cannot connect" in watch.texts[watch.states.index(StreamState.STALLED)]
+        assert "cannot connect" in watch.text(StreamState.STALLED)
     assert watch.error is None
 
 
@@ -316,7 +373,7 @@ def test_an_unexpected_error_in_the_reader_is_a_stall_and_tried_again(
     monkeypatch.setattr("companion.sources.av_source._Decoder", decoder)
     with Watch(url, retry_max_s=0.3) as watch:
         watch.wait_until(lambda: StreamState.STALLED in watch.states)
-        assert "unexpected ValueError" in watch.texts[watch.states.index(StreamState.STALLED)]
+        assert "unexpected ValueError" in watch.text(StreamState.STALLED)
         monkeypatch.undo()
         with PacedSender(url):
             watch.wait_for(3)
