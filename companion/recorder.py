@@ -18,6 +18,7 @@ import numpy as np
 
 from companion.config import CompanionConfig, RecordConfig
 from companion.errors import DiskFaultError, ReportError
+from companion.sources.timing import system_minus_monotonic
 from companion.versions import versions
 from localizer.geo import LocalFrame
 from localizer.pose import quaternion_from_matrix
@@ -78,9 +79,10 @@ def write_manifest(folder: Path, config: CompanionConfig) -> None:
 
     The pair of clocks dates the .tlog (UTC) against everything else (CLOCK_MONOTONIC).
     """
+    monotonic_ns = time.monotonic_ns()
     document = {
-        "monotonic_ns": time.monotonic_ns(),
-        "utc_ns": time.time_ns(),
+        "monotonic_ns": monotonic_ns,
+        "utc_ns": monotonic_ns + system_minus_monotonic(),
         "versions": versions(),
         "config": config.model_dump(mode="json"),
     }
@@ -175,7 +177,7 @@ class Recorder:
             self._put("snapshot", (frame,))
 
     def close(self) -> None:
-        """Write what is queued and close the files; a disk that stands still is left after 10 s."""
+        """Write what is queued and close the files; a disk that stands still is left behind."""
         with contextlib.suppress(queue.Full):
             self._rows.put(None, timeout=_CLOSE_S)
         self._thread.join(_CLOSE_S)

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import time
 from fractions import Fraction
 
 import av
 import numpy as np
 
 from companion.sources.misp import MispTime, sei_nal
+from companion.sources.timing import system_minus_monotonic
 from localizer.types import Image
 
 _CLOCK = Fraction(1, 90_000)  # MPEG-TS presentation clock, Hz
@@ -79,7 +79,7 @@ class VideoSender:
 
     @staticmethod
     def _stamp(exposure_ns: int) -> bytes:
-        system_ns = exposure_ns + time.time_ns() - time.monotonic_ns()
+        system_ns = exposure_ns + system_minus_monotonic()
         return sei_nal(MispTime(system_ns // 1000, locked=True))
 
 

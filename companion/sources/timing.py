@@ -95,9 +95,9 @@ class ExposureClock:
 
     def _from_misp(self, misp: MispTime, arrival_ns: int) -> int:
         # Both clocks are read anew for each frame, because NTP may step the system's clock.
-        system_minus_monotonic = _system_minus_monotonic()
-        self._watch_wall_clock(system_minus_monotonic)
-        monotonic = misp.time_us * 1000 - system_minus_monotonic
+        offset_ns = system_minus_monotonic()
+        self._watch_wall_clock(offset_ns)
+        monotonic = misp.time_us * 1000 - offset_ns
         relative = self._by_misp.map(misp.time_us * 1000, arrival_ns)
         if misp.locked and _plausible(monotonic, arrival_ns):
             return monotonic
@@ -111,20 +111,21 @@ class ExposureClock:
             )
         return relative
 
-    def _watch_wall_clock(self, system_minus_monotonic: int) -> None:
+    def _watch_wall_clock(self, offset_ns: int) -> None:
         """A step moves all exposure times with it: right if it was set right, and else unseen."""
-        before, self._wall_clock_ns = self._wall_clock_ns, system_minus_monotonic
-        if before is not None and abs(system_minus_monotonic - before) > _STEP_NS:
+        before, self._wall_clock_ns = self._wall_clock_ns, offset_ns
+        if before is not None and abs(offset_ns - before) > _STEP_NS:
             _log.warning(
                 "this computer's clock was stepped by %+.3f s: the exposure times of the camera's "
                 "MISP clock moved against it; let NTP slew in flight, not step",
-                (system_minus_monotonic - before) / 1e9,
+                (offset_ns - before) / 1e9,
             )
 
 
-def _system_minus_monotonic() -> int:
-    """Difference of the two clocks, ns, from the closest of a few pairs of readings: another thread
-    may have its turn between two readings.
+def system_minus_monotonic() -> int:
+    """The system's clock minus CLOCK_MONOTONIC, ns.
+
+    From the closest of a few pairs of readings: another thread may have its turn between two.
     """
     pairs = []
     for _ in range(_READINGS):

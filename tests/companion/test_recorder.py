@@ -164,10 +164,13 @@ def test_a_disk_that_stands_still_is_left_behind(tmp_path, monkeypatch):
     monkeypatch.setattr("companion.recorder._CLOSE_S", 0.2)
     recorder = Recorder(RecordConfig(folder=tmp_path), FRAME)
     still = threading.Event()
-    monkeypatch.setattr(recorder, "_write", lambda *_: still.wait(30.0))
+    monkeypatch.setattr(recorder, "_write", lambda *_: still.wait(60.0))
     for _ in range(5000):  # more than the queue holds
         recorder.event("info", "x")
     began = time.monotonic()
     recorder.close()
-    assert time.monotonic() - began < 5.0
-    still.set()
+    assert time.monotonic() - began < 30.0
+    still.set()  # and its thread ends
+    recorder._rows.put(None, timeout=30.0)
+    recorder._thread.join(30.0)
+    recorder.close()

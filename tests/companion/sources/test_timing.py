@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import time
-
 import numpy as np
 import pytest
 
@@ -13,10 +11,35 @@ from companion.sources.timing import (
     MinimumLag,
     Stamps,
     Timing,
-    _system_minus_monotonic,
+    system_minus_monotonic,
 )
 
 MS = 1_000_000
+
+
+class Clocks:
+    """Both of a computer, in place of the module `time`: each reading takes a microsecond."""
+
+    def __init__(self) -> None:
+        self.now_ns = 10**13
+        self.offset_ns = 1_790_000_000 * 10**9
+        self.waits_ns: list[int] = []  # for another thread's turn, after the readings to come
+
+    def monotonic_ns(self) -> int:
+        self.now_ns += 1000
+        return self.now_ns
+
+    def time_ns(self) -> int:
+        reading = self.monotonic_ns() + self.offset_ns
+        self.now_ns += self.waits_ns.pop(0) if self.waits_ns else 0
+        return reading
+
+
+@pytest.fixture
+def clocks(monkeypatch: pytest.MonkeyPatch) -> Clocks:
+    it = Clocks()
+    monkeypatch.setattr("companion.sources.timing.time", it)
+    return it
 
 
 def test_a_misp_stamp_survives_the_round_trip_and_matches_the_standards_layout() -> None:
@@ -70,38 +93,38 @@ def test_a_sender_that_starts_again_is_taken_up_at_once() -> None:
     assert clock.map(100 * 10**9, 102 * 10**9) == 102 * 10**9
 
 
-def _misp_us(monotonic_ns: int, offset_ns: int = 0) -> int:
-    return (monotonic_ns + offset_ns + time.time_ns() - time.monotonic_ns()) // 1000
-
-
-def test_a_locked_misp_stamp_is_taken_as_it_is_and_the_latency_setting_is_not() -> None:
-    now = time.monotonic_ns()
+def test_a_locked_misp_stamp_is_taken_as_it_is_and_the_latency_setting_is_not(
+    clocks: Clocks,
+) -> None:
+    now = clocks.now_ns
     clock = ExposureClock(latency_ns=90 * MS)
-    stamps = Stamps(pts_ns=7, misp=MispTime(_misp_us(now - 60 * MS), locked=True))
-    assert clock.exposure_time(stamps, now) == pytest.approx(now - 60 * MS, abs=0.1 * MS)
+    misp = MispTime((now - 60 * MS + clocks.offset_ns) // 1000, locked=True)
+    exposed = clock.exposure_time(Stamps(pts_ns=7, misp=misp), now)
+    assert exposed == pytest.approx(now - 60 * MS, abs=0.1 * MS)
 
 
 @pytest.mark.parametrize(
     ("offset_ns", "locked"), [(0, False), (3600 * 10**9, True), (-5 * 10**9, True)]
 )
 def test_a_misp_clock_that_is_not_ours_gives_differences_only(
-    offset_ns: int, locked: bool, caplog: pytest.LogCaptureFixture
+    clocks: Clocks, offset_ns: int, locked: bool, caplog: pytest.LogCaptureFixture
 ) -> None:
-    now = time.monotonic_ns()
+    now = clocks.now_ns
     clock = ExposureClock(latency_ns=30 * MS)
     for i, lag in enumerate([30, 55, 48]):
         true = now + i * 100 * MS
-        stamps = Stamps(None, MispTime(_misp_us(true, offset_ns), locked))
+        misp = MispTime((true + offset_ns + clocks.offset_ns) // 1000, locked)
+        stamps = Stamps(None, misp)
         result = clock.exposure_time(stamps, true + lag * MS)
         assert result == pytest.approx(true, abs=0.2 * MS)
     assert caplog.text.count("MISP clock") == 1
 
 
-def test_device_stamps_on_the_monotonic_clock_are_exposure_times() -> None:
-    now = time.monotonic_ns()
+def test_device_stamps_on_the_monotonic_clock_are_exposure_times(clocks: Clocks) -> None:
+    now = clocks.now_ns
     clock = ExposureClock(latency_ns=30 * MS, device=True)
     assert clock.exposure_time(Stamps(now - 25 * MS, None), now) == now - 25 * MS
-    wall_clock = Stamps(time.time_ns(), None)
+    wall_clock = Stamps(clocks.time_ns(), None)
     assert clock.exposure_time(wall_clock, now) == now - 30 * MS
 
 
@@ -112,42 +135,34 @@ def test_without_any_stamp_the_arrival_less_the_latency_is_left() -> None:
 
 @pytest.mark.parametrize("step_s", [0.0, 0.3, -0.1])
 def test_a_step_of_the_wall_clock_is_told(
-    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture, step_s: float
+    clocks: Clocks, caplog: pytest.LogCaptureFixture, step_s: float
 ) -> None:
-    clock, offset_ns = ExposureClock(0), 1_790_000_000 * 10**9
-    stepped_ns = 0
-    monkeypatch.setattr(
-        "companion.sources.timing.time.time_ns",
-        lambda: time.monotonic_ns() + offset_ns + stepped_ns,
-    )
+    clock, camera_offset_ns = ExposureClock(0), clocks.offset_ns
 
     def seen() -> int:
         """Age of a frame that was exposed 0.12 s ago by the camera's clock, ns."""
-        now = time.monotonic_ns()
-        stamp = MispTime((now - 120_000_000 + offset_ns) // 1000, locked=True)
+        clocks.now_ns += 100 * MS
+        now = clocks.now_ns
+        stamp = MispTime((now - 120 * MS + camera_offset_ns) // 1000, locked=True)
         return now - clock.exposure_time(Stamps(None, stamp), now)
 
-    assert seen() == pytest.approx(120e6, abs=5e6)
-    stepped_ns = round(step_s * 1e9)
-    assert seen() == pytest.approx(120e6 + stepped_ns, abs=5e6)
+    assert seen() == pytest.approx(120e6, abs=0.1e6)
+    clocks.offset_ns += round(step_s * 1e9)
+    assert seen() == pytest.approx(120e6 + step_s * 1e9, abs=0.1e6)
     seen()
     told = [r.getMessage() for r in caplog.records if "clock was stepped" in r.getMessage()]
     assert len(told) == (1 if step_s else 0)
     assert all(f"{step_s:+.1f}" in text for text in told)
 
 
-def test_another_thread_between_two_readings_of_the_clocks_costs_nothing(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    truth, readings = time.time_ns() - time.monotonic_ns(), iter((50, 0))
+def test_another_thread_between_two_readings_of_the_clocks_costs_nothing(clocks: Clocks) -> None:
+    clocks.waits_ns = [50 * MS, 7 * MS]
+    assert system_minus_monotonic() == pytest.approx(clocks.offset_ns, abs=2000)
 
-    def slowly() -> int:
-        now = time.monotonic_ns() + truth
-        time.sleep(next(readings, 0) * 1e-3)
-        return now
 
-    monkeypatch.setattr("companion.sources.timing.time.time_ns", slowly)
-    assert _system_minus_monotonic() == pytest.approx(truth, abs=2e6)
+def test_the_closest_readings_count_where_none_are_close(clocks: Clocks) -> None:
+    clocks.waits_ns = [50 * MS, 7 * MS, MS, 9 * MS, 20 * MS]
+    assert system_minus_monotonic() == pytest.approx(clocks.offset_ns, abs=0.51 * MS)
 
 
 @pytest.mark.parametrize("device", [False, True])
@@ -158,7 +173,7 @@ def test_no_stamp_whatever_it_says_makes_a_frame_of_the_future_or_of_long_ago(
     """Stamps that repeat, run back, leap by hours and stop, and a wall clock that is stepped."""
     rng = np.random.default_rng(5)
     wall_ns = [10**18]
-    monkeypatch.setattr("companion.sources.timing._system_minus_monotonic", lambda: wall_ns[0])
+    monkeypatch.setattr("companion.sources.timing.system_minus_monotonic", lambda: wall_ns[0])
     clock = ExposureClock(30 * MS, timing, device=device)
     leaps = [0, 0, 0, 1, -1, 40 * MS, -40 * MS, 10**9, -(10**9), 3600 * 10**9, -3600 * 10**9]
     arrival, pts, misp = 10**13, 10**13, 10**13
