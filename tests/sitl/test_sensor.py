@@ -68,7 +68,7 @@ def test_weather_that_is_drawn_goes_through_the_general_function(condition: str)
     result = Sensor(quiet, seed=5).apply(rgb, depth, 0.0, 0.0)
     without = replace(quiet, rain_streaks=0, snow_flakes=0, snow_cover=0.0)
     bare = Sensor(without, seed=5).apply(rgb, depth, 0.0, 0.0)
-    assert np.abs(result.astype(int) - bare).max() > 20
+    assert np.abs(result.astype(int) - bare).max() > 10  # dim rain is 20, snow 60
 
 
 def test_the_blur_kernel_is_a_line_of_the_given_length_and_direction() -> None:
