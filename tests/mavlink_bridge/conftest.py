@@ -45,6 +45,7 @@ class FakeAutopilot:
             self._codec.signing.secret_key = key
             self._codec.signing.sign_outgoing = True
             self._codec.signing.timestamp = int((time.time() - 1420070400) * 1e5)
+        self._sending = threading.Lock()  # a test sends from its own thread, too
         self._stop = threading.Event()
         self._thread = threading.Thread(target=self._run, daemon=True)
         self._thread.start()
@@ -78,10 +79,11 @@ class FakeAutopilot:
         return self.of(name)
 
     def send(self, message: Any, component: int = 1, system: int = 1) -> None:
-        self._codec.srcSystem, self._codec.srcComponent = system, component
-        frame = message.pack(self._codec)
-        self._codec.seq = (self._codec.seq + 1) % 256
-        self.send_bytes(frame)
+        with self._sending:
+            self._codec.srcSystem, self._codec.srcComponent = system, component
+            frame = message.pack(self._codec)
+            self._codec.seq = (self._codec.seq + 1) % 256
+            self.send_bytes(frame)
 
     def send_bytes(self, data: bytes) -> None:
         if self.peer is not None:
