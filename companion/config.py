@@ -97,7 +97,7 @@ class TargetConfig(_Model):
     """Target geo-localization."""
 
     detections: str | None = Field(None, description="host:port where pixel detections arrive")
-    rate_hz: float = Field(5.0, gt=0, le=30, description="reports per second and target")
+    rate_hz: float = Field(5.0, ge=0.01, le=30, description="reports per second and target")
     pixel_sigma: float = Field(1.5, ge=0.01, le=1000, description="error of a detection, pixels")
     map_sigma_m: float = Field(
         0.3, ge=0.001, le=100, description="error of the map's surface, metres"
@@ -126,7 +126,7 @@ class RecordConfig(_Model):
 
     folder: Path = Field(description="estimates, targets, events, health and snapshots")
     snapshot_interval_s: float | None = Field(
-        10.0, gt=0, description="a video frame is kept this often; none: never"
+        10.0, ge=0.1, le=86400, description="a video frame is kept this often; none: never"
     )
 
 

@@ -18,8 +18,10 @@ class AttitudePrior(BaseModel):
 
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
 
-    tilt_sigma_deg: float = Field(0.7, gt=0, description="roll and pitch, which gravity shows")
-    heading_sigma_deg: float = Field(4.0, gt=0, description="yaw, by the compass")
+    tilt_sigma_deg: float = Field(
+        0.7, ge=0.01, le=90, description="roll and pitch, which gravity shows"
+    )
+    heading_sigma_deg: float = Field(4.0, ge=0.01, le=180, description="yaw, by the compass")
 
 
 class LocalizerConfig(BaseModel):
@@ -40,7 +42,7 @@ class LocalizerConfig(BaseModel):
     )
     feature_half: bool = Field(False, description="TensorRT computes features in float16")
     cache_mib: int = Field(384, ge=16, le=1 << 20, description="resident tiles, MiB")
-    seed: int = Field(0, ge=0, description="seed of anchors and hypotheses")
+    seed: int = Field(0, ge=0, lt=2**31, description="seed of anchors and hypotheses")
     registration: JNGOConfig = JNGOConfig()
     # Off: a gimbal that is half a degree off pulls the position by a metre at 120 m, while vision
     # alone knows the tilt to 0.2 degrees. For poor light, give it the gimbal's honest error.

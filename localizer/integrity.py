@@ -23,11 +23,17 @@ class IntegrityConfig(BaseModel):
 
     min_overlap: float = Field(0.35, ge=0, le=1, description="share of anchors in view")
     min_quality: float = Field(0.15, ge=0, le=1, description="registration quality")
-    max_sigma_m: float = Field(4.0, gt=0, description="position sigma of a usable estimate")
-    gate: float = Field(40.0, gt=0, description="squared Mahalanobis distance, 6 dof")
-    confirmations: int = Field(3, ge=1, description="acceptances in a row that begin TRACKING")
-    degraded_after: int = Field(3, ge=1, description="rejections in a row that end TRACKING")
-    lost_after: int = Field(10, ge=1, description="rejections in a row until LOST")
+    max_sigma_m: float = Field(
+        4.0, ge=0.01, le=100, description="position sigma of a usable estimate"
+    )
+    gate: float = Field(40.0, ge=1, le=1e4, description="squared Mahalanobis distance, 6 dof")
+    confirmations: int = Field(
+        3, ge=1, le=1000, description="acceptances in a row that begin TRACKING"
+    )
+    degraded_after: int = Field(
+        3, ge=1, le=1000, description="rejections in a row that end TRACKING"
+    )
+    lost_after: int = Field(10, ge=1, le=1000, description="rejections in a row until LOST")
 
 
 @dataclass(frozen=True)

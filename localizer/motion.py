@@ -26,16 +26,23 @@ _H = np.hstack([np.eye(6), np.zeros((6, 6))])
 
 
 class MotionConfig(BaseModel):
-    """Process noise of the constant-velocity model, as white accelerations."""
+    """Process noise of the constant-velocity model, as white accelerations.
+
+    The limits are those of flight, and of what double precision can add and invert.
+    """
 
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
 
-    acceleration_sigma: float = Field(3.0, gt=0, description="m/s²")
-    angular_acceleration_sigma: float = Field(1.0, gt=0, description="rad/s²")
-    turn_sigma: float = Field(0.006, gt=0, description="error of a measured turn, rad")
-    initial_velocity_sigma: float = Field(8.0, gt=0, description="m/s, of an unknown velocity")
-    prior_velocity_sigma: float = Field(2.0, gt=0, description="m/s, of the velocity of a prior")
-    initial_angular_rate_sigma: float = Field(0.3, gt=0, description="rad/s")
+    acceleration_sigma: float = Field(3.0, ge=0.01, le=100, description="m/s²")
+    angular_acceleration_sigma: float = Field(1.0, ge=0.001, le=100, description="rad/s²")
+    turn_sigma: float = Field(0.006, ge=1e-4, le=1, description="error of a measured turn, rad")
+    initial_velocity_sigma: float = Field(
+        8.0, ge=0.01, le=100, description="m/s, of an unknown velocity"
+    )
+    prior_velocity_sigma: float = Field(
+        2.0, ge=0.01, le=100, description="m/s, of the velocity of a prior"
+    )
+    initial_angular_rate_sigma: float = Field(0.3, ge=0.001, le=10, description="rad/s")
 
 
 @dataclass(frozen=True)

@@ -39,13 +39,13 @@ class YawGuardConfig(_Model):
     enabled: bool = True
     limit_deg: float = Field(
         default=3.5,
-        gt=0.0,
+        ge=0.1,
         le=45.0,
         description="against the autopilot's yaw, or against its gyros since the fixes before",
     )
     gross_deg: float = Field(default=20.0, gt=0.0, le=90.0, description="never more than this")
     memory_s: float = Field(
-        default=60.0, gt=0.0, le=600.0, description="how long the gyros are trusted"
+        default=60.0, ge=0.1, le=600.0, description="how long the gyros are trusted"
     )
     minimum_samples: int = Field(
         default=5, ge=1, le=100, description="their majority blocks, all of them release"
@@ -69,7 +69,7 @@ class InjectionConfig(_Model):
         le=250.0,
         description="age at which a fix is sent: VISO_DELAY_MS or GPSn_DELAY_MS, n = gps_id + 1",
     )
-    sigma_floor_m: float = Field(default=0.1, gt=0.0, le=100.0)
+    sigma_floor_m: float = Field(default=0.1, ge=1e-6, le=100.0)
     max_sigma_m: float = Field(
         default=10.0, gt=0.0, le=100.0, description="nothing is sent above it"
     )
@@ -85,7 +85,7 @@ class InjectionConfig(_Model):
         le=1000.0,
         description="nothing is sent once no fix came for so many of their usual intervals",
     )
-    acceleration_sigma_mps2: float = Field(default=2.0, gt=0.0, le=50.0)
+    acceleration_sigma_mps2: float = Field(default=2.0, ge=0.001, le=50.0)
     send_attitude: bool = True
     covariance: Literal["profile", "cbrt", "sqrt", "variance"] = "profile"
     gps_id: int = Field(default=0, ge=0, le=3, description="0-based GPS instance of GPS_INPUT")
@@ -108,8 +108,8 @@ class SourceSwitchConfig(_Model):
     enabled: bool = False
     gnss_set: int = Field(default=1, ge=1, le=3)
     vision_set: int = Field(default=2, ge=1, le=3)
-    bad_after_s: float = Field(default=1.5, gt=0.0, le=60.0)
-    good_after_s: float = Field(default=20.0, gt=0.0, le=3600.0)
+    bad_after_s: float = Field(default=1.5, ge=0.1, le=60.0)
+    good_after_s: float = Field(default=20.0, ge=0.1, le=3600.0)
     return_to_gnss: bool = False
     inconsistency_sigmas: float = Field(default=5.0, ge=1.0, le=100.0)
 
@@ -139,7 +139,7 @@ class CameraConfig(_Model):
     model: str = Field(default="map camera", max_length=31)
     width_px: int = Field(default=1280, ge=1, le=65535)
     height_px: int = Field(default=720, ge=1, le=65535)
-    horizontal_fov_deg: float = Field(default=60.0, gt=0.0, lt=180.0)
+    horizontal_fov_deg: float = Field(default=60.0, ge=0.1, lt=180.0)
     stream_uri: str = Field(default="", max_length=159)
     mount: Literal["gimbal", "fixed"] = "gimbal"
     mount_roll_deg: float = Field(default=0.0, ge=-180.0, le=180.0)
@@ -156,10 +156,10 @@ class CameraConfig(_Model):
 class TargetsConfig(_Model):
     """How targets are reported."""
 
-    rate_hz: float = Field(default=5.0, gt=0.0, le=30.0)
+    rate_hz: float = Field(default=5.0, ge=0.01, le=30.0)
     adsb: bool = Field(default=False, description="ADSB_VEHICLE, on the ground link only")
     cot_endpoint: str = Field(default="", description="host:port of a Cursor-on-Target listener")
-    cot_stale_s: float = Field(default=30.0, gt=0.0, le=86400.0)
+    cot_stale_s: float = Field(default=30.0, ge=0.1, le=86400.0)
 
     @field_validator("cot_endpoint")
     @classmethod

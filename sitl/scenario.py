@@ -5,8 +5,9 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Literal
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import BaseModel, ConfigDict, Field, model_validator
 
+from companion.config import CameraModel
 from companion.settings_file import SettingsError, read_settings, validated
 from localizer.camera import Camera
 from sitl.errors import SimulationError
@@ -28,9 +29,9 @@ class Leg(_Model):
     way there (-90 looks straight down).
     """
 
-    east_m: float
-    north_m: float
-    height_m: float = 120.0
+    east_m: float = Field(ge=-20_000, le=20_000)
+    north_m: float = Field(ge=-20_000, le=20_000)
+    height_m: float = Field(120.0, ge=5, le=1000)
     gimbal_pitch_deg: float = Field(-75.0, ge=-90, le=0)
 
 
@@ -41,7 +42,15 @@ class CameraSpec(_Model):
     height: int = Field(480, ge=64, le=4096, multiple_of=2)
     horizontal_fov_deg: float = Field(65.0, gt=20, lt=120)
     distortion: tuple[float, float, float, float, float] = (-0.09, 0.02, 0.0006, -0.0004, 0.0)
-    rate_hz: float = Field(10.0, gt=0, le=60)
+    rate_hz: float = Field(10.0, ge=0.5, le=60)
+
+    @model_validator(mode="after")
+    def _is_a_lens(self) -> CameraSpec:
+        """What the companion would refuse is not filmed with either."""
+        c = self.camera()
+        CameraModel(width=c.width, height=c.height, fx=c.fx, fy=c.fy, cx=c.cx, cy=c.cy,
+                    distortion=c.distortion)  # fmt: skip
+        return self
 
     def camera(self) -> Camera:
         """The calibrated model."""
@@ -64,14 +73,16 @@ _LEGS = (
 class Scenario(_Model):
     """One GNSS-denied flight."""
 
-    takeoff_height_m: float = Field(120.0, gt=20)
-    deny_after_s: float = Field(20.0, gt=0, description="after the take-off height is reached")
-    speed_m_s: float = Field(10.0, gt=0, le=25)
+    takeoff_height_m: float = Field(120.0, gt=20, le=1000)
+    deny_after_s: float = Field(
+        20.0, gt=0, le=3600, description="after the take-off height is reached"
+    )
+    speed_m_s: float = Field(10.0, ge=0.5, le=25)
     legs: tuple[Leg, ...] = Field(_LEGS, min_length=1)
     camera: CameraSpec = CameraSpec()
     condition: Literal["day", "dusk", "night", "fog", "rain", "snow"] = "day"
-    cars: int = Field(30, ge=1)
-    people: int = Field(40, ge=0)
+    cars: int = Field(30, ge=1, le=2000)
+    people: int = Field(40, ge=0, le=2000)
     localizer_width: int = Field(320, ge=64, le=2048, description="the localizer's working width")
     injection: Injection = "vision_position_estimate"
     injection_delay_ms: float = Field(220.0, ge=0, le=250, description="VISO_DELAY_MS")

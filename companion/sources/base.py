@@ -78,11 +78,11 @@ class SourceSettings(BaseModel):
         description="a live stream without a picture for so long is stalled",
     )
     retry_max_s: float = Field(
-        default=4.0, gt=0, le=600, description="longest wait between two attempts to connect"
+        default=4.0, ge=0.1, le=600, description="longest wait between two attempts to connect"
     )
     rate_hz: float = Field(
         default=10.0,
-        gt=0,
+        ge=0.01,
         le=1000,
         description="frame rate of an image folder without timestamps.txt",
     )

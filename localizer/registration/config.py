@@ -12,8 +12,8 @@ from localizer.registration.hypotheses import generate_hypotheses
 from localizer.types import PosePrior
 
 _Steps = Annotated[int, Field(ge=0, le=1000)]
-_Count = Annotated[int, Field(ge=1)]
-_Scale = Annotated[float, Field(gt=0)]
+_Count = Annotated[int, Field(ge=1, le=8000)]
+_Scale = Annotated[float, Field(ge=0.01, le=100)]
 
 
 class JNGOConfig(BaseModel):
@@ -22,12 +22,18 @@ class JNGOConfig(BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
 
     hypotheses: int = Field(default=144, ge=1, le=4096, description="largest size M of the swarm")
-    box_deg: float = Field(default=11.0, gt=0, description="largest pitch and yaw perturbation")
-    step_deg: float = Field(default=2.0, gt=0, description="largest step of the pitch and yaw grid")
-    translation_sigma_m: float = Field(
-        default=1.0, ge=0, description="largest sigma of the perturbation"
+    box_deg: float = Field(
+        default=11.0, ge=0.01, le=90, description="largest pitch and yaw perturbation"
     )
-    spread_sigmas: float = Field(default=2.2, gt=0, description="grid half-width in prior sigmas")
+    step_deg: float = Field(
+        default=2.0, ge=0.001, le=90, description="largest step of the pitch and yaw grid"
+    )
+    translation_sigma_m: float = Field(
+        default=1.0, ge=0, le=100, description="largest sigma of the perturbation"
+    )
+    spread_sigmas: float = Field(
+        default=2.2, ge=0.01, le=100, description="grid half-width in prior sigmas"
+    )
     iterations: tuple[_Steps, ...] = Field(
         default=(2, 3, 4), min_length=1, description="LM steps per level, coarse to fine"
     )
@@ -40,7 +46,9 @@ class JNGOConfig(BaseModel):
         default=(64, 16), description="survivors after each level but the last"
     )
     sharpen: int = Field(default=6, ge=0, le=1000, description="the winner's last LM steps, each")
-    sharpen_damping: float = Field(default=0.003, gt=0, description="their first Marquardt factor")
+    sharpen_damping: float = Field(
+        default=0.003, ge=1e-9, le=1e6, description="their first Marquardt factor"
+    )
     sharpen_scales: tuple[_Scale, ...] = Field(
         default=(2.0, 1.0, 0.7),
         description="for each of these Geman-McClure scales, in median residual norms",
@@ -49,42 +57,53 @@ class JNGOConfig(BaseModel):
         default=(1.0, 0.7), description="likewise on the detail level"
     )
     distinct_px: float = Field(
-        default=0.25, ge=0, description="least rms distance of survivors, level px"
+        default=0.25, ge=0, le=1000, description="least rms distance of survivors, level px"
     )
-    huber: float = Field(default=0.5, gt=0, description="Huber threshold on the residual norm")
-    damping: float = Field(default=0.03, gt=0, description="first Marquardt factor")
+    huber: float = Field(
+        default=0.5, ge=1e-3, le=1000, description="Huber threshold on the residual norm"
+    )
+    damping: float = Field(default=0.03, ge=1e-9, le=1e6, description="first Marquardt factor")
     min_overlap: float = Field(
         default=0.25, gt=0, le=1, description="least share of anchors in view"
     )
-    min_anchors: int = Field(default=50, ge=6, description="anchors below which nothing is tried")
+    min_anchors: int = Field(
+        default=50, ge=6, le=8000, description="anchors below which nothing is tried"
+    )
     motion_weight: float = Field(
-        default=0.02, ge=0, description="lambda of Eq. 10, in best costs per d²"
+        default=0.02, ge=0, le=1e4, description="lambda of Eq. 10, in best costs per d²"
     )
     prior_weight: float = Field(
-        default=0.0001, ge=0, description="weight of a constraint, likewise"
+        default=0.0001, ge=0, le=1e4, description="weight of a constraint, likewise"
     )
     correlation: float = Field(
         default=4.4,
-        gt=0,
+        ge=0.01,
+        le=1000,
         description="covariance factor of the sums over all anchors, calibrated",
     )
     few_anchors: float = Field(
-        default=150.0, ge=0, description="anchors in view with which the covariance doubles"
+        default=150.0, ge=0, le=1e5, description="anchors in view with which the covariance doubles"
     )
     correlation_px: float = Field(
-        default=32.0, gt=0, description="image cell within which residuals may correlate"
+        default=32.0, ge=1, le=4096, description="image cell within which residuals may correlate"
     )
     curvature_px: float = Field(
-        default=0.15, gt=0, description="distance at which the cost's curvature is measured, px"
+        default=0.15,
+        ge=0.01,
+        le=10,
+        description="distance at which the cost's curvature is measured, px",
     )
     mode_px: float = Field(
-        default=5.0, ge=0, description="least distance of another mode from the winner, level px"
+        default=5.0,
+        ge=0,
+        le=4096,
+        description="least distance of another mode from the winner, level px",
     )
     covariance_floor: float = Field(
-        default=0.05, ge=0, description="least share of the isotropic model"
+        default=0.05, ge=0, le=1, description="least share of the isotropic model"
     )
     max_sigma_m: float = Field(
-        default=50.0, gt=0, description="position sigma that counts as no texture"
+        default=50.0, ge=0.01, le=1000, description="position sigma that counts as no texture"
     )
 
     @property

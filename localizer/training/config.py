@@ -11,7 +11,6 @@ from pydantic import (
     ConfigDict,
     Discriminator,
     Field,
-    PositiveInt,
     Tag,
     ValidationError,
     model_validator,
@@ -23,6 +22,10 @@ from localizer.synth.heightfield import BLOCK
 from localizer.training.networks import NetworkConfig
 
 _MOST_WORKERS = 1024  # processes or threads
+_MOST_STEPS = 10**9
+_Side = Annotated[int, Field(gt=0, le=8192)]  # of an image, pixels
+_Weight = Annotated[float, Field(ge=0.0, le=1000.0)]  # of a loss; less than 0 would be learned
+_Error = Annotated[float, Field(ge=0.0, le=1000.0)]  # pixels
 
 
 class _Frozen(BaseModel):
@@ -46,11 +49,11 @@ class DataSection(_PlacesSection):
     """Pairs on disk. Shards are generated in the order of their seeds."""
 
     shards: Path
-    initial_scenes: int = Field(gt=0)
-    scenes_per_step: float = Field(ge=0.0)
-    worlds: int = Field(ge=0)
+    initial_scenes: int = Field(gt=0, lt=2**31)
+    scenes_per_step: float = Field(ge=0.0, le=1e6)
+    worlds: int = Field(ge=0, lt=2**31)
     world_share: float = Field(ge=0.0, le=1.0)
-    world_first_step: int = Field(ge=0)
+    world_first_step: int = Field(ge=0, le=_MOST_STEPS)
 
 
 class LiveSection(_PlacesSection):
@@ -60,11 +63,11 @@ class LiveSection(_PlacesSection):
     """
 
     live: Literal[True]
-    image: tuple[PositiveInt, PositiveInt]
-    cells: int = Field(gt=0, multiple_of=BLOCK)
+    image: tuple[_Side, _Side]
+    cells: int = Field(gt=0, le=16384, multiple_of=BLOCK)
     active: int = Field(gt=0)
-    steps_per_scene: int = Field(gt=0)
-    visits: int = Field(gt=0)
+    steps_per_scene: int = Field(gt=0, le=_MOST_STEPS)
+    visits: int = Field(gt=0, le=1000)
 
     @model_validator(mode="after")
     def _places_suffice(self) -> LiveSection:
@@ -91,23 +94,23 @@ class OptimizerSection(_Frozen):
     contrast.
     """
 
-    steps: int = Field(gt=0)
+    steps: int = Field(gt=0, le=_MOST_STEPS)
     decay_steps: int = Field(gt=0)
     mixed_precision: bool
-    batch: int = Field(gt=0)
-    crop: tuple[PositiveInt, PositiveInt]
+    batch: int = Field(gt=0, le=65536)
+    crop: tuple[_Side, _Side]
     anchors: int = Field(ge=32)
-    learning_rate: float = Field(gt=0.0)
-    warmup_steps: int = Field(ge=0)
-    weight_decay: float = Field(ge=0.0)
+    learning_rate: float = Field(ge=1e-9, le=1.0)
+    warmup_steps: int = Field(ge=0, le=_MOST_STEPS)
+    weight_decay: float = Field(ge=0.0, le=1.0)
     ema_decay: float = Field(gt=0.0, lt=1.0)
-    contrast_weight: float
-    alignment_weight: float
-    alignment_ramp_steps: int = Field(ge=1)
-    alignment_first_step: int = Field(default=0, ge=0)
-    whole_map_cells: int = Field(default=1200, ge=0)
-    lm_iterations: int = Field(gt=0)
-    start_error_px: tuple[float, float, float]
+    contrast_weight: _Weight
+    alignment_weight: _Weight
+    alignment_ramp_steps: int = Field(ge=1, le=_MOST_STEPS)
+    alignment_first_step: int = Field(default=0, ge=0, le=_MOST_STEPS)
+    whole_map_cells: int = Field(default=1200, ge=0, le=10**6)
+    lm_iterations: int = Field(gt=0, le=1000)
+    start_error_px: tuple[_Error, _Error, _Error]
     threads: int = Field(gt=0, le=_MOST_WORKERS)
 
     @model_validator(mode="after")
@@ -123,16 +126,16 @@ class DistillSection(_Frozen):
     """A teacher beside the losses: its run's checkpoint, and the weight of its term a level."""
 
     teacher: Path
-    weight: float = Field(gt=0.0)
+    weight: float = Field(gt=0.0, le=1000.0)
 
 
 class TrainConfig(_Frozen):
     """A whole run. warm_start: checkpoint whose averaged weights are the first ones."""
 
     name: str = Field(pattern=r"^\w[\w.-]*$")  # of files
-    seed: int = Field(ge=0)
+    seed: int = Field(ge=0, lt=2**31)
     output: Path
-    checkpoint_steps: int = Field(gt=0)
+    checkpoint_steps: int = Field(gt=0, le=_MOST_STEPS)
     warm_start: Path | None = None
     model: NetworkConfig
     data: Data

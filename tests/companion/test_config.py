@@ -6,9 +6,10 @@ import pytest
 import yaml
 from pydantic import BaseModel
 
-from companion.config import load_config
+from companion.config import CompanionConfig, load_config
 from companion.errors import ConfigError
 from mavlink_bridge import BridgeConfig
+from tests.bounds import unbounded
 
 MODEL = {"width": 640, "height": 480, "fx": 550, "fy": 550, "cx": 320, "cy": 240}
 CAMERA = {"source": "udp://127.0.0.1:5600", "model": MODEL}
@@ -69,6 +70,13 @@ def test_minimal_config_and_paths_relative_to_the_file(tmp_path):
         ({"camera": CAMERA | {"settings": {"stall_timeout_s": 1e-9}}}, "stall_timeout_s"),
         ({"prior": {"position_sigma_m": 1e300}}, "prior.position_sigma_m"),
         ({"targets": {"pixel_sigma": 1e-300}}, "targets.pixel_sigma"),
+        ({"targets": {"rate_hz": 1e-300}}, "targets.rate_hz"),
+        ({"bridge": {"targets": {"rate_hz": 1e-300}}}, "bridge.targets.rate_hz"),
+        ({"camera": CAMERA | {"settings": {"rate_hz": 1e-300}}}, "camera.settings.rate_hz"),
+        ({"record": {"folder": "f", "snapshot_interval_s": 1e300}}, "snapshot_interval_s"),
+        ({"localizer": {"motion": {"turn_sigma": 1e300}}}, "turn_sigma: .* equal to 1 "),
+        ({"localizer": {"integrity": {"gate": 1e300}}}, "localizer.integrity.gate"),
+        ({"localizer": {"seed": 10**400}}, "localizer.seed"),
         ({"map": ""}, "map: '.' names no file"),
         ({"record": {"folder": ""}}, "record.folder: '.' names no file"),
         ({"bridge": {"tlog": "a\0b"}}, "bridge.tlog: 'a.x00b' names no file"),
@@ -174,3 +182,8 @@ def test_the_deployment_file_shows_the_defaults_or_says_so():
                 assert f"default {getattr(kept, name):g}" in text.split(f" {name}:", 1)[1][:80], (
                     name
                 )
+
+
+def test_every_number_has_its_bounds():
+    lens = {"fx", "fy", "cx", "cy", "distortion"}  # judged together, as a lens
+    assert unbounded(CompanionConfig) == {f"camera.model.{name}" for name in lens}

@@ -7,7 +7,8 @@ from localizer.pose import so3_log
 from sitl.embedded.geodesy import Location
 from sitl.flight_script import mission
 from sitl.kinematic import camera_path
-from sitl.scenario import Leg, Scenario, ScenarioError, check_inside, load_scenario
+from sitl.scenario import CameraSpec, Leg, Scenario, ScenarioError, check_inside, load_scenario
+from tests.bounds import unbounded
 
 CONFIGS = Path(__file__).parents[2] / "configs"
 
@@ -69,9 +70,19 @@ def test_the_kinematic_path_is_smooth_and_visits_every_corner():
     assert np.degrees(max(turns)) < 8.0
 
 
-@pytest.mark.parametrize("east", [801.0, -9e4])
+@pytest.mark.parametrize("east", [801.0, -9e3])
 def test_a_leg_outside_the_world_is_named(east):
     check_inside(Scenario(), 1600.0)
     home = Leg(east_m=0, north_m=0)
     with pytest.raises(ScenarioError, match=r"legs\.1: .* reaches 800 m"):
         check_inside(Scenario(legs=(home, Leg(east_m=east, north_m=0))), 1600.0)
+
+
+def test_every_number_has_its_bounds():
+    assert unbounded(Scenario) == {"camera.distortion"}  # judged as a lens
+
+
+@pytest.mark.parametrize("distortion", [(9.0, 0, 0, 0, 0), (0, 0, -1e300, 0, 0)])
+def test_a_distortion_that_is_no_lens_is_named(distortion):
+    with pytest.raises(ValueError, match="the distortion moves a corner"):
+        CameraSpec(distortion=distortion)

@@ -298,6 +298,27 @@ def test_settings_without_a_meaning_are_refused(bad: dict[str, Any]) -> None:
         JNGOConfig(**bad)
 
 
+def at_the_limits() -> list[dict[str, Any]]:
+    """Each setting of one number at the least and at the largest that is accepted."""
+    found = []
+    for name, p in JNGOConfig.model_json_schema()["properties"].items():
+        least = p.get("minimum", p.get("exclusiveMinimum"))
+        if p["type"] in ("number", "integer"):
+            found += [{name: least if "minimum" in p else 1e-12}, {name: p["maximum"]}]
+    return found
+
+
+@pytest.mark.parametrize("setting", at_the_limits(), ids=str)
+def test_settings_at_their_limits_give_an_answer(scene, prior, setting: dict[str, Any]) -> None:
+    """A poor one, perhaps, but finite and with a covariance that is one."""
+    result = JNGO(JNGOConfig(**setting)).register(
+        scene.query, scene.camera, scene.anchors, prior(scene.reference, 1.0, 1.0)
+    )
+    assert np.isfinite(result.world_from_camera.translation).all()
+    assert np.isfinite(result.covariance).all()
+    assert np.linalg.eigvalsh(result.covariance)[0] > 0.0
+
+
 def test_unknown_backend_is_named():
     with pytest.raises(ValueError, match="cuda-magic"):
         JNGO(backend="cuda-magic")

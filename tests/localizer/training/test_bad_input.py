@@ -16,7 +16,7 @@ from localizer.features.extractor import SHIPPED_MODEL  # noqa: E402
 from localizer.training import __main__ as cli  # noqa: E402
 from localizer.training import quantize as quantization  # noqa: E402
 from localizer.training.checkpoint import read_checkpoint, write_checkpoint  # noqa: E402
-from localizer.training.config import load_config  # noqa: E402
+from localizer.training.config import TrainConfig, load_config  # noqa: E402
 from localizer.training.curves import plot  # noqa: E402
 from localizer.training.data import LoaderConfig, Schedule, ShardStream  # noqa: E402
 from localizer.training.export import export, load_network  # noqa: E402
@@ -26,6 +26,7 @@ from localizer.training.quantize import quantize  # noqa: E402
 from localizer.training.shards import read_shard, store  # noqa: E402
 from localizer.training.train import Trainer  # noqa: E402
 from localizer.training.unfuse import unfuse  # noqa: E402
+from tests.bounds import unbounded  # noqa: E402
 
 SHIPPED = Path(__file__).parents[3] / "configs" / "train_tiny.yaml"
 
@@ -222,3 +223,22 @@ def test_a_model_is_tried_before_it_is_quantised(tmp_path: Path) -> None:
 def test_unfusing_needs_pairs() -> None:
     with pytest.raises(ModelError, match="needs training pairs"):
         unfuse(SHIPPED_MODEL, [])
+
+
+def test_every_number_of_a_run_has_its_bounds() -> None:
+    others = {"data.active", "optimizer.anchors", "optimizer.decay_steps"}  # scenes, crop, steps
+    assert unbounded(TrainConfig) == others
+
+
+@pytest.mark.parametrize(
+    ("key", "value"),
+    [("learning_rate", "1.0e+300"), ("contrast_weight", "-1.0"), ("batch", "1" + 30 * "0"),
+     ("weight_decay", ".inf"), ("threads", "-1")],
+)  # fmt: skip
+def test_absurd_numbers_of_a_run_are_named(tmp_path: Path, key: str, value: str) -> None:
+    lines = [f"  {key}: {value}" if line.startswith(f"  {key}:") else line
+             for line in SHIPPED.read_text().splitlines()]  # fmt: skip
+    path = tmp_path / "run.yaml"
+    path.write_text("\n".join(lines))
+    with pytest.raises(ModelError, match=rf"optimizer\.{key}: Input should be"):
+        load_config(path)
