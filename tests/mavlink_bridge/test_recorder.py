@@ -46,7 +46,7 @@ def test_a_full_disk_is_told_once_and_costs_the_record_only(autopilot: Any) -> N
     config = BridgeConfig(connection=f"udpout:127.0.0.1:{autopilot.port}", tlog=FULL)
     with Bridge(config, 0.0) as bridge:
         assert sleep_until(lambda: int(bridge.counters()["tlog_dropped"]) > 20, 30.0)
-        assert bridge.state().connected
+        assert sleep_until(lambda: bridge.state().connected, 30.0)
         assert [t for t in bridge.texts() if "tlog" in t] == [
             "PiLoT: tlog is incomplete: No space left on device"
         ]
