@@ -1,7 +1,5 @@
 """Which tiles a view needs: screen-space error, frustum and horizon culling (numba kernel)."""
 
-# ruff: noqa: PLR0912, PLR0915 (the kernel passes arrays and is one loop body)
-
 from __future__ import annotations
 
 from dataclasses import dataclass
@@ -189,12 +187,7 @@ def _select(  # type: ignore[no-untyped-def]
     """
     n = len(refine)
     state = np.zeros(n, np.uint8)
-    backed = np.zeros(n, np.bool_)  # an ancestor is resident and can be shown instead
-    covered = np.ones(n, np.bool_)  # everything visible below can be shown
-    stands_in = np.zeros(n, np.bool_)  # shown in place of children that are not all resident
     distance = np.empty(n)
-    wanted = shown = requests = 0
-
     state[0] = _WANTED
     for i in range(n):
         if state[i] == _UNSEEN:
@@ -210,11 +203,23 @@ def _select(  # type: ignore[no-untyped-def]
             state[i] = _REFINED
             for c in range(child_start[i], child_start[i] + child_count[i]):
                 state[c] = _WANTED
-                backed[c] = backed[i] or (resident[i] and tile_count[i] > 0)
-        if tile_count[i] > 0 and (state[i] == _WANTED or refine[i] != REPLACE):
-            nodes[0, wanted] = i
-            wanted += 1
+    tree = (refine, child_start, child_count, tile_count)
+    covered, stands_in = _coverage(state, resident, tree)
+    wanted, shown, requests = _listed(
+        state, resident, tree, covered, stands_in, distance, nodes, priority
+    )
+    return wanted, shown, requests, not covered[0]
 
+
+@njit(cache=True)
+def _coverage(state, resident, tree):  # type: ignore[no-untyped-def]
+    """Bottom up: whether everything visible below a node can be shown, and whether the node is
+    shown in place of children that are not all resident.
+    """
+    refine, child_start, child_count, tile_count = tree
+    n = len(refine)
+    covered = np.ones(n, np.bool_)
+    stands_in = np.zeros(n, np.bool_)
     for i in range(n - 1, -1, -1):
         if state[i] == _WANTED:
             covered[i] = tile_count[i] == 0 or resident[i]
@@ -226,28 +231,39 @@ def _select(  # type: ignore[no-untyped-def]
                     covered[i] &= resident[i]
                 elif not covered[i] and resident[i]:
                     stands_in[i] = covered[i] = True
+    return covered, stands_in
 
+
+@njit(cache=True)
+def _listed(  # type: ignore[no-untyped-def]
+    state, resident, tree, covered, stands_in, distance, nodes, priority
+):
+    """Top down: fills nodes and the requests' priority; returns the three counts."""
+    refine, child_start, child_count, tile_count = tree
+    n = len(refine)
+    backed = np.zeros(n, np.bool_)  # an ancestor is resident and can be shown instead
+    hidden = np.zeros(n, np.bool_)  # an ancestor stands in
+    wanted = shown = requests = 0
     for i in range(n):
         if state[i] == _UNSEEN or state[i] == _CULLED:
+            continue
+        if state[i] == _REFINED:
+            for c in range(child_start[i], child_start[i] + child_count[i]):
+                backed[c] = backed[i] or (resident[i] and tile_count[i] > 0)
+                hidden[c] = hidden[i] or stands_in[i]
+        if tile_count[i] == 0:
             continue
         needed = state[i] == _WANTED or refine[i] != REPLACE
         fallback = not needed and not covered[i] and not backed[i]
-        if tile_count[i] > 0 and not resident[i] and (needed or fallback):
+        if needed:
+            nodes[0, wanted] = i
+            wanted += 1
+        if resident[i]:
+            if not hidden[i] and (needed or stands_in[i]):
+                nodes[1, shown] = i
+                shown += 1
+        elif needed or fallback:
             nodes[2, requests] = i
             priority[requests] = i - 1e9 if fallback else distance[i]
             requests += 1
-
-    # Top down again: what stands in hides everything below it.
-    hidden = backed  # reused: from here on, whether an ancestor stands in
-    hidden[:] = False
-    for i in range(n):
-        if state[i] == _UNSEEN or state[i] == _CULLED:
-            continue
-        own = state[i] == _WANTED or stands_in[i] or refine[i] != REPLACE
-        if not hidden[i] and own and tile_count[i] > 0 and resident[i]:
-            nodes[1, shown] = i
-            shown += 1
-        if state[i] == _REFINED:
-            for c in range(child_start[i], child_start[i] + child_count[i]):
-                hidden[c] = hidden[i] or stands_in[i]
-    return wanted, shown, requests, not covered[0]
+    return wanted, shown, requests
