@@ -73,6 +73,7 @@ class Bridge:
         self._started = False
         self._utc = SteadyUtc()
         self._health_lock = threading.Lock()
+        self._text_lock = threading.Lock()
         self._health = (HealthLevel.STARTING, "")
         self._texts: deque[tuple[int, str]] = deque(maxlen=_TEXTS)
         self._text_id = 0
@@ -201,8 +202,9 @@ class Bridge:
         self._texts.append((severity, text))
         log.log(logging.WARNING if severity <= mavlink.MAV_SEVERITY_WARNING else logging.INFO, text)
         self._on_text(severity, text)
-        self._text_id = self._text_id % 0xFFFF + 1
-        for message in status_texts(severity, text, self._text_id):
+        with self._text_lock:  # two threads' texts under one id would be mixed at the receiver
+            self._text_id = text_id = self._text_id % 0xFFFF + 1
+        for message in status_texts(severity, text, text_id):
             self._ground_link.send(message, self._config.companion_component)
 
     def _gate_changed(self, text: str) -> None:

@@ -48,8 +48,12 @@ class VehicleClient:
 
     def __enter__(self: _Self) -> _Self:
         self._link.start()
-        if not self.wait_for(lambda: self.system != 0, _CONNECT_S):
-            self._link.stop()
+        try:
+            self.wait_for(lambda: self.system != 0, _CONNECT_S)
+        finally:  # an interrupt included
+            if not self.system:
+                self._link.stop()
+        if not self.system:
             raise ConnectionSilentError(
                 f"no autopilot heartbeat at {self.config.connection} in {_CONNECT_S:.0f} s; "
                 "check the connection string, the wiring and the port's MAVLink 2 protocol"

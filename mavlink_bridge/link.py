@@ -109,6 +109,8 @@ class Link:
         self._stop = threading.Event()
         self._thread: threading.Thread | None = None
         self._transport: Transport | None = None
+        # The pipe's numbers may be other files' once it is closed: nobody writes while it is.
+        self._pipe_lock = threading.Lock()
         self._wake_read, self._wake_write = os.pipe()
         os.set_blocking(self._wake_read, False)
         os.set_blocking(self._wake_write, False)
@@ -144,16 +146,22 @@ class Link:
         self.wake()
         if self._thread is not None and self._thread is not threading.current_thread():
             self._thread.join(timeout=5.0)
-            if not self._thread.is_alive() and self._wake_read >= 0:
-                os.close(self._wake_read)
-                os.close(self._wake_write)
-                self._wake_read = self._wake_write = -1
+        if self._thread is None or not self._thread.is_alive():
+            self._close_pipe()
 
     def wake(self) -> None:
         """Make the owner thread run `on_tick` now."""
         # A full pipe wakes the thread anyway, and a closed one has no thread to wake.
-        with contextlib.suppress(OSError):
-            os.write(self._wake_write, b"w")
+        with self._pipe_lock, contextlib.suppress(BlockingIOError):
+            if self._wake_write >= 0:
+                os.write(self._wake_write, b"w")
+
+    def _close_pipe(self) -> None:
+        with self._pipe_lock:
+            if self._wake_read >= 0:
+                os.close(self._wake_read)
+                os.close(self._wake_write)
+                self._wake_read = self._wake_write = -1
 
     def send(self, message: Any, component: int) -> bool:
         """Send as `component` of the vehicle's system; False when it was dropped at once."""
