@@ -335,7 +335,7 @@ def test_nothing_is_sent_before_the_vehicles_id_is_known(
 
 def test_neither_threads_nor_descriptors_leak() -> None:
     def descriptors() -> set[str]:
-        """Sockets and pipes by their inodes: what an earlier test's thread closes does not count."""
+        """Sockets and pipes by inode: what an earlier test's thread closes does not count."""
         found = set()
         for number in os.listdir("/proc/self/fd"):
             with contextlib.suppress(OSError):

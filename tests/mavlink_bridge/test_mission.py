@@ -102,7 +102,7 @@ def test_places_of_the_mission(with_mission: Callable[..., Any], lost: int) -> N
 def test_refusal_and_silence_are_named(
     with_mission: Callable[..., Any], monkeypatch: pytest.MonkeyPatch, how: Any, why: str
 ) -> None:
-    monkeypatch.setattr("mavlink_bridge.mission._ANSWER_S", 0.2)
+    monkeypatch.setattr("mavlink_bridge.mission._ANSWER_S", 0.2 if "silent" in how else 30.0)
     vehicle = with_mission(**how)
     with pytest.raises(MissionError, match=rf"number of items .*{why}"):
         download_mission(config(f"udpout:127.0.0.1:{vehicle.port}"))
@@ -142,7 +142,7 @@ def test_a_place_that_is_not_set_is_where_the_vehicle_is(
 def test_a_mission_that_never_ends_is_given_up(
     with_mission: Callable[..., Any], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("mavlink_bridge.mission._LONGEST_S", 0.0)
+    monkeypatch.setattr("mavlink_bridge.mission._LONGEST_S", -1.0)
     vehicle = with_mission()
     with pytest.raises(MissionError, match="gave 0 of 6 items"):
         download_mission(config(f"udpout:127.0.0.1:{vehicle.port}"))

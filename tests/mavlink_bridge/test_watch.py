@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import contextlib
+import itertools
 import socket
 import threading
 import time
@@ -36,22 +38,41 @@ class Ticks:
         return now_ns + 100_000_000
 
 
-def test_the_handlers_clock_goes_on_while_the_transport_is_closed() -> None:
+def test_the_handlers_clock_goes_on_while_the_transport_is_closed(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Half a minute of simulated time, in the test's own thread."""
+    now_ns = [10**12]
+    monkeypatch.setattr("mavlink_bridge.link.monotonic_ns", lambda: now_ns[0])
+    attempts: list[float] = []
+
     def refuse(_: Endpoint) -> Any:
+        attempts.append(now_ns[0] * 1e-9)
         raise ConnectionRefusedError("nobody there")
+
+    class Stop:
+        """The link's event, whose waiting is what moves the clock."""
+
+        def is_set(self) -> bool:
+            return now_ns[0] > 10**12 + 30 * 10**9
+
+        def wait(self, seconds: float) -> bool:
+            now_ns[0] += int(seconds * 1e9) + 1
+            return self.is_set()
 
     ticks = Ticks()
     link = Link(Endpoint.parse("tcp:127.0.0.1:9"), ticks, opener=refuse)
     link.system_id = 1
-    link.start()
-    time.sleep(3.5)  # by then the back-off is at its seconds
+    link._stop = Stop()  # type: ignore[assignment]
     for _ in range(700):
         link.send(HEARTBEAT, 191)
-    assert sleep_until(lambda: not link._outbox, 30.0)
-    link.stop()
-    gaps = [b - a for a, b in zip(ticks.times, ticks.times[1:], strict=False)]
-    assert len(gaps) > 8
-    assert max(gaps) < 1.2  # a tick at each attempt only would leave 1.6 s
+    link._thread = threading.current_thread()
+    link._run()
+    link._close_pipe()
+    assert not link._outbox
+    waits = [b - a for a, b in itertools.pairwise(attempts)]
+    assert max(waits) == pytest.approx(5.0, abs=0.01)  # a tick at each attempt only would leave it
+    assert max(b - a for a, b in itertools.pairwise(ticks.times)) <= 0.21
     assert not any(ticks.sent)
     assert link.counters.tx_dropped >= 700
 
@@ -126,7 +147,8 @@ def test_loss_is_told_on_the_ground_link_within_seconds(reconnecting: bool) -> N
             connection=f"tcp:127.0.0.1:{server.getsockname()[1]}",
             ground_connection=f"udpout:127.0.0.1:{station.getsockname()[1]}",
         )
-        codec, texts, over = mavlink.MAVLink(None, 255, 190), [], threading.Event()
+        codec, over = mavlink.MAVLink(None, 255, 190), threading.Event()
+        texts: list[str] = []
 
         def hang(_: Endpoint) -> Any:
             over.wait()
@@ -137,16 +159,22 @@ def test_loss_is_told_on_the_ground_link_within_seconds(reconnecting: bool) -> N
             assert sleep_until(lambda: bridge._fc_link.connected, 30.0)
             if reconnecting:
                 bridge._fc_link._open = hang
+            spoke_at = time.monotonic()
             client.sendall(HEARTBEAT.pack(mavlink.MAVLink(None, 1, 1)))
             assert sleep_until(lambda: bridge.state().connected, 30.0)
-            lost_at = time.monotonic()
             client.close()
             server.close()
-            station.settimeout(30.0)
-            while not any("lost" in text for text in texts):
-                for m in codec.parse_buffer(station.recv(65536)) or []:
-                    texts += [m.text] if m.get_type() == "STATUSTEXT" else []
-            assert 2.5 < time.monotonic() - lost_at < 20.0
+            station.settimeout(0.1)
+
+            def told() -> bool:
+                with contextlib.suppress(TimeoutError):
+                    for m in codec.parse_buffer(station.recv(65536)) or []:
+                        texts.extend([m.text] if m.get_type() == "STATUSTEXT" else [])
+                return any("lost" in text for text in texts)
+
+            # A link that waited for its connection, or for TCP, would need minutes.
+            assert sleep_until(told, 30.0, step_s=0.0)
+            assert time.monotonic() - spoke_at > 3.0
             over.set()
             time.sleep(0.5)
             told = [text for text in bridge.texts() if "lost" in text]
