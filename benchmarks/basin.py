@@ -18,12 +18,14 @@ from dataclasses import asdict
 from functools import partial
 from pathlib import Path
 
-import basin_axes
 from arguments import Parser, existing, number, output, whole
-from basin_run import Outcome, Start, groups, random_start, run, summary
-from basin_variants import DEFAULT_ANCHORS, FULL, our_rows, paper_rows, prior_rows
-from basin_views import View, load_views
-from named_errors import named_errors
+from named_errors import named_errors, needs_torch
+
+with needs_torch():
+    import basin_axes
+    from basin_run import Outcome, Start, groups, random_start, run, summary
+    from basin_variants import DEFAULT_ANCHORS, FULL, our_rows, paper_rows, prior_rows
+    from basin_views import View, load_views
 
 STARTS = (5.0, 10.0)  # metres and degrees: the paper's columns but the easiest
 

@@ -25,23 +25,25 @@ from pathlib import Path
 
 import numpy as np
 from arguments import Parser, existing, output, whole
-from feature_methods import Direct, IntensityExtractor, Method, load_xfeat, sift_pnp
-from feature_pairs import (
-    DEGREES,
-    METRES,
-    MadePlaces,
-    TestPair,
-    made_pairs,
-    mesh_pairs,
-)
-from feature_real import real_pairs
-from feature_report import Outcome, read_outcomes, report, write_outcomes
-from named_errors import named_errors
+from named_errors import named_errors, needs_torch
 
 from localizer.config import LocalizerConfig
 from localizer.features import FeatureExtractor, GradientExtractor, load_extractor
 from localizer.features.detail import DetailExtractor
 from localizer.types import PosePrior
+
+with needs_torch():
+    from feature_methods import Direct, IntensityExtractor, Method, load_xfeat, sift_pnp
+    from feature_pairs import (
+        DEGREES,
+        METRES,
+        MadePlaces,
+        TestPair,
+        made_pairs,
+        mesh_pairs,
+    )
+    from feature_real import real_pairs
+    from feature_report import Outcome, read_outcomes, report, write_outcomes
 
 logger = logging.getLogger(__name__)
 

@@ -1,4 +1,4 @@
-"""A benchmark's bad input in one line and exit code 2, as the companion's."""
+"""A benchmark's bad input, or what it lacks, in one line and exit code 2, as the companion's."""
 
 from __future__ import annotations
 
@@ -18,4 +18,16 @@ def named_errors() -> Iterator[None]:
         yield
     except (CompanionError, LocalizerError, BridgeError, OSError) as error:
         print(f"{type(error).__name__}: {error}", file=sys.stderr)
+        sys.exit(2)
+
+
+@contextmanager
+def needs_torch() -> Iterator[None]:
+    """Around the imports of a benchmark that does nothing without PyTorch."""
+    try:
+        yield
+    except ModuleNotFoundError as error:
+        if error.name != "torch":
+            raise
+        print("this benchmark needs PyTorch: pip install '.[train]'", file=sys.stderr)
         sys.exit(2)

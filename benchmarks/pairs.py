@@ -13,17 +13,20 @@ import time
 
 import cv2
 import numpy as np
-import torch
 from arguments import Parser, existing, whole
-from named_errors import named_errors
+from named_errors import named_errors, needs_torch
 
 from localizer.synth.heightfield_render import render
-from localizer.training.config import LiveSection, load_config
-from localizer.training.data import LoaderConfig, crop_pair, window_pair
-from localizer.training.live import LivePlan, LiveStream
-from localizer.training.pairs import Pair, SceneConfig, draw_views
-from localizer.training.streams import photo_source, scene_config
-from localizer.training.visits import PlaceVisits, make_place
+
+with needs_torch():
+    import torch
+
+    from localizer.training.config import LiveSection, load_config
+    from localizer.training.data import LoaderConfig, crop_pair, window_pair
+    from localizer.training.live import LivePlan, LiveStream
+    from localizer.training.pairs import Pair, SceneConfig, draw_views
+    from localizer.training.streams import photo_source, scene_config
+    from localizer.training.visits import PlaceVisits, make_place
 
 
 def numpy_pairs(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import subprocess
 import sys
 from pathlib import Path
 
@@ -28,3 +29,34 @@ def test_a_named_error_is_one_line(error: Exception, capsys: pytest.CaptureFixtu
 @pytest.mark.parametrize("path", COMMANDS, ids=lambda p: p.stem)
 def test_every_benchmark_does_so(path: Path) -> None:
     assert "    with named_errors():\n" in path.read_text()
+
+
+WITHOUT_TORCH = """
+import importlib.abc, runpy, sys
+class Missing(importlib.abc.MetaPathFinder):
+    def find_spec(self, name, path, target=None):
+        if name.split(".")[0] == "torch":
+            raise ModuleNotFoundError(name, name="torch")
+sys.meta_path.insert(0, Missing())
+sys.path.insert(0, sys.argv[1])
+for name in sys.argv[2:]:
+    sys.argv = [name, "--help"]
+    try:
+        runpy.run_path(name, run_name="__main__")
+    except SystemExit as end:
+        print(name, end.code)
+"""
+NEED_TORCH = [BENCHMARKS / f"{name}.py" for name in ("basin", "features", "pairs")]
+
+
+def test_a_benchmark_that_needs_torch_says_so() -> None:
+    run = subprocess.run(
+        [sys.executable, "-c", WITHOUT_TORCH, str(BENCHMARKS), *map(str, NEED_TORCH)],
+        check=False,
+        capture_output=True,
+        text=True,
+    )
+    assert run.returncode == 0, run.stderr
+    said = "this benchmark needs PyTorch: pip install '.[train]'"
+    assert run.stderr.splitlines() == [said] * len(NEED_TORCH)
+    assert run.stdout.splitlines() == [f"{path} 2" for path in NEED_TORCH]
