@@ -9,7 +9,8 @@ from dataclasses import dataclass
 from mavlink_bridge.bridge import Bridge
 from mavlink_bridge.clock import SteadyUtc, monotonic_ns
 from mavlink_bridge.config import BridgeConfig
-from mavlink_bridge.messages import VehicleState
+from mavlink_bridge.link import sleep_until
+from mavlink_bridge.messages import GimbalAttitude, VehicleState
 from mavlink_bridge.parameter_rules import (
     Read,
     Rule,
@@ -21,11 +22,14 @@ from mavlink_bridge.parameter_rules import (
 from mavlink_bridge.parameters import ParameterClient
 from mavlink_bridge.profile import select_profile
 
+Counters = dict[str, int | float | str]
+
 _CONNECT_S = 15.0
 _MEASURE_S = 4.0
 _ROUND_TRIP_LIMIT_MS = 30.0
 _RATE_SHARE = 0.7
 _LOST_SHARE = 0.02
+_GIMBAL_AGE_NS = 200_000_000  # of an exposure, roughly
 _PX4_RATE_HZ = 30.0  # its documentation asks for 30 to 50 Hz
 
 
@@ -91,45 +95,70 @@ def check_parameters(rules: Iterable[Rule], read: Read) -> list[Finding]:
     return findings
 
 
+@dataclass(frozen=True)
+class _Measurement:
+    """What came over the link in so many seconds, and the vehicle at their end."""
+
+    state: VehicleState
+    before: Counters
+    after: Counters
+    seconds: float
+    gimbal: GimbalAttitude | None
+
+    def grown(self, key: str) -> float:
+        """By how much a counter grew."""
+        return float(self.after.get(key, 0)) - float(self.before.get(key, 0))
+
+
 def check_link(config: BridgeConfig) -> tuple[list[Finding], VehicleState]:
     """Connect in shadow mode for a few seconds and measure identity, clock and streams."""
     quiet = config.model_copy(update={"mode": "shadow", "tlog": None})
     with Bridge(quiet, 0.0) as bridge:
-        end = time.monotonic() + _CONNECT_S
-        while not bridge.state().connected and time.monotonic() < end:
-            time.sleep(0.05)
-        if not bridge.state().connected:
-            needed = f"heartbeats at {config.connection}"
-            found, why = "silence", "wiring, port, SERIALn_PROTOCOL=2, signing key"
-            counters = bridge.counters()
-            if counters["fc_open_failures"] and not counters["fc_opened"]:
-                found = "cannot be opened"
-                why = "nothing there, no permission, or in use: is the companion running?"
-            return [Finding("connection", found, needed, why, False, True)], bridge.state()
+        if not sleep_until(lambda: bridge.state().connected, _CONNECT_S, step_s=0.05):
+            return [_no_connection(config, bridge.counters())], bridge.state()
         time.sleep(_MEASURE_S / 2)
-        before = bridge.counters()
-        time.sleep(_MEASURE_S)
-        return _link_findings(config, bridge, before), bridge.state()
+        measured = _measure(bridge, config.camera.mount == "gimbal")
+    findings = [*_vehicle_findings(config, measured), *_stream_findings(config, measured)]
+    return findings, measured.state
 
 
-def _link_findings(
-    config: BridgeConfig, bridge: Bridge, before: dict[str, int | float | str]
-) -> list[Finding]:
-    state, after = bridge.state(), bridge.counters()
+def _no_connection(config: BridgeConfig, counters: Counters) -> Finding:
+    found, why = "silence", "wiring, port, SERIALn_PROTOCOL=2, signing key"
+    if counters["fc_open_failures"] and not counters["fc_opened"]:
+        found = "cannot be opened"
+        why = "nothing there, no permission, or in use: is the companion running?"
+    return Finding("connection", found, f"heartbeats at {config.connection}", why, False, True)
 
-    def grown(key: str) -> float:
-        return float(after.get(key, 0)) - float(before.get(key, 0))
 
+def _measure(bridge: Bridge, gimbal: bool) -> _Measurement:
+    before, begun_s = bridge.counters(), time.monotonic()
+    time.sleep(_MEASURE_S)
+    after, seconds = bridge.counters(), time.monotonic() - begun_s
+
+    def angles() -> GimbalAttitude | None:
+        return bridge.gimbal_at(monotonic_ns() - _GIMBAL_AGE_NS)
+
+    if gimbal:  # one moment says little: a hiccup of this computer is no silence
+        sleep_until(lambda: angles() is not None, _MEASURE_S)
+    return _Measurement(bridge.state(), before, after, seconds, angles())
+
+
+def _vehicle_findings(config: BridgeConfig, measured: _Measurement) -> list[Finding]:
+    """Who is there, and whether it takes what is to be injected."""
+    state, message = measured.state, config.injection.message
     profile = select_profile(state.autopilot, state.version)
     version = "unknown" if state.version is None else ".".join(map(str, state.version))
-    round_trip = float(after["clock_round_trip_ms"])
-    attitude = grown("rx_ATTITUDE") / _MEASURE_S
-    wanted = config.attitude_rate_hz * _RATE_SHARE
-    received = max(grown("fc_messages") + grown("fc_skipped_messages"), 1.0)
-    lost = grown("fc_lost") / received
-    message = config.injection.message
+    several = bool(measured.after.get("bridge_other_autopilots"))
     findings = [
         Finding("connection", f"system {state.system_id}", "heartbeats", "", True, True),
+        Finding(
+            "vehicles",
+            "several" if several else "one",
+            "one, or bridge.system_id",
+            "positions and parameters must not go to another vehicle",
+            not several,
+            True,
+        ),
         Finding(
             "firmware",
             f"{state.autopilot} {version}",
@@ -147,38 +176,6 @@ def _link_findings(
             True,
         ),
         Finding(
-            "clock",
-            f"{state.clock_source}, {round_trip:.1f} ms",
-            f"timesync within {_ROUND_TRIP_LIMIT_MS:.0f} ms",
-            "attitude and gimbal are looked up at exposure time",
-            state.clock_source == "timesync" and round_trip <= _ROUND_TRIP_LIMIT_MS,
-            True,
-        ),
-        Finding(
-            "ATTITUDE",
-            f"{attitude:.0f} Hz",
-            f">= {wanted:.0f} Hz",
-            "raise the port's baud rate or lower attitude_rate_hz",
-            attitude >= wanted,
-            True,
-        ),
-        Finding(
-            "vehicles",
-            "several" if after.get("bridge_other_autopilots") else "one",
-            "one, or bridge.system_id",
-            "positions and parameters must not go to another vehicle",
-            not after.get("bridge_other_autopilots"),
-            True,
-        ),
-        Finding(
-            "lost messages",
-            f"{100 * lost:.1f} %",
-            f"<= {100 * _LOST_SHARE:.0f} %",
-            "flow control, baud rate, cable",
-            lost <= _LOST_SHARE,
-            False,
-        ),
-        Finding(
             "EKF origin",
             "read" if state.origin else ("configured" if config.origin else "none"),
             "read or configured",
@@ -192,15 +189,51 @@ def _link_findings(
         why = "external vision is not fused at lower rates; set bridge.injection.rate_hz"
         enough = rate >= _PX4_RATE_HZ
         findings.append(Finding("rate_hz", f"{rate:g}", ">= 30 for PX4", why, enough, False))
+    return findings
+
+
+def _stream_findings(config: BridgeConfig, measured: _Measurement) -> list[Finding]:
+    """Whether what localization needs comes often enough, in time and whole."""
+    source = measured.state.clock_source
+    round_trip = float(measured.after["clock_round_trip_ms"])
+    attitude = measured.grown("rx_ATTITUDE") / measured.seconds
+    wanted = config.attitude_rate_hz * _RATE_SHARE
+    received = measured.grown("fc_messages") + measured.grown("fc_skipped_messages")
+    lost = measured.grown("fc_lost") / max(received, 1.0)
+    findings = [
+        Finding(
+            "clock",
+            f"{source}, {round_trip:.1f} ms",
+            f"timesync within {_ROUND_TRIP_LIMIT_MS:.0f} ms",
+            "attitude and gimbal are looked up at exposure time",
+            source == "timesync" and round_trip <= _ROUND_TRIP_LIMIT_MS,
+            True,
+        ),
+        Finding(
+            "ATTITUDE",
+            f"{attitude:.0f} Hz",
+            f">= {wanted:.0f} Hz",
+            "raise the port's baud rate or lower attitude_rate_hz",
+            attitude >= wanted,
+            True,
+        ),
+        Finding(
+            "lost messages",
+            f"{100 * lost:.1f} %",
+            f"<= {100 * _LOST_SHARE:.0f} %",
+            "flow control, baud rate, cable",
+            lost <= _LOST_SHARE,
+            False,
+        ),
+    ]
     if config.camera.mount == "gimbal":
-        at = bridge.gimbal_at(time.monotonic_ns() - 200_000_000)
         findings.append(
             Finding(
                 "gimbal",
-                "silent" if at is None else at.source,
+                "silent" if measured.gimbal is None else measured.gimbal.source,
                 "GIMBAL_DEVICE_ATTITUDE_STATUS or MOUNT_STATUS",
                 "MNT1_TYPE; or bridge.camera.mount: fixed",
-                at is not None,
+                measured.gimbal is not None,
                 True,
             )
         )

@@ -55,7 +55,7 @@ class Station:
         )
 
     def command(self, command: int, component: int, *parameters: float) -> int:
-        """MAV_RESULT of a COMMAND_LONG to a component; -1 if nobody answers in 3 s."""
+        """MAV_RESULT of a COMMAND_LONG to a component; -1 if nobody answers."""
         padded = [*parameters, *([0.0] * (7 - len(parameters)))]
         fields = {"target_system": 1, "target_component": component, "command": command}
         fields |= {"confirmation": 0} | {f"param{i}": p for i, p in enumerate(padded, 1)}
@@ -67,7 +67,7 @@ class Station:
         def answers() -> list[dict[str, Any]]:
             return [m for m in self.heard["COMMAND_ACK"][before:] if m["command"] == command]
 
-        sleep_until(lambda: bool(answers()), 3.0)
+        sleep_until(lambda: bool(answers()), 30.0)
         return int(answers()[-1]["result"]) if answers() else -1
 
 

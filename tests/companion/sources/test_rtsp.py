@@ -127,7 +127,7 @@ def test_an_rtsp_camera_is_received_and_taken_up_again_when_it_hangs_up(real_tim
         period_ms = 1000 / RATE_HZ
         settings = SourceSettings(stall_timeout_s=1.0, latency_ms=period_ms)
         source = open_source(server.url, CAMERA, settings, lambda s, _: states.append(s))
-        errors, latencies = [], []
+        errors, latencies, ends_s = [], [], time.monotonic() + 120.0
         for count, frame in enumerate(source.frames()):
             sent = server.sent[_STEP * round(float(frame.image[140:].mean()) / _STEP)]
             errors.append((frame.exposure_time_ns - sent) / 1e6)
@@ -136,6 +136,7 @@ def test_an_rtsp_camera_is_received_and_taken_up_again_when_it_hangs_up(real_tim
                 server.hang_up()
             if count == 30:
                 break
+            assert time.monotonic() < ends_s, states
         source.close()
         server.close()
         print(f"\nRTSP: latency median {np.median(latencies):.1f} ms, exposure error "
