@@ -16,11 +16,10 @@ import numpy as np
 from arguments import Parser, existing, whole
 from named_errors import named_errors, needs_torch
 
-from localizer.synth.heightfield_render import render
-
 with needs_torch():
     import torch
 
+    from localizer.synth.heightfield_render import render
     from localizer.training.config import LiveSection, load_config
     from localizer.training.data import LoaderConfig, crop_pair, window_pair
     from localizer.training.live import LivePlan, LiveStream

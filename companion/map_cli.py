@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import os
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -9,6 +12,8 @@ import typer
 from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
+
+from companion.errors import ReportError
 
 app = typer.Typer(no_args_is_help=True)
 
@@ -160,6 +165,8 @@ def render(
     """A picture of the map and of its depth from a pose."""
     if out.suffix.lower() != ".png":
         raise typer.BadParameter(f"--out {out}: give a name that ends in .png")
+    depth = out.with_name(f"{out.stem}_depth{out.suffix}")
+    _require_place(out, depth)
     from localizer.camera import Camera
     from localizer.map import inspect
     from localizer.map.cache import TileCache
@@ -167,9 +174,9 @@ def render(
     opened = TileCache.open(cache)
     pose = inspect.camera_pose(opened, latitude, longitude, height, heading, pitch)
     view = inspect.render_view(opened, pose, Camera.from_fov(width, image_height, fov))
-    depth = out.with_name(f"{out.stem}_depth{out.suffix}")
-    inspect.write_picture(out, view.rgb)
-    inspect.write_picture(depth, inspect.depth_picture(view.depth))
+    with _written(out):
+        inspect.write_picture(out, view.rgb)
+        inspect.write_picture(depth, inspect.depth_picture(view.depth))
     shown = view.depth[view.depth > 0]
     Console().print(f"{out}, {depth}: depth {shown.min():.1f} to {shown.max():.1f} m")
 
@@ -183,10 +190,31 @@ def export(
     ] = None,
 ) -> None:
     """The map's surface as one GLB (y up, metres about the cache's origin)."""
-    if not out.parent.is_dir():  # told before the minutes that it takes
-        raise typer.BadParameter(f"--out {out}: no such folder")
+    _require_place(out)
     from localizer.map.cache import TileCache
     from localizer.map.inspect import export_glb
 
-    triangles = export_glb(TileCache.open(cache), out, level)
+    opened = TileCache.open(cache)
+    with _written(out):
+        triangles = export_glb(opened, out, level)
     Console().print(f"{out}: {triangles} triangles, {out.stat().st_size / 1e6:.1f} MB")
+
+
+def _require_place(*files: Path) -> None:
+    """Files that can be written as far as can be seen: told before the minutes that it takes."""
+    for file in files:
+        if file.is_dir():
+            raise typer.BadParameter(f"--out {file}: is a folder; give a file's name")
+        if not file.parent.is_dir():
+            raise typer.BadParameter(f"--out {file}: no such folder")
+        if not os.access(file if file.exists() else file.parent, os.W_OK):
+            raise typer.BadParameter(f"--out {file}: may not be written; choose another place")
+
+
+@contextmanager
+def _written(out: Path) -> Iterator[None]:
+    """Around the writing of a file: what the disk says is a named error."""
+    try:
+        yield
+    except OSError as error:
+        raise ReportError(f"--out {out}: cannot be written: {error.strerror or error}") from error

@@ -146,9 +146,10 @@ def depth_picture(depth: NDArray[np.float32]) -> Image:
 
 
 def write_picture(path: Path, rgb: Image) -> None:
-    """Write an RGB image; the suffix says the format."""
-    if not cv2.imwrite(str(path), cv2.cvtColor(rgb, cv2.COLOR_RGB2BGR)):
-        raise OSError(f"{path}: cannot be written")
+    """Write an RGB image; the suffix says the format. OSError where it cannot be written."""
+    # imencode, because imwrite prints a warning and keeps the reason for itself.
+    coded = cv2.imencode(path.suffix, cv2.cvtColor(rgb, cv2.COLOR_RGB2BGR))[1]
+    path.write_bytes(coded.tobytes())
 
 
 def export_glb(cache: TileCache, out: Path, level: int | None = None) -> int:

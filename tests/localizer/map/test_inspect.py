@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import shutil
 
 import cv2
@@ -11,6 +12,7 @@ import trimesh
 from typer.testing import CliRunner
 
 from companion.cli import app
+from companion.errors import ReportError
 from localizer.camera import Camera
 from localizer.errors import GeoreferenceError, OutsideMapError
 from localizer.map.cache import TileCache
@@ -115,6 +117,32 @@ def test_commands(source, tmp_path):
     damaged = run("verify", out)
     assert damaged.exit_code == 1
     assert "tile 2" in damaged.output
+
+
+@pytest.mark.parametrize("what", ["render", "export"])
+@pytest.mark.parametrize(
+    ("place", "why"),
+    [("folder.png", "is a folder"), ("none/v.png", "no such folder"),
+     ("v.png", "may not be written"), ("v.png", "cannot be written: No space left")],
+)  # fmt: skip
+def test_a_place_that_cannot_be_written_is_one_line(cache, tmp_path, monkeypatch, what, place, why):
+    (tmp_path / "folder.png").mkdir()
+
+    def full(_path, _data):
+        raise OSError(28, "No space left on device")
+
+    if "may not" in why:  # root, as whom tests may run, is refused nothing
+        monkeypatch.setattr("os.access", lambda _path, mode: mode != os.W_OK)
+    elif "No space" in why:
+        monkeypatch.setattr("pathlib.Path.write_bytes", full)
+    pose = ["--latitude", 47.2, "--longitude", 8.2, "--height", 500, "--width", 64]
+    result = run(what, cache.path, *(pose if what == "render" else ()), "--out", tmp_path / place)
+    if "No space" in why:
+        assert isinstance(result.exception, ReportError)
+        assert why in str(result.exception)
+    else:
+        assert result.exit_code == 2
+        assert why in " ".join(result.output.replace("│", " ").split())
 
 
 def test_dask_builds_the_same_cache(source, cache, tmp_path):
