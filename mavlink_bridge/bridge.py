@@ -70,7 +70,7 @@ class Bridge:
         on_text: Callable[[int, str], None] = lambda _severity, _text: None,
     ) -> None:
         self._config = config
-        self._started = False
+        self._started = self._stopped = False
         self._utc = SteadyUtc()
         self._health_lock = threading.Lock()
         self._text_lock = threading.Lock()
@@ -147,7 +147,10 @@ class Bridge:
             link.start()
 
     def stop(self) -> None:
-        """Close the links; the bridge cannot be started again."""
+        """Close the links; the bridge cannot be started again. Harmless when called again."""
+        if self._stopped:
+            return
+        self._stopped = True
         for link in self._links:
             link.stop()
         if self._cot is not None:

@@ -21,7 +21,7 @@ log = logging.getLogger(__name__)
 _MAX_BYTES = 2 << 30
 _MAX_WAITING = 8192  # frames: 10 s of five times the usual traffic
 _WRITE_EVERY_S = 0.2
-
+_CLOSE_S = 5.0
 
 _DISK_FAULTS = (errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.EIO)
 
@@ -81,10 +81,13 @@ class TlogRecorder:
         self._waiting.append((time_us, frame))
 
     def close(self) -> None:
-        """Write what waits and close the file."""
+        """Write what waits and close the file; a disk that stands still is left behind."""
         self._stop.set()
         if self._thread is not None:
-            self._thread.join(timeout=5.0)
+            self._thread.join(_CLOSE_S)
+            if self._thread.is_alive():
+                log.warning("%s: the record is incomplete: its disk does not answer", self._path)
+                return
         if self._file is not None:
             try:
                 self._file.close()

@@ -99,9 +99,11 @@ def test_greatest_size_and_bounded_queue(tmp_path: Path) -> None:
     idle.close()
 
 
-def test_a_disk_that_stalls_does_not_stall_the_sender(tmp_path: Path) -> None:
+def test_a_disk_that_stalls_does_not_stall_the_sender(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     recorder = TlogRecorder(tmp_path / "a.tlog")
-    writing, written = threading.Event(), threading.Event()
+    writing, written, closed = threading.Event(), threading.Event(), threading.Event()
     waited_in_vain = []
 
     class Stalled:
@@ -113,7 +115,8 @@ def test_a_disk_that_stalls_does_not_stall_the_sender(tmp_path: Path) -> None:
                 waited_in_vain.append(len(data))
             return len(data)
 
-        def close(self) -> None: ...
+        def close(self) -> None:
+            closed.set()
 
     assert recorder._file is not None
     recorder._file.close()
@@ -123,8 +126,13 @@ def test_a_disk_that_stalls_does_not_stall_the_sender(tmp_path: Path) -> None:
     assert writing.wait(30.0)
     for i in range(1, 100):
         recorder.write(frame(i), i)
+    monkeypatch.setattr("mavlink_bridge.recorder._CLOSE_S", 0.1)
+    recorder.close()  # nor its end; the file is still in use then
+    assert not closed.is_set()
     written.set()
+    monkeypatch.undo()
     recorder.close()
+    assert closed.is_set()
     assert waited_in_vain == []
     assert recorder.dropped == 0
 
