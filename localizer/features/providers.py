@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import contextlib
+import errno
 import logging
+import os
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -44,22 +47,23 @@ def start_session(
     once: engines are built and algorithms chosen there, not at the first frame.
 
     only: short name of the provider to use instead of the best. Each provider that does not run the
-    model is one warning. Raises `ModelError` when none does.
+    model is one warning; TensorRT is tried again without what it kept, which may be damaged. Raises
+    `ModelError` when none does.
     """
     available = ort.get_available_providers()
     names = [name for name in (_TENSORRT, _CUDA, _CPU) if name in available]
     if only is not None:
         names = [name for name in names if SHORT_NAMES[name] == only]
     for k, name in enumerate(names):
-        # What a provider cannot compute goes to the ones after it.
-        providers = [_configured(n, expected) for n in names[k:]]
+        kept = _kept(expected) if name == _TENSORRT else []
         try:
-            session = ort.InferenceSession(
-                str(model), options, providers=providers, enable_fallback=False
-            )
-            if name != session.get_providers()[0]:
-                raise RuntimeError("its libraries could not be loaded")
-            check(session)
+            try:
+                return _started(model, options, expected, names[k:], check)
+            except Exception as error:
+                if not _removed(kept):
+                    raise
+                logger.warning("features: TensorRT builds its engine anew: %s", _line(error))
+                return _started(model, options, expected, names[k:], check)
         except Exception as error:  # onnxruntime raises its own untyped exceptions
             if k + 1 == len(names):
                 if isinstance(error, ModelError):
@@ -67,13 +71,31 @@ def start_session(
                 raise ModelError(f"{model}: onnxruntime cannot load it: {error}") from error
             logger.warning(
                 "features: %s does not run %s, trying %s: %s",
-                SHORT_NAMES[name], model.name, SHORT_NAMES[names[k + 1]], str(error).split("\n")[0],
+                SHORT_NAMES[name], model.name, SHORT_NAMES[names[k + 1]], _line(error),
             )  # fmt: skip
-        else:
-            return session
     raise ModelError(
         f"{model}: this onnxruntime has no {only or 'provider'} that can run it: {available}"
     )
+
+
+def _started(
+    model: Path,
+    options: ort.SessionOptions,
+    expected: Expected,
+    names: list[str],
+    check: Callable[[ort.InferenceSession], None],
+) -> ort.InferenceSession:
+    """A session on the first of the providers; what it cannot compute goes to those after it."""
+    providers = [_configured(n, expected) for n in names]
+    session = ort.InferenceSession(str(model), options, providers=providers, enable_fallback=False)
+    if names[0] != session.get_providers()[0]:
+        raise RuntimeError("its libraries could not be loaded")
+    check(session)
+    return session
+
+
+def _line(error: Exception) -> str:
+    return str(error).split("\n")[0]
 
 
 def provider_of(session: ort.InferenceSession) -> str:
@@ -82,28 +104,69 @@ def provider_of(session: ort.InferenceSession) -> str:
     return SHORT_NAMES.get(name, name.removesuffix("ExecutionProvider"))
 
 
-def _configured(name: str, expected: Expected) -> Provider:
-    if name != _TENSORRT:
-        return name
+def _prefix(expected: Expected) -> str:
+    """Of kept engines: those of other weights, sizes or precision must not be taken for this's."""
+    kind = "float16" if expected.half else "float32"
+    height, width = _sides(expected)
+    return f"{expected.sha256[:16]}-{width}x{height}-{kind}"
+
+
+def _sides(expected: Expected) -> tuple[int, int]:
+    side = 4 * expected.multiple
+    return max(expected.height, side), max(expected.width, side)
+
+
+def _kept(expected: Expected) -> list[Path]:
+    """What TensorRT kept of such a model, and its timings."""
+    folder = cache_folder("tensorrt")
+    try:
+        return sorted([*folder.glob(f"{_prefix(expected)}*"), *folder.glob("*.timing")])
+    except OSError:
+        return []
+
+
+def _removed(files: list[Path]) -> bool:
+    """Whether one of them could be removed."""
+    removed = False
+    for file in files:
+        with contextlib.suppress(OSError):
+            file.unlink()
+            removed = True
+    return removed
+
+
+def _kept_in(expected: Expected) -> dict[str, str]:
+    """Options that keep the engine; none, with a warning, where the folder takes no files: then it
+    is built, a minute or more, at every start.
+    """
     folder = cache_folder("tensorrt")
     try:
         folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:  # then it builds its engine, a minute or more, at every start
+        if not os.access(folder, os.W_OK | os.X_OK):
+            raise PermissionError(errno.EACCES, "may not be written", str(folder))
+    except OSError as error:
         logger.warning("features: TensorRT's engine is not kept: %s", error)
+        return {}
+    return {
+        "trt_engine_cache_enable": "True",
+        "trt_engine_cache_path": str(folder),
+        "trt_engine_cache_prefix": _prefix(expected),
+        "trt_timing_cache_enable": "True",
+        "trt_timing_cache_path": str(folder),
+    }
+
+
+def _configured(name: str, expected: Expected) -> Provider:
+    if name != _TENSORRT:
+        return name
     side = 4 * expected.multiple
+    height, width = _sides(expected)
 
     def shape(height: int, width: int) -> str:
         return f"image:1x{height}x{width}x3"
 
-    kind = "float16" if expected.half else "float32"
-    height, width = max(expected.height, side), max(expected.width, side)
     return name, {
-        "trt_engine_cache_enable": "True",
-        "trt_engine_cache_path": str(folder),
-        # Engines of other weights, sizes or precision must not be taken for this one's.
-        "trt_engine_cache_prefix": f"{expected.sha256[:16]}-{width}x{height}-{kind}",
-        "trt_timing_cache_enable": "True",
-        "trt_timing_cache_path": str(folder),
+        **_kept_in(expected),
         "trt_fp16_enable": str(expected.half),
         "trt_profile_min_shapes": shape(side, side),
         "trt_profile_opt_shapes": shape(height, width),

@@ -58,6 +58,9 @@ def install(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Callable[..., As
             assert rest == {"enable_fallback": False}
             first = providers[0] if isinstance(providers[0], str) else providers[0][0]
             fault = broken.get(first.removesuffix("ExecutionProvider"), "")
+            kept = [f for f in tmp_path.glob("tensorrt/*") if f.read_bytes() == b"damaged"]
+            if fault == "kept" and kept:
+                raise RuntimeError(f"could not deserialize engine from cache: {kept[0]}")
             if fault == "start":
                 raise RuntimeError("libnvinfer.so.10: cannot open shared object file\nmore")
             real = START(path, options, providers=["CPUExecutionProvider"])
@@ -167,3 +170,50 @@ def test_tensorrt_keeps_its_engine_and_knows_the_sizes(
         assert all(a <= b <= c for a, b, c in zip(*shapes, strict=True))
         prefixes.add(options["trt_engine_cache_prefix"])
     assert len(prefixes) == 3
+
+
+def test_a_kept_engine_that_is_damaged_is_built_anew(
+    install: Callable[..., Asked], tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    """As after a power cut while it was written: TensorRT refuses it at every start."""
+    asked = install(["TensorRT", "CUDA", "CPU"])
+    OnnxExtractor(SHIPPED_MODEL)
+    prefix = asked[0][0][1]["trt_engine_cache_prefix"]
+    folder = tmp_path / "tensorrt"
+    for name in (f"{prefix}_sm87.engine", "TensorrtExecutionProvider_cache_sm87.timing"):
+        (folder / name).write_bytes(b"damaged")
+    (folder / "another-models.engine").write_bytes(b"sound")
+    install(["TensorRT", "CUDA", "CPU"], Tensorrt="kept")
+    assert OnnxExtractor(SHIPPED_MODEL).provider == "TensorRT"
+    assert [f.name for f in folder.iterdir()] == ["another-models.engine"]
+    assert len(caplog.messages) == 1
+    assert "TensorRT builds its engine anew: could not deserialize" in caplog.messages[0]
+
+
+def test_what_was_kept_is_not_always_to_blame(
+    install: Callable[..., Asked], tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    asked = install(["TensorRT", "CUDA", "CPU"])
+    OnnxExtractor(SHIPPED_MODEL)
+    (tmp_path / "tensorrt" / asked[0][0][1]["trt_engine_cache_prefix"]).write_bytes(b"sound")
+    install(["TensorRT", "CUDA", "CPU"], Tensorrt="run")
+    assert OnnxExtractor(SHIPPED_MODEL).provider == "CUDA"
+    assert "does not run tiny.onnx, trying CUDA" in caplog.messages[-1]
+
+
+@pytest.mark.parametrize("how", ["a file", "not to be written"])
+def test_a_cache_folder_that_takes_no_engine_is_told(
+    how: str, install: Callable[..., Asked], tmp_path: Path, caplog: pytest.LogCaptureFixture,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:  # fmt: skip
+    asked = install(["TensorRT", "CUDA", "CPU"])
+    if how == "a file":
+        (tmp_path / "tensorrt").write_bytes(b"")
+    else:  # root, as whom tests may run, is refused nothing
+        monkeypatch.setattr("os.access", lambda *_: False)
+    assert OnnxExtractor(SHIPPED_MODEL).provider == "TensorRT"
+    _, options = asked[0][0]
+    assert not any("cache" in key for key in options)
+    assert len(caplog.messages) == 1
+    assert caplog.messages[0].startswith("features: TensorRT's engine is not kept: ")
+    assert str(tmp_path / "tensorrt") in caplog.messages[0]
