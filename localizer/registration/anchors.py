@@ -60,7 +60,8 @@ def _candidates(
     the cell's middle, would shift the pose (measured: 0.02 px of the finest level).
     """
     hole = ~(np.isfinite(depth) & (depth > 0))
-    inverse = np.where(hole, 0.0, 1.0 / np.maximum(depth, 1e-3)).astype(np.float32)
+    # 0 in holes, whatever stands there: no arithmetic touches it.
+    inverse = (1.0 / np.maximum(np.where(hole, np.inf, depth), 1e-3)).astype(np.float32)
     edge = np.zeros(depth.shape, dtype=bool)
     # On a plane, 1/depth is linear in the pixel whatever the slant, so a grazing road is no edge.
     limit = _MAX_CURVATURE * inverse

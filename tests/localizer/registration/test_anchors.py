@@ -98,3 +98,18 @@ def test_compiled_sampling_is_the_references(reference):
     x, y = rng.uniform(-3, 40, 500), rng.uniform(-3, 40, 500)
     exact = sample_bilinear(level.features, x, y)
     np.testing.assert_allclose(sample_features(level.features, x, y), exact, atol=1e-6)
+
+
+@pytest.mark.filterwarnings("error")
+@pytest.mark.parametrize("pattern", [0x7FA00000, 0x7FC00000, 0xFF800000, 0x7F7FFFFF, 1, 0x80000000])
+def test_what_is_no_depth_is_a_hole_without_a_warning(reference, pattern):
+    """Signalling NaN, NaN, -inf, the largest and the smallest number, -0."""
+    view, pyramid = reference
+    depth = view.depth.copy()
+    depth.view(np.uint32)[60:64, 80:84] = pattern
+    anchors = select_anchors(replace(view, depth=depth), pyramid)
+    assert np.isfinite(anchors.points_world).all()
+    u, v = anchors.pixels.T
+    assert not np.any((np.abs(u - 82) < 3) & (np.abs(v - 62) < 3))
+    whole = select_anchors(view, pyramid)
+    assert len(anchors.pixels) == len(whole.pixels)
