@@ -39,6 +39,7 @@ _log = logging.getLogger(__name__)
 # How long a thread may keep the interpreter from another that woke up. Python's 5 ms, several times
 # between an estimate and the autopilot, would be 7 ms in the median (benchmarks/bridge.py).
 _SWITCH_S = 0.0002
+_CLICK_NS = 2_000_000_000  # how old the pose may be that an operator's click is placed by
 _WARNING = 4  # MAV_SEVERITY_WARNING; lower is worse
 
 
@@ -138,6 +139,7 @@ class Companion:
             lambda: self._is_recorded,
         )
         self._was_tracking = False
+        self._click_refused_ns = 0
         self._target_numbers: dict[str, int] = {}
         self._feed_error: Exception | None = None
 
@@ -228,7 +230,13 @@ class Companion:
     def _on_track(self, request: TrackRequest) -> None:
         """The ground station's click: the place under that pixel of the newest localized frame."""
         newest = self._newest
-        if request.kind == "stop" or newest is None:
+        if request.kind == "stop":
+            return
+        if newest is None or request.time_ns - newest.exposure_time_ns > _CLICK_NS:
+            # The operator points into the present picture; an old pose would place it elsewhere.
+            if request.time_ns - self._click_refused_ns > _CLICK_NS:
+                self._click_refused_ns = request.time_ns
+                self._bridge.say(_WARNING, "PiLoT: no target: the camera's position is not known")
             return
         x, y = np.array(request.coordinates).reshape(-1, 2).mean(axis=0)
         u, v = x * newest.camera.width, y * newest.camera.height

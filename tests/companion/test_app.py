@@ -7,6 +7,7 @@ import logging
 import os
 import threading
 from pathlib import Path
+from types import SimpleNamespace
 
 import cv2
 import numpy as np
@@ -17,7 +18,7 @@ from companion.config import parse_config
 from companion.errors import ConfigError, StreamOpenError
 from mavlink_bridge.bridge import Bridge
 from mavlink_bridge.link import sleep_until
-from mavlink_bridge.messages import without_figures
+from mavlink_bridge.messages import TrackRequest, without_figures
 from sitl.embedded.geodesy import Location
 from sitl.vehicles import GIMBAL, EmbeddedSitl, vision_parameters
 
@@ -76,6 +77,29 @@ def test_the_order_to_stop_takes_no_lock():
     with companion._feed_ended._cond:
         threading.Thread(target=order, daemon=True).start()
         assert ordered.wait(30.0)
+
+
+@pytest.mark.parametrize(("age_s", "placed"), [(0.3, True), (2.5, False), (None, False)])
+def test_a_click_is_not_placed_by_an_old_pose(age_s, placed):
+    """The operator points into the present picture, and is told when nobody knows where it is."""
+    second, now_ns = 10**9, 10**12
+    companion = Companion(
+        parse_config({"map": "m", "camera": {"source": "s", "model": MODEL}}, "test")
+    )
+    camera = SimpleNamespace(width=160, height=120)
+    detections, texts = [], []
+    companion._newest = None if age_s is None else SimpleNamespace(
+        camera=camera, exposure_time_ns=now_ns - round(age_s * second)
+    )  # fmt: skip
+    companion._click_refused_ns = 0
+    companion._targets = SimpleNamespace(add_detection=detections.append)
+    companion._bridge = SimpleNamespace(say=lambda _, text: texts.append(text))
+    for k in range(5):  # an impatient operator
+        companion._on_track(TrackRequest("point", now_ns + k, (0.5, 0.25)))
+    companion._on_track(TrackRequest("stop", now_ns))
+    assert [(d.u, d.v) for d in detections] == ([(80.0, 30.0)] * 5 if placed else [])
+    told = ["PiLoT: no target: the camera's position is not known"]
+    assert texts == ([] if placed else told)
 
 
 def test_what_happens_is_logged_and_recorded_once_and_every_thread_ends(
