@@ -492,6 +492,7 @@ def test_tlog_is_read_by_pymavlinks_own_tools(
     while (m := log.recv_match()) is not None:
         kinds.add(m.get_type())
         stamps.append(m._timestamp)
+    log.close()
     assert {"ATTITUDE", "HEARTBEAT", "VISION_POSITION_ESTIMATE", "TIMESYNC"} <= kinds
     assert "BAD_DATA" not in kinds
     assert begun_s - 0.1 <= stamps[0] <= stamps[-1] <= ended_s + 0.1

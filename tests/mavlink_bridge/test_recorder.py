@@ -149,6 +149,7 @@ def test_mavlogdump_and_mavutil_read_every_frame(tmp_path: Path) -> None:
     stamps = []
     while (m := log.recv_match(type="ATTITUDE")) is not None:
         stamps.append((m.time_boot_ms, m._timestamp))
+    log.close()
     assert [boot for boot, _ in stamps] == list(range(200))
     assert stamps[-1][1] - begun == pytest.approx(0.02 * 199, abs=1e-3)
     tool = Path(sys.executable).with_name("mavlogdump.py")

@@ -85,6 +85,7 @@ def test_an_independent_client_through_the_autopilots_routing(vehicle: Any, tmp_
     log = mavutil.mavlink_connection(str(path))
     while (m := log.recv_match()) is not None:
         kinds[m.get_type()] = kinds.get(m.get_type(), 0) + 1
+    log.close()
     assert kinds.pop("BAD_DATA", 0) == 0
     assert kinds["CAMERA_TRACKING_GEO_STATUS"] > 0
     assert kinds["ATTITUDE"] > 10
