@@ -82,6 +82,8 @@ class ExposureClock:
         self._by_misp = MinimumLag(latency_ns)
         self._warned = False
         self._wall_clock_ns: int | None = None
+        self._excess_ns: int | None = None  # of the smallest lag's times over the exact ones
+        self._held = False
 
     def exposure_time(self, stamps: Stamps, arrival_ns: int) -> int:
         """CLOCK_MONOTONIC nanoseconds of the exposure of a frame that arrived at `arrival_ns`."""
@@ -96,12 +98,14 @@ class ExposureClock:
     def _from_misp(self, misp: MispTime, arrival_ns: int) -> int:
         # Both clocks are read anew for each frame, because NTP may step the system's clock.
         offset_ns = system_minus_monotonic()
-        self._watch_wall_clock(offset_ns)
         monotonic = misp.time_us * 1000 - offset_ns
         relative = self._by_misp.map(misp.time_us * 1000, arrival_ns)
-        if misp.locked and _plausible(monotonic, arrival_ns):
+        exact = misp.locked and _plausible(monotonic, arrival_ns)
+        self._watch_wall_clock(offset_ns)
+        if exact and self._agrees(relative - monotonic):
+            self._excess_ns, self._held = relative - monotonic, False
             return monotonic
-        if not self._warned:
+        if not exact and not self._warned:
             self._warned = True
             _log.warning(
                 "the camera's MISP clock is not the companion's (locked: %s, age %.3f s): using "
@@ -109,15 +113,26 @@ class ExposureClock:
                 misp.locked,
                 (arrival_ns - monotonic) / 1e9,
             )
-        return relative
+        # With what is known of the lag from the stamps that were exact before.
+        known = relative - (self._excess_ns or 0)
+        return known if _plausible(known, arrival_ns) else relative
+
+    def _agrees(self, excess_ns: int) -> bool:
+        """Whether a stamp may be taken as it is: after a step of this computer's clock only if it
+        says of the lag what the stamps before the step said.
+        """
+        if not self._held or self._excess_ns is None:
+            return True
+        return abs(excess_ns - self._excess_ns) <= _STEP_NS
 
     def _watch_wall_clock(self, offset_ns: int) -> None:
-        """A step moves all exposure times with it: right if it was set right, and else unseen."""
+        """A step of it must not enter the flight: the vehicle has not moved."""
         before, self._wall_clock_ns = self._wall_clock_ns, offset_ns
         if before is not None and abs(offset_ns - before) > _STEP_NS:
+            self._held = True
             _log.warning(
                 "this computer's clock was stepped by %+.3f s: the exposure times of the camera's "
-                "MISP clock moved against it; let NTP slew in flight, not step",
+                "MISP clock are kept as they were, by the lag known before; let NTP slew, not step",
                 (offset_ns - before) / 1e9,
             )
 

@@ -134,7 +134,7 @@ def test_without_any_stamp_the_arrival_less_the_latency_is_left() -> None:
 
 
 @pytest.mark.parametrize("step_s", [0.0, 0.3, -0.1])
-def test_a_step_of_the_wall_clock_is_told(
+def test_a_step_of_the_wall_clock_is_told_and_enters_no_exposure_time(
     clocks: Clocks, caplog: pytest.LogCaptureFixture, step_s: float
 ) -> None:
     clock, camera_offset_ns = ExposureClock(0), clocks.offset_ns
@@ -148,11 +148,29 @@ def test_a_step_of_the_wall_clock_is_told(
 
     assert seen() == pytest.approx(120e6, abs=0.1e6)
     clocks.offset_ns += round(step_s * 1e9)
-    assert seen() == pytest.approx(120e6 + step_s * 1e9, abs=0.1e6)
-    seen()
+    for _ in range(3):
+        assert seen() == pytest.approx(120e6, abs=0.1e6)
+    camera_offset_ns += round(step_s * 1e9)  # the camera follows, whose clock hangs on ours
+    # A lag that grew may be the line's: it is the camera's once the smaller one is forgotten.
+    ages = [seen() for _ in range(230)]
+    assert ages[200:] == pytest.approx([120e6] * 30, abs=0.1e6)
+    assert step_s < 0 or ages == pytest.approx([120e6] * 230, abs=0.1e6)
     told = [r.getMessage() for r in caplog.records if "clock was stepped" in r.getMessage()]
     assert len(told) == (1 if step_s else 0)
     assert all(f"{step_s:+.1f}" in text for text in told)
+
+
+def test_a_camera_that_loses_its_reference_keeps_its_times(clocks: Clocks) -> None:
+    """As one does whose clock hangs on the GNSS that is denied: the status bit falls, no more."""
+    clock = ExposureClock(latency_ns=0)
+    for k in range(40):
+        clocks.now_ns += 100 * MS
+        now = clocks.now_ns
+        lag = (120 + 7 * (k % 3)) * MS
+        misp = MispTime((now - lag + clocks.offset_ns) // 1000, locked=k < 20)
+        exposed = clock.exposure_time(Stamps(None, misp), now)
+        if k > 5:
+            assert exposed == pytest.approx(now - lag, abs=0.2 * MS)
 
 
 def test_another_thread_between_two_readings_of_the_clocks_costs_nothing(clocks: Clocks) -> None:
