@@ -8,6 +8,7 @@ from pydantic import BaseModel, ConfigDict, Field
 
 from localizer.pose import Array
 from localizer.registration.backend import LMSettings
+from localizer.registration.covariance import NoiseModel
 from localizer.registration.hypotheses import generate_hypotheses
 from localizer.types import PosePrior
 
@@ -102,6 +103,15 @@ class JNGOConfig(BaseModel):
     covariance_floor: float = Field(
         default=0.05, ge=0, le=1, description="least share of the isotropic model"
     )
+    shape_cells: float = Field(
+        default=40.0, ge=0, le=1e6, description="cells that the noise's model shape counts for"
+    )
+    map_error_m2: float = Field(
+        default=0.1,
+        ge=0,
+        le=1e4,
+        description="the map's displacement (sigma) times the length over which it is the same",
+    )
     max_sigma_m: float = Field(
         default=50.0, ge=0.01, le=1000, description="position sigma that counts as no texture"
     )
@@ -110,6 +120,17 @@ class JNGOConfig(BaseModel):
     def settings(self) -> LMSettings:
         """What the backends need of it."""
         return LMSettings(self.huber, damping=self.damping, min_overlap=self.min_overlap)
+
+    @property
+    def noise(self) -> NoiseModel:
+        """What the covariance needs of it."""
+        return NoiseModel(
+            self.correlation,
+            self.covariance_floor,
+            self.few_anchors,
+            self.shape_cells,
+            self.map_error_m2,
+        )
 
     def swarm(self, prior: PosePrior, seed: int) -> tuple[Array, Array]:
         """Rotations (M, 3, 3) and centres (M, 3) of the hypotheses about a prior."""

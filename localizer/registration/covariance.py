@@ -29,8 +29,8 @@ class AnchorModel:
 
     projection: (N, 2, 6) of equation 6; structure: (N, 2, 2) and slope: (N, 2), S and b of
     equation 7; squares: (N,) squared residual norms; weights: (N,) joint confidences; robust: (N,)
-    the loss's weights; cell: (N,) number, from 0 on, of the image cell in which it lies; channels:
-    C; prior_hessian: (6, 6).
+    the loss's weights; cell: (N,) number, from 0 on, of the image cell in which it lies; cell_px:
+    side of a cell in level px; channels: C; prior_hessian: (6, 6).
     """
 
     projection: Array
@@ -40,6 +40,7 @@ class AnchorModel:
     weights: Array
     robust: Array
     cell: NDArray[np.int64]
+    cell_px: float
     channels: int
     prior_hessian: Array
 
@@ -72,6 +73,7 @@ def anchor_model(
         confidence,
         robust_loss(np.sqrt(squares), settings)[1],
         _cells(u, v, cell_px),
+        cell_px,
         residuals.shape[1],
         prior_hessian,
     )
@@ -88,15 +90,16 @@ def _cells(u: Array, v: Array, side: float) -> NDArray[np.int64]:
 class CovarianceSums:
     """What equation 11 adds up over the anchors in view. hessian: Σ ŵ JᵀSJ, without the prior;
     meat: Σ_cells G Gᵀ; isotropic: Σ ŵ² σ_r² JᵀSJ, all (6, 6); cells: how many are occupied;
-    prior_hessian: (6, 6); motion: (6, 6), mean of JᵀJ, so that xi moves the image by
-    sqrt(xi' motion xi) level px, rms; anchors: how many are in view, of all that the pose was
-    fitted to; share: of those, that were added up; curvature: equation 11a.
+    cell_px: their side in level px; prior_hessian: (6, 6); motion: (6, 6), mean of JᵀJ, so that xi
+    moves the image by sqrt(xi' motion xi) level px, rms; anchors: how many are in view, of all that
+    the pose was fitted to; share: of those, that were added up; curvature: equation 11a.
     """
 
     hessian: Array
     meat: Array
     isotropic: Array
     cells: int
+    cell_px: float
     prior_hessian: Array
     motion: Array
     anchors: int
@@ -123,6 +126,7 @@ def covariance_sums(model: AnchorModel) -> CovarianceSums | None:
         per_cell.T @ per_cell,
         variance * (share * information).sum(axis=0),
         cells,
+        model.cell_px,
         model.prior_hessian,
         mean_motion(J),
         len(J),
@@ -155,37 +159,81 @@ def curvature_ratio(scores: Array, steps: Array, hessian: Array) -> float:
     return max(float(ratios.mean()), _LEAST_CURVATURE) if len(ratios) else _LEAST_CURVATURE
 
 
+@dataclass(frozen=True)
+class NoiseModel:
+    """What the covariance assumes of the noise. correlation: variance factor for what the sums
+    cannot see (11b); floor: least share of the isotropic model, so that a perfect fit does not
+    claim perfect knowledge; few_anchors: anchors in view with which the noise counts twice (11b);
+    shape_cells: cells that the isotropic model's shape counts for (11c); map_error: standard
+    deviation of the map's displacement times the length over which it is the same, m² (11d).
+    """
+
+    correlation: float
+    floor: float = 0.0
+    few_anchors: float = 0.0
+    shape_cells: float = 0.0
+    map_error: float = 0.0
+
+
 def sandwich_covariance(
-    sums: CovarianceSums,
-    correlation: float,
-    floor: float,
-    few_anchors: float = 0.0,
-    prior_weight: float = 0.0,
+    sums: CovarianceSums, noise: NoiseModel, prior_weight: float = 0.0
 ) -> Array | None:
     """Covariance (6, 6) of xi = (rho, phi) at the optimum, None where H is singular.
 
     The sandwich of equation 11 takes the residuals' variance, and their correlation between
-    channels and within a cell of the image, from the data. correlation: variance factor for what
-    it cannot see. floor: least share of the isotropic model, so that a perfect fit does not claim
-    perfect knowledge. few_anchors: anchors in view with which the noise counts twice (11b). A prior
-    of weight `prior_weight` adds its own noise.
+    channels and within a cell of the image, from the data. A prior of weight `prior_weight` adds
+    its own noise.
     """
-    hessian = sums.curvature * sums.hessian + sums.prior_hessian
-    diagonal = np.diag(hessian)
+    inverse = _inverse(sums.curvature * sums.hessian + sums.prior_hessian)
+    if inverse is None or sums.cells <= 6:
+        return None
+    factor = noise.correlation * sums.share * (1.0 + noise.few_anchors / max(sums.anchors, 1))
+    meat = factor * (_shrunk_meat(sums, noise.shape_cells) + noise.floor * sums.isotropic)
+    if noise.map_error > 0:
+        displaced = _map_displacement(sums, noise.map_error)
+        if displaced is None:
+            return None
+        meat = meat + sums.curvature**2 * sums.hessian @ displaced @ sums.hessian
+    covariance: Array = inverse @ (meat + prior_weight * sums.prior_hessian) @ inverse
+    return 0.5 * (covariance + covariance.T)
+
+
+def _inverse(matrix: Array) -> Array | None:
+    """Of a positive definite matrix, whatever its rows' units; None where it is singular."""
+    diagonal = np.diag(matrix)
     if not np.all(diagonal > 0):
         return None
     spread = 1.0 / np.sqrt(diagonal)
-    scaled = hessian * np.outer(spread, spread)
+    scaled = matrix * np.outer(spread, spread)
     if np.linalg.eigvalsh(scaled)[0] < 1e-9:
         return None
-    inverse = np.linalg.inv(scaled) * np.outer(spread, spread)
-    if sums.cells <= 6:
+    inverse: Array = np.linalg.inv(scaled) * np.outer(spread, spread)
+    return inverse
+
+
+def _shrunk_meat(sums: CovarianceSums, shape_cells: float) -> Array:
+    """Equation 11c: the meat, drawn towards the isotropic model of the same size."""
+    freedom = sums.cells - 6
+    meat = sums.meat * (sums.cells / freedom)
+    shape = _inverse(sums.isotropic)
+    if shape is None:
+        return meat
+    ratio = float(np.einsum("ij,ji->", shape, meat)) / 6
+    drawn: Array = (freedom * meat + shape_cells * ratio * sums.isotropic) / (freedom + shape_cells)
+    return drawn
+
+
+def _map_displacement(sums: CovarianceSums, map_error: float) -> Array | None:
+    """Equation 11d: covariance (6, 6) of xi by displaced patches of the map, None where the anchors
+    do not span a pose.
+    """
+    inverse = _inverse(sums.motion)
+    if inverse is None:
         return None
-    meat = sums.meat * (sums.cells / (sums.cells - 6))
-    factor = correlation * sums.share * (1.0 + few_anchors / max(sums.anchors, 1))
-    noise = factor * (meat + floor * sums.isotropic)
-    covariance: Array = inverse @ (noise + prior_weight * sums.prior_hessian) @ inverse
-    return 0.5 * (covariance + covariance.T)
+    px_per_m = np.sqrt(0.5 * (sums.motion[0, 0] + sums.motion[1, 1]))
+    area = sums.cells * (sums.cell_px / px_per_m) ** 2
+    displaced: Array = (map_error * px_per_m) ** 2 / area * inverse
+    return displaced
 
 
 def pose_covariance(tangent: Array, rotation: Array, translation: Array) -> Array:

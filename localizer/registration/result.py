@@ -62,13 +62,7 @@ def registration(found: Found, config: JNGOConfig, prior: PosePrior, origin: Arr
     """The chosen pose with its covariance (equations 11 to 14), or NO_TEXTURE."""
     tangent = None
     if found.sums is not None:
-        tangent = sandwich_covariance(
-            found.sums,
-            config.correlation,
-            config.covariance_floor,
-            config.few_anchors,
-            found.prior_weight,
-        )
+        tangent = sandwich_covariance(found.sums, config.noise, found.prior_weight)
     if found.sums is None or tangent is None:
         return failure(prior, RegistrationStatus.NO_TEXTURE, found.evaluations)
     rotations, centres = world_from_camera(found.rotations, found.translations, origin)

@@ -41,7 +41,8 @@ def register_on_device(
         return failure(prior, RegistrationStatus.BAD_FEATURES)
     if len(search.scores) == 0:
         return failure(prior, RegistrationStatus.NO_OVERLAP, search.evaluations)
-    return registration(_found(search, local), config, prior, origin)
+    cell_px = config.correlation_px / query.levels[-1].stride
+    return registration(_found(search, local, cell_px), config, prior, origin)
 
 
 def _local_constraint(constraint: PoseConstraint | None, origin: Array) -> QuadraticPrior | None:
@@ -52,15 +53,15 @@ def _local_constraint(constraint: PoseConstraint | None, origin: Array) -> Quadr
     return QuadraticPrior(Pose(R[0], t[0]), constraint.information, 1.0)
 
 
-def _found(search: Search, constraint: QuadraticPrior | None) -> Found:
+def _found(search: Search, constraint: QuadraticPrior | None, cell_px: float) -> Found:
     prior_hessian, weight = np.zeros((6, 6)), 0.0
     if constraint is not None:
         weight = search.prior_weight
         R, t = search.rotations[0], search.translations[0]
         prior_hessian = weight * prior_terms(constraint, R, t)[1]
     sums = CovarianceSums(
-        search.hessian, search.meat, search.isotropic, search.cells, prior_hessian,
-        search.motion, search.anchors, search.share, search.curvature,
+        search.hessian, search.meat, search.isotropic, search.cells, cell_px,
+        prior_hessian, search.motion, search.anchors, search.share, search.curvature,
     )  # fmt: skip
     return Found(
         search.rotations,

@@ -10,6 +10,8 @@ import pytest
 from localizer.pose import Pose, so3_exp
 from localizer.registration.backend import LMSettings, level_problems, local_origin
 from localizer.registration.covariance import (
+    CovarianceSums,
+    NoiseModel,
     anchor_model,
     apart_px,
     covariance_sums,
@@ -27,6 +29,7 @@ from localizer.registration.reference import (
 )
 from localizer.registration.selection import mode_probabilities, thinned
 
+PLAIN = NoiseModel(1.0, floor=0.05)
 SETTINGS = LMSettings(scale=10.0)  # least squares, so that only noise acts
 
 
@@ -101,8 +104,8 @@ def test_noise_that_inflates_the_hessian_lowers_the_curvature(problem, pose):
 
 def test_half_the_curvature_is_four_times_the_covariance(problem, pose):
     sums, _ = measured(problem, pose, 0.05)
-    full = sandwich_covariance(sums, 1.0, 0.05)
-    half = sandwich_covariance(replace(sums, curvature=0.5), 1.0, 0.05)
+    full = sandwich_covariance(sums, PLAIN)
+    half = sandwich_covariance(replace(sums, curvature=0.5), PLAIN)
     assert full is not None
     np.testing.assert_allclose(half, 4.0 * full, rtol=1e-9)
 
@@ -123,8 +126,8 @@ def test_adding_up_fewer_anchors_does_not_change_the_covariance(problem, pose):
     for _ in range(30):
         noise = 0.1 * rng.standard_normal(level.anchor_features.shape).astype(np.float32)
         noisy = replace(level, anchor_features=level.anchor_features + noise)
-        every = sandwich_covariance(summed(noisy, pose, noisy.points.shape[1]), 1.0, 0.05)
-        third = sandwich_covariance(summed(noisy, pose, noisy.points.shape[1] // 3), 1.0, 0.05)
+        every = sandwich_covariance(summed(noisy, pose, noisy.points.shape[1]), PLAIN)
+        third = sandwich_covariance(summed(noisy, pose, noisy.points.shape[1] // 3), PLAIN)
         assert every is not None
         assert third is not None
         ratios.append(np.exp(np.linalg.slogdet(third)[1] / 6 - np.linalg.slogdet(every)[1] / 6))
@@ -134,11 +137,92 @@ def test_adding_up_fewer_anchors_does_not_change_the_covariance(problem, pose):
 def test_few_anchors_count_for_less_than_their_noise_says(problem, pose):
     sums = summed(problem[0], pose, 10_000)
     many, few = (
-        sandwich_covariance(replace(sums, anchors=n), 1.0, 0.05, few_anchors=150.0)
+        sandwich_covariance(replace(sums, anchors=n), replace(PLAIN, few_anchors=150.0))
         for n in (1_500_000, 150)
     )
     assert many is not None
     np.testing.assert_allclose(few, 2.0 * many, rtol=1e-3)
+
+
+def share_within(rng, cells, noise):
+    """Share of 400 estimates within the 95 % bound of their covariances, where the gradients of
+    `cells` cells are what the isotropic model says they are.
+    """
+    half = rng.standard_normal((6, 6))
+    shape = half @ half.T + np.eye(6)
+    root, none, inside = np.linalg.cholesky(shape), np.zeros((6, 6)), 0
+    for _ in range(400):
+        gradients = (root @ rng.standard_normal((6, cells))).T
+        error = gradients.sum(axis=0)
+        rest = gradients - error / cells  # at the optimum the gradients cancel
+        sums = CovarianceSums(
+            np.eye(6), rest.T @ rest, cells * shape, cells, 32.0, none, np.eye(6), 1000
+        )
+        covariance = sandwich_covariance(sums, noise)
+        assert covariance is not None
+        inside += error @ np.linalg.solve(covariance, error) < 12.59
+    return inside / 400
+
+
+def test_few_cells_do_not_tell_the_noises_shape():
+    """From 20 cells the 21 numbers of the meat are too uncertain; the model's shape mends that."""
+    rng = np.random.default_rng(4)
+    assert share_within(rng, 20, NoiseModel(1.0)) < 0.9
+    assert share_within(rng, 20, NoiseModel(1.0, shape_cells=40.0)) > 0.93
+    assert 0.92 < share_within(rng, 200, NoiseModel(1.0, shape_cells=40.0)) < 0.99
+
+
+def test_the_models_size_does_not_matter_to_the_shrunk_noise(problem, pose):
+    sums = summed(problem[0], pose, 10_000)
+    noise = NoiseModel(1.0, shape_cells=40.0)
+    larger = replace(sums, isotropic=7.0 * sums.isotropic)
+    np.testing.assert_allclose(
+        sandwich_covariance(larger, noise), sandwich_covariance(sums, noise), rtol=1e-9
+    )
+
+
+def displaced(level, pose, cell_px):
+    """Sums without noise, in cells of `cell_px`, and the cells of the anchors in view, with J."""
+    model = anchor_model(level, *pose, SETTINGS, cell_px)
+    sums = covariance_sums(model)
+    assert sums is not None
+    none = np.zeros((6, 6))
+    return replace(sums, meat=none, isotropic=none), model
+
+
+@pytest.mark.parametrize("curvature", [1.0, 0.4])
+def test_displaced_patches_of_the_map_move_the_pose_as_far_as_it_says(problem, pose, curvature):
+    """Patches of 20 px, each shifted by 0.5 px (sigma) in either direction, seen by plain least
+    squares.
+    """
+    side, sigma_px = 20.0, 0.5
+    sums, model = displaced(problem[0], pose, side)
+    J, rng = model.projection, np.random.default_rng(2)
+    normal = np.linalg.inv(np.einsum("nai,naj->ij", J, J))
+    moves = sigma_px * rng.standard_normal((3000, sums.cells, 2))[:, model.cell]
+    errors = np.einsum("nai,mna->mi", J, moves, optimize=True) @ normal
+    px_per_m = np.sqrt(0.5 * (sums.motion[0, 0] + sums.motion[1, 1]))
+    noise = NoiseModel(1.0, map_error=(sigma_px / px_per_m) * (side / px_per_m))
+    claimed = sandwich_covariance(replace(sums, curvature=curvature), noise)
+    assert claimed is not None
+    seen = np.cov(errors.T)
+    ratio = np.exp((np.linalg.slogdet(claimed)[1] - np.linalg.slogdet(seen)[1]) / 6)
+    assert 0.6 < ratio < 1.4
+
+
+def test_a_prior_holds_against_a_displaced_map(problem, pose):
+    sums, _ = displaced(problem[0], pose, 20.0)
+    noise = NoiseModel(1.0, map_error=0.1)
+    free = sandwich_covariance(sums, noise)
+    held = sandwich_covariance(replace(sums, prior_hessian=1e3 * sums.hessian), noise)
+    assert free is not None
+    np.testing.assert_allclose(held, free / 1001.0**2, rtol=1e-6)
+
+
+def test_anchors_that_do_not_span_a_pose_have_no_covariance(problem, pose):
+    sums = summed(problem[0], pose, 10_000)
+    flat = replace(sums, motion=np.diag([1.0, 1.0, 1.0, 1.0, 1.0, 0.0]))
+    assert sandwich_covariance(flat, NoiseModel(1.0, map_error=0.1)) is None
 
 
 def test_distances_between_poses_are_those_of_the_image(scene, problem, pose):
