@@ -126,7 +126,7 @@ class RecordConfig(_Model):
 
     folder: Path = Field(description="estimates, targets, events, health and snapshots")
     snapshot_interval_s: float | None = Field(
-        10.0, ge=0.1, le=86400, description="a video frame is kept this often; none: never"
+        10.0, ge=0.001, le=86400, description="a video frame is kept this often; none: never"
     )
 
 
