@@ -12,7 +12,7 @@ from mavlink_bridge.messages import VehicleState
 
 _PATIENCE_NS = 5_000_000_000
 _TWIN_WINDOW_NS = 5_000_000_000
-_TWIN_SWITCHES = 20  # in a window: damaged or doubled frames are not old by a second so often
+_TWIN_SWITCHES = 40  # in a window: even a line that damages every third frame is far below
 _TEXTS = {
     "there": (mavlink.MAV_SEVERITY_INFO, "flight controller found"),
     "lost": (mavlink.MAV_SEVERITY_WARNING, "flight controller lost: no heartbeat for 3 s"),

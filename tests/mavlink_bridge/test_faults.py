@@ -269,6 +269,7 @@ def test_damaged_frames_on_the_flight_controllers_link(
     assert counters.bad_checksums > 50
     assert flight.side.counters["reboots"] == 0
     assert flight.attitude_error() < 0.01
+    assert not [t for t in flight.texts if "two autopilots" in t]
     assert {m.reset_counter for _, m in flight.vision()} == {0}
     assert len(flight.vision(flight.now_ns - 60 * SECOND)) > 550
     assert max(flight.waiting().values()) < 1024
