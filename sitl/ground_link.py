@@ -39,7 +39,7 @@ _WALL_MARGIN_S = 30.0
 # Wall time. A busy machine may let one of the two wait for seconds: an answer that comes costs
 # nothing, and only a vehicle that is alive and silent takes that long.
 _REPEAT_S = 1.5
-_TRIES = 20
+_TRIES = 80
 
 _Self = TypeVar("_Self", bound="GroundLink")
 

@@ -71,20 +71,22 @@ def real_time() -> Callable[[], AbstractContextManager[None]]:
     @contextmanager
     def guarded() -> Iterator[None]:
         _skip_if_starved("before the test")
-        with _watched_processors() as readings:
+        with _watched_processors() as processors:
             try:
                 yield
             except (AssertionError, SimulationError) as error:
-                share = most_other_work(readings)
-                if share > 0.15:
-                    pytest.skip(
-                        f"other work took {100 * share:.0f} % of processors that were never idle "
-                        f"while it failed ({error})"
-                    )
+                if processors.shared:
+                    pytest.skip(f"{processors} while it failed ({error})")
                 _skip_if_starved(f"after it failed ({error})")
                 raise
 
     return guarded
+
+
+@pytest.fixture
+def watched_processors() -> Callable[[], AbstractContextManager[Processors]]:
+    """``with watched_processors() as processors:`` tells whether they were `shared` meanwhile."""
+    return _watched_processors
 
 
 @dataclass(frozen=True)
@@ -112,8 +114,24 @@ def most_other_work(readings: Sequence[Reading], span_s: float = 5.0) -> float:
     return worst
 
 
+@dataclass(frozen=True)
+class Processors:
+    """What they did for us and for others; `str` says it."""
+
+    readings: list[Reading]
+
+    @property
+    def shared(self) -> bool:
+        """Whether other work had more than a little of processors that were never idle."""
+        return most_other_work(self.readings) > 0.15
+
+    def __str__(self) -> str:
+        share = most_other_work(self.readings)
+        return f"other work took {100 * share:.0f} % of processors that were not idle for 5 s"
+
+
 @contextmanager
-def _watched_processors() -> Iterator[list[Reading]]:
+def _watched_processors() -> Iterator[Processors]:
     readings, ended = [_reading()], threading.Event()
 
     def watch() -> None:
@@ -123,7 +141,7 @@ def _watched_processors() -> Iterator[list[Reading]]:
     watcher = threading.Thread(target=watch, daemon=True)
     watcher.start()
     try:
-        yield readings
+        yield Processors(readings)
     finally:
         ended.set()
         watcher.join()

@@ -10,7 +10,9 @@ import os
 import signal
 import threading
 import time
+from collections.abc import Callable
 from concurrent.futures import ProcessPoolExecutor
+from contextlib import AbstractContextManager
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -40,26 +42,42 @@ KINDS = [
 
 
 @cache
-def flown(kind: VehicleKind, few: bool) -> dict[str, Row]:
-    """All of them side by side, once: a flight in real time takes 0.15 of a processor."""
-    rows = run_suite(FEW if few else REST, [kind], jobs=len(FEW))
-    return {row.case.name: row for row in rows}
+def flown(kind: VehicleKind, few: bool, watched_processors: Any) -> tuple[dict[str, Row], bool]:
+    """All of them side by side, once: a flight in real time takes 0.15 of a processor.
+
+    And whether other work took their processors.
+    """
+    with watched_processors() as processors:
+        rows = run_suite(FEW if few else REST, [kind], jobs=len(FEW))
+    return {row.case.name: row for row in rows}, processors.shared
 
 
-def check(row: Row) -> None:
-    """What a vehicle did that fell behind real time says nothing: it flies once more, alone."""
-    if not row.ok and (row.slow or row.error):
+@pytest.fixture
+def check(real_time: Any, watched_processors: Any) -> Callable[[VehicleKind, str, bool], None]:
+    def checked(kind: VehicleKind, name: str, few: bool) -> None:
+        rows, shared = flown(kind, few, watched_processors)
+        _check(rows[name], shared, real_time)
+
+    return checked
+
+
+def _check(row: Row, shared: bool, real_time: Callable[[], AbstractContextManager[None]]) -> None:
+    """What a flight did that fell behind real time says nothing: it flies once more, alone."""
+    if row.ok or not (shared or row.slow or row.error):
+        assert row.ok, [f.what for f in row.findings if not f.ok]
+        return
+    with real_time():
         row = run_case(row.case, row.vehicle, seed=1)
-    failed = row.error or [f.what for f in row.findings if not f.ok]
-    if row.slow and not row.ok and row.record is not None:
-        pytest.skip(f"twice too slow a machine ({row.record.starved}): {failed}")
-    assert row.ok, failed
+        failed = row.error or [f.what for f in row.findings if not f.ok]
+        if row.slow and not row.ok and row.record is not None:
+            pytest.skip(f"twice too slow a machine ({row.record.starved}): {failed}")
+        assert row.ok, failed
 
 
 @pytest.mark.parametrize("kind", KINDS)
 @pytest.mark.parametrize("name", [case.name for case in FEW])
-def test_scenario(kind: VehicleKind, name: str) -> None:
-    check(flown(kind, True)[name])
+def test_scenario(check: Any, kind: VehicleKind, name: str) -> None:
+    check(kind, name, few=True)
 
 
 @pytest.fixture
@@ -118,5 +136,5 @@ def _all_is_over(folders: Path) -> None:
 @pytest.mark.long
 @pytest.mark.parametrize("kind", KINDS)
 @pytest.mark.parametrize("name", [case.name for case in REST])
-def test_every_other_scenario(kind: VehicleKind, name: str) -> None:
-    check(flown(kind, False)[name])
+def test_every_other_scenario(check: Any, kind: VehicleKind, name: str) -> None:
+    check(kind, name, few=False)
