@@ -118,7 +118,7 @@ def test_the_exported_model_runs_at_sizes_divisible_by_eight(model: Path) -> Non
 def test_float16_is_close_and_says_so(trainer: Trainer, tmp_path: Path) -> None:
     path = tmp_path / "s0.onnx"
     parity = export(trainer.checkpoint, path, half=True)
-    assert 0.9995 < parity.cosine < 1.0
+    assert parity.cosine == pytest.approx(1.0, abs=5e-4)  # of lengths that are 1 but for rounding
     assert 1e-6 < parity.difference < 0.05
     kinds = {i.data_type for i in onnx.load(path).graph.initializer if len(i.dims) == 4}
     assert kinds == {onnx.TensorProto.FLOAT16}
