@@ -105,7 +105,7 @@ class EmbeddedSitl(VehicleProcess):
     """The embedded vehicle (`sitl.embedded`) as a process of its own."""
 
     kind = "embedded"
-    start_timeout_s = 180.0  # the first start compiles the kernels
+    start_timeout_s = 300.0  # the first start compiles the kernels
 
     def __init__(
         self,
