@@ -107,7 +107,7 @@ class JNGOConfig(BaseModel):
         default=40.0, ge=0, le=1e6, description="cells that the noise's model shape counts for"
     )
     map_error_m2: float = Field(
-        default=0.1,
+        default=0.13,
         ge=0,
         le=1e4,
         description="the map's displacement (sigma) times the length over which it is the same",
