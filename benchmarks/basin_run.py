@@ -166,12 +166,13 @@ class Trial:
             metres,
             degrees,
             float(np.sqrt(np.trace(found.covariance[:3, :3]))),
-            _nees(pose, found.covariance, truth) if ok else np.nan,
+            squared_error(pose, found.covariance, truth) if ok else np.nan,
             ms,
         )
 
 
-def _nees(pose: Pose, covariance: Array, truth: Pose) -> float:
+def squared_error(pose: Pose, covariance: Array, truth: Pose) -> float:
+    """Normalised estimation error squared (NEES), six axes."""
     d = np.concatenate(
         [truth.translation - pose.translation, so3_log(truth.rotation @ pose.rotation.T)]
     )

@@ -151,22 +151,23 @@ def _make_real(source: Path, home: Path, count: int) -> None:
         progress=False,
     )
     if (source / "queries").exists():
-        _store_photos(home, cache, source / "queries")
+        _store(home, photo_views(cache, source / "queries"))
     else:
         halves = {"quito": (220.0, 130.0), "portugal": (100.0, 110.0)}
         _store_renders(home, cache, cache, halves[source.name], rng, count)
 
 
-def _store_photos(home: Path, cache: Path, photos: Path) -> None:
-    camera = Camera.from_json(photos / "camera.json").resized(*SIZE)
+def photo_views(cache: Path, photos: Path, size: tuple[int, int] = SIZE) -> list[View]:
+    """The photos of a folder with camera.json and poses.json, of `size` (width, height)."""
+    camera = Camera.from_json(photos / "camera.json").resized(*size)
     poses = json.loads((photos / "poses.json").read_text())
     views = []
     for path in sorted((photos / "images").iterdir()):
         photo = cv2.cvtColor(cv2.imread(str(path)), cv2.COLOR_BGR2RGB)
-        query = cv2.resize(photo, SIZE, interpolation=cv2.INTER_AREA).astype(np.uint8)
+        query = cv2.resize(photo, size, interpolation=cv2.INTER_AREA).astype(np.uint8)
         truth = Pose.from_matrix(np.array(poses[path.name]["T_enu_from_cam"]))
         views.append(View(cache, query, truth, camera, "photo", 40.0))
-    _store(home, views)
+    return views
 
 
 def _store_renders(

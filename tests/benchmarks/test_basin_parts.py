@@ -1,0 +1,52 @@
+"""Parts of the image that the covariance benchmark leaves of the map."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from localizer.camera import Camera
+from localizer.pose import Pose
+from localizer.types import RenderedView
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[2] / "benchmarks"))
+
+from basin_parts import PARTS, Trial, covered, part_of, report
+
+SHARES = {"whole": 1.0, "half": 0.5, "quarter": 0.25, "band": 0.3, "discs": 0.38}
+
+
+@pytest.mark.parametrize("part", PARTS)
+def test_a_part_is_as_large_as_it_says_and_not_always_the_same(part):
+    kept = [part_of(part, (60, 80), np.random.default_rng(k)) for k in range(12)]
+    for k in kept:
+        assert k.mean() == pytest.approx(SHARES[part], abs=0.04 if part != "discs" else 0.38)
+    assert part == "whole" or len({k.tobytes() for k in kept}) >= 3
+
+
+def test_outside_of_the_part_there_is_sky_and_no_depth():
+    camera = Camera.from_fov(8, 8, 60.0)
+    view = RenderedView(
+        np.full((8, 8, 3), 9, np.uint8),
+        np.full((8, 8), 30.0, np.float32),
+        Pose(np.eye(3), np.zeros(3)),
+        camera,
+    )
+    kept = np.zeros((8, 8), dtype=bool)
+    kept[:, :4] = True
+    shown = covered(view, kept)
+    assert (shown.depth[:, :4] == 30).all()
+    assert (shown.depth[:, 4:] == 0).all()
+    assert (shown.rgb[:, :4] == 9).all()
+    assert (shown.rgb[:, 4:] > 100).all()
+
+
+def test_the_report_counts_those_near_the_truth_and_those_accepted_apart():
+    near, wrong = Trial("half", 0.1, 0.1, 4.0, True), Trial("half", 9.0, 0.1, 90.0, True)
+    line = report("half", [near, near, wrong, Trial("half", 0.2, 0.1, 20.0, False)])
+    assert " 66.7 " in line.split("accepted")[0]
+    assert "of 3, mean 9.3" in line
+    assert " 66.7 " in line.split("accepted")[1]
