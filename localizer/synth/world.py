@@ -210,5 +210,9 @@ def _blocks(
         with ProcessPoolExecutor(
             processes, context, initializer=start_worker, initargs=(scene_file, folder)
         ) as pool:
-            futures = [pool.submit(bake_block, place) for place in places]
-            yield (future.result() for future in as_completed(futures))
+            try:
+                futures = [pool.submit(bake_block, place) for place in places]
+                yield (future.result() for future in as_completed(futures))
+            except BaseException:  # interrupted, say: nobody wants the blocks that wait
+                pool.shutdown(wait=False, cancel_futures=True)
+                raise

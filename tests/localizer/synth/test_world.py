@@ -3,8 +3,10 @@
 import hashlib
 import json
 import struct
+import threading
 import time
 from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -14,6 +16,7 @@ import pytest
 
 from localizer.errors import MapSourceError
 from localizer.geo import ecef_from_geodetic
+from localizer.synth import world
 from localizer.synth.config import WorldConfig
 from localizer.synth.layout import plan_world
 from localizer.synth.world import WorldInfo, build_world, world_origin
@@ -141,6 +144,35 @@ def painted_here(small_world, tmp_path_factory):
 
 def test_same_seed_gives_the_same_bytes_in_any_number_of_processes(small_world, painted_here):
     assert hashes(painted_here[0]) == hashes(small_world["survey"][0])
+
+
+def test_a_world_that_is_interrupted_paints_no_more_blocks(tmp_path, monkeypatch):
+    """It went on for minutes: every block was waited for."""
+    pools = []
+
+    class Pool(ThreadPoolExecutor):
+        def __init__(self, _workers, _context, **_more):
+            super().__init__(1)
+            self.ending, self.painted = threading.Event(), []
+            pools.append(self)
+
+        def submit(self, _task, place):
+            return super().submit(self._paint, place)
+
+        def _paint(self, place):
+            self.painted.append(place)
+            self.ending.wait(60)
+
+        def shutdown(self, wait=True, *, cancel_futures=False):
+            super().shutdown(wait=False, cancel_futures=cancel_futures)
+            self.ending.set()
+            super().shutdown(wait=wait)
+
+    monkeypatch.setattr(world, "ProcessPoolExecutor", Pool)
+    places = [(column, 0) for column in range(20)]
+    with pytest.raises(KeyboardInterrupt), world._blocks(None, tmp_path, places, processes=2):
+        raise KeyboardInterrupt
+    assert len(pools[0].painted) <= 1
 
 
 def test_another_seed_gives_another_place(small_world):
