@@ -33,6 +33,7 @@ from localizer.map.cache import TileCache
 from localizer.map.stream import TileStreamer
 from localizer.registration import JNGO, Registration, select_anchors
 from localizer.render.base import SKY
+from localizer.render.holes import fill_holes
 from localizer.render.numba_raster import NumbaRenderer
 from localizer.types import RegistrationStatus, RenderedView
 
@@ -100,7 +101,9 @@ def trials(
                 for part in parts:
                     rng = np.random.default_rng((7, _SEEDS[part], index))
                     shown = covered(reference, part_of(part, reference.depth.shape, rng))
-                    anchors = select_anchors(shown, extractor.extract(shown.rgb), 4000, index)
+                    anchors = select_anchors(
+                        shown, extractor.extract(fill_holes(shown)), 4000, index
+                    )
                     found = optimizer.register(
                         query, view.camera, anchors, prior, motion=prior, seed=index
                     )

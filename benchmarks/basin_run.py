@@ -24,6 +24,7 @@ from localizer.map.cache import TileCache
 from localizer.map.stream import TileStreamer
 from localizer.pose import Array, Pose, so3_exp, so3_log
 from localizer.registration import JNGO, Registration
+from localizer.render.holes import fill_holes
 from localizer.render.numba_raster import NumbaRenderer
 from localizer.types import (
     Anchors,
@@ -110,7 +111,7 @@ def run_views(
                 if (reference.depth > 0).mean() < _LEAST_DEPTH:
                     continue  # the start leads off the map: no method could tell
                 trial = Trial(index, view, start, prior, query, reference)
-                outcomes += trial.run(optimizers, extractor.extract(reference.rgb))
+                outcomes += trial.run(optimizers, extractor.extract(fill_holes(reference)))
     return outcomes
 
 

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from localizer.features import FeatureExtractor
 from localizer.pose import Pose
 from localizer.registration import JNGO, select_anchors
+from localizer.render.holes import fill_holes
 from localizer.types import FeatureLevel, FeaturePyramid, Image, PosePrior, RenderedView
 
 Method = Callable[[RenderedView, Image, PosePrior, int], Pose]
@@ -44,7 +45,7 @@ class Direct:
         self._extractor, self._optimizer, self._anchors = extractor, JNGO(), anchors
 
     def __call__(self, view: RenderedView, query: Image, prior: PosePrior, seed: int) -> Pose:
-        reference = self._extractor.extract(view.rgb)
+        reference = self._extractor.extract(fill_holes(view))
         anchors = select_anchors(view, reference, self._anchors, seed=seed)
         found = self._optimizer.register(
             self._extractor.extract(query), view.camera, anchors, prior, seed=seed

@@ -28,6 +28,7 @@ from localizer.registration.jngo import JNGO
 from localizer.registration.priors import PoseConstraint, attitude_constraint
 from localizer.registration.result import Registration
 from localizer.render.base import MapRenderer
+from localizer.render.holes import fill_holes
 from localizer.types import (
     Anchors,
     FeaturePyramid,
@@ -190,7 +191,7 @@ class Localizer:
                 f"the view from east {e:.1f} north {n:.1f} up {u:.1f} m (map frame) does not meet "
                 "the map: check the prior, the map's extent and the camera's direction"
             )
-        features = self._extractor.extract(view.rgb)
+        features = self._extractor.extract(fill_holes(view))
         anchors = select_anchors(view, features, self._config.anchors, self._config.seed)
         return ReferenceBundle(view, anchors, prior.time_ns)
 

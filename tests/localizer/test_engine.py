@@ -2,6 +2,7 @@
 
 import threading
 import time
+from dataclasses import replace
 from types import SimpleNamespace
 
 import cv2
@@ -15,6 +16,7 @@ from localizer.errors import CameraError, MapCacheError, OutsideMapError
 from localizer.pipeline import Localizer, Undistorter, working_camera
 from localizer.pose import Pose
 from localizer.registration.result import Registration
+from localizer.render.base import SKY
 from localizer.types import (
     FeatureLevel,
     FeaturePyramid,
@@ -259,6 +261,28 @@ def test_a_stream_that_changes_its_size_is_undistorted_with_its_own_camera():
     inner = np.s_[20:-20, 20:-20]  # both are black outside the lens's picture
     np.testing.assert_allclose(seen[1][inner].astype(float), seen[0][inner], atol=2.5)
     np.testing.assert_array_equal(seen[2], seen[0])
+
+
+def test_features_of_a_reference_do_not_see_the_maps_holes():
+    class Holed(FakeRenderer):
+        def render(self, world_from_camera, camera, *, wait=False):
+            view = super().render(world_from_camera, camera, wait=wait)
+            depth = view.depth.copy()
+            depth[50:90, 100:140] = 0
+            rgb = np.where(depth[..., None] > 0, 70, SKY).astype(np.uint8)
+            return replace(view, rgb=rgb, depth=depth)
+
+    seen = []
+
+    class Watching(FakeExtractor):
+        def extract(self, rgb):
+            seen.append(rgb)
+            return super().extract(rgb)
+
+    localizer = Localizer(Holed(), Watching(), FakeOptimizer(), CAMERA, LocalizerConfig())
+    anchors = localizer.make_reference(_prior(10**9)).anchors
+    assert (seen[0] == 70).all()
+    assert len(anchors.points_world) > 0
 
 
 @pytest.mark.parametrize("size", [(640, 480), (1920, 1080), (1024, 768)])

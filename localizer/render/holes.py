@@ -1,0 +1,54 @@
+"""What stands in a rendered view where the map has nothing."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from localizer.types import Image, RenderedView
+
+
+def fill_holes(view: RenderedView) -> Image:
+    """The view's picture (H, W, 3) uint8, the map's holes painted over from what surrounds them.
+
+    No flight sees the edge of a hole, but the features of everything near would. What is above the
+    horizon stays: there the sky may be seen. By averages from fine to coarse and back: Gortler et
+    al., The Lumigraph (SIGGRAPH 1996), section 3.4.3, "pull-push". Without any surface in view the
+    picture stays as it is.
+    """
+    known = view.depth > 0
+    holes = ~known & ~_above_horizon(view)
+    if not holes.any() or not known.any():
+        return view.rgb
+    filled = _pull_push(view.rgb, known)
+    return np.where(holes[..., None], filled, view.rgb)
+
+
+def _above_horizon(view: RenderedView) -> NDArray[np.bool_]:
+    """(H, W): whether the pixel's ray leads upwards in the world (z up)."""
+    camera, (right, down, ahead) = view.camera, view.world_from_camera.rotation[2]
+    x = (np.arange(camera.width) + 0.5 - camera.cx) / camera.fx
+    y = (np.arange(camera.height) + 0.5 - camera.cy) / camera.fy
+    return np.asarray(right * x[None, :] + down * y[:, None] + ahead > 0)
+
+
+def _pull_push(rgb: Image, known: NDArray[np.bool_]) -> Image:
+    weights = [known.astype(np.float32)]
+    colours = [rgb * weights[0][..., None]]  # premultiplied
+    while weights[-1].size > 1:
+        height, width = weights[-1].shape
+        half = ((width + 1) // 2, (height + 1) // 2)
+        weights.append(_resized(weights[-1], half, cv2.INTER_AREA))
+        colours.append(_resized(colours[-1], half, cv2.INTER_AREA))
+    filled = colours.pop() / weights.pop()[..., None]
+    while weights:
+        weight, colour = weights.pop(), colours.pop()
+        behind = _resized(filled, weight.shape[::-1], cv2.INTER_LINEAR)
+        filled = colour + (1 - weight[..., None]) * behind
+    return np.rint(filled).clip(0, 255).astype(np.uint8)
+
+
+def _resized(image: NDArray[np.float32], size: tuple[int, ...], how: int) -> NDArray[np.float32]:
+    shape = (size[1], size[0], *image.shape[2:])
+    return cv2.resize(image, size, interpolation=how).reshape(shape).astype(np.float32, copy=False)
