@@ -104,7 +104,11 @@ class HealthMonitor:
             return HealthLevel.DEGRADED, _SILENT_VEHICLE
         error = self._engine.health.last_error
         if not self._estimates:
-            return HealthLevel.STARTING, error or "waiting for video and a pose prior"
+            seen = self._engine.health.frames_in > 0
+            return (
+                HealthLevel.STARTING,
+                error or f"waiting for {'a pose prior' if seen else 'video'}",
+            )
         arrived, estimate = self._estimates[-1]
         if time.monotonic() - arrived > _STALE_S:
             return HealthLevel.DEGRADED, error or "no frame is being localized"

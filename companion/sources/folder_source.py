@@ -72,7 +72,7 @@ def read_timestamps(path: Path) -> dict[str, int]:
 
 class FolderSource:
     """Frames from a folder. Times come from ``timestamps.txt`` in it, else from a fixed rate that
-    starts now.
+    starts now; played in real time the recorded ones start now, too, as a video file's do.
     """
 
     def __init__(
@@ -106,6 +106,7 @@ class FolderSource:
         """Every image; raises `StreamDecodeError` or `StreamSizeError` naming the file."""
         start = time.monotonic_ns()
         first = self._times[0] if self._times else 0
+        recorded = bool(self._times) and not self._settings.realtime
         self._report(StreamState.LIVE, f"{self._folder}: {len(self._images)} images")
         for sequence, path in enumerate(self._images):
             offset = self._offset_ns(sequence, first)
@@ -113,7 +114,7 @@ class FolderSource:
                 self._closed.wait((start + offset - time.monotonic_ns()) / 1e9)
             if self._closed.is_set():
                 return
-            frame = self._load(path, (first if self._times else start) + offset, sequence)
+            frame = self._load(path, (first if recorded else start) + offset, sequence)
             self._delivered += 1
             yield frame
         self._report(StreamState.ENDED, f"{self._folder}: all {len(self._images)} images delivered")

@@ -34,10 +34,10 @@ class FakeBridge:
         return SimpleNamespace(line=lambda: "no comparison yet")
 
 
-def _one_report(folder, state, connected, tracking=None, **options):
+def _one_report(folder, state, connected, tracking=None, frames_in=0, **options):
     """What the bridge is told, and the events, of a monitor that is started and stopped."""
     bridge, events = FakeBridge(connected), []
-    engine = SimpleNamespace(health=EngineHealth())
+    engine = SimpleNamespace(health=EngineHealth(frames_in=frames_in))
     monitor = HealthMonitor(
         engine, bridge, lambda: state, lambda *e: events.append(e), RecordConfig(folder=folder),
         **options,
@@ -77,6 +77,12 @@ def test_the_worst_thing_is_told(tmp_path, state, connected, level, text):
     assert written["bridge"]["fix_latency_ms"] is None  # NaN is no JSON
     assert written["level"] == level.value
     assert time.monotonic_ns() - written["time_ns"] < 60e9
+
+
+def test_what_is_waited_for_is_told(tmp_path):
+    """With pictures and no estimate it is the autopilot's position or attitude that is missing."""
+    told, _ = _one_report(tmp_path, StreamState.LIVE, True, frames_in=3)
+    assert told[-1] == (HealthLevel.STARTING, "waiting for a pose prior")
 
 
 def test_scaled_video_is_told_beside_what_localization_makes_of_it(tmp_path):

@@ -124,6 +124,17 @@ def test_timestamps_are_used_as_they_stand(folder: Path) -> None:
     assert times == [10**9 + i * 33_000_000 for i in range(COUNT)]
 
 
+def test_timestamps_begin_now_in_real_time(folder: Path) -> None:
+    """Or no attitude of the autopilot would be found at the frames' times."""
+    lines = [f"img{i}.png {1_000_000 * i + 5}" for i in range(COUNT)]
+    (folder / "timestamps.txt").write_text("\n".join(lines))
+    before = time.monotonic_ns()
+    source = open_source(folder, CAMERA, SourceSettings(realtime=True))
+    times = [f.exposure_time_ns for f in source.frames()]
+    assert before <= times[0] <= time.monotonic_ns()
+    np.testing.assert_array_equal(np.diff(times), 1_000_000)
+
+
 def test_timestamps_that_lack_an_image_or_are_no_numbers_are_named(folder: Path) -> None:
     (folder / "timestamps.txt").write_text("img0.png 1\n")
     with pytest.raises(StreamOpenError, match=r"11 of 12 images, first img1.png"):
