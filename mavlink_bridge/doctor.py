@@ -232,7 +232,7 @@ def _stream_findings(config: BridgeConfig, measured: _Measurement) -> list[Findi
                 "gimbal",
                 "silent" if measured.gimbal is None else measured.gimbal.source,
                 "GIMBAL_DEVICE_ATTITUDE_STATUS or MOUNT_STATUS",
-                "MNT1_TYPE; or bridge.camera.mount: fixed",
+                "set MNT1_TYPE to the gimbal's type; or bridge.camera.mount: fixed",
                 measured.gimbal is not None,
                 True,
             )
