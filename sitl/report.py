@@ -328,4 +328,5 @@ def _verdict(report: FlightReport) -> Table:
 
 
 def _add(table: Table, name: str, spread: Spread, note: str) -> None:
-    table.add_row(name, f"{spread.median:.2f}", f"{spread.p95:.2f}", f"{spread.maximum:.2f}", note)
+    figures = (spread.median, spread.p95, spread.maximum)
+    table.add_row(name, *("none" if np.isnan(x) else f"{x:.2f}" for x in figures), note)
