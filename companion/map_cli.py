@@ -64,19 +64,23 @@ def build(
     """Import a source into a tile cache; goes on where an interrupted build stopped."""
     from localizer.map.build import build_cache
 
-    manifest = build_cache(
-        source,
-        out,
-        geoid_separation_m=geoid_separation,
-        vertical_datum=vertical_datum,
-        georeference=georeference,
-        up_axis=up_axis,
-        attribution=attribution,
-        skip_bad_tiles=skip_bad_tiles,
-        overwrite=overwrite,
-        workers=workers,
-        scheduler=scheduler,
-    )
+    try:
+        manifest = build_cache(
+            source,
+            out,
+            geoid_separation_m=geoid_separation,
+            vertical_datum=vertical_datum,
+            georeference=georeference,
+            up_axis=up_axis,
+            attribution=attribution,
+            skip_bad_tiles=skip_bad_tiles,
+            overwrite=overwrite,
+            workers=workers,
+            scheduler=scheduler,
+        )
+    except KeyboardInterrupt:
+        Console(stderr=True).print("interrupted: the same command goes on with what is done")
+        raise
     Console().print(
         f"[green]{escape(str(out))}[/] from {escape(manifest.source)}: {manifest.tiles} tiles, "
         f"{manifest.triangles} triangles, {manifest.gsd_m:.3f} m texels, "

@@ -189,7 +189,8 @@ class Localizer:
             e, n, u = prior.world_from_camera.translation
             raise OutsideMapError(
                 f"the view from east {e:.1f} north {n:.1f} up {u:.1f} m (map frame) does not meet "
-                "the map: check the prior, the map's extent and the camera's direction"
+                "the map, as far as it is loaded: if it stays so, check the prior, the map's "
+                "extent and the camera's direction"
             )
         features = self._extractor.extract(fill_holes(view))
         anchors = select_anchors(view, features, self._config.anchors, self._config.seed)

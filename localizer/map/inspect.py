@@ -129,8 +129,19 @@ def render_view(cache: TileCache, world_from_camera: Pose, camera: Camera) -> Re
         finally:
             renderer.close()
     if not (view.depth > 0).any():
-        raise OutsideMapError(f"{cache.path}: the view shows nothing of the map")
+        raise OutsideMapError(f"{cache.path}: the view shows nothing of the map; {_place(cache)}")
     return view
+
+
+def _place(cache: TileCache) -> str:
+    low, high = cache.index.box_min[0], cache.index.box_max[0]
+    middle = cache.frame.position((low + high) / 2)
+    east, north = (high - low)[:2]
+    lowest, highest = cache.manifest.height_range_m
+    return (
+        f"it lies about {middle.latitude_deg:.5f}, {middle.longitude_deg:.5f}, {east:.0f} x "
+        f"{north:.0f} m, between {lowest:.0f} and {highest:.0f} m (ellipsoidal)"
+    )
 
 
 def depth_picture(depth: NDArray[np.float32]) -> Image:
@@ -156,7 +167,11 @@ def export_glb(cache: TileCache, out: Path, level: int | None = None) -> int:
     """Write the surface as one GLB, y up, metres about the cache's origin; returns triangles.
 
     level: the depth of the tile tree to take (what ends above it is taken too), else the finest.
+    `OutsideMapError` for a level below the finest.
     """
+    finest = int(_depths(cache).max())
+    if level is not None and level > finest:
+        raise OutsideMapError(f"{cache.path}: no level {level}, the finest is {finest}")
     scene = trimesh.Scene()
     triangles = 0
     for tile in _cut(cache, level):

@@ -15,6 +15,7 @@ from companion.cli import app
 from companion.errors import ReportError
 from localizer.camera import Camera
 from localizer.errors import GeoreferenceError, OutsideMapError
+from localizer.map import build
 from localizer.map.cache import TileCache
 from localizer.map.inspect import (
     camera_pose,
@@ -117,6 +118,27 @@ def test_commands(source, tmp_path):
     damaged = run("verify", out)
     assert damaged.exit_code == 1
     assert "tile 2" in damaged.output
+
+
+def test_a_level_or_a_place_that_the_map_does_not_have_is_named(source, tmp_path):
+    out = tmp_path / "c"
+    assert run("build", source, "--out", out, "--workers", "1").exit_code == 0
+    with pytest.raises(OutsideMapError, match=r"no level 9, the finest is [0-9]"):
+        export_glb(TileCache.open(out), tmp_path / "e.glb", 9)
+    assert not (tmp_path / "e.glb").exists()
+    far = camera_pose(TileCache.open(out), 10.0, 8.2, 500.0)
+    with pytest.raises(OutsideMapError, match=r"nothing of the map; it lies about 47\.\d+, 8\.\d+"):
+        render_view(TileCache.open(out), far, Camera.from_fov(64, 48, 60.0))
+
+
+def test_an_interrupted_build_says_how_to_go_on(source, tmp_path, monkeypatch):
+    def interrupted(*_args, **_options):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(build, "build_cache", interrupted)
+    result = run("build", source, "--out", tmp_path / "c")
+    assert result.exit_code == 130
+    assert "the same command goes on" in result.output
 
 
 @pytest.mark.parametrize("what", ["render", "export"])
