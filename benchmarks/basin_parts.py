@@ -28,13 +28,13 @@ from numpy.typing import NDArray
 
 from localizer.features import load_extractor
 from localizer.features.detail import DetailExtractor
-from localizer.integrity import IntegrityConfig, is_acceptable
-from localizer.map.cache import TileCache
-from localizer.map.stream import TileStreamer
+from localizer.map.cache.cache import TileCache
+from localizer.map.cache.stream import TileStreamer
 from localizer.registration import JNGO, Registration, select_anchors
 from localizer.render.base import SKY
 from localizer.render.holes import fill_holes
 from localizer.render.numba_raster import NumbaRenderer
+from localizer.tracking.integrity import IntegrityConfig, is_acceptable
 from localizer.types import RegistrationStatus, RenderedView
 
 PARTS = ("whole", "half", "quarter", "band", "discs")

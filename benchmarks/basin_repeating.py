@@ -17,10 +17,10 @@ from basin_variants import FULL, Variant, changed
 from feature_report import wilson
 from named_errors import named_errors
 
-from localizer.camera import Camera
-from localizer.pose import Array, Pose
+from localizer.geometry.camera import Camera
+from localizer.geometry.pose import Array, Pose
 from localizer.registration import select_anchors
-from localizer.training.pairs import look_at
+from localizer.training.data.pairs import look_at
 from localizer.types import FeatureLevel, FeaturePyramid, PosePrior, RenderedView
 
 _CAMERA = Camera(160, 120, 150.0, 144.0, 76.0, 63.5)

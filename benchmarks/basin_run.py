@@ -20,9 +20,9 @@ from feature_report import wilson
 
 from localizer.features import load_extractor
 from localizer.features.detail import DetailExtractor
-from localizer.map.cache import TileCache
-from localizer.map.stream import TileStreamer
-from localizer.pose import Array, Pose, so3_exp, so3_log
+from localizer.geometry.pose import Array, Pose, so3_exp, so3_log
+from localizer.map.cache.cache import TileCache
+from localizer.map.cache.stream import TileStreamer
 from localizer.registration import JNGO, Registration
 from localizer.render.holes import fill_holes
 from localizer.render.numba_raster import NumbaRenderer

@@ -16,7 +16,7 @@ from unittest import mock
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from localizer.pose import Array, Pose, so3_exp
+from localizer.geometry.pose import Array, Pose, so3_exp
 from localizer.registration import (
     PoseConstraint,
     attitude_constraint,

@@ -17,19 +17,19 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from localizer.camera import Camera
-from localizer.geo import Geodetic
-from localizer.map.build import build_cache
-from localizer.map.cache import TileCache
-from localizer.map.stream import TileStreamer
-from localizer.pose import Pose
+from localizer.geometry.camera import Camera
+from localizer.geometry.geo import Geodetic
+from localizer.geometry.pose import Pose
+from localizer.map.building.build import build_cache
+from localizer.map.cache.cache import TileCache
+from localizer.map.cache.stream import TileStreamer
 from localizer.render.numba_raster import NumbaRenderer
-from localizer.synth.appearance import CONDITIONS, apply_appearance, sample_appearance
+from localizer.synth.appearance.model import CONDITIONS, apply_appearance, sample_appearance
 from localizer.synth.config import SURVEY, WorldConfig
 from localizer.synth.world import build_visits
-from localizer.training.data import tamed
-from localizer.training.pairs import look_at, soften
-from localizer.training.worlds import random_look
+from localizer.training.data.batches import tamed
+from localizer.training.data.pairs import look_at, soften
+from localizer.training.places.worlds import random_look
 from localizer.types import Image, RenderedView
 
 SIZE = (320, 240)

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from localizer.features import FeatureExtractor
-from localizer.pose import Pose
+from localizer.geometry.pose import Pose
 from localizer.registration import JNGO, select_anchors
 from localizer.render.holes import fill_holes
 from localizer.types import FeatureLevel, FeaturePyramid, Image, PosePrior, RenderedView

@@ -12,12 +12,12 @@ from pathlib import Path
 
 import numpy as np
 
-from localizer.pose import Pose
-from localizer.synth.appearance import CONDITIONS, apply_appearance, sample_appearance
-from localizer.training.data import tamed
-from localizer.training.pairs import COMBINED, OUTDATED, SEASON, Pair, SceneConfig
-from localizer.training.shards import PhotoSource, read_shard, shard_path, write_shards
-from localizer.training.worlds import world_pairs
+from localizer.geometry.pose import Pose
+from localizer.synth.appearance.model import CONDITIONS, apply_appearance, sample_appearance
+from localizer.training.data.batches import tamed
+from localizer.training.data.pairs import COMBINED, OUTDATED, SEASON, Pair, SceneConfig
+from localizer.training.data.shards import PhotoSource, read_shard, shard_path, write_shards
+from localizer.training.places.worlds import world_pairs
 from localizer.types import Image, RenderedView
 
 METRES, DEGREES = 5.0, 5.0  # distance of the reference view from the query's true pose

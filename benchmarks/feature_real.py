@@ -19,18 +19,18 @@ import cv2
 import numpy as np
 from feature_pairs import DEGREES, METRES, SIZE, TestPair
 
-from localizer.camera import Camera
-from localizer.geo import Geodetic
-from localizer.map.build import build_cache
-from localizer.map.cache import TileCache
-from localizer.map.stream import TileStreamer
-from localizer.pose import Pose
+from localizer.geometry.camera import Camera
+from localizer.geometry.geo import Geodetic
+from localizer.geometry.pose import Pose
+from localizer.map.building.build import build_cache
+from localizer.map.cache.cache import TileCache
+from localizer.map.cache.stream import TileStreamer
 from localizer.render.numba_raster import NumbaRenderer
-from localizer.synth.appearance import CONDITIONS, apply_appearance, sample_appearance
-from localizer.training.data import tamed
-from localizer.training.pairs import SEASON, look_at, moved
-from localizer.training.revisit import coarser, draw_texel, hard_surfaces, regrown
-from localizer.training.seasons import season_shift
+from localizer.synth.appearance.model import CONDITIONS, apply_appearance, sample_appearance
+from localizer.training.data.batches import tamed
+from localizer.training.data.pairs import SEASON, look_at, moved
+from localizer.training.places.changes import coarser, draw_texel, hard_surfaces, regrown
+from localizer.training.places.seasons import season_shift
 from localizer.types import Float32, Image, RenderedView
 
 PHOTO, COARSE_MAP, OLDER_MAP = "photo", "photo, coarser map", "photo, older map"

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from localizer.errors import SequenceError
-from localizer.synth.appearance import CONDITIONS
+from localizer.synth.appearance.model import CONDITIONS
 
 _DRAWS = 2000  # of the bootstrap
 

@@ -27,13 +27,13 @@ from named_errors import named_errors
 from rich.console import Console
 from rich.table import Table
 
-from localizer.camera import Camera
-from localizer.geo import Geodetic, LocalFrame
-from localizer.map.build import build_tree
-from localizer.map.cache import TileCache
+from localizer.geometry.camera import Camera
+from localizer.geometry.geo import Geodetic, LocalFrame
+from localizer.geometry.pose import Pose, so3_exp
+from localizer.map.building.build import build_tree
+from localizer.map.cache.cache import TileCache
+from localizer.map.cache.stream import StreamCounters, TileStreamer
 from localizer.map.source import SourceMesh, SourceNode, SourceTree
-from localizer.map.stream import StreamCounters, TileStreamer
-from localizer.pose import Pose, so3_exp
 
 ORIGIN = Geodetic(47.0, 8.0, 400.0)
 LEAF_M, TEXELS, CELLS = 80.0, 512, 64

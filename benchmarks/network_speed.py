@@ -47,8 +47,8 @@ def untrained_s0(folder: Path) -> list[Path]:
         import torch
 
         from localizer.training.config import load_config
-        from localizer.training.export import export
-        from localizer.training.networks import build
+        from localizer.training.export.export import export
+        from localizer.training.models.networks import build
     except ModuleNotFoundError as error:
         raise ModelError(
             f"an untrained s0 needs {error.name}: pip install '.[train]', or give --s0 MODEL.onnx"

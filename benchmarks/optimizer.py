@@ -33,13 +33,13 @@ from optimizer_problem import (
 from rich.console import Console
 from rich.table import Table
 
-from localizer.camera import Camera
-from localizer.pose import Pose
+from localizer.geometry.camera import Camera
+from localizer.geometry.pose import Pose
 from localizer.registration import JNGO
 from localizer.registration import anchors as anchors_module
 from localizer.registration.backend import Backend, LevelProblem, LMSettings, sample_bilinear
-from localizer.registration.kernel_numba import NumbaBackend
-from localizer.registration.reference import ReferenceBackend
+from localizer.registration.cpu.kernel import NumbaBackend
+from localizer.registration.cpu.reference import ReferenceBackend
 from localizer.types import Anchors, FeatureLevel, FeaturePyramid, PosePrior
 
 PAPER_TABLE_7 = {

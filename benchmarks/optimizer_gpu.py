@@ -22,8 +22,8 @@ from optimizer_problem import SIZES, make_problem, make_swarm, naive_torch
 from rich.console import Console
 from rich.table import Table
 
-from localizer.camera import Camera
-from localizer.pose import Pose
+from localizer.geometry.camera import Camera
+from localizer.geometry.pose import Pose
 from localizer.registration.backend import (
     LevelProblem,
     LMSettings,
@@ -31,12 +31,12 @@ from localizer.registration.backend import (
     world_from_camera,
 )
 from localizer.registration.config import JNGOConfig
+from localizer.registration.cpu.reference import in_view, linearize, project
 from localizer.registration.cuda.backend import CudaBackend
 from localizer.registration.cuda.compiler import compile_sources
 from localizer.registration.cuda.driver import Arena, Device, Kernels
 from localizer.registration.cuda.errors import CudaError
 from localizer.registration.cuda.schedule import CudaSchedule
-from localizer.registration.reference import in_view, linearize, project
 from localizer.types import Anchors, FeatureLevel, FeaturePyramid
 
 REPEATS, WARM_UP = 50, 5

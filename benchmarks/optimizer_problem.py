@@ -7,7 +7,7 @@ from collections.abc import Callable
 import cv2
 import numpy as np
 
-from localizer.pose import so3_exp
+from localizer.geometry.pose import so3_exp
 from localizer.registration.backend import LevelProblem, sample_bilinear
 
 HYPOTHESES, ANCHORS, CHANNELS = 144, 500, 32

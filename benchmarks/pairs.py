@@ -2,7 +2,7 @@
 
     python benchmarks/pairs.py configs/train_s0.yaml --pairs 4
 
-One process, one thread, places of the run's own size. "torch" is what `localizer.training.live`
+One process, one thread, places of the run's own size. "torch" is what `training.data.live`
 does (views, appearance, windows), on a GPU where there is one; "NumPy" makes pairs of the same
 places by the CPU's renderer, as the shards are made.
 """
@@ -19,13 +19,13 @@ from named_errors import named_errors, needs_torch
 with needs_torch():
     import torch
 
-    from localizer.synth.heightfield_render import render
+    from localizer.synth.heightfield.render import render
     from localizer.training.config import LiveSection, load_config
-    from localizer.training.data import LoaderConfig, crop_pair, window_pair
-    from localizer.training.live import LivePlan, LiveStream
-    from localizer.training.pairs import Pair, SceneConfig, draw_views
-    from localizer.training.streams import photo_source, scene_config
-    from localizer.training.visits import PlaceVisits, make_place
+    from localizer.training.data.batches import LoaderConfig, crop_pair, window_pair
+    from localizer.training.data.live import LivePlan, LiveStream
+    from localizer.training.data.pairs import Pair, SceneConfig, draw_views
+    from localizer.training.data.streams import photo_source, scene_config
+    from localizer.training.places.lit_places import PlaceVisits, make_place
 
 
 def numpy_pairs(

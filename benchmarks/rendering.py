@@ -19,11 +19,11 @@ from named_errors import named_errors
 from rich.console import Console
 from rich.table import Table
 
-from localizer.camera import Camera
 from localizer.errors import RenderError
-from localizer.map.pick import cast_rays
-from localizer.map.tile import TileMesh, build_mips
-from localizer.pose import Pose, so3_exp
+from localizer.geometry.camera import Camera
+from localizer.geometry.pose import Pose, so3_exp
+from localizer.map.cache.pick import cast_rays
+from localizer.map.cache.tile import TileMesh, build_mips
 from localizer.render.base import MapRenderer, StaticTiles
 from localizer.render.select import make_renderer
 from localizer.types import Image

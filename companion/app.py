@@ -26,10 +26,10 @@ from companion.recorder import Recorder, fresh_folder, remove_empty, write_manif
 from companion.sources import StreamState, open_source
 from companion.target_reporter import Target, TargetReporter
 from companion.view_reporter import ViewReporter
-from localizer.engine import DualThreadEngine
-from localizer.map.cache import TileCache
-from localizer.map.surface import MapSurface
-from localizer.pose import Array
+from localizer.geometry.pose import Array
+from localizer.map.cache.cache import TileCache
+from localizer.map.cache.surface import MapSurface
+from localizer.tracking.engine import DualThreadEngine
 from localizer.types import PoseEstimate, PosePrior, ReferenceBundle, TrackingState
 from mavlink_bridge.bridge import Bridge
 from mavlink_bridge.config import BridgeConfig

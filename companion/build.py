@@ -6,18 +6,18 @@ from pathlib import Path
 
 import numpy as np
 
-from localizer.camera import Camera
 from localizer.config import LocalizerConfig
 from localizer.errors import ModelError
 from localizer.features.detail import DetailExtractor
 from localizer.features.extractor import DeviceExtractor, FeatureExtractor, load_extractor
-from localizer.map.cache import TileCache
-from localizer.map.stream import TileStreamer
-from localizer.pipeline import Localizer, RotationAt, working_camera
+from localizer.geometry.camera import Camera
+from localizer.map.cache.cache import TileCache
+from localizer.map.cache.stream import TileStreamer
 from localizer.registration.devices import open_backend
 from localizer.registration.jngo import JNGO
 from localizer.render.base import MapRenderer
 from localizer.render.select import open_renderer
+from localizer.tracking.pipeline import Localizer, RotationAt, working_camera
 
 
 class MapStack:

@@ -12,9 +12,9 @@ from companion.detections import parse_host_port
 from companion.errors import ConfigError
 from companion.settings_file import SettingsError, read_settings, validated
 from companion.sources.base import SourceSettings
-from localizer.camera import Camera
 from localizer.config import LocalizerConfig
 from localizer.errors import CameraError
+from localizer.geometry.camera import Camera
 from mavlink_bridge.config import BridgeConfig
 
 _FIELDS_OF_VIEW_DEG = (1.0, 170.0)

@@ -7,9 +7,9 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from localizer.geo import LocalFrame
-from localizer.map.cache import TileCache
-from localizer.pose import Array
+from localizer.geometry.geo import LocalFrame
+from localizer.geometry.pose import Array
+from localizer.map.cache.cache import TileCache
 from mavlink_bridge.config import OriginConfig
 from mavlink_bridge.doctor import Finding
 from mavlink_bridge.mission import Waypoint

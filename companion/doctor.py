@@ -13,8 +13,8 @@ from companion.errors import CompanionError
 from companion.sources import SourceSettings, open_source
 from localizer.errors import LocalizerError
 from localizer.features.extractor import load_extractor
-from localizer.geo import LocalFrame
-from localizer.map.cache import TileCache
+from localizer.geometry.geo import LocalFrame
+from localizer.map.cache.cache import TileCache
 from mavlink_bridge.doctor import Diagnosis, Finding, examine
 from mavlink_bridge.errors import BridgeError
 from mavlink_bridge.mission import download_mission

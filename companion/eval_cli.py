@@ -19,9 +19,9 @@ from companion.build import MapStack, build_localizer
 from companion.errors import ConfigError, ReportError
 from companion.plots import ErrorSeries, overlay_sheet, plot_errors, save_image
 from companion.versions import versions
-from localizer.camera import Camera
 from localizer.config import LocalizerConfig
-from localizer.evaluation import (
+from localizer.evaluation.metrics import LocalizationMetrics
+from localizer.evaluation.sequences import (
     CSV_COLUMNS,
     EvaluatedFrame,
     Perturbation,
@@ -32,12 +32,12 @@ from localizer.evaluation import (
     load_sequence,
 )
 from localizer.features.extractor import load_extractor
-from localizer.geo import LocalFrame
-from localizer.metrics import LocalizationMetrics
-from localizer.pipeline import Undistorter
+from localizer.geometry.camera import Camera
+from localizer.geometry.geo import LocalFrame
 from localizer.registration.devices import DeviceChoice
 from localizer.render.base import MapRenderer
 from localizer.render.select import Backend
+from localizer.tracking.pipeline import Undistorter
 
 _OVERLAYS = 4
 _PROBLEMS = 5  # texts that are printed

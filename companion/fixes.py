@@ -19,8 +19,8 @@ from companion.geometry import (
     world_from_camera,
 )
 from localizer.errors import GeoreferenceError
-from localizer.geo import NED_FROM_ENU, Geodetic, LocalFrame
-from localizer.pose import Array, euler_from_matrix, matrix_from_quaternion
+from localizer.geometry.geo import NED_FROM_ENU, Geodetic, LocalFrame
+from localizer.geometry.pose import Array, euler_from_matrix, matrix_from_quaternion
 from localizer.types import PoseEstimate, PosePrior
 from mavlink_bridge.messages import Attitude, GimbalAttitude, VehicleState, VisionFix
 

@@ -16,7 +16,7 @@ import numpy as np
 
 from companion.config import RecordConfig
 from companion.sources import StreamState
-from localizer.engine import DualThreadEngine
+from localizer.tracking.engine import DualThreadEngine
 from localizer.types import PoseEstimate, TrackingState
 from mavlink_bridge.bridge import Bridge
 from mavlink_bridge.messages import HealthLevel

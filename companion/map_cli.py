@@ -62,7 +62,7 @@ def build(
     ] = None,
 ) -> None:
     """Import a source into a tile cache; goes on where an interrupted build stopped."""
-    from localizer.map.build import build_cache
+    from localizer.map.building.build import build_cache
 
     try:
         manifest = build_cache(
@@ -94,8 +94,8 @@ def build(
 @app.command("info")
 def info(cache: CachePath) -> None:
     """Coverage, texel size, levels and sizes."""
-    from localizer.map.cache import TileCache
-    from localizer.map.inspect import levels
+    from localizer.map.cache.cache import TileCache
+    from localizer.map.inspection.inspect import levels
 
     opened = TileCache.open(cache)
     m = opened.manifest
@@ -133,8 +133,8 @@ def verify(cache: CachePath) -> None:
     Holes may be in the source, as under a bridge's parapet or at a ragged edge: they are listed,
     and do not count as damage.
     """
-    from localizer.map.cache import TileCache
-    from localizer.map.inspect import verify as check
+    from localizer.map.cache.cache import TileCache
+    from localizer.map.inspection.inspect import verify as check
 
     result = check(TileCache.open(cache))
     console = Console()
@@ -171,9 +171,9 @@ def render(
         raise typer.BadParameter(f"--out {out}: give a name that ends in .png")
     depth = out.with_name(f"{out.stem}_depth{out.suffix}")
     _require_place(out, depth)
-    from localizer.camera import Camera
-    from localizer.map import inspect
-    from localizer.map.cache import TileCache
+    from localizer.geometry.camera import Camera
+    from localizer.map.cache.cache import TileCache
+    from localizer.map.inspection import inspect
 
     opened = TileCache.open(cache)
     pose = inspect.camera_pose(opened, latitude, longitude, height, heading, pitch)
@@ -195,8 +195,8 @@ def export(
 ) -> None:
     """The map's surface as one GLB (y up, metres about the cache's origin)."""
     _require_place(out)
-    from localizer.map.cache import TileCache
-    from localizer.map.inspect import export_glb
+    from localizer.map.cache.cache import TileCache
+    from localizer.map.inspection.inspect import export_glb
 
     opened = TileCache.open(cache)
     with _written(out):

@@ -11,7 +11,7 @@ import matplotlib as mpl
 import numpy as np
 from matplotlib.figure import Figure
 
-from localizer.pose import Array
+from localizer.geometry.pose import Array
 from localizer.types import Image
 
 mpl.use("Agg")

@@ -20,8 +20,8 @@ from companion.config import CompanionConfig, RecordConfig
 from companion.errors import DiskFaultError, ReportError
 from companion.sources.timing import system_minus_monotonic
 from companion.versions import versions
-from localizer.geo import LocalFrame
-from localizer.pose import quaternion_from_matrix
+from localizer.geometry.geo import LocalFrame
+from localizer.geometry.pose import quaternion_from_matrix
 from localizer.types import Frame, PoseEstimate, TargetFix
 from mavlink_bridge.recorder import is_disk_fault
 

@@ -25,10 +25,10 @@ from companion.fixes import camera_rotation, vehicle_prior
 from companion.recorder import MANIFEST_NAME
 from companion.sources.base import fitted_camera
 from companion.sources.folder_source import read_image
-from localizer.camera import Camera
 from localizer.errors import OutsideMapError
-from localizer.pipeline import Localizer
-from localizer.pose import Array, Pose, matrix_from_quaternion
+from localizer.geometry.camera import Camera
+from localizer.geometry.pose import Array, Pose, matrix_from_quaternion
+from localizer.tracking.pipeline import Localizer
 from localizer.types import Frame, PoseEstimate
 from mavlink_bridge import quaternion as quat
 from mavlink_bridge.vehicle import VehicleTracker

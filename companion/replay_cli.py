@@ -13,7 +13,7 @@ from rich.progress import Progress
 from rich.table import Table
 
 from companion.errors import RecordError
-from localizer.pose import Array
+from localizer.geometry.pose import Array
 
 
 def replay_command(

@@ -10,9 +10,9 @@ from dataclasses import dataclass
 
 from companion.config import TargetConfig
 from companion.detections import Detection
-from localizer.pose import Array
-from localizer.target_filter import TargetFilter
-from localizer.targets import RayCaster, locate
+from localizer.geometry.pose import Array
+from localizer.targets.filter import TargetFilter
+from localizer.targets.locate import RayCaster, locate
 from localizer.types import PoseEstimate, TargetFix, TargetSighting
 
 _log = logging.getLogger(__name__)

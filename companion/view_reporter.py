@@ -8,9 +8,9 @@ import threading
 from collections.abc import Callable
 
 from companion.geometry import GIMBAL_FROM_CAMERA, ned_from_world
-from localizer.geo import LocalFrame
-from localizer.pose import quaternion_from_matrix
-from localizer.targets import RayCaster, ray_in_world
+from localizer.geometry.geo import LocalFrame
+from localizer.geometry.pose import quaternion_from_matrix
+from localizer.targets.locate import RayCaster, ray_in_world
 from localizer.types import PoseEstimate
 from mavlink_bridge.messages import CameraView
 

@@ -6,11 +6,11 @@ from pathlib import Path
 
 from pydantic import BaseModel, ConfigDict, Field
 
-from localizer.integrity import IntegrityConfig
-from localizer.motion import MotionConfig
 from localizer.registration.config import JNGOConfig
 from localizer.registration.devices import DeviceChoice
 from localizer.render.select import Backend
+from localizer.tracking.integrity import IntegrityConfig
+from localizer.tracking.motion import MotionConfig
 
 
 class AttitudePrior(BaseModel):

@@ -1,6 +1,6 @@
 """The small frozen messages that travel between threads and packages.
 
-World means the map's ENU frame (`localizer.geo.LocalFrame` about the map's origin), float64
+World means the map's ENU frame (`geometry.geo.LocalFrame` about the map's origin), float64
 metres. Camera means OpenCV axes (x right, y down, z forward). Times are CLOCK_MONOTONIC
 nanoseconds of the exposure's middle.
 """
@@ -13,8 +13,8 @@ from enum import Enum
 import numpy as np
 from numpy.typing import NDArray
 
-from localizer.camera import Camera
-from localizer.pose import Array, Pose
+from localizer.geometry.camera import Camera
+from localizer.geometry.pose import Array, Pose
 
 Float32 = NDArray[np.float32]
 Image = NDArray[np.uint8]
@@ -110,7 +110,7 @@ class RegistrationStatus(Enum):
 
 
 class TrackingState(Enum):
-    """State of the tracking state machine (`localizer.integrity`)."""
+    """State of the tracking state machine (`localizer.tracking.integrity`)."""
 
     INITIALIZING = "initializing"
     TRACKING = "tracking"

@@ -15,7 +15,7 @@ from rich.markup import escape
 
 from companion.errors import CompanionError
 from localizer.errors import LocalizerError
-from localizer.synth.appearance import CONDITIONS
+from localizer.synth.appearance.model import CONDITIONS
 from sitl.assets import prepare
 from sitl.errors import SimulationError
 from sitl.flight import fly

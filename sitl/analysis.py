@@ -9,8 +9,8 @@ from pathlib import Path
 
 import numpy as np
 
-from localizer.metrics import LocalizationMetrics, localization_metrics
-from localizer.pose import Array, Pose, matrix_from_quaternion
+from localizer.evaluation.metrics import LocalizationMetrics, localization_metrics
+from localizer.geometry.pose import Array, Pose, matrix_from_quaternion
 
 Columns = Mapping[str, Array]
 

@@ -8,8 +8,8 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
-from localizer.map.build import build_cache
-from localizer.map.cache import TileCache
+from localizer.map.building.build import build_cache
+from localizer.map.cache.cache import TileCache
 from localizer.synth.config import WorldConfig, look_of
 from localizer.synth.world import WorldInfo, build_visits
 

@@ -20,12 +20,12 @@ import cv2
 import numpy as np
 
 from companion.geometry import Mount
-from localizer.camera import Camera
-from localizer.geo import Geodetic, LocalFrame
-from localizer.map.cache import TileCache
-from localizer.map.stream import TileStreamer
+from localizer.geometry.camera import Camera
+from localizer.geometry.geo import Geodetic, LocalFrame
+from localizer.map.cache.cache import TileCache
+from localizer.map.cache.stream import TileStreamer
 from localizer.render.numba_raster import NumbaRenderer
-from localizer.synth.appearance import Appearance
+from localizer.synth.appearance.model import Appearance
 from sitl.detector import Detector, Observed
 from sitl.errors import WorldCameraError
 from sitl.moving import Mover

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from localizer.metrics import LocalizationMetrics
+from localizer.evaluation.metrics import LocalizationMetrics
 from sitl.analysis import Spread
 
 _MAX_LATENCY_MS = 250.0  # the oldest measurement that ArduPilot fuses; VISO_DELAY_MS's maximum

@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from localizer.camera import Camera
+from localizer.geometry.camera import Camera
 from localizer.types import Float32, Image
 
 

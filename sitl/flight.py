@@ -15,8 +15,8 @@ from pathlib import Path
 
 import numpy as np
 
-from localizer.map.cache import TileCache
-from localizer.synth.appearance import sample_appearance
+from localizer.map.cache.cache import TileCache
+from localizer.synth.appearance.model import sample_appearance
 from sitl.assets import FlightAssets
 from sitl.camera_process import CameraStatistics, WorldCameraConfig, WorldCameraProcess
 from sitl.companion_process import Ports, free_udp_port, running_companion, write_deployment

@@ -8,12 +8,12 @@ from pathlib import Path
 import numpy as np
 
 from companion.geometry import GIMBAL_FROM_CAMERA
-from localizer.geo import NED_FROM_ENU
-from localizer.map.cache import TileCache
-from localizer.map.stream import TileStreamer
-from localizer.pose import Array, Pose, matrix_from_euler
+from localizer.geometry.geo import NED_FROM_ENU
+from localizer.geometry.pose import Array, Pose, matrix_from_euler
+from localizer.map.cache.cache import TileCache
+from localizer.map.cache.stream import TileStreamer
 from localizer.render.numba_raster import NumbaRenderer
-from localizer.synth.appearance import sample_appearance
+from localizer.synth.appearance.model import sample_appearance
 from sitl.assets import FlightAssets
 from sitl.scenario import Scenario
 from sitl.sequence import record_sequence

@@ -9,8 +9,8 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import ArrayLike
 
-from localizer.map.tile import TileMesh
-from localizer.pose import Array, Pose
+from localizer.geometry.pose import Array, Pose
+from localizer.map.cache.tile import TileMesh
 
 _TURN_M = 2.5  # half the length over which a direction is taken: objects turn smoothly at corners
 

@@ -23,14 +23,14 @@ from companion.plots import (
     save_image,
 )
 from companion.versions import versions
-from localizer.camera import Camera
+from localizer.evaluation.metrics import LocalizationMetrics
 from localizer.features.extractor import load_extractor
-from localizer.map.cache import TileCache
-from localizer.map.stream import TileStreamer
-from localizer.metrics import LocalizationMetrics
-from localizer.pipeline import Undistorter
-from localizer.pose import Array, Pose
+from localizer.geometry.camera import Camera
+from localizer.geometry.pose import Array, Pose
+from localizer.map.cache.cache import TileCache
+from localizer.map.cache.stream import TileStreamer
 from localizer.render.numba_raster import NumbaRenderer
+from localizer.tracking.pipeline import Undistorter
 from localizer.types import Frame
 from sitl.analysis import (
     Columns,

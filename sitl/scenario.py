@@ -9,7 +9,7 @@ from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from companion.config import CameraModel
 from companion.settings_file import SettingsError, read_settings, validated
-from localizer.camera import Camera
+from localizer.geometry.camera import Camera
 from sitl.errors import SimulationError
 
 VehicleKind = Literal["auto", "ardupilot", "embedded"]

@@ -1,4 +1,4 @@
-"""`localizer.synth.appearance` at video rate: the same model, fused into two passes over the image.
+"""`synth.appearance.model` at video rate: the same model, fused into two passes over the image.
 
 The general function costs as much as rendering does; the world camera shares two cores with the
 companion it tests. What few live scenes need (lamps, rain, snow) is left to that function.
@@ -13,7 +13,7 @@ import cv2
 import numpy as np
 from numba import njit
 
-from localizer.synth.appearance import Appearance, apply_appearance
+from localizer.synth.appearance.model import Appearance, apply_appearance
 from localizer.types import Float32, Image
 
 _SKY_M = 4000.0  # haze distance of pixels without a surface, as in the general function

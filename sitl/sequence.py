@@ -8,8 +8,8 @@ from pathlib import Path
 
 import cv2
 
-from localizer.geo import LocalFrame
-from localizer.posefile import PoseRow, pose_row, write_poses
+from localizer.geometry.geo import LocalFrame
+from localizer.geometry.posefile import PoseRow, pose_row, write_poses
 from sitl.truth import PoseTrack
 from sitl.world_camera import WorldCamera
 

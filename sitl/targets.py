@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import numpy as np
 
-from localizer.camera import Camera
-from localizer.map.cache import TileCache
-from localizer.map.pick import cast_rays
-from localizer.map.stream import TileStreamer
-from localizer.map.tile import TileMesh
-from localizer.pose import Array, Pose
+from localizer.geometry.camera import Camera
+from localizer.geometry.pose import Array, Pose
+from localizer.map.cache.cache import TileCache
+from localizer.map.cache.pick import cast_rays
+from localizer.map.cache.stream import TileStreamer
+from localizer.map.cache.tile import TileMesh
 from sitl.assets import FlightAssets
 from sitl.detector import FixedPoint, Observed
 from sitl.kinematic import camera_path

@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from localizer.geo import LocalFrame
-from localizer.pose import Array
-from localizer.synth.props import CAR_COLOURS, car_mesh, person_mesh
+from localizer.geometry.geo import LocalFrame
+from localizer.geometry.pose import Array
+from localizer.synth.tiles.props import CAR_COLOURS, car_mesh, person_mesh
 from localizer.synth.world import WorldInfo
 from sitl.moving import Mover, spread, there_and_back
 

@@ -15,8 +15,8 @@ from companion.geometry import (
     ned_from_world,
     world_from_camera,
 )
-from localizer.geo import LocalFrame
-from localizer.pose import Array, Pose, matrix_from_quaternion, so3_exp, so3_log
+from localizer.geometry.geo import LocalFrame
+from localizer.geometry.pose import Array, Pose, matrix_from_quaternion, so3_exp, so3_log
 
 
 @dataclass(frozen=True)

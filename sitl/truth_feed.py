@@ -9,7 +9,7 @@ from dataclasses import replace
 from typing import Any
 
 from companion.geometry import GimbalAngles, GimbalFrame
-from localizer.map.cache import TileCache
+from localizer.map.cache.cache import TileCache
 from sitl.camera_process import WorldCameraProcess
 from sitl.embedded.geodesy import Location
 from sitl.errors import SimulationError

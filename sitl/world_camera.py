@@ -15,10 +15,10 @@ from types import TracebackType
 
 import numpy as np
 
-from localizer.camera import Camera
-from localizer.pose import Array, Pose, quaternion_from_matrix
+from localizer.geometry.camera import Camera
+from localizer.geometry.pose import Array, Pose, quaternion_from_matrix
 from localizer.render.base import MapRenderer
-from localizer.synth.appearance import Appearance
+from localizer.synth.appearance.model import Appearance
 from localizer.types import Float32, Image, RenderedView
 from sitl.distortion import Lens
 from sitl.moving import Mover

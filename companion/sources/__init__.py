@@ -14,7 +14,7 @@ from companion.sources.base import (
     StreamState,
 )
 from companion.sources.folder_source import FolderSource
-from localizer.camera import Camera
+from localizer.geometry.camera import Camera
 
 __all__ = [
     "FolderSource",

@@ -26,7 +26,7 @@ from companion.sources.base import (
 from companion.sources.misp import MispTime, parse_message
 from companion.sources.slot import NewestSlot
 from companion.sources.timing import ExposureClock, Stamps
-from localizer.camera import Camera
+from localizer.geometry.camera import Camera
 from localizer.types import Frame, Image
 
 _log = logging.getLogger(__name__)

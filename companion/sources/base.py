@@ -11,8 +11,8 @@ from pydantic import BaseModel, ConfigDict, Field
 
 from companion.errors import StreamSizeError
 from companion.sources.timing import Timing
-from localizer.camera import Camera
 from localizer.errors import CameraError
+from localizer.geometry.camera import Camera
 from localizer.types import Frame
 
 # Relative difference of width / height that rounding to even sizes makes; 1080 padded to 1088

@@ -20,7 +20,7 @@ from companion.sources.base import (
     fitted_camera,
     scaling_text,
 )
-from localizer.camera import Camera
+from localizer.geometry.camera import Camera
 from localizer.types import Frame, Image
 
 IMAGE_SUFFIXES = frozenset({".jpg", ".jpeg", ".png", ".bmp", ".tif", ".tiff"})

@@ -10,7 +10,7 @@ from typing import Literal, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from localizer.pose import Array
+from localizer.geometry.pose import Array
 from localizer.types import Float32, Image
 
 VerticalDatum = Literal["ellipsoidal", "amsl"]

@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from localizer.pose import Array
+from localizer.geometry.pose import Array
 from localizer.registration.sampling import sample_features
 from localizer.types import Anchors, FeatureLevel, FeaturePyramid, Float32, RenderedView
 

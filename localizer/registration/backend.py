@@ -13,8 +13,8 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from localizer.camera import Camera
-from localizer.pose import Array, Pose
+from localizer.geometry.camera import Camera
+from localizer.geometry.pose import Array, Pose
 from localizer.types import Anchors, FeatureLevel, FeaturePyramid, Float32
 
 

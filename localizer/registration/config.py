@@ -6,7 +6,7 @@ from typing import Annotated
 
 from pydantic import BaseModel, ConfigDict, Field
 
-from localizer.pose import Array
+from localizer.geometry.pose import Array
 from localizer.registration.backend import LMSettings
 from localizer.registration.covariance import NoiseModel
 from localizer.registration.hypotheses import generate_hypotheses

@@ -8,9 +8,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from localizer.pose import Array, Pose
+from localizer.geometry.pose import Array, Pose
 from localizer.registration.backend import LevelProblem, LMSettings, sample_bilinear
-from localizer.registration.reference import (
+from localizer.registration.cpu.reference import (
     feature_gradients,
     in_view,
     pose_tangent_map,

@@ -8,10 +8,10 @@ from typing import Literal
 import numpy as np
 
 from localizer.registration.backend import Backend, LevelProblem, LMSettings
+from localizer.registration.cpu.kernel import NumbaBackend
 from localizer.registration.cuda.backend import CudaBackend
 from localizer.registration.cuda.driver import Device
 from localizer.registration.cuda.errors import CudaError, CudaUnavailableError
-from localizer.registration.kernel_numba import NumbaBackend
 
 logger = logging.getLogger(__name__)
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from localizer.pose import Array
+from localizer.geometry.pose import Array
 from localizer.types import PosePrior
 
 _LEAST_TICKS = 3  # per axis, however well the attitude is known

@@ -13,9 +13,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from localizer.camera import Camera
 from localizer.device_array import DeviceArray
-from localizer.pose import Array, Pose
+from localizer.geometry.camera import Camera
+from localizer.geometry.pose import Array, Pose
 from localizer.registration.backend import (
     Backend,
     LevelProblem,
@@ -35,14 +35,14 @@ from localizer.registration.covariance import (
     curvature_steps,
     pose_differences,
 )
+from localizer.registration.cpu.kernel import NumbaBackend
+from localizer.registration.cpu.reference import ReferenceBackend, count_in_view, retractions
 from localizer.registration.cuda.backend import CudaBackend
 from localizer.registration.cuda.errors import CudaError
 from localizer.registration.cuda.registration import register_on_device
 from localizer.registration.cuda.schedule import CudaSchedule
 from localizer.registration.devices import trial
-from localizer.registration.kernel_numba import NumbaBackend
 from localizer.registration.priors import PoseConstraint
-from localizer.registration.reference import ReferenceBackend, count_in_view, retractions
 from localizer.registration.result import Found, Registration, failure, registration
 from localizer.registration.selection import (
     LEAST_SCORE,

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from localizer.pose import Array, Pose, so3_exp, so3_log
+from localizer.geometry.pose import Array, Pose, so3_exp, so3_log
 
 
 @dataclass(frozen=True)

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from localizer.pose import Array, Pose
+from localizer.geometry.pose import Array, Pose
 from localizer.registration.backend import world_from_camera
 from localizer.registration.config import JNGOConfig
 from localizer.registration.covariance import (

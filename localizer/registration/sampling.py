@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
-from localizer.pose import Array
-from localizer.registration.kernel_algebra import JIT
+from localizer.geometry.pose import Array
+from localizer.registration.cpu.algebra import JIT
 from localizer.types import Float32
 
 

@@ -10,9 +10,9 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from localizer.pose import Array
+from localizer.geometry.pose import Array
 from localizer.registration.backend import LevelProblem, LMSettings, sample_bilinear
-from localizer.registration.reference import in_view, project, robust_loss
+from localizer.registration.cpu.reference import in_view, project, robust_loss
 from localizer.registration.sampling import sample_features
 from localizer.types import Float32
 

@@ -11,10 +11,10 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from localizer.camera import Camera
 from localizer.errors import CameraError
-from localizer.map.tile import TileMesh
-from localizer.pose import Array, Pose
+from localizer.geometry.camera import Camera
+from localizer.geometry.pose import Array, Pose
+from localizer.map.cache.tile import TileMesh
 from localizer.types import RenderedView
 
 NEAR_M = 0.5  # nearer surfaces are cut off: no aircraft's camera is that close to its map

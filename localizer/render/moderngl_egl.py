@@ -18,10 +18,10 @@ import cv2
 import moderngl
 import numpy as np
 
-from localizer.camera import Camera
 from localizer.errors import RenderError
-from localizer.map.tile import TileMesh
-from localizer.pose import Pose
+from localizer.geometry.camera import Camera
+from localizer.geometry.pose import Pose
+from localizer.map.cache.tile import TileMesh
 from localizer.render.base import SKY, TileProvider, TileRenderer, clip_from_camera
 from localizer.types import RenderedView
 

@@ -17,9 +17,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from localizer.camera import Camera
-from localizer.map.tile import TileMesh
-from localizer.pose import Array, Pose
+from localizer.geometry.camera import Camera
+from localizer.geometry.pose import Array, Pose
+from localizer.map.cache.tile import TileMesh
 from localizer.render.base import NEAR_M, SKY, TileProvider, TileRenderer
 from localizer.render.raster_kernels import (
     clear,

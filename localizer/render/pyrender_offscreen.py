@@ -24,10 +24,10 @@ from OpenGL import GL
 from pyrender.renderer import Renderer
 from pyrender.shader_program import ShaderProgramCache
 
-from localizer.camera import Camera
 from localizer.errors import RenderError
-from localizer.map.tile import TileMesh
-from localizer.pose import Array, Pose
+from localizer.geometry.camera import Camera
+from localizer.geometry.pose import Array, Pose
+from localizer.map.cache.tile import TileMesh
 from localizer.render.base import SKY, TileProvider, TileRenderer, clip_from_camera
 from localizer.types import RenderedView
 

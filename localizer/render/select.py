@@ -7,10 +7,10 @@ from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from typing import Literal, TypeVar
 
-from localizer.camera import Camera
 from localizer.errors import RenderError
-from localizer.map.tile import TileMesh
-from localizer.pose import Pose
+from localizer.geometry.camera import Camera
+from localizer.geometry.pose import Pose
+from localizer.map.cache.tile import TileMesh
 from localizer.render.base import SKY, MapRenderer, TileProvider
 from localizer.render.numba_raster import NumbaRenderer
 from localizer.types import RenderedView

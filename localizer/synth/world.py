@@ -17,16 +17,16 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from localizer.errors import MapSourceError
-from localizer.geo import Geodetic, LocalFrame
-from localizer.pose import Array
-from localizer.synth.bake import Baker, Part, bake_block, start_worker
-from localizer.synth.coarse_tiles import assemble_root, assemble_top
+from localizer.geometry.geo import Geodetic, LocalFrame
+from localizer.geometry.pose import Array
 from localizer.synth.config import BLOCK_M, TOP_M, Look, Variant, WorldConfig, look_of
-from localizer.synth.layout import plan_world
-from localizer.synth.plan import Target, WorldPlan
-from localizer.synth.scene import Scene, make_scene
-from localizer.synth.terrain import River, Terrain
-from localizer.synth.tiles import write_tileset
+from localizer.synth.plan.layout import plan_world
+from localizer.synth.plan.plan import Target, WorldPlan
+from localizer.synth.plan.terrain import River, Terrain
+from localizer.synth.tiles.bake import Baker, Part, bake_block, start_worker
+from localizer.synth.tiles.coarse import assemble_root, assemble_top
+from localizer.synth.tiles.scene import Scene, make_scene
+from localizer.synth.tiles.write import write_tileset
 
 _FORMAT = 1
 _INFO, _HEIGHTS = "world.json", "heights.npy"

@@ -16,8 +16,8 @@ from localizer.errors import LocalizerError
 
 try:
     from localizer.training.config import LiveSection, TrainConfig, load_config
-    from localizer.training.seeds import FIRST_WORLD_SEED
-    from localizer.training.shards import write_shards, write_world_shards
+    from localizer.training.data.seeds import FIRST_WORLD_SEED
+    from localizer.training.data.shards import write_shards, write_world_shards
 except ModuleNotFoundError as error:
     if error.name != "torch":
         raise
@@ -46,7 +46,7 @@ def train(
 
     On several GPUs: torchrun --nproc-per-node N -m localizer.training train CONFIG.
     """
-    from localizer.training.train import Trainer
+    from localizer.training.loop.train import Trainer
 
     loaded = load_config(config)
     trainer = Trainer(loaded)
@@ -63,9 +63,9 @@ def ablation(
 
     Compare them with: python benchmarks/features.py --baselines --models RUN/tiny.onnx ...
     """
-    from localizer.training.ablation import ablations
-    from localizer.training.export import export as write
-    from localizer.training.train import Trainer
+    from localizer.training.export.export import export as write
+    from localizer.training.loop.ablation import ablations
+    from localizer.training.loop.train import Trainer
 
     for name, run in ablations(load_config(config), steps, scenes).items():
         _generate(run)
@@ -83,7 +83,7 @@ def export(
     float16: Annotated[bool, typer.Option("--float16", help="Half precision; s0 only.")] = False,
 ) -> None:
     """Write a checkpoint's averaged weights as an ONNX model with its description."""
-    from localizer.training.export import export as write
+    from localizer.training.export.export import export as write
 
     parity = write(checkpoint, model, half=float16)
     typer.echo(
@@ -99,7 +99,7 @@ def quantize(
     shards: Annotated[list[Path], typer.Argument(help="Shards (.npz) to calibrate on.")],
 ) -> None:
     """Write the int8 form of a model. Compare both with benchmarks/features.py before using it."""
-    from localizer.training.quantize import quantize as write
+    from localizer.training.export.quantize import quantize as write
 
     typer.echo(f"{out}: mean cosine to the float features {write(model, out, shards):.4f}")
 
@@ -111,9 +111,9 @@ def unfuse(
     shards: Annotated[list[Path], typer.Argument(help="Shards (.npz) to take statistics on.")],
 ) -> None:
     """Make a published model trainable again."""
-    from localizer.training.checkpoint import write_checkpoint
-    from localizer.training.quantize import calibration_images
-    from localizer.training.unfuse import unfuse as load
+    from localizer.training.export.from_published import unfuse as load
+    from localizer.training.export.quantize import calibration_images
+    from localizer.training.loop.checkpoint import write_checkpoint
 
     network = load(model, list(calibration_images(shards)))
     write_checkpoint(out, {"average": network.state_dict()})
@@ -122,7 +122,7 @@ def unfuse(
 @app.command()
 def curves(log: Annotated[Path, typer.Argument(help="CSV that a run wrote.")]) -> None:
     """Plot a run's metrics beside its CSV."""
-    from localizer.training.curves import plot
+    from localizer.training.loop.curves import plot
 
     typer.echo(plot(log))
 
@@ -134,8 +134,8 @@ def sheet(
     pairs: Annotated[int, typer.Option(help="Pairs from each shard.")] = 2,
 ) -> None:
     """Show training pairs, each with its depth-warp check."""
-    from localizer.training.shards import read_shard
-    from localizer.training.sheet import contact_sheet
+    from localizer.training.data.contact_sheet import contact_sheet
+    from localizer.training.data.shards import read_shard
 
     typer.echo(contact_sheet([p for s in shards for p in read_shard(s)[:pairs]], out))
 
@@ -161,7 +161,7 @@ def _generate(config: TrainConfig) -> None:
     data = config.data
     if isinstance(data, LiveSection):
         return  # it makes its pairs while it trains
-    from localizer.training.streams import photo_source, scene_config
+    from localizer.training.data.streams import photo_source, scene_config
 
     photos, scenes = photo_source(data), scene_config(data)
     first = range(data.first_seed, data.first_seed + min(data.initial_scenes, data.scenes))

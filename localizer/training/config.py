@@ -18,8 +18,8 @@ from pydantic import (
 
 from localizer.errors import ModelError
 from localizer.strict_yaml import load_yaml, misread_booleans
-from localizer.synth.heightfield import BLOCK
-from localizer.training.networks import NetworkConfig
+from localizer.synth.heightfield.scene import BLOCK
+from localizer.training.models.networks import NetworkConfig
 
 _MOST_WORKERS = 1024  # processes or threads
 _MOST_STEPS = 10**9
@@ -57,7 +57,7 @@ class DataSection(_PlacesSection):
 
 
 class LiveSection(_PlacesSection):
-    """Pairs rendered while training (`localizer.training.live`). image: width, height of a view;
+    """Pairs rendered while training (`training.data.live`). image: width, height of a view;
     cells: side of a place; active: places that a step draws from, of which one is replaced every
     `steps_per_scene` steps; visits: days of flight at each place.
     """

@@ -8,8 +8,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from localizer.camera import Camera
-from localizer.pose import Pose
+from localizer.geometry.camera import Camera
+from localizer.geometry.pose import Pose
 from localizer.types import RenderedView
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[2] / "benchmarks"))

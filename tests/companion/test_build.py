@@ -5,9 +5,9 @@ import threading
 import pytest
 
 from companion.build import MapStack, build_localizer
-from localizer.camera import Camera
 from localizer.config import LocalizerConfig
 from localizer.errors import ModelError, RenderError
+from localizer.geometry.camera import Camera
 from localizer.registration.config import JNGOConfig
 from localizer.render import select
 

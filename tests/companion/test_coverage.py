@@ -7,7 +7,7 @@ import pytest
 from companion.config import parse_config
 from companion.coverage import check_mission, covered
 from companion.doctor import examine_deployment
-from localizer.map.cache import TileCache
+from localizer.map.cache.cache import TileCache
 from mavlink_bridge.mission import Waypoint
 from sitl.embedded.geodesy import Location
 from sitl.mission_steps import takeoff_step, waypoint_step

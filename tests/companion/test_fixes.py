@@ -5,9 +5,9 @@ import pytest
 
 from companion.fixes import vehicle_prior, vision_fix
 from companion.geometry import GIMBAL_FROM_CAMERA, ned_from_world
-from localizer.camera import Camera
-from localizer.geo import Geodetic, LocalFrame
-from localizer.pose import matrix_from_euler, quaternion_from_matrix
+from localizer.geometry.camera import Camera
+from localizer.geometry.geo import Geodetic, LocalFrame
+from localizer.geometry.pose import matrix_from_euler, quaternion_from_matrix
 from localizer.types import PoseEstimate, RegistrationStatus, TrackingState
 from mavlink_bridge.messages import Attitude, GimbalAttitude, VehicleState
 

@@ -9,9 +9,9 @@ import pytest
 
 from companion.detections import Detection, parse_detection
 from companion.recorder import ESTIMATE_COLUMNS, EVENT_COLUMNS, TARGET_COLUMNS
-from localizer.engine import EngineHealth
-from localizer.evaluation import CSV_COLUMNS
-from localizer.metrics import LocalizationMetrics
+from localizer.evaluation.metrics import LocalizationMetrics
+from localizer.evaluation.sequences import CSV_COLUMNS
+from localizer.tracking.engine import EngineHealth
 from localizer.types import TrackingState
 from mavlink_bridge.messages import HealthLevel
 

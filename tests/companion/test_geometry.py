@@ -18,9 +18,9 @@ from companion.geometry import (
     vehicle_from_camera_pose,
     world_from_camera,
 )
-from localizer.geo import NED_FROM_ENU, Geodetic, LocalFrame
-from localizer.pose import matrix_from_euler
-from localizer.posefile import pose_row
+from localizer.geometry.geo import NED_FROM_ENU, Geodetic, LocalFrame
+from localizer.geometry.pose import matrix_from_euler
+from localizer.geometry.posefile import pose_row
 
 LEVEL = Mount.from_degrees()
 NORTH, EAST, DOWN = np.eye(3)

@@ -9,7 +9,7 @@ import pytest
 from companion.config import RecordConfig
 from companion.health import HealthMonitor
 from companion.sources import StreamState
-from localizer.engine import EngineHealth
+from localizer.tracking.engine import EngineHealth
 from localizer.types import TrackingState
 from mavlink_bridge.link import sleep_until
 from mavlink_bridge.messages import HealthLevel

@@ -14,9 +14,9 @@ import pytest
 from companion.config import RecordConfig
 from companion.errors import DiskFaultError, ReportError
 from companion.recorder import ESTIMATE_COLUMNS, Recorder, fresh_folder, remove_empty
-from localizer.camera import Camera
-from localizer.geo import Geodetic, LocalFrame
-from localizer.pose import Pose, so3_exp
+from localizer.geometry.camera import Camera
+from localizer.geometry.geo import Geodetic, LocalFrame
+from localizer.geometry.pose import Pose, so3_exp
 from localizer.types import Frame, PoseEstimate, RegistrationStatus, TargetFix, TrackingState
 from sitl.analysis import poses, read_csv
 

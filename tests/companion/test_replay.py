@@ -18,11 +18,11 @@ from companion.config import parse_config
 from companion.errors import RecordError
 from companion.geometry import GIMBAL_FROM_CAMERA
 from companion.replay import load_record, read_tlog, replay, summarize
-from localizer.camera import Camera
-from localizer.geo import NED_FROM_ENU
-from localizer.map.cache import TileCache
-from localizer.pose import quaternion_from_matrix
-from localizer.posefile import read_poses, world_from_camera
+from localizer.geometry.camera import Camera
+from localizer.geometry.geo import NED_FROM_ENU
+from localizer.geometry.pose import quaternion_from_matrix
+from localizer.geometry.posefile import read_poses, world_from_camera
+from localizer.map.cache.cache import TileCache
 from sitl.kinematic import record_scenario
 from sitl.scenario import CameraSpec, Leg, Scenario
 

@@ -6,9 +6,9 @@ import numpy as np
 from companion.config import TargetConfig
 from companion.detections import Detection
 from companion.target_reporter import TargetReporter
-from localizer.camera import Camera
-from localizer.map.pick import BundleHits
-from localizer.pose import Pose
+from localizer.geometry.camera import Camera
+from localizer.geometry.pose import Pose
+from localizer.map.cache.pick import BundleHits
 from localizer.types import PoseEstimate, RegistrationStatus, TrackingState
 from mavlink_bridge.link import sleep_until
 

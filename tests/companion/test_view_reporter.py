@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 
 from companion.view_reporter import ViewReporter, camera_view
-from localizer.camera import Camera
-from localizer.geo import Geodetic, LocalFrame
-from localizer.map.pick import BundleHits
-from localizer.pose import Pose, matrix_from_euler
+from localizer.geometry.camera import Camera
+from localizer.geometry.geo import Geodetic, LocalFrame
+from localizer.geometry.pose import Pose, matrix_from_euler
+from localizer.map.cache.pick import BundleHits
 from localizer.types import PoseEstimate, RegistrationStatus, TrackingState
 
 FRAME = LocalFrame(Geodetic(47.0, 8.0, 500.0))

@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from localizer.pose import Pose, quaternion_from_matrix, so3_exp
+from localizer.geometry.pose import Pose, quaternion_from_matrix, so3_exp
 from sitl.analysis import (
     Spread,
     ekf_errors,

@@ -17,14 +17,14 @@ from PIL import Image as PilImage
 
 from companion.geometry import GimbalAngles
 from companion.sources import SourceSettings, StreamState, open_source
-from localizer.camera import Camera
-from localizer.geo import Geodetic, LocalFrame
-from localizer.map.build import build_cache
-from localizer.map.cache import TileCache
-from localizer.map.stream import TileStreamer
-from localizer.pose import matrix_from_euler, quaternion_from_matrix
+from localizer.geometry.camera import Camera
+from localizer.geometry.geo import Geodetic, LocalFrame
+from localizer.geometry.pose import matrix_from_euler, quaternion_from_matrix
+from localizer.map.building.build import build_cache
+from localizer.map.cache.cache import TileCache
+from localizer.map.cache.stream import TileStreamer
 from localizer.render.numba_raster import NumbaRenderer
-from localizer.synth.appearance import Appearance
+from localizer.synth.appearance.model import Appearance
 from localizer.types import Frame
 from sitl.analysis import poses, read_csv
 from sitl.camera_process import WorldCameraConfig, WorldCameraProcess

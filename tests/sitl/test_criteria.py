@@ -1,6 +1,6 @@
 import pytest
 
-from localizer.metrics import LocalizationMetrics
+from localizer.evaluation.metrics import LocalizationMetrics
 from sitl.analysis import Spread
 from sitl.criteria import judge, latency_warning
 

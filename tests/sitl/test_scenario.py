@@ -3,7 +3,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from localizer.pose import so3_log
+from localizer.geometry.pose import so3_log
 from sitl.embedded.geodesy import Location
 from sitl.flight_script import mission
 from sitl.kinematic import camera_path

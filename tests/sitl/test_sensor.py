@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 import pytest
 
-from localizer.synth.appearance import Appearance, apply_appearance, sample_appearance
+from localizer.synth.appearance.model import Appearance, apply_appearance, sample_appearance
 from sitl.sensor import Sensor, line_kernel
 from sitl.world_camera import HAZY_AFTERNOON
 

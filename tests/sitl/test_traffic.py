@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from localizer.geo import Geodetic, LocalFrame
-from localizer.synth.terrain import River, Terrain
+from localizer.geometry.geo import Geodetic, LocalFrame
+from localizer.synth.plan.terrain import River, Terrain
 from localizer.synth.world import WorldInfo
 from sitl.traffic import traffic
 

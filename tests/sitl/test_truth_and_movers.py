@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from companion.geometry import GimbalAngles, Mount
-from localizer.geo import Geodetic, LocalFrame
-from localizer.map.tile import TileMesh
-from localizer.pose import Pose, matrix_from_euler, quaternion_from_matrix, so3_exp
+from localizer.geometry.geo import Geodetic, LocalFrame
+from localizer.geometry.pose import Pose, matrix_from_euler, quaternion_from_matrix, so3_exp
+from localizer.map.cache.tile import TileMesh
 from sitl.moving import Mover, spread, there_and_back
 from sitl.truth import PoseTrack, TruthSample, camera_pose
 

@@ -10,14 +10,14 @@ import pytest
 
 from companion.geometry import GimbalAngles, Mount, camera_attitude, world_from_camera
 from companion.sources import open_source
-from localizer.camera import Camera
-from localizer.geo import Geodetic, LocalFrame
-from localizer.map.tile import TileMesh, build_mips
-from localizer.pose import Pose, matrix_from_euler, matrix_from_quaternion, so3_exp
-from localizer.posefile import read_poses
-from localizer.posefile import world_from_camera as pose_of_row
+from localizer.geometry.camera import Camera
+from localizer.geometry.geo import Geodetic, LocalFrame
+from localizer.geometry.pose import Pose, matrix_from_euler, matrix_from_quaternion, so3_exp
+from localizer.geometry.posefile import read_poses
+from localizer.geometry.posefile import world_from_camera as pose_of_row
+from localizer.map.cache.tile import TileMesh, build_mips
 from localizer.render.numba_raster import NumbaRenderer
-from localizer.synth.appearance import Appearance
+from localizer.synth.appearance.model import Appearance
 from sitl.analysis import poses, read_csv
 from sitl.distortion import Lens
 from sitl.moving import Mover

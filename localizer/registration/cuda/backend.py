@@ -8,7 +8,7 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import NDArray
 
-from localizer.pose import Array
+from localizer.geometry.pose import Array
 from localizer.registration.backend import LevelProblem, LMSettings, Refinement
 from localizer.registration.cuda import layout
 from localizer.registration.cuda.compiler import Image, compile_kernels

@@ -6,14 +6,14 @@ from dataclasses import replace
 
 import numpy as np
 
-from localizer.pose import Array
+from localizer.geometry.pose import Array
 from localizer.registration.backend import LevelProblem, LMSettings
 from localizer.registration.covariance import curvature_ratio, curvature_steps, mean_motion
+from localizer.registration.cpu.reference import in_view, project, projection_jacobian, retractions
 from localizer.registration.cuda import layout
 from localizer.registration.cuda.backend import CudaBackend
 from localizer.registration.cuda.memory import PROBES, FrameMemory
 from localizer.registration.cuda.steps import Step
-from localizer.registration.reference import in_view, project, projection_jacobian, retractions
 from localizer.types import Float32
 
 

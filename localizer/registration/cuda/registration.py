@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import numpy as np
 
-from localizer.camera import Camera
-from localizer.pose import Array, Pose
+from localizer.geometry.camera import Camera
+from localizer.geometry.pose import Array, Pose
 from localizer.registration.backend import QuadraticPrior, camera_from_local, local_origin
 from localizer.registration.config import JNGOConfig
 from localizer.registration.covariance import CovarianceSums
+from localizer.registration.cpu.reference import prior_terms
 from localizer.registration.cuda.schedule import CudaSchedule, Search
 from localizer.registration.priors import PoseConstraint
-from localizer.registration.reference import prior_terms
 from localizer.registration.result import Found, Registration, failure, registration
 from localizer.types import Anchors, FeaturePyramid, PosePrior, RegistrationStatus
 

@@ -13,15 +13,16 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from localizer.camera import Camera
 from localizer.device_array import DeviceArray
-from localizer.pose import Array
+from localizer.geometry.camera import Camera
+from localizer.geometry.pose import Array
 from localizer.registration.backend import (
     LevelProblem,
     QuadraticPrior,
     level_intrinsics,
 )
 from localizer.registration.config import JNGOConfig
+from localizer.registration.cpu.reference import count_in_view
 from localizer.registration.cuda import layout
 from localizer.registration.cuda.backend import CudaBackend, stored
 from localizer.registration.cuda.curvature import (
@@ -39,7 +40,6 @@ from localizer.registration.cuda.steps import (
     launches,
     refining,
 )
-from localizer.registration.reference import count_in_view
 from localizer.types import Anchors, FeatureLevel, FeaturePyramid, PosePrior
 
 

@@ -13,7 +13,7 @@ import pytest
 from companion.errors import StreamOpenError, StreamSizeError
 from companion.sources import FrameSource, SourceSettings, StreamState, open_source
 from companion.sources.base import fitted_camera
-from localizer.camera import Camera
+from localizer.geometry.camera import Camera
 from localizer.types import Frame, Image
 from sitl.stream import VideoSender
 

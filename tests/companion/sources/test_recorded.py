@@ -14,7 +14,7 @@ from pydantic import ValidationError
 from companion.errors import StreamDecodeError, StreamOpenError, StreamSizeError
 from companion.sources import SourceSettings, StreamState, open_source
 from companion.sources.base import fitted_camera
-from localizer.camera import Camera
+from localizer.geometry.camera import Camera
 
 CAMERA = Camera.from_fov(160, 120, 70.0)
 COUNT = 12

@@ -13,7 +13,7 @@ import av
 import numpy as np
 
 from companion.sources import SourceSettings, StreamState, open_source
-from localizer.camera import Camera
+from localizer.geometry.camera import Camera
 
 CAMERA = Camera.from_fov(320, 240, 60.0)
 RATE_HZ = 10

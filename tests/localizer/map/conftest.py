@@ -12,9 +12,9 @@ import cv2
 import numpy as np
 import pytest
 
-from localizer.geo import Geodetic, LocalFrame
-from localizer.map.build import build_cache
-from localizer.map.cache import TileCache
+from localizer.geometry.geo import Geodetic, LocalFrame
+from localizer.map.building.build import build_cache
+from localizer.map.cache.cache import TileCache
 
 ORIGIN = Geodetic(47.2, 8.2, 430.0)
 SIZE_M = 400.0

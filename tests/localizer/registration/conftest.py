@@ -8,8 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 import pytest
 
-from localizer.camera import Camera
-from localizer.pose import Array, Pose, so3_exp
+from localizer.geometry.camera import Camera
+from localizer.geometry.pose import Array, Pose, so3_exp
 from localizer.registration import select_anchors
 from localizer.types import Anchors, FeatureLevel, FeaturePyramid, PosePrior, RenderedView
 

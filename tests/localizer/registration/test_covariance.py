@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from localizer.pose import Pose, so3_exp
+from localizer.geometry.pose import Pose, so3_exp
 from localizer.registration.backend import LMSettings, level_problems, local_origin
 from localizer.registration.covariance import (
     CovarianceSums,
@@ -21,7 +21,7 @@ from localizer.registration.covariance import (
     pose_differences,
     sandwich_covariance,
 )
-from localizer.registration.reference import (
+from localizer.registration.cpu.reference import (
     ReferenceBackend,
     project,
     projection_jacobian,

@@ -10,11 +10,11 @@ import numpy as np
 import pytest
 
 from localizer.registration import JNGO, JNGOConfig, devices
+from localizer.registration.cpu.kernel import NumbaBackend
 from localizer.registration.cuda import backend as cuda_backend
 from localizer.registration.cuda import compiler, driver
 from localizer.registration.cuda.errors import CudaError, CudaUnavailableError
 from localizer.registration.devices import open_backend
-from localizer.registration.kernel_numba import NumbaBackend
 
 
 def lines(caplog):

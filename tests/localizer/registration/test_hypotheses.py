@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from localizer.pose import Pose, so3_exp
+from localizer.geometry.pose import Pose, so3_exp
 from localizer.registration.hypotheses import generate_hypotheses
 from localizer.types import PosePrior
 

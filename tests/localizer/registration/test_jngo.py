@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from pydantic import ValidationError
 
-from localizer.pose import Pose, so3_exp, so3_log
+from localizer.geometry.pose import Pose, so3_exp, so3_log
 from localizer.registration import (
     JNGO,
     JNGOConfig,

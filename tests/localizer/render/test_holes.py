@@ -4,8 +4,8 @@ import cv2
 import numpy as np
 import pytest
 
-from localizer.camera import Camera
-from localizer.pose import Pose
+from localizer.geometry.camera import Camera
+from localizer.geometry.pose import Pose
 from localizer.render.base import SKY
 from localizer.render.holes import fill_holes
 from localizer.types import RenderedView

@@ -7,11 +7,11 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from localizer.camera import Camera
 from localizer.errors import CameraError
-from localizer.map.pick import cast_rays, pick
-from localizer.map.tile import TileMesh, build_mips
-from localizer.pose import Pose, so3_exp
+from localizer.geometry.camera import Camera
+from localizer.geometry.pose import Pose, so3_exp
+from localizer.map.cache.pick import cast_rays, pick
+from localizer.map.cache.tile import TileMesh, build_mips
 from localizer.render.base import NEAR_M, SKY, are_visible, bounding_spheres
 from localizer.render.numba_raster import NumbaRenderer
 

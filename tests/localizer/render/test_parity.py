@@ -11,11 +11,11 @@ import cv2
 import numpy as np
 import pytest
 
-from localizer.camera import Camera
 from localizer.errors import RenderError
-from localizer.map.pick import cast_rays
-from localizer.map.tile import TileMesh, build_mips
-from localizer.pose import Pose, so3_exp
+from localizer.geometry.camera import Camera
+from localizer.geometry.pose import Pose, so3_exp
+from localizer.map.cache.pick import cast_rays
+from localizer.map.cache.tile import TileMesh, build_mips
 from localizer.render.base import StaticTiles
 from localizer.render.numba_raster import NumbaRenderer
 from localizer.render.select import make_renderer, open_renderer

@@ -3,7 +3,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from localizer.synth.appearance import (
+from localizer.synth.appearance.model import (
     CONDITIONS,
     Appearance,
     apply_appearance,

@@ -1,10 +1,10 @@
 import numpy as np
 import pytest
 
-from localizer.camera import Camera
-from localizer.pose import Pose
-from localizer.synth.heightfield import Land, Light, LitScene, Prism, compose, light_scene
-from localizer.synth.heightfield_render import render
+from localizer.geometry.camera import Camera
+from localizer.geometry.pose import Pose
+from localizer.synth.heightfield.render import render
+from localizer.synth.heightfield.scene import Land, Light, LitScene, Prism, compose, light_scene
 
 N, CELL = 128, 0.5
 NADIR = np.diag([1.0, -1.0, -1.0])

@@ -7,14 +7,14 @@ import pytest
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 
-from localizer.synth.building_kinds import build
-from localizer.synth.buildings import Kind
+from localizer.synth.buildings.kinds import build
+from localizer.synth.buildings.model import Kind
 from localizer.synth.config import WorldConfig
-from localizer.synth.ground import Material
-from localizer.synth.layout import assign_zones, plan_world
-from localizer.synth.plan import URBAN, WorldPlan
-from localizer.synth.streets import make_lattice, make_streets
-from localizer.synth.terrain import make_terrain
+from localizer.synth.plan.ground import Material
+from localizer.synth.plan.layout import assign_zones, plan_world
+from localizer.synth.plan.plan import URBAN, WorldPlan
+from localizer.synth.plan.streets import make_lattice, make_streets
+from localizer.synth.plan.terrain import make_terrain
 
 
 @pytest.fixture(scope="module", params=[1, 2])

@@ -10,24 +10,18 @@ import pytest
 
 torch = pytest.importorskip("torch", reason="needs the extra `train`")
 
-from localizer.camera import Camera  # noqa: E402
-from localizer.pose import Pose  # noqa: E402
-from localizer.synth import appearance_torch, heightfield_torch  # noqa: E402
-from localizer.synth.appearance import (  # noqa: E402
+from localizer.geometry.camera import Camera  # noqa: E402
+from localizer.geometry.pose import Pose  # noqa: E402
+from localizer.synth.appearance import model_torch as appearance_torch  # noqa: E402
+from localizer.synth.appearance.model import (  # noqa: E402
     CONDITIONS,
     Appearance,
     apply_appearance,
     sample_appearance,
 )
-from localizer.synth.heightfield import (  # noqa: E402
-    Land,
-    Light,
-    LitScene,
-    Prism,
-    compose,
-    light_scene,
-)
-from localizer.synth.heightfield_render import render  # noqa: E402
+from localizer.synth.heightfield import render_torch as heightfield_torch  # noqa: E402
+from localizer.synth.heightfield.render import render  # noqa: E402
+from localizer.synth.heightfield.scene import Land, Light, LitScene, Prism, compose, light_scene  # noqa: E402
 
 N = 128
 

@@ -3,11 +3,11 @@
 import numpy as np
 
 from localizer.synth.config import SURVEY, Look, WorldConfig
-from localizer.synth.lighting import DSM_GSD_M, make_light, raise_surface
-from localizer.synth.mesh import ChartedMesh, pack
-from localizer.synth.props import CAR_HEIGHT_M, CAR_LENGTH_M, car_mesh, person_mesh
-from localizer.synth.terrain import River, Terrain, make_terrain
-from localizer.synth.terrain_mesh import terrain_mesh
+from localizer.synth.paint.lighting import DSM_GSD_M, make_light, raise_surface
+from localizer.synth.plan.terrain import River, Terrain, make_terrain
+from localizer.synth.tiles.charts import ChartedMesh, pack
+from localizer.synth.tiles.props import CAR_HEIGHT_M, CAR_LENGTH_M, car_mesh, person_mesh
+from localizer.synth.tiles.terrain_mesh import terrain_mesh
 
 
 def flat_light(look: Look):

@@ -3,13 +3,13 @@
 import numpy as np
 import pytest
 
-from localizer.camera import Camera
-from localizer.map.build import build_cache
-from localizer.map.cache import TileCache
-from localizer.map.stream import TileStreamer
-from localizer.pose import Pose
+from localizer.geometry.camera import Camera
+from localizer.geometry.pose import Pose
+from localizer.map.building.build import build_cache
+from localizer.map.cache.cache import TileCache
+from localizer.map.cache.stream import TileStreamer
 from localizer.render.numba_raster import NumbaRenderer
-from localizer.synth.props import car_mesh
+from localizer.synth.tiles.props import car_mesh
 
 NADIR = np.array([[1.0, 0, 0], [0, -1, 0], [0, 0, -1]])  # x east, y south, z down
 CAMERA = Camera.from_fov(320, 240, 60.0)

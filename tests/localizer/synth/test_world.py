@@ -15,10 +15,10 @@ import numpy as np
 import pytest
 
 from localizer.errors import MapSourceError
-from localizer.geo import ecef_from_geodetic
+from localizer.geometry.geo import ecef_from_geodetic
 from localizer.synth import world
 from localizer.synth.config import WorldConfig
-from localizer.synth.layout import plan_world
+from localizer.synth.plan.layout import plan_world
 from localizer.synth.world import WorldInfo, build_world, world_origin
 
 TERRAIN_FACES = 2 * 20 * 20  # of a leaf, first in its face list

@@ -14,13 +14,17 @@ onnx = pytest.importorskip("onnx")
 
 from localizer.errors import ModelError  # noqa: E402
 from localizer.features import GradientExtractor, OnnxExtractor  # noqa: E402
-from localizer.pose import Pose  # noqa: E402
-from localizer.training.ablation import ablations  # noqa: E402
+from localizer.geometry.pose import Pose  # noqa: E402
 from localizer.training.config import TrainConfig, load_config  # noqa: E402
-from localizer.training.curves import plot  # noqa: E402
-from localizer.training.data import LoaderConfig, collate, crop_pair, mirrored  # noqa: E402
-from localizer.training.export import export  # noqa: E402
-from localizer.training.losses import (  # noqa: E402
+from localizer.training.data.batches import LoaderConfig, collate, crop_pair, mirrored  # noqa: E402
+from localizer.training.data.pairs import SceneConfig, scene_pairs  # noqa: E402
+from localizer.training.data.shards import write_shard  # noqa: E402
+from localizer.training.export.export import export  # noqa: E402
+from localizer.training.export.from_published import unfuse  # noqa: E402
+from localizer.training.export.quantize import quantize  # noqa: E402
+from localizer.training.loop.ablation import ablations  # noqa: E402
+from localizer.training.loop.curves import plot  # noqa: E402
+from localizer.training.loop.losses import (  # noqa: E402
     Batch,
     alignment_loss,
     contrast_loss,
@@ -28,13 +32,9 @@ from localizer.training.losses import (  # noqa: E402
     sample,
     se3_exp,
 )
-from localizer.training.model import ModelConfig, TinyNet, fuse  # noqa: E402
-from localizer.training.orientation import OrientationFeatures  # noqa: E402
-from localizer.training.pairs import SceneConfig, scene_pairs  # noqa: E402
-from localizer.training.quantize import quantize  # noqa: E402
-from localizer.training.shards import write_shard  # noqa: E402
-from localizer.training.train import Trainer, learning_rate, perturbed  # noqa: E402
-from localizer.training.unfuse import unfuse  # noqa: E402
+from localizer.training.loop.train import Trainer, learning_rate, perturbed  # noqa: E402
+from localizer.training.models.orientation import OrientationFeatures  # noqa: E402
+from localizer.training.models.tiny import ModelConfig, TinyNet, fuse  # noqa: E402
 
 SHIPPED = Path(__file__).parents[3] / "configs" / "train_tiny.yaml"
 SCENES = SceneConfig(cells=256, width=128, height=96, references=3, queries_per_light=3)
@@ -46,7 +46,7 @@ import sys
 from pathlib import Path
 import torch
 from localizer.training.config import load_config
-from localizer.training.train import Trainer
+from localizer.training.loop.train import Trainer
 run = Path(sys.argv[1])
 trainer = Trainer(load_config(run))
 trainer.run(steps=3)

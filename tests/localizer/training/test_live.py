@@ -11,12 +11,12 @@ torch = pytest.importorskip("torch", reason="needs the extra `train`")
 
 from localizer.errors import ModelError  # noqa: E402
 from localizer.training.config import LiveSection, TrainConfig, load_config  # noqa: E402
-from localizer.training.data import LoaderConfig  # noqa: E402
-from localizer.training.live import LivePlan, LiveStream  # noqa: E402
-from localizer.training.losses import project  # noqa: E402
-from localizer.training.model_s0 import S0Config  # noqa: E402
-from localizer.training.pairs import Pair, SceneConfig, warp_check  # noqa: E402
-from localizer.training.train import Trainer  # noqa: E402
+from localizer.training.data.batches import LoaderConfig  # noqa: E402
+from localizer.training.data.live import LivePlan, LiveStream  # noqa: E402
+from localizer.training.data.pairs import Pair, SceneConfig, warp_check  # noqa: E402
+from localizer.training.loop.losses import project  # noqa: E402
+from localizer.training.loop.train import Trainer  # noqa: E402
+from localizer.training.models.s0 import S0Config  # noqa: E402
 
 SHIPPED = Path(__file__).parents[3] / "configs" / "train_s0.yaml"
 SCENES = SceneConfig(cells=256, width=128, height=96)

@@ -9,9 +9,8 @@ import onnxruntime as ort
 import pytest
 
 torch = pytest.importorskip("torch", reason="needs the extra `train`")
-from localizer.training.export import OPSET, Deployed  # noqa: E402
-from localizer.training.model import parameter_count  # noqa: E402
-from localizer.training.model_s0 import (  # noqa: E402
+from localizer.training.export.export import OPSET, Deployed  # noqa: E402
+from localizer.training.models.s0 import (  # noqa: E402
     STRIDES,
     BranchedBlock,
     S0Config,
@@ -19,6 +18,7 @@ from localizer.training.model_s0 import (  # noqa: E402
     fuse,
     multiply_adds,
 )
+from localizer.training.models.tiny import parameter_count  # noqa: E402
 
 
 @pytest.fixture(scope="module")

@@ -6,8 +6,9 @@ import numpy as np
 import pytest
 
 from localizer.errors import SequenceError
-from localizer.pose import Pose
-from localizer.training.pairs import (
+from localizer.geometry.pose import Pose
+from localizer.training.data.contact_sheet import contact_sheet
+from localizer.training.data.pairs import (
     COMBINED,
     OUTDATED,
     SEASON,
@@ -16,9 +17,8 @@ from localizer.training.pairs import (
     scene_pairs,
     warp_check,
 )
-from localizer.training.photos import PhotoLibrary
-from localizer.training.shards import read_shard, write_shard, write_shards
-from localizer.training.sheet import contact_sheet
+from localizer.training.data.shards import read_shard, write_shard, write_shards
+from localizer.training.places.photos import PhotoLibrary
 
 SMALL = SceneConfig(cells=256, width=128, height=96, references=3, queries_per_light=3)
 

@@ -4,8 +4,8 @@ import cv2
 import numpy as np
 import pytest
 
-from localizer.synth.heightfield import Land, Light, LitScene, Prism, compose, light_scene
-from localizer.training.revisit import (
+from localizer.synth.heightfield.scene import Land, Light, LitScene, Prism, compose, light_scene
+from localizer.training.places.changes import (
     coarse_mesh,
     coarser,
     draw_texel,

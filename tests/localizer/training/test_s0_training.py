@@ -13,13 +13,13 @@ onnx = pytest.importorskip("onnx")
 from localizer.errors import ModelError  # noqa: E402
 from localizer.features import OnnxExtractor  # noqa: E402
 from localizer.training.config import TrainConfig, load_config  # noqa: E402
-from localizer.training.export import export  # noqa: E402
-from localizer.training.model_s0 import S0Config, S0Net  # noqa: E402
-from localizer.training.pairs import SceneConfig  # noqa: E402
-from localizer.training.quantize import quantize  # noqa: E402
-from localizer.training.shards import write_shard  # noqa: E402
-from localizer.training.train import Trainer, alignment_ramp  # noqa: E402
-from localizer.training.unfuse import unfuse  # noqa: E402
+from localizer.training.data.pairs import SceneConfig  # noqa: E402
+from localizer.training.data.shards import write_shard  # noqa: E402
+from localizer.training.export.export import export  # noqa: E402
+from localizer.training.export.from_published import unfuse  # noqa: E402
+from localizer.training.export.quantize import quantize  # noqa: E402
+from localizer.training.loop.train import Trainer, alignment_ramp  # noqa: E402
+from localizer.training.models.s0 import S0Config, S0Net  # noqa: E402
 
 CONFIGS = Path(__file__).parents[3] / "configs"
 SCENES = SceneConfig(cells=256, width=128, height=96, references=3, queries_per_light=3)

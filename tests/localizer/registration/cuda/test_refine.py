@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from localizer.pose import Pose, so3_exp
+from localizer.geometry.pose import Pose, so3_exp
 from localizer.registration.backend import (
     LevelProblem,
     LMSettings,
@@ -18,9 +18,9 @@ from localizer.registration.backend import (
     local_origin,
     world_from_camera,
 )
+from localizer.registration.cpu.reference import ReferenceBackend
 from localizer.registration.cuda.driver import CudaError
 from localizer.registration.hypotheses import generate_hypotheses
-from localizer.registration.reference import ReferenceBackend
 
 TOLERANCE_M, TOLERANCE_DEG = 1e-3, 1e-3
 # Float16 moves a feature's component by up to 2e-4; these are ten times the pose errors seen.

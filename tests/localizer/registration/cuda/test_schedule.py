@@ -9,7 +9,7 @@ import pytest
 
 from localizer.device_array import DeviceArray
 from localizer.errors import DeviceArrayError
-from localizer.pose import so3_exp
+from localizer.geometry.pose import so3_exp
 from localizer.registration import (
     JNGO,
     JNGOConfig,

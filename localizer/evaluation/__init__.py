@@ -1,0 +1,1 @@
+"""Recorded sequences and the paper's measures."""

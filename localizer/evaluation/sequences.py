@@ -1,0 +1,287 @@
+"""Localizing recorded sequences: the paper's protocol (Sec. 4.1) from a perturbed prior.
+
+Two folder layouts are read: ours (``images/``, ``poses.txt``, ``camera.json``) and PiLoT's data
+set (``images/NAME/``, ``poses/NAME.txt``, with ``camera.json`` or ``cameras/NAME.json``).
+"""
+
+from __future__ import annotations
+
+import itertools
+import time
+from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Literal
+
+import cv2
+import numpy as np
+
+from localizer.errors import LocalizerError, OutsideMapError, SequenceError
+from localizer.evaluation.metrics import LocalizationMetrics, localization_metrics
+from localizer.geometry.camera import Camera
+from localizer.geometry.geo import LocalFrame
+from localizer.geometry.pose import Array, Pose, so3_exp
+from localizer.geometry.posefile import read_poses, world_from_camera
+from localizer.tracking.pipeline import Localizer
+from localizer.types import Frame, Image, PoseEstimate, PosePrior, RegistrationStatus
+
+PriorMode = Literal["first", "each"]
+
+# Video that says nothing of time is taken as 30 frames per second (the paper's data sets).
+_FRAME_INTERVAL_NS = 33_333_333
+
+CSV_COLUMNS = (
+    "name", "latitude_deg", "longitude_deg", "height_m", "translation_error_m",
+    "rotation_error_deg", "quality", "state", "status", "accepted", "problem",
+)  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Sequence:
+    """A recorded sequence: image paths in order, and the true pose of each."""
+
+    images: tuple[Path, ...]
+    times_ns: tuple[int, ...]
+    truth: tuple[Pose, ...]
+    camera: Camera
+
+    def frame(self, index: int) -> Frame:
+        """Decode one frame."""
+        data = cv2.imread(str(self.images[index]), cv2.IMREAD_COLOR)
+        if data is None:
+            raise SequenceError(f"{self.images[index]}: missing or not an image")
+        if data.shape[:2] != (self.camera.height, self.camera.width):
+            raise SequenceError(
+                f"{self.images[index]}: is {data.shape[1]}x{data.shape[0]}, the camera model says "
+                f"{self.camera.width}x{self.camera.height}: give this sequence's calibration"
+            )
+        rgb: Image = cv2.cvtColor(data, cv2.COLOR_BGR2RGB).astype(np.uint8, copy=False)
+        return Frame(rgb, self.times_ns[index], self.camera, index)
+
+    def first(self, count: int) -> Sequence:
+        """The first frames of the sequence."""
+        return replace(
+            self,
+            images=self.images[:count],
+            times_ns=self.times_ns[:count],
+            truth=self.truth[:count],
+        )
+
+
+@dataclass(frozen=True)
+class EvaluatedFrame:
+    """One frame's outcome. Errors are NaN where integrity accepted no estimate.
+
+    estimate: None for an image that cannot be used; `problem` says why then.
+    """
+
+    name: str
+    estimate: PoseEstimate | None
+    translation_error_m: float = float("nan")
+    rotation_error_deg: float = float("nan")
+    problem: str = ""
+
+
+@dataclass(frozen=True)
+class Perturbation:
+    """How far a prior is from the truth: up to so many metres and degrees, seeded."""
+
+    translation_m: float = 10.0
+    rotation_deg: float = 10.0
+    seed: int = 0
+
+    def prior(self, truth: Pose, index: int, time_ns: int) -> PosePrior:
+        """The truth moved along and turned about random axes by uniform amounts."""
+        rng = np.random.default_rng((self.seed, index))
+        offset = _random_vector(rng, self.translation_m)
+        turn = _random_vector(rng, np.radians(self.rotation_deg))
+        pose = Pose(so3_exp(turn) @ truth.rotation, truth.translation + offset)
+        # A vector of uniform length up to a in a random direction has variance a²/9 per axis;
+        # half the bound keeps the bound itself within two sigma.
+        sigma = np.repeat([self.translation_m / 2, np.radians(self.rotation_deg) / 2], 3)
+        return PosePrior(pose, np.diag(np.maximum(sigma, 1e-3) ** 2), time_ns)
+
+
+def _random_vector(rng: np.random.Generator, limit: float) -> Array:
+    direction = rng.standard_normal(3)
+    return direction / np.linalg.norm(direction) * rng.uniform(0.0, limit)
+
+
+def load_sequence(path: Path, frame: LocalFrame, name: str | None = None) -> Sequence:
+    """Read a sequence folder of either layout; `name` chooses one of several in PiLoT's."""
+    if not path.is_dir():
+        raise SequenceError(f"{path}: no such folder")
+    images, poses, camera = _layout(path, name)
+    rows = read_poses(poses)
+    paths = tuple(images / row.name for row in rows)
+    missing = [p.name for p in paths if not p.is_file()]
+    if missing:
+        raise SequenceError(
+            f"{images}: {len(missing)} of {len(paths)} images named in {poses.name} are missing, "
+            f"first {missing[0]}"
+        )
+    truth = tuple(world_from_camera(row, frame) for row in rows)
+    return Sequence(paths, _times(images, paths), truth, Camera.from_json(camera))
+
+
+def _times(images: Path, paths: tuple[Path, ...]) -> tuple[int, ...]:
+    """Exposure times from ``timestamps.txt`` (name and ns per line); else 30 frames a second."""
+    file = images / "timestamps.txt"
+    if not file.is_file():
+        return tuple((index + 1) * _FRAME_INTERVAL_NS for index in range(len(paths)))
+    try:
+        stamps = {
+            name: int(time_ns)
+            for name, time_ns in (x.split() for x in file.read_text().split("\n") if x)
+        }
+        times = tuple(stamps[path.name] for path in paths)
+    except (OSError, ValueError, KeyError) as error:
+        raise SequenceError(f"{file}: not 'name nanoseconds' for every image: {error}") from error
+    if any(b <= a for a, b in itertools.pairwise(times)):
+        raise SequenceError(f"{file}: exposure times must increase")
+    return times
+
+
+def _layout(path: Path, name: str | None) -> tuple[Path, Path, Path]:
+    """(image folder, pose file, camera file) of a sequence folder."""
+    if (path / "poses.txt").is_file():
+        return path / "images", path / "poses.txt", path / "camera.json"
+    names = sorted(p.stem for p in (path / "poses").glob("*.txt"))
+    if not names:
+        raise SequenceError(f"{path}: holds neither poses.txt nor poses/NAME.txt")
+    if name is None and len(names) > 1:
+        raise SequenceError(f"{path}: holds {len(names)} sequences, name one: {', '.join(names)}")
+    chosen = name or names[0]
+    if chosen not in names:
+        raise SequenceError(f"{path}: no sequence {chosen!r}, there are: {', '.join(names)}")
+    own = path / "cameras" / f"{chosen}.json"
+    camera = own if own.is_file() else path / "camera.json"
+    return path / "images" / chosen, path / "poses" / f"{chosen}.txt", camera
+
+
+def evaluate(
+    localizer: Localizer,
+    sequence: Sequence,
+    perturbation: Perturbation,
+    mode: PriorMode = "first",
+    passes: int = 3,
+    progress: Callable[[int], None] = lambda _: None,
+) -> tuple[list[EvaluatedFrame], LocalizationMetrics]:
+    """Localize every frame and measure it.
+
+    mode ``first``: only the first frame's prior is known, as in the paper. ``each``: every frame
+    starts from its own perturbed truth. passes: how often a frame that starts from a perturbed
+    prior is rendered and registered, each time from the last result. A frame that is predicted
+    outside the map, or whose image cannot be used, counts as not localized; `OutsideMapError` or
+    `SequenceError` if that befalls every frame.
+    """
+    frames: list[EvaluatedFrame] = []
+    errors: list[LocalizerError] = []
+    has_prior = False
+    seconds = 0.0
+    with ThreadPoolExecutor(1, thread_name_prefix="query") as pool:
+        for index in range(len(sequence.images)):
+            try:
+                frame = sequence.frame(index)
+            except SequenceError as error:
+                errors.append(error)
+                frames.append(EvaluatedFrame(sequence.images[index].name, None, problem=str(error)))
+                progress(index)
+                continue
+            started = time.perf_counter()
+            fresh = mode == "each" or not has_prior
+            if fresh:
+                prior = perturbation.prior(sequence.truth[index], index, frame.exposure_time_ns)
+                localizer.set_prior(prior)
+                has_prior = True
+            try:
+                outcome = _localize(localizer, frame, passes if fresh else 1, pool)
+            except OutsideMapError as error:
+                if mode == "first" and fresh:  # every other frame hangs on this prior
+                    raise
+                errors.append(error)
+                outcome = _not_localized(localizer, frame)
+            seconds += time.perf_counter() - started
+            frames.append(_measure(sequence, index, outcome))
+            progress(index)
+    if len(errors) == len(frames):
+        raise errors[0]
+    return frames, _summary(frames, seconds)
+
+
+def _localize(
+    localizer: Localizer, frame: Frame, passes: int, pool: ThreadPoolExecutor
+) -> PoseEstimate:
+    """Reference and query features side by side, then registration, `passes` times."""
+    pending = pool.submit(localizer.extract_query, frame)
+    while True:
+        prior = localizer.predict(frame.exposure_time_ns)
+        if prior is None:
+            raise SequenceError("no prior was set before localizing")
+        bundle = localizer.make_reference(prior, wait=True)
+        estimate = localizer.localize(frame, pending.result(), bundle.anchors)
+        passes -= 1
+        if passes == 0:
+            return estimate
+        if estimate.status is RegistrationStatus.OK:
+            # The same image again is no new evidence: start anew from its result, halving sigma.
+            localizer.set_prior(
+                PosePrior(estimate.world_from_camera, prior.covariance / 4, prior.time_ns)
+            )
+
+
+def _not_localized(localizer: Localizer, frame: Frame) -> PoseEstimate:
+    """The prediction, as the answer for a frame whose prediction is outside the map."""
+    prior = localizer.predict(frame.exposure_time_ns)
+    if prior is None:
+        raise SequenceError("no prior was set before localizing")
+    return PoseEstimate(
+        world_from_camera=prior.world_from_camera,
+        covariance=prior.covariance,
+        quality=0.0,
+        state=localizer.tracker.integrity.state,
+        status=RegistrationStatus.TOO_FEW_ANCHORS,
+        accepted=False,
+        exposure_time_ns=frame.exposure_time_ns,
+        sequence=frame.sequence,
+        camera=frame.camera,
+    )
+
+
+def _measure(sequence: Sequence, index: int, estimate: PoseEstimate) -> EvaluatedFrame:
+    truth = sequence.truth[index]
+    translation, rotation = truth.distance_to(estimate.world_from_camera)
+    if not estimate.accepted:
+        translation = rotation = float("nan")
+    name = sequence.images[index].name
+    return EvaluatedFrame(name, estimate, translation, rotation)
+
+
+def _summary(frames: list[EvaluatedFrame], seconds: float) -> LocalizationMetrics:
+    """seconds: spent on the frames whose image could be used; the rate is theirs."""
+    translation = np.array([f.translation_error_m for f in frames])
+    rotation = np.array([f.rotation_error_deg for f in frames])
+    usable = sum(f.estimate is not None for f in frames)
+    metrics = localization_metrics(translation, rotation, seconds)
+    return replace(metrics, fps=metrics.fps * usable / len(frames))
+
+
+def csv_rows(frames: list[EvaluatedFrame], frame: LocalFrame) -> Iterator[dict[str, str]]:
+    """One dictionary per frame for a CSV file; what an unusable image has no value for is ""."""
+    for f in frames:
+        row = dict.fromkeys(CSV_COLUMNS, "") | {"name": f.name, "problem": f.problem}
+        if f.estimate is not None:
+            position = frame.position(f.estimate.world_from_camera.translation)
+            row |= {
+                "latitude_deg": f"{position.latitude_deg:.9f}",
+                "longitude_deg": f"{position.longitude_deg:.9f}",
+                "height_m": f"{position.height_m:.3f}",
+                "translation_error_m": f"{f.translation_error_m:.4f}",
+                "rotation_error_deg": f"{f.rotation_error_deg:.4f}",
+                "quality": f"{f.estimate.quality:.3f}",
+                "state": f.estimate.state.value,
+                "status": f.estimate.status.name,
+                "accepted": str(int(f.estimate.accepted)),
+            }
+        yield row

@@ -1,0 +1,1 @@
+"""Poses, cameras, the geodesy of a map's frame, and PiLoT's pose lines."""

@@ -1,0 +1,87 @@
+"""WGS84, ECEF and the local ENU frame of a map (pyproj does the geodesy).
+
+Heights are above the WGS84 ellipsoid; what MAVLink calls AMSL is ``height - geoid_separation``.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import ArrayLike
+from pyproj import Transformer
+
+from localizer.errors import GeoreferenceError
+from localizer.geometry.pose import Array, Pose
+
+_ECEF_FROM_GEODETIC = Transformer.from_crs("EPSG:4979", "EPSG:4978", always_xy=True)
+
+
+@dataclass(frozen=True)
+class Geodetic:
+    """A WGS84 position: degrees, and metres above the ellipsoid."""
+
+    latitude_deg: float
+    longitude_deg: float
+    height_m: float
+
+    def __post_init__(self) -> None:
+        if not all(np.isfinite((self.latitude_deg, self.longitude_deg, self.height_m))):
+            raise GeoreferenceError(f"not a position on Earth: {self}")
+        if not (-90 <= self.latitude_deg <= 90 and -360 <= self.longitude_deg <= 360):
+            raise GeoreferenceError(f"latitude or longitude out of range: {self}")
+
+
+def ecef_from_geodetic(latitude_deg: ArrayLike, longitude_deg: ArrayLike, h_m: ArrayLike) -> Array:
+    """ECEF metres (..., 3) of WGS84 degrees and ellipsoidal metres."""
+    x, y, z = _ECEF_FROM_GEODETIC.transform(longitude_deg, latitude_deg, h_m)
+    return np.stack([x, y, z], axis=-1).astype(np.float64)
+
+
+def geodetic_from_ecef(ecef: ArrayLike) -> Array:
+    """(latitude_deg, longitude_deg, height_m), shape (..., 3), of ECEF metres (..., 3)."""
+    ecef = np.asarray(ecef, dtype=np.float64)
+    lon, lat, h = _ECEF_FROM_GEODETIC.transform(
+        ecef[..., 0], ecef[..., 1], ecef[..., 2], direction="INVERSE"
+    )
+    return np.stack([lat, lon, h], axis=-1).astype(np.float64)
+
+
+# ENU <-> NED is its own inverse: swap x and y, negate z.
+NED_FROM_ENU: Array = np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, -1.0]])
+
+
+@dataclass(frozen=True)
+class LocalFrame:
+    """A tangent-plane ENU frame (metres, float64) about a WGS84 origin."""
+
+    origin: Geodetic
+
+    @cached_property
+    def ecef_from_enu(self) -> Pose:
+        """The frame's rigid transform to ECEF."""
+        lat, lon = np.radians([self.origin.latitude_deg, self.origin.longitude_deg])
+        sl, cl, so, co = np.sin(lat), np.cos(lat), np.sin(lon), np.cos(lon)
+        east = [-so, co, 0.0]
+        north = [-sl * co, -sl * so, cl]
+        up = [cl * co, cl * so, sl]
+        o = self.origin
+        centre = ecef_from_geodetic(o.latitude_deg, o.longitude_deg, o.height_m)
+        return Pose(np.column_stack([east, north, up]), centre)
+
+    def enu_from_geodetic(
+        self, latitude_deg: ArrayLike, longitude_deg: ArrayLike, height_m: ArrayLike
+    ) -> Array:
+        """ENU metres (..., 3) of WGS84 degrees and ellipsoidal metres."""
+        ecef = ecef_from_geodetic(latitude_deg, longitude_deg, height_m)
+        return self.ecef_from_enu.inverse.apply(ecef)
+
+    def geodetic_from_enu(self, enu: ArrayLike) -> Array:
+        """(latitude_deg, longitude_deg, height_m), shape (..., 3), of ENU metres (..., 3)."""
+        return geodetic_from_ecef(self.ecef_from_enu.apply(enu))
+
+    def position(self, enu: ArrayLike) -> Geodetic:
+        """One ENU point (3,) as a `Geodetic`."""
+        lat, lon, h = self.geodetic_from_enu(enu)
+        return Geodetic(float(lat), float(lon), float(h))

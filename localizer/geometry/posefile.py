@@ -1,0 +1,111 @@
+"""PiLoT's pose lines: ``name lon lat alt roll pitch yaw`` (degrees, ellipsoidal metres).
+
+Pitch 0 looks at the nadir, yaw counts counter-clockwise from north. The rotation is
+``R = Rz(yaw) Ry(roll) Rx(pitch)`` from the OpenGL camera to ENU *at the camera's own position*;
+flipping y and z turns the camera axes into OpenCV's.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from localizer.errors import GeoreferenceError, PoseFileError
+from localizer.geometry.geo import Geodetic, LocalFrame
+from localizer.geometry.pose import Array, Pose
+
+_OPENCV_FROM_OPENGL: Array = np.diag([1.0, -1.0, -1.0])
+
+
+@dataclass(frozen=True)
+class PoseRow:
+    """One line of a pose file. Angles in degrees."""
+
+    name: str
+    position: Geodetic
+    roll_deg: float
+    pitch_deg: float
+    yaw_deg: float
+
+
+def read_poses(path: Path) -> tuple[PoseRow, ...]:
+    """Every pose of a file, in its order; blank lines and lines that begin with # are skipped."""
+    try:
+        lines = path.read_text(encoding="utf-8").splitlines()
+    except (OSError, UnicodeDecodeError) as error:
+        raise PoseFileError(f"{path}: cannot be read: {error}") from error
+    rows = [
+        _parse(line, f"{path}:{number}")
+        for number, line in enumerate(lines, start=1)
+        if line.strip() and not line.lstrip().startswith("#")
+    ]
+    if not rows:
+        raise PoseFileError(f"{path}: holds no pose; expected 'name lon lat alt roll pitch yaw'")
+    return tuple(rows)
+
+
+def _parse(line: str, where: str) -> PoseRow:
+    parts = line.split()
+    if len(parts) != 7:
+        raise PoseFileError(
+            f"{where}: expected 'name lon lat alt roll pitch yaw', got {len(parts)} fields"
+        )
+    try:
+        lon, lat, height, roll, pitch, yaw = (float(x) for x in parts[1:])
+        row = PoseRow(parts[0], Geodetic(lat, lon, height), roll, pitch, yaw)
+    except (ValueError, GeoreferenceError) as error:
+        raise PoseFileError(f"{where}: {error}") from error
+    if not np.isfinite([roll, pitch, yaw]).all():
+        raise PoseFileError(f"{where}: angles must be finite")
+    return row
+
+
+def write_poses(path: Path, rows: Iterable[PoseRow]) -> None:
+    """Write a pose file: 1e-9 degrees of position (0.1 mm), 1e-4 m, 1e-6 degrees of angle."""
+    lines = [
+        f"{r.name} {r.position.longitude_deg:.9f} {r.position.latitude_deg:.9f} "
+        f"{r.position.height_m:.4f} {r.roll_deg:.6f} {r.pitch_deg:.6f} {r.yaw_deg:.6f}\n"
+        for r in rows
+    ]
+    path.write_text("".join(lines), encoding="utf-8")
+
+
+def world_from_camera(row: PoseRow, frame: LocalFrame) -> Pose:
+    """The row's pose in the map's ENU frame (its own tangent plane is turned into the map's)."""
+    p = row.position
+    centre = frame.enu_from_geodetic(p.latitude_deg, p.longitude_deg, p.height_m)
+    roll, pitch, yaw = np.radians([row.roll_deg, row.pitch_deg, row.yaw_deg])
+    enu_from_opengl = _rz(yaw) @ _ry(roll) @ _rx(pitch)
+    return Pose(_map_from_local(p, frame) @ enu_from_opengl @ _OPENCV_FROM_OPENGL, centre)
+
+
+def pose_row(name: str, pose: Pose, frame: LocalFrame) -> PoseRow:
+    """Inverse of `world_from_camera`."""
+    position = frame.position(pose.translation)
+    R = _map_from_local(position, frame).T @ pose.rotation @ _OPENCV_FROM_OPENGL
+    # R = Rz(yaw) Ry(roll) Rx(pitch): the middle angle is roll, from R[2, 0] = -sin(roll).
+    roll = np.arcsin(np.clip(-R[2, 0], -1.0, 1.0))
+    pitch = np.arctan2(R[2, 1], R[2, 2])
+    yaw = np.arctan2(R[1, 0], R[0, 0])
+    angles = np.degrees([roll, pitch, yaw])
+    return PoseRow(name, position, float(angles[0]), float(angles[1]), float(angles[2]))
+
+
+def _map_from_local(position: Geodetic, frame: LocalFrame) -> Array:
+    """Rotation (3, 3) from the tangent plane at `position` to the map's: 0.5 arcmin per km."""
+    return frame.ecef_from_enu.rotation.T @ LocalFrame(position).ecef_from_enu.rotation
+
+
+def _rx(a: float) -> Array:
+    return np.array([[1, 0, 0], [0, np.cos(a), -np.sin(a)], [0, np.sin(a), np.cos(a)]])
+
+
+def _ry(a: float) -> Array:
+    return np.array([[np.cos(a), 0, np.sin(a)], [0, 1, 0], [-np.sin(a), 0, np.cos(a)]])
+
+
+def _rz(a: float) -> Array:
+    return np.array([[np.cos(a), -np.sin(a), 0], [np.sin(a), np.cos(a), 0], [0, 0, 1]])

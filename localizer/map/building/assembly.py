@@ -1,0 +1,174 @@
+"""From imported tiles to a cache: the tree of what is there, its index and its manifest."""
+
+from __future__ import annotations
+
+import os
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from scipy.spatial import ConvexHull, QhullError
+
+from localizer.errors import MapSourceError
+from localizer.geometry.geo import LocalFrame
+from localizer.geometry.pose import Array
+from localizer.map.building.staging import Record, Staging, StoredTile
+from localizer.map.cache.cache import ADD, REPLACE, Manifest, TileIndex, tile_name
+from localizer.map.source import SourceNode, SourceTree
+
+
+@dataclass(eq=False)
+class _Node:
+    """A node with its stored tiles, on the way to the index."""
+
+    source: SourceNode
+    keys: list[int]
+    records: list[Record]
+    children: list[_Node]
+
+    @property
+    def tiles(self) -> list[StoredTile]:
+        return [tile for record in self.records for tile in record.tiles]
+
+    @property
+    def failed(self) -> bool:
+        return any(record.error is not None for record in self.records)
+
+
+def _graft(root: SourceNode, records: dict[int, Record]) -> _Node:
+    """The tree with records, pruned where a tile is missing.
+
+    Where a child of a REPLACE node could not be imported, nothing below the node is used: its
+    coarser surface is shown instead of a hole.
+    """
+    first: dict[int, int] = {}
+    key = 0
+    order = list(root.walk())
+    for node in order:
+        first[id(node)] = key
+        key += len(node.tiles)
+    built: dict[int, _Node] = {}
+    for node in reversed(order):
+        keys = list(range(first[id(node)], first[id(node)] + len(node.tiles)))
+        children = [built.pop(id(c)) for c in node.children]
+        result = _Node(node, keys, [records[k] for k in keys], children)
+        whole = all(_covers(c) for c in children)
+        if node.replaces and node.stands_in and result.tiles and not whole:
+            result.children = []
+        result.children = [c for c in result.children if c.tiles or c.children]
+        built[id(node)] = result
+    return built[id(root)]
+
+
+def _covers(node: _Node) -> bool:
+    """Whether the node, or what is below it, shows everything it should."""
+    if node.failed:
+        return bool(node.children) and all(_covers(c) for c in node.children)
+    return True
+
+
+def assemble(
+    tree: SourceTree, records: dict[int, Record], staged: Staging, frame: LocalFrame
+) -> tuple[TileIndex, Manifest]:
+    """Put the imported tiles in their places in the staging folder; the index, and the manifest as
+    far as the tiles tell.
+    """
+    root = _graft(tree.root, records)
+    nodes = [root]
+    child_start = []
+    for node in nodes:  # grows while it is walked: breadth first, children side by side
+        child_start.append(len(nodes))
+        nodes.extend(node.children)
+    tiles: list[StoredTile] = []
+    tile_start = []
+    for node in nodes:
+        tile_start.append(len(tiles))
+        for key, record in zip(node.keys, node.records, strict=True):
+            for part, tile in enumerate(record.tiles):
+                _link(staged.tile_path(key, part), staged.folder / tile_name(len(tiles)))
+                tiles.append(tile)
+    if not tiles:
+        raise MapSourceError("not one tile of the source has a surface")
+    low, high = _boxes(nodes, child_start)
+    index = TileIndex(
+        box_min=low,
+        box_max=high,
+        geometric_error=np.array([n.source.geometric_error for n in nodes]),
+        gsd=np.array([max((t.gsd for t in n.tiles), default=0.0) for n in nodes]),
+        refine=np.array([REPLACE if n.source.replaces else ADD for n in nodes], np.uint8),
+        child_start=np.array(child_start, np.int32),
+        child_count=np.array([len(n.children) for n in nodes], np.int32),
+        tile_start=np.array(tile_start, np.int32),
+        tile_count=np.array([len(n.tiles) for n in nodes], np.int32),
+        ecef_from_tile=_tile_transforms(tiles, frame),
+        size=np.array([t.size for t in tiles], np.int64),
+        digest=np.array([list(bytes.fromhex(t.sha256)) for t in tiles], np.uint8),
+    )
+    return index, _manifest(nodes, child_start, tiles, frame)
+
+
+def _link(source: Path, target: Path) -> None:
+    target.parent.mkdir(parents=True, exist_ok=True)
+    try:
+        os.link(source, target)  # the part stays, so that a build killed here can go on
+    except OSError:
+        os.replace(source, target)
+
+
+def _boxes(nodes: list[_Node], child_start: list[int]) -> tuple[Array, Array]:
+    low = np.full((len(nodes), 3), np.inf)
+    high = np.full((len(nodes), 3), -np.inf)
+    for i in reversed(range(len(nodes))):
+        for tile in nodes[i].tiles:
+            low[i] = np.minimum(low[i], tile.box_min)
+            high[i] = np.maximum(high[i], tile.box_max)
+        below = slice(child_start[i], child_start[i] + len(nodes[i].children))
+        if nodes[i].children:
+            low[i] = np.minimum(low[i], low[below].min(axis=0))
+            high[i] = np.maximum(high[i], high[below].max(axis=0))
+    return low, high
+
+
+def _tile_transforms(tiles: list[StoredTile], frame: LocalFrame) -> Array:
+    transforms = np.tile(frame.ecef_from_enu.matrix, (len(tiles), 1, 1))
+    transforms[:, :3, 3] = frame.ecef_from_enu.apply(np.array([t.center for t in tiles]))
+    return transforms
+
+
+def _manifest(
+    nodes: list[_Node], child_start: list[int], tiles: list[StoredTile], frame: LocalFrame
+) -> Manifest:
+    depth = np.ones(len(nodes), int)
+    for i, node in enumerate(nodes):
+        depth[child_start[i] : child_start[i] + len(node.children)] = depth[i] + 1
+    leaves = [t for n in nodes if not n.children for t in n.tiles]
+    gsd = [t.gsd for t in leaves if t.gsd > 0]
+    corners = np.array([c for t in leaves for c in (t.box_min, t.box_max)])
+    boxes = np.array([(*t.box_min, *t.box_max) for t in leaves])
+    footprint = np.concatenate(
+        [boxes[:, [0, 1]], boxes[:, [3, 1]], boxes[:, [3, 4]], boxes[:, [0, 4]]]
+    )
+    try:
+        outline = footprint[ConvexHull(footprint).vertices]
+    except QhullError as error:
+        raise MapSourceError("the source's surface has no extent on the ground") from error
+    flat = np.column_stack([outline, np.zeros(len(outline))])
+    geodetic = frame.geodetic_from_enu(flat)
+    heights = frame.geodetic_from_enu(corners)[:, 2]
+    return Manifest(
+        origin=frame.origin,
+        vertical_datum="ellipsoidal",
+        geoid_separation_m=0.0,
+        source="",
+        attribution="",
+        gsd_m=float(np.median(gsd)) if gsd else 0.0,
+        levels=int(depth.max()),
+        tiles=len(tiles),
+        triangles=sum(t.triangles for t in leaves),
+        bytes=sum(t.file_bytes for t in tiles),
+        extent=tuple((float(lat), float(lon)) for lat, lon, _ in geodetic),
+        height_range_m=(float(heights.min()), float(heights.max())),
+        build={},
+        skipped={},
+        index_sha256="",
+    )

@@ -1,0 +1,184 @@
+"""Importing every tile of a source: here, in a pool of processes or on a Dask cluster."""
+
+from __future__ import annotations
+
+import multiprocessing
+import multiprocessing.connection
+import os
+import threading
+from collections.abc import Iterable, Iterator
+from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
+from concurrent.futures.process import BrokenProcessPool
+from dataclasses import dataclass, replace
+from itertools import islice
+
+import cv2
+import numpy as np
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+
+from localizer.errors import MapSourceError
+from localizer.geometry.geo import LocalFrame, geodetic_from_ecef
+from localizer.map.building.staging import Record, Staging
+from localizer.map.cache.tile import mesh_fault
+from localizer.map.source import SourceMesh, SourceNode, TileSource
+
+
+@dataclass(frozen=True)
+class ImportJob:
+    """What a worker needs besides the tile. frame: the cache's world; lift_m: added to heights."""
+
+    staged: Staging
+    frame: LocalFrame
+    lift_m: float
+
+    def run(self, key: int, tile: TileSource) -> Record:
+        """Import one tile; a bad one is recorded, not raised."""
+        try:
+            meshes = [self._to_enu(m) for m in tile.load() if len(m.faces)]
+        except MapSourceError as error:
+            return self.staged.reject(key, str(error))
+        except MemoryError:
+            return self.staged.reject(key, "does not fit into memory")
+        return self.staged.store(key, meshes)
+
+    def _to_enu(self, mesh: SourceMesh) -> SourceMesh:
+        positions = mesh.positions
+        fault = mesh_fault(positions, mesh.uvs, mesh.faces)
+        if fault is not None:
+            raise MapSourceError(fault)
+        if self.lift_m:
+            lat, lon, _ = np.radians(geodetic_from_ecef(positions.mean(axis=0)))
+            up = np.array([np.cos(lat) * np.cos(lon), np.cos(lat) * np.sin(lon), np.sin(lat)])
+            positions = positions + self.lift_m * up
+        enu = self.frame.ecef_from_enu.inverse.apply(positions)
+        if not np.abs(enu).max() <= 1e6:
+            raise MapSourceError("lies more than 1000 km from the map's origin")
+        return replace(mesh, positions=enu)
+
+
+def tiles_of(root: SourceNode) -> Iterator[TileSource]:
+    """Every tile of a tree, in the order that numbers them."""
+    for node in root.walk():
+        yield from node.tiles
+
+
+def import_all(
+    root: SourceNode, job: ImportJob, workers: int, scheduler: str | None, *, progress: bool
+) -> dict[int, Record]:
+    """Records of every source tile, by its place in `tiles_of` order.
+
+    workers: local processes; scheduler: address of a Dask scheduler instead.
+    """
+    records: dict[int, Record] = {}
+    todo: list[tuple[int, TileSource]] = []
+    for key, tile in enumerate(tiles_of(root)):
+        done = job.staged.record(key)
+        if done is not None and done.error is None:
+            records[key] = done
+        else:
+            todo.append((key, tile))
+    if not records and not todo:
+        raise MapSourceError("the source has no tile with content")
+    columns = (TextColumn("importing tiles"), BarColumn(), MofNCompleteColumn())
+    with Progress(*columns, TimeRemainingColumn(), disable=not progress) as bar:
+        task = bar.add_task("", total=len(records) + len(todo), completed=len(records))
+        if scheduler is not None:
+            run = _run_dask(job, todo, scheduler)
+        else:
+            run = _run_here(job, todo) if workers == 1 else _run_pool(job, todo, workers)
+        for key, record in run:
+            records[key] = record
+            bar.advance(task)
+    return records
+
+
+def _run_here(
+    job: ImportJob, todo: Iterable[tuple[int, TileSource]]
+) -> Iterator[tuple[int, Record]]:
+    for key, tile in todo:
+        yield key, job.run(key, tile)
+
+
+def _run_dask(
+    job: ImportJob, todo: list[tuple[int, TileSource]], address: str
+) -> Iterator[tuple[int, Record]]:
+    try:
+        from distributed import Client, as_completed
+    except ImportError as error:
+        raise MapSourceError(f"a Dask scheduler needs the package distributed: {error}") from error
+    with Client(address) as client:
+        queue = iter(todo)
+        room = 4 * max(
+            1, sum(client.nthreads().values())
+        )  # queued tiles, so that memory is bounded
+        running = as_completed(
+            [client.submit(_numbered, job, *item, pure=False) for item in islice(queue, room)]
+        )
+        for future in running:
+            yield future.result()
+            for item in islice(queue, 1):
+                running.add(client.submit(_numbered, job, *item, pure=False))
+
+
+def _numbered(job: ImportJob, key: int, tile: TileSource) -> tuple[int, Record]:
+    return key, job.run(key, tile)
+
+
+def _run_pool(
+    job: ImportJob, todo: list[tuple[int, TileSource]], workers: int
+) -> Iterator[tuple[int, Record]]:
+    pending: dict[Future[Record], tuple[int, TileSource]] = {}
+    queue = iter(todo)
+    suspects: list[tuple[int, TileSource]] = []
+    pool = _pool(min(workers, max(1, len(todo))))
+    try:
+        while True:
+            # A short queue bounds memory: each pending tile is at most one decoded tile.
+            for item in queue:
+                pending[pool.submit(job.run, *item)] = item
+                if len(pending) >= 2 * workers:
+                    break
+            if not pending:
+                break
+            done, _ = wait(pending, return_when=FIRST_COMPLETED)
+            try:
+                for future in done:
+                    record = future.result()
+                    yield pending.pop(future)[0], record
+            except BrokenProcessPool:
+                suspects += pending.values()
+                pending.clear()
+                pool.shutdown(wait=False)
+                pool = _pool(workers)
+    finally:
+        pool.shutdown(wait=False, cancel_futures=True)
+    for item in suspects:
+        yield item[0], _run_alone(job, *item)
+
+
+def _run_alone(job: ImportJob, key: int, tile: TileSource) -> Record:
+    """A tile that was in flight when a worker died: does it kill this one too?"""
+    with _pool(1) as pool:
+        try:
+            return pool.submit(job.run, key, tile).result()
+        except BrokenProcessPool:
+            return job.staged.reject(key, "its decoder crashed: the file is damaged")
+
+
+def _pool(workers: int) -> ProcessPoolExecutor:
+    # Not fork: OpenCV's and the caller's threads do not survive it.
+    context = multiprocessing.get_context("spawn")
+    return ProcessPoolExecutor(workers, mp_context=context, initializer=_start_worker)
+
+
+def _start_worker() -> None:
+    cv2.setNumThreads(1)
+    threading.Thread(target=_end_with_parent, daemon=True).start()
+
+
+def _end_with_parent() -> None:
+    """A worker waits for tasks for ever; nobody sends any once the parent was killed."""
+    parent = multiprocessing.parent_process()
+    if parent is not None:
+        multiprocessing.connection.wait([parent.sentinel])
+        os._exit(1)

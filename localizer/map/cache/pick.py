@@ -1,0 +1,212 @@
+"""From a pixel to the map's surface: by the rendered depth, or exactly by its triangles."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numba import njit
+from numpy.typing import ArrayLike, NDArray
+
+from localizer.geometry.pose import Array
+from localizer.map.cache.tile import TileMesh
+from localizer.types import RenderedView
+
+_JUMP = 0.02  # relative change of depth between neighbouring pixels that may be an edge
+_CORNERS = np.array(list(np.ndindex(2, 2, 2)), np.bool_)
+
+
+@dataclass(frozen=True)
+class BundleHits:
+    """Where the rays of a bundle meet the map. distances: (N,) in multiples of the directions, NaN
+    where there is nothing; normals: (N, 3) unit, world axes, of the triangle, towards the eye.
+    """
+
+    distances: Array
+    normals: Array
+
+
+@dataclass(frozen=True)
+class Pyramid:
+    """What four planes through the eye enclose. axes: (3, 3) rows x, y, and z times the slope;
+    inside |x| and |y| are at most z.
+    """
+
+    axes: Array
+
+    @classmethod
+    def about(cls, directions: Array) -> Pyramid:
+        """The pyramid about a bundle of directions (N, 3), all within 90 degrees of their mean."""
+        axis = directions.mean(axis=0)
+        axis = axis / np.linalg.norm(axis)
+        sideways = np.linalg.svd(axis[None, :])[2][1:]
+        slopes = np.abs(directions @ sideways.T) / (directions @ axis)[:, None]
+        return cls(np.vstack([sideways, axis * (float(slopes.max()) * (1 + 1e-9) + 1e-9)]))
+
+    def beyond(self, points: Array) -> NDArray[np.uint8]:
+        """Which planes each point (..., 3), from the eye, lies beyond: (...) four bits."""
+        x, y, z = np.moveaxis(points @ self.axes.T, -1, 0)
+        return np.asarray((x > z) + 2 * (-x > z) + 4 * (y > z) + 8 * (-y > z), np.uint8)
+
+    def meets_boxes(self, low: Array, high: Array) -> NDArray[np.bool_]:
+        """Which boxes (N,) with corners (N, 3), from the eye, are not wholly beyond a plane."""
+        corners = np.where(_CORNERS[None, :, :], high[:, None, :], low[:, None, :])
+        return np.bitwise_and.reduce(self.beyond(corners), axis=1) == 0
+
+
+def pick(
+    view: RenderedView, pixels: ArrayLike, meshes: Sequence[TileMesh] = ()
+) -> tuple[Array, NDArray[np.bool_]]:
+    """Surface points (N, 3) in world metres under pixels (N, 2), and which of them exist.
+
+    1/z is linear in the image on a plane, so it is interpolated bilinearly. Where neighbouring
+    depths jump (a roof's edge, the skyline) that would invent points in mid-air: there the nearest
+    pixel's depth is taken. With `meshes` (what the view was drawn from) every ray is intersected
+    with their triangles instead, exactly; about 0.3 ms a pixel.
+    """
+    pixels = np.asarray(pixels, dtype=np.float64).reshape(-1, 2)
+    rays = view.camera.rays(pixels)
+    if len(meshes):
+        directions = rays @ view.world_from_camera.rotation.T
+        z = cast_rays(meshes, view.world_from_camera.translation, directions)
+    else:
+        z = _interpolated_depth(view.depth, pixels)
+    valid = np.isfinite(z) & (z > 0)
+    points = view.world_from_camera.apply(rays * np.where(valid, z, np.nan)[:, None])
+    return points, valid
+
+
+def cast_rays(meshes: Sequence[TileMesh], origin: ArrayLike, directions: ArrayLike) -> Array:
+    """Multiples (N,) of `directions` (N, 3) at which rays from `origin` (3,) first meet a triangle.
+
+    World frame; NaN where a ray meets nothing. Both sides of a triangle count.
+    """
+    directions = np.asarray(directions, dtype=np.float64).reshape(-1, 3)
+    nearest = np.full(len(directions), np.inf)
+    for mesh in meshes:
+        tile_from_world = mesh.world_from_tile.inverse
+        local = np.ascontiguousarray(directions @ tile_from_world.rotation.T)
+        low, high = mesh.bounds
+        _cast(mesh.positions, mesh.faces, low, high, tile_from_world.apply(origin), local, nearest)
+    return np.where(np.isfinite(nearest), nearest, np.nan)
+
+
+def cast_bundle(meshes: Sequence[TileMesh], origin: Array, directions: Array) -> BundleHits:
+    """The nearest hits of rays from `origin` (3,) close about one direction: directions (N, 3).
+
+    For N rays about as fast as `cast_rays` for one: a triangle on the far side of one of the
+    bundle's four bounding planes is passed over for all of them.
+    """
+    pyramid = Pyramid.about(directions)
+    nearest = np.full(len(directions), np.inf)
+    normals = np.zeros((len(directions), 3))
+    for mesh in meshes:
+        tile_from_world = mesh.world_from_tile.inverse
+        turn = tile_from_world.rotation.T
+        eye, local = tile_from_world.apply(origin), np.ascontiguousarray(directions @ turn)
+        low, high = mesh.bounds
+        turned = Pyramid(pyramid.axes @ turn)
+        if not turned.meets_boxes((low - eye)[None, :], (high - eye)[None, :])[0]:
+            continue
+        beyond = turned.beyond(mesh.positions - eye)
+        hit = np.full(len(directions), -1, np.int32)
+        _cast_bundle(mesh.positions, mesh.faces, beyond, eye, local, nearest, hit)
+        new = hit >= 0
+        normals[new] = _normals(mesh, hit[new], local[new]) @ turn.T
+    return BundleHits(np.where(np.isfinite(nearest), nearest, np.nan), normals)
+
+
+def warm_up() -> None:
+    """Compile what casts bundles: a first target in flight must not wait for it."""
+    corner = np.array([[0.0, 0, 1], [1, 0, 1], [0, 1, 1]], np.float32)
+    faces, beyond = np.array([[0, 1, 2]], np.int32), np.zeros(3, np.uint8)
+    hit, nearest = np.zeros(1, np.int32), np.full(1, np.inf)
+    _cast_bundle(corner, faces, beyond, np.zeros(3), np.ones((1, 3)), nearest, hit)
+
+
+def _normals(mesh: TileMesh, faces: NDArray[np.int32], directions: Array) -> Array:
+    """Unit normals (N, 3) of faces in the tile's axes, against the directions (N, 3)."""
+    p, q, s = np.moveaxis(mesh.positions[mesh.faces[faces]].astype(np.float64), 1, 0)
+    n = np.cross(q - p, s - p)
+    n /= np.linalg.norm(n, axis=1)[:, None]
+    return np.where(((n * directions).sum(axis=1) > 0)[:, None], -n, n)
+
+
+def _interpolated_depth(depth: NDArray[np.float32], pixels: Array) -> Array:
+    """Depth (N,) at sub-pixel positions, 0 outside the image and where there is none."""
+    h, w = depth.shape
+    inside = (pixels >= 0).all(axis=1) & (pixels[:, 0] <= w) & (pixels[:, 1] <= h)
+    x = np.clip(np.nan_to_num(pixels[:, 0]) - 0.5, 0, w - 1)
+    y = np.clip(np.nan_to_num(pixels[:, 1]) - 0.5, 0, h - 1)
+    x0, y0 = np.minimum(x.astype(int), w - 2), np.minimum(y.astype(int), h - 2)
+    fx, fy = x - x0, y - y0
+    corners = np.stack(
+        [depth[y0, x0], depth[y0, x0 + 1], depth[y0 + 1, x0], depth[y0 + 1, x0 + 1]]
+    ).astype(np.float64)
+    low, high = corners.min(axis=0), corners.max(axis=0)
+    smooth = (low > 0) & (high <= low * (1 + _JUMP))
+    weights = np.stack([(1 - fx) * (1 - fy), fx * (1 - fy), (1 - fx) * fy, fx * fy])
+    with np.errstate(divide="ignore", invalid="ignore"):
+        interpolated = 1 / (weights / corners).sum(axis=0)
+    nearest = depth[np.rint(y).astype(int), np.rint(x).astype(int)]
+    return np.where(inside, np.where(smooth, interpolated, nearest), 0.0)
+
+
+@njit(cache=True, nogil=True)
+def _cast(positions, faces, low, high, origin, directions, nearest):  # type: ignore[no-untyped-def]
+    """The intersection of every ray that meets the box with every triangle."""
+    for r in range(directions.shape[0]):
+        d = directions[r]
+        enter, leave = 0.0, nearest[r]
+        for a in range(3):
+            if d[a] == 0.0:
+                if origin[a] < low[a] or origin[a] > high[a]:
+                    leave = -1.0
+                continue
+            t0, t1 = (low[a] - origin[a]) / d[a], (high[a] - origin[a]) / d[a]
+            enter, leave = max(enter, min(t0, t1)), min(leave, max(t0, t1))
+        if enter > leave + 1e-6 * abs(leave):
+            continue
+        for f in range(faces.shape[0]):
+            t = _meet(positions, faces[f], origin, d)
+            if 0.0 < t < nearest[r]:
+                nearest[r] = t
+
+
+@njit(cache=True, nogil=True)
+def _cast_bundle(  # type: ignore[no-untyped-def]
+    positions, faces, beyond, origin, directions, nearest, hit
+):
+    """The same for all rays of a bundle, with the face that each hits; `beyond` of the vertices."""
+    for f in range(faces.shape[0]):
+        if beyond[faces[f, 0]] & beyond[faces[f, 1]] & beyond[faces[f, 2]]:
+            continue
+        for r in range(directions.shape[0]):
+            t = _meet(positions, faces[f], origin, directions[r])
+            if 0.0 < t < nearest[r]:
+                nearest[r] = t
+                hit[r] = f
+
+
+@njit(cache=True, nogil=True)
+def _meet(positions, face, origin, d):  # type: ignore[no-untyped-def]
+    """Where a ray meets a triangle (Möller and Trumbore), in multiples of `d`; -1 if nowhere."""
+    p, q, s = positions[face[0]], positions[face[1]], positions[face[2]]
+    ax, ay, az = float(p[0]), float(p[1]), float(p[2])
+    ux, uy, uz = q[0] - ax, q[1] - ay, q[2] - az
+    vx, vy, vz = s[0] - ax, s[1] - ay, s[2] - az
+    hx, hy, hz = d[1] * vz - d[2] * vy, d[2] * vx - d[0] * vz, d[0] * vy - d[1] * vx
+    det = ux * hx + uy * hy + uz * hz
+    if det == 0.0:
+        return -1.0
+    inv = 1.0 / det
+    ox, oy, oz = origin[0] - ax, origin[1] - ay, origin[2] - az
+    b = (ox * hx + oy * hy + oz * hz) * inv
+    if b < 0.0 or b > 1.0:
+        return -1.0
+    gx, gy, gz = oy * uz - oz * uy, oz * ux - ox * uz, ox * uy - oy * ux
+    c = (d[0] * gx + d[1] * gy + d[2] * gz) * inv
+    if c < 0.0 or b + c > 1.0:
+        return -1.0
+    return (vx * gx + vy * gy + vz * gz) * inv

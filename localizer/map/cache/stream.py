@@ -1,0 +1,286 @@
+"""Streaming: the tiles of a view from memory, the missing ones loaded behind its back.
+
+`select` never waits for the disk unless it is told to. Missing detail is replaced by resident
+parents and loaded by one thread (decoding releases the GIL); least recently used nodes leave when
+the byte budget is full.
+"""
+
+from __future__ import annotations
+
+import logging
+import threading
+from collections import OrderedDict
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from localizer.errors import MapCacheError
+from localizer.geometry.camera import Camera
+from localizer.geometry.pose import Pose
+from localizer.map.cache.cache import TileCache
+from localizer.map.cache.select import DetailLimits, Selection, TileSelector
+from localizer.map.cache.tile import TileMesh
+
+_log = logging.getLogger(__name__)
+
+_RELAX = 1.4  # step by which detail is reduced when a view does not fit into the budget
+
+
+@dataclass(frozen=True)
+class StreamCounters:
+    """Since the streamer was made.
+
+    hits, misses: wanted nodes that were in memory or not; complete: selections at the wanted detail
+    throughout; stalls: selections with a hole; failures: nodes that could not be read; loaded,
+    evicted: nodes; resident_bytes: now.
+    """
+
+    selections: int = 0
+    complete: int = 0
+    stalls: int = 0
+    hits: int = 0
+    misses: int = 0
+    loaded: int = 0
+    evicted: int = 0
+    failures: int = 0
+    resident_bytes: int = 0
+
+
+class TileStreamer:
+    """Tiles of a cache within a byte budget; one thread selects and prefetches."""
+
+    def __init__(
+        self,
+        cache: TileCache,
+        byte_budget: int = 512 << 20,
+        max_error_px: float = DetailLimits.max_error_px,
+        max_texel_px: float = DetailLimits.max_texel_px,
+        bytes_per_select: int = 64 << 20,
+    ) -> None:
+        """Start the loader thread.
+
+        byte_budget: of decoded tiles. max_error_px, max_texel_px: see `DetailLimits`.
+        bytes_per_select: how much new data one selection may bring in, so that a renderer that has
+        to upload it keeps its pace; a selection that waits is not bounded.
+        """
+        self.cache = cache
+        self._index = cache.index
+        self._selector = TileSelector(cache.index, cache.frame)
+        self._limits = DetailLimits(max_error_px, max_texel_px)
+        self._budget = byte_budget
+        self._node_bytes = _node_bytes(cache)
+        self._meshes: OrderedDict[int, list[TileMesh]] = OrderedDict()  # least recent first
+        self._current: list[TileMesh] = []
+        self._resident = np.zeros(len(self._node_bytes), np.bool_)
+        self._failed: dict[int, MapCacheError] = {}
+        self._bytes = 0
+        self._counts = dict.fromkeys(StreamCounters.__dataclass_fields__, 0)
+        self._lock = threading.Condition()
+        self._queue: list[int] = []  # nodes to load, most urgent first
+        self._ahead: list[int] = []  # after those
+        self._arrived: list[tuple[int, list[TileMesh]]] = []  # loaded, not yet in use
+        self._arrived_bytes = 0
+        self._evicted: list[list[TileMesh]] = []  # for the loader to free
+        self._bytes_per_select = bytes_per_select
+        self._protected: set[int] = set()  # in the current view
+        self._closed = False
+        self._thread = threading.Thread(target=self._run, name="tile-loader", daemon=True)
+        self._thread.start()
+
+    def select(
+        self, world_from_camera: Pose, camera: Camera, *, wait: bool = False
+    ) -> list[TileMesh]:
+        """Meshes to draw for a view.
+
+        wait: block until all wanted detail is resident; then a tile that cannot be read raises
+        `MapCacheError`, while without `wait` its parent stays in view and the failure is logged.
+        """
+        limits = self._fitting_limits(world_from_camera, camera)
+        with self._lock:
+            self._take_in(None if wait else self._bytes_per_select)
+            choice = self._choose(world_from_camera, camera, limits)
+            while wait and not self._resident[choice.wanted].all():
+                missing = choice.wanted[~self._resident[choice.wanted]].tolist()
+                for node in missing:
+                    if node in self._failed:
+                        raise self._failed[node]
+                self._queue = missing
+                self._lock.notify_all()
+                self._lock.wait()
+                self._take_in(None)
+                choice = self._choose(world_from_camera, camera, limits)
+            self._count(choice)
+            self._current = [mesh for node in choice.shown for mesh in self._touched(int(node))]
+            return list(self._current)
+
+    def current(self) -> list[TileMesh]:
+        """The meshes of the latest `select`; may be called from any thread (for picking)."""
+        with self._lock:
+            return list(self._current)
+
+    def prefetch(self, views: Sequence[Pose], camera: Camera) -> None:
+        """Load what views (world_from_camera) to come will need, the first one's first, after what
+        the current one needs and as far as the budget reaches.
+        """
+        limits = [self._fitting_limits(view, camera) for view in views]
+        with self._lock:
+            room = self._budget - int(self._node_bytes[list(self._protected)].sum())
+            seen = set(self._protected)
+            self._ahead = []
+            for view, limit in zip(views, limits, strict=True):
+                choice = self._selector.select(view, camera, self._resident, limit)
+                for node in choice.wanted.tolist():
+                    if node in seen:
+                        continue
+                    seen.add(node)
+                    room -= int(self._node_bytes[node])
+                    if room < 0:
+                        break
+                    if self._resident[node]:
+                        self._meshes.move_to_end(node)
+                    elif node not in self._failed:
+                        self._ahead.append(node)
+            self._lock.notify_all()
+
+    def counters(self) -> StreamCounters:
+        """What has happened so far."""
+        with self._lock:
+            resident = self._bytes + self._arrived_bytes
+            return StreamCounters(**self._counts | {"resident_bytes": resident})
+
+    def close(self) -> None:
+        """Stop the loader thread and drop all tiles."""
+        with self._lock:
+            self._closed = True
+            self._lock.notify_all()
+        self._thread.join()
+        with self._lock:
+            self._meshes.clear()
+            self._arrived.clear()
+            self._evicted.clear()
+            self._resident[:] = False
+            self._bytes = 0
+
+    def __enter__(self) -> TileStreamer:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def _fitting_limits(self, world_from_camera: Pose, camera: Camera) -> DetailLimits:
+        """The finest limits at which the view's wanted nodes fit into the budget."""
+        limits = self._limits
+        everything = np.ones(len(self._resident), np.bool_)
+        for _ in range(16):
+            choice = self._selector.select(world_from_camera, camera, everything, limits)
+            if self._node_bytes[choice.wanted].sum() <= self._budget:
+                break
+            limits = limits.relaxed(_RELAX)
+        return limits
+
+    def _choose(self, world_from_camera: Pose, camera: Camera, limits: DetailLimits) -> Selection:
+        """Select, and hand the loader its list. The lock is held."""
+        if self._closed:
+            raise RuntimeError("the tile streamer is closed")
+        choice = self._selector.select(world_from_camera, camera, self._resident, limits)
+        self._protected = {0, *choice.wanted.tolist(), *choice.shown.tolist()}
+        self._queue = [n for n in choice.requests.tolist() if n not in self._failed]
+        self._lock.notify_all()
+        return choice
+
+    def _touched(self, node: int) -> Sequence[TileMesh]:
+        self._meshes.move_to_end(node)
+        return self._meshes[node]
+
+    def _count(self, choice: Selection) -> None:
+        hits = int(self._resident[choice.wanted].sum())
+        self._counts["selections"] += 1
+        self._counts["hits"] += hits
+        self._counts["misses"] += len(choice.wanted) - hits
+        self._counts["complete"] += hits == len(choice.wanted)
+        self._counts["stalls"] += choice.hole
+
+    def _run(self) -> None:
+        while True:
+            with self._lock:
+                while not (self._closed or self._evicted or self._to_load()):
+                    self._lock.wait()
+                if self._closed:
+                    return
+                evicted, self._evicted = self._evicted, []
+            # Giving megabytes back to the system takes its time: not the render thread's.
+            del evicted
+            with self._lock:
+                nodes = self._to_load()
+                if not nodes:
+                    continue
+                node = nodes.pop(0)
+                # A node may have been asked for again while it was being loaded.
+                if node in self._failed or self._resident[node] or self._has_arrived(node):
+                    continue
+            meshes: list[TileMesh] | None = None
+            failure: MapCacheError | None = None
+            start = int(self._index.tile_start[node])
+            try:
+                tiles = range(start, start + int(self._index.tile_count[node]))
+                meshes = [_ready(self.cache.load_tile(t)) for t in tiles]
+            except MapCacheError as error:
+                failure = error
+            with self._lock:
+                if meshes is not None:
+                    self._arrived.append((node, meshes))
+                    self._arrived_bytes += int(self._node_bytes[node])
+                    self._counts["loaded"] += 1
+                elif failure is not None:
+                    _log.error("%s", failure)
+                    self._failed[node] = failure
+                    self._counts["failures"] += 1
+                self._lock.notify_all()
+
+    def _has_arrived(self, node: int) -> bool:
+        return any(node == arrived for arrived, _ in self._arrived)
+
+    def _to_load(self) -> list[int]:
+        """The nodes to load, in order; empty while there is no room to put them down."""
+        if self._arrived_bytes >= self._bytes_per_select:
+            return []
+        return self._queue or self._ahead
+
+    def _take_in(self, limit: int | None) -> None:
+        """Bring loaded nodes into use, at most `limit` bytes but at least one. The lock is held."""
+        taken = 0
+        while self._arrived and (limit is None or taken < limit):
+            node, meshes = self._arrived.pop(0)
+            size = int(self._node_bytes[node])
+            self._arrived_bytes -= size
+            taken += size
+            self._make_room(size)
+            self._meshes[node] = meshes
+            self._resident[node] = True
+            self._bytes += size
+
+    def _make_room(self, needed: int) -> None:
+        """Drop least recently used nodes; the current view's stay, so that it can complete."""
+        for node in list(self._meshes):
+            if self._bytes + self._arrived_bytes + needed <= self._budget:
+                return
+            if node in self._protected:
+                continue
+            self._evicted.append(self._meshes.pop(node))
+            self._resident[node] = False
+            self._bytes -= int(self._node_bytes[node])
+            self._counts["evicted"] += 1
+
+
+def _ready(mesh: TileMesh) -> TileMesh:
+    """With what drawing asks for computed here, not on the render thread."""
+    _ = mesh.bounds, mesh.texture
+    return mesh
+
+
+def _node_bytes(cache: TileCache) -> NDArray[np.int64]:
+    index = cache.index
+    total = np.concatenate([[0], np.cumsum(index.size)])
+    return np.asarray(total[index.tile_start + index.tile_count] - total[index.tile_start])

@@ -1,0 +1,87 @@
+"""Grids of heights to meshes: what the raster importer and made-up coarse levels share."""
+
+from __future__ import annotations
+
+import fast_simplification
+import numpy as np
+from numpy.typing import NDArray
+
+from localizer.geometry.pose import Array
+
+REDUCTION = 0.5  # share of triangles that simplification takes away above the finest level
+# Detail limits are set for photogrammetric tilesets, whose stated error is several times the step
+# of their grid; a height field's is put on the same scale.
+ERROR_PER_STEP = 2.0
+
+
+def height_mesh(
+    heights: np.ma.MaskedArray,
+    shown: NDArray[np.bool_],
+    step: tuple[float, float],
+    *,
+    lossless: bool,
+) -> tuple[Array, NDArray[np.int32]] | None:
+    """Vertices (V, 3), x east and y north of the tile's first vertex, and faces (F, 3).
+
+    None where nothing is left. Cells with an unknown corner or no picture are left out.
+    """
+    n = heights.shape[0] - 1
+    known = ~np.ma.getmaskarray(heights)
+    whole = known[:-1, :-1] & known[1:, :-1] & known[:-1, 1:] & known[1:, 1:]
+    rows = np.minimum((np.arange(n) + 0.5) * shown.shape[0] / n, shown.shape[0] - 1).astype(int)
+    whole &= shown[np.ix_(rows, rows)]
+    if not whole.any():
+        return None
+    r, c = np.nonzero(whole)
+    corner = r * (n + 1) + c
+    below = corner + n + 1
+    faces = np.concatenate(
+        [np.stack([corner, below, corner + 1], 1), np.stack([corner + 1, below, below + 1], 1)]
+    )
+    gy, gx = np.mgrid[0 : n + 1, 0 : n + 1]
+    points = np.stack([gx * step[0], -gy * step[1], np.where(known, heights.data, 0.0)], -1)
+    used, index = np.unique(faces, return_inverse=True)
+    points, faces = points.reshape(-1, 3)[used], index.reshape(-1, 3)
+    points, faces = _simplified(points, faces, lossless)
+    extent = (n * step[0], n * step[1])
+    return _skirted(points, faces.astype(np.int32), extent, depth=2 * max(step))
+
+
+def _simplified(
+    points: Array, faces: NDArray[np.int64], lossless: bool
+) -> tuple[Array, NDArray[np.int64]]:
+    base = points.mean(axis=0)
+    local = points - base
+    if lossless:
+        out, kept = fast_simplification.simplify(local, faces, 0.5, lossless=True)
+    else:
+        out, kept = fast_simplification.simplify(local, faces, REDUCTION)
+    if len(kept) == 0:
+        return points, faces
+    return np.asarray(out, np.float64) + base, np.asarray(kept)
+
+
+def _skirted(
+    points: Array, faces: NDArray[np.int32], extent: tuple[float, float], depth: float
+) -> tuple[Array, NDArray[np.int32]]:
+    """With vertical strips hung from the edges that lie on the tile's border."""
+    edges = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
+    slack = 1e-3 * max(extent)
+    x, y = points[edges, 0], points[edges, 1]
+    on_border = (
+        (np.abs(x) < slack).all(1)
+        | (np.abs(x - extent[0]) < slack).all(1)
+        | (np.abs(y) < slack).all(1)
+        | (np.abs(y + extent[1]) < slack).all(1)
+    )
+    edges = edges[on_border]
+    top, inverse = np.unique(edges, return_inverse=True)
+    bottom = inverse.reshape(-1, 2).astype(np.int32) + np.int32(len(points))
+    hung = points[top] - (0.0, 0.0, depth)
+    strips = np.concatenate(
+        [
+            np.stack([edges[:, 1], edges[:, 0], bottom[:, 0]], 1),
+            np.stack([edges[:, 1], bottom[:, 0], bottom[:, 1]], 1),
+        ]
+    )
+    return np.concatenate([points, hung]), np.concatenate([faces, strips]).astype(np.int32)

@@ -1,0 +1,82 @@
+"""glTF, GLB and OBJ meshes with a georeference: cut into tiles, coarser levels made for them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import trimesh
+
+from localizer.errors import MapSourceError
+from localizer.geometry.pose import Array
+from localizer.map.cache.tile import mesh_fault
+from localizer.map.importers.georeference import Georeference, UpAxis
+from localizer.map.importers.gltf import read_gltf
+from localizer.map.importers.textures import palette_mesh
+from localizer.map.importers.tiles3d import inside, read_file
+from localizer.map.source import SourceMesh
+
+_Z_UP_FROM_Y_UP = np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]])
+
+
+@dataclass(frozen=True)
+class MeshFile:
+    """A mesh file and where it stands; one `Model`."""
+
+    path: Path
+    up_axis: UpAxis
+    georeference: Georeference
+
+    @property
+    def name(self) -> str:
+        """How errors name it."""
+        return self.path.name
+
+    def load(self) -> list[SourceMesh]:
+        """See `Model.load`."""
+        if self.path.suffix.lower() == ".obj":
+            meshes = _read_obj(self.path)
+        else:
+            folder = self.path.parent.resolve()
+            data = read_file(self.path)
+            meshes, rtc = read_gltf(data, lambda uri: read_file(inside(folder, folder, uri)))
+            meshes = [replace(m, positions=m.positions + rtc) for m in meshes]
+        meshes = [m for m in meshes if len(m.faces)]
+        if not meshes:
+            raise MapSourceError(f"{self.path}: holds no triangles")
+        for mesh in meshes:
+            fault = mesh_fault(mesh.positions, mesh.uvs, mesh.faces)
+            if fault is not None:
+                raise MapSourceError(f"{self.path}: {fault}")
+        if self.up_axis == "y":
+            meshes = [replace(m, positions=m.positions @ _Z_UP_FROM_Y_UP.T) for m in meshes]
+        return meshes
+
+    def ecef(self, points: Array) -> Array:
+        """See `Model.ecef`."""
+        return self.georeference.ecef(points)
+
+
+def _read_obj(path: Path) -> list[SourceMesh]:
+    try:
+        loaded = trimesh.load_scene(path, process=False)
+    except Exception as error:  # trimesh raises whatever its readers meet
+        raise MapSourceError(f"{path}: cannot be read as OBJ: {error!r}") from error
+    return [_from_trimesh(g) for g in loaded.geometry.values() if hasattr(g, "faces")]
+
+
+def _from_trimesh(mesh: Any) -> SourceMesh:
+    positions = np.asarray(mesh.vertices, np.float64)
+    faces = np.asarray(mesh.faces, np.int32)
+    uv = getattr(mesh.visual, "uv", None)
+    material = getattr(mesh.visual, "material", None)
+    picture = getattr(material, "image", None) or getattr(material, "baseColorTexture", None)
+    if uv is None or picture is None:
+        colours = np.asarray(mesh.visual.face_colors, np.uint8)[:, :3]
+        return palette_mesh(positions, faces, colours)
+    uvs = np.column_stack([uv[:, 0], 1.0 - uv[:, 1]]).astype(np.float32)  # v upwards there
+    image = np.asarray(picture.convert("RGB"), np.uint8)
+    outside = uvs.min() < -0.01 or uvs.max() > 1.01
+    return SourceMesh(positions, uvs, faces, image, repeat=bool(outside))

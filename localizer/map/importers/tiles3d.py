@@ -1,0 +1,310 @@
+"""3D Tiles 1.0 and 1.1, explicit tilesets: the tree and the content (b3dm, glb, glTF)."""
+
+from __future__ import annotations
+
+import json
+import struct
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+from urllib.parse import unquote, urlsplit
+
+import numpy as np
+
+from localizer.errors import MapSourceError
+from localizer.geometry.geo import ecef_from_geodetic
+from localizer.geometry.pose import Array
+from localizer.map.importers.gltf import gltf_weight, read_gltf
+from localizer.map.importers.referenced_files import files_beside
+from localizer.map.source import SourceMesh, SourceNode, SourceTree
+
+MAX_TILES = 5_000_000
+MAX_DEPTH = 200
+MAX_CONTENT_BYTES = 1 << 30
+
+# glTF is y up, 3D Tiles z up: (x, y, z) -> (x, -z, y).
+_Z_UP = {
+    "Y": np.array([[1.0, 0, 0, 0], [0, 0, -1, 0], [0, 1, 0, 0], [0, 0, 0, 1]]),
+    "X": np.array([[0.0, 0, -1, 0], [0, 1, 0, 0], [1, 0, 0, 0], [0, 0, 0, 1]]),
+    "Z": np.eye(4),
+}
+
+
+@dataclass(frozen=True, eq=False)
+class ContentFile:
+    """A tile's content. folder: the tileset's; ecef_from_tile: (4, 4); up_axis: of its glTF."""
+
+    path: Path
+    folder: Path
+    ecef_from_tile: Array
+    up_axis: str
+
+    @property
+    def name(self) -> str:
+        """How errors name it."""
+        return str(self.path.relative_to(self.folder))
+
+    def size_bytes(self) -> int:
+        """Of the file; 0 where it cannot be read."""
+        try:
+            return self.path.stat().st_size
+        except OSError:
+            return 0
+
+    def weight(self) -> tuple[int, int]:
+        """Triangles and texels by the file's headers."""
+        return gltf_weight(self._gltf()[0], self._beside)
+
+    def load(self) -> list[SourceMesh]:
+        """Meshes with positions in ECEF metres (float64)."""
+        data, rtc = self._gltf()
+        meshes, gltf_rtc = read_gltf(data, self._beside)
+        # Tile transform, then RTC_CENTER (in z-up axes), then the turn of the glTF's up axis.
+        centred = np.eye(4)
+        centred[:3, 3] = rtc + gltf_rtc
+        T = self.ecef_from_tile @ centred @ _Z_UP[self.up_axis]
+        return [replace(m, positions=m.positions @ T[:3, :3].T + T[:3, 3]) for m in meshes]
+
+    def _gltf(self) -> tuple[bytes, Array]:
+        """The glTF or GLB of the content, and the centre (3,) that it is relative to."""
+        data = read_file(self.path)
+        if data[:4] == b"b3dm":
+            return _unwrap_b3dm(data)
+        if data[:4] in (b"i3dm", b"pnts", b"cmpt"):
+            raise MapSourceError(f"content of type {data[:4].decode()} is not supported")
+        if data[:4] != b"glTF" and data.lstrip()[:1] != b"{":
+            raise MapSourceError(f"content starts with {data[:4]!r}: neither b3dm nor glTF")
+        return data, np.zeros(3)
+
+    def _beside(self, uri: str) -> bytes:
+        return read_file(inside(self.folder, self.path.parent, uri))
+
+
+def read_tileset(path: Path) -> SourceTree:
+    """Read `tileset.json` (or the folder that holds it) and every tileset it refers to."""
+    try:
+        return _read_tileset(path)
+    except (AttributeError, KeyError, OverflowError, TypeError, ValueError) as error:
+        raise MapSourceError(f"{path}: malformed tileset: {error!r}") from error
+
+
+def _read_tileset(path: Path) -> SourceTree:
+    path = (path / "tileset.json" if path.is_dir() else path).resolve()
+    reader = _Reader(path.parent)
+    document = reader.load(path)
+    root_json = _object(document.get("root"), f"{path}: root")
+    extras: dict[str, Any] = {}
+    asset = _object(document.get("asset", {}), f"{path}: asset")
+    for holder in (document, asset):
+        if isinstance(holder.get("extras"), dict):
+            extras |= holder["extras"]
+    separation = extras.get("geoid_separation_m")
+    if separation is not None and not isinstance(separation, int | float):
+        raise MapSourceError(f"{path}: geoid_separation_m is {separation!r}, not a number")
+    root = reader.tileset(path, np.eye(4), 0, replaces=True)
+    return SourceTree(
+        root,
+        _centre(root_json, str(path)),
+        None if separation is None else float(separation),
+        str(asset.get("copyright", extras.get("attribution", ""))),
+        tuple(reader.files),
+        "ellipsoidal",  # by the specification
+    )
+
+
+def read_file(path: Path) -> bytes:
+    """Bytes of a source file, which must exist and be of a sane size."""
+    try:
+        if path.stat().st_size > MAX_CONTENT_BYTES:
+            raise MapSourceError(f"{path} is larger than {MAX_CONTENT_BYTES} bytes")
+        return path.read_bytes()
+    except OSError as error:
+        raise MapSourceError(f"{path} cannot be read: {error.strerror or error}") from error
+
+
+def inside(folder: Path, base: Path, uri: str) -> Path:
+    """The file that `uri` means, relative to `base`; it must lie within `folder`."""
+    parts = urlsplit(uri)
+    if parts.scheme or parts.netloc:
+        raise MapSourceError(f"{uri!r} is not a local file; download the tileset first")
+    name = unquote(parts.path)
+    if not name or "\0" in name:
+        raise MapSourceError(f"{uri!r} is not a file name")
+    path = (base / name).resolve()
+    if not path.is_relative_to(folder):
+        raise MapSourceError(f"{uri!r} leaves the tileset's folder {folder}")
+    return path
+
+
+class _Reader:
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+        self._open: list[Path] = []  # tilesets being read, to find cycles
+        self._count = 0
+        self.files: list[Path] = []
+
+    def load(self, path: Path) -> dict[str, Any]:
+        try:
+            document = json.loads(read_file(path))
+        except (ValueError, RecursionError) as error:
+            raise MapSourceError(f"{path}: cannot be read as JSON: {error}") from error
+        return _object(document, f"{path}: the document")
+
+    def tileset(self, path: Path, parent: Array, depth: int, *, replaces: bool) -> SourceNode:
+        """The root node of a tileset file, placed under `parent` (4, 4)."""
+        if path in self._open:
+            raise MapSourceError(f"{path}: external tilesets refer to each other in a cycle")
+        document = self.load(path)
+        version = _object(document.get("asset", {}), f"{path}: asset").get("version")
+        if version not in ("1.0", "1.1"):
+            raise MapSourceError(f"{path}: 3D Tiles version {version!r}; 1.0 and 1.1 are read")
+        up_axis = str(document["asset"].get("gltfUpAxis", "Y")).upper()
+        if up_axis not in _Z_UP:
+            raise MapSourceError(f"{path}: gltfUpAxis {up_axis!r} is not X, Y or Z")
+        self._open.append(path)
+        self.files.append(path)
+        root = _object(document.get("root"), f"{path}: root")
+        node = self._node(root, parent, replaces, up_axis, path, depth)
+        self._open.pop()
+        return node
+
+    def _node(
+        self, data: dict[str, Any], parent: Array, replaces: bool, up: str, path: Path, depth: int
+    ) -> SourceNode:
+        self._count += 1
+        if self._count > MAX_TILES or depth > MAX_DEPTH:
+            raise MapSourceError(
+                f"{path}: more than {MAX_TILES} tiles or {MAX_DEPTH} levels; is it in a cycle?"
+            )
+        if "implicitTiling" in data or "3DTILES_implicit_tiling" in data.get("extensions", {}):
+            raise MapSourceError(f"{path}: implicit tiling is not supported, explicit tiles are")
+        T = parent @ _transform(data, str(path))
+        refine = str(data.get("refine", "REPLACE" if replaces else "ADD")).upper()
+        if refine not in ("REPLACE", "ADD"):
+            raise MapSourceError(f"{path}: refine is {refine!r}, neither REPLACE nor ADD")
+        tiles: list[ContentFile] = []
+        children: list[SourceNode] = []
+        for uri in _content_uris(data, path):
+            file = inside(self.folder, path.parent, uri)
+            if file.suffix.lower() == ".json":
+                children.append(self.tileset(file, T, depth + 1, replaces=refine == "REPLACE"))
+            else:
+                tiles.append(ContentFile(file, self.folder, T, up))
+                self.files += [file, *files_beside(file)]
+        for item in data.get("children", []):
+            child = _object(item, f"{path}: a child")
+            children.append(self._node(child, T, refine == "REPLACE", up, path, depth + 1))
+        error = _number(data.get("geometricError", 0.0), f"{path}: geometricError")
+        scale = float(np.linalg.norm(T[:3, :3], axis=0).max())
+        corners = _corners(data.get("boundingVolume"), T)
+        return SourceNode(error * scale, refine == "REPLACE", tuple(tiles), children, corners)
+
+
+def _content_uris(data: dict[str, Any], path: Path) -> list[str]:
+    contents = data.get("contents", [])
+    if "content" in data:
+        contents = [data["content"], *contents]
+    uris = []
+    for item in contents:
+        content = _object(item, f"{path}: content")
+        uri = content.get("uri", content.get("url"))  # `url` before 1.0 was final
+        if not isinstance(uri, str):
+            raise MapSourceError(f"{path}: a content has no uri")
+        uris.append(uri)
+    return uris
+
+
+def _unwrap_b3dm(data: bytes) -> tuple[bytes, Array]:
+    if len(data) < 28:
+        raise MapSourceError("b3dm is cut off in its header")
+    version, length, *tables = struct.unpack_from("<6I", data, 4)
+    if version != 1:
+        raise MapSourceError(f"b3dm version {version} is not supported, 1 is")
+    start = 28 + sum(tables)
+    if length > len(data) or start > length:
+        raise MapSourceError(f"b3dm is cut off: {len(data)} of {max(length, start)} bytes")
+    try:
+        features = json.loads(data[28 : 28 + tables[0]] or b"{}")
+        center = features.get("RTC_CENTER", [0.0, 0.0, 0.0])
+        if isinstance(center, dict):  # in the binary body
+            at = 28 + tables[0] + int(center["byteOffset"])
+            center = struct.unpack_from("<3f", data[: 28 + tables[0] + tables[1]], at)
+        rtc = np.asarray(center, np.float64)
+    except (ValueError, AttributeError, KeyError, TypeError, struct.error) as error:
+        raise MapSourceError(f"b3dm feature table cannot be read: {error}") from error
+    if rtc.shape != (3,) or not np.isfinite(rtc).all():
+        raise MapSourceError("b3dm RTC_CENTER is not three finite numbers")
+    return data[start:length], rtc
+
+
+def _transform(data: dict[str, Any], where: str) -> Array:
+    values = data.get("transform")
+    if values is None:
+        return np.eye(4)
+    try:
+        T = np.asarray(values, np.float64)
+    except (TypeError, ValueError) as error:
+        raise MapSourceError(f"{where}: a transform is not numbers") from error
+    if T.shape != (16,) or not np.isfinite(T).all():
+        raise MapSourceError(f"{where}: a transform is not 16 finite numbers")
+    return T.reshape(4, 4).T.copy()
+
+
+def _centre(root: dict[str, Any], where: str) -> Array:
+    """Where the map is, (3,) ECEF: the root's transform if it goes there, else its volume."""
+    T = _transform(root, where)
+    if np.linalg.norm(T[:3, 3]) > 1e6:
+        return np.asarray(T[:3, 3])
+    volume = _object(root.get("boundingVolume"), f"{where}: the root's boundingVolume")
+    if "region" in volume:
+        west, south, east, north, low, _ = _numbers(volume["region"], 6, where)
+        lat, lon = np.degrees(0.5 * (south + north)), np.degrees(0.5 * (west + east))
+        return ecef_from_geodetic(lat, lon, low)
+    key = "box" if "box" in volume else "sphere"
+    centre = _numbers(volume.get(key), 12 if key == "box" else 4, where)[:3]
+    return np.asarray(T[:3, :3] @ centre + T[:3, 3])
+
+
+def _corners(volume: Any, T: Array) -> Array | None:
+    """(8, 3) ECEF corners of a box that holds a bounding volume; None where that says nothing."""
+    if not isinstance(volume, dict):
+        return None
+    signs = np.array([[a, b, c] for a in (-1, 1) for b in (-1, 1) for c in (-1, 1)], np.float64)
+    try:
+        if "region" in volume:
+            west, south, east, north, low, high = np.asarray(volume["region"], np.float64)
+            middle = np.array([south + north, west + east, low + high]) / 2
+            half = np.array([north - south, east - west, high - low]) / 2
+            lat, lon, h = (middle + signs * half).T
+            corners = ecef_from_geodetic(np.degrees(lat), np.degrees(lon), h)
+        elif "box" in volume:
+            box = np.asarray(volume["box"], np.float64).reshape(4, 3)
+            corners = (box[0] + signs @ box[1:]) @ T[:3, :3].T + T[:3, 3]
+        else:
+            x, y, z, radius = np.asarray(volume.get("sphere"), np.float64)
+            corners = (np.array([x, y, z]) + signs * radius) @ T[:3, :3].T + T[:3, 3]
+    except (TypeError, ValueError):
+        return None
+    return corners if np.isfinite(corners).all() else None
+
+
+def _numbers(values: Any, length: int, where: str) -> Array:
+    try:
+        array = np.asarray(values, np.float64)
+    except (TypeError, ValueError):
+        array = np.empty(0)
+    if array.shape != (length,) or not np.isfinite(array).all():
+        raise MapSourceError(f"{where}: the root's boundingVolume is not {length} finite numbers")
+    return array
+
+
+def _number(value: Any, what: str) -> float:
+    if not isinstance(value, int | float) or not np.isfinite(value) or value < 0:
+        raise MapSourceError(f"{what} is {value!r}, not a number from 0 up")
+    return float(value)
+
+
+def _object(value: Any, what: str) -> dict[str, Any]:
+    if not isinstance(value, dict):
+        raise MapSourceError(f"{what} is not an object")
+    return value

@@ -1,0 +1,1 @@
+"""Looking at a tile cache: figures, integrity, pictures."""

@@ -1,0 +1,262 @@
+"""Looking at a tile cache: its figures, its integrity, pictures of it, and back to GLB."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import cv2
+import numpy as np
+import trimesh
+from numpy.typing import NDArray
+from PIL import Image as PillowImage
+
+from localizer.errors import MapCacheError, OutsideMapError
+from localizer.geometry.camera import Camera
+from localizer.geometry.geo import Geodetic
+from localizer.geometry.pose import Array, Pose, matrix_from_euler
+from localizer.map.cache.cache import TileCache
+from localizer.map.cache.stream import TileStreamer
+from localizer.map.cache.tile import TileMesh
+from localizer.render.numba_raster import NumbaRenderer
+from localizer.types import Image, RenderedView
+
+HOLE_CELL_M = 1.0
+MIN_HOLE_M2 = 25.0  # smaller gaps are ponds, glass roofs and other failures of photogrammetry
+_MAX_CELLS = 20_000 * 20_000
+
+# Camera axes (x right, y down, z forward) of a camera that looks along the body's x (FRD).
+_BODY_FROM_CAMERA = np.array([[0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
+_ENU_FROM_NED = np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, -1.0]])
+
+
+@dataclass(frozen=True)
+class LevelSummary:
+    """One depth of the tile tree. gsd_m: median texel size; megabytes: on disk."""
+
+    level: int
+    tiles: int
+    gsd_m: float
+    geometric_error_m: float
+    megabytes: float
+
+
+@dataclass(frozen=True)
+class Hole:
+    """A gap that surface surrounds. centre: latitude, longitude in degrees."""
+
+    area_m2: float
+    centre: tuple[float, float]
+
+
+@dataclass(frozen=True)
+class Verification:
+    """damaged: why each bad tile is bad; holes: largest first; covered_m2: ground covered."""
+
+    tiles: int
+    damaged: tuple[str, ...]
+    holes: tuple[Hole, ...]
+    covered_m2: float
+
+    @property
+    def ok(self) -> bool:
+        """Whether every tile is intact; holes may be in the source."""
+        return not self.damaged
+
+
+def levels(cache: TileCache) -> list[LevelSummary]:
+    """Figures of each level, coarsest first."""
+    index = cache.index
+    depth = _depths(cache)
+    result = []
+    for level in range(int(depth.max()) + 1):
+        nodes = np.flatnonzero((depth == level) & (index.tile_count > 0))
+        tiles = [t for n in nodes for t in _tiles_of(cache, int(n))]
+        gsd = index.gsd[nodes]
+        size = sum(cache.tile_path(t).stat().st_size for t in tiles if cache.tile_path(t).exists())
+        result.append(
+            LevelSummary(
+                level,
+                len(tiles),
+                float(np.median(gsd[gsd > 0])) if (gsd > 0).any() else 0.0,
+                float(np.median(index.geometric_error[nodes])) if len(nodes) else 0.0,
+                size / 1e6,
+            )
+        )
+    return result
+
+
+def verify(cache: TileCache) -> Verification:
+    """Read every tile against its hash, and look for holes in the finest surface."""
+    damaged: list[str] = []
+    leaf = set(_leaf_tiles(cache))
+    seen = _Occupancy(cache)
+    for tile in cache.tile_ids:
+        try:
+            mesh = cache.load_tile(tile)
+        except MapCacheError as error:
+            damaged.append(str(error))
+            continue
+        if tile in leaf:
+            seen.add(mesh)
+    return Verification(len(cache.tile_ids), tuple(damaged), tuple(seen.holes()), seen.covered_m2())
+
+
+def camera_pose(
+    cache: TileCache,
+    latitude_deg: float,
+    longitude_deg: float,
+    height_m: float,
+    heading_deg: float = 0.0,
+    pitch_deg: float = -90.0,
+) -> Pose:
+    """World pose of a level camera. height_m: ellipsoidal; heading: clockwise from north; pitch: of
+    the optical axis above the horizon, -90 looks straight down.
+    """
+    p = Geodetic(latitude_deg, longitude_deg, height_m)  # names what is no place on Earth
+    position = cache.frame.enu_from_geodetic(p.latitude_deg, p.longitude_deg, p.height_m)
+    attitude = matrix_from_euler(0.0, np.radians(pitch_deg), np.radians(heading_deg))
+    return Pose(_ENU_FROM_NED @ attitude @ _BODY_FROM_CAMERA, position)
+
+
+def render_view(cache: TileCache, world_from_camera: Pose, camera: Camera) -> RenderedView:
+    """One view at full detail; `OutsideMapError` when it shows nothing of the map."""
+    with TileStreamer(cache) as streamer:
+        renderer = NumbaRenderer(streamer)
+        try:
+            view = renderer.render(world_from_camera, camera, wait=True)
+        finally:
+            renderer.close()
+    if not (view.depth > 0).any():
+        raise OutsideMapError(f"{cache.path}: the view shows nothing of the map; {_place(cache)}")
+    return view
+
+
+def _place(cache: TileCache) -> str:
+    low, high = cache.index.box_min[0], cache.index.box_max[0]
+    middle = cache.frame.position((low + high) / 2)
+    east, north = (high - low)[:2]
+    lowest, highest = cache.manifest.height_range_m
+    return (
+        f"it lies about {middle.latitude_deg:.5f}, {middle.longitude_deg:.5f}, {east:.0f} x "
+        f"{north:.0f} m, between {lowest:.0f} and {highest:.0f} m (ellipsoidal)"
+    )
+
+
+def depth_picture(depth: NDArray[np.float32]) -> Image:
+    """Depth as colours (RGB), near is bright; black where there is no surface."""
+    shown = depth > 0
+    if not shown.any():
+        return np.zeros((*depth.shape, 3), np.uint8)
+    inverse = np.where(shown, 1 / np.maximum(depth, 1e-6), 0)
+    low, high = np.percentile(inverse[shown], (1, 99))
+    scaled = np.clip((inverse - low) / max(high - low, 1e-9), 0, 1)
+    colours = cv2.applyColorMap((255 * scaled).astype(np.uint8), cv2.COLORMAP_TURBO)
+    return np.where(shown[..., None], cv2.cvtColor(colours, cv2.COLOR_BGR2RGB), 0).astype(np.uint8)
+
+
+def write_picture(path: Path, rgb: Image) -> None:
+    """Write an RGB image; the suffix says the format. OSError where it cannot be written."""
+    # imencode, because imwrite prints a warning and keeps the reason for itself.
+    coded = cv2.imencode(path.suffix, cv2.cvtColor(rgb, cv2.COLOR_RGB2BGR))[1]
+    path.write_bytes(coded.tobytes())
+
+
+def export_glb(cache: TileCache, out: Path, level: int | None = None) -> int:
+    """Write the surface as one GLB, y up, metres about the cache's origin; returns triangles.
+
+    level: the depth of the tile tree to take (what ends above it is taken too), else the finest.
+    `OutsideMapError` for a level below the finest.
+    """
+    finest = int(_depths(cache).max())
+    if level is not None and level > finest:
+        raise OutsideMapError(f"{cache.path}: no level {level}, the finest is {finest}")
+    scene = trimesh.Scene()
+    triangles = 0
+    for tile in _cut(cache, level):
+        mesh = cache.load_tile(tile)
+        points = mesh.world_from_tile.apply(mesh.positions)
+        y_up = np.stack([points[:, 0], points[:, 2], -points[:, 1]], axis=-1)
+        material = trimesh.visual.material.PBRMaterial(
+            baseColorTexture=PillowImage.fromarray(np.ascontiguousarray(mesh.mips[0])),
+            metallicFactor=0.0,
+            roughnessFactor=1.0,
+            doubleSided=True,
+        )
+        # trimesh counts v upwards, as its glTF writer expects.
+        uv = np.column_stack([mesh.uvs[:, 0], 1.0 - mesh.uvs[:, 1]])
+        visual = trimesh.visual.TextureVisuals(uv=uv, material=material)
+        part = trimesh.Trimesh(y_up, mesh.faces, visual=visual, process=False)
+        scene.add_geometry(part, geom_name=f"tile{tile:07d}")
+        triangles += len(mesh.faces)
+    out.write_bytes(scene.export(file_type="glb"))
+    return triangles
+
+
+def _depths(cache: TileCache) -> NDArray[np.int32]:
+    index = cache.index
+    depth = np.zeros(len(index.refine), np.int32)
+    for node in range(len(depth)):
+        start = index.child_start[node]
+        depth[start : start + index.child_count[node]] = depth[node] + 1
+    return depth
+
+
+def _tiles_of(cache: TileCache, node: int) -> range:
+    start = int(cache.index.tile_start[node])
+    return range(start, start + int(cache.index.tile_count[node]))
+
+
+def _leaf_tiles(cache: TileCache) -> Iterator[int]:
+    return _cut(cache, None)
+
+
+def _cut(cache: TileCache, level: int | None) -> Iterator[int]:
+    """Tiles that together show the surface once, at a depth or at the finest."""
+    index = cache.index
+    depth = _depths(cache)
+    for node in range(len(depth)):
+        adds = index.refine[node] != 0  # ADD: the node's own tiles stay beside its children's
+        if level is None:
+            taken = index.child_count[node] == 0 or adds
+        else:
+            ends_above = depth[node] < level and index.child_count[node] == 0
+            taken = depth[node] == level or ends_above or (adds and depth[node] < level)
+        if taken:
+            yield from _tiles_of(cache, node)
+
+
+class _Occupancy:
+    """Which cells of the ground some triangle covers, from above."""
+
+    def __init__(self, cache: TileCache) -> None:
+        self._frame = cache.frame
+        self._low: Array = cache.index.box_min[0, :2]
+        extent = cache.index.box_max[0, :2] - self._low
+        self._cell = max(HOLE_CELL_M, float(np.sqrt(np.prod(extent) / _MAX_CELLS)))
+        width, height = (int(n) for n in np.ceil(extent / self._cell))
+        self._grid = np.zeros((height + 3, width + 3), np.uint8)  # a free cell around it
+
+    def add(self, mesh: TileMesh) -> None:
+        points = mesh.world_from_tile.apply(mesh.positions)[:, :2]
+        cells = np.floor((points - self._low) / self._cell).astype(np.int32) + 1
+        for triangle in cells[mesh.faces]:
+            cv2.fillConvexPoly(self._grid, triangle, 1)
+
+    def covered_m2(self) -> float:
+        return float(self._grid.sum(dtype=np.int64)) * self._cell**2
+
+    def holes(self) -> list[Hole]:
+        count, labels, stats, centroids = cv2.connectedComponentsWithStats(
+            1 - self._grid, connectivity=4
+        )
+        outside = labels[0, 0]
+        found = []
+        for label in range(1, count):
+            area = float(stats[label, cv2.CC_STAT_AREA]) * self._cell**2
+            if label != outside and area >= MIN_HOLE_M2:
+                east, north = (centroids[label] - 0.5) * self._cell + self._low
+                lat, lon, _ = self._frame.geodetic_from_enu([east, north, 0.0])
+                found.append(Hole(area, (float(lat), float(lon))))
+        return sorted(found, key=lambda hole: -hole.area_m2)

@@ -1,0 +1,1 @@
+"""Registration on the CPU: the numba kernel, and the specification that it is held against."""

@@ -1,0 +1,1 @@
+"""What light, weather and a camera do to a rendered image."""

@@ -1,0 +1,1 @@
+"""Buildings: footprints, kinds and the surfaces of each."""

@@ -1,0 +1,1 @@
+"""Fast scenes for training: lit height fields, ray-marched."""

@@ -1,0 +1,1 @@
+"""Painting: light, ground, facades, crowns."""

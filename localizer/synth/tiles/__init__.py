@@ -1,0 +1,1 @@
+"""From a painted scene to 3D Tiles."""

@@ -1,0 +1,286 @@
+"""Painting and writing tiles, a block of 200 m at a time."""
+
+from __future__ import annotations
+
+import pickle
+from collections import defaultdict
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from localizer.geometry.pose import Array
+from localizer.synth.buildings.kinds import build
+from localizer.synth.buildings.model import LEAF, MID, NEAR_LEVELS, ROOT, TOP, Building, Surface
+from localizer.synth.config import BLOCK_M, LEAF_GSD_M, LEAF_M, TOP_M
+from localizer.synth.paint.covers import Cover, Light, new_image
+from localizer.synth.paint.facades import paint_surface
+from localizer.synth.paint.ground import paint_ground
+from localizer.synth.paint.lighting import DSM_GSD_M, make_light
+from localizer.synth.plan.ground import Shape, rasterize, shape_bounds
+from localizer.synth.tiles.charts import ChartedMesh, pack
+from localizer.synth.tiles.props import CAR_COLOURS, car_image, car_shape
+from localizer.synth.tiles.scene import Scene, car_positions, hedge_quads
+from localizer.synth.tiles.terrain_mesh import terrain_mesh
+from localizer.synth.tiles.vegetation import crown_images, tree_meshes
+from localizer.synth.tiles.write import TileNode, glb_bytes
+from localizer.types import Image
+
+_LIGHT_MARGIN_M = 60.0  # objects belong to the tile of their middle and reach out of it
+_GUTTER_PX, _PAD_PX = 16, 4
+_MAX_CHART_PX = 800
+_CAR_PX_PER_M = 16
+_GRID = {LEAF: 1, MID: 2, TOP: 4, ROOT: 8}  # terrain cells merged per side
+_NAMES = {LEAF: "leaf", MID: "mid", TOP: "top", ROOT: "root"}
+_SIDE_M = {LEAF: LEAF_M, MID: BLOCK_M, TOP: TOP_M}
+
+
+@dataclass(frozen=True)
+class Part:
+    """What a finished tile hands up to the next coarser one. ground: its image at twice the texel
+    size of that tile's; mesh: what coarser levels still show; node: itself.
+    """
+
+    nodes: list[TileNode]
+    ground: Image
+    mesh: ChartedMesh
+    west: float
+    north: float
+
+
+@dataclass
+class Baker:
+    """Paints the tiles of one scene into a folder. Belongs to one process."""
+
+    scene: Scene
+    folder: Path
+    _bounds: Array = field(init=False)
+    _leaf_buildings: dict[tuple[int, int], list[Building]] = field(init=False)
+    _slopes: tuple[NDArray[np.float32], NDArray[np.float32]] = field(init=False)
+
+    def __post_init__(self) -> None:
+        self._bounds = shape_bounds(self.scene.plan.shapes)
+        self._slopes = self.scene.plan.terrain.gradient()
+        self._leaf_buildings = defaultdict(list)
+        for building in self.scene.buildings:
+            self._leaf_buildings[self._leaf_of(np.array(building.centre))].append(building)
+
+    def _leaf_of(self, xy: Array) -> tuple[int, int]:
+        column, row = np.floor((xy + self.scene.plan.config.half_m) / LEAF_M).astype(int)
+        return int(column), int(row)
+
+    def block(self, column: int, row: int) -> Part:
+        """Paint and write the four leaves and the middle tile of a block; count from south-west."""
+        half = self.scene.plan.config.half_m
+        west, south = column * BLOCK_M - half, row * BLOCK_M - half
+        north = south + BLOCK_M
+        light = self._light(west, north)
+        ground = self._ground(west, north, light)
+        n = ground.shape[0] // 2
+        leaves, meshes = [], []
+        for dy in (0, 1):
+            for dx in (0, 1):
+                leaf = (2 * column + dx, 2 * row + dy)
+                mesh = self._objects(leaf, light)
+                image = ground[(1 - dy) * n : (2 - dy) * n, dx * n : (dx + 1) * n]
+                leaf_west, leaf_north = west + dx * LEAF_M, south + (dy + 1) * LEAF_M
+                leaves.append(self.write(LEAF, leaf, leaf_west, leaf_north, image, mesh))
+                meshes.append(mesh)
+        image = half_size(ground)
+        mesh = ChartedMesh.merged(meshes)
+        mesh = mesh.at_level(MID | TOP | ROOT).halved()
+        middle = self.write(MID, (column, row), west, north, image, mesh)
+        middle.children = leaves
+        return Part([middle], half_size(image), mesh.at_level(TOP | ROOT).halved(), west, north)
+
+    def write(
+        self, level: int, place: tuple[int, int], west: float, north: float, ground: Image,
+        mesh: ChartedMesh,
+    ) -> TileNode:  # fmt: skip
+        """Write one tile: terrain with its image, and the mesh's faces of this level."""
+        terrain = self.scene.plan.terrain
+        side = self.scene.plan.config.size_m if level == ROOT else _SIDE_M[level]
+        shown = mesh.at_level(level)
+        scale = {LEAF: 0, MID: 1, TOP: 2, ROOT: 4}[level]
+        atlas = pack(ground, shown.charts, _GUTTER_PX, max(1, _PAD_PX >> scale))
+        size = np.array([atlas.image.shape[1], atlas.image.shape[0]], float)
+        points, st, faces, error = terrain_mesh(terrain, west, north, side, _GRID[level])
+        uv = (st * ground.shape[0] + atlas.ground) / size
+        uv_shown = (shown.st + atlas.offsets[shown.chart]) / size if len(shown.st) else shown.st
+        positions = np.concatenate([points, shown.positions])
+        origin = np.array([west + side / 2, north - side / 2, float(points[:, 2].mean())])
+        origin = np.round(origin, 3)
+        local = (positions - origin).astype(np.float32)
+        data = glb_bytes(
+            local, np.concatenate([uv, uv_shown]).astype(np.float32),
+            np.concatenate([faces, shown.faces + len(points)]), atlas.image,
+        )  # fmt: skip
+        uri = f"{_NAMES[level]}_{place[0]}_{place[1]}.glb"
+        (self.folder / uri).write_bytes(data)
+        low, high = local.min(0).astype(float), local.max(0).astype(float)
+        dropped = self._dropped_m(level, west, north, side)
+        return TileNode(uri, origin, origin + low, origin + high, max(error, dropped))
+
+    def _dropped_m(self, level: int, west: float, north: float, side: float) -> float:
+        """Size of what a level leaves out or simplifies within a tile, metres."""
+        if level == LEAF:
+            return 0.0
+        xy = self.scene.plan.trees.xy
+        inside = (xy[:, 0] >= west) & (xy[:, 0] < west + side)
+        inside &= (xy[:, 1] <= north) & (xy[:, 1] > north - side)
+        radius = self.scene.plan.trees.radius[inside].max(initial=0.0)
+        if level == MID:
+            return float(0.3 * radius) + 0.35  # rounder crowns, inner sides of parapets
+        if level == TOP:
+            return float(max(3.0, 0.8 * radius))  # cars, hedges, chimneys, dormers
+        return float(self.scene.plan.trees.height[inside].max(initial=3.0))
+
+    def _light(self, west: float, north: float) -> Light:
+        scene = self.scene
+        margin = _LIGHT_MARGIN_M
+        left = max(0, int((west - margin - scene.west) / DSM_GSD_M))
+        top = max(0, int((scene.north - north - margin) / DSM_GSD_M))
+        n = scene.dsm.shape[0]
+        right = min(n, int((west + BLOCK_M + margin - scene.west) / DSM_GSD_M))
+        bottom = min(n, int((scene.north - north + BLOCK_M + margin) / DSM_GSD_M))
+        window = (top, left, bottom - top, right - left)
+        return make_light(scene.dsm, scene.ground, scene.west, scene.north, window, scene.look)
+
+    def _ground(self, west: float, north: float, light: Light) -> Image:
+        plan = self.scene.plan
+        n = round(BLOCK_M / LEAF_GSD_M)
+        b = self._bounds
+        near = (b[:, 0] < west + BLOCK_M) & (b[:, 2] > west)
+        near &= (b[:, 1] < north) & (b[:, 3] > north - BLOCK_M)
+        shapes: list[Shape] = [plan.shapes[k] for k in np.flatnonzero(near)]
+        region = rasterize(shapes, west, north, LEAF_GSD_M, (n, n))
+        out = new_image(n, n)
+        paint_ground(
+            region, plan.regions.material, plan.regions.tint, plan.regions.shape,
+            west, north, LEAF_GSD_M, plan.terrain.heights, *self._slopes,
+            plan.terrain.spacing_m, plan.terrain.half_m, light.ceiling, light.ambient, light.west,
+            light.north, light.gsd_m, light.sun, light.sun_rgb, light.sky_rgb, light.season, out,
+        )  # fmt: skip
+        return out
+
+    def _objects(self, leaf: tuple[int, int], light: Light) -> ChartedMesh:
+        """Everything that stands on a leaf tile."""
+        parts = [
+            self._surface(s, light) for b in self._leaf_buildings.get(leaf, ()) for s in build(b)
+        ]
+        west, south = np.array(leaf) * LEAF_M - self.scene.plan.config.half_m
+        parts += self._hedges(west, south, light)
+        parts.append(self._trees(leaf, west, south, light))
+        parts.append(self._cars(west, south, light))
+        return ChartedMesh.merged([p for p in parts if len(p.faces)])
+
+    def _surface(self, surface: Surface, light: Light) -> ChartedMesh:
+        width, length = surface.extent
+        gsd = max(LEAF_GSD_M, max(width, length) / _MAX_CHART_PX)
+        out = new_image(max(2, int(np.ceil(length / gsd))), max(2, int(np.ceil(width / gsd))))
+        paint_surface(
+            surface.cover, surface.origin, surface.right, surface.down, surface.normal, gsd,
+            width, length, surface.base, surface.accent, surface.params, surface.floor_z,
+            surface.eaves_z, surface.seed, light.ceiling, light.ambient, light.west, light.north,
+            light.gsd_m, light.sun, light.sun_rgb, light.sky_rgb, light.season, out,
+        )  # fmt: skip
+        n = len(surface.polygon)
+        away = surface.polygon - surface.origin
+        st = np.stack([away @ surface.right, away @ surface.down], -1) / gsd
+        faces = np.array([(0, k, k + 1) for k in range(1, n - 1)], np.int64)
+        return ChartedMesh(
+            surface.polygon, np.zeros(n, np.int64), st, faces,
+            np.full(len(faces), surface.levels, np.uint8), (out,),
+        )  # fmt: skip
+
+    def _hedges(self, west: float, south: float, light: Light) -> list[ChartedMesh]:
+        parts = []
+        for hedge in self.scene.plan.hedges:
+            middle = (hedge.a + hedge.b) / 2
+            if not (west <= middle[0] < west + LEAF_M and south <= middle[1] < south + LEAF_M):
+                continue
+            rng = np.random.default_rng(hedge.seed)
+            colour = np.array([84.0, 98.0, 56.0]) * rng.normal(1, 0.12)
+            for quad in hedge_quads(self.scene.plan.terrain, hedge):
+                normal = np.cross(quad[1] - quad[0], quad[3] - quad[0])
+                normal /= max(float(np.linalg.norm(normal)), 1e-9)
+                right = quad[1] - quad[0]
+                right /= max(float(np.linalg.norm(right)), 1e-9)
+                down = np.cross(right, normal)
+                u, v = (quad - quad[0]) @ right, (quad - quad[0]) @ down
+                surface = Surface(
+                    quad, quad[0] + right * u.min() + down * v.min(), right, down, normal,
+                    (float(np.ptp(u)), float(np.ptp(v))), int(Cover.HEDGE), colour, np.zeros(3),
+                    np.zeros(6), float(quad[:, 2].min()), 0.0, hedge.seed, NEAR_LEVELS,
+                )  # fmt: skip
+                parts.append(self._surface(surface, light))
+        return parts
+
+    def _trees(self, leaf: tuple[int, int], west: float, south: float, light: Light) -> ChartedMesh:
+        trees = self.scene.plan.trees
+        xy = trees.xy
+        inside = (xy[:, 0] >= west) & (xy[:, 0] < west + LEAF_M)
+        inside &= (xy[:, 1] >= south) & (xy[:, 1] < south + LEAF_M)
+        chosen = np.flatnonzero(inside)
+        if not len(chosen):
+            return ChartedMesh.empty()
+        z = self.scene.plan.terrain.height(xy[chosen, 0], xy[chosen, 1])
+        column = ((xy[chosen, 0] - light.west) / light.gsd_m).astype(int)
+        row = ((light.north - xy[chosen, 1]) / light.gsd_m).astype(int)
+        top = z + 0.75 * trees.height[chosen]
+        shaded = light.ceiling[row, column] > top
+        rng = self.scene.plan.config.rng(50, leaf[0] + 500, leaf[1] + 500)
+        return tree_meshes(trees, chosen, z, shaded, crown_images(rng, self.scene.look, light))
+
+    def _cars(self, west: float, south: float, light: Light) -> ChartedMesh:
+        cars = self.scene.cars
+        inside = (cars[:, 0] >= west) & (cars[:, 0] < west + LEAF_M)
+        inside &= (cars[:, 1] >= south) & (cars[:, 1] < south + LEAF_M)
+        cars = cars[inside]
+        if not len(cars):
+            return ChartedMesh.empty()
+        shape = car_shape()
+        row = ((light.north - cars[:, 1]) / light.gsd_m).astype(int)
+        column = ((cars[:, 0] - light.west) / light.gsd_m).astype(int)
+        z = self.scene.plan.terrain.height(cars[:, 0], cars[:, 1])
+        shaded = light.ceiling[row, column] > z + 1.6
+        colours = cars[:, 3].astype(int) % len(CAR_COLOURS)
+        used, chart = np.unique(colours * 2 + shaded, return_inverse=True)
+        images = []
+        for key in used:
+            image = car_image(CAR_COLOURS[key // 2], int(key), self.scene.look)
+            shade = 0.45 if key % 2 else 1.0
+            image = np.asarray(image * shade, np.uint8)
+            size = (image.shape[1] * 5 // 8, image.shape[0] * 5 // 8)
+            images.append(np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA)))
+        n, m = len(cars), len(shape.positions)
+        st = np.broadcast_to(shape.st * _CAR_PX_PER_M * 5 / 8, (n, m, 2)).reshape(-1, 2)
+        faces = (shape.faces[None] + (np.arange(n) * m)[:, None, None]).reshape(-1, 3)
+        return ChartedMesh(
+            car_positions(self.scene.plan.terrain, cars, shape).reshape(-1, 3),
+            np.repeat(chart.reshape(-1), m).astype(np.int64), st.copy(), faces.astype(np.int64),
+            np.full(len(faces), NEAR_LEVELS, np.uint8), tuple(images),
+        )  # fmt: skip
+
+
+def half_size(image: Image) -> Image:
+    """The image at half its width and height."""
+    size = (image.shape[1] // 2, image.shape[0] // 2)
+    return np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA), np.uint8)
+
+
+_baker: list[Baker] = []  # the baker of a worker process, set once by `start_worker`
+
+
+def start_worker(scene_file: Path, folder: Path) -> None:
+    """Initialise a worker process."""
+    cv2.setNumThreads(1)
+    with scene_file.open("rb") as file:
+        _baker[:] = [Baker(pickle.load(file), folder)]
+
+
+def bake_block(place: tuple[int, int]) -> tuple[tuple[int, int], Part]:
+    """Paint one block in a worker process."""
+    return place, _baker[0].block(*place)

@@ -1,0 +1,1 @@
+"""Pixels to places on Earth, and a target over time."""

@@ -1,0 +1,165 @@
+"""One target's position over time, with every surface that its pixels may have shown.
+
+A sum of Gaussians (Alspach and Sorenson 1972, "Nonlinear Bayesian estimation using Gaussian sum
+approximations"): one constant-velocity Kalman track for each surface that the sightings so far
+allow. Tracks of different surfaces are never averaged; the most probable one is reported, and the
+others widen its covariance.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from filterpy.common import Q_continuous_white_noise
+from filterpy.kalman import predict as kalman_predict
+from filterpy.kalman import update as kalman_update
+
+from localizer.geometry.pose import Array
+from localizer.types import TargetFix, TargetSighting, TargetSurface
+
+# Spectral density of a target's acceleration, east north up, m²/s³: 0.3 m/s in a second is a car in
+# traffic, 0.15 m/s the slope of its road.
+_ACCELERATION = (0.45, 0.45, 0.02)
+_SPEED_SIGMA = (10.0, 10.0, 2.0)  # m/s, before anything is known
+_GATE = 25.0  # squared Mahalanobis distance, 3 dimensions
+_OUTLIERS = 3  # sightings in a row that no track explains: the target is elsewhere
+_LONELY = 0.01  # factor for a track whose surface is not in the sighting, while another's is
+_NEGLIGIBLE = 1e-3
+_MOST_TRACKS = 6
+_SAME = 1.0  # squared Mahalanobis distance below which two tracks are one
+_ELSEWHERE = 9.0  # and above which a track is another place than the reported one
+_H = np.hstack([np.eye(3), np.zeros((3, 3))])
+
+
+@dataclass(frozen=True)
+class _Track:
+    """A hypothesis. mean: (6,) position m and velocity m/s, world axes; covariance: (6, 6)."""
+
+    weight: float
+    mean: Array
+    covariance: Array
+
+
+class TargetFilter:
+    """Tracks one target; not thread-safe."""
+
+    def __init__(self) -> None:
+        self._tracks: list[_Track] = []
+        self._time_ns = 0
+        self._outliers = 0
+
+    @property
+    def velocity(self) -> Array:
+        """Velocity (3,) in m/s, world axes; zero before the first sighting."""
+        return self._tracks[0].mean[3:].copy() if self._tracks else np.zeros(3)
+
+    def update(self, sighting: TargetSighting) -> TargetFix:
+        """Fuse a sighting of at least one surface. Three that fit no track restart the filter."""
+        tracks = [_predicted(t, sighting.time_ns - self._time_ns) for t in self._tracks]
+        met = _met(tracks, sighting.surfaces)
+        self._outliers = 0 if met else self._outliers + 1
+        if not tracks or self._outliers >= _OUTLIERS:
+            met = [_new_track(s) for s in sighting.surfaces]
+            self._outliers = 0
+        self._tracks = _reduced(met or tracks)
+        self._time_ns = sighting.time_ns
+        return self._fix(sighting)
+
+    def _fix(self, sighting: TargetSighting) -> TargetFix:
+        """The most probable track; the covariance is the mean square about it of all of them."""
+        best = self._tracks[0]
+        covariance, elsewhere = np.zeros((3, 3)), 0.0
+        for track in self._tracks:
+            offset = track.mean[:3] - best.mean[:3]
+            P = track.covariance[:3, :3]
+            covariance += track.weight * (P + np.outer(offset, offset))
+            if offset @ np.linalg.solve(best.covariance[:3, :3], offset) > _ELSEWHERE:
+                elsewhere += track.weight
+        return TargetFix(
+            sighting.target_id,
+            best.mean[:3].copy(),
+            covariance,
+            sighting.pixel,
+            sighting.time_ns,
+            elsewhere,
+        )
+
+
+def _new_track(surface: TargetSurface) -> _Track:
+    covariance = np.zeros((6, 6))
+    covariance[:3, :3] = surface.covariance
+    covariance[3:, 3:] = np.diag(np.square(_SPEED_SIGMA))
+    return _Track(surface.probability, np.concatenate([surface.position, np.zeros(3)]), covariance)
+
+
+def _predicted(track: _Track, elapsed_ns: int) -> _Track:
+    dt = max(elapsed_ns * 1e-9, 1e-3)
+    F = np.eye(6)
+    F[:3, 3:] = np.eye(3) * dt
+    Q = np.kron(Q_continuous_white_noise(2, dt), np.diag(_ACCELERATION))
+    mean, P = kalman_predict(track.mean, track.covariance, F, Q)
+    return replace(track, mean=np.asarray(mean), covariance=np.asarray(P))
+
+
+def _met(tracks: list[_Track], surfaces: tuple[TargetSurface, ...]) -> list[_Track]:
+    """Every track with every surface within its gate; empty if there is no such pair.
+
+    What is measured is a pixel, whichever surface it shows: the likelihood is a Gaussian of the
+    same height for all, taken over the track's own spread. The surfaces' probabilities count only
+    between those that a track cannot tell apart. Counted in every frame, what is wrong with the
+    map's edge or with the aim in all of them would be taken for evidence.
+    """
+    met, lonely = [], []
+    for track in tracks:
+        pairs = [(s, _likelihood(track, s)) for s in surfaces]
+        pairs = [(s, likelihood) for s, likelihood in pairs if likelihood > 0.0]
+        total = sum(s.probability for s, _ in pairs)
+        for surface, likelihood in pairs:
+            weight = track.weight * likelihood * surface.probability / total
+            mean, P = kalman_update(
+                track.mean, track.covariance, surface.position, surface.covariance, _H
+            )
+            met.append(_Track(weight, np.asarray(mean), np.asarray(P)))
+        if not pairs:
+            lonely.append(track)
+    heaviest = max((t.weight for t in met), default=0.0)
+    factor = _LONELY * heaviest / max((t.weight for t in tracks), default=1.0)
+    return met + [replace(t, weight=t.weight * factor) for t in lonely] if met else []
+
+
+def _likelihood(track: _Track, surface: TargetSurface) -> float:
+    """Of a surface's point, relative to the best possible one; 0 outside the gate."""
+    S = track.covariance[:3, :3] + surface.covariance
+    innovation = surface.position - track.mean[:3]
+    distance = float(innovation @ np.linalg.solve(S, innovation))
+    if distance > _GATE:
+        return 0.0
+    height = np.linalg.det(surface.covariance) / np.linalg.det(S)
+    return float(np.sqrt(height) * np.exp(-0.5 * distance))
+
+
+def _reduced(tracks: list[_Track]) -> list[_Track]:
+    """Normalised, the heaviest first; the same ones merged, negligible ones dropped."""
+    waiting = sorted(tracks, key=lambda t: -t.weight)
+    total = sum(t.weight for t in waiting)
+    kept: list[_Track] = []
+    while waiting and len(kept) < _MOST_TRACKS:
+        head = waiting[0]
+        offsets = [t.mean - head.mean for t in waiting]
+        same = [o @ np.linalg.solve(head.covariance, o) < _SAME for o in offsets]
+        kept.append(_merged([t for t, s in zip(waiting, same, strict=True) if s]))
+        waiting = [t for t, s in zip(waiting, same, strict=True) if not s]
+    kept = [t for t in kept if t.weight >= _NEGLIGIBLE * total]
+    total = sum(t.weight for t in kept)
+    return sorted((replace(t, weight=t.weight / total) for t in kept), key=lambda t: -t.weight)
+
+
+def _merged(tracks: list[_Track]) -> _Track:
+    """One Gaussian with the tracks' common mean and covariance."""
+    weight = sum(t.weight for t in tracks)
+    mean = np.sum([t.weight * t.mean for t in tracks], axis=0) / weight
+    covariance = np.zeros((6, 6))
+    for t in tracks:
+        covariance += t.weight / weight * (t.covariance + np.outer(t.mean - mean, t.mean - mean))
+    return _Track(weight, mean, covariance)

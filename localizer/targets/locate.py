@@ -1,0 +1,142 @@
+"""Pixels to places: rays from the estimated pose, with covariance and every surface in reach.
+
+Paper, Sec. 3.3.2 (end): a query pixel is mapped to the map by a ray from the estimated pose. At a
+roof's edge the errors of pose and pixel decide which surface that ray meets. So a bundle of rays is
+cast that samples these errors, and every surface that it meets is told with its probability.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+from localizer.geometry.pose import Array, hat
+from localizer.map.cache.pick import BundleHits
+from localizer.types import PoseEstimate, TargetSurface
+
+RayCaster = Callable[[Array, Array], BundleHits]
+"""Origin (3,) and unit directions (N, 3), close about one, in the map frame, to what they meet."""
+
+_ORDER = 5  # Gauss-Hermite nodes per axis of the bundle: out to 2.86 sigma
+_STEP_SIGMA = 1.5  # the widest gap between neighbouring nodes
+# Neighbouring rays of one surface differ in distance by their spacing times the tangent of the
+# incidence: 4 stands for 76 degrees.
+_STEEPNESS = 4.0
+_SMALLEST_STEP_M = 1.0
+# At grazing incidence the plane model explodes: 3 degrees is where we stop believing it.
+_MIN_COSINE = 0.05
+
+
+@dataclass(frozen=True)
+class RaySpread:
+    """Uncertainty of a ray's direction. sideways: (2, 3) unit vectors across the ray; covariance:
+    (2, 2) rad² along them, of pose and pixel together, for a point at the given distance.
+    """
+
+    sideways: Array
+    covariance: Array
+
+
+def ray_in_world(estimate: PoseEstimate, pixel: tuple[float, float]) -> tuple[Array, Array]:
+    """Origin (3,) and unit direction (3,) in world axes of a pixel of the (distorted) frame."""
+    direction = estimate.world_from_camera.rotation @ estimate.camera.rays(np.asarray(pixel))
+    return estimate.world_from_camera.translation, direction / np.linalg.norm(direction)
+
+
+def ray_spread(
+    estimate: PoseEstimate, pixel: tuple[float, float], pixel_sigma: float, distance: float
+) -> RaySpread:
+    """How far off the ray of a pixel may be, first order.
+
+    A point at ``s d`` from the camera moves across the ray by ``dC + s [phi]x d``; a pixel's error
+    turns the ray by the camera model's own derivative.
+    """
+    _, d = ray_in_world(estimate, pixel)
+    sideways = np.linalg.svd(d[None, :])[2][1:]
+    from_pose = np.hstack([sideways / distance, -sideways @ hat(d)])
+    moved = [ray_in_world(estimate, (pixel[0] + du, pixel[1] + 1 - du))[1] for du in (1, 0)]
+    from_pixel = pixel_sigma * sideways @ (np.array(moved) - d).T
+    covariance = from_pose @ estimate.covariance @ from_pose.T + from_pixel @ from_pixel.T
+    return RaySpread(sideways, covariance)
+
+
+def surface_covariance(
+    offset: Array, normal: Array, spread: RaySpread, map_sigma_m: float
+) -> Array:
+    """Covariance (3, 3) in m², world axes, of a ray's meeting point with a surface.
+
+    offset: (3,) from the camera to the point. First order about the tangent plane with normal n
+    (3,): what moves the ray across by e moves the point by ``M e``, ``M = I - d n' / (n' d)``. The
+    map's own error adds along the ray.
+    """
+    distance = float(np.linalg.norm(offset))
+    d = offset / distance
+    cosine = float(normal @ d)
+    cosine = np.copysign(max(abs(cosine), _MIN_COSINE), cosine or -1.0)
+    M = (np.eye(3) - np.outer(d, normal) / cosine) @ spread.sideways.T * distance
+    P = M @ spread.covariance @ M.T + np.outer(d, d) * (map_sigma_m / cosine) ** 2
+    return np.asarray(0.5 * (P + P.T))
+
+
+def locate(
+    estimate: PoseEstimate,
+    pixel: tuple[float, float],
+    cast: RayCaster,
+    pixel_sigma: float,
+    map_sigma_m: float,
+) -> tuple[TargetSurface, ...]:
+    """The surfaces that a pixel may show, the most probable one first; none if it shows no map.
+
+    Where the whole bundle meets one surface, its position is the exact hit of the pixel's ray; else
+    a surface's is the mean of its own hits.
+    """
+    eye, d = ray_in_world(estimate, pixel)
+    distance = float(cast(eye, d[None, :]).distances[0])
+    if not np.isfinite(distance):
+        return ()
+    spread = ray_spread(estimate, pixel, pixel_sigma, distance)
+    nodes, weights = _nodes()
+    offsets = nodes @ np.linalg.cholesky(spread.covariance).T @ spread.sideways
+    directions = d + offsets
+    directions /= np.linalg.norm(directions, axis=1)[:, None]
+    hits = cast(eye, directions)
+    centre = int(np.argmax(weights))
+    step = _STEEPNESS * _STEP_SIGMA * distance * float(np.sqrt(spread.covariance.trace()))
+    groups = _surfaces(hits.distances, max(step, _SMALLEST_STEP_M))
+    surfaces = []
+    for group in groups:
+        share = weights[group] / weights[group].sum()
+        points = directions[group] * hits.distances[group, None]
+        exact = len(groups) == 1 and centre in group
+        offset = points[group == centre][0] if exact else share @ points
+        normal = share @ hits.normals[group]
+        normal = normal / max(float(np.linalg.norm(normal)), 1e-9)
+        own = ray_spread(estimate, pixel, pixel_sigma, float(np.linalg.norm(offset)))
+        covariance = surface_covariance(offset, normal, own, map_sigma_m)
+        covariance += _roughness(points - offset, share, normal, d)
+        surfaces.append(TargetSurface(float(weights[group].sum()), eye + offset, covariance))
+    total = sum(s.probability for s in surfaces)
+    found = (TargetSurface(s.probability / total, s.position, s.covariance) for s in surfaces)
+    return tuple(sorted(found, key=lambda s: -s.probability))
+
+
+def _nodes() -> tuple[Array, Array]:
+    """Gauss-Hermite quadrature of the plane's standard normal: nodes (N, 2), weights (N,)."""
+    x, w = np.polynomial.hermite_e.hermegauss(_ORDER)
+    grid = np.stack(np.meshgrid(x, x), axis=-1).reshape(-1, 2)
+    return grid, np.outer(w, w).ravel() / w.sum() ** 2
+
+
+def _surfaces(distances: Array, step: float) -> list[np.ndarray]:
+    """Indices of the hits, grouped where sorted distances (N,) leap by more than `step`."""
+    order = np.argsort(distances)
+    order = order[np.isfinite(distances[order])]
+    return np.split(order, np.flatnonzero(np.diff(distances[order]) > step) + 1)
+
+
+def _roughness(offsets: Array, share: Array, normal: Array, d: Array) -> Array:
+    """What a surface's hits, (N, 3) from its point, stray from the tangent plane: (3, 3) m²."""
+    cosine = max(abs(float(normal @ d)), _MIN_COSINE)
+    return np.outer(d, d) * float(share @ (offsets @ normal) ** 2) / cosine**2

@@ -1,0 +1,187 @@
+"""Constant-velocity motion model of the camera pose (paper, Sec. 3.2), on filterpy.
+
+The state is an error state about a nominal rotation: ``x = (p, phi, v, omega)``, shape (12,), in
+world axes: position (m), small left rotation (rad), velocity (m/s), angular rate (rad/s).
+`MotionState` is immutable and the functions are pure, so the render thread may predict from the
+same state that the localization thread is about to replace.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from filterpy.common import Q_discrete_white_noise
+from filterpy.kalman import predict as kalman_predict
+from filterpy.kalman import update as kalman_update
+from pydantic import BaseModel, ConfigDict, Field
+
+from localizer.geometry.pose import Array, Pose, so3_exp, so3_log
+from localizer.types import PosePrior
+
+_MAX_SIGMA_M = 10.0  # beyond it nothing is gained: the swarm's own limits are reached
+_MAX_SIGMA_RAD = float(np.radians(8.0))
+_LONGEST_S = 10.0  # a camera's clock that jumped, or a gap that no velocity bridges
+_H = np.hstack([np.eye(6), np.zeros((6, 6))])
+
+
+class MotionConfig(BaseModel):
+    """Process noise of the constant-velocity model, as white accelerations.
+
+    The limits are those of flight, and of what double precision can add and invert.
+    """
+
+    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
+
+    acceleration_sigma: float = Field(3.0, ge=0.01, le=100, description="m/s²")
+    angular_acceleration_sigma: float = Field(1.0, ge=0.001, le=100, description="rad/s²")
+    turn_sigma: float = Field(0.006, ge=1e-4, le=1, description="error of a measured turn, rad")
+    initial_velocity_sigma: float = Field(
+        8.0, ge=0.01, le=100, description="m/s, of an unknown velocity"
+    )
+    prior_velocity_sigma: float = Field(
+        2.0, ge=0.01, le=100, description="m/s, of the velocity of a prior"
+    )
+    initial_angular_rate_sigma: float = Field(0.3, ge=0.001, le=10, description="rad/s")
+
+
+@dataclass(frozen=True)
+class MotionState:
+    """Filter state at `time_ns`: error-state mean (12,), covariance (12, 12), nominal rotation."""
+
+    mean: Array
+    covariance: Array
+    rotation: Array
+    time_ns: int
+
+    @property
+    def velocity(self) -> Array:
+        """Velocity (3,) in world axes, m/s."""
+        return self.mean[6:9]
+
+    @property
+    def prior(self) -> PosePrior:
+        """The pose and its covariance (6, 6)."""
+        pose = Pose(self.rotation, self.mean[:3].copy())
+        return PosePrior(pose, self.covariance[:6, :6].copy(), self.time_ns)
+
+
+def start(prior: PosePrior, config: MotionConfig) -> MotionState:
+    """A filter that knows `prior` and nothing else."""
+    mean = np.zeros(12)
+    mean[:3] = prior.world_from_camera.translation
+    known = prior.velocity is not None
+    if known:
+        mean[6:9] = prior.velocity
+    P = np.zeros((12, 12))
+    P[:6, :6] = prior.covariance
+    velocity_sigma = config.prior_velocity_sigma if known else config.initial_velocity_sigma
+    P[6:9, 6:9] = np.eye(3) * velocity_sigma**2
+    P[9:, 9:] = np.eye(3) * config.initial_angular_rate_sigma**2
+    return MotionState(mean, P, prior.world_from_camera.rotation, prior.time_ns)
+
+
+def predict(
+    state: MotionState, time_ns: int, config: MotionConfig, turn: Array | None = None
+) -> MotionState:
+    """The state moved to `time_ns`; a time before the state's own moves it back the same way.
+
+    Over more than 10 s it is `kept`.
+    turn: rotation (3, 3) of the camera since the state's time in world axes (new = turn @ old), if
+    something measured it; else the angular rate is taken as constant.
+    """
+    dt = (time_ns - state.time_ns) * 1e-9
+    if dt == 0.0:
+        return state
+    if abs(dt) > _LONGEST_S:
+        return kept(state, time_ns, config, turn)
+    F = np.eye(12)
+    F[:6, 6:] = np.eye(6) * dt
+    Q = _process_noise(abs(dt), config)
+    if turn is not None:
+        F[3:6, 9:] = 0.0
+        Q[3:6, :] = Q[:, 3:6] = 0.0
+        Q[3:6, 3:6] = np.eye(3) * config.turn_sigma**2
+    mean, P = kalman_predict(state.mean, state.covariance, F, Q)
+    if turn is None:
+        return _fold_rotation(mean, P, state.rotation, time_ns)
+    mean, P = np.asarray(mean).reshape(12).copy(), np.asarray(P).copy()
+    mean[9:] = so3_log(turn) / dt
+    P[9:, :] = P[:, 9:] = 0.0
+    P[9:, 9:] = np.eye(3) * config.initial_angular_rate_sigma**2
+    return _fold_rotation(mean, P, turn @ state.rotation, time_ns)
+
+
+def update(ahead: MotionState, pose: Pose, covariance: Array) -> MotionState:
+    """Fuse a pose measured at the time of the predicted state `ahead`, covariance (6, 6)."""
+    z = np.concatenate([pose.translation, so3_log(pose.rotation @ ahead.rotation.T)])
+    mean, P = kalman_update(ahead.mean, ahead.covariance, z, covariance, _H)
+    return _fold_rotation(mean, P, ahead.rotation, ahead.time_ns)
+
+
+def inflated(state: MotionState, config: MotionConfig) -> MotionState:
+    """The same motion believed half as much: what a good measurement contradicts is a manoeuvre
+    that the constant-velocity model did not foresee, or a wrong measurement. Doubling sigma lets
+    the former in after a frame or two, while the latter would have to repeat itself.
+    """
+    sigma = np.sqrt(state.covariance.diagonal())
+    scale = np.clip(_limits(config) / sigma, 1.0, 2.0)
+    return replace(state, covariance=state.covariance * np.outer(scale, scale))
+
+
+def mahalanobis_squared(prior: PosePrior, pose: Pose, extra: Array | float = 0.0) -> float:
+    """Squared Mahalanobis distance of `pose` from `prior`, 6 degrees of freedom.
+
+    extra: covariance (6, 6) of the pose itself, added to the prior's.
+    """
+    delta = pose_difference(prior.world_from_camera, pose)
+    S = prior.covariance + extra
+    return float(delta @ np.linalg.solve(S, delta))
+
+
+def pose_difference(a: Pose, b: Pose) -> Array:
+    """``b - a`` as (position, left rotation vector), shape (6,), world axes."""
+    return np.concatenate([b.translation - a.translation, so3_log(b.rotation @ a.rotation.T)])
+
+
+def kept(state: MotionState, time_ns: int, config: MotionConfig, turn: Array | None) -> MotionState:
+    """The state's pose at another time, with the sigmas of a search about it; its motion unknown.
+
+    For a camera whose clock jumped: pictures still follow each other, times do not. turn: as in
+    `predict`.
+    """
+    mean = np.concatenate([state.mean[:3], np.zeros(9)])
+    rotation = state.rotation if turn is None else turn @ state.rotation
+    return MotionState(mean, np.diag(_limits(config) ** 2), rotation, time_ns)
+
+
+def _limits(config: MotionConfig) -> Array:
+    """Sigmas (12,) of a state of which nothing is known but about where it is."""
+    return np.repeat(
+        [_MAX_SIGMA_M, _MAX_SIGMA_RAD, config.initial_velocity_sigma,
+         config.initial_angular_rate_sigma], 3,
+    )  # fmt: skip
+
+
+def _fold_rotation(mean: Array, P: Array, rotation: Array, time_ns: int) -> MotionState:
+    """Move the rotation error into the nominal rotation, so that it stays small."""
+    mean = np.asarray(mean, dtype=np.float64).reshape(12).copy()
+    folded = so3_exp(mean[3:6]) @ rotation
+    mean[3:6] = 0.0
+    P = np.asarray(P, dtype=np.float64)
+    return MotionState(mean, 0.5 * (P + P.T), folded, time_ns)
+
+
+def _process_noise(dt: float, config: MotionConfig) -> Array:
+    """Discrete white-noise acceleration, (12, 12)."""
+    Q = np.zeros((12, 12))
+    for start_index, sigma in (
+        (0, config.acceleration_sigma),
+        (3, config.angular_acceleration_sigma),
+    ):
+        q = Q_discrete_white_noise(2, dt, sigma**2)
+        for axis in range(start_index, start_index + 3):
+            for i in range(2):
+                for j in range(2):
+                    Q[axis + 6 * i, axis + 6 * j] = q[i, j]
+    return Q

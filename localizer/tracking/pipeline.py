@@ -1,0 +1,289 @@
+"""One frame's way through the algorithm, without threads: the two halves that the engine runs.
+
+`Localizer.make_reference` is the render thread's half (predict, render, extract, anchors),
+`Localizer.localize` the localization thread's (extract, register, judge, filter).
+"""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+
+import cv2
+import numpy as np
+
+from localizer.config import LocalizerConfig
+from localizer.errors import CameraError, OutsideMapError
+from localizer.features.extractor import DeviceExtractor, FeatureExtractor
+from localizer.geometry.camera import Camera
+from localizer.geometry.pose import Array
+from localizer.registration.anchors import select_anchors
+from localizer.registration.jngo import JNGO
+from localizer.registration.priors import PoseConstraint, attitude_constraint
+from localizer.registration.result import Registration
+from localizer.render.base import MapRenderer
+from localizer.render.holes import fill_holes
+from localizer.tracking import motion
+from localizer.tracking.integrity import Integrity, is_acceptable, judge
+from localizer.tracking.motion import MotionState
+from localizer.types import (
+    Anchors,
+    FeaturePyramid,
+    Frame,
+    Image,
+    PoseEstimate,
+    PosePrior,
+    ReferenceBundle,
+    RegistrationStatus,
+    TrackingState,
+)
+
+# The camera's rotation (3, 3), world_from_camera, at a time in ns by another sensor, or None.
+RotationAt = Callable[[int], "Array | None"]
+
+# The map is loaded for where the motion model leads in so many seconds: what comes next, and as far
+# as a turn rate can be believed at all.
+_LOOK_AHEAD_S = (1.0, 3.0)
+
+# A reference view with less of the map in it than this has nothing to register against.
+_MIN_MAP_SHARE = 0.1
+
+
+@dataclass(frozen=True)
+class TrackerState:
+    """What the two halves share; replaced as a whole, never changed."""
+
+    motion: MotionState | None = None
+    integrity: Integrity = field(default_factory=Integrity)
+
+
+def working_camera(camera: Camera, width: int) -> Camera:
+    """The ideal pinhole at the network's input size: `width` wide, both sides divisible by 8."""
+    w = max(8, round(width / 8) * 8)
+    h = max(8, round(w * camera.height / camera.width / 8) * 8)
+    return camera.without_distortion().resized(w, h)
+
+
+class Undistorter:
+    """Turns frames of a (distorted) camera into the working pinhole's images."""
+
+    def __init__(self, source: Camera, target: Camera) -> None:
+        self.source, self._target = source, target
+        # Shrinking by more than 2 under bilinear sampling aliases: average down to twice the
+        # target first, undistort there, and average again.
+        double = (2 * target.width, 2 * target.height)
+        shrinks = source.width > double[0]
+        self._middle = source.resized(*double) if shrinks else source
+        pinhole = target.resized(self._middle.width, self._middle.height)
+        self._maps = self._middle.undistortion_maps(pinhole) if source.is_distorted else None
+
+    def __call__(self, frame: Frame) -> Image:
+        """The frame's image (height, width, 3) uint8 at the target's size."""
+        height, width = frame.image.shape[:2]
+        if (width, height) != (self.source.width, self.source.height):
+            raise CameraError(
+                f"frame {frame.sequence} is {width}x{height}, the camera model says "
+                f"{self.source.width}x{self.source.height}: give this stream's calibration"
+            )
+        image = _shrink(frame.image, self._middle)
+        if self._maps is not None:
+            image = cv2.remap(image, *self._maps, cv2.INTER_LINEAR).astype(np.uint8, copy=False)
+        return _shrink(image, self._target)
+
+
+def _shrink(image: Image, camera: Camera) -> Image:
+    if image.shape[:2] == (camera.height, camera.width):
+        return image
+    resized = cv2.resize(image, (camera.width, camera.height), interpolation=cv2.INTER_AREA)
+    return resized.astype(np.uint8, copy=False)
+
+
+class Localizer:
+    """The algorithm for one camera. Each half may run on its own thread.
+
+    rotation_at: the camera's attitude by another sensor's account (autopilot and gimbal). Its turns
+    replace the constant angular rate of the motion model, and it enters the registration as a
+    weak prior (`AttitudePrior`).
+    """
+
+    def __init__(
+        self,
+        renderer: MapRenderer,
+        extractor: FeatureExtractor,
+        optimizer: JNGO,
+        camera: Camera,
+        config: LocalizerConfig,
+        rotation_at: RotationAt = lambda _time_ns: None,
+    ) -> None:
+        self._renderer = renderer
+        self._extractor = extractor
+        self._optimizer = optimizer
+        self._config = config
+        self._rotation_at = rotation_at
+        self.camera = working_camera(camera, config.width)
+        self._undistorter = Undistorter(camera, self.camera)
+        self._lock = threading.Lock()
+        self._tracker = TrackerState()
+
+    @property
+    def features_name(self) -> str:
+        """Which model computes the features, and on what."""
+        return self._extractor.name
+
+    @property
+    def optimizer_name(self) -> str:
+        """What registers now, for reports: the CPU takes over where a GPU fails."""
+        return self._optimizer.backend.name
+
+    @property
+    def tracker(self) -> TrackerState:
+        """The current motion state and integrity."""
+        with self._lock:
+            return self._tracker
+
+    @property
+    def renderer_name(self) -> str:
+        """Which renderer draws the references."""
+        return self._renderer.name
+
+    def set_prior(self, prior: PosePrior) -> None:
+        """Begin (again) from a pose known from outside, e.g. the autopilot's."""
+        state = motion.start(prior, self._config.motion)
+        with self._lock:
+            self._tracker = TrackerState(state, Integrity())
+
+    def predict(self, time_ns: int) -> PosePrior | None:
+        """The motion model's prediction at `time_ns`; None before the first prior."""
+        state = self.tracker.motion
+        return self._ahead(state, time_ns).prior if state else None
+
+    def _ahead(self, state: MotionState, time_ns: int) -> MotionState:
+        turn = self._turn(state.time_ns, time_ns)
+        return motion.predict(state, time_ns, self._config.motion, turn)
+
+    def _turn(self, begin_ns: int, end_ns: int) -> Array | None:
+        begin, end = self._rotation_at(begin_ns), self._rotation_at(end_ns)
+        return end @ begin.T if begin is not None and end is not None else None
+
+    def _at_frame(self, state: MotionState, time_ns: int) -> MotionState:
+        if time_ns >= state.time_ns:
+            return self._ahead(state, time_ns)
+        # The camera's clock jumped: by its velocity the state would be moved the wrong way.
+        turn = self._turn(state.time_ns, time_ns)
+        return motion.kept(state, time_ns, self._config.motion, turn)
+
+    def _attitude(self, time_ns: int) -> PoseConstraint | None:
+        sigma, rotation = self._config.attitude, self._rotation_at(time_ns)
+        if sigma is None or rotation is None:
+            return None
+        tilt, heading = np.radians([sigma.tilt_sigma_deg, sigma.heading_sigma_deg])
+        return attitude_constraint(rotation, float(tilt), float(heading))
+
+    def make_reference(self, prior: PosePrior, *, wait: bool = False) -> ReferenceBundle:
+        """Render the view at the prior's pose and select its geo-anchors (paper, Eq. 1 and 2)."""
+        view = self._renderer.render(prior.world_from_camera, self.camera, wait=wait)
+        if np.count_nonzero(view.depth) < _MIN_MAP_SHARE * view.depth.size:
+            e, n, u = prior.world_from_camera.translation
+            raise OutsideMapError(
+                f"the view from east {e:.1f} north {n:.1f} up {u:.1f} m (map frame) does not meet "
+                "the map, as far as it is loaded: if it stays so, check the prior, the map's "
+                "extent and the camera's direction"
+            )
+        features = self._extractor.extract(fill_holes(view))
+        anchors = select_anchors(view, features, self._config.anchors, self._config.seed)
+        return ReferenceBundle(view, anchors, prior.time_ns)
+
+    def prefetch(self, time_ns: int) -> None:
+        """Have the map loaded along the predicted trajectory after `time_ns`; returns at once."""
+        times = [time_ns + round(s * 1e9) for s in _LOOK_AHEAD_S]
+        ahead = [prior for t in times if (prior := self.predict(t)) is not None]
+        self._renderer.prefetch([prior.world_from_camera for prior in ahead], self.camera)
+
+    def extract_query(self, frame: Frame) -> FeaturePyramid:
+        """Features of the frame (does not need the reference, so it may run beside it).
+
+        They may be on the GPU, and are then valid until the next call.
+        """
+        if frame.camera != self._undistorter.source:  # the stream changed its size in flight
+            self._undistorter = Undistorter(frame.camera, self.camera)
+        image = self._undistorter(frame)
+        if self._optimizer.on_gpu and isinstance(self._extractor, DeviceExtractor):
+            return self._extractor.extract_on_device(image)
+        return self._extractor.extract(image)
+
+    def localize(self, frame: Frame, query: FeaturePyramid, anchors: Anchors) -> PoseEstimate:
+        """Register the frame against the anchors, judge the result and update the filter."""
+        tracker = self.tracker
+        if tracker.motion is None:
+            raise OutsideMapError("no pose prior yet: call set_prior before localizing")
+        config = self._config
+        ahead = self._at_frame(tracker.motion, frame.exposure_time_ns)
+        started = time.perf_counter()
+        result = self._optimizer.register(
+            query,
+            self.camera,
+            anchors,
+            ahead.prior,
+            motion=ahead.prior if tracker.integrity.trusts_prediction else None,
+            constraint=self._attitude(frame.exposure_time_ns),
+            seed=config.seed + frame.sequence,
+        )
+        elapsed_ms = (time.perf_counter() - started) * 1e3
+        acceptable = self._acceptable(result, ahead.prior)
+        integrity = judge(tracker.integrity, config.integrity, acceptable)
+        self._store(tracker, self._next_motion(ahead, result, acceptable), integrity)
+        return _estimate(frame, result, integrity, acceptable, {"register": elapsed_ms})
+
+    def _acceptable(self, result: Registration, prior: PosePrior) -> bool:
+        # Also before tracking: the gate is against the prior's own covariance, which is wide then.
+        distance = motion.mahalanobis_squared(prior, result.world_from_camera, result.covariance)
+        return is_acceptable(self._config.integrity, result, distance)
+
+    def _next_motion(
+        self, ahead: MotionState, result: Registration, acceptable: bool
+    ) -> MotionState:
+        if not acceptable:
+            credible = is_acceptable(self._config.integrity, result, 0.0)
+            return motion.inflated(ahead, self._config.motion) if credible else ahead
+        return motion.update(ahead, result.world_from_camera, result.covariance)
+
+    def _store(self, seen: TrackerState, state: MotionState, integrity: Integrity) -> None:
+        """Keep the new state unless a prior from outside replaced it meanwhile."""
+        with self._lock:
+            if self._tracker is seen:
+                self._tracker = TrackerState(state, integrity)
+
+
+def _estimate(
+    frame: Frame,
+    result: Registration,
+    integrity: Integrity,
+    acceptable: bool,
+    stage_ms: dict[str, float],
+) -> PoseEstimate:
+    usable = acceptable and integrity.state is not TrackingState.LOST
+    return PoseEstimate(
+        world_from_camera=result.world_from_camera,
+        covariance=result.covariance,
+        quality=result.quality if result.status is RegistrationStatus.OK else 0.0,
+        state=integrity.state,
+        status=result.status,
+        accepted=usable,
+        exposure_time_ns=frame.exposure_time_ns,
+        sequence=frame.sequence,
+        camera=frame.camera,
+        stage_ms=stage_ms,
+    )
+
+
+@contextmanager
+def stopwatch(stage_ms: dict[str, float], stage: str) -> Iterator[None]:
+    """Add the milliseconds spent inside to ``stage_ms[stage]``."""
+    started = time.perf_counter()
+    try:
+        yield
+    finally:
+        stage_ms[stage] = stage_ms.get(stage, 0.0) + (time.perf_counter() - started) * 1e3

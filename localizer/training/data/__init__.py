@@ -1,0 +1,1 @@
+"""Training pairs: made, kept in shards, batched."""

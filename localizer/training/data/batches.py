@@ -1,0 +1,272 @@
+"""Batches of augmented crops from shards: what a step sees depends on seed, rank and step alone."""
+
+from __future__ import annotations
+
+import threading
+from collections import OrderedDict
+from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from localizer.errors import SequenceError
+from localizer.synth.appearance.model import Appearance, apply_appearance, sample_appearance
+from localizer.training.data.pairs import Pair, relative_pose
+from localizer.training.data.shards import read_shard
+from localizer.training.loop.losses import Batch
+from localizer.types import Float32, Image
+
+_POLL_S = 0.5  # between looks for a shard that is still being generated
+_MOST_DRAWS = 200  # for one sample; most pairs give one
+_DENSEST_HAZE = 2.0  # optical depth at the scene's median distance; beyond it nothing is left
+
+
+@dataclass(frozen=True)
+class LoaderConfig:
+    """pairs and anchors of a batch, crop size in pixels, whether queries get weather and sensor."""
+
+    batch: int
+    anchors: int
+    crop: tuple[int, int]
+    appearance: bool
+    cached_shards: int = 700
+
+
+@dataclass(frozen=True)
+class Schedule:
+    """Which shards a step draws from. paths: in order of generation, of which the first `initial`
+    plus `growth` a step are in use; world_paths: mesh worlds, with their share of the samples from
+    `world_first` on.
+    """
+
+    paths: tuple[Path, ...]
+    initial: int
+    growth: float
+    world_paths: tuple[Path, ...]
+    world_share: float
+    world_first: int = 0
+
+    def draw(self, step: int, rng: np.random.Generator) -> Path:
+        """The shard of one sample."""
+        if self.world_paths and step >= self.world_first and rng.random() < self.world_share:
+            return self.world_paths[int(rng.integers(len(self.world_paths)))]
+        count = min(len(self.paths), int(self.initial + step * self.growth))
+        return self.paths[int(rng.integers(count))]
+
+
+class ShardStream:
+    """Deals batches of the shards that a schedule names.
+
+    A step waits for the shards it may draw from, so that training can begin while later shards are
+    still being generated and yet see the same data every time.
+    """
+
+    def __init__(
+        self,
+        schedule: Schedule,
+        config: LoaderConfig,
+        seed: int,
+        rank: int = 0,
+        generating: Future[None] | None = None,
+    ) -> None:
+        self._schedule, self._config = schedule, config
+        self._generating = generating
+        self._closed = threading.Event()
+        self._seed = (seed,) if rank == 0 else (seed, rank)
+        self._cache: OrderedDict[Path, list[Pair]] = OrderedDict()
+        self._pool = ThreadPoolExecutor(1)
+        self._next: tuple[int, Future[Batch]] | None = None
+
+    def batch(self, step: int) -> Batch:
+        """The batch of a step; the next one is prepared meanwhile."""
+        if self._next is not None and self._next[0] == step:
+            current = self._next[1]
+        else:
+            current = self._pool.submit(self._make, step)
+        self._next = (step + 1, self._pool.submit(self._make, step + 1))
+        return current.result()
+
+    def close(self) -> None:
+        """Stop preparing batches."""
+        self._closed.set()
+        self._pool.shutdown(wait=False, cancel_futures=True)
+
+    def _make(self, step: int) -> Batch:
+        rng = np.random.default_rng((*self._seed, step))
+        samples: list[Sample] = []
+        for _ in range(_MOST_DRAWS * self._config.batch):
+            pairs = self._shard(self._schedule.draw(step, rng))
+            if not pairs:
+                continue
+            made = crop_pair(pairs[int(rng.integers(len(pairs)))], self._config, rng)
+            if made is not None:
+                samples.append(made)
+            if len(samples) == self._config.batch:
+                return collate(samples)
+        raise SequenceError(
+            f"step {step}: hardly a pair of the run's shards has {self._config.anchors} anchors "
+            f"in a crop of {self._config.crop}: enlarge `crop`, or look at them with `sheet`"
+        )
+
+    def _shard(self, path: Path) -> list[Pair]:
+        if path in self._cache:
+            self._cache.move_to_end(path)
+            return self._cache[path]
+        self._await(path)
+        pairs = read_shard(path)
+        width, height = self._config.crop
+        if pairs and (pairs[0].camera.width < width or pairs[0].camera.height < height):
+            size = f"{pairs[0].camera.width}x{pairs[0].camera.height}"
+            raise SequenceError(f"{path}: its images are {size}, less than `crop` {width}x{height}")
+        self._cache[path] = pairs
+        if len(self._cache) > self._config.cached_shards:
+            self._cache.popitem(last=False)
+        return self._cache[path]
+
+    def _await(self, path: Path) -> None:
+        while not path.exists():
+            if self._generating is not None and self._generating.done() and not path.exists():
+                self._generating.result()  # its error, if that is why
+                raise SequenceError(f"{path}: was not generated; run `generate` again")
+            if self._closed.wait(_POLL_S):
+                raise SequenceError(f"{path}: is not there yet, and the run has ended")
+
+
+@dataclass(frozen=True)
+class Sample:
+    """One augmented crop pair; arrays as in `localizer.training.loop.losses.Batch`, without B."""
+
+    reference: Image
+    query: Image
+    points: Float32
+    reference_pixels: Float32
+    query_pixels: Float32
+    visible: Float32
+    query_from_reference: NDArray[np.float64]
+    K_query: Float32
+
+
+def crop_pair(pair: Pair, config: LoaderConfig, rng: np.random.Generator) -> Sample | None:
+    """Weather on the query, windows that see the same ground, anchors; None without overlap."""
+    query, reference = pair.query, pair.reference
+    if config.appearance:
+        look = tamed(sample_appearance(rng, pair.condition), pair.query_depth)
+        query = apply_appearance(query, pair.query_depth, look, rng)
+        survey = survey_appearance(rng)
+        if survey is not None:
+            reference = apply_appearance(reference, pair.reference_depth, survey, rng)
+    return window_pair(replace(pair, reference=reference, query=query), config, rng)
+
+
+def window_pair(pair: Pair, config: LoaderConfig, rng: np.random.Generator) -> Sample | None:
+    """Windows of a degraded pair that see the same ground, with anchors; None without overlap."""
+    width, height = config.crop
+    camera, reference, query = pair.camera, pair.reference, pair.query
+    T = relative_pose(pair)
+    rx = int(rng.integers(0, camera.width - width + 1))
+    ry = int(rng.integers(0, camera.height - height + 1))
+    window = pair.reference_depth[ry : ry + height, rx : rx + width]
+    rows, cols = np.nonzero(window > 0)
+    if len(rows) < 2 * config.anchors:
+        return None
+    pick = rng.choice(len(rows), 2 * config.anchors, replace=False)
+    pixels = np.stack([cols[pick] + rx, rows[pick] + ry], 1) + 0.5
+    points = camera.rays(pixels) * window[rows[pick], cols[pick]][:, None]
+    local = points @ T[:3, :3].T + T[:3, 3]
+    seen, inside = camera.project(local)
+    if inside.sum() < config.anchors // 3:
+        return None
+    # The query's window follows the content, with some freedom, so that large motions stay in view.
+    middle = np.median(seen[inside], axis=0) + rng.normal(0, 8, 2)
+    qx = int(np.clip(middle[0] - width / 2, 0, camera.width - width))
+    qy = int(np.clip(middle[1] - height / 2, 0, camera.height - height))
+    visible = inside & _unoccluded(seen, local[:, 2], pair.query_depth)
+    moved = seen - (qx, qy)
+    visible &= ((moved > 3) & (moved < (width - 3, height - 3))).all(1)
+    if visible.sum() < config.anchors // 4:
+        return None
+    order = np.r_[np.flatnonzero(visible)[: int(0.85 * config.anchors)], np.flatnonzero(~visible)]
+    order = np.r_[order, np.flatnonzero(visible)[int(0.85 * config.anchors) :]][: config.anchors]
+    sample = Sample(
+        reference[ry : ry + height, rx : rx + width],
+        query[qy : qy + height, qx : qx + width],
+        points[order].astype(np.float32),
+        (pixels[order] - (rx, ry)).astype(np.float32),
+        np.nan_to_num(moved[order]).astype(np.float32),
+        visible[order].astype(np.float32),
+        T,
+        np.array([camera.fx, camera.fy, camera.cx - qx, camera.cy - qy], np.float32),
+    )
+    return mirrored(sample) if rng.random() < 0.5 else sample
+
+
+def survey_appearance(rng: np.random.Generator) -> Appearance | None:
+    """The map's own sensor and light, on half of the references; None on the others."""
+    if rng.random() >= 0.5:
+        return None
+    return replace(sample_appearance(rng, "day"), motion_blur_px=0.0, extinction_per_m=0.0)
+
+
+def mirrored(sample: Sample) -> Sample:
+    """The same pair seen in a mirror: images flipped, x negated in both camera frames."""
+    width = sample.query.shape[1]
+    M = np.diag([-1.0, 1.0, 1.0, 1.0])
+    flip = np.array([-1.0, 1.0], np.float32)
+    return Sample(
+        sample.reference[:, ::-1],
+        sample.query[:, ::-1],
+        sample.points * np.array([-1, 1, 1], np.float32),
+        sample.reference_pixels * flip + np.array([width, 0], np.float32),
+        sample.query_pixels * flip + np.array([width, 0], np.float32),
+        sample.visible,
+        M @ sample.query_from_reference @ M,
+        sample.K_query * np.array([1, 1, -1, 1], np.float32)
+        + np.array([0, 0, width, 0], np.float32),
+    )
+
+
+def collate(samples: list[Sample]) -> Batch:
+    """Stack samples into tensors."""
+    images = np.stack([s.reference for s in samples] + [s.query for s in samples])
+    # channels_last tensors corrupt memory in torch 2.13's CPU backward pass.
+    pixels = torch.from_numpy(np.ascontiguousarray(images.transpose(0, 3, 1, 2)))
+    stacked = [
+        torch.from_numpy(np.stack(a).astype(np.float32))
+        for a in zip(
+            *(
+                (
+                    s.points,
+                    s.reference_pixels,
+                    s.query_pixels,
+                    s.visible,
+                    s.query_from_reference,
+                    s.K_query,
+                )
+                for s in samples
+            ),
+            strict=True,
+        )
+    ]
+    return Batch(pixels.float() / 255.0, *stacked)
+
+
+def tamed(appearance: Appearance, depth: Float32) -> Appearance:
+    """The appearance with haze no denser than leaves something to see at these distances."""
+    surface = depth[depth > 0]
+    if not surface.size:
+        return appearance
+    limit = _DENSEST_HAZE / float(np.median(surface))
+    return replace(appearance, extinction_per_m=min(appearance.extinction_per_m, limit))
+
+
+def _unoccluded(
+    pixels: NDArray[np.float64], z: NDArray[np.float64], depth: Float32
+) -> NDArray[np.bool_]:
+    """Whether the surface seen at `pixels` is the one at distance `z`."""
+    h, w = depth.shape
+    col = np.nan_to_num(pixels[:, 0]).astype(int).clip(0, w - 1)
+    row = np.nan_to_num(pixels[:, 1]).astype(int).clip(0, h - 1)
+    return np.abs(depth[row, col] - z) < 0.012 * z + 0.5

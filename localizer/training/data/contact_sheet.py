@@ -1,0 +1,39 @@
+"""A contact sheet of training pairs with the depth-warp check of the paper's Fig. 14."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from localizer.synth.appearance.model import apply_appearance, sample_appearance
+from localizer.training.data.batches import tamed
+from localizer.training.data.pairs import Pair, warp_check
+from localizer.types import Image
+
+_CHECKER_PX = 24
+
+
+def contact_sheet(pairs: Sequence[Pair], path: Path) -> Path:
+    """One row a pair: reference, clean query, query as trained on, warped checkerboard, depth."""
+    rows = [_row(pair, np.random.default_rng(k)) for k, pair in enumerate(pairs)]
+    cv2.imwrite(str(path), cv2.cvtColor(np.vstack(rows), cv2.COLOR_RGB2BGR))
+    return path
+
+
+def _row(pair: Pair, rng: np.random.Generator) -> Image:
+    look = tamed(sample_appearance(rng, pair.condition), pair.query_depth)
+    weathered = apply_appearance(pair.query, pair.query_depth, look, rng)
+    warped, mask = warp_check(pair)
+    height, width = mask.shape
+    tiles = np.add.outer(np.arange(height) // _CHECKER_PX, np.arange(width) // _CHECKER_PX) % 2
+    checker = pair.reference.copy()
+    shown = mask & (tiles == 1)
+    checker[shown] = warped[shown].astype(np.uint8)
+    depth = pair.reference_depth
+    gray = (255 * (depth - depth.min()) / max(float(np.ptp(depth)), 1e-3)).astype(np.uint8)
+    return np.hstack(
+        [pair.reference, pair.query, weathered, checker, np.repeat(gray[..., None], 3, 2)]
+    )

@@ -1,0 +1,327 @@
+"""Training pairs: a reference view of the map and a query view of the same place, both posed.
+
+The reference shows the map as it was surveyed. The query shows the place later: other sun, season
+and objects, from a pose 5-15 m and 5-15 deg away, as in the paper, or closer, as in video. Light,
+weather and sensor are put on the query afterwards (`localizer.synth.appearance.model`), by depth.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from localizer.geometry.camera import Camera
+from localizer.geometry.pose import Array, Pose, so3_exp
+from localizer.synth.appearance.model import CONDITIONS
+from localizer.synth.heightfield.render import render
+from localizer.synth.heightfield.scene import (
+    Land,
+    Light,
+    LitScene,
+    compose,
+    height_at,
+    light_scene,
+    without,
+)
+from localizer.training.places.changes import coarse_mesh, draw_texel, plain_walls, regrown, wetted
+from localizer.training.places.land import generated_place, photo_place
+from localizer.training.places.objects import new_buildings, parked_cars
+from localizer.training.places.photos import PhotoLibrary
+from localizer.training.places.place import Place
+from localizer.training.places.seasons import season_shift
+from localizer.types import Float32, Image
+
+SEASON, OUTDATED, COMBINED = "season", "outdated map", "combined"
+_PLAIN_WALLS = 0.4  # share of the maps whose facades were not photographed
+_COARSE_MESH = 0.8  # share of the maps on a photogrammetric mesh instead of the true surface
+_OVERLAP = 0.45  # least share of the reference's surface that the query must see
+
+
+@dataclass(frozen=True)
+class Pair:
+    """Both views of one pair. reference, query: (H, W, 3) uint8; depths (H, W) float32, metres
+    along the axis, 0 = sky. The query is clean: its `condition` says what weather to put on it.
+    outdated: buildings are gone and new; season: the query's vegetation is of another time of year.
+    """
+
+    reference: Image
+    reference_depth: Float32
+    query: Image
+    query_depth: Float32
+    world_from_reference: Pose
+    world_from_query: Pose
+    camera: Camera
+    condition: str
+    outdated: bool
+    source: str
+    season: bool = False
+
+
+@dataclass(frozen=True)
+class SceneConfig:
+    """Size and variety of the scenes and views. light_variety False keeps the map's own light and
+    season in the query (the ablation of the paper's Table 4). cell_m: range of the size of a cell,
+    which sets the altitude. conditions: of each light in turn when given (`visit_of`), as many as
+    there are lights; else drawn. motion: metres and
+    degrees between the two views, exactly, instead of the training's mixture. shared_detail: the
+    query repeats the map's fine texture and the map is nearly as sharp as the query; no flight is
+    like that, it is kept as the easier condition of earlier reports.
+    """
+
+    cells: int = 1024
+    width: int = 256
+    height: int = 192
+    photo_share: float = 0.5
+    references: int = 10
+    queries_per_light: int = 5
+    light_variety: bool = True
+    cell_m: tuple[float, float] = (0.2, 2.2)
+    conditions: tuple[str, ...] = ()
+    motion: tuple[float, float] | None = None
+    shared_detail: bool = False
+
+
+@dataclass(frozen=True)
+class Visit:
+    """The day of a flight: weather or light (of `CONDITIONS`), buildings gone and new, vegetation
+    of another season (None: drawn).
+    """
+
+    weather: str
+    outdated: bool
+    season: bool | None
+
+
+def scene_pairs(seed: int, config: SceneConfig, library: PhotoLibrary | None) -> Iterator[Pair]:
+    """All pairs of the place that belongs to `seed`."""
+    rng = np.random.default_rng(seed)
+    place, source = draw_place(rng, config, library)
+    survey = survey_scene(rng, place, config)
+    lived: LitScene | None = None
+    visit, season = Visit("day", False, None), False
+    for k in range(config.references):
+        if lived is None or k % config.queries_per_light == 0:
+            if config.conditions:
+                visit = visit_of(rng, config.conditions[k // config.queries_per_light])
+            else:
+                visit = draw_visit(rng)
+            fixed = None if config.light_variety else survey.light
+            lived, season = lived_scene(rng, place, visit, fixed, config.shared_detail)
+        pair = draw_views(rng, survey, lived, config)
+        if pair is None:
+            continue
+        reference, query, camera = pair
+        image, depth = render(survey, reference, camera)
+        seen, seen_depth = render(lived, query, camera, supersample=2)
+        if config.shared_detail:
+            image = soften(rng, image)
+        yield Pair(
+            image, depth, seen, seen_depth, reference, query, camera, visit.weather,
+            visit.outdated, source, season,
+        )  # fmt: skip
+
+
+def draw_place(
+    rng: np.random.Generator, config: SceneConfig, library: PhotoLibrary | None
+) -> tuple[Place, str]:
+    """A place, and where its ground is from: "photo" or "generated"."""
+    n = config.cells
+    cell = float(np.exp(rng.uniform(*np.log(config.cell_m))))
+    if library is not None and rng.random() < config.photo_share:
+        return photo_place(rng, n, min(cell, 0.8), library.sample(rng, n)), "photo"
+    return generated_place(rng, n, cell), "generated"
+
+
+def draw_visit(rng: np.random.Generator) -> Visit:
+    """The day of a training flight."""
+    return Visit(draw_condition(rng), bool(rng.random() < 0.4), None)
+
+
+def warp_check(pair: Pair) -> tuple[Float32, NDArray[np.bool_]]:
+    """The query's colours brought into the reference view by depth and poses (paper, Fig. 14).
+
+    Returns the warped image (H, W, 3) float32 in 0..255 and the mask (H, W) of what both views see.
+    """
+    camera = pair.camera
+    v, u = np.mgrid[0 : camera.height, 0 : camera.width] + 0.5
+    rays = camera.rays(np.stack([u, v], -1))
+    points = pair.world_from_reference.apply(rays * pair.reference_depth[..., None])
+    local = pair.world_from_query.inverse.apply(points)
+    pixels, inside = camera.project(local)
+    pixels = np.nan_to_num(pixels, nan=-1.0).astype(np.float32) - np.float32(0.5)
+    x, y = pixels[..., 0], pixels[..., 1]
+    warped = cv2.remap(pair.query.astype(np.float32), x, y, cv2.INTER_LINEAR)
+    depth = cv2.remap(pair.query_depth, x, y, cv2.INTER_NEAREST)
+    z = local[..., 2]
+    same = np.abs(depth - z) < 0.02 * z + 1.0
+    return warped, inside & same & (pair.reference_depth > 0)
+
+
+def survey_scene(rng: np.random.Generator, place: Place, config: SceneConfig) -> LitScene:
+    """The map: the place on the day of the survey, as a baked texture on a coarse mesh."""
+    prisms = [*place.prisms, *parked_cars(rng, place, _car_count(rng, place))]
+    if not config.shared_detail:
+        if rng.random() < _PLAIN_WALLS:
+            prisms = plain_walls(prisms)
+        light = _sun(rng, rng.uniform(30, 70), rng.uniform(0.0, 1.0))
+        lit = light_scene(compose(place.land, prisms), light, _sky(rng, "day"), draw_texel(rng))
+        return coarse_mesh(lit, rng) if rng.random() < _COARSE_MESH else lit
+    scene = compose(place.land, prisms)
+    if rng.random() < 0.25:
+        blurred = cv2.GaussianBlur(scene.height, (0, 0), rng.uniform(0.5, 1.5))
+        scene = type(scene)(blurred, scene.albedo, scene.prism, scene.facades, scene.cell_m)
+    light = _sun(rng, rng.uniform(30, 70), rng.uniform(0.0, 1.0))
+    return light_scene(scene, light, _sky(rng, "day"))
+
+
+def lived_scene(
+    rng: np.random.Generator,
+    place: Place,
+    visit: Visit,
+    light: Light | None,
+    shared_detail: bool,
+) -> tuple[LitScene, bool]:
+    """The place on the day of the flight, and whether that is another season than the map's; a
+    given light also keeps the season.
+    """
+    land, prisms, season = place.land, list(place.prisms), False
+    condition, outdated = visit.weather, visit.outdated
+    if light is None and visit.season is not False:
+        season = bool(place.seasons) and rng.random() < 0.6
+        albedo = place.seasons[0] if season else land.albedo
+        if rng.random() < 0.7 or (visit.season and not season):
+            albedo, season = season_shift(albedo, rng), True
+        land = Land(land.height, albedo, land.cell_m)
+    if not shared_detail:
+        albedo = regrown(land.albedo, place.lasting, land.cell_m, rng)
+        land = Land(land.height, wetted(albedo, place.lasting, rng), land.cell_m)
+    if outdated:
+        prisms = without(prisms, rng, rng.uniform(0.03, 0.25))
+        prisms += new_buildings(rng, place, int(rng.integers(3, 40)))
+    prisms += parked_cars(rng, place, _car_count(rng, place))
+    direct = 0.0 if condition in ("fog", "rain", "snow", "night") else 1.0
+    if condition == "day" and rng.random() < 0.25:
+        direct = 0.15
+    if condition == "night" and rng.random() < 0.4:
+        direct = 0.5  # moonlight
+    elevation = rng.uniform(8, 22) if condition == "dusk" else rng.uniform(22, 75)
+    sun = _sun(rng, elevation, direct)
+    return light_scene(compose(land, prisms), light or sun, _sky(rng, condition)), season
+
+
+def _car_count(rng: np.random.Generator, place: Place) -> int:
+    return int(rng.integers(0, 250)) if place.land.cell_m < 0.9 else 0
+
+
+def _sun(rng: np.random.Generator, elevation_deg: float, direct: float) -> Light:
+    azimuth, elevation = rng.uniform(0, 2 * np.pi), np.radians(elevation_deg)
+    flat = np.cos(elevation)
+    sun = (flat * np.cos(azimuth), flat * np.sin(azimuth), np.sin(elevation))
+    strength = direct * rng.uniform(0.7, 1.1)
+    return Light((float(sun[0]), float(sun[1]), float(sun[2])), strength, 1.15 - 0.7 * strength)
+
+
+def _sky(rng: np.random.Generator, condition: str) -> tuple[float, float, float]:
+    level = rng.uniform(0.6, 0.95)
+    return (level * 0.85, level * 0.93, level) if condition == "day" else (level, level, level)
+
+
+def draw_condition(rng: np.random.Generator) -> str:
+    """The weather or light of a query, with the training's shares."""
+    return str(rng.choice(CONDITIONS, p=(0.42, 0.15, 0.17, 0.1, 0.08, 0.08)))
+
+
+def visit_of(rng: np.random.Generator, condition: str) -> Visit:
+    """The visit of a test condition: a weather alone, `SEASON` or `OUTDATED` on a day, or any
+    weather together with both (`COMBINED`).
+    """
+    if condition == COMBINED:
+        return Visit(str(rng.choice(CONDITIONS)), True, True)
+    if condition in (SEASON, OUTDATED):
+        return Visit("day", condition == OUTDATED, condition == SEASON)
+    return Visit(condition, False, False)
+
+
+def draw_views(
+    rng: np.random.Generator, survey: LitScene, lived: LitScene, config: SceneConfig
+) -> tuple[Pose, Pose, Camera] | None:
+    """Poses of a pair with enough common view; None when chance offers none in a few tries."""
+    for _ in range(12):
+        fov = rng.uniform(30, 90)
+        camera = Camera.from_fov(config.width, config.height, fov)
+        reference, distance = _viewpoint(rng, survey, camera)
+        query = moved(rng, reference, distance, config.motion)
+        if not (_clear(survey, reference) and _clear(lived, query)):
+            continue
+        if _overlap(survey, reference, query, camera) >= _OVERLAP:
+            return reference, query, camera
+    return None
+
+
+def _viewpoint(rng: np.random.Generator, scene: LitScene, camera: Camera) -> tuple[Pose, float]:
+    """A camera 50-800 m up, 20-90 deg below the horizon, that sees cells at 0.5 to 2 px."""
+    extent = scene.height.shape[0] * scene.cell_m
+    x, y = rng.uniform(0.1, 0.9, 2) * extent
+    gsd = scene.cell_m * np.exp(rng.uniform(np.log(0.6), np.log(2.0)))
+    pitch = np.radians(90 - 70 * rng.random() ** 1.6)
+    distance = float(np.clip(camera.fx * gsd, 50 / np.sin(pitch), 800 / np.sin(pitch)))
+    target = np.array([x, y, height_at(scene, x, y)])
+    return look_at(target, distance, pitch, rng), distance
+
+
+def look_at(target: Array, distance: float, pitch_rad: float, rng: np.random.Generator) -> Pose:
+    """A camera at `distance` from `target`, `pitch_rad` below the horizon, with some roll."""
+    yaw, roll = rng.uniform(0, 2 * np.pi), np.radians(rng.normal(0, 3))
+    flat = np.cos(pitch_rad)
+    forward = np.array([flat * np.cos(yaw), flat * np.sin(yaw), -np.sin(pitch_rad)])
+    right = np.array([np.sin(yaw), -np.cos(yaw), 0.0])
+    rotation = np.stack([right, np.cross(forward, right), forward], 1) @ so3_exp((0, 0, roll))
+    return Pose(rotation, target - distance * forward)
+
+
+def moved(
+    rng: np.random.Generator, pose: Pose, distance: float, exact: tuple[float, float] | None
+) -> Pose:
+    """The query pose: up to 15 m and 15 deg away, or a few frames of video further."""
+    if rng.random() < 0.3:
+        metres, degrees = rng.uniform(0, 3), rng.uniform(0, 3)
+    else:
+        metres, degrees = rng.uniform(3, 15), rng.uniform(2, 15)
+    metres = min(metres, 0.15 * distance)
+    if exact is not None:
+        metres, degrees = exact
+    shift, axis = rng.standard_normal(3), rng.standard_normal(3)
+    shift *= metres / np.linalg.norm(shift)
+    axis *= np.radians(degrees) / np.linalg.norm(axis)
+    return Pose(so3_exp(axis) @ pose.rotation, pose.translation + shift)
+
+
+def _clear(scene: LitScene, pose: Pose) -> bool:
+    """Whether the camera is well above everything."""
+    return bool(pose.translation[2] > scene.height.max() + 15.0)
+
+
+def _overlap(scene: LitScene, reference: Pose, query: Pose, camera: Camera) -> float:
+    """Share of the reference's pixels that project into the query, from a thumbnail."""
+    small = camera.resized(32, 24)
+    depth = render(scene, reference, small)[1]
+    v, u = np.mgrid[0:24, 0:32] + 0.5
+    points = reference.apply(small.rays(np.stack([u, v], -1)) * depth[..., None])
+    inside = small.project(query.inverse.apply(points))[1] & (depth > 0)
+    return float(inside.mean())
+
+
+def soften(rng: np.random.Generator, image: Image) -> Image:
+    """A map texture somewhat coarser than the view (the easier, earlier condition)."""
+    if rng.random() < 0.5:
+        return image
+    return cv2.GaussianBlur(image, (0, 0), rng.uniform(0.4, 1.3))
+
+
+def relative_pose(pair: Pair) -> Array:
+    """(4, 4) ``query_from_reference``."""
+    return (pair.world_from_query.inverse @ pair.world_from_reference).matrix

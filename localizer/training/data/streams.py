@@ -1,0 +1,57 @@
+"""Where a run's batches come from: shards on disk, or pairs rendered while it trains."""
+
+from __future__ import annotations
+
+from concurrent.futures import Future
+from dataclasses import replace
+
+from localizer.training.config import DataSection, LiveSection, TrainConfig
+from localizer.training.data.batches import LoaderConfig, Schedule, ShardStream
+from localizer.training.data.live import LivePlan, LiveStream
+from localizer.training.data.pairs import SceneConfig
+from localizer.training.data.seeds import FIRST_WORLD_SEED
+from localizer.training.data.shards import PhotoSource, shard_path, world_shard_paths
+from localizer.training.loop.distributed import Workers
+
+
+def open_stream(
+    config: TrainConfig, workers: Workers, generating: Future[None] | None
+) -> ShardStream | LiveStream:
+    """The batches of one process of a run. generating: what writes missing shards alongside."""
+    data, o = config.data, config.optimizer
+    loader = LoaderConfig(o.batch, o.anchors, o.crop, data.appearance)
+    if isinstance(data, DataSection):
+        return ShardStream(schedule(data), loader, config.seed, workers.rank, generating)
+    plan = LivePlan(data.first_seed, data.scenes, data.active, data.steps_per_scene, data.visits)
+    return LiveStream(
+        plan, scene_config(data), photo_source(data), loader, config.seed, workers.device,
+        rank=workers.rank, count=workers.count, workers=data.workers,
+    )  # fmt: skip
+
+
+def schedule(data: DataSection) -> Schedule:
+    """The shards of a run."""
+    seeds = range(data.first_seed, data.first_seed + data.scenes)
+    worlds = range(FIRST_WORLD_SEED, FIRST_WORLD_SEED + data.worlds)
+    return Schedule(
+        tuple(shard_path(data.shards, seed) for seed in seeds),
+        data.initial_scenes,
+        data.scenes_per_step,
+        tuple(path for seed in worlds for path in world_shard_paths(data.shards, seed)),
+        data.world_share,
+        data.world_first_step,
+    )
+
+
+def scene_config(data: DataSection | LiveSection) -> SceneConfig:
+    """What the generator needs of a run's configuration."""
+    scenes = SceneConfig(photo_share=data.photo_share, light_variety=data.light_variety)
+    if isinstance(data, DataSection):
+        return scenes
+    width, height = data.image
+    return replace(scenes, cells=data.cells, width=width, height=height)
+
+
+def photo_source(data: DataSection | LiveSection) -> PhotoSource | None:
+    """The real textures of a run, if it uses any."""
+    return None if data.photos is None else PhotoSource(data.photos, data.photo_groups)

@@ -1,0 +1,231 @@
+"""The training loop: both losses together, EMA, exact resumption, curves."""
+
+from __future__ import annotations
+
+import csv
+import logging
+import time
+from concurrent.futures import Future
+from pathlib import Path
+
+import numpy as np
+import torch
+from torch import Tensor, nn
+
+from localizer.errors import ModelError
+from localizer.training.config import OptimizerSection, TrainConfig
+from localizer.training.data.streams import open_stream
+from localizer.training.loop.checkpoint import fill, read_checkpoint, write_checkpoint
+from localizer.training.loop.distill import Teacher, distillation_loss
+from localizer.training.loop.distributed import Workers
+from localizer.training.loop.losses import Batch, alignment_loss, contrast_loss, sample, se3_exp
+from localizer.training.models.networks import build
+
+logger = logging.getLogger(__name__)
+
+
+class Trainer:
+    """A run that stops and continues at any step with the same result.
+
+    Under torchrun every process takes batches of its own and all take the mean step; the first one
+    writes. Batch statistics stay each process's own, the first one's are kept.
+    """
+
+    def __init__(self, config: TrainConfig) -> None:
+        self.config = config
+        torch.manual_seed(config.seed)
+        torch.set_num_threads(config.optimizer.threads)
+        self.workers = Workers.from_environment()
+        self.device = self.workers.device
+        self.model = build(config.model).to(self.device).train()
+        if config.warm_start is not None:
+            first = read_checkpoint(config.warm_start, self.device)
+            fill(self.model, first["average"], config.warm_start)
+        self.average = build(config.model).to(self.device).eval()
+        self.average.load_state_dict(self.model.state_dict())
+        self.log_scale = nn.Parameter(
+            torch.full((len(self.model.strides),), 3.2, device=self.device)
+        )
+        self.optimizer = torch.optim.AdamW(
+            [
+                {"params": list(self.model.parameters())},
+                {"params": [self.log_scale], "weight_decay": 0.0},
+            ],
+            lr=config.optimizer.learning_rate,
+            weight_decay=config.optimizer.weight_decay,
+        )
+        self.teacher = None
+        if config.distill is not None:
+            self.teacher = Teacher(config.distill.teacher, self.model.strides, self.device)
+        self.step = 0
+        self.seconds = 0.0
+        self._resume()
+
+    @property
+    def checkpoint(self) -> Path:
+        """The newest state of this run."""
+        return self.config.output / f"{self.config.name}.pt"
+
+    def run(self, steps: int | None = None, generating: Future[None] | None = None) -> None:
+        """Train up to the configured number of steps, or `steps` more.
+
+        generating: what writes the shards alongside; its failure ends the run.
+        """
+        last = self.config.optimizer.steps
+        if steps is not None:
+            last = min(last, self.step + steps)
+        self.config.output.mkdir(parents=True, exist_ok=True)  # its error now, not after hours
+        stream = open_stream(self.config, self.workers, generating)
+        rows: list[dict[str, float]] = []
+        began = time.monotonic() - self.seconds
+        try:
+            while self.step < last:
+                rows.append(self._train_step(stream.batch(self.step)))
+                self.step += 1
+                self.seconds = time.monotonic() - began
+                if self.step % self.config.checkpoint_steps == 0 or self.step == last:
+                    self._save()
+                if self.step % 25 == 0 or self.step == last:
+                    self._log(rows)
+                    rows = []
+        finally:
+            stream.close()
+
+    def _train_step(self, batch: Batch) -> dict[str, float]:
+        o = self.config.optimizer
+        batch = Batch(*(t.to(self.device) for t in vars(batch).values()))
+        for group in self.optimizer.param_groups:
+            group["lr"] = learning_rate(self.step, o)
+        loss, parts = self._loss(batch)
+        self.optimizer.zero_grad()
+        loss.backward()
+        parameters = [*self.model.parameters(), self.log_scale]
+        self.workers.average_gradients(parameters)
+        norm = nn.utils.clip_grad_norm_(parameters, 5.0)
+        if torch.isfinite(norm):
+            self.optimizer.step()
+            self._update_average()
+        else:
+            logger.warning("step %d skipped: gradient is not finite", self.step)
+        return parts | {"loss": float(loss.detach()), "gradient": float(norm)}
+
+    def _loss(self, batch: Batch) -> tuple[Tensor, dict[str, float]]:
+        o = self.config.optimizer
+        pairs = batch.points.shape[0]
+        with torch.autocast(self.device.type, torch.bfloat16, enabled=o.mixed_precision):
+            levels = self.model(batch.images.contiguous())
+            taught = None if self.teacher is None else self.teacher.levels(batch.images)
+        ramp = alignment_ramp(self.step, o)
+        generator = torch.Generator().manual_seed(self.config.seed * 1_000_003 + self.step)
+        total, parts = batch.points.new_zeros(()), {}
+        strides = self.model.strides
+        for k, ((features, confidence), stride) in enumerate(zip(levels, strides, strict=True)):
+            at = batch.reference_pixels / stride
+            anchors = sample(features[:pairs], at)
+            trust = sample(confidence[:pairs, None], at)[..., 0]
+            query = features[pairs:]
+            contrast = contrast_loss(
+                anchors, query, batch.query_pixels / stride, batch.visible,
+                self.log_scale[k].exp(), 64, o.whole_map_cells,
+            )  # fmt: skip
+            start = perturbed(batch, o.start_error_px[k], generator)
+            alignment, error = alignment_loss(
+                batch, (anchors, trust), (query, confidence[pairs:]), stride, start,
+                o.lm_iterations,
+            )  # fmt: skip
+            total = total + o.contrast_weight * contrast
+            total = total + ramp * o.alignment_weight * alignment
+            if taught is not None and self.config.distill is not None:
+                lesson = distillation_loss(
+                    (features, confidence), self.log_scale[k].exp(), taught[k], at,
+                    batch.query_pixels / stride, batch.visible,
+                )  # fmt: skip
+                total = total + self.config.distill.weight * lesson
+                parts[f"distill_{k}"] = float(lesson.detach())
+            parts[f"contrast_{k}"] = float(contrast.detach())
+            parts[f"alignment_{k}"] = float(alignment.detach())
+            parts[f"error_px_{k}"] = float(error)
+        return total, parts
+
+    def _update_average(self) -> None:
+        decay = min(self.config.optimizer.ema_decay, (1 + self.step) / (10 + self.step))
+        with torch.no_grad():
+            for mean, value in zip(
+                self.average.state_dict().values(), self.model.state_dict().values(), strict=True
+            ):
+                if mean.is_floating_point():
+                    mean.lerp_(value, 1 - decay)
+                else:
+                    mean.copy_(value)
+
+    def _save(self) -> None:
+        if self.workers.rank > 0:
+            return
+        write_checkpoint(
+            self.checkpoint,
+            {
+                "model": self.model.state_dict(),
+                "average": self.average.state_dict(),
+                "log_scale": self.log_scale.detach(),
+                "optimizer": self.optimizer.state_dict(),
+                "step": self.step,
+                "seconds": self.seconds,
+                "config": self.config.model_dump(mode="json"),
+            },
+        )
+
+    def _resume(self) -> None:
+        if not self.checkpoint.exists():
+            return
+        state = read_checkpoint(self.checkpoint, self.device)
+        try:
+            fill(self.model, state["model"], self.checkpoint)
+            fill(self.average, state["average"], self.checkpoint)
+            with torch.no_grad():
+                self.log_scale.copy_(state["log_scale"])
+            self.optimizer.load_state_dict(state["optimizer"])
+            self.step, self.seconds = int(state["step"]), float(state["seconds"])
+        except (KeyError, RuntimeError, TypeError, ValueError, AttributeError) as error:
+            raise ModelError(
+                f"{self.checkpoint}: no state to continue from ({type(error).__name__}: {error}); "
+                "weights alone go into `warm_start`"
+            ) from error
+        logger.info("resumed %s at step %d", self.checkpoint, self.step)
+
+    def _log(self, rows: list[dict[str, float]]) -> None:
+        if self.workers.rank > 0:
+            return
+        means: dict[str, float] = {k: float(np.mean([r[k] for r in rows])) for k in rows[0]}
+        row = {"step": float(self.step), "seconds": round(self.seconds, 1)} | means
+        path = self.config.output / f"{self.config.name}.csv"
+        new = not path.exists()
+        path.parent.mkdir(parents=True, exist_ok=True)
+        with path.open("a", newline="") as file:
+            writer = csv.DictWriter(file, row.keys())
+            if new:
+                writer.writeheader()
+            writer.writerow({k: f"{v:.5g}" for k, v in row.items()})
+        shown = " ".join(f"{k} {v:.3g}" for k, v in row.items())
+        logger.info("%s", shown)
+
+
+def learning_rate(step: int, o: OptimizerSection) -> float:
+    """Linear warm-up, a plateau, a cosine to zero over the last `decay_steps`."""
+    warm = min(1.0, (step + 1) / max(o.warmup_steps, 1))
+    left = min(1.0, (o.steps - step) / o.decay_steps)
+    return float(o.learning_rate * warm * 0.5 * (1 - np.cos(np.pi * left)))
+
+
+def alignment_ramp(step: int, o: OptimizerSection) -> float:
+    """Share of Eq. 3's weight at a step: none before its first one, then rising to all of it."""
+    since = max(step - o.alignment_first_step, 0)
+    return min(1.0, since / o.alignment_ramp_steps)
+
+
+def perturbed(batch: Batch, error_px: float, generator: torch.Generator) -> Tensor:
+    """True poses moved so that anchors are off by about `error_px` image pixels."""
+    depth = batch.points[..., 2].median(dim=1).values
+    xi = torch.randn(len(depth), 6, generator=generator).to(depth.device) * 0.6
+    angle = error_px / batch.K_query[:, 0]
+    size = torch.stack([angle * depth] * 3 + [angle] * 3, 1)
+    return se3_exp(xi * size) @ batch.query_from_reference

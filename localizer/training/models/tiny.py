@@ -1,0 +1,195 @@
+"""The `tiny` network: MobileOne blocks in the encoder, an additive U-Net decoder, three levels.
+
+Each level gives unit-length features and a confidence in (0, 1), the complement of the paper's
+uncertainty (Sec. 3.3.1, A.1). Eight channels are fixed orientation energy (`orientation`), the rest
+is learned; what share each has in the squared distance is learned too, pixel by pixel, because
+orientation does not last on grass, leaves and water. The confidence is the
+orientation's clarity: one that was learned with the features gathered the anchors in a few places
+and cost accuracy each time it was tried (docs/model-card.md). The finest level is at stride 2: half
+the paper's, a quarter of the work. The coarsest stage is dilated, because at stride 8 a wide field
+of view costs next to nothing.
+"""
+
+from __future__ import annotations
+
+from typing import Annotated, ClassVar, Literal
+
+import torch
+from pydantic import BaseModel, ConfigDict, Field
+from torch import Tensor, nn
+from torch.nn import functional as F  # noqa: N812 (torch's own name for it)
+
+from localizer.training.models.orientation import CHANNELS, OrientationFeatures
+
+STRIDES = (8, 4, 2)
+
+_Width = Annotated[int, Field(gt=0, le=4096)]  # channels
+_Dilation = Annotated[int, Field(gt=0, le=64)]
+
+
+class ModelConfig(BaseModel):
+    """Shape of the network. widths: encoder channels at strides 2, 4, 8; decoder: at 4 and 2;
+    dilations: one block of the coarsest stage each.
+    """
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+    network: Literal["tiny"] = "tiny"
+    channels: int = Field(default=32, gt=CHANNELS, le=4096)
+    widths: tuple[_Width, _Width, _Width] = (24, 48, 96)
+    decoder: tuple[_Width, _Width] = (48, 32)
+    dilations: tuple[_Dilation, ...] = Field(default=(1, 1, 2, 1, 4, 2), min_length=1)
+
+
+class MobileOneBlock(nn.Module):
+    """Convolution that trains as parallel branches and runs as one (MobileOne, Fig. 3).
+
+    Branches: the k x k convolution with batch normalisation, and the identity where shapes allow;
+    MobileOne's 1 x 1 branch is left out, because its memory traffic costs a third of a CPU step.
+    `fuse` folds the branches into a single convolution.
+    """
+
+    def __init__(
+        self,
+        inputs: int,
+        outputs: int,
+        size: int,
+        *,
+        stride: int = 1,
+        groups: int = 1,
+        dilation: int = 1,
+    ) -> None:
+        super().__init__()
+        self.shape = (inputs, outputs, size, stride, groups, dilation)
+        padding = dilation * (size // 2)
+        self.main = _conv_bn(inputs, outputs, size, stride, groups, dilation, padding)
+        self.residual = inputs == outputs and stride == 1
+
+    def forward(self, x: Tensor) -> Tensor:
+        """(B, inputs, H, W) to (B, outputs, H/stride, W/stride)."""
+        y = self.main(x)
+        return F.relu(y + x if self.residual else y)
+
+    def fuse(self) -> nn.Sequential:
+        """The same function as one convolution and a ReLU (evaluation statistics)."""
+        inputs, outputs, size, stride, groups, dilation = self.shape
+        fused = nn.Conv2d(
+            inputs,
+            outputs,
+            size,
+            stride,
+            dilation * (size // 2),
+            groups=groups,
+            dilation=dilation,
+        )
+        weight, bias = _folded(self.main)
+        if self.residual:
+            index = torch.arange(outputs)
+            identity = torch.zeros_like(weight)
+            identity[index, index % (inputs // groups), size // 2, size // 2] = 1.0
+            weight = weight + identity
+        fused.weight = nn.Parameter(weight.detach().clone())
+        fused.bias = nn.Parameter(bias.detach().clone())
+        return nn.Sequential(fused, nn.ReLU())
+
+
+class TinyNet(nn.Module):
+    """Image (B, 3, H, W) in 0..1, H and W divisible by 8, to three (features, confidence) levels.
+
+    Level k is at stride `STRIDES[k]`: features (B, C, h, w) of unit length, confidence (B, h, w).
+    """
+
+    strides: ClassVar[tuple[int, ...]] = STRIDES
+
+    def __init__(self, config: ModelConfig) -> None:
+        super().__init__()
+        w0, w1, w2 = config.widths
+        d1, d2 = config.decoder
+        self.stem = MobileOneBlock(3, w0, 3, stride=2)
+        self.stage2 = nn.Sequential(*_pair(w0, w1, stride=2), *_pair(w1, w1))
+        deep: list[nn.Module] = []
+        for k, dilation in enumerate(config.dilations):
+            first = k == 0
+            deep += _pair(w1 if first else w2, w2, stride=2 if first else 1, dilation=dilation)
+        self.stage3 = nn.Sequential(*deep)
+        self.lateral1, self.lateral2 = nn.Conv2d(w1, d1, 1), nn.Conv2d(w0, d2, 1)
+        self.down1, self.down2 = nn.Conv2d(w2, d1, 1), nn.Conv2d(d1, d2, 1)
+        self.merge1 = nn.Sequential(MobileOneBlock(d1, d1, 3), MobileOneBlock(d1, d1, 3))
+        self.merge2 = nn.Sequential(MobileOneBlock(d2, d2, 3), MobileOneBlock(d2, d2, 3))
+        learned = config.channels - CHANNELS
+        self.orientation = nn.ModuleList(OrientationFeatures(s) for s in STRIDES)
+        self.share = nn.ModuleList(_half(c) for c in (w2, d1, d2))
+        self.features = nn.ModuleList(nn.Conv2d(c, learned, 1) for c in (w2, d1, d2))
+
+    def forward(self, image: Tensor) -> list[tuple[Tensor, Tensor]]:
+        """See the class."""
+        a = self.stem((image - 0.45) / 0.25)
+        b = self.stage2(a)
+        c = self.stage3(b)
+        d = self.merge1(F.relu(self.lateral1(b) + _double(self.down1(c))))
+        e = self.merge2(F.relu(self.lateral2(a) + _double(self.down2(d))))
+        levels = []
+        for k, x in enumerate((c, d, e)):
+            oriented, clear = self.orientation[k](image)
+            f = self.features[k](x).float()
+            unit = f * torch.rsqrt((f * f).sum(1, keepdim=True) + 1e-8)
+            share = torch.sigmoid(self.share[k](x).float())
+            both = torch.cat([torch.sqrt(share) * oriented, torch.sqrt(1 - share) * unit], 1)
+            levels.append((both, clear))
+        return levels
+
+
+def fuse(model: nn.Module) -> nn.Module:
+    """Replace every MobileOne block by its single convolution, in place; returns the model."""
+    for name, child in model.named_children():
+        if isinstance(child, MobileOneBlock):
+            setattr(model, name, child.fuse())
+        else:
+            fuse(child)
+    return model
+
+
+def parameter_count(model: nn.Module) -> int:
+    """Number of learned values."""
+    return sum(p.numel() for p in model.parameters())
+
+
+def _pair(inputs: int, outputs: int, *, stride: int = 1, dilation: int = 1) -> list[nn.Module]:
+    """Depthwise 3 x 3, then pointwise: the MobileOne unit."""
+    return [
+        MobileOneBlock(inputs, inputs, 3, stride=stride, groups=inputs, dilation=dilation),
+        MobileOneBlock(inputs, outputs, 1),
+    ]
+
+
+def _conv_bn(
+    inputs: int, outputs: int, size: int, stride: int, groups: int, dilation: int, padding: int
+) -> nn.Sequential:
+    conv = nn.Conv2d(
+        inputs, outputs, size, stride, padding, dilation=dilation, groups=groups, bias=False
+    )
+    return nn.Sequential(conv, nn.BatchNorm2d(outputs))
+
+
+def _affine(bn: nn.BatchNorm2d) -> tuple[Tensor, Tensor]:
+    """Gain and shift (C,) that a batch normalisation applies in evaluation."""
+    assert bn.running_var is not None
+    assert bn.running_mean is not None
+    gain = bn.weight / torch.sqrt(bn.running_var + bn.eps)
+    return gain, bn.bias - bn.running_mean * gain
+
+
+def _folded(branch: nn.Sequential) -> tuple[Tensor, Tensor]:
+    gain, shift = _affine(branch[1])
+    return branch[0].weight * gain[:, None, None, None], shift
+
+
+def _half(channels: int) -> nn.Conv2d:
+    """The logit of the orientation's share at a pixel: half everywhere at first."""
+    conv = nn.Conv2d(channels, 1, 1)
+    nn.init.zeros_(conv.weight)
+    nn.init.zeros_(conv.bias)
+    return conv
+
+
+def _double(x: Tensor) -> Tensor:
+    return F.interpolate(x, scale_factor=2.0, mode="nearest")

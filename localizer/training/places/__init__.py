@@ -1,0 +1,1 @@
+"""Training places: land, objects, what changes between two visits."""

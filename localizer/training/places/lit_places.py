@@ -1,0 +1,50 @@
+"""Places with several days of flight, lit and ready to render on a device."""
+
+from __future__ import annotations
+
+import os
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+
+from localizer.synth.heightfield.scene import LitScene
+from localizer.training.data.pairs import (
+    SceneConfig,
+    Visit,
+    draw_place,
+    draw_visit,
+    lived_scene,
+    survey_scene,
+)
+from localizer.training.data.shards import PhotoSource
+
+
+@dataclass(frozen=True)
+class PlaceVisits:
+    """A place as it was surveyed, and on the days of several flights."""
+
+    survey: LitScene
+    days: tuple[tuple[LitScene, Visit, bool], ...]
+    source: str
+
+
+def make_place(
+    seed: int, scenes: SceneConfig, photos: PhotoSource | None, visits: int
+) -> PlaceVisits:
+    """The place of a seed, lit and ready to render."""
+    rng = np.random.default_rng(seed)
+    place, source = draw_place(rng, scenes, None if photos is None else photos.library())
+    survey = survey_scene(rng, place, scenes)
+    days = []
+    for _ in range(visits):
+        visit = draw_visit(rng)
+        fixed = None if scenes.light_variety else survey.light
+        days.append((visit, *lived_scene(rng, place, visit, fixed, scenes.shared_detail)))
+    return PlaceVisits(survey, tuple((lit, visit, season) for visit, lit, season in days), source)
+
+
+def be_modest() -> None:
+    """How a process that makes places begins: it yields to the training, and uses one core."""
+    os.nice(5)
+    cv2.setNumThreads(1)

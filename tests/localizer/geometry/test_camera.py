@@ -1,0 +1,162 @@
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+
+import cv2
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from localizer.errors import CameraError
+from localizer.geometry.camera import Camera
+
+BROWN = (-0.21, 0.07, 0.0011, -0.0008, -0.012)
+
+
+@pytest.fixture
+def camera():
+    return Camera(640, 480, 610.0, 605.0, 331.0, 236.0)
+
+
+@pytest.fixture
+def distorted(camera):
+    return replace(camera, distortion=BROWN)
+
+
+def opencv_project(points, camera):
+    """OpenCV's projection; its pixel centres are at integers, ours half a pixel further."""
+    K = camera.K - np.array([[0, 0, 0.5], [0, 0, 0.5], [0, 0, 0]])
+    pixels, _ = cv2.projectPoints(
+        points.reshape(-1, 1, 3), np.zeros(3), np.zeros(3), K, np.array(camera.distortion)
+    )
+    return pixels.reshape(-1, 2) + 0.5
+
+
+def cloud(n=200):
+    rng = np.random.default_rng(0)
+    return np.column_stack([rng.uniform(-0.5, 0.5, (n, 2)), np.ones(n)]) * rng.uniform(
+        5, 400, (n, 1)
+    )
+
+
+@pytest.mark.parametrize("distortion", [(0.0,) * 5, BROWN])
+def test_projection_is_opencvs_plus_half_a_pixel(camera, distortion):
+    camera = replace(camera, distortion=distortion)
+    pixels, _ = camera.project(cloud())
+    np.testing.assert_allclose(pixels, opencv_project(cloud(), camera), atol=1e-8)
+
+
+@pytest.mark.parametrize("distortion", [(0.0,) * 5, BROWN])
+def test_rays_invert_the_projection(camera, distortion):
+    camera = replace(camera, distortion=distortion)
+    rng = np.random.default_rng(1)
+    pixels = rng.uniform([0, 0], [640, 480], (300, 2))
+    again, inside = camera.project(camera.rays(pixels) * 37.0)
+    assert inside.mean() > 0.97  # on the very border rounding may put one out
+    np.testing.assert_allclose(again, pixels, atol=1e-6)
+
+
+def test_rays_keep_the_shape(camera, distorted):
+    assert camera.rays(np.zeros((3, 4, 2))).shape == (3, 4, 3)
+    assert distorted.rays(np.zeros((3, 4, 2))).shape == (3, 4, 3)
+    np.testing.assert_allclose(camera.rays([camera.cx, camera.cy]), [0, 0, 1])
+
+
+def test_first_pixel_centre_is_one_half(camera):
+    """The image spans [0, width]: its left edge is half a pixel left of the first centre."""
+    _, inside = camera.project(camera.rays([[0.5, 0.5], [639.5, 479.5], [640.5, 10], [10, -0.5]]))
+    np.testing.assert_array_equal(inside, [True, True, False, False])
+
+
+def test_points_behind_are_not_in_view(camera):
+    pixels, inside = camera.project([[0.0, 0.0, -5.0], [0.0, 0.0, 0.0], [0.0, 0.0, 5.0]])
+    np.testing.assert_array_equal(inside, [False, False, True])
+    assert np.isnan(pixels[:2]).all()
+
+
+@given(st.integers(8, 4000), st.integers(8, 4000), st.floats(5, 150))
+def test_field_of_view(width, height, fov):
+    camera = Camera.from_fov(width, height, fov)
+    assert camera.horizontal_fov_deg == pytest.approx(fov)
+    left, right = camera.rays([[0, height / 2], [width, height / 2]])
+    angle = np.degrees(np.arccos(left @ right / np.linalg.norm(left) / np.linalg.norm(right)))
+    assert angle == pytest.approx(fov, abs=1e-6)
+
+
+def test_resizing_keeps_every_ray(camera):
+    small = camera.resized(320, 120)
+    pixels = np.array([[0.0, 0.0], [100.0, 300.0], [640.0, 480.0]])
+    np.testing.assert_allclose(
+        small.rays(pixels * [320 / 640, 120 / 480]), camera.rays(pixels), atol=1e-12
+    )
+    assert small.resized(640, 480) == camera
+
+
+def test_resizing_agrees_with_cv2_resize(camera):
+    """A dot drawn at a known ray lies at the resized camera's pixel in the resized image."""
+    image = np.zeros((480, 640), np.float32)
+    image[200:204, 300:304] = 1.0
+    small = cv2.resize(image, (160, 120), interpolation=cv2.INTER_AREA)
+    rows, columns = np.nonzero(small)
+    centre = np.array([columns.mean() + 0.5, rows.mean() + 0.5])
+    expected, _ = camera.resized(160, 120).project(camera.rays([302.0, 202.0]))
+    np.testing.assert_allclose(centre, expected, atol=1e-9)
+
+
+def test_undistortion_maps_put_every_ray_where_the_pinhole_sees_it(distorted):
+    """A smooth picture of the ray direction: after remapping each pixel shows its own ray."""
+    target = distorted.without_distortion().resized(320, 240)
+    v, u = np.mgrid[0:480, 0:640] + 0.5
+    seen = distorted.rays(np.stack([u, v], axis=-1))[..., :2].astype(np.float32)
+    remapped = cv2.remap(seen, *distorted.undistortion_maps(target), cv2.INTER_LINEAR)
+    v, u = np.mgrid[0:240, 0:320] + 0.5
+    expected = target.rays(np.stack([u, v], axis=-1))[..., :2]
+    inner = np.s_[12:-12, 12:-12]
+    # cv2's fixed-point maps resolve 1/32 pixel.
+    np.testing.assert_allclose(remapped[inner], expected[inner], atol=1.0 / 32 / 600)
+
+
+def test_dictionary_and_json_round_trip(distorted, tmp_path):
+    assert Camera.from_dict(distorted.to_dict()) == distorted
+    path = tmp_path / "camera.json"
+    path.write_text(json.dumps(distorted.to_dict()))
+    assert Camera.from_json(path) == distorted
+
+
+def test_single_distortion_keys(camera):
+    data = {k: v for k, v in camera.to_dict().items() if k != "distortion"}
+    named = data | dict(zip(("k1", "k2", "p1", "p2", "k3"), BROWN, strict=True))
+    assert Camera.from_dict(named).distortion == BROWN
+    assert Camera.from_dict(data | {"distortion": [0.1, 0.2]}).distortion == (0.1, 0.2, 0, 0, 0)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"fx": 0.0}, "focal"),
+        ({"fy": -3.0}, "focal"),
+        ({"cx": float("nan")}, "finite"),
+        ({"width": 2}, "8x8"),
+        ({"distortion": (0.0, 0.0)}, "k1 k2 p1 p2 k3"),
+    ],
+)
+def test_impossible_cameras(camera, change, message):
+    with pytest.raises(CameraError, match=message):
+        replace(camera, **change)
+
+
+def test_bad_files_are_named(tmp_path):
+    path = tmp_path / "camera.json"
+    with pytest.raises(CameraError, match=r"camera\.json"):
+        Camera.from_json(path)
+    path.write_text("[1, 2]")
+    with pytest.raises(CameraError, match="width, height"):
+        Camera.from_json(path)
+    path.write_text('{"width": 640, "height": 480}')
+    with pytest.raises(CameraError, match="missing fx, fy, cx, cy"):
+        Camera.from_json(path)
+    path.write_text('{"width": 640, "height": 480, "fx": "x", "fy": 1, "cx": 1, "cy": 1}')
+    with pytest.raises(CameraError, match=r"camera\.json"):
+        Camera.from_json(path)

@@ -1,0 +1,325 @@
+"""The cache on disk: hashes, versions, atomic and resumable builds."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from localizer.errors import LocalizerError, MapCacheError, MapSourceError
+from localizer.geometry.pose import Pose
+from localizer.map.building.build import build_cache
+from localizer.map.cache.cache import TileCache, decode_tile, encode_tile
+from localizer.map.cache.tile import TileMesh, build_mips, texel_coverage
+
+
+@pytest.fixture
+def copy(cache_path: Path, tmp_path: Path) -> Path:
+    """A cache that may be damaged."""
+    return Path(shutil.copytree(cache_path, tmp_path / "copy"))
+
+
+def test_missing_cache_says_how_to_make_one(tmp_path):
+    with pytest.raises(MapCacheError, match="companion map build"):
+        TileCache.open(tmp_path / "nothing")
+
+
+@pytest.mark.parametrize("at", [0, 100, -1])
+def test_a_flipped_bit_in_a_tile_is_found(copy, at):
+    cache = TileCache.open(copy)
+    path = cache.tile_path(5)
+    data = bytearray(path.read_bytes())
+    data[at] ^= 1
+    path.write_bytes(data)
+    with pytest.raises(MapCacheError, match=r"tile 5.*hash"):
+        cache.load_tile(5)
+    assert isinstance(cache.load_tile(4), TileMesh)
+
+
+def test_missing_tile_is_named(copy):
+    cache = TileCache.open(copy)
+    cache.tile_path(3).unlink()
+    with pytest.raises(MapCacheError, match="tile 3"):
+        cache.load_tile(3)
+    with pytest.raises(MapCacheError, match="no tile 999"):
+        cache.load_tile(999)
+
+
+def test_damaged_index_is_found(copy):
+    path = copy / "index.safetensors"
+    data = bytearray(path.read_bytes())
+    data[-5] ^= 1
+    path.write_bytes(data)
+    with pytest.raises(MapCacheError, match="hash in the manifest"):
+        TileCache.open(copy)
+    path.unlink()
+    with pytest.raises(MapCacheError, match="cannot be read"):
+        TileCache.open(copy)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"format_version": 99}, "format 99"),
+        ({"geoid_separation_m": "high"}, "geoid_separation_m"),
+        ({"geoid_separation_m": 1e5}, "geoid_separation_m"),
+        ({"geoid_separation_m": float("nan")}, "geoid_separation_m"),
+        ({"extent": [[float("inf"), 0.0]]}, "extent"),
+        ({"surprise": 1}, "surprise"),
+        ({"origin": {"latitude_deg": 200, "longitude_deg": 0, "height_m": 0}}, "out of range"),
+    ],
+)
+def test_bad_manifest_is_named(copy, change, message):
+    path = copy / "manifest.json"
+    path.write_text(json.dumps(json.loads(path.read_text()) | change))
+    with pytest.raises(MapCacheError, match=message):
+        TileCache.open(copy)
+
+
+def test_a_manifest_of_another_index_is_refused(copy):
+    """Boxes about another origin would let the view lose its tiles in flight."""
+    path = copy / "manifest.json"
+    manifest = json.loads(path.read_text())
+    for change in (
+        {"origin": manifest["origin"] | {"latitude_deg": 47.21}},
+        {"origin": manifest["origin"] | {"height_m": 1e12}},
+        {"tiles": manifest["tiles"] + 1},
+    ):
+        path.write_text(json.dumps(manifest | change))
+        with pytest.raises(MapCacheError, match="build it again"):
+            TileCache.open(copy)
+
+
+def test_manifest_that_is_not_json(copy):
+    (copy / "manifest.json").write_bytes(b"\0\xff")
+    with pytest.raises(MapCacheError, match="JSON"):
+        TileCache.open(copy)
+
+
+def test_tile_round_trip():
+    rng = np.random.default_rng(0)
+    positions = rng.normal(size=(30, 3)).astype(np.float32)
+    uvs = rng.random((30, 2)).astype(np.float32)
+    faces = rng.integers(0, 30, (20, 3), dtype=np.int32)
+    image = np.full((100, 80, 3), (200, 100, 50), np.uint8)
+    data = encode_tile(positions, uvs, faces, build_mips(image), repeat=True)
+    mesh = decode_tile(data, Pose.identity())
+    assert np.array_equal(mesh.positions, positions)
+    assert np.array_equal(mesh.uvs, uvs)
+    assert np.array_equal(mesh.faces, faces)
+    assert mesh.repeat
+    assert [m.shape[:2] for m in mesh.mips[:3]] == [(100, 80), (50, 40), (25, 20)]
+    assert all(np.abs(m.astype(int) - (200, 100, 50)).max() <= 3 for m in mesh.mips)
+    assert np.array_equal(mesh.texture.mip(1), mesh.mips[1])
+
+
+@pytest.mark.parametrize(
+    ("array", "value", "told"),
+    [
+        ("positions", np.nan, "position"),
+        ("uvs", np.inf, "texture coordinate"),
+        ("uvs", 1e30, "texture coordinate"),
+        ("faces", 3, "vertex that is not there"),
+    ],
+)
+def test_a_tile_that_would_lead_kernels_astray_is_refused(array, value, told):
+    arrays = {
+        "positions": np.eye(3, dtype=np.float32),
+        "uvs": np.zeros((3, 2), np.float32),
+        "faces": np.array([[0, 1, 2]], np.int32),
+    }
+    arrays[array][0, 1] = value
+    data = encode_tile(**arrays, mips=build_mips(np.zeros((8, 8, 3), np.uint8)))
+    for textured in (True, False):
+        with pytest.raises(MapCacheError, match=told):
+            decode_tile(data, Pose.identity(), textured=textured)
+
+
+@pytest.mark.parametrize("keep", [0, 7, 8, 50, 500])
+def test_truncated_tile_data_is_a_named_error(keep):
+    data = encode_tile(
+        np.zeros((3, 3), np.float32),
+        np.zeros((3, 2), np.float32),
+        np.array([[0, 1, 2]], np.int32),
+        (np.zeros((64, 64, 3), np.uint8),),
+    )
+    with pytest.raises(MapCacheError):
+        decode_tile(data[:keep], Pose.identity())
+
+
+def test_unused_texels_do_not_bleed_into_mips():
+    image = np.zeros((64, 64, 3), np.uint8)
+    image[:, :24] = 200  # one chart on black
+    uvs = np.array([[0, 0], [24 / 64, 0], [0, 1], [24 / 64, 1]], np.float32)
+    faces = np.array([[0, 1, 2], [1, 3, 2]], np.int32)
+    mips = build_mips(image, texel_coverage(uvs, faces, 64, 64))
+    for mip in mips[1:4]:
+        used = mip[:, : max(1, mip.shape[1] * 24 // 64)]
+        assert used.min() > 190
+    assert build_mips(image)[4].min() < 150  # what the mask prevents
+
+
+def test_same_input_gives_the_same_bytes(source, tmp_path):
+    manifests = [
+        build_cache(source, tmp_path / name, workers=workers, progress=False)
+        for name, workers in (("a", 1), ("b", 2))
+    ]
+    assert manifests[0] == manifests[1]
+    for path in (p for p in (tmp_path / "a").rglob("*") if p.is_file()):
+        assert path.read_bytes() == (tmp_path / "b" / path.relative_to(tmp_path / "a")).read_bytes()
+
+
+KILLED = """
+import os, sys
+from pathlib import Path
+from localizer.map.building.build import build_cache
+import localizer.map.building.staging as staging
+store, count = staging.Staging.store, 0
+def store_some(self, key, meshes):
+    global count
+    count += 1
+    if count > 9:
+        os.kill(os.getpid(), 9)
+    return store(self, key, meshes)
+staging.Staging.store = store_some
+build_cache(Path(sys.argv[1]), Path(sys.argv[2]), workers=1, progress=False)
+"""
+
+
+def test_build_goes_on_after_kill(source, cache, tmp_path, monkeypatch):
+    out = tmp_path / "cache"
+    run = subprocess.run([sys.executable, "-c", KILLED, str(source), str(out)], check=False)
+    assert run.returncode == -signal.SIGKILL
+    assert not out.exists()
+    from localizer.map.building.staging import Staging
+
+    stored = []
+    store = Staging.store
+    monkeypatch.setattr(
+        Staging,
+        "store",
+        lambda self, key, meshes: (stored.append(key), store(self, key, meshes))[1],
+    )
+    manifest = build_cache(source, out, workers=1, progress=False)
+    assert sorted(stored) == list(range(9, 21))
+    assert manifest == cache.manifest
+    assert not out.with_name("cache.building").exists()
+
+
+FULL = """
+import resource, signal, sys
+from pathlib import Path
+from localizer.errors import MapCacheError
+from localizer.map.building.build import build_cache
+signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
+resource.setrlimit(resource.RLIMIT_FSIZE, (5000, 5000))
+try:
+    build_cache(Path(sys.argv[1]), Path(sys.argv[2]), workers=1, progress=False)
+except MapCacheError as error:
+    sys.exit(f"named: {error}")
+"""
+
+
+def test_a_full_disk_is_named_and_the_build_goes_on_after_it(source, cache, tmp_path):
+    out = tmp_path / "cache"
+    command = [sys.executable, "-c", FULL, str(source), str(out)]
+    run = subprocess.run(command, check=False, capture_output=True, text=True)
+    assert run.stderr.startswith("named: ")
+    assert "cannot be written: File too large" in run.stderr
+    assert not out.exists()
+    assert build_cache(source, out, workers=1, progress=False) == cache.manifest
+
+
+ORPHANS = """
+import os, signal, time
+from localizer.map.building.workers import _pool
+if __name__ == "__main__":
+    pool = _pool(2)
+    print(*{pool.submit(os.getpid).result() for _ in range(8)}, *pool._processes, flush=True)
+    os.kill(os.getpid(), signal.SIGKILL)
+"""
+
+
+def _runs(pid: int) -> bool:
+    try:
+        return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] != "Z"
+    except OSError:
+        return False
+
+
+def test_workers_end_with_a_build_that_was_killed(tmp_path):
+    script = tmp_path / "orphans.py"
+    script.write_text(ORPHANS)
+    # To a file: what outlives its parent would hold a pipe open.
+    with (tmp_path / "pids").open("w") as file:
+        subprocess.run([sys.executable, str(script)], stdout=file, check=False)
+    workers = {int(pid) for pid in (tmp_path / "pids").read_text().split()}
+    assert workers
+    deadline = time.monotonic() + 120  # one that is killed while it starts ends once it has
+    while any(_runs(pid) for pid in workers):
+        assert time.monotonic() < deadline, "workers stayed behind"
+        time.sleep(0.05)
+
+
+def test_a_changed_source_is_not_mixed_with_an_old_build(make, tmp_path):
+    source = make.tileset(tmp_path / "s")
+    out = tmp_path / "cache"
+    subprocess.run([sys.executable, "-c", KILLED, str(source), str(out)], check=False)
+    first = next((tmp_path / "s").glob("0_*.glb"))
+    os.utime(first, ns=(time.time_ns(), time.time_ns() + 10**9))
+    fresh = build_cache(source, out, workers=1, progress=False)
+    assert fresh.tiles == 21
+
+
+def test_two_builds_do_not_share_a_folder(source, tmp_path):
+    from localizer.map.building.staging import staging
+
+    with (
+        staging(tmp_path / "c", {}, overwrite=False),
+        pytest.raises(MapCacheError, match="another"),
+    ):
+        build_cache(source, tmp_path / "c", workers=1, progress=False)
+
+
+def test_overwrite_replaces_the_cache(source, tmp_path):
+    out = tmp_path / "c"
+    build_cache(source, out, workers=1, progress=False)
+    (out / "mark").write_text("old")
+    build_cache(source, out, workers=1, progress=False, overwrite=True)
+    assert not (out / "mark").exists()
+    assert TileCache.open(out).manifest.tiles == 21
+    assert [p.name for p in tmp_path.iterdir() if p.name.startswith("c")] == ["c"]
+
+
+def test_overwrite_spares_what_is_no_cache(source, tmp_path):
+    out = tmp_path / "c"
+    out.mkdir()
+    (out / "thesis.tex").touch()
+    (tmp_path / "c.old").mkdir()
+    (tmp_path / "c.old" / "draft.tex").touch()
+    with pytest.raises(MapCacheError, match="no tile cache"):
+        build_cache(source, out, workers=1, progress=False, overwrite=True)
+    (out / "thesis.tex").unlink()
+    build_cache(source, out, workers=1, progress=False, overwrite=True)
+    assert (tmp_path / "c.old" / "draft.tex").exists()
+
+
+def test_a_source_that_is_not_there(tmp_path):
+    with pytest.raises(MapSourceError, match="no such file"):
+        build_cache(tmp_path / "x", tmp_path / "c")
+    (tmp_path / "x.las").write_bytes(b"LASF")
+    with pytest.raises(MapSourceError, match="not a source"):
+        build_cache(tmp_path / "x.las", tmp_path / "c")
+
+
+def test_every_error_has_one_base():
+    assert issubclass(MapCacheError, LocalizerError)
+    assert issubclass(MapSourceError, LocalizerError)

@@ -1,0 +1,426 @@
+"""Import of 3D Tiles: where things end up, and what is refused."""
+
+from __future__ import annotations
+
+import json
+import struct
+
+import cv2
+import DracoPy
+import numpy as np
+import pytest
+
+from localizer.errors import GeoreferenceError, MapCacheError, MapSourceError
+from localizer.geometry.pose import Pose
+from localizer.map.building.build import build_cache
+from localizer.map.importers.gltf import read_gltf
+from localizer.map.importers.tiles3d import read_tileset
+
+
+def world_vertices(cache):
+    meshes = [cache.load_tile(i) for i in cache.tile_ids]
+    return np.concatenate([m.world_from_tile.apply(m.positions) for m in meshes])
+
+
+def no_files(uri):
+    raise AssertionError(f"{uri} should not be read")
+
+
+def single_tile(make, folder, content: bytes, name="tile.glb", **root):
+    """A tileset of one tile about the test origin."""
+    from localizer.geometry.geo import LocalFrame
+
+    folder.mkdir(exist_ok=True)
+    (folder / name).write_bytes(content)
+    T = LocalFrame(make.origin).ecef_from_enu.matrix.T.ravel().tolist()
+    document = {
+        "asset": {"version": "1.0", "extras": {"geoid_separation_m": 10.0}},
+        "geometricError": 10,
+        "root": {
+            "transform": T,
+            "boundingVolume": {"sphere": [0, 0, 0, 100]},
+            "geometricError": 0,
+            "content": {"uri": name},
+        }
+        | root,
+    }
+    (folder / "tileset.json").write_text(json.dumps(document))
+    return folder / "tileset.json"
+
+
+def flat_patch(make, **extra):
+    positions, uvs, faces = make.patch(-50, -50, 100, 4)
+    return positions, make.glb(make.y_up(positions), uvs, faces, make.picture(1), **extra)
+
+
+def test_vertices_are_where_the_source_puts_them(cache, make):
+    points = world_vertices(cache)
+    assert np.abs(points[:, 2] - make.height(points[:, 0], points[:, 1])).max() < 1e-3
+    assert points[:, :2].min() == pytest.approx(-200, abs=1e-3)
+    assert points[:, :2].max() == pytest.approx(200, abs=1e-3)
+
+
+def test_manifest_tells_origin_separation_and_size(cache, make):
+    m = cache.manifest
+    assert (m.geoid_separation_m, m.vertical_datum) == (make.separation, "ellipsoidal")
+    assert (m.tiles, m.levels) == (21, 3)
+    assert m.origin.latitude_deg == pytest.approx(make.origin.latitude_deg, abs=1e-8)
+    assert m.origin.height_m == pytest.approx(make.origin.height_m, abs=1e-3)
+    assert m.gsd_m == pytest.approx(100 / 64, rel=0.1)
+    latitudes = [lat for lat, _ in m.extent]
+    assert max(latitudes) - min(latitudes) == pytest.approx(400 / 111_194, rel=0.02)
+
+
+def test_texture_keeps_its_orientation(tmp_path, make, build):
+    positions, uvs, faces = make.patch(-50, -50, 100, 2)
+    image = np.zeros((64, 64, 3), np.uint8)
+    image[:8, :8] = (0, 0, 255)  # red (BGR) in the north-west corner
+    png = cv2.imencode(".png", image)[1].tobytes()
+    content = make.glb(make.y_up(positions), uvs, faces, png, "image/png")
+    mesh = build(single_tile(make, tmp_path / "s", content)).load_tile(0)
+    northwest = np.argmin(mesh.positions[:, 0] - mesh.positions[:, 1])
+    u, v = mesh.uvs[northwest]
+    assert (u, v) == pytest.approx((0, 0))
+    assert mesh.mips[0][2, 2, 0] > 200
+    assert mesh.mips[0][40, 40].max() < 20
+
+
+@pytest.mark.parametrize("mime", [".png", ".webp", ".jpg"])
+def test_image_formats(tmp_path, make, build, mime):
+    positions, uvs, faces = make.patch(-50, -50, 100, 2)
+    image = make.picture(3, extension=mime)
+    extra = {}
+    if mime == ".webp":
+        textures = [{"extensions": {"EXT_texture_webp": {"source": 0}}}]
+        extra = {"textures": textures, "extensionsRequired": ["EXT_texture_webp"]}
+    content = make.glb(make.y_up(positions), uvs, faces, image, f"image/{mime[1:]}", **extra)
+    mesh = build(single_tile(make, tmp_path / "s", content)).load_tile(0)
+    decoded = cv2.cvtColor(cv2.imdecode(np.frombuffer(image, np.uint8), 1), cv2.COLOR_BGR2RGB)
+    assert np.abs(mesh.mips[0].astype(int) - decoded).mean() < 3
+
+
+def test_draco_and_b3dm_with_rtc_center(tmp_path, make, build):
+    positions, uvs, faces = make.patch(-50, -50, 100, 4)
+    shift = np.array([30.0, -20.0, 5.0])  # z-up, as RTC_CENTER is
+    data = DracoPy.encode(make.y_up(positions - shift), faces, tex_coord=uvs, quantization_bits=16)
+    primitive = {
+        "attributes": {"POSITION": 0, "TEXCOORD_0": 1},
+        "indices": 2,
+        "material": 0,
+        "extensions": {
+            "KHR_draco_mesh_compression": {
+                "bufferView": 4,
+                "attributes": {"POSITION": 1, "TEXCOORD_0": 0},  # DracoPy's unique ids
+            }
+        },
+    }
+    plain = make.glb(make.y_up(positions), uvs, faces, make.picture(1))
+    length = struct.unpack_from("<I", plain, 12)[0]
+    document = json.loads(plain[20 : 20 + length])
+    binary = plain[28 + length :]
+    document["bufferViews"].append(
+        {"buffer": 0, "byteOffset": len(binary), "byteLength": len(data)}
+    )
+    document["meshes"] = [{"primitives": [primitive]}]
+    document["extensionsRequired"] = ["KHR_draco_mesh_compression"]
+    text = json.dumps(document).encode()
+    text += b" " * (-len(text) % 4)
+    binary += data + b"\0" * (-len(data) % 4)
+    body = struct.pack("<I4s", len(text), b"JSON") + text
+    body += struct.pack("<I4s", len(binary), b"BIN\0") + binary
+    content = struct.pack("<4sII", b"glTF", 2, 12 + len(body)) + body
+    tileset = single_tile(make, tmp_path / "s", make.b3dm(content, shift.tolist()), "t.b3dm")
+    points = world_vertices(build(tileset))
+    assert np.abs(points[:, 2] - make.height(points[:, 0], points[:, 1])).max() < 0.02
+    assert points[:, 0].min() == pytest.approx(-50, abs=0.01)
+
+
+def test_node_and_tile_transforms_and_quantisation(tmp_path, make, build):
+    positions, uvs, faces = make.patch(-50, -50, 100, 4)
+    low, span = -60.0, 120.0
+    q = np.rint((make.y_up(positions) - low) / span * 32767).astype(np.int16)
+    padded = np.zeros((len(q), 4), np.int16)
+    padded[:, :3] = q
+    plain = make.glb(np.zeros((len(q), 2)), uvs, faces, make.picture(1))
+    # Same bytes a vertex as two floats, so the short positions fit into the first view.
+    length = struct.unpack_from("<I", plain, 12)[0]
+    document = json.loads(plain[20 : 20 + length])
+    document["bufferViews"][0]["byteStride"] = 8
+    document["accessors"][0] |= {"componentType": 5122, "normalized": True}
+    document["extensionsRequired"] = ["KHR_mesh_quantization"]
+    document["nodes"] = [{"children": [1], "translation": [7, 0, 0]}, {"mesh": 0}]
+    document["nodes"][1] |= {"scale": [span] * 3, "translation": [low - 7, low, low]}
+    text = json.dumps(document).encode()
+    text += b" " * (-len(text) % 4)
+    binary = padded.tobytes() + plain[28 + length + padded.nbytes :]
+    body = struct.pack("<I4s", len(text), b"JSON") + text
+    body += struct.pack("<I4s", len(binary), b"BIN\0") + binary
+    content = struct.pack("<4sII", b"glTF", 2, 12 + len(body)) + body
+    points = world_vertices(build(single_tile(make, tmp_path / "s", content)))
+    assert np.abs(points[:, 2] - make.height(points[:, 0], points[:, 1])).max() < 0.02
+
+
+def test_external_tileset_and_transform_chain(tmp_path, make, build):
+    positions, uvs, faces = make.patch(-50, -50, 100, 4)
+    shift = np.array([100.0, 40.0, -3.0])
+    inner = tmp_path / "s" / "inner"
+    inner.mkdir(parents=True)
+    content = make.glb(make.y_up(positions - shift), uvs, faces, make.picture(1))
+    (inner / "a b.glb").write_bytes(content)
+    document = {
+        "asset": {"version": "1.0"},
+        "geometricError": 1,
+        "root": {"geometricError": 0, "content": {"url": "a%20b.glb"}},
+    }
+    (inner / "tileset.json").write_text(json.dumps(document))
+    move = Pose(np.eye(3), shift).matrix.T.ravel().tolist()
+    children = [{"transform": move, "geometricError": 1, "content": {"uri": "inner/tileset.json"}}]
+    tileset = single_tile(make, tmp_path / "s", content, children=children)
+    document = json.loads(tileset.read_text())
+    del document["root"]["content"]
+    tileset.write_text(json.dumps(document))
+    points = world_vertices(build(tileset))
+    assert np.abs(points[:, 2] - make.height(points[:, 0], points[:, 1])).max() < 1e-3
+
+
+def test_flat_colours_become_a_palette(make):
+    positions, uvs, faces = make.patch(-50, -50, 100, 2)
+    colour = {"pbrMetallicRoughness": {"baseColorFactor": [1.0, 0.0, 0.2158605, 1.0]}}
+    content = make.glb(make.y_up(positions), uvs, faces, make.picture(1), materials=[colour])
+    (mesh,), _ = read_gltf(content, no_files)
+    x, y = (mesh.uvs[0] * mesh.image.shape[1::-1]).astype(int)
+    assert tuple(mesh.image[y, x]) == (255, 0, 128)
+
+
+def test_missing_children_leave_the_parent_in_view(tmp_path, make, build):
+    source = make.tileset(tmp_path / "s")
+    leaf = next((tmp_path / "s").glob("2_*.glb"))
+    leaf.unlink()
+    with pytest.raises(MapSourceError, match=leaf.name):
+        build(source)
+    assert not (tmp_path / "cache").exists()
+    cache = build(source, skip_bad_tiles=True)
+    assert list(cache.manifest.skipped) == [leaf.name]
+    # The leaf's parent keeps its own surface: its other three children are left out.
+    assert cache.manifest.tiles == 17
+    assert int((cache.index.child_count == 0).sum()) == 13
+
+
+def test_amsl_heights_are_lifted_by_the_separation(source, make, build, cache):
+    lifted = build(source, vertical_datum="amsl", geoid_separation_m=20.0)
+    raised = lifted.manifest.origin.height_m - cache.manifest.origin.height_m
+    assert raised == pytest.approx(20, abs=1e-3)
+    assert np.allclose(world_vertices(lifted), world_vertices(cache), atol=2e-3)
+
+
+def test_origin_can_be_chosen(source, make, build):
+    from localizer.geometry.geo import Geodetic
+
+    cache = build(source, origin=Geodetic(47.2, 8.2, 400.0))
+    points = world_vertices(cache)
+    z = make.height(points[:, 0], points[:, 1]) + 30
+    assert np.abs(points[:, 2] - z).max() < 1e-3
+
+
+def test_unknown_geoid_separation_is_an_error(tmp_path, make):
+    source = make.tileset(tmp_path / "s")
+    document = json.loads(source.read_text())
+    del document["asset"]["extras"]
+    source.write_text(json.dumps(document))
+    with pytest.raises(GeoreferenceError, match="geoid separation"):
+        build_cache(source, tmp_path / "c", workers=1, progress=False)
+    with pytest.raises(GeoreferenceError, match="does not occur"):
+        build_cache(source, tmp_path / "c", geoid_separation_m=900, workers=1, progress=False)
+
+
+def test_a_tileset_that_is_not_on_earth_is_an_error(tmp_path, make, build):
+    source = make.tileset(tmp_path / "s")
+    document = json.loads(source.read_text())
+    del document["root"]["transform"]
+    source.write_text(json.dumps(document))
+    with pytest.raises(GeoreferenceError, match="not placed on Earth"):
+        build(source)
+
+
+def test_existing_cache_is_kept_unless_told(source, cache_path):
+    with pytest.raises(MapCacheError, match=r"exists already.*--overwrite"):
+        build_cache(source, cache_path, workers=1, progress=False)
+
+
+HOSTILE_TILESETS = {
+    "no json": b"\xff\xfe not json",
+    "deep json": b"[" * 200_000,
+    "array": b"[]",
+    "no root": b'{"asset": {"version": "1.0"}}',
+    "version": b'{"asset": {"version": "9"}, "root": {}}',
+    "cycle": b'{"asset": {"version": "1.0"}, "root": {"content": {"uri": "tileset.json"}}}',
+    "escape": b'{"asset": {"version": "1.0"}, "root": {"content": {"uri": "../../secret.b3dm"}}}',
+    "absolute": b'{"asset": {"version": "1.0"}, "root": {"content": {"uri": "/etc/passwd"}}}',
+    "scheme": b'{"asset": {"version": "1.0"}, "root": {"content": {"uri": "http://a/b.glb"}}}',
+    "nul": b'{"asset": {"version": "1.0"}, "root": {"content": {"uri": "a\\u0000b.glb"}}}',
+    "uri": b'{"asset": {"version": "1.0"}, "root": {"content": {"uri": 5}}}',
+    "implicit": b'{"asset": {"version": "1.1"}, "root": {"implicitTiling": {}}}',
+    "error": b'{"asset": {"version": "1.0"}, "root": {"geometricError": -1}}',
+    "nan": b'{"asset": {"version": "1.0"}, "root": {"geometricError": NaN}}',
+    "transform": b'{"asset": {"version": "1.0"}, "root": {"transform": [1, 2]}}',
+    "children": b'{"asset": {"version": "1.0"}, "root": {"children": [5]}}',
+    "volume": b'{"asset": {"version": "1.0"}, "root": {"boundingVolume": {"box": ["x"]}}}',
+    "asset": b'{"asset": 5, "root": {}}',
+}
+
+
+@pytest.mark.parametrize("name", HOSTILE_TILESETS)
+def test_hostile_tilesets_are_named_errors(tmp_path, name):
+    path = tmp_path / "s" / "tileset.json"
+    path.parent.mkdir()
+    path.write_bytes(HOSTILE_TILESETS[name])
+    with pytest.raises(MapSourceError, match=r"."):
+        read_tileset(path)
+
+
+def test_external_tilesets_in_a_cycle_are_named(tmp_path):
+    for name, other in (("tileset", "b"), ("b", "c"), ("c", "b")):
+        document = {"asset": {"version": "1.1"}, "root": {"content": {"uri": f"{other}.json"}}}
+        (tmp_path / f"{name}.json").write_text(json.dumps(document))
+    with pytest.raises(MapSourceError, match=r"b\.json: external tilesets refer .* cycle"):
+        read_tileset(tmp_path)
+
+
+def test_symbolic_link_out_of_the_folder_is_refused(tmp_path, make):
+    outside = tmp_path / "outside.glb"
+    outside.write_bytes(b"glTF")
+    folder = tmp_path / "s"
+    source = single_tile(make, folder, b"")
+    (folder / "tile.glb").unlink()
+    (folder / "tile.glb").symlink_to(outside)
+    with pytest.raises(MapSourceError, match="leaves the tileset"):
+        read_tileset(source)
+
+
+def bomb() -> bytes:
+    """A PNG header of 60000 x 60000 pixels."""
+    import zlib
+
+    def chunk(kind, data):
+        body = kind + data
+        return struct.pack(">I", len(data)) + body + struct.pack(">I", zlib.crc32(body))
+
+    header = struct.pack(">IIBBBBB", 60000, 60000, 8, 2, 0, 0, 0)
+    data = zlib.compress(b"\0" * 100)
+    return (
+        b"\x89PNG\r\n\x1a\n" + chunk(b"IHDR", header) + chunk(b"IDAT", data) + chunk(b"IEND", b"")
+    )
+
+
+def edited(content: bytes, change) -> bytes:
+    """A GLB with its JSON changed."""
+    length = struct.unpack_from("<I", content, 12)[0]
+    document = json.loads(content[20 : 20 + length])
+    change(document)
+    text = json.dumps(document).encode()
+    text += b" " * (-len(text) % 4)
+    body = struct.pack("<I4s", len(text), b"JSON") + text + content[20 + length :]
+    return struct.pack("<4sII", b"glTF", 2, 12 + len(body)) + body
+
+
+HOSTILE_EDITS = {
+    "count beyond the buffer": lambda d: d["accessors"][0].update(count=10**6),
+    "absurd count": lambda d: d["accessors"][0].update(count=10**18),
+    "negative count": lambda d: d["accessors"][0].update(count=-1),
+    "fractional offset": lambda d: d["bufferViews"][0].update(byteOffset=0.5),
+    "view beyond the buffer": lambda d: d["bufferViews"][2].update(byteLength=10**12),
+    "unknown type": lambda d: d["accessors"][0].update(type="VEC9"),
+    "indices as floats": lambda d: d["accessors"][2].update(componentType=5126),
+    "node cycle": lambda d: d["nodes"][0].update(children=[0]),
+    "no such mesh": lambda d: d["nodes"][0].update(mesh=7),
+    "bool as index": lambda d: d["nodes"][0].update(mesh="0"),
+    "no position": lambda d: d["meshes"][0]["primitives"][0].update(attributes={}),
+    "unknown extension": lambda d: d.update(extensionsRequired=["KHR_texture_basisu"]),
+    "basisu only": lambda d: d.update(textures=[{"extensions": {"KHR_texture_basisu": {}}}]),
+    "meshopt": lambda d: d["bufferViews"][0].update(extensions={"EXT_meshopt_compression": {}}),
+    "image outside": lambda d: d.update(images=[{"uri": "../../x.png"}]),
+    "bad base64": lambda d: d.update(images=[{"uri": "data:image/png;base64,@@@"}]),
+    "scale": lambda d: d["nodes"][0].update(scale=["a", 1, 1]),
+    "rotation": lambda d: d["nodes"][0].update(rotation=[0, 0, 0, 0]),
+    "sparse": lambda d: d["accessors"][0].update(sparse={}),
+    "nodes as a number": lambda d: d.update(nodes=5),
+    "primitives as a string": lambda d: d["meshes"][0].update(primitives="x"),
+    "attributes as a list": lambda d: d["meshes"][0]["primitives"][0].update(attributes=[1]),
+    "scene without nodes": lambda d: d.update(scenes=[{"nodes": ["x"]}]),
+}
+
+
+@pytest.mark.parametrize("name", HOSTILE_EDITS)
+def test_hostile_glb_is_a_named_error_and_leaves_no_cache(tmp_path, make, build, name):
+    _, content = flat_patch(make)
+    source = single_tile(make, tmp_path / "s", edited(content, HOSTILE_EDITS[name]))
+    with pytest.raises(MapSourceError, match=r"tile\.glb"):
+        build(source)
+    assert not (tmp_path / "cache").exists()
+
+
+def test_texture_bomb_is_refused_unread(tmp_path, make, build):
+    positions, uvs, faces = make.patch(-50, -50, 100, 2)
+    content = make.glb(make.y_up(positions), uvs, faces, bomb(), "image/png")
+    with pytest.raises(MapSourceError, match=r"decompression bomb|too large"):
+        build(single_tile(make, tmp_path / "s", content))
+
+
+KTX2 = b"\xabKTX 20\xbb\r\n\x1a\n" + bytes(68)
+
+
+def test_what_cannot_be_decoded_is_named_tile_by_tile_or_left_out(tmp_path, make, build):
+    folder = tmp_path / "s"
+    source = make.tileset(folder)
+    positions, uvs, faces = make.patch(-50, -50, 100, 2)
+    ktx2 = make.glb(make.y_up(positions), uvs, faces, KTX2, "image/ktx2")
+    leaves = sorted(folder.glob("2_*.glb"))
+    leaves[0].write_bytes(edited(ktx2, basisu))
+    leaves[1].write_bytes(edited(leaves[1].read_bytes(), HOSTILE_EDITS["meshopt"]))
+    leaves[2].write_bytes(ktx2)
+    with pytest.raises(MapSourceError) as caught:
+        build(source)
+    lines = str(caught.value).splitlines()
+    assert "3 tiles cannot be imported" in lines[0]
+    for leaf, reason in zip(leaves, ("basisu", "EXT_meshopt_compression", "picture"), strict=False):
+        assert any(leaf.name in line and reason in line for line in lines[1:])
+    assert not (tmp_path / "cache").exists()
+    cache = build(source, skip_bad_tiles=True)
+    assert sorted(cache.manifest.skipped) == [leaf.name for leaf in leaves[:3]]
+
+
+def basisu(document):
+    document["extensionsRequired"] = ["KHR_texture_basisu"]
+    document["textures"] = [{"extensions": {"KHR_texture_basisu": {"source": 0}}}]
+
+
+def test_an_absurd_count_is_refused_before_memory_is_asked_for(make, tmp_path, build):
+    content = edited(flat_patch(make)[1], lambda d: d["accessors"][0].update(count=10**9))
+    with pytest.raises(MapSourceError, match="1000000000 elements"):
+        build(single_tile(make, tmp_path / "s", content))
+
+
+def test_not_finite_positions_are_refused(make):
+    positions, uvs, faces = make.patch(-50, -50, 100, 2)
+    positions[3, 1] = np.nan
+    with pytest.raises(MapSourceError, match="finite"):
+        read_gltf(make.glb(positions, uvs, faces, make.picture(1)), no_files)
+
+
+@pytest.mark.parametrize("keep", [0, 3, 12, 19, 27, 40, 400, -1])
+def test_truncated_content_is_a_named_error(tmp_path, make, build, keep):
+    _, content = flat_patch(make)
+    for name, data in (("t.glb", content), ("t.b3dm", make.b3dm(content))):
+        source = single_tile(make, tmp_path / "s", data[:keep], name)
+        with pytest.raises(MapSourceError, match=name):
+            build(source)
+
+
+@pytest.mark.real
+def test_malvern_names_its_missing_tiles(tmp_path, real_data, build):
+    source = real_data("malvern") / "b3dmtileset.json"
+    with pytest.raises(MapSourceError, match=r"356 tiles cannot be imported"):
+        build(source, geoid_separation_m=-33.0)
+    cache = build(source, geoid_separation_m=-33.0, skip_bad_tiles=True)
+    assert len(cache.manifest.skipped) == 356
+    assert cache.manifest.tiles <= 17

@@ -1,0 +1,185 @@
+"""Figures, verification, pictures and export of a cache, and the commands that show them."""
+
+from __future__ import annotations
+
+import os
+import shutil
+
+import cv2
+import numpy as np
+import pytest
+import trimesh
+from typer.testing import CliRunner
+
+from companion.cli import app
+from companion.errors import ReportError
+from localizer.errors import GeoreferenceError, OutsideMapError
+from localizer.geometry.camera import Camera
+from localizer.map.building import build
+from localizer.map.cache.cache import TileCache
+from localizer.map.cache.tile import TileMesh
+from localizer.map.inspection.inspect import (
+    camera_pose,
+    depth_picture,
+    export_glb,
+    levels,
+    render_view,
+    verify,
+)
+
+
+def test_levels(cache):
+    rows = levels(cache)
+    assert [r.tiles for r in rows] == [1, 4, 16]
+    assert [r.geometric_error_m for r in rows] == [40, 20, 0]
+    assert rows[0].gsd_m == pytest.approx(2 * rows[1].gsd_m, rel=0.05)
+
+
+def test_verify_whole_and_damaged(cache, tmp_path):
+    whole = verify(cache)
+    assert whole.ok
+    assert whole.holes == ()
+    assert whole.covered_m2 == pytest.approx(400 * 400, rel=0.02)
+    copy = TileCache.open(shutil.copytree(cache.path, tmp_path / "copy"))
+    inner = [
+        t for t in copy.tile_ids
+        if np.abs(copy.world_from_tile[t].translation[:2]).max() < 60 and t > 4
+    ]  # fmt: skip
+    copy.tile_path(inner[0]).write_bytes(b"x")
+    result = verify(copy)
+    assert len(result.damaged) == 1
+    assert f"tile {inner[0]}" in result.damaged[0]
+    assert len(result.holes) == 1
+    assert result.holes[0].area_m2 == pytest.approx(100 * 100, rel=0.05)
+
+
+def test_camera_pose_looks_where_it_is_told(cache):
+    o = cache.manifest.origin
+    pose = camera_pose(cache, o.latitude_deg, o.longitude_deg, o.height_m + 50, 90.0, -30.0)
+    forward = pose.rotation[:, 2]
+    assert forward == pytest.approx([np.cos(np.radians(30)), 0, -0.5], abs=1e-9)
+    assert pose.rotation[:, 0] == pytest.approx([0, -1, 0], abs=1e-9)  # right is south
+    assert pose.translation == pytest.approx([0, 0, 50], abs=1e-6)
+
+
+def test_render_view_and_outside(cache):
+    o = cache.manifest.origin
+    camera = Camera.from_fov(64, 48, 60)
+    pose = camera_pose(cache, o.latitude_deg, o.longitude_deg, o.height_m + 80)
+    view = render_view(cache, pose, camera)
+    assert view.depth[24, 32] == pytest.approx(80 - 6, abs=1.0)
+    colours = depth_picture(view.depth)
+    assert colours.shape == (48, 64, 3)
+    assert (colours[view.depth == 0] == 0).all()
+    with pytest.raises(OutsideMapError, match="nothing of the map"):
+        render_view(cache, camera_pose(cache, 10.0, 10.0, 500.0), camera)
+
+
+def test_export_is_the_same_surface(cache, tmp_path, make):
+    count = export_glb(cache, tmp_path / "out.glb")
+    scene = trimesh.load_scene(tmp_path / "out.glb")
+    assert count == 16 * 128 == sum(len(g.faces) for g in scene.geometry.values())
+    points = np.concatenate([g.vertices for g in scene.geometry.values()])
+    error = points[:, 1] - make.height(points[:, 0], -points[:, 2])
+    assert np.abs(error).max() < 1e-3
+    assert export_glb(cache, tmp_path / "coarse.glb", level=0) == 128
+
+
+def test_export_keeps_texture_orientation(cache, tmp_path):
+    export_glb(cache, tmp_path / "out.glb", level=0)
+    (geometry,) = trimesh.load_scene(tmp_path / "out.glb").geometry.values()
+    mesh: TileMesh = cache.load_tile(0)
+    order = np.lexsort(np.round(geometry.vertices, 2).T)
+    points = mesh.world_from_tile.apply(mesh.positions)
+    ours = np.lexsort(np.round(np.stack([points[:, 0], points[:, 2], -points[:, 1]], -1), 2).T)
+    assert geometry.visual.uv[order][:, 1] == pytest.approx(1 - mesh.uvs[ours][:, 1], abs=1e-4)
+
+
+def run(*arguments):
+    return CliRunner().invoke(app, ["map", *map(str, arguments)])
+
+
+def test_commands(source, tmp_path):
+    out = tmp_path / "c"
+    built = run("build", source, "--out", out, "--workers", "1")
+    assert built.exit_code == 0, built.output
+    assert "21 tiles" in built.output
+    shown = run("info", out)
+    assert "47.5" in shown.output
+    assert "4 " in shown.output
+    assert "21 of 21 tiles intact" in run("verify", out).output
+    picture = tmp_path / "v.png"
+    place = ["--latitude", 47.2, "--longitude", 8.2, "--height", 500]
+    assert run("render", out, *place, "--width", 64, "--out", picture).exit_code == 0
+    assert cv2.imread(str(picture)).shape == (960, 64, 3)
+    assert (tmp_path / "v_depth.png").is_file()
+    assert run("export", out, "--out", tmp_path / "e.glb", "--level", 1).exit_code == 0
+    TileCache.open(out).tile_path(2).write_bytes(b"x")
+    damaged = run("verify", out)
+    assert damaged.exit_code == 1
+    assert "tile 2" in damaged.output
+
+
+def test_a_level_or_a_place_that_the_map_does_not_have_is_named(source, tmp_path):
+    out = tmp_path / "c"
+    assert run("build", source, "--out", out, "--workers", "1").exit_code == 0
+    with pytest.raises(OutsideMapError, match=r"no level 9, the finest is [0-9]"):
+        export_glb(TileCache.open(out), tmp_path / "e.glb", 9)
+    assert not (tmp_path / "e.glb").exists()
+    far = camera_pose(TileCache.open(out), 10.0, 8.2, 500.0)
+    with pytest.raises(OutsideMapError, match=r"nothing of the map; it lies about 47\.\d+, 8\.\d+"):
+        render_view(TileCache.open(out), far, Camera.from_fov(64, 48, 60.0))
+
+
+def test_an_interrupted_build_says_how_to_go_on(source, tmp_path, monkeypatch):
+    def interrupted(*_args, **_options):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(build, "build_cache", interrupted)
+    result = run("build", source, "--out", tmp_path / "c")
+    assert result.exit_code == 130
+    assert "the same command goes on" in result.output
+
+
+@pytest.mark.parametrize("what", ["render", "export"])
+@pytest.mark.parametrize(
+    ("place", "why"),
+    [("folder.png", "is a folder"), ("none/v.png", "no such folder"),
+     ("v.png", "may not be written"), ("v.png", "cannot be written: No space left")],
+)  # fmt: skip
+def test_a_place_that_cannot_be_written_is_one_line(cache, tmp_path, monkeypatch, what, place, why):
+    (tmp_path / "folder.png").mkdir()
+
+    def full(_path, _data):
+        raise OSError(28, "No space left on device")
+
+    if "may not" in why:  # root, as whom tests may run, is refused nothing
+        monkeypatch.setattr("os.access", lambda _path, mode: mode != os.W_OK)
+    elif "No space" in why:
+        monkeypatch.setattr("pathlib.Path.write_bytes", full)
+    pose = ["--latitude", 47.2, "--longitude", 8.2, "--height", 500, "--width", 64]
+    result = run(what, cache.path, *(pose if what == "render" else ()), "--out", tmp_path / place)
+    if "No space" in why:
+        assert isinstance(result.exception, ReportError)
+        assert why in str(result.exception)
+    else:
+        assert result.exit_code == 2
+        assert why in " ".join(result.output.replace("│", " ").split())
+
+
+def test_dask_builds_the_same_cache(source, cache, tmp_path):
+    distributed = pytest.importorskip("distributed")
+    from localizer.map.building.build import build_cache
+
+    with distributed.LocalCluster(
+        n_workers=2, threads_per_worker=1, processes=True, dashboard_address=None
+    ) as cluster:
+        manifest = build_cache(
+            source, tmp_path / "c", scheduler=cluster.scheduler_address, progress=False
+        )
+    assert manifest == cache.manifest
+
+
+def test_a_pose_off_the_earth_is_named(cache):
+    with pytest.raises(GeoreferenceError):
+        camera_pose(cache, 95.0, 8.0, 100.0)

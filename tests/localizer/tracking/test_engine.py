@@ -1,0 +1,344 @@
+"""The dual-thread engine over fakes of the renderer, the network and the optimizer."""
+
+import threading
+import time
+from dataclasses import replace
+from types import SimpleNamespace
+
+import cv2
+import numpy as np
+import pytest
+
+from localizer.config import LocalizerConfig
+from localizer.errors import CameraError, MapCacheError, OutsideMapError
+from localizer.geometry.camera import Camera
+from localizer.geometry.pose import Pose
+from localizer.registration.result import Registration
+from localizer.render.base import SKY
+from localizer.tracking.engine import DualThreadEngine
+from localizer.tracking.pipeline import Localizer, Undistorter, working_camera
+from localizer.types import (
+    FeatureLevel,
+    FeaturePyramid,
+    Frame,
+    PosePrior,
+    RegistrationStatus,
+    RenderedView,
+    TrackingState,
+)
+
+CAMERA = Camera.from_fov(640, 480, 60.0)
+NADIR = Pose(np.diag([1.0, -1.0, -1.0]), np.array([0.0, 0.0, 100.0]))
+INTERVAL_NS = 20_000_000
+
+
+class FakeRenderer:
+    name = "fake"
+
+    def __init__(self) -> None:
+        self.depth = 100.0
+        self.poses: list[Pose] = []
+        self.ahead: list[tuple[str, list[Pose]]] = []
+        self.error: Exception | None = None
+
+    def prefetch(self, views, camera):
+        self.ahead.append((threading.current_thread().name, list(views)))
+        if self.error is not None:
+            raise self.error
+
+    def render(self, world_from_camera, camera, extra=(), *, wait=False):
+        self.poses.append(world_from_camera)
+        rgb = np.zeros((camera.height, camera.width, 3), np.uint8)
+        depth = np.full(rgb.shape[:2], self.depth, np.float32)
+        return RenderedView(rgb, depth, world_from_camera, camera)
+
+
+class FakeExtractor:
+    name = "fake"
+
+    def extract(self, rgb):
+        h, w = rgb.shape[:2]
+        rng = np.random.default_rng(0)
+        levels = tuple(
+            FeatureLevel(
+                rng.standard_normal((h // s, w // s, 4)).astype(np.float32),
+                np.ones((h // s, w // s), np.float32),
+                s,
+            )
+            for s in (8, 4, 2)
+        )
+        return FeaturePyramid(levels, w, h)
+
+
+class FakeOptimizer:
+    """Finds the camera where `truth` says it is, 1 cm off; or raises what `error` holds."""
+
+    on_gpu = False
+    backend = SimpleNamespace(name="fake")
+
+    def __init__(self) -> None:
+        self.error: Exception | None = None
+        self.status = RegistrationStatus.OK
+        self.offset = np.zeros(3)
+
+    def register(self, query, camera, anchors, prior, *, motion=None, constraint=None, seed=0):
+        if self.error is not None:
+            raise self.error
+        pose = Pose(NADIR.rotation, NADIR.translation + 0.01 + self.offset)
+        return Registration(pose, np.eye(6) * 0.01, 0.1, 0.9, 0.8, self.status, 1)
+
+
+def _localizer(renderer=None, optimizer=None) -> Localizer:
+    return Localizer(
+        renderer or FakeRenderer(),
+        FakeExtractor(),
+        optimizer or FakeOptimizer(),  # type: ignore[arg-type]
+        CAMERA,
+        LocalizerConfig(),
+    )
+
+
+def _frame(sequence: int) -> Frame:
+    image = np.zeros((480, 640, 3), np.uint8)
+    return Frame(image, 10**9 + sequence * INTERVAL_NS, CAMERA, sequence)
+
+
+def _prior(time_ns: int) -> PosePrior:
+    return PosePrior(NADIR, np.eye(6), time_ns)
+
+
+class Flight:
+    """An engine, its estimates, and frames on demand."""
+
+    def __init__(self, localizer: Localizer, provider=_prior) -> None:
+        self.estimates = []
+        self.engine = DualThreadEngine(
+            localizer, (lambda e, _: self.estimates.append(e),), provider
+        )
+        self.sequence = 0
+        self.engine.start()
+
+    def feed_until(self, condition, timeout_s=60.0):
+        deadline = time.monotonic() + timeout_s
+        while not condition():
+            assert time.monotonic() < deadline, self.engine.health
+            self.engine.submit(_frame(self.sequence))
+            self.sequence += 1
+            time.sleep(INTERVAL_NS * 1e-9)
+
+
+@pytest.fixture
+def flight(request):
+    flights = []
+
+    def start(*args, **kwargs) -> Flight:
+        flights.append(Flight(*args, **kwargs))
+        return flights[-1]
+
+    yield start
+    for f in flights:
+        f.engine.stop()
+
+
+def threads() -> set[str]:
+    """The engine's that run; others may be an earlier test's."""
+    return {t.name for t in threading.enumerate()} & {"render", "localize"}
+
+
+def test_reaches_tracking_from_a_prior_and_stops_cleanly(flight):
+    f = flight(_localizer())
+    f.feed_until(lambda: f.estimates and f.estimates[-1].state is TrackingState.TRACKING)
+    estimate = f.estimates[-1]
+    assert estimate.accepted
+    assert set(estimate.stage_ms) == {"reference", "extract", "register", "latency"}
+    assert threads() == {"render", "localize"}
+    f.engine.stop()
+    assert not threads()
+
+
+def test_the_map_is_loaded_along_the_way_ahead(flight):
+    renderer = FakeRenderer()
+    localizer = _localizer(renderer)
+    way = np.array([20.0, 0.0, 0.0])  # m/s
+    localizer.predict = lambda t: PosePrior(Pose(NADIR.rotation, way * t * 1e-9), np.eye(6), t)
+    localizer.prefetch(500_000_000)
+    _, views = renderer.ahead.pop()
+    assert [v.translation[0] for v in views] == pytest.approx([30.0, 70.0])
+    f = flight(_localizer(renderer))
+    f.feed_until(lambda: len(f.estimates) >= 5 and len(renderer.ahead) >= 4)
+    assert {thread for thread, _ in renderer.ahead} == {"render"}
+
+
+def test_loading_ahead_that_fails_costs_no_reference(flight):
+    renderer = FakeRenderer()
+    renderer.error = MapCacheError("the disk is gone")
+    f = flight(_localizer(renderer))
+    f.feed_until(lambda: f.engine.health.accepted >= 3 and f.engine.health.errors > 0)
+    health = f.engine.health
+    assert (health.renderer, health.features, health.optimizer) == ("fake", "fake", "fake")
+
+
+def test_without_a_prior_nothing_is_estimated(flight):
+    f = flight(_localizer(), provider=lambda _: None)
+    with pytest.raises(AssertionError):
+        f.feed_until(lambda: bool(f.estimates), timeout_s=1.0)
+    assert f.engine.health.errors == 0
+
+
+def test_an_error_on_a_thread_is_reported_and_survived(flight):
+    optimizer = FakeOptimizer()
+    f = flight(_localizer(optimizer=optimizer))
+    f.feed_until(lambda: bool(f.estimates))
+    optimizer.error = RuntimeError("boom")
+    f.feed_until(lambda: "boom" in f.engine.health.last_error)
+    optimizer.error = None
+    count = len(f.estimates)
+    f.feed_until(lambda: len(f.estimates) > count + 2)
+    assert f.engine.health.last_error == ""
+    assert f.engine.health.errors > 0
+
+
+def test_leaving_the_map_is_named_and_survived(flight):
+    renderer = FakeRenderer()
+    renderer.depth = 0.0
+    f = flight(_localizer(renderer=renderer))
+    f.feed_until(lambda: "does not meet the map" in f.engine.health.last_error)
+    renderer.depth = 100.0
+    f.feed_until(lambda: bool(f.estimates))
+
+
+def test_a_lost_tracker_asks_outside_and_comes_back(flight):
+    optimizer, asked = FakeOptimizer(), []
+    f = flight(_localizer(optimizer=optimizer), lambda t: asked.append(t) or _prior(t))
+    f.feed_until(lambda: f.estimates and f.estimates[-1].state is TrackingState.TRACKING)
+    before = len(asked)
+    optimizer.status = RegistrationStatus.NO_OVERLAP
+    # A single estimate says LOST: the next frame begins anew from the pose asked for.
+    f.feed_until(lambda: any(e.state is TrackingState.LOST for e in f.estimates))
+    assert not next(e for e in f.estimates if e.state is TrackingState.LOST).accepted
+    f.feed_until(lambda: len(asked) > before)
+    optimizer.status = RegistrationStatus.OK
+    f.feed_until(lambda: f.estimates[-1].state is TrackingState.TRACKING)
+
+
+def test_a_jump_against_the_prediction_is_not_accepted():
+    optimizer = FakeOptimizer()
+    localizer = _localizer(optimizer=optimizer)
+    localizer.set_prior(_prior(10**9))
+    anchors = localizer.make_reference(_prior(10**9)).anchors
+    for k in range(1, 6):
+        frame = _frame(k)
+        assert localizer.localize(frame, localizer.extract_query(frame), anchors).accepted
+    optimizer.offset = np.array([40.0, 0.0, 0.0])
+    frame = _frame(6)
+    assert not localizer.localize(frame, localizer.extract_query(frame), anchors).accepted
+
+
+def test_localizing_before_a_prior_is_an_error():
+    localizer = _localizer()
+    with pytest.raises(OutsideMapError, match="no pose prior"):
+        localizer.localize(_frame(0), FakeExtractor().extract(np.zeros((240, 320, 3))), None)
+
+
+def test_a_frame_of_another_size_is_named():
+    undistort = Undistorter(CAMERA, working_camera(CAMERA, 320))
+    bad = Frame(np.zeros((100, 100, 3), np.uint8), 0, CAMERA, 7)
+    with pytest.raises(CameraError, match="frame 7 is 100x100"):
+        undistort(bad)
+
+
+def test_a_stream_that_changes_its_size_is_undistorted_with_its_own_camera():
+    """The same lens at half the size gives the same working image, but for sampling."""
+    camera = Camera(640, 480, 500.0, 500.0, 320.0, 240.0, (-0.12, 0.03, 0.001, -0.0005, 0.0))
+    seen = []
+    extractor = SimpleNamespace(extract=seen.append)
+    localizer = Localizer(FakeRenderer(), extractor, FakeOptimizer(), camera, LocalizerConfig())
+    ramp = np.broadcast_to(np.linspace(0, 255, 640).astype(np.uint8)[None, :, None], (480, 640, 3))
+    half = cv2.resize(np.ascontiguousarray(ramp), (320, 240), interpolation=cv2.INTER_AREA)
+    for image, its in ((ramp, camera), (half, camera.resized(320, 240)), (ramp, camera)):
+        localizer.extract_query(Frame(np.ascontiguousarray(image), 0, its, 0))
+    assert [image.shape for image in seen] == [(240, 320, 3)] * 3
+    inner = np.s_[20:-20, 20:-20]  # both are black outside the lens's picture
+    np.testing.assert_allclose(seen[1][inner].astype(float), seen[0][inner], atol=2.5)
+    np.testing.assert_array_equal(seen[2], seen[0])
+
+
+def test_features_of_a_reference_do_not_see_the_maps_holes():
+    class Holed(FakeRenderer):
+        def render(self, world_from_camera, camera, *, wait=False):
+            view = super().render(world_from_camera, camera, wait=wait)
+            depth = view.depth.copy()
+            depth[50:90, 100:140] = 0
+            rgb = np.where(depth[..., None] > 0, 70, SKY).astype(np.uint8)
+            return replace(view, rgb=rgb, depth=depth)
+
+    seen = []
+
+    class Watching(FakeExtractor):
+        def extract(self, rgb):
+            seen.append(rgb)
+            return super().extract(rgb)
+
+    localizer = Localizer(Holed(), Watching(), FakeOptimizer(), CAMERA, LocalizerConfig())
+    anchors = localizer.make_reference(_prior(10**9)).anchors
+    assert (seen[0] == 70).all()
+    assert len(anchors.points_world) > 0
+
+
+@pytest.mark.parametrize("size", [(640, 480), (1920, 1080), (1024, 768)])
+def test_undistorted_image_agrees_with_the_projection(size):
+    """A dot drawn where the distorted camera sees a point is found where the pinhole sees it."""
+    camera = Camera(size[0], size[1], 0.8 * size[0], 0.8 * size[0], 0.51 * size[0], 0.49 * size[1],
+                    (-0.12, 0.03, 0.001, -0.0005, 0.0))  # fmt: skip
+    target = working_camera(camera, 320)
+    assert target.width % 8 == 0
+    assert target.height % 8 == 0
+    point = np.array([0.3, -0.2, 1.0])
+    source_pixel, _ = camera.project(point)
+    u, v = np.mgrid[0 : size[0], 0 : size[1]] + 0.5
+    sigma = 0.01 * size[0]
+    dot = np.exp(-((u - source_pixel[0]) ** 2 + (v - source_pixel[1]) ** 2) / (2 * sigma**2)).T
+    image = np.repeat((dot * 255).astype(np.uint8)[..., None], 3, axis=2)
+    seen = Undistorter(camera, target)(Frame(image, 0, camera, 0))[..., 0].astype(float)
+    rows, columns = np.indices(seen.shape) + 0.5
+    centroid = np.array([(columns * seen).sum(), (rows * seen).sum()]) / seen.sum()
+    expected, _ = target.project(point)
+    np.testing.assert_allclose(centroid, expected, atol=0.15)
+
+
+class NearOptimizer(FakeOptimizer):
+    """Finds a camera that flies at 10 m/s, if the prior is within 12 m of it."""
+
+    true_ns = 0
+
+    def register(self, query, camera, anchors, prior, *, motion=None, constraint=None, seed=0):
+        self.offset = np.array([10.0, 0.0, 0.0]) * (self.true_ns - 10**13) * 1e-9
+        away = prior.world_from_camera.translation - NADIR.translation - self.offset
+        far = np.linalg.norm(away) > 12.0
+        self.status = RegistrationStatus.NO_OVERLAP if far else RegistrationStatus.OK
+        return super().register(query, camera, anchors, prior)
+
+
+@pytest.mark.parametrize("jump_s", [4e9, 3 * 3600.0, -3 * 3600.0, 20.0, 1.0, -1.0, -0.15])
+@pytest.mark.parametrize("frames", [1, 3, 100])
+def test_frames_of_a_wrong_time_are_got_over(jump_s, frames):
+    """Camera times that run back or leap ahead, for some frames or for good; no help outside."""
+    optimizer = NearOptimizer()
+    localizer = _localizer(optimizer=optimizer)
+    start, step_ns = 10**13, 10**8
+    localizer.set_prior(PosePrior(NADIR, np.eye(6), start, np.array([10.0, 0.0, 0.0])))
+    anchors = localizer.make_reference(_prior(start)).anchors
+    estimates = {}
+    for k in range(1, 40):
+        optimizer.true_ns = start + k * step_ns
+        wrong = 10 <= k < 10 + frames
+        told = optimizer.true_ns + (round(jump_s * 1e9) if wrong else 0)
+        frame = Frame(np.zeros((480, 640, 3), np.uint8), told, CAMERA, k)
+        estimates[k] = localizer.localize(frame, localizer.extract_query(frame), anchors)
+        assert estimates[k].exposure_time_ns == told
+    assert all(estimates[k].accepted for k in range(1, 10))
+    assert all(estimates[k].accepted for k in range(30, 40))
+    assert estimates[39].state is TrackingState.TRACKING
+    state = localizer.tracker.motion
+    assert state.velocity[0] == pytest.approx(10.0, abs=1.0)
+    assert np.sqrt(state.covariance[0, 0]) < 0.2

@@ -1,0 +1,125 @@
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from localizer.geometry.pose import Pose, so3_exp
+from localizer.tracking import motion
+from localizer.tracking.motion import MotionConfig
+from localizer.types import PosePrior
+
+CONFIG = MotionConfig()
+SECOND = 1_000_000_000
+
+
+def _prior(sigma: float = 1.0) -> PosePrior:
+    return PosePrior(Pose.identity(), np.eye(6) * sigma**2, 0)
+
+
+def test_filter_learns_a_constant_velocity_and_turn_rate():
+    velocity, rate = np.array([8.0, -3.0, 1.0]), np.array([0.0, 0.1, 0.3])
+    state = motion.start(_prior(), CONFIG)
+    for k in range(1, 31):
+        t = 0.1 * k
+        pose = Pose(so3_exp(rate * t), velocity * t)
+        ahead = motion.predict(state, round(t * SECOND), CONFIG)
+        state = motion.update(ahead, pose, np.eye(6) * 1e-4)
+    ahead = motion.predict(state, round(3.5 * SECOND), CONFIG)
+    truth = Pose(so3_exp(rate * 3.5), velocity * 3.5)
+    translation, rotation = truth.distance_to(ahead.prior.world_from_camera)
+    assert translation < 0.05
+    assert rotation < 0.1
+    np.testing.assert_allclose(state.velocity, velocity, atol=0.05)
+
+
+def test_prediction_grows_the_covariance_and_leaves_the_state_alone():
+    state = motion.start(_prior(), CONFIG)
+    before = state.covariance.copy()
+    ahead = motion.predict(state, SECOND, CONFIG)
+    assert np.trace(ahead.covariance) > np.trace(before)
+    np.testing.assert_array_equal(state.covariance, before)
+    assert np.linalg.eigvalsh(ahead.covariance).min() > 0
+
+
+def test_filtered_errors_match_the_filters_own_covariance():
+    """NEES over many runs: the mean of chi² with 6 degrees of freedom is 6."""
+    rng = np.random.default_rng(1)
+    nees = []
+    for _ in range(60):
+        velocity = rng.normal(0, 5, 3)
+        state = motion.start(_prior(3.0), CONFIG)
+        truth = Pose.identity()
+        for k in range(1, 40):
+            dt = 0.1
+            velocity = velocity + rng.normal(0, CONFIG.acceleration_sigma, 3) * dt
+            truth = Pose(truth.rotation, truth.translation + velocity * dt)
+            noise = rng.normal(0, [0.3] * 3 + [0.005] * 3)
+            seen = Pose(so3_exp(noise[3:]) @ truth.rotation, truth.translation + noise[:3])
+            R = np.diag([0.09] * 3 + [0.005**2] * 3)
+            ahead = motion.predict(state, round(k * dt * SECOND), CONFIG)
+            state = motion.update(ahead, seen, R)
+        nees.append(motion.mahalanobis_squared(state.prior, truth))
+    # The rotation never accelerates here, so its part is conservative.
+    assert 2.0 < np.mean(nees) < 8.0
+
+
+def test_mahalanobis_counts_sigmas():
+    moved = Pose(np.eye(3), np.array([3.0, 0.0, 0.0]))
+    assert motion.mahalanobis_squared(_prior(), moved) == pytest.approx(9.0)
+
+
+def test_inflation_doubles_sigma_up_to_its_limits():
+    state = motion.predict(motion.start(_prior(0.1), CONFIG), SECOND, CONFIG)
+    wider = motion.inflated(state, CONFIG)
+    ratio = np.sqrt(wider.covariance.diagonal() / state.covariance.diagonal())
+    assert (ratio[:3] > 1.0).all()
+    assert (ratio <= 2.0 + 1e-9).all()
+    for _ in range(20):
+        wider = motion.inflated(wider, CONFIG)
+    assert np.sqrt(wider.covariance.diagonal()[:3]).max() <= 10.0 + 1e-6
+    assert np.linalg.eigvalsh(wider.covariance).min() >= 0
+
+
+def test_a_measured_turn_replaces_the_constant_rate():
+    state = motion.start(_prior(0.01), CONFIG)
+    turn = so3_exp([0.0, 0.0, 0.5])
+    ahead = motion.predict(state, SECOND, CONFIG, turn)
+    np.testing.assert_allclose(ahead.rotation, turn, atol=1e-12)
+    blind = motion.predict(state, SECOND, CONFIG)
+    assert ahead.covariance[5, 5] < 0.01 * blind.covariance[5, 5]
+    # and what follows without a measurement goes on turning at that rate
+    later = motion.predict(ahead, 2 * SECOND, CONFIG)
+    np.testing.assert_allclose(later.rotation, so3_exp([0.0, 0.0, 1.0]), atol=1e-9)
+
+
+def test_the_priors_velocity_starts_the_filter():
+    """A prior that knows its velocity is moved by it, with less doubt than one that does not."""
+    moving = replace(_prior(), velocity=np.array([12.0, 0.0, 0.0]))
+    ahead = motion.predict(motion.start(moving, CONFIG), SECOND, CONFIG)
+    still = motion.predict(motion.start(_prior(), CONFIG), SECOND, CONFIG)
+    np.testing.assert_allclose(ahead.mean[:3] - still.mean[:3], [12.0, 0.0, 0.0], atol=1e-9)
+    assert ahead.covariance[0, 0] < 0.25 * still.covariance[0, 0]
+
+
+@pytest.mark.parametrize("end", ["minimum", "maximum"])
+@pytest.mark.parametrize("name", [*MotionConfig.model_fields, None])
+def test_settings_at_their_limits_keep_a_covariance_that_is_one(name, end):
+    """The limits are what the arithmetic bears, each alone and all at once."""
+    limits = {k: p[end] for k, p in MotionConfig.model_json_schema()["properties"].items()}
+    config = MotionConfig(**(limits if name is None else {name: limits[name]}))
+    state = motion.start(_prior(), config)
+    turn = so3_exp(np.array([0.0, 0.0, 0.01]))
+    for k in range(1, 60):
+        # Turns come and go, the localizer is silent at times, and some poses are refused.
+        gap = 9 * SECOND if k % 20 == 0 else SECOND // 10
+        measured = turn if k % 3 else None
+        state = motion.predict(state, state.time_ns + gap, config, measured)
+        if k % 7:
+            assert np.isfinite(motion.mahalanobis_squared(state.prior, Pose.identity()))
+            state = motion.update(state, Pose.identity(), np.eye(6) * 1e-4)
+        else:
+            state = motion.inflated(state, config)
+        scale = np.sqrt(state.covariance.diagonal())
+        assert np.isfinite(scale).all()
+        correlation = state.covariance / np.outer(scale, scale)
+        assert np.linalg.eigvalsh(correlation)[0] > -1e-9
