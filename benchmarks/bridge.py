@@ -31,7 +31,7 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from mavlink_bridge import Bridge, BridgeConfig, VisionFix
 from mavlink_bridge.config import InjectionConfig, OriginConfig
-from mavlink_bridge.framing import FrameReader
+from mavlink_bridge.link.framing import FrameReader
 
 HOME = (47.397742, 8.545594)
 FIX_HZ = 20.0

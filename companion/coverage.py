@@ -11,8 +11,8 @@ from localizer.geometry.geo import LocalFrame
 from localizer.geometry.pose import Array
 from localizer.map.cache.cache import TileCache
 from mavlink_bridge.config import OriginConfig
-from mavlink_bridge.doctor import Finding
-from mavlink_bridge.mission import Waypoint
+from mavlink_bridge.preflight.doctor import Finding
+from mavlink_bridge.preflight.mission import Waypoint
 
 _STEP_M = 25.0
 _NAME = "mission"

@@ -15,9 +15,9 @@ from localizer.errors import LocalizerError
 from localizer.features.extractor import load_extractor
 from localizer.geometry.geo import LocalFrame
 from localizer.map.cache.cache import TileCache
-from mavlink_bridge.doctor import Diagnosis, Finding, examine
 from mavlink_bridge.errors import BridgeError
-from mavlink_bridge.mission import download_mission
+from mavlink_bridge.preflight.doctor import Diagnosis, Finding, examine
+from mavlink_bridge.preflight.mission import download_mission
 
 _FEED_S = 8.0
 _MIN_RATE_HZ = 5.0

@@ -13,7 +13,7 @@ from rich.table import Table
 from rich.text import Text
 
 from companion.config import load_config
-from mavlink_bridge.doctor import Diagnosis, Finding
+from mavlink_bridge.preflight.doctor import Diagnosis, Finding
 
 
 def doctor_command(
@@ -26,7 +26,7 @@ def doctor_command(
 ) -> None:
     """Check a deployment; exit code 0 good, 1 advice, 2 not fit to fly."""
     from companion.doctor import examine_deployment
-    from mavlink_bridge.doctor import repair
+    from mavlink_bridge.preflight.doctor import repair
 
     settings = load_config(config)
     console = Console()

@@ -23,7 +23,7 @@ from companion.versions import versions
 from localizer.geometry.geo import LocalFrame
 from localizer.geometry.pose import quaternion_from_matrix
 from localizer.types import Frame, PoseEstimate, TargetFix
-from mavlink_bridge.recorder import is_disk_fault
+from mavlink_bridge.link.tlog import is_disk_fault
 
 _log = logging.getLogger(__name__)
 _QUEUE_SIZE = 4096

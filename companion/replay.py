@@ -31,7 +31,7 @@ from localizer.geometry.pose import Array, Pose, matrix_from_quaternion
 from localizer.tracking.pipeline import Localizer
 from localizer.types import Frame, PoseEstimate
 from mavlink_bridge import quaternion as quat
-from mavlink_bridge.vehicle import VehicleTracker
+from mavlink_bridge.vehicle.tracker import VehicleTracker
 
 _log = logging.getLogger(__name__)
 _MIN_IMAGES = 0.9  # share of the localized frames

@@ -12,13 +12,19 @@ from typing import Any
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from mavlink_bridge import quaternion as quat
-from mavlink_bridge.clock import SteadyUtc, monotonic_ns
-from mavlink_bridge.closed_loop import LoopVerdict
+from mavlink_bridge.camera.messages import cursor_on_target
 from mavlink_bridge.config import BridgeConfig, SigningConfig
 from mavlink_bridge.errors import BridgeStateError
-from mavlink_bridge.fc_side import FC_WANTED, FlightControllerSide, message_id
-from mavlink_bridge.gate import InjectionGate
-from mavlink_bridge.link import Link, LinkHandler
+from mavlink_bridge.flight_controller import FC_WANTED, FlightControllerSide, message_id
+from mavlink_bridge.injection.closed_loop import LoopVerdict
+from mavlink_bridge.injection.rc_gate import InjectionGate
+from mavlink_bridge.injection.shadow import ShadowScore
+from mavlink_bridge.link.clock import SteadyUtc, monotonic_ns
+from mavlink_bridge.link.link import Link, LinkHandler
+from mavlink_bridge.link.signing import load_key
+from mavlink_bridge.link.tlog import TlogRecorder
+from mavlink_bridge.link.transport import Endpoint, UdpTransport
+from mavlink_bridge.link_end import COMMANDS_IN, GroundSide, Shared, Side
 from mavlink_bridge.messages import (
     Attitude,
     CameraView,
@@ -30,14 +36,8 @@ from mavlink_bridge.messages import (
     VisionFix,
     without_figures,
 )
-from mavlink_bridge.recorder import TlogRecorder
-from mavlink_bridge.shadow import ShadowScore
-from mavlink_bridge.side import COMMANDS_IN, GroundSide, Shared, Side
-from mavlink_bridge.signing import load_key
-from mavlink_bridge.targets_out import cursor_on_target
-from mavlink_bridge.transport import Endpoint, UdpTransport
-from mavlink_bridge.vehicle import VehicleTracker
-from mavlink_bridge.watch import VehicleWatch
+from mavlink_bridge.vehicle.presence import VehicleWatch
+from mavlink_bridge.vehicle.tracker import VehicleTracker
 
 log = logging.getLogger(__name__)
 

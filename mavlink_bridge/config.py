@@ -234,7 +234,7 @@ class BridgeConfig(_Model):
 
 def _check_endpoint(text: str, hint: str = "") -> None:
     from mavlink_bridge.errors import EndpointError
-    from mavlink_bridge.transport import Endpoint
+    from mavlink_bridge.link.transport import Endpoint
 
     try:
         Endpoint.parse(text)

@@ -10,7 +10,7 @@ from pathlib import Path
 import yaml
 
 from mavlink_bridge import BridgeConfig
-from mavlink_bridge.doctor import examine
+from mavlink_bridge.preflight.doctor import examine
 from sitl.errors import SimulationError
 from sitl.suite.record import Doctor
 

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from mavlink_bridge import Bridge, BridgeConfig
-from mavlink_bridge.link import sleep_until
+from mavlink_bridge.link.link import sleep_until
 from sitl.embedded.geodesy import Location
 from sitl.errors import PilotError
 from sitl.feed import BridgeFeed, FixModel, TruthFeed

@@ -17,7 +17,7 @@ from companion.app import Companion
 from companion.config import parse_config
 from companion.errors import ConfigError, StreamOpenError
 from mavlink_bridge.bridge import Bridge
-from mavlink_bridge.link import sleep_until
+from mavlink_bridge.link.link import sleep_until
 from mavlink_bridge.messages import TrackRequest, without_figures
 from sitl.embedded.geodesy import Location
 from sitl.vehicles import GIMBAL, EmbeddedSitl, vision_parameters

@@ -11,7 +11,7 @@ import yaml
 from typer.testing import CliRunner
 
 from companion.cli import app
-from mavlink_bridge.link import sleep_until
+from mavlink_bridge.link.link import sleep_until
 
 MODEL = {"width": 640, "height": 480, "fx": 550, "fy": 550, "cx": 320, "cy": 240}
 START_S = 400.0  # of a process, on a busy machine that compiles everything anew

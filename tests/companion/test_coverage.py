@@ -8,7 +8,7 @@ from companion.config import parse_config
 from companion.coverage import check_mission, covered
 from companion.doctor import examine_deployment
 from localizer.map.cache.cache import TileCache
-from mavlink_bridge.mission import Waypoint
+from mavlink_bridge.preflight.mission import Waypoint
 from sitl.embedded.geodesy import Location
 from sitl.mission_steps import takeoff_step, waypoint_step
 from sitl.pilot import Pilot
@@ -77,7 +77,7 @@ def test_no_mission_and_a_long_list(cache):
 def test_doctor_against_the_embedded_vehicle(cache, small_assets, tmp_path, monkeypatch):
     # What a busy machine does to the line between two processes is not the subject here.
     for name, loose in (("_ROUND_TRIP_LIMIT_MS", 1e4), ("_RATE_SHARE", 0.02), ("_LOST_SHARE", 0.9)):
-        monkeypatch.setattr(f"mavlink_bridge.doctor.{name}", loose)
+        monkeypatch.setattr(f"mavlink_bridge.preflight.doctor.{name}", loose)
     for i in range(12):
         cv2.imwrite(str(tmp_path / f"{i}.png"), np.full((120, 160, 3), 10 * i, np.uint8))
     home = _at(cache, 0, 0)

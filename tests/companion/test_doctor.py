@@ -10,7 +10,7 @@ from rich.console import Console
 from companion.config import parse_config
 from companion.doctor import examine_deployment
 from companion.doctor_cli import print_diagnosis
-from mavlink_bridge.doctor import Diagnosis, Finding
+from mavlink_bridge.preflight.doctor import Diagnosis, Finding
 
 SIZE = (160, 120)
 MODEL = {"width": 160, "height": 120, "fx": 140, "fy": 140, "cx": 80, "cy": 60}

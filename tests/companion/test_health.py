@@ -11,7 +11,7 @@ from companion.health import HealthMonitor
 from companion.sources import StreamState
 from localizer.tracking.engine import EngineHealth
 from localizer.types import TrackingState
-from mavlink_bridge.link import sleep_until
+from mavlink_bridge.link.link import sleep_until
 from mavlink_bridge.messages import HealthLevel
 
 

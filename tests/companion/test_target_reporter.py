@@ -10,7 +10,7 @@ from localizer.geometry.camera import Camera
 from localizer.geometry.pose import Pose
 from localizer.map.cache.pick import BundleHits
 from localizer.types import PoseEstimate, RegistrationStatus, TrackingState
-from mavlink_bridge.link import sleep_until
+from mavlink_bridge.link.link import sleep_until
 
 CAMERA = Camera.from_fov(640, 480, 60)
 NADIR = Pose(np.diag([1.0, -1.0, -1.0]), np.array([0.0, 0.0, 100.0]))

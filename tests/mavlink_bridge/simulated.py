@@ -13,14 +13,14 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from mavlink_bridge import BridgeConfig, HealthLevel, VisionFix
 from mavlink_bridge import quaternion as quat
-from mavlink_bridge.clock import SteadyUtc
 from mavlink_bridge.config import InjectionConfig, OriginConfig
-from mavlink_bridge.fc_side import FC_WANTED, FlightControllerSide
-from mavlink_bridge.framing import FrameReader
-from mavlink_bridge.side import Shared
-from mavlink_bridge.transport import Endpoint
-from mavlink_bridge.vehicle import VehicleTracker
-from mavlink_bridge.watch import VehicleWatch
+from mavlink_bridge.flight_controller import FC_WANTED, FlightControllerSide
+from mavlink_bridge.link.clock import SteadyUtc
+from mavlink_bridge.link.framing import FrameReader
+from mavlink_bridge.link.transport import Endpoint
+from mavlink_bridge.link_end import Shared
+from mavlink_bridge.vehicle.presence import VehicleWatch
+from mavlink_bridge.vehicle.tracker import VehicleTracker
 
 MS = 1_000_000
 SECOND = 1_000 * MS
@@ -65,7 +65,7 @@ class Flight:
         options.setdefault("origin", ORIGIN)
         config = BridgeConfig(mode="inject", **options)
         self.now_ns = 1_000 * SECOND
-        for module in ("fc_side", "watch", "clock"):
+        for module in ("flight_controller", "vehicle.presence", "link.clock"):
             monkeypatch.setattr(f"mavlink_bridge.{module}.monotonic_ns", lambda: self.now_ns)
         self.texts: list[str] = []
 

@@ -19,8 +19,8 @@ from mavlink_bridge import Bridge, BridgeConfig, HealthLevel, TargetReport, Trac
 from mavlink_bridge.bridge import status_texts
 from mavlink_bridge.config import InjectionConfig, OriginConfig, SigningConfig, TargetsConfig
 from mavlink_bridge.errors import BridgeStateError, FixError
-from mavlink_bridge.link import sleep_until
-from mavlink_bridge.signing import create_key
+from mavlink_bridge.link.link import sleep_until
+from mavlink_bridge.link.signing import create_key
 
 HOME = (47.397742, 8.545594)
 GEOID = 47.0

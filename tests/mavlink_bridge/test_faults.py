@@ -16,11 +16,11 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from mavlink_bridge import TargetReport, VisionFix
 from mavlink_bridge.config import InjectionConfig, RcGateConfig, SourceSwitchConfig
-from mavlink_bridge.fc_side import FC_WANTED
-from mavlink_bridge.framing import FrameReader
-from mavlink_bridge.gate import InjectionGate
-from mavlink_bridge.inject import FixQueue
-from mavlink_bridge.side import GroundSide
+from mavlink_bridge.flight_controller import FC_WANTED
+from mavlink_bridge.injection.injector import FixQueue
+from mavlink_bridge.injection.rc_gate import InjectionGate
+from mavlink_bridge.link.framing import FrameReader
+from mavlink_bridge.link_end import GroundSide
 from tests.mavlink_bridge.simulated import HOME, MS, SECOND, Flight, SimulatedLink
 
 

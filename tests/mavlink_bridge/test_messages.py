@@ -9,10 +9,10 @@ from typing import Any
 import numpy as np
 import pytest
 
+from mavlink_bridge.camera.messages import adsb_vehicle, camera_fov_status, tracking_geo_status
 from mavlink_bridge.config import CameraConfig
 from mavlink_bridge.errors import FixError
 from mavlink_bridge.messages import CameraView, TargetReport, VisionFix
-from mavlink_bridge.targets_out import adsb_vehicle, camera_fov_status, tracking_geo_status
 
 PLACE = (10**9, 47.0, 8.0, 500.0)
 LEVEL = (1.0, 0.0, 0.0, 0.0)

@@ -15,14 +15,14 @@ import pytest
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from mavlink_bridge import BridgeConfig, VisionFix
-from mavlink_bridge.clock import SteadyUtc
 from mavlink_bridge.config import InjectionConfig
-from mavlink_bridge.doctor import check_parameters
-from mavlink_bridge.inject import InjectionContext, Injector
+from mavlink_bridge.injection.injector import InjectionContext, Injector
+from mavlink_bridge.link.clock import SteadyUtc
 from mavlink_bridge.messages import Attitude, Origin
-from mavlink_bridge.parameter_rules import px4_rules
-from mavlink_bridge.profile import PX4, select_profile
+from mavlink_bridge.preflight.doctor import check_parameters
+from mavlink_bridge.preflight.rules import px4_rules
 from mavlink_bridge.quaternion import from_euler
+from mavlink_bridge.vehicle.profile import PX4, select_profile
 
 MS = 1_000_000
 SECOND = 1_000 * MS

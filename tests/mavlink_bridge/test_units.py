@@ -10,25 +10,25 @@ import pytest
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from mavlink_bridge import quaternion as quat
-from mavlink_bridge.config import CameraConfig, InjectionConfig, OriginConfig
-from mavlink_bridge.injection_messages import (
-    Estimate,
-    global_position_sensor,
-    gps_input,
-    odometry,
-    vision_position_estimate,
-)
-from mavlink_bridge.messages import CameraView, Origin, TargetReport
-from mavlink_bridge.origin import OriginKeeper
-from mavlink_bridge.propagate import PropagatedFix
-from mavlink_bridge.targets_out import (
+from mavlink_bridge.camera.messages import (
     adsb_vehicle,
     camera_fov_status,
     camera_information,
     tracking_geo_status,
     video_stream_information,
 )
-from mavlink_bridge.vehicle import VehicleTracker
+from mavlink_bridge.config import CameraConfig, InjectionConfig, OriginConfig
+from mavlink_bridge.injection.encode import (
+    Estimate,
+    global_position_sensor,
+    gps_input,
+    odometry,
+    vision_position_estimate,
+)
+from mavlink_bridge.injection.propagate import PropagatedFix
+from mavlink_bridge.messages import CameraView, Origin, TargetReport
+from mavlink_bridge.vehicle.origin import OriginKeeper
+from mavlink_bridge.vehicle.tracker import VehicleTracker
 
 # How many of a unit make one degree, metre, m/s, radian or second.
 PER = {

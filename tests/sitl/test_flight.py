@@ -7,7 +7,7 @@ from typing import get_args
 import pytest
 
 from companion.config import load_config
-from mavlink_bridge.parameter_rules import ardupilot_rules, find_source_set
+from mavlink_bridge.preflight.rules import ardupilot_rules, find_source_set
 from sitl import flight
 from sitl.companion_process import Ports, write_deployment
 from sitl.flight import fly

@@ -16,7 +16,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from mavlink_bridge.link import sleep_until
+from mavlink_bridge.link.link import sleep_until
 from sitl import ardupilot, process
 from sitl.ardupilot import ArduPilotNotFoundError, ArduPilotSitl, find_arducopter
 from sitl.embedded.geodesy import Location

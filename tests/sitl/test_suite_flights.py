@@ -19,7 +19,7 @@ from typing import Any
 
 import pytest
 
-from mavlink_bridge.link import sleep_until
+from mavlink_bridge.link.link import sleep_until
 from sitl.ardupilot import find_arducopter
 from sitl.process import VehicleKind
 from sitl.suite import runner

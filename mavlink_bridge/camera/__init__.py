@@ -1,0 +1,1 @@
+"""The camera component: MAVLink camera protocol, targets, Cursor-on-Target."""

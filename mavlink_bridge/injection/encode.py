@@ -1,0 +1,171 @@
+"""The four messages that carry a position to a flight controller, from an estimate."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from pymavlink.dialects.v20 import ardupilotmega as mavlink
+
+from mavlink_bridge import quaternion as quat
+from mavlink_bridge.config import InjectionConfig
+from mavlink_bridge.injection.propagate import PropagatedFix
+from mavlink_bridge.vehicle.profile import CovarianceFormula, covariance_entry
+
+NAN = math.nan
+# Index of the diagonal (x, y, z, roll, pitch, yaw) in MAVLink's row-major upper triangle of 6x6.
+DIAGONAL = (0, 6, 11, 15, 18, 20)
+_IGNORE_VELOCITY = (
+    mavlink.GPS_INPUT_IGNORE_FLAG_VEL_HORIZ
+    | mavlink.GPS_INPUT_IGNORE_FLAG_VEL_VERT
+    | mavlink.GPS_INPUT_IGNORE_FLAG_SPEED_ACCURACY
+)
+GLOBAL_SENSOR_ID = 1  # EKF2_AGP0_ID; 0 may stand for "no sensor"
+_CLAIMED_SATELLITES = 12  # ArduPilot refuses to arm below 6, or with hdop ignored
+_CLAIMED_HDOP = 0.8
+_CLAIMED_VDOP = 1.0
+
+
+@dataclass(frozen=True)
+class Estimate:
+    """What is about to be sent. position: as propagated; attitude: (roll, pitch, yaw), NaN unknown.
+
+    fresh: a fix as it came, not propagated. quality: 0..100. repeated: the fix was sent before, at
+    another time: its velocity is no new measurement.
+    """
+
+    position: PropagatedFix
+    attitude: tuple[float, float, float]
+    attitude_sigma_rad: float
+    quality: int
+    reset_counter: int
+    fresh: bool
+    repeated: bool = False
+
+
+def pose_covariance(
+    P: np.ndarray, attitude_sigma_rad: float, formula: CovarianceFormula
+) -> list[float]:
+    """The 21 entries of VISION_POSITION_ESTIMATE and ODOMETRY for an NED covariance P (3, 3).
+
+    ArduPilot reads one error from the three position entries, so all three carry the worst
+    horizontal sigma; PX4 reads variances.
+    """
+    entries = [0.0] * 21
+    if formula == "variance":
+        entries[0], entries[6], entries[11] = (float(P[i, i]) for i in range(3))
+        entries[1], entries[2], entries[7] = float(P[0, 1]), float(P[0, 2]), float(P[1, 2])
+    else:
+        error = math.sqrt(float(np.linalg.eigvalsh(P[:2, :2])[-1]))
+        for i in DIAGONAL[:3]:
+            entries[i] = covariance_entry(error, formula)
+    for i in DIAGONAL[3:]:
+        entries[i] = covariance_entry(attitude_sigma_rad, formula)
+    return entries
+
+
+def vision_position_estimate(
+    e: Estimate, ned: tuple[float, float, float], formula: CovarianceFormula
+) -> Any:
+    """VISION_POSITION_ESTIMATE (102): NED metres from the EKF origin, yaw from true north."""
+    covariance = pose_covariance(e.position.covariance_ned, e.attitude_sigma_rad, formula)
+    return mavlink.MAVLink_vision_position_estimate_message(
+        e.position.time_ns // 1000, *ned, *e.attitude, covariance, e.reset_counter
+    )
+
+
+def odometry(
+    e: Estimate,
+    ned: tuple[float, float, float],
+    formula: CovarianceFormula,
+    frame: int,
+) -> Any:
+    """ODOMETRY (331): position NED, velocity in the body frame by the message's own quaternion.
+
+    A repeated velocity is NaN, "unknown": the EKF would take its error for an independent one.
+    """
+    q = quat.from_euler(*e.attitude)
+    vn, ve, vd = (float(v) for v in e.position.velocity_ned)
+    body = quat.rotate(quat.conjugate(q), (vn, ve, vd))
+    covariance = pose_covariance(e.position.covariance_ned, e.attitude_sigma_rad, formula)
+    Rbn = np.array([quat.rotate(quat.conjugate(q), tuple(row)) for row in np.eye(3)]).T
+    Pv = Rbn @ e.position.velocity_covariance_ned @ Rbn.T
+    velocity_covariance = [NAN] * 21
+    for k, i in enumerate(DIAGONAL[:3]):
+        velocity_covariance[i] = float(Pv[k, k])
+    if e.repeated:
+        body, velocity_covariance = (NAN, NAN, NAN), [NAN] * 21
+    return mavlink.MAVLink_odometry_message(
+        e.position.time_ns // 1000,
+        frame,
+        mavlink.MAV_FRAME_BODY_FRD,
+        *ned,
+        list(q),
+        *body,
+        NAN,
+        NAN,
+        NAN,
+        covariance,
+        velocity_covariance,
+        e.reset_counter,
+        mavlink.MAV_ESTIMATOR_TYPE_VISION,
+        e.quality,
+    )
+
+
+def gps_input(
+    e: Estimate, altitude_amsl_m: float, week_ms: tuple[int, int], config: InjectionConfig
+) -> Any:
+    """GPS_INPUT (232), every field filled: ArduPilot never arms on one with HDOP ignored."""
+    p = e.position
+    yaw = 0  # 0 means none; north is 36000
+    if config.gps_yaw and math.isfinite(e.attitude[2]):
+        yaw = round(math.degrees(e.attitude[2]) % 360.0 * 100.0) or 36000
+    vn, ve, vd = (float(v) for v in p.velocity_ned) if config.gps_velocity else (0.0, 0.0, 0.0)
+    week, ms = week_ms
+    return mavlink.MAVLink_gps_input_message(
+        p.time_ns // 1000,
+        config.gps_id,
+        0 if config.gps_velocity else _IGNORE_VELOCITY,
+        ms,
+        week,
+        mavlink.GPS_FIX_TYPE_3D_FIX,
+        round(p.latitude_deg * 1e7),
+        round(p.longitude_deg * 1e7),
+        altitude_amsl_m,
+        _CLAIMED_HDOP,
+        _CLAIMED_VDOP,
+        vn,
+        ve,
+        vd,
+        p.speed_sigma_mps,
+        p.horizontal_sigma_m,
+        p.vertical_sigma_m,
+        _CLAIMED_SATELLITES,
+        yaw,
+    )
+
+
+def global_position_sensor(e: Estimate, altitude_amsl_m: float, now_ns: int) -> Any:
+    """GLOBAL_POSITION_SENSOR (296): latitude, longitude and both altitudes.
+
+    Unlike the others it is stamped with its transmission, and says how long ago the exposure was.
+    """
+    p = e.position
+    return mavlink.MAVLink_global_position_sensor_message(
+        0,
+        0,
+        GLOBAL_SENSOR_ID,
+        now_ns // 1000,
+        max(0, (now_ns - p.time_ns) // 1000),
+        mavlink.GLOBAL_POSITION_SRC_VISION,
+        0,
+        round(p.latitude_deg * 1e7),
+        round(p.longitude_deg * 1e7),
+        p.height_m,
+        altitude_amsl_m,
+        p.horizontal_sigma_m,
+        p.vertical_sigma_m,
+    )

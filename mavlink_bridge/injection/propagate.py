@@ -1,0 +1,135 @@
+"""Fixes carried forward in time: a constant-velocity Kalman filter over the fixes alone.
+
+The autopilot's own velocity is not used: what is injected must not contain what the injection
+itself produced, or the EKF would be told its own opinion.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from filterpy.kalman import KalmanFilter
+from numpy.typing import NDArray
+
+from mavlink_bridge.messages import VisionFix
+from mavlink_bridge.vehicle.origin import north_east, offset
+
+Array = NDArray[np.float64]
+
+_UNKNOWN_SPEED_MPS = 15.0  # 1 sigma before two fixes were seen
+_FORGET_AFTER_S = 3.0
+
+
+@dataclass(frozen=True)
+class PropagatedFix:
+    """Position at a time. covariance_ned (3, 3) m^2; velocity_ned (3,) m/s or None if unknown."""
+
+    time_ns: int
+    latitude_deg: float
+    longitude_deg: float
+    height_m: float
+    covariance_ned: Array
+    velocity_ned: Array
+    velocity_covariance_ned: Array
+
+    @property
+    def horizontal_sigma_m(self) -> float:
+        """1 sigma along the worst horizontal direction."""
+        return float(np.sqrt(np.linalg.eigvalsh(self.covariance_ned[:2, :2])[-1]))
+
+    @property
+    def vertical_sigma_m(self) -> float:
+        """1 sigma of the height."""
+        return float(np.sqrt(self.covariance_ned[2, 2]))
+
+    @property
+    def speed_sigma_mps(self) -> float:
+        """1 sigma of the speed along the worst direction."""
+        return float(np.sqrt(np.linalg.eigvalsh(self.velocity_covariance_ned)[-1]))
+
+
+class FixPropagator:
+    """Estimates velocity from fixes and carries the newest fix to a wanted time.
+
+    The propagated position starts at the newest fix itself, not at the filter's smoothed state, and
+    its covariance is that fix's plus what the unknown velocity and acceleration add: smoothing here
+    and again in the EKF would claim the same information twice.
+    """
+
+    def __init__(self, acceleration_sigma_mps2: float, sigma_floor_m: float) -> None:
+        self._acceleration = acceleration_sigma_mps2
+        self._floor = np.eye(3) * sigma_floor_m**2
+        self._filter: KalmanFilter | None = None
+        self._anchor = (0.0, 0.0)
+        self._fix: VisionFix | None = None
+
+    @property
+    def fix(self) -> VisionFix | None:
+        """The newest fix."""
+        return self._fix
+
+    def update(self, fix: VisionFix) -> None:
+        """Take in a fix newer than all before."""
+        R = fix.position_covariance_ned + self._floor
+        last, self._fix = self._fix, fix
+        gap_s = np.inf if last is None else (fix.time_ns - last.time_ns) * 1e-9
+        if self._filter is None or gap_s > _FORGET_AFTER_S:
+            self._start(fix, R)
+            return
+        F, Q = self._motion(gap_s)
+        self._filter.predict(F=F, Q=Q)
+        z = self._ned(fix)
+        if fix.reset:
+            # The estimate jumped, the aircraft did not: keep the velocity, take the position.
+            self._filter.x[:3, 0] = z
+            self._filter.P[:3, :] = 0.0
+            self._filter.P[:, :3] = 0.0
+            self._filter.P[:3, :3] = R
+        else:
+            self._filter.update(z, R=R)
+
+    def at(self, time_ns: int) -> PropagatedFix | None:
+        """The newest fix carried to `time_ns`; None before the first."""
+        fix, kalman = self._fix, self._filter
+        if fix is None or kalman is None:
+            return None
+        dt = (time_ns - fix.time_ns) * 1e-9
+        if fix.velocity_ned is not None:
+            velocity, Pv = np.array(fix.velocity_ned), np.eye(3) * fix.velocity_sigma_mps**2
+        else:
+            velocity, Pv = kalman.x[3:, 0].copy(), kalman.P[3:, 3:].copy()
+        north, east, down = velocity * dt
+        latitude, longitude = offset(fix.latitude_deg, fix.longitude_deg, north, east)
+        q = self._acceleration**2
+        P = fix.position_covariance_ned + self._floor + Pv * dt**2 + np.eye(3) * q * dt**4 / 4.0
+        return PropagatedFix(
+            time_ns,
+            latitude,
+            longitude,
+            fix.height_m - float(down),
+            P,
+            velocity,
+            Pv + np.eye(3) * q * dt**2,
+        )
+
+    def _start(self, fix: VisionFix, R: Array) -> None:
+        self._anchor = (fix.latitude_deg, fix.longitude_deg)
+        kalman = KalmanFilter(dim_x=6, dim_z=3)
+        kalman.x = np.zeros((6, 1))
+        kalman.x[:3, 0] = self._ned(fix)
+        kalman.P = np.diag([0.0] * 3 + [_UNKNOWN_SPEED_MPS**2] * 3)
+        kalman.P[:3, :3] = R
+        kalman.H = np.hstack([np.eye(3), np.zeros((3, 3))])
+        self._filter = kalman
+
+    def _ned(self, fix: VisionFix) -> Array:
+        north, east = north_east(*self._anchor, fix.latitude_deg, fix.longitude_deg)
+        return np.array([north, east, -fix.height_m])
+
+    def _motion(self, dt: float) -> tuple[Array, Array]:
+        """Transition and noise of constant velocity with white acceleration over dt seconds."""
+        eye = np.eye(3)
+        F = np.block([[eye, dt * eye], [np.zeros((3, 3)), eye]])
+        G = np.vstack([0.5 * dt**2 * eye, dt * eye])
+        return F, G @ G.T * self._acceleration**2

@@ -1,0 +1,119 @@
+"""Shadow mode's score: would vision have been good enough to fly on?
+
+While GNSS is healthy, every fix is compared with the autopilot's own global position at the fix's
+exposure time. The score is a go or a no-go with reasons that an operator can act on.
+"""
+
+from __future__ import annotations
+
+import math
+import threading
+from collections import deque
+from dataclasses import dataclass
+
+import numpy as np
+
+from mavlink_bridge.injection.propagate import PropagatedFix
+from mavlink_bridge.messages import VehicleState
+from mavlink_bridge.vehicle.origin import north_east
+
+_WINDOW_NS = 120_000_000_000
+_LENGTH = 4096
+_GNSS_FRESH_NS = 1_500_000_000
+_MINIMUM_FIX = 3
+_REFERENCE_SIGMA_M = 1.5  # the EKF on GNSS, horizontally
+_MINIMUM_SAMPLES = 50
+_MEDIAN_LIMIT_M = 3.0
+_P95_LIMIT_M = 6.0
+_RATE_LIMIT_HZ = 4.0
+# A chi-square of two degrees of freedom is 1.39 in the median; three times the claimed sigma is 9x.
+_HEIGHT_LIMIT_M = 10.0  # barometer and GNSS heights differ by metres, wrong geoids by tens
+_CONSISTENCY_LIMIT = 9.0 * 1.39
+
+
+@dataclass(frozen=True)
+class ShadowScore:
+    """How vision compared with GNSS over the last two minutes; errors are horizontal.
+
+    bias_ne_m: mean north and east difference. height_m: median difference of the heights.
+    consistency: median squared Mahalanobis distance (1.4 is ideal). reasons: why it is a no-go;
+    empty if it is a go.
+    """
+
+    go: bool
+    samples: int
+    median_m: float
+    p95_m: float
+    bias_ne_m: tuple[float, float]
+    height_m: float
+    consistency: float
+    rate_hz: float
+    reasons: tuple[str, ...]
+
+    def line(self) -> str:
+        """One line for the operator."""
+        if not self.samples:
+            return f"{'go' if self.go else 'no-go'}: {'; '.join(self.reasons)}"
+        figures = f"median {self.median_m:.1f} m, p95 {self.p95_m:.1f} m, n {self.samples}"
+        return f"go: {figures}" if self.go else f"no-go: {'; '.join(self.reasons)} ({figures})"
+
+
+def gnss_healthy(state: VehicleState, now_ns: int) -> bool:
+    """Whether the receiver reports a 3D fix, now."""
+    fresh = now_ns - state.gps_time_ns < _GNSS_FRESH_NS
+    return fresh and state.gps_fix_type >= _MINIMUM_FIX
+
+
+class ShadowScorer:
+    """Collects comparisons in one thread; `score` may be called from any."""
+
+    def __init__(self, geoid_separation_m: float) -> None:
+        self._geoid_m = geoid_separation_m
+        self._lock = threading.Lock()
+        self._samples: deque[tuple[int, float, float, float, float]] = deque(maxlen=_LENGTH)
+
+    def compare(self, fix: PropagatedFix, reference: tuple[float, ...]) -> None:
+        """A fix, and the autopilot's (latitude, longitude, altitude AMSL) at the same time."""
+        difference = np.array(
+            north_east(reference[0], reference[1], fix.latitude_deg, fix.longitude_deg)
+        )
+        P = fix.covariance_ned[:2, :2] + np.eye(2) * _REFERENCE_SIGMA_M**2
+        distance = float(difference @ np.linalg.solve(P, difference))
+        north, east = (float(d) for d in difference)
+        up = fix.height_m - self._geoid_m - reference[2]
+        with self._lock:
+            self._samples.append((fix.time_ns, north, east, distance, up))
+
+    def score(self, now_ns: int, yaw_difference_rad: float, yaw_blocked: bool) -> ShadowScore:
+        """The verdict on the last two minutes."""
+        with self._lock:
+            samples = np.array([s for s in self._samples if now_ns - s[0] < _WINDOW_NS])
+        if not len(samples):
+            reason = "no fix could be compared with GNSS"
+            nan = math.nan
+            return ShadowScore(False, 0, nan, nan, (nan, nan), nan, nan, 0.0, (reason,))
+        errors = np.hypot(samples[:, 1], samples[:, 2])
+        median, p95 = float(np.median(errors)), float(np.percentile(errors, 95))
+        consistency = float(np.median(samples[:, 3]))
+        span_s = float(samples[-1, 0] - samples[0, 0]) * 1e-9
+        rate = (len(samples) - 1) / span_s if span_s > 0 else 0.0
+        reasons = []
+        if len(samples) < _MINIMUM_SAMPLES:
+            reasons.append(f"only {len(samples)} fixes of {_MINIMUM_SAMPLES}")
+        elif rate < _RATE_LIMIT_HZ:
+            reasons.append(f"{rate:.1f} Hz, needs {_RATE_LIMIT_HZ:.0f}")
+        if median > _MEDIAN_LIMIT_M:
+            reasons.append(f"median error {median:.1f} m")
+        if p95 > _P95_LIMIT_M:
+            reasons.append(f"p95 error {p95:.1f} m")
+        if consistency > _CONSISTENCY_LIMIT:
+            reasons.append("errors exceed the claimed covariance")
+        height = float(np.median(samples[:, 4]))
+        if abs(height) > _HEIGHT_LIMIT_M:
+            reasons.append(f"height differs by {height:+.0f} m; check geoid, datum, barometer")
+        if yaw_blocked:
+            reasons.append(f"yaw differs by {math.degrees(yaw_difference_rad):+.1f} deg")
+        bias = (float(samples[:, 1].mean()), float(samples[:, 2].mean()))
+        return ShadowScore(
+            not reasons, len(samples), median, p95, bias, height, consistency, rate, tuple(reasons)
+        )

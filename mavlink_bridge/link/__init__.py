@@ -1,0 +1,1 @@
+"""One MAVLink link: transports, framing, signing, clocks, the tlog."""

@@ -1,0 +1,373 @@
+"""One MAVLink link: one endpoint, one owner thread, bounded queues, reconnection, counters.
+
+Everything that touches the transport, the parser and the packers happens in the owner thread; a
+handler's callbacks run there too. `send` may be called from anywhere.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import logging
+import os
+import select
+import threading
+import time
+from collections import deque
+from collections.abc import Callable, Collection, Mapping
+from dataclasses import asdict, dataclass
+from typing import Any, Protocol
+
+from pymavlink.dialects.v20 import ardupilotmega as mavlink
+
+from mavlink_bridge.errors import BridgeStateError, EndpointError
+from mavlink_bridge.link import signing
+from mavlink_bridge.link.clock import monotonic_ns, utc_us
+from mavlink_bridge.link.framing import FrameReader
+from mavlink_bridge.link.tlog import TlogRecorder
+from mavlink_bridge.link.transport import Endpoint, Transport, UdpTransport, open_transport
+
+log = logging.getLogger(__name__)
+
+_OUTBOX = 512
+_MAX_UNSENT = 4096  # bytes; more would wait so long on a slow port that it is worthless
+_CONGESTED = _MAX_UNSENT // 8
+_IDLE_TICK_S = 0.2
+_BACKOFF_S = (0.1, 5.0)
+_LONGEST_WAIT_S = 0.5
+_MAX_READS = 64
+
+
+class LinkHandler(Protocol):
+    """What a link calls, always in its owner thread."""
+
+    def on_open(self, link: Link) -> None:
+        """The transport was (re)opened."""
+
+    def on_message(self, link: Link, message: Any, time_ns: int) -> None:
+        """A message arrived; time_ns is when its bytes were read."""
+
+    def on_tick(self, link: Link, now_ns: int) -> int:
+        """Do what is due and return when to be called next (CLOCK_MONOTONIC ns).
+
+        It is called while the transport is closed, too: what is sent then is dropped and counted.
+        """
+
+
+@dataclass
+class LinkCounters:
+    """What a link did."""
+
+    opened: int = 0
+    open_failures: int = 0
+    rx_bytes: int = 0
+    tx_bytes: int = 0
+    tx_messages: int = 0
+    tx_rate_limited: int = 0
+    tx_dropped: int = 0
+    handler_errors: int = 0
+    failures: int = 0
+    timeouts: int = 0
+
+
+class Link:
+    """A MAVLink 2 link that stays up.
+
+    min_interval_ns: shortest time between two messages of one id and component; faster ones are
+    dropped and counted. timeout_s: silence after which a stream (TCP, serial) is reopened.
+    """
+
+    def __init__(
+        self,
+        endpoint: Endpoint,
+        handler: LinkHandler,
+        *,
+        name: str = "link",
+        wanted: Collection[int] | None = None,
+        min_interval_ns: Mapping[int, int] | None = None,
+        signing_key: bytes | None = None,
+        signing_link_id: int = 1,
+        recorder: TlogRecorder | None = None,
+        timeout_s: float = 5.0,
+        opener: Callable[[Endpoint], Transport] = open_transport,
+    ) -> None:
+        self.endpoint = endpoint
+        self.name = name
+        self.counters = LinkCounters()
+        self.system_id = 0
+        self._handler = handler
+        self._reader = FrameReader(wanted, signing_key)
+        self._min_interval_ns = dict(min_interval_ns or {})
+        self._key, self._key_link = signing_key, signing_link_id
+        self._recorder = recorder
+        self._timeout_ns = int(timeout_s * 1e9)
+        self._open = opener
+        self._packers: dict[int, Any] = {}
+        self._last_sent_ns: dict[tuple[int, int], int] = {}
+        self._outbox: deque[tuple[Any, int]] = deque(maxlen=_OUTBOX)
+        self._unsent = bytearray()
+        self._broken: OSError | None = None
+        self._stop = threading.Event()
+        self._thread: threading.Thread | None = None
+        self._transport: Transport | None = None
+        # The pipe's numbers may be other files' once it is closed: nobody writes while it is.
+        self._pipe_lock = threading.Lock()
+        self._wake_read, self._wake_write = os.pipe()
+        os.set_blocking(self._wake_read, False)
+        os.set_blocking(self._wake_write, False)
+
+    @property
+    def connected(self) -> bool:
+        """Whether the transport is open (UDP: always, once bound)."""
+        return self._transport is not None
+
+    @property
+    def congested(self) -> bool:
+        """Whether so much waits for a slow port that only positions should be added.
+
+        To be asked in the owner thread.
+        """
+        return len(self._unsent) > _CONGESTED
+
+    def keep_peer(self) -> None:
+        """Answer who sent the message that is being handled, whoever else speaks on the port."""
+        if isinstance(self._transport, UdpTransport):
+            self._transport.keep_peer()
+
+    def start(self) -> None:
+        """Start the owner thread; the first connection attempt happens in it."""
+        if self._thread is not None:
+            raise BridgeStateError(f"{self.name}: already started; make a new link")
+        self._thread = threading.Thread(target=self._run, name=f"mavlink-{self.name}", daemon=True)
+        self._thread.start()
+
+    def stop(self) -> None:
+        """Stop the owner thread and close the transport."""
+        self._stop.set()
+        self.wake()
+        if self._thread is not None and self._thread is not threading.current_thread():
+            self._thread.join(timeout=5.0)
+        if self._thread is None or not self._thread.is_alive():
+            self._close_pipe()
+
+    def wake(self) -> None:
+        """Make the owner thread run `on_tick` now."""
+        # A full pipe wakes the thread anyway, and a closed one has no thread to wake.
+        with self._pipe_lock, contextlib.suppress(BlockingIOError):
+            if self._wake_write >= 0:
+                os.write(self._wake_write, b"w")
+
+    def _close_pipe(self) -> None:
+        with self._pipe_lock:
+            if self._wake_read >= 0:
+                os.close(self._wake_read)
+                os.close(self._wake_write)
+                self._wake_read = self._wake_write = -1
+
+    def send(self, message: Any, component: int) -> bool:
+        """Send as `component` of the vehicle's system; False when it was dropped at once."""
+        if threading.current_thread() is self._thread:
+            return self._send_now(message, component)
+        if len(self._outbox) == _OUTBOX:
+            self.counters.tx_dropped += 1
+        self._outbox.append((message, component))
+        self.wake()
+        return True
+
+    def stats(self) -> dict[str, int]:
+        """Counters of link and framing."""
+        return {**asdict(self.counters), **asdict(self._reader.counters)}
+
+    # --- owner thread ---------------------------------------------------------------------------
+
+    def _run(self) -> None:
+        backoff_s = _BACKOFF_S[0]
+        while not self._stop.is_set():
+            opened_ns = monotonic_ns()
+            self._transport = self._try_open()
+            if self._transport is not None:
+                self._serve_until_lost(self._transport)
+            # An endpoint that accepts and closes at once must be backed off from, too.
+            lasted = self._transport is not None and monotonic_ns() - opened_ns > 2e9
+            self._transport = None
+            backoff_s = _BACKOFF_S[0] if lasted else backoff_s
+            self._idle(backoff_s)
+            backoff_s = min(2.0 * backoff_s, _BACKOFF_S[1])
+
+    def _try_open(self) -> Transport | None:
+        try:
+            return self._open(self.endpoint)
+        except (OSError, EndpointError) as error:
+            self.counters.open_failures += 1
+            if self.counters.open_failures == 1:
+                log.warning(
+                    "%s: %s cannot be opened (%s), retrying", self.name, self.endpoint, error
+                )
+        return None
+
+    def _serve_until_lost(self, transport: Transport) -> None:
+        self.counters.opened += 1
+        try:
+            self._serve(transport)
+        except OSError as error:
+            log.warning("%s: %s lost (%s), reconnecting", self.name, self.endpoint, error)
+        except Exception:  # whatever it is, the link must come back
+            self.counters.failures += 1
+            log.exception("%s: %s failed, reconnecting", self.name, self.endpoint)
+        finally:
+            transport.close()
+
+    def _idle(self, seconds: float) -> None:
+        """Wait without a transport: the handler's clock goes on."""
+        end_ns = monotonic_ns() + int(seconds * 1e9)
+        while (left_ns := end_ns - monotonic_ns()) > 0:
+            if self._stop.wait(min(left_ns * 1e-9, _IDLE_TICK_S)):
+                return
+            self._empty_outbox()
+            self._guard(self._handler.on_tick, self, monotonic_ns())
+
+    def _serve(self, transport: Transport) -> None:
+        self._reader.reset()
+        self._unsent.clear()
+        self._broken = None
+        self._guard(self._handler.on_open, self)
+        # poll, not select: a process of many files has descriptors that select refuses.
+        poller = select.poll()
+        poller.register(self._wake_read, select.POLLIN)
+        poller.register(transport, select.POLLIN)
+        last_rx_ns = monotonic_ns()
+        deadline_ns = 0
+        while not self._stop.is_set():
+            wait_s = min(max(deadline_ns - monotonic_ns(), 0) * 1e-9, _LONGEST_WAIT_S)
+            poller.modify(transport, select.POLLIN | (select.POLLOUT if self._unsent else 0))
+            ready = dict(poller.poll(wait_s * 1e3))
+            events = ready.get(transport.fileno(), 0)
+            if events & ~select.POLLOUT and self._receive(transport):
+                last_rx_ns = monotonic_ns()
+            if events & select.POLLOUT:
+                self._flush()
+            self._empty_outbox()
+            now_ns = monotonic_ns()
+            due = self._guard(self._handler.on_tick, self, now_ns)
+            if self._broken is not None:
+                raise self._broken
+            deadline_ns = due if due is not None else now_ns + int(_LONGEST_WAIT_S * 1e9)
+            if self._wake_read in ready:
+                # Only now: a read may have to wait for the interpreter lock, and what woke us
+                # should be on its way first. What came meanwhile has its turn at once.
+                os.read(self._wake_read, 4096)
+                deadline_ns = 0
+            if transport.stream and now_ns - last_rx_ns > self._timeout_ns:
+                self.counters.timeouts += 1
+                raise TimeoutError(f"nothing received for {self._timeout_ns * 1e-9:.1f} s")
+
+    def _empty_outbox(self) -> None:
+        while self._outbox:
+            self._send_now(*self._outbox.popleft())
+
+    def _receive(self, transport: Transport) -> bool:
+        """Read and dispatch what has arrived, a bounded amount; True if there was something."""
+        received = False
+        for _ in range(_MAX_READS):
+            data = transport.read()
+            if not data:
+                break
+            received = True
+            time_ns = monotonic_ns()
+            self.counters.rx_bytes += len(data)
+            raw: deque[bytes] | None = deque() if self._recorder is not None else None
+            messages = self._reader.feed(data, raw)
+            if self._recorder is not None and raw:
+                stamp = utc_us()
+                for frame in raw:
+                    self._recorder.write(frame, stamp)
+            for message in messages:
+                self._guard(self._handler.on_message, self, message, time_ns)
+            if transport.stream:
+                break  # select tells whether there is more
+        return received
+
+    def _guard(self, function: Callable[..., Any], *arguments: Any) -> Any:
+        """Call a handler; its error is logged and counted, and the link lives on."""
+        try:
+            return function(*arguments)
+        except Exception:
+            self.counters.handler_errors += 1
+            if self.counters.handler_errors in (1, 10, 100, 1000):
+                log.exception(
+                    "%s: handler failed (%d times)", self.name, self.counters.handler_errors
+                )
+            return None
+
+    def _packer(self, component: int) -> Any:
+        packer = self._packers.get(component)
+        if packer is None:
+            packer = mavlink.MAVLink(None, self.system_id, component)
+            if self._key is not None:
+                signing.enable(packer, self._key, self._key_link)
+            self._packers[component] = packer
+        packer.srcSystem = self.system_id
+        return packer
+
+    def _send_now(self, message: Any, component: int) -> bool:
+        if self._transport is None or self.system_id == 0:
+            self.counters.tx_dropped += 1
+            return False
+        now_ns = monotonic_ns()
+        identity = (message.get_msgId(), component)
+        interval = self._min_interval_ns.get(identity[0])
+        if interval is not None and now_ns - self._last_sent_ns.get(identity, 0) < interval:
+            self.counters.tx_rate_limited += 1
+            return False
+        if len(self._unsent) > _MAX_UNSENT:
+            self.counters.tx_dropped += 1
+            return False
+        packer = self._packer(component)
+        if self._key is not None:
+            # Never behind the wall clock or the peer: either refuses streams a minute old.
+            packer.signing.timestamp = max(
+                packer.signing.timestamp,
+                signing.signing_timestamp(),
+                self._reader.signing_timestamp,
+            )
+        frame = message.pack(packer)
+        packer.seq = (packer.seq + 1) % 256
+        self._last_sent_ns[identity] = now_ns
+        return self._write(frame)
+
+    def _write(self, frame: bytes) -> bool:
+        assert self._transport is not None
+        if self._transport.stream:
+            self._unsent += frame
+            self._flush()
+        elif self._put(frame) == 0:
+            self.counters.tx_dropped += 1
+            return False
+        self.counters.tx_messages += 1
+        self.counters.tx_bytes += len(frame)
+        if self._recorder is not None:
+            self._recorder.write(frame, utc_us())
+        return True
+
+    def _flush(self) -> None:
+        """Send what is left over of a stream."""
+        if self._unsent:
+            del self._unsent[: self._put(bytes(self._unsent))]
+
+    def _put(self, data: bytes) -> int:
+        """Write to the transport; that it is gone is the link's affair, not its handler's."""
+        assert self._transport is not None
+        try:
+            return self._transport.write(data)
+        except OSError as error:
+            self._broken = error
+            return 0
+
+
+def sleep_until(predicate: Callable[[], bool], timeout_s: float, step_s: float = 0.01) -> bool:
+    """Poll until the predicate holds; False after the timeout."""
+    end = time.monotonic() + timeout_s
+    while not predicate():
+        if time.monotonic() > end:
+            return False
+        time.sleep(step_s)
+    return True

@@ -1,0 +1,1 @@
+"""Before the flight: parameters, mission, the examination."""

@@ -1,0 +1,119 @@
+"""A short conversation with the autopilot on a link of its own: parameters, missions."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable, Collection
+from types import TracebackType
+from typing import Any, TypeVar
+
+from pymavlink.dialects.v20 import ardupilotmega as mavlink
+
+from mavlink_bridge.config import BridgeConfig
+from mavlink_bridge.errors import ConnectionSilentError
+from mavlink_bridge.link.link import Link
+from mavlink_bridge.link.signing import load_key
+from mavlink_bridge.link.transport import Endpoint
+from mavlink_bridge.vehicle.tracker import VehicleTracker
+
+_CONNECT_S = 15.0
+_FIRST_GUESS = 1
+
+_Self = TypeVar("_Self", bound="VehicleClient")
+
+
+class VehicleClient:
+    """Finds the autopilot and keeps its link awake. A context manager.
+
+    Raises `ConnectionSilentError` when no heartbeat comes. Subclasses take their messages in
+    `take`, which is called under the lock of `wait_for`.
+    """
+
+    def __init__(self, config: BridgeConfig, name: str, wanted: Collection[int]) -> None:
+        key = None if config.signing is None else load_key(config.signing.key_file)
+        self.config = config
+        self._link = Link(
+            Endpoint.parse(config.connection),
+            self,
+            name=name,
+            wanted={mavlink.MAVLINK_MSG_ID_HEARTBEAT, *wanted},
+            signing_key=key,
+            signing_link_id=1 if config.signing is None else config.signing.link_id,
+        )
+        self._changed = threading.Condition()
+        self.system = 0
+        self.component = mavlink.MAV_COMP_ID_AUTOPILOT1
+        self.autopilot = mavlink.MAV_AUTOPILOT_INVALID
+        self._next_heartbeat_ns = 0
+
+    def __enter__(self: _Self) -> _Self:
+        self._link.start()
+        try:
+            self.wait_for(lambda: self.system != 0, _CONNECT_S)
+        finally:  # an interrupt included
+            if not self.system:
+                self._link.stop()
+        if not self.system:
+            raise ConnectionSilentError(
+                f"no autopilot heartbeat at {self.config.connection} in {_CONNECT_S:.0f} s; "
+                "check the connection string, the wiring and the port's MAVLink 2 protocol"
+            )
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        traceback: TracebackType | None,
+    ) -> None:
+        self._link.stop()
+
+    def take(self, message: Any) -> None:
+        """One message of the autopilot, other than its heartbeat."""
+        raise NotImplementedError
+
+    def ask(self, message: Any) -> None:
+        """Send as the companion."""
+        self._link.send(message, self.config.companion_component)
+
+    def wait_for(self, predicate: Callable[[], bool], timeout_s: float) -> bool:
+        """Whether the predicate came true in time."""
+        with self._changed:
+            return self._changed.wait_for(predicate, timeout_s)
+
+    # --- link handler ---------------------------------------------------------------------------
+
+    def on_open(self, link: Link) -> None:
+        """Nothing to say before a heartbeat."""
+
+    def on_message(self, link: Link, message: Any, time_ns: int) -> None:
+        """The autopilot's heartbeat, or an answer of it."""
+        system = message.get_srcSystem()
+        if message.get_type() == "HEARTBEAT":
+            # The first one decides: a second vehicle on the link must not be given what was asked
+            # of, or written for, the first.
+            if self.system or self.config.system_id not in (None, system):
+                return
+            if not VehicleTracker.is_autopilot(message):
+                return
+            link.system_id = system
+            with self._changed:
+                self.system, self.component = system, message.get_srcComponent()
+                self.autopilot = message.autopilot
+                self._changed.notify_all()
+        elif (system, message.get_srcComponent()) == (self.system, self.component):
+            with self._changed:
+                self.take(message)
+                self._changed.notify_all()
+
+    def on_tick(self, link: Link, now_ns: int) -> int:
+        """Heartbeat, so that the autopilot answers on this link."""
+        if link.system_id == 0 and (link.endpoint.kind == "udpout" or self.config.signing):
+            link.system_id = _FIRST_GUESS
+        if link.system_id and now_ns >= self._next_heartbeat_ns:
+            self._next_heartbeat_ns = now_ns + 1_000_000_000
+            message = mavlink.MAVLink_heartbeat_message(
+                mavlink.MAV_TYPE_ONBOARD_CONTROLLER, mavlink.MAV_AUTOPILOT_INVALID, 0, 0, 3, 3
+            )
+            link.send(message, self.config.companion_component)
+        return now_ns + 100_000_000

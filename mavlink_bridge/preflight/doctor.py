@@ -1,0 +1,283 @@
+"""What must be right before a flight: parameters for the chosen injection, link, clock, streams."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+
+from mavlink_bridge.bridge import Bridge
+from mavlink_bridge.config import BridgeConfig
+from mavlink_bridge.link.clock import SteadyUtc, monotonic_ns
+from mavlink_bridge.link.link import sleep_until
+from mavlink_bridge.messages import GimbalAttitude, VehicleState
+from mavlink_bridge.preflight.parameters import ParameterClient
+from mavlink_bridge.preflight.rules import (
+    Read,
+    Rule,
+    ardupilot_rules,
+    arming_rules,
+    find_source_set,
+    px4_rules,
+)
+from mavlink_bridge.vehicle.profile import select_profile
+
+Counters = dict[str, int | float | str]
+
+_CONNECT_S = 15.0
+_MEASURE_S = 4.0
+_ROUND_TRIP_LIMIT_MS = 30.0
+_RATE_SHARE = 0.7
+_LOST_SHARE = 0.02
+_GIMBAL_AGE_NS = 200_000_000  # of an exposure, roughly
+_PX4_RATE_HZ = 30.0  # its documentation asks for 30 to 50 Hz
+
+
+@dataclass(frozen=True)
+class Finding:
+    """One line of the table. fix: the value to write, None where writing cannot help."""
+
+    name: str
+    found: str
+    needed: str
+    why: str
+    ok: bool
+    required: bool
+    fix: float | None = None
+    reboot: bool = False
+
+
+@dataclass(frozen=True)
+class Diagnosis:
+    """All lines; a flight may begin when none that is required fails."""
+
+    findings: tuple[Finding, ...]
+
+    @property
+    def ok(self) -> bool:
+        """Whether every required line holds."""
+        return all(f.ok for f in self.findings if f.required)
+
+    @property
+    def exit_code(self) -> int:
+        """For scripts: 0 good, 1 advice, 2 not fit to fly."""
+        if not self.ok:
+            return 2
+        return 0 if all(f.ok for f in self.findings) else 1
+
+    @property
+    def fixable(self) -> tuple[Finding, ...]:
+        """The lines that writing a parameter puts right."""
+        return tuple(f for f in self.findings if not f.ok and f.fix is not None)
+
+
+# --- examinations -----------------------------------------------------------------------------
+
+
+def check_parameters(rules: Iterable[Rule], read: Read) -> list[Finding]:
+    """Compare each rule with what the flight controller says."""
+    findings = []
+    for rule in rules:
+        name, value = rule.names[0], None
+        for name in rule.names:
+            value = read(name)
+            if value is not None:
+                break
+        if value is None:
+            finding = Finding(rule.names[0], "missing", rule.needed, rule.why, False, rule.required)
+        else:
+            ok = rule.holds(value)
+            fix = None if ok else rule.fix(value)
+            finding = Finding(
+                name, f"{value:.7g}", rule.needed, rule.why, ok, rule.required, fix, rule.reboot
+            )
+        findings.append(finding)
+    return findings
+
+
+@dataclass(frozen=True)
+class _Measurement:
+    """What came over the link in so many seconds, and the vehicle at their end."""
+
+    state: VehicleState
+    before: Counters
+    after: Counters
+    seconds: float
+    gimbal: GimbalAttitude | None
+
+    def grown(self, key: str) -> float:
+        """By how much a counter grew."""
+        return float(self.after.get(key, 0)) - float(self.before.get(key, 0))
+
+
+def check_link(config: BridgeConfig) -> tuple[list[Finding], VehicleState]:
+    """Connect in shadow mode for a few seconds and measure identity, clock and streams."""
+    quiet = config.model_copy(update={"mode": "shadow", "tlog": None})
+    with Bridge(quiet, 0.0) as bridge:
+        if not sleep_until(lambda: bridge.state().connected, _CONNECT_S, step_s=0.05):
+            return [_no_connection(config, bridge.counters())], bridge.state()
+        time.sleep(_MEASURE_S / 2)
+        measured = _measure(bridge, config.camera.mount == "gimbal")
+    findings = [*_vehicle_findings(config, measured), *_stream_findings(config, measured)]
+    return findings, measured.state
+
+
+def _no_connection(config: BridgeConfig, counters: Counters) -> Finding:
+    found, why = "silence", "wiring, port, SERIALn_PROTOCOL=2, signing key"
+    if counters["fc_open_failures"] and not counters["fc_opened"]:
+        found = "cannot be opened"
+        why = "nothing there, no permission, or in use: is the companion running?"
+    return Finding("connection", found, f"heartbeats at {config.connection}", why, False, True)
+
+
+def _measure(bridge: Bridge, gimbal: bool) -> _Measurement:
+    before, begun_s = bridge.counters(), time.monotonic()
+    time.sleep(_MEASURE_S)
+    after, seconds = bridge.counters(), time.monotonic() - begun_s
+
+    def angles() -> GimbalAttitude | None:
+        return bridge.gimbal_at(monotonic_ns() - _GIMBAL_AGE_NS)
+
+    if gimbal:  # one moment says little: a hiccup of this computer is no silence
+        sleep_until(lambda: angles() is not None, _MEASURE_S)
+    return _Measurement(bridge.state(), before, after, seconds, angles())
+
+
+def _vehicle_findings(config: BridgeConfig, measured: _Measurement) -> list[Finding]:
+    """Who is there, and whether it takes what is to be injected."""
+    state, message = measured.state, config.injection.message
+    profile = select_profile(state.autopilot, state.version)
+    version = "unknown" if state.version is None else ".".join(map(str, state.version))
+    several = bool(measured.after.get("bridge_other_autopilots"))
+    findings = [
+        Finding("connection", f"system {state.system_id}", "heartbeats", "", True, True),
+        Finding(
+            "vehicles",
+            "several" if several else "one",
+            "one, or bridge.system_id",
+            "positions and parameters must not go to another vehicle",
+            not several,
+            True,
+        ),
+        Finding(
+            "firmware",
+            f"{state.autopilot} {version}",
+            "a known profile",
+            f"profile: {profile.name}",
+            profile.known,
+            False,
+        ),
+        Finding(
+            "injection",
+            message,
+            " or ".join(profile.messages),
+            "other messages are dropped without a word",
+            message in profile.messages,
+            True,
+        ),
+        Finding(
+            "EKF origin",
+            "read" if state.origin else ("configured" if config.origin else "none"),
+            "read or configured",
+            "without one: 'AHRS: waiting for home'; wait for a GNSS fix, or set bridge.origin",
+            state.origin is not None or config.origin is not None or message == "gps_input",
+            True,
+        ),
+    ]
+    if state.autopilot == "px4" and message in ("vision_position_estimate", "odometry"):
+        rate = config.injection.rate_hz
+        why = "external vision is not fused at lower rates; set bridge.injection.rate_hz"
+        enough = rate >= _PX4_RATE_HZ
+        findings.append(Finding("rate_hz", f"{rate:g}", ">= 30 for PX4", why, enough, False))
+    return findings
+
+
+def _stream_findings(config: BridgeConfig, measured: _Measurement) -> list[Finding]:
+    """Whether what localization needs comes often enough, in time and whole."""
+    source = measured.state.clock_source
+    round_trip = float(measured.after["clock_round_trip_ms"])
+    attitude = measured.grown("rx_ATTITUDE") / measured.seconds
+    wanted = config.attitude_rate_hz * _RATE_SHARE
+    received = measured.grown("fc_messages") + measured.grown("fc_skipped_messages")
+    lost = measured.grown("fc_lost") / max(received, 1.0)
+    findings = [
+        Finding(
+            "clock",
+            f"{source}, {round_trip:.1f} ms",
+            f"timesync within {_ROUND_TRIP_LIMIT_MS:.0f} ms",
+            "attitude and gimbal are looked up at exposure time",
+            source == "timesync" and round_trip <= _ROUND_TRIP_LIMIT_MS,
+            True,
+        ),
+        Finding(
+            "ATTITUDE",
+            f"{attitude:.0f} Hz",
+            f">= {wanted:.0f} Hz",
+            "raise the port's baud rate or lower attitude_rate_hz",
+            attitude >= wanted,
+            True,
+        ),
+        Finding(
+            "lost messages",
+            f"{100 * lost:.1f} %",
+            f"<= {100 * _LOST_SHARE:.0f} %",
+            "flow control, baud rate, cable",
+            lost <= _LOST_SHARE,
+            False,
+        ),
+    ]
+    if config.camera.mount == "gimbal":
+        findings.append(
+            Finding(
+                "gimbal",
+                "silent" if measured.gimbal is None else measured.gimbal.source,
+                "GIMBAL_DEVICE_ATTITUDE_STATUS or MOUNT_STATUS",
+                "set MNT1_TYPE to the gimbal's type; or bridge.camera.mount: fixed",
+                measured.gimbal is not None,
+                True,
+            )
+        )
+    return findings
+
+
+def check_computer_clock(config: BridgeConfig) -> list[Finding]:
+    """A computer without a battery clock wakes up in the past; some links care."""
+    if config.injection.message != "gps_input" and not (config.signing or config.ground_signing):
+        return []
+    utc = SteadyUtc()
+    year = time.gmtime(utc.utc_ns(monotonic_ns()) * 1e-9).tm_year
+    why = "GPS_INPUT and signatures carry the time; set it by NTP or a battery clock"
+    return [Finding("computer clock", str(year), "the present", why, utc.is_set, True)]
+
+
+def examine(config: BridgeConfig) -> Diagnosis:
+    """Connect, measure the link, read the parameters and judge."""
+    findings, state = check_link(config)
+    findings += check_computer_clock(config)
+    if not findings[0].ok or any(f.name == "vehicles" and not f.ok for f in findings):
+        return Diagnosis(tuple(findings))
+    with ParameterClient(config) as client:
+        if state.autopilot == "px4":
+            rules: Sequence[Rule] = px4_rules(config)
+        else:
+            source_set = find_source_set(config, client.read)
+            rules = [
+                *ardupilot_rules(config, source_set),
+                *arming_rules(config, source_set, client.read),
+            ]
+        findings += check_parameters(rules, client.read)
+    return Diagnosis(tuple(findings))
+
+
+def repair(config: BridgeConfig, findings: Iterable[Finding]) -> bool:
+    """Write what `Finding.fix` says, in order; True if a reboot is needed for it to count.
+
+    The order matters: VISO_TYPE brings the other VISO parameters into being.
+    """
+    reboot = False
+    with ParameterClient(config) as client:
+        for finding in findings:
+            if finding.fix is not None:
+                client.write(finding.name, finding.fix)
+                reboot = reboot or finding.reboot
+    return reboot

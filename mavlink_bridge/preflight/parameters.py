@@ -1,0 +1,90 @@
+"""Reading and writing the flight controller's parameters, one by one and by name.
+
+https://mavlink.io/en/services/parameter.html
+"""
+
+from __future__ import annotations
+
+import struct
+from typing import Any
+
+from pymavlink.dialects.v20 import ardupilotmega as mavlink
+
+from mavlink_bridge.config import BridgeConfig
+from mavlink_bridge.errors import ParameterError
+from mavlink_bridge.preflight.client import VehicleClient
+
+_RETRIES = 3
+_ANSWER_S = 0.7
+_INTEGER_FORMATS = {
+    mavlink.MAV_PARAM_TYPE_UINT8: "<B3x",
+    mavlink.MAV_PARAM_TYPE_INT8: "<b3x",
+    mavlink.MAV_PARAM_TYPE_UINT16: "<H2x",
+    mavlink.MAV_PARAM_TYPE_INT16: "<h2x",
+    mavlink.MAV_PARAM_TYPE_UINT32: "<I",
+    mavlink.MAV_PARAM_TYPE_INT32: "<i",
+}
+
+
+def decode_value(value: float, kind: int, *, bytewise: bool) -> float:
+    """The number in PARAM_VALUE: PX4 puts an integer's bytes into the float, ArduPilot casts."""
+    if bytewise and kind in _INTEGER_FORMATS:
+        return float(struct.unpack(_INTEGER_FORMATS[kind], struct.pack("<f", value))[0])
+    return float(value)
+
+
+def encode_value(value: float, kind: int, *, bytewise: bool) -> float:
+    """Inverse of `decode_value`."""
+    if bytewise and kind in _INTEGER_FORMATS:
+        raw = struct.pack(_INTEGER_FORMATS[kind], round(value))
+        return float(struct.unpack("<f", raw)[0])
+    return value
+
+
+class ParameterClient(VehicleClient):
+    """Reads and writes parameters. A context manager."""
+
+    def __init__(self, config: BridgeConfig) -> None:
+        super().__init__(config, "parameters", (mavlink.MAVLINK_MSG_ID_PARAM_VALUE,))
+        self._values: dict[str, tuple[float, int]] = {}
+
+    def read(self, name: str) -> float | None:
+        """The parameter's value; None when the flight controller does not know it."""
+        self._values.pop(name, None)
+        request = mavlink.MAVLink_param_request_read_message(
+            self.system, self.component, name.encode("ascii"), -1
+        )
+        for _ in range(_RETRIES):
+            self.ask(request)
+            if self.wait_for(lambda: name in self._values, _ANSWER_S):
+                return self._values[name][0]
+        return None
+
+    def write(self, name: str, value: float) -> None:
+        """Set a parameter and check what the flight controller made of it."""
+        if self.read(name) is None:
+            raise ParameterError(f"{name}: the flight controller has no such parameter")
+        kind = self._values[name][1]
+        message = mavlink.MAVLink_param_set_message(
+            self.system,
+            self.component,
+            name.encode("ascii"),
+            encode_value(value, kind, bytewise=self._bytewise),
+            kind,
+        )
+        for _ in range(_RETRIES):
+            self._values.pop(name, None)
+            self.ask(message)
+            answered = self.wait_for(lambda: name in self._values, _ANSWER_S)
+            if answered and abs(self._values[name][0] - value) < 1e-3 * max(1, abs(value)):
+                return
+        raise ParameterError(f"{name} = {value:g} was not taken by the flight controller")
+
+    @property
+    def _bytewise(self) -> bool:
+        return bool(self.autopilot == mavlink.MAV_AUTOPILOT_PX4)
+
+    def take(self, message: Any) -> None:
+        """PARAM_VALUE."""
+        value = decode_value(message.param_value, message.param_type, bytewise=self._bytewise)
+        self._values[message.param_id] = (value, message.param_type)

@@ -1,0 +1,1 @@
+"""What the vehicle says, on our clock, and what it is asked for."""

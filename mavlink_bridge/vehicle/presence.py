@@ -1,0 +1,67 @@
+"""Whether the flight controller is there, told once by whichever link notices first."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable
+
+from pymavlink.dialects.v20 import ardupilotmega as mavlink
+
+from mavlink_bridge.link.clock import monotonic_ns
+from mavlink_bridge.messages import VehicleState
+
+_PATIENCE_NS = 5_000_000_000
+_TWIN_WINDOW_NS = 5_000_000_000
+_TWIN_SWITCHES = 40  # in a window: even a line that damages every third frame is far below
+_TEXTS = {
+    "there": (mavlink.MAV_SEVERITY_INFO, "flight controller found"),
+    "lost": (mavlink.MAV_SEVERITY_WARNING, "flight controller lost: no heartbeat for 3 s"),
+    "silent": (mavlink.MAV_SEVERITY_WARNING, "no heartbeat from the flight controller"),
+}
+
+
+class VehicleWatch:
+    """Every link asks with each tick: the flight controller's own may be waiting to reconnect.
+
+    say: tell the operator (severity, text).
+    """
+
+    def __init__(self, say: Callable[[int, str], None]) -> None:
+        self._say = say
+        self._lock = threading.Lock()
+        # Of the first tick: an application may compile for minutes before it starts the bridge.
+        self._begun_ns: int | None = None
+        self._known = "nothing"
+
+    def check(self, state: VehicleState) -> None:
+        """Tell what changed since the last call."""
+        now_ns = monotonic_ns()
+        with self._lock:
+            before, self._begun_ns = self._known, self._begun_ns or now_ns
+            if state.connected:
+                self._known = "there"
+            elif before == "there":
+                self._known = "lost"
+            elif before == "nothing" and now_ns - self._begun_ns > _PATIENCE_NS:
+                self._known = "silent"
+            if self._known == before:
+                return
+        severity, text = _TEXTS[self._known]
+        if before == "lost":
+            text = "flight controller is back"
+        self._say(severity, f"PiLoT: {text}")
+
+
+class TwinWatch:
+    """Notices two vehicles of the same ids on one link: boot time runs back again and again."""
+
+    def __init__(self) -> None:
+        self._begun_ns = 0
+        self._count = 0
+
+    def two(self, now_ns: int, ran_back: int) -> bool:
+        """Whether there are two. ran_back: how often boot time ran back so far."""
+        many = ran_back - self._count >= _TWIN_SWITCHES
+        if many or now_ns - self._begun_ns >= _TWIN_WINDOW_NS:
+            self._begun_ns, self._count = now_ns, ran_back
+        return many

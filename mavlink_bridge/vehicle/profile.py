@@ -1,0 +1,139 @@
+"""Firmware profiles: what each autopilot makes of the messages it is sent.
+
+Measured or read from source; see docs/bridge.md for the table and where each entry comes from.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Literal
+
+from pymavlink.dialects.v20 import ardupilotmega as mavlink
+
+from mavlink_bridge.config import InjectionMessage
+from mavlink_bridge.vehicle.origin import Projection
+
+CovarianceFormula = Literal["cbrt", "sqrt", "variance"]
+Version = tuple[int, int, int]
+
+
+@dataclass(frozen=True)
+class FirmwareProfile:
+    """How to speak to one firmware.
+
+    covariance: how it turns the message's diagonal into an error (see `covariance_entry`).
+    max_delay_ms: age beyond which a measurement cannot be fused any more.
+    messages: the injections it accepts. odometry_frame: MAV_FRAME it accepts for position.
+    """
+
+    name: str
+    covariance: CovarianceFormula
+    projection: Projection
+    max_delay_ms: float
+    messages: tuple[InjectionMessage, ...]
+    odometry_frame: int
+    delay_parameter: str
+    gps_delay_parameter: str  # {n}: the receiver, gps_id + 1
+    known: bool = True
+
+
+_ARDUPILOT_MESSAGES: tuple[InjectionMessage, ...] = (
+    "vision_position_estimate",
+    "odometry",
+    "gps_input",
+)
+
+ARDUPILOT = FirmwareProfile(
+    name="ArduPilot 4.5-4.7",
+    covariance="cbrt",
+    projection="ardupilot",
+    max_delay_ms=250.0,
+    messages=_ARDUPILOT_MESSAGES,
+    odometry_frame=mavlink.MAV_FRAME_LOCAL_FRD,
+    delay_parameter="VISO_DELAY_MS",
+    gps_delay_parameter="GPS{n}_DELAY_MS",
+)
+# Pull request 32084 (merged February 2026) replaced the cube root.
+ARDUPILOT_SQRT = FirmwareProfile(
+    name="ArduPilot 4.8+",
+    covariance="sqrt",
+    projection="ardupilot",
+    max_delay_ms=250.0,
+    messages=_ARDUPILOT_MESSAGES,
+    odometry_frame=mavlink.MAV_FRAME_LOCAL_FRD,
+    delay_parameter="VISO_DELAY_MS",
+    gps_delay_parameter="GPS{n}_DELAY_MS",
+)
+PX4 = FirmwareProfile(
+    name="PX4 1.15+",
+    covariance="variance",
+    projection="px4",
+    max_delay_ms=300.0,
+    messages=("vision_position_estimate", "odometry", "global_position_sensor"),
+    odometry_frame=mavlink.MAV_FRAME_LOCAL_NED,
+    delay_parameter="EKF2_DELAY_MAX",
+    gps_delay_parameter="EKF2_GPS_DELAY",
+)
+# The cube-root entry overstates the error in every formula below 3 m, so it is the safe one.
+GENERIC = FirmwareProfile(
+    name="generic",
+    covariance="cbrt",
+    projection="ardupilot",
+    max_delay_ms=250.0,
+    messages=("vision_position_estimate",),
+    odometry_frame=mavlink.MAV_FRAME_LOCAL_FRD,
+    delay_parameter="VISO_DELAY_MS",
+    gps_delay_parameter="GPS{n}_DELAY_MS",
+    known=False,
+)
+
+
+def autopilot_name(autopilot: int) -> str:
+    """ "ardupilot", "px4" or "unknown" of a heartbeat's MAV_AUTOPILOT."""
+    return {
+        mavlink.MAV_AUTOPILOT_ARDUPILOTMEGA: "ardupilot",
+        mavlink.MAV_AUTOPILOT_PX4: "px4",
+    }.get(autopilot, "unknown")
+
+
+def decode_version(flight_sw_version: int) -> Version:
+    """(major, minor, patch) of AUTOPILOT_VERSION.flight_sw_version."""
+    return (
+        flight_sw_version >> 24 & 0xFF,
+        flight_sw_version >> 16 & 0xFF,
+        flight_sw_version >> 8 & 0xFF,
+    )
+
+
+def select_profile(autopilot: str, version: Version | None) -> FirmwareProfile:
+    """The profile of a firmware; an unknown one gets `GENERIC` (``known`` is False)."""
+    if autopilot == "ardupilot":
+        if version is None or (4, 5, 0) <= version < (4, 8, 0):
+            return ARDUPILOT
+        return ARDUPILOT_SQRT if version >= (4, 8, 0) else GENERIC
+    if autopilot == "px4" and (version is None or version >= (1, 15, 0)):
+        return PX4
+    return GENERIC
+
+
+def covariance_entry(error: float, formula: CovarianceFormula) -> float:
+    """What to write into each of three diagonal entries so that the firmware reads `error`.
+
+    cbrt: ``error = cbrt(3 c^2)`` (ArduPilot 4.5-4.7, GCS_Common.cpp). sqrt: ``error = sqrt(3 c)``
+    (pull request 32084). variance: ``c = error^2``, as MAVLink defines it (PX4).
+    """
+    if formula == "cbrt":
+        return math.sqrt(error**3 / 3.0)
+    if formula == "sqrt":
+        return error**2 / 3.0
+    return error**2
+
+
+def error_from_entry(entry: float, formula: CovarianceFormula) -> float:
+    """The error a firmware reads from three equal diagonal entries; inverse of the above."""
+    if formula == "cbrt":
+        return (3.0 * entry**2) ** (1.0 / 3.0)
+    if formula == "sqrt":
+        return math.sqrt(3.0 * entry)
+    return math.sqrt(entry)

@@ -1,0 +1,430 @@
+"""The injector by itself: timing, covariance, reset counter, yaw guard, bounds."""
+
+from __future__ import annotations
+
+import itertools
+import math
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import pytest
+
+from mavlink_bridge.config import InjectionConfig
+from mavlink_bridge.injection.encode import DIAGONAL
+from mavlink_bridge.injection.injector import Injection, InjectionContext, Injector
+from mavlink_bridge.link.clock import SteadyUtc
+from mavlink_bridge.messages import Attitude, Origin, VisionFix
+from mavlink_bridge.quaternion import from_euler
+from mavlink_bridge.vehicle.profile import (
+    ARDUPILOT,
+    ARDUPILOT_SQRT,
+    PX4,
+    FirmwareProfile,
+    error_from_entry,
+)
+
+MS = 1_000_000
+SECOND = 1_000 * MS
+HOME = (47.397742, 8.545594)
+GEOID = 47.0
+ORIGIN = Origin(*HOME, 488.0)
+METRE = 1.0 / 111318.84502145034
+
+
+def context(
+    origin: Origin | None = ORIGIN,
+    profile: FirmwareProfile = ARDUPILOT,
+    yaw: float = 0.0,
+    yaw_error_deg: Callable[[float], float] = lambda _: 0.0,
+) -> InjectionContext:
+    """yaw_error_deg: the error of the estimated yaw by seconds; the gyros are right."""
+
+    def attitude_at(time_ns: int) -> Attitude:
+        estimated = yaw + math.radians(yaw_error_deg(time_ns / SECOND))
+        q = from_euler(0.0, 0.0, estimated)
+        return Attitude(time_ns, 0.0, 0.0, estimated, q, gyro_heading_rad=0.7)
+
+    return InjectionContext(origin, profile, attitude_at)
+
+
+def injector(**options: Any) -> Injector:
+    utc = SteadyUtc(utc_ns=1_700_000_000 * SECOND, at_monotonic_ns=0)
+    return Injector(InjectionConfig(**options), GEOID, utc)
+
+
+def fix(time_ns: int, north: float = 0.0, east: float = 0.0, **options: Any) -> VisionFix:
+    options.setdefault("yaw_rad", 0.0)
+    options.setdefault("position_covariance_ned", np.eye(3) * 0.25)
+    return VisionFix(
+        time_ns,
+        HOME[0] + north * METRE,
+        HOME[1] + east * METRE / math.cos(math.radians(HOME[0])),
+        488.0 + GEOID + 60.0,
+        0.0,
+        0.0,
+        **options,
+    )
+
+
+def fly(
+    it: Injector,
+    *,
+    seconds: float,
+    fix_hz: float,
+    latency_ms: float,
+    speed: float = 0.0,
+    where: InjectionContext | None = None,
+    start: int = SECOND,
+    change: Any = None,
+) -> list[tuple[int, Injection]]:
+    """Feed fixes of a vehicle that flies north, in 1 ms steps; (send time, injection) of each."""
+    sent = []
+    arriving: list[tuple[int, VisionFix]] = []
+    period = int(SECOND / fix_hz)
+    for t in range(start, start + int(seconds * SECOND), MS):
+        if (t - start) % period < MS:
+            f = fix(t, north=speed * t / SECOND)
+            f = change(f) if change else f
+            if f is not None:
+                arriving.append((t + int(latency_ms * MS), f))
+        while arriving and arriving[0][0] <= t:
+            it.submit(arriving.pop(0)[1], t)
+        injection = it.step(t, where or context())
+        if injection is not None:
+            sent.append((t, injection))
+    return sent
+
+
+def test_fix_is_sent_at_the_configured_delay_with_its_exposure_time() -> None:
+    it = injector(rate_hz=10, delay_ms=100)
+    sent = fly(it, seconds=3, fix_hz=10, latency_ms=40)
+    lags = {(t - i.estimate.position.time_ns) // MS for t, i in sent}
+    assert lags == {100}
+    assert all(i.estimate.fresh for _, i in sent)
+    assert sent[0][1].message.usec == sent[0][1].estimate.position.time_ns // 1000
+
+
+def test_position_is_ned_from_the_origin_and_altitude_is_amsl() -> None:
+    it = injector(rate_hz=10, delay_ms=0)
+    it.submit(fix(SECOND, north=120.0, east=-35.0), SECOND)
+    message = it.step(SECOND, context()).message  # type: ignore[union-attr]
+    assert (message.x, message.y, message.z) == pytest.approx((120.0, -35.0, -60.0), abs=0.01)
+
+
+def test_slow_fixes_are_propagated_to_a_steady_rate_and_least_lag_stays_the_delay() -> None:
+    it = injector(rate_hz=20, delay_ms=100)
+    sent = fly(it, seconds=6, fix_hz=4, latency_ms=150, speed=10.0)
+    late = [(t, i) for t, i in sent if t > 3 * SECOND]
+    rate = len(late) / 4.0
+    assert 18 <= rate <= 26
+    lags = [(t - i.estimate.position.time_ns) / MS for t, i in late]
+    assert min(lags) == pytest.approx(100.0, abs=1.0)
+    gaps = np.diff([t for t, _ in late]) / MS
+    assert gaps.max() <= 76.0
+    # Where the vehicle was at the stamp, not where the last fix saw it.
+    errors = [i.message.x - 10.0 * i.estimate.position.time_ns / SECOND for _, i in late]
+    assert np.abs(errors).max() < 0.3
+
+
+def test_stamps_never_run_back() -> None:
+    it = injector(rate_hz=30, delay_ms=50)
+    sent = fly(it, seconds=5, fix_hz=7, latency_ms=180, speed=5.0)
+    stamps = [i.message.usec for _, i in sent]
+    assert len(stamps) > 100
+    assert all(b > a for a, b in itertools.pairwise(stamps))
+
+
+def test_rate_never_passes_what_ardupilot_drops() -> None:
+    it = injector(rate_hz=30, delay_ms=100)
+    sent = fly(it, seconds=3, fix_hz=90, latency_ms=50)
+    gaps = np.diff([t for t, _ in sent]) / SECOND
+    assert (1.0 / gaps).max() <= 50.0
+
+
+def test_fix_too_old_to_fuse_is_propagated() -> None:
+    it = injector(rate_hz=10, delay_ms=200)
+    sent = fly(it, seconds=4, fix_hz=10, latency_ms=400, speed=8.0)
+    assert not any(i.estimate.fresh for _, i in sent)
+    lags = {(t - i.estimate.position.time_ns) // MS for t, i in sent}
+    assert lags == {200}
+    steady = [i for t, i in sent if t > 3 * SECOND]
+    errors = [i.message.x - 8.0 * i.estimate.position.time_ns / SECOND for i in steady]
+    assert np.abs(errors).max() < 0.2
+
+
+def test_covariance_grows_between_fixes_and_sending_ends_at_the_bound() -> None:
+    it = injector(
+        rate_hz=20, delay_ms=0, max_sigma_m=2.0, max_extrapolation_s=5.0, overdue_intervals=1000.0
+    )
+    for k in range(20):
+        it.submit(fix(SECOND + k * 100 * MS), SECOND + k * 100 * MS)
+        it.step(SECOND + k * 100 * MS, context())
+    last = SECOND + 1900 * MS
+    sigmas = []
+    for t in range(last + MS, last + 6 * SECOND, MS):
+        injection = it.step(t, context())
+        if injection is not None:
+            sigmas.append(injection.estimate.position.horizontal_sigma_m)
+    assert sigmas == sorted(sigmas)
+    assert sigmas[0] < 0.7
+    assert 1.5 < sigmas[-1] <= 2.0
+    assert it.counters["withheld_covariance"] > 10
+    assert "covariance" in it.reason or "fresh" in it.reason
+
+
+@pytest.mark.parametrize(("fix_hz", "silent_after_s"), [(10, 0.2), (5, 0.4), (1, 0.5)])
+def test_sending_ends_when_the_next_fix_is_overdue(fix_hz: float, silent_after_s: float) -> None:
+    it = injector(rate_hz=20, delay_ms=0)
+
+    def until_6_s(f: VisionFix) -> VisionFix | None:
+        return f if f.time_ns <= 6 * SECOND else None
+
+    sent = fly(it, seconds=9, fix_hz=fix_hz, latency_ms=0, change=until_6_s)
+    last = max(t for t, _ in sent) / SECOND
+    assert 6.0 + silent_after_s - 0.06 <= last <= 6.0 + silent_after_s
+    assert it.reason == "no fresh fix"
+
+
+@pytest.mark.parametrize("profile", [ARDUPILOT, ARDUPILOT_SQRT, PX4])
+@pytest.mark.parametrize("sigma", [0.5, 2.0])
+def test_firmware_reads_the_error_that_was_meant(profile: FirmwareProfile, sigma: float) -> None:
+    it = injector(rate_hz=10, delay_ms=0, sigma_floor_m=1e-6)
+    it.submit(fix(SECOND, position_covariance_ned=np.eye(3) * sigma**2), SECOND)
+    covariance = it.step(SECOND, context(profile=profile)).message.covariance  # type: ignore[union-attr]
+    if profile is ARDUPILOT:  # GCS_Common.cpp: cbrtf(sq(c0) + sq(c6) + sq(c11))
+        read = sum(covariance[i] ** 2 for i in DIAGONAL[:3]) ** (1 / 3)
+    elif profile is ARDUPILOT_SQRT:  # pull request 32084
+        read = math.sqrt(sum(covariance[i] for i in DIAGONAL[:3]))
+    else:
+        read = math.sqrt(covariance[0])
+    assert read == pytest.approx(sigma, rel=1e-4)
+    assert error_from_entry(covariance[0], profile.covariance) == pytest.approx(sigma, rel=1e-4)
+
+
+def test_reset_counter_changes_on_the_very_message_that_carries_the_jump() -> None:
+    it = injector(rate_hz=20, delay_ms=100)
+    jump_at = 3 * SECOND
+
+    def jump(f: VisionFix) -> VisionFix:
+        if f.time_ns < jump_at:
+            return f
+        first = jump_at <= f.time_ns < jump_at + 125 * MS
+        return fix(f.time_ns, north=10.0, reset=first)
+
+    sent = fly(it, seconds=5, fix_hz=8, latency_ms=60, change=jump)
+    counters = [i.message.reset_counter for _, i in sent]
+    norths = [i.message.x for _, i in sent]
+    first = counters.index(1)
+    assert set(counters) == {0, 1}
+    assert norths[first - 1] == pytest.approx(0.0, abs=0.5)
+    assert norths[first] == pytest.approx(10.0, abs=0.5)
+    assert all(n == pytest.approx(10.0, abs=0.5) for n in norths[first:])
+
+
+def test_reset_of_a_fix_that_is_not_sent_itself_is_not_lost() -> None:
+    it = injector(rate_hz=10, delay_ms=0)
+    it.submit(fix(SECOND), SECOND)
+    it.step(SECOND, context())
+    # Two fixes inside one slot: the older carries the reset and is superseded.
+    it.submit(fix(SECOND + 10 * MS, north=10.0, reset=True), SECOND + 10 * MS)
+    it.submit(fix(SECOND + 20 * MS, north=10.0), SECOND + 20 * MS)
+    it.step(SECOND + 20 * MS, context())
+    sent = None
+    for t in range(SECOND + 21 * MS, SECOND + 200 * MS, MS):
+        sent = sent or it.step(t, context())
+    assert sent is not None
+    assert sent.message.reset_counter == 1
+    assert sent.message.x == pytest.approx(10.0, abs=0.1)
+
+
+def turned_by(schedule: Any) -> Any:
+    """Fixes whose yaw differs from the autopilot's by schedule(seconds) degrees."""
+    return lambda f: fix(f.time_ns, yaw_rad=math.radians(schedule(f.time_ns / SECOND)))
+
+
+def test_frame_rotated_from_the_start_is_never_sent_and_the_reason_is_told() -> None:
+    it = injector(rate_hz=10, delay_ms=0)
+    assert fly(it, seconds=3, fix_hz=10, latency_ms=0, change=turned_by(lambda _: 5.0)) == []
+    assert it.counters["withheld_yaw"] > 10
+    assert it.reason == "vision yaw differs from the autopilot's by +5.0 deg"
+
+
+def test_frame_that_rotates_in_flight_is_refused_at_once_and_released_when_right_again() -> None:
+    it = injector(rate_hz=10, delay_ms=0)
+    change = turned_by(lambda t: 5.0 if 3.0 <= t < 6.0 else 0.3)
+    sent = fly(it, seconds=8, fix_hz=10, latency_ms=0, change=change)
+    exposures = [i.estimate.position.time_ns / SECOND for _, i in sent if i.estimate.fresh]
+    assert not [t for t in exposures if 3.0 <= t < 6.3]
+    assert [t for t in exposures if t > 6.7]
+    assert it.counters["fixes_yaw_refused"] == 34  # 30 rotated, 4 on probation
+
+
+def test_frame_that_turns_towards_a_wrong_yaw_of_the_autopilot_is_refused() -> None:
+    it = injector(rate_hz=10, delay_ms=0)
+    where = context(yaw_error_deg=lambda _: 2.5)
+    change = turned_by(lambda t: 5.0 if t >= 3.0 else 0.0)
+    sent = fly(it, seconds=6, fix_hz=10, latency_ms=0, where=where, change=change)
+    assert max(i.estimate.position.time_ns for _, i in sent if i.estimate.fresh) < 3 * SECOND
+    assert it.counters["fixes_yaw_refused"] == 40
+
+
+def test_announced_turn_towards_the_autopilots_yaw_is_taken() -> None:
+    it = injector(rate_hz=10, delay_ms=0)
+
+    def relocalized(f: VisionFix) -> VisionFix:
+        jumps = f.time_ns == 3 * SECOND
+        yaw = math.radians(3.0 if f.time_ns < 3 * SECOND else -1.0)
+        return fix(f.time_ns, yaw_rad=yaw, reset=jumps)
+
+    sent = fly(it, seconds=6, fix_hz=10, latency_ms=0, change=relocalized)
+    assert max(i.estimate.position.time_ns for _, i in sent) > 5.5 * SECOND
+    assert it.counters["fixes_yaw_refused"] == 0
+
+
+@pytest.mark.parametrize(
+    "error",
+    [
+        lambda t: -min(t, 8.0),  # hover on ODOMETRY: 6 deg in seconds
+        lambda t: -8.0 if t > 4.0 else 0.0,  # aligned again in flight
+    ],
+)
+def test_autopilots_own_yaw_error_does_not_withhold_vision(error: Any) -> None:
+    it = injector(rate_hz=10, delay_ms=0)
+    sent = fly(it, seconds=12, fix_hz=10, latency_ms=0, where=context(yaw_error_deg=error))
+    assert len(sent) >= 118
+    assert it.counters["fixes_yaw_refused"] == 0
+    assert math.degrees(it.yaw_difference_rad) == pytest.approx(8.0)
+
+
+def test_gross_difference_is_refused_however_slowly_it_came() -> None:
+    it = injector(rate_hz=10, delay_ms=0)
+    where = context(yaw_error_deg=lambda t: t - 1.0)
+    sent = fly(it, seconds=30, fix_hz=10, latency_ms=0, where=where)
+    assert 20 * SECOND < max(i.estimate.position.time_ns for _, i in sent) <= 22 * SECOND
+
+
+def test_gyros_are_trusted_over_a_dropout() -> None:
+    it = injector(rate_hz=10, delay_ms=0)
+    where = context(yaw_error_deg=lambda t: 6.0 if t > 5.0 else 0.0)
+
+    def dropout(f: VisionFix) -> VisionFix | None:
+        return None if 9 * SECOND <= f.time_ns < 15 * SECOND else f
+
+    sent = fly(it, seconds=17, fix_hz=10, latency_ms=0, where=where, change=dropout)
+    assert [t for t, _ in sent if t > 15.5 * SECOND]
+
+
+def test_single_wild_yaw_is_dropped_without_blocking() -> None:
+    it = injector(rate_hz=10, delay_ms=0)
+
+    def wild(f: VisionFix) -> VisionFix:
+        return fix(f.time_ns, yaw_rad=1.5, north=50.0) if f.time_ns == 3 * SECOND else f
+
+    sent = fly(it, seconds=4, fix_hz=10, latency_ms=0, change=wild)
+    assert max(abs(i.message.x) for _, i in sent) < 1.0
+    assert it.counters["fixes_yaw_refused"] == 1
+
+
+def test_without_an_origin_nothing_local_is_sent_and_the_reason_says_so() -> None:
+    it = injector(rate_hz=10, delay_ms=0)
+    assert fly(it, seconds=1, fix_hz=10, latency_ms=0, where=context(origin=None)) == []
+    assert it.reason == "the EKF has no origin"
+
+
+def test_late_future_and_unordered_fixes_are_dropped_and_counted() -> None:
+    it = injector()
+    it.submit(fix(10 * SECOND), 10 * SECOND)
+    it.submit(fix(9 * SECOND), 10 * SECOND)
+    it.submit(fix(12 * SECOND), 11 * SECOND)
+    it.submit(fix(11 * SECOND), 20 * SECOND)
+    assert it.counters["fixes"] == 1
+    assert it.counters["fixes_out_of_order"] == 1
+    assert it.counters["fixes_from_future"] == 1
+    assert it.counters["fixes_stale"] == 1
+
+
+def test_unknown_attitude_is_sent_as_nan() -> None:
+    it = injector(delay_ms=0)
+    unknown = fix(SECOND, yaw_rad=math.nan)
+    it.submit(unknown, SECOND)
+    message = it.step(SECOND, context()).message  # type: ignore[union-attr]
+    assert math.isnan(message.yaw)
+    assert it.guard.unchecked == 1
+
+
+@pytest.mark.parametrize("latency_ms", [0, 400])
+def test_each_velocity_is_sent_once(latency_ms: float) -> None:
+    """Also of fixes that are too old to be sent as they are."""
+    it = injector(message="odometry", rate_hz=20, delay_ms=0)
+    sent = fly(it, seconds=4, fix_hz=10, latency_ms=latency_ms, speed=5.0)
+    known = [math.isfinite(i.message.vx) for _, i in sent]
+    assert known.count(True) == pytest.approx(40 - latency_ms // 100, abs=2)
+    assert known.count(False) >= 25
+    assert not any(i.message.vx == 0.0 for t, i in sent if t > 2 * SECOND)
+
+
+def test_odometry_has_the_frames_ardupilot_accepts_and_body_velocity() -> None:
+    it = injector(message="odometry", rate_hz=10, delay_ms=0)
+    east = math.radians(90.0)
+
+    def turned(f: VisionFix) -> VisionFix:
+        return fix(f.time_ns, north=10.0 * f.time_ns / SECOND, yaw_rad=east, quality=77)
+
+    sent = fly(it, seconds=4, fix_hz=10, latency_ms=0, where=context(yaw=east), change=turned)
+    m = sent[-1][1].message
+    assert (m.frame_id, m.child_frame_id) == (20, 12)
+    # Nose to the east, flying north: the body moves to its left.
+    assert (m.vx, m.vy, m.vz) == pytest.approx((0.0, -10.0, 0.0), abs=0.3)
+    assert m.quality == 77
+    assert 0.0 < m.velocity_covariance[0] < 1.0
+    assert m.q == pytest.approx([math.cos(east / 2), 0.0, 0.0, math.sin(east / 2)], abs=1e-6)
+
+
+def test_measured_velocity_is_used() -> None:
+    it = injector(message="odometry", rate_hz=10, delay_ms=0)
+
+    def measured(f: VisionFix) -> VisionFix:
+        return fix(
+            f.time_ns,
+            north=3.0 * f.time_ns / SECOND,
+            velocity_ned=(3.0, -2.0, 1.0),
+            velocity_sigma_mps=0.05,
+        )
+
+    m = fly(it, seconds=1, fix_hz=10, latency_ms=0, change=measured)[-1][1].message
+    assert (m.vx, m.vy, m.vz) == pytest.approx((3.0, -2.0, 1.0), abs=0.15)
+    assert m.velocity_covariance[0] < 0.1**2
+
+
+def test_gps_input_fills_every_field() -> None:
+    it = injector(message="gps_input", rate_hz=5, delay_ms=100, gps_yaw=True)
+    sent = fly(it, seconds=4, fix_hz=5, latency_ms=40, speed=10.0, where=context(origin=None))
+    t, injection = sent[-1]
+    m = injection.message
+    assert m.fix_type == 3
+    assert m.satellites_visible >= 6
+    assert m.hdop < 1.4
+    assert m.ignore_flags == 0
+    assert m.alt == pytest.approx(548.0, abs=0.01)
+    assert m.yaw == 36000
+    assert m.vn == pytest.approx(10.0, abs=0.3)
+    gps_s = 1_700_000_000 + m.time_usec * 1e-6 - 315_964_800 + 18
+    assert m.time_week == int(gps_s // 604800)
+    assert m.time_week_ms == pytest.approx(gps_s % 604800 * 1000, abs=1.1)
+    assert (t - injection.estimate.position.time_ns) / MS == pytest.approx(100.0, abs=1.0)
+
+
+def test_gps_input_without_velocity_sets_the_ignore_flags() -> None:
+    it = injector(message="gps_input", rate_hz=5, delay_ms=0, gps_velocity=False)
+    sent = fly(it, seconds=1, fix_hz=5, latency_ms=0)
+    assert sent[0][1].message.ignore_flags == 8 | 16 | 32
+    assert sent[0][1].message.yaw == 0
+
+
+def test_global_position_sensor_carries_both_altitudes() -> None:
+    it = injector(message="global_position_sensor", rate_hz=10, delay_ms=0)
+    it.submit(fix(SECOND), SECOND)
+    m = it.step(SECOND, context(profile=PX4)).message  # type: ignore[union-attr]
+    assert (m.alt_ellipsoid, m.alt) == pytest.approx((595.0, 548.0), abs=0.01)
+    assert m.eph == pytest.approx(0.51, abs=0.02)

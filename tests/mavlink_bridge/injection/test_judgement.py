@@ -1,0 +1,249 @@
+"""Shadow score, closed-loop check and source switching, without any link."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from mavlink_bridge.config import SourceSwitchConfig
+from mavlink_bridge.injection.closed_loop import ClosedLoopCheck, LoopVerdict
+from mavlink_bridge.injection.propagate import PropagatedFix
+from mavlink_bridge.injection.shadow import ShadowScorer
+from mavlink_bridge.injection.switching import SourceSwitch, SwitchOrder
+from mavlink_bridge.messages import VehicleState
+
+MS = 1_000_000
+SECOND = 1_000 * MS
+HOME = (47.397742, 8.545594)
+METRE = 1.0 / 111318.84502145034
+GOOD_FLAGS = 831
+
+
+def position(
+    time_ns: int, north: float = 0.0, sigma: float = 0.5, speed: float = 0.0
+) -> PropagatedFix:
+    return PropagatedFix(
+        time_ns,
+        HOME[0] + north * METRE,
+        HOME[1],
+        600.0,
+        np.eye(3) * sigma**2,
+        np.array([speed, 0.0, 0.0]),
+        np.eye(3) * 0.01,
+    )
+
+
+def vehicle(now_ns: int = SECOND, **options: Any) -> VehicleState:
+    return replace(
+        VehicleState(
+            connected=True,
+            autopilot="ardupilot",
+            ekf_flags=GOOD_FLAGS,
+            ekf_horizontal_variance=0.1,
+            gps_fix_type=3,
+            gps_latitude_deg=HOME[0],
+            gps_longitude_deg=HOME[1],
+            gps_h_accuracy_m=1.0,
+            gps_time_ns=now_ns,
+        ),
+        **options,
+    )
+
+
+# --- shadow -------------------------------------------------------------------------------------
+
+
+def scored(error_m: float, *, sigma: float = 0.5, hz: float = 10.0, seconds: float = 10.0) -> Any:
+    rng = np.random.default_rng(1)
+    scorer = ShadowScorer(100.0)
+    for i in range(int(hz * seconds)):
+        north = error_m + rng.normal(0.0, 0.2)
+        scorer.compare(position(int(i * SECOND / hz), north, sigma), (*HOME, 500.0))
+    return scorer.score(int(seconds * SECOND), 0.0, False)
+
+
+def test_good_vision_is_a_go() -> None:
+    score = scored(0.5)
+    assert score.go
+    assert score.samples == 100
+    assert score.median_m == pytest.approx(0.5, abs=0.1)
+    assert score.bias_ne_m == pytest.approx((0.5, 0.0), abs=0.1)
+    assert score.rate_hz == pytest.approx(10.0)
+    assert score.line().startswith("go: median 0.5 m")
+
+
+@pytest.mark.parametrize(
+    ("options", "reason"),
+    [
+        ({"error_m": 4.0, "sigma": 4.0}, "median error 4.0 m"),
+        ({"error_m": 2.9 * 2, "sigma": 0.1}, "errors exceed the claimed covariance"),
+        ({"error_m": 0.1, "seconds": 3.0}, "only 30 fixes"),
+        ({"error_m": 0.1, "hz": 2.0, "seconds": 40.0}, "2.0 Hz"),
+    ],
+)
+def test_bad_vision_is_a_no_go_with_its_reason(options: dict[str, float], reason: str) -> None:
+    score = scored(**options)
+    assert not score.go
+    assert any(reason in r for r in score.reasons)
+    assert score.line().startswith("no-go: ")
+
+
+@pytest.mark.parametrize(("altitude", "go"), [(493.0, True), (547.0, False), (406.0, False)])
+def test_a_wrong_geoid_is_seen_in_the_heights(altitude: float, go: bool) -> None:
+    """Fixes at 600 m above the ellipsoid, 100 m of geoid: 500 m AMSL, whatever the autopilot has.
+
+    With the separation's sign turned they would be 200 m off, without it 100 m.
+    """
+    scorer = ShadowScorer(100.0)
+    for i in range(100):
+        scorer.compare(position(i * 100 * MS), (*HOME, altitude))
+    score = scorer.score(10 * SECOND, 0.0, False)
+    assert score.height_m == pytest.approx(500.0 - altitude)
+    assert score.go is go
+    assert any("check geoid" in reason for reason in score.reasons) is not go
+
+
+def test_nothing_compared_is_a_no_go() -> None:
+    score = ShadowScorer(100.0).score(SECOND, 0.0, False)
+    assert not score.go
+    assert "no fix could be compared" in score.line()
+
+
+def test_blocked_yaw_is_a_no_go() -> None:
+    scorer = ShadowScorer(100.0)
+    for i in range(100):
+        scorer.compare(position(i * 100 * MS), (*HOME, 500.0))
+    assert scorer.score(10 * SECOND, math.radians(5.0), True).reasons == (
+        "yaw differs by +5.0 deg",
+    )
+
+
+# --- closed loop --------------------------------------------------------------------------------
+
+
+def looped(
+    ekf_north: float | None = 0.0, hz: float = 10.0, message: Any = "odometry", **options: Any
+) -> LoopVerdict | None:
+    check = ClosedLoopCheck(message)
+    for i in range(int(hz * 8)):
+        now = int(i * SECOND / hz)
+        check.sent(now - 100 * MS, now, 0.0, 0.0, 0.5)
+    local = None if ekf_north is None else (ekf_north, 0.0, -60.0)
+    return check.verdict(8 * SECOND, vehicle(**options), lambda _: local)
+
+
+def test_followed_position_is_used() -> None:
+    verdict = looped(0.4)
+    assert verdict == LoopVerdict(True, "", pytest.approx(0.4))
+
+
+@pytest.mark.parametrize(
+    ("options", "reason"),
+    [
+        ({"ekf_north": 30.0}, "30.0 m from what is sent"),
+        ({"ekf_north": None}, "no local position; check VISO_TYPE=1"),
+        ({"ekf_flags": 128 | 1}, "no position source"),
+        ({"ekf_flags": 1024}, "not initialised"),
+        ({"ekf_horizontal_variance": 1.4}, "innovation gate"),
+        ({"hz": 2.0}, "rate 2.0 Hz is below 4.0 Hz"),
+        ({"message": "gps_input", "hz": 4.5}, "below 4.7 Hz"),
+        ({"message": "gps_input", "ekf_flags": 128}, "GPS1_TYPE=14"),
+    ],
+)
+def test_reason_in_one_line(options: dict[str, Any], reason: str) -> None:
+    verdict = looped(**options)
+    assert verdict is not None
+    assert not verdict.used
+    assert reason in verdict.reason
+
+
+def test_no_verdict_before_it_has_settled_or_after_sending_ended() -> None:
+    check = ClosedLoopCheck("odometry")
+    for i in range(20):
+        check.sent(i * 100 * MS, i * 100 * MS, 0.0, 0.0, 0.5)
+    assert check.verdict(2 * SECOND, vehicle(), lambda _: (0.0, 0.0, 0.0)) is None
+    assert check.verdict(60 * SECOND, vehicle(), lambda _: (0.0, 0.0, 0.0)) is None
+
+
+# --- source switch ------------------------------------------------------------------------------
+
+CONFIG = SourceSwitchConfig(enabled=True, bad_after_s=1.5, good_after_s=10.0)
+
+
+def drive(switch: SourceSwitch, seconds: float, start: float = 0.0, **how: Any) -> list[Any]:
+    """Decide ten times a second; orders are acknowledged. how: see the body."""
+    orders = []
+    for i in range(int(seconds * 10)):
+        now = int((start + i / 10) * SECOND) + SECOND
+        gps = how.get("gps", True)
+        state = vehicle(
+            now if gps else 0,
+            gps_fix_type=3 if gps else 0,
+            ekf_flags=GOOD_FLAGS | how.get("flags", 0),
+        )
+        vision = position(now - 100 * MS, how.get("north", 0.0), speed=how.get("speed", 0.0))
+        order = switch.decide(now, state, vision, how.get("good", True))
+        if order is not None:
+            orders.append((start + i / 10, order))
+            if how.get("acknowledge", True):
+                switch.acknowledged(True)
+    return orders
+
+
+@pytest.mark.parametrize(
+    ("how", "reason"),
+    [
+        ({"gps": False}, "GNSS lost"),
+        ({"flags": 32768}, "GNSS glitch"),
+        ({"north": 12.0}, "GNSS 12 m from vision"),
+    ],
+)
+def test_bad_gnss_switches_once_to_vision(how: dict[str, Any], reason: str) -> None:
+    switch = SourceSwitch(CONFIG)
+    assert drive(switch, 5.0) == []
+    orders = drive(switch, 6.0, 5.0, **how)
+    assert [order for _, order in orders] == [SwitchOrder(2, reason)]
+    assert orders[0][0] == pytest.approx(6.5, abs=0.15)
+    assert switch.current == 2
+
+
+def test_short_fault_switches_nothing() -> None:
+    switch = SourceSwitch(CONFIG)
+    for i in range(10):
+        assert drive(switch, 1.0, 4.0 * i, gps=False) == []
+        assert drive(switch, 3.0, 4.0 * i + 1.0) == []
+
+
+def test_fast_flight_is_no_inconsistency() -> None:
+    assert drive(SourceSwitch(CONFIG), 5.0, north=8.0, speed=15.0) == []
+
+
+def test_no_switch_to_vision_that_is_not_good() -> None:
+    assert drive(SourceSwitch(CONFIG), 5.0, gps=False, good=False) == []
+
+
+def test_order_is_repeated_until_acknowledged() -> None:
+    orders = drive(SourceSwitch(CONFIG), 6.0, gps=False, acknowledge=False)
+    assert 4 <= len(orders) <= 6
+
+
+def test_back_to_gnss_only_if_configured_and_after_long_health() -> None:
+    never = SourceSwitch(CONFIG)
+    drive(never, 5.0, gps=False)
+    assert drive(never, 60.0, 5.0) == []
+    back = SourceSwitch(CONFIG.model_copy(update={"return_to_gnss": True}))
+    drive(back, 5.0, gps=False)
+    for i in range(5):
+        # A receiver that comes and goes does not bring it back.
+        assert drive(back, 9.0, 5.0 + 10 * i) == []
+        assert drive(back, 1.0, 14.0 + 10 * i, gps=False) == []
+    orders = drive(back, 12.0, 55.0)
+    assert [order.source_set for _, order in orders] == [1]
+
+
+def test_disabled_does_nothing() -> None:
+    assert drive(SourceSwitch(SourceSwitchConfig()), 10.0, gps=False) == []

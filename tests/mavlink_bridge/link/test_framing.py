@@ -1,0 +1,182 @@
+"""Frames out of damaged streams, and signing."""
+
+from __future__ import annotations
+
+import os
+import random
+import time
+from collections import deque
+from pathlib import Path
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from pymavlink.dialects.v20 import ardupilotmega as mavlink
+
+from mavlink_bridge.errors import SigningKeyError
+from mavlink_bridge.link.framing import FrameReader
+from mavlink_bridge.link.signing import create_key, load_key, signing_timestamp
+
+KEY = bytes(range(32))
+
+
+def frames(count: int, key: bytes | None = None, stamp: int | None = None) -> list[bytes]:
+    codec = mavlink.MAVLink(None, 1, 1)
+    if key is not None:
+        codec.signing.secret_key = key
+        codec.signing.sign_outgoing = True
+        codec.signing.timestamp = signing_timestamp() if stamp is None else stamp
+    result = []
+    for i in range(count):
+        message = mavlink.MAVLink_attitude_message(1000 + i, 0.1, 0.2, 0.3, 0.4, 0.5, 0.6)
+        result.append(message.pack(codec))
+        codec.seq = (codec.seq + 1) % 256
+    return result
+
+
+@given(st.lists(st.integers(1, 40), min_size=1, max_size=60))
+def test_fragments_of_any_size(cuts: list[int]) -> None:
+    data = b"".join(frames(8))
+    reader = FrameReader()
+    got, start, i = [], 0, 0
+    while start < len(data):
+        size = cuts[i % len(cuts)]
+        got += reader.feed(data[start : start + size])
+        start, i = start + size, i + 1
+    assert [m.time_boot_ms for m in got] == list(range(1000, 1008))
+    assert reader.counters.bad_bytes == 0
+
+
+@settings(max_examples=200)
+@given(st.binary(max_size=400))
+def test_garbage_between_frames_costs_no_frame(noise: bytes) -> None:
+    good = frames(20)
+    reader = FrameReader()
+    got = reader.feed(noise + b"".join(good))
+    # A marker in the noise may claim up to 280 bytes that are still to come; they come.
+    got += reader.feed(b"\x00" * 300)
+    assert [m.time_boot_ms for m in got] == list(range(1000, 1020))
+
+
+def test_truncated_and_corrupted_frames_cost_only_themselves() -> None:
+    rng = random.Random(1)
+    good = frames(300)
+    stream = b""
+    kept = []
+    for i, frame in enumerate(good):
+        kind = i % 3
+        if kind == 0:
+            stream += frame[: rng.randrange(1, len(frame))]
+        elif kind == 1:
+            position = rng.randrange(1, len(frame) - 2)
+            stream += frame[:position] + bytes([frame[position] ^ 0x55]) + frame[position + 1 :]
+        else:
+            stream += frame
+            kept.append(1000 + i)
+    reader = FrameReader()
+    got = [m.time_boot_ms for m in reader.feed(stream + b"\x00" * 300)]
+    assert got == kept
+
+
+def test_duplicated_and_lost_frames_are_counted() -> None:
+    good = frames(10)
+    reader = FrameReader()
+    reader.feed(b"".join(good[:4] + good[7:]))
+    assert reader.counters.lost == 3
+
+
+@settings(max_examples=300)
+@given(st.binary(max_size=600))
+def test_no_bytes_raise(data: bytes) -> None:
+    reader = FrameReader()
+    reader.feed(data)
+    reader.feed(data[::-1])
+
+
+def test_any_payload_of_any_message_is_decoded_or_counted() -> None:
+    rng = random.Random(2)
+    reader = FrameReader()
+    for message_id, kind in mavlink.mavlink_map.items():
+        payload = rng.randbytes(kind.unpacker.size)
+        header = bytes([0xFD, len(payload), 0, 0, 1, 1, 1]) + message_id.to_bytes(3, "little")
+        crc = mavlink.x25crc(header[1:] + payload)
+        crc.accumulate(bytes([kind.crc_extra]))
+        reader.feed(header + payload + crc.crc.to_bytes(2, "little"))
+    counters = reader.counters
+    assert counters.messages + counters.undecodable == len(mavlink.mavlink_map)
+    assert counters.messages > 0.9 * len(mavlink.mavlink_map)
+
+
+def test_memory_stays_bounded_on_endless_noise() -> None:
+    rng = random.Random(3)
+    reader = FrameReader()
+    for _ in range(200):
+        reader.feed(bytes(0xFD if rng.random() < 0.5 else rng.randrange(256) for _ in range(1000)))
+    assert len(reader._buffer) < 1000
+
+
+def test_unwanted_messages_are_not_decoded() -> None:
+    reader = FrameReader(wanted={0})
+    assert reader.feed(b"".join(frames(5))) == []
+    assert reader.counters.skipped_messages == 5
+
+
+def test_raw_frames_for_the_recorder_include_unwanted_ones() -> None:
+    raw: deque[bytes] = deque()
+    good = frames(3)
+    FrameReader(wanted=()).feed(b"".join(good), raw)
+    assert list(raw) == good
+
+
+def test_only_frames_signed_with_the_key_pass() -> None:
+    reader = FrameReader(key=KEY)
+    assert reader.feed(b"".join(frames(2))) == []
+    assert reader.feed(b"".join(frames(3, bytes(32)))) == []
+    assert len(reader.feed(b"".join(frames(4, KEY)))) == 4
+    assert reader.counters.unsigned == 2
+    assert reader.counters.bad_signatures == 3
+
+
+def test_replay_is_refused() -> None:
+    reader = FrameReader(key=KEY)
+    recorded = frames(3, KEY)
+    assert len(reader.feed(b"".join(recorded))) == 3
+    assert reader.feed(b"".join(recorded)) == []
+    assert reader.counters.bad_signatures == 3
+
+
+def test_replay_of_an_old_recording_is_refused_on_a_new_stream() -> None:
+    reader = FrameReader(key=KEY)
+    old = signing_timestamp(time.time() - 3600)
+    assert reader.feed(b"".join(frames(3, KEY, stamp=old))) == []
+
+
+def test_forged_frame_from_the_future_does_not_shut_out_the_real_sender() -> None:
+    reader = FrameReader(key=KEY)
+    future = signing_timestamp(time.time() + 86400)
+    assert reader.feed(b"".join(frames(1, bytes(32), stamp=future))) == []
+    assert len(reader.feed(b"".join(frames(2, KEY)))) == 2
+
+
+def test_key_files(tmp_path: Path) -> None:
+    path = tmp_path / "key"
+    assert load_key(path) if path.exists() else create_key(path) == load_key(path)
+    path.chmod(0o644)
+    with pytest.raises(SigningKeyError, match="chmod 600"):
+        load_key(path)
+    path.chmod(0o600)
+    path.write_text("abc")
+    with pytest.raises(SigningKeyError, match="64 hexadecimal"):
+        load_key(path)
+    path.write_text("ab" * 31)
+    with pytest.raises(SigningKeyError, match="31 bytes"):
+        load_key(path)
+    path.write_text("00" * 32)
+    with pytest.raises(SigningKeyError, match="no signing"):
+        load_key(path)
+    with pytest.raises(SigningKeyError, match="cannot be read"):
+        load_key(tmp_path / "missing")
+    os.mkfifo(tmp_path / "pipe")
+    for place in (tmp_path / "pipe", tmp_path):
+        with pytest.raises(SigningKeyError, match="no file"):
+            load_key(place)

@@ -1,0 +1,462 @@
+"""Links by themselves: TCP that breaks, serial, limits, queues; streams that are asked for."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import pty
+import socket
+import threading
+import time
+import tty
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+from pydantic import ValidationError
+from pymavlink.dialects.v20 import ardupilotmega as mavlink
+
+from mavlink_bridge import Bridge, BridgeConfig
+from mavlink_bridge.config import InjectionConfig, SigningConfig, TargetsConfig
+from mavlink_bridge.errors import BridgeStateError, EndpointError
+from mavlink_bridge.link.framing import FrameReader
+from mavlink_bridge.link.link import Link, sleep_until
+from mavlink_bridge.link.signing import create_key
+from mavlink_bridge.link.transport import Endpoint, UdpTransport, open_transport
+from mavlink_bridge.vehicle.streams import StreamKeeper, wanted_streams
+
+SECOND = 1_000_000_000
+HEARTBEAT = mavlink.MAVLink_heartbeat_message(2, 3, 81, 4, 4, 3)
+
+
+def packed(system: int = 1) -> bytes:
+    return bytes(HEARTBEAT.pack(mavlink.MAVLink(None, system, 1)))
+
+
+class Recorder:
+    """A handler that remembers; `fail` makes it raise."""
+
+    def __init__(self) -> None:
+        self.opened = 0
+        self.messages: list[Any] = []
+        self.ticks = 0
+        self.fail = False
+
+    def on_open(self, link: Link) -> None:
+        self.opened += 1
+
+    def on_message(self, link: Link, message: Any, time_ns: int) -> None:
+        self.messages.append(message)
+        if self.fail:
+            raise RuntimeError("handler")
+
+    def on_tick(self, link: Link, now_ns: int) -> int:
+        self.ticks += 1
+        return now_ns + SECOND // 10
+
+
+@pytest.fixture
+def start() -> Iterator[Callable[..., tuple[Link, Recorder]]]:
+    links = []
+
+    def make(endpoint: str, **options: Any) -> tuple[Link, Recorder]:
+        handler = Recorder()
+        link = Link(Endpoint.parse(endpoint), handler, **options)
+        link.system_id = 1
+        links.append(link)
+        link.start()
+        return link, handler
+
+    yield make
+    for link in links:
+        link.stop()
+
+
+def bound(port: int = 0) -> socket.socket:
+    """A TCP socket that refuses connections; whoever reuses addresses may listen beside it."""
+    it = socket.socket(socket.AF_INET, socket.SOCK_STREAM)
+    it.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+    it.bind(("127.0.0.1", port))
+    return it
+
+
+def listen(port: int = 0) -> socket.socket:
+    server = bound(port)
+    server.listen(4)
+    server.settimeout(30.0)
+    return server
+
+
+@pytest.mark.parametrize(
+    ("text", "kind", "address", "number"),
+    [
+        ("udpin:0.0.0.0:14550", "udpin", "0.0.0.0", 14550),
+        ("tcp:host.example:5762", "tcp", "host.example", 5762),
+        ("serial:/dev/ttyTHS1:921600", "serial", "/dev/ttyTHS1", 921600),
+        ("udpout:10.0.0.1:14550", "udpout", "10.0.0.1", 14550),
+    ],
+)
+def test_endpoints(text: str, kind: str, address: str, number: int) -> None:
+    endpoint = Endpoint.parse(text)
+    assert (endpoint.kind, endpoint.address, endpoint.number) == (kind, address, number)
+    assert str(endpoint) == text
+
+
+@pytest.mark.parametrize(
+    "text",
+    ["", "tcp", "tcp:host", "ftp:host:1", "tcp:host:port", "tcp::1", "udpin: 0.0.0.0:14550",
+     "tcp:[::1]:5760", "udpin:::1:14550", "udpout://10.0.0.1:14550"],
+)  # fmt: skip
+def test_wrong_endpoints_say_what_is_wanted(text: str) -> None:
+    with pytest.raises(EndpointError, match="udpin:HOST:PORT"):
+        Endpoint.parse(text)
+    with pytest.raises(ValidationError, match="is no endpoint"):
+        BridgeConfig(connection=text)
+
+
+def test_the_kept_peer_is_answered_whoever_else_speaks(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A ground station that sends to the same port must not get the positions."""
+    clock = SimpleNamespace(now_s=1000.0, monotonic=lambda: clock.now_s)
+    monkeypatch.setattr("mavlink_bridge.link.transport.time", clock)
+    ours = open_transport(Endpoint.parse("udpin:127.0.0.1:0"))
+    assert isinstance(ours, UdpTransport)
+    with (
+        socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as vehicle,
+        socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as station,
+    ):
+
+        def answered(*speakers: socket.socket) -> list[bool]:
+            for speaker in speakers:
+                speaker.sendto(packed(), ("127.0.0.1", ours.port))
+                assert sleep_until(lambda: bool(ours.read()), 30.0)
+                if speaker is vehicle:
+                    ours.keep_peer()
+            ours.write(b"position")
+            heard = []
+            for s in (vehicle, station):
+                s.settimeout(0.2)
+                with contextlib.suppress(TimeoutError):
+                    heard.append(s.recv(100) == b"position" and s is vehicle)
+            return heard
+
+        assert answered(station) == [False]  # the first who speaks
+        assert answered(vehicle, station, station) == [True]
+        clock.now_s += 10.0
+        assert answered(station) == [False]  # the vehicle is silent for long
+    ours.close()
+
+
+def test_a_second_process_cannot_take_a_udp_port_over() -> None:
+    """As `companion doctor` would in flight: the last socket bound gets the datagrams."""
+    first = open_transport(Endpoint.parse("udpin:127.0.0.1:0"))
+    assert isinstance(first, UdpTransport)
+    with pytest.raises(OSError, match="in use"):
+        open_transport(Endpoint.parse(f"udpin:127.0.0.1:{first.port}"))
+    first.close()
+
+
+def test_port_out_of_range() -> None:
+    with pytest.raises(EndpointError, match="70000 is no port"):
+        Endpoint.parse("tcp:host:70000")
+
+
+def test_configuration_refuses_what_cannot_work() -> None:
+    with pytest.raises(ValidationError, match="rate_hz >= 5"):
+        InjectionConfig(message="gps_input", rate_hz=4.0)
+    with pytest.raises(ValidationError, match="needs ground_connection"):
+        BridgeConfig(targets=TargetsConfig(adsb=True))
+    with pytest.raises(ValidationError, match="extra"):
+        BridgeConfig(conection="tcp:localhost:1")  # type: ignore[call-arg]
+    assert BridgeConfig(mode=False).mode == "off"  # type: ignore[arg-type]
+
+
+def test_tcp_is_reopened_when_the_server_goes_and_comes_back(
+    start: Callable[..., tuple[Link, Recorder]],
+) -> None:
+    reserved = bound()  # nobody else gets its port meanwhile
+    port = reserved.getsockname()[1]
+    server = listen(port)
+    link, handler = start(f"tcp:127.0.0.1:{port}")
+    first, _ = server.accept()
+    first.sendall(packed())
+    assert sleep_until(lambda: len(handler.messages) == 1, 30.0)
+    first.close()
+    server.close()
+    assert sleep_until(lambda: link.counters.open_failures > 0, 30.0)
+    assert not link.connected
+    server = listen(port)
+    second, _ = server.accept()
+    second.sendall(packed())
+    assert sleep_until(lambda: len(handler.messages) == 2, 30.0)
+    assert handler.opened == 2
+    for end in (second, server, reserved):
+        end.close()
+
+
+def test_silent_tcp_is_reopened(start: Callable[..., tuple[Link, Recorder]]) -> None:
+    with listen() as server:
+        link, _ = start(f"tcp:127.0.0.1:{server.getsockname()[1]}", timeout_s=0.4)
+        silent, _ = server.accept()
+        again, _ = server.accept()
+        assert link.counters.timeouts >= 1
+        silent.close()
+        again.close()
+
+
+def test_half_a_frame_before_a_break_does_not_spoil_the_next(
+    start: Callable[..., tuple[Link, Recorder]],
+) -> None:
+    with listen() as server:
+        _, handler = start(f"tcp:127.0.0.1:{server.getsockname()[1]}")
+        first, _ = server.accept()
+        first.sendall(packed()[:7])
+        time.sleep(0.1)
+        first.close()
+        second, _ = server.accept()
+        second.sendall(packed())
+        assert sleep_until(lambda: len(handler.messages) == 1, 30.0)
+        second.close()
+
+
+def test_peer_that_does_not_read_costs_messages_not_memory_or_time(
+    start: Callable[..., tuple[Link, Recorder]],
+) -> None:
+    with listen() as server:
+        link, _ = start(f"tcp:127.0.0.1:{server.getsockname()[1]}")
+        deaf, _ = server.accept()
+        text = mavlink.MAVLink_statustext_message(6, b"x" * 50)
+        begun = time.monotonic()
+        for _ in range(200):
+            for _ in range(400):
+                link.send(text, 191)
+            time.sleep(0.002)
+        assert time.monotonic() - begun < 60.0  # a send that blocked once would never end
+        assert sleep_until(lambda: link.counters.tx_dropped > 1000, 30.0)
+        assert len(link._unsent) < 128 * 1024
+        deaf.close()
+
+
+def test_tcp_server_takes_a_client(start: Callable[..., tuple[Link, Recorder]]) -> None:
+    with bound() as reserved:
+        port = reserved.getsockname()[1]
+        link, handler = start(f"tcpin:127.0.0.1:{port}")
+        client: socket.socket | None = None
+
+        def connected() -> bool:
+            """It listens for two seconds at a time; who comes between them comes again."""
+            nonlocal client
+            if client is None:
+                with contextlib.suppress(ConnectionRefusedError):
+                    client = socket.create_connection(("127.0.0.1", port), timeout=5.0)
+            elif not sleep_until(lambda: link.connected, 3.0):
+                client.close()
+                client = None
+            return client is not None and link.connected
+
+        assert sleep_until(connected, 60.0, step_s=0.05)
+        assert client is not None
+        client.sendall(packed())
+        assert sleep_until(lambda: len(handler.messages) == 1, 30.0)
+        client.close()
+
+
+def test_serial_port_both_ways_and_unplugged(
+    start: Callable[..., tuple[Link, Recorder]], tmp_path: Path
+) -> None:
+    master, slave = pty.openpty()
+    tty.setraw(slave)
+    device = tmp_path / "ttyUSB0"  # a terminal's number is soon another's
+    device.symlink_to(os.ttyname(slave))
+    link, handler = start(f"serial:{device}:115200")
+    assert sleep_until(lambda: link.connected, 30.0)
+    os.write(master, packed())
+    assert sleep_until(lambda: len(handler.messages) == 1, 30.0)
+    link.send(HEARTBEAT, 191)
+    codec = mavlink.MAVLink(None)
+    (message,) = codec.parse_buffer(os.read(master, 4096))
+    assert (message.get_srcSystem(), message.get_srcComponent()) == (1, 191)
+    device.unlink()
+    os.close(slave)
+    os.close(master)
+    assert sleep_until(lambda: link.counters.open_failures > 0, 30.0)
+
+
+def test_rate_limit_is_per_message_and_component(
+    start: Callable[..., tuple[Link, Recorder]], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    now_ns = 10**15  # stands still, so that how fast this machine is does not count
+    monkeypatch.setattr("mavlink_bridge.link.link.monotonic_ns", lambda: now_ns)
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as peer:
+        peer.bind(("127.0.0.1", 0))
+        link, _ = start(
+            f"udpout:127.0.0.1:{peer.getsockname()[1]}",
+            min_interval_ns={mavlink.MAVLINK_MSG_ID_HEARTBEAT: SECOND // 5},
+        )
+        assert sleep_until(lambda: link.connected, 30.0)
+        for rounds in (1, 2, 3):
+            for _ in range(50):
+                link.send(HEARTBEAT, 191)
+                link.send(HEARTBEAT, 197)
+                link.send(mavlink.MAVLink_timesync_message(0, 1), 191)
+            assert sleep_until(lambda n=rounds: link.counters.tx_rate_limited == 98 * n, 30.0)
+            assert link.counters.tx_messages == (50 + 2) * rounds
+            now_ns += SECOND // 5
+
+
+def test_failing_handler_is_counted_and_the_link_lives(
+    start: Callable[..., tuple[Link, Recorder]],
+) -> None:
+    with listen() as server:
+        link, handler = start(f"tcp:127.0.0.1:{server.getsockname()[1]}")
+        client, _ = server.accept()
+        handler.fail = True
+        client.sendall(packed() * 3)
+        assert sleep_until(lambda: link.counters.handler_errors == 3, 30.0)
+        handler.fail = False
+        client.sendall(packed())
+        assert sleep_until(lambda: len(handler.messages) == 4, 30.0)
+        client.close()
+
+
+def test_nothing_is_sent_before_the_vehicles_id_is_known(
+    start: Callable[..., tuple[Link, Recorder]],
+) -> None:
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as peer:
+        peer.bind(("127.0.0.1", 0))
+        link, _ = start(f"udpout:127.0.0.1:{peer.getsockname()[1]}")
+        link.system_id = 0
+        assert sleep_until(lambda: link.connected, 30.0)
+        link.send(HEARTBEAT, 191)
+        assert sleep_until(lambda: link.counters.tx_dropped == 1, 30.0)
+        assert link.counters.tx_messages == 0
+
+
+def test_neither_threads_nor_descriptors_leak() -> None:
+    def descriptors() -> set[str]:
+        """Sockets and pipes by inode: what an earlier test's thread closes does not count."""
+        found = set()
+        for number in os.listdir("/proc/self/fd"):
+            with contextlib.suppress(OSError):
+                found.add(os.readlink(f"/proc/self/fd/{number}"))
+        return {name for name in found if name.startswith(("socket:", "pipe:"))}
+
+    threads, before = set(threading.enumerate()), descriptors()
+    for _ in range(20):
+        link = Link(Endpoint.parse("udpin:127.0.0.1:0"), Recorder())
+        link.start()
+        assert sleep_until(lambda link=link: link.connected, 30.0)  # type: ignore[misc]
+        link.stop()
+    Link(Endpoint.parse("udpin:127.0.0.1:0"), Recorder()).stop()  # never started
+    assert set(threading.enumerate()) <= threads
+    assert descriptors() <= before
+    with pytest.raises(BridgeStateError, match="already started"):
+        link.start()
+
+
+def test_waking_a_link_that_is_stopped_writes_into_nobody_elses_file(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """The pipe's number is soon another file's, a vehicle's record perhaps."""
+    link = Link(Endpoint.parse("udpin:127.0.0.1:0"), Recorder())
+    written: list[int] = []
+    wakers = []
+
+    def close_slowly(number: int) -> None:
+        """Another thread wakes the link while its pipe is closed."""
+        os.close(number)
+        waker = threading.Thread(target=link.wake)
+        wakers.append(waker)
+        waker.start()
+        waker.join(0.1)  # as far as it comes
+
+    def note(number: int, data: bytes) -> int:
+        written.append(number)
+        return len(data)
+
+    number = link._wake_write
+    link.wake()
+    system = SimpleNamespace(close=close_slowly, write=note)
+    monkeypatch.setattr("mavlink_bridge.link.link.os", system)
+    link._close_pipe()
+    for waker in wakers:
+        waker.join(30.0)
+    link.wake()
+    assert len(wakers) == 2
+    assert number not in written
+
+
+# --- streams ------------------------------------------------------------------------------------
+
+
+def names(keeper: StreamKeeper, config: BridgeConfig, now_s: float) -> set[str]:
+    return {s.name for s in keeper.due(wanted_streams(config, "ardupilot"), int(now_s * SECOND))}
+
+
+def test_streams_are_asked_once_while_they_flow_and_again_when_they_stop() -> None:
+    keeper, config = StreamKeeper(), BridgeConfig()
+    assert "ATTITUDE" in names(keeper, config, 10.0)
+    for t in range(11, 20):
+        keeper.seen("ATTITUDE", t * SECOND)
+        assert "ATTITUDE" not in names(keeper, config, t + 0.5)
+    assert "ATTITUDE" in names(keeper, config, 25.0)
+
+
+def test_old_gimbal_message_is_asked_for_only_when_the_new_one_stays_silent() -> None:
+    keeper, config = StreamKeeper(), BridgeConfig()
+    asked = [names(keeper, config, 10.0 + 2.5 * i) for i in range(12)]
+    new, old = "GIMBAL_DEVICE_ATTITUDE_STATUS", "MOUNT_STATUS"
+    assert [new in a for a in asked[:4]] == [True, True, False, False]
+    assert old not in asked[0] | asked[1]
+    assert sum(old in a for a in asked) == 2
+    flowing = StreamKeeper()
+    for t in range(10, 30):
+        flowing.seen(new, t * SECOND)
+        assert old not in names(flowing, config, t + 0.1)
+
+
+def test_rc_channels_and_estimator_by_configuration() -> None:
+    wanted = {s.name for s in wanted_streams(BridgeConfig(mode="rc"), "px4")}
+    assert {"RC_CHANNELS", "ESTIMATOR_STATUS"} <= wanted
+    assert "EKF_STATUS_REPORT" not in wanted
+
+
+def heard(server: socket.socket, reader: FrameReader) -> set[str]:
+    """Accepts one connection, listens until a message passes, and closes it."""
+    connection, _ = server.accept()
+    with connection:
+        connection.settimeout(30.0)
+        while not (messages := reader.feed(connection.recv(4096))):
+            pass
+    return {m.get_type() for m in messages}
+
+
+def replace(path: Path) -> None:
+    path.unlink()
+    create_key(path)
+
+
+@pytest.mark.parametrize(
+    "fate",
+    [Path.unlink, replace, lambda path: path.write_text("ab"), lambda path: path.chmod(0o644)],
+    ids=["removed", "replaced", "truncated", "readable"],
+)
+def test_a_key_file_that_changes_while_the_link_runs_changes_nothing(
+    fate: Callable[[Path], Any], tmp_path: Path
+) -> None:
+    """The key counts that was read at the start, over every reconnection, until the next start."""
+    path = tmp_path / "key"
+    reader = FrameReader(key=create_key(path))
+    with listen() as server:
+        settings = BridgeConfig(
+            connection=f"tcp:127.0.0.1:{server.getsockname()[1]}",
+            system_id=1,
+            signing=SigningConfig(key_file=path),
+        )
+        with Bridge(settings, 0.0) as bridge:
+            assert "HEARTBEAT" in heard(server, reader)
+            fate(path)
+            assert heard(server, reader)
+            assert bridge.counters()["fc_opened"] >= 2
+    assert reader.counters.bad_signatures == 0

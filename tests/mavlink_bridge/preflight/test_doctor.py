@@ -1,0 +1,283 @@
+"""Parameter rules, and the examination of a small autopilot."""
+
+from __future__ import annotations
+
+import math
+import socket
+from typing import Any
+
+import pytest
+from pymavlink.dialects.v20 import ardupilotmega as mavlink
+
+from mavlink_bridge import Bridge, BridgeConfig
+from mavlink_bridge.config import InjectionConfig, OriginConfig
+from mavlink_bridge.errors import ParameterError
+from mavlink_bridge.link.link import sleep_until
+from mavlink_bridge.preflight.doctor import check_parameters, examine, repair
+from mavlink_bridge.preflight.parameters import ParameterClient, decode_value, encode_value
+from mavlink_bridge.preflight.rules import ardupilot_rules, arming_rules, find_source_set, px4_rules
+
+ORIGIN = OriginConfig(latitude_deg=47.0, longitude_deg=8.0, altitude_amsl_m=500.0)
+GOOD = {
+    "AHRS_EKF_TYPE": 3.0,
+    "EK3_ENABLE": 1.0,
+    "VISO_TYPE": 1.0,
+    "EK3_SRC1_POSXY": 6.0,
+    "EK3_SRC1_VELXY": 0.0,
+    "EK3_SRC1_VELZ": 0.0,
+    "EK3_SRC1_POSZ": 1.0,
+    "EK3_SRC1_YAW": 1.0,
+    "VISO_DELAY_MS": 100.0,
+    "VISO_SCALE": 1.0,
+    "VISO_POS_X": 0.0,
+    "VISO_POS_Y": 0.0,
+    "VISO_POS_Z": 0.0,
+    "VISO_QUAL_MIN": 0.0,
+    "GPS1_TYPE": 0.0,
+}
+
+
+def config(port: int = 14551, **injection: Any) -> BridgeConfig:
+    return BridgeConfig(
+        connection=f"udpout:127.0.0.1:{port}",
+        injection=InjectionConfig(**injection),
+        origin=ORIGIN,
+    )
+
+
+def failures(settings: BridgeConfig, parameters: dict[str, float]) -> set[str]:
+    rules = ardupilot_rules(settings, find_source_set(settings, parameters.get))
+    return {f.name for f in check_parameters(rules, parameters.get) if not f.ok}
+
+
+def test_the_measured_set_is_right() -> None:
+    assert failures(config(), GOOD) == set()
+
+
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [
+        ("EK3_SRC1_VELXY", 3.0),
+        ("EK3_SRC1_VELZ", 3.0),
+        ("VISO_TYPE", 0.0),
+        ("VISO_DELAY_MS", 10.0),
+        ("VISO_QUAL_MIN", 50.0),
+        ("EK3_SRC1_POSXY", 3.0),
+        ("EK3_SRC1_YAW", 6.0),
+        ("GPS1_TYPE", 1.0),
+        ("AHRS_EKF_TYPE", 2.0),
+    ],
+)
+def test_each_wrong_parameter_is_found(name: str, value: float) -> None:
+    assert failures(config(), {**GOOD, name: value}) == {name}
+
+
+def test_second_source_set_is_found_and_gps_is_left_alone_there() -> None:
+    second = {k.replace("SRC1", "SRC2"): v for k, v in GOOD.items()}
+    second |= {"EK3_SRC1_POSXY": 3.0, "GPS1_TYPE": 1.0}
+    assert find_source_set(config(), second.get) == 2
+    assert failures(config(), second) == set()
+
+
+def test_a_vehicle_on_gnss_keeps_its_first_source_set() -> None:
+    """Vision goes into the set it is switched to; the receiver is not taken away."""
+    stock = {"EK3_SRC1_POSXY": 3.0, "EK3_SRC2_POSXY": 0.0, "GPS1_TYPE": 1.0}
+    assert find_source_set(config(), stock.get) == 2
+    rules = ardupilot_rules(config(), 2)
+    names = {name for rule in rules for name in rule.names}
+    assert "GPS1_TYPE" not in names
+    assert "EK3_SRC1_POSXY" not in names
+
+
+def test_gps_input_with_old_names_and_another_receiver() -> None:
+    parameters = {
+        "AHRS_EKF_TYPE": 3.0,
+        "EK3_ENABLE": 1.0,
+        "GPS_TYPE2": 1.0,
+        "GPS_DELAY_MS2": 100.0,
+        "VISO_TYPE": 1.0,
+        "VISO_DELAY_MS": 100.0,
+        "EK3_SRC1_POSXY": 3.0,
+        "EK3_SRC1_VELXY": 3.0,
+        "EK3_SRC1_VELZ": 3.0,
+        "EK3_SRC1_POSZ": 1.0,
+        "EK3_SRC1_YAW": 1.0,
+    }
+    settings = config(message="gps_input", gps_id=1)
+    assert failures(settings, parameters) == {"GPS_TYPE2"}
+    still = config(message="gps_input", gps_id=1, gps_velocity=False)
+    assert failures(still, {**parameters, "GPS_TYPE2": 14.0}) == {
+        "EK3_SRC1_VELXY",
+        "EK3_SRC1_VELZ",
+    }
+
+
+@pytest.mark.parametrize(("gps_id", "asked"), [(0, False), (1, True)])
+def test_a_second_receiver_needs_room_in_the_ekfs_buffer(gps_id: int, asked: bool) -> None:
+    parameters = {"VISO_TYPE": 0.0, "VISO_DELAY_MS": 10.0}
+    settings = config(message="gps_input", gps_id=gps_id)
+    findings = check_parameters(ardupilot_rules(settings, 1), parameters.get)
+    advice = {f.name: f.fix for f in findings if f.name.startswith("VISO") and not f.ok}
+    assert advice == ({"VISO_TYPE": 1.0, "VISO_DELAY_MS": 100.0} if asked else {})
+    assert not any(f.required for f in findings if f.name in advice)
+
+
+@pytest.mark.parametrize(
+    ("parameters", "fixed"),
+    [
+        ({"ARMING_CHECK": 1.0}, {"ARMING_CHECK": float((1 << 21) - 2 - (1 << 18))}),
+        ({"ARMING_CHECK": 0.0}, {}),
+        ({"ARMING_CHECK": float((1 << 18) + 8)}, {"ARMING_CHECK": 8.0}),
+        ({"ARMING_CHECK": 8.0}, {}),
+        ({"ARMING_SKIPCHK": 2.0}, {"ARMING_SKIPCHK": float((1 << 18) + 2)}),
+        ({"ARMING_SKIPCHK": -1.0}, {}),
+    ],
+)
+def test_a_vehicle_on_gnss_arms_without_vision(
+    parameters: dict[str, float], fixed: dict[str, float]
+) -> None:
+    shadow = BridgeConfig(connection="udpout:127.0.0.1:1", mode="shadow")
+    found = check_parameters(arming_rules(shadow, 2, parameters.get), parameters.get)
+    assert {f.name: f.fix for f in found if not f.ok} == fixed
+    assert all(f.required for f in found)
+    assert arming_rules(shadow, 1, parameters.get) == []  # takes off on vision: keeps the check
+
+
+def test_odometry_wants_velocity_noise_that_is_true() -> None:
+    parameters = {**GOOD, "EK3_SRC1_VELXY": 6.0, "EK3_SRC1_VELZ": 6.0, "VISO_VEL_M_NSE": 0.1}
+    assert failures(config(message="odometry"), parameters) == {"VISO_VEL_M_NSE"}
+
+
+@pytest.mark.parametrize("kind", [mavlink.MAV_PARAM_TYPE_INT32, mavlink.MAV_PARAM_TYPE_INT8])
+@pytest.mark.parametrize("value", [0, 1, 9, -3, 100])
+def test_px4_integers_travel_as_bytes(kind: int, value: int) -> None:
+    wire = encode_value(value, kind, bytewise=True)
+    assert decode_value(wire, kind, bytewise=True) == value
+    assert decode_value(float(value), kind, bytewise=False) == value
+
+
+def gimbal(fake: Any, boot_ms: int) -> list[Any]:
+    return [
+        mavlink.MAVLink_gimbal_device_attitude_status_message(
+            0, 0, boot_ms, 32, [1.0, 0.0, 0.0, 0.0], 0.0, 0.0, 0.0, 0, 0.0, 0.0
+        )
+    ]
+
+
+def test_examination_and_repair(autopilot: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    # What a busy machine does to the line between two threads is not the subject here.
+    for name, loose in (("_ROUND_TRIP_LIMIT_MS", 1e4), ("_RATE_SHARE", 0.05), ("_LOST_SHARE", 0.9)):
+        monkeypatch.setattr(f"mavlink_bridge.preflight.doctor.{name}", loose)
+    monkeypatch.setattr("mavlink_bridge.preflight.doctor._MEASURE_S", 2.0)
+    autopilot.parameters = {**GOOD, "EK3_SRC1_VELXY": 3.0, "VISO_DELAY_MS": 10.0}
+    autopilot.extra = gimbal
+    settings = config(autopilot.port)
+    diagnosis = examine(settings)
+    wrong = {f.name: f for f in diagnosis.findings if not f.ok}
+    assert set(wrong) == {"EK3_SRC1_VELXY", "VISO_DELAY_MS"}
+    assert diagnosis.exit_code == 2
+    assert (wrong["VISO_DELAY_MS"].found, wrong["VISO_DELAY_MS"].needed) == ("10", "100")
+    assert {"connection", "firmware", "clock", "ATTITUDE", "EKF origin", "gimbal"} <= {
+        f.name for f in diagnosis.findings if f.ok
+    }
+    assert repair(settings, diagnosis.fixable)  # VISO_DELAY_MS is read at the start
+    assert autopilot.parameters["VISO_DELAY_MS"] == 100.0
+    assert examine(settings).exit_code == 0
+
+
+@pytest.mark.parametrize("value", [math.nan, math.inf, -math.inf])
+@pytest.mark.parametrize(
+    "message", ["vision_position_estimate", "odometry", "gps_input", "global_position_sensor"]
+)
+def test_parameters_that_are_no_numbers_are_wrong_and_can_be_written(
+    message: Any, value: float
+) -> None:
+    config = BridgeConfig(injection=InjectionConfig(message=message))
+    for rules in (ardupilot_rules(config, find_source_set(config, lambda _: value)),
+                  px4_rules(config)):  # fmt: skip
+        for finding in check_parameters(rules, lambda _: value):
+            assert not finding.ok
+            assert finding.fix is not None
+            assert math.isfinite(finding.fix)
+
+
+def test_silence_is_one_required_failure(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("mavlink_bridge.preflight.doctor._CONNECT_S", 0.3)
+    diagnosis = examine(config(9))
+    assert diagnosis.exit_code == 2
+    assert [f.name for f in diagnosis.findings] == ["connection"]
+
+
+def test_a_port_that_is_taken_is_told_as_that(monkeypatch: pytest.MonkeyPatch) -> None:
+
+    class Tried(Bridge):
+        """Starts with one attempt, however long a busy machine takes for it."""
+
+        def start(self) -> None:
+            super().start()
+            assert sleep_until(lambda: bool(self.counters()["fc_open_failures"]), 30.0)
+
+    monkeypatch.setattr("mavlink_bridge.preflight.doctor.Bridge", Tried)
+    monkeypatch.setattr("mavlink_bridge.preflight.doctor._CONNECT_S", 0.0)
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as taken:
+        taken.bind(("127.0.0.1", 0))
+        endpoint = f"udpin:127.0.0.1:{taken.getsockname()[1]}"
+        (finding,) = examine(BridgeConfig(connection=endpoint)).findings
+    assert finding.found == "cannot be opened"
+    assert "is the companion running" in finding.why
+
+
+def test_unknown_parameter_cannot_be_written(
+    autopilot: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("mavlink_bridge.preflight.parameters._ANSWER_S", 0.2)
+    autopilot.parameters = {"A": 1.0}
+    with ParameterClient(config(autopilot.port)) as client:
+        assert client.read("NO_SUCH") is None
+        with pytest.raises(ParameterError, match="no such parameter"):
+            client.write("NO_SUCH", 1.0)
+
+
+def test_parameters_are_asked_of_one_vehicle_and_taken_from_its_autopilot(autopilot: Any) -> None:
+    """A second vehicle and a gimbal on the same link answer, too."""
+    autopilot.parameters = {"A": 1.0}
+    answer = autopilot._parameter
+
+    def everybody(name: str) -> None:
+        other = mavlink.MAVLink_param_value_message(b"A", 9.0, mavlink.MAV_PARAM_TYPE_REAL32, 1, 0)
+        beat = mavlink.MAVLink_heartbeat_message(2, 3, 81, 4, 4, 3)
+        autopilot.send(beat, component=1, system=2)
+        autopilot.send(other, component=1, system=2)
+        autopilot.send(other, component=154, system=1)
+        answer(name)
+
+    autopilot._parameter = everybody
+    with ParameterClient(config(autopilot.port)) as client:
+        for _ in range(3):
+            assert client.read("A") == 1.0
+        assert client.system == 1
+        client.write("A", 2.0)
+    sets = autopilot.of("PARAM_SET")
+    assert {m.target_system for m in sets} == {1}
+
+
+def test_two_vehicles_on_the_link_are_a_required_failure(
+    autopilot: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """No parameter may be read, judged or written while nobody said of which vehicle."""
+    monkeypatch.setattr("mavlink_bridge.preflight.doctor._MEASURE_S", 0.6)
+    autopilot.parameters = dict(GOOD)
+    slow = autopilot._slow
+
+    def both() -> None:
+        slow()
+        autopilot.send(mavlink.MAVLink_heartbeat_message(2, 3, 81, 4, 4, 3), component=1, system=2)
+
+    autopilot._slow = both
+    diagnosis = examine(config(autopilot.port))
+    assert diagnosis.exit_code == 2
+    (vehicles,) = (f for f in diagnosis.findings if f.name == "vehicles")
+    assert (vehicles.found, vehicles.ok, vehicles.required) == ("several", False, True)
+    assert not autopilot.of("PARAM_REQUEST_READ")
+    chosen = examine(config(autopilot.port).model_copy(update={"system_id": 1}))
+    assert next(f for f in chosen.findings if f.name == "vehicles").ok

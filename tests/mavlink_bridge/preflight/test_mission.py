@@ -1,0 +1,184 @@
+"""The mission is downloaded from a small autopilot, the embedded vehicle and the real one."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import pytest
+from pymavlink.dialects.v20 import ardupilotmega as mavlink
+
+from mavlink_bridge import BridgeConfig
+from mavlink_bridge.errors import ConnectionSilentError, MissionError
+from mavlink_bridge.preflight.mission import Waypoint, download_mission
+from sitl.ardupilot import ArduPilotSitl, find_arducopter
+from sitl.embedded.geodesy import Location
+from sitl.mission_steps import MissionStep, takeoff_step, waypoint_step
+from sitl.pilot import Pilot
+from sitl.vehicles import EmbeddedSitl
+
+HOME = Location(47.397742, 8.545594, 488.0)
+RELATIVE = mavlink.MAV_FRAME_GLOBAL_RELATIVE_ALT
+# (command, frame, x, y): home, take-off here, a place, a servo, a place in local metres, a place
+ITEMS = [
+    (16, 0, 473977420, 85455940),
+    (22, RELATIVE, 0, 0),
+    (16, RELATIVE, 474000000, 85455940),
+    (183, RELATIVE, 9, 1500),
+    (16, mavlink.MAV_FRAME_LOCAL_NED, 1000, 1000),
+    (19, RELATIVE, 474000000, 85500000),
+]
+
+
+def config(connection: str) -> BridgeConfig:
+    return BridgeConfig(connection=connection)
+
+
+@pytest.fixture
+def with_mission(autopilot: Any) -> Callable[..., Any]:
+    """The small autopilot, with a mission; `lost` answers are not sent, `refused` is an ack."""
+
+    def make(lost: int = 0, refused: int | None = None, silent: bool = False) -> Any:
+        left = [lost]
+        answer = autopilot._answer
+
+        def reply(message: Any) -> None:
+            if left[0] > 0:
+                left[0] -= 1
+            elif refused is not None:
+                autopilot.send(mavlink.MAVLink_mission_ack_message(255, 0, refused))
+            else:
+                autopilot.send(message)
+
+        def mission(m: Any) -> None:
+            kind = m.get_type()
+            if kind == "MISSION_REQUEST_LIST" and not silent:
+                # A fence of one item is not the mission.
+                autopilot.send(mavlink.MAVLink_mission_count_message(1, 191, 1, 1))
+                reply(mavlink.MAVLink_mission_count_message(1, 191, len(ITEMS), 0))
+            elif kind == "MISSION_REQUEST_INT":
+                command, frame, x, y = ITEMS[m.seq]
+                reply(
+                    mavlink.MAVLink_mission_item_int_message(
+                        1, 191, m.seq, frame, command, 0, 1, 0, 0, 0, 0, x, y, 30.0, 0
+                    )
+                )
+            else:
+                answer(m)
+
+        autopilot._answer = mission
+        return autopilot
+
+    return make
+
+
+PLACES = [
+    Waypoint(0, 47.397742, 8.545594),
+    Waypoint(2, 47.4, 8.545594),
+    Waypoint(5, 47.4, 8.55),
+]
+
+
+def same(found: list[Waypoint], expected: list[Waypoint]) -> None:
+    assert [w.number for w in found] == [w.number for w in expected]
+    for a, b in zip(found, expected, strict=True):
+        assert (a.latitude_deg, a.longitude_deg) == pytest.approx(
+            (b.latitude_deg, b.longitude_deg), abs=2e-7
+        )
+
+
+@pytest.mark.parametrize("lost", [0, 2])
+def test_places_of_the_mission(with_mission: Callable[..., Any], lost: int) -> None:
+    vehicle = with_mission(lost=lost)
+    same(download_mission(config(f"udpout:127.0.0.1:{vehicle.port}")), PLACES)
+    acks = vehicle.wait_for("MISSION_ACK")
+    assert acks[0].type == mavlink.MAV_MISSION_ACCEPTED
+
+
+@pytest.mark.parametrize(
+    ("how", "why"),
+    [({"refused": mavlink.MAV_MISSION_DENIED}, "MAV_MISSION_RESULT 14"), ({"silent": True}, "sil")],
+)
+def test_refusal_and_silence_are_named(
+    with_mission: Callable[..., Any], monkeypatch: pytest.MonkeyPatch, how: Any, why: str
+) -> None:
+    monkeypatch.setattr(
+        "mavlink_bridge.preflight.mission._ANSWER_S", 0.2 if "silent" in how else 30.0
+    )
+    vehicle = with_mission(**how)
+    with pytest.raises(MissionError, match=rf"number of items .*{why}"):
+        download_mission(config(f"udpout:127.0.0.1:{vehicle.port}"))
+
+
+def test_a_count_that_changes_meanwhile_is_not_ours(with_mission: Callable[..., Any]) -> None:
+    vehicle = with_mission()
+    answer = vehicle._answer
+
+    def interrupted(message: Any) -> None:
+        if message.get_type() == "MISSION_REQUEST_INT":
+            vehicle.send(mavlink.MAVLink_mission_count_message(1, 191, 50, 0))
+        answer(message)
+
+    vehicle._answer = interrupted
+    same(download_mission(config(f"udpout:127.0.0.1:{vehicle.port}")), PLACES)
+
+
+def test_a_place_that_is_not_on_earth_is_named(
+    with_mission: Callable[..., Any], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(f"{__name__}.ITEMS", [*ITEMS[:2], (16, RELATIVE, 1_740_000_000, 85455940)])
+    vehicle = with_mission()
+    with pytest.raises(MissionError, match=r"item 2 .* 174, 8\.54559 degrees"):
+        download_mission(config(f"udpout:127.0.0.1:{vehicle.port}"))
+
+
+def test_a_place_that_is_not_set_is_where_the_vehicle_is(
+    with_mission: Callable[..., Any], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    unset = (21, RELATIVE, 0x7FFFFFFF, 0x7FFFFFFF)  # land here
+    monkeypatch.setattr(f"{__name__}.ITEMS", [*ITEMS, unset])
+    vehicle = with_mission()
+    same(download_mission(config(f"udpout:127.0.0.1:{vehicle.port}")), PLACES)
+
+
+def test_a_mission_that_never_ends_is_given_up(
+    with_mission: Callable[..., Any], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("mavlink_bridge.preflight.mission._LONGEST_S", -1.0)
+    vehicle = with_mission()
+    with pytest.raises(MissionError, match="gave 0 of 6 items"):
+        download_mission(config(f"udpout:127.0.0.1:{vehicle.port}"))
+
+
+def test_nobody_there(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("mavlink_bridge.preflight.client._CONNECT_S", 0.2)
+    with pytest.raises(ConnectionSilentError, match="no autopilot heartbeat at udpout"):
+        download_mission(config("udpout:127.0.0.1:9"))
+
+
+def upload_and_download(vehicle: Any) -> None:
+    places = [HOME.offset(north, east, 0.0) for north, east in ((200, 0), (200, 150), (-900, 0))]
+    steps: list[MissionStep] = [
+        takeoff_step(40.0),
+        *(waypoint_step(p.latitude_deg, p.longitude_deg, 40.0) for p in places),
+    ]
+    assert not [w for w in download_mission(config(vehicle.companion_endpoint)) if w.number > 0]
+    pilot = Pilot(vehicle.gcs_endpoint, alive=vehicle.check)
+    pilot.connect()
+    pilot.upload_mission(steps)
+    found = download_mission(config(vehicle.companion_endpoint))
+    pilot.close()
+    flown = [w for w in found if w.number > 0]
+    same(flown, [Waypoint(2 + i, p.latitude_deg, p.longitude_deg) for i, p in enumerate(places)])
+
+
+def test_embedded_vehicle() -> None:
+    with EmbeddedSitl(HOME) as vehicle:
+        upload_and_download(vehicle)
+
+
+@pytest.mark.sitl
+@pytest.mark.skipif(find_arducopter() is None, reason="no arducopter binary")
+def test_real_arducopter() -> None:
+    with ArduPilotSitl(HOME) as vehicle:
+        upload_and_download(vehicle)

@@ -1,0 +1,236 @@
+"""A flight controller that goes silent is told in seconds, whatever its link is doing."""
+
+from __future__ import annotations
+
+import contextlib
+import itertools
+import socket
+import threading
+import time
+from dataclasses import replace
+from typing import Any
+
+import pytest
+from pymavlink.dialects.v20 import ardupilotmega as mavlink
+
+from mavlink_bridge import Bridge, BridgeConfig, HealthLevel, VehicleState
+from mavlink_bridge.link.link import Link, sleep_until
+from mavlink_bridge.link.transport import Endpoint
+from mavlink_bridge.vehicle.presence import VehicleWatch
+
+HEARTBEAT = mavlink.MAVLink_heartbeat_message(2, 3, 81, 4, 4, 3)
+
+
+class Ticks:
+    """Handler that counts its ticks and sends something with each."""
+
+    def __init__(self) -> None:
+        self.times: list[float] = []
+        self.sent: list[bool] = []
+
+    def on_open(self, link: Link) -> None: ...
+
+    def on_message(self, link: Link, message: Any, time_ns: int) -> None: ...
+
+    def on_tick(self, link: Link, now_ns: int) -> int:
+        self.times.append(now_ns * 1e-9)
+        self.sent.append(link.send(HEARTBEAT, 191))
+        return now_ns + 100_000_000
+
+
+def test_the_handlers_clock_goes_on_while_the_transport_is_closed(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Half a minute of simulated time, in the test's own thread."""
+    now_ns = [10**12]
+    monkeypatch.setattr("mavlink_bridge.link.link.monotonic_ns", lambda: now_ns[0])
+    attempts: list[float] = []
+
+    def refuse(_: Endpoint) -> Any:
+        attempts.append(now_ns[0] * 1e-9)
+        raise ConnectionRefusedError("nobody there")
+
+    class Stop:
+        """The link's event, whose waiting is what moves the clock."""
+
+        def is_set(self) -> bool:
+            return now_ns[0] > 10**12 + 30 * 10**9
+
+        def wait(self, seconds: float) -> bool:
+            now_ns[0] += int(seconds * 1e9) + 1
+            return self.is_set()
+
+    ticks = Ticks()
+    link = Link(Endpoint.parse("tcp:127.0.0.1:9"), ticks, opener=refuse)
+    link.system_id = 1
+    link._stop = Stop()  # type: ignore[assignment]
+    for _ in range(700):
+        link.send(HEARTBEAT, 191)
+    link._thread = threading.current_thread()
+    link._run()
+    link._close_pipe()
+    assert not link._outbox
+    waits = [b - a for a, b in itertools.pairwise(attempts)]
+    assert max(waits) == pytest.approx(5.0, abs=0.01)  # a tick at each attempt only would leave it
+    assert max(b - a for a, b in itertools.pairwise(ticks.times)) <= 0.21
+    assert not any(ticks.sent)
+    assert link.counters.tx_dropped >= 700
+
+
+def test_an_unforeseen_error_costs_the_connection_and_not_the_link() -> None:
+    class Broken:
+        stream = True
+
+        def __init__(self) -> None:
+            self.socket, self.other = socket.socketpair()
+            self.other.send(b"x")
+
+        def fileno(self) -> int:
+            return self.socket.fileno()
+
+        def read(self) -> bytes:
+            raise RuntimeError("a driver's bug")
+
+        def write(self, data: bytes) -> int:
+            return len(data)
+
+        def close(self) -> None:
+            self.socket.close()
+            self.other.close()
+
+    link = Link(Endpoint.parse("tcp:127.0.0.1:9"), Ticks(), opener=lambda _: Broken())
+    link.start()
+    assert sleep_until(lambda: link.counters.failures >= 3, 30.0)
+    link.stop()
+
+
+def test_a_write_that_fails_reconnects_at_once_and_is_no_error_of_the_handler() -> None:
+    class Deaf:
+        """Readable never, writable never: a connection that was reset."""
+
+        stream = True
+
+        def __init__(self) -> None:
+            self.socket, self.other = socket.socketpair()
+
+        def fileno(self) -> int:
+            return self.socket.fileno()
+
+        def read(self) -> bytes:
+            return b""
+
+        def write(self, data: bytes) -> int:
+            raise ConnectionResetError("reset by peer")
+
+        def close(self) -> None:
+            self.socket.close()
+            self.other.close()
+
+    link = Link(Endpoint.parse("tcp:127.0.0.1:9"), Ticks(), opener=lambda _: Deaf())
+    link.system_id = 1
+    link.start()
+    assert sleep_until(lambda: link.counters.opened >= 3, 30.0)
+    link.stop()
+    assert link.counters.handler_errors == 0
+    assert link.counters.failures == 0
+
+
+@pytest.mark.parametrize("reconnecting", [False, True])
+def test_loss_is_told_on_the_ground_link_within_seconds(reconnecting: bool) -> None:
+    """reconnecting: the connection attempt itself hangs, as one to a host that is gone does."""
+    with (
+        socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as station,
+        socket.create_server(("127.0.0.1", 0)) as server,
+    ):
+        station.bind(("127.0.0.1", 0))
+        config = BridgeConfig(
+            connection=f"tcp:127.0.0.1:{server.getsockname()[1]}",
+            ground_connection=f"udpout:127.0.0.1:{station.getsockname()[1]}",
+        )
+        codec, over = mavlink.MAVLink(None, 255, 190), threading.Event()
+        texts: list[str] = []
+
+        def hang(_: Endpoint) -> Any:
+            over.wait()
+            raise ConnectionRefusedError("nobody there")
+
+        with Bridge(config, 0.0) as bridge:
+            client, _ = server.accept()
+            assert sleep_until(lambda: bridge._fc_link.connected, 30.0)
+            if reconnecting:
+                bridge._fc_link._open = hang
+            spoke_at = time.monotonic()
+            client.sendall(HEARTBEAT.pack(mavlink.MAVLink(None, 1, 1)))
+            assert sleep_until(lambda: bridge.state().connected, 30.0)
+            client.close()
+            server.close()
+            station.settimeout(0.1)
+
+            def told() -> bool:
+                with contextlib.suppress(TimeoutError):
+                    for m in codec.parse_buffer(station.recv(65536)) or []:
+                        texts.extend([m.text] if m.get_type() == "STATUSTEXT" else [])
+                return any("lost" in text for text in texts)
+
+            # A link that waited for its connection, or for TCP, would need minutes.
+            assert sleep_until(told, 30.0, step_s=0.0)
+            assert time.monotonic() - spoke_at > 3.0
+            over.set()
+            time.sleep(0.5)
+            told = [text for text in bridge.texts() if "lost" in text]
+            assert told == ["PiLoT: flight controller lost: no heartbeat for 3 s"]
+
+
+def test_each_change_is_told_once() -> None:
+    told: list[str] = []
+    watch = VehicleWatch(lambda _, text: told.append(text))
+    state = VehicleState()
+    for connected in (False, True, True, False, False, True, False):
+        watch.check(replace(state, connected=connected))
+    assert [text.removeprefix("PiLoT: flight controller ") for text in told] == [
+        "found",
+        "lost: no heartbeat for 3 s",
+        "is back",
+        "lost: no heartbeat for 3 s",
+    ]
+
+
+def test_a_vehicle_that_never_speaks_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Five seconds after the first tick, however long the application took to get there."""
+    now_ns = [10**12]
+    monkeypatch.setattr("mavlink_bridge.vehicle.presence.monotonic_ns", lambda: now_ns[0])
+    told: list[str] = []
+    watch = VehicleWatch(lambda _, text: told.append(text))
+    for seconds, connected, texts in ((100, False, 0), (4, False, 0), (2, False, 1), (1, True, 2)):
+        now_ns[0] += seconds * 10**9
+        watch.check(VehicleState(connected=connected))
+        assert len(told) == texts
+    assert told == [
+        "PiLoT: no heartbeat from the flight controller",
+        "PiLoT: flight controller found",
+    ]
+
+
+def test_what_the_operator_reads_is_logged_and_recorded_once(
+    autopilot: Any, caplog: pytest.LogCaptureFixture
+) -> None:
+    recorded: list[tuple[int, str]] = []
+
+    def record(severity: int, text: str) -> None:
+        recorded.append((severity, text))
+
+    config = BridgeConfig(connection=f"udpout:127.0.0.1:{autopilot.port}")
+    bridge = Bridge(config, 0.0, on_text=record)
+    with caplog.at_level("INFO"):
+        for _ in range(3):
+            bridge.set_health(HealthLevel.DEGRADED, "localization degraded")
+        for i in range(3):
+            bridge.set_health(HealthLevel.DEGRADED, f"no map at north {-9590.3 + i:.1f} m")
+        bridge.set_health(HealthLevel.DEGRADED, "no heartbeat", tell=False)
+    bridge.stop()
+    lines = [r.getMessage() for r in caplog.records if "localization" in r.getMessage()]
+    assert lines == ["PiLoT: localization degraded"]
+    assert recorded == [
+        (mavlink.MAV_SEVERITY_WARNING, "PiLoT: localization degraded"),
+        (mavlink.MAV_SEVERITY_WARNING, "PiLoT: no map at north -9590.3 m"),
+    ]

@@ -1,0 +1,345 @@
+"""Clock mapping, attitude and gimbal at exposure time, origin, profiles."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from typing import Any
+
+import pytest
+from pymavlink.dialects.v20 import ardupilotmega as mavlink
+
+from mavlink_bridge import quaternion as quat
+from mavlink_bridge.config import OriginConfig
+from mavlink_bridge.messages import Origin
+from mavlink_bridge.vehicle.origin import OriginKeeper, ned_from_origin, north_east, offset
+from mavlink_bridge.vehicle.profile import ARDUPILOT, ARDUPILOT_SQRT, GENERIC, PX4, select_profile
+from mavlink_bridge.vehicle.tracker import VehicleTracker, gimbal_in_earth_frame
+
+MS = 1_000_000
+SECOND = 1_000 * MS
+Quaternion = Callable[[float, float, float], list[float]]
+
+
+def sent(message: Any, system: int = 1, component: int = 1) -> Any:
+    """As it comes out of a decoder: with a source."""
+    codec = mavlink.MAVLink(None, system, component)
+    return codec.decode(bytearray(message.pack(codec)))
+
+
+def tracker(mount: quat.Quaternion = quat.IDENTITY, *, fixed: bool = False) -> VehicleTracker:
+    it = VehicleTracker(None, mount, fixed)
+    heartbeat = sent(mavlink.MAVLink_heartbeat_message(2, 3, 81, 4, 4, 3))
+    assert it.accepts(heartbeat)
+    it.handle(heartbeat, SECOND)
+    return it
+
+
+def feed_yaw(it: VehicleTracker, rate_hz: float, seconds: float, yaw_rate: float) -> None:
+    for i in range(int(seconds * rate_hz)):
+        t = i / rate_hz
+        yaw = quat.wrap_pi(yaw_rate * t)
+        m = mavlink.MAVLink_attitude_message(int(t * 1000), 0.0, 0.0, yaw, 0.0, 0.0, yaw_rate)
+        it.handle(sent(m), 10 * SECOND + int(t * SECOND))
+
+
+def test_attitude_is_interpolated_across_the_wrap_of_yaw() -> None:
+    it = tracker()
+    feed_yaw(it, 10.0, 8.0, math.radians(60.0))
+    for ms in (2950, 3020, 3333, 6666):
+        at = it.attitude_at(10 * SECOND + ms * MS)
+        assert at is not None
+        expected = quat.wrap_pi(math.radians(60.0) * ms / 1000)
+        assert quat.wrap_pi(at.yaw_rad - expected) == pytest.approx(0.0, abs=1e-4)
+
+
+def test_attitude_is_extrapolated_a_little_and_not_more() -> None:
+    it = tracker()
+    feed_yaw(it, 10.0, 1.0, 0.5)
+    newest = 10 * SECOND + 900 * MS
+    at = it.attitude_at(newest + 80 * MS)
+    assert at is not None
+    assert at.yaw_rad == pytest.approx(0.5 * 0.98, abs=1e-4)
+    assert it.attitude_at(newest + 200 * MS) is None
+    assert it.attitude_at(10 * SECOND - 50 * MS) is None
+
+
+def test_gyro_heading_follows_the_turn_and_ignores_resets_of_the_estimator() -> None:
+    it = tracker()
+    rate = math.radians(50.0)
+    for i in range(500):
+        t = i / 50
+        estimated = quat.wrap_pi(rate * t + (0.14 if t > 5.0 else 0.0))
+        m = mavlink.MAVLink_attitude_message(int(t * 1000), 0.0, 0.0, estimated, 0.0, 0.0, rate)
+        it.handle(sent(m), 10 * SECOND + int(t * SECOND))
+    early, late = (it.attitude_at(10 * SECOND + ms * MS) for ms in (1000, 9000))
+    assert early is not None
+    assert late is not None
+    assert late.gyro_heading_rad - early.gyro_heading_rad == pytest.approx(rate * 8.0, abs=1e-3)
+
+
+def test_gap_in_the_attitudes_is_no_attitude() -> None:
+    it = tracker()
+    for ms in (0, 100, 900, 1000):
+        m = mavlink.MAVLink_attitude_message(ms, 0.0, 0.0, 0.1, 0.0, 0.0, 0.0)
+        it.handle(sent(m), 10 * SECOND + ms * MS)
+    assert it.attitude_at(10 * SECOND + 500 * MS) is None
+    assert it.attitude_at(10 * SECOND + 950 * MS) is not None
+
+
+def test_attitude_quaternion_message() -> None:
+    it = tracker()
+    q = quat.from_euler(0.1, -0.2, 2.0)
+    it.handle(
+        sent(mavlink.MAVLink_attitude_quaternion_message(5000, *q, 0.0, 0.0, 0.0)), 10 * SECOND
+    )
+    at = it.attitude_at(10 * SECOND)
+    assert at is not None
+    assert (at.roll_rad, at.pitch_rad, at.yaw_rad) == pytest.approx((0.1, -0.2, 2.0), abs=1e-6)
+
+
+YAW_LOCK, IN_VEHICLE, IN_EARTH = 16, 32, 64
+
+
+@pytest.mark.parametrize(
+    ("flags", "earth"),
+    [
+        (0, False),
+        (YAW_LOCK, True),
+        (IN_VEHICLE, False),
+        (IN_EARTH, True),
+        (YAW_LOCK | IN_VEHICLE, False),
+        (YAW_LOCK | IN_EARTH, True),
+    ],
+)
+def test_gimbal_frame_by_yaw_in_flags_first_then_yaw_lock(
+    flags: int, earth: bool, quaternion_of: Quaternion
+) -> None:
+    assert gimbal_in_earth_frame(flags) is earth
+    it = tracker()
+    vehicle_yaw = 100.0
+    for ms in (0, 100, 200):
+        attitude = mavlink.MAVLink_attitude_message(
+            ms, 0.05, 0.02, math.radians(vehicle_yaw), 0.0, 0.0, 0.0
+        )
+        it.handle(sent(attitude), 10 * SECOND + ms * MS)
+        q = quaternion_of(0.0, -45.0, 30.0)
+        gimbal = mavlink.MAVLink_gimbal_device_attitude_status_message(
+            0, 0, ms, flags, q, 0.0, 0.0, 0.0, 0, math.nan, math.nan
+        )
+        it.handle(sent(gimbal), 10 * SECOND + ms * MS)
+    at = it.gimbal_at(10 * SECOND + 150 * MS)
+    assert at is not None
+    yaw = 30.0 if earth else 130.0
+    assert math.degrees(at.yaw_rad) == pytest.approx(yaw, abs=1e-3)
+    assert math.degrees(at.pitch_rad) == pytest.approx(-45.0, abs=1e-3)
+    assert math.degrees(at.yaw_vehicle_rad) == pytest.approx(yaw - vehicle_yaw, abs=1e-3)
+    assert at.source == "GIMBAL_DEVICE_ATTITUDE_STATUS"
+
+
+def attitude_and(it: VehicleTracker, ms: int, *messages: Any, yaw: float = 0.0) -> None:
+    attitude = mavlink.MAVLink_attitude_message(ms, 0.0, 0.0, yaw, 0.0, 0.0, 0.0)
+    for m in (attitude, *messages):
+        it.handle(sent(m), 10 * SECOND + ms * MS)
+
+
+def test_old_mount_messages_are_used_only_without_the_new_one(quaternion_of: Quaternion) -> None:
+    it = tracker()
+    mount = mavlink.MAVLink_mount_status_message(0, 0, -3000, 100, 2000)
+    for ms in (0, 100, 200):
+        attitude_and(it, ms, mount, yaw=math.radians(10.0))
+    at = it.gimbal_at(10 * SECOND + 100 * MS)
+    assert at is not None
+    assert at.source == "MOUNT_STATUS"
+    assert math.degrees(at.pitch_rad) == pytest.approx(-30.0, abs=1e-3)
+    assert math.degrees(at.roll_rad) == pytest.approx(1.0, abs=1e-3)
+    assert math.degrees(at.yaw_rad) == pytest.approx(30.0, abs=1e-3)
+    device = mavlink.MAVLink_gimbal_device_attitude_status_message(
+        0, 0, 300, IN_EARTH, quaternion_of(0.0, -80.0, 0.0), 0.0, 0.0, 0.0, 0, math.nan, math.nan
+    )
+    attitude_and(it, 300, device, mount)
+    attitude_and(it, 400, mount)
+    at = it.gimbal_at(10 * SECOND + 350 * MS)
+    assert at is not None
+    assert at.source == "GIMBAL_DEVICE_ATTITUDE_STATUS"
+
+
+def test_mount_orientation() -> None:
+    it = tracker()
+    m = mavlink.MAVLink_mount_orientation_message(0, 1.0, -20.0, 15.0, 99.0)
+    attitude_and(it, 0, m, yaw=math.radians(90.0))
+    at = it.gimbal_at(10 * SECOND)
+    assert at is not None
+    assert math.degrees(at.yaw_rad) == pytest.approx(105.0, abs=1e-3)
+    assert math.degrees(at.pitch_rad) == pytest.approx(-20.0, abs=1e-3)
+
+
+def test_fixed_camera_follows_the_body_and_its_mounting() -> None:
+    it = tracker(quat.from_euler(0.0, math.radians(-60.0), 0.0), fixed=True)
+    m = mavlink.MAVLink_attitude_message(0, 0.0, math.radians(10.0), 1.0, 0.0, 0.0, 0.0)
+    it.handle(sent(m), 10 * SECOND)
+    at = it.gimbal_at(10 * SECOND)
+    assert at is not None
+    assert math.degrees(at.pitch_rad) == pytest.approx(-50.0, abs=1e-3)
+    assert at.yaw_rad == pytest.approx(1.0, abs=1e-6)
+    assert at.source == "fixed"
+
+
+def test_other_systems_ground_stations_and_companions_are_not_the_vehicle() -> None:
+    it = VehicleTracker(None, quat.IDENTITY, False)
+    assert not it.accepts(sent(mavlink.MAVLink_heartbeat_message(6, 8, 0, 0, 4, 3), 255, 190))
+    assert not it.accepts(sent(mavlink.MAVLink_heartbeat_message(18, 8, 0, 0, 4, 3), 7, 191))
+    assert it.snapshot(SECOND).system_id is None
+    vehicle = sent(mavlink.MAVLink_heartbeat_message(2, 3, 81, 4, 4, 3), 7, 1)
+    assert it.accepts(vehicle)
+    it.handle(vehicle, SECOND)
+    assert it.snapshot(SECOND).system_id == 7
+    other = sent(mavlink.MAVLink_attitude_message(0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0), 8, 1)
+    assert not it.accepts(other)
+
+
+def test_position_at_null_island_is_no_position() -> None:
+    it = tracker()
+    for lat in (0, 473977420):
+        m = mavlink.MAVLink_global_position_int_message(1, lat, 0, 500000, 0, 0, 0, 0, 0)
+        it.handle(sent(m), 10 * SECOND)
+        assert math.isfinite(it.snapshot(SECOND).latitude_deg) is (lat != 0)
+
+
+@pytest.mark.parametrize("place", [(910_000_000, 0), (1, 1_800_000_001), (1, -(2**31))])
+def test_position_that_is_not_on_earth_is_no_position(place: tuple[int, int]) -> None:
+    it = tracker()
+    message = mavlink.MAVLink_global_position_int_message(1, *place, 500000, 0, 0, 0, 0, 0)
+    it.handle(sent(message), 10 * SECOND)
+    assert math.isnan(it.snapshot(SECOND).latitude_deg)
+    assert it.global_at(10 * SECOND) is None
+
+
+def test_heartbeat_age_and_connection() -> None:
+    it = tracker()
+    assert it.snapshot(2 * SECOND).connected
+    late = it.snapshot(5 * SECOND)
+    assert not late.connected
+    assert late.heartbeat_age_s == pytest.approx(4.0)
+
+
+def test_reboot_is_noticed_and_the_clock_starts_over() -> None:
+    it = tracker()
+    feed_yaw(it, 10.0, 3.0, 0.1)
+    rebooted = [
+        it.handle(
+            sent(mavlink.MAVLink_attitude_message(ms, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)),
+            20 * SECOND + ms * MS,
+        )
+        for ms in (5, 25, 45, 65)
+    ]
+    assert rebooted == [False, False, True, False]
+    assert it.clock.offset_ns == 20 * SECOND
+    assert it.attitude_at(10 * SECOND + 100 * MS) is None
+    assert it.attitude_at(20 * SECOND + 50 * MS) is not None
+    assert it.snapshot(20 * SECOND).reboots == 1
+
+
+def test_what_is_not_finite_or_old_is_ignored() -> None:
+    it = tracker()
+    feed_yaw(it, 10.0, 1.0, 0.0)
+    now = 11 * SECOND
+    nan = math.nan
+    for m in (
+        mavlink.MAVLink_attitude_message(950, nan, 0.0, 0.0, 0.0, 0.0, 0.0),
+        mavlink.MAVLink_attitude_quaternion_message(960, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0),
+        mavlink.MAVLink_local_position_ned_message(970, nan, 0.0, 0.0, 0.0, 0.0, 0.0),
+        mavlink.MAVLink_global_position_int_message(980, 1_000_000_000, 5, 0, 0, 0, 0, 0, 0),
+    ):
+        it.handle(sent(m), now)
+    assert it.ignored == 4
+    state = it.snapshot(now)
+    assert state.local_position_ned is None
+    assert math.isnan(state.latitude_deg)
+    at = it.attitude_at(now - 100 * MS)
+    assert at is not None
+    assert math.isfinite(at.yaw_rad)
+    # A copy of an old frame does not turn the position back.
+    good = mavlink.MAVLink_local_position_ned_message(1000, 5.0, 0.0, 0.0, 0.0, 0.0, 0.0)
+    it.handle(sent(good), now)
+    old = mavlink.MAVLink_local_position_ned_message(500, 1.0, 0.0, 0.0, 0.0, 0.0, 0.0)
+    it.handle(sent(old), now + 3 * SECOND)
+    assert it.snapshot(now).local_position_ned == (5.0, 0.0, 0.0)
+
+
+# --- origin -----------------------------------------------------------------------------------
+
+
+def test_scaling_is_ardupilots_own() -> None:
+    # Location::get_distance_NE with LOCATION_SCALING_FACTOR and the mean latitude.
+    dlat, dlon = 123456, -234567  # 1e-7 deg
+    lat, lon = 47.397742, 8.545594
+    mean = math.radians(lat + dlat * 1e-7 / 2)
+    expected = (dlat * 0.011131884502145034, dlon * 0.011131884502145034 * math.cos(mean))
+    assert north_east(lat, lon, lat + dlat * 1e-7, lon + dlon * 1e-7) == pytest.approx(expected)
+
+
+@pytest.mark.parametrize("where", [(47.4, 8.5), (-33.9, 151.2), (64.1, -21.9), (0.0, 179.999)])
+def test_offset_inverts_the_scaling(where: tuple[float, float]) -> None:
+    latitude, longitude = offset(*where, 4000.0, 3000.0)
+    assert north_east(*where, latitude, longitude) == pytest.approx((4000.0, 3000.0), abs=1e-3)
+
+
+def test_px4_projection_agrees_with_a_sphere() -> None:
+    # 1 degree of latitude on PX4's sphere of 6371 km.
+    north, east = north_east(47.0, 8.0, 48.0, 8.0, "px4")
+    assert north == pytest.approx(math.radians(1.0) * 6371000.0, rel=1e-9)
+    assert east == pytest.approx(0.0, abs=1e-6)
+
+
+def test_down_is_origin_minus_altitude() -> None:
+    assert ned_from_origin(Origin(47.0, 8.0, 500.0), 47.0, 8.0, 620.0)[2] == -120.0
+
+
+def test_origin_is_read_and_only_set_when_the_vehicle_has_none() -> None:
+    configured = OriginConfig(latitude_deg=47.0, longitude_deg=8.0, altitude_amsl_m=500.0)
+    keeper = OriginKeeper(configured)
+    asked: list[int] = []
+    messages = [keeper.tick(i * SECOND, 1, asked.append) for i in range(1, 6)]
+    assert asked == [49] * 5
+    assert messages[:3] == [None] * 3
+    assert messages[3] is not None
+    assert messages[3].latitude == 470000000
+    assert messages[3].altitude == 500000
+    # The vehicle has another one: ours is ignored, and so must positions be relative to the read.
+    news = keeper.on_origin(mavlink.MAVLink_gps_global_origin_message(471000000, 80000000, 480000))
+    assert news is not None
+    assert "from the configured one" in news
+    assert keeper.origin == Origin(pytest.approx(47.1), pytest.approx(8.0), pytest.approx(480.0))
+    assert keeper.tick(10 * SECOND, 1, asked.append) is None
+
+
+def test_no_origin_is_set_unless_configured() -> None:
+    keeper = OriginKeeper(None)
+    assert all(keeper.tick(i * SECOND, 1, lambda _: None) is None for i in range(20))
+
+
+def test_zero_origin_is_none() -> None:
+    keeper = OriginKeeper(None)
+    keeper.on_origin(mavlink.MAVLink_gps_global_origin_message(0, 0, 0))
+    assert keeper.origin is None
+
+
+# --- profiles ---------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("autopilot", "version", "profile"),
+    [
+        ("ardupilot", (4, 5, 0), ARDUPILOT),
+        ("ardupilot", (4, 7, 9), ARDUPILOT),
+        ("ardupilot", None, ARDUPILOT),
+        ("ardupilot", (4, 8, 0), ARDUPILOT_SQRT),
+        ("ardupilot", (4, 1, 0), GENERIC),
+        ("px4", (1, 15, 2), PX4),
+        ("px4", (1, 12, 0), GENERIC),
+        ("unknown", (1, 0, 0), GENERIC),
+    ],
+)
+def test_profile_of_a_firmware(autopilot: str, version: Any, profile: Any) -> None:
+    assert select_profile(autopilot, version) is profile
