@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import signal
 
-from companion.interrupts import end_at_once
+from companion.cli.interrupts import end_at_once
 
 
 def main() -> None:
     """Entry point. The imports take seconds, in which an operator may think better of it."""
     signal.signal(signal.SIGINT, end_at_once)
-    from companion.cli import main as command_line
+    from companion.cli.commands import main as command_line
 
     command_line()
 

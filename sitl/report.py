@@ -14,7 +14,7 @@ from rich.console import Console
 from rich.table import Table
 
 from companion.config import CompanionConfig, load_config
-from companion.plots import (
+from companion.offline.plots import (
     ErrorSeries,
     MapPicture,
     overlay_sheet,

@@ -11,7 +11,7 @@ import pytest
 import trimesh
 from typer.testing import CliRunner
 
-from companion.cli import app
+from companion.cli.commands import app
 from companion.errors import ReportError
 from localizer.errors import GeoreferenceError, OutsideMapError
 from localizer.geometry.camera import Camera

@@ -6,15 +6,15 @@ import threading
 from collections.abc import Iterable
 from pathlib import Path
 
-from companion.build import MapStack, build_localizer
 from companion.config import CompanionConfig
-from companion.coverage import check_mission, check_origin
 from companion.errors import CompanionError
+from companion.preflight.coverage import check_mission, check_origin
 from companion.sources import SourceSettings, open_source
 from localizer.errors import LocalizerError
 from localizer.features.extractor import load_extractor
 from localizer.geometry.geo import LocalFrame
 from localizer.map.cache.cache import TileCache
+from localizer.tracking.opening import MapStack, build_localizer
 from mavlink_bridge.errors import BridgeError
 from mavlink_bridge.preflight.doctor import Diagnosis, Finding, examine
 from mavlink_bridge.preflight.mission import download_mission

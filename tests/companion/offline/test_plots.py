@@ -2,7 +2,7 @@ import cv2
 import numpy as np
 import pytest
 
-from companion.plots import ErrorSeries, MapPicture, checkerboard, plot_errors, plot_tracks
+from companion.offline.plots import ErrorSeries, MapPicture, checkerboard, plot_errors, plot_tracks
 
 TIME = np.linspace(-5.0, 10.0, 60)
 

@@ -15,9 +15,8 @@ from rich.markup import escape
 from rich.progress import Progress
 from rich.table import Table
 
-from companion.build import MapStack, build_localizer
 from companion.errors import ConfigError, ReportError
-from companion.plots import ErrorSeries, overlay_sheet, plot_errors, save_image
+from companion.offline.plots import ErrorSeries, overlay_sheet, plot_errors, save_image
 from companion.versions import versions
 from localizer.config import LocalizerConfig
 from localizer.evaluation.metrics import LocalizationMetrics
@@ -37,6 +36,7 @@ from localizer.geometry.geo import LocalFrame
 from localizer.registration.devices import DeviceChoice
 from localizer.render.base import MapRenderer
 from localizer.render.select import Backend
+from localizer.tracking.opening import MapStack, build_localizer
 from localizer.tracking.pipeline import Undistorter
 
 _OVERLAYS = 4

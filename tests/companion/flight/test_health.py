@@ -7,7 +7,7 @@ from types import SimpleNamespace
 import pytest
 
 from companion.config import RecordConfig
-from companion.health import HealthMonitor
+from companion.flight.health import HealthMonitor
 from companion.sources import StreamState
 from localizer.tracking.engine import EngineHealth
 from localizer.types import TrackingState
@@ -52,7 +52,7 @@ def _one_report(folder, state, connected, tracking=None, frames_in=0, **options)
 @pytest.fixture(autouse=True)
 def no_estimate_is_stale(monkeypatch):
     """However long a busy machine takes from adding it to reporting it."""
-    monkeypatch.setattr("companion.health._STALE_S", 600.0)
+    monkeypatch.setattr("companion.flight.health._STALE_S", 600.0)
 
 
 @pytest.mark.parametrize(
@@ -104,7 +104,7 @@ def test_a_record_that_fails_is_told_as_long_as_it_does(tmp_path):
 
 
 def test_a_report_that_fails_is_not_the_last(tmp_path, monkeypatch, caplog):
-    monkeypatch.setattr("companion.health._PERIOD_S", 0.05)
+    monkeypatch.setattr("companion.flight.health._PERIOD_S", 0.05)
     states = iter([RuntimeError("boom"), RuntimeError("boom")])
 
     def state():

@@ -10,7 +10,7 @@ import pytest
 import yaml
 from typer.testing import CliRunner
 
-from companion.cli import app
+from companion.cli.commands import app
 from mavlink_bridge.link.link import sleep_until
 
 MODEL = {"width": 640, "height": 480, "fx": 550, "fy": 550, "cx": 320, "cy": 240}
@@ -26,8 +26,8 @@ def map_cache(small_assets):
 # exception would be printed and lost.
 INTERRUPTED_IN_A_CALLBACK = """
 import ctypes, os, signal, sys
-import companion.app
-from companion.cli import main
+import companion.flight.app
+from companion.cli.commands import main
 
 number, part = getattr(signal, sys.argv.pop()), sys.argv.pop()
 
@@ -36,7 +36,7 @@ def make(*_):
     print("went on", flush=True)
     raise SystemExit(1)
 
-setattr(companion.app, part, make)
+setattr(companion.flight.app, part, make)
 main()
 """
 

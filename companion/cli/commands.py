@@ -15,15 +15,15 @@ import typer
 from rich.console import Console
 from rich.markup import escape
 
-from companion.doctor_cli import doctor_command
+from companion.cli.doctor import doctor_command
+from companion.cli.evaluate import evaluate_command
+from companion.cli.interrupts import INTERRUPTED
+from companion.cli.map import app as map_app
+from companion.cli.replay import replay_command
+from companion.cli.run import run_command
+from companion.cli.world import app as world_app
 from companion.errors import CompanionError
-from companion.eval_cli import evaluate_command
-from companion.interrupts import INTERRUPTED
-from companion.map_cli import app as map_app
-from companion.replay_cli import replay_command
-from companion.run_cli import run_command
 from companion.versions import versions
-from companion.world_cli import app as world_app
 from localizer.errors import LocalizerError
 from mavlink_bridge.errors import BridgeError
 

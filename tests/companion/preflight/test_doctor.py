@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 from rich.console import Console
 
+from companion.cli.doctor import print_diagnosis
 from companion.config import parse_config
-from companion.doctor import examine_deployment
-from companion.doctor_cli import print_diagnosis
+from companion.preflight.doctor import examine_deployment
 from mavlink_bridge.preflight.doctor import Diagnosis, Finding
 
 SIZE = (160, 120)

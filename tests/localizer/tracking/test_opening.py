@@ -4,12 +4,12 @@ import threading
 
 import pytest
 
-from companion.build import MapStack, build_localizer
 from localizer.config import LocalizerConfig
 from localizer.errors import ModelError, RenderError
 from localizer.geometry.camera import Camera
 from localizer.registration.config import JNGOConfig
 from localizer.render import select
+from localizer.tracking.opening import MapStack, build_localizer
 
 
 def test_the_configured_renderer_serves(small_assets):

@@ -8,9 +8,9 @@ from typing import Annotated
 
 import typer
 
+from companion.cli.console_log import console_log
+from companion.cli.interrupts import end_at_once
 from companion.config import load_config
-from companion.console_log import console_log
-from companion.interrupts import end_at_once
 from localizer.registration.devices import DeviceChoice
 from localizer.render.select import Backend
 
@@ -36,7 +36,7 @@ def run_command(
     changes = {key: value for key, value in given.items() if value is not None}
     localizer = settings.localizer.model_copy(update=changes)
     settings = settings.model_copy(update={"localizer": localizer})
-    from companion.app import Companion
+    from companion.flight.app import Companion
 
     companion = Companion(settings)
 

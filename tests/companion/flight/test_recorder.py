@@ -13,7 +13,7 @@ import pytest
 
 from companion.config import RecordConfig
 from companion.errors import DiskFaultError, ReportError
-from companion.recorder import ESTIMATE_COLUMNS, Recorder, fresh_folder, remove_empty
+from companion.flight.recorder import ESTIMATE_COLUMNS, Recorder, fresh_folder, remove_empty
 from localizer.geometry.camera import Camera
 from localizer.geometry.geo import Geodetic, LocalFrame
 from localizer.geometry.pose import Pose, so3_exp
@@ -161,7 +161,7 @@ def test_what_cannot_be_written_costs_itself_only(tmp_path):
 
 
 def test_a_disk_that_stands_still_is_left_behind(tmp_path, monkeypatch):
-    monkeypatch.setattr("companion.recorder._CLOSE_S", 0.2)
+    monkeypatch.setattr("companion.flight.recorder._CLOSE_S", 0.2)
     recorder = Recorder(RecordConfig(folder=tmp_path), FRAME)
     still = threading.Event()
     monkeypatch.setattr(recorder, "_write", lambda *_: still.wait(60.0))

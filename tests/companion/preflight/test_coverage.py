@@ -5,8 +5,8 @@ import numpy as np
 import pytest
 
 from companion.config import parse_config
-from companion.coverage import check_mission, covered
-from companion.doctor import examine_deployment
+from companion.preflight.coverage import check_mission, covered
+from companion.preflight.doctor import examine_deployment
 from localizer.map.cache.cache import TileCache
 from mavlink_bridge.preflight.mission import Waypoint
 from sitl.embedded.geodesy import Location

@@ -18,16 +18,16 @@ from typing import Any, TextIO
 import numpy as np
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
-from companion.build import MapStack, build_localizer
 from companion.config import CompanionConfig, parse_config
 from companion.errors import RecordError, StreamDecodeError
-from companion.fixes import camera_rotation, vehicle_prior
-from companion.recorder import MANIFEST_NAME
+from companion.flight.conversions import camera_rotation, vehicle_prior
+from companion.flight.recorder import MANIFEST_NAME
 from companion.sources.base import fitted_camera
 from companion.sources.folder_source import read_image
 from localizer.errors import OutsideMapError
 from localizer.geometry.camera import Camera
 from localizer.geometry.pose import Array, Pose, matrix_from_quaternion
+from localizer.tracking.opening import MapStack, build_localizer
 from localizer.tracking.pipeline import Localizer
 from localizer.types import Frame, PoseEstimate
 from mavlink_bridge import quaternion as quat

@@ -27,7 +27,7 @@ def replay_command(
     ] = 1.0,
 ) -> None:
     """Localize a recorded flight again; exit code 0 if it agrees with the record, else 1."""
-    from companion.replay import load_record, replay, summarize
+    from companion.offline.replay import load_record, replay, summarize
 
     loaded = load_record(record)
     log = tlog or loaded.config.bridge.tlog

@@ -25,7 +25,7 @@ def doctor_command(
     vehicle: Annotated[bool, typer.Option(help="examine the flight controller too")] = True,
 ) -> None:
     """Check a deployment; exit code 0 good, 1 advice, 2 not fit to fly."""
-    from companion.doctor import examine_deployment
+    from companion.preflight.doctor import examine_deployment
     from mavlink_bridge.preflight.doctor import repair
 
     settings = load_config(config)

@@ -12,12 +12,12 @@ import pytest
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 from typer.testing import CliRunner
 
-from companion.app import Companion
-from companion.cli import app
+from companion.cli.commands import app
 from companion.config import parse_config
 from companion.errors import RecordError
+from companion.flight.app import Companion
 from companion.geometry import GIMBAL_FROM_CAMERA
-from companion.replay import load_record, read_tlog, replay, summarize
+from companion.offline.replay import load_record, read_tlog, replay, summarize
 from localizer.geometry.camera import Camera
 from localizer.geometry.geo import NED_FROM_ENU
 from localizer.geometry.pose import quaternion_from_matrix

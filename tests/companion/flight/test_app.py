@@ -13,9 +13,9 @@ import cv2
 import numpy as np
 import pytest
 
-from companion.app import Companion
 from companion.config import parse_config
 from companion.errors import ConfigError, StreamOpenError
+from companion.flight.app import Companion
 from mavlink_bridge.bridge import Bridge
 from mavlink_bridge.link.link import sleep_until
 from mavlink_bridge.messages import TrackRequest, without_figures

@@ -15,21 +15,21 @@ from pathlib import Path
 
 import numpy as np
 
-from companion.build import MapStack, build_localizer
 from companion.config import CompanionConfig, RecordConfig
-from companion.coverage import check_origin
-from companion.detections import Detection, DetectionListener
 from companion.errors import ConfigError, DiskFaultError
-from companion.fixes import camera_rotation, vehicle_prior, vision_fix
-from companion.health import HealthMonitor
-from companion.recorder import Recorder, fresh_folder, remove_empty, write_manifest
+from companion.flight.conversions import camera_rotation, vehicle_prior, vision_fix
+from companion.flight.detections import Detection, DetectionListener
+from companion.flight.health import HealthMonitor
+from companion.flight.recorder import Recorder, fresh_folder, remove_empty, write_manifest
+from companion.flight.target_reporter import Target, TargetReporter
+from companion.flight.view_reporter import ViewReporter
+from companion.preflight.coverage import check_origin
 from companion.sources import StreamState, open_source
-from companion.target_reporter import Target, TargetReporter
-from companion.view_reporter import ViewReporter
 from localizer.geometry.pose import Array
 from localizer.map.cache.cache import TileCache
 from localizer.map.cache.surface import MapSurface
 from localizer.tracking.engine import DualThreadEngine
+from localizer.tracking.opening import MapStack, build_localizer
 from localizer.types import PoseEstimate, PosePrior, ReferenceBundle, TrackingState
 from mavlink_bridge.bridge import Bridge
 from mavlink_bridge.config import BridgeConfig

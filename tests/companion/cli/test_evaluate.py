@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from companion.cli import app
+from companion.cli.commands import app
 from companion.errors import ReportError
 from localizer.errors import CameraError, OutsideMapError, SequenceError
 from sitl.kinematic import record_scenario

@@ -6,7 +6,7 @@ import threading
 import numpy as np
 import pytest
 
-from companion.view_reporter import ViewReporter, camera_view
+from companion.flight.view_reporter import ViewReporter, camera_view
 from localizer.geometry.camera import Camera
 from localizer.geometry.geo import Geodetic, LocalFrame
 from localizer.geometry.pose import Pose, matrix_from_euler

@@ -3,14 +3,14 @@ import time
 
 import pytest
 
-from companion.detections import (
+from companion.errors import ConfigError, DetectionError
+from companion.flight.detections import (
     Detection,
     DetectionListener,
     encode_detection,
     parse_detection,
     parse_host_port,
 )
-from companion.errors import ConfigError, DetectionError
 
 
 def test_round_trip():

@@ -1,0 +1,1 @@
+"""The flight process: what runs, and how its parts are wired."""
