@@ -11,8 +11,8 @@ from typing import Any
 
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
-from sitl.embedded.geodesy import Location
-from sitl.vehicles import GIMBAL, EmbeddedSitl, vision_only_parameters
+from sitl.geodesy import Location
+from sitl.vehicles.launch import GIMBAL, EmbeddedSitl, vision_only_parameters
 
 HOME = Location(47.397742, 8.545594, 488.0)
 

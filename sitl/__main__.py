@@ -16,14 +16,12 @@ from rich.markup import escape
 from companion.errors import CompanionError
 from localizer.errors import LocalizerError
 from localizer.synth.appearance.model import CONDITIONS
-from sitl.assets import prepare
-from sitl.errors import SimulationError
-from sitl.flight import fly
-from sitl.kinematic import record_scenario
-from sitl.process import VehicleKind as FlownKind
-from sitl.progress import shown_progress
-from sitl.report import make_report, print_report
-from sitl.scenario import (
+from sitl.demo.assets import prepare
+from sitl.demo.flight import fly
+from sitl.demo.kinematic import record_scenario
+from sitl.demo.progress import shown_progress
+from sitl.demo.report import make_report, print_report
+from sitl.demo.scenario import (
     Injection,
     Scenario,
     ScenarioError,
@@ -31,9 +29,11 @@ from sitl.scenario import (
     check_inside,
     load_scenario,
 )
+from sitl.errors import SimulationError
 from sitl.suite.case import SCENARIOS, load_cases
 from sitl.suite.report import print_row, print_table, write_report
 from sitl.suite.runner import run_suite
+from sitl.vehicles.process import VehicleKind as FlownKind
 
 # What a flight and its report leave in their folder.
 _REPORT_FILES = (

@@ -17,7 +17,7 @@ from pathlib import Path
 import hypothesis
 import pytest
 
-from sitl.assets import FlightAssets, prepare
+from sitl.demo.assets import FlightAssets, prepare
 from sitl.errors import SimulationError
 
 # The suite tries the same examples every time, so that a failure belongs to the change it is seen

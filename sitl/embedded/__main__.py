@@ -9,10 +9,10 @@ from pathlib import Path
 from types import FrameType
 
 from sitl.embedded.errors import VehicleError
-from sitl.embedded.geodesy import Location
-from sitl.embedded.mavlink_server import MavlinkServer
+from sitl.embedded.mavlink.server import MavlinkServer
 from sitl.embedded.parameters import Parameters, read_parameter_file
 from sitl.embedded.vehicle import Vehicle
+from sitl.geodesy import Location
 
 SERIAL_OFFSETS = (0, 2, 3)  # serial0, serial1, serial2 of ArduPilot SITL, from the base port
 

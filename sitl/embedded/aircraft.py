@@ -7,21 +7,21 @@ from math import cos, exp, radians, sin, sqrt
 import numpy as np
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
-from sitl.embedded import dynamics
-from sitl.embedded.arming import ArmingContext, arming_failures
-from sitl.embedded.estimator import Estimator
-from sitl.embedded.geodesy import Location
-from sitl.embedded.gimbal import Gimbal
-from sitl.embedded.injection import Injection
-from sitl.embedded.loop import TICK_S
-from sitl.embedded.mavlink_server import MavlinkServer
-from sitl.embedded.measurements import Baro, Compass, GpsData
-from sitl.embedded.mission import MissionStore
-from sitl.embedded.modes import FlightModes
+from sitl.embedded.control.arming import ArmingContext, arming_failures
+from sitl.embedded.control.loop import TICK_S
+from sitl.embedded.control.mission import MissionStore
+from sitl.embedded.control.modes import FlightModes
+from sitl.embedded.ekf.estimator import Estimator
+from sitl.embedded.ekf.injection import Injection
+from sitl.embedded.ekf.measurements import Baro, Compass, GpsData
+from sitl.embedded.mavlink.server import MavlinkServer
 from sitl.embedded.parameters import Parameters
-from sitl.embedded.rotation import Array
-from sitl.embedded.sensors import GpsSample, Sensors
+from sitl.embedded.physics import dynamics
+from sitl.embedded.physics.gimbal import Gimbal
+from sitl.embedded.physics.rotation import Array
+from sitl.embedded.physics.sensors import GpsSample, Sensors
 from sitl.embedded.severity import CRITICAL, INFO
+from sitl.geodesy import Location
 
 _GPS_FIX_AFTER_S = 30.0  # a cold start; with the filter's 10 s of checks ArduPilot's 42 s
 GPS_SIMULATED = (1, 2)  # GPS1_TYPE auto and u-blox read the simulated receiver

@@ -7,13 +7,13 @@ import time
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from sitl.embedded.aircraft import GPS_SIMULATED, Aircraft
-from sitl.embedded.commands import Commands
-from sitl.embedded.geodesy import Location
-from sitl.embedded.loop import TICK_S, advance
-from sitl.embedded.mavlink_server import MavlinkServer
+from sitl.embedded.control.loop import TICK_S, advance
+from sitl.embedded.mavlink.commands import Commands
+from sitl.embedded.mavlink.server import MavlinkServer
+from sitl.embedded.mavlink.telemetry import DEFAULT_STREAMS, Telemetry
 from sitl.embedded.parameters import Parameters
-from sitl.embedded.rotation import euler
-from sitl.embedded.telemetry import DEFAULT_STREAMS, Telemetry
+from sitl.embedded.physics.rotation import euler
+from sitl.geodesy import Location
 
 _MAX_LAG_S = 0.25  # of wall time behind schedule after which the schedule starts anew
 

@@ -10,10 +10,10 @@ from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from companion.settings_file import SettingsError, read_settings, validated
 from mavlink_bridge import BridgeConfig
-from sitl.feed import FixModel, RawMessage
-from sitl.scenario import ScenarioError
+from sitl.demo.scenario import ScenarioError
 from sitl.suite.checks import Check
-from sitl.vehicles import (
+from sitl.suite.simulated_localizer import FixModel, RawMessage
+from sitl.vehicles.launch import (
     GPS_OFF,
     SPEEDS,
     gps_input_only_parameters,

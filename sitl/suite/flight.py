@@ -12,15 +12,15 @@ import numpy as np
 
 from mavlink_bridge import Bridge, BridgeConfig
 from mavlink_bridge.link.link import sleep_until
-from sitl.embedded.geodesy import Location
 from sitl.errors import PilotError
-from sitl.feed import BridgeFeed, FixModel, TruthFeed
-from sitl.pilot import Pilot
-from sitl.process import VehicleKind, VehicleProcess, VehicleProcessError
+from sitl.geodesy import Location
+from sitl.ground.pilot import Pilot
 from sitl.suite.case import Case, Event
 from sitl.suite.doctor import consult
 from sitl.suite.record import Record, Sample, Text
-from sitl.vehicles import open_vehicle
+from sitl.suite.simulated_localizer import BridgeFeed, FixModel, TruthFeed
+from sitl.vehicles.launch import open_vehicle
+from sitl.vehicles.process import VehicleKind, VehicleProcess, VehicleProcessError
 
 HOME = Location(47.397742, 8.545594, 488.0)
 GEOID_M = 47.3

@@ -15,11 +15,11 @@ from dataclasses import dataclass
 import numpy as np
 
 from sitl.errors import SimulationError
-from sitl.process import VehicleKind
 from sitl.suite.case import Case
 from sitl.suite.checks import Finding, Reference
 from sitl.suite.flight import fly
 from sitl.suite.record import Array, Record
+from sitl.vehicles.process import VehicleKind
 
 _PACE_LIMIT = 0.98
 _STALL_LIMIT_S = 0.05  # on a machine with room it is below 0.01 s

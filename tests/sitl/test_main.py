@@ -4,7 +4,7 @@ import pytest
 from typer.testing import CliRunner
 
 from sitl import __main__ as cli
-from sitl.scenario import ScenarioError
+from sitl.demo.scenario import ScenarioError
 
 
 @pytest.fixture(autouse=True)

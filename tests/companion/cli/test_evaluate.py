@@ -12,8 +12,8 @@ from typer.testing import CliRunner
 from companion.cli.commands import app
 from companion.errors import ReportError
 from localizer.errors import CameraError, OutsideMapError, SequenceError
-from sitl.kinematic import record_scenario
-from sitl.scenario import CameraSpec, Leg, Scenario
+from sitl.demo.kinematic import record_scenario
+from sitl.demo.scenario import CameraSpec, Leg, Scenario
 
 FRAMES = 25
 

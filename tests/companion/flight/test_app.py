@@ -19,8 +19,8 @@ from companion.flight.app import Companion
 from mavlink_bridge.bridge import Bridge
 from mavlink_bridge.link.link import sleep_until
 from mavlink_bridge.messages import TrackRequest, without_figures
-from sitl.embedded.geodesy import Location
-from sitl.vehicles import GIMBAL, EmbeddedSitl, vision_parameters
+from sitl.geodesy import Location
+from sitl.vehicles.launch import GIMBAL, EmbeddedSitl, vision_parameters
 
 HOME = Location(47.397742, 8.545594, 488.0)
 MODEL = {"width": 160, "height": 120, "fx": 140, "fy": 140, "cx": 80, "cy": 60}

@@ -18,7 +18,7 @@ from localizer.geometry.camera import Camera
 from localizer.geometry.geo import Geodetic, LocalFrame
 from localizer.geometry.pose import Pose, so3_exp
 from localizer.types import Frame, PoseEstimate, RegistrationStatus, TargetFix, TrackingState
-from sitl.analysis import poses, read_csv
+from sitl.demo.analysis import poses, read_csv
 
 FRAME = LocalFrame(Geodetic(47.3, 8.5, 450.0))
 CAMERA = Camera.from_fov(64, 48, 60)

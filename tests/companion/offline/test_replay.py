@@ -23,8 +23,8 @@ from localizer.geometry.geo import NED_FROM_ENU
 from localizer.geometry.pose import quaternion_from_matrix
 from localizer.geometry.posefile import read_poses, world_from_camera
 from localizer.map.cache.cache import TileCache
-from sitl.kinematic import record_scenario
-from sitl.scenario import CameraSpec, Leg, Scenario
+from sitl.demo.kinematic import record_scenario
+from sitl.demo.scenario import CameraSpec, Leg, Scenario
 
 FRAMES_AT_LEAST = 6
 

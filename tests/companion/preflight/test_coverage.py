@@ -9,10 +9,10 @@ from companion.preflight.coverage import check_mission, covered
 from companion.preflight.doctor import examine_deployment
 from localizer.map.cache.cache import TileCache
 from mavlink_bridge.preflight.mission import Waypoint
-from sitl.embedded.geodesy import Location
-from sitl.mission_steps import takeoff_step, waypoint_step
-from sitl.pilot import Pilot
-from sitl.vehicles import GIMBAL, EmbeddedSitl, vision_only_parameters
+from sitl.geodesy import Location
+from sitl.ground.mission_steps import takeoff_step, waypoint_step
+from sitl.ground.pilot import Pilot
+from sitl.vehicles.launch import GIMBAL, EmbeddedSitl, vision_only_parameters
 
 
 @pytest.fixture(scope="module")

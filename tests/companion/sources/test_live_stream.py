@@ -15,7 +15,7 @@ from companion.sources import FrameSource, SourceSettings, StreamState, open_sou
 from companion.sources.base import fitted_camera
 from localizer.geometry.camera import Camera
 from localizer.types import Frame, Image
-from sitl.stream import VideoSender
+from sitl.camera.stream import VideoSender
 
 CAMERA = Camera.from_fov(320, 240, 70.0)
 _CELL = 16

@@ -3,7 +3,7 @@ from pathlib import Path
 import pytest
 
 from localizer.synth.world import WorldInfo
-from sitl.assets import FlightAssets
+from sitl.demo.assets import FlightAssets
 
 
 @pytest.fixture(scope="session")

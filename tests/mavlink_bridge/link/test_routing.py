@@ -21,9 +21,9 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from mavlink_bridge import Bridge, BridgeConfig, CameraView, TargetReport, TrackRequest
 from mavlink_bridge.link.link import sleep_until
-from sitl.ardupilot import ArduPilotSitl, find_arducopter
-from sitl.embedded.geodesy import Location
-from sitl.vehicles import GIMBAL, EmbeddedSitl
+from sitl.geodesy import Location
+from sitl.vehicles.ardupilot import ArduPilotSitl, find_arducopter
+from sitl.vehicles.launch import GIMBAL, EmbeddedSitl
 
 HOME = Location(47.397742, 8.545594, 488.0)
 GEOID = 47.3

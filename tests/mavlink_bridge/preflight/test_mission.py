@@ -11,11 +11,11 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 from mavlink_bridge import BridgeConfig
 from mavlink_bridge.errors import ConnectionSilentError, MissionError
 from mavlink_bridge.preflight.mission import Waypoint, download_mission
-from sitl.ardupilot import ArduPilotSitl, find_arducopter
-from sitl.embedded.geodesy import Location
-from sitl.mission_steps import MissionStep, takeoff_step, waypoint_step
-from sitl.pilot import Pilot
-from sitl.vehicles import EmbeddedSitl
+from sitl.geodesy import Location
+from sitl.ground.mission_steps import MissionStep, takeoff_step, waypoint_step
+from sitl.ground.pilot import Pilot
+from sitl.vehicles.ardupilot import ArduPilotSitl, find_arducopter
+from sitl.vehicles.launch import EmbeddedSitl
 
 HOME = Location(47.397742, 8.545594, 488.0)
 RELATIVE = mavlink.MAV_FRAME_GLOBAL_RELATIVE_ALT

@@ -10,13 +10,13 @@ import numpy as np
 import pytest
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
-from sitl.embedded.geodesy import Location
-from sitl.embedded.mavlink_server import MavlinkServer
-from sitl.embedded.mode import Mode
+from sitl.embedded.control.mode import Mode
+from sitl.embedded.ekf.timesync import JitterCorrection
+from sitl.embedded.mavlink.server import MavlinkServer
 from sitl.embedded.parameters import Parameters
-from sitl.embedded.rotation import euler
-from sitl.embedded.timesync import JitterCorrection
+from sitl.embedded.physics.rotation import euler
 from sitl.embedded.vehicle import Vehicle
+from sitl.geodesy import Location
 
 HOME = Location(47.397742, 8.545594, 488.0)
 

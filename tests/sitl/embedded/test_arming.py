@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from sitl.embedded.mode import Mode
+from sitl.embedded.control.mode import Mode
 
 
 def guided(b, home=None):

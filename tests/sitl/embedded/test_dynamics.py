@@ -7,10 +7,10 @@ import math
 import numpy as np
 import pytest
 
-from sitl.embedded import dynamics
-from sitl.embedded.controller import Carrot, Limits, PositionController, attitude_control
-from sitl.embedded.dynamics import GRAVITY, MASS, MOTOR_MAX
-from sitl.embedded.rotation import euler, quaternion
+from sitl.embedded.control.controller import Carrot, Limits, PositionController, attitude_control
+from sitl.embedded.physics import dynamics
+from sitl.embedded.physics.dynamics import GRAVITY, MASS, MOTOR_MAX
+from sitl.embedded.physics.rotation import euler, quaternion
 
 DT = 0.0025
 

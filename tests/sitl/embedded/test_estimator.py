@@ -7,15 +7,15 @@ import math
 import numpy as np
 import pytest
 
-from sitl.embedded import navigation as nav
-from sitl.embedded.aided_filter import Aiding
-from sitl.embedded.dynamics import GRAVITY
-from sitl.embedded.estimator import EkfFlags, Estimator
-from sitl.embedded.geodesy import METRES_PER_DEGREE, Location, north_east
-from sitl.embedded.measurements import Baro, ExternalPosition, ExternalVelocity, GpsData
+from sitl.embedded.ekf import navigation as nav
+from sitl.embedded.ekf.aided_filter import Aiding
+from sitl.embedded.ekf.estimator import EkfFlags, Estimator
+from sitl.embedded.ekf.measurements import Baro, ExternalPosition, ExternalVelocity, GpsData
+from sitl.embedded.ekf.timesync import JitterCorrection
 from sitl.embedded.parameters import Parameters
-from sitl.embedded.rotation import euler, quaternion, rotate_world
-from sitl.embedded.timesync import JitterCorrection
+from sitl.embedded.physics.dynamics import GRAVITY
+from sitl.embedded.physics.rotation import euler, quaternion, rotate_world
+from sitl.geodesy import METRES_PER_DEGREE, Location, north_east
 
 ORIGIN = Location(47.397742, 8.545594, 488.0)
 AT_REST = np.array([0, 0, 0, 0, 0, -GRAVITY * 0.01, 0.01])
@@ -64,7 +64,7 @@ def difference(a, b):
 
 
 def quaternion_to_matrix(q):
-    from sitl.embedded.rotation import matrix
+    from sitl.embedded.physics.rotation import matrix
 
     return matrix(q)
 

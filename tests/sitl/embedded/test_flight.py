@@ -7,11 +7,11 @@ import math
 import numpy as np
 import pytest
 
-from sitl.embedded import mission as mis
-from sitl.embedded.aided_filter import Aiding
-from sitl.embedded.estimator import EkfFlags
-from sitl.embedded.mission import MissionItem
-from sitl.embedded.mode import Mode
+from sitl.embedded.control import mission as mis
+from sitl.embedded.control.mission import MissionItem
+from sitl.embedded.control.mode import Mode
+from sitl.embedded.ekf.aided_filter import Aiding
+from sitl.embedded.ekf.estimator import EkfFlags
 
 
 def test_takes_off_on_gps_and_hovers(bench):

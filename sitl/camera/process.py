@@ -1,0 +1,290 @@
+"""The world camera as a process of its own: true poses in by a pipe, H.264 out by UDP.
+
+It shares nothing with the companion but the network, so that the companion receives it as it would
+a real camera, and so that rendering for the simulation does not hold the companion's interpreter.
+"""
+
+from __future__ import annotations
+
+import multiprocessing
+import queue
+import threading
+import time
+from dataclasses import dataclass, field
+from multiprocessing.connection import Connection
+from pathlib import Path
+from types import TracebackType
+from typing import Literal
+
+import cv2
+import numpy as np
+
+from companion.geometry import Mount
+from localizer.geometry.camera import Camera
+from localizer.geometry.geo import Geodetic, LocalFrame
+from localizer.map.cache.cache import TileCache
+from localizer.map.cache.stream import TileStreamer
+from localizer.render.numba_raster import NumbaRenderer
+from localizer.synth.appearance.model import Appearance
+from sitl.camera.detector import Detector, Observed
+from sitl.camera.movers import Mover
+from sitl.camera.stream import VideoSender
+from sitl.camera.true_motion import PoseTrack, TruthSample, camera_pose
+from sitl.camera.world_camera import FrameLog, WorldCamera
+from sitl.errors import WorldCameraError
+
+Command = Literal["pause", "resume", "stop"]
+
+_START_S = 300.0  # numba compiles on the first run, a minute where there is room
+_STOP_S = 60.0
+_MAX_BEHIND = 2  # frame periods after which exposures are skipped instead of made late
+
+
+@dataclass(frozen=True)
+class WorldCameraConfig:
+    """Everything the process needs; it is pickled to it.
+
+    cache: tiles of the live world. origin: of the map's ENU frame, in which truth samples and
+    movers are given. log: where the true pose of every frame is written. threads: of the
+    rasteriser. targets: what a `Detector` watches and reports to the address `detections`.
+    """
+
+    cache: Path
+    origin: Geodetic
+    camera: Camera
+    url: str
+    log: Path
+    rate_hz: float = 10.0
+    appearance: Appearance = field(default_factory=Appearance)
+    movers: tuple[Mover, ...] = ()
+    mount: Mount = field(default_factory=Mount.from_degrees)
+    shutter_s: float = 0.005
+    seed: int = 0
+    threads: int = 1
+    bit_rate: int = 4_000_000
+    misp: bool = True
+    targets: tuple[Observed, ...] = ()
+    detections: str | None = None
+
+
+@dataclass(frozen=True)
+class CameraStatistics:
+    """What the process did. skipped: exposures left out because it was behind or paused.
+
+    stage_ms: (p50, p95) of render, distort, appearance and encode.
+    """
+
+    frames: int
+    skipped: int
+    sent_bytes: int
+    stage_ms: dict[str, tuple[float, float]]
+
+
+class WorldCameraProcess:
+    """The parent's handle. `send` truth samples at 20 Hz or more, in order of time."""
+
+    def __init__(self, config: WorldCameraConfig) -> None:
+        context = multiprocessing.get_context("spawn")
+        self._connection, child = context.Pipe()
+        self._process = context.Process(
+            target=_run, args=(config, child), name="world-camera", daemon=True
+        )
+        self._child = child
+        # One thread at a time on the pipe: flights stop the camera while their truth is still sent.
+        self._lock = threading.Lock()
+        self.statistics: CameraStatistics | None = None
+
+    def start(self) -> None:
+        """Starts the process and waits until it can take samples."""
+        self._process.start()
+        self._child.close()  # so that a dead child is seen as the end of the pipe
+        if not self._connection.poll(_START_S):
+            raise WorldCameraError(f"the world camera was not ready after {_START_S:.0f} s")
+        self._receive()
+
+    def send(self, sample: TruthSample) -> None:
+        """Tells where the vehicle was; raises `WorldCameraError` when the process has died."""
+        self._send(sample)
+
+    def pause(self) -> None:
+        """Stops sending pictures, as a camera whose link is cut."""
+        self._send("pause")
+
+    def resume(self) -> None:
+        """Takes up sending again."""
+        self._send("resume")
+
+    def stop(self) -> None:
+        """Ends the process; `statistics` holds what it did. Harmless when it is not running."""
+        if self._process.pid is None:
+            return
+        try:
+            with self._lock:
+                self._connection.send("stop")
+                if self._connection.poll(_STOP_S):
+                    self._receive()
+        except (OSError, EOFError, WorldCameraError):
+            pass  # it is gone already, which is what is wanted
+        self._process.join(_STOP_S)
+        if self._process.is_alive():
+            self._process.terminate()
+
+    def __enter__(self) -> WorldCameraProcess:
+        try:
+            self.start()
+        except BaseException:
+            self.stop()
+            raise
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        self.stop()
+
+    def _send(self, message: TruthSample | Command) -> None:
+        with self._lock:
+            if self._connection.poll():
+                self._receive()
+            try:
+                self._connection.send(message)
+            except OSError as error:
+                raise WorldCameraError("the world camera's process has died") from error
+
+    def _receive(self) -> None:
+        try:
+            message = self._connection.recv()
+        except (EOFError, OSError) as error:
+            raise WorldCameraError("the world camera's process has died") from error
+        if isinstance(message, CameraStatistics):
+            self.statistics = message
+        elif isinstance(message, str) and message:
+            raise WorldCameraError(f"the world camera failed: {message}")
+
+
+def _run(config: WorldCameraConfig, connection: Connection) -> None:
+    """The child's main function: an empty string says ready, any other one is an error."""
+    cv2.setNumThreads(1)
+    try:
+        with _Studio(config) as studio:
+            connection.send("")
+            inbox: queue.SimpleQueue[TruthSample | Command] = queue.SimpleQueue()
+            threading.Thread(target=_listen, args=(connection, inbox), daemon=True).start()
+            connection.send(studio.run(inbox))
+    except KeyboardInterrupt:
+        pass  # the parent got it too and decides
+    except Exception as error:
+        connection.send(f"{type(error).__name__}: {error}")
+
+
+def _listen(connection: Connection, inbox: queue.SimpleQueue[TruthSample | Command]) -> None:
+    # Emptied by a thread of its own: while a frame is rendered the pipe must not fill up and hold
+    # the parent, which flies the vehicle.
+    try:
+        while True:
+            inbox.put(connection.recv())
+    except (EOFError, OSError):
+        inbox.put("stop")
+
+
+class _Studio:
+    """Owns renderer, encoder and log for the life of the process."""
+
+    def __init__(self, config: WorldCameraConfig) -> None:
+        c = self._config = config
+        cache = TileCache.open(c.cache)
+        self._frame = LocalFrame(c.origin)
+        self._streamer = TileStreamer(cache)
+        self._renderer = NumbaRenderer(self._streamer, threads=c.threads)
+        self._renderer.warm_up()
+        self._camera = WorldCamera(
+            self._renderer,
+            c.camera,
+            c.appearance,
+            c.movers,
+            scene_from_world=cache.frame.ecef_from_enu.inverse @ self._frame.ecef_from_enu,
+            shutter_s=c.shutter_s,
+            seed=c.seed,
+        )
+        self._log = FrameLog(c.log)
+        self._sender = VideoSender(
+            c.url, c.camera.width, c.camera.height, c.rate_hz, bit_rate=c.bit_rate, misp=c.misp
+        )
+        self._detector = (
+            Detector(c.detections, c.camera, c.targets, seed=c.seed) if c.detections else None
+        )
+        self._track = PoseTrack()
+        self._paused = self._stopped = False
+        self._frames = self._skipped = 0
+        self._stages: dict[str, list[float]] = {}
+
+    def __enter__(self) -> _Studio:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._sender.close()
+        if self._detector is not None:
+            self._detector.close()
+        self._log.close()
+        self._renderer.close()
+        self._streamer.close()
+
+    def run(self, inbox: queue.SimpleQueue[TruthSample | Command]) -> CameraStatistics:
+        """Exposes at the configured rate as far as the truth is known, until told to stop."""
+        period_ns = round(1e9 / self._config.rate_hz)
+        margin_ns = round(self._config.shutter_s * 0.5e9)
+        due: int | None = None
+        while True:
+            self._handle(inbox.get())
+            while not inbox.empty():
+                self._handle(inbox.get())
+            if self._stopped:
+                return self._statistics()
+            newest = self._track.newest_ns
+            if newest is None:
+                continue
+            due = newest if due is None else due
+            behind = (newest - due) // period_ns
+            if behind > _MAX_BEHIND:
+                self._skipped += behind
+                due += behind * period_ns
+            if newest >= due + margin_ns:
+                self._expose(due)
+                due += period_ns
+
+    def _handle(self, message: TruthSample | Command) -> None:
+        if isinstance(message, TruthSample):
+            pose = camera_pose(message, self._frame, self._config.mount)
+            self._track.add(message.time_ns, pose)
+        elif message == "stop":
+            self._stopped = True
+        else:
+            self._paused = message == "pause"
+
+    def _expose(self, time_ns: int) -> None:
+        if self._paused:
+            self._skipped += 1
+            return
+        exposure = self._camera.expose(time_ns, self._track)
+        if exposure is None:
+            self._skipped += 1
+            return
+        start = time.perf_counter()
+        self._sender.send(exposure.image, time_ns)
+        if self._detector is not None:
+            self._detector.observe(time_ns, exposure.world_from_camera, exposure.depth)
+        self._log.add(self._frames, time_ns, exposure.world_from_camera)
+        self._frames += 1
+        stages = exposure.stage_ms | {"encode": 1e3 * (time.perf_counter() - start)}
+        for name, value in stages.items():
+            self._stages.setdefault(name, []).append(value)
+
+    def _statistics(self) -> CameraStatistics:
+        stages = {
+            name: (float(np.percentile(values, 50)), float(np.percentile(values, 95)))
+            for name, values in self._stages.items()
+        }
+        return CameraStatistics(self._frames, self._skipped, self._sender.sent_bytes, stages)

@@ -1,0 +1,170 @@
+"""What the simulated aircraft's camera sees, rendered from its true pose.
+
+`WorldCamera` makes one picture; `sitl.camera.process` streams pictures from a process of its own,
+`sitl.demo.sequence` writes them as an evaluation sequence.
+"""
+
+from __future__ import annotations
+
+import csv
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from types import TracebackType
+
+import numpy as np
+
+from localizer.geometry.camera import Camera
+from localizer.geometry.pose import Array, Pose, quaternion_from_matrix
+from localizer.render.base import MapRenderer
+from localizer.synth.appearance.model import Appearance
+from localizer.types import Float32, Image, RenderedView
+from sitl.camera.distortion import Lens
+from sitl.camera.imaging import Sensor
+from sitl.camera.movers import Mover
+from sitl.camera.true_motion import PoseTrack
+
+FRAME_COLUMNS = (
+    "exposure_time_ns", "sequence", "east_m", "north_m", "up_m", "qw", "qx", "qy", "qz",
+)  # fmt: skip
+
+# A hazy late afternoon through a small sensor. The stream's own compression comes on top.
+HAZY_AFTERNOON = Appearance(
+    exposure=0.92,
+    contrast=0.95,
+    gamma=1.06,
+    saturation=0.85,
+    balance=(1.05, 1.0, 0.93),
+    extinction_per_m=3e-4,
+    vignetting=0.2,
+    shot_noise=0.015,
+    read_noise=0.006,
+    defocus_px=0.5,
+)
+
+
+@dataclass(frozen=True)
+class Exposure:
+    """One picture and its truth. image: (H, W, 3) uint8, distorted, with all of the appearance;
+    depth: (H, W), metres along the optical axis, distorted alike.
+    """
+
+    image: Image
+    depth: Float32
+    time_ns: int
+    world_from_camera: Pose
+    stage_ms: dict[str, float]
+
+
+class WorldCamera:
+    """Renders the live world as a real camera would show it.
+
+    scene_from_world: from the map's ENU, in which poses and movers are given, to that of the
+    renderer's own cache (the two caches may have different origins). shutter_s: the motion during
+    it blurs the picture.
+    """
+
+    def __init__(
+        self,
+        renderer: MapRenderer,
+        camera: Camera,
+        appearance: Appearance,
+        movers: Sequence[Mover] = (),
+        *,
+        scene_from_world: Pose | None = None,
+        shutter_s: float = 0.005,
+        seed: int = 0,
+    ) -> None:
+        self.camera = camera
+        self._renderer = renderer
+        self._lens = Lens.of(camera)
+        self._sensor = Sensor(appearance, seed)
+        self._movers = tuple(movers)
+        self._scene_from_world = scene_from_world or Pose.identity()
+        self._shutter_ns = round(shutter_s * 1e9)
+
+    def expose(self, time_ns: int, track: PoseTrack) -> Exposure | None:
+        """The picture at a time; None where the track has no pose."""
+        pose = track.at(time_ns)
+        if pose is None:
+            return None
+        start = time.perf_counter()
+        view = self._render(pose, time_ns)
+        rendered = time.perf_counter()
+        image = self._lens.distort(view.rgb)
+        depth = self._lens.distort_depth(view.depth)
+        bent = time.perf_counter()
+        length_px, angle_deg = self._blur(track, pose, depth, time_ns)
+        image = self._sensor.apply(image, depth, length_px, angle_deg)
+        done = time.perf_counter()
+        stages = {
+            "render": 1e3 * (rendered - start),
+            "distort": 1e3 * (bent - rendered),
+            "appearance": 1e3 * (done - bent),
+        }
+        return Exposure(image, depth, time_ns, pose, stages)
+
+    def _render(self, pose: Pose, time_ns: int) -> RenderedView:
+        extra = []
+        for mover in self._movers:
+            mesh = mover.placed_at(time_ns)
+            extra.append(mesh.placed(self._scene_from_world @ mesh.world_from_tile))
+        scene = self._scene_from_world @ pose
+        # Waiting for detail: a real camera does not show coarse ground while data is loading.
+        return self._renderer.render(scene, self._lens.pinhole, extra, wait=True)
+
+    def _blur(
+        self, track: PoseTrack, pose: Pose, depth: Float32, time_ns: int
+    ) -> tuple[float, float]:
+        """Length (pixels) and direction (degrees) of the motion during the shutter."""
+        before = track.at(time_ns - self._shutter_ns // 2) or pose
+        after = track.at(time_ns + self._shutter_ns // 2) or pose
+        flow = centre_flow(before, after, self.camera, _typical_depth(depth))
+        return float(np.hypot(*flow)), float(np.degrees(np.arctan2(flow[1], flow[0])))
+
+
+def centre_flow(before: Pose, after: Pose, camera: Camera, depth_m: float) -> Array:
+    """Pixels (2,) that what is seen at the image's centre moves between two camera poses."""
+    point = before.apply(np.array([0.0, 0.0, depth_m]))
+    start, _ = camera.project(before.inverse.apply(point))
+    end, _ = camera.project(after.inverse.apply(point))
+    return np.asarray(end - start)
+
+
+def _typical_depth(depth: Float32) -> float:
+    coarse = depth[::16, ::16]
+    hit = coarse[coarse > 0]
+    return float(np.median(hit)) if hit.size else 1000.0
+
+
+class FrameLog:
+    """``frames.csv``: the true camera pose of every exposed frame."""
+
+    def __init__(self, path: Path) -> None:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        self._file = path.open("w", newline="", encoding="utf-8")
+        self._writer = csv.writer(self._file)
+        self._writer.writerow(FRAME_COLUMNS)
+
+    def add(self, sequence: int, time_ns: int, world_from_camera: Pose) -> None:
+        """Append one frame; it is on disk when this returns."""
+        t, q = world_from_camera.translation, quaternion_from_matrix(world_from_camera.rotation)
+        row = (time_ns, sequence, *(f"{x:.5f}" for x in t), *(f"{x:.9f}" for x in q))
+        self._writer.writerow(row)
+        self._file.flush()
+
+    def close(self) -> None:
+        """Close the file."""
+        self._file.close()
+
+    def __enter__(self) -> FrameLog:
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        self.close()

@@ -1,0 +1,1 @@
+"""The GNSS-denied demo flight and its report."""

@@ -1,0 +1,91 @@
+"""The companion of a demo flight: its deployment file, and `companion run` as a process."""
+
+from __future__ import annotations
+
+import os
+import signal
+import socket
+import subprocess
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+
+import yaml
+
+from sitl.demo.assets import FlightAssets
+from sitl.demo.scenario import Scenario
+from sitl.vehicles.process import VehicleProcess
+
+_COMPANION_STOP_S = 20.0
+
+
+@dataclass(frozen=True)
+class Ports:
+    """Local UDP ports of one flight."""
+
+    video: int
+    detections: int
+
+
+def free_udp_port() -> int:
+    """A port that nobody listens on now."""
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
+        probe.bind(("127.0.0.1", 0))
+        return int(probe.getsockname()[1])
+
+
+def write_deployment(
+    folder: Path,
+    assets: FlightAssets,
+    scenario: Scenario,
+    vehicle: VehicleProcess,
+    ports: Ports,
+) -> Path:
+    """The deployment file of this flight: what an operator would write by hand."""
+    camera = scenario.camera.camera()
+    config = {
+        "map": str(assets.map_cache.resolve()),
+        "camera": {
+            "source": f"udp://127.0.0.1:{ports.video}",
+            "model": camera.to_dict(),
+        },
+        "localizer": {"width": scenario.localizer_width},
+        "bridge": {
+            "connection": vehicle.companion_endpoint,
+            "mode": "inject",
+            "injection": {
+                "message": scenario.injection,
+                "delay_ms": scenario.injection_delay_ms,
+                "gps_id": 1,
+            },
+        },
+        "targets": {"detections": f"127.0.0.1:{ports.detections}"},
+        "record": {"folder": str((folder / "companion").resolve())},
+    }
+    path = folder / "companion.yaml"
+    path.write_text(yaml.safe_dump(config, sort_keys=False))
+    return path
+
+
+@contextmanager
+def running_companion(config: Path, folder: Path) -> Iterator[subprocess.Popen[bytes]]:
+    """``companion run`` as a process; interrupted, as an operator would, at the end."""
+    environment = os.environ | {"PYTHONUNBUFFERED": "1", "COLUMNS": "160"}
+    with (folder / "companion.log").open("wb") as log:
+        process = subprocess.Popen(
+            [sys.executable, "-m", "companion", "run", str(config.resolve())],
+            stdout=log, stderr=subprocess.STDOUT, env=environment,
+            cwd=Path(__file__).resolve().parents[2],
+        )  # fmt: skip
+        try:
+            yield process
+        finally:
+            if process.poll() is None:
+                process.send_signal(signal.SIGINT)
+            try:
+                process.wait(_COMPANION_STOP_S)
+            except subprocess.TimeoutExpired:
+                process.kill()
+                process.wait()

@@ -1,0 +1,161 @@
+"""The demo flight: every process started, the mission flown on vision alone, records kept.
+
+Four processes, as on a real aircraft and its surroundings: the vehicle, the world camera, the
+companion (`companion run`), and this one, which plays the ground station. They share only MAVLink,
+the video stream, and detections.
+"""
+
+from __future__ import annotations
+
+import csv
+import time
+from contextlib import ExitStack
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from localizer.map.cache.cache import TileCache
+from localizer.synth.appearance.model import sample_appearance
+from sitl.camera.detector import Observed
+from sitl.camera.gimbal_error import GimbalError
+from sitl.camera.movers import Mover
+from sitl.camera.pose_sender import enu, truth_feed
+from sitl.camera.process import CameraStatistics, WorldCameraConfig, WorldCameraProcess
+from sitl.camera.traffic import traffic
+from sitl.demo.assets import FlightAssets
+from sitl.demo.companion_process import Ports, free_udp_port, running_companion, write_deployment
+from sitl.demo.scenario import Scenario, VehicleKind
+from sitl.demo.script import FlightError, FlightScript, Progress
+from sitl.demo.targets import observed_targets
+from sitl.geodesy import Location
+from sitl.ground.pilot import Pilot
+from sitl.vehicles.launch import (
+    GIMBAL,
+    SPEEDS,
+    gps_input_parameters,
+    open_vehicle,
+    vision_parameters,
+)
+
+
+@dataclass(frozen=True)
+class FlightRecord:
+    """What a flight left behind. denied_ns: from GNSS off to the end of the mission."""
+
+    folder: Path
+    vehicle: str
+    denied_ns: tuple[int, int]
+    camera: CameraStatistics
+    home_error_m: float
+    targets: tuple[Observed, ...]
+    texts: tuple[str, ...]
+
+
+def fly(
+    assets: FlightAssets,
+    scenario: Scenario,
+    kind: VehicleKind,
+    seed: int,
+    folder: Path,
+    progress: Progress = lambda *_: None,
+) -> FlightRecord:
+    """Fly the scenario; `folder` receives every record. Progress is (phase, share done)."""
+    folder.mkdir(parents=True, exist_ok=True)
+    cache = TileCache.open(assets.map_cache)
+    home = _home(assets)
+    ports = Ports(free_udp_port(), free_udp_port())
+    with ExitStack() as stack:
+        progress("starting the vehicle", 0.0)
+        vehicle = stack.enter_context(
+            open_vehicle(
+                kind, home, 0.0, _parameters(scenario), seed=seed, log=folder / "vehicle.log"
+            )
+        )
+        pilot = stack.enter_context(Pilot(vehicle.gcs_endpoint, alive=vehicle.check))
+        progress("waiting for GNSS and the EKF", 0.0)
+        with pilot.fast_forward():
+            pilot.wait_ready()
+        movers = traffic(
+            assets.world, cache.frame, cars=scenario.cars, people=scenario.people, seed=seed,
+            epoch_ns=time.monotonic_ns(),
+        )  # fmt: skip
+        targets = observed_targets(assets, scenario, movers)
+        config = write_deployment(folder, assets, scenario, vehicle, ports)
+        progress("starting the world camera", 0.0)
+        camera = WorldCameraProcess(
+            _camera_config(folder, assets, scenario, movers, targets, ports, seed)
+        )
+        stack.enter_context(camera)
+        stack.enter_context(truth_feed(pilot, camera, cache, GimbalError(seed)))
+        companion = stack.enter_context(running_companion(config, folder))
+        run = FlightScript(pilot, scenario, home, folder, companion, progress)
+        denied_ns = run.fly()
+        home_error_m = run.distance_from_home()
+        camera.stop()
+        texts = tuple(t.text for t in pilot.texts)
+        _write_vehicle_csv(folder / "vehicle.csv", pilot, cache)
+    if camera.statistics is None:
+        raise FlightError("the world camera left no statistics")
+    return FlightRecord(
+        folder,
+        vehicle.kind,
+        denied_ns,
+        camera.statistics,
+        home_error_m,
+        targets,
+        texts,
+    )
+
+
+def _home(assets: FlightAssets) -> Location:
+    """The world's centre, on the ground, AMSL."""
+    world = assets.world
+    position = world.frame.position([0.0, 0.0, float(world.ground_height(0.0, 0.0))])
+    altitude = position.height_m - world.geoid_separation_m
+    return Location(position.latitude_deg, position.longitude_deg, altitude)
+
+
+def _parameters(scenario: Scenario) -> dict[str, float]:
+    delay_ms = scenario.injection_delay_ms
+    if scenario.injection == "gps_input":
+        injection = gps_input_parameters(delay_ms=delay_ms)
+    else:
+        injection = vision_parameters(delay_ms=delay_ms)
+    return injection | GIMBAL | SPEEDS | {"WPNAV_SPEED": 100 * scenario.speed_m_s}
+
+
+def _camera_config(
+    folder: Path,
+    assets: FlightAssets,
+    scenario: Scenario,
+    movers: tuple[Mover, ...],
+    targets: tuple[Observed, ...],
+    ports: Ports,
+    seed: int,
+) -> WorldCameraConfig:
+    return WorldCameraConfig(
+        cache=assets.live_cache,
+        origin=TileCache.open(assets.map_cache).manifest.origin,
+        camera=scenario.camera.camera(),
+        url=f"udp://127.0.0.1:{ports.video}",
+        log=folder / "frames.csv",
+        rate_hz=scenario.camera.rate_hz,
+        appearance=sample_appearance(np.random.default_rng([seed, 11]), scenario.condition),
+        movers=movers,
+        seed=seed,
+        targets=targets,
+        detections=f"127.0.0.1:{ports.detections}",
+    )
+
+
+def _write_vehicle_csv(path: Path, pilot: Pilot, cache: TileCache) -> None:
+    """True and EKF positions in the map's ENU, at the EKF's times."""
+    with path.open("w", newline="", encoding="utf-8") as file:
+        writer = csv.writer(file)
+        names = ("east_m", "north_m", "up_m")
+        writer.writerow(("time_ns", *names, *(f"ekf_{n}" for n in names)))
+        for sample, true in pilot.ekf_pairs():
+            if sample.location is not None:
+                values = (*enu(true, cache), *enu(sample.location, cache))
+                writer.writerow((sample.time_ns, *(f"{v:.4f}" for v in values)))

@@ -1,0 +1,86 @@
+"""A scenario's path flown without dynamics: for sequences that need no vehicle."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+
+from companion.geometry import GIMBAL_FROM_CAMERA
+from localizer.geometry.geo import NED_FROM_ENU
+from localizer.geometry.pose import Array, Pose, matrix_from_euler
+from localizer.map.cache.cache import TileCache
+from localizer.map.cache.stream import TileStreamer
+from localizer.render.numba_raster import NumbaRenderer
+from localizer.synth.appearance.model import sample_appearance
+from sitl.camera.traffic import traffic
+from sitl.camera.true_motion import PoseTrack
+from sitl.camera.world_camera import WorldCamera
+from sitl.demo.assets import FlightAssets
+from sitl.demo.scenario import Scenario
+from sitl.demo.sequence import record_sequence
+
+_STEP_S = 0.02
+_YAW_RATE = np.radians(45.0)  # per second, a multirotor's at a waypoint
+_PITCH_RATE = np.radians(20.0)
+_ACCELERATION = 2.5  # m/s²
+
+
+def camera_path(scenario: Scenario, ground_m: float) -> Iterator[tuple[int, Pose]]:
+    """(time in ns, world_from_camera) every 20 ms along the legs; `ground_m` is home's ENU height.
+
+    The vehicle brakes to a stop at each corner, turns its nose to the next one and goes on.
+    """
+    position = np.array([0.0, 0.0, ground_m + scenario.takeoff_height_m])
+    first = scenario.legs[0]
+    yaw = float(np.arctan2(first.east_m, first.north_m))
+    pitch = np.radians(first.gimbal_pitch_deg)
+    speed, time_s = 0.0, 1.0
+    for leg in scenario.legs:
+        goal = np.array([leg.east_m, leg.north_m, ground_m + leg.height_m])
+        heading = float(np.arctan2(*(goal - position)[:2]))
+        while np.linalg.norm(goal - position) > 0.05:
+            yaw = _towards(yaw, heading, _YAW_RATE * _STEP_S)
+            pitch = _towards(pitch, np.radians(leg.gimbal_pitch_deg), _PITCH_RATE * _STEP_S)
+            away = float(np.linalg.norm(goal - position))
+            limit = min(scenario.speed_m_s, np.sqrt(2 * _ACCELERATION * away))
+            speed = min(speed + _ACCELERATION * _STEP_S, limit)
+            position = position + (goal - position) / away * min(speed * _STEP_S, away)
+            yield round(time_s * 1e9), _camera(position, yaw, pitch)
+            time_s += _STEP_S
+
+
+def record_scenario(assets: FlightAssets, scenario: Scenario, seed: int, out: Path) -> int:
+    """Render the path as today's world shows itself; returns the number of frames."""
+    cache, live = TileCache.open(assets.map_cache), TileCache.open(assets.live_cache)
+    path = list(camera_path(scenario, float(assets.world.ground_height(0.0, 0.0))))
+    track = PoseTrack(path, keep=None)
+    movers = traffic(
+        assets.world, cache.frame, cars=scenario.cars, people=scenario.people, seed=seed
+    )
+    streamer = TileStreamer(live)
+    try:
+        camera = WorldCamera(
+            NumbaRenderer(streamer),
+            scenario.camera.camera(),
+            sample_appearance(np.random.default_rng([seed, 11]), scenario.condition),
+            movers,
+            scene_from_world=live.frame.ecef_from_enu.inverse @ cache.frame.ecef_from_enu,
+            seed=seed,
+        )
+        period_ns = round(1e9 / scenario.camera.rate_hz)
+        times = range(path[0][0] + period_ns, path[-1][0] - period_ns, period_ns)
+        return record_sequence(camera, track, times, cache.frame, out)
+    finally:
+        streamer.close()
+
+
+def _camera(position: Array, yaw: float, pitch: float) -> Pose:
+    return Pose(NED_FROM_ENU.T @ matrix_from_euler(0.0, pitch, yaw) @ GIMBAL_FROM_CAMERA, position)
+
+
+def _towards(value: float, goal: float, step: float) -> float:
+    """`value` moved to `goal` by at most `step`, the short way round (rad)."""
+    error = float(np.remainder(goal - value + np.pi, 2 * np.pi) - np.pi)
+    return value + float(np.clip(error, -step, step))

@@ -1,0 +1,332 @@
+"""A flight's report: numbers, plots, overlays and tables in one folder."""
+
+from __future__ import annotations
+
+import csv
+import json
+from collections.abc import Iterable, Mapping
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+import cv2
+import numpy as np
+from rich.console import Console
+from rich.table import Table
+
+from companion.config import CompanionConfig, load_config
+from companion.offline.plots import (
+    ErrorSeries,
+    MapPicture,
+    overlay_sheet,
+    plot_errors,
+    plot_tracks,
+    save_image,
+)
+from companion.versions import versions
+from localizer.evaluation.metrics import LocalizationMetrics
+from localizer.features.extractor import load_extractor
+from localizer.geometry.camera import Camera
+from localizer.geometry.pose import Array, Pose
+from localizer.map.cache.cache import TileCache
+from localizer.map.cache.stream import TileStreamer
+from localizer.render.numba_raster import NumbaRenderer
+from localizer.tracking.pipeline import Undistorter
+from localizer.types import Frame
+from sitl.camera.detector import FixedPoint
+from sitl.demo.analysis import (
+    Columns,
+    FrameErrors,
+    Spread,
+    ekf_errors,
+    frame_errors,
+    localization_summary,
+    poses,
+    read_csv,
+    stage_latencies,
+    target_errors,
+)
+from sitl.demo.criteria import Criterion, judge, latency_warning
+from sitl.demo.flight import FlightRecord
+from sitl.demo.scenario import Scenario
+
+_OVERLAYS = 4
+_MAP_MARGIN_M = 90.0
+_MAP_PICTURE_PX = 900
+
+
+@dataclass(frozen=True)
+class FlightReport:
+    """The flight's figures over the span without GNSS.
+
+    localizer: the paper's columns over processed frames, and the spreads of its accepted estimates'
+    errors; completeness_sent: per cent of all frames that the camera sent in the span with an
+    accepted estimate. targets: name to 3-D error. warning: of late estimates.
+    """
+
+    vehicle: str
+    denied_s: float
+    flown_m: float
+    localizer: LocalizationMetrics
+    localizer_m: Spread
+    localizer_horizontal_m: Spread
+    localizer_deg: Spread
+    completeness_sent: float
+    frames_sent: int
+    frames_dropped: int
+    ekf_horizontal_m: Spread
+    ekf_vertical_m: Spread
+    home_error_m: float
+    fixed_targets_m: Spread
+    moving_targets_m: Spread
+    targets_m: Mapping[str, Spread]
+    target_fixes: Mapping[str, int]
+    stages_ms: Mapping[str, Spread]
+    camera_ms: Mapping[str, tuple[float, float]]
+    criteria: tuple[Criterion, ...]
+    warning: str | None
+
+
+def make_report(record: FlightRecord, scenario: Scenario, seed: int) -> FlightReport:
+    """Measure the records and write report.json, frames, plots and overlays into their folder."""
+    folder, span = record.folder, record.denied_ns
+    truth = read_csv(folder / "frames.csv")
+    estimates = read_csv(folder / "companion" / "estimates.csv", text=("state", "status"))
+    targets = read_csv(folder / "companion" / "targets.csv", text=("target_id",))
+    vehicle = read_csv(folder / "vehicle.csv")
+    errors = frame_errors(truth, estimates, span)
+    ekf_times, horizontal, vertical = ekf_errors(vehicle, span)
+    by_target = _target_errors(record, targets)
+    still = {t.name for t in record.targets if isinstance(t, FixedPoint)}
+    fixed = [e for name, e in by_target.items() if name in still]
+    moving = {name: e for name, e in by_target.items() if name not in still}
+    # Every car that was seen is in `moving_targets_m`; one line of the table is the longest seen.
+    longest = max(moving, key=lambda name: len(moving[name]), default="")
+    by_target = {n: e for n, e in by_target.items() if n not in moving or n == longest}
+    accepted = np.isfinite(errors.translation_m)
+    config = load_config(folder / "companion.yaml")
+    summary = localization_summary(errors)
+    ekf, fixed_targets = Spread.of(horizontal), Spread.of(np.concatenate([*fixed, np.empty(0)]))
+    stages = stage_latencies(estimates, span)
+    report = FlightReport(
+        vehicle=record.vehicle,
+        denied_s=(span[1] - span[0]) * 1e-9,
+        flown_m=_flown(vehicle, span),
+        localizer=summary,
+        localizer_m=Spread.of(errors.translation_m),
+        localizer_horizontal_m=Spread.of(errors.horizontal_m),
+        localizer_deg=Spread.of(errors.rotation_deg),
+        completeness_sent=100.0 * float(accepted.mean()) if len(accepted) else 0.0,
+        frames_sent=len(accepted),
+        frames_dropped=int((~errors.processed).sum()),
+        ekf_horizontal_m=ekf,
+        ekf_vertical_m=Spread.of(vertical),
+        home_error_m=record.home_error_m,
+        fixed_targets_m=fixed_targets,
+        moving_targets_m=Spread.of(np.concatenate([*moving.values(), np.empty(0)])),
+        targets_m={name: Spread.of(e) for name, e in by_target.items()},
+        target_fixes={name: len(e) for name, e in by_target.items()},
+        stages_ms=stages,
+        camera_ms=record.camera.stage_ms,
+        criteria=judge(summary, ekf, fixed_targets),
+        warning=latency_warning(stages["latency"], config.bridge.injection.delay_ms),
+    )
+    _write_json(folder, report, record, scenario, seed, config)
+    _write_frames(folder / "frames_report.csv", errors)
+    _plot(folder, record, truth, estimates, vehicle, errors, (ekf_times, horizontal), config)
+    return report
+
+
+def _target_errors(record: FlightRecord, targets: Columns) -> dict[str, Array]:
+    if not len(targets):
+        return {t.name: np.empty(0) for t in record.targets}
+    times = [int(t) for t in targets["exposure_time_ns"]]
+    truth = {t.name: {ns: t.position_at(ns) for ns in times} for t in record.targets}
+    return target_errors(targets, truth, record.denied_ns)
+
+
+def _flown(vehicle: Columns, span: tuple[int, int]) -> float:
+    inside = (vehicle["time_ns"] >= span[0]) & (vehicle["time_ns"] <= span[1])
+    track = np.column_stack([vehicle[k][inside] for k in ("east_m", "north_m", "up_m")])
+    return float(np.linalg.norm(np.diff(track[::5], axis=0), axis=1).sum())
+
+
+def _write_json(
+    folder: Path,
+    report: FlightReport,
+    record: FlightRecord,
+    scenario: Scenario,
+    seed: int,
+    config: CompanionConfig,
+) -> None:
+    document = {
+        "report": asdict(report) | {"passed": all(c.ok for c in report.criteria)},
+        "versions": versions(),
+        "seed": seed,
+        "features": load_extractor(config.localizer.model).name,
+        "scenario": scenario.model_dump(mode="json"),
+        "config": config.model_dump(mode="json"),
+        "texts": list(record.texts),
+    }
+    (folder / "report.json").write_text(json.dumps(document, indent=1, default=float))
+
+
+def _write_frames(path: Path, errors: FrameErrors) -> None:
+    with path.open("w", newline="", encoding="utf-8") as file:
+        writer = csv.writer(file)
+        writer.writerow(
+            ("exposure_time_ns", "processed", "translation_error_m", "horizontal_error_m",
+             "rotation_error_deg")
+        )  # fmt: skip
+        values = (errors.translation_m, errors.horizontal_m, errors.rotation_deg)
+        for time_ns, processed, *row in zip(errors.time_ns, errors.processed, *values, strict=True):
+            writer.writerow((int(time_ns), int(processed), *(f"{x:.4f}" for x in row)))
+
+
+def _plot(
+    folder: Path,
+    record: FlightRecord,
+    truth: Columns,
+    estimates: Columns,
+    vehicle: Columns,
+    errors: FrameErrors,
+    ekf: tuple[Array, Array],
+    config: CompanionConfig,
+) -> None:
+    start = record.denied_ns[0]
+    all_errors = frame_errors(truth, estimates, (0, 2**62))
+    exposed_s = _seconds(all_errors.time_ns, start)
+    series = [
+        ErrorSeries("localizer", exposed_s, all_errors.translation_m, "3-D position error, m"),
+        ErrorSeries("localizer", exposed_s, all_errors.horizontal_m, "horizontal error, m"),
+        ErrorSeries("autopilot's EKF", _seconds(ekf[0], start), ekf[1], "horizontal error, m"),
+        ErrorSeries("localizer", exposed_s, all_errors.rotation_deg, "rotation error, °"),
+    ]
+    end = (record.denied_ns[1] - start) * 1e-9
+    plot_errors(
+        folder / "errors.png", series, [(0.0, end, "GNSS denied")], "time since GNSS went off, s"
+    )
+    cache = TileCache.open(config.map)
+    streamer = TileStreamer(cache)
+    try:
+        renderer = NumbaRenderer(streamer)
+        accepted = np.asarray(estimates["accepted"]) > 0
+        tracks = {
+            "truth": _track(vehicle, ""),
+            "autopilot's EKF": _track(vehicle, "ekf_"),
+            "localizer (camera)": _track(estimates, "")[accepted],
+        }
+        fixed = (t for t in record.targets if isinstance(t, FixedPoint))
+        marks = {t.name: t.position_at(start) for t in fixed}
+        denied = min(int(np.searchsorted(vehicle["time_ns"], start)), len(tracks["truth"]) - 1)
+        marks["GNSS off"] = tracks["truth"][denied]
+        picture = _map_picture(renderer, tracks.values())
+        plot_tracks(folder / "tracks.png", tracks, picture, marks)
+        _overlays(folder, estimates, renderer, config, start)
+    finally:
+        streamer.close()
+
+
+def _seconds(time_ns: Array, start: int) -> Array:
+    return np.asarray((np.asarray(time_ns) - start) * 1e-9, dtype=np.float64)
+
+
+def _track(columns: Columns, prefix: str) -> Array:
+    return np.column_stack([columns[f"{prefix}{k}_m"] for k in ("east", "north", "up")])
+
+
+def _map_picture(renderer: NumbaRenderer, tracks: Iterable[Array]) -> MapPicture:
+    """The map about the tracks from high above through a long lens: nearly an orthophoto."""
+    height = 6000.0
+    size = max(float(np.abs(t[:, :2]).max()) for t in tracks if len(t)) + _MAP_MARGIN_M
+    fov = float(np.degrees(2 * np.arctan(size / height)))
+    camera = Camera.from_fov(_MAP_PICTURE_PX, _MAP_PICTURE_PX, fov)
+    pose = Pose(np.diag([1.0, -1.0, -1.0]), np.array([0.0, 0.0, height]))
+    view = renderer.render(pose, camera, wait=True)
+    return MapPicture(view.rgb, -size, size, -size, size)
+
+
+def _overlays(
+    folder: Path, estimates: Columns, renderer: NumbaRenderer, config: CompanionConfig, start: int
+) -> None:
+    """Recorded video frames against the map rendered at their estimated poses; times from start."""
+    stamps = np.asarray(estimates["exposure_time_ns"])
+    accepted = np.asarray(estimates["accepted"]) > 0
+    estimated = poses(estimates)
+    camera = config.camera.model.camera()
+    target = camera.without_distortion()
+    undistort = Undistorter(camera, target)
+    snapshots = sorted((folder / "companion" / "snapshots").glob("*.jpg"))
+    usable = []
+    for path in snapshots:
+        k = int(np.argmin(np.abs(stamps - int(path.stem))))
+        if accepted[k] and abs(int(stamps[k]) - int(path.stem)) < 2_000_000:
+            usable.append((path, k))
+    chosen = np.unique(np.linspace(0, max(len(usable) - 1, 0), _OVERLAYS).astype(int))
+    for number, i in enumerate(chosen if usable else []):
+        path, k = usable[i]
+        image = cv2.cvtColor(cv2.imread(str(path)), cv2.COLOR_BGR2RGB).astype(np.uint8)
+        video = undistort(Frame(image, int(path.stem), camera, 0))
+        view = renderer.render(estimated[k], target, wait=True)
+        time_s = (int(path.stem) - start) * 1e-9
+        caption = f"t = {time_s:.1f} s"
+        save_image(folder / f"overlay-{number}.png", overlay_sheet(video, view.rgb, caption))
+
+
+def print_report(report: FlightReport, folder: Path) -> None:
+    """The tables that end a flight."""
+    console = Console()
+    m = report.localizer
+    table = Table(title=f"GNSS denied for {report.denied_s:.0f} s, {report.flown_m:.0f} m flown "
+                        f"({report.vehicle})")  # fmt: skip
+    table.add_column("")
+    for column in ("median", "p95", "max", ""):
+        table.add_column(column, justify="right")
+    _add(table, "localizer 3-D, m", report.localizer_m,
+         f"R@1/3/5 {m.recall_1:.1f}/{m.recall_3:.1f}/{m.recall_5:.1f} %")  # fmt: skip
+    _add(table, "localizer horizontal, m", report.localizer_horizontal_m, "")
+    _add(table, "localizer rotation, °", report.localizer_deg,
+         f"completeness {m.completeness:.1f} % ({report.completeness_sent:.1f} % of sent)",
+         )  # fmt: skip
+    _add(
+        table,
+        "EKF horizontal, m",
+        report.ekf_horizontal_m,
+        f"{report.home_error_m:.1f} m from home at end",
+    )
+    _add(table, "EKF vertical, m", report.ekf_vertical_m, "")
+    _add(table, "fixed targets, m", report.fixed_targets_m, "3-D")
+    _add(table, "moving targets, m", report.moving_targets_m, "3-D, every car seen")
+    for name, spread in report.targets_m.items():
+        _add(table, f"  {name}, m", spread, f"{report.target_fixes[name]} fixes")
+    console.print(table)
+    stages = Table(title=f"{m.fps:.1f} localized frames/s, {report.frames_dropped} of "
+                         f"{report.frames_sent} frames dropped")  # fmt: skip
+    stages.add_column("stage, ms")
+    stages.add_column("p50", justify="right")
+    stages.add_column("p95", justify="right")
+    for name, spread in report.stages_ms.items():
+        stages.add_row(name, f"{spread.median:.0f}", f"{spread.p95:.0f}")
+    for name, (p50, p95) in report.camera_ms.items():
+        stages.add_row(f"world camera: {name}", f"{p50:.0f}", f"{p95:.0f}")
+    console.print(stages)
+    console.print(_verdict(report))
+    if report.warning is not None:
+        console.print(f"[yellow]warning:[/] {report.warning}", highlight=False)
+    console.print(f"report: [green]{folder}[/]/report.json, tracks.png, errors.png, overlay-*.png")
+
+
+def _verdict(report: FlightReport) -> Table:
+    passed = all(c.ok for c in report.criteria)
+    table = Table(title="[green]targets reached" if passed else "[red]targets missed")
+    for column in ("target", "found", "needed", ""):
+        table.add_column(column, justify="left" if column in ("target", "") else "right")
+    for c in report.criteria:
+        needed = f"{'>=' if c.at_least else '<='} {c.limit:g} {c.unit}"
+        mark = "[green]ok" if c.ok else "[red]missed"
+        table.add_row(c.name, f"{c.value:.2f} {c.unit}", needed, mark)
+    return table
+
+
+def _add(table: Table, name: str, spread: Spread, note: str) -> None:
+    figures = (spread.median, spread.p95, spread.maximum)
+    table.add_row(name, *("none" if np.isnan(x) else f"{x:.2f}" for x in figures), note)

@@ -1,0 +1,152 @@
+"""The ground station's script of a demo flight, from arming to the return."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from sitl.demo.scenario import Scenario
+from sitl.errors import SimulationError
+from sitl.geodesy import Location
+from sitl.ground.mission_steps import MissionStep, gimbal_step, speed_step, waypoint_step
+from sitl.ground.pilot import Pilot
+from sitl.vehicles.launch import VISION_SOURCE
+
+_TRACKING_TIMEOUT_S = 60.0
+_LEG_MARGIN_S = 60.0
+_COMPANION_START_S = 300.0
+
+Progress = Callable[[str, float], None]
+
+
+class FlightError(SimulationError):
+    """A flight that could not be flown to its end; says which part failed and where its log is."""
+
+
+class FlightScript:
+    """The ground station's script, from arming to the return."""
+
+    def __init__(
+        self,
+        pilot: Pilot,
+        scenario: Scenario,
+        home: Location,
+        folder: Path,
+        companion: subprocess.Popen[bytes],
+        progress: Progress,
+    ) -> None:
+        self._pilot = pilot
+        self._scenario = scenario
+        self._home = home
+        self._folder = folder
+        self._companion = companion
+        self._progress = progress
+
+    def fly(self) -> tuple[int, int]:
+        """Returns the span without GNSS, CLOCK_MONOTONIC ns."""
+        pilot, scenario = self._pilot, self._scenario
+        self._progress("starting the companion", 0.0)
+        self._await_companion()
+        steps = mission(scenario, self._home)
+        pilot.upload_mission(steps)
+        pilot.point_gimbal(scenario.legs[0].gimbal_pitch_deg, 0.0)
+        self._progress("taking off on GNSS", 0.05)
+        pilot.set_mode("GUIDED")
+        pilot.arm()
+        pilot.takeoff(scenario.takeoff_height_m)
+        at_height_s = pilot.time_s
+        self._progress("waiting for the localizer to track", 0.15)
+        pilot.wait(self._tracking, _TRACKING_TIMEOUT_S, "the localizer to track")
+        pilot.sleep(max(0.0, scenario.deny_after_s - (pilot.time_s - at_height_s)))
+        self._require_companion()
+        self._deny()
+        begin_ns = time.monotonic_ns()
+        pilot.start_mission()
+        self._follow(len(steps))
+        return begin_ns, time.monotonic_ns()
+
+    def distance_from_home(self) -> float:
+        """How far, horizontally and in truth, the vehicle is from where it took off."""
+        north, east, _ = self._home.ned_of(self._pilot.truth.location)
+        return float(np.hypot(north, east))
+
+    def _deny(self) -> None:
+        if self._scenario.injection != "gps_input":  # that is a second receiver of the same set
+            self._pilot.use_source_set(VISION_SOURCE)
+        self._pilot.gps(False)
+
+    def _follow(self, last_item: int) -> None:
+        """Wait for the mission's last item, watching the companion."""
+        legs = self._scenario.legs
+        length = _mission_length(self._scenario)
+        limit = length / self._scenario.speed_m_s * 1.5 + _LEG_MARGIN_S
+        started = self._pilot.time_s
+        while last_item not in self._pilot.reached:
+            self._require_companion()
+            if self._pilot.mode != "AUTO":
+                raise FlightError(
+                    f"the vehicle left AUTO for {self._pilot.mode}: "
+                    + "; ".join(t.text for t in self._pilot.texts[-4:])
+                )
+            elapsed = self._pilot.time_s - started
+            if elapsed > limit:
+                raise FlightError(f"the mission took longer than {limit:.0f} s")
+            share = min(0.2 + 0.8 * elapsed * self._scenario.speed_m_s / length / 1.15, 0.99)
+            done = sum(1 for item in self._pilot.reached if item > 1)
+            self._progress(f"GNSS denied: waypoint {min(done + 1, len(legs))}/{len(legs)}", share)
+            self._pilot.sleep(0.5)
+        self._progress("returned on vision alone", 1.0)
+
+    def _await_companion(self) -> None:
+        """On the ground: its first start on a machine compiles for a minute or more."""
+        started = time.monotonic()
+        while self._health() is None:
+            self._require_companion()
+            if time.monotonic() - started > _COMPANION_START_S:
+                raise FlightError(
+                    f"the companion is not up after {_COMPANION_START_S:.0f} s; "
+                    f"{self._folder / 'companion.log'}"
+                )
+            self._progress("starting the companion", 0.0)
+            time.sleep(0.2)
+
+    def _tracking(self) -> bool:
+        self._require_companion()
+        health = self._health()
+        return health is not None and health["text"] == "localization tracking"
+
+    def _health(self) -> dict[str, Any] | None:
+        """What the companion says of itself; None while it is not up."""
+        try:
+            health = json.loads((self._folder / "companion" / "health.json").read_text())
+        except (OSError, ValueError):
+            return None
+        return dict(health)
+
+    def _require_companion(self) -> None:
+        code = self._companion.poll()
+        if code is not None:
+            log = self._folder / "companion.log"
+            tail = log.read_text(errors="replace")[-1500:]
+            raise FlightError(f"the companion ended with code {code}; {log}:\n{tail}")
+
+
+def mission(scenario: Scenario, home: Location) -> list[MissionStep]:
+    """The legs as mission items: a gimbal command and a waypoint each."""
+    steps = [speed_step(scenario.speed_m_s)]
+    for leg in scenario.legs:
+        place = home.offset(leg.north_m, leg.east_m, 0.0)
+        steps.append(gimbal_step(leg.gimbal_pitch_deg, 0.0))
+        steps.append(waypoint_step(place.latitude_deg, place.longitude_deg, leg.height_m))
+    return steps
+
+
+def _mission_length(scenario: Scenario) -> float:
+    corners = np.array([(0.0, 0.0)] + [(leg.east_m, leg.north_m) for leg in scenario.legs])
+    return float(np.linalg.norm(np.diff(corners, axis=0), axis=1).sum())

@@ -1,0 +1,42 @@
+"""Evaluation sequences without a flight: ``images/``, ``poses.txt``, ``camera.json``."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterable
+from pathlib import Path
+
+import cv2
+
+from localizer.geometry.geo import LocalFrame
+from localizer.geometry.posefile import PoseRow, pose_row, write_poses
+from sitl.camera.true_motion import PoseTrack
+from sitl.camera.world_camera import WorldCamera
+
+_JPEG_QUALITY = 92
+
+
+def record_sequence(
+    camera: WorldCamera, track: PoseTrack, times_ns: Iterable[int], frame: LocalFrame, out: Path
+) -> int:
+    """Writes the pictures at the given times; returns how many (times off the track have none).
+
+    frame: the ENU frame of the track. ``images/timestamps.txt`` keeps the exposure times.
+    """
+    images = out / "images"
+    images.mkdir(parents=True, exist_ok=True)
+    rows: list[PoseRow] = []
+    stamps: list[str] = []
+    for time_ns in times_ns:
+        exposure = camera.expose(time_ns, track)
+        if exposure is None:
+            continue
+        name = f"{len(rows):06d}.jpg"
+        options = [cv2.IMWRITE_JPEG_QUALITY, _JPEG_QUALITY]
+        cv2.imwrite(str(images / name), exposure.image[..., ::-1], options)
+        rows.append(pose_row(name, exposure.world_from_camera, frame))
+        stamps.append(f"{name} {time_ns}\n")
+    write_poses(out / "poses.txt", rows)
+    (images / "timestamps.txt").write_text("".join(stamps), encoding="utf-8")
+    (out / "camera.json").write_text(json.dumps(camera.camera.to_dict(), indent=2) + "\n")
+    return len(rows)

@@ -1,0 +1,1 @@
+"""Control loops, modes, missions, arming."""

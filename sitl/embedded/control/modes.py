@@ -1,0 +1,352 @@
+"""What the vehicle is doing: modes, the mission and the failsafe, as ArduCopter's."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from enum import Enum
+from math import radians
+
+import numpy as np
+
+from sitl.embedded.control import mission as mis
+from sitl.embedded.control.controller import Vector
+from sitl.embedded.control.guidance import Guidance
+from sitl.embedded.control.mode import Mode, RcInput
+from sitl.embedded.ekf.ekf_check import EkfCheck
+from sitl.embedded.ekf.estimator import Estimator
+from sitl.embedded.parameters import Parameters
+from sitl.embedded.physics.gimbal import Gimbal
+from sitl.embedded.physics.rotation import Array, quaternion, wrap_pi
+from sitl.embedded.severity import CRITICAL, INFO
+from sitl.geodesy import Location
+
+
+class RtlStage(Enum):
+    """Where a return to launch stands."""
+
+    CLIMB = "climb"
+    RETURN = "return"
+    LOITER = "loiter"
+    LAND = "land"
+
+
+@dataclass
+class FlightModes:
+    """What the vehicle is doing, and the attitude and thrust that follow from it."""
+
+    parameters: Parameters
+    estimator: Estimator
+    gimbal: Gimbal
+    mission: mis.MissionStore
+    notify: Callable[[int, str], None]
+    on_reached: Callable[[int], None]
+    mode: Mode = Mode.STABILIZE
+    armed: bool = False
+    home: Location | None = None
+    rc: RcInput = field(default_factory=RcInput)
+    on_ground: bool = True
+    mission_index: int = 0
+    _flying: bool = False
+    _rtl: RtlStage = RtlStage.CLIMB
+    _stage_since: float = 0.0
+    _time: float = 0.0
+    _armed_since: float = 0.0
+    _ground_since: float = 0.0
+
+    def __post_init__(self) -> None:
+        self._guidance = Guidance(self.parameters, self.estimator)
+        self.ekf_check = EkfCheck(self.parameters, self.estimator, self.notify)
+
+    # --- requests ----------------------------------------------------------------------------
+
+    def set_mode(self, mode: Mode) -> bool:
+        """Change mode; refused without a position where one is needed."""
+        if mode is self.mode:
+            return True
+        if mode.needs_position and self.armed and not self.estimator.position_valid:
+            self.notify(CRITICAL, f"Mode change to {mode.name} failed: requires position")
+            return False
+        if mode is Mode.AUTO and len(self.mission.items) < 2:
+            self.notify(CRITICAL, "Mode change to AUTO failed: init failed")
+            return False
+        self._enter(mode)
+        return True
+
+    def _enter(self, mode: Mode) -> None:
+        self.mode = mode
+        self._guidance.returning = mode is Mode.RTL
+        self._guidance.velocity_target = None
+        self._guidance.yaw_rate = None
+        self._guidance.landing = mode is Mode.LAND
+        self._guidance.yaw_target = None
+        self._guidance.hold_here()
+        if mode is Mode.AUTO:
+            self._guidance.speed_override = None
+            self.mission_index = 0
+            if self.armed:
+                self._advance_mission()
+        elif mode is Mode.RTL:
+            self._begin_rtl()
+
+    def arm(self) -> None:
+        """Arm; the caller has run the checks."""
+        self.armed = self.estimator.armed = True
+        self._armed_since = self._ground_since = self._time
+        self._flying = False
+        self._guidance.reset()
+        self._guidance.hold_here()
+
+    def disarm(self) -> None:
+        """Stop the motors."""
+        self.armed = self.estimator.armed = False
+        self._flying = self._guidance.landing = False
+        self._guidance.carrot = None
+
+    def takeoff(self, height_m: float) -> bool:
+        """MAV_CMD_NAV_TAKEOFF: climb to a height above home; only on the ground in GUIDED."""
+        if not (self.armed and self.mode is Mode.GUIDED and not self._flying):
+            return False
+        self._begin_takeoff(height_m)
+        return True
+
+    def go_to(self, location: Location, yaw_rad: float | None = None) -> bool:
+        """Fly to a location in GUIDED."""
+        if not self._guided or self.estimator.origin is None:
+            return False
+        self.go_to_local(self.estimator.origin.ned_of(location), yaw_rad)
+        return True
+
+    def go_to_local(self, target: Vector, yaw_rad: float | None = None) -> bool:
+        """Fly to NED metres about the EKF origin in GUIDED."""
+        if not self._guided:
+            return False
+        self._guidance.velocity_target = None
+        self._guidance.yaw_rate = None
+        self._guidance.fly(target)
+        if yaw_rad is not None:
+            self._guidance.yaw_target = yaw_rad
+        return True
+
+    def fly_velocity(self, velocity: Vector, yaw_rad: float | None, yaw_rate: float | None) -> bool:
+        """Fly at a NED velocity in GUIDED."""
+        if not self._guided:
+            return False
+        self._guidance.velocity_target = velocity
+        self._guidance.yaw_rate = yaw_rate
+        if yaw_rad is not None:
+            self._guidance.yaw_target = yaw_rad
+        return True
+
+    def start_mission(self, index: int = 1) -> bool:
+        """MAV_CMD_MISSION_START, MISSION_SET_CURRENT: (re)start AUTO at an item."""
+        if not 0 < index < len(self.mission.items):
+            return False
+        if self.mode is Mode.AUTO:
+            self.mission_index = index - 1
+            if self.armed:
+                self._advance_mission()
+            return True
+        return index == 1 and self.set_mode(Mode.AUTO)
+
+    def condition_yaw(self, angle_deg: float, direction: float, relative: bool) -> None:
+        """MAV_CMD_CONDITION_YAW: hold a heading until the next waypoint."""
+        angle = radians(angle_deg)
+        if relative:
+            angle = self._guidance.yaw + (angle if direction >= 0 else -angle)
+        self._guidance.yaw_target = wrap_pi(angle)
+        self._guidance.yaw_rate = None
+
+    def change_speed(self, speed_m_s: float) -> bool:
+        """MAV_CMD_DO_CHANGE_SPEED."""
+        if speed_m_s <= 0:
+            return False
+        self._guidance.speed_override = speed_m_s
+        return True
+
+    @property
+    def flying(self) -> bool:
+        """Whether the vehicle has left the ground."""
+        return self._flying
+
+    @property
+    def speed_limit(self) -> float:
+        """Horizontal, m/s, of the present mode."""
+        return self._guidance.limits.speed
+
+    @property
+    def target(self) -> Vector | None:
+        """Where the vehicle is headed, NED metres about the origin."""
+        return self._guidance.carrot.end if self._guidance.carrot else None
+
+    # --- every tick --------------------------------------------------------------------------
+
+    def update(self, time_s: float) -> Array:
+        """Attitude quaternion and total thrust (5,) for the next tick."""
+        self._time = time_s
+        self._set_home()
+        if not self.armed:
+            return np.array([*quaternion(0.0, 0.0, self._guidance.yaw), 0.0])
+        self._watch_ground()
+        if not self.armed:
+            return np.array([*quaternion(0.0, 0.0, self._guidance.yaw), 0.0])
+        if self.mode is Mode.STABILIZE:
+            self._flying = not self.on_ground
+            return self._guidance.stabilize(self.rc)
+        if not self._flying:
+            return np.array([*quaternion(0.0, 0.0, self._guidance.yaw), 0.0])
+        if self.mode is Mode.AUTO:
+            self._run_mission()
+        elif self.mode is Mode.RTL:
+            self._run_rtl()
+        return self._guidance.steer(self._home_ned()[2], level_when_lost=self.mode is Mode.LAND)
+
+    def check_ekf(self) -> None:
+        """The 10 Hz checks of the filter, and the failsafe."""
+        if self.ekf_check.fails(self._time) and self.armed:
+            self.ekf_check.failsafe = True
+            if not self.mode.needs_position or self.parameters["FS_EKF_ACTION"] == 0:
+                self.notify(CRITICAL, "EKF Failsafe")
+            else:
+                self._enter(Mode.LAND)
+                self.notify(CRITICAL, "EKF Failsafe: changed to LAND Mode")
+        self.ekf_check.watch_glitch()
+
+    # --- helpers -----------------------------------------------------------------------------
+
+    @property
+    def _guided(self) -> bool:
+        return self.mode is Mode.GUIDED and self.armed and self._flying
+
+    def _set_home(self) -> None:
+        if not self.armed and self.estimator.position_valid and self.estimator.location:
+            if self.home is None:
+                self.notify(INFO, "AHRS: EKF3 active")
+            self.home = self.estimator.location
+
+    def _home_ned(self) -> Vector:
+        if self.home is None or self.estimator.origin is None:
+            return 0.0, 0.0, 0.0
+        return self.estimator.origin.ned_of(self.home)
+
+    def _begin_takeoff(self, height_m: float) -> None:
+        self._flying = True
+        self._guidance.climb(self._home_ned()[2] - height_m)
+
+    def _watch_ground(self) -> None:
+        """Take note of landing, and disarm on the ground as ArduCopter does."""
+        if not self.on_ground:
+            self._ground_since = self._time
+        settled = self._time - self._ground_since > 1.0
+        if self._guidance.landing and settled:
+            self.notify(INFO, "Disarming motors")
+            self.disarm()
+        delay = self.parameters["DISARM_DELAY"]
+        idle = self.mode is not Mode.STABILIZE or self.rc.throttle < 0.05
+        if not self._flying and self.on_ground and idle and delay > 0:
+            if self._time - self._armed_since > delay:
+                self.notify(INFO, "Disarming motors")
+                self.disarm()
+        elif not self.on_ground:
+            self._armed_since = self._time
+
+    # --- return to launch --------------------------------------------------------------------
+
+    def _begin_rtl(self) -> None:
+        self._rtl = RtlStage.CLIMB
+        north, east, down = self.estimator.position
+        top = min(down, self._home_ned()[2] - self.parameters["RTL_ALT"] / 100.0)
+        self._guidance.fly((north, east, top))
+
+    def _run_rtl(self) -> None:
+        if self._rtl is RtlStage.CLIMB and self._guidance.arrived():
+            self._rtl = RtlStage.RETURN
+            home = self._home_ned()
+            self._guidance.fly((home[0], home[1], self.estimator.position[2]))
+        elif self._rtl is RtlStage.RETURN and self._guidance.arrived():
+            self._rtl, self._stage_since = RtlStage.LOITER, self._time
+        elif (
+            self._rtl is RtlStage.LOITER
+            and self._time - self._stage_since >= self.parameters["RTL_LOIT_TIME"] / 1000.0
+        ):
+            self._rtl = RtlStage.LAND
+            self._guidance.landing = True
+
+    # --- mission -----------------------------------------------------------------------------
+
+    def _advance_mission(self) -> None:
+        """Go to the next navigation item, running the commands on the way to it."""
+        while self.mission_index + 1 < len(self.mission.items):
+            self.mission_index += 1
+            item = self.mission.items[self.mission_index]
+            if item.command in mis.NAVIGATION:
+                self._start_item(item)
+                return
+            self._do(item)
+
+    def _start_item(self, item: mis.MissionItem) -> None:
+        origin, here = self.estimator.origin, self.estimator.location
+        if origin is None or here is None or self.home is None:
+            return
+        self._stage_since = 0.0
+        self.notify(INFO, f"Mission: {self.mission_index} {_NAMES[item.command]}")
+        target = origin.ned_of(item.location(here, self.home))
+        if item.command == mis.TAKEOFF:
+            if self._flying:
+                self._guidance.fly((*self.estimator.position[:2], target[2]))
+            else:
+                self._begin_takeoff(self._home_ned()[2] - target[2])
+        elif item.command == mis.RTL:
+            self._begin_rtl()
+        elif item.command == mis.LAND:
+            down = self.estimator.position[2]
+            self._guidance.fly((target[0], target[1], down))
+        else:
+            self._guidance.fly(target)
+
+    def _run_mission(self) -> None:
+        if not 0 < self.mission_index < len(self.mission.items):
+            return
+        item = self.mission.items[self.mission_index]
+        if item.command == mis.RTL:
+            self._run_rtl()
+            return
+        if not self._guidance.arrived():
+            return
+        if item.command == mis.LAND:
+            self._guidance.landing = True
+            return
+        if self._stage_since == 0.0:
+            self._stage_since = self._time
+        delay = item.parameters[0] if item.command in (mis.WAYPOINT, mis.LOITER_TIME) else 0.0
+        last = self.mission_index + 1 >= len(self.mission.items)
+        if self._time - self._stage_since >= delay:
+            self.on_reached(self.mission_index)
+            if last:
+                self._stage_since = float("inf")  # reached once; hold here
+            else:
+                self._advance_mission()
+
+    def _do(self, item: mis.MissionItem) -> None:
+        p = item.parameters
+        if item.command == mis.CONDITION_YAW:
+            self.condition_yaw(p[0], p[2], bool(p[3]))
+        elif item.command == mis.CHANGE_SPEED:
+            self.change_speed(p[1])
+        elif item.command == mis.MOUNT_CONTROL:
+            self.gimbal.point(p[0], p[2], yaw_locked=False)
+        elif item.command == mis.GIMBAL_PITCHYAW:
+            self.gimbal.point(p[0], p[1], yaw_locked=bool(int(item.latitude_deg * 1e7) & 16))
+        elif item.command == mis.ROI_NONE:
+            self.gimbal.look_at(None)
+        elif item.command == mis.ROI_LOCATION and self.estimator.location and self.home:
+            self.gimbal.look_at(item.location(self.estimator.location, self.home))
+
+
+_NAMES = {
+    mis.TAKEOFF: "Takeoff",
+    mis.WAYPOINT: "WP",
+    mis.LOITER_TIME: "LoitTime",
+    mis.RTL: "RTL",
+    mis.LAND: "Land",
+}

@@ -1,0 +1,1 @@
+"""The navigation filter, as EKF3 behaves."""

@@ -1,0 +1,238 @@
+"""The filter's sources: which measurements are used, when aiding starts and ends, as in EKF3 4.7.
+
+No aiding for 7 s (10 s with velocity) ends the position flag, 15 s ends aiding; a jump is taken at
+once only when announced.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from enum import IntEnum
+from math import radians
+
+from sitl.embedded.ekf import navigation as nav
+from sitl.embedded.ekf.gated_filter import GatedFilter
+from sitl.embedded.ekf.measurements import (
+    Baro,
+    Compass,
+    ExternalPosition,
+    ExternalVelocity,
+    GpsData,
+    Measurement,
+)
+from sitl.embedded.parameters import Parameters
+from sitl.embedded.severity import INFO, WARNING
+from sitl.geodesy import Location, north_east
+
+_POSITION_LOST_NO_VELOCITY_MS = 7000
+_POSITION_LOST_WITH_VELOCITY_MS = 10000
+_ATTITUDE_LOST_MS = 15000
+_GPS_GOOD_MS = 10000
+_HEIGHT_FRESH_MS = 500
+_COMPASS_SIGMA = 0.25  # rad per sample; what EKF3's 0.05 gauss per axis amounts to in heading
+
+# EK3_SRCn_* values
+GPS, COMPASS, EXTERNAL = 3, 1, 6
+
+
+class Aiding(IntEnum):
+    """EKF3's position and velocity aiding mode."""
+
+    NONE = 0
+    ABSOLUTE = 1
+
+
+class AidedFilter(GatedFilter):
+    """Fuses what the active source set names. `notify(severity, text)` sends a STATUSTEXT."""
+
+    def __init__(self, parameters: Parameters, notify: Callable[[int, str], None]) -> None:
+        super().__init__(parameters)
+        self.notify = notify
+        self.origin: Location | None = None
+        self.aiding = Aiding.NONE
+        self.source_set = 1
+        self.armed = False
+        self._last_known_ne = (0.0, 0.0)
+        self._aligned = False
+        self._last_position_source = -1
+        self._last_yaw_source = -1
+
+    def set_origin(self, origin: Location) -> bool:
+        """Set the origin once; a second one is refused, silently, as EKF3 does."""
+        if self.origin is not None:
+            return False
+        self.origin = origin
+        for lane in (0, 1):
+            self.notify(INFO, f"EKF3 IMU{lane} origin set")
+        return True
+
+    def force_position(self, north_m: float, east_m: float, sigma_m: float) -> bool:
+        """MAV_CMD_EXTERNAL_POSITION_ESTIMATE: a reset, taken only after 1 s without aiding."""
+        if self._now_ms - self._clock.position_pass <= 1000 or self.origin is None:
+            return False
+        self._reset_position(north_m, east_m, sigma_m**2)
+        return True
+
+    def _fuse(self, measurement: Measurement) -> None:
+        """Use one measurement, if its source is the one that counts."""
+        if isinstance(measurement, Baro):
+            self._fuse_baro(measurement.height)
+        elif isinstance(measurement, Compass):
+            if self._source("YAW") == COMPASS:
+                self._fuse_yaw(measurement.yaw, _COMPASS_SIGMA)
+        elif isinstance(measurement, GpsData):
+            self._use_gps(measurement)
+        elif isinstance(measurement, ExternalPosition):
+            self._use_external(measurement)
+        else:
+            self._use_external_velocity(measurement)
+
+    # --- sources and aiding ------------------------------------------------------------------
+
+    def _source(self, what: str) -> int:
+        return int(self.parameters[f"EK3_SRC{self.source_set}_{what}"])
+
+    def _check_sources(self) -> None:
+        position, yaw = self._source("POSXY"), self._source("YAW")
+        if position != self._last_position_source:
+            self._source_reset = self._last_position_source >= 0 and position != 0
+            self._last_position_source = position
+        if yaw != self._last_yaw_source:
+            self._yaw_reset = self._last_yaw_source >= 0
+            self._last_yaw_source = yaw
+
+    def _check_gps(self, gps: GpsData) -> None:
+        now = self._now_ms
+        good = (
+            gps.satellites >= 6
+            and gps.hdop <= 2.5
+            and gps.horizontal_accuracy <= 5.0
+            and gps.speed_accuracy <= 1.5
+        )
+        if not good or now - self._clock.gps_received > 1000:
+            self._clock.gps_bad = now
+        self._clock.gps_received = now
+        self._gps_fix_good = now - self._clock.gps_bad >= _GPS_GOOD_MS
+        if self._gps_fix_good and self.origin is None:
+            height = -float(self._state[nav.P + 2])
+            self.set_origin(Location(gps.latitude_deg, gps.longitude_deg, gps.altitude_m - height))
+
+    def _start_aiding(self, source: str) -> None:
+        self.aiding = Aiding.ABSOLUTE
+        self._position_timeout = self._velocity_timeout = False
+        self._clock.position_pass = self._clock.velocity_pass = self._now_ms
+        for lane in (0, 1):
+            self.notify(INFO, f"EKF3 IMU{lane} is using {source}")
+
+    def _update_aiding(self) -> None:
+        if self.aiding is not Aiding.ABSOLUTE:
+            return
+        now, clock = self._now_ms, self._clock
+        position_used = now - clock.position_pass <= _POSITION_LOST_NO_VELOCITY_MS
+        velocity_used = now - clock.velocity_pass <= _POSITION_LOST_NO_VELOCITY_MS
+        self._velocity_aiding = position_used or velocity_used
+        silent = now - max(clock.position_pass, clock.velocity_pass)
+        if silent > _ATTITUDE_LOST_MS:
+            self._stop_aiding()
+        elif not position_used:
+            limit = (
+                _POSITION_LOST_WITH_VELOCITY_MS
+                if self._velocity_aiding
+                else _POSITION_LOST_NO_VELOCITY_MS
+            )
+            if now - clock.position_pass > limit:
+                self._position_timeout = True
+                self._velocity_timeout = not velocity_used
+
+    def _stop_aiding(self) -> None:
+        self.aiding = Aiding.NONE
+        self._position_timeout = self._velocity_timeout = True
+        self._last_known_ne = (float(self._state[nav.P]), float(self._state[nav.P + 1]))
+        self._state[nav.V : nav.V + 2] = 0.0
+        nav.reset_error(self._cov, 3, 2, self.parameters["EK3_VELNE_M_NSE"] ** 2)
+        self.ratios.position = self.ratios.velocity = 0.0
+        for lane in (0, 1):
+            self.notify(WARNING, f"EKF3 IMU{lane} stopped aiding")
+
+    # --- fusion ------------------------------------------------------------------------------
+
+    def _use_gps(self, gps: GpsData) -> None:
+        self._note_innovations()
+        if self._source("YAW") == 2 and gps.yaw_rad is not None:
+            self._fuse_yaw(gps.yaw_rad, radians(10.0))
+        if self._source("POSXY") != GPS or self.origin is None:
+            return
+        position = north_east(self.origin, gps.latitude_deg, gps.longitude_deg)
+        sigma = max(gps.horizontal_accuracy, self.parameters["EK3_POSNE_M_NSE"])
+        horizontal = gps.horizontal_velocity if self._source("VELXY") == GPS else None
+        vertical = gps.vertical_velocity if self._source("VELZ") == GPS else None
+        if self.aiding is Aiding.NONE:
+            if not (self._gps_fix_good and self._aligned):
+                return
+            self._start_aiding("GPS")
+            self._reset_position(*position, sigma**2)
+            self._reset_velocity(horizontal or (0.0, 0.0), 0.5**2 if horizontal else 25.0)
+            return
+        if self._source_reset:
+            self._reset_position(*position, sigma**2)
+        speed = max(gps.speed_accuracy, self.parameters["EK3_VELNE_M_NSE"])
+        self._fuse_position(position, sigma, horizontal)
+        if horizontal is not None:
+            self._fuse_velocity(horizontal, vertical, speed, self.parameters["EK3_VELNE_M_NSE"])
+        elif vertical is not None:
+            nav.fuse(self._state, self._cov, 5, vertical - self._state[nav.V + 2], 0.5**2)
+        if self._source("POSZ") == GPS:
+            self._fuse_height(gps.altitude_m - self.origin.altitude_m, 1.5)
+
+    def _use_external(self, fix: ExternalPosition) -> None:
+        if self._source("YAW") == EXTERNAL and fix.yaw_rad is not None:
+            if self._yaw_reset:
+                self._rotate_to(fix.yaw_rad, fix.yaw_sigma)
+            else:
+                self._fuse_yaw(fix.yaw_rad, fix.yaw_sigma)
+        if self._source("POSXY") != EXTERNAL:
+            return
+        north, east, down = fix.position
+        if self.aiding is Aiding.NONE:
+            if not self._aligned:
+                return
+            self._start_aiding("external nav data")
+            for lane in (0, 1):
+                text = f"initial pos NED = {north:3.1f},{east:3.1f},{down:3.1f} (m)"
+                self.notify(INFO, f"EKF3 IMU{lane} {text}")
+            self._reset_position(north, east, fix.sigma**2)
+            self._reset_velocity((0.0, 0.0), 25.0)
+            return
+        if fix.reset or self._source_reset:
+            self._reset_position(north, east, None)
+            if self._source("POSZ") == EXTERNAL:
+                self._state[nav.P + 2] = down
+        self._fuse_position((north, east), fix.sigma, None)
+        if self._source("POSZ") == EXTERNAL:
+            self._fuse_height(-down, max(fix.sigma, 0.1))
+
+    def _use_external_velocity(self, observed: ExternalVelocity) -> None:
+        if self._source("VELXY") != EXTERNAL or self.aiding is Aiding.NONE:
+            return
+        vertical = observed.velocity[2] if self._source("VELZ") == EXTERNAL else None
+        horizontal = (observed.velocity[0], observed.velocity[1])
+        self._fuse_velocity(horizontal, vertical, observed.sigma, observed.sigma)
+
+    def _fuse_baro(self, height: float) -> None:
+        source = self._source("POSZ")
+        external_fresh = (
+            source == EXTERNAL and self._now_ms - self._clock.external_received < _HEIGHT_FRESH_MS
+        )
+        gps_fresh = (
+            source == GPS
+            and self._now_ms - self._clock.gps_received < _HEIGHT_FRESH_MS
+            and self.aiding is Aiding.ABSOLUTE
+        )
+        if not (external_fresh or gps_fresh):
+            self._fuse_height(height, self.parameters["EK3_ALT_M_NSE"])
+        if self.aiding is Aiding.NONE:
+            # As EKF3: hold position with a synthetic measurement, to keep the tilt bounded.
+            sigma = self.parameters["EK3_NOAID_M_NSE"] if self.armed else 0.5
+            for i in range(2):
+                residual = self._last_known_ne[i] - self._state[nav.P + i]
+                nav.fuse(self._state, self._cov, 6 + i, residual, sigma**2)

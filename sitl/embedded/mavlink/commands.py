@@ -1,0 +1,195 @@
+"""What the vehicle does with each MAVLink message that is meant for it."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from pymavlink.dialects.v20 import ardupilotmega as mavlink
+
+from sitl.embedded.aircraft import Aircraft
+from sitl.embedded.control.mode import Mode, RcInput
+from sitl.embedded.mavlink.gimbal_commands import GimbalCommands
+from sitl.embedded.mavlink.handling import ACCEPTED, FAILED, UNSUPPORTED, CommandHandler, Handler
+from sitl.embedded.mavlink.navigation_commands import NavigationCommands
+from sitl.embedded.mavlink.parameter_commands import ParameterCommands
+from sitl.embedded.mavlink.server import Link
+from sitl.embedded.mavlink.telemetry import Telemetry
+from sitl.embedded.severity import INFO, WARNING
+
+_FORCE_ARM = 21196.0
+_EKF_SOURCE_SET_OPTION = 90
+
+
+class Commands:
+    """Dispatch of incoming messages and commands."""
+
+    def __init__(self, vehicle: Aircraft, telemetry: Telemetry) -> None:
+        self._vehicle, self._telemetry = vehicle, telemetry
+        self._rc8: int | None = None
+        navigation, gimbal = NavigationCommands(vehicle), GimbalCommands(vehicle)
+        self._messages: dict[str, Handler] = {
+            **navigation.messages,
+            **gimbal.messages,
+            **ParameterCommands(vehicle).messages,
+            "COMMAND_LONG": self._command,
+            "COMMAND_INT": self._command,
+            "SET_MODE": self._set_mode_message,
+            "VISION_POSITION_ESTIMATE": self._vision,
+            "GLOBAL_VISION_POSITION_ESTIMATE": self._vision,
+            "ODOMETRY": self._odometry,
+            "GPS_INPUT": self._gps_input,
+            "TIMESYNC": self._timesync,
+            "RC_CHANNELS_OVERRIDE": self._rc,
+            "REQUEST_DATA_STREAM": self._data_stream,
+        }
+        m = mavlink
+        self._commands: dict[int, CommandHandler] = {
+            **navigation.commands,
+            **gimbal.commands,
+            m.MAV_CMD_COMPONENT_ARM_DISARM: self._arm,
+            m.MAV_CMD_PREFLIGHT_REBOOT_SHUTDOWN: self._reboot,
+            m.MAV_CMD_NAV_LAND: lambda _l, _c: self._mode(Mode.LAND),
+            m.MAV_CMD_NAV_RETURN_TO_LAUNCH: lambda _l, _c: self._mode(Mode.RTL),
+            m.MAV_CMD_DO_SET_MODE: self._set_mode,
+            m.MAV_CMD_SET_MESSAGE_INTERVAL: self._set_interval,
+            m.MAV_CMD_REQUEST_MESSAGE: self._request_message,
+            m.MAV_CMD_REQUEST_AUTOPILOT_CAPABILITIES: self._request_version,
+        }
+
+    def handle(self, link: Link, message: Any) -> None:
+        """Act on one message."""
+        kind = message.get_type()
+        handler = self._messages.get(kind)
+        if handler is not None:
+            handler(link, message)
+        elif kind.startswith("MISSION_") and self._vehicle.mission.handle(message, link):
+            self._vehicle.modes.mission_index = 0
+
+    # --- commands ----------------------------------------------------------------------------
+
+    def _command(self, link: Link, message: Any) -> None:
+        handler = self._commands.get(message.command)
+        result = handler(link, message) if handler else UNSUPPORTED
+        link.send(
+            mavlink.MAVLink_command_ack_message(
+                message.command, result, 0, 0, message.get_srcSystem(), message.get_srcComponent()
+            )
+        )
+
+    def _arm(self, _link: Link, command: Any) -> int:
+        v = self._vehicle
+        forced = command.param2 == _FORCE_ARM
+        if command.param1 == 0:
+            if v.modes.flying and not v.modes.on_ground and not forced:
+                return FAILED
+            v.modes.disarm()
+            return ACCEPTED
+        if v.modes.armed:
+            return ACCEPTED
+        if not forced and v.report_failures("Arm"):
+            return FAILED
+        v.modes.arm()
+        v.notify(INFO, "Arming motors")
+        return ACCEPTED
+
+    def _reboot(self, _link: Link, command: Any) -> int:
+        if command.param1 != 1 or self._vehicle.modes.armed:
+            return FAILED
+        self._vehicle.reboot_ordered = True
+        return ACCEPTED
+
+    def _mode(self, mode: Mode) -> int:
+        return ACCEPTED if self._vehicle.modes.set_mode(mode) else FAILED
+
+    def _set_mode(self, _link: Link, command: Any) -> int:
+        try:
+            mode = Mode(int(command.param2))
+        except ValueError:
+            return FAILED
+        return self._mode(mode)
+
+    def _set_mode_message(self, _link: Link, message: Any) -> None:
+        try:
+            mode = Mode(message.custom_mode)
+        except ValueError:
+            self._vehicle.notify(WARNING, f"No such mode {message.custom_mode}")
+            return
+        self._mode(mode)
+
+    def _set_interval(self, link: Link, command: Any) -> int:
+        message_id, interval_us = int(command.param1), command.param2
+        if not self._telemetry.knows(message_id):
+            return FAILED
+        if interval_us < 0:
+            link.set_interval(message_id, None)
+        elif interval_us > 0:
+            link.set_interval(message_id, max(interval_us / 1e6, 0.01))
+        return ACCEPTED
+
+    def _request_message(self, link: Link, command: Any) -> int:
+        sent = self._telemetry.send(link, int(command.param1))
+        return ACCEPTED if sent else FAILED
+
+    def _request_version(self, link: Link, _command: Any) -> int:
+        self._telemetry.send(link, mavlink.MAVLINK_MSG_ID_AUTOPILOT_VERSION)
+        return ACCEPTED
+
+    # --- injection ---------------------------------------------------------------------------
+
+    def _vision(self, link: Link, message: Any) -> None:
+        self._vehicle.injection.vision(message, link.jitter, self._vehicle.time_ms)
+
+    def _odometry(self, link: Link, message: Any) -> None:
+        self._vehicle.injection.odometry(message, link.jitter, self._vehicle.time_ms)
+
+    def _gps_input(self, link: Link, message: Any) -> None:
+        self._vehicle.injection.gps_input(message, link.jitter, self._vehicle.time_ms)
+
+    def _timesync(self, link: Link, message: Any) -> None:
+        if message.tc1 == 0:
+            link.send(
+                mavlink.MAVLink_timesync_message(self._vehicle.time_ms * 1_000_000, message.ts1)
+            )
+
+    # --- RC, streams -------------------------------------------------------------------------
+
+    def _rc(self, _link: Link, message: Any) -> None:
+        v = self._vehicle
+
+        def stick(value: int, old: float) -> float:
+            return old if value in (0, 65535) else min(max((value - 1500) / 500.0, -1.0), 1.0)
+
+        old = v.modes.rc
+        v.modes.rc = RcInput(
+            stick(message.chan1_raw, old.roll),
+            stick(message.chan2_raw, old.pitch),
+            stick(message.chan4_raw, old.yaw),
+            (stick(message.chan3_raw, 2 * old.throttle - 1) + 1) / 2,
+        )
+        channel = message.chan8_raw
+        if v.parameters["RC8_OPTION"] != _EKF_SOURCE_SET_OPTION or channel in (0, 65535):
+            return
+        position = 1 if channel < 1200 else 3 if channel > 1800 else 2
+        if position != self._rc8:
+            self._rc8 = position
+            self._vehicle.use_source(position)
+
+    def _data_stream(self, link: Link, message: Any) -> None:
+        """REQUEST_DATA_STREAM, the old way: the attitude and position groups."""
+        groups = {
+            6: (
+                mavlink.MAVLINK_MSG_ID_GLOBAL_POSITION_INT,
+                mavlink.MAVLINK_MSG_ID_LOCAL_POSITION_NED,
+            ),
+            10: (mavlink.MAVLINK_MSG_ID_ATTITUDE, mavlink.MAVLINK_MSG_ID_SIM_STATE),
+            12: (mavlink.MAVLINK_MSG_ID_EKF_STATUS_REPORT,),
+        }
+        wanted = (
+            groups.values()
+            if message.req_stream_id == 0
+            else [groups.get(message.req_stream_id, ())]
+        )
+        rate = message.req_message_rate if message.start_stop else 0
+        for group in wanted:
+            for message_id in group:
+                link.set_interval(message_id, 1.0 / rate if rate > 0 else None)

@@ -1,0 +1,28 @@
+"""What the handlers of messages share: their kinds, results, and places in messages."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+from sitl.embedded.mavlink.server import Link
+from sitl.geodesy import Location
+
+ACCEPTED, DENIED, UNSUPPORTED, FAILED = 0, 2, 3, 4  # MAV_RESULT
+_GLOBAL_FRAMES_RELATIVE = (3, 6)
+_GLOBAL_FRAMES = (0, 5, *_GLOBAL_FRAMES_RELATIVE)
+
+Handler = Callable[[Link, Any], None]
+CommandHandler = Callable[[Link, Any], int]
+
+
+def location_of(
+    home: Location | None, frame: int, x: int, y: int, altitude: float
+) -> Location | None:
+    """A place in a message's global frame (degrees * 1e7, m); None where the frame is no global one
+    or home, which relative altitudes are above, is not set.
+    """
+    if frame not in _GLOBAL_FRAMES or home is None:
+        return None
+    base = home.altitude_m if frame in _GLOBAL_FRAMES_RELATIVE else 0.0
+    return Location(x / 1e7, y / 1e7, base + altitude)

@@ -1,0 +1,1 @@
+"""The rigid body, its sensors and its gimbal."""

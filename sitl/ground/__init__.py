@@ -1,0 +1,1 @@
+"""The scripted ground station, and what it saw."""

@@ -1,0 +1,166 @@
+"""What a vehicle did, as samples in time: true states, gimbal angles and EKF positions.
+
+Samples lie on CLOCK_MONOTONIC; seconds since boot are simulated seconds.
+"""
+
+from __future__ import annotations
+
+import bisect
+import threading
+from collections import deque
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from pymavlink.dialects.v20 import ardupilotmega as mavlink
+
+from sitl.embedded.physics.rotation import euler
+from sitl.geodesy import Location
+
+Array = NDArray[np.float64]
+
+_CLOCK_WINDOW = 25  # samples over which the least latency is taken
+
+
+@dataclass(frozen=True)
+class Truth:
+    """The vehicle's true state. altitude: AMSL; quaternion: (4,) w, x, y, z, FRD to NED;
+    velocity_ned: (3,) m/s; time_ns: CLOCK_MONOTONIC; boot_s: simulated seconds since boot.
+    """
+
+    time_ns: int
+    boot_s: float
+    latitude_deg: float
+    longitude_deg: float
+    altitude_m: float
+    quaternion: Array
+    velocity_ned: Array
+
+    @property
+    def location(self) -> Location:
+        """Latitude, longitude, altitude AMSL."""
+        return Location(self.latitude_deg, self.longitude_deg, self.altitude_m)
+
+    @property
+    def roll_pitch_yaw(self) -> tuple[float, float, float]:
+        """Euler angles in radians."""
+        return euler(self.quaternion)
+
+
+@dataclass(frozen=True)
+class GimbalState:
+    """GIMBAL_DEVICE_ATTITUDE_STATUS: quaternion (4,) with earth-frame roll and pitch; the yaw is
+    from the vehicle's nose, or from north, as the flags say.
+    """
+
+    time_ns: int
+    quaternion: Array
+    flags: int
+
+    @property
+    def yaw_in_vehicle_frame(self) -> bool:
+        """By the YAW_IN_* flags; where neither is set, by YAW_LOCK."""
+        if self.flags & mavlink.GIMBAL_DEVICE_FLAGS_YAW_IN_VEHICLE_FRAME:
+            return True
+        if self.flags & mavlink.GIMBAL_DEVICE_FLAGS_YAW_IN_EARTH_FRAME:
+            return False
+        return not self.flags & mavlink.GIMBAL_DEVICE_FLAGS_YAW_LOCK
+
+    @property
+    def roll_pitch_yaw(self) -> tuple[float, float, float]:
+        """Euler angles in radians, in the frames that the flags name."""
+        return euler(self.quaternion)
+
+
+@dataclass(frozen=True)
+class EkfSample:
+    """LOCAL_POSITION_NED with the EKF origin and flags of its time; times as in `Truth`."""
+
+    time_ns: int
+    boot_s: float
+    position_ned: tuple[float, float, float]
+    velocity_ned: tuple[float, float, float]
+    origin: Location | None
+    flags: int
+
+    @property
+    def location(self) -> Location | None:
+        """Where the EKF says the vehicle is."""
+        return self.origin.offset(*self.position_ned) if self.origin else None
+
+
+class BootClock:
+    """Maps the vehicle's boot time to CLOCK_MONOTONIC by the least latency lately seen."""
+
+    def __init__(self, speedup: float) -> None:
+        self._scale = 1e6 / speedup  # ns of wall time per ms of simulated time
+        self._offsets: deque[float] = deque(maxlen=_CLOCK_WINDOW)
+
+    def restart(self, speedup: float) -> None:
+        """Simulated time runs at another speed from now on."""
+        self._scale = 1e6 / speedup
+        self._offsets.clear()
+
+    def observe(self, boot_ms: int, received_ns: int) -> None:
+        """A message of boot time boot_ms was received."""
+        self._offsets.append(received_ns - boot_ms * self._scale)
+
+    def monotonic_ns(self, boot_ms: int) -> int:
+        """CLOCK_MONOTONIC at a boot time."""
+        return round(boot_ms * self._scale + min(self._offsets, default=0.0))
+
+
+class Track:
+    """Samples in time order, safe between one writer and many readers."""
+
+    def __init__(self, limit: int) -> None:
+        self._lock = threading.Lock()
+        self._times: list[int] = []
+        self._samples: list[Any] = []
+        self._limit = limit
+
+    def add(self, sample: Any) -> None:
+        """Append a sample; it must carry `time_ns`, and be newer than the last."""
+        with self._lock:
+            if self._times and sample.time_ns <= self._times[-1]:
+                return
+            self._times.append(sample.time_ns)
+            self._samples.append(sample)
+            if len(self._times) > 2 * self._limit:
+                del self._times[: self._limit]
+                del self._samples[: self._limit]
+
+    def around(self, time_ns: int) -> tuple[Any, Any] | None:
+        """The samples before and after a time; None outside the track."""
+        with self._lock:
+            i = bisect.bisect_left(self._times, time_ns)
+            if i == len(self._times) or (i == 0 and self._times[0] != time_ns):
+                return None
+            return self._samples[max(i - 1, 0)], self._samples[i]
+
+    def all(self) -> list[Any]:
+        """A copy of the track."""
+        with self._lock:
+            return list(self._samples)
+
+    @property
+    def newest(self) -> Any | None:
+        """The last sample."""
+        with self._lock:
+            return self._samples[-1] if self._samples else None
+
+
+def share(before_ns: int, after_ns: int, time_ns: int) -> float:
+    """How far a time lies between two others, 0 to 1."""
+    return (time_ns - before_ns) / (after_ns - before_ns) if after_ns > before_ns else 0.0
+
+
+def slerp(a: Array, b: Array, t: float) -> Array:
+    """Between two unit quaternions that are close (20 ms apart): normalised linear is exact to
+    far below sensor noise.
+    """
+    if float(a @ b) < 0:
+        b = -b
+    q = a + t * (b - a)
+    return np.asarray(q / np.linalg.norm(q))

@@ -1,0 +1,227 @@
+"""What the vehicle says of itself, kept: the state now, and the tracks since the connection."""
+
+from __future__ import annotations
+
+import queue
+from collections.abc import Callable, Iterator
+from typing import Any
+
+import numpy as np
+from pymavlink.dialects.v20 import ardupilotmega as mavlink
+
+from sitl.errors import PilotError
+from sitl.geodesy import Location
+from sitl.ground.statustext import StatusText, TextLog
+from sitl.ground.tracks import Array, BootClock, EkfSample, GimbalState, Track, Truth, share, slerp
+
+_VEHICLE, _AUTOPILOT = 1, 1
+_SECONDS_KEPT = 60 * 60
+
+MODES = {"STABILIZE": 0, "AUTO": 3, "GUIDED": 4, "LOITER": 5, "RTL": 6, "LAND": 9}
+_MODE_NAMES = {number: name for name, number in MODES.items()}
+
+
+class VehicleRecord:
+    """Takes in a vehicle's messages on one thread; any thread may look things up."""
+
+    def __init__(self, speedup: float) -> None:
+        self._boxes: list[tuple[frozenset[str], queue.SimpleQueue[Any]]] = []
+        self._clock = BootClock(speedup)
+        self._boot_ms = 0
+        self._attitude_ms: int | None = None
+        self._flags = 0
+        self._subscribers: list[Callable[[Truth], None]] = []
+        self._truth = Track(_SECONDS_KEPT * 50)
+        self._gimbal = Track(_SECONDS_KEPT * 50)
+        self._ekf = Track(_SECONDS_KEPT * 25)
+        self.origin: Location | None = None
+        self.latest: dict[str, Any] = {}
+        self._text_log = TextLog()
+        self.reached: list[int] = []
+        self.mode: str | None = None
+        self.armed = False
+
+    # --- what is known -----------------------------------------------------------------------
+
+    @property
+    def texts(self) -> list[StatusText]:
+        """The status texts of every component, oldest first."""
+        return self._text_log.lines
+
+    @property
+    def time_s(self) -> float:
+        """Simulated seconds since the vehicle's boot."""
+        return self._boot_ms / 1000.0
+
+    @property
+    def truth(self) -> Truth:
+        """The newest true state."""
+        newest = self._truth.newest
+        if newest is None:
+            raise PilotError("no truth has been received: connect first")
+        return newest
+
+    @property
+    def ekf(self) -> EkfSample | None:
+        """The newest position that the EKF reports; None while it reports none."""
+        return self._ekf.newest
+
+    @property
+    def ekf_flags(self) -> int:
+        """EKF_STATUS_FLAGS as last reported."""
+        return self._flags
+
+    def truth_at(self, time_ns: int) -> Truth | None:
+        """The true state at a CLOCK_MONOTONIC time, interpolated; None outside the record."""
+        pair = self._truth.around(time_ns)
+        if pair is None:
+            return None
+        a, b = pair
+        t = share(a.time_ns, b.time_ns, time_ns)
+        return Truth(
+            time_ns,
+            a.boot_s + t * (b.boot_s - a.boot_s),
+            a.latitude_deg + t * (b.latitude_deg - a.latitude_deg),
+            a.longitude_deg + t * (b.longitude_deg - a.longitude_deg),
+            a.altitude_m + t * (b.altitude_m - a.altitude_m),
+            slerp(a.quaternion, b.quaternion, t),
+            a.velocity_ned + t * (b.velocity_ned - a.velocity_ned),
+        )
+
+    def gimbal_at(self, time_ns: int) -> GimbalState | None:
+        """The gimbal at a CLOCK_MONOTONIC time, interpolated; None outside the record."""
+        pair = self._gimbal.around(time_ns)
+        if pair is None:
+            return None
+        a, b = pair
+        t = share(a.time_ns, b.time_ns, time_ns)
+        return GimbalState(time_ns, slerp(a.quaternion, b.quaternion, t), b.flags)
+
+    def newest_common_ns(self) -> int | None:
+        """The latest time at which both truth and gimbal are known."""
+        truth, gimbal = self._truth.newest, self._gimbal.newest
+        return min(truth.time_ns, gimbal.time_ns) if truth and gimbal else None
+
+    def truth_track(self) -> list[Truth]:
+        """Everything recorded of the true state."""
+        return self._truth.all()
+
+    def gimbal_track(self) -> list[GimbalState]:
+        """Everything recorded of the gimbal."""
+        return self._gimbal.all()
+
+    def ekf_track(self) -> list[EkfSample]:
+        """Everything recorded of the EKF's position."""
+        return self._ekf.all()
+
+    def ekf_pairs(self) -> Iterator[tuple[EkfSample, Location]]:
+        """Every position that the EKF reported, with where the vehicle truly was then."""
+        # Paired by the vehicle's own clock: CLOCK_MONOTONIC stamps move when simulated time stalls.
+        truth = self.truth_track()
+        times = np.array([t.boot_s for t in truth])
+        for sample in self.ekf_track():
+            i = int(np.searchsorted(times, sample.boot_s))
+            if sample.location is None or not 0 < i < len(times):
+                continue
+            a, b = truth[i - 1].location, truth[i].location
+            t = (sample.boot_s - times[i - 1]) / (times[i] - times[i - 1])
+            leg = a.ned_of(b)
+            yield sample, a.offset(t * leg[0], t * leg[1], t * leg[2])
+
+    def ekf_errors(self, since_ns: int = 0, until_ns: int = 1 << 62) -> Array:
+        """NED errors (N, 3) in metres of the EKF's positions against the truth of their times."""
+        errors = [
+            true.ned_of(sample.location)
+            for sample, true in self.ekf_pairs()
+            if sample.location is not None and since_ns <= sample.time_ns <= until_ns
+        ]
+        return np.array(errors, dtype=np.float64).reshape(-1, 3)
+
+    def subscribe(self, callback: Callable[[Truth], None]) -> None:
+        """Call back with every new true state, from the reading thread: be quick."""
+        self._subscribers.append(callback)
+
+    # --- messages ----------------------------------------------------------------------------
+
+    def _take(self, message: Any, received_ns: int) -> None:
+        kind = message.get_type()
+        if kind == "STATUSTEXT":
+            self._text_log.take(message, received_ns)
+        if message.get_srcSystem() != _VEHICLE or message.get_srcComponent() != _AUTOPILOT:
+            return
+        self.latest[kind] = message
+        for kinds, box in self._boxes:
+            if kind in kinds:
+                box.put(message)
+        handler = _HANDLERS.get(kind)
+        if handler is not None:
+            handler(self, message, received_ns)
+
+    def _take_heartbeat(self, message: Any, _received_ns: int) -> None:
+        self.mode = _MODE_NAMES.get(message.custom_mode, str(message.custom_mode))
+        self.armed = bool(message.base_mode & mavlink.MAV_MODE_FLAG_SAFETY_ARMED)
+
+    def _take_attitude(self, message: Any, received_ns: int) -> None:
+        self._boot_ms = self._attitude_ms = message.time_boot_ms
+        self._clock.observe(message.time_boot_ms, received_ns)
+
+    def _take_sim_state(self, message: Any, _received_ns: int) -> None:
+        # SIM_STATE has no time stamp; the ATTITUDE streamed just before it does.
+        if self._attitude_ms is None:
+            return
+        truth = Truth(
+            self._clock.monotonic_ns(self._attitude_ms),
+            self._attitude_ms / 1000.0,
+            message.lat_int / 1e7,
+            message.lon_int / 1e7,
+            message.alt,
+            np.array([message.q1, message.q2, message.q3, message.q4]),
+            np.array([message.vn, message.ve, message.vd]),
+        )
+        self._truth.add(truth)
+        for callback in self._subscribers:
+            callback(truth)
+
+    def _take_gimbal(self, message: Any, _received_ns: int) -> None:
+        self._gimbal.add(
+            GimbalState(
+                self._clock.monotonic_ns(message.time_boot_ms),
+                np.array(message.q, dtype=np.float64),
+                message.flags,
+            )
+        )
+
+    def _take_position(self, message: Any, _received_ns: int) -> None:
+        self._ekf.add(
+            EkfSample(
+                self._clock.monotonic_ns(message.time_boot_ms),
+                message.time_boot_ms / 1000.0,
+                (message.x, message.y, message.z),
+                (message.vx, message.vy, message.vz),
+                self.origin,
+                self._flags,
+            )
+        )
+
+    def _take_ekf(self, message: Any, _received_ns: int) -> None:
+        self._flags = message.flags
+
+    def _take_origin(self, message: Any, _received_ns: int) -> None:
+        self.origin = Location(
+            message.latitude / 1e7, message.longitude / 1e7, message.altitude / 1000.0
+        )
+
+    def _take_reached(self, message: Any, _received_ns: int) -> None:
+        self.reached.append(message.seq)
+
+
+_HANDLERS: dict[str, Callable[[VehicleRecord, Any, int], None]] = {
+    "HEARTBEAT": VehicleRecord._take_heartbeat,
+    "ATTITUDE": VehicleRecord._take_attitude,
+    "SIM_STATE": VehicleRecord._take_sim_state,
+    "GIMBAL_DEVICE_ATTITUDE_STATUS": VehicleRecord._take_gimbal,
+    "LOCAL_POSITION_NED": VehicleRecord._take_position,
+    "EKF_STATUS_REPORT": VehicleRecord._take_ekf,
+    "GPS_GLOBAL_ORIGIN": VehicleRecord._take_origin,
+    "MISSION_ITEM_REACHED": VehicleRecord._take_reached,
+}

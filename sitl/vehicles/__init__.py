@@ -1,0 +1,1 @@
+"""Simulated vehicles as processes: ArduPilot SITL, or the embedded one."""

@@ -1,0 +1,154 @@
+"""One way to open either vehicle, and the parameter sets that flights and tests need."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+from typing import Literal
+
+from sitl.geodesy import Location
+from sitl.vehicles.ardupilot import ArduPilotSitl, find_arducopter
+from sitl.vehicles.process import BASE_PORT, PARAMETERS, PORTS_PER_INSTANCE, VehicleProcess
+
+VISION_SOURCE = 2  # MAV_CMD_SET_EKF_SOURCE_SET
+
+# A self-stabilising gimbal (MNT1_TYPE 7). Type 1 looks the same but reports servo angles, from
+# which the vehicle's lean is subtracted, under flags that claim the earth frame: its reports are
+# off by the lean. Servo functions: 7 pitch, 6 yaw, 8 roll.
+GIMBAL: dict[str, float] = {
+    "MNT1_TYPE": 7,
+    "MNT1_DEFLT_MODE": 2,
+    "MNT1_PITCH_MIN": -90,
+    "MNT1_PITCH_MAX": 20,
+    "MNT1_YAW_MIN": -180,
+    "MNT1_YAW_MAX": 180,
+    "SERVO9_FUNCTION": 7,
+    "SERVO10_FUNCTION": 6,
+    "SERVO11_FUNCTION": 8,
+}
+
+SPEEDS: dict[str, float] = {
+    "WPNAV_SPEED": 1000,
+    "WPNAV_SPEED_UP": 500,
+    "WPNAV_SPEED_DN": 300,
+    "WPNAV_ACCEL": 250,
+    "LAND_SPEED_HIGH": 300,
+}
+
+GPS_OFF: dict[str, float] = {"SIM_GPS1_ENABLE": 0}
+
+# Bits 1 to 19 but for 18, "visual odometry": on the ground the camera sees no map yet, so vision
+# cannot be healthy before take-off.
+_CHECK_ALL_BUT_VISION = ((1 << 20) - 2) & ~(1 << 18)
+
+
+def vision_parameters(*, sigma_m: float = 0.5, delay_ms: float = 100.0) -> dict[str, float]:
+    """Start on GNSS (source set 1), switch to VISION_POSITION_ESTIMATE or ODOMETRY (set 2)."""
+    return {
+        "VISO_TYPE": 1,
+        "VISO_POS_M_NSE": sigma_m,
+        "VISO_DELAY_MS": delay_ms,
+        **_sources(1, position=3, velocity=3, climb=3),
+        **_sources(2, position=6, velocity=0, climb=0),
+        "ARMING_CHECK": _CHECK_ALL_BUT_VISION,
+    }
+
+
+def vision_only_parameters(*, sigma_m: float = 0.5, delay_ms: float = 100.0) -> dict[str, float]:
+    """No GNSS receiver at all; the origin must be sent. The smallest set that arms on vision."""
+    return {
+        "GPS1_TYPE": 0,
+        "VISO_TYPE": 1,
+        "VISO_POS_M_NSE": sigma_m,
+        "VISO_DELAY_MS": delay_ms,
+        **_sources(1, position=6, velocity=0, climb=0),
+    }
+
+
+def gps_input_parameters(*, delay_ms: float = 100.0) -> dict[str, float]:
+    """Start on the simulated receiver; GPS_INPUT with gps_id 1 takes over when that goes."""
+    return {
+        "GPS2_TYPE": 14,
+        "GPS2_DELAY_MS": delay_ms,
+        # The EKF's buffer, which the delay of the first receiver or of vision sizes, must reach
+        # back to what the second receiver says.
+        "VISO_TYPE": 1,
+        "VISO_DELAY_MS": delay_ms,
+        "GPS_AUTO_SWITCH": 1,
+        **_sources(1, position=3, velocity=0, climb=0),
+        "ARMING_CHECK": _CHECK_ALL_BUT_VISION & ~(1 << 3),  # nor does the second receiver arm
+    }
+
+
+def gps_input_only_parameters(*, delay_ms: float = 100.0) -> dict[str, float]:
+    """GPS_INPUT with gps_id 0 is the only receiver; no velocity is sent."""
+    return {
+        "GPS1_TYPE": 14,
+        "GPS1_DELAY_MS": delay_ms,
+        **_sources(1, position=3, velocity=0, climb=0),
+    }
+
+
+def _sources(number: int, *, position: int, velocity: int, climb: int) -> dict[str, float]:
+    """EK3_SRCn_*: heights from the barometer, heading from the compass."""
+    prefix = f"EK3_SRC{number}_"
+    return {
+        prefix + "POSXY": position,
+        prefix + "VELXY": velocity,
+        prefix + "POSZ": 1,
+        prefix + "VELZ": climb,
+        prefix + "YAW": 1,
+    }
+
+
+class EmbeddedSitl(VehicleProcess):
+    """The embedded vehicle (`sitl.embedded`) as a process of its own."""
+
+    kind = "embedded"
+    start_timeout_s = 300.0  # the first start compiles the kernels
+
+    def __init__(
+        self,
+        home: Location,
+        heading_deg: float = 0.0,
+        parameters: dict[str, float] | None = None,
+        speedup: float = 1.0,
+        seed: int = 0,
+        log: Path | None = None,
+    ) -> None:
+        super().__init__(parameters, speedup, log)
+        self._home = f"{home.latitude_deg},{home.longitude_deg},{home.altitude_m},{heading_deg}"
+        self._seed = seed
+
+    def command(self, instance: int) -> list[str]:
+        """See `VehicleProcess.command`."""
+        return [
+            sys.executable,
+            "-m",
+            "sitl.embedded",
+            f"--home={self._home}",
+            f"--port={BASE_PORT + PORTS_PER_INSTANCE * instance}",
+            f"--params={PARAMETERS}",
+            f"--speedup={self.speedup:g}",
+            f"--seed={self._seed}",
+        ]
+
+
+def open_vehicle(
+    kind: Literal["auto", "ardupilot", "embedded"],
+    home: Location,
+    heading_deg: float = 0.0,
+    parameters: dict[str, float] | None = None,
+    *,
+    speedup: float = 1.0,
+    seed: int = 0,
+    log: Path | None = None,
+) -> VehicleProcess:
+    """A vehicle that is not started yet; "auto" is ArduPilot where its binary is found.
+
+    home: altitude AMSL. The seed is for the embedded vehicle; ArduPilot draws its own noise. log:
+    where what it prints is kept.
+    """
+    if kind == "ardupilot" or (kind == "auto" and find_arducopter() is not None):
+        return ArduPilotSitl(home, heading_deg, parameters, speedup, log)
+    return EmbeddedSitl(home, heading_deg, parameters, speedup, seed, log)

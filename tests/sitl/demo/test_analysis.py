@@ -1,0 +1,89 @@
+import numpy as np
+import pytest
+
+from localizer.geometry.pose import Pose, quaternion_from_matrix, so3_exp
+from sitl.demo.analysis import (
+    Spread,
+    ekf_errors,
+    frame_errors,
+    localization_summary,
+    read_csv,
+    stage_latencies,
+    target_errors,
+)
+
+
+def _columns(poses, times, **more):
+    q = np.array([quaternion_from_matrix(p.rotation) for p in poses]).reshape(-1, 4)
+    t = np.array([p.translation for p in poses]).reshape(-1, 3)
+    names = ("east_m", "north_m", "up_m", "qw", "qx", "qy", "qz")
+    return {
+        "exposure_time_ns": np.array(times, dtype=np.int64),
+        **dict(zip(names, np.hstack([t, q]).T, strict=True)),
+        **more,
+    }
+
+
+def _pose(x, angle=0.0, up=0.0):
+    return Pose(so3_exp([0, 0, angle]), np.array([x, 0.0, up]))
+
+
+def test_frames_are_matched_by_time_and_measured():
+    truth = _columns([_pose(0.0), _pose(1.0), _pose(2.0), _pose(3.0)], [0, 10**8, 2 * 10**8, 3e8])
+    estimates = _columns(
+        [_pose(0.3, up=0.4), _pose(2.0, 0.1), _pose(9.0)], [0, 2 * 10**8, 3 * 10**8],
+        accepted=np.array([1, 1, 0]),
+    )  # fmt: skip
+    errors = frame_errors(truth, estimates, (0, 10**9))
+    np.testing.assert_array_equal(errors.processed, [True, False, True, True])
+    np.testing.assert_allclose(errors.translation_m, [0.5, np.nan, 0.0, np.nan], atol=1e-9)
+    np.testing.assert_allclose(errors.horizontal_m, [0.3, np.nan, 0.0, np.nan], atol=1e-9)
+    assert errors.rotation_deg[2] == pytest.approx(np.degrees(0.1))
+    summary = localization_summary(errors)
+    assert summary.frames == 3
+    assert summary.completeness == pytest.approx(200 / 3)
+    assert summary.fps == pytest.approx(2 / 0.3)
+
+
+def test_frames_outside_the_span_do_not_count():
+    truth = _columns([_pose(0.0), _pose(1.0)], [0, 10**9])
+    estimates = _columns([_pose(0.0), _pose(1.0)], [0, 10**9], accepted=np.array([1, 1]))
+    assert len(frame_errors(truth, estimates, (5, 2 * 10**9)).time_ns) == 1
+
+
+def test_no_estimate_at_all_counts_as_dropped():
+    truth = _columns([_pose(0.0)], [0])
+    errors = frame_errors(truth, {}, (0, 1))
+    assert not errors.processed.any()
+
+
+def test_ekf_target_and_stage_errors():
+    vehicle = {"time_ns": np.array([0, 1, 2])}
+    for axis, offset in (("east", 3.0), ("north", 4.0), ("up", -1.0)):
+        vehicle[f"{axis}_m"] = np.zeros(3)
+        vehicle[f"ekf_{axis}_m"] = np.full(3, offset)
+    _, horizontal, vertical = ekf_errors(vehicle, (1, 2))
+    np.testing.assert_allclose(horizontal, [5.0, 5.0])
+    np.testing.assert_allclose(vertical, [1.0, 1.0])
+    targets = {
+        "target_id": np.array(["a", "b", "a"]), "exposure_time_ns": np.array([1, 1, 7]),
+        "east_m": np.array([1.0, 0.0, 0.0]), "north_m": np.zeros(3), "up_m": np.zeros(3),
+    }  # fmt: skip
+    found = target_errors(targets, {"a": {1: np.zeros(3)}, "b": {1: np.zeros(3)}}, (0, 5))
+    np.testing.assert_allclose(found["a"], [1.0])
+    stages = stage_latencies({"exposure_time_ns": np.array([0, 9]), "x_ms": np.array([4.0, 8.0])},
+                             (0, 5))  # fmt: skip
+    assert stages["x"].median == 4.0
+
+
+def test_spread_ignores_gaps_and_survives_nothing():
+    assert Spread.of(np.array([1.0, np.nan, 3.0])).median == 2.0
+    assert np.isnan(Spread.of(np.array([])).maximum)
+
+
+def test_nanoseconds_survive_the_csv(tmp_path):
+    path = tmp_path / "a.csv"
+    path.write_text("time_ns,x,name\n1234567890123456789,1.5,n\n")
+    columns = read_csv(path, text=("name",))
+    assert columns["time_ns"][0] == 1234567890123456789
+    assert columns["name"][0] == "n"

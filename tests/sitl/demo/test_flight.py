@@ -1,0 +1,72 @@
+"""The product's main job, end to end, on a small world: every process, real video, real MAVLink."""
+
+import json
+from types import SimpleNamespace
+from typing import get_args
+
+import pytest
+
+from companion.config import load_config
+from mavlink_bridge.preflight.rules import ardupilot_rules, find_source_set
+from sitl.demo import flight
+from sitl.demo.companion_process import Ports, write_deployment
+from sitl.demo.flight import fly
+from sitl.demo.report import make_report, print_report
+from sitl.demo.scenario import CameraSpec, Injection, Leg, Scenario
+
+# Light, because it flies in real time on what may be two cores.
+SCENARIO = Scenario(
+    takeoff_height_m=80,
+    deny_after_s=3,
+    speed_m_s=6,
+    legs=(
+        Leg(east_m=0, north_m=60, height_m=80, gimbal_pitch_deg=-80),
+        Leg(east_m=50, north_m=30, height_m=85, gimbal_pitch_deg=-80),
+        Leg(east_m=0, north_m=0, height_m=80, gimbal_pitch_deg=-85),
+    ),
+    cars=3,
+    people=3,
+    camera=CameraSpec(width=480, height=360, rate_hz=8),
+    localizer_width=256,
+)
+
+
+@pytest.mark.parametrize("injection", get_args(Injection))
+def test_the_vehicles_parameters_suit_what_the_companion_sends(tmp_path, injection):
+    """By the doctor's own rules, which are measured refusals of ArduPilot."""
+    scenario = Scenario(injection=injection)
+    parameters = flight._parameters(scenario)
+    path = write_deployment(
+        tmp_path,
+        SimpleNamespace(map_cache=tmp_path),
+        scenario,
+        SimpleNamespace(companion_endpoint="tcp:127.0.0.1:5762"),
+        Ports(5600, 5601),
+    )
+    config = load_config(path).bridge
+    assert config.injection.message == injection
+    source_set = find_source_set(config, parameters.get)
+    assert source_set == (1 if injection == "gps_input" else 2)
+    rules = [r for r in ardupilot_rules(config, source_set) if r.required]
+    given = {name: rule for rule in rules for name in rule.names if name in parameters}
+    assert len(given) >= 5
+    assert [n for n, rule in given.items() if not rule.holds(parameters[n])] == []
+
+
+@pytest.mark.parametrize("kind", ["embedded", pytest.param("ardupilot", marks=pytest.mark.sitl)])
+def test_a_short_flight_without_gnss_comes_home(real_time, small_assets, tmp_path, kind):
+    folder = tmp_path / "report"
+    with real_time():
+        record = fly(small_assets, SCENARIO, kind, 3, folder)
+        report = make_report(record, SCENARIO, 3)
+        print_report(report, folder)
+        assert report.vehicle == kind
+        assert report.localizer.completeness > 90
+        assert report.localizer.median_translation_m < 2.0
+        assert report.ekf_horizontal_m.p95 < 6.0
+        assert report.home_error_m < 6.0
+        assert report.fixed_targets_m.median < 5.0
+    written = json.loads((folder / "report.json").read_text())
+    assert written["report"]["frames_sent"] == report.frames_sent > 100
+    for name in ("tracks.png", "errors.png", "frames_report.csv", "overlay-0.png"):
+        assert (folder / name).stat().st_size > 0

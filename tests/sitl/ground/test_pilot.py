@@ -1,0 +1,319 @@
+"""The pilot's clock and tracks, and real flights over TCP of the embedded vehicle."""
+
+from __future__ import annotations
+
+import contextlib
+import math
+import shutil
+import signal
+import subprocess
+import sys
+import tempfile
+import time
+from pathlib import Path
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from mavlink_bridge.link.link import sleep_until
+from sitl.errors import PilotError
+from sitl.geodesy import Location
+from sitl.ground.mission_steps import (
+    gimbal_step,
+    return_step,
+    speed_step,
+    takeoff_step,
+    waypoint_step,
+)
+from sitl.ground.pilot import Pilot
+from sitl.ground.tracks import BootClock, Track
+from sitl.suite.simulated_localizer import FixModel, TruthFeed
+from sitl.vehicles import ardupilot, process
+from sitl.vehicles.ardupilot import ArduPilotNotFoundError, ArduPilotSitl, find_arducopter
+from sitl.vehicles.launch import GIMBAL, SPEEDS, EmbeddedSitl, open_vehicle, vision_parameters
+from sitl.vehicles.process import VehicleProcess, VehicleProcessError
+
+HOME = Location(47.397742, 8.545594, 488.0)
+SPEEDUP = 5.0
+
+
+def test_boot_clock_takes_the_least_latency():
+    clock = BootClock(speedup=2.0)
+    for boot_ms, latency_ms in ((100, 7), (120, 3), (140, 20)):
+        clock.observe(boot_ms, int((1000 + boot_ms / 2 + latency_ms) * 1e6))
+    assert clock.monotonic_ns(140) == int((1000 + 70 + 3) * 1e6)
+
+
+def test_track_brackets_a_time_and_forgets_the_oldest():
+    track = Track(limit=10)
+    for t in range(100):
+        track.add(SimpleNamespace(time_ns=10 * t))
+    before, after = track.around(985)
+    assert (before.time_ns, after.time_ns) == (980, 990)
+    assert track.around(991) is None
+    assert track.around(0) is None
+    assert len(track.all()) <= 20
+    track.add(SimpleNamespace(time_ns=5))
+    assert track.newest.time_ns == 990
+
+
+def test_a_vehicle_that_dies_at_once_is_reported_with_its_log(folders, tmp_path):
+    for log in (None, tmp_path / "vehicle.log"):
+        vehicle = EmbeddedSitl(HOME, parameters={}, log=log)
+        vehicle.command = lambda _instance: ["/bin/sh", "-c", "echo out of propellers; exit 3"]
+        with pytest.raises(VehicleProcessError, match=r"(?s)ended with status.*out of propellers"):
+            vehicle.start()
+    assert log.read_text() == "out of propellers\n"
+    assert not list(folders.iterdir())
+
+
+class _Idle(VehicleProcess):
+    """A vehicle that listens, as its log says, and does nothing."""
+
+    kind = "embedded"
+    start_timeout_s = 60.0
+
+    def command(self, instance: int) -> list[str]:
+        return ["/bin/sh", "-c", f"echo SERIAL2 on TCP port {5763 + 10 * instance}; sleep 600"]
+
+
+@pytest.fixture
+def folders(monkeypatch, tmp_path):
+    """Where the folders of vehicles are made."""
+    (tmp_path / "temporary").mkdir()
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path / "temporary"))
+    return tmp_path / "temporary"
+
+
+@pytest.mark.parametrize("end", [None, PilotError("not armed"), KeyboardInterrupt(), SystemExit(1)])
+def test_a_vehicles_folder_goes_with_its_end(folders, end):
+    with pytest.raises(type(end)) if end else contextlib.nullcontext(), _Idle() as vehicle:
+        assert len(list(folders.iterdir())) == 1
+        assert "SERIAL2" in vehicle.log_tail()
+        if end:
+            raise end
+    assert not list(folders.iterdir())
+
+
+@pytest.mark.parametrize("step", ["mkdtemp", "Popen", "_end_with_us", "_wait_listening"])
+def test_a_start_that_is_interrupted_leaves_neither_process_nor_folder(folders, monkeypatch, step):
+    """In the middle of each of its steps, when that has happened and nobody has been told."""
+    where = {"mkdtemp": tempfile, "Popen": subprocess, "_wait_listening": _Idle}.get(step, process)
+    real, started, popen = getattr(where, step), [], subprocess.Popen
+
+    def interrupted(*arguments, **more):
+        result = real(*arguments, **more)
+        signal.raise_signal(signal.SIGINT)
+        return result
+
+    def noted(*arguments, **more):
+        started.append(popen(*arguments, **more))
+        return started[-1]
+
+    monkeypatch.setattr(subprocess, "Popen", noted)
+    if step == "Popen":
+        real = noted
+    monkeypatch.setattr(where, step, interrupted)
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    try:
+        with pytest.raises(KeyboardInterrupt):
+            _Idle().start()
+    finally:
+        signal.signal(signal.SIGINT, before)
+    assert None not in [child.poll() for child in started]
+    assert not list(folders.iterdir())
+
+
+def test_a_vehicle_does_not_outlive_a_killed_parent():
+    script = (
+        "import time; from tests.sitl.ground.test_pilot import _Idle; v = _Idle(); v.start();"
+        "print(v._process.pid, v._folder, flush=True); time.sleep(600)"
+    )
+    root = Path(__file__).resolve().parents[3]
+    parent = subprocess.Popen(
+        [sys.executable, "-c", script], stdout=subprocess.PIPE, text=True, cwd=root
+    )
+    pid, folder = parent.stdout.readline().split()
+    assert Path(f"/proc/{pid}").exists()
+    parent.kill()
+    parent.communicate()
+    assert sleep_until(lambda: _ended(pid), 30.0)
+    shutil.rmtree(folder)
+
+
+def _ended(pid: str) -> bool:
+    """Gone, or a zombie that nobody waits for."""
+    try:
+        return Path(f"/proc/{pid}/stat").read_text().rsplit(")", 1)[1].split()[0] == "Z"
+    except OSError:
+        return True
+
+
+def test_a_stopped_vehicle_leaves_no_process_behind():
+    with _Idle() as vehicle:
+        children = [vehicle._process, vehicle._lifeline]
+        assert [c.poll() for c in children] == [None, None]
+    assert None not in [c.poll() for c in children]
+
+
+def test_no_endpoint_before_the_start():
+    vehicle = EmbeddedSitl(HOME)
+    with pytest.raises(VehicleProcessError, match="before it is started"):
+        _ = vehicle.gcs_endpoint
+
+
+def test_no_vehicle_at_the_endpoint():
+    with pytest.raises(PilotError, match="no vehicle listens"):
+        Pilot("tcp:127.0.0.1:9").connect(timeout_s=0.5)
+
+
+def test_a_missing_arducopter_is_a_named_error(monkeypatch, tmp_path):
+    monkeypatch.setenv("PATH", str(tmp_path))
+    monkeypatch.delenv("ARDUPILOT_HOME", raising=False)
+    with pytest.raises(ArduPilotNotFoundError, match="ARDUPILOT_HOME"):
+        ArduPilotSitl(HOME)
+    assert open_vehicle("auto", HOME).kind == "embedded"
+
+
+def test_missing_default_parameters_are_a_named_error(monkeypatch, tmp_path):
+    binary = tmp_path / "arducopter"
+    binary.write_text("#!/bin/sh\n")
+    binary.chmod(0o755)
+    monkeypatch.setenv("ARDUPILOT_HOME", str(tmp_path))
+    assert find_arducopter() == binary
+    with pytest.raises(ArduPilotNotFoundError, match=r"copter\.parm"):
+        ArduPilotSitl(HOME)
+
+
+def test_finds_binary_and_defaults_in_a_source_tree(monkeypatch, tmp_path):
+    binary = tmp_path / "build/sitl/bin/arducopter"
+    defaults = tmp_path / "Tools/autotest/default_params/copter.parm"
+    for path in (binary, defaults):
+        path.parent.mkdir(parents=True)
+        path.write_text("")
+    binary.chmod(0o755)
+    monkeypatch.setenv("ARDUPILOT_HOME", str(tmp_path))
+    assert find_arducopter() == binary
+    assert ardupilot.find_defaults(binary) == defaults
+
+
+# --- flights, of either vehicle ------------------------------------------------------------------
+
+
+KINDS = ["embedded", pytest.param("ardupilot", marks=pytest.mark.sitl)]
+
+
+@pytest.fixture(params=KINDS)
+def kind(request):
+    if request.param == "ardupilot" and find_arducopter() is None:
+        pytest.skip("no arducopter binary on PATH or below ARDUPILOT_HOME")
+    return request.param
+
+
+def horizontal(a: Location, b: Location) -> float:
+    return math.hypot(*a.ned_of(b)[:2])
+
+
+def test_flies_a_mission_on_gps_and_then_on_vision(real_time, kind):
+    parameters = {**vision_parameters(), **GIMBAL, **SPEEDS}
+    with (
+        real_time(),
+        open_vehicle(kind, HOME, 30.0, parameters, speedup=SPEEDUP) as vehicle,
+    ):
+        pilot = Pilot(vehicle.gcs_endpoint, SPEEDUP, vehicle.check)
+        with pilot:
+            feed = TruthFeed(pilot, vehicle.companion_endpoint, FixModel(sigma_m=0.3))
+            pilot.wait_ready()
+            pilot.arm()
+            pilot.takeoff(40.0)
+            far = HOME.offset(120.0, 0.0, 0.0)
+            turn = HOME.offset(120.0, 80.0, 0.0)
+            steps = [
+                takeoff_step(40.0),
+                speed_step(8.0),
+                waypoint_step(far.latitude_deg, far.longitude_deg, 40.0),
+                gimbal_step(-60.0, 20.0),
+                waypoint_step(turn.latitude_deg, turn.longitude_deg, 50.0),
+                return_step(),
+            ]
+            pilot.upload_mission(steps)
+            assert [i.command for i in pilot.download_mission()][1:] == [s.command for s in steps]
+            pilot.use_source_set(2)
+            denied = time.monotonic_ns()
+            pilot.gps(on=False)
+            pilot.start_mission()
+            pilot.wait(lambda: 5 in pilot.reached, 120.0, "the last waypoint")
+            assert horizontal(pilot.truth.location, turn) < 6.0
+            errors = pilot.ekf_errors(denied)
+            flat = np.hypot(errors[:, 0], errors[:, 1])
+            assert len(flat) > 100
+            assert np.percentile(flat, 95) < 2.0
+            _check_gimbal(pilot)
+            pilot.wait(lambda: not pilot.armed, 180.0, "the landing")
+            assert horizontal(pilot.truth.location, HOME) < 4.0
+            feed.close()
+            assert feed.sent > 500
+
+
+def _check_gimbal(pilot):
+    newest = pilot.gimbal_track()[-1]
+    roll, pitch, yaw = (math.degrees(a) for a in newest.roll_pitch_yaw)
+    assert (roll, pitch, yaw) == pytest.approx((0.0, -60.0, 20.0), abs=1.0)
+    assert newest.yaw_in_vehicle_frame
+    state = pilot.gimbal_at(newest.time_ns - 10_000_000)
+    assert state is not None
+    assert pilot.truth_at(newest.time_ns - 50_000_000) is not None
+
+
+def test_a_vehicle_comes_back_on_its_ports(kind):
+    with open_vehicle(kind, HOME, 0.0, {}, speedup=SPEEDUP) as vehicle:
+        endpoint = vehicle.gcs_endpoint
+        with Pilot(endpoint, SPEEDUP, vehicle.check) as pilot:
+            pilot.sleep(5)
+            before = pilot.time_s
+        vehicle.restart()
+        assert vehicle.gcs_endpoint == endpoint
+        with Pilot(endpoint, SPEEDUP, vehicle.check) as pilot:
+            assert 0 < pilot.time_s < before + 5
+
+
+def test_a_reboot_by_command_keeps_the_parameters(kind):
+    with open_vehicle(kind, HOME, 0.0, {}, speedup=SPEEDUP) as vehicle:
+        with Pilot(vehicle.gcs_endpoint, SPEEDUP, vehicle.check) as pilot:
+            pilot.set_parameter("VISO_TYPE", 1)
+            pilot.sleep(5)
+            before = pilot.time_s
+            pilot.reboot()
+        assert sleep_until(lambda: vehicle.boots == 2, 60.0)
+        with Pilot(vehicle.gcs_endpoint, SPEEDUP, vehicle.check) as pilot:
+            assert 0 < pilot.time_s < before + 10
+            assert pilot.parameter("VISO_TYPE") == 1
+
+
+def test_waiting_for_a_vehicle_that_died_ends_at_once():
+    with open_vehicle("embedded", HOME, 0.0, {}, speedup=SPEEDUP) as vehicle:
+        pilot = Pilot(vehicle.gcs_endpoint, SPEEDUP, vehicle.check)
+        with pilot:
+            vehicle.stop()
+            start = time.monotonic()
+            with pytest.raises(VehicleProcessError, match="died"):
+                pilot.sleep(600)
+            assert time.monotonic() - start < 60.0  # of the 600 / SPEEDUP
+
+
+def test_refusals_reach_the_pilot(kind):
+    with open_vehicle(kind, HOME, 0.0, {"SIM_GPS1_ENABLE": 0}, speedup=SPEEDUP) as vehicle:
+        pilot = Pilot(vehicle.gcs_endpoint, SPEEDUP, vehicle.check)
+        with pilot:
+            pilot.sleep(26)
+            pilot.set_mode("GUIDED")
+            with pytest.raises(PilotError, match=r"GPS 1: Bad fix|Need Position Estimate"):
+                pilot.arm(timeout_s=6.0)
+            with pytest.raises(PilotError, match="NO_SUCH_PARAM"):
+                pilot.parameter("NO_SUCH_PARAM", tries=2)
+            with pilot.fast_forward(8.0):
+                assert pilot.parameter("SIM_SPEEDUP") == 8.0
+            assert pilot.parameter("SIM_SPEEDUP") == SPEEDUP
+    with pytest.raises(VehicleProcessError, match="died"):
+        vehicle.check()
