@@ -1,6 +1,6 @@
 """Everything that waits for a GPU, in one command and at most ten minutes, into one report.
 
-    python benchmarks/gpu_checklist.py [--sequence SEQ --map CACHE] [--report gpu-report.md]
+    python -m benchmarks.gpu_checklist [--sequence SEQ --map CACHE] [--report gpu-report.md]
 
 Steps: what the machine is; the tests marked gpu; the same under compute-sanitizer (memcheck, then
 racecheck), where it is installed; the time of both networks on every execution provider; how fast
@@ -18,9 +18,8 @@ import time
 from dataclasses import dataclass
 from pathlib import Path
 
-from arguments import Parser, existing, number, output
-from named_errors import named_errors
-
+from benchmarks.common.arguments import Parser, existing, number, output
+from benchmarks.common.named_errors import named_errors
 from localizer.registration.cuda import CudaError, Device
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -60,11 +59,11 @@ def steps(sequence: Path | None, cache: Path | None, report: Path) -> list[Step]
                      "--target-processes", "all")  # fmt: skip
         command = (*sanitizer, *tests, "-k", "agrees_with_the_reference or agrees_with_the_cpu")
         found.append(Step(f"compute-sanitizer {tool}", command, 90))
-    speed = (python, "benchmarks/network_speed.py")
+    speed = (python, "-m", "benchmarks.features.network_speed")
     found.append(Step("networks: s0 and tiny on every provider", speed, 120))
-    found.append(Step("pairs while training", (python, "benchmarks/pairs.py",
+    found.append(Step("pairs while training", (python, "-m", "benchmarks.pairs",
                       "configs/train_s0.yaml", "--pairs", "32", "--no-photos"), 90))  # fmt: skip
-    found.append(Step("optimizer", (python, "benchmarks/optimizer_gpu.py"), 150))
+    found.append(Step("optimizer", (python, "-m", "benchmarks.optimizer.gpu"), 150))
     if sequence is not None and cache is not None:
         for device in ("cuda", "cpu"):
             command = (

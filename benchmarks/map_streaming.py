@@ -1,6 +1,6 @@
 """Streaming a large generated region: build throughput, and what the render thread waits for.
 
-    python benchmarks/map_streaming.py [--km 10] [--seconds 40] [--budget-mb 384] [--keep DIR]
+    python -m benchmarks.map_streaming [--km 10] [--seconds 40] [--budget-mb 384] [--keep DIR]
 
 First, regions of growing size are built: tiles a second, and that they stay as they are (regions
 that are in DIR already are not built again). Then an aircraft flies over the largest at 25 m/s, at
@@ -22,11 +22,11 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-from arguments import Parser, number, whole
-from named_errors import named_errors
 from rich.console import Console
 from rich.table import Table
 
+from benchmarks.common.arguments import Parser, number, whole
+from benchmarks.common.named_errors import named_errors
 from localizer.geometry.camera import Camera
 from localizer.geometry.geo import Geodetic, LocalFrame
 from localizer.geometry.pose import Pose, so3_exp

@@ -1,6 +1,6 @@
 """How fast training pairs are made: places in processes, pairs on a device and on the CPU.
 
-    python benchmarks/pairs.py configs/train_s0.yaml --pairs 4
+    python -m benchmarks.pairs configs/train_s0.yaml --pairs 4
 
 One process, one thread, places of the run's own size. "torch" is what `training.data.live`
 does (views, appearance, windows), on a GPU where there is one; "NumPy" makes pairs of the same
@@ -13,8 +13,9 @@ import time
 
 import cv2
 import numpy as np
-from arguments import Parser, existing, whole
-from named_errors import named_errors, needs_torch
+
+from benchmarks.common.arguments import Parser, existing, whole
+from benchmarks.common.named_errors import named_errors, needs_torch
 
 with needs_torch():
     import torch

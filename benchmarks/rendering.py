@@ -1,6 +1,6 @@
 """Renderer backends side by side, in one run: CPU and wall time a frame, depth against exact rays.
 
-    python benchmarks/rendering.py [--triangles 0.3 1 2] [--size 512x384] [--frames 20]
+    python -m benchmarks.rendering [--triangles 0.3 1 2] [--size 512x384] [--frames 20]
 
 The scene is a generated town on hills, all of it resident. Every backend draws the same tiles from
 the same poses (nadir and oblique, 120 m); CPU time is of the whole process.
@@ -14,11 +14,11 @@ import time
 
 import cv2
 import numpy as np
-from arguments import Parser, number, whole
-from named_errors import named_errors
 from rich.console import Console
 from rich.table import Table
 
+from benchmarks.common.arguments import Parser, number, whole
+from benchmarks.common.named_errors import named_errors
 from localizer.errors import RenderError
 from localizer.geometry.camera import Camera
 from localizer.geometry.pose import Pose, so3_exp

@@ -37,7 +37,7 @@ from mavlink_bridge.messages import TargetReport, TrackRequest
 
 _log = logging.getLogger(__name__)
 # How long a thread may keep the interpreter from another that woke up. Python's 5 ms, several times
-# between an estimate and the autopilot, would be 7 ms in the median (benchmarks/bridge.py).
+# between an estimate and the autopilot, would be 7 ms in the median (benchmarks.bridge).
 _SWITCH_S = 0.0002
 _CLICK_NS = 2_000_000_000  # how old the pose may be that an operator's click is placed by
 _WARNING = 4  # MAV_SEVERITY_WARNING; lower is worse

@@ -61,7 +61,7 @@ def ablation(
 ) -> None:
     """Repeat the paper's training-data ablation (Table 4): three runs, exported for the benchmark.
 
-    Compare them with: python benchmarks/features.py --baselines --models RUN/tiny.onnx ...
+    Compare them with: python -m benchmarks.features --baselines --models RUN/tiny.onnx ...
     """
     from localizer.training.export.export import export as write
     from localizer.training.loop.ablation import ablations
@@ -98,7 +98,7 @@ def quantize(
     out: Annotated[Path, typer.Argument(help="ONNX file to write; its JSON goes beside it.")],
     shards: Annotated[list[Path], typer.Argument(help="Shards (.npz) to calibrate on.")],
 ) -> None:
-    """Write the int8 form of a model. Compare both with benchmarks/features.py before using it."""
+    """Write the int8 form of a model. Compare both with benchmarks.features before using it."""
     from localizer.training.export.quantize import quantize as write
 
     typer.echo(f"{out}: mean cosine to the float features {write(model, out, shards):.4f}")

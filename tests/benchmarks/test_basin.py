@@ -2,18 +2,12 @@
 
 from __future__ import annotations
 
-import sys
-from pathlib import Path
-
 import numpy as np
 import pytest
 
+from benchmarks.basin.axes import AXES, STEPS, axis_start, axis_starts, limit, limits
+from benchmarks.basin.run import Outcome, random_start, summary
 from localizer.geometry.pose import Pose, so3_exp
-
-sys.path.insert(0, str(Path(__file__).resolve().parents[2] / "benchmarks"))
-
-from basin_axes import AXES, STEPS, axis_start, axis_starts, limit, limits
-from basin_run import Outcome, random_start, summary
 
 TRUTH = Pose(so3_exp([2.0, 0.3, -0.4]), np.array([10.0, -20.0, 120.0]))
 

@@ -2,19 +2,13 @@
 
 from __future__ import annotations
 
-import sys
-from pathlib import Path
-
 import numpy as np
 import pytest
 
+from benchmarks.basin.parts import PARTS, Trial, covered, part_of, report
 from localizer.geometry.camera import Camera
 from localizer.geometry.pose import Pose
 from localizer.types import RenderedView
-
-sys.path.insert(0, str(Path(__file__).resolve().parents[2] / "benchmarks"))
-
-from basin_parts import PARTS, Trial, covered, part_of, report
 
 SHARES = {"whole": 1.0, "half": 0.5, "quarter": 0.25, "band": 0.3, "discs": 0.38}
 

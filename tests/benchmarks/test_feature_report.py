@@ -1,14 +1,11 @@
 """The statistics of the feature benchmark, which decide what is called better."""
 
-import sys
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-sys.path.insert(0, str(Path(__file__).parents[2] / "benchmarks"))
-
-from feature_report import (
+from benchmarks.features.report import (
     Outcome,
     difference,
     read_outcomes,
@@ -16,7 +13,6 @@ from feature_report import (
     wilson,
     write_outcomes,
 )
-
 from localizer.errors import SequenceError
 
 

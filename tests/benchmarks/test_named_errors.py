@@ -4,18 +4,12 @@ from __future__ import annotations
 
 import subprocess
 import sys
-from pathlib import Path
 
 import pytest
 
+from benchmarks.common.named_errors import named_errors
 from localizer.errors import ModelError
-
-sys.path.insert(0, str(Path(__file__).resolve().parents[2] / "benchmarks"))
-
-from named_errors import named_errors
-
-BENCHMARKS = Path(__file__).resolve().parents[2] / "benchmarks"
-COMMANDS = sorted(p for p in BENCHMARKS.glob("*.py") if '__name__ == "__main__"' in p.read_text())
+from tests.benchmarks.commands import COMMANDS, ROOT, source
 
 
 @pytest.mark.parametrize("error", [ModelError("a.onnx: no"), FileNotFoundError("a.csv")])
@@ -26,9 +20,9 @@ def test_a_named_error_is_one_line(error: Exception, capsys: pytest.CaptureFixtu
     assert capsys.readouterr().err == f"{type(error).__name__}: {error}\n"
 
 
-@pytest.mark.parametrize("path", COMMANDS, ids=lambda p: p.stem)
-def test_every_benchmark_does_so(path: Path) -> None:
-    assert "    with named_errors():\n" in path.read_text()
+@pytest.mark.parametrize("name", COMMANDS)
+def test_every_benchmark_does_so(name: str) -> None:
+    assert "    with named_errors():\n" in source(name).read_text()
 
 
 WITHOUT_TORCH = """
@@ -38,25 +32,25 @@ class Missing(importlib.abc.MetaPathFinder):
         if name.split(".")[0] == "torch":
             raise ModuleNotFoundError(name, name="torch")
 sys.meta_path.insert(0, Missing())
-sys.path.insert(0, sys.argv[1])
-for name in sys.argv[2:]:
+for name in sys.argv[1:]:
     sys.argv = [name, "--help"]
     try:
-        runpy.run_path(name, run_name="__main__")
+        runpy.run_module(f"benchmarks.{name}", run_name="__main__")
     except SystemExit as end:
         print(name, end.code)
 """
-NEED_TORCH = [BENCHMARKS / "pairs.py"]  # and two more, whose other imports take seconds
+NEED_TORCH = ["pairs"]  # and two more, whose other imports take seconds
 
 
 @pytest.mark.parametrize("name", ["basin", "features", "pairs"])
 def test_imports_that_need_torch_are_guarded(name: str) -> None:
-    assert "\nwith needs_torch():\n    " in (BENCHMARKS / f"{name}.py").read_text()
+    assert "\nwith needs_torch():\n    " in source(name).read_text()
 
 
 def test_a_benchmark_that_needs_torch_says_so() -> None:
     run = subprocess.run(
-        [sys.executable, "-c", WITHOUT_TORCH, str(BENCHMARKS), *map(str, NEED_TORCH)],
+        [sys.executable, "-c", WITHOUT_TORCH, *NEED_TORCH],
+        cwd=ROOT,
         check=False,
         capture_output=True,
         text=True,
@@ -64,4 +58,4 @@ def test_a_benchmark_that_needs_torch_says_so() -> None:
     assert run.returncode == 0, run.stderr
     said = "this benchmark needs PyTorch: pip install '.[train]'"
     assert run.stderr.splitlines() == [said] * len(NEED_TORCH)
-    assert run.stdout.splitlines() == [f"{path} 2" for path in NEED_TORCH]
+    assert run.stdout.splitlines() == [f"{name} 2" for name in NEED_TORCH]

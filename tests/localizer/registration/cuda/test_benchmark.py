@@ -3,20 +3,16 @@
 from __future__ import annotations
 
 from functools import partial
-from pathlib import Path
 
 import numpy as np
 import pytest
 from rich.console import Console
 
-BENCHMARKS = Path(__file__).resolve().parents[4] / "benchmarks"
-
 
 @pytest.fixture
 def benchmark(monkeypatch):
-    monkeypatch.syspath_prepend(str(BENCHMARKS))
-    import optimizer_gpu
-    import optimizer_problem
+    from benchmarks.optimizer import gpu as optimizer_gpu
+    from benchmarks.optimizer import problem as optimizer_problem
 
     monkeypatch.setattr(optimizer_gpu, "REPEATS", 1)
     monkeypatch.setattr(optimizer_gpu, "WARM_UP", 0)

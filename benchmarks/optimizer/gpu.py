@@ -1,6 +1,6 @@
 """The GPU's part of the optimizer benchmark, beside the paper's Table 7; '-' where there is none.
 
-    python benchmarks/optimizer_gpu.py
+    python -m benchmarks.optimizer.gpu
 
 Device events, median of many after warm-up. One iteration is (7 iterations - 1) / 6 of a launch,
 which starts from the same poses each time.
@@ -16,12 +16,12 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from arguments import Parser
-from named_errors import named_errors
-from optimizer_problem import SIZES, make_problem, make_swarm, naive_torch
 from rich.console import Console
 from rich.table import Table
 
+from benchmarks.common.arguments import Parser
+from benchmarks.common.named_errors import named_errors
+from benchmarks.optimizer.problem import SIZES, make_problem, make_swarm, naive_torch
 from localizer.geometry.camera import Camera
 from localizer.geometry.pose import Pose
 from localizer.registration.backend import (

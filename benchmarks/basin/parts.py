@@ -1,6 +1,6 @@
 """Covariance of registrations against a map that covers a part of the image only.
 
-    python benchmarks/basin_parts.py FOLDER [--set generated|plain|quito|portugal|caliterra]
+    python -m benchmarks.basin.parts FOLDER [--set generated|plain|quito|portugal|caliterra]
 
 The reference view shows the map in a part and the sky elsewhere, as past a map's edge. For each
 part: the share of the registrations within 3 m and 3 degrees whose squared error, normalised by
@@ -17,15 +17,16 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
-from arguments import Parser, existing, number, whole
-from named_errors import named_errors, needs_torch
+
+from benchmarks.common.arguments import Parser, existing, number, whole
+from benchmarks.common.named_errors import named_errors, needs_torch
 
 with needs_torch():
-    from basin_run import random_start, squared_error
-    from basin_views import SIZE, View, load_views, photo_views
-from feature_report import wilson
+    from benchmarks.basin.run import random_start, squared_error
+    from benchmarks.basin.views import SIZE, View, load_views, photo_views
 from numpy.typing import NDArray
 
+from benchmarks.features.report import wilson
 from localizer.features import load_extractor
 from localizer.features.detail import DetailExtractor
 from localizer.map.cache.cache import TileCache

@@ -1,11 +1,11 @@
 """Features side by side, by condition: intensity, gradient, SIFT and XFeat with PnP, the network.
 
-    python benchmarks/features.py --pairs 200 --seed 0 --out seed0.csv
-    python benchmarks/features.py --report seed0.csv seed1.csv quito.csv   (pooled, and each set)
-    python benchmarks/features.py --real ../shared/data/caliterra --pairs 320   (real photos)
-    python benchmarks/features.py --real ../shared/data/quito --pairs 280       (real mesh)
-    python benchmarks/features.py --real ../shared/data/textures/neon_sjer_pairs --pairs 80
-    python benchmarks/features.py --speed
+    python -m benchmarks.features --pairs 200 --seed 0 --out seed0.csv
+    python -m benchmarks.features --report seed0.csv seed1.csv quito.csv   (pooled, and each set)
+    python -m benchmarks.features --real ../shared/data/caliterra --pairs 320   (real photos)
+    python -m benchmarks.features --real ../shared/data/quito --pairs 280       (real mesh)
+    python -m benchmarks.features --real ../shared/data/textures/neon_sjer_pairs --pairs 80
+    python -m benchmarks.features --speed
 
 Every pair shows a place that no training run has seen, its query under its own light, weather and
 season (feature_real.py says what the real sets are). The reference is rendered 5 m and 5 deg from
@@ -24,17 +24,17 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import numpy as np
-from arguments import Parser, existing, output, whole
-from named_errors import named_errors, needs_torch
 
+from benchmarks.common.arguments import Parser, existing, output, whole
+from benchmarks.common.named_errors import named_errors, needs_torch
 from localizer.config import LocalizerConfig
 from localizer.features import FeatureExtractor, GradientExtractor, load_extractor
 from localizer.features.detail import DetailExtractor
 from localizer.types import PosePrior
 
 with needs_torch():
-    from feature_methods import Direct, IntensityExtractor, Method, load_xfeat, sift_pnp
-    from feature_pairs import (
+    from benchmarks.features.methods import Direct, IntensityExtractor, Method, load_xfeat, sift_pnp
+    from benchmarks.features.pairs import (
         DEGREES,
         METRES,
         MadePlaces,
@@ -42,8 +42,8 @@ with needs_torch():
         made_pairs,
         mesh_pairs,
     )
-    from feature_real import real_pairs
-    from feature_report import Outcome, read_outcomes, report, write_outcomes
+    from benchmarks.features.real import real_pairs
+    from benchmarks.features.report import Outcome, read_outcomes, report, write_outcomes
 
 logger = logging.getLogger(__name__)
 

@@ -14,10 +14,10 @@ from functools import partial
 from pathlib import Path
 
 import numpy as np
-from basin_variants import FULL, Variant
-from basin_views import View
-from feature_report import wilson
 
+from benchmarks.basin.variants import FULL, Variant
+from benchmarks.basin.views import View
+from benchmarks.features.report import wilson
 from localizer.features import load_extractor
 from localizer.features.detail import DetailExtractor
 from localizer.geometry.pose import Array, Pose, so3_exp, so3_log

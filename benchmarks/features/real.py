@@ -17,8 +17,8 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-from feature_pairs import DEGREES, METRES, SIZE, TestPair
 
+from benchmarks.features.pairs import DEGREES, METRES, SIZE, TestPair
 from localizer.geometry.camera import Camera
 from localizer.geometry.geo import Geodetic
 from localizer.geometry.pose import Pose

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import math
+import sys
 from collections.abc import Callable
 from pathlib import Path
 from typing import NoReturn
@@ -25,7 +26,9 @@ class Parser(argparse.ArgumentParser):
     """A parser whose help is the benchmark's docstring, and whose errors are one line."""
 
     def __init__(self, description: str | None) -> None:
-        super().__init__(description=description, formatter_class=_Help)
+        path = Path(sys.argv[0])
+        name = path.parent.name if path.stem == "__main__" else path.stem
+        super().__init__(prog=name, description=description, formatter_class=_Help)
 
     def error(self, message: str) -> NoReturn:
         """The fault without the usage, which `--help` shows."""

@@ -1,6 +1,6 @@
 """What the bridge can carry, and how fast: throughput on one core, latency from estimate to socket.
 
-    python benchmarks/bridge.py [--seconds 10] [--load 1 5 10]
+    python -m benchmarks.bridge [--seconds 10] [--load 1 5 10]
 
 An autopilot (a process of its own, UDP loopback) streams LOAD times what the bridge asks for, while
 fixes are submitted at 20 Hz (more than 50 Hz ArduPilot drops). Latency is from `Bridge.submit` to
@@ -25,10 +25,10 @@ from collections import Counter
 from typing import Any
 
 import numpy as np
-from arguments import Parser, number
-from named_errors import named_errors
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
+from benchmarks.common.arguments import Parser, number
+from benchmarks.common.named_errors import named_errors
 from mavlink_bridge import Bridge, BridgeConfig, VisionFix
 from mavlink_bridge.config import InjectionConfig, OriginConfig
 from mavlink_bridge.link.framing import FrameReader

@@ -7,7 +7,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from soak_line import Fault
+
+from benchmarks.bridge.soak_line import Fault
 
 FIX_HZ = 20.0
 WARM_UP_S = 120.0

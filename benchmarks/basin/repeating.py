@@ -1,6 +1,6 @@
 """Registrations between two equal modes: a flat ground whose features repeat every 12 to 24 m.
 
-    python benchmarks/basin_repeating.py [--pairs 60]
+    python -m benchmarks.basin.repeating [--pairs 60]
 
 The prior lies between the true place and its copy one period away. What decides is the prediction
 (equation 10); without one, either place may be found, and the covariance has to know of the other.
@@ -12,11 +12,11 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
-from arguments import Parser, whole
-from basin_variants import FULL, Variant, changed
-from feature_report import wilson
-from named_errors import named_errors
 
+from benchmarks.basin.variants import FULL, Variant, changed
+from benchmarks.common.arguments import Parser, whole
+from benchmarks.common.named_errors import named_errors
+from benchmarks.features.report import wilson
 from localizer.geometry.camera import Camera
 from localizer.geometry.pose import Array, Pose
 from localizer.registration import select_anchors

@@ -1,6 +1,6 @@
 """Milliseconds per LM iteration and per registration, beside the paper's Table 7.
 
-    python benchmarks/optimizer.py [--threads 2] [--quick]
+    python -m benchmarks.optimizer [--threads 2] [--quick]
 
 M = 144 hypotheses, N = 500 anchors, C = 32 channels, random smooth features, one process. "naive"
 is the obvious batched PyTorch: gather C x 6 Jacobians of every anchor and hypothesis, then einsum;
@@ -16,10 +16,13 @@ from collections.abc import Callable, Sequence
 from functools import partial
 
 import numpy as np
-from arguments import Parser, whole
-from named_errors import named_errors
-from optimizer_gpu import print_tables
-from optimizer_problem import (
+from rich.console import Console
+from rich.table import Table
+
+from benchmarks.common.arguments import Parser, whole
+from benchmarks.common.named_errors import named_errors
+from benchmarks.optimizer.gpu import print_tables
+from benchmarks.optimizer.problem import (
     ANCHORS,
     CHANNELS,
     HYPOTHESES,
@@ -30,9 +33,6 @@ from optimizer_problem import (
     naive_torch,
     smooth_features,
 )
-from rich.console import Console
-from rich.table import Table
-
 from localizer.geometry.camera import Camera
 from localizer.geometry.pose import Pose
 from localizer.registration import JNGO

@@ -1,6 +1,6 @@
 """Half an hour of the bridge against a vehicle on a line that does everything wrong.
 
-    python benchmarks/soak.py [--minutes 30] [--plot soak.png] [--trace]
+    python -m benchmarks.bridge.soak [--minutes 30] [--plot soak.png] [--trace]
 
 The embedded vehicle and the line are processes of their own. The line cuts the connection for five
 minutes, refuses, falls silent, stops reading, resets, flips bits, truncates, duplicates and swaps
@@ -24,11 +24,11 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from arguments import Parser, number, output, whole
-from named_errors import named_errors
-from soak_line import HOME, Fault, world
-from soak_report import FIX_HZ, WARM_UP_S, Sample, judge, plot
 
+from benchmarks.bridge.soak_line import HOME, Fault, world
+from benchmarks.bridge.soak_report import FIX_HZ, WARM_UP_S, Sample, judge, plot
+from benchmarks.common.arguments import Parser, number, output, whole
+from benchmarks.common.named_errors import named_errors
 from mavlink_bridge import Bridge, BridgeConfig, CameraView, HealthLevel, TargetReport, VisionFix
 from mavlink_bridge.config import InjectionConfig, OriginConfig
 

@@ -1,8 +1,8 @@
 """Convergence of the registration: the paper's Table 4 (ablation), Table 6 and Fig. 10 (basin).
 
-    python benchmarks/basin.py ablation FOLDER [--set generated|plain|quito|portugal|caliterra]
-    python benchmarks/basin.py priors FOLDER [--set ...] [--anchors N]
-    python benchmarks/basin.py axes FOLDER [--set ...] [--plot basin.png]
+    python -m benchmarks.basin ablation FOLDER [--set generated|plain|quito|portugal|caliterra]
+    python -m benchmarks.basin priors FOLDER [--set ...] [--anchors N]
+    python -m benchmarks.basin axes FOLDER [--set ...] [--plot basin.png]
 
 FOLDER keeps generated worlds, imported maps and query images between runs. Every registration
 starts from a prior that is wrong by exact amounts: along a random direction and about a random axis
@@ -18,14 +18,14 @@ from dataclasses import asdict
 from functools import partial
 from pathlib import Path
 
-from arguments import Parser, existing, number, output, whole
-from named_errors import named_errors, needs_torch
+from benchmarks.common.arguments import Parser, existing, number, output, whole
+from benchmarks.common.named_errors import named_errors, needs_torch
 
 with needs_torch():
-    import basin_axes
-    from basin_run import Outcome, Start, groups, random_start, run, summary
-    from basin_variants import DEFAULT_ANCHORS, FULL, our_rows, paper_rows, prior_rows
-    from basin_views import View, load_views
+    from benchmarks.basin import axes as basin_axes
+    from benchmarks.basin.run import Outcome, Start, groups, random_start, run, summary
+    from benchmarks.basin.variants import DEFAULT_ANCHORS, FULL, our_rows, paper_rows, prior_rows
+    from benchmarks.basin.views import View, load_views
 
 STARTS = (5.0, 10.0)  # metres and degrees: the paper's columns but the easiest
 

@@ -6,9 +6,9 @@ from pathlib import Path
 
 import matplotlib.pyplot as plt
 import numpy as np
-from basin_run import Outcome, Start, groups, random_start, summary
-from basin_variants import FULL, Variant
 
+from benchmarks.basin.run import Outcome, Start, groups, random_start, summary
+from benchmarks.basin.variants import FULL, Variant
 from localizer.registration import JNGOConfig
 
 AXES = ("yaw", "pitch", "roll", "x", "y", "z")  # camera axes; yaw about y, pitch about x

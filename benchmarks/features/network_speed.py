@@ -1,6 +1,6 @@
 """Time of feature extraction: `tiny` and `s0` on every execution provider there is, in one table.
 
-    python benchmarks/network_speed.py [--s0 MODEL.onnx] [--threads 2]
+    python -m benchmarks.features.network_speed [--s0 MODEL.onnx] [--threads 2]
 
 Without a model of `s0` an untrained one is exported (extra `train`): weights do not change its
 time. "to host" is what `extract` takes, with every feature copied back; "on device" leaves them on
@@ -17,16 +17,16 @@ from pathlib import Path
 
 import numpy as np
 import onnxruntime as ort
-from arguments import Parser, existing, whole
-from named_errors import named_errors
 
+from benchmarks.common.arguments import Parser, existing, whole
+from benchmarks.common.named_errors import named_errors
 from localizer.errors import ModelError
 from localizer.features import OnnxExtractor
 from localizer.features.extractor import SHIPPED_MODEL
 from localizer.features.providers import SHORT_NAMES
 from localizer.types import Image
 
-ROOT = Path(__file__).resolve().parent.parent
+ROOT = Path(__file__).resolve().parents[2]
 SIZES = ((320, 240), (512, 512))
 
 

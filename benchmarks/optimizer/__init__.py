@@ -1,0 +1,1 @@
+"""Milliseconds per LM iteration and per registration."""
