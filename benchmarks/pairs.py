@@ -23,10 +23,10 @@ with needs_torch():
     from localizer.synth.heightfield.render import render
     from localizer.training.config import LiveSection, load_config
     from localizer.training.data.batches import LoaderConfig, crop_pair, window_pair
+    from localizer.training.data.lit_places import PlaceVisits, make_place
     from localizer.training.data.live import LivePlan, LiveStream
     from localizer.training.data.pairs import Pair, SceneConfig, draw_views
     from localizer.training.data.streams import photo_source, scene_config
-    from localizer.training.places.lit_places import PlaceVisits, make_place
 
 
 def numpy_pairs(

@@ -29,7 +29,7 @@ from localizer.synth.config import SURVEY, WorldConfig
 from localizer.synth.world import build_visits
 from localizer.training.data.batches import tamed
 from localizer.training.data.pairs import look_at, soften
-from localizer.training.places.worlds import random_look
+from localizer.training.data.worlds import random_look
 from localizer.types import Image, RenderedView
 
 SIZE = (320, 240)

@@ -17,7 +17,7 @@ from localizer.synth.appearance.model import CONDITIONS, apply_appearance, sampl
 from localizer.training.data.batches import tamed
 from localizer.training.data.pairs import COMBINED, OUTDATED, SEASON, Pair, SceneConfig
 from localizer.training.data.shards import PhotoSource, read_shard, shard_path, write_shards
-from localizer.training.places.worlds import world_pairs
+from localizer.training.data.worlds import world_pairs
 from localizer.types import Image, RenderedView
 
 METRES, DEGREES = 5.0, 5.0  # distance of the reference view from the query's true pose

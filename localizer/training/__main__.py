@@ -111,9 +111,9 @@ def unfuse(
     shards: Annotated[list[Path], typer.Argument(help="Shards (.npz) to take statistics on.")],
 ) -> None:
     """Make a published model trainable again."""
+    from localizer.training.checkpoint import write_checkpoint
     from localizer.training.export.from_published import unfuse as load
     from localizer.training.export.quantize import calibration_images
-    from localizer.training.loop.checkpoint import write_checkpoint
 
     network = load(model, list(calibration_images(shards)))
     write_checkpoint(out, {"average": network.state_dict()})

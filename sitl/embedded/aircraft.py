@@ -8,7 +8,6 @@ import numpy as np
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from sitl.embedded.control.arming import ArmingContext, arming_failures
-from sitl.embedded.control.loop import TICK_S
 from sitl.embedded.control.mission import MissionStore
 from sitl.embedded.control.modes import FlightModes
 from sitl.embedded.ekf.estimator import Estimator
@@ -17,6 +16,7 @@ from sitl.embedded.ekf.measurements import Baro, Compass, GpsData
 from sitl.embedded.mavlink.server import MavlinkServer
 from sitl.embedded.parameters import Parameters
 from sitl.embedded.physics import dynamics
+from sitl.embedded.physics.dynamics import TICK_S
 from sitl.embedded.physics.gimbal import Gimbal
 from sitl.embedded.physics.rotation import Array
 from sitl.embedded.physics.sensors import GpsSample, Sensors

@@ -7,11 +7,12 @@ import time
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from sitl.embedded.aircraft import GPS_SIMULATED, Aircraft
-from sitl.embedded.control.loop import TICK_S, advance
+from sitl.embedded.control.loop import advance
 from sitl.embedded.mavlink.commands import Commands
 from sitl.embedded.mavlink.server import MavlinkServer
 from sitl.embedded.mavlink.telemetry import DEFAULT_STREAMS, Telemetry
 from sitl.embedded.parameters import Parameters
+from sitl.embedded.physics.dynamics import TICK_S
 from sitl.embedded.physics.rotation import euler
 from sitl.geodesy import Location
 

@@ -6,7 +6,7 @@ import numpy as np
 
 from localizer.geometry.pose import Array
 from localizer.synth.buildings.model import Kind, rectangle
-from localizer.synth.plan.ground import Material
+from localizer.synth.paint.ground_plan import Material
 from localizer.synth.plan.plan import Hedge
 from localizer.synth.plan.planner import (
     LAYER_GARDEN,

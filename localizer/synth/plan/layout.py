@@ -11,6 +11,7 @@ from localizer.geometry.pose import Array
 from localizer.synth.buildings.kinds import build
 from localizer.synth.buildings.model import Building, Kind, Surface, rectangle
 from localizer.synth.config import WorldConfig
+from localizer.synth.paint.ground_plan import GroundPlan, Material
 from localizer.synth.plan.country import (
     hedgerow,
     plan_farm,
@@ -20,7 +21,6 @@ from localizer.synth.plan.country import (
     plan_orchard,
     plan_riverside,
 )
-from localizer.synth.plan.ground import GroundPlan, Material
 from localizer.synth.plan.houses import plan_houses
 from localizer.synth.plan.plan import URBAN, Target, Trees, WorldPlan, Zone
 from localizer.synth.plan.planner import (

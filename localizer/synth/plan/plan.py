@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from localizer.geometry.pose import Array
 from localizer.synth.buildings.model import Building
 from localizer.synth.config import WorldConfig
-from localizer.synth.plan.ground import Regions, Shape
+from localizer.synth.paint.ground_plan import Regions, Shape
 from localizer.synth.plan.terrain import Terrain
 
 

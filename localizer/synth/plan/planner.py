@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 from localizer.geometry.pose import Array
 from localizer.synth.buildings.model import Building, Kind, rectangle
 from localizer.synth.config import WorldConfig
-from localizer.synth.plan.ground import GroundPlan, Material
+from localizer.synth.paint.ground_plan import GroundPlan, Material
 from localizer.synth.plan.plan import Hedge
 from localizer.synth.plan.streets import Street, StreetNet, resample
 from localizer.synth.plan.terrain import Terrain

@@ -12,7 +12,7 @@ from scipy.sparse.csgraph import connected_components
 
 from localizer.geometry.pose import Array
 from localizer.synth.config import WorldConfig
-from localizer.synth.plan.ground import GroundPlan, Material
+from localizer.synth.paint.ground_plan import GroundPlan, Material
 from localizer.synth.plan.terrain import Terrain
 
 MAIN_WIDTH_M, SIDE_WIDTH_M, LANE_WIDTH_M = 9.0, 6.0, 3.6

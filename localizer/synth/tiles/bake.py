@@ -18,8 +18,8 @@ from localizer.synth.config import BLOCK_M, LEAF_GSD_M, LEAF_M, TOP_M
 from localizer.synth.paint.covers import Cover, Light, new_image
 from localizer.synth.paint.facades import paint_surface
 from localizer.synth.paint.ground import paint_ground
+from localizer.synth.paint.ground_plan import Shape, rasterize, shape_bounds
 from localizer.synth.paint.lighting import DSM_GSD_M, make_light
-from localizer.synth.plan.ground import Shape, rasterize, shape_bounds
 from localizer.synth.tiles.charts import ChartedMesh, pack
 from localizer.synth.tiles.props import CAR_COLOURS, car_image, car_shape
 from localizer.synth.tiles.scene import Scene, car_positions, hedge_quads

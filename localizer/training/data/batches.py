@@ -16,7 +16,7 @@ from localizer.errors import SequenceError
 from localizer.synth.appearance.model import Appearance, apply_appearance, sample_appearance
 from localizer.training.data.pairs import Pair, relative_pose
 from localizer.training.data.shards import read_shard
-from localizer.training.loop.losses import Batch
+from localizer.training.losses import Batch
 from localizer.types import Float32, Image
 
 _POLL_S = 0.5  # between looks for a shard that is still being generated
@@ -137,7 +137,7 @@ class ShardStream:
 
 @dataclass(frozen=True)
 class Sample:
-    """One augmented crop pair; arrays as in `localizer.training.loop.losses.Batch`, without B."""
+    """One augmented crop pair; arrays as in `localizer.training.losses.Batch`, without B."""
 
     reference: Image
     query: Image

@@ -30,10 +30,10 @@ from localizer.training.data.batches import (
     tamed,
     window_pair,
 )
+from localizer.training.data.lit_places import PlaceVisits, be_modest, make_place
 from localizer.training.data.pairs import Pair, SceneConfig, draw_views
 from localizer.training.data.shards import PhotoSource
-from localizer.training.loop.losses import Batch
-from localizer.training.places.lit_places import PlaceVisits, be_modest, make_place
+from localizer.training.losses import Batch
 
 _SPARE = 1.25  # candidates for each sample: some see too little in common
 

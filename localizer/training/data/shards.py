@@ -60,7 +60,7 @@ def write_shards(
 def write_world_shards(out: Path, seeds: range, scenes: SceneConfig) -> Iterator[Path]:
     """Generate the mesh worlds of `seeds` whose shards are not all on disk yet."""
     # The map's importers (GDAL, pyproj, trimesh) are not needed on a machine that only trains.
-    from localizer.training.places.worlds import world_pairs
+    from localizer.training.data.worlds import world_pairs
 
     for seed in seeds:
         paths = world_shard_paths(out, seed)

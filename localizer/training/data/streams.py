@@ -11,7 +11,7 @@ from localizer.training.data.live import LivePlan, LiveStream
 from localizer.training.data.pairs import SceneConfig
 from localizer.training.data.seeds import FIRST_WORLD_SEED
 from localizer.training.data.shards import PhotoSource, shard_path, world_shard_paths
-from localizer.training.loop.distributed import Workers
+from localizer.training.distributed import Workers
 
 
 def open_stream(

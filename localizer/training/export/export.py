@@ -15,8 +15,8 @@ from torch import Tensor, nn
 
 from localizer.errors import ModelError
 from localizer.features.extractor import OnnxExtractor
+from localizer.training.checkpoint import fill, read_checkpoint
 from localizer.training.config import TrainConfig
-from localizer.training.loop.checkpoint import fill, read_checkpoint
 from localizer.training.models.networks import Network, build, fuse
 from localizer.training.models.s0 import S0Net
 from localizer.training.models.tiny import parameter_count

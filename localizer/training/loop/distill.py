@@ -15,9 +15,9 @@ from torch import Tensor
 from torch.nn import functional as F  # noqa: N812 (torch's own name for it)
 
 from localizer.errors import ModelError
+from localizer.training.checkpoint import read_checkpoint
 from localizer.training.export.export import load_network
-from localizer.training.loop.checkpoint import read_checkpoint
-from localizer.training.loop.losses import sample, window_similarity
+from localizer.training.losses import sample, window_similarity
 
 
 class Teacher:

@@ -13,12 +13,12 @@ import torch
 from torch import Tensor, nn
 
 from localizer.errors import ModelError
+from localizer.training.checkpoint import fill, read_checkpoint, write_checkpoint
 from localizer.training.config import OptimizerSection, TrainConfig
 from localizer.training.data.streams import open_stream
-from localizer.training.loop.checkpoint import fill, read_checkpoint, write_checkpoint
+from localizer.training.distributed import Workers
 from localizer.training.loop.distill import Teacher, distillation_loss
-from localizer.training.loop.distributed import Workers
-from localizer.training.loop.losses import Batch, alignment_loss, contrast_loss, sample, se3_exp
+from localizer.training.losses import Batch, alignment_loss, contrast_loss, sample, se3_exp
 from localizer.training.models.networks import build
 
 logger = logging.getLogger(__name__)

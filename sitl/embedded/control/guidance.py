@@ -8,11 +8,10 @@ from math import atan2, cos, hypot, radians
 import numpy as np
 
 from sitl.embedded.control.controller import Carrot, Limits, PositionController, Vector
-from sitl.embedded.control.loop import TICK_S
 from sitl.embedded.control.mode import RcInput
 from sitl.embedded.ekf.estimator import Estimator
 from sitl.embedded.parameters import Parameters
-from sitl.embedded.physics.dynamics import GRAVITY, MASS, MOTOR_MAX
+from sitl.embedded.physics.dynamics import GRAVITY, MASS, MOTOR_MAX, TICK_S
 from sitl.embedded.physics.rotation import Array, euler, quaternion
 
 _LAND_FINAL_HEIGHT = 10.0  # m; below it LAND_SPEED

@@ -7,12 +7,8 @@ from numba import njit
 
 from sitl.embedded.control.controller import attitude_control
 from sitl.embedded.ekf.navigation import BG, strapdown
-from sitl.embedded.physics.dynamics import RATES, step
+from sitl.embedded.physics.dynamics import RATES, SUBSTEP_S, SUBSTEPS, TICK_S, step
 from sitl.embedded.physics.rotation import Array, matrix, rotate_body
-
-SUBSTEPS = 4
-SUBSTEP_S = 0.0025
-TICK_S = SUBSTEPS * SUBSTEP_S
 
 
 @njit(cache=True)

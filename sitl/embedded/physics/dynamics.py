@@ -14,6 +14,9 @@ from numba import njit
 
 from sitl.embedded.physics.rotation import Array, matrix, rotate_body
 
+SUBSTEPS = 4  # of the integration, in a tick of the vehicle
+SUBSTEP_S = 0.0025
+TICK_S = SUBSTEPS * SUBSTEP_S
 GRAVITY = 9.80665
 MASS = 2.5  # kg
 INERTIA_XY = 0.035  # kg m²

@@ -12,8 +12,7 @@ from math import exp, sqrt
 
 import numpy as np
 
-from sitl.embedded.control.loop import SUBSTEPS, TICK_S
-from sitl.embedded.physics.dynamics import ATTITUDE, POSITION, VELOCITY
+from sitl.embedded.physics.dynamics import ATTITUDE, POSITION, SUBSTEPS, TICK_S, VELOCITY
 from sitl.embedded.physics.rotation import Array, euler, wrap_pi
 
 _GYRO_NOISE = 0.01  # rad/s per 400 Hz sample

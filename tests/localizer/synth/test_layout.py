@@ -10,7 +10,7 @@ from scipy.sparse.csgraph import connected_components
 from localizer.synth.buildings.kinds import build
 from localizer.synth.buildings.model import Kind
 from localizer.synth.config import WorldConfig
-from localizer.synth.plan.ground import Material
+from localizer.synth.paint.ground_plan import Material
 from localizer.synth.plan.layout import assign_zones, plan_world
 from localizer.synth.plan.plan import URBAN, WorldPlan
 from localizer.synth.plan.streets import make_lattice, make_streets

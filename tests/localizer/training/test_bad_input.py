@@ -14,6 +14,7 @@ pytest.importorskip("onnx")
 from localizer.errors import ModelError, SequenceError  # noqa: E402
 from localizer.features.extractor import SHIPPED_MODEL  # noqa: E402
 from localizer.training import __main__ as cli  # noqa: E402
+from localizer.training.checkpoint import read_checkpoint, write_checkpoint  # noqa: E402
 from localizer.training.config import TrainConfig, load_config  # noqa: E402
 from localizer.training.data.batches import LoaderConfig, Schedule, ShardStream  # noqa: E402
 from localizer.training.data.pairs import SceneConfig  # noqa: E402
@@ -22,7 +23,6 @@ from localizer.training.export import quantize as quantization  # noqa: E402
 from localizer.training.export.export import export, load_network  # noqa: E402
 from localizer.training.export.from_published import unfuse  # noqa: E402
 from localizer.training.export.quantize import quantize  # noqa: E402
-from localizer.training.loop.checkpoint import read_checkpoint, write_checkpoint  # noqa: E402
 from localizer.training.loop.curves import plot  # noqa: E402
 from localizer.training.loop.train import Trainer  # noqa: E402
 from localizer.training.models.networks import build  # noqa: E402

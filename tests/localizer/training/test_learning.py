@@ -24,15 +24,8 @@ from localizer.training.export.from_published import unfuse  # noqa: E402
 from localizer.training.export.quantize import quantize  # noqa: E402
 from localizer.training.loop.ablation import ablations  # noqa: E402
 from localizer.training.loop.curves import plot  # noqa: E402
-from localizer.training.loop.losses import (  # noqa: E402
-    Batch,
-    alignment_loss,
-    contrast_loss,
-    project,
-    sample,
-    se3_exp,
-)
 from localizer.training.loop.train import Trainer, learning_rate, perturbed  # noqa: E402
+from localizer.training.losses import Batch, alignment_loss, contrast_loss, project, sample, se3_exp  # noqa: E402
 from localizer.training.models.orientation import OrientationFeatures  # noqa: E402
 from localizer.training.models.tiny import ModelConfig, TinyNet, fuse  # noqa: E402
 

@@ -14,8 +14,8 @@ from localizer.training.config import LiveSection, TrainConfig, load_config  # n
 from localizer.training.data.batches import LoaderConfig  # noqa: E402
 from localizer.training.data.live import LivePlan, LiveStream  # noqa: E402
 from localizer.training.data.pairs import Pair, SceneConfig, warp_check  # noqa: E402
-from localizer.training.loop.losses import project  # noqa: E402
 from localizer.training.loop.train import Trainer  # noqa: E402
+from localizer.training.losses import project  # noqa: E402
 from localizer.training.models.s0 import S0Config  # noqa: E402
 
 SHIPPED = Path(__file__).parents[3] / "configs" / "train_s0.yaml"
