@@ -17,11 +17,14 @@ _WANDER_TIME_S = 6.0
 
 
 class GimbalError:
-    """Turns reported angles into true ones: a constant and a first-order Gauss-Markov process."""
+    """Turns reported angles into true ones: a constant and a first-order Gauss-Markov process.
 
-    def __init__(self, seed: int) -> None:
+    fault_rad: a gross error of (roll, pitch, yaw) on top of what every gimbal has.
+    """
+
+    def __init__(self, seed: int, fault_rad: tuple[float, float, float] = (0.0, 0.0, 0.0)) -> None:
         self._rng = np.random.default_rng([seed, 17])
-        self._alignment = self._rng.normal(0.0, _ALIGNMENT_SIGMA, 3)
+        self._alignment = self._rng.normal(0.0, _ALIGNMENT_SIGMA, 3) + np.array(fault_rad)
         self._wander = self._rng.normal(0.0, _WANDER_SIGMA, 3)
         self._time_ns: int | None = None
 

@@ -8,6 +8,8 @@ from contextlib import contextmanager
 from dataclasses import replace
 from typing import Any
 
+import numpy as np
+
 from companion.geometry import GimbalAngles, GimbalFrame
 from localizer.map.cache.cache import TileCache
 from sitl.camera.gimbal_error import GimbalError
@@ -22,9 +24,17 @@ _TRUTH_PERIOD_S = 0.02
 
 @contextmanager
 def truth_feed(
-    pilot: Pilot, camera: WorldCameraProcess, cache: TileCache, gimbal_error: GimbalError
+    pilot: Pilot,
+    camera: WorldCameraProcess,
+    cache: TileCache,
+    gimbal_error: GimbalError,
+    map_shift_m: tuple[float, float, float] = (0.0, 0.0, 0.0),
 ) -> Iterator[None]:
-    """Tells the world camera where the vehicle is, 50 times a second, on a thread."""
+    """Tells the world camera where the vehicle is, 50 times a second, on a thread.
+
+    map_shift_m: how far the map lies east, north and up of where GNSS says it should.
+    """
+    shift = np.array(map_shift_m)
     stop = threading.Event()
 
     def feed() -> None:
@@ -34,7 +44,8 @@ def truth_feed(
             if sample is not None and sample.time_ns > last_ns:
                 last_ns = sample.time_ns
                 angles = gimbal_error.true_angles(sample.gimbal, last_ns)
-                sample = replace(sample, gimbal=angles)
+                place = sample.position - shift  # over that place of a map that lies off
+                sample = replace(sample, position=place, gimbal=angles)
                 try:
                     camera.send(sample)
                 except SimulationError:

@@ -27,6 +27,7 @@ from localizer.map.cache.stream import TileStreamer
 from localizer.render.numba_raster import NumbaRenderer
 from localizer.synth.appearance.model import Appearance
 from sitl.camera.detector import Detector, Observed
+from sitl.camera.faults import FaultyLens, PictureFault
 from sitl.camera.movers import Mover
 from sitl.camera.stream import VideoSender
 from sitl.camera.true_motion import PoseTrack, TruthSample, camera_pose
@@ -34,6 +35,7 @@ from sitl.camera.world_camera import FrameLog, WorldCamera
 from sitl.errors import WorldCameraError
 
 Command = Literal["pause", "resume", "stop"]
+Message = TruthSample | Command | PictureFault | None  # None ends the fault
 
 _START_S = 300.0  # numba compiles on the first run, a minute where there is room
 _STOP_S = 60.0
@@ -114,6 +116,10 @@ class WorldCameraProcess:
         """Takes up sending again."""
         self._send("resume")
 
+    def fault(self, fault: PictureFault | None) -> None:
+        """From now on the pictures have this fault; None ends it."""
+        self._send(fault)
+
     def stop(self) -> None:
         """Ends the process; `statistics` holds what it did. Harmless when it is not running."""
         if self._process.pid is None:
@@ -145,7 +151,7 @@ class WorldCameraProcess:
     ) -> None:
         self.stop()
 
-    def _send(self, message: TruthSample | Command) -> None:
+    def _send(self, message: Message) -> None:
         with self._lock:
             if self._connection.poll():
                 self._receive()
@@ -171,7 +177,7 @@ def _run(config: WorldCameraConfig, connection: Connection) -> None:
     try:
         with _Studio(config) as studio:
             connection.send("")
-            inbox: queue.SimpleQueue[TruthSample | Command] = queue.SimpleQueue()
+            inbox: queue.SimpleQueue[Message] = queue.SimpleQueue()
             threading.Thread(target=_listen, args=(connection, inbox), daemon=True).start()
             connection.send(studio.run(inbox))
     except KeyboardInterrupt:
@@ -180,7 +186,7 @@ def _run(config: WorldCameraConfig, connection: Connection) -> None:
         connection.send(f"{type(error).__name__}: {error}")
 
 
-def _listen(connection: Connection, inbox: queue.SimpleQueue[TruthSample | Command]) -> None:
+def _listen(connection: Connection, inbox: queue.SimpleQueue[Message]) -> None:
     # Emptied by a thread of its own: while a frame is rendered the pipe must not fill up and hold
     # the parent, which flies the vehicle.
     try:
@@ -216,6 +222,7 @@ class _Studio:
         self._detector = (
             Detector(c.detections, c.camera, c.targets, seed=c.seed) if c.detections else None
         )
+        self._lens = FaultyLens(c.seed)
         self._track = PoseTrack()
         self._paused = self._stopped = False
         self._frames = self._skipped = 0
@@ -232,7 +239,7 @@ class _Studio:
         self._renderer.close()
         self._streamer.close()
 
-    def run(self, inbox: queue.SimpleQueue[TruthSample | Command]) -> CameraStatistics:
+    def run(self, inbox: queue.SimpleQueue[Message]) -> CameraStatistics:
         """Exposes at the configured rate as far as the truth is known, until told to stop."""
         period_ns = round(1e9 / self._config.rate_hz)
         margin_ns = round(self._config.shutter_s * 0.5e9)
@@ -255,17 +262,19 @@ class _Studio:
                 self._expose(due)
                 due += period_ns
 
-    def _handle(self, message: TruthSample | Command) -> None:
+    def _handle(self, message: Message) -> None:
         if isinstance(message, TruthSample):
             pose = camera_pose(message, self._frame, self._config.mount)
             self._track.add(message.time_ns, pose)
+        elif message is None or isinstance(message, PictureFault):
+            self._lens.set(message)
         elif message == "stop":
             self._stopped = True
         else:
             self._paused = message == "pause"
 
     def _expose(self, time_ns: int) -> None:
-        if self._paused:
+        if self._paused or self._lens.is_silent:
             self._skipped += 1
             return
         exposure = self._camera.expose(time_ns, self._track)
@@ -273,7 +282,7 @@ class _Studio:
             self._skipped += 1
             return
         start = time.perf_counter()
-        self._sender.send(exposure.image, time_ns)
+        self._sender.send(self._lens.picture(exposure.image), self._lens.stamp(time_ns))
         if self._detector is not None:
             self._detector.observe(time_ns, exposure.world_from_camera, exposure.depth)
         self._log.add(self._frames, time_ns, exposure.world_from_camera)

@@ -63,13 +63,13 @@ def fly(
     """Fly the scenario; `folder` receives every record. Progress is (phase, share done)."""
     folder.mkdir(parents=True, exist_ok=True)
     cache = TileCache.open(assets.map_cache)
-    home = _home(assets)
+    home = home_of(assets)
     ports = Ports(free_udp_port(), free_udp_port())
     with ExitStack() as stack:
         progress("starting the vehicle", 0.0)
         vehicle = stack.enter_context(
             open_vehicle(
-                kind, home, 0.0, _parameters(scenario), seed=seed, log=folder / "vehicle.log"
+                kind, home, 0.0, vehicle_parameters(scenario), seed=seed, log=folder / "vehicle.log"
             )
         )
         pilot = stack.enter_context(Pilot(vehicle.gcs_endpoint, alive=vehicle.check))
@@ -84,7 +84,7 @@ def fly(
         config = write_deployment(folder, assets, scenario, vehicle, ports)
         progress("starting the world camera", 0.0)
         camera = WorldCameraProcess(
-            _camera_config(folder, assets, scenario, movers, targets, ports, seed)
+            camera_config(folder, assets, scenario, movers, targets, ports, seed)
         )
         stack.enter_context(camera)
         stack.enter_context(truth_feed(pilot, camera, cache, GimbalError(seed)))
@@ -94,7 +94,7 @@ def fly(
         home_error_m = run.distance_from_home()
         camera.stop()
         texts = tuple(t.text for t in pilot.texts)
-        _write_vehicle_csv(folder / "vehicle.csv", pilot, cache)
+        write_vehicle_csv(folder / "vehicle.csv", pilot, cache)
     if camera.statistics is None:
         raise FlightError("the world camera left no statistics")
     return FlightRecord(
@@ -108,7 +108,7 @@ def fly(
     )
 
 
-def _home(assets: FlightAssets) -> Location:
+def home_of(assets: FlightAssets) -> Location:
     """The world's centre, on the ground, AMSL."""
     world = assets.world
     position = world.frame.position([0.0, 0.0, float(world.ground_height(0.0, 0.0))])
@@ -116,7 +116,8 @@ def _home(assets: FlightAssets) -> Location:
     return Location(position.latitude_deg, position.longitude_deg, altitude)
 
 
-def _parameters(scenario: Scenario) -> dict[str, float]:
+def vehicle_parameters(scenario: Scenario) -> dict[str, float]:
+    """The autopilot's parameters for what the companion sends."""
     delay_ms = scenario.injection_delay_ms
     if scenario.injection == "gps_input":
         injection = gps_input_parameters(delay_ms=delay_ms)
@@ -125,7 +126,7 @@ def _parameters(scenario: Scenario) -> dict[str, float]:
     return injection | GIMBAL | SPEEDS | {"WPNAV_SPEED": 100 * scenario.speed_m_s}
 
 
-def _camera_config(
+def camera_config(
     folder: Path,
     assets: FlightAssets,
     scenario: Scenario,
@@ -134,6 +135,7 @@ def _camera_config(
     ports: Ports,
     seed: int,
 ) -> WorldCameraConfig:
+    """The world camera of a flight; its frames' true poses go to ``frames.csv``."""
     return WorldCameraConfig(
         cache=assets.live_cache,
         origin=TileCache.open(assets.map_cache).manifest.origin,
@@ -149,7 +151,7 @@ def _camera_config(
     )
 
 
-def _write_vehicle_csv(path: Path, pilot: Pilot, cache: TileCache) -> None:
+def write_vehicle_csv(path: Path, pilot: Pilot, cache: TileCache) -> None:
     """True and EKF positions in the map's ENU, at the EKF's times."""
     with path.open("w", newline="", encoding="utf-8") as file:
         writer = csv.writer(file)

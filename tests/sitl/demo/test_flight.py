@@ -35,7 +35,7 @@ SCENARIO = Scenario(
 def test_the_vehicles_parameters_suit_what_the_companion_sends(tmp_path, injection):
     """By the doctor's own rules, which are measured refusals of ArduPilot."""
     scenario = Scenario(injection=injection)
-    parameters = flight._parameters(scenario)
+    parameters = flight.vehicle_parameters(scenario)
     path = write_deployment(
         tmp_path,
         SimpleNamespace(map_cache=tmp_path),

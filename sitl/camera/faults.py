@@ -1,0 +1,69 @@
+"""Faults of the picture on its way to the companion: covered, blinded, frozen, or stamped wrong."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+
+from localizer.types import Image
+
+PictureFaultKind = Literal["covered", "blinded", "frozen", "stamped_late", "silent"]
+
+_COVERED_LEVEL, _COVERED_NOISE = 9.0, 4.0  # of 255: a lens cap, and the sensor's read noise
+_BLINDED_LEVEL, _BLINDED_NOISE = 205.0, 3.0  # inside a cloud: bright, even, next to no contrast
+
+
+@dataclass(frozen=True)
+class PictureFault:
+    """What is wrong with the pictures from now on.
+
+    covered: a lens cap. blinded: cloud or fog that shows nothing. frozen: the last picture again
+    and again under fresh stamps, encoded anew each time, as a hung sensor does. stamped_late: by
+    `seconds` after the true exposure. silent: nothing is sent.
+    """
+
+    kind: PictureFaultKind
+    seconds: float = 0.0
+
+
+class FaultyLens:
+    """Applies the fault that stands, if any, to picture after picture."""
+
+    def __init__(self, seed: int) -> None:
+        self._rng = np.random.default_rng([seed, 23])
+        self._fault: PictureFault | None = None
+        self._last: Image | None = None
+
+    @property
+    def is_silent(self) -> bool:
+        """Whether no picture is sent at all."""
+        return self._fault is not None and self._fault.kind == "silent"
+
+    def set(self, fault: PictureFault | None) -> None:
+        """The fault from the next picture on; None ends it."""
+        self._fault = fault
+
+    def picture(self, image: Image) -> Image:
+        """What is sent instead of `image` (H, W, 3) uint8."""
+        kind = self._fault.kind if self._fault is not None else None
+        if kind == "frozen" and self._last is not None:
+            return self._last
+        self._last = image
+        if kind == "covered":
+            return self._even(image, _COVERED_LEVEL, _COVERED_NOISE)
+        if kind == "blinded":
+            return self._even(image, _BLINDED_LEVEL, _BLINDED_NOISE)
+        return image
+
+    def stamp(self, exposure_ns: int) -> int:
+        """The time that the picture is stamped with."""
+        late = self._fault is not None and self._fault.kind == "stamped_late"
+        return (
+            exposure_ns + round(self._fault.seconds * 1e9) if late and self._fault else exposure_ns
+        )
+
+    def _even(self, image: Image, level: float, noise: float) -> Image:
+        values = self._rng.normal(level, noise, image.shape)
+        return np.clip(values, 0, 255).astype(np.uint8)

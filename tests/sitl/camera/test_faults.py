@@ -1,0 +1,40 @@
+"""What a faulty lens sends instead of the picture."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from sitl.camera.faults import FaultyLens, PictureFault
+
+
+def picture(seed: int) -> np.ndarray:
+    return np.random.default_rng(seed).integers(0, 255, (24, 32, 3)).astype(np.uint8)
+
+
+def test_a_frozen_picture_stays_the_last_good_one_until_it_ends() -> None:
+    lens = FaultyLens(0)
+    first = lens.picture(picture(1))
+    lens.set(PictureFault("frozen"))
+    assert np.array_equal(lens.picture(picture(2)), first)
+    assert np.array_equal(lens.picture(picture(3)), first)
+    lens.set(None)
+    assert np.array_equal(lens.picture(picture(4)), picture(4))
+
+
+@pytest.mark.parametrize(("kind", "low", "high"), [("covered", 0, 30), ("blinded", 190, 220)])
+def test_a_covered_or_blinded_camera_shows_nothing(kind: str, low: int, high: int) -> None:
+    lens = FaultyLens(0)
+    lens.set(PictureFault(kind))  # type: ignore[arg-type]
+    shown = lens.picture(picture(1))
+    assert low <= shown.mean() <= high
+    assert shown.std() < 8
+
+
+def test_late_stamps_move_the_time_alone() -> None:
+    lens = FaultyLens(0)
+    lens.set(PictureFault("stamped_late", 0.3))
+    assert lens.stamp(1_000_000_000) == 1_300_000_000
+    assert np.array_equal(lens.picture(picture(1)), picture(1))
+    lens.set(PictureFault("silent"))
+    assert lens.is_silent
