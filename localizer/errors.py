@@ -43,6 +43,10 @@ class ModelError(LocalizerError):
     """A feature network that is missing, corrupt or of the wrong shape."""
 
 
+class BackendError(LocalizerError):
+    """A device that registers is not there, or failed; the CPU takes over."""
+
+
 class SequenceError(LocalizerError):
     """An evaluation sequence that lacks a part or contradicts itself."""
 

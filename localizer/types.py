@@ -98,6 +98,18 @@ class PosePrior:
     time_ns: int
     velocity: Array | None = None
 
+    @classmethod
+    def around(
+        cls,
+        world_from_camera: Pose,
+        position_sigma_m: float = 5.0,
+        rotation_sigma_deg: float = 4.0,
+        time_ns: int = 0,
+    ) -> PosePrior:
+        """A pose known to so many metres and degrees, standard deviation per axis."""
+        sigma = np.repeat([position_sigma_m, np.radians(rotation_sigma_deg)], 3)
+        return cls(world_from_camera, np.diag(sigma**2), time_ns)
+
 
 class RegistrationStatus(Enum):
     """Why a registration did or did not give a pose."""

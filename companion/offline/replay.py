@@ -260,12 +260,8 @@ def _localize(
     image = read_image(path)
     fitted = fitted_camera(image.shape[1], image.shape[0], camera, str(path))
     frame = Frame(image, recorded.exposure_time_ns, fitted, recorded.sequence)
-    prior = localizer.predict(frame.exposure_time_ns)
-    if prior is None:
-        return None
     try:
-        bundle = localizer.make_reference(prior, wait=True)
-        return localizer.localize(frame, localizer.extract_query(frame), bundle.anchors)
+        return localizer.track(frame)
     except OutsideMapError:
         return None
 

@@ -24,9 +24,9 @@ from companion.sources.base import (
     scaling_text,
 )
 from companion.sources.misp import MispTime, parse_message
-from companion.sources.slot import NewestSlot
 from companion.sources.timing import ExposureClock, Stamps
 from localizer.geometry.camera import Camera
+from localizer.tracking.mailbox import Mailbox
 from localizer.types import Frame, Image
 
 _log = logging.getLogger(__name__)
@@ -217,7 +217,7 @@ class LiveVideoSource:
         self._settings = settings or SourceSettings()
         self._input = live_input(location, camera, self._settings)
         self._on_state = on_state
-        self._slot: NewestSlot[tuple[av.VideoFrame, Camera, int, int]] = NewestSlot()
+        self._newest: Mailbox[tuple[av.VideoFrame, Camera, int, int]] = Mailbox()
         self._closing = threading.Event()
         self._reader: threading.Thread | None = None
         self._lock = threading.Lock()
@@ -230,7 +230,7 @@ class LiveVideoSource:
     def counters(self) -> SourceCounters:
         """Live counters; `dropped` are the pictures that a newer one overtook."""
         with self._lock:
-            return replace(self._counters, dropped=self._slot.dropped)
+            return replace(self._counters, dropped=self._newest.dropped)
 
     @property
     def state(self) -> StreamState:
@@ -244,7 +244,7 @@ class LiveVideoSource:
         stream that changes its shape later is reported as MISFIT until it fits again.
         """
         self._start()
-        while (item := self._slot.get()) is not None:
+        while (item := self._newest.take()) is not None:
             picture, camera, exposure_ns, sequence = item
             # Converted here and not in the reader: pictures that are dropped cost no conversion.
             image = _rgb(picture, self._to_rgb)
@@ -260,7 +260,7 @@ class LiveVideoSource:
         with self._lock:  # a reader that is being started is started
             self._closing.set()
             reader = self._reader
-        self._slot.close()
+        self._newest.close()
         if reader is not None and reader is not threading.current_thread():
             reader.join(2 * _OPEN_TIMEOUT_S + self._settings.stall_timeout_s + 2.0)
         if self._state is not StreamState.CLOSED:
@@ -284,7 +284,7 @@ class LiveVideoSource:
                 connections += 1
             except StreamError as error:
                 self._report(StreamState.FAILED, str(error))
-                self._slot.close(error)
+                self._newest.close(error)
                 return
             except av.error.ExitError:  # the open time-out
                 reason = f"nothing came within {_OPEN_TIMEOUT_S:g} s; is the camera sending there?"
@@ -339,7 +339,7 @@ class LiveVideoSource:
             return
         stamps = Stamps(_pts_ns(picture), _misp_time(picture))
         exposure_ns = clock.exposure_time(stamps, arrival_ns)
-        if not self._slot.put((picture, camera, exposure_ns, self._counters.received)):
+        if not self._newest.put((picture, camera, exposure_ns, self._counters.received)):
             return  # closed meanwhile
         self._count(received=1)
         width, height = camera.width, camera.height

@@ -196,7 +196,11 @@ def evaluate(
                 localizer.set_prior(prior)
                 has_prior = True
             try:
-                outcome = _localize(localizer, frame, passes if fresh else 1, pool)
+                # Reference and query features side by side.
+                pending = pool.submit(localizer.extract_query, frame)
+                outcome = localizer.track(
+                    frame, passes=passes if fresh else 1, query=pending.result
+                )
             except OutsideMapError as error:
                 if mode == "first" and fresh:  # every other frame hangs on this prior
                     raise
@@ -208,27 +212,6 @@ def evaluate(
     if len(errors) == len(frames):
         raise errors[0]
     return frames, _summary(frames, seconds)
-
-
-def _localize(
-    localizer: Localizer, frame: Frame, passes: int, pool: ThreadPoolExecutor
-) -> PoseEstimate:
-    """Reference and query features side by side, then registration, `passes` times."""
-    pending = pool.submit(localizer.extract_query, frame)
-    while True:
-        prior = localizer.predict(frame.exposure_time_ns)
-        if prior is None:
-            raise SequenceError("no prior was set before localizing")
-        bundle = localizer.make_reference(prior, wait=True)
-        estimate = localizer.localize(frame, pending.result(), bundle.anchors)
-        passes -= 1
-        if passes == 0:
-            return estimate
-        if estimate.status is RegistrationStatus.OK:
-            # The same image again is no new evidence: start anew from its result, halving sigma.
-            localizer.set_prior(
-                PosePrior(estimate.world_from_camera, prior.covariance / 4, prior.time_ns)
-            )
 
 
 def _not_localized(localizer: Localizer, frame: Frame) -> PoseEstimate:

@@ -7,11 +7,12 @@ from typing import Literal
 
 import numpy as np
 
+from localizer.errors import BackendError
 from localizer.registration.backend import Backend, LevelProblem, LMSettings
 from localizer.registration.cpu.kernel import NumbaBackend
 from localizer.registration.cuda.backend import CudaBackend
 from localizer.registration.cuda.driver import Device
-from localizer.registration.cuda.errors import CudaError, CudaUnavailableError
+from localizer.registration.cuda.errors import CudaUnavailableError
 
 logger = logging.getLogger(__name__)
 
@@ -31,14 +32,17 @@ def open_backend(device: DeviceChoice = "auto", threads: int = 2) -> Backend:
     try:
         backend = CudaBackend(Device())
         trial(backend, _TRIAL_CHANNELS)
-    except CudaError as error:
-        expected = device == "auto" and isinstance(error, CudaUnavailableError)
-        text = str(error).split("\n")[0]
-        logger.log(
-            logging.INFO if expected else logging.WARNING, "registration on the CPU: %s", text
-        )
-        return NumbaBackend(threads)
+    except CudaUnavailableError as error:
+        return _on_the_cpu(error, logging.INFO if device == "auto" else logging.WARNING, threads)
+    except BackendError as error:
+        return _on_the_cpu(error, logging.WARNING, threads)
     return backend
+
+
+def _on_the_cpu(error: BackendError, level: int, threads: int) -> Backend:
+    text = str(error).split("\n")[0]
+    logger.log(level, "registration on the CPU: %s", text)
+    return NumbaBackend(threads)
 
 
 def trial(backend: Backend, channels: int) -> None:

@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from localizer.device_array import DeviceArray
+from localizer.errors import BackendError
 from localizer.geometry.camera import Camera
 from localizer.geometry.pose import Array, Pose
 from localizer.registration.backend import (
@@ -37,10 +38,6 @@ from localizer.registration.covariance import (
 )
 from localizer.registration.cpu.kernel import NumbaBackend
 from localizer.registration.cpu.reference import ReferenceBackend, count_in_view, retractions
-from localizer.registration.cuda.backend import CudaBackend
-from localizer.registration.cuda.errors import CudaError
-from localizer.registration.cuda.registration import register_on_device
-from localizer.registration.cuda.schedule import CudaSchedule
 from localizer.registration.devices import trial
 from localizer.registration.priors import PoseConstraint
 from localizer.registration.result import Found, Registration, failure, registration
@@ -51,6 +48,7 @@ from localizer.registration.selection import (
     quality,
     thinned,
 )
+from localizer.registration.whole import WholeBackend
 from localizer.types import Anchors, FeaturePyramid, PosePrior, RegistrationStatus
 
 logger = logging.getLogger(__name__)
@@ -72,14 +70,12 @@ class JNGO:
         self.config = config or JNGOConfig()
         self.backend = make_backend(backend, threads) if isinstance(backend, str) else backend
         self._threads = threads
-        self._schedule = (
-            CudaSchedule(self.backend) if isinstance(self.backend, CudaBackend) else None
-        )
+        self._whole = self.backend.whole() if isinstance(self.backend, WholeBackend) else None
 
     @property
     def on_gpu(self) -> bool:
         """Whether features may be on the device now: not any more after the GPU has failed."""
-        return self._schedule is not None
+        return self._whole is not None
 
     def register(
         self,
@@ -102,15 +98,15 @@ class JNGO:
         status = _input_status(query, anchors, self.config)
         if status is not RegistrationStatus.OK:
             return failure(prior, status)
-        if self._schedule is not None:
+        if self._whole is not None:
             try:
-                return register_on_device(
-                    self._schedule, self.config, query, camera, anchors, prior,
+                return self._whole.register(
+                    self.config, query, camera, anchors, prior,
                     motion=motion, constraint=constraint, seed=seed,
                 )  # fmt: skip
-            except CudaError as error:
+            except BackendError as error:
                 logger.error("registration continues on the CPU: %s", error)
-                self.backend, self._schedule = NumbaBackend(self._threads), None
+                self.backend, self._whole = NumbaBackend(self._threads), None
                 if any(isinstance(level.features, DeviceArray) for level in query.levels):
                     raise  # this frame's features are where the CPU cannot read them
         if not _all_finite(query, anchors):

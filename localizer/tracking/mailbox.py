@@ -1,4 +1,4 @@
-"""A one-item queue between threads: the newest item wins, what it displaces is counted."""
+"""A hand-over between threads that holds one item; the newest wins, displaced ones are counted."""
 
 from __future__ import annotations
 
@@ -9,31 +9,50 @@ T = TypeVar("T")
 
 
 class Mailbox(Generic[T]):
-    """Holds at most one item. `put` never blocks, so a slow reader cannot stall the writer."""
+    """One-item queue between a producer that must not wait and a slower consumer."""
 
     def __init__(self) -> None:
-        self._condition = threading.Condition()
+        self._changed = threading.Condition()
         self._item: T | None = None
+        self._error: Exception | None = None
         self._closed = False
-        self.dropped = 0
+        self._dropped = 0
 
-    def put(self, item: T) -> None:
-        """Place an item; an unread one is dropped and counted."""
-        with self._condition:
+    @property
+    def dropped(self) -> int:
+        """How many items were displaced before they were taken."""
+        with self._changed:
+            return self._dropped
+
+    def put(self, item: T) -> bool:
+        """Place an item, over an older one that nobody took; never waits. False if closed."""
+        with self._changed:
+            if self._closed:
+                return False
             if self._item is not None:
-                self.dropped += 1
+                self._dropped += 1
             self._item = item
-            self._condition.notify()
+            self._changed.notify()
+            return True
 
     def take(self, timeout_s: float | None = None) -> T | None:
-        """Remove and return the item, waiting for one; None after the timeout or when closed."""
-        with self._condition:
-            self._condition.wait_for(lambda: self._item is not None or self._closed, timeout_s)
+        """Remove and return the item, waiting for one; None after the timeout or once closed.
+
+        Raises what the producer failed with (`close`).
+        """
+        with self._changed:
+            self._changed.wait_for(lambda: self._item is not None or self._closed, timeout_s)
+            if self._error is not None:
+                raise self._error
+            if self._closed:
+                return None
             item, self._item = self._item, None
             return item
 
-    def close(self) -> None:
-        """Wake every waiting reader for good."""
-        with self._condition:
-            self._closed = True
-            self._condition.notify_all()
+    def close(self, error: Exception | None = None) -> None:
+        """Wake the consumer for good, with an error or without. Only the first call counts."""
+        with self._changed:
+            if self._closed:
+                return
+            self._closed, self._error = True, error
+            self._changed.notify_all()

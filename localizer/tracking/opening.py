@@ -1,7 +1,8 @@
-"""From a configuration to the localizer's parts: shared by ``run`` and ``eval``."""
+"""From a map, a camera and a configuration to a localizer: the parts, opened and warmed up."""
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -38,13 +39,40 @@ class MapStack:
         self.streamer.close()
 
 
+def open_localizer(
+    map_cache: Path | str,
+    camera: Camera,
+    config: LocalizerConfig | None = None,
+    rotation_at: RotationAt = lambda _time_ns: None,
+) -> Localizer:
+    """A localizer for one camera over a tile cache on disk; close it, or use it in a ``with``.
+
+    map_cache: folder that `build_cache` (``companion map build``) made. camera: of the frames as
+    they arrive, with its distortion. config: every setting has a default. rotation_at: see
+    `Localizer`. The first call on a machine compiles for a minute. Use it on the thread that opened
+    it: a GPU's renderer belongs to that one.
+    """
+    config = config or LocalizerConfig()
+    stack = MapStack(Path(map_cache), config)
+    try:
+        return build_localizer(stack, camera, config, rotation_at, on_close=stack.close)
+    except BaseException:
+        stack.close()
+        raise
+
+
 def build_localizer(
     stack: MapStack,
     camera: Camera,
     config: LocalizerConfig,
     rotation_at: RotationAt = lambda _time_ns: None,
+    *,
+    on_close: Callable[[], None] = lambda: None,
 ) -> Localizer:
-    """A localizer for one camera over an open map. rotation_at: see `Localizer`."""
+    """A localizer for one camera over an open map, which stays the caller's to close.
+
+    rotation_at, on_close: see `Localizer`.
+    """
     size = working_camera(camera, config.width)
     features = load_extractor(
         config.model,
@@ -57,7 +85,10 @@ def build_localizer(
         config.registration, open_backend(config.device, config.threads), config.threads
     )
     _warm_up(stack.renderer, extractor, optimizer, camera, config)
-    return Localizer(stack.renderer, extractor, optimizer, camera, config, rotation_at)
+    return Localizer(
+        stack.renderer, extractor, optimizer, camera, config, rotation_at,
+        map_frame=stack.cache.frame, on_close=on_close,
+    )  # fmt: skip
 
 
 def _warm_up(

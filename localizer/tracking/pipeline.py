@@ -2,6 +2,7 @@
 
 `Localizer.make_reference` is the render thread's half (predict, render, extract, anchors),
 `Localizer.localize` the localization thread's (extract, register, judge, filter).
+`Localizer.track` is both, one after the other.
 """
 
 from __future__ import annotations
@@ -10,15 +11,16 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import cv2
 import numpy as np
 
 from localizer.config import LocalizerConfig
-from localizer.errors import CameraError, OutsideMapError
+from localizer.errors import CameraError, GeoreferenceError, OutsideMapError
 from localizer.features.extractor import DeviceExtractor, FeatureExtractor
 from localizer.geometry.camera import Camera
+from localizer.geometry.geo import LocalFrame
 from localizer.geometry.pose import Array
 from localizer.registration.anchors import select_anchors
 from localizer.registration.jngo import JNGO
@@ -50,6 +52,8 @@ _LOOK_AHEAD_S = (1.0, 3.0)
 
 # A reference view with less of the map in it than this has nothing to register against.
 _MIN_MAP_SHARE = 0.1
+
+_NO_PRIOR = "no pose prior yet: call set_prior before localizing"
 
 
 @dataclass(frozen=True)
@@ -102,11 +106,14 @@ def _shrink(image: Image, camera: Camera) -> Image:
 
 
 class Localizer:
-    """The algorithm for one camera. Each half may run on its own thread.
+    """The algorithm for one camera. `open_localizer` makes one; `set_prior`, then `track` frames.
+
+    Each half (`make_reference`, `localize`) may also run on its own thread, as in the engine.
 
     rotation_at: the camera's attitude by another sensor's account (autopilot and gimbal). Its turns
     replace the constant angular rate of the motion model, and it enters the registration as a
-    weak prior (`AttitudePrior`).
+    weak prior (`AttitudePrior`). map_frame: the map's. on_close: releases what was opened for this
+    localizer alone.
     """
 
     def __init__(
@@ -117,7 +124,11 @@ class Localizer:
         camera: Camera,
         config: LocalizerConfig,
         rotation_at: RotationAt = lambda _time_ns: None,
+        *,
+        map_frame: LocalFrame | None = None,
+        on_close: Callable[[], None] = lambda: None,
     ) -> None:
+        self._map_frame, self._on_close = map_frame, on_close
         self._renderer = renderer
         self._extractor = extractor
         self._optimizer = optimizer
@@ -127,6 +138,23 @@ class Localizer:
         self._undistorter = Undistorter(camera, self.camera)
         self._lock = threading.Lock()
         self._tracker = TrackerState()
+
+    def __enter__(self) -> Localizer:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """Release what `open_localizer` opened: the renderer and the map's loader thread."""
+        self._on_close()
+
+    @property
+    def frame(self) -> LocalFrame:
+        """The map's ENU frame, in which poses are given: to and from WGS84."""
+        if self._map_frame is None:
+            raise GeoreferenceError("this localizer was made without its map's frame")
+        return self._map_frame
 
     @property
     def features_name(self) -> str:
@@ -154,6 +182,40 @@ class Localizer:
         state = motion.start(prior, self._config.motion)
         with self._lock:
             self._tracker = TrackerState(state, Integrity())
+
+    def track(
+        self,
+        frame: Frame,
+        *,
+        passes: int = 1,
+        query: Callable[[], FeaturePyramid] | None = None,
+    ) -> PoseEstimate:
+        """Localize one frame on this thread: predict, render the reference, extract, register.
+
+        passes: how often it is rendered and registered, each time from the last result; 3 for a
+        prior that is metres and degrees off, since the view from there shows another place. query:
+        gives the frame's features (`extract_query`), if they are computed beside the rendering.
+        Raises `OutsideMapError` without a prior (`set_prior`), or where the view from the
+        prediction does not meet the map.
+        """
+        stage_ms: dict[str, float] = {}
+        features: FeaturePyramid | None = None
+        for remaining in range(passes - 1, -1, -1):
+            prior = self.predict(frame.exposure_time_ns)
+            if prior is None:
+                raise OutsideMapError(_NO_PRIOR)
+            with stopwatch(stage_ms, "reference"):
+                bundle = self.make_reference(prior, wait=True)
+            if features is None:
+                with stopwatch(stage_ms, "extract"):
+                    features = query() if query is not None else self.extract_query(frame)
+            estimate = self.localize(frame, features, bundle.anchors)
+            if remaining and estimate.status is RegistrationStatus.OK:
+                # The same image again is no new evidence: start anew from its result, halving sigma
+                self.set_prior(
+                    PosePrior(estimate.world_from_camera, prior.covariance / 4, prior.time_ns)
+                )
+        return replace(estimate, stage_ms=stage_ms | estimate.stage_ms)
 
     def predict(self, time_ns: int) -> PosePrior | None:
         """The motion model's prediction at `time_ns`; None before the first prior."""
@@ -218,7 +280,7 @@ class Localizer:
         """Register the frame against the anchors, judge the result and update the filter."""
         tracker = self.tracker
         if tracker.motion is None:
-            raise OutsideMapError("no pose prior yet: call set_prior before localizing")
+            raise OutsideMapError(_NO_PRIOR)
         config = self._config
         ahead = self._at_frame(tracker.motion, frame.exposure_time_ns)
         started = time.perf_counter()

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from localizer.errors import LocalizerError
+from localizer.errors import BackendError
 
 
-class CudaError(LocalizerError):
+class CudaError(BackendError):
     """A call of the driver or the run-time compiler failed, or there is no usable GPU."""
 
 

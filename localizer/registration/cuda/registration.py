@@ -10,39 +10,46 @@ from localizer.registration.backend import QuadraticPrior, camera_from_local, lo
 from localizer.registration.config import JNGOConfig
 from localizer.registration.covariance import CovarianceSums
 from localizer.registration.cpu.reference import prior_terms
+from localizer.registration.cuda.backend import CudaBackend
 from localizer.registration.cuda.schedule import CudaSchedule, Search
 from localizer.registration.priors import PoseConstraint
 from localizer.registration.result import Found, Registration, failure, registration
 from localizer.types import Anchors, FeaturePyramid, PosePrior, RegistrationStatus
 
 
-def register_on_device(
-    schedule: CudaSchedule,
-    config: JNGOConfig,
-    query: FeaturePyramid,
-    camera: Camera,
-    anchors: Anchors,
-    prior: PosePrior,
-    *,
-    motion: PosePrior | None = None,
-    constraint: PoseConstraint | None = None,
-    seed: int = 0,
-) -> Registration:
-    """As `JNGO.register`, for levels and anchors that it has checked; features may be on the
-    device (`DeviceArray`).
-    """
-    origin = local_origin(anchors, prior.world_from_camera)
-    local = _local_constraint(constraint, origin) if config.prior_weight > 0 else None
-    search = schedule.run(
-        query, camera, anchors, origin, camera_from_local(*config.swarm(prior, seed), origin),
-        config, motion, local,
-    )  # fmt: skip
-    if not search.finite:
-        return failure(prior, RegistrationStatus.BAD_FEATURES)
-    if len(search.scores) == 0:
-        return failure(prior, RegistrationStatus.NO_OVERLAP, search.evaluations)
-    cell_px = config.correlation_px / query.levels[-1].stride
-    return registration(_found(search, local, cell_px), config, prior, origin)
+class CudaRegistration:
+    """`WholeRegistration` on a `CudaBackend`."""
+
+    def __init__(self, backend: CudaBackend) -> None:
+        self._schedule = CudaSchedule(backend)
+
+    def register(
+        self,
+        config: JNGOConfig,
+        query: FeaturePyramid,
+        camera: Camera,
+        anchors: Anchors,
+        prior: PosePrior,
+        *,
+        motion: PosePrior | None = None,
+        constraint: PoseConstraint | None = None,
+        seed: int = 0,
+    ) -> Registration:
+        """As `JNGO.register`, for levels and anchors that it has checked; features may be on the
+        device (`DeviceArray`).
+        """
+        origin = local_origin(anchors, prior.world_from_camera)
+        local = _local_constraint(constraint, origin) if config.prior_weight > 0 else None
+        search = self._schedule.run(
+            query, camera, anchors, origin, camera_from_local(*config.swarm(prior, seed), origin),
+            config, motion, local,
+        )  # fmt: skip
+        if not search.finite:
+            return failure(prior, RegistrationStatus.BAD_FEATURES)
+        if len(search.scores) == 0:
+            return failure(prior, RegistrationStatus.NO_OVERLAP, search.evaluations)
+        cell_px = config.correlation_px / query.levels[-1].stride
+        return registration(_found(search, local, cell_px), config, prior, origin)
 
 
 def _local_constraint(constraint: PoseConstraint | None, origin: Array) -> QuadraticPrior | None:

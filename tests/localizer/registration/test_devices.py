@@ -12,7 +12,7 @@ import pytest
 from localizer.registration import JNGO, JNGOConfig, devices
 from localizer.registration.cpu.kernel import NumbaBackend
 from localizer.registration.cuda import backend as cuda_backend
-from localizer.registration.cuda import compiler, driver
+from localizer.registration.cuda import compiler, driver, schedule
 from localizer.registration.cuda.errors import CudaError, CudaUnavailableError
 from localizer.registration.devices import open_backend
 
@@ -119,13 +119,16 @@ def test_a_gpu_that_fails_in_flight_leaves_the_cpu(monkeypatch, caplog, scene, p
     """The frame is still registered, once told, and the next ones do not try again."""
     monkeypatch.setattr(driver, "Arena", lambda _device: None)
     backend = cuda_backend.CudaBackend(_Gpu())
+    failed = []
     config = JNGOConfig(hypotheses=9, keep=(4, 2))
     optimizer = JNGO(config, backend, 1)
+    assert optimizer.on_gpu
 
     def fail(*_a, **_k):
+        failed.append(True)
         raise CudaError("cuLaunchKernel failed: CUDA_ERROR_LAUNCH_FAILED")
 
-    monkeypatch.setattr(optimizer._schedule, "run", fail)
+    monkeypatch.setattr(schedule.CudaSchedule, "run", fail)
     arguments = (scene.query, scene.camera, scene.anchors, prior(scene.reference, 1.0, 1.0))
     found = optimizer.register(*arguments)
     again = optimizer.register(*arguments)
@@ -134,6 +137,8 @@ def test_a_gpu_that_fails_in_flight_leaves_the_cpu(monkeypatch, caplog, scene, p
         np.testing.assert_array_equal(
             result.world_from_camera.matrix, expected.world_from_camera.matrix
         )
+    assert failed == [True]
+    assert not optimizer.on_gpu
     (line,) = lines(caplog)
     assert "continues on the CPU" in line.getMessage()
     assert optimizer.backend.name.startswith("numba")

@@ -238,6 +238,32 @@ def test_localizing_before_a_prior_is_an_error():
     localizer = _localizer()
     with pytest.raises(OutsideMapError, match="no pose prior"):
         localizer.localize(_frame(0), FakeExtractor().extract(np.zeros((240, 320, 3))), None)
+    with pytest.raises(OutsideMapError, match="no pose prior"):
+        localizer.track(_frame(0))
+
+
+def test_a_frame_is_tracked_in_one_call_as_in_its_two_halves():
+    whole, halves = _localizer(), _localizer()
+    for localizer in (whole, halves):
+        localizer.set_prior(_prior(10**9))
+    for k in range(1, 5):
+        frame = _frame(k)
+        tracked = whole.track(frame)
+        prior = halves.predict(frame.exposure_time_ns)
+        anchors = halves.make_reference(prior, wait=True).anchors
+        localized = halves.localize(frame, halves.extract_query(frame), anchors)
+        assert tracked.accepted
+        np.testing.assert_array_equal(
+            tracked.world_from_camera.matrix, localized.world_from_camera.matrix
+        )
+        assert tracked.state is localized.state
+    assert {"reference", "extract", "register"} <= set(tracked.stage_ms)
+    # No second set of features of the frame, and no evidence from it counted twice.
+    again = _localizer(renderer := FakeRenderer())
+    again.set_prior(_prior(10**9))
+    assert again.track(_frame(0), passes=3, query=lambda: whole.extract_query(_frame(0))).accepted
+    assert len(renderer.poses) == 3
+    assert again.tracker.integrity.accepted_in_row == 1
 
 
 def test_a_frame_of_another_size_is_named():

@@ -1,5 +1,7 @@
 import threading
 
+import pytest
+
 from localizer.tracking.mailbox import Mailbox
 
 
@@ -20,3 +22,14 @@ def test_close_wakes_a_waiting_reader():
     box.close()
     reader.join(timeout=60)
     assert got == [None]
+
+
+def test_the_producers_failure_reaches_the_consumer_over_an_item_that_waits():
+    box: Mailbox[int] = Mailbox()
+    assert box.put(1)
+    box.close(ValueError("the stream broke"))
+    box.close(RuntimeError("later"))
+    with pytest.raises(ValueError, match="the stream broke"):
+        box.take()
+    assert not box.put(2)
+    assert box.dropped == 0
