@@ -7,15 +7,18 @@ import math
 import threading
 from collections import deque
 from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from mavlink_bridge import quaternion as quat
 from mavlink_bridge.camera.messages import cursor_on_target
+from mavlink_bridge.components import COMMANDS_IN, Components
 from mavlink_bridge.config import BridgeConfig, SigningConfig
 from mavlink_bridge.errors import BridgeStateError
-from mavlink_bridge.flight_controller import FC_WANTED, FlightControllerSide, message_id
+from mavlink_bridge.flight_controller import FC_WANTED, FlightControllerEnd, message_id
+from mavlink_bridge.ground import GroundEnd
 from mavlink_bridge.injection.closed_loop import LoopVerdict
 from mavlink_bridge.injection.rc_gate import InjectionGate
 from mavlink_bridge.injection.shadow import ShadowScore
@@ -24,7 +27,6 @@ from mavlink_bridge.link.link import Link, LinkHandler
 from mavlink_bridge.link.signing import load_key
 from mavlink_bridge.link.tlog import TlogRecorder
 from mavlink_bridge.link.transport import Endpoint, UdpTransport
-from mavlink_bridge.link_end import COMMANDS_IN, GroundSide, Shared, Side
 from mavlink_bridge.messages import (
     Attitude,
     CameraView,
@@ -36,6 +38,7 @@ from mavlink_bridge.messages import (
     VisionFix,
     without_figures,
 )
+from mavlink_bridge.shared import Shared
 from mavlink_bridge.vehicle.presence import VehicleWatch
 from mavlink_bridge.vehicle.tracker import VehicleTracker
 
@@ -84,7 +87,7 @@ class Bridge:
         self._tracker = VehicleTracker(
             config.system_id, _mount(config), config.camera.mount == "fixed"
         )
-        shared = Shared(
+        self._shared = shared = Shared(
             config,
             geoid_separation_m,
             self._utc,
@@ -96,37 +99,19 @@ class Bridge:
             VehicleWatch(self.say),
             InjectionGate(config.rc, self._gate_changed) if config.mode == "rc" else None,
         )
-        self._fc = FlightControllerSide(shared)
-        self._fc_link = self._link(config.connection, self._fc, "fc", FC_WANTED, config.signing)
+        self._fc = FlightControllerEnd(shared)
+        make = partial(_make_link, recorder=self._recorder, timeout_s=config.link_timeout_s)
+        self._fc_link = make(config.connection, self._fc, "fc", FC_WANTED, config.signing)
         # Without a ground link of its own, what is for the ground is routed by the autopilot.
-        self._ground: Side = self._fc
+        self._ground: Components = self._fc.components
         self._ground_link = self._fc_link
         if config.ground_connection is not None:
-            ground = GroundSide(shared)
-            self._ground = ground
-            self._ground_link = self._link(
+            ground = GroundEnd(shared)
+            self._ground = ground.components
+            self._ground_link = make(
                 config.ground_connection, ground, "ground", _GROUND_WANTED, config.ground_signing
             )
         self._cot = _cot_socket(config.targets.cot_endpoint)
-
-    def _link(
-        self,
-        connection: str,
-        handler: LinkHandler,
-        name: str,
-        wanted: frozenset[int],
-        signing: SigningConfig | None,
-    ) -> Link:
-        return Link(
-            Endpoint.parse(connection),
-            handler,
-            name=name,
-            wanted=wanted,
-            signing_key=None if signing is None else load_key(signing.key_file),
-            signing_link_id=1 if signing is None else signing.link_id,
-            recorder=self._recorder,
-            timeout_s=self._config.link_timeout_s,
-        )
 
     @property
     def _links(self) -> tuple[Link, ...]:
@@ -169,7 +154,7 @@ class Bridge:
 
     def submit(self, fix: VisionFix) -> None:
         """Hand over a fix; never blocks."""
-        self._fc.fixes.put(fix)
+        self._fc.sender.fixes.put(fix)
         self._fc_link.wake()
 
     def report(self, target: TargetReport) -> None:
@@ -186,7 +171,7 @@ class Bridge:
         self._to_ground(view)
 
     def _to_ground(self, item: TargetReport | CameraView) -> None:
-        self._ground.outbound.append(item)
+        self._ground.show(item)
         self._ground_link.wake()
 
     def set_health(self, level: HealthLevel, text: str = "", *, tell: bool = True) -> None:
@@ -237,40 +222,59 @@ class Bridge:
     @property
     def injecting(self) -> bool:
         """Whether fixes are sent to the flight controller right now (mode and gate)."""
-        return self._fc.mode() == "inject"
+        return self._shared.mode() == "inject"
 
     def shadow_score(self) -> ShadowScore:
         """How vision compared with GNSS while that was healthy: the go or no-go before denial."""
-        injector = self._fc.injector
-        return self._fc.shadow.score(
+        injector = self._fc.sender.injector
+        return self._fc.outcome.shadow.score(
             monotonic_ns(), injector.yaw_difference_rad, injector.guard.blocked
         )
 
     def loop_verdict(self) -> LoopVerdict | None:
         """Whether the EKF follows what is sent; None while nothing is sent or it is too early."""
-        return self._fc.verdict
+        return self._fc.outcome.verdict
 
     def counters(self) -> dict[str, int | float | str]:
         """Counters of links and injection; keys are prefixed by where they come from."""
-        injector = self._fc.injector
         result: dict[str, int | float | str] = {}
         for link in self._links:
             result.update({f"{link.name}_{k}": v for k, v in link.stats().items()})
-        result.update({f"inject_{k}": v for k, v in dict(injector.counters).items()})
-        result.update({f"bridge_{k}": v for k, v in dict(self._fc.counters).items()})
-        result.update({f"rx_{k}": v for k, v in dict(self._fc.streams.counts).items()})
-        result["inject_reason"] = injector.reason
-        result["reset_counter"] = injector.reset_counter
-        result["yaw_difference_deg"] = math.degrees(injector.yaw_difference_rad)
-        result["fix_latency_ms"] = injector.latency_ms
-        result["clock_round_trip_ms"] = (self._tracker.clock.round_trip_ns or 0) * 1e-6
-        result["clock_rate"] = self._tracker.clock.rate
-        result["clock_steps"] = self._tracker.clock.steps
-        result["ignored_messages"] = self._tracker.ignored
-        result["fixes_not_taken"] = self._fc.fixes.dropped
+        result.update(self._fc.figures())
         result["tlog_dropped"] = 0 if self._recorder is None else self._recorder.dropped
-        result["ekf_source_set"] = self._fc.switch.current
+        result["ekf_source_set"] = self._fc.sources.current
         return result
+
+    def waiting(self) -> dict[str, int]:
+        """Messages and bytes that wait anywhere in the bridge, by where they do."""
+        result = {"texts": len(self._texts), **self._fc.waiting()}
+        if self._ground is not self._fc.components:
+            result.update({f"ground {name}": n for name, n in self._ground.waiting().items()})
+        for link in self._links:
+            result.update({f"{link.name} {name}": n for name, n in link.waiting().items()})
+        return result
+
+
+def _make_link(
+    connection: str,
+    handler: LinkHandler,
+    name: str,
+    wanted: frozenset[int],
+    signing: SigningConfig | None,
+    *,
+    recorder: TlogRecorder | None,
+    timeout_s: float,
+) -> Link:
+    return Link(
+        Endpoint.parse(connection),
+        handler,
+        name=name,
+        wanted=wanted,
+        signing_key=None if signing is None else load_key(signing.key_file),
+        signing_link_id=1 if signing is None else signing.link_id,
+        recorder=recorder,
+        timeout_s=timeout_s,
+    )
 
 
 def status_texts(severity: int, text: str, text_id: int) -> list[Any]:

@@ -41,15 +41,6 @@ def rss_mib() -> float:
     return pages * os.sysconf("SC_PAGE_SIZE") / 2**20
 
 
-def waiting(bridge: Bridge) -> int:
-    """Messages and bytes that wait anywhere in the bridge."""
-    fc, links = bridge._fc, bridge._links
-    queues: list[Any] = [fc.fixes._fixes, fc.injector._waiting, fc._to_compare, fc.outbound]
-    queues += [fc._sync_sent, fc.loop._sent, fc.loop._pending, fc.loop._differences, bridge._texts]
-    queues += [q for link in links for q in (link._outbox, link._unsent, link._reader._buffer)]
-    return sum(len(q) for q in queues)
-
-
 def feed(bridge: Bridge, stop: threading.Event) -> None:
     """A localizer that stands at home: fixes, targets, views and changing health."""
     rng = np.random.default_rng(1)
@@ -81,7 +72,7 @@ def take(bridge: Bridge, begun: float) -> Sample:
         rss_mib(),
         threading.active_count(),
         len(os.listdir("/proc/self/fd")),
-        waiting(bridge),
+        sum(bridge.waiting().values()),
         int(bridge.counters().get("bridge_injected", 0)),
     )
 

@@ -69,6 +69,11 @@ class CameraComponent:
         self._view_sent_ns = 0
         self._idle_ns = 0
 
+    @property
+    def targets(self) -> int:
+        """How many targets are reported on."""
+        return len(self._targets)
+
     def report(self, target: TargetReport) -> None:
         """The newest fix of a target."""
         self._targets[target.target_id] = target

@@ -94,6 +94,14 @@ class ClosedLoopCheck:
         reason = self._reason(rate, state, difference, recent[-1][3])
         return LoopVerdict(not reason, reason, difference)
 
+    def waiting(self) -> dict[str, int]:
+        """Lengths of everything that is remembered."""
+        return {
+            "sent": len(self._sent),
+            "pending": len(self._pending),
+            "differences": len(self._differences),
+        }
+
     def jump_missed(self) -> bool:
         """Whether an announced jump must be announced again, because the EKF is still elsewhere.
 

@@ -91,6 +91,9 @@ class FixQueue:
                 if self._fixes.popleft().reset:
                     self._fixes[0] = replace(self._fixes[0], reset=True)
 
+    def __len__(self) -> int:
+        return len(self._fixes)
+
     def take(self) -> list[VisionFix]:
         """All that wait, oldest first."""
         if not self._fixes:
@@ -131,6 +134,11 @@ class Injector:
     def reset_counter(self) -> int:
         """The counter of the last message."""
         return self._reset_counter
+
+    @property
+    def waiting(self) -> int:
+        """How many fixes are not of age yet."""
+        return len(self._waiting)
 
     @property
     def latency_ms(self) -> float:

@@ -92,6 +92,16 @@ class FrameReader:
         self._buffer.clear()
         self._sequences.clear()
 
+    @property
+    def waiting(self) -> int:
+        """Bytes of frames that are not complete yet."""
+        return len(self._buffer)
+
+    @property
+    def sources(self) -> int:
+        """How many (system, component) pairs are followed for their sequence numbers."""
+        return len(self._sequences)
+
     def feed(self, data: bytes, raw: deque[bytes] | None = None) -> list[Any]:
         """Messages completed by `data`; their frames are appended to `raw` when given."""
         buffer = self._buffer

@@ -177,6 +177,14 @@ class Link:
         """Counters of link and framing."""
         return {**asdict(self.counters), **asdict(self._reader.counters)}
 
+    def waiting(self) -> dict[str, int]:
+        """Messages of other threads, and bytes in and out, that wait here."""
+        return {
+            "outbox": len(self._outbox),
+            "unsent": len(self._unsent),
+            "unread": self._reader.waiting,
+        }
+
     # --- owner thread ---------------------------------------------------------------------------
 
     def _run(self) -> None:

@@ -1,4 +1,4 @@
-"""The bridge's flight-controller side under a simulated clock: minutes of flight in seconds."""
+"""The bridge's flight-controller end under a simulated clock: minutes of flight in seconds."""
 
 from __future__ import annotations
 
@@ -14,11 +14,12 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 from mavlink_bridge import BridgeConfig, HealthLevel, VisionFix
 from mavlink_bridge import quaternion as quat
 from mavlink_bridge.config import InjectionConfig, OriginConfig
-from mavlink_bridge.flight_controller import FC_WANTED, FlightControllerSide
+from mavlink_bridge.flight_controller import FC_WANTED, FlightControllerEnd
+from mavlink_bridge.injection.rc_gate import InjectionGate
 from mavlink_bridge.link.clock import SteadyUtc
 from mavlink_bridge.link.framing import FrameReader
 from mavlink_bridge.link.transport import Endpoint
-from mavlink_bridge.link_end import Shared
+from mavlink_bridge.shared import Shared
 from mavlink_bridge.vehicle.presence import VehicleWatch
 from mavlink_bridge.vehicle.tracker import VehicleTracker
 
@@ -33,7 +34,7 @@ TURN_RATE = 0.2  # rad/s of the vehicle's yaw
 
 @dataclass
 class SimulatedLink:
-    """What a side sees of a link; `open` false drops as a closed one does."""
+    """What an end sees of its link; `open` false drops as a closed one does."""
 
     sent: list[tuple[int, Any, int]] = field(default_factory=list)
     system_id: int = 0
@@ -60,12 +61,14 @@ class Flight:
     boot_ns: its boot time as a function of the simulated time. mangle: what becomes of each frame.
     """
 
-    def __init__(self, monkeypatch: pytest.MonkeyPatch, **options: Any) -> None:
+    def __init__(
+        self, monkeypatch: pytest.MonkeyPatch, gate: InjectionGate | None = None, **options: Any
+    ) -> None:
         options.setdefault("injection", InjectionConfig(rate_hz=10, delay_ms=100))
         options.setdefault("origin", ORIGIN)
         config = BridgeConfig(mode="inject", **options)
         self.now_ns = 1_000 * SECOND
-        for module in ("flight_controller", "vehicle.presence", "link.clock"):
+        for module in ("vehicle.timesync", "vehicle.presence", "link.clock"):
             monkeypatch.setattr(f"mavlink_bridge.{module}.monotonic_ns", lambda: self.now_ns)
         self.texts: list[str] = []
 
@@ -82,9 +85,10 @@ class Flight:
             say,
             None,
             VehicleWatch(say),
-            None,
+            gate,
         )
-        self.side = FlightControllerSide(shared)
+        self.shared = shared
+        self.end = FlightControllerEnd(shared)
         self.link = SimulatedLink()
         self.reader = FrameReader(FC_WANTED)
         self.codec = mavlink.MAVLink(None, 1, 1)
@@ -122,7 +126,7 @@ class Flight:
                 self._vehicle(step)
             if self.sees and step % 10 == 5:
                 self._fix(self.now_ns - self.latency_ms * MS)
-            self.side.on_tick(self.link, self.now_ns)  # type: ignore[arg-type]
+            self.end.on_tick(self.link, self.now_ns)  # type: ignore[arg-type]
 
     def vision(self, since_ns: int = 0) -> list[tuple[int, Any]]:
         """What was injected: (time, message)."""
@@ -142,16 +146,16 @@ class Flight:
             reset=self.reset_next,
         )
         self.reset_next = False
-        self.side.fixes.put(fix)
+        self.end.sender.fixes.put(fix)
 
     def _vehicle(self, step: int) -> None:
         boot_ms = self.boot_ns(self.now_ns) // MS
         if step % 100 == 0:
-            self._say(mavlink.MAVLink_heartbeat_message(2, 3, 81, 4, 4, 3))
+            self.say(mavlink.MAVLink_heartbeat_message(2, 3, 81, 4, 4, 3))
         if step % 4 == 0:
             yaw = self.yaw(self.now_ns)
-            self._say(mavlink.MAVLink_attitude_message(boot_ms, 0.0, 0.0, yaw, 0.0, 0.0, TURN_RATE))
-            self._say(
+            self.say(mavlink.MAVLink_attitude_message(boot_ms, 0.0, 0.0, yaw, 0.0, 0.0, TURN_RATE))
+            self.say(
                 mavlink.MAVLink_local_position_ned_message(
                     boot_ms, self.ekf_north_m, 0.0, -500.0, 0, 0, 0
                 )
@@ -164,44 +168,35 @@ class Flight:
     def _answer(self, m: Any) -> None:
         kind = m.get_type()
         if kind == "TIMESYNC" and m.tc1 == 0:
-            self._say(mavlink.MAVLink_timesync_message(self.boot_ns(m.ts1 + 4 * MS), m.ts1))
+            self.say(mavlink.MAVLink_timesync_message(self.boot_ns(m.ts1 + 4 * MS), m.ts1))
         elif kind == "SET_GPS_GLOBAL_ORIGIN" and self.origin is None:
             self.origin = (m.latitude * 1e-7, m.longitude * 1e-7, m.altitude * 1e-3)
         elif kind == "COMMAND_LONG" and m.command == 512 and m.param1 == 49 and self.origin:
             lat, lon, alt = self.origin
-            self._say(
+            self.say(
                 mavlink.MAVLink_gps_global_origin_message(
                     round(lat * 1e7), round(lon * 1e7), round(alt * 1e3), 0
                 )
             )
 
-    def _say(self, message: Any) -> None:
+    def say(self, message: Any) -> None:
+        """One message from the vehicle."""
         frame = bytes(message.pack(self.codec))
         self.codec.seq = (self.codec.seq + 1) % 256
         for decoded in self.reader.feed(self.mangle(frame)):
-            self.side.on_message(self.link, decoded, self.now_ns)  # type: ignore[arg-type]
+            self.end.on_message(self.link, decoded, self.now_ns)  # type: ignore[arg-type]
 
     def waiting(self) -> dict[str, int]:
         """Lengths of everything that could grow."""
-        side = self.side
-        queues: dict[str, Any] = {
-            "fixes": side.fixes._fixes,
-            "due": side.injector._waiting,
-            "to compare": side._to_compare,
-            "outbound": side.outbound,
-            "timesync": side._sync_sent,
-            "sent": side.loop._sent,
-            "pending": side.loop._pending,
-            "differences": side.loop._differences,
-            "bytes": self.reader._buffer,
-            "sequences": self.reader._sequences,
-            "targets": side.camera._targets,
+        return {
+            **self.end.waiting(),
+            "bytes": self.reader.waiting,
+            "sequences": self.reader.sources,
         }
-        return {name: len(queue) for name, queue in queues.items()}
 
     def attitude_error(self, age_ns: int = 200 * MS) -> float:
         """Error of the interpolated yaw at an exposure, rad; NaN while there is none."""
-        at = self.side.tracker.attitude_at(self.now_ns - age_ns)
+        at = self.shared.tracker.attitude_at(self.now_ns - age_ns)
         if at is None:
             return math.nan
         return abs(quat.wrap_pi(at.yaw_rad - self.yaw(self.now_ns - age_ns)))

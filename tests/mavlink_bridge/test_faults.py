@@ -8,7 +8,6 @@ import random
 import struct
 import time
 from collections.abc import Callable, Iterator
-from dataclasses import replace
 from typing import Any
 
 import pytest
@@ -17,10 +16,10 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 from mavlink_bridge import TargetReport, VisionFix
 from mavlink_bridge.config import InjectionConfig, RcGateConfig, SourceSwitchConfig
 from mavlink_bridge.flight_controller import FC_WANTED
+from mavlink_bridge.ground import GroundEnd
 from mavlink_bridge.injection.injector import FixQueue
 from mavlink_bridge.injection.rc_gate import InjectionGate
 from mavlink_bridge.link.framing import FrameReader
-from mavlink_bridge.link_end import GroundSide
 from tests.mavlink_bridge.simulated import HOME, MS, SECOND, Flight, SimulatedLink
 
 
@@ -59,7 +58,7 @@ def test_five_minutes_without_a_link(flight: Flight) -> None:
         "PiLoT: flight controller lost: no heartbeat for 3 s",
         "PiLoT: flight controller is back",
     ]
-    assert flight.side.counters["reboots"] == 0
+    assert flight.end.counters["reboots"] == 0
     # Only what is fresh: nothing that waited during the loss.
     assert all(t - m.usec * 1000 <= 251 * MS for t, m in after)
     assert max(flight.waiting().values()) <= 256
@@ -90,7 +89,7 @@ def test_reboot_in_flight(flight: Flight) -> None:
     assert after[0][0] - rebooted_ns < 10 * SECOND  # origin asked for, then set again
     assert len(after) > 40
     assert {m.reset_counter for _, m in after} == {0}
-    assert flight.side.counters["reboots"] == 1
+    assert flight.end.counters["reboots"] == 1
     assert sum("rebooted" in t for t in flight.texts) == 1
     assert flight.attitude_error() < 0.005
 
@@ -100,12 +99,12 @@ def test_only_a_gap_of_a_second_is_told(flight: Flight) -> None:
 
     def blind(seconds: float) -> list[str]:
         before = len(flight.texts)
-        withheld = flight.side.injector.counters["withheld_stale"]
+        withheld = flight.end.sender.injector.counters["withheld_stale"]
         flight.sees = False
         flight.run(seconds)
         flight.sees = True
         flight.run(2.0)
-        assert flight.side.injector.counters["withheld_stale"] > withheld
+        assert flight.end.sender.injector.counters["withheld_stale"] > withheld
         return [t for t in flight.texts[before:] if "sent" in t or "injecting" in t]
 
     assert blind(0.8) == []
@@ -124,7 +123,7 @@ def test_step_of_the_vehicles_clock(flight: Flight, step_s: float) -> None:
     assert {m.reset_counter for _, m in after} == {0}
     stamps = [m.usec for _, m in flight.vision()]
     assert all(b > a for a, b in itertools.pairwise(stamps))
-    assert flight.side.counters["reboots"] == (1 if step_s < -1.0 else 0)
+    assert flight.end.counters["reboots"] == (1 if step_s < -1.0 else 0)
 
 
 @pytest.mark.parametrize("step_s", [3600.0, -3600.0])
@@ -267,7 +266,7 @@ def test_damaged_frames_on_the_flight_controllers_link(
     counters = flight.reader.counters
     assert counters.bad_bytes > 1000
     assert counters.bad_checksums > 50
-    assert flight.side.counters["reboots"] == 0
+    assert flight.end.counters["reboots"] == 0
     assert flight.attitude_error() < 0.01
     assert not [t for t in flight.texts if "two autopilots" in t]
     assert {m.reset_counter for _, m in flight.vision()} == {0}
@@ -301,9 +300,9 @@ def nonsense(rng: random.Random, count: int) -> Iterator[Any]:
 def test_nonsense_with_right_checksums_raises_nothing_and_leaves_nothing(
     flight: Flight, seed: int
 ) -> None:
-    ground, link = GroundSide(flight.side.shared), SimulatedLink(system_id=1)
+    ground, link = GroundEnd(flight.shared), SimulatedLink(system_id=1)
     for i, message in enumerate(nonsense(random.Random(seed), 4000)):
-        flight.side.on_message(flight.link, message, flight.now_ns)  # type: ignore[arg-type]
+        flight.end.on_message(flight.link, message, flight.now_ns)  # type: ignore[arg-type]
         ground.on_message(link, message, flight.now_ns)  # type: ignore[arg-type]
         if i % 40 == 0:
             flight.run(0.05)
@@ -314,7 +313,7 @@ def test_nonsense_with_right_checksums_raises_nothing_and_leaves_nothing(
     flight.run(30.0)
     assert len(flight.vision(flight.now_ns - 10 * SECOND)) > 90
     assert flight.attitude_error() < 0.005
-    at = flight.side.tracker.attitude_at(flight.now_ns - 100 * MS)
+    at = flight.shared.tracker.attitude_at(flight.now_ns - 100 * MS)
     assert at is not None
     assert math.isfinite(at.yaw_rad)
 
@@ -364,11 +363,11 @@ def extreme_messages() -> Iterator[Any]:
 
 
 def test_every_field_of_every_message_at_its_extremes_raises_nothing(flight: Flight) -> None:
-    ground, link = GroundSide(flight.side.shared), SimulatedLink(system_id=1)
+    ground, link = GroundEnd(flight.shared), SimulatedLink(system_id=1)
     count = 0
     for message in extreme_messages():
         count += 1
-        flight.side.on_message(flight.link, message, flight.now_ns)  # type: ignore[arg-type]
+        flight.end.on_message(flight.link, message, flight.now_ns)  # type: ignore[arg-type]
         ground.on_message(link, message, flight.now_ns)  # type: ignore[arg-type]
         if count % 8 == 0:
             flight.run(0.02)
@@ -396,14 +395,14 @@ def test_a_jump_that_the_ekf_missed_is_announced_again(
             flight.ekf_north_m = 10.0
     assert counters == set(range((taken_at or 6) + 1))  # six: announced, and five times again
     again = [t for t in flight.texts if "missed a jump" in t]
-    assert len(again) == flight.side.counters["jumps_repeated"] == (taken_at or 6) - 1
+    assert len(again) == flight.end.counters["jumps_repeated"] == (taken_at or 6) - 1
 
 
 def test_a_flood_of_targets_and_commands_leaves_a_slow_link_to_positions(flight: Flight) -> None:
     """A hundred targets at once, and a ground station that orders without end."""
     for i in range(100):
         report = TargetReport(flight.now_ns, *HOME, 500.0, target_id=i, pixel=(0.5, 0.5))
-        flight.side.outbound.append(report)
+        flight.end.components.show(report)
     told: dict[int, int] = {}
     begun_ns = flight.now_ns
     flight.run(1.0)
@@ -418,14 +417,14 @@ def test_a_flood_of_targets_and_commands_leaves_a_slow_link_to_positions(flight:
     station = mavlink.MAVLink(None, 255, 190)
     for _ in range(50):
         for message in flight.reader.feed(order.pack(station)):
-            flight.side.on_message(flight.link, message, flight.now_ns)  # type: ignore[arg-type]
+            flight.end.on_message(flight.link, message, flight.now_ns)  # type: ignore[arg-type]
         flight.run(0.1)
     kinds = {m.get_type() for t, m, _ in flight.link.sent if t > begun_ns}
     assert "VISION_POSITION_ESTIMATE" in kinds
     assert not kinds & {"COMMAND_ACK", "CAMERA_TRACKING_GEO_STATUS"}
     flight.link.congested = False
     for message in flight.reader.feed(order.pack(station)):
-        flight.side.on_message(flight.link, message, flight.now_ns)  # type: ignore[arg-type]
+        flight.end.on_message(flight.link, message, flight.now_ns)  # type: ignore[arg-type]
     assert flight.link.sent[-1][1].get_type() == "COMMAND_ACK"
 
 
@@ -451,12 +450,12 @@ def test_a_second_vehicle_and_a_second_companion_are_told_once(
     for _ in range(3):
         kept = flight.link.kept
         for message in flight.reader.feed(beat):
-            flight.side.on_message(flight.link, message, flight.now_ns)  # type: ignore[arg-type]
+            flight.end.on_message(flight.link, message, flight.now_ns)  # type: ignore[arg-type]
         assert flight.link.kept == kept
         flight.run(1.0)
         assert flight.link.kept == kept + 1  # by the vehicle's own heartbeat
     assert flight.texts == ([f"PiLoT: {said}"] if said else [])
-    assert flight.side.tracker.snapshot(flight.now_ns).system_id == 1
+    assert flight.shared.tracker.snapshot(flight.now_ns).system_id == 1
 
 
 @pytest.mark.parametrize("ahead_s", [-50, 500])
@@ -470,7 +469,7 @@ def test_two_vehicles_of_the_same_ids_are_told_once(flight: Flight, ahead_s: int
             boot_ms = flight.boot_ns(flight.now_ns) // MS + ahead_s * 1000
             attitude = mavlink.MAVLink_attitude_message(boot_ms, 0.0, 0.0, -1.0, 0.0, 0.0, 0.0)
             for message in flight.reader.feed(attitude.pack(other)):
-                flight.side.on_message(flight.link, message, flight.now_ns)  # type: ignore[arg-type]
+                flight.end.on_message(flight.link, message, flight.now_ns)  # type: ignore[arg-type]
     told = [t for t in flight.texts if "two autopilots" in t]
     assert told == ["PiLoT: two autopilots speak as system 1: change one's id"]
     assert {m.yaw for _, m in flight.vision()}.isdisjoint({-1.0})
@@ -478,7 +477,7 @@ def test_two_vehicles_of_the_same_ids_are_told_once(flight: Flight, ahead_s: int
 
 def test_a_target_from_the_future_is_not_reported_for_ever(flight: Flight) -> None:
     hour = 3600 * SECOND
-    flight.side.outbound.append(TargetReport(flight.now_ns + hour, *HOME, 500.0))
+    flight.end.components.show(TargetReport(flight.now_ns + hour, *HOME, 500.0))
     flight.run(1.0)
     assert flight.waiting()["targets"] == 0
     assert not [m for _, m, _ in flight.link.sent if m.get_type() == "CAMERA_TRACKING_GEO_STATUS"]
@@ -521,16 +520,15 @@ def test_answers_to_others_commands_are_not_ours(
     flight = Flight(monkeypatch)
     flight.run(5.0)
     ack = mavlink.MAVLink_command_ack_message(42007, 4, 0, 0, system, component)
-    flight._say(ack)
-    assert flight.side.counters["commands_refused"] == (1 if ours else 0)
+    flight.say(ack)
+    assert flight.end.counters["commands_refused"] == (1 if ours else 0)
     assert bool([t for t in flight.texts if "source switch refused" in t]) is ours
 
 
 def test_no_origin_is_set_while_the_gate_is_closed(monkeypatch: pytest.MonkeyPatch) -> None:
-    flight = Flight(monkeypatch)
     opened: list[str] = []
     gate = InjectionGate(RcGateConfig(), opened.append)
-    flight.side.shared = replace(flight.side.shared, gate=gate)
+    flight = Flight(monkeypatch, gate)
     flight.run(15.0)
     assert flight.origin is None
     assert gate.command(mavlink.MAV_CMD_USER_1, 1.0) == mavlink.MAV_RESULT_ACCEPTED

@@ -1,0 +1,113 @@
+"""Our components on a link: heartbeats, commands to them, and what the camera tells."""
+
+from __future__ import annotations
+
+import math
+from collections import deque
+from typing import Any
+
+from pymavlink.dialects.v20 import ardupilotmega as mavlink
+
+from mavlink_bridge.camera.component import CameraComponent
+from mavlink_bridge.link.link import Link
+from mavlink_bridge.messages import CameraView, HealthLevel, Origin, TargetReport, VehicleState
+from mavlink_bridge.shared import Shared
+
+COMMANDS_IN = ("COMMAND_LONG", "COMMAND_INT")
+_QUEUE = 64
+_HEARTBEAT_NS = 1_000_000_000
+
+SYSTEM_STATUS = {
+    HealthLevel.STARTING: mavlink.MAV_STATE_BOOT,
+    HealthLevel.OK: mavlink.MAV_STATE_ACTIVE,
+    HealthLevel.DEGRADED: mavlink.MAV_STATE_CRITICAL,
+    HealthLevel.FAILED: mavlink.MAV_STATE_EMERGENCY,
+}
+
+
+class Components:
+    """The bridge's components as one link sees them; its owner thread calls.
+
+    They speak up once a second, answer commands and tell of targets and camera poses. Only `show`
+    may be called from other threads.
+    """
+
+    def __init__(self, shared: Shared, *, ground: bool) -> None:
+        self._shared = shared
+        self._config = shared.config
+        self._outbound: deque[TargetReport | CameraView] = deque(maxlen=_QUEUE)
+        self._camera = CameraComponent(
+            self._config, shared.geoid_separation_m, shared.on_track, ground_link=ground
+        )
+        self._next_heartbeat_ns = 0
+
+    def show(self, item: TargetReport | CameraView) -> None:
+        """Queue a target or a camera pose for the ground; the oldest go first when it is full."""
+        self._outbound.append(item)
+
+    def waiting(self) -> dict[str, int]:
+        """Lengths of everything that waits here."""
+        return {"outbound": len(self._outbound), "targets": self._camera.targets}
+
+    def announce(self) -> None:
+        """The link was opened: the next heartbeat is due at once."""
+        self._next_heartbeat_ns = 0
+
+    def heartbeat(self, link: Link, now_ns: int) -> None:
+        """HEARTBEAT of each component at 1 Hz; system status follows the localizer's health."""
+        if now_ns < self._next_heartbeat_ns:
+            return
+        self._next_heartbeat_ns = now_ns + _HEARTBEAT_NS
+        status = SYSTEM_STATUS[self._shared.health()]
+        onboard = mavlink.MAV_TYPE_ONBOARD_CONTROLLER
+        components = [
+            (self._config.companion_component, onboard),
+            (self._config.localizer_component, onboard),
+        ]
+        if self._config.camera.announce:
+            components.append((self._config.camera_component, mavlink.MAV_TYPE_CAMERA))
+        for component, kind in components:
+            message = mavlink.MAVLink_heartbeat_message(
+                kind, mavlink.MAV_AUTOPILOT_INVALID, 0, 0, status, 3
+            )
+            link.send(message, component)
+
+    def serve_camera(self, link: Link, state: VehicleState, now_ns: int) -> None:
+        """Targets and camera pose to the ground, where the link has room for them."""
+        if link.congested:
+            return
+        while self._outbound:
+            item = self._outbound.popleft()
+            if isinstance(item, TargetReport):
+                self._camera.report(item)
+            else:
+                self._camera.look(item)
+        position = None
+        if math.isfinite(state.latitude_deg):
+            position = Origin(state.latitude_deg, state.longitude_deg, state.altitude_amsl_m)
+        self._camera.tick(now_ns, position, self._shared.uptime_ms(now_ns), link.send)
+
+    def command(self, link: Link, message: Any, time_ns: int) -> None:
+        """A command of a ground station to one of our components.
+
+        While the link is congested it is left unanswered, as if lost: the sender repeats it, and
+        a flood of commands costs no position its place.
+        """
+        if link.congested:
+            return
+        localizer = self._config.localizer_component
+        if (message.target_system, message.target_component) == (link.system_id, localizer):
+            self._localizer_command(link, message)
+        elif self._config.camera.announce and message.target_system in (0, link.system_id):
+            self._camera.command(message, time_ns, self._shared.uptime_ms(time_ns), link.send)
+
+    def _localizer_command(self, link: Link, message: Any) -> None:
+        """The command that gates injection; every other one is refused in the protocol's way."""
+        gate = self._shared.gate
+        result = mavlink.MAV_RESULT_UNSUPPORTED
+        if gate is not None:
+            result = gate.command(message.command, message.param1)
+        ack = mavlink.MAVLink_command_ack_message(
+            message.command, result, 0, 0, message.get_srcSystem(), message.get_srcComponent()
+        )
+        link.send(ack, self._config.localizer_component)

@@ -1,0 +1,40 @@
+"""The separate ground link: telemetry bandwidth is not spent on injection there."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from mavlink_bridge.components import COMMANDS_IN, Components
+from mavlink_bridge.link.link import Link
+from mavlink_bridge.shared import Shared
+
+_TICK_NS = 20_000_000
+
+
+class GroundEnd:
+    """Runs in the ground link's thread, and only its components are filled from outside."""
+
+    def __init__(self, shared: Shared) -> None:
+        self.components = Components(shared, ground=True)
+        self._shared = shared
+
+    def on_open(self, link: Link) -> None:
+        """Announce at once."""
+        self.components.announce()
+
+    def on_message(self, link: Link, message: Any, time_ns: int) -> None:
+        """Commands for our components."""
+        if message.get_type() in COMMANDS_IN:
+            self.components.command(link, message, time_ns)
+
+    def on_tick(self, link: Link, now_ns: int) -> int:
+        """Heartbeats and targets, once the vehicle's system id is known."""
+        config = self._shared.config
+        state = self._shared.tracker.snapshot(now_ns)
+        link.system_id = config.system_id or state.system_id or 0
+        self._shared.watch.check(state)
+        if link.system_id:
+            self.components.heartbeat(link, now_ns)
+            if config.camera.announce:
+                self.components.serve_camera(link, state, now_ns)
+        return now_ns + _TICK_NS

@@ -1,0 +1,90 @@
+"""Fixes from any thread to positions on the link, or to nothing with a reason that is told."""
+
+from __future__ import annotations
+
+from collections import Counter
+
+from mavlink_bridge.config import Mode
+from mavlink_bridge.injection.injector import (
+    NO_FIX_YET,
+    NO_FRESH_FIX,
+    FixQueue,
+    Injection,
+    InjectionContext,
+    Injector,
+)
+from mavlink_bridge.injection.outcome import InjectionOutcome
+from mavlink_bridge.injection.propagate import PropagatedFix
+from mavlink_bridge.link.link import Link
+from mavlink_bridge.shared import Shared
+from mavlink_bridge.texts import Teller
+from mavlink_bridge.vehicle.origin_exchange import OriginExchange
+from mavlink_bridge.vehicle.profile import FirmwareProfile
+
+_QUEUE = 64
+_NEWS_AFTER_NS = 1_000_000_000  # a gap in the fixes that is told
+_GOOD_NS = 1_000_000_000
+
+
+class FixSender:
+    """Runs in the flight-controller link's thread; only `fixes` is filled from outside.
+
+    vision: the last position that was sent or scored.
+    """
+
+    def __init__(
+        self,
+        shared: Shared,
+        origin: OriginExchange,
+        outcome: InjectionOutcome,
+        teller: Teller,
+        counters: Counter[str],
+    ) -> None:
+        self.fixes = FixQueue(_QUEUE)
+        self.injector = Injector(shared.config.injection, shared.geoid_separation_m, shared.utc)
+        self.vision: PropagatedFix | None = None
+        self._component = shared.config.localizer_component
+        self._attitude_at = shared.tracker.attitude_at
+        self._origin = origin
+        self._outcome = outcome
+        self._teller = teller
+        self._counters = counters
+        self._delivered_ns = 0
+
+    def take(self, now_ns: int) -> None:
+        """The fixes that came since the last call."""
+        for fix in self.fixes.take():
+            self.injector.submit(fix, now_ns)
+
+    def step(self, link: Link, profile: FirmwareProfile, mode: Mode, now_ns: int) -> None:
+        """Send what is due, as the mode allows, and tell why not. mode: not ``off``."""
+        context = InjectionContext(self._origin.origin, profile, self._attitude_at)
+        injection = self.injector.step(now_ns, context)
+        if injection is not None:
+            self.vision = injection.estimate.position
+            self._deliver(link, mode, injection, now_ns)
+        reason = self.injector.reason
+        # A late fix or two is no news: the texts would follow every hiccup of a busy computer.
+        brief = reason == NO_FRESH_FIX and now_ns - self._delivered_ns < _NEWS_AFTER_NS
+        if reason != NO_FIX_YET and not brief:
+            problem = f"not sent: {reason}" if reason else ""
+            self._teller.tell("inject", problem, "injecting", prefix=mode)
+
+    def is_good(self, now_ns: int) -> bool:
+        """Whether positions came of late, and the yaw guard is content."""
+        return not self.injector.guard.blocked and now_ns - self._delivered_ns < _GOOD_NS
+
+    def waiting(self) -> dict[str, int]:
+        """Lengths of everything that waits here."""
+        return {"fixes": len(self.fixes), "due": self.injector.waiting}
+
+    def _deliver(self, link: Link, mode: Mode, injection: Injection, now_ns: int) -> None:
+        self._delivered_ns = now_ns
+        self._outcome.made(injection.estimate)
+        if mode != "inject":
+            self._counters["shadowed"] += 1
+            return
+        if not link.send(injection.message, self._component):
+            return
+        self._counters["injected"] += 1
+        self._outcome.sent(injection.estimate, now_ns)

@@ -1,0 +1,85 @@
+"""What came of the positions: how they compare with GNSS, and whether the EKF follows them."""
+
+from __future__ import annotations
+
+from collections import Counter, deque
+
+from mavlink_bridge.injection.closed_loop import ClosedLoopCheck, LoopVerdict
+from mavlink_bridge.injection.encode import Estimate
+from mavlink_bridge.injection.propagate import PropagatedFix
+from mavlink_bridge.injection.shadow import ShadowScorer, gnss_healthy
+from mavlink_bridge.messages import VehicleState
+from mavlink_bridge.shared import Shared
+from mavlink_bridge.texts import Teller
+from mavlink_bridge.vehicle.origin import north_east
+from mavlink_bridge.vehicle.origin_exchange import OriginExchange
+
+_QUEUE = 64
+_REFERENCE_WAIT_NS = 500_000_000
+
+
+class InjectionOutcome:
+    """Remembers what was made and sent, and judges; one thread.
+
+    verdict: the last one; None while nothing is sent or it is too early.
+    """
+
+    def __init__(
+        self, shared: Shared, origin: OriginExchange, teller: Teller, counters: Counter[str]
+    ) -> None:
+        self.shadow = ShadowScorer(shared.geoid_separation_m)
+        self.verdict: LoopVerdict | None = None
+        self._loop = ClosedLoopCheck(shared.config.injection.message)
+        self._tracker = shared.tracker
+        self._origin = origin
+        self._teller = teller
+        self._counters = counters
+        self._to_compare: deque[PropagatedFix] = deque(maxlen=_QUEUE)
+
+    def made(self, estimate: Estimate) -> None:
+        """An estimate is due, whether it is sent or not."""
+        if estimate.fresh:
+            self._to_compare.append(estimate.position)
+
+    def sent(self, estimate: Estimate, now_ns: int) -> None:
+        """An estimate went to the flight controller."""
+        origin, position = self._origin.origin, estimate.position
+        if origin is None:
+            return
+        north, east = north_east(
+            origin.latitude_deg,
+            origin.longitude_deg,
+            position.latitude_deg,
+            position.longitude_deg,
+        )
+        self._loop.sent(
+            position.time_ns,
+            now_ns,
+            north,
+            east,
+            position.horizontal_sigma_m,
+            estimate.reset_counter,
+        )
+
+    def compare(self, state: VehicleState, now_ns: int, *, on_gnss: bool) -> None:
+        """Score against the EKF's position at the same time, while GNSS made that."""
+        while self._to_compare and now_ns - self._to_compare[0].time_ns > _REFERENCE_WAIT_NS:
+            fix = self._to_compare.popleft()
+            reference = self._tracker.global_at(fix.time_ns)
+            if reference is not None and on_gnss and gnss_healthy(state, now_ns):
+                self.shadow.compare(fix, reference)
+
+    def judge(self, state: VehicleState, now_ns: int) -> bool:
+        """Whether the EKF follows, told; True when a jump must be announced again."""
+        self.verdict = self._loop.verdict(now_ns, state, self._tracker.local_at)
+        if self.verdict is not None:
+            self._teller.tell("loop", self.verdict.reason, "the EKF follows")
+        if not self._loop.jump_missed():
+            return False
+        self._counters["jumps_repeated"] += 1
+        self._teller.notice("the EKF missed a jump: announced again")
+        return True
+
+    def waiting(self) -> dict[str, int]:
+        """Lengths of everything that waits here."""
+        return {"to compare": len(self._to_compare), **self._loop.waiting()}

@@ -1,0 +1,42 @@
+"""What the bridge lends to the ends of its links."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+from mavlink_bridge.config import BridgeConfig, Mode
+from mavlink_bridge.injection.rc_gate import InjectionGate
+from mavlink_bridge.link.clock import SteadyUtc
+from mavlink_bridge.messages import HealthLevel, TrackRequest
+from mavlink_bridge.vehicle.presence import VehicleWatch
+from mavlink_bridge.vehicle.tracker import VehicleTracker
+
+
+@dataclass(frozen=True)
+class Shared:
+    """What the bridge lends to its ends. say: tell the operator (severity, text).
+
+    gate: None unless the mode is ``rc``.
+    """
+
+    config: BridgeConfig
+    geoid_separation_m: float
+    utc: SteadyUtc
+    tracker: VehicleTracker
+    begun_ns: int
+    health: Callable[[], HealthLevel]
+    say: Callable[[int, str], None]
+    on_track: Callable[[TrackRequest], None] | None
+    watch: VehicleWatch
+    gate: InjectionGate | None
+
+    def uptime_ms(self, now_ns: int) -> int:
+        """Milliseconds since the bridge began: its own time_boot_ms."""
+        return (now_ns - self.begun_ns) // 1_000_000 & 0xFFFFFFFF
+
+    def mode(self) -> Mode:
+        """off, shadow or inject; mode rc follows its gate."""
+        if self.gate is None:
+            return self.config.mode
+        return "inject" if self.gate.open else "shadow"

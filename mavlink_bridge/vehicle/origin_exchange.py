@@ -1,0 +1,63 @@
+"""The EKF origin on the link: asked for, read, and set where the vehicle has none."""
+
+from __future__ import annotations
+
+from collections import Counter
+from typing import Any
+
+from pymavlink.dialects.v20 import ardupilotmega as mavlink
+
+from mavlink_bridge.config import BridgeConfig
+from mavlink_bridge.link.link import Link
+from mavlink_bridge.messages import Origin
+from mavlink_bridge.texts import Teller
+from mavlink_bridge.vehicle.commands import Commander
+from mavlink_bridge.vehicle.origin import OriginKeeper
+from mavlink_bridge.vehicle.tracker import VehicleTracker
+
+
+class OriginExchange:
+    """Lets the keeper speak, and gives what it knows to the tracker; one thread."""
+
+    def __init__(
+        self,
+        config: BridgeConfig,
+        tracker: VehicleTracker,
+        commander: Commander,
+        teller: Teller,
+        counters: Counter[str],
+    ) -> None:
+        self._keeper = OriginKeeper(config.origin)
+        self._component = config.companion_component
+        self._tracker = tracker
+        self._commander = commander
+        self._teller = teller
+        self._counters = counters
+
+    @property
+    def origin(self) -> Origin | None:
+        """The EKF's origin; None while it is not known."""
+        return self._keeper.origin
+
+    def on_message(self, message: Any) -> None:
+        """GPS_GLOBAL_ORIGIN (49) came."""
+        news = self._keeper.on_origin(message)
+        self._tracker.set_origin(self._keeper.origin)
+        if news is not None:
+            self._teller.inform(news)
+
+    def forget(self) -> None:
+        """Nothing is sent relative to an origin that may be another one by now."""
+        self._keeper.reset()
+        self._tracker.set_origin(None)
+
+    def tick(self, link: Link, now_ns: int, *, may_set: bool) -> None:
+        """Ask when it is due. may_set: whether the configured one may be sent."""
+
+        def ask(wanted: int) -> None:
+            self._commander.send(link, mavlink.MAV_CMD_REQUEST_MESSAGE, wanted)
+
+        message = self._keeper.tick(now_ns, link.system_id, ask)
+        if message is not None and may_set:
+            self._counters["origins_sent"] += 1
+            link.send(message, self._component)

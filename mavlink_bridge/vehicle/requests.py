@@ -1,0 +1,43 @@
+"""What the flight controller is asked for: streams that do not flow, its firmware's version."""
+
+from __future__ import annotations
+
+from pymavlink.dialects.v20 import ardupilotmega as mavlink
+
+from mavlink_bridge.config import BridgeConfig
+from mavlink_bridge.link.link import Link
+from mavlink_bridge.messages import VehicleState
+from mavlink_bridge.vehicle.commands import Commander
+from mavlink_bridge.vehicle.streams import StreamKeeper, wanted_streams
+
+_VERSION_EVERY_NS = 1_000_000_000
+
+
+class VehicleRequests:
+    """Asks, and asks again; one thread."""
+
+    def __init__(self, config: BridgeConfig, commander: Commander) -> None:
+        self.streams = StreamKeeper()
+        self._config = config
+        self._commander = commander
+        self._next_version_ns = 0
+
+    def reset(self) -> None:
+        """The link was opened or the vehicle came back: ask for everything again."""
+        self.streams.reset()
+        self._next_version_ns = 0
+
+    def tick(self, link: Link, state: VehicleState, now_ns: int) -> None:
+        """Ask for what is missing."""
+        for stream in self.streams.due(wanted_streams(self._config, state.autopilot), now_ns):
+            interval_us = round(1e6 / stream.rate_hz)
+            self._commander.send(
+                link, mavlink.MAV_CMD_SET_MESSAGE_INTERVAL, stream.message_id, interval_us
+            )
+        if state.version is None and now_ns >= self._next_version_ns:
+            self._next_version_ns = now_ns + _VERSION_EVERY_NS
+            self._commander.send(
+                link,
+                mavlink.MAV_CMD_REQUEST_MESSAGE,
+                mavlink.MAVLINK_MSG_ID_AUTOPILOT_VERSION,
+            )

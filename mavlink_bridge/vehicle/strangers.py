@@ -1,0 +1,55 @@
+"""Others on the link who mean a wiring or a start by mistake: a second vehicle, a second us."""
+
+from __future__ import annotations
+
+from collections import Counter
+from typing import Any
+
+from mavlink_bridge.config import BridgeConfig
+from mavlink_bridge.link.link import Link
+from mavlink_bridge.texts import Teller
+from mavlink_bridge.vehicle.presence import TwinWatch
+from mavlink_bridge.vehicle.tracker import VehicleTracker
+
+
+class StrangerWatch:
+    """Tells the operator of them, once each; one thread."""
+
+    def __init__(
+        self,
+        config: BridgeConfig,
+        tracker: VehicleTracker,
+        teller: Teller,
+        counters: Counter[str],
+    ) -> None:
+        self._config = config
+        self._tracker = tracker
+        self._teller = teller
+        self._counters = counters
+        self._twins = TwinWatch()
+
+    def on_message(self, link: Link, message: Any) -> None:
+        """A message that is not the vehicle's; only its heartbeat says who it is from."""
+        if message.get_type() != "HEARTBEAT" or not link.system_id:
+            return
+        system, component = message.get_srcSystem(), message.get_srcComponent()
+        config, tell = self._config, self._teller.tell
+        ours = (config.localizer_component, config.companion_component, config.camera_component)
+        if system == link.system_id and component in ours:
+            tell("twin", f"another companion speaks as component {component}: stop one")
+        elif system == link.system_id and self._tracker.is_autopilot(message):
+            self._counters["other_autopilots"] += 1
+            tell("twins", f"another autopilot is system {system}, too: give it another id")
+        elif config.system_id is None and self._tracker.is_autopilot(message):
+            self._counters["other_autopilots"] += 1
+            tell(
+                "others",
+                f"autopilot {system} is heard, {link.system_id} is followed: set bridge.system_id",
+            )
+
+    def check(self, link: Link, now_ns: int) -> None:
+        """Two vehicles of the same ids: their boot times alternate."""
+        clock = self._tracker.clock
+        if self._twins.two(now_ns, clock.strays + clock.reboots):
+            system = link.system_id
+            self._teller.tell("twins", f"two autopilots speak as system {system}: change one's id")

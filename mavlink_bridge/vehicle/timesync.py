@@ -1,0 +1,53 @@
+"""TIMESYNC (111): the flight controller's questions answered, ours asked once in a while."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from pymavlink.dialects.v20 import ardupilotmega as mavlink
+
+from mavlink_bridge.link.clock import monotonic_ns
+from mavlink_bridge.link.link import Link
+from mavlink_bridge.vehicle.tracker import VehicleTracker
+
+_PERIOD_NS = 1_000_000_000
+_PENDING = 8
+
+
+class TimeSync:
+    """Asks for the vehicle's clock at 1 Hz and gives each answer to the tracker; one thread."""
+
+    def __init__(self, tracker: VehicleTracker, component: int) -> None:
+        self._tracker = tracker
+        self._component = component
+        self._sent: dict[int, int] = {}
+        self._next_ns = 0
+
+    def reset(self) -> None:
+        """The link was opened: what was asked before it is not answered any more."""
+        self._next_ns = 0
+        self._sent.clear()
+
+    def on_message(self, link: Link, message: Any, time_ns: int) -> bool:
+        """A question or an answer; True when the vehicle's clock tells of a reboot."""
+        if message.tc1 == 0:
+            answer = mavlink.MAVLink_timesync_message(monotonic_ns(), message.ts1)
+            link.send(answer, self._component)
+            return False
+        sent_ns = self._sent.pop(message.ts1, None)
+        return sent_ns is not None and self._tracker.timesync(message.tc1, sent_ns, time_ns)
+
+    def tick(self, link: Link, now_ns: int) -> None:
+        """Ask when it is due."""
+        if now_ns < self._next_ns:
+            return
+        self._next_ns = now_ns + _PERIOD_NS
+        while len(self._sent) >= _PENDING:
+            del self._sent[next(iter(self._sent))]
+        sent_ns = monotonic_ns()
+        self._sent[sent_ns] = sent_ns
+        link.send(mavlink.MAVLink_timesync_message(0, sent_ns), self._component)
+
+    def waiting(self) -> dict[str, int]:
+        """Lengths of everything that waits here."""
+        return {"timesync": len(self._sent)}
