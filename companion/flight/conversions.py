@@ -1,4 +1,6 @@
-"""Between the map's camera poses and the vehicle: pure geometry, no threads, no MAVLink.
+"""Between what the localizer knows and what the bridge tells: every conversion of the flight.
+
+Pure geometry, no threads, no MAVLink.
 
 Axes: the map's ENU; NED at the vehicle; body FRD; gimbal (x along the boresight, y right, z down);
 camera OpenCV (x right, y down, z forward). The gimbal's attitude comes from the bridge, which
@@ -8,6 +10,7 @@ knows its flags and the camera's mounting on it.
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -19,21 +22,45 @@ from companion.geometry import (
     world_from_camera,
 )
 from localizer.errors import GeoreferenceError
+from localizer.geometry.camera import Camera
 from localizer.geometry.geo import NED_FROM_ENU, Geodetic, LocalFrame
-from localizer.geometry.pose import Array, euler_from_matrix, matrix_from_quaternion
-from localizer.types import PoseEstimate, PosePrior
-from mavlink_bridge.messages import Attitude, GimbalAttitude, VehicleState, VisionFix
+from localizer.geometry.pose import (
+    Array,
+    euler_from_matrix,
+    matrix_from_quaternion,
+    quaternion_from_matrix,
+)
+from localizer.targets.locate import RayCaster, ray_in_world
+from localizer.types import PoseEstimate, PosePrior, TargetFix
+from mavlink_bridge.messages import (
+    Attitude,
+    CameraView,
+    GimbalAttitude,
+    TargetReport,
+    VehicleState,
+    VisionFix,
+)
 
 # An autopilot position older than this does not start tracking.
 _MAX_POSITION_AGE_NS = 2_000_000_000
 
 
+@dataclass(frozen=True)
+class Installation:
+    """What stays the same for a flight: the map's frame and the camera's place on the vehicle."""
+
+    frame: LocalFrame
+    geoid_separation_m: float
+    lever_arm_m: Array
+    """(3,) metres, from the autopilot to the camera, body axes."""
+
+
 def vision_fix(
     estimate: PoseEstimate,
-    frame: LocalFrame,
+    installation: Installation,
     attitude: Attitude | None,
     gimbal: GimbalAttitude | None,
-    lever_arm_m: Array,
+    *,
     reset: bool,
 ) -> VisionFix:
     """The vehicle's position and attitude as the camera's estimate implies them.
@@ -41,13 +68,17 @@ def vision_fix(
     attitude and gimbal at the exposure: together they give the camera's orientation on the body.
     Without them the vehicle's attitude is unknown (NaN) and the lever arm is not applied.
     """
+    frame = installation.frame
     camera = frame.position(estimate.world_from_camera.translation)
     to_ned = ned_from_world(frame, camera)
     roll = pitch = yaw = math.nan
     body = estimate.world_from_camera.translation
     if attitude is not None and gimbal is not None:
         body, ned_from_body = vehicle_from_camera_pose(
-            estimate.world_from_camera, camera_on_body(attitude, gimbal), lever_arm_m, to_ned
+            estimate.world_from_camera,
+            camera_on_body(attitude, gimbal),
+            installation.lever_arm_m,
+            to_ned,
         )
         roll, pitch, yaw = euler_from_matrix(ned_from_body)
     position = frame.position(body)
@@ -84,9 +115,7 @@ def vehicle_prior(
     state: VehicleState,
     attitude: Attitude | None,
     gimbal: GimbalAttitude | None,
-    frame: LocalFrame,
-    geoid_separation_m: float,
-    lever_arm_m: Array,
+    installation: Installation,
     sigma: tuple[float, float],
     time_ns: int,
 ) -> PosePrior | None:
@@ -97,10 +126,9 @@ def vehicle_prior(
     age_ns = time_ns - state.position_time_ns
     if attitude is None or gimbal is None or abs(age_ns) > _MAX_POSITION_AGE_NS:
         return None
+    frame, height_m = installation.frame, state.altitude_amsl_m + installation.geoid_separation_m
     try:
-        position = Geodetic(
-            state.latitude_deg, state.longitude_deg, state.altitude_amsl_m + geoid_separation_m
-        )
+        position = Geodetic(state.latitude_deg, state.longitude_deg, height_m)
     except GeoreferenceError:
         return None
     body = frame.enu_from_geodetic(position.latitude_deg, position.longitude_deg, position.height_m)
@@ -111,6 +139,51 @@ def vehicle_prior(
         body = body + velocity * age_ns * 1e-9
     ned_from_body = matrix_from_quaternion(attitude.quaternion)
     ned_from_camera = matrix_from_quaternion(gimbal.quaternion) @ GIMBAL_FROM_CAMERA
-    camera = world_from_camera(body, ned_from_body, ned_from_camera, lever_arm_m, to_ned)
+    arm = installation.lever_arm_m
+    camera = world_from_camera(body, ned_from_body, ned_from_camera, arm, to_ned)
     covariance = np.diag(np.repeat(np.square(sigma), 3))
     return PosePrior(camera, covariance, time_ns, velocity)
+
+
+def target_report(
+    fix: TargetFix, velocity: Array, camera: Camera, frame: LocalFrame, number: int
+) -> TargetReport:
+    """A located target for the ground. velocity: (3,) m/s, world axes; camera: that of the frame
+    in which it was seen.
+    """
+    position = frame.position(fix.position_world)
+    east, north, up = velocity
+    return TargetReport(
+        time_ns=fix.exposure_time_ns,
+        latitude_deg=position.latitude_deg,
+        longitude_deg=position.longitude_deg,
+        height_m=position.height_m,
+        velocity_ned=(float(north), float(east), float(-up)),
+        h_accuracy_m=float(np.sqrt(fix.covariance[0, 0] + fix.covariance[1, 1])),
+        v_accuracy_m=float(np.sqrt(fix.covariance[2, 2])),
+        pixel=(fix.pixel[0] / camera.width, fix.pixel[1] / camera.height),
+        target_id=number,
+        elsewhere=fix.elsewhere,
+    )
+
+
+def camera_view(estimate: PoseEstimate, frame: LocalFrame, cast: RayCaster) -> CameraView:
+    """Camera and the ground in the picture's centre; NaN where that ray meets no map."""
+    pose, camera = estimate.world_from_camera, estimate.camera
+    position = frame.position(pose.translation)
+    ned_from_camera = ned_from_world(frame, position) @ pose.rotation
+    w, x, y, z = quaternion_from_matrix(ned_from_camera @ GIMBAL_FROM_CAMERA.T)
+    eye, direction = ray_in_world(estimate, (camera.width / 2.0, camera.height / 2.0))
+    distance = float(cast(eye, direction[None, :]).distances[0])
+    ground = (math.nan, math.nan, math.nan)
+    if math.isfinite(distance):
+        seen = frame.position(eye + distance * direction)
+        ground = (seen.latitude_deg, seen.longitude_deg, seen.height_m)
+    return CameraView(
+        estimate.exposure_time_ns,
+        position.latitude_deg,
+        position.longitude_deg,
+        position.height_m,
+        (float(w), float(x), float(y), float(z)),
+        *ground,
+    )

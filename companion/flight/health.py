@@ -10,13 +10,13 @@ import time
 from collections import deque
 from collections.abc import Callable
 from dataclasses import asdict
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from companion.config import RecordConfig
 from companion.sources import StreamState
-from localizer.tracking.engine import DualThreadEngine
+from localizer.tracking.engine import EngineHealth
 from localizer.types import PoseEstimate, TrackingState
 from mavlink_bridge.bridge import Bridge
 from mavlink_bridge.messages import HealthLevel
@@ -45,19 +45,19 @@ class HealthMonitor:
 
     def __init__(
         self,
-        engine: DualThreadEngine,
+        engine_health: Callable[[], EngineHealth],
         bridge: Bridge,
         feed_state: Callable[[], StreamState],
         event: Callable[[str, str], None],
-        record: RecordConfig | None,
+        record_folder: Path | None,
         is_recorded: Callable[[], bool] = lambda: True,
     ) -> None:
-        self._engine = engine
+        self._engine_health = engine_health
         self._bridge = bridge
         self._feed_state = feed_state
         self._event = event
         self._is_recorded = is_recorded
-        self._file = record.folder / "health.json" if record else None
+        self._file = record_folder / "health.json" if record_folder else None
         self._estimates: deque[tuple[float, PoseEstimate]] = deque(maxlen=_WINDOW)
         self._write_failed = False
         self._failures = 0
@@ -102,9 +102,9 @@ class HealthMonitor:
             return _OF_FEED[feed]
         if not self._bridge.state().connected:
             return HealthLevel.DEGRADED, _SILENT_VEHICLE
-        error = self._engine.health.last_error
+        error = self._engine_health().last_error
         if not self._estimates:
-            seen = self._engine.health.frames_in > 0
+            seen = self._engine_health().frames_in > 0
             return (
                 HealthLevel.STARTING,
                 error or f"waiting for {'a pose prior' if seen else 'video'}",
@@ -123,7 +123,7 @@ class HealthMonitor:
             "level": level.value,
             "text": text,
             "time_ns": time.monotonic_ns(),
-            "engine": asdict(self._engine.health),
+            "engine": asdict(self._engine_health()),
             "rate_hz": self._rate(),
             "stages_ms": self._stages(),
             "bridge": self._bridge.counters(),

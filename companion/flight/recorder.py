@@ -21,7 +21,7 @@ from companion.errors import DiskFaultError, ReportError
 from companion.sources.timing import system_minus_monotonic
 from companion.versions import versions
 from localizer.geometry.geo import LocalFrame
-from localizer.geometry.pose import quaternion_from_matrix
+from localizer.geometry.pose import Array, quaternion_from_matrix
 from localizer.types import Frame, PoseEstimate, TargetFix
 from mavlink_bridge.link.tlog import is_disk_fault
 
@@ -97,6 +97,38 @@ def _unwritable(folder: Path, error: OSError) -> ReportError:
     return kind(f"record.folder {folder}: cannot be written: {error}")
 
 
+def _estimate_row(estimate: PoseEstimate, frame: LocalFrame) -> tuple[Any, ...]:
+    """What stands in `ESTIMATE_COLUMNS` for an estimate."""
+    pose = estimate.world_from_camera
+    position = frame.position(pose.translation)
+    sigma = estimate.covariance.diagonal() ** 0.5
+    stages = (estimate.stage_ms.get(k, 0.0) for k in ("reference", "extract", "register"))
+    return (
+        estimate.exposure_time_ns, estimate.sequence,
+        *(f"{x:.4f}" for x in pose.translation),
+        *(f"{x:.8f}" for x in quaternion_from_matrix(pose.rotation)),
+        f"{position.latitude_deg:.9f}", f"{position.longitude_deg:.9f}",
+        f"{position.height_m:.4f}",
+        *(f"{x:.4f}" for x in sigma[:3]), f"{sigma[3:].max():.6f}",
+        f"{estimate.quality:.4f}", estimate.state.value, estimate.status.name,
+        int(estimate.accepted), *(f"{x:.2f}" for x in stages),
+        f"{estimate.stage_ms.get('latency', 0.0):.2f}",
+    )  # fmt: skip
+
+
+def _target_row(fix: TargetFix, velocity: Array, frame: LocalFrame) -> tuple[Any, ...]:
+    """What stands in `TARGET_COLUMNS` for a target's fix."""
+    position = frame.position(fix.position_world)
+    horizontal = (fix.covariance[0, 0] + fix.covariance[1, 1]) ** 0.5
+    return (
+        fix.exposure_time_ns, fix.target_id, *(f"{x:.4f}" for x in fix.position_world),
+        f"{position.latitude_deg:.9f}", f"{position.longitude_deg:.9f}",
+        f"{position.height_m:.4f}", f"{horizontal:.3f}", f"{fix.covariance[2, 2] ** 0.5:.3f}",
+        *(f"{x:.3f}" for x in velocity), *(f"{x:.2f}" for x in fix.pixel),
+        *(f"{x:.5f}" for x in fix.covariance[np.triu_indices(3)]), f"{fix.elsewhere:.3f}",
+    )  # fmt: skip
+
+
 class Recorder:
     """Writes ``estimates.csv``, ``targets.csv`` and ``events.csv`` in a folder.
 
@@ -116,7 +148,8 @@ class Recorder:
         self._interval_ns = (config.snapshot_interval_s or 0.0) * 1e9
         self._next_snapshot_ns = 0.0
         self._frame = frame
-        self._rows: queue.Queue[tuple[str, Iterable[Any]] | None] = queue.Queue(_QUEUE_SIZE)
+        self._rows: queue.Queue[tuple[str, Callable[[], Iterable[Any]]] | None]
+        self._rows = queue.Queue(_QUEUE_SIZE)
         self.dropped = 0
         self._on_failure = on_failure
         self._failed = False
@@ -136,45 +169,22 @@ class Recorder:
 
     def estimate(self, estimate: PoseEstimate) -> None:
         """Record one estimate (accepted or not)."""
-        pose = estimate.world_from_camera
-        position = self._frame.position(pose.translation)
-        sigma = estimate.covariance.diagonal() ** 0.5
-        stages = (estimate.stage_ms.get(k, 0.0) for k in ("reference", "extract", "register"))
-        row = (
-            estimate.exposure_time_ns, estimate.sequence,
-            *(f"{x:.4f}" for x in pose.translation),
-            *(f"{x:.8f}" for x in quaternion_from_matrix(pose.rotation)),
-            f"{position.latitude_deg:.9f}", f"{position.longitude_deg:.9f}",
-            f"{position.height_m:.4f}",
-            *(f"{x:.4f}" for x in sigma[:3]), f"{sigma[3:].max():.6f}",
-            f"{estimate.quality:.4f}", estimate.state.value, estimate.status.name,
-            int(estimate.accepted), *(f"{x:.2f}" for x in stages),
-            f"{estimate.stage_ms.get('latency', 0.0):.2f}",
-        )  # fmt: skip
-        self._put("estimates", row)
+        self._put("estimates", lambda: _estimate_row(estimate, self._frame))
 
-    def target(self, fix: TargetFix, velocity: Iterable[float]) -> None:
+    def target(self, fix: TargetFix, velocity: Array) -> None:
         """Record one target fix with its filtered velocity (3,) in world axes."""
-        position = self._frame.position(fix.position_world)
-        horizontal = (fix.covariance[0, 0] + fix.covariance[1, 1]) ** 0.5
-        row = (
-            fix.exposure_time_ns, fix.target_id, *(f"{x:.4f}" for x in fix.position_world),
-            f"{position.latitude_deg:.9f}", f"{position.longitude_deg:.9f}",
-            f"{position.height_m:.4f}", f"{horizontal:.3f}", f"{fix.covariance[2, 2] ** 0.5:.3f}",
-            *(f"{x:.3f}" for x in velocity), *(f"{x:.2f}" for x in fix.pixel),
-            *(f"{x:.5f}" for x in fix.covariance[np.triu_indices(3)]), f"{fix.elsewhere:.3f}",
-        )  # fmt: skip
-        self._put("targets", row)
+        self._put("targets", lambda: _target_row(fix, velocity, self._frame))
 
     def event(self, level: str, text: str) -> None:
         """Record something that happened, at the current time."""
-        self._put("events", (time.monotonic_ns(), level, text))
+        row = (time.monotonic_ns(), level, text)
+        self._put("events", lambda: row)
 
     def snapshot(self, frame: Frame) -> None:
         """Keep the frame's image, named by its exposure time, if it is time for one."""
         if self._interval_ns and frame.exposure_time_ns >= self._next_snapshot_ns:
             self._next_snapshot_ns = frame.exposure_time_ns + self._interval_ns
-            self._put("snapshot", (frame,))
+            self._put("snapshot", lambda: (frame,))
 
     def close(self) -> None:
         """Write what is queued and close the files; a disk that stands still is left behind."""
@@ -194,20 +204,21 @@ class Recorder:
         writer.writerow(columns)
         return writer
 
-    def _put(self, name: str, row: Iterable[Any]) -> None:
+    def _put(self, name: str, row: Callable[[], Iterable[Any]]) -> None:
+        """Queue what makes a row: its coordinates and figures are the recorder's thread's work."""
         try:
             self._rows.put_nowait((name, row))
         except queue.Full:
             self.dropped += 1
 
-    def _write(self, name: str, row: Iterable[Any]) -> None:
+    def _write(self, name: str, row: Callable[[], Iterable[Any]]) -> None:
         if name == "snapshot":
-            (frame,) = row
+            (frame,) = row()
             # Not imwrite, which does not tell why it could not.
             _, jpeg = cv2.imencode(".jpg", cv2.cvtColor(frame.image, cv2.COLOR_RGB2BGR))
             (self._snapshots / f"{frame.exposure_time_ns}.jpg").write_bytes(jpeg.tobytes())
         elif name:
-            self._writers[name].writerow(row)
+            self._writers[name].writerow(row())
 
     def _run(self) -> None:
         flushed = time.monotonic()
@@ -215,7 +226,7 @@ class Recorder:
             try:
                 item = self._rows.get(timeout=_FLUSH_S)
             except queue.Empty:
-                item = ("", ())
+                item = ("", tuple)
             if item is None:
                 return
             self._guarded(self._write, *item)
@@ -233,3 +244,44 @@ class Recorder:
                 self._failed = True
                 _log.warning("the record is incomplete: %s", error)
                 self._on_failure(getattr(error, "strerror", None) or str(error))
+
+
+class RecordKeeper:
+    """The record of one process, where the disk takes one: this may be a restart in the air.
+
+    say_incomplete: tells the operator why something is missing in it; from any thread.
+    """
+
+    def __init__(self, frame: LocalFrame, say_incomplete: Callable[[str], None]) -> None:
+        self._frame = frame
+        self._say_incomplete = say_incomplete
+        self.recorder: Recorder | None = None
+        self.folder: Path | None = None
+        """Where it is written; None while the disk takes none."""
+        self.is_complete = True
+
+    def open(
+        self, config: CompanionConfig, record: RecordConfig, claim: Callable[[Path], None]
+    ) -> None:
+        """Begin a record in a folder of its own. claim: called with it before it is made."""
+        try:
+            record = record.model_copy(update={"folder": fresh_folder(record.folder)})
+            claim(record.folder)
+            self.recorder = Recorder(record, self._frame, self.failed)
+            self.folder = record.folder
+            write_manifest(record.folder, config)
+        except DiskFaultError as error:
+            self.failed(str(error.__cause__))
+        except BaseException:
+            self.close()
+            raise
+
+    def close(self) -> None:
+        """Write what is queued and close the files."""
+        if self.recorder is not None:
+            self.recorder.close()
+
+    def failed(self, why: str) -> None:
+        """Something is missing in the record from now on."""
+        self.is_complete = False
+        self._say_incomplete(why)

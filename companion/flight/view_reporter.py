@@ -3,40 +3,16 @@
 from __future__ import annotations
 
 import logging
-import math
 import threading
 from collections.abc import Callable
 
-from companion.geometry import GIMBAL_FROM_CAMERA, ned_from_world
+from companion.flight.conversions import camera_view
 from localizer.geometry.geo import LocalFrame
-from localizer.geometry.pose import quaternion_from_matrix
-from localizer.targets.locate import RayCaster, ray_in_world
+from localizer.targets.locate import RayCaster
 from localizer.types import PoseEstimate
 from mavlink_bridge.messages import CameraView
 
 _log = logging.getLogger(__name__)
-
-
-def camera_view(estimate: PoseEstimate, frame: LocalFrame, cast: RayCaster) -> CameraView:
-    """Camera and the ground in the picture's centre; NaN where that ray meets no map."""
-    pose, camera = estimate.world_from_camera, estimate.camera
-    position = frame.position(pose.translation)
-    ned_from_camera = ned_from_world(frame, position) @ pose.rotation
-    w, x, y, z = quaternion_from_matrix(ned_from_camera @ GIMBAL_FROM_CAMERA.T)
-    eye, direction = ray_in_world(estimate, (camera.width / 2.0, camera.height / 2.0))
-    distance = float(cast(eye, direction[None, :]).distances[0])
-    ground = (math.nan, math.nan, math.nan)
-    if math.isfinite(distance):
-        seen = frame.position(eye + distance * direction)
-        ground = (seen.latitude_deg, seen.longitude_deg, seen.height_m)
-    return CameraView(
-        estimate.exposure_time_ns,
-        position.latitude_deg,
-        position.longitude_deg,
-        position.height_m,
-        (float(w), float(x), float(y), float(z)),
-        *ground,
-    )
 
 
 class ViewReporter:

@@ -20,7 +20,7 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from companion.config import CompanionConfig, parse_config
 from companion.errors import RecordError, StreamDecodeError
-from companion.flight.conversions import camera_rotation, vehicle_prior
+from companion.flight.conversions import Installation, camera_rotation, vehicle_prior
 from companion.flight.recorder import MANIFEST_NAME
 from companion.sources.base import fitted_camera
 from companion.sources.folder_source import read_image
@@ -220,7 +220,9 @@ def replay(
     try:
         camera = config.camera.model.camera()
         localizer = build_localizer(stack, camera, config.localizer, autopilot.rotation_at)
-        arm, sigma = np.array(config.camera.lever_arm_m), config.prior
+        cache, sigma = stack.cache, config.prior
+        arm = np.array(config.camera.lever_arm_m)
+        installation = Installation(cache.frame, cache.manifest.geoid_separation_m, arm)
         sigmas = (sigma.position_sigma_m, float(np.radians(sigma.rotation_sigma_deg)))
         frames = []
         for recorded in record.estimates:
@@ -233,8 +235,7 @@ def replay(
                 tracker = autopilot.tracker
                 prior = vehicle_prior(
                     tracker.snapshot(recorded.known_ns), tracker.attitude_at(time_ns),
-                    tracker.gimbal_at(time_ns), stack.cache.frame,
-                    stack.cache.manifest.geoid_separation_m, arm, sigmas, time_ns,
+                    tracker.gimbal_at(time_ns), installation, sigmas, time_ns,
                 )  # fmt: skip
                 if prior is not None:
                     localizer.set_prior(prior)

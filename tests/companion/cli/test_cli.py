@@ -26,7 +26,8 @@ def map_cache(small_assets):
 # exception would be printed and lost.
 INTERRUPTED_IN_A_CALLBACK = """
 import ctypes, os, signal, sys
-import companion.flight.app
+import companion.flight.recorder
+import companion.flight.table
 from companion.cli.commands import main
 
 number, part = getattr(signal, sys.argv.pop()), sys.argv.pop()
@@ -36,7 +37,8 @@ def make(*_):
     print("went on", flush=True)
     raise SystemExit(1)
 
-setattr(companion.flight.app, part, make)
+module = {"build_localizer": companion.flight.table, "write_manifest": companion.flight.recorder}
+setattr(module[part], part, make)
 main()
 """
 

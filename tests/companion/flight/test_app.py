@@ -6,8 +6,8 @@ import itertools
 import logging
 import os
 import threading
+from dataclasses import replace
 from pathlib import Path
-from types import SimpleNamespace
 
 import cv2
 import numpy as np
@@ -16,9 +16,12 @@ import pytest
 from companion.config import parse_config
 from companion.errors import ConfigError, StreamOpenError
 from companion.flight.app import Companion
+from companion.flight.feed import Feed
+from companion.flight.parts import Part
+from companion.flight.table import PARTS
 from mavlink_bridge.bridge import Bridge
 from mavlink_bridge.link.link import sleep_until
-from mavlink_bridge.messages import TrackRequest, without_figures
+from mavlink_bridge.messages import without_figures
 from sitl.geodesy import Location
 from sitl.vehicles.launch import GIMBAL, EmbeddedSitl, vision_parameters
 
@@ -41,7 +44,9 @@ def test_an_origin_far_from_the_map_is_never_sent(small_assets, tmp_path):
         Companion(config).run()
 
 
-def test_a_restart_on_a_full_disk_goes_on_without_a_record(small_assets, tmp_path, monkeypatch):
+def test_a_restart_on_a_full_disk_goes_on_without_a_record(
+    small_assets, tmp_path, monkeypatch, caplog
+):
     """In the air a position is worth more than a record. The feed's error ends the start here."""
     (tmp_path / "image.png").touch()
     config = parse_config(
@@ -58,61 +63,53 @@ def test_a_restart_on_a_full_disk_goes_on_without_a_record(small_assets, tmp_pat
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
     monkeypatch.setattr(Path, "mkdir", refuse)
-    companion = Companion(config)
     with pytest.raises(StreamOpenError):
-        companion.run()
-    assert any("record is incomplete: [Errno 28]" in text for text in companion._bridge.texts())
+        Companion(config).run()
+    assert any("record is incomplete: [Errno 28]" in r.getMessage() for r in caplog.records)
 
 
-def test_the_order_to_stop_takes_no_lock():
+class _InterruptedWait:
+    """A feed's `ended` whose `wait`, as an Event's, holds its lock when a signal interrupts it."""
+
+    def __init__(self):
+        self.interrupt = lambda: None
+        self._lock = threading.Lock()
+
+    def wait(self, timeout):
+        with self._lock:
+            self.interrupt()
+        return False
+
+    def set(self):
+        assert self._lock.acquire(timeout=0), "would wait for ever"
+
+
+class _StubFeed(Feed):
+    def __init__(self):
+        self.ended, self.error = _InterruptedWait(), None
+
+
+def test_the_order_to_stop_takes_no_lock(small_assets):
     """It comes from a signal handler, which may interrupt the very lines that hold the lock."""
-    config = parse_config({"map": "m", "camera": {"source": "s", "model": MODEL}}, "test")
-    companion = Companion(config)
-    ordered = threading.Event()
-
-    def order():
-        companion.stop()
-        ordered.set()
-
-    with companion._feed_ended._cond:
-        threading.Thread(target=order, daemon=True).start()
-        assert ordered.wait(30.0)
-
-
-@pytest.mark.parametrize(("age_s", "placed"), [(0.3, True), (2.5, False), (None, False)])
-def test_a_click_is_not_placed_by_an_old_pose(age_s, placed):
-    """The operator points into the present picture, and is told when nobody knows where it is."""
-    second, now_ns = 10**9, 10**12
-    companion = Companion(
-        parse_config({"map": "m", "camera": {"source": "s", "model": MODEL}}, "test")
+    config = parse_config(
+        {"map": str(small_assets.map_cache), "camera": {"source": "s", "model": MODEL}}, "test"
     )
-    camera = SimpleNamespace(width=160, height=120)
-    detections, texts = [], []
-    companion._newest = None if age_s is None else SimpleNamespace(
-        camera=camera, exposure_time_ns=now_ns - round(age_s * second)
-    )  # fmt: skip
-    companion._click_refused_ns = 0
-    companion._targets = SimpleNamespace(add_detection=detections.append)
-    companion._bridge = SimpleNamespace(say=lambda _, text: texts.append(text))
-    for k in range(5):  # an impatient operator
-        companion._on_track(TrackRequest("point", now_ns + k, (0.5, 0.25)))
-    companion._on_track(TrackRequest("stop", now_ns))
-    assert [(d.u, d.v) for d in detections] == ([(80.0, 30.0)] * 5 if placed else [])
-    told = ["PiLoT: no target: the camera's position is not known"]
-    assert texts == ([] if placed else told)
+    feed, orders = _StubFeed(), []
+    parts = [p for p in PARTS if p.name == "map"]
+    companion = Companion(config, [*parts, Part("feed", Feed, lambda _: feed)])
+    feed.ended.interrupt = lambda: orders.append(companion.stop())
+    companion.run()
+    assert orders == [True]
 
 
 def test_what_happens_is_logged_and_recorded_once_and_every_thread_ends(
-    small_assets, tmp_path, caplog, monkeypatch
+    small_assets, tmp_path, caplog
 ):
-    stop, last = Bridge.stop, iter(["PiLoT: last words"])
-
     def stop_with_last_words(bridge):
-        for text in last:
-            bridge.say(6, text)
-        stop(bridge)
+        bridge.say(6, "PiLoT: last words")
+        bridge.stop()
 
-    monkeypatch.setattr(Bridge, "stop", stop_with_last_words)
+    parts = [replace(p, stop=stop_with_last_words) if p.kind is Bridge else p for p in PARTS]
     for i in range(40):
         cv2.imwrite(str(tmp_path / f"{i:02}.png"), np.full((120, 160, 3), 3 * i, np.uint8))
     threads = set(threading.enumerate())
@@ -131,7 +128,7 @@ def test_what_happens_is_logged_and_recorded_once_and_every_thread_ends(
             "test",
         )
         with caplog.at_level(logging.INFO):
-            Companion(config).run()
+            Companion(config, parts).run()
     assert sleep_until(lambda: set(threading.enumerate()) <= threads, 30.0), threading.enumerate()
     with (tmp_path / "record" / "events.csv").open() as file:
         recorded = [row["text"] for row in csv.DictReader(file)]

@@ -3,7 +3,7 @@ import math
 import numpy as np
 import pytest
 
-from companion.flight.conversions import vehicle_prior, vision_fix
+from companion.flight.conversions import Installation, vehicle_prior, vision_fix
 from companion.geometry import GIMBAL_FROM_CAMERA, ned_from_world
 from localizer.geometry.camera import Camera
 from localizer.geometry.geo import Geodetic, LocalFrame
@@ -15,6 +15,7 @@ ORIGIN = Geodetic(47.3, 8.5, 450.0)
 FRAME = LocalFrame(ORIGIN)
 LEVER = np.array([0.4, -0.1, 0.2])
 SEPARATION = 47.5
+INSTALLATION = Installation(FRAME, SEPARATION, LEVER)
 
 
 def _attitude(roll, pitch, yaw, time_ns=0) -> Attitude:
@@ -39,7 +40,7 @@ def _state(position: Geodetic, time_ns: int = 0, velocity=None) -> VehicleState:
 
 
 def _prior(state, attitude, gimbal, time_ns=0):
-    return vehicle_prior(state, attitude, gimbal, FRAME, SEPARATION, LEVER, (5.0, 0.1), time_ns)
+    return vehicle_prior(state, attitude, gimbal, INSTALLATION, (5.0, 0.1), time_ns)
 
 
 def test_a_nadir_gimbal_looks_down_with_the_vehicles_heading_up_in_the_image():
@@ -68,7 +69,7 @@ def test_fix_of_the_prior_is_the_vehicle_again(seed):
         prior.world_from_camera, prior.covariance, 0.9, TrackingState.TRACKING,
         RegistrationStatus.OK, True, 5, 1, Camera.from_fov(640, 480, 60),
     )  # fmt: skip
-    fix = vision_fix(estimate, FRAME, attitude, gimbal, LEVER, reset=False)
+    fix = vision_fix(estimate, INSTALLATION, attitude, gimbal, reset=False)
     seen = FRAME.enu_from_geodetic(fix.latitude_deg, fix.longitude_deg, fix.height_m)
     true = FRAME.enu_from_geodetic(vehicle.latitude_deg, vehicle.longitude_deg, vehicle.height_m)
     np.testing.assert_allclose(seen, true, atol=1e-6)
@@ -85,7 +86,7 @@ def test_without_the_gimbal_the_attitude_is_unknown_not_guessed():
         prior.world_from_camera, prior.covariance, 0.9, TrackingState.TRACKING,
         RegistrationStatus.OK, True, 5, 1, Camera.from_fov(640, 480, 60),
     )  # fmt: skip
-    fix = vision_fix(estimate, FRAME, _attitude(0, 0, 0), None, LEVER, reset=True)
+    fix = vision_fix(estimate, INSTALLATION, _attitude(0, 0, 0), None, reset=True)
     assert math.isnan(fix.yaw_rad)
     assert fix.reset
 

@@ -6,7 +6,6 @@ from types import SimpleNamespace
 
 import pytest
 
-from companion.config import RecordConfig
 from companion.flight.health import HealthMonitor
 from companion.sources import StreamState
 from localizer.tracking.engine import EngineHealth
@@ -37,10 +36,9 @@ class FakeBridge:
 def _one_report(folder, state, connected, tracking=None, frames_in=0, **options):
     """What the bridge is told, and the events, of a monitor that is started and stopped."""
     bridge, events = FakeBridge(connected), []
-    engine = SimpleNamespace(health=EngineHealth(frames_in=frames_in))
     monitor = HealthMonitor(
-        engine, bridge, lambda: state, lambda *e: events.append(e), RecordConfig(folder=folder),
-        **options,
+        lambda: EngineHealth(frames_in=frames_in), bridge, lambda: state,
+        lambda *e: events.append(e), folder, **options,
     )  # fmt: skip
     if tracking is not None:
         monitor.add_estimate(SimpleNamespace(state=tracking, stage_ms={}))
@@ -114,8 +112,7 @@ def test_a_report_that_fails_is_not_the_last(tmp_path, monkeypatch, caplog):
         return StreamState.LIVE
 
     bridge = FakeBridge(True)
-    engine = SimpleNamespace(health=EngineHealth())
-    monitor = HealthMonitor(engine, bridge, state, lambda *_: None, RecordConfig(folder=tmp_path))
+    monitor = HealthMonitor(EngineHealth, bridge, state, lambda *_: None, tmp_path)
     monitor.start()
     assert sleep_until(lambda: bool(bridge.told), 30.0)
     monitor.stop()

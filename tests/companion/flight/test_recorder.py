@@ -22,6 +22,7 @@ from sitl.demo.analysis import poses, read_csv
 
 FRAME = LocalFrame(Geodetic(47.3, 8.5, 450.0))
 CAMERA = Camera.from_fov(64, 48, 60)
+CAR = TargetFix("car", np.zeros(3), np.eye(3), (3.0, 4.0), 5)
 
 
 def test_what_is_recorded_can_be_read_back(tmp_path):
@@ -32,7 +33,9 @@ def test_what_is_recorded_can_be_read_back(tmp_path):
         1_700_000_000_123_456_789, 7, CAMERA, {"register": 12.5},
     )  # fmt: skip
     recorder.estimate(estimate)
-    recorder.target(TargetFix("car", np.zeros(3), np.eye(3), (3.0, 4.0), 5), (1.0, 2.0, 0.0))
+    recorder.target(
+        TargetFix("car", np.zeros(3), np.eye(3), (3.0, 4.0), 5), np.array([1.0, 2.0, 0.0])
+    )
     recorder.event("warning", 'a, "quoted" text\nof two lines')
     image = np.full((48, 64, 3), 200, np.uint8)
     for time_ns in (10**9, 1_500_000_000, 2 * 10**9):
@@ -80,7 +83,9 @@ def test_a_full_disk_costs_rows_and_not_the_recorder(tmp_path, caplog):
     with caplog.at_level(logging.WARNING):
         for _ in range(2000):  # more than a file's buffer holds
             recorder.event("info", "x" * 100)
-        recorder.target(TargetFix("car", np.zeros(3), np.eye(3), (3.0, 4.0), 5), (1.0, 2.0, 0.0))
+        recorder.target(
+            TargetFix("car", np.zeros(3), np.eye(3), (3.0, 4.0), 5), np.array([1.0, 2.0, 0.0])
+        )
         recorder.close()
     assert recorder.dropped > 0
     assert told == ["No space left on device"]

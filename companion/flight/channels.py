@@ -1,0 +1,58 @@
+"""What flows between the parts of the process.
+
+Each part subscribes to what it needs when it is made; the sender knows none of them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import Generic, ParamSpec
+
+from companion.flight.target_reporter import Target
+from localizer.types import Frame, PoseEstimate, ReferenceBundle
+from mavlink_bridge.messages import TrackRequest
+
+P = ParamSpec("P")
+
+
+class Channel(Generic[P]):
+    """Hands what is sent to every subscriber, on the sender's thread, in the order in which they
+    subscribed. Subscribers only queue, or do what is as cheap: whoever sends must not wait.
+    """
+
+    def __init__(self) -> None:
+        self._subscribers: tuple[Callable[P, None], ...] = ()
+
+    def subscribe(self, take: Callable[P, None]) -> None:
+        """Have `take` called with everything that is sent from now on."""
+        self._subscribers = (*self._subscribers, take)
+
+    def send(self, *args: P.args, **kwargs: P.kwargs) -> None:
+        """Serve every subscriber; the first error among them is raised when all have been."""
+        failed: Exception | None = None
+        for take in self._subscribers:
+            try:
+                take(*args, **kwargs)
+            except Exception as error:  # one part's fault must not starve the others
+                failed = failed or error
+        if failed is not None:
+            raise failed
+
+
+@dataclass(frozen=True)
+class Channels:
+    """Every channel of one process, each with the thread that sends on it."""
+
+    frames: Channel[[Frame]] = field(default_factory=Channel)
+    """Every frame of the camera, on the feed's thread."""
+    estimates: Channel[[PoseEstimate, ReferenceBundle]] = field(default_factory=Channel)
+    """Every estimate, accepted or not, with its reference view, on the localization thread."""
+    targets: Channel[[Target]] = field(default_factory=Channel)
+    """Every located target, on the targets' thread."""
+    clicks: Channel[[TrackRequest]] = field(default_factory=Channel)
+    """What the ground station asks the camera to track, on a MAVLink link's thread."""
+    texts: Channel[[int, str]] = field(default_factory=Channel)
+    """Every line (MAV_SEVERITY, text) that the bridge told the operator, on any thread."""
+    events: Channel[[str, str]] = field(default_factory=Channel)
+    """What happens (level, text) and is told nobody in flight: for log and record, any thread."""

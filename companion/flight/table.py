@@ -1,0 +1,256 @@
+"""The table of what runs: every part of the flight process, how it is made, started and stopped.
+
+A new part is a line in `PARTS` and a function that makes it. It takes what it needs from the parts
+above it and subscribes to the channels that it reads.
+"""
+
+from __future__ import annotations
+
+import logging
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from companion.config import CompanionConfig
+from companion.errors import ConfigError
+from companion.flight.clicks import ClickPolicy
+from companion.flight.conversions import Installation, target_report
+from companion.flight.detections import DetectionListener
+from companion.flight.feed import Feed
+from companion.flight.health import HealthMonitor
+from companion.flight.injection import FixInjection
+from companion.flight.parts import Making, Part
+from companion.flight.priors import AutopilotPose, PriorSources
+from companion.flight.recorder import RecordKeeper, remove_empty
+from companion.flight.target_numbers import TargetNumbers
+from companion.flight.target_reporter import Target, TargetReporter
+from companion.flight.view_reporter import ViewReporter
+from companion.preflight.coverage import check_origin
+from companion.sources import FrameSource, StreamState, open_source
+from localizer.map.cache.cache import TileCache
+from localizer.map.cache.surface import MapSurface
+from localizer.tracking.engine import DualThreadEngine
+from localizer.tracking.opening import MapStack, build_localizer
+from localizer.tracking.pipeline import Localizer
+from mavlink_bridge.bridge import Bridge
+from mavlink_bridge.config import BridgeConfig
+
+_log = logging.getLogger(__name__)
+_WARNING = 4  # MAV_SEVERITY_WARNING; lower is worse
+_BAD_FEED = (StreamState.STALLED, StreamState.FAILED, StreamState.SCALED, StreamState.MISFIT)
+
+
+def _map(making: Making) -> MapStack:
+    config = making.config
+    stack = MapStack(config.map, config.localizer)
+    try:
+        _require_origin_at_map(config, stack.cache)
+    except BaseException:
+        stack.close()
+        raise
+    return stack
+
+
+def _installation(making: Making) -> Installation:
+    cache = making[MapStack].cache
+    arm = np.array(making.config.camera.lever_arm_m)
+    return Installation(cache.frame, cache.manifest.geoid_separation_m, arm)
+
+
+def _bridge(making: Making) -> Bridge:
+    return Bridge(
+        _bridge_config(making.config),
+        making[MapStack].cache.manifest.geoid_separation_m,
+        on_track=making.channels.clicks.send,
+        on_text=making.channels.texts.send,
+    )
+
+
+def _record(making: Making) -> RecordKeeper:
+    bridge, channels, config = making[Bridge], making.channels, making.config
+    keeper = RecordKeeper(
+        making[MapStack].cache.frame,
+        lambda why: bridge.say(_WARNING, f"PiLoT: record is incomplete: {why}"),
+    )
+    if config.record is None:
+        return keeper
+
+    def claim(folder: Path) -> None:
+        making.if_abandoned(lambda: remove_empty(folder))
+
+    keeper.open(config, config.record, claim)
+    recorder = keeper.recorder
+    if recorder is not None:
+        channels.frames.subscribe(recorder.snapshot)
+        channels.estimates.subscribe(lambda estimate, _: recorder.estimate(estimate))
+        channels.targets.subscribe(lambda target: recorder.target(target.fix, target.velocity))
+        channels.events.subscribe(recorder.event)
+        # What the operator was told belongs in the record; the bridge has logged it.
+        channels.texts.subscribe(lambda severity, text: recorder.event(_level(severity), text))
+    return keeper
+
+
+def _source(making: Making) -> FrameSource:
+    camera, events = making.config.camera, making.channels.events
+
+    def on_state(state: StreamState, text: str) -> None:
+        events.send("warning" if state in _BAD_FEED else "info", f"feed: {text}")
+
+    return open_source(camera.source, camera.model.camera(), camera.settings, on_state)
+
+
+def _health(making: Making) -> HealthMonitor:
+    engine, keeper = making.later(DualThreadEngine), making[RecordKeeper]
+    source = making[FrameSource]  # type: ignore[type-abstract]  # whichever of its kinds
+    health = HealthMonitor(
+        lambda: engine().health,
+        making[Bridge],
+        lambda: source.state,
+        making.channels.events.send,
+        keeper.folder,
+        lambda: keeper.is_complete,
+    )
+    making.channels.estimates.subscribe(lambda estimate, _: health.add_estimate(estimate))
+    return health
+
+
+def _targets(making: Making) -> TargetReporter:
+    channels, bridge = making.channels, making[Bridge]
+    cache, numbers = making[MapStack].cache, TargetNumbers()
+    reporter = TargetReporter(making.config.targets, MapSurface(cache).cast, channels.targets.send)
+
+    def report(target: Target) -> None:
+        camera, number = target.estimate.camera, numbers.of(target.fix.target_id)
+        bridge.report(target_report(target.fix, target.velocity, camera, cache.frame, number))
+
+    channels.estimates.subscribe(lambda estimate, _: reporter.add_estimate(estimate))
+    channels.targets.subscribe(report)
+    return reporter
+
+
+def _clicks(making: Making) -> ClickPolicy:
+    clicks = ClickPolicy(making[TargetReporter].add_detection, making[Bridge].say)
+    making.channels.estimates.subscribe(clicks.add_estimate)
+    making.channels.clicks.subscribe(clicks.on_request)
+    return clicks
+
+
+def _detections(making: Making) -> DetectionListener:
+    address = making.config.targets.detections
+    assert address is not None  # or the part is not wanted
+    return DetectionListener(address, making[TargetReporter].add_detection)
+
+
+def _view(making: Making) -> ViewReporter:
+    cache, bridge = making[MapStack].cache, making[Bridge]
+    rate_hz = making.config.bridge.targets.rate_hz
+    view = ViewReporter(rate_hz, cache.frame, MapSurface(cache).cast, bridge.look)
+    making.channels.estimates.subscribe(lambda estimate, _: view.add_estimate(estimate))
+    return view
+
+
+def _autopilot(making: Making) -> AutopilotPose:
+    return AutopilotPose(making[Bridge], making[Installation], making.config.prior)
+
+
+def _localizer(making: Making) -> Localizer:
+    _log.info("making the localizer ready; the first start on a machine compiles its kernels")
+    config, autopilot = making.config, making[AutopilotPose]
+    camera = config.camera.model.camera()
+    return build_localizer(making[MapStack], camera, config.localizer, autopilot.rotation)
+
+
+def _injection(making: Making) -> FixInjection:
+    injection = FixInjection(making[Bridge], making[Installation])
+    making.channels.estimates.subscribe(injection.add_estimate)
+    return injection
+
+
+def _feed(making: Making) -> Feed:
+    source = making[FrameSource]  # type: ignore[type-abstract]  # whichever of its kinds
+    return Feed(source, making.channels.frames.send)
+
+
+def _engine(making: Making) -> DualThreadEngine:
+    channels = making.channels
+    engine = DualThreadEngine(
+        making[Localizer], (channels.estimates.send,), making[PriorSources].at
+    )
+    channels.frames.subscribe(engine.submit)
+    return engine
+
+
+# In this order the parts are made and then started, and in the reverse order stopped and then
+# closed. What gives an estimate's age its last milliseconds, injection, is served first. A wrong
+# source and a port in use are found before the localizer, whose compilation takes its time; the
+# record is closed after all that could tell it something.
+PARTS: tuple[Part[Any], ...] = (
+    Part("map", MapStack, _map, close=MapStack.close),
+    Part("installation", Installation, _installation, depends=(MapStack,)),
+    Part(
+        "bridge", Bridge, _bridge, depends=(MapStack,),
+        start=Bridge.start, stop=Bridge.stop, close=Bridge.stop,  # one not started has files open
+    ),
+    Part("injection", FixInjection, _injection, depends=(Bridge, Installation)),
+    Part(
+        "record", RecordKeeper, _record, depends=(MapStack, Bridge), close=RecordKeeper.close
+    ),
+    Part("source", FrameSource, _source),
+    Part(
+        "health", HealthMonitor, _health, depends=(Bridge, RecordKeeper, FrameSource),
+        later=(DualThreadEngine,), start=HealthMonitor.start, stop=HealthMonitor.stop,
+    ),
+    Part(
+        "targets", TargetReporter, _targets, depends=(MapStack, Bridge),
+        start=TargetReporter.start, stop=TargetReporter.stop,
+    ),
+    Part("clicks", ClickPolicy, _clicks, depends=(TargetReporter, Bridge)),
+    Part(
+        "detections", DetectionListener, _detections, depends=(TargetReporter,),
+        close=DetectionListener.close, wanted=lambda config: config.targets.detections is not None,
+    ),
+    Part("autopilot", AutopilotPose, _autopilot, depends=(Bridge, Installation)),
+    Part(
+        "priors", PriorSources, lambda making: PriorSources(making[AutopilotPose].prior),
+        depends=(AutopilotPose,),
+    ),
+    Part("localizer", Localizer, _localizer, depends=(MapStack, AutopilotPose)),
+    Part(
+        "view", ViewReporter, _view, depends=(MapStack, Bridge),
+        start=ViewReporter.start, stop=ViewReporter.stop,
+        wanted=lambda config: config.bridge.camera.announce,
+    ),
+    Part(
+        "engine", DualThreadEngine, _engine, depends=(Localizer, PriorSources),
+        start=DualThreadEngine.start, stop=DualThreadEngine.stop,
+    ),
+    Part(
+        "feed", Feed, _feed, depends=(FrameSource,), start=Feed.start, stop=Feed.stop
+    ),
+)  # fmt: skip
+
+
+def _level(severity: int) -> str:
+    return "warning" if severity <= _WARNING else "info"
+
+
+def _require_origin_at_map(config: CompanionConfig, cache: TileCache) -> None:
+    """The vehicle keeps an origin until it is switched off: a wrong one must never be sent."""
+    if config.bridge.origin is not None:
+        finding = check_origin(config.bridge.origin, cache)
+        if not finding.ok:
+            raise ConfigError(f"bridge.origin: {finding.found} (needed {finding.needed})")
+
+
+def _bridge_config(config: CompanionConfig) -> BridgeConfig:
+    """The bridge announces the camera that the feed really has."""
+    camera = config.camera.model.camera()
+    announced = config.bridge.camera.model_copy(
+        update={
+            "width_px": camera.width,
+            "height_px": camera.height,
+            "horizontal_fov_deg": camera.horizontal_fov_deg,
+        }
+    )
+    return config.bridge.model_copy(update={"camera": announced})

@@ -1,0 +1,82 @@
+"""Which estimates become fixes, which of them carries a jump, and who may withhold one."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from companion.flight.conversions import Installation
+from companion.flight.injection import FixInjection
+from localizer.geometry.camera import Camera
+from localizer.geometry.geo import Geodetic, LocalFrame
+from localizer.geometry.pose import Pose
+from localizer.types import PoseEstimate, RegistrationStatus, TrackingState
+
+LOST, TRACKING = TrackingState.LOST, TrackingState.TRACKING
+DEGRADED, INITIALIZING = TrackingState.DEGRADED, TrackingState.INITIALIZING
+CAMERA = Camera.from_fov(640, 480, 60)
+INSTALLATION = Installation(LocalFrame(Geodetic(47.3, 8.5, 450.0)), 47.5, np.zeros(3))
+
+
+class FakeBridge:
+    def __init__(self):
+        self.fixes = []
+
+    def attitude_at(self, _):
+        return None
+
+    def gimbal_at(self, _):
+        return None
+
+    def submit(self, fix):
+        self.fixes.append(fix)
+
+
+def _estimate(state, accepted=True):
+    pose = Pose(np.diag([1.0, -1.0, -1.0]), np.array([0.0, 0.0, 100.0]))
+    return PoseEstimate(
+        pose, np.eye(6) * 1e-4, 1.0, state, RegistrationStatus.OK, accepted, 5, 0, CAMERA
+    )
+
+
+@pytest.mark.parametrize(
+    ("states", "resets"),
+    [
+        ((INITIALIZING, TRACKING, TRACKING), [True, False]),
+        ((TRACKING, DEGRADED, TRACKING), [True, False]),  # it kept the filter's track
+        ((TRACKING, LOST, INITIALIZING, TRACKING, TRACKING), [True, True, False]),
+    ],
+)
+def test_only_a_new_start_carries_a_jump(states, resets):
+    bridge = FakeBridge()
+    injection = FixInjection(bridge, INSTALLATION)
+    for state in states:
+        injection.add_estimate(_estimate(state), None)
+    assert [fix.reset for fix in bridge.fixes] == resets
+
+
+def test_what_is_rejected_or_unconfirmed_is_not_injected():
+    bridge = FakeBridge()
+    injection = FixInjection(bridge, INSTALLATION)
+    injection.add_estimate(_estimate(TRACKING, accepted=False), None)
+    for state in (INITIALIZING, DEGRADED, LOST):
+        injection.add_estimate(_estimate(state), None)
+    assert bridge.fixes == []
+
+
+def test_a_jump_survives_the_fix_that_a_judge_withholds():
+    bridge, verdicts = FakeBridge(), iter([None, "wider", "as it is"])
+    injection = FixInjection(bridge, INSTALLATION)
+
+    def judge(estimate, fix):
+        verdict = next(verdicts)
+        if verdict == "wider":
+            return replace(fix, position_covariance_ned=4.0 * fix.position_covariance_ned)
+        return fix if verdict else None
+
+    injection.add_judge(judge)
+    for _ in range(3):
+        injection.add_estimate(_estimate(TRACKING), None)
+    assert [fix.reset for fix in bridge.fixes] == [True, False]
+    widths = [fix.position_covariance_ned[0, 0] for fix in bridge.fixes]
+    assert widths == pytest.approx([4e-4, 1e-4])
