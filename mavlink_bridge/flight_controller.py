@@ -12,7 +12,7 @@ from mavlink_bridge.components import COMMANDS_IN, Components
 from mavlink_bridge.injection.fix_sender import FixSender
 from mavlink_bridge.injection.fix_warnings import FixWarnings
 from mavlink_bridge.injection.outcome import InjectionOutcome
-from mavlink_bridge.injection.source_orders import SourceOrders
+from mavlink_bridge.injection.switching import SourceOrders
 from mavlink_bridge.link.link import Link
 from mavlink_bridge.messages import VehicleState
 from mavlink_bridge.shared import Shared
@@ -20,10 +20,10 @@ from mavlink_bridge.texts import Teller
 from mavlink_bridge.vehicle.commands import Commander, accepted
 from mavlink_bridge.vehicle.origin_exchange import OriginExchange
 from mavlink_bridge.vehicle.profile import select_profile
+from mavlink_bridge.vehicle.readings import MESSAGES_IN
 from mavlink_bridge.vehicle.requests import VehicleRequests
 from mavlink_bridge.vehicle.strangers import StrangerWatch
 from mavlink_bridge.vehicle.timesync import TimeSync
-from mavlink_bridge.vehicle.tracker import MESSAGES_IN
 
 _FIRST_GUESS = 1  # the system id that vehicles are delivered with
 _IDLE_NS = 100_000_000

@@ -5,14 +5,9 @@ from __future__ import annotations
 from collections import Counter
 
 from mavlink_bridge.config import Mode
-from mavlink_bridge.injection.injector import (
-    NO_FIX_YET,
-    NO_FRESH_FIX,
-    FixQueue,
-    Injection,
-    InjectionContext,
-    Injector,
-)
+from mavlink_bridge.injection.fix_queue import FixQueue
+from mavlink_bridge.injection.injector import NO_FIX_YET, NO_FRESH_FIX, Injector
+from mavlink_bridge.injection.message_maker import Injection, InjectionContext
 from mavlink_bridge.injection.outcome import InjectionOutcome
 from mavlink_bridge.injection.propagate import PropagatedFix
 from mavlink_bridge.link.link import Link

@@ -12,96 +12,31 @@ from __future__ import annotations
 
 import math
 import statistics
-import threading
 from collections import Counter, deque
-from collections.abc import Callable
-from dataclasses import dataclass, replace
-from typing import Any
 
-from mavlink_bridge import quaternion as quat
-from mavlink_bridge.config import InjectionConfig, InjectionMessage
-from mavlink_bridge.injection.encode import (
-    Estimate,
-    global_position_sensor,
-    gps_input,
-    odometry,
-    vision_position_estimate,
+from mavlink_bridge.config import InjectionConfig
+from mavlink_bridge.injection.encode import Estimate
+from mavlink_bridge.injection.fix_queue import PendingJump
+from mavlink_bridge.injection.message_maker import (
+    Injection,
+    InjectionContext,
+    MessageMaker,
+    Withheld,
+    attitude_of,
 )
 from mavlink_bridge.injection.propagate import FixPropagator
 from mavlink_bridge.injection.yaw_guard import YawGuard
 from mavlink_bridge.link.clock import SteadyUtc
-from mavlink_bridge.messages import Attitude, Origin, VisionFix
-from mavlink_bridge.vehicle.origin import ned_from_origin
-from mavlink_bridge.vehicle.profile import CovarianceFormula, FirmwareProfile
+from mavlink_bridge.messages import VisionFix
 
 NAN = math.nan
 NO_FIX_YET = "no fix yet"
 NO_FRESH_FIX = "no fresh fix"
 _QUEUE = 32
 _LATENCIES = 50
-_FARTHEST_M = 100_000.0  # from the origin: farther, one of the two is wrong
 _FUTURE_SLACK_NS = 20_000_000
 _INTERVALS, _INTERVALS_KNOWN = 10, 3
 _STALE_NS = 3_000_000_000
-
-
-@dataclass(frozen=True)
-class Withheld:
-    """Why nothing is sent although it is time. counter: the name it is counted under."""
-
-    reason: str
-    counter: str
-
-
-@dataclass(frozen=True)
-class Injection:
-    """One message to send, and the estimate it was made from."""
-
-    message: Any
-    estimate: Estimate
-
-
-@dataclass(frozen=True)
-class InjectionContext:
-    """What the injector must know about the vehicle. now: the origin and profile of this moment."""
-
-    origin: Origin | None
-    profile: FirmwareProfile
-    attitude_at: Callable[[int], Attitude | None]
-
-
-class FixQueue:
-    """Fixes on their way from any thread to the link's; the oldest go first when it is full.
-
-    A jump that went with a dropped fix is told by the next.
-    """
-
-    def __init__(self, length: int) -> None:
-        self._length = length
-        self._fixes: deque[VisionFix] = deque()
-        self._lock = threading.Lock()
-        self.dropped = 0
-
-    def put(self, fix: VisionFix) -> None:
-        """Append; never blocks for long."""
-        with self._lock:
-            self._fixes.append(fix)
-            if len(self._fixes) > self._length:
-                self.dropped += 1
-                if self._fixes.popleft().reset:
-                    self._fixes[0] = replace(self._fixes[0], reset=True)
-
-    def __len__(self) -> int:
-        return len(self._fixes)
-
-    def take(self) -> list[VisionFix]:
-        """All that wait, oldest first."""
-        if not self._fixes:
-            return []
-        with self._lock:
-            fixes = list(self._fixes)
-            self._fixes.clear()
-        return fixes
 
 
 class Injector:
@@ -109,8 +44,7 @@ class Injector:
 
     def __init__(self, config: InjectionConfig, geoid_separation_m: float, utc: SteadyUtc) -> None:
         self._config = config
-        self._geoid_m = geoid_separation_m
-        self._utc = utc
+        self._maker = MessageMaker(config, geoid_separation_m, utc)
         self._delay_ns = int(config.delay_ms * 1e6)
         self._period_ns = int(1e9 / config.rate_hz)
         self._propagator = FixPropagator(config.acceleration_sigma_mps2, config.sigma_floor_m)
@@ -118,7 +52,7 @@ class Injector:
         self._waiting: deque[VisionFix] = deque()
         self._latencies_ms: deque[float] = deque(maxlen=_LATENCIES)
         self._fresh: VisionFix | None = None
-        self._reset_pending = False
+        self._jump = PendingJump()
         self._reset_counter = 0
         self._newest_ns = 0
         self._last_slot_ns = 0
@@ -152,17 +86,10 @@ class Injector:
 
     def submit(self, fix: VisionFix, now_ns: int) -> None:
         """Queue a fix; one that is late by seconds, from the future or out of order is dropped."""
-        if fix.time_ns <= self._newest_ns:
-            self.counters["fixes_out_of_order"] += 1
-            self._keep_reset(fix)
-            return
-        if fix.time_ns > now_ns + _FUTURE_SLACK_NS:
-            self.counters["fixes_from_future"] += 1
-            self._keep_reset(fix)
-            return
-        if now_ns - fix.time_ns > _STALE_NS:
-            self.counters["fixes_stale"] += 1
-            self._keep_reset(fix)
+        unusable = self._unusable(fix, now_ns)
+        if unusable is not None:
+            self.counters[unusable] += 1
+            self._jump.note(fix)
             return
         self._newest_ns = fix.time_ns
         self._latencies_ms.append((now_ns - fix.time_ns) * 1e-6)
@@ -170,16 +97,24 @@ class Injector:
         self._waiting.append(fix)
         if len(self._waiting) > _QUEUE:
             self.counters["fixes_overflowed"] += 1
-            self._keep_reset(self._waiting.popleft())
+            self._jump.note(self._waiting.popleft())
+
+    def _unusable(self, fix: VisionFix, now_ns: int) -> str | None:
+        """Why a fix is dropped at once (the name it is counted under), or None."""
+        if fix.time_ns <= self._newest_ns:
+            return "fixes_out_of_order"
+        if fix.time_ns > now_ns + _FUTURE_SLACK_NS:
+            return "fixes_from_future"
+        return "fixes_stale" if now_ns - fix.time_ns > _STALE_NS else None
 
     def announce_jump(self) -> None:
         """Raise the reset counter with the next message."""
-        self._reset_pending = True
+        self._jump.announce()
 
     def skip(self) -> None:
         """Nothing can be sent now: forget what waits, but not that the position jumped."""
         while self._waiting:
-            self._keep_reset(self._waiting.popleft())
+            self._jump.note(self._waiting.popleft())
         self._fresh = None
 
     def step(self, now_ns: int, context: InjectionContext) -> Injection | None:
@@ -219,7 +154,7 @@ class Injector:
             verdict = self.guard.check(fix.time_ns, fix.yaw_rad, attitude, reset=fix.reset)
             if math.isfinite(verdict.difference_rad):
                 self.yaw_difference_rad = verdict.difference_rad
-            self._keep_reset(fix)
+            self._jump.note(fix)
             if not verdict.accept:
                 self.counters["fixes_yaw_refused"] += 1
                 continue
@@ -240,10 +175,6 @@ class Injector:
             return False
         usual = statistics.median(self._intervals_ns)
         return now_ns - self._taken_ns > self._config.overdue_intervals * usual
-
-    def _keep_reset(self, fix: VisionFix) -> None:
-        """A jump must be told even when the fix that carried it is not sent itself."""
-        self._reset_pending = self._reset_pending or fix.reset
 
     # --- what to send ----------------------------------------------------------------------------
 
@@ -288,8 +219,8 @@ class Injector:
         sigma = position.horizontal_sigma_m
         if sigma > self._config.max_sigma_m:
             return Withheld(f"covariance too large ({sigma:.1f} m)", "withheld_covariance")
-        attitude = self._attitude(fix, time_ns, context)
-        counter = (self._reset_counter + self._reset_pending) % 256
+        attitude = attitude_of(fix, time_ns, context)
+        counter = (self._reset_counter + self._jump.pending) % 256
         estimate = Estimate(
             position,
             attitude,
@@ -299,65 +230,9 @@ class Injector:
             fresh,
             repeated=fix.time_ns == self._sent_fix_ns,
         )
-        outcome = self._message(estimate, now_ns, context)
+        outcome = self._maker.make(estimate, now_ns, context)
         if isinstance(outcome, Injection):
-            self._reset_counter, self._reset_pending = counter, False
+            self._reset_counter = counter
+            self._jump.told()
             self._sent_fix_ns = fix.time_ns
         return outcome
-
-    def _attitude(
-        self, fix: VisionFix, time_ns: int, context: InjectionContext
-    ) -> tuple[float, float, float]:
-        """Vision attitude at time_ns: the fix's, turned as the autopilot turned since."""
-        vision = (fix.roll_rad, fix.pitch_rad, fix.yaw_rad)
-        if time_ns == fix.time_ns or not all(math.isfinite(angle) for angle in vision):
-            return vision
-        then, now = context.attitude_at(fix.time_ns), context.attitude_at(time_ns)
-        if then is None or now is None:
-            return vision
-        turned = quat.multiply(quat.conjugate(then.quaternion), now.quaternion)
-        return quat.to_euler(quat.multiply(quat.from_euler(*vision), turned))
-
-    def _message(self, e: Estimate, now_ns: int, context: InjectionContext) -> Injection | Withheld:
-        kind: InjectionMessage = self._config.message
-        altitude = e.position.height_m - self._geoid_m
-        if kind == "gps_input":
-            week_ms = self._utc.gps_week_ms(e.position.time_ns)
-            return Injection(gps_input(e, altitude, week_ms, self._config), e)
-        if kind == "global_position_sensor":
-            return Injection(global_position_sensor(e, altitude, now_ns), e)
-        if context.origin is None:
-            return Withheld("the EKF has no origin", "withheld_no_origin")
-        ned = ned_from_origin(
-            context.origin,
-            e.position.latitude_deg,
-            e.position.longitude_deg,
-            altitude,
-            context.profile.projection,
-        )
-        if math.hypot(*ned) > _FARTHEST_M:
-            reason = f"the EKF origin is {math.hypot(*ned) * 1e-3:.0f} km away"
-            return Withheld(reason, "withheld_far_origin")
-        formula = context.profile.covariance
-        if self._config.covariance != "profile":
-            formula = self._config.covariance
-        if kind == "odometry":
-            return self._odometry(e, ned, formula, context)
-        if not self._config.send_attitude:
-            e = replace(e, attitude=(NAN, NAN, NAN))
-        return Injection(vision_position_estimate(e, ned, formula), e)
-
-    def _odometry(
-        self,
-        e: Estimate,
-        ned: tuple[float, float, float],
-        formula: CovarianceFormula,
-        context: InjectionContext,
-    ) -> Injection | Withheld:
-        """Velocity is rotated by the message's quaternion, so there must be one."""
-        if not all(math.isfinite(angle) for angle in e.attitude):
-            now = context.attitude_at(e.position.time_ns)
-            if now is None:
-                return Withheld("no attitude for ODOMETRY", "withheld_no_attitude")
-            e = replace(e, attitude=(now.roll_rad, now.pitch_rad, now.yaw_rad))
-        return Injection(odometry(e, ned, formula, context.profile.odometry_frame), e)

@@ -74,6 +74,9 @@ class Link:
 
     min_interval_ns: shortest time between two messages of one id and component; faster ones are
     dropped and counted. timeout_s: silence after which a stream (TCP, serial) is reopened.
+
+    Over 200 lines, because one thread owns transport, parser, packers and what is unsent, and the
+    order in which its loop serves them keeps positions first on a slow port.
     """
 
     def __init__(

@@ -14,7 +14,7 @@ from mavlink_bridge.errors import ConnectionSilentError
 from mavlink_bridge.link.link import Link
 from mavlink_bridge.link.signing import load_key
 from mavlink_bridge.link.transport import Endpoint
-from mavlink_bridge.vehicle.tracker import VehicleTracker
+from mavlink_bridge.vehicle.readings import is_autopilot
 
 _CONNECT_S = 15.0
 _FIRST_GUESS = 1
@@ -94,7 +94,7 @@ class VehicleClient:
             # of, or written for, the first.
             if self.system or self.config.system_id not in (None, system):
                 return
-            if not VehicleTracker.is_autopilot(message):
+            if not is_autopilot(message):
                 return
             link.system_id = system
             with self._changed:

@@ -9,6 +9,7 @@ from mavlink_bridge.config import BridgeConfig
 from mavlink_bridge.link.link import Link
 from mavlink_bridge.texts import Teller
 from mavlink_bridge.vehicle.presence import TwinWatch
+from mavlink_bridge.vehicle.readings import is_autopilot
 from mavlink_bridge.vehicle.tracker import VehicleTracker
 
 
@@ -37,10 +38,10 @@ class StrangerWatch:
         ours = (config.localizer_component, config.companion_component, config.camera_component)
         if system == link.system_id and component in ours:
             tell("twin", f"another companion speaks as component {component}: stop one")
-        elif system == link.system_id and self._tracker.is_autopilot(message):
+        elif system == link.system_id and is_autopilot(message):
             self._counters["other_autopilots"] += 1
             tell("twins", f"another autopilot is system {system}, too: give it another id")
-        elif config.system_id is None and self._tracker.is_autopilot(message):
+        elif config.system_id is None and is_autopilot(message):
             self._counters["other_autopilots"] += 1
             tell(
                 "others",

@@ -17,7 +17,7 @@ from mavlink_bridge import TargetReport, VisionFix
 from mavlink_bridge.config import InjectionConfig, RcGateConfig, SourceSwitchConfig
 from mavlink_bridge.flight_controller import FC_WANTED
 from mavlink_bridge.ground import GroundEnd
-from mavlink_bridge.injection.injector import FixQueue
+from mavlink_bridge.injection.fix_queue import FixQueue
 from mavlink_bridge.injection.rc_gate import InjectionGate
 from mavlink_bridge.link.framing import FrameReader
 from tests.mavlink_bridge.simulated import HOME, MS, SECOND, Flight, SimulatedLink

@@ -12,7 +12,8 @@ import pytest
 
 from mavlink_bridge.config import InjectionConfig
 from mavlink_bridge.injection.encode import DIAGONAL
-from mavlink_bridge.injection.injector import Injection, InjectionContext, Injector
+from mavlink_bridge.injection.injector import Injector
+from mavlink_bridge.injection.message_maker import Injection, InjectionContext
 from mavlink_bridge.link.clock import SteadyUtc
 from mavlink_bridge.messages import Attitude, Origin, VisionFix
 from mavlink_bridge.quaternion import from_euler

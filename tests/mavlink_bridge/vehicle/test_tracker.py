@@ -14,7 +14,8 @@ from mavlink_bridge.config import OriginConfig
 from mavlink_bridge.messages import Origin
 from mavlink_bridge.vehicle.origin import OriginKeeper, ned_from_origin, north_east, offset
 from mavlink_bridge.vehicle.profile import ARDUPILOT, ARDUPILOT_SQRT, GENERIC, PX4, select_profile
-from mavlink_bridge.vehicle.tracker import VehicleTracker, gimbal_in_earth_frame
+from mavlink_bridge.vehicle.readings import gimbal_in_earth_frame
+from mavlink_bridge.vehicle.tracker import VehicleTracker
 
 MS = 1_000_000
 SECOND = 1_000 * MS

@@ -1,0 +1,211 @@
+"""What each of the vehicle's messages says, in the bridge's units and frames."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from typing import Any
+
+from pymavlink import mavutil
+from pymavlink.dialects.v20 import ardupilotmega as mavlink
+
+from mavlink_bridge import quaternion as quat
+from mavlink_bridge.messages import Attitude, Origin, VehicleState
+from mavlink_bridge.vehicle.buffers import (
+    GIMBAL_SOURCES,
+    AttitudeBuffer,
+    GimbalBuffer,
+    GimbalSample,
+    VectorBuffer,
+    attitude,
+)
+from mavlink_bridge.vehicle.profile import autopilot_name, decode_version, select_profile
+
+
+def is_autopilot(message: Any) -> bool:
+    """Whether it is an autopilot's heartbeat: no ground station's, camera's or companion's."""
+    return (
+        message.get_type() == "HEARTBEAT"
+        and message.autopilot != mavlink.MAV_AUTOPILOT_INVALID
+        and message.type != mavlink.MAV_TYPE_GCS
+        and message.get_srcSystem() != 0
+    )
+
+
+def gimbal_in_earth_frame(flags: int) -> bool:
+    """Whether GIMBAL_DEVICE_ATTITUDE_STATUS gives yaw from north: YAW_IN_* first, then YAW_LOCK."""
+    if flags & mavlink.GIMBAL_DEVICE_FLAGS_YAW_IN_VEHICLE_FRAME:
+        return False
+    if flags & mavlink.GIMBAL_DEVICE_FLAGS_YAW_IN_EARTH_FRAME:
+        return True
+    return bool(flags & mavlink.GIMBAL_DEVICE_FLAGS_YAW_LOCK)
+
+
+class VehicleReadings:
+    """The newest of everything and buffers of what is interpolated; the tracker's lock guards it.
+
+    globals: the EKF's latitude, longitude, altitude AMSL. locals: its NED from the origin.
+    """
+
+    def __init__(self) -> None:
+        self.state = VehicleState()
+        self.heartbeat_ns: int | None = None
+        self.attitudes = AttitudeBuffer()
+        self.gimbals = GimbalBuffer()
+        self.globals = VectorBuffer()
+        self.locals = VectorBuffer()
+
+    def take(self, message: Any, time_ns: int) -> None:
+        """One of MESSAGES_IN. Raises ValueError where it is not finite or no rotation."""
+        _HANDLERS[message.get_type()](self, message, time_ns)
+
+    def set_origin(self, origin: Origin | None) -> None:
+        """What the origin keeper read."""
+        self.state = replace(self.state, origin=origin)
+
+    def forget(self) -> None:
+        """What was dated by the clock before a reboot, and the origin, are void."""
+        for buffer in (self.attitudes, self.gimbals, self.globals, self.locals):
+            buffer.clear()
+        self.set_origin(None)
+
+    def _heartbeat(self, m: Any, time_ns: int) -> None:
+        if not is_autopilot(m):
+            return
+        self.heartbeat_ns = time_ns
+        autopilot = autopilot_name(m.autopilot)
+        self.state = replace(
+            self.state,
+            system_id=m.get_srcSystem(),
+            component_id=m.get_srcComponent(),
+            autopilot=autopilot,
+            vehicle_type=m.type,
+            armed=bool(m.base_mode & mavlink.MAV_MODE_FLAG_SAFETY_ARMED),
+            custom_mode=m.custom_mode,
+            mode=mavutil.mode_string_v10(m),
+            system_status=m.system_status,
+            profile=select_profile(autopilot, self.state.version).name,
+        )
+
+    def _version(self, m: Any, _: int) -> None:
+        version = decode_version(m.flight_sw_version)
+        name = select_profile(self.state.autopilot, version).name
+        self.state = replace(self.state, version=version, profile=name)
+
+    def _attitude_euler(self, m: Any, time_ns: int) -> None:
+        _check_finite(m.roll, m.pitch, m.yaw, m.rollspeed, m.pitchspeed, m.yawspeed)
+        q = quat.from_euler(m.roll, m.pitch, m.yaw)
+        rates = (m.rollspeed, m.pitchspeed, m.yawspeed)
+        self.attitudes.add(Attitude(time_ns, m.roll, m.pitch, m.yaw, q, rates))
+
+    def _attitude_quaternion(self, m: Any, time_ns: int) -> None:
+        _check_finite(m.rollspeed, m.pitchspeed, m.yawspeed)
+        q = quat.normalise((m.q1, m.q2, m.q3, m.q4))
+        self.attitudes.add(attitude(time_ns, q, (m.rollspeed, m.pitchspeed, m.yawspeed)))
+
+    def _gimbal_device(self, m: Any, time_ns: int) -> None:
+        earth = gimbal_in_earth_frame(m.flags)
+        self.gimbals.add(GimbalSample(time_ns, quat.normalise(m.q), earth, GIMBAL_SOURCES[0]))
+
+    def _mount_orientation(self, m: Any, time_ns: int) -> None:
+        _check_finite(m.roll, m.pitch, m.yaw)
+        roll, pitch, yaw = (math.radians(a) for a in (m.roll, m.pitch, m.yaw))
+        q = quat.from_euler(roll, pitch, yaw)
+        self.gimbals.add(GimbalSample(time_ns, q, False, GIMBAL_SOURCES[1]))
+
+    def _mount_status(self, m: Any, time_ns: int) -> None:
+        # pointing_a, b, c: pitch, roll, yaw in centidegrees, yaw from the vehicle's nose.
+        pitch, roll, yaw = (
+            math.radians(0.01 * a) for a in (m.pointing_a, m.pointing_b, m.pointing_c)
+        )
+        q = quat.from_euler(roll, pitch, yaw)
+        self.gimbals.add(GimbalSample(time_ns, q, False, GIMBAL_SOURCES[2]))
+
+    def _local_position(self, m: Any, time_ns: int) -> None:
+        _check_finite(m.x, m.y, m.z, m.vx, m.vy, m.vz)
+        self.locals.add(time_ns, (m.x, m.y, m.z))
+        self.state = replace(
+            self.state,
+            local_position_ned=(m.x, m.y, m.z),
+            local_velocity_ned=(m.vx, m.vy, m.vz),
+            local_time_ns=time_ns,
+        )
+
+    def _global_position(self, m: Any, time_ns: int) -> None:
+        if m.lat == 0 and m.lon == 0:
+            return  # what firmwares send before they have a position
+        if abs(m.lat) > 900_000_000 or abs(m.lon) > 1_800_000_000:
+            raise ValueError(f"no place on Earth: {m.lat}, {m.lon}")
+        self.globals.add(time_ns, (m.lat * 1e-7, m.lon * 1e-7, m.alt * 1e-3))
+        self.state = replace(
+            self.state,
+            latitude_deg=m.lat * 1e-7,
+            longitude_deg=m.lon * 1e-7,
+            altitude_amsl_m=m.alt * 1e-3,
+            altitude_relative_m=m.relative_alt * 1e-3,
+            position_time_ns=time_ns,
+        )
+
+    def _ekf_status(self, m: Any, _: int) -> None:
+        self.state = replace(
+            self.state,
+            ekf_flags=m.flags,
+            ekf_velocity_variance=m.velocity_variance,
+            ekf_horizontal_variance=m.pos_horiz_variance,
+            ekf_vertical_variance=m.pos_vert_variance,
+            ekf_compass_variance=m.compass_variance,
+        )
+
+    def _estimator_status(self, m: Any, _: int) -> None:
+        # PX4's innovation test ratios; the flags share their first bits with EKF_STATUS_REPORT.
+        self.state = replace(
+            self.state,
+            ekf_flags=m.flags,
+            ekf_velocity_variance=m.vel_ratio,
+            ekf_horizontal_variance=m.pos_horiz_ratio,
+            ekf_vertical_variance=m.pos_vert_ratio,
+            ekf_compass_variance=m.mag_ratio,
+        )
+
+    def _gps(self, m: Any, time_ns: int) -> None:
+        accuracy = getattr(m, "h_acc", 0)
+        self.state = replace(
+            self.state,
+            gps_fix_type=m.fix_type,
+            gps_satellites=0 if m.satellites_visible == 255 else m.satellites_visible,
+            gps_latitude_deg=m.lat * 1e-7,
+            gps_longitude_deg=m.lon * 1e-7,
+            gps_h_accuracy_m=accuracy * 1e-3 if accuracy else math.nan,
+            gps_time_ns=time_ns,
+        )
+
+    def _rc(self, m: Any, time_ns: int) -> None:
+        channels = tuple(getattr(m, f"chan{i}_raw") for i in range(1, 19))
+        self.state = replace(self.state, rc_channels_us=channels, rc_time_ns=time_ns)
+
+    def _text(self, m: Any, _: int) -> None:
+        self.state = replace(self.state, last_text=str(m.text))
+
+
+def _check_finite(*values: float) -> None:
+    if not all(math.isfinite(value) for value in values):
+        raise ValueError(f"{values} is not finite")
+
+
+_HANDLERS = {
+    "HEARTBEAT": VehicleReadings._heartbeat,
+    "AUTOPILOT_VERSION": VehicleReadings._version,
+    "ATTITUDE": VehicleReadings._attitude_euler,
+    "ATTITUDE_QUATERNION": VehicleReadings._attitude_quaternion,
+    "GIMBAL_DEVICE_ATTITUDE_STATUS": VehicleReadings._gimbal_device,
+    "MOUNT_ORIENTATION": VehicleReadings._mount_orientation,
+    "MOUNT_STATUS": VehicleReadings._mount_status,
+    "LOCAL_POSITION_NED": VehicleReadings._local_position,
+    "GLOBAL_POSITION_INT": VehicleReadings._global_position,
+    "EKF_STATUS_REPORT": VehicleReadings._ekf_status,
+    "ESTIMATOR_STATUS": VehicleReadings._estimator_status,
+    "GPS_RAW_INT": VehicleReadings._gps,
+    "RC_CHANNELS": VehicleReadings._rc,
+    "STATUSTEXT": VehicleReadings._text,
+}
+MESSAGES_IN: tuple[str, ...] = tuple(_HANDLERS)
