@@ -26,7 +26,7 @@ from mavlink_bridge.link.clock import SteadyUtc, monotonic_ns
 from mavlink_bridge.link.link import Link, LinkHandler
 from mavlink_bridge.link.signing import load_key
 from mavlink_bridge.link.tlog import TlogRecorder
-from mavlink_bridge.link.transport import Endpoint, UdpTransport
+from mavlink_bridge.link.transport import Endpoint, Transport, UdpTransport, open_transport
 from mavlink_bridge.messages import (
     Attitude,
     CameraView,
@@ -61,6 +61,7 @@ class Bridge:
 
     on_track: called (in a link's thread; must return at once) when the operator asks for tracking.
     on_text: called likewise with every line for the operator (severity, text), for a record.
+    opener: opens the links' transports; raises OSError or EndpointError while it cannot.
     Raises errors of `mavlink_bridge.errors` for keys, files and endpoints that cannot be used.
     """
 
@@ -71,6 +72,7 @@ class Bridge:
         *,
         on_track: Callable[[TrackRequest], None] | None = None,
         on_text: Callable[[int, str], None] = lambda _severity, _text: None,
+        opener: Callable[[Endpoint], Transport] = open_transport,
     ) -> None:
         self._config = config
         self._started = self._stopped = False
@@ -100,7 +102,7 @@ class Bridge:
             InjectionGate(config.rc, self._gate_changed) if config.mode == "rc" else None,
         )
         self._fc = FlightControllerEnd(shared)
-        make = partial(_make_link, recorder=self._recorder, timeout_s=config.link_timeout_s)
+        make = partial(_make_link, config=config, recorder=self._recorder, opener=opener)
         self._fc_link = make(config.connection, self._fc, "fc", FC_WANTED, config.signing)
         # Without a ground link of its own, what is for the ground is routed by the autopilot.
         self._ground: Components = self._fc.components
@@ -220,6 +222,14 @@ class Bridge:
         return [text for _, text in list(self._texts)]
 
     @property
+    def port(self) -> int | None:
+        """The local UDP port of the flight controller's link; None while it has none.
+
+        With ``udpin:HOST:0`` the system chooses it, and the vehicle must be told.
+        """
+        return self._fc_link.port
+
+    @property
     def injecting(self) -> bool:
         """Whether fixes are sent to the flight controller right now (mode and gate)."""
         return self._shared.mode() == "inject"
@@ -262,8 +272,9 @@ def _make_link(
     wanted: frozenset[int],
     signing: SigningConfig | None,
     *,
+    config: BridgeConfig,
     recorder: TlogRecorder | None,
-    timeout_s: float,
+    opener: Callable[[Endpoint], Transport],
 ) -> Link:
     return Link(
         Endpoint.parse(connection),
@@ -273,7 +284,8 @@ def _make_link(
         signing_key=None if signing is None else load_key(signing.key_file),
         signing_link_id=1 if signing is None else signing.link_id,
         recorder=recorder,
-        timeout_s=timeout_s,
+        timeout_s=config.link_timeout_s,
+        opener=opener,
     )
 
 

@@ -6,7 +6,6 @@ handler's callbacks run there too. `send` may be called from anywhere.
 
 from __future__ import annotations
 
-import contextlib
 import logging
 import os
 import select
@@ -25,6 +24,7 @@ from mavlink_bridge.link.clock import monotonic_ns, utc_us
 from mavlink_bridge.link.framing import FrameReader
 from mavlink_bridge.link.tlog import TlogRecorder
 from mavlink_bridge.link.transport import Endpoint, Transport, UdpTransport, open_transport
+from mavlink_bridge.link.waking import WakePipe
 
 log = logging.getLogger(__name__)
 
@@ -75,6 +75,8 @@ class Link:
     min_interval_ns: shortest time between two messages of one id and component; faster ones are
     dropped and counted. timeout_s: silence after which a stream (TCP, serial) is reopened.
 
+    stop: what ends the owner thread when it is set.
+
     Over 200 lines, because one thread owns transport, parser, packers and what is unsent, and the
     order in which its loop serves them keeps positions first on a slow port.
     """
@@ -92,6 +94,7 @@ class Link:
         recorder: TlogRecorder | None = None,
         timeout_s: float = 5.0,
         opener: Callable[[Endpoint], Transport] = open_transport,
+        stop: threading.Event | None = None,
     ) -> None:
         self.endpoint = endpoint
         self.name = name
@@ -109,19 +112,22 @@ class Link:
         self._outbox: deque[tuple[Any, int]] = deque(maxlen=_OUTBOX)
         self._unsent = bytearray()
         self._broken: OSError | None = None
-        self._stop = threading.Event()
+        self._stop = threading.Event() if stop is None else stop
         self._thread: threading.Thread | None = None
         self._transport: Transport | None = None
-        # The pipe's numbers may be other files' once it is closed: nobody writes while it is.
-        self._pipe_lock = threading.Lock()
-        self._wake_read, self._wake_write = os.pipe()
-        os.set_blocking(self._wake_read, False)
-        os.set_blocking(self._wake_write, False)
+        self._waker = WakePipe()
+        self._wake_read = self._waker.read_end
 
     @property
     def connected(self) -> bool:
         """Whether the transport is open (UDP: always, once bound)."""
         return self._transport is not None
+
+    @property
+    def port(self) -> int | None:
+        """The local UDP port; None while the transport is closed, and for streams."""
+        transport = self._transport
+        return transport.port if isinstance(transport, UdpTransport) else None
 
     @property
     def congested(self) -> bool:
@@ -150,21 +156,11 @@ class Link:
         if self._thread is not None and self._thread is not threading.current_thread():
             self._thread.join(timeout=5.0)
         if self._thread is None or not self._thread.is_alive():
-            self._close_pipe()
+            self._waker.close()
 
     def wake(self) -> None:
         """Make the owner thread run `on_tick` now."""
-        # A full pipe wakes the thread anyway, and a closed one has no thread to wake.
-        with self._pipe_lock, contextlib.suppress(BlockingIOError):
-            if self._wake_write >= 0:
-                os.write(self._wake_write, b"w")
-
-    def _close_pipe(self) -> None:
-        with self._pipe_lock:
-            if self._wake_read >= 0:
-                os.close(self._wake_read)
-                os.close(self._wake_write)
-                self._wake_read = self._wake_write = -1
+        self._waker.wake()
 
     def send(self, message: Any, component: int) -> bool:
         """Send as `component` of the vehicle's system; False when it was dropped at once."""

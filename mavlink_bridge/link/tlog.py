@@ -11,8 +11,8 @@ import struct
 import threading
 from collections import deque
 from collections.abc import Callable
-from io import FileIO
 from pathlib import Path
+from typing import Protocol
 
 from mavlink_bridge.errors import RecordError
 
@@ -33,12 +33,26 @@ def is_disk_fault(error: OSError) -> bool:
     return error.errno in _DISK_FAULTS
 
 
+class RecordFile(Protocol):
+    """A file that is written to without a buffer."""
+
+    def write(self, data: bytes | bytearray, /) -> int:
+        """Append; how much of it was taken. Raises OSError."""
+
+    def close(self) -> None:
+        """Close it."""
+
+
+def _append_to(path: Path) -> RecordFile:
+    return path.open("ab", buffering=0)
+
+
 class TlogRecorder:
     """Appends frames to a .tlog file: 8 bytes of big-endian microseconds UTC, then the frame.
 
     Raises `RecordError` when the file cannot be opened, unless the disk is full or failing. What
     the disk does not take is dropped and counted, and on_failure (called once, in the recorder's
-    thread) is told why.
+    thread) is told why. open_file: raises OSError as `Path.open` does.
     """
 
     def __init__(
@@ -46,12 +60,13 @@ class TlogRecorder:
         path: Path,
         on_failure: Callable[[str], None] = lambda _: None,
         max_bytes: int = _MAX_BYTES,
+        open_file: Callable[[Path], RecordFile] = _append_to,
     ) -> None:
-        self._file: FileIO | None = None
+        self._file: RecordFile | None = None
         self._refusal = ""
         try:
             path.parent.mkdir(parents=True, exist_ok=True)
-            self._file = path.open("ab", buffering=0)
+            self._file = open_file(path)
         except OSError as error:
             self._refusal = error.strerror or str(error)
             if not is_disk_fault(error):

@@ -39,12 +39,12 @@ class FakeAutopilot:
         self.boot_ns = time.monotonic_ns() - 100_000_000_000
         self.extra: Callable[[FakeAutopilot, int], list[Any]] | None = None
         self._rate_hz = rate_hz
-        self._codec = mavlink.MAVLink(None, 1, 1)
-        self._codec.robust_parsing = True
+        self.codec = mavlink.MAVLink(None, 1, 1)
+        self.codec.robust_parsing = True
         if key is not None:
-            self._codec.signing.secret_key = key
-            self._codec.signing.sign_outgoing = True
-            self._codec.signing.timestamp = int((time.time() - 1420070400) * 1e5)
+            self.codec.signing.secret_key = key
+            self.codec.signing.sign_outgoing = True
+            self.codec.signing.timestamp = int((time.time() - 1420070400) * 1e5)
         self._sending = threading.Lock()  # a test sends from its own thread, too
         self._stop = threading.Event()
         self._thread = threading.Thread(target=self._run, daemon=True)
@@ -80,9 +80,9 @@ class FakeAutopilot:
 
     def send(self, message: Any, component: int = 1, system: int = 1) -> None:
         with self._sending:
-            self._codec.srcSystem, self._codec.srcComponent = system, component
-            frame = message.pack(self._codec)
-            self._codec.seq = (self._codec.seq + 1) % 256
+            self.codec.srcSystem, self.codec.srcComponent = system, component
+            frame = message.pack(self.codec)
+            self.codec.seq = (self.codec.seq + 1) % 256
             self.send_bytes(frame)
 
     def send_bytes(self, data: bytes) -> None:
@@ -99,7 +99,7 @@ class FakeAutopilot:
                 continue
             if now >= next_slow:
                 next_slow = now + 0.2
-                self._slow()
+                self.slow()
             if now >= next_fast:
                 next_fast = now + 1.0 / self._rate_hz
                 self._fast()
@@ -110,12 +110,12 @@ class FakeAutopilot:
                 data, self.peer = self.socket.recvfrom(65536)
             except (BlockingIOError, ConnectionRefusedError):
                 return
-            for message in self._codec.parse_buffer(data) or []:
+            for message in self.codec.parse_buffer(data) or []:
                 self.received.append(message)
                 if message.get_type() != "BAD_DATA":
-                    self._answer(message)
+                    self.answer(message)
 
-    def _answer(self, m: Any) -> None:
+    def answer(self, m: Any) -> None:
         kind = m.get_type()
         if kind == "TIMESYNC" and m.tc1 == 0:
             self.send(mavlink.MAVLink_timesync_message(time.monotonic_ns() - self.boot_ns, m.ts1))
@@ -126,14 +126,14 @@ class FakeAutopilot:
         elif kind == "PARAM_REQUEST_READ":
             name = m.param_id.rstrip("\x00")
             if name in self.parameters:
-                self._parameter(name)
+                self.parameter(name)
         elif kind == "PARAM_SET":
             name = m.param_id.rstrip("\x00")
             if name in self.parameters:
                 self.parameters[name] = m.param_value
-                self._parameter(name)
+                self.parameter(name)
 
-    def _parameter(self, name: str) -> None:
+    def parameter(self, name: str) -> None:
         self.send(
             mavlink.MAVLink_param_value_message(
                 name.encode(), self.parameters[name], mavlink.MAV_PARAM_TYPE_REAL32, 1, 0
@@ -163,7 +163,7 @@ class FakeAutopilot:
             )
         )
 
-    def _slow(self) -> None:
+    def slow(self) -> None:
         self.send(mavlink.MAVLink_heartbeat_message(2, self.autopilot, 81, 4, 4, 3))
         self.send(
             mavlink.MAVLink_ekf_status_report_message(

@@ -90,8 +90,8 @@ def run() -> Iterator[Callable[..., Bridge]]:
         made.append(bridge)
         bridge.start()
         if settings.connection == LISTENING:
-            assert sleep_until(lambda: bridge._fc_link.connected, 30.0)
-            autopilot.peer = ("127.0.0.1", bridge._fc_link._transport.port)  # type: ignore[union-attr]
+            assert sleep_until(lambda: bridge.port is not None, 30.0)
+            autopilot.peer = ("127.0.0.1", bridge.port)
         assert sleep_until(lambda: bridge.state().connected, 30.0)
         return bridge
 
@@ -491,7 +491,7 @@ def test_tlog_is_read_by_pymavlinks_own_tools(
     stamps = []
     while (m := log.recv_match()) is not None:
         kinds.add(m.get_type())
-        stamps.append(m._timestamp)
+        stamps.append(log.timestamp)
     log.close()
     assert {"ATTITUDE", "HEARTBEAT", "VISION_POSITION_ESTIMATE", "TIMESYNC"} <= kinds
     assert "BAD_DATA" not in kinds
@@ -518,7 +518,7 @@ def test_signing_vehicle_that_does_not_know_the_time(
     """Without GNSS it signs with last year's stamps, until it has heard newer ones: from us."""
     key = create_key(tmp_path / "key")
     vehicle = make_autopilot(key=key)
-    vehicle._codec.signing.timestamp -= 365 * 86_400 * 100_000
+    vehicle.codec.signing.timestamp -= 365 * 86_400 * 100_000
     settings = BridgeConfig(connection=LISTENING, signing=SigningConfig(key_file=tmp_path / "key"))
     bridge = run(settings, vehicle)
     assert bridge.counters()["fc_bad_signatures"] > 0

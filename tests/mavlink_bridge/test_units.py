@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
@@ -28,6 +29,7 @@ from mavlink_bridge.injection.encode import (
 from mavlink_bridge.injection.propagate import PropagatedFix
 from mavlink_bridge.messages import CameraView, Origin, TargetReport
 from mavlink_bridge.vehicle.origin import OriginKeeper
+from mavlink_bridge.vehicle.readings import VehicleReadings
 from mavlink_bridge.vehicle.tracker import VehicleTracker
 
 # How many of a unit make one degree, metre, m/s, radian or second.
@@ -146,6 +148,13 @@ def test_the_origin_is_set_and_read_in_the_units_of_the_definition() -> None:
 def read(name: str, values: dict[str, float], **others: Any) -> VehicleTracker:
     """A tracker that took in one message, its fields given in degrees, metres, m/s."""
     tracker = VehicleTracker(None, quat.IDENTITY, False)
+    for message, time_ns in sent(name, values, **others):
+        tracker.handle(message, time_ns)
+    return tracker
+
+
+def sent(name: str, values: dict[str, float], **others: Any) -> Iterator[tuple[Any, int]]:
+    """Three times a heartbeat and the message, with the times when they came."""
     vehicle = mavlink.MAVLink(None, 1, 1)
     kind = mavlink.mavlink_map[getattr(mavlink, f"MAVLINK_MSG_ID_{name}")]
     fields = {n: others.get(n, 0) for n in kind.fieldnames} | {
@@ -157,8 +166,7 @@ def read(name: str, values: dict[str, float], **others: Any) -> VehicleTracker:
     for k in range(3):
         for message in (beat, kind(**whole)):
             decoded = vehicle.decode(bytearray(message.pack(vehicle)))
-            tracker.handle(decoded, (1000 + k) * 10**6)
-    return tracker
+            yield decoded, (1000 + k) * 10**6
 
 
 def test_what_is_read_is_in_the_units_of_the_definition() -> None:
@@ -190,8 +198,10 @@ def test_what_is_read_is_in_the_units_of_the_definition() -> None:
 def test_old_gimbal_angles_are_in_the_units_of_the_definition(
     name: str, angles: tuple[str, ...]
 ) -> None:
-    tracker = read(name, dict(zip(angles, (-45.0, 5.0, 30.0), strict=True)))
-    (sample,) = {tracker._gimbals.at(1001 * 10**6)}
+    readings = VehicleReadings()
+    for message, time_ns in sent(name, dict(zip(angles, (-45.0, 5.0, 30.0), strict=True))):
+        readings.take(message, time_ns)
+    sample = readings.gimbals.at(1001 * 10**6)
     assert sample is not None
     roll, pitch, yaw = np.degrees(quat.to_euler(sample.quaternion))
     assert (pitch, roll, yaw) == pytest.approx((-45.0, 5.0, 30.0), abs=1e-3)

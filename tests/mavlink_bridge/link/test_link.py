@@ -25,6 +25,7 @@ from mavlink_bridge.link.framing import FrameReader
 from mavlink_bridge.link.link import Link, sleep_until
 from mavlink_bridge.link.signing import create_key
 from mavlink_bridge.link.transport import Endpoint, UdpTransport, open_transport
+from mavlink_bridge.link.waking import WakePipe
 from mavlink_bridge.vehicle.streams import StreamKeeper, wanted_streams
 
 SECOND = 1_000_000_000
@@ -234,7 +235,7 @@ def test_peer_that_does_not_read_costs_messages_not_memory_or_time(
             time.sleep(0.002)
         assert time.monotonic() - begun < 60.0  # a send that blocked once would never end
         assert sleep_until(lambda: link.counters.tx_dropped > 1000, 30.0)
-        assert len(link._unsent) < 128 * 1024
+        assert link.waiting()["unsent"] < 128 * 1024
         deaf.close()
 
 
@@ -359,14 +360,14 @@ def test_waking_a_link_that_is_stopped_writes_into_nobody_elses_file(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     """The pipe's number is soon another file's, a vehicle's record perhaps."""
-    link = Link(Endpoint.parse("udpin:127.0.0.1:0"), Recorder())
+    pipe = WakePipe()
     written: list[int] = []
     wakers = []
 
     def close_slowly(number: int) -> None:
         """Another thread wakes the link while its pipe is closed."""
         os.close(number)
-        waker = threading.Thread(target=link.wake)
+        waker = threading.Thread(target=pipe.wake)
         wakers.append(waker)
         waker.start()
         waker.join(0.1)  # as far as it comes
@@ -375,14 +376,14 @@ def test_waking_a_link_that_is_stopped_writes_into_nobody_elses_file(
         written.append(number)
         return len(data)
 
-    number = link._wake_write
-    link.wake()
+    number = pipe.write_end
+    pipe.wake()
     system = SimpleNamespace(close=close_slowly, write=note)
-    monkeypatch.setattr("mavlink_bridge.link.link.os", system)
-    link._close_pipe()
+    monkeypatch.setattr("mavlink_bridge.link.waking.os", system)
+    pipe.close()
     for waker in wakers:
         waker.join(30.0)
-    link.wake()
+    pipe.wake()
     assert len(wakers) == 2
     assert number not in written
 

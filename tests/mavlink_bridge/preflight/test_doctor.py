@@ -241,7 +241,7 @@ def test_unknown_parameter_cannot_be_written(
 def test_parameters_are_asked_of_one_vehicle_and_taken_from_its_autopilot(autopilot: Any) -> None:
     """A second vehicle and a gimbal on the same link answer, too."""
     autopilot.parameters = {"A": 1.0}
-    answer = autopilot._parameter
+    answer = autopilot.parameter
 
     def everybody(name: str) -> None:
         other = mavlink.MAVLink_param_value_message(b"A", 9.0, mavlink.MAV_PARAM_TYPE_REAL32, 1, 0)
@@ -251,7 +251,7 @@ def test_parameters_are_asked_of_one_vehicle_and_taken_from_its_autopilot(autopi
         autopilot.send(other, component=154, system=1)
         answer(name)
 
-    autopilot._parameter = everybody
+    autopilot.parameter = everybody
     with ParameterClient(config(autopilot.port)) as client:
         for _ in range(3):
             assert client.read("A") == 1.0
@@ -267,13 +267,13 @@ def test_two_vehicles_on_the_link_are_a_required_failure(
     """No parameter may be read, judged or written while nobody said of which vehicle."""
     monkeypatch.setattr("mavlink_bridge.preflight.doctor._MEASURE_S", 0.6)
     autopilot.parameters = dict(GOOD)
-    slow = autopilot._slow
+    slow = autopilot.slow
 
     def both() -> None:
         slow()
         autopilot.send(mavlink.MAVLink_heartbeat_message(2, 3, 81, 4, 4, 3), component=1, system=2)
 
-    autopilot._slow = both
+    autopilot.slow = both
     diagnosis = examine(config(autopilot.port))
     assert diagnosis.exit_code == 2
     (vehicles,) = (f for f in diagnosis.findings if f.name == "vehicles")

@@ -40,7 +40,7 @@ def with_mission(autopilot: Any) -> Callable[..., Any]:
 
     def make(lost: int = 0, refused: int | None = None, silent: bool = False) -> Any:
         left = [lost]
-        answer = autopilot._answer
+        answer = autopilot.answer
 
         def reply(message: Any) -> None:
             if left[0] > 0:
@@ -66,7 +66,7 @@ def with_mission(autopilot: Any) -> Callable[..., Any]:
             else:
                 answer(m)
 
-        autopilot._answer = mission
+        autopilot.answer = mission
         return autopilot
 
     return make
@@ -112,14 +112,14 @@ def test_refusal_and_silence_are_named(
 
 def test_a_count_that_changes_meanwhile_is_not_ours(with_mission: Callable[..., Any]) -> None:
     vehicle = with_mission()
-    answer = vehicle._answer
+    answer = vehicle.answer
 
     def interrupted(message: Any) -> None:
         if message.get_type() == "MISSION_REQUEST_INT":
             vehicle.send(mavlink.MAVLink_mission_count_message(1, 191, 50, 0))
         answer(message)
 
-    vehicle._answer = interrupted
+    vehicle.answer = interrupted
     same(download_mission(config(f"udpout:127.0.0.1:{vehicle.port}")), PLACES)
 
 

@@ -15,7 +15,7 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from mavlink_bridge import Bridge, BridgeConfig, HealthLevel, VehicleState
 from mavlink_bridge.link.link import Link, sleep_until
-from mavlink_bridge.link.transport import Endpoint
+from mavlink_bridge.link.transport import Endpoint, Transport, open_transport
 from mavlink_bridge.vehicle.presence import VehicleWatch
 
 HEARTBEAT = mavlink.MAVLink_heartbeat_message(2, 3, 81, 4, 4, 3)
@@ -41,7 +41,7 @@ class Ticks:
 def test_the_handlers_clock_goes_on_while_the_transport_is_closed(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """Half a minute of simulated time, in the test's own thread."""
+    """Half a minute of simulated time, which only the link's thread moves."""
     now_ns = [10**12]
     monkeypatch.setattr("mavlink_bridge.link.link.monotonic_ns", lambda: now_ns[0])
     attempts: list[float] = []
@@ -50,26 +50,24 @@ def test_the_handlers_clock_goes_on_while_the_transport_is_closed(
         attempts.append(now_ns[0] * 1e-9)
         raise ConnectionRefusedError("nobody there")
 
-    class Stop:
+    class Stop(threading.Event):
         """The link's event, whose waiting is what moves the clock."""
 
         def is_set(self) -> bool:
             return now_ns[0] > 10**12 + 30 * 10**9
 
-        def wait(self, seconds: float) -> bool:
-            now_ns[0] += int(seconds * 1e9) + 1
+        def wait(self, timeout: float | None = None) -> bool:
+            now_ns[0] += int((timeout or 0.0) * 1e9) + 1
             return self.is_set()
 
     ticks = Ticks()
-    link = Link(Endpoint.parse("tcp:127.0.0.1:9"), ticks, opener=refuse)
+    link = Link(Endpoint.parse("tcp:127.0.0.1:9"), ticks, opener=refuse, stop=Stop())
     link.system_id = 1
-    link._stop = Stop()  # type: ignore[assignment]
     for _ in range(700):
         link.send(HEARTBEAT, 191)
-    link._thread = threading.current_thread()
-    link._run()
-    link._close_pipe()
-    assert not link._outbox
+    link.start()
+    link.stop()
+    assert link.waiting()["outbox"] == 0
     waits = [b - a for a, b in itertools.pairwise(attempts)]
     assert max(waits) == pytest.approx(5.0, abs=0.01)  # a tick at each attempt only would leave it
     assert max(b - a for a, b in itertools.pairwise(ticks.times)) <= 0.21
@@ -150,15 +148,17 @@ def test_loss_is_told_on_the_ground_link_within_seconds(reconnecting: bool) -> N
         codec, over = mavlink.MAVLink(None, 255, 190), threading.Event()
         texts: list[str] = []
 
-        def hang(_: Endpoint) -> Any:
-            over.wait()
-            raise ConnectionRefusedError("nobody there")
+        attempts: list[Endpoint] = []
 
-        with Bridge(config, 0.0) as bridge:
+        def opened(endpoint: Endpoint) -> Transport:
+            if reconnecting and endpoint in attempts:
+                over.wait()
+                raise ConnectionRefusedError("nobody there")
+            attempts.append(endpoint)
+            return open_transport(endpoint)
+
+        with Bridge(config, 0.0, opener=opened) as bridge:
             client, _ = server.accept()
-            assert sleep_until(lambda: bridge._fc_link.connected, 30.0)
-            if reconnecting:
-                bridge._fc_link._open = hang
             spoke_at = time.monotonic()
             client.sendall(HEARTBEAT.pack(mavlink.MAVLink(None, 1, 1)))
             assert sleep_until(lambda: bridge.state().connected, 30.0)
