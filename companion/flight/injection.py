@@ -7,6 +7,7 @@ from collections.abc import Callable
 from companion.flight.conversions import Installation, vision_fix
 from localizer.types import PoseEstimate, ReferenceBundle, TrackingState
 from mavlink_bridge.bridge import Bridge
+from mavlink_bridge.injection.fix_queue import PendingJump
 from mavlink_bridge.messages import VisionFix
 
 Judge = Callable[[PoseEstimate, VisionFix], VisionFix | None]
@@ -23,16 +24,21 @@ class JumpPolicy:
     """
 
     def __init__(self) -> None:
-        self.is_due = True
+        self._jump = PendingJump(pending=True)
+
+    @property
+    def is_due(self) -> bool:
+        """Whether the next fix carries it."""
+        return self._jump.pending
 
     def note(self, state: TrackingState) -> None:
         """Take in the tracking state of a frame."""
         if state is TrackingState.LOST:
-            self.is_due = True
+            self._jump.announce()
 
     def carried(self) -> None:
         """A fix that said so has gone out."""
-        self.is_due = False
+        self._jump.told()
 
 
 class FixInjection:
