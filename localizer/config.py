@@ -8,7 +8,7 @@ from pydantic import BaseModel, ConfigDict, Field
 
 from localizer.registration.config import JNGOConfig
 from localizer.registration.devices import DeviceChoice
-from localizer.render.select import Backend
+from localizer.render.select import RendererName
 from localizer.tracking.integrity import IntegrityConfig
 from localizer.tracking.motion import MotionConfig
 
@@ -32,7 +32,7 @@ class LocalizerConfig(BaseModel):
     width: int = Field(320, ge=64, le=2048, description="width of query and reference, pixels")
     model: Path | None = Field(None, description="ONNX feature network; none: the shipped one")
     anchors: int = Field(4000, ge=50, le=8000, description="geo-anchors per reference view")
-    renderer: Backend = Field("auto", description="auto: a GPU where there is one, else numba")
+    renderer: RendererName = Field("auto", description="auto: a GPU where there is one, else numba")
     device: DeviceChoice = Field(
         "auto", description="of the optimizer; auto, cuda: a GPU that works, else the CPU"
     )

@@ -42,7 +42,7 @@ from mavlink_bridge.shared import Shared
 from mavlink_bridge.vehicle.presence import VehicleWatch
 from mavlink_bridge.vehicle.tracker import VehicleTracker
 
-log = logging.getLogger(__name__)
+_log = logging.getLogger(__name__)
 
 _TEXTS = 64
 _TEXT_LENGTH = 50  # STATUSTEXT.text
@@ -166,7 +166,7 @@ class Bridge:
             try:
                 self._cot.write(cursor_on_target(target, self._config.targets, self._utc))
             except OSError as error:
-                log.debug("Cursor-on-Target not sent: %s", error)
+                _log.debug("Cursor-on-Target not sent: %s", error)
 
     def look(self, view: CameraView) -> None:
         """Tell the ground where the camera looks (CAMERA_FOV_STATUS); never blocks."""
@@ -190,7 +190,8 @@ class Bridge:
     def say(self, severity: int, text: str) -> None:
         """A line for the operator: STATUSTEXT on the ground side, and the log."""
         self._texts.append((severity, text))
-        log.log(logging.WARNING if severity <= mavlink.MAV_SEVERITY_WARNING else logging.INFO, text)
+        grave = severity <= mavlink.MAV_SEVERITY_WARNING
+        _log.log(logging.WARNING if grave else logging.INFO, text)
         self._on_text(severity, text)
         with self._text_lock:  # two threads' texts under one id would be mixed at the receiver
             self._text_id = text_id = self._text_id % 0xFFFF + 1

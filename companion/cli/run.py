@@ -12,7 +12,7 @@ from companion.cli.console_log import console_log
 from companion.cli.interrupts import end_at_once
 from companion.config import load_config
 from localizer.registration.devices import DeviceChoice
-from localizer.render.select import Backend
+from localizer.render.select import RendererName
 
 ENDING = (signal.SIGINT, signal.SIGTERM)
 
@@ -20,7 +20,7 @@ ENDING = (signal.SIGINT, signal.SIGTERM)
 def run_command(
     config: Annotated[Path, typer.Argument(help="deployment YAML, see configs/")],
     renderer: Annotated[
-        Backend | None, typer.Option(help="instead of the configuration's localizer.renderer")
+        RendererName | None, typer.Option(help="instead of the configuration's localizer.renderer")
     ] = None,
     device: Annotated[
         DeviceChoice | None, typer.Option(help="instead of the configuration's localizer.device")

@@ -24,7 +24,7 @@ from localizer.features.image import check_image
 from localizer.features.providers import Expected, provider_of, start_session
 from localizer.types import FeatureLevel, FeaturePyramid, Image
 
-logger = logging.getLogger(__name__)
+_log = logging.getLogger(__name__)
 
 SHIPPED_MODEL = Path(__file__).parent / "weights" / "tiny.onnx"
 
@@ -145,7 +145,7 @@ class OnnxExtractor:
         self._bound = (
             None if self.provider == "CPU" else BoundSession(self._session, self._outputs, "cuda")
         )
-        logger.info("features: %s", self.name)
+        _log.info("features: %s", self.name)
 
     @property
     def provider(self) -> str:
@@ -230,7 +230,7 @@ def load_extractor(
     """
     if model is None:
         if not SHIPPED_MODEL.exists():
-            logger.warning("no model file at %s: using gradient features", SHIPPED_MODEL)
+            _log.warning("no model file at %s: using gradient features", SHIPPED_MODEL)
             return GradientExtractor()
         model = SHIPPED_MODEL
     if not model.exists():

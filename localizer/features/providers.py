@@ -15,7 +15,7 @@ import onnxruntime as ort
 from localizer.caches import cache_folder
 from localizer.errors import ModelError
 
-logger = logging.getLogger(__name__)
+_log = logging.getLogger(__name__)
 
 _TENSORRT, _CUDA, _CPU = (f"{n}ExecutionProvider" for n in ("Tensorrt", "CUDA", "CPU"))
 SHORT_NAMES = {_TENSORRT: "TensorRT", _CUDA: "CUDA", _CPU: "CPU"}
@@ -62,14 +62,14 @@ def start_session(
             except Exception as error:
                 if not _removed(kept):
                     raise
-                logger.warning("features: TensorRT builds its engine anew: %s", _line(error))
+                _log.warning("features: TensorRT builds its engine anew: %s", _line(error))
                 return _started(model, options, expected, names[k:], check)
         except Exception as error:  # onnxruntime raises its own untyped exceptions
             if k + 1 == len(names):
                 if isinstance(error, ModelError):
                     raise
                 raise ModelError(f"{model}: onnxruntime cannot load it: {error}") from error
-            logger.warning(
+            _log.warning(
                 "features: %s does not run %s, trying %s: %s",
                 SHORT_NAMES[name], model.name, SHORT_NAMES[names[k + 1]], _line(error),
             )  # fmt: skip
@@ -145,7 +145,7 @@ def _kept_in(expected: Expected) -> dict[str, str]:
         if not os.access(folder, os.W_OK | os.X_OK):
             raise PermissionError(errno.EACCES, "may not be written", str(folder))
     except OSError as error:
-        logger.warning("features: TensorRT's engine is not kept: %s", error)
+        _log.warning("features: TensorRT's engine is not kept: %s", error)
         return {}
     return {
         "trt_engine_cache_enable": "True",

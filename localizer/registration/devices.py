@@ -14,7 +14,7 @@ from localizer.registration.cuda.backend import CudaBackend
 from localizer.registration.cuda.driver import Device
 from localizer.registration.cuda.errors import CudaUnavailableError
 
-logger = logging.getLogger(__name__)
+_log = logging.getLogger(__name__)
 
 DeviceChoice = Literal["auto", "cpu", "cuda"]
 _TRIAL_CHANNELS = 32  # the networks'
@@ -41,7 +41,7 @@ def open_backend(device: DeviceChoice = "auto", threads: int = 2) -> Backend:
 
 def _on_the_cpu(error: BackendError, level: int, threads: int) -> Backend:
     text = str(error).split("\n")[0]
-    logger.log(level, "registration on the CPU: %s", text)
+    _log.log(level, "registration on the CPU: %s", text)
     return NumbaBackend(threads)
 
 

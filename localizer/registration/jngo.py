@@ -51,7 +51,7 @@ from localizer.registration.selection import (
 from localizer.registration.whole import WholeBackend
 from localizer.types import Anchors, FeaturePyramid, PosePrior, RegistrationStatus
 
-logger = logging.getLogger(__name__)
+_log = logging.getLogger(__name__)
 
 _COVARIANCE_ANCHORS = 1000  # enough for a covariance, cheap enough for every frame
 _LEAST_SCALE = 0.02  # of the sharpening loss, where features fit perfectly
@@ -105,7 +105,7 @@ class JNGO:
                     motion=motion, constraint=constraint, seed=seed,
                 )  # fmt: skip
             except BackendError as error:
-                logger.error("registration continues on the CPU: %s", error)
+                _log.error("registration continues on the CPU: %s", error)
                 self.backend, self._whole = NumbaBackend(self._threads), None
                 if any(isinstance(level.features, DeviceArray) for level in query.levels):
                     raise  # this frame's features are where the CPU cannot read them

@@ -15,13 +15,15 @@ from localizer.render.base import SKY, MapRenderer, TileProvider
 from localizer.render.numba_raster import NumbaRenderer
 from localizer.types import RenderedView
 
-Backend = Literal["auto", "numba", "moderngl", "pyrender"]
+RendererName = Literal["auto", "numba", "moderngl", "pyrender"]
 T = TypeVar("T")
 
 _log = logging.getLogger(__name__)
 
 
-def open_renderer(backend: Backend, streamer: TileProvider, *, threads: int = 2) -> MapRenderer:
+def open_renderer(
+    backend: RendererName, streamer: TileProvider, *, threads: int = 2
+) -> MapRenderer:
     """A renderer that any thread may use, one at a time; see `make_renderer`.
 
     An OpenGL context belongs to the thread that made it: it is given one, which makes it, draws
@@ -40,7 +42,7 @@ def open_renderer(backend: Backend, streamer: TileProvider, *, threads: int = 2)
 
 
 def make_renderer(
-    backend: Backend,
+    backend: RendererName,
     streamer: TileProvider,
     *,
     threads: int = 2,

@@ -26,7 +26,7 @@ from mavlink_bridge.link.tlog import TlogRecorder
 from mavlink_bridge.link.transport import Endpoint, Transport, UdpTransport, open_transport
 from mavlink_bridge.link.waking import WakePipe
 
-log = logging.getLogger(__name__)
+_log = logging.getLogger(__name__)
 
 _OUTBOX = 512
 _MAX_UNSENT = 4096  # bytes; more would wait so long on a slow port that it is worthless
@@ -206,7 +206,7 @@ class Link:
         except (OSError, EndpointError) as error:
             self.counters.open_failures += 1
             if self.counters.open_failures == 1:
-                log.warning(
+                _log.warning(
                     "%s: %s cannot be opened (%s), retrying", self.name, self.endpoint, error
                 )
         return None
@@ -216,10 +216,10 @@ class Link:
         try:
             self._serve(transport)
         except OSError as error:
-            log.warning("%s: %s lost (%s), reconnecting", self.name, self.endpoint, error)
+            _log.warning("%s: %s lost (%s), reconnecting", self.name, self.endpoint, error)
         except Exception:  # whatever it is, the link must come back
             self.counters.failures += 1
-            log.exception("%s: %s failed, reconnecting", self.name, self.endpoint)
+            _log.exception("%s: %s failed, reconnecting", self.name, self.endpoint)
         finally:
             transport.close()
 
@@ -300,7 +300,7 @@ class Link:
         except Exception:
             self.counters.handler_errors += 1
             if self.counters.handler_errors in (1, 10, 100, 1000):
-                log.exception(
+                _log.exception(
                     "%s: handler failed (%d times)", self.name, self.counters.handler_errors
                 )
             return None

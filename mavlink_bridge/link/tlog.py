@@ -16,7 +16,7 @@ from typing import Protocol
 
 from mavlink_bridge.errors import RecordError
 
-log = logging.getLogger(__name__)
+_log = logging.getLogger(__name__)
 
 _MAX_BYTES = 2 << 30
 _MAX_WAITING = 8192  # frames: 10 s of five times the usual traffic
@@ -101,7 +101,7 @@ class TlogRecorder:
         if self._thread is not None:
             self._thread.join(_CLOSE_S)
             if self._thread.is_alive():
-                log.warning("%s: the record is incomplete: its disk does not answer", self._path)
+                _log.warning("%s: the record is incomplete: its disk does not answer", self._path)
                 return
         if self._file is not None:
             try:
@@ -147,5 +147,5 @@ class TlogRecorder:
     def _fail(self, why: str) -> None:
         if not self._failed:
             self._failed = True
-            log.warning("%s: the record is incomplete: %s", self._path, why)
+            _log.warning("%s: the record is incomplete: %s", self._path, why)
             self._on_failure(why)

@@ -16,7 +16,7 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 from mavlink_bridge.config import OriginConfig
 from mavlink_bridge.messages import Origin
 
-log = logging.getLogger(__name__)
+_log = logging.getLogger(__name__)
 
 Projection = Literal["ardupilot", "px4"]
 
@@ -147,7 +147,7 @@ class OriginKeeper:
         if self._configured is None or patient:
             return None
         if not self._told:
-            log.info("the vehicle has no EKF origin: setting the configured one")
+            _log.info("the vehicle has no EKF origin: setting the configured one")
             self._told = True
         return mavlink.MAVLink_set_gps_global_origin_message(
             system_id,

@@ -25,7 +25,7 @@ from sitl.camera.process import CameraStatistics, WorldCameraConfig, WorldCamera
 from sitl.camera.traffic import traffic
 from sitl.demo.assets import FlightAssets
 from sitl.demo.companion_process import Ports, free_udp_port, running_companion, write_deployment
-from sitl.demo.scenario import Scenario, VehicleKind
+from sitl.demo.scenario import Scenario, VehicleChoice
 from sitl.demo.script import FlightError, FlightScript, Progress
 from sitl.demo.targets import observed_targets
 from sitl.geodesy import Location
@@ -55,7 +55,7 @@ class FlightRecord:
 def fly(
     assets: FlightAssets,
     scenario: Scenario,
-    kind: VehicleKind,
+    kind: VehicleChoice,
     seed: int,
     folder: Path,
     progress: Progress = lambda *_: None,

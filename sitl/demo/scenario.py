@@ -12,7 +12,7 @@ from companion.settings_file import SettingsError, read_settings, validated
 from localizer.geometry.camera import Camera
 from sitl.errors import SimulationError
 
-VehicleKind = Literal["auto", "ardupilot", "embedded"]
+VehicleChoice = Literal["auto", "ardupilot", "embedded"]
 Injection = Literal["vision_position_estimate", "odometry", "gps_input"]
 
 

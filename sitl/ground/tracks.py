@@ -90,7 +90,7 @@ class EkfSample:
         return self.origin.offset(*self.position_ned) if self.origin else None
 
 
-class BootClock:
+class LeastLatencyClock:
     """Maps the vehicle's boot time to CLOCK_MONOTONIC by the least latency lately seen."""
 
     def __init__(self, speedup: float) -> None:

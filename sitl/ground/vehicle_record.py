@@ -12,7 +12,16 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 from sitl.errors import PilotError
 from sitl.geodesy import Location
 from sitl.ground.statustext import StatusText, TextLog
-from sitl.ground.tracks import Array, BootClock, EkfSample, GimbalState, Track, Truth, share, slerp
+from sitl.ground.tracks import (
+    Array,
+    EkfSample,
+    GimbalState,
+    LeastLatencyClock,
+    Track,
+    Truth,
+    share,
+    slerp,
+)
 
 _VEHICLE, _AUTOPILOT = 1, 1
 _SECONDS_KEPT = 60 * 60
@@ -26,7 +35,7 @@ class VehicleRecord:
 
     def __init__(self, speedup: float) -> None:
         self._boxes: list[tuple[frozenset[str], queue.SimpleQueue[Any]]] = []
-        self._clock = BootClock(speedup)
+        self._clock = LeastLatencyClock(speedup)
         self._boot_ms = 0
         self._attitude_ms: int | None = None
         self._flags = 0

@@ -16,7 +16,7 @@ import numpy as np
 
 from sitl.errors import SimulationError
 from sitl.suite.case import Case
-from sitl.suite.checks import Finding, Reference
+from sitl.suite.checks import CheckResult, Reference
 from sitl.suite.flight import fly
 from sitl.suite.record import Array, Record
 from sitl.vehicles.process import VehicleKind
@@ -34,7 +34,7 @@ class Row:
     case: Case
     vehicle: VehicleKind
     record: Record | None
-    findings: tuple[Finding, ...]
+    findings: tuple[CheckResult, ...]
     error: str = ""
     wall_s: float = 0.0
 
@@ -80,7 +80,7 @@ def figures(errors: Array) -> Figures | None:
     return median, p95, largest
 
 
-def judge(case: Case, record: Record) -> tuple[Finding, ...]:
+def judge(case: Case, record: Record) -> tuple[CheckResult, ...]:
     """Every expectation of the case, held against the record."""
     return tuple(expectation.judge(record) for expectation in case.expect)
 

@@ -21,7 +21,7 @@ from localizer.training.loop.distill import Teacher, distillation_loss
 from localizer.training.losses import Batch, alignment_loss, contrast_loss, sample, se3_exp
 from localizer.training.models.networks import build
 
-logger = logging.getLogger(__name__)
+_log = logging.getLogger(__name__)
 
 
 class Trainer:
@@ -106,7 +106,7 @@ class Trainer:
             self.optimizer.step()
             self._update_average()
         else:
-            logger.warning("step %d skipped: gradient is not finite", self.step)
+            _log.warning("step %d skipped: gradient is not finite", self.step)
         return parts | {"loss": float(loss.detach()), "gradient": float(norm)}
 
     def _loss(self, batch: Batch) -> tuple[Tensor, dict[str, float]]:
@@ -190,7 +190,7 @@ class Trainer:
                 f"{self.checkpoint}: no state to continue from ({type(error).__name__}: {error}); "
                 "weights alone go into `warm_start`"
             ) from error
-        logger.info("resumed %s at step %d", self.checkpoint, self.step)
+        _log.info("resumed %s at step %d", self.checkpoint, self.step)
 
     def _log(self, rows: list[dict[str, float]]) -> None:
         if self.workers.rank > 0:
@@ -206,7 +206,7 @@ class Trainer:
                 writer.writeheader()
             writer.writerow({k: f"{v:.5g}" for k, v in row.items()})
         shown = " ".join(f"{k} {v:.3g}" for k, v in row.items())
-        logger.info("%s", shown)
+        _log.info("%s", shown)
 
 
 def learning_rate(step: int, o: OptimizerSection) -> float:

@@ -12,7 +12,7 @@ from sitl.embedded.mavlink.gimbal_commands import GimbalCommands
 from sitl.embedded.mavlink.handling import ACCEPTED, FAILED, UNSUPPORTED, CommandHandler, Handler
 from sitl.embedded.mavlink.navigation_commands import NavigationCommands
 from sitl.embedded.mavlink.parameter_commands import ParameterCommands
-from sitl.embedded.mavlink.server import Link
+from sitl.embedded.mavlink.server import SerialPort
 from sitl.embedded.mavlink.telemetry import Telemetry
 from sitl.embedded.severity import INFO, WARNING
 
@@ -56,7 +56,7 @@ class Commands:
             m.MAV_CMD_REQUEST_AUTOPILOT_CAPABILITIES: self._request_version,
         }
 
-    def handle(self, link: Link, message: Any) -> None:
+    def handle(self, link: SerialPort, message: Any) -> None:
         """Act on one message."""
         kind = message.get_type()
         handler = self._messages.get(kind)
@@ -67,7 +67,7 @@ class Commands:
 
     # --- commands ----------------------------------------------------------------------------
 
-    def _command(self, link: Link, message: Any) -> None:
+    def _command(self, link: SerialPort, message: Any) -> None:
         handler = self._commands.get(message.command)
         result = handler(link, message) if handler else UNSUPPORTED
         link.send(
@@ -76,7 +76,7 @@ class Commands:
             )
         )
 
-    def _arm(self, _link: Link, command: Any) -> int:
+    def _arm(self, _link: SerialPort, command: Any) -> int:
         v = self._vehicle
         forced = command.param2 == _FORCE_ARM
         if command.param1 == 0:
@@ -92,7 +92,7 @@ class Commands:
         v.notify(INFO, "Arming motors")
         return ACCEPTED
 
-    def _reboot(self, _link: Link, command: Any) -> int:
+    def _reboot(self, _link: SerialPort, command: Any) -> int:
         if command.param1 != 1 or self._vehicle.modes.armed:
             return FAILED
         self._vehicle.reboot_ordered = True
@@ -101,14 +101,14 @@ class Commands:
     def _mode(self, mode: Mode) -> int:
         return ACCEPTED if self._vehicle.modes.set_mode(mode) else FAILED
 
-    def _set_mode(self, _link: Link, command: Any) -> int:
+    def _set_mode(self, _link: SerialPort, command: Any) -> int:
         try:
             mode = Mode(int(command.param2))
         except ValueError:
             return FAILED
         return self._mode(mode)
 
-    def _set_mode_message(self, _link: Link, message: Any) -> None:
+    def _set_mode_message(self, _link: SerialPort, message: Any) -> None:
         try:
             mode = Mode(message.custom_mode)
         except ValueError:
@@ -116,7 +116,7 @@ class Commands:
             return
         self._mode(mode)
 
-    def _set_interval(self, link: Link, command: Any) -> int:
+    def _set_interval(self, link: SerialPort, command: Any) -> int:
         message_id, interval_us = int(command.param1), command.param2
         if not self._telemetry.knows(message_id):
             return FAILED
@@ -126,26 +126,26 @@ class Commands:
             link.set_interval(message_id, max(interval_us / 1e6, 0.01))
         return ACCEPTED
 
-    def _request_message(self, link: Link, command: Any) -> int:
+    def _request_message(self, link: SerialPort, command: Any) -> int:
         sent = self._telemetry.send(link, int(command.param1))
         return ACCEPTED if sent else FAILED
 
-    def _request_version(self, link: Link, _command: Any) -> int:
+    def _request_version(self, link: SerialPort, _command: Any) -> int:
         self._telemetry.send(link, mavlink.MAVLINK_MSG_ID_AUTOPILOT_VERSION)
         return ACCEPTED
 
     # --- injection ---------------------------------------------------------------------------
 
-    def _vision(self, link: Link, message: Any) -> None:
+    def _vision(self, link: SerialPort, message: Any) -> None:
         self._vehicle.injection.vision(message, link.jitter, self._vehicle.time_ms)
 
-    def _odometry(self, link: Link, message: Any) -> None:
+    def _odometry(self, link: SerialPort, message: Any) -> None:
         self._vehicle.injection.odometry(message, link.jitter, self._vehicle.time_ms)
 
-    def _gps_input(self, link: Link, message: Any) -> None:
+    def _gps_input(self, link: SerialPort, message: Any) -> None:
         self._vehicle.injection.gps_input(message, link.jitter, self._vehicle.time_ms)
 
-    def _timesync(self, link: Link, message: Any) -> None:
+    def _timesync(self, link: SerialPort, message: Any) -> None:
         if message.tc1 == 0:
             link.send(
                 mavlink.MAVLink_timesync_message(self._vehicle.time_ms * 1_000_000, message.ts1)
@@ -153,7 +153,7 @@ class Commands:
 
     # --- RC, streams -------------------------------------------------------------------------
 
-    def _rc(self, _link: Link, message: Any) -> None:
+    def _rc(self, _link: SerialPort, message: Any) -> None:
         v = self._vehicle
 
         def stick(value: int, old: float) -> float:
@@ -174,7 +174,7 @@ class Commands:
             self._rc8 = position
             self._vehicle.use_source(position)
 
-    def _data_stream(self, link: Link, message: Any) -> None:
+    def _data_stream(self, link: SerialPort, message: Any) -> None:
         """REQUEST_DATA_STREAM, the old way: the attitude and position groups."""
         groups = {
             6: (

@@ -9,7 +9,7 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from sitl.embedded.aircraft import Aircraft
 from sitl.embedded.mavlink.handling import ACCEPTED, FAILED, CommandHandler, Handler, location_of
-from sitl.embedded.mavlink.server import Link
+from sitl.embedded.mavlink.server import SerialPort
 from sitl.embedded.physics.gimbal import FLAG_NEUTRAL, FLAG_YAW_LOCK
 
 
@@ -30,7 +30,7 @@ class GimbalCommands:
             m.MAV_CMD_DO_SET_ROI_NONE: self._roi_none,
         }
 
-    def _mount_control(self, _link: Link, command: Any) -> int:
+    def _mount_control(self, _link: SerialPort, command: Any) -> int:
         gimbal = self._vehicle.gimbal
         mode = int(command.z if command.get_type() == "COMMAND_INT" else command.param7)
         if not gimbal.fitted:
@@ -43,11 +43,11 @@ class GimbalCommands:
             return FAILED
         return ACCEPTED
 
-    def _gimbal_pitchyaw(self, _link: Link, command: Any) -> int:
+    def _gimbal_pitchyaw(self, _link: SerialPort, command: Any) -> int:
         flags = int(command.x if command.get_type() == "COMMAND_INT" else command.param5)
         return self._point(command.param1, command.param2, command.param3, command.param4, flags)
 
-    def _gimbal_pitchyaw_message(self, _link: Link, message: Any) -> None:
+    def _gimbal_pitchyaw_message(self, _link: SerialPort, message: Any) -> None:
         self._point(
             degrees(message.pitch),
             degrees(message.yaw),
@@ -73,7 +73,7 @@ class GimbalCommands:
             return FAILED
         return ACCEPTED
 
-    def _roi(self, _link: Link, command: Any) -> int:
+    def _roi(self, _link: SerialPort, command: Any) -> int:
         v = self._vehicle
         if not v.gimbal.fitted or command.get_type() != "COMMAND_INT":
             return FAILED
@@ -85,6 +85,6 @@ class GimbalCommands:
         v.gimbal.look_at(location)
         return ACCEPTED
 
-    def _roi_none(self, _link: Link, _command: Any) -> int:
+    def _roi_none(self, _link: SerialPort, _command: Any) -> int:
         self._vehicle.gimbal.look_at(None)
         return ACCEPTED

@@ -5,15 +5,15 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any
 
-from sitl.embedded.mavlink.server import Link
+from sitl.embedded.mavlink.server import SerialPort
 from sitl.geodesy import Location
 
 ACCEPTED, DENIED, UNSUPPORTED, FAILED = 0, 2, 3, 4  # MAV_RESULT
 _GLOBAL_FRAMES_RELATIVE = (3, 6)
 _GLOBAL_FRAMES = (0, 5, *_GLOBAL_FRAMES_RELATIVE)
 
-Handler = Callable[[Link, Any], None]
-CommandHandler = Callable[[Link, Any], int]
+Handler = Callable[[SerialPort, Any], None]
+CommandHandler = Callable[[SerialPort, Any], int]
 
 
 def location_of(

@@ -18,7 +18,7 @@ from sitl.embedded.mavlink.handling import (
     Handler,
     location_of,
 )
-from sitl.embedded.mavlink.server import Link
+from sitl.embedded.mavlink.server import SerialPort
 from sitl.geodesy import Location
 
 _IGNORE_POSITION, _IGNORE_VELOCITY, _IGNORE_YAW, _IGNORE_YAW_RATE = 7, 7 << 3, 1 << 10, 1 << 11
@@ -51,16 +51,16 @@ class NavigationCommands:
             m.MAV_CMD_DO_REPOSITION: self._reposition,
         }
 
-    def _takeoff(self, _link: Link, command: Any) -> int:
+    def _takeoff(self, _link: SerialPort, command: Any) -> int:
         height = command.z if command.get_type() == "COMMAND_INT" else command.param7
         return ACCEPTED if self._vehicle.modes.takeoff(height) else FAILED
 
-    def _set_origin(self, _link: Link, command: Any) -> int:
+    def _set_origin(self, _link: SerialPort, command: Any) -> int:
         if command.get_type() != "COMMAND_INT":
             return UNSUPPORTED
         return self._new_origin(command.x, command.y, command.z)
 
-    def _set_origin_message(self, _link: Link, message: Any) -> None:
+    def _set_origin_message(self, _link: SerialPort, message: Any) -> None:
         self._new_origin(message.latitude, message.longitude, message.altitude / 1000.0)
 
     def _new_origin(self, latitude_e7: int, longitude_e7: int, altitude_m: float) -> int:
@@ -69,7 +69,7 @@ class NavigationCommands:
         location = Location(latitude_e7 / 1e7, longitude_e7 / 1e7, altitude_m)
         return ACCEPTED if self._vehicle.estimator.set_origin(location) else FAILED
 
-    def _set_home(self, _link: Link, command: Any) -> int:
+    def _set_home(self, _link: SerialPort, command: Any) -> int:
         v = self._vehicle
         if v.estimator.origin is None:
             return FAILED
@@ -83,14 +83,14 @@ class NavigationCommands:
             return UNSUPPORTED
         return ACCEPTED
 
-    def _set_source(self, _link: Link, command: Any) -> int:
+    def _set_source(self, _link: SerialPort, command: Any) -> int:
         source = int(command.param1)
         if source not in (1, 2, 3):
             return DENIED
         self._vehicle.use_source(source)
         return ACCEPTED
 
-    def _external_position(self, _link: Link, command: Any) -> int:
+    def _external_position(self, _link: SerialPort, command: Any) -> int:
         v = self._vehicle
         if command.get_type() != "COMMAND_INT" or v.estimator.origin is None:
             return FAILED
@@ -98,23 +98,23 @@ class NavigationCommands:
         sigma = command.param3 if command.param3 > 0 else 10.0
         return ACCEPTED if v.estimator.force_position(north, east, sigma) else FAILED
 
-    def _mission_start(self, _link: Link, _command: Any) -> int:
+    def _mission_start(self, _link: SerialPort, _command: Any) -> int:
         return ACCEPTED if self._vehicle.modes.start_mission() else FAILED
 
-    def _set_current(self, _link: Link, command: Any) -> int:
+    def _set_current(self, _link: SerialPort, command: Any) -> int:
         return ACCEPTED if self._vehicle.modes.start_mission(int(command.param1)) else FAILED
 
-    def _mission_set_current(self, _link: Link, message: Any) -> None:
+    def _mission_set_current(self, _link: SerialPort, message: Any) -> None:
         self._vehicle.modes.start_mission(message.seq)
 
-    def _condition_yaw(self, _link: Link, command: Any) -> int:
+    def _condition_yaw(self, _link: SerialPort, command: Any) -> int:
         self._vehicle.modes.condition_yaw(command.param1, command.param3, bool(command.param4))
         return ACCEPTED
 
-    def _change_speed(self, _link: Link, command: Any) -> int:
+    def _change_speed(self, _link: SerialPort, command: Any) -> int:
         return ACCEPTED if self._vehicle.modes.change_speed(command.param2) else FAILED
 
-    def _reposition(self, _link: Link, command: Any) -> int:
+    def _reposition(self, _link: SerialPort, command: Any) -> int:
         if command.get_type() != "COMMAND_INT":
             return UNSUPPORTED
         v = self._vehicle
@@ -128,7 +128,7 @@ class NavigationCommands:
         yaw = None if isnan(command.param4) else radians(command.param4)
         return ACCEPTED if v.modes.go_to(location, yaw) else DENIED
 
-    def _target_local(self, _link: Link, message: Any) -> None:
+    def _target_local(self, _link: SerialPort, message: Any) -> None:
         modes, here = self._vehicle.modes, self._vehicle.estimator.position
         if message.coordinate_frame not in (_LOCAL_NED, _LOCAL_OFFSET_NED):
             return
@@ -141,7 +141,7 @@ class NavigationCommands:
         elif not message.type_mask & _IGNORE_VELOCITY:
             modes.fly_velocity((message.vx, message.vy, message.vz), yaw, rate)
 
-    def _target_global(self, _link: Link, message: Any) -> None:
+    def _target_global(self, _link: SerialPort, message: Any) -> None:
         modes = self._vehicle.modes
         yaw, rate = self._yaw_of(message)
         if not message.type_mask & _IGNORE_POSITION:

@@ -8,7 +8,7 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from sitl.embedded.aircraft import Aircraft
 from sitl.embedded.mavlink.handling import Handler
-from sitl.embedded.mavlink.server import Link
+from sitl.embedded.mavlink.server import SerialPort
 from sitl.embedded.parameters import type_of
 
 
@@ -29,18 +29,18 @@ class ParameterCommands:
             name.encode(), p[name], type_of(name), len(p), index
         )
 
-    def _param_list(self, link: Link, _message: Any) -> None:
+    def _param_list(self, link: SerialPort, _message: Any) -> None:
         for index, name in enumerate(self._vehicle.parameters):
             link.send(self._param_value(name, index))
 
-    def _param_read(self, link: Link, message: Any) -> None:
+    def _param_read(self, link: SerialPort, message: Any) -> None:
         p = self._vehicle.parameters
         name = _text(message.param_id)
         found = name if message.param_index < 0 else p.name_at(message.param_index)
         if found is not None and found in p:
             link.send(self._param_value(found, p.index_of(found)))
 
-    def _param_set(self, _link: Link, message: Any) -> None:
+    def _param_set(self, _link: SerialPort, message: Any) -> None:
         v = self._vehicle
         name = _text(message.param_id)
         if v.parameters.set(name, message.param_value):

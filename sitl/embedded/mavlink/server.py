@@ -25,7 +25,7 @@ _NEVER_FORWARDED = frozenset({"BAD_DATA", "RADIO", "RADIO_STATUS"})
 
 
 @dataclass
-class Link:
+class SerialPort:
     """One serial port and its client."""
 
     name: str
@@ -146,15 +146,15 @@ class MavlinkServer:
 
     def __init__(self, ports: tuple[int, ...], system_id: int) -> None:
         self.system_id = system_id
-        self.links: list[Link] = []
+        self.links: list[SerialPort] = []
         try:
             for number, port in enumerate(ports):
-                self.links.append(Link(f"serial{number}", _listen(port), system_id))
+                self.links.append(SerialPort(f"serial{number}", _listen(port), system_id))
         except PortError:
             self.close()
             raise
 
-    def poll(self) -> Iterator[tuple[Link, Any]]:
+    def poll(self) -> Iterator[tuple[SerialPort, Any]]:
         """Messages for the autopilot, after routing; (link it came on, message)."""
         sockets = [link.client or link.listener for link in self.links]
         ready = set(select.select(sockets, [], [], 0.0)[0])
@@ -180,7 +180,7 @@ class MavlinkServer:
         for link in self.links:
             link.close()
 
-    def _route(self, source: Link, message: Any) -> bool:
+    def _route(self, source: SerialPort, message: Any) -> bool:
         """Forward as ArduPilot's MAVLink_routing does; True when it is for the autopilot too."""
         sender = (message.get_srcSystem(), message.get_srcComponent())
         if sender == (self.system_id, 1):
@@ -203,7 +203,7 @@ class MavlinkServer:
         return system == self.system_id and (component == 0 or not found)
 
 
-def _reaches(link: Link, system: int, component: int) -> bool:
+def _reaches(link: SerialPort, system: int, component: int) -> bool:
     if system == 0:
         return True
     if component == 0:

@@ -10,7 +10,7 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from sitl.embedded.aircraft import Aircraft
 from sitl.embedded.ekf.estimator import EkfFlags
-from sitl.embedded.mavlink.server import Link
+from sitl.embedded.mavlink.server import SerialPort
 from sitl.embedded.physics.rotation import euler
 
 FIRMWARE_VERSION = (4, 7, 0, 0)  # major, minor, patch, FIRMWARE_VERSION_TYPE_DEV
@@ -73,7 +73,7 @@ class Telemetry:
                 if built[message_id] is not None:
                     link.send(built[message_id])
 
-    def send(self, link: Link, message_id: int) -> bool:
+    def send(self, link: SerialPort, message_id: int) -> bool:
         """Send one message on one link; False when there is none to send."""
         message = self.message(message_id)
         if message is not None:

@@ -15,7 +15,7 @@ PLACE = (473981000, 85460000)  # north-east of home, degrees * 1e7
 NAN = math.nan
 
 
-class Link:
+class SerialPort:
     """What a handler needs of a link."""
 
     def __init__(self):
@@ -45,7 +45,7 @@ def grounded(bench):
 def told(bench, message):
     """The link after the vehicle has handled the message."""
     message._header.srcSystem, message._header.srcComponent = 255, 190
-    link = Link()
+    link = SerialPort()
     bench.vehicle.commands.handle(link, message)
     return link
 

@@ -27,7 +27,7 @@ from sitl.ground.mission_steps import (
     waypoint_step,
 )
 from sitl.ground.pilot import Pilot
-from sitl.ground.tracks import BootClock, Track
+from sitl.ground.tracks import LeastLatencyClock, Track
 from sitl.suite.simulated_localizer import FixModel, TruthFeed
 from sitl.vehicles import ardupilot, process
 from sitl.vehicles.ardupilot import ArduPilotNotFoundError, ArduPilotSitl, find_arducopter
@@ -39,7 +39,7 @@ SPEEDUP = 5.0
 
 
 def test_boot_clock_takes_the_least_latency():
-    clock = BootClock(speedup=2.0)
+    clock = LeastLatencyClock(speedup=2.0)
     for boot_ms, latency_ms in ((100, 7), (120, 3), (140, 20)):
         clock.observe(boot_ms, int((1000 + boot_ms / 2 + latency_ms) * 1e6))
     assert clock.monotonic_ns(140) == int((1000 + 70 + 3) * 1e6)
