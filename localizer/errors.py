@@ -53,3 +53,7 @@ class SequenceError(LocalizerError):
 
 class DeviceArrayError(LocalizerError):
     """An array in GPU memory that the kernels cannot read in place."""
+
+
+class OdometryError(LocalizerError):
+    """Odometry that has nothing to carry on from."""

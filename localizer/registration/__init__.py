@@ -1,6 +1,6 @@
 """Registration: geo-anchors, pose hypotheses and the JNGO optimizer (docs/registration.md)."""
 
-from localizer.registration.anchors import select_anchors
+from localizer.registration.anchors import anchors_at, select_anchors
 from localizer.registration.config import JNGOConfig
 from localizer.registration.jngo import JNGO
 from localizer.registration.priors import (
@@ -17,6 +17,7 @@ __all__ = [
     "JNGOConfig",
     "PoseConstraint",
     "Registration",
+    "anchors_at",
     "attitude_constraint",
     "combine",
     "height_constraint",

@@ -34,14 +34,23 @@ def select_anchors(
     )
     picked = _stratified(cell, count, rng)
     rows, columns = rows[picked], columns[picked]
-    order = np.argsort(_morton(columns, rows), kind="stable")
-    rows, columns = rows[order], columns[order]
     pixels = np.stack([columns + 0.5, rows + 0.5], axis=1)
     points = view.world_from_camera.apply(
         view.camera.rays(pixels) * view.depth[rows, columns, None].astype(np.float64)
     )
+    return anchors_at(points, pixels, features)
+
+
+def anchors_at(points_world: Array, pixels: Array, features: FeaturePyramid) -> Anchors:
+    """Anchors of known surface points (N, 3) that the image shows at pixels (N, 2).
+
+    They come in Morton order, see `select_anchors`.
+    """
+    columns, rows = np.maximum(pixels, 0).astype(np.int64).T
+    order = np.argsort(_morton(columns, rows), kind="stable")
+    pixels = pixels[order]
     return Anchors(
-        points,
+        np.ascontiguousarray(points_world[order]),
         pixels.astype(np.float32),
         tuple(_sample(level, level.features, pixels) for level in features.levels),
         tuple(

@@ -1,0 +1,25 @@
+"""Visual odometry: frame to keyframe, where the map does not match (docs/odometry.md)."""
+
+from localizer.odometry.config import GrowthModel, OdometryConfig
+from localizer.odometry.estimate import OdometryEstimate, OdometryFrame, OdometryStatus
+from localizer.odometry.ground import FlatGround, Ground
+from localizer.odometry.keyframe import DepthSource
+from localizer.odometry.odometry import VisualOdometry, odometry_optimizer
+from localizer.odometry.usability import ImageFault, Usability, UsabilityConfig, examine
+
+__all__ = [
+    "DepthSource",
+    "FlatGround",
+    "Ground",
+    "GrowthModel",
+    "ImageFault",
+    "OdometryConfig",
+    "OdometryEstimate",
+    "OdometryFrame",
+    "OdometryStatus",
+    "Usability",
+    "UsabilityConfig",
+    "VisualOdometry",
+    "examine",
+    "odometry_optimizer",
+]

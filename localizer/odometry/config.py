@@ -1,0 +1,62 @@
+"""The odometry's settings: when a keyframe is left, what is believed, how errors grow."""
+
+from __future__ import annotations
+
+from pydantic import BaseModel, ConfigDict, Field
+
+
+class GrowthModel(BaseModel):
+    """How the error grows along the way, beside each registration's own covariance.
+
+    Fitted by ``python -m benchmarks.odometry`` (docs/odometry.md). A walk is a sigma per square
+    root of a metre flown, from keyframe to keyframe; scale is an error that stays.
+    """
+
+    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
+
+    scale: float = Field(ge=0, le=1, description="sigma of the way's length, as a share of it")
+    horizontal: float = Field(ge=0, le=10, description="walk of east and north, m per root m")
+    vertical: float = Field(ge=0, le=10, description="walk of the height, m per root m")
+    tilt: float = Field(ge=0, le=1, description="walk of roll and pitch, rad per root m")
+    heading: float = Field(ge=0, le=1, description="walk of the heading, rad per root m")
+
+
+class OdometryConfig(BaseModel):
+    """When a keyframe is left, which registrations count, and how errors grow."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
+
+    anchors: int = Field(3000, ge=100, le=8000, description="anchors per keyframe")
+    min_overlap: float = Field(
+        0.35, ge=0, le=1, description="share of a keyframe's anchors in view of a usable frame"
+    )
+    min_quality: float = Field(0.2, ge=0, le=1, description="registration quality of a usable one")
+    max_sigma_m: float = Field(
+        2.0, ge=0.01, le=100, description="position sigma of a usable registration"
+    )
+    gate: float = Field(
+        60.0, ge=1, le=1e4, description="squared Mahalanobis distance from the prediction, 6 dof"
+    )
+    new_below_overlap: float = Field(
+        0.7, ge=0, le=1, description="overlap below which the next keyframe begins"
+    )
+    new_below_quality: float = Field(
+        0.6, ge=0, le=1, description="quality, as a share of the keyframe's first, likewise"
+    )
+    new_beyond_turn_deg: float = Field(
+        25.0, ge=1, le=180, description="turn since the keyframe, likewise"
+    )
+    longest_gap_s: float = Field(
+        3.0, ge=0.1, le=60, description="without a usable frame until the thread is lost"
+    )
+    acceleration_sigma: float = Field(
+        2.0, ge=0.01, le=100, description="m/s² of the motion while nothing is seen"
+    )
+    with_map: GrowthModel = Field(
+        GrowthModel(scale=0.001, horizontal=0.02, vertical=0.02, tilt=1e-4, heading=1e-4),
+        description="growth with depth from the map's geometry",
+    )
+    with_ground: GrowthModel = Field(
+        GrowthModel(scale=0.02, horizontal=0.05, vertical=0.05, tilt=3e-4, heading=3e-4),
+        description="growth with depth from the ground's height alone",
+    )

@@ -1,0 +1,63 @@
+"""What goes into the odometry with a frame, and what comes out."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from enum import Enum
+
+from localizer.geometry.pose import Array, Pose
+from localizer.odometry.keyframe import DepthSource
+from localizer.odometry.usability import Usability
+from localizer.types import FeaturePyramid
+
+
+class OdometryStatus(Enum):
+    """Whether a frame carried the pose on, and why not."""
+
+    OK = "carried on"
+    UNUSABLE_IMAGE = "the picture shows nothing that could be registered"
+    NOT_REGISTERED = "the picture does not fit the keyframe"
+    LOST = "the thread is lost: nothing was seen for too long, the map must be found again"
+
+
+@dataclass(frozen=True)
+class OdometryFrame:
+    """A picture's part in the odometry.
+
+    features: of the undistorted picture, in host memory, as for the map registration. time_ns: the
+    exposure's. usability: `usability.examine`'s verdict on the picture, None if nobody looked.
+    """
+
+    features: FeaturePyramid
+    time_ns: int
+    usability: Usability | None = None
+
+
+@dataclass(frozen=True)
+class OdometryEstimate:
+    """The odometry's answer for one frame.
+
+    world_from_camera: the camera's pose; what is predicted, if the status is not OK. covariance:
+    (6, 6) as `PosePrior`'s, the beginning's included. quality: 0 to 1, of the registration against
+    the keyframe. reason: of a status that is not OK, for people. bridged_s, way_m: time and way
+    since the pose was last known otherwise (`begin`). drift_m: radius that the horizontal error
+    added since then stays within in 95 % of cases. keyframe_age_s: since the keyframe's exposure.
+    source: of the keyframe's depth.
+    """
+
+    world_from_camera: Pose
+    covariance: Array
+    quality: float
+    status: OdometryStatus
+    reason: str
+    time_ns: int
+    bridged_s: float
+    way_m: float
+    drift_m: float
+    keyframe_age_s: float
+    source: DepthSource
+
+    @property
+    def usable(self) -> bool:
+        """Whether the pose may be used as a measurement."""
+        return self.status is OdometryStatus.OK

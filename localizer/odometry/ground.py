@@ -1,0 +1,57 @@
+"""The ground as the odometry knows it where the map has no geometry: a height at every place."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from localizer.geometry.camera import Camera
+from localizer.geometry.pose import Array, Pose
+
+_STEPS = 8  # of the fixed-point iteration; terrain flatter than the rays are steep converges
+_LEAST_DOWN = 0.05  # sine of the angle below the horizon of the flattest ray that is used
+_LOW_SHARE = 0.3  # of the points, what counts as ground: below roofs and crowns
+
+
+class Ground(Protocol):
+    """A terrain model: a height grid, a plane, or a rangefinder's account of the ground."""
+
+    def height(self, east: Array, north: Array) -> Array:
+        """World z (...) in metres at world places (...)."""
+        ...
+
+
+@dataclass(frozen=True)
+class FlatGround:
+    """A horizontal plane. height_m: its world z."""
+
+    height_m: float
+
+    @classmethod
+    def under(cls, points_world: Array) -> FlatGround:
+        """The ground under surface points (N, 3), e.g. the last anchors that the map gave."""
+        return cls(float(np.quantile(points_world[:, 2], _LOW_SHARE)))
+
+    def height(self, east: Array, north: Array) -> Array:
+        """See `Ground.height`."""
+        del north
+        return np.full(np.shape(east), self.height_m)
+
+
+def ground_points(
+    ground: Ground, world_from_camera: Pose, camera: Camera, pixels: Array
+) -> tuple[Array, NDArray[np.bool_]]:
+    """Where the rays of pixels (N, 2) meet the ground: points (N, 3), and which do at all (N,)."""
+    rays = camera.rays(pixels) @ world_from_camera.rotation.T
+    steep = -rays[:, 2] > _LEAST_DOWN * np.linalg.norm(rays, axis=1)
+    down = np.where(steep, rays[:, 2], -1.0)
+    origin = world_from_camera.translation
+    level = np.full(len(rays), float(ground.height(origin[:1], origin[1:2])[0]))
+    for _ in range(_STEPS):
+        points = origin + rays * ((level - origin[2]) / down)[:, None]
+        level = np.asarray(ground.height(points[:, 0], points[:, 1]), dtype=np.float64)
+    points = origin + rays * ((level - origin[2]) / down)[:, None]
+    return points, steep & (origin[2] - level > 0)

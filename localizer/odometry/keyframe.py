@@ -1,0 +1,112 @@
+"""Keyframes: the features of a flown picture on surfaces whose shape is known from elsewhere."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from enum import Enum
+
+import numpy as np
+
+from localizer.device_array import DeviceArray
+from localizer.errors import DeviceArrayError
+from localizer.geometry.camera import Camera
+from localizer.geometry.pose import Array, Pose
+from localizer.odometry.ground import Ground, ground_points
+from localizer.registration.anchors import anchors_at
+from localizer.types import Anchors, FeaturePyramid
+
+_BORDER_SHARE = 0.02  # of the shorter side, where features see the padding
+_CELLS = 12  # per shorter side: what the map covers is told by cells of this size
+_LEAST_MAP_SHARE = 0.5  # of the anchors, for errors to grow as with the map's geometry
+
+
+class DepthSource(Enum):
+    """Where a keyframe's depth comes from, for the most part."""
+
+    MAP = "the map's geometry"
+    GROUND = "the ground's height"
+
+
+@dataclass(frozen=True)
+class Keyframe:
+    """A picture that later ones are registered against.
+
+    anchors: its features at world points, as the map registration's. covariance: (6, 6) of its
+    pose, as `PosePrior`'s. source: of its depth. way_m: flown up to it.
+    """
+
+    anchors: Anchors
+    world_from_camera: Pose
+    covariance: Array
+    time_ns: int
+    source: DepthSource
+    way_m: float
+
+
+def keyframe_anchors(
+    features: FeaturePyramid,
+    camera: Camera,
+    world_from_camera: Pose,
+    surface: Array | None,
+    ground: Ground | None,
+    count: int,
+    seed: int = 0,
+) -> tuple[Anchors, DepthSource]:
+    """Anchors of a flown picture, at most about `count`.
+
+    surface: points (N, 3) on the map's surfaces, off their edges, as seen from about here: the
+    anchors of the map view that was rendered for this frame. Nothing is rendered anew, and their
+    picture plays no part. ground: gives points where the map has none. Without either there are
+    no anchors.
+    """
+    _require_host(features)
+    rng = np.random.default_rng(seed)
+    points, pixels = np.zeros((0, 3)), np.zeros((0, 2))
+    if surface is not None:
+        points, pixels = _in_view(surface, world_from_camera, camera)
+        if len(points) > count:
+            chosen = np.sort(rng.choice(len(points), count, replace=False))
+            points, pixels = points[chosen], pixels[chosen]
+    mapped = len(points)
+    if ground is not None:
+        free = _uncovered(pixels, camera, count, rng)
+        below, met = ground_points(ground, world_from_camera, camera, free)
+        points = np.concatenate([points, below[met]])
+        pixels = np.concatenate([pixels, free[met]])
+    source = DepthSource.MAP if mapped > _LEAST_MAP_SHARE * len(points) else DepthSource.GROUND
+    return anchors_at(points, pixels, features), source
+
+
+def _require_host(features: FeaturePyramid) -> None:
+    if any(isinstance(level.features, DeviceArray) for level in features.levels):
+        raise DeviceArrayError(
+            "a keyframe outlives its frame, and these features lie on the GPU until the next one: "
+            "give the odometry features that were extracted to the host"
+        )
+
+
+def _in_view(points: Array, pose: Pose, camera: Camera) -> tuple[Array, Array]:
+    """Those of the points (N, 3) that the camera sees off its border, with their pixels."""
+    pixels, inside = camera.project(pose.inverse.apply(points))
+    pixels, points = pixels[inside], points[inside]
+    border = max(2.0, _BORDER_SHARE * min(camera.width, camera.height))
+    size = np.array([camera.width, camera.height])
+    off = np.all((pixels >= border) & (pixels <= size - border), axis=1)
+    return points[off], pixels[off]
+
+
+def _uncovered(pixels: Array, camera: Camera, count: int, rng: np.random.Generator) -> Array:
+    """About `count` random pixels over the whole image, those left out that lie in a cell with one
+    of `pixels` (N, 2).
+    """
+    side = min(camera.width, camera.height) / _CELLS
+    border = max(2.0, _BORDER_SHARE * min(camera.width, camera.height))
+    step = np.sqrt(camera.width * camera.height / count)
+    v, u = np.mgrid[border : camera.height - border : step, border : camera.width - border : step]
+    drawn = np.stack([u.ravel(), v.ravel()], axis=1) + rng.uniform(0, step, (u.size, 2))
+    limit = np.array([camera.width, camera.height]) - border
+    drawn = drawn[np.all(drawn <= limit, axis=1)]
+    covered = np.zeros((_CELLS * 8, _CELLS * 8), dtype=bool)
+    covered[tuple((pixels // side).astype(np.int64).T)] = True
+    free: Array = drawn[~covered[tuple((drawn // side).astype(np.int64).T)]]
+    return free

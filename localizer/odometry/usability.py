@@ -1,0 +1,125 @@
+"""Whether a picture shows anything that can be registered: before any feature is computed.
+
+It is judged by itself, without a map: a covered lens, cloud, night without gain, a lens that looks
+into the sun, a picture smeared by a fast turn, or a stream that repeats one frame.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from enum import Enum
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import BaseModel, ConfigDict, Field
+
+from localizer.types import Float32, Image
+
+_WIDTH = 160  # px; what is judged is averaged down to it, which leaves structure and not noise
+_BLOCK = 10  # px of that size
+
+
+class ImageFault(Enum):
+    """What is wrong with a picture."""
+
+    BLACK = "the picture is black"
+    SATURATED = "the picture is saturated"
+    FLAT = "the picture shows no structure"
+    BLURRED = "the picture is blurred"
+    FROZEN = "the stream repeats one picture"
+
+
+class UsabilityConfig(BaseModel):
+    """Thresholds; shares are of the picture's area, grey values of 255."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
+
+    black: float = Field(6.0, ge=0, le=255, description="grey value that counts as black")
+    white: float = Field(250.0, ge=0, le=255, description="grey value that counts as saturated")
+    most_lost: float = Field(0.9, ge=0, le=1, description="share of black or saturated area")
+    structure: float = Field(
+        1.5, ge=0, le=255, description="contrast of a block that shows something, grey values"
+    )
+    least_structured: float = Field(
+        0.2, ge=0, le=1, description="share of the area that must show something"
+    )
+    least_sharpness: float = Field(
+        0.06, ge=0, le=1, description="fine over coarse contrast of a sharp picture"
+    )
+
+
+@dataclass(frozen=True)
+class Usability:
+    """The verdict on one picture, with what it rests on.
+
+    fault: None if it can be used. black, saturated, structured: shares of the area.
+    sharpness: contrast between neighbours over contrast between blocks, 0 for a flat picture.
+    """
+
+    fault: ImageFault | None
+    black: float
+    saturated: float
+    structured: float
+    sharpness: float
+
+    @property
+    def usable(self) -> bool:
+        """Whether there is something to register."""
+        return self.fault is None
+
+
+def examine(
+    image: Image, previous: Image | None = None, config: UsabilityConfig | None = None
+) -> Usability:
+    """The verdict on a picture (H, W, 3) uint8 RGB; previous: the stream's picture before it.
+
+    Takes a fraction of a millisecond at the working size.
+    """
+    c = config or UsabilityConfig()
+    grey = _shrunk(image)
+    black, saturated = float(np.mean(grey <= c.black)), float(np.mean(grey >= c.white))
+    contrast = _block_contrast(grey)
+    structured = float(np.mean(contrast >= c.structure))
+    sharpness = _sharpness(grey, contrast >= c.structure)
+    frozen = previous is not None and np.array_equal(image, previous)
+    fault = ImageFault.FROZEN if frozen else _fault(c, black, saturated, structured, sharpness)
+    return Usability(fault, black, saturated, structured, sharpness)
+
+
+def _fault(
+    c: UsabilityConfig, black: float, saturated: float, structured: float, sharpness: float
+) -> ImageFault | None:
+    if black >= c.most_lost:
+        return ImageFault.BLACK
+    if saturated >= c.most_lost:
+        return ImageFault.SATURATED
+    if structured < c.least_structured:
+        return ImageFault.FLAT
+    return ImageFault.BLURRED if sharpness < c.least_sharpness else None
+
+
+def _shrunk(image: Image) -> Float32:
+    grey = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)
+    height = max(_BLOCK, round(_WIDTH * image.shape[0] / image.shape[1]))
+    small = cv2.resize(grey, (_WIDTH, height), interpolation=cv2.INTER_AREA)
+    return small.astype(np.float32)
+
+
+def _block_contrast(grey: Float32) -> Float32:
+    """Standard deviation of each whole block of `_BLOCK` x `_BLOCK` pixels."""
+    rows, columns = (n // _BLOCK for n in grey.shape)
+    blocks = grey[: rows * _BLOCK, : columns * _BLOCK].reshape(rows, _BLOCK, columns, _BLOCK)
+    return np.asarray(blocks.std(axis=(1, 3)), np.float32)
+
+
+def _sharpness(grey: Float32, seen: NDArray[np.bool_]) -> float:
+    """Contrast that an average over three pixels takes away, over contrast, in the blocks seen.
+
+    Along rows or columns, whichever has less: motion blurs in one direction.
+    """
+    if not seen.any():
+        return 0.0
+    whole = _block_contrast(grey)[seen]
+    fine = [_block_contrast(grey - cv2.blur(grey, size))[seen] for size in ((3, 1), (1, 3))]
+    return min(float(np.median(part / whole)) for part in fine)

@@ -1,0 +1,73 @@
+"""The algebra of errors that grow."""
+
+import numpy as np
+import pytest
+
+from localizer.geometry.pose import Pose, so3_exp
+from localizer.odometry.config import GrowthModel
+from localizer.odometry.growth import carried, fused, scaled, walked
+from localizer.registration import attitude_constraint, combine, height_constraint
+
+MODEL = GrowthModel(scale=0.01, horizontal=0.1, vertical=0.2, tilt=1e-3, heading=2e-3)
+SIGMA = np.diag([0.3, 0.2, 0.5, 0.01, 0.02, 0.03]) ** 2
+
+
+def test_a_carried_pose_errs_as_its_keyframe_does():
+    """By Monte Carlo: the same small turn and shift of both."""
+    rng = np.random.default_rng(0)
+    lever = np.array([30.0, -20.0, 5.0])
+    errors = rng.multivariate_normal(np.zeros(6), SIGMA, 20_000)
+    moved = [e[:3] + so3_exp(e[3:]) @ lever - lever for e in errors]
+    expected = np.cov(np.array(moved).T)
+    np.testing.assert_allclose(
+        carried(SIGMA, lever)[:3, :3], expected, atol=0.06 * expected.diagonal().max()
+    )
+
+
+def test_a_walk_grows_with_the_root_of_the_way_and_a_scale_with_the_way():
+    np.testing.assert_allclose(walked(MODEL, 400.0).diagonal() ** 0.5,
+                               [2.0, 2.0, 4.0, 0.02, 0.02, 0.04])  # fmt: skip
+    assert not walked(MODEL, 0.0).any()
+    along = scaled(MODEL, np.array([300.0, 400.0, 0.0]))
+    np.testing.assert_allclose(along[:2, :2], [[9.0, 12.0], [12.0, 16.0]])
+    assert not along[3:].any()
+
+
+def test_a_sensor_is_weighed_against_what_is_known():
+    pose = Pose(np.eye(3), np.array([1.0, 2.0, 10.0]))
+    after, covariance = fused(pose, SIGMA, height_constraint(11.0, 0.5))
+    assert after.translation == pytest.approx([1.0, 2.0, 10.5])
+    assert covariance[2, 2] == pytest.approx(0.25)  # the sensor's own: its error stays
+    assert covariance[0, 0] == pytest.approx(SIGMA[0, 0])
+
+
+def test_a_sensor_that_is_asked_often_does_not_average_out():
+    pose, covariance = Pose(np.eye(3), np.zeros(3)), SIGMA
+    for _ in range(100):
+        pose, covariance = fused(pose, covariance + np.eye(6) * 0.01, height_constraint(1.0, 0.4))
+    assert covariance[2, 2] >= 0.16
+    assert np.linalg.eigvalsh(covariance)[0] > 0
+
+
+def test_a_better_known_height_is_left_alone():
+    surely = np.diag([0.01] * 6) ** 2
+    after, covariance = fused(Pose.identity(), surely, height_constraint(2.0, 1.0))
+    assert abs(after.translation[2]) < 1e-3
+    assert covariance[2, 2] == pytest.approx(1e-4, rel=1e-6)
+
+
+def test_attitude_turns_the_pose_and_spares_the_heading():
+    """A tilt of 2 degrees is mended; a compass that is 30 degrees off and says so is not heard."""
+    tilted = Pose(so3_exp([np.radians(2), 0, 0]), np.zeros(3))
+    unsure = np.diag([0.1, 0.1, 0.1, 0.05, 0.05, 0.01]) ** 2
+    compass = so3_exp([0, 0, np.radians(30)])
+    constraint = combine(attitude_constraint(compass, np.radians(0.2), 10.0))
+    after, _ = fused(tilted, unsure, constraint)
+    tilt = np.degrees(np.arccos(after.rotation[2, 2]))
+    assert tilt < 0.3
+    assert abs(np.degrees(np.arctan2(after.rotation[1, 0], after.rotation[0, 0]))) < 0.5
+
+
+def test_no_constraint_changes_nothing():
+    pose = Pose(so3_exp([0.1, 0.2, 0.3]), np.ones(3))
+    assert fused(pose, SIGMA, None) == (pose, SIGMA)

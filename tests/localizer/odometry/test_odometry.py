@@ -1,0 +1,174 @@
+"""Carrying a pose on: how far off it is, what it says of itself, and when it stops."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from localizer.errors import OdometryError
+from localizer.geometry.pose import Pose, so3_exp
+from localizer.odometry import (
+    DepthSource,
+    FlatGround,
+    ImageFault,
+    OdometryConfig,
+    OdometryStatus,
+    Usability,
+    VisualOdometry,
+    odometry_optimizer,
+)
+from localizer.registration import JNGO, attitude_constraint, combine, height_constraint
+from tests.localizer.odometry.conftest import BEGUN, CAMERA, STEP_NS, VELOCITY, Flight
+from tests.localizer.registration.conftest import SyntheticPlace
+
+COVERED = Usability(ImageFault.FLAT, 0.0, 0.0, 0.0, 0.0)
+
+
+def odometry(ground: FlatGround | None = None, **changes: float) -> VisualOdometry:
+    optimizer = odometry_optimizer(JNGO(threads=1))
+    return VisualOdometry(CAMERA, optimizer, OdometryConfig(**{"anchors": 600, **changes}), ground)
+
+
+def begun(flight: Flight, vo: VisualOdometry, *, mapped: bool, **more) -> VisualOdometry:
+    surface = flight.surface(0) if mapped else None
+    vo.begin(flight.frame(0), flight.pose(0), BEGUN, velocity=VELOCITY, surface=surface, **more)
+    return vo
+
+
+def horizontal(pose: Pose, truth: Pose) -> float:
+    return float(np.linalg.norm((pose.translation - truth.translation)[:2]))
+
+
+def test_the_maps_geometry_carries_the_pose_on(hills):
+    vo = begun(hills, odometry(), mapped=True)
+    radii = []
+    for k in range(1, 26):
+        estimate = vo.step(hills.frame(k), surface=hills.surface(k))
+        assert estimate.status is OdometryStatus.OK, estimate.reason
+        assert estimate.source is DepthSource.MAP
+        error = estimate.world_from_camera.translation - hills.pose(k).translation
+        P = estimate.covariance[:3, :3]
+        assert error @ np.linalg.solve(P, error) < 16.3, k  # 99.9 % of three degrees of freedom
+        radii.append(estimate.drift_m)
+    assert horizontal(estimate.world_from_camera, hills.pose(25)) < 0.01 * 100
+    assert estimate.bridged_s == pytest.approx(10.0)
+    assert estimate.way_m == pytest.approx(100, rel=0.03)
+    assert estimate.keyframe_age_s < 8.0  # others took over on the way
+    assert radii[-1] > radii[10] > radii[0] > 0
+    assert radii[-1] < 0.03 * 100
+
+
+def test_a_ground_without_relief_is_enough(plain):
+    vo = begun(plain, odometry(FlatGround(0.0)), mapped=False)
+    for k in range(1, 26):
+        estimate = vo.step(plain.frame(k))
+        assert estimate.usable, estimate.reason
+    assert estimate.source is DepthSource.GROUND
+    error = horizontal(estimate.world_from_camera, plain.pose(25))
+    assert error < 0.02 * 100
+    assert error < estimate.drift_m < 0.1 * 100
+
+
+def test_at_the_maps_edge_the_ground_goes_on_at_the_last_height(plain):
+    vo = begun(plain, odometry(), mapped=True)
+    sources = []
+    for k in range(1, 21):
+        estimate = vo.step(plain.frame(k), surface=plain.surface(k) if k < 6 else None)
+        assert estimate.usable, estimate.reason
+        sources.append(estimate.source)
+    assert sources[0] is DepthSource.MAP
+    assert sources[-1] is DepthSource.GROUND
+    assert horizontal(estimate.world_from_camera, plain.pose(20)) < 0.02 * 80
+
+
+def test_without_any_depth_there_is_nothing_to_carry_on_with(hills):
+    with pytest.raises(OdometryError, match="call begin with a known pose"):
+        odometry().step(hills.frame(1))
+    with pytest.raises(OdometryError, match="neither the map nor a ground"):
+        begun(hills, odometry(), mapped=False).step(hills.frame(1))
+
+
+def test_a_covered_lens_is_told_and_a_short_one_survived(hills):
+    vo = begun(hills, odometry(), mapped=True)
+    assert vo.step(hills.frame(1), surface=hills.surface(1)).usable
+    sigmas = []
+    for k in range(2, 7):
+        blind = vo.step(replace(hills.frame(k), usability=COVERED))
+        assert blind.status is OdometryStatus.UNUSABLE_IMAGE
+        assert not blind.usable
+        assert "no structure" in blind.reason
+        sigmas.append(blind.covariance[0, 0] ** 0.5)
+        assert horizontal(blind.world_from_camera, hills.pose(k)) < 3 * sigmas[-1]
+    assert sigmas == sorted(sigmas)
+    again = vo.step(hills.frame(7), surface=hills.surface(7))
+    assert again.usable, again.reason
+    assert horizontal(again.world_from_camera, hills.pose(7)) < 0.3
+
+
+def test_what_is_covered_for_long_is_lost_until_the_next_beginning(hills):
+    vo = begun(hills, odometry(), mapped=True)
+    for k in range(1, 8):
+        blind = vo.step(replace(hills.frame(k), usability=COVERED))
+        assert blind.status is OdometryStatus.UNUSABLE_IMAGE
+    for k in range(8, 12):  # the picture is good again, and nobody knows where it is from
+        lost = vo.step(hills.frame(k), surface=hills.surface(k))
+        assert lost.status is OdometryStatus.LOST
+        assert not lost.usable
+    vo.begin(hills.frame(12), hills.pose(12), BEGUN, velocity=VELOCITY, surface=hills.surface(12))
+    found = vo.step(hills.frame(13), surface=hills.surface(13))
+    assert found.usable
+    assert found.bridged_s == pytest.approx(STEP_NS * 1e-9)
+
+
+def test_another_places_picture_is_refused(hills):
+    elsewhere = Flight(SyntheticPlace.from_seed(99))
+    vo = begun(hills, odometry(), mapped=True)
+    for k in range(1, 6):
+        wrong = vo.step(elsewhere.frame(k), surface=hills.surface(k))
+        assert wrong.status is OdometryStatus.NOT_REGISTERED, k
+        assert wrong.reason
+    assert vo.step(hills.frame(6), surface=hills.surface(6)).usable
+
+
+def test_a_constant_error_of_the_sensors_is_no_drift(plain):
+    """The barometer reads 3 m too much and the gimbal is 1 degree off, from the beginning on."""
+
+    def sensed(k):
+        pose = plain.pose(k)
+        turned = pose.rotation @ so3_exp(np.radians([1.0, -0.6, 0.5]))
+        return combine(
+            attitude_constraint(turned, np.radians(0.3), np.radians(4)),
+            height_constraint(pose.translation[2] + 3.0, 0.2),
+        )
+
+    vo = begun(plain, odometry(FlatGround(0.0)), mapped=False, constraint=sensed(0))
+    for k in range(1, 16):
+        estimate = vo.step(plain.frame(k), constraint=sensed(k))
+        assert estimate.usable, estimate.reason
+    assert abs(estimate.world_from_camera.translation[2] - plain.pose(15).translation[2]) < 0.3
+    assert plain.pose(15).distance_to(estimate.world_from_camera)[1] < 0.3
+
+
+def test_the_barometer_holds_the_height(plain):
+    """A beginning 4 m too high stays so without a barometer, and is mended with one."""
+    high = Pose(plain.pose(0).rotation, plain.pose(0).translation + np.array([0.0, 0.0, 4.0]))
+    unsure = BEGUN + np.diag([0, 0, 16.0, 0, 0, 0])
+    heights = {}
+    for name in ("free", "aided"):
+        vo = odometry(FlatGround(0.0))
+        vo.begin(plain.frame(0), high, unsure, velocity=VELOCITY)
+        for k in range(1, 13):
+            level = height_constraint(plain.pose(k).translation[2], 0.3)
+            estimate = vo.step(plain.frame(k), constraint=level if name == "aided" else None)
+        heights[name] = estimate.world_from_camera.translation[2] - plain.pose(12).translation[2]
+    assert heights["free"] > 2.0
+    assert abs(heights["aided"]) < 0.6
+
+
+def test_the_same_flight_gives_the_same_poses(hills):
+    runs = []
+    for _ in range(2):
+        vo = begun(hills, odometry(), mapped=True)
+        runs.append([vo.step(hills.frame(k), surface=hills.surface(k)) for k in range(1, 4)][-1])
+    assert np.array_equal(runs[0].world_from_camera.matrix, runs[1].world_from_camera.matrix)
+    assert np.array_equal(runs[0].covariance, runs[1].covariance)
