@@ -1,0 +1,99 @@
+"""Trajectories: camera poses with names, times and covariances, and the files that hold them.
+
+TUM's format (``time x y z qx qy qz qw``, seconds and metres) is what evo and most tools read. Poses
+in it are `world_from_camera` in the map's ENU frame, camera axes OpenCV.
+"""
+
+from __future__ import annotations
+
+import csv
+from collections.abc import Iterable
+from dataclasses import dataclass
+from decimal import Decimal, InvalidOperation
+from pathlib import Path
+
+import numpy as np
+
+from localizer.errors import PoseFileError
+from localizer.geometry.pose import Array, Pose, matrix_from_quaternion, quaternion_from_matrix
+
+_TUM_FIELDS = "time x y z qx qy qz qw"
+COVARIANCE_COLUMNS = (
+    "name", "exposure_time_ns",
+    *(f"c{row}{column}" for row in range(6) for column in range(row, 6)),
+)  # fmt: skip
+
+
+@dataclass(frozen=True)
+class StampedPose:
+    """A camera's pose at a time. time_ns: of the exposure, None where only the order is known.
+
+    covariance: (6, 6) as in `PosePrior`, None where it is not known.
+    """
+
+    name: str
+    world_from_camera: Pose
+    time_ns: int | None = None
+    covariance: Array | None = None
+
+
+def write_tum(path: Path, poses: Iterable[StampedPose]) -> None:
+    """Write TUM lines: nanoseconds of time, 0.1 µm of position, 1e-9 of the quaternion."""
+    path.write_text("".join(f"{_tum_line(path, pose)}\n" for pose in poses), encoding="utf-8")
+
+
+def _tum_line(path: Path, pose: StampedPose) -> str:
+    if pose.time_ns is None:
+        raise PoseFileError(f"{path}: {pose.name} has no time; TUM's lines need one")
+    w, x, y, z = quaternion_from_matrix(pose.world_from_camera.rotation)
+    seconds, rest = divmod(pose.time_ns, 10**9)
+    position = " ".join(f"{value:.7f}" for value in pose.world_from_camera.translation)
+    return f"{seconds}.{rest:09d} {position} {x:.9f} {y:.9f} {z:.9f} {w:.9f}"
+
+
+def read_tum(path: Path) -> tuple[StampedPose, ...]:
+    """Every pose of a TUM file, named by its time in ns; blank lines and comments are skipped."""
+    try:
+        lines = path.read_text(encoding="utf-8").splitlines()
+    except (OSError, UnicodeDecodeError) as error:
+        raise PoseFileError(f"{path}: cannot be read: {error}") from error
+    poses = tuple(
+        _parse_tum(line, f"{path}:{number}")
+        for number, line in enumerate(lines, start=1)
+        if line.strip() and not line.lstrip().startswith("#")
+    )
+    if not poses:
+        raise PoseFileError(f"{path}: holds no pose; expected '{_TUM_FIELDS}'")
+    return poses
+
+
+def _parse_tum(line: str, where: str) -> StampedPose:
+    parts = line.replace(",", " ").split()
+    if len(parts) != 8:
+        raise PoseFileError(f"{where}: expected '{_TUM_FIELDS}', got {len(parts)} fields")
+    try:
+        # Decimal: seconds of an epoch with nine digits behind the point do not fit into a float.
+        time_ns = int((Decimal(parts[0]) * 10**9).to_integral_value())
+        x, y, z, qx, qy, qz, qw = (float(part) for part in parts[1:])
+    except (ValueError, ArithmeticError, InvalidOperation) as error:
+        raise PoseFileError(f"{where}: {error}") from error
+    position, q = np.array([x, y, z]), np.array([qw, qx, qy, qz])
+    if not np.isfinite([*position, *q]).all() or abs(np.linalg.norm(q) - 1.0) > 0.01:
+        raise PoseFileError(f"{where}: not a position and a unit quaternion")
+    return StampedPose(str(time_ns), Pose(matrix_from_quaternion(q), position), time_ns)
+
+
+def write_covariances(path: Path, poses: Iterable[StampedPose]) -> None:
+    """Write the upper triangles as CSV (`COVARIANCE_COLUMNS`); poses without one are left out.
+
+    Axes 0 to 2: position east, north, up (m); 3 to 5: rotation vector about them (rad).
+    """
+    upper = np.triu_indices(6)
+    with path.open("w", newline="", encoding="utf-8") as file:
+        writer = csv.writer(file)
+        writer.writerow(COVARIANCE_COLUMNS)
+        for pose in poses:
+            if pose.covariance is not None:
+                time_ns = "" if pose.time_ns is None else pose.time_ns
+                values = (f"{value:.6e}" for value in pose.covariance[upper])
+                writer.writerow([pose.name, time_ns, *values])

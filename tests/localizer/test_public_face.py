@@ -1,0 +1,27 @@
+"""`from localizer import ...`: every name is there, once, and costs nothing until it is used."""
+
+import subprocess
+import sys
+
+import pytest
+
+import localizer
+
+
+def test_every_public_name_is_there_and_documented():
+    for name in localizer.__all__:
+        value = getattr(localizer, name)
+        assert value.__doc__, name
+        assert not value.__doc__.startswith(f"{name}("), f"{name}: a dataclass's default docstring"
+    assert set(localizer.__all__) <= set(dir(localizer))
+
+
+def test_a_name_that_is_not_there_is_an_attribute_error():
+    with pytest.raises(AttributeError, match="no attribute 'Locolizer'"):
+        _ = localizer.Locolizer
+
+
+def test_importing_the_package_imports_no_kernel_and_no_network():
+    heavy = "{'numba', 'onnxruntime', 'cv2', 'scipy', 'torch'}"
+    code = f"import sys, localizer; sys.exit(bool({heavy} & set(sys.modules)))"
+    assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
