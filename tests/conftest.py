@@ -18,6 +18,8 @@ import hypothesis
 import pytest
 
 from sitl.demo.assets import FlightAssets, prepare
+from sitl.demo.kinematic import record_scenario
+from sitl.demo.scenario import CameraSpec, Leg, Scenario
 from sitl.errors import SimulationError
 
 # The suite tries the same examples every time, so that a failure belongs to the change it is seen
@@ -57,6 +59,18 @@ def real_data() -> Callable[[str], Path]:
 def small_assets(tmp_path_factory: pytest.TempPathFactory) -> FlightAssets:
     """A 400 m world with both caches: 12 s of processor, so all tests share it."""
     return prepare(5, tmp_path_factory.mktemp("worlds"), size_m=400.0)
+
+
+@pytest.fixture(scope="session")
+def small_sequence(small_assets: FlightAssets, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A video of the small world at 5 Hz with its true poses, as `companion eval` reads it."""
+    leg = Leg(east_m=0, north_m=26, height_m=80, gimbal_pitch_deg=-85)
+    scenario = Scenario(
+        takeoff_height_m=80, legs=(leg,), cars=2, people=2, camera=CameraSpec(rate_hz=5)
+    )
+    out = tmp_path_factory.mktemp("sequence")
+    assert record_scenario(small_assets, scenario, 5, out) >= 25
+    return out
 
 
 @pytest.fixture

@@ -1,8 +1,8 @@
-"""The command line: ``companion run | eval | replay | map | world | doctor``.
+"""The command line: ``companion run | eval | localize | convert | replay | map | world | doctor``.
 
-Exit codes: 0 done; 1 `doctor` found advice, `replay` differs or `map verify` found damage; 2 wrong
-usage, a named error, or `doctor` found the vehicle not fit to fly; 130 interrupted (`run` that was
-flying ends with 0).
+Exit codes: 0 done; 1 `doctor` found advice, `replay` differs, `localize` localized nothing or `map
+verify` found damage; 2 wrong usage, a named error, or `doctor` found the vehicle not fit to fly;
+130 interrupted (`run` that was flying ends with 0).
 """
 
 from __future__ import annotations
@@ -15,9 +15,11 @@ import typer
 from rich.console import Console
 from rich.markup import escape
 
+from companion.cli.convert import convert_command
 from companion.cli.doctor import doctor_command
 from companion.cli.evaluate import evaluate_command
 from companion.cli.interrupts import INTERRUPTED
+from companion.cli.localize import localize_command
 from companion.cli.map import app as map_app
 from companion.cli.replay import replay_command
 from companion.cli.run import run_command
@@ -54,6 +56,8 @@ def _options(
 
 app.command("run")(run_command)
 app.command("eval")(evaluate_command)
+app.command("localize")(localize_command)
+app.command("convert")(convert_command)
 app.command("replay")(replay_command)
 app.command("doctor")(doctor_command)
 app.add_typer(map_app, name="map", help="Build and inspect tile caches.")

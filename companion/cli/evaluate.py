@@ -17,6 +17,7 @@ from rich.table import Table
 
 from companion.errors import ConfigError, ReportError
 from companion.offline.plots import ErrorSeries, overlay_sheet, plot_errors, save_image
+from companion.offline.trajectories import stamped, write_trajectory
 from companion.versions import versions
 from localizer.config import LocalizerConfig
 from localizer.evaluation.metrics import LocalizationMetrics
@@ -27,12 +28,15 @@ from localizer.evaluation.sequences import (
     PriorMode,
     Sequence,
     csv_rows,
+    error_arrays,
     evaluate,
     load_sequence,
+    worst_first,
 )
 from localizer.features.extractor import load_extractor
 from localizer.geometry.camera import Camera
 from localizer.geometry.geo import LocalFrame
+from localizer.geometry.trajectory import StampedPose, write_tum
 from localizer.registration.devices import DeviceChoice
 from localizer.render.base import MapRenderer
 from localizer.render.select import RendererName
@@ -101,6 +105,7 @@ def evaluate_command(
         print_metrics(metrics, unusable, str(sequence))
         try:
             _write_report(report, frames, metrics, settings, stack.cache.frame)
+            _write_trajectories(report, frames, data, stack.cache.frame)
             _write_overlays(report, frames, data, stack.renderer, localizer.camera)
         except OSError as error:
             raise ReportError(f"--report {report}: cannot be written: {error}") from error
@@ -120,17 +125,27 @@ def _print_problems(frames: list[EvaluatedFrame]) -> None:
 def print_metrics(metrics: LocalizationMetrics, unusable: int, title: str) -> None:
     """The columns of the paper's Table 2, and how many images could not be used."""
     caption = "medians of localized frames; recalls and completeness of all"
+    m = metrics
     table = Table(title=title, caption=caption)
     for column in ("frames", "unusable", "Med m", "Med °", "R@1", "R@3", "R@5", "Comp. %", "FPS"):
         table.add_column(column, justify="right")
-    m = metrics
     table.add_row(
         str(m.frames), str(unusable),
-        f"{m.median_translation_m:.2f}", f"{m.median_rotation_deg:.3f}",
+        _text(m.median_translation_m, 2), _text(m.median_rotation_deg, 3),
         f"{m.recall_1:.1f}", f"{m.recall_3:.1f}", f"{m.recall_5:.1f}",
         f"{m.completeness:.1f}", f"{m.fps:.1f}",
     )  # fmt: skip
     Console().print(table)
+    Console().print(
+        f"p95 {_text(m.p95_translation_m, 2)} m {_text(m.p95_rotation_deg, 3)}°, "
+        f"maximum {_text(m.max_translation_m, 2)} m {_text(m.max_rotation_deg, 3)}° "
+        "of localized frames",
+        highlight=False,
+    )
+
+
+def _text(value: float | None, digits: int) -> str:
+    return "-" if value is None else f"{value:.{digits}f}"
 
 
 def _prepare(folder: Path) -> None:
@@ -161,6 +176,26 @@ def _write_report(
         writer.writerows(csv_rows(frames, local))
 
 
+def _write_trajectories(
+    folder: Path, frames: list[EvaluatedFrame], data: Sequence, local: LocalFrame
+) -> None:
+    """What was localized, and the truth beside it: ``evo_ape tum truth.tum trajectory.tum``."""
+    estimates = [(f.name, f.estimate) for f in frames if f.estimate is not None]
+    write_trajectory(folder, [stamped(n, e) for n, e in estimates if e.accepted], local)
+    names = (path.name for path in data.images)
+    truth = map(StampedPose, names, data.truth, data.times_ns)
+    write_tum(folder / "truth.tum", truth)
+
+
+def _shown(frames: list[EvaluatedFrame]) -> list[int]:
+    """The worst frames; at most half of them rejected ones, if others were localized."""
+    order = worst_first(frames)
+    rejected = [i for i in order if frames[i].translation_error_m is None]
+    localized = [i for i in order if frames[i].translation_error_m is not None]
+    few = rejected[: max(_OVERLAYS // 2, _OVERLAYS - len(localized))]
+    return localized[: _OVERLAYS - len(few)] + few
+
+
 def _write_overlays(
     folder: Path,
     frames: list[EvaluatedFrame],
@@ -168,19 +203,19 @@ def _write_overlays(
     renderer: MapRenderer,
     camera: Camera,
 ) -> None:
-    """A few frames over the map rendered at their estimated poses, and the errors of all."""
+    """The worst frames over the map rendered at their estimated poses, and the errors of all."""
     undistort = Undistorter(data.camera, camera)
-    usable = [(i, f, f.estimate) for i, f in enumerate(frames) if f.estimate is not None]
-    for k in np.unique(np.linspace(0, len(usable) - 1, _OVERLAYS).astype(int)):
-        i, f, estimate = usable[k]
+    for i in _shown(frames):
+        f, estimate = frames[i], frames[i].estimate
+        if estimate is None:
+            continue
         view = renderer.render(estimate.world_from_camera, camera, wait=True)
         video = undistort(data.frame(i))
-        error = f"{f.translation_error_m:.2f} m {f.rotation_error_deg:.2f} deg"
-        caption = f"{f.name}: {error if np.isfinite(f.translation_error_m) else 'rejected'}"
+        error = f"{_text(f.translation_error_m, 2)} m {_text(f.rotation_error_deg, 2)} deg"
+        caption = f"{f.name}: {'rejected' if f.translation_error_m is None else error}"
         save_image(folder / f"overlay-{i:04d}.png", overlay_sheet(video, view.rgb, caption))
     number = np.arange(len(frames), dtype=np.float64)
-    position = np.array([f.translation_error_m for f in frames])
-    rotation = np.array([f.rotation_error_deg for f in frames])
+    position, rotation = error_arrays(frames)
     plot_errors(
         folder / "errors.png",
         [

@@ -100,8 +100,7 @@ def load_record(folder: Path) -> FlightRecord:
         start_ns = int(manifest["monotonic_ns"])
         offset_ns = int(manifest["utc_ns"]) - start_ns
         config = parse_config(manifest["config"], str(folder / MANIFEST_NAME))
-        with (folder / "estimates.csv").open(newline="", encoding="utf-8") as file:
-            estimates = tuple(_estimate(row) for row in _whole_rows(file))
+        estimates = _estimates(folder / "estimates.csv")
     # RecursionError: endless nesting.
     except (
         OSError, ValueError, KeyError, TypeError, ArithmeticError, RecursionError, csv.Error
@@ -116,6 +115,19 @@ def load_record(folder: Path) -> FlightRecord:
             "fly with record.snapshot_interval_s 0.001 to keep every frame"
         )
     return FlightRecord(folder, config, start_ns, offset_ns, estimates)
+
+
+def read_estimates(path: Path) -> tuple[RecordedEstimate, ...]:
+    """The rows of a record's ``estimates.csv``. `RecordError` says why it is none."""
+    try:
+        return _estimates(path)
+    except (OSError, ValueError, KeyError, TypeError, ArithmeticError, csv.Error) as error:
+        raise RecordError(f"{path}: not a record's estimates: {error}") from error
+
+
+def _estimates(path: Path) -> tuple[RecordedEstimate, ...]:
+    with path.open(newline="", encoding="utf-8") as file:
+        return tuple(_estimate(row) for row in _whole_rows(file))
 
 
 def _whole_rows(file: TextIO) -> Iterator[dict[str, str]]:

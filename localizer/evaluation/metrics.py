@@ -11,20 +11,27 @@ from localizer.geometry.pose import Array
 
 @dataclass(frozen=True)
 class LocalizationMetrics:
-    """One row of the paper's Table 2. Recalls and completeness in per cent of all frames."""
+    """One row of the paper's Table 2. Recalls and completeness in per cent of all frames.
+
+    Medians, 95th percentiles and maxima are over the localized frames; None if there is none.
+    """
 
     frames: int
-    median_translation_m: float
-    median_rotation_deg: float
+    median_translation_m: float | None
+    median_rotation_deg: float | None
     recall_1: float
     recall_3: float
     recall_5: float
     completeness: float
     fps: float
+    p95_translation_m: float | None = None
+    p95_rotation_deg: float | None = None
+    max_translation_m: float | None = None
+    max_rotation_deg: float | None = None
 
     def to_dict(self) -> dict[str, float | int | None]:
         """JSON-ready; a median over no frame is null."""
-        return {k: None if np.isnan(v) else v for k, v in asdict(self).items()}
+        return asdict(self)
 
 
 def localization_metrics(
@@ -44,18 +51,25 @@ def localization_metrics(
 
     return LocalizationMetrics(
         frames=frames,
-        median_translation_m=_median(translation_m[found]),
-        median_rotation_deg=_median(rotation_deg[found]),
+        median_translation_m=_percentile(translation_m[found], 50),
+        median_rotation_deg=_percentile(rotation_deg[found], 50),
         recall_1=recall(1.0),
         recall_3=recall(3.0),
         recall_5=recall(5.0),
         completeness=_percent(int(np.count_nonzero(found)), frames),
         fps=frames / seconds if seconds > 0 else 0.0,
+        p95_translation_m=_percentile(translation_m[found], 95),
+        p95_rotation_deg=_percentile(rotation_deg[found], 95),
+        max_translation_m=_percentile(translation_m[found], 100),
+        max_rotation_deg=_percentile(rotation_deg[found], 100),
     )
 
 
-def _median(values: Array) -> float:
-    return float(np.median(values)) if len(values) else float("nan")
+def _percentile(values: Array, percent: float) -> float | None:
+    if not len(values):
+        return None
+    # Of an even number of values np.percentile rounds differently than the mean of the two.
+    return float(np.median(values) if percent == 50 else np.percentile(values, percent))
 
 
 def _percent(part: int, whole: int) -> float:

@@ -71,15 +71,15 @@ class Sequence:
 
 @dataclass(frozen=True)
 class EvaluatedFrame:
-    """One frame's outcome. Errors are NaN where integrity accepted no estimate.
+    """One frame's outcome. Errors are None where integrity accepted no estimate.
 
     estimate: None for an image that cannot be used; `problem` says why then.
     """
 
     name: str
     estimate: PoseEstimate | None
-    translation_error_m: float = float("nan")
-    rotation_error_deg: float = float("nan")
+    translation_error_m: float | None = None
+    rotation_error_deg: float | None = None
     problem: str = ""
 
 
@@ -233,21 +233,41 @@ def _not_localized(localizer: Localizer, frame: Frame) -> PoseEstimate:
 
 
 def _measure(sequence: Sequence, index: int, estimate: PoseEstimate) -> EvaluatedFrame:
-    truth = sequence.truth[index]
-    translation, rotation = truth.distance_to(estimate.world_from_camera)
-    if not estimate.accepted:
-        translation = rotation = float("nan")
     name = sequence.images[index].name
+    if not estimate.accepted:
+        return EvaluatedFrame(name, estimate)
+    translation, rotation = sequence.truth[index].distance_to(estimate.world_from_camera)
     return EvaluatedFrame(name, estimate, translation, rotation)
 
 
 def _summary(frames: list[EvaluatedFrame], seconds: float) -> LocalizationMetrics:
     """seconds: spent on the frames whose image could be used; the rate is theirs."""
-    translation = np.array([f.translation_error_m for f in frames])
-    rotation = np.array([f.rotation_error_deg for f in frames])
+    translation, rotation = error_arrays(frames)
     usable = sum(f.estimate is not None for f in frames)
     metrics = localization_metrics(translation, rotation, seconds)
     return replace(metrics, fps=metrics.fps * usable / len(frames))
+
+
+def error_arrays(frames: list[EvaluatedFrame]) -> tuple[Array, Array]:
+    """Position errors (F,) in metres and rotation errors (F,) in degrees, NaN where unknown."""
+    return (
+        np.array([f.translation_error_m for f in frames], dtype=np.float64),
+        np.array([f.rotation_error_deg for f in frames], dtype=np.float64),
+    )
+
+
+def worst_first(frames: list[EvaluatedFrame]) -> list[int]:
+    """Indices of the localized frames from the largest position error down, then of the rejected
+    ones from the lowest quality up. Images that could not be used are not among them.
+    """
+
+    def place(index: int) -> tuple[bool, float]:
+        error, estimate = frames[index].translation_error_m, frames[index].estimate
+        if error is not None:
+            return False, -error
+        return True, 0.0 if estimate is None else estimate.quality
+
+    return sorted((i for i, f in enumerate(frames) if f.estimate is not None), key=place)
 
 
 def csv_rows(frames: list[EvaluatedFrame], frame: LocalFrame) -> Iterator[dict[str, str]]:
@@ -260,11 +280,15 @@ def csv_rows(frames: list[EvaluatedFrame], frame: LocalFrame) -> Iterator[dict[s
                 "latitude_deg": f"{position.latitude_deg:.9f}",
                 "longitude_deg": f"{position.longitude_deg:.9f}",
                 "height_m": f"{position.height_m:.3f}",
-                "translation_error_m": f"{f.translation_error_m:.4f}",
-                "rotation_error_deg": f"{f.rotation_error_deg:.4f}",
+                "translation_error_m": _error_text(f.translation_error_m),
+                "rotation_error_deg": _error_text(f.rotation_error_deg),
                 "quality": f"{f.estimate.quality:.3f}",
                 "state": f.estimate.state.value,
                 "status": f.estimate.status.name,
                 "accepted": str(int(f.estimate.accepted)),
             }
         yield row
+
+
+def _error_text(error: float | None) -> str:
+    return "nan" if error is None else f"{error:.4f}"  # so that a column reads as numbers

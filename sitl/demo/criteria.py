@@ -15,14 +15,16 @@ class Criterion:
     """One target: a value that must reach (`at_least`) or stay within a limit."""
 
     name: str
-    value: float
+    value: float | None
     limit: float
     unit: str
     at_least: bool = False
 
     @property
     def ok(self) -> bool:
-        """Whether it holds; a value that is not known (NaN) does not."""
+        """Whether it holds; a value that is not known (None, NaN) does not."""
+        if self.value is None:
+            return False
         if self.at_least:
             return self.value >= self.limit
         return self.value <= self.limit

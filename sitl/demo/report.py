@@ -323,7 +323,8 @@ def _verdict(report: FlightReport) -> Table:
     for c in report.criteria:
         needed = f"{'>=' if c.at_least else '<='} {c.limit:g} {c.unit}"
         mark = "[green]ok" if c.ok else "[red]missed"
-        table.add_row(c.name, f"{c.value:.2f} {c.unit}", needed, mark)
+        value = "-" if c.value is None else f"{c.value:.2f} {c.unit}"
+        table.add_row(c.name, value, needed, mark)
     return table
 
 

@@ -12,21 +12,13 @@ from typer.testing import CliRunner
 from companion.cli.commands import app
 from companion.errors import ReportError
 from localizer.errors import CameraError, OutsideMapError, SequenceError
-from sitl.demo.kinematic import record_scenario
-from sitl.demo.scenario import CameraSpec, Leg, Scenario
 
 FRAMES = 25
 
 
-@pytest.fixture(scope="module")
-def recorded(small_assets, tmp_path_factory):
-    leg = Leg(east_m=0, north_m=26, height_m=80, gimbal_pitch_deg=-85)
-    scenario = Scenario(
-        takeoff_height_m=80, legs=(leg,), cars=2, people=2, camera=CameraSpec(rate_hz=5)
-    )
-    out = tmp_path_factory.mktemp("sequence")
-    assert record_scenario(small_assets, scenario, 5, out) >= FRAMES
-    return small_assets, out
+@pytest.fixture
+def recorded(small_assets, small_sequence):
+    return small_assets, small_sequence
 
 
 def _run(*arguments):
@@ -48,7 +40,28 @@ def test_report_has_the_papers_columns(recorded, tmp_path, prior):
     assert report["recall_3"] >= 80
     assert report["median_translation_m"] < 1.0
     assert (tmp_path / "frames.csv").stat().st_size > 0
-    assert len(list(tmp_path.glob("overlay-*.png"))) == 4
+    assert report["median_translation_m"] <= report["p95_translation_m"]
+    with (tmp_path / "frames.csv").open(newline="") as file:
+        errors = [float(row["translation_error_m"]) for row in csv.DictReader(file)]
+    worst = sorted(np.argsort(errors)[-4:])
+    shown = sorted(int(p.stem.removeprefix("overlay-")) for p in tmp_path.glob("overlay-*.png"))
+    assert shown == worst
+    assert report["max_translation_m"] == pytest.approx(max(errors), abs=1e-4)
+    _is_a_trajectory_as_evo_reads_it(tmp_path, errors)
+
+
+def _is_a_trajectory_as_evo_reads_it(report, errors):
+    """By evo's own definition of the absolute error: same times, distance of the positions."""
+    truth, found = (np.loadtxt(report / name) for name in ("truth.tum", "trajectory.tum"))
+    np.testing.assert_array_equal(truth[: len(found), 0], found[:, 0])
+    distances = np.linalg.norm(truth[: len(found), 1:4] - found[:, 1:4], axis=1)
+    assert distances == pytest.approx(errors, abs=1e-4)
+    assert np.linalg.norm(found[:, 4:], axis=1) == pytest.approx(1.0, abs=1e-8)
+    poses = [line.split()[0] for line in (report / "poses.txt").read_text().splitlines()]
+    with (report / "covariances.csv").open(newline="") as file:
+        rows = list(csv.DictReader(file))
+    assert [row["name"] for row in rows] == poses
+    assert all(float(row["c00"]) > 0 and float(row["c55"]) > 0 for row in rows)
 
 
 def test_pilots_own_layout_is_read(recorded, tmp_path):

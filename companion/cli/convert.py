@@ -1,0 +1,124 @@
+"""``companion convert``: camera poses from and to the formats of other programs."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from enum import Enum
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from companion.cli.geographic import numbers
+from companion.errors import ConfigError, ReportError
+from localizer.geometry.geo import Geodetic, LocalFrame
+from localizer.geometry.trajectory import StampedPose
+
+
+class Source(str, Enum):
+    """What is read."""
+
+    POSES = "poses"
+    TUM = "tum"
+    COLMAP = "colmap"
+    PHOTOS = "photos"
+    AUTOPILOT = "autopilot"
+    RECORD = "record"
+
+
+class Target(str, Enum):
+    """What is written."""
+
+    POSES = "poses"
+    TUM = "tum"
+    COLMAP = "colmap"
+    PHOTOS = "photos"
+    AUTOPILOT = "autopilot"
+
+
+class HeightDatum(str, Enum):
+    """What photos' heights are above."""
+
+    AMSL = "amsl"
+    ELLIPSOIDAL = "ellipsoidal"
+
+
+def convert_command(
+    source: Annotated[
+        Path, typer.Argument(help="a file; a folder for photos and for the record of a flight")
+    ],
+    out: Annotated[Path, typer.Argument(help="file to write; a folder of sidecars for photos")],
+    of: Annotated[Source, typer.Option("--from", help="format of the source")],
+    to: Annotated[Target, typer.Option("--to", help="format of the result")],
+    map_cache: Annotated[
+        Path | None, typer.Option("--map", help="tile cache whose ENU frame is meant")
+    ] = None,
+    origin: Annotated[
+        str | None, typer.Option(help="LAT,LON,HEIGHT of the ENU frame, instead of --map")
+    ] = None,
+    heights: Annotated[
+        HeightDatum | None, typer.Option(help="what the heights in photos' tags are above")
+    ] = None,
+    geoid_separation: Annotated[
+        float | None, typer.Option(help="geoid above the ellipsoid, m; else the map's")
+    ] = None,
+    times: Annotated[
+        Path | None,
+        typer.Option(help="timestamps.txt ('name nanoseconds'): of poses that have no time"),
+    ] = None,
+) -> None:
+    """Convert camera poses: pose lines, TUM, COLMAP, photos' tags, autopilot angles, records."""
+    from companion.convert.formats import READERS, WRITERS, Place
+    from companion.convert.photos import Heights
+
+    frame, separation = _frame(map_cache, origin)
+    separation = separation if geoid_separation is None else geoid_separation
+    above = None
+    if heights is not None:
+        if heights is HeightDatum.AMSL and separation is None:
+            raise ConfigError("--heights amsl needs --geoid-separation or --map")
+        above = Heights(heights.value, separation or 0.0)
+    place = Place(frame, above)
+    poses = _dated(READERS[of.value](source, place), times, needed=to is Target.TUM)
+    try:
+        WRITERS[to.value](out, poses, place)
+    except OSError as error:
+        raise ReportError(f"{out}: cannot be written: {error.strerror or error}") from error
+    typer.echo(f"{out}: {len(poses)} poses")
+
+
+def _frame(map_cache: Path | None, origin: str | None) -> tuple[LocalFrame, float | None]:
+    """The ENU frame, and the geoid's separation there if a map says it."""
+    if (map_cache is None) == (origin is None):
+        raise ConfigError("poses need a frame: give either --map or --origin LAT,LON,HEIGHT")
+    if origin is not None:
+        lat, lon, height = numbers(origin, "--origin", ("LAT", "LON", "HEIGHT"))
+        return LocalFrame(Geodetic(lat, lon, height)), None
+    from localizer.map.cache.cache import TileCache
+
+    cache = TileCache.open(Path(str(map_cache)))
+    return cache.frame, cache.manifest.geoid_separation_m
+
+
+def _dated(
+    poses: Sequence[StampedPose], times: Path | None, *, needed: bool
+) -> tuple[StampedPose, ...]:
+    """The poses with the file's times, or with the names that it has for their times."""
+    if times is None:
+        if needed and any(pose.time_ns is None for pose in poses):
+            raise ConfigError("these poses have no times: give --times timestamps.txt")
+        return tuple(poses)
+    from companion.sources.folder_source import read_timestamps
+
+    by_name = read_timestamps(times)
+    names = {time_ns: name for name, time_ns in by_name.items()}
+    dated = []
+    for pose in poses:
+        if pose.name in by_name:
+            dated.append(replace(pose, time_ns=by_name[pose.name]))
+        elif pose.time_ns in names:
+            dated.append(replace(pose, name=names[pose.time_ns]))
+        else:
+            raise ConfigError(f"--times {times}: says nothing of {pose.name}")
+    return tuple(dated)

@@ -1,0 +1,174 @@
+"""``companion localize``: where were these images taken? Their true poses need not be known."""
+
+from __future__ import annotations
+
+import csv
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Annotated
+
+import numpy as np
+import typer
+from rich.console import Console
+from rich.markup import escape
+from rich.progress import Progress
+
+from companion.cli.geographic import numbers
+from companion.errors import ConfigError, ReportError
+from companion.offline.localize import LocalizedImage, Sigmas, image_times, localize_images
+from companion.offline.trajectories import stamped, write_trajectory
+from companion.sources.folder_source import list_images
+from localizer.config import LocalizerConfig
+from localizer.geometry.camera import Camera
+from localizer.geometry.geo import Geodetic, LocalFrame
+from localizer.geometry.pose import Pose
+from localizer.geometry.posefile import PoseRow, read_poses, world_from_camera
+from localizer.registration.devices import DeviceChoice
+from localizer.render.select import Backend
+from localizer.tracking.opening import open_localizer
+from localizer.types import PoseEstimate
+
+COLUMNS = (
+    "name", "latitude_deg", "longitude_deg", "height_m", "sigma_east_m", "sigma_north_m",
+    "sigma_up_m", "sigma_rotation_deg", "quality", "state", "status", "accepted", "problem",
+)  # fmt: skip
+
+
+def localize_command(
+    images: Annotated[Path, typer.Argument(help="an image, or a folder of images in order")],
+    map_cache: Annotated[Path, typer.Option("--map", help="tile cache")],
+    camera: Annotated[Path, typer.Option(help="camera.json: the images' intrinsics")],
+    prior: Annotated[
+        str | None,
+        typer.Option(
+            help="about where the first image was taken: LAT,LON,HEIGHT,ROLL,PITCH,YAW in degrees "
+            "and metres above the ellipsoid, angles as in a pose file (pitch 0 looks straight "
+            "down, yaw counter-clockwise from north)"
+        ),
+    ] = None,
+    priors: Annotated[
+        Path | None, typer.Option(help="pose file: about where each image named in it was taken")
+    ] = None,
+    prior_sigma_m: Annotated[
+        float, typer.Option(min=0.01, max=1000, help="how well the priors' place is known, m")
+    ] = 5.0,
+    prior_sigma_deg: Annotated[
+        float, typer.Option(min=0.01, max=180, help="and their attitude, degrees")
+    ] = 4.0,
+    out: Annotated[Path, typer.Option(help="folder of the results")] = Path("localized"),
+    rate_hz: Annotated[
+        float, typer.Option(min=0.001, max=1000, help="of images without timestamps.txt")
+    ] = 30.0,
+    width: Annotated[int, typer.Option(min=64, max=2048, help="working width, pixels")] = 320,
+    renderer: Annotated[
+        Backend, typer.Option(help="auto: a GPU where there is one, else numba")
+    ] = "auto",
+    device: Annotated[
+        DeviceChoice, typer.Option(help="of the optimizer; auto, cuda: a GPU that works, else CPU")
+    ] = "auto",
+    model: Annotated[Path | None, typer.Option(help="ONNX feature network")] = None,
+) -> None:
+    """Localize images against a map; exit code 1 if not one of them was localized."""
+    if (prior is None) == (priors is None):
+        raise ConfigError("give either --prior (of the first image) or --priors (a pose file)")
+    paths = list_images(images) if images.is_dir() else [images]
+    intrinsics = Camera.from_json(camera)
+    rows = read_poses(priors) if priors is not None else [_row(paths[0].name, str(prior))]
+    if paths[0].name not in {row.name for row in rows}:
+        raise ConfigError(f"--priors {priors}: has no line for the first image, {paths[0].name}")
+    _prepare(out)
+    config = LocalizerConfig(
+        width=width, model=model, renderer=renderer, device=device, feature_threads=2
+    )
+    times = image_times(paths, rate_hz)
+    with open_localizer(map_cache, intrinsics, config) as localizer, Progress() as bar:
+        frame = localizer.frame
+        known: Mapping[str, Pose] = {row.name: world_from_camera(row, frame) for row in rows}
+        sigmas = Sigmas(prior_sigma_m, prior_sigma_deg)
+        found = list(
+            bar.track(
+                localize_images(localizer, paths, times, intrinsics, known, sigmas),
+                total=len(paths),
+                description="localizing",
+            )
+        )
+    accepted = _print(found, frame)
+    try:
+        _write(out, found, frame)
+    except OSError as error:
+        raise ReportError(f"--out {out}: cannot be written: {error}") from error
+    raise typer.Exit(0 if accepted else 1)
+
+
+def _row(name: str, prior: str) -> PoseRow:
+    lat, lon, height, roll, pitch, yaw = numbers(
+        prior, "--prior", ("LAT", "LON", "HEIGHT", "ROLL", "PITCH", "YAW")
+    )
+    return PoseRow(name, Geodetic(lat, lon, height), roll, pitch, yaw)
+
+
+def _prepare(folder: Path) -> None:
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise ReportError(f"--out {folder}: cannot be written: {error}") from error
+
+
+def _print(found: Sequence[LocalizedImage], frame: LocalFrame) -> int:
+    """Where a single image was taken, and how many of several were localized."""
+    for image in found:
+        if image.problem:
+            text = escape(f"{image.name}: {image.problem}")
+            Console(stderr=True).print(text, style="yellow", soft_wrap=True, highlight=False)
+    estimates = [i.estimate for i in found if i.estimate is not None and i.estimate.accepted]
+    if len(found) == 1 and estimates:
+        position, sigma = (
+            frame.position(estimates[0].world_from_camera.translation),
+            _sigmas(estimates[0]),
+        )
+        typer.echo(
+            f"{position.latitude_deg:.7f} {position.longitude_deg:.7f} {position.height_m:.2f} m "
+            f"above the ellipsoid, sigma {sigma[0]:.2f} {sigma[1]:.2f} {sigma[2]:.2f} m "
+            f"east north up, {sigma[3]:.3f}° of attitude"
+        )
+    typer.echo(f"{len(estimates)} of {len(found)} images localized")
+    return len(estimates)
+
+
+def _sigmas(estimate: PoseEstimate) -> list[float]:
+    """East, north and up in metres; the largest of the attitude in degrees."""
+    sigma = np.sqrt(estimate.covariance.diagonal())
+    return [*(float(x) for x in sigma[:3]), float(np.degrees(sigma[3:].max()))]
+
+
+def _write(folder: Path, found: Sequence[LocalizedImage], frame: LocalFrame) -> None:
+    used = [
+        stamped(i.name, i.estimate) for i in found if i.estimate is not None and i.estimate.accepted
+    ]
+    write_trajectory(folder, used, frame)
+    with (folder / "images.csv").open("w", newline="", encoding="utf-8") as file:
+        writer = csv.DictWriter(file, COLUMNS)
+        writer.writeheader()
+        writer.writerows(_csv_row(image, frame) for image in found)
+
+
+def _csv_row(image: LocalizedImage, frame: LocalFrame) -> dict[str, str]:
+    row = dict.fromkeys(COLUMNS, "") | {"name": image.name, "problem": image.problem}
+    estimate = image.estimate
+    if estimate is None:
+        return row
+    position = frame.position(estimate.world_from_camera.translation)
+    sigma = [f"{x:.4f}" for x in _sigmas(estimate)]
+    return (
+        row
+        | dict(zip(COLUMNS[4:8], sigma, strict=True))
+        | {
+            "latitude_deg": f"{position.latitude_deg:.9f}",
+            "longitude_deg": f"{position.longitude_deg:.9f}",
+            "height_m": f"{position.height_m:.3f}",
+            "quality": f"{estimate.quality:.3f}",
+            "state": estimate.state.value,
+            "status": estimate.status.name,
+            "accepted": str(int(estimate.accepted)),
+        }
+    )

@@ -1,0 +1,1 @@
+"""Camera poses from and to the formats of other programs."""

@@ -1,0 +1,104 @@
+"""The angle conventions around a camera's pose (docs/angles.md), turned into each other.
+
+Everything meets in one place: NED from camera, (3, 3), axes OpenCV, at the camera's position.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from companion.geometry import (
+    GIMBAL_FROM_CAMERA,
+    GimbalAngles,
+    GimbalFrame,
+    Mount,
+    camera_attitude,
+    ned_from_world,
+    world_from_camera,
+)
+from localizer.geometry.geo import Geodetic, LocalFrame
+from localizer.geometry.pose import Array, Pose, euler_from_matrix, matrix_from_euler
+
+_LOCKED = 1e-9  # cosine of a pitch at which roll and yaw turn about the same axis
+
+
+@dataclass(frozen=True)
+class Angles:
+    """Rz(yaw) Ry(pitch) Rx(roll), in degrees: a body's in NED, or a gimbal's."""
+
+    roll_deg: float
+    pitch_deg: float
+    yaw_deg: float
+
+    @property
+    def radians(self) -> tuple[float, float, float]:
+        """(roll, pitch, yaw)."""
+        roll, pitch, yaw = np.radians([self.roll_deg, self.pitch_deg, self.yaw_deg])
+        return float(roll), float(pitch), float(yaw)
+
+
+@dataclass(frozen=True)
+class AutopilotAngles:
+    """What an autopilot says of a camera: its position, the body's attitude (FRD to NED), and the
+    gimbal's (`GimbalFrame` says against what).
+    """
+
+    name: str
+    time_ns: int | None
+    position: Geodetic
+    body: Angles
+    gimbal: Angles
+    gimbal_frame: GimbalFrame = GimbalFrame.HEADING
+
+
+def pose_of_autopilot(angles: AutopilotAngles, frame: LocalFrame) -> Pose:
+    """The camera's pose in the map. The position is taken as the camera's: no lever arm."""
+    p = angles.position
+    body = matrix_from_euler(*angles.body.radians)
+    gimbal = GimbalAngles(*angles.gimbal.radians, angles.gimbal_frame)
+    return world_from_camera(
+        frame.enu_from_geodetic(p.latitude_deg, p.longitude_deg, p.height_m),
+        body,
+        camera_attitude(body, gimbal, Mount.from_degrees()),
+        np.zeros(3),
+        ned_from_world(frame, p),
+    )
+
+
+def autopilot_of_pose(
+    name: str, time_ns: int | None, pose: Pose, frame: LocalFrame
+) -> AutopilotAngles:
+    """A vehicle that would see so: level, its nose where the camera looks, the rest the gimbal's.
+
+    A camera's pose alone does not say how the vehicle was tilted.
+    """
+    position = frame.position(pose.translation)
+    gimbal = gimbal_of_pose(pose, frame)
+    body = Angles(0.0, 0.0, gimbal.yaw_deg)
+    relative = Angles(gimbal.roll_deg, gimbal.pitch_deg, 0.0)
+    return AutopilotAngles(name, time_ns, position, body, relative)
+
+
+def gimbal_of_pose(pose: Pose, frame: LocalFrame) -> Angles:
+    """The angles of a gimbal against north and the horizon, as DJI's XMP tells them."""
+    to_ned = ned_from_world(frame, frame.position(pose.translation))
+    return angles_of_matrix(to_ned @ pose.rotation @ GIMBAL_FROM_CAMERA.T)
+
+
+def pose_of_gimbal(position: Geodetic, gimbal: Angles, frame: LocalFrame) -> Pose:
+    """Inverse of `gimbal_of_pose`, with the camera's place."""
+    angles = AutopilotAngles("", None, position, Angles(0.0, 0.0, 0.0), gimbal, GimbalFrame.EARTH)
+    return pose_of_autopilot(angles, frame)
+
+
+def angles_of_matrix(R: Array) -> Angles:
+    """Euler angles of a rotation (3, 3). Straight down, where roll and yaw are one, roll is 0."""
+    if np.hypot(R[0, 0], R[1, 0]) < _LOCKED:
+        pitch = float(np.copysign(np.pi / 2, -R[2, 0]))
+        roll, yaw = 0.0, float(np.arctan2(-R[0, 1], R[1, 1]))
+    else:
+        roll, pitch, yaw = euler_from_matrix(R)
+    degrees = np.degrees([roll, pitch, yaw])
+    return Angles(float(degrees[0]), float(degrees[1]), float(degrees[2]))

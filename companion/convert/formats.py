@@ -1,0 +1,200 @@
+"""Reading and writing camera poses: one reader and one writer a format.
+
+All poses are `StampedPose` in the map's ENU frame in between.
+"""
+
+from __future__ import annotations
+
+import csv
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from companion.convert.angles import (
+    Angles,
+    AutopilotAngles,
+    autopilot_of_pose,
+    pose_of_autopilot,
+)
+from companion.convert.photos import Heights, read_photos, write_sidecars
+from companion.geometry import GimbalFrame
+from localizer.errors import GeoreferenceError, PoseFileError
+from localizer.geometry.geo import Geodetic, LocalFrame
+from localizer.geometry.pose import Pose, matrix_from_quaternion, quaternion_from_matrix
+from localizer.geometry.posefile import pose_row, read_poses, world_from_camera, write_poses
+from localizer.geometry.trajectory import StampedPose, read_tum, write_tum
+
+AUTOPILOT_COLUMNS = (
+    "name", "time_ns", "latitude_deg", "longitude_deg", "height_m",
+    "roll_deg", "pitch_deg", "yaw_deg",
+    "gimbal_roll_deg", "gimbal_pitch_deg", "gimbal_yaw_deg", "gimbal_frame",
+)  # fmt: skip
+_IMAGES_TXT = "IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME"
+
+
+@dataclass(frozen=True)
+class Place:
+    """What a conversion needs to know of the map. heights: of photos' tags, None if not known."""
+
+    frame: LocalFrame
+    heights: Heights | None = None
+
+
+Reader = Callable[[Path, Place], tuple[StampedPose, ...]]
+Writer = Callable[[Path, Sequence[StampedPose], Place], None]
+
+
+def _read_poses(path: Path, place: Place) -> tuple[StampedPose, ...]:
+    return tuple(
+        StampedPose(row.name, world_from_camera(row, place.frame)) for row in read_poses(path)
+    )
+
+
+def _write_poses(path: Path, poses: Sequence[StampedPose], place: Place) -> None:
+    for pose in poses:
+        if not pose.name or pose.name.split() != [pose.name]:
+            raise PoseFileError(f"{path}: a pose line cannot hold the name {pose.name!r}")
+    write_poses(path, (pose_row(p.name, p.world_from_camera, place.frame) for p in poses))
+
+
+def _read_tum(path: Path, place: Place) -> tuple[StampedPose, ...]:
+    return read_tum(path)
+
+
+def _write_tum(path: Path, poses: Sequence[StampedPose], place: Place) -> None:
+    write_tum(path, poses)
+
+
+def _read_colmap(path: Path, place: Place) -> tuple[StampedPose, ...]:
+    """Poses of an ``images.txt``: camera from world, two lines an image, the second of points."""
+    rows = [
+        (number, line)
+        for number, line in enumerate(_lines(path), start=1)
+        if not line.startswith("#")
+    ]
+    while rows and not rows[0][1].strip():
+        rows.pop(0)
+    poses = tuple(_parse_colmap(line, f"{path}:{n}") for n, line in rows[::2] if line.strip())
+    if not poses:
+        raise PoseFileError(f"{path}: holds no image; expected '{_IMAGES_TXT}'")
+    return poses
+
+
+def _parse_colmap(line: str, where: str) -> StampedPose:
+    parts = line.split(maxsplit=9)
+    try:
+        if len(parts) != 10:
+            raise ValueError(f"expected '{_IMAGES_TXT}', got {len(parts)} fields")
+        q, t = np.array([float(x) for x in parts[1:5]]), np.array([float(x) for x in parts[5:8]])
+        if not np.isfinite([*q, *t]).all() or abs(np.linalg.norm(q) - 1.0) > 0.01:
+            raise ValueError("not a unit quaternion and a translation")
+    except ValueError as error:
+        raise PoseFileError(f"{where}: {error}") from error
+    return StampedPose(parts[9].strip(), Pose(matrix_from_quaternion(q), t).inverse)
+
+
+def _write_colmap(path: Path, poses: Sequence[StampedPose], place: Place) -> None:
+    lines = [f"# {_IMAGES_TXT}\n# world: the map's ENU frame, metres; no points\n"]
+    for number, pose in enumerate(poses, start=1):
+        inverse = pose.world_from_camera.inverse
+        q = " ".join(f"{x:.12f}" for x in quaternion_from_matrix(inverse.rotation))
+        t = " ".join(f"{x:.9f}" for x in inverse.translation)
+        lines.append(f"{number} {q} {t} 1 {pose.name}\n\n")
+    path.write_text("".join(lines), encoding="utf-8")
+
+
+def _read_autopilot(path: Path, place: Place) -> tuple[StampedPose, ...]:
+    poses = []
+    for number, row in enumerate(csv.DictReader(_lines(path)), start=2):
+        angles = _autopilot_row(row, f"{path}:{number}")
+        pose = pose_of_autopilot(angles, place.frame)
+        poses.append(StampedPose(angles.name, pose, angles.time_ns))
+    if not poses:
+        raise PoseFileError(f"{path}: holds no row; expected {','.join(AUTOPILOT_COLUMNS)}")
+    return tuple(poses)
+
+
+def _autopilot_row(row: dict[str, Any], where: str) -> AutopilotAngles:
+    try:
+        lat, lon, height, *angles = (float(row[name]) for name in AUTOPILOT_COLUMNS[2:11])
+        if not np.isfinite(angles).all():
+            raise ValueError("angles must be finite")
+        return AutopilotAngles(
+            row["name"],
+            int(row["time_ns"]) if row["time_ns"] else None,
+            Geodetic(lat, lon, height),
+            Angles(*angles[:3]),
+            Angles(*angles[3:]),
+            GimbalFrame(row["gimbal_frame"]),
+        )
+    except (KeyError, TypeError, ValueError, GeoreferenceError) as error:
+        raise PoseFileError(
+            f"{where}: {type(error).__name__} {error}; expected {','.join(AUTOPILOT_COLUMNS)}, "
+            "gimbal_frame heading, earth or body"
+        ) from error
+
+
+def _write_autopilot(path: Path, poses: Sequence[StampedPose], place: Place) -> None:
+    with path.open("w", newline="", encoding="utf-8") as file:
+        writer = csv.writer(file)
+        writer.writerow(AUTOPILOT_COLUMNS)
+        for pose in poses:
+            a = autopilot_of_pose(pose.name, pose.time_ns, pose.world_from_camera, place.frame)
+            p, angles = a.position, (a.body, a.gimbal)
+            writer.writerow([
+                a.name, "" if a.time_ns is None else a.time_ns,
+                f"{p.latitude_deg:.9f}", f"{p.longitude_deg:.9f}", f"{p.height_m:.4f}",
+                *(f"{x:.7f}" for x in _flat(angles)), a.gimbal_frame.value,
+            ])  # fmt: skip
+
+
+def _flat(angles: Iterable[Angles]) -> Iterable[float]:
+    for a in angles:
+        yield from (a.roll_deg, a.pitch_deg, a.yaw_deg)
+
+
+def _read_record(path: Path, place: Place) -> tuple[StampedPose, ...]:
+    """The accepted estimates of a flight's record (its folder, or its ``estimates.csv``)."""
+    from companion.offline.replay import read_estimates
+
+    file = path / "estimates.csv" if path.is_dir() else path
+    return tuple(
+        StampedPose(f"{e.exposure_time_ns}.jpg", e.world_from_camera, e.exposure_time_ns)
+        for e in read_estimates(file)
+        if e.accepted
+    )
+
+
+def _read_photos(path: Path, place: Place) -> tuple[StampedPose, ...]:
+    return read_photos(path, place.frame, place.heights)
+
+
+def _write_photos(path: Path, poses: Sequence[StampedPose], place: Place) -> None:
+    write_sidecars(path, poses, place.frame, place.heights)
+
+
+def _lines(path: Path) -> list[str]:
+    try:
+        return path.read_text(encoding="utf-8").splitlines()
+    except (OSError, UnicodeDecodeError) as error:
+        raise PoseFileError(f"{path}: cannot be read: {error}") from error
+
+
+READERS: dict[str, Reader] = {
+    "poses": _read_poses,
+    "tum": _read_tum,
+    "colmap": _read_colmap,
+    "photos": _read_photos,
+    "autopilot": _read_autopilot,
+    "record": _read_record,
+}
+WRITERS: dict[str, Writer] = {
+    "poses": _write_poses,
+    "tum": _write_tum,
+    "colmap": _write_colmap,
+    "photos": _write_photos,
+    "autopilot": _write_autopilot,
+}

@@ -1,0 +1,161 @@
+"""Poses in photos' tags: EXIF's GPS position, DJI's gimbal angles in XMP; XMP sidecars.
+
+XMP stands in the JPEG itself (an APP1 segment) or beside it as NAME.xmp, which wins. Gimbal angles:
+roll, pitch (0 horizontal, -90 down), yaw from north clockwise, Rz(yaw) Ry(pitch) Rx(roll).
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+from PIL import ExifTags, Image
+
+from companion.convert.angles import Angles, gimbal_of_pose, pose_of_gimbal
+from localizer.errors import GeoreferenceError, PoseFileError
+from localizer.geometry.geo import Geodetic, LocalFrame
+from localizer.geometry.trajectory import StampedPose
+
+_PHOTO_SUFFIXES = frozenset({".jpg", ".jpeg"})
+_XMP_HEADER = b"http://ns.adobe.com/xap/1.0/\x00"
+_LARGEST_BYTES = 1 << 20  # of a photo's head, in which its tags stand
+_ANGLES = ("GimbalRollDegree", "GimbalPitchDegree", "GimbalYawDegree")
+_SIDECAR = """<x:xmpmeta xmlns:x="adobe:ns:meta/">
+ <rdf:RDF xmlns:rdf="http://www.w3.org/1999/02/22-rdf-syntax-ns#">
+  <rdf:Description rdf:about="" xmlns:drone-dji="http://www.dji.com/drone-dji/1.0/"
+{attributes}/>
+ </rdf:RDF>
+</x:xmpmeta>
+"""
+
+
+@dataclass(frozen=True)
+class Heights:
+    """What the heights in photos' tags are above. separation_m: of the geoid from the ellipsoid."""
+
+    datum: Literal["amsl", "ellipsoidal"]
+    separation_m: float = 0.0
+
+    @property
+    def lift_m(self) -> float:
+        """What is added to a tag's height to be above the ellipsoid."""
+        return self.separation_m if self.datum == "amsl" else 0.0
+
+
+def read_photos(path: Path, frame: LocalFrame, heights: Heights | None) -> tuple[StampedPose, ...]:
+    """The pose of each photo of a folder, by name, or of one photo."""
+    lift = _known(path, heights).lift_m
+    photos = [path]
+    if path.is_dir():
+        photos = sorted(p for p in path.iterdir() if p.suffix.lower() in _PHOTO_SUFFIXES)
+        # Sidecars alone, as `write_sidecars` leaves them.
+        stems = {p.stem for p in photos}
+        photos += sorted(p for p in path.glob("*.xmp") if p.stem not in stems)
+    if not photos:
+        raise PoseFileError(f"{path}: holds no photo (.jpg, .jpeg) and no sidecar (.xmp)")
+    return tuple(_read_photo(photo, frame, lift) for photo in photos)
+
+
+def write_sidecars(
+    folder: Path, poses: Sequence[StampedPose], frame: LocalFrame, heights: Heights | None
+) -> None:
+    """``NAME.xmp`` per pose, with DJI's tags; photos themselves are never changed."""
+    lift = _known(folder, heights).lift_m
+    folder.mkdir(parents=True, exist_ok=True)
+    for pose in poses:
+        position = frame.position(pose.world_from_camera.translation)
+        gimbal = gimbal_of_pose(pose.world_from_camera, frame)
+        tags = {
+            "GpsLatitude": f"{position.latitude_deg:.9f}",
+            "GpsLongitude": f"{position.longitude_deg:.9f}",
+            "AbsoluteAltitude": f"{position.height_m - lift:+.4f}",
+            "GimbalRollDegree": f"{gimbal.roll_deg:+.7f}",
+            "GimbalPitchDegree": f"{gimbal.pitch_deg:+.7f}",
+            "GimbalYawDegree": f"{gimbal.yaw_deg:+.7f}",
+        }
+        attributes = "\n".join(f'   drone-dji:{name}="{value}"' for name, value in tags.items())
+        file = folder / Path(pose.name).with_suffix(".xmp").name
+        file.write_text(_SIDECAR.format(attributes=attributes), encoding="utf-8")
+
+
+def _known(path: Path, heights: Heights | None) -> Heights:
+    if heights is None:
+        raise GeoreferenceError(
+            f"{path}: photos' tags do not say what their heights are above: give --heights amsl or "
+            "ellipsoidal (RTK drones may write either; see the maker's manual)"
+        )
+    return heights
+
+
+def _read_photo(path: Path, frame: LocalFrame, lift_m: float) -> StampedPose:
+    tags = _xmp_tags(path)
+    missing = [name for name in _ANGLES if name not in tags]
+    if missing:
+        raise PoseFileError(f"{path}: its XMP lacks {', '.join(missing)}; which camera took it?")
+    try:
+        lat, lon, height = _xmp_position(tags) or _exif_position(path)
+        angles = Angles(*(float(tags[name]) for name in _ANGLES))
+        if not np.isfinite(angles.radians).all():
+            raise ValueError("angles must be finite")
+        position = Geodetic(lat, lon, height + lift_m)
+    except (ValueError, GeoreferenceError) as error:
+        raise PoseFileError(f"{path}: {error}") from error
+    return StampedPose(path.name, pose_of_gimbal(position, angles, frame))
+
+
+def _xmp_tags(path: Path) -> dict[str, str]:
+    """DJI's tags by name: as attributes or as elements, both occur."""
+    sidecar = path.with_suffix(".xmp")
+    try:
+        if sidecar.is_file():
+            text = sidecar.read_text(encoding="utf-8")
+        else:
+            with path.open("rb") as file:
+                head = file.read(_LARGEST_BYTES)
+            begin = head.find(_XMP_HEADER)
+            end = head.find(b"</x:xmpmeta>", begin)
+            if begin < 0 or end < 0:
+                raise PoseFileError(f"{path}: has no XMP tags, and there is no {sidecar.name}")
+            text = head[begin:end].decode("utf-8", errors="replace")
+    except (OSError, UnicodeDecodeError) as error:
+        raise PoseFileError(f"{path}: cannot be read: {error}") from error
+    tags = dict(re.findall(r'drone-dji:(\w+)\s*=\s*"([^"]*)"', text))
+    return tags | dict(re.findall(r"<drone-dji:(\w+)>([^<]*)</", text))
+
+
+def _xmp_position(tags: dict[str, str]) -> tuple[float, float, float] | None:
+    """(latitude, longitude, height) of the tags; None where a part is missing."""
+    # "GpsLongtitude" is how some of DJI's firmwares spell it.
+    longitude = tags.get("GpsLongitude", tags.get("GpsLongtitude"))
+    values = (tags.get("GpsLatitude"), longitude, tags.get("AbsoluteAltitude"))
+    if any(value is None for value in values):
+        return None
+    lat, lon, height = (float(value) for value in values if value is not None)
+    return lat, lon, height
+
+
+def _exif_position(path: Path) -> tuple[float, float, float]:
+    try:
+        with Image.open(path) as image:
+            gps = image.getexif().get_ifd(ExifTags.IFD.GPSInfo)
+    except OSError as error:
+        raise PoseFileError(f"{path}: cannot be read: {error}") from error
+    try:
+        lat = _degrees(gps[ExifTags.GPS.GPSLatitude], gps[ExifTags.GPS.GPSLatitudeRef] == "S")
+        lon = _degrees(gps[ExifTags.GPS.GPSLongitude], gps[ExifTags.GPS.GPSLongitudeRef] == "W")
+        height = float(gps[ExifTags.GPS.GPSAltitude])
+    except (KeyError, TypeError, ZeroDivisionError) as error:
+        raise PoseFileError(f"{path}: has no GPS position in EXIF or XMP: {error}") from error
+    # 1 and b"\\x01" both occur; Pillow gives the byte as it stands.
+    below = gps.get(ExifTags.GPS.GPSAltitudeRef, 0) in (1, b"\x01")
+    return lat, lon, -height if below else height
+
+
+def _degrees(parts: Sequence[float], negative: bool) -> float:
+    degrees, minutes, seconds = (float(part) for part in parts)
+    value = degrees + minutes / 60 + seconds / 3600
+    return -value if negative else value

@@ -1,0 +1,86 @@
+"""Images localized without their true poses: photos with priors, or a video's frames."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from companion.errors import StreamDecodeError, StreamSizeError
+from companion.sources.base import fitted_camera
+from companion.sources.folder_source import TIMESTAMPS_NAME, read_image, read_timestamps
+from localizer.errors import OutsideMapError
+from localizer.geometry.camera import Camera
+from localizer.geometry.pose import Pose
+from localizer.tracking.pipeline import Localizer
+from localizer.types import Frame, PoseEstimate, PosePrior
+
+_PASSES = 3  # of an image that starts from a prior: the view from there shows another place
+
+
+@dataclass(frozen=True)
+class Sigmas:
+    """How well priors are known, standard deviations per axis."""
+
+    position_m: float
+    rotation_deg: float
+
+
+@dataclass(frozen=True)
+class LocalizedImage:
+    """One image's outcome. estimate: None where there is none; `problem` says why then."""
+
+    name: str
+    estimate: PoseEstimate | None
+    problem: str = ""
+
+
+def image_times(images: Sequence[Path], rate_hz: float) -> tuple[int, ...]:
+    """Exposure times in ns, from ``timestamps.txt`` beside the images, else at `rate_hz`."""
+    file = images[0].parent / TIMESTAMPS_NAME
+    if not file.is_file():
+        return tuple(round((k + 1) * 1e9 / rate_hz) for k in range(len(images)))
+    stamps = read_timestamps(file)
+    missing = [path.name for path in images if path.name not in stamps]
+    if missing:
+        raise StreamDecodeError(f"{file}: has no time for {missing[0]}; add it or remove the file")
+    return tuple(stamps[path.name] for path in images)
+
+
+def localize_images(
+    localizer: Localizer,
+    images: Sequence[Path],
+    times_ns: Sequence[int],
+    camera: Camera,
+    priors: Mapping[str, Pose],
+    sigmas: Sigmas,
+) -> Iterator[LocalizedImage]:
+    """Localize images in their order.
+
+    An image named in `priors` starts from its own; the others go on from the one before, as a
+    video's frames do. An image that cannot be used, or that is outside the map, is told and left
+    out.
+    """
+    for sequence, (path, time_ns) in enumerate(zip(images, times_ns, strict=True)):
+        prior = priors.get(path.name)
+        if prior is not None:
+            around = PosePrior.around(prior, sigmas.position_m, sigmas.rotation_deg, time_ns)
+            localizer.set_prior(around)
+        try:
+            frame = _frame(path, camera, time_ns, sequence)
+            estimate = localizer.track(frame, passes=1 if prior is None else _PASSES)
+        except (OutsideMapError, StreamDecodeError, StreamSizeError) as error:
+            yield LocalizedImage(path.name, None, str(error))
+            continue
+        problem = "" if estimate.accepted else f"rejected: {_why(estimate)}"
+        yield LocalizedImage(path.name, estimate, problem)
+
+
+def _frame(path: Path, camera: Camera, time_ns: int, sequence: int) -> Frame:
+    image = read_image(path)
+    fitted = fitted_camera(image.shape[1], image.shape[0], camera, str(path))
+    return Frame(image, time_ns, fitted, sequence)
+
+
+def _why(estimate: PoseEstimate) -> str:
+    return f"{estimate.status.value}, quality {estimate.quality:.2f}"

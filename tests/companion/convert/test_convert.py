@@ -1,0 +1,236 @@
+"""Poses from and to other programs' formats: there and back, and against cases made by hand."""
+
+import csv
+
+import numpy as np
+import pytest
+from PIL import Image
+from typer.testing import CliRunner
+
+from companion.cli.commands import app
+from companion.convert.angles import Angles, angles_of_matrix, gimbal_of_pose, pose_of_gimbal
+from companion.convert.formats import AUTOPILOT_COLUMNS
+from companion.errors import ConfigError
+from companion.flight.recorder import ESTIMATE_COLUMNS
+from localizer.errors import GeoreferenceError, PoseFileError
+from localizer.geometry.geo import Geodetic, LocalFrame
+from localizer.geometry.pose import matrix_from_euler, quaternion_from_matrix
+from localizer.geometry.posefile import PoseRow, read_poses, world_from_camera, write_poses
+
+ORIGIN = Geodetic(47.3, 8.5, 450.0)
+FRAME = LocalFrame(ORIGIN)
+PLACE = ("--origin", "47.3,8.5,450")
+ROWS = (
+    PoseRow("a.jpg", Geodetic(47.301, 8.502, 560.0), 3.0, 20.0, -40.0),
+    PoseRow("b.jpg", Geodetic(47.302, 8.499, 571.5), -2.0, 0.0, 170.0),  # straight down, rolled
+    PoseRow("c.jpg", Geodetic(47.299, 8.501, 600.25), 0.0, 0.0, 10.0),  # exactly straight down
+    PoseRow("d.jpg", Geodetic(47.3, 8.5, 520.0), 0.0, 85.0, -95.0),
+)
+
+
+def _convert(*arguments):
+    result = CliRunner().invoke(app, ["convert", *map(str, arguments)], catch_exceptions=False)
+    assert result.exit_code == 0, result.output
+    return result
+
+
+@pytest.fixture
+def poses(tmp_path):
+    path = tmp_path / "poses.txt"
+    write_poses(path, ROWS)
+    return path
+
+
+@pytest.fixture
+def times(tmp_path):
+    path = tmp_path / "timestamps.txt"
+    stamps = (1_700_000_000_123_456_789 + k * 200_000_000 for k in range(len(ROWS)))
+    path.write_text("".join(f"{r.name} {t}\n" for r, t in zip(ROWS, stamps, strict=True)))
+    return path
+
+
+def _same(path, metres=1e-3, degrees=2e-5, names=True):
+    found = read_poses(path)
+    assert len(found) == len(ROWS)
+    for a, b in zip(found, ROWS, strict=True):
+        moved, turned = world_from_camera(a, FRAME).distance_to(world_from_camera(b, FRAME))
+        assert moved < metres
+        assert turned < degrees
+        assert not names or a.name == b.name
+
+
+@pytest.mark.parametrize("between", ["poses", "colmap", "autopilot"])
+def test_there_and_back(poses, tmp_path, between):
+    _convert(poses, tmp_path / "x", "--from", "poses", "--to", between, *PLACE)
+    _convert(tmp_path / "x", tmp_path / "back.txt", "--from", between, "--to", "poses", *PLACE)
+    _same(tmp_path / "back.txt")
+
+
+def test_there_and_back_by_tum_with_the_names_of_the_times(poses, times, tmp_path):
+    dated = ("--times", times, *PLACE)
+    _convert(poses, tmp_path / "x.tum", "--from", "poses", "--to", "tum", *dated)
+    _convert(tmp_path / "x.tum", tmp_path / "back.txt", "--from", "tum", "--to", "poses", *dated)
+    _same(tmp_path / "back.txt")
+    first = (tmp_path / "x.tum").read_text().split()
+    assert first[0] == "1700000000.123456789"  # a float would have lost the nanoseconds
+    with pytest.raises(ConfigError, match="no times"):
+        _convert(poses, tmp_path / "y.tum", "--from", "poses", "--to", "tum", *PLACE)
+
+
+@pytest.mark.parametrize(("datum", "lift"), [("amsl", 47.5), ("ellipsoidal", 0.0)])
+def test_there_and_back_by_sidecars(poses, tmp_path, datum, lift):
+    heights = ("--heights", datum, "--geoid-separation", 47.5, *PLACE)
+    _convert(poses, tmp_path / "x", "--from", "poses", "--to", "photos", *heights)
+    assert f'AbsoluteAltitude="+{560 - lift:.4f}"' in (tmp_path / "x" / "a.xmp").read_text()
+    back = tmp_path / "back.txt"
+    _convert(tmp_path / "x", back, "--from", "photos", "--to", "poses", *heights)
+    _same(back, names=False)
+
+
+def test_heights_of_unknown_datum_are_no_guess(poses, tmp_path):
+    with pytest.raises(GeoreferenceError, match="--heights"):
+        _convert(poses, tmp_path / "x", "--from", "poses", "--to", "photos", *PLACE)
+    with pytest.raises(ConfigError, match="--geoid-separation"):
+        _convert(poses, tmp_path / "x", "--from", "poses", "--to", "photos", "--heights", "amsl",
+                 *PLACE)  # fmt: skip
+
+
+def _photo(path, xmp, *, below=False):
+    """A JPEG with EXIF's GPS position and an XMP segment, made by hand."""
+    exif = Image.Exif()
+    exif[0x8825] = {1: "S", 2: (12.0, 30.0, 36.0), 3: "W", 4: (77.0, 0.0, 18.0),
+                    5: b"\x01" if below else b"\x00", 6: 154.0}  # fmt: skip
+    Image.new("RGB", (16, 12)).save(path, exif=exif)
+    data = path.read_bytes()
+    payload = b"http://ns.adobe.com/xap/1.0/\x00" + xmp.encode()
+    segment = b"\xff\xe1" + (len(payload) + 2).to_bytes(2, "big") + payload
+    path.write_bytes(data[:2] + segment + data[2:])
+
+
+DJI = (
+    '<x:xmpmeta><rdf:Description drone-dji:GimbalRollDegree="+0.00" '
+    'drone-dji:GimbalYawDegree="+90.00"{more}>'
+    "<drone-dji:GimbalPitchDegree>-60.00</drone-dji:GimbalPitchDegree>"
+    "</rdf:Description></x:xmpmeta>"
+)
+
+
+def test_a_photos_own_tags(tmp_path):
+    """East, 60 degrees down: the camera's axes by hand, the position from EXIF."""
+    _photo(tmp_path / "DJI_0001.JPG", DJI.format(more=""))
+    out = tmp_path / "poses.txt"
+    options = ("--from", "photos", "--to", "poses", "--heights", "amsl", "--geoid-separation", 20,
+               "--origin", "-12.51,-77.005,170")  # fmt: skip
+    _convert(tmp_path, out, *options)
+    (row,) = read_poses(out)
+    assert row.name == "DJI_0001.JPG"
+    assert (row.position.latitude_deg, row.position.longitude_deg) == pytest.approx(
+        (-12.51, -77.005), abs=1e-8
+    )
+    assert row.position.height_m == pytest.approx(174.0)
+    R = world_from_camera(row, LocalFrame(row.position)).rotation
+    assert R[:, 2] == pytest.approx([0.5, 0, -np.sqrt(0.75)], abs=1e-6)  # forward
+    assert R[:, 0] == pytest.approx([0, -1, 0], abs=1e-6)  # right is south
+    assert (row.roll_deg, row.pitch_deg, row.yaw_deg) == pytest.approx((0, 30, -90), abs=1e-5)
+    # XMP's own position, more digits, wins.
+    more = ' drone-dji:GpsLatitude="-12.5" drone-dji:GpsLongtitude="-77.0" '
+    _photo(tmp_path / "DJI_0001.JPG", DJI.format(more=more + 'drone-dji:AbsoluteAltitude="+9.5"'))
+    _convert(tmp_path, out, *options)
+    (row,) = read_poses(out)
+    assert row.position.latitude_deg == pytest.approx(-12.5)
+    assert row.position.height_m == pytest.approx(29.5)
+
+
+def test_a_photo_without_angles_is_named(tmp_path):
+    options = ("--from", "photos", "--to", "poses", "--heights", "ellipsoidal", *PLACE)
+    Image.new("RGB", (16, 12)).save(tmp_path / "plain.jpg")
+    with pytest.raises(PoseFileError, match=r"plain\.jpg: has no XMP"):
+        _convert(tmp_path, tmp_path / "o", *options)
+    _photo(tmp_path / "plain.jpg", '<x:xmpmeta drone-dji:GimbalYawDegree="1"></x:xmpmeta>')
+    with pytest.raises(PoseFileError, match="lacks GimbalRollDegree, GimbalPitchDegree"):
+        _convert(tmp_path, tmp_path / "o", *options)
+
+
+@pytest.mark.parametrize("gimbal_frame", ["heading", "earth", "body"])
+def test_autopilot_angles_by_hand(tmp_path, gimbal_frame):
+    """Nose east, rolled 10 degrees right, a gimbal 30 degrees down: three meanings of one row."""
+    values = ["x.jpg", "5", "47.3", "8.5", "500", "10", "0", "90", "0", "-30", "0", gimbal_frame]
+    with (tmp_path / "a.csv").open("w", newline="") as file:
+        csv.writer(file).writerows([AUTOPILOT_COLUMNS, values])
+    _convert(tmp_path / "a.csv", tmp_path / "p", "--from", "autopilot", "--to", "poses", *PLACE)
+    (row,) = read_poses(tmp_path / "p")
+    forward = world_from_camera(row, FRAME).rotation[:, 2]
+    level, down = np.cos(np.radians(30)), np.sin(np.radians(30))
+    tilt = np.radians(10)
+    expected = {
+        "heading": [level, 0, -down],  # the horizon's pitch, the body's heading
+        "earth": [0, level, -down],  # north
+        # Rolled right, the body's down points to its left, which is north of a nose to the east.
+        "body": [level, down * np.sin(tilt), -down * np.cos(tilt)],
+    }
+    assert forward == pytest.approx(expected[gimbal_frame], abs=1e-6)
+
+
+def test_colmap_by_hand(tmp_path):
+    """A camera 100 m above the origin that looks down, its top to the north; points stand below."""
+    (tmp_path / "images.txt").write_text(
+        "# Image list\n1 0 1 0 0 0 0 100 1 dir name.jpg\n12.5 3.5 -1 7 8 9\n"
+    )
+    _convert(tmp_path / "images.txt", tmp_path / "x.csv", "--from", "colmap", "--to", "autopilot",
+             *PLACE)  # fmt: skip
+    with (tmp_path / "x.csv").open(newline="") as file:
+        (row,) = csv.DictReader(file)
+    assert row["name"] == "dir name.jpg"
+    assert float(row["height_m"]) == pytest.approx(550)
+    assert float(row["gimbal_pitch_deg"]) == pytest.approx(-90)
+    assert float(row["yaw_deg"]) == pytest.approx(0, abs=1e-6)
+    with pytest.raises(PoseFileError, match="cannot hold the name"):
+        _convert(tmp_path / "images.txt", tmp_path / "p", "--from", "colmap", "--to", "poses",
+                 *PLACE)  # fmt: skip
+
+
+def test_a_flights_record_becomes_a_trajectory(tmp_path):
+    record = tmp_path / "record"
+    record.mkdir()
+    q = quaternion_from_matrix(world_from_camera(ROWS[0], FRAME).rotation)
+    with (record / "estimates.csv").open("w", newline="") as file:
+        writer = csv.DictWriter(file, ESTIMATE_COLUMNS, restval="0")
+        writer.writeheader()
+        for k, accepted in enumerate("101"):
+            pose = dict(zip(("qw", "qx", "qy", "qz"), q, strict=True))
+            writer.writerow(pose | {"exposure_time_ns": 10**9 + k, "sequence": k, "east_m": k,
+                                    "latency_ms": 50, "accepted": accepted})  # fmt: skip
+    _convert(record, tmp_path / "x.tum", "--from", "record", "--to", "tum", *PLACE)
+    lines = np.loadtxt(tmp_path / "x.tum")
+    assert lines[:, 1] == pytest.approx([0, 2])  # the rejected one is none
+    assert lines[:, 4:] == pytest.approx(np.tile(q[[1, 2, 3, 0]], (2, 1)), abs=1e-8)
+
+
+@pytest.mark.parametrize(
+    ("of", "text"),
+    [
+        ("tum", "1 2 3\n"), ("tum", "1 0 0 0 0 0 0 0\n"), ("tum", "x 0 0 0 0 0 0 1\n"),
+        ("tum", "inf 0 0 0 0 0 0 1\n"), ("tum", "# nothing\n"),
+        ("colmap", "1 1 0 0 0 0 0 1 a.jpg\n"), ("colmap", "1 2 0 0 0 0 0 0 1 a.jpg\n\n"),
+        ("colmap", "\n"), ("autopilot", "name,time_ns\na,1\n"), ("autopilot", "name\n"),
+        ("poses", "a 1 2 3\n"),
+    ],
+)  # fmt: skip
+def test_what_is_no_pose_is_named_with_its_file(tmp_path, of, text):
+    (tmp_path / "bad").write_text(text)
+    with pytest.raises(PoseFileError, match="bad"):
+        _convert(tmp_path / "bad", tmp_path / "o", "--from", of, "--to", "colmap", *PLACE)
+
+
+def test_a_gimbal_straight_down_keeps_its_heading():
+    for yaw in (-170.0, 0.0, 33.0, 179.0):
+        angles = angles_of_matrix(matrix_from_euler(0.0, -np.pi / 2, np.radians(yaw)))
+        assert (angles.roll_deg, angles.pitch_deg) == (0.0, -90.0)
+        assert angles.yaw_deg == pytest.approx(yaw)
+        pose = pose_of_gimbal(ORIGIN, Angles(0.0, -90.0, yaw), FRAME)
+        assert gimbal_of_pose(pose, FRAME).yaw_deg == pytest.approx(yaw)
+
+
+def test_a_map_or_an_origin_is_needed(poses, tmp_path):
+    with pytest.raises(ConfigError, match="--map or --origin"):
+        _convert(poses, tmp_path / "x", "--from", "poses", "--to", "colmap")
