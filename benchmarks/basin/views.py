@@ -79,7 +79,7 @@ def _make_world(home: Path) -> None:
     info = build_visits(WorldConfig(seed, _WORLD_M), visits, processes=1)[0]
     for folder in visits:
         build_cache(
-            folder, home / f"{folder.name}.cache", origin=info.origin, workers=1, progress=False,
+            folder, home / f"{folder.name}.cache", origin=info.origin, workers=1,
             overwrite=True,
         )  # fmt: skip
     half = 0.36 * _WORLD_M
@@ -148,7 +148,6 @@ def _make_real(source: Path, home: Path, count: int) -> None:
         vertical_datum="ellipsoidal",
         origin=Geodetic(origin["lat"], origin["lon"], origin["height"]) if origin else None,
         overwrite=True,
-        progress=False,
     )
     if (source / "queries").exists():
         _store(home, photo_views(cache, source / "queries"))

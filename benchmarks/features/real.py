@@ -64,7 +64,6 @@ def _map(folder: Path, cache: Path, origin: Geodetic | None) -> Path:
             geoid_separation_m=0.0,
             vertical_datum="ellipsoidal",
             origin=origin,
-            progress=False,
         )
     return built
 

@@ -13,6 +13,7 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
+from companion.cli.import_bar import ImportBar
 from companion.errors import ReportError
 
 app = typer.Typer(no_args_is_help=True)
@@ -65,19 +66,21 @@ def build(
     from localizer.map.building.build import build_cache
 
     try:
-        manifest = build_cache(
-            source,
-            out,
-            geoid_separation_m=geoid_separation,
-            vertical_datum=vertical_datum,
-            georeference=georeference,
-            up_axis=up_axis,
-            attribution=attribution,
-            skip_bad_tiles=skip_bad_tiles,
-            overwrite=overwrite,
-            workers=workers,
-            scheduler=scheduler,
-        )
+        with ImportBar() as bar:
+            manifest = build_cache(
+                source,
+                out,
+                geoid_separation_m=geoid_separation,
+                vertical_datum=vertical_datum,
+                georeference=georeference,
+                up_axis=up_axis,
+                attribution=attribution,
+                skip_bad_tiles=skip_bad_tiles,
+                overwrite=overwrite,
+                workers=workers,
+                scheduler=scheduler,
+                progress=bar,
+            )
     except KeyboardInterrupt:
         Console(stderr=True).print("interrupted: the same command goes on with what is done")
         raise

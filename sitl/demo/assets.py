@@ -53,7 +53,7 @@ def prepare(
         build_visits(config, visits)
         for visit in visits:
             say(f"importing the {visit.name} tileset")
-            build_cache(visit / "tileset.json", home / f"{visit.name}-cache", progress=False)
+            build_cache(visit / "tileset.json", home / f"{visit.name}-cache")
         done.touch()
     caches = (home / "survey-cache", home / "live-cache")
     for cache in caches:

@@ -14,7 +14,7 @@ from localizer.geometry.geo import Geodetic, LocalFrame, geodetic_from_ecef
 from localizer.map.building.assembly import assemble
 from localizer.map.building.sources import find_source, read_source
 from localizer.map.building.staging import Record, publish, staging
-from localizer.map.building.workers import ImportJob, import_all, tiles_of
+from localizer.map.building.workers import ImportJob, Progress, import_all, tiles_of
 from localizer.map.cache.cache import HIGHEST_GEOID_M, LOWEST_GEOID_M, Manifest
 from localizer.map.importers.georeference import Georeference, UpAxis
 from localizer.map.source import SourceNode, SourceTree, VerticalDatum
@@ -35,7 +35,7 @@ def build_cache(
     skip_bad_tiles: bool = False,
     overwrite: bool = False,
     workers: int | None = None,
-    progress: bool = True,
+    progress: Progress | None = None,
     scheduler: str | None = None,
 ) -> Manifest:
     """Import a map source into a tile cache at `out`.
@@ -49,8 +49,9 @@ def build_cache(
     frame, else the source's centre. skip_bad_tiles: leave out tiles that cannot be imported (their
     parents are shown there) instead of failing. workers: processes, else one per core; more than
     one needs the usual ``if __name__ == "__main__"`` guard in a script. scheduler: address of a
-    Dask scheduler whose workers share the file system, instead of local processes. An interrupted
-    build goes on where it stopped.
+    Dask scheduler whose workers share the file system, instead of local processes. progress: told
+    the number of imported tiles and of all, at the start and after each. An interrupted build goes
+    on where it stopped.
     """
     given = [Path(source)] if isinstance(source, str | Path) else [Path(s) for s in source]
     sources, georeference = find_source(given, georeference)
@@ -83,7 +84,7 @@ def build_tree(
     skip_bad_tiles: bool = False,
     overwrite: bool = False,
     workers: int | None = None,
-    progress: bool = True,
+    progress: Progress | None = None,
     scheduler: str | None = None,
 ) -> Manifest:
     """Build a cache from any importer's tree; see `build_cache`. name: of the source."""
@@ -99,9 +100,8 @@ def build_tree(
     }
     with staging(Path(out), parameters, overwrite=overwrite) as staged:
         job = ImportJob(staged, frame, lift)
-        records = import_all(
-            tree.root, job, workers or os.cpu_count() or 1, scheduler, progress=progress
-        )
+        tell = progress or (lambda _done, _total: None)
+        records = import_all(tree.root, job, workers or os.cpu_count() or 1, scheduler, tell)
         skipped = _failures(tree.root, records)
         if skipped and not skip_bad_tiles:
             raise MapSourceError(_failure_text(name, skipped))

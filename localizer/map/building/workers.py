@@ -6,7 +6,7 @@ import multiprocessing
 import multiprocessing.connection
 import os
 import threading
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
 from dataclasses import dataclass, replace
@@ -14,13 +14,14 @@ from itertools import islice
 
 import cv2
 import numpy as np
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
 from localizer.errors import MapSourceError
 from localizer.geometry.geo import LocalFrame, geodetic_from_ecef
 from localizer.map.building.staging import Record, Staging
 from localizer.map.cache.tile import mesh_fault
 from localizer.map.source import SourceMesh, SourceNode, TileSource
+
+Progress = Callable[[int, int], None]
 
 
 @dataclass(frozen=True)
@@ -63,11 +64,12 @@ def tiles_of(root: SourceNode) -> Iterator[TileSource]:
 
 
 def import_all(
-    root: SourceNode, job: ImportJob, workers: int, scheduler: str | None, *, progress: bool
+    root: SourceNode, job: ImportJob, workers: int, scheduler: str | None, progress: Progress
 ) -> dict[int, Record]:
     """Records of every source tile, by its place in `tiles_of` order.
 
-    workers: local processes; scheduler: address of a Dask scheduler instead.
+    workers: local processes; scheduler: address of a Dask scheduler instead. progress: called here,
+    in the caller's thread, with the number of tiles that are done and of all.
     """
     records: dict[int, Record] = {}
     todo: list[tuple[int, TileSource]] = []
@@ -79,16 +81,15 @@ def import_all(
             todo.append((key, tile))
     if not records and not todo:
         raise MapSourceError("the source has no tile with content")
-    columns = (TextColumn("importing tiles"), BarColumn(), MofNCompleteColumn())
-    with Progress(*columns, TimeRemainingColumn(), disable=not progress) as bar:
-        task = bar.add_task("", total=len(records) + len(todo), completed=len(records))
-        if scheduler is not None:
-            run = _run_dask(job, todo, scheduler)
-        else:
-            run = _run_here(job, todo) if workers == 1 else _run_pool(job, todo, workers)
-        for key, record in run:
-            records[key] = record
-            bar.advance(task)
+    total = len(records) + len(todo)
+    progress(len(records), total)
+    if scheduler is not None:
+        run = _run_dask(job, todo, scheduler)
+    else:
+        run = _run_here(job, todo) if workers == 1 else _run_pool(job, todo, workers)
+    for key, record in run:
+        records[key] = record
+        progress(len(records), total)
     return records
 
 

@@ -41,7 +41,7 @@ def world_pairs(
         renderers = []
         for folder in looks:
             cache = root / f"{folder.name}.cache"
-            build_cache(folder, cache, origin=info.origin, workers=1, progress=False)
+            build_cache(folder, cache, origin=info.origin, workers=1)
             streamer = stack.enter_context(TileStreamer(TileCache.open(cache)))
             renderers.append(NumbaRenderer(streamer, threads=1))
         survey, days = renderers[0], renderers[1:]

@@ -168,7 +168,7 @@ def source(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def cache_path(source: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The cache of `source`; read only."""
     out = tmp_path_factory.mktemp("built") / "cache"
-    build_cache(source, out, workers=1, progress=False)
+    build_cache(source, out, workers=1)
     return out
 
 
@@ -183,7 +183,7 @@ def build(tmp_path: Path) -> Callable[..., TileCache]:
 
     def run(source: Path, **options) -> TileCache:
         out = tmp_path / "cache"
-        build_cache(source, out, workers=1, progress=False, **options)
+        build_cache(source, out, workers=1, **options)
         return TileCache.open(out)
 
     return run

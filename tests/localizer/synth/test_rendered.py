@@ -19,9 +19,7 @@ CAMERA = Camera.from_fov(320, 240, 60.0)
 def renderer(small_world, tmp_path_factory):
     folder, info = small_world["survey"]
     out = tmp_path_factory.mktemp("cache") / "map"
-    manifest = build_cache(
-        folder / "tileset.json", out, origin=info.origin, workers=1, progress=False
-    )
+    manifest = build_cache(folder / "tileset.json", out, origin=info.origin, workers=1)
     assert manifest.geoid_separation_m == info.geoid_separation_m
     streamer = TileStreamer(TileCache.open(out))
     yield NumbaRenderer(streamer, threads=1)

@@ -67,7 +67,6 @@ def cache(tmp_path_factory: pytest.TempPathFactory) -> Path:
         geoid_separation_m=47.0,
         origin=ORIGIN,
         workers=1,
-        progress=False,
     )
     return folder / "cache"
 

@@ -74,7 +74,7 @@ def imported(real_data, tmp_path_factory):
     def build(name: str, tileset: str, **options) -> tuple[Path, TileCache]:
         source = real_data(name) / tileset
         out = tmp_path_factory.mktemp(name) / "cache"
-        build_cache(source, out, progress=False, workers=2, **options)
+        build_cache(source, out, workers=2, **options)
         return source, TileCache.open(out)
 
     return build

@@ -101,7 +101,7 @@ def test_a_texture_that_changes_while_a_build_rests_begins_it_anew(tmp_path, mon
             raise KeyboardInterrupt
         return store(self, key, meshes)
 
-    options = {"georeference": Georeference(origin=ORIGIN), "workers": 1, "progress": False}
+    options = {"georeference": Georeference(origin=ORIGIN), "workers": 1}
     options |= DATUM
     monkeypatch.setattr(Staging, "store", interrupted)
     monkeypatch.setattr("localizer.map.building.quadtree.LEAF_TRIANGLES", 400)

@@ -228,9 +228,9 @@ def test_unknown_geoid_separation_is_an_error(tmp_path, make):
     del document["asset"]["extras"]
     source.write_text(json.dumps(document))
     with pytest.raises(GeoreferenceError, match="geoid separation"):
-        build_cache(source, tmp_path / "c", workers=1, progress=False)
+        build_cache(source, tmp_path / "c", workers=1)
     with pytest.raises(GeoreferenceError, match="does not occur"):
-        build_cache(source, tmp_path / "c", geoid_separation_m=900, workers=1, progress=False)
+        build_cache(source, tmp_path / "c", geoid_separation_m=900, workers=1)
 
 
 def test_a_tileset_that_is_not_on_earth_is_an_error(tmp_path, make, build):
@@ -244,7 +244,7 @@ def test_a_tileset_that_is_not_on_earth_is_an_error(tmp_path, make, build):
 
 def test_existing_cache_is_kept_unless_told(source, cache_path):
     with pytest.raises(MapCacheError, match=r"exists already.*--overwrite"):
-        build_cache(source, cache_path, workers=1, progress=False)
+        build_cache(source, cache_path, workers=1)
 
 
 HOSTILE_TILESETS = {

@@ -1,21 +1,15 @@
-"""Figures, verification, pictures and export of a cache, and the commands that show them."""
+"""Figures, verification, pictures and export of a cache."""
 
 from __future__ import annotations
 
-import os
 import shutil
 
-import cv2
 import numpy as np
 import pytest
 import trimesh
-from typer.testing import CliRunner
 
-from companion.cli.commands import app
-from companion.errors import ReportError
 from localizer.errors import GeoreferenceError, OutsideMapError
 from localizer.geometry.camera import Camera
-from localizer.map.building import build
 from localizer.map.cache.cache import TileCache
 from localizer.map.cache.tile import TileMesh
 from localizer.map.inspection.inspect import (
@@ -95,76 +89,13 @@ def test_export_keeps_texture_orientation(cache, tmp_path):
     assert geometry.visual.uv[order][:, 1] == pytest.approx(1 - mesh.uvs[ours][:, 1], abs=1e-4)
 
 
-def run(*arguments):
-    return CliRunner().invoke(app, ["map", *map(str, arguments)])
-
-
-def test_commands(source, tmp_path):
-    out = tmp_path / "c"
-    built = run("build", source, "--out", out, "--workers", "1")
-    assert built.exit_code == 0, built.output
-    assert "21 tiles" in built.output
-    shown = run("info", out)
-    assert "47.5" in shown.output
-    assert "4 " in shown.output
-    assert "21 of 21 tiles intact" in run("verify", out).output
-    picture = tmp_path / "v.png"
-    place = ["--latitude", 47.2, "--longitude", 8.2, "--height", 500]
-    assert run("render", out, *place, "--width", 64, "--out", picture).exit_code == 0
-    assert cv2.imread(str(picture)).shape == (960, 64, 3)
-    assert (tmp_path / "v_depth.png").is_file()
-    assert run("export", out, "--out", tmp_path / "e.glb", "--level", 1).exit_code == 0
-    TileCache.open(out).tile_path(2).write_bytes(b"x")
-    damaged = run("verify", out)
-    assert damaged.exit_code == 1
-    assert "tile 2" in damaged.output
-
-
-def test_a_level_or_a_place_that_the_map_does_not_have_is_named(source, tmp_path):
-    out = tmp_path / "c"
-    assert run("build", source, "--out", out, "--workers", "1").exit_code == 0
+def test_a_level_or_a_place_that_the_map_does_not_have_is_named(cache, tmp_path):
     with pytest.raises(OutsideMapError, match=r"no level 9, the finest is [0-9]"):
-        export_glb(TileCache.open(out), tmp_path / "e.glb", 9)
+        export_glb(cache, tmp_path / "e.glb", 9)
     assert not (tmp_path / "e.glb").exists()
-    far = camera_pose(TileCache.open(out), 10.0, 8.2, 500.0)
+    far = camera_pose(cache, 10.0, 8.2, 500.0)
     with pytest.raises(OutsideMapError, match=r"nothing of the map; it lies about 47\.\d+, 8\.\d+"):
-        render_view(TileCache.open(out), far, Camera.from_fov(64, 48, 60.0))
-
-
-def test_an_interrupted_build_says_how_to_go_on(source, tmp_path, monkeypatch):
-    def interrupted(*_args, **_options):
-        raise KeyboardInterrupt
-
-    monkeypatch.setattr(build, "build_cache", interrupted)
-    result = run("build", source, "--out", tmp_path / "c")
-    assert result.exit_code == 130
-    assert "the same command goes on" in result.output
-
-
-@pytest.mark.parametrize("what", ["render", "export"])
-@pytest.mark.parametrize(
-    ("place", "why"),
-    [("folder.png", "is a folder"), ("none/v.png", "no such folder"),
-     ("v.png", "may not be written"), ("v.png", "cannot be written: No space left")],
-)  # fmt: skip
-def test_a_place_that_cannot_be_written_is_one_line(cache, tmp_path, monkeypatch, what, place, why):
-    (tmp_path / "folder.png").mkdir()
-
-    def full(_path, _data):
-        raise OSError(28, "No space left on device")
-
-    if "may not" in why:  # root, as whom tests may run, is refused nothing
-        monkeypatch.setattr("os.access", lambda _path, mode: mode != os.W_OK)
-    elif "No space" in why:
-        monkeypatch.setattr("pathlib.Path.write_bytes", full)
-    pose = ["--latitude", 47.2, "--longitude", 8.2, "--height", 500, "--width", 64]
-    result = run(what, cache.path, *(pose if what == "render" else ()), "--out", tmp_path / place)
-    if "No space" in why:
-        assert isinstance(result.exception, ReportError)
-        assert why in str(result.exception)
-    else:
-        assert result.exit_code == 2
-        assert why in " ".join(result.output.replace("│", " ").split())
+        render_view(cache, far, Camera.from_fov(64, 48, 60.0))
 
 
 def test_dask_builds_the_same_cache(source, cache, tmp_path):
@@ -174,9 +105,7 @@ def test_dask_builds_the_same_cache(source, cache, tmp_path):
     with distributed.LocalCluster(
         n_workers=2, threads_per_worker=1, processes=True, dashboard_address=None
     ) as cluster:
-        manifest = build_cache(
-            source, tmp_path / "c", scheduler=cluster.scheduler_address, progress=False
-        )
+        manifest = build_cache(source, tmp_path / "c", scheduler=cluster.scheduler_address)
     assert manifest == cache.manifest
 
 

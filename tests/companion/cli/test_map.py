@@ -1,0 +1,97 @@
+"""``companion map``: building, showing and exporting caches from the shell."""
+
+from __future__ import annotations
+
+import os
+
+import cv2
+import pytest
+from typer.testing import CliRunner
+
+from companion.cli.commands import app
+from companion.errors import ReportError
+from localizer.map.building import build
+from localizer.map.cache.cache import TileCache
+from tests.localizer.map.conftest import write_tileset
+
+
+@pytest.fixture(scope="module")
+def source(tmp_path_factory):
+    """tileset.json of a tileset of 21 tiles."""
+    return write_tileset(tmp_path_factory.mktemp("source"))
+
+
+@pytest.fixture(scope="module")
+def cache(source, tmp_path_factory):
+    out = tmp_path_factory.mktemp("built") / "cache"
+    build.build_cache(source, out, workers=1)
+    return TileCache.open(out)
+
+
+def run(*arguments):
+    return CliRunner().invoke(app, ["map", *map(str, arguments)])
+
+
+def test_commands(source, tmp_path):
+    out = tmp_path / "c"
+    built = run("build", source, "--out", out, "--workers", "1")
+    assert built.exit_code == 0, built.output
+    assert "21 tiles" in built.output
+    shown = run("info", out)
+    assert "47.5" in shown.output
+    assert "4 " in shown.output
+    assert "21 of 21 tiles intact" in run("verify", out).output
+    picture = tmp_path / "v.png"
+    place = ["--latitude", 47.2, "--longitude", 8.2, "--height", 500]
+    assert run("render", out, *place, "--width", 64, "--out", picture).exit_code == 0
+    assert cv2.imread(str(picture)).shape == (960, 64, 3)
+    assert (tmp_path / "v_depth.png").is_file()
+    assert run("export", out, "--out", tmp_path / "e.glb", "--level", 1).exit_code == 0
+    TileCache.open(out).tile_path(2).write_bytes(b"x")
+    damaged = run("verify", out)
+    assert damaged.exit_code == 1
+    assert "tile 2" in damaged.output
+
+
+def test_an_interrupted_build_says_how_to_go_on(source, tmp_path, monkeypatch):
+    def interrupted(*_args, **_options):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(build, "build_cache", interrupted)
+    result = run("build", source, "--out", tmp_path / "c")
+    assert result.exit_code == 130
+    assert "the same command goes on" in result.output
+
+
+@pytest.mark.parametrize("what", ["render", "export"])
+@pytest.mark.parametrize(
+    ("place", "why"),
+    [("folder.png", "is a folder"), ("none/v.png", "no such folder"),
+     ("v.png", "may not be written"), ("v.png", "cannot be written: No space left")],
+)  # fmt: skip
+def test_a_place_that_cannot_be_written_is_one_line(cache, tmp_path, monkeypatch, what, place, why):
+    (tmp_path / "folder.png").mkdir()
+
+    def full(_path, _data):
+        raise OSError(28, "No space left on device")
+
+    if "may not" in why:  # root, as whom tests may run, is refused nothing
+        monkeypatch.setattr("os.access", lambda _path, mode: mode != os.W_OK)
+    elif "No space" in why:
+        monkeypatch.setattr("pathlib.Path.write_bytes", full)
+    pose = ["--latitude", 47.2, "--longitude", 8.2, "--height", 500, "--width", 64]
+    result = run(what, cache.path, *(pose if what == "render" else ()), "--out", tmp_path / place)
+    if "No space" in why:
+        assert isinstance(result.exception, ReportError)
+        assert why in str(result.exception)
+    else:
+        assert result.exit_code == 2
+        assert why in " ".join(result.output.replace("│", " ").split())
+
+
+def test_progress_is_told_from_the_start_to_all_tiles(source, tmp_path):
+    told = []
+    build.build_cache(
+        source, tmp_path / "c", workers=1, progress=lambda done, total: told.append((done, total))
+    )
+    assert told == [(done, 21) for done in range(22)]
