@@ -36,10 +36,10 @@ def frames(video: str, camera: Camera) -> Iterator[Frame]:
     capture = cv2.VideoCapture(video)
     sequence = 0
     while True:
-        time_ns = round(capture.get(cv2.CAP_PROP_POS_MSEC) * 1e6)  # of the frame that comes
         is_there, bgr = capture.read()
         if not is_there:
             break
+        time_ns = round(capture.get(cv2.CAP_PROP_POS_MSEC) * 1e6)  # of the frame that was read
         yield Frame(cv2.cvtColor(bgr, cv2.COLOR_BGR2RGB), time_ns, camera, sequence)
         sequence += 1
     capture.release()

@@ -2,10 +2,12 @@
 
 import subprocess
 import sys
+from pathlib import Path
 
 import pytest
 
 import localizer
+from localizer.api_page import page
 
 
 def test_every_public_name_is_there_and_documented():
@@ -25,3 +27,8 @@ def test_importing_the_package_imports_no_kernel_and_no_network():
     heavy = "{'numba', 'onnxruntime', 'cv2', 'scipy', 'torch'}"
     code = f"import sys, localizer; sys.exit(bool({heavy} & set(sys.modules)))"
     assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
+
+
+def test_the_api_page_is_made_from_todays_docstrings():
+    docs = Path(__file__).resolve().parents[2] / "docs" / "api.md"
+    assert docs.read_text(encoding="utf-8") == page(), "python -m localizer.api_page docs/api.md"

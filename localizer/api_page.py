@@ -1,0 +1,125 @@
+"""The API page, made from the docstrings: ``python -m localizer.api_page docs/api.md``.
+
+A test holds the page equal to what this prints.
+"""
+
+from __future__ import annotations
+
+import inspect
+import sys
+from collections.abc import Iterator
+from enum import Enum
+from pathlib import Path
+from typing import Any
+
+from pydantic import BaseModel
+
+import localizer
+
+_HEAD = """# API of `localizer`
+
+Made from the docstrings by `python -m localizer.api_page docs/api.md`; do not edit. Everything here
+is imported as `from localizer import NAME` and stays; what is not here may change. Frames, heights
+and time are those of [architecture.md](architecture.md), angles those of [angles.md](angles.md);
+[examples/](../examples) shows it at work.
+"""
+
+
+def page() -> str:
+    """The whole page."""
+    parts = [_HEAD, *(_section(name, getattr(localizer, name)) for name in _documented())]
+    errors = (getattr(localizer, name) for name in localizer.__all__ if _is_error(name))
+    rows = [f"| `{e.__name__}` | `{e.__base__.__name__}` | {_flat(e)} |" for e in errors]
+    table = ["| error | is a | when |", "|---|---|---|", *rows]
+    return "\n".join([*parts, "## Errors\n", *table]) + "\n"
+
+
+def _is_error(name: str) -> bool:
+    value = getattr(localizer, name)
+    return isinstance(value, type) and issubclass(value, Exception)
+
+
+def _documented() -> Iterator[str]:
+    return (name for name in localizer.__all__ if not _is_error(name))
+
+
+def _section(name: str, value: Any) -> str:
+    lines = [f"## {name}\n", *_text(value)]
+    if inspect.isfunction(value):
+        lines.insert(1, _code(f"{name}{_signature(value)}"))
+    elif issubclass(value, Enum):
+        lines += [f"- `{member.name}`: {member.value}" for member in value]
+    elif issubclass(value, BaseModel):
+        lines += [
+            "| setting | default | |",
+            "|---|---|---|",
+            *map(_setting, value.model_fields.items()),
+        ]
+    else:
+        lines.insert(1, _code(f"{name}{_signature(value.__init__)}"))
+        lines += [line for member in _members(value) for line in member]
+    return "\n".join(lines) + "\n"
+
+
+def _setting(item: tuple[str, Any]) -> str:
+    name, field = item
+    default = field.default
+    if isinstance(default, BaseModel):
+        return f"| `{name}` | | `{type(default).__name__}` |"
+    return f"| `{name}` | `{default}` | {field.description or ''} |"
+
+
+def _members(kind: type) -> Iterator[list[str]]:
+    """Public methods and properties that the class itself defines, in the order of its source."""
+    for name, member in vars(kind).items():
+        if name.startswith("_"):
+            continue
+        if isinstance(member, property) or hasattr(member, "attrname"):  # a cached property
+            yield [f"### {kind.__name__}.{name}\n", *_text(member)]
+        elif callable(function := getattr(kind, name)) and inspect.isroutine(function):
+            code = _code(f"{kind.__name__}.{name}{_signature(function)}")
+            yield [f"### {kind.__name__}.{name}\n", code, *_text(function)]
+
+
+def _signature(function: Any) -> str:
+    """Parameters and result as in the source, a default that is a function as ``...``."""
+    shown, star = [], False
+    signature = inspect.signature(function)
+    for p in signature.parameters.values():
+        if p.name in ("self", "cls"):
+            continue
+        if p.kind is p.KEYWORD_ONLY and not star:
+            shown.append("*")
+            star = True
+        text = p.name if p.annotation is p.empty else f"{p.name}: {_annotation(p.annotation)}"
+        if p.default is not p.empty:
+            known = "..." if callable(p.default) else repr(p.default)
+            text += f" = {known}"
+        shown.append(text)
+    result = _annotation(signature.return_annotation)
+    inside = ", ".join(shown)
+    if len(inside) > 60:
+        inside = "".join(f"\n    {parameter}," for parameter in shown) + "\n"
+    return f"({inside})" + (f" -> {result}" if result not in ("None", "") else "")
+
+
+def _annotation(annotation: Any) -> str:
+    if annotation is inspect.Signature.empty or annotation is None:
+        return ""
+    return annotation if isinstance(annotation, str) else getattr(annotation, "__name__", "")
+
+
+def _code(text: str) -> str:
+    return f"```python\n{text}\n```\n"
+
+
+def _text(value: Any) -> list[str]:
+    return [f"{inspect.getdoc(value) or ''}\n"]
+
+
+def _flat(value: Any) -> str:
+    return " ".join((inspect.getdoc(value) or "").split())
+
+
+if __name__ == "__main__":
+    Path(sys.argv[1]).write_text(page(), encoding="utf-8")

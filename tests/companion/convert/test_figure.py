@@ -1,0 +1,34 @@
+"""The figure of docs/angles.md can be drawn, and its page says what the conversions say."""
+
+from pathlib import Path
+
+import cv2
+import pytest
+
+from companion.convert.angles import Angles, pose_of_gimbal
+from companion.convert.figure import draw
+from localizer.geometry.geo import Geodetic, LocalFrame
+from localizer.geometry.posefile import pose_row
+
+
+def test_the_figure(tmp_path):
+    draw(tmp_path / "angles.png")
+    drawn = cv2.imread(str(tmp_path / "angles.png"))
+    kept = cv2.imread(str(Path(__file__).resolve().parents[3] / "docs" / "angles.png"))
+    assert drawn.shape == kept.shape
+
+
+@pytest.mark.parametrize(
+    ("gimbal", "row"),
+    [
+        ((0, -40, 60), (0, 50, -60)),  # the figure's
+        ((0, -90, 0), (0, 0, 0)),  # straight down, the picture's top to the north
+        ((0, 0, -90), (0, 90, 90)),  # level, to the west
+    ],
+)
+def test_the_tables_zeros_and_signs(gimbal, row):
+    place = Geodetic(47.3, 8.5, 500.0)
+    found = pose_row(
+        "", pose_of_gimbal(place, Angles(*gimbal), LocalFrame(place)), LocalFrame(place)
+    )
+    assert (found.roll_deg, found.pitch_deg, found.yaw_deg) == pytest.approx(row, abs=1e-9)
