@@ -24,7 +24,7 @@ from localizer.geometry.geo import Geodetic, LocalFrame
 from localizer.geometry.pose import Pose
 from localizer.geometry.posefile import PoseRow, read_poses, world_from_camera
 from localizer.registration.devices import DeviceChoice
-from localizer.render.select import Backend
+from localizer.render.select import RendererName
 from localizer.tracking.opening import open_localizer
 from localizer.types import PoseEstimate
 
@@ -61,7 +61,7 @@ def localize_command(
     ] = 30.0,
     width: Annotated[int, typer.Option(min=64, max=2048, help="working width, pixels")] = 320,
     renderer: Annotated[
-        Backend, typer.Option(help="auto: a GPU where there is one, else numba")
+        RendererName, typer.Option(help="auto: a GPU where there is one, else numba")
     ] = "auto",
     device: Annotated[
         DeviceChoice, typer.Option(help="of the optimizer; auto, cuda: a GPU that works, else CPU")
