@@ -8,6 +8,7 @@ from pydantic import BaseModel, ConfigDict, Field
 
 from localizer.registration.config import JNGOConfig
 from localizer.registration.devices import DeviceChoice
+from localizer.relocalization.config import RelocalizationConfig
 from localizer.render.select import RendererName
 from localizer.tracking.integrity import IntegrityConfig
 from localizer.tracking.motion import MotionConfig
@@ -49,3 +50,4 @@ class LocalizerConfig(BaseModel):
     attitude: AttitudePrior | None = None
     motion: MotionConfig = MotionConfig()
     integrity: IntegrityConfig = IntegrityConfig()
+    relocalization: RelocalizationConfig = RelocalizationConfig()

@@ -1,0 +1,49 @@
+"""Settings of the search for a place."""
+
+from __future__ import annotations
+
+from pydantic import BaseModel, ConfigDict, Field
+
+
+class RelocalizationConfig(BaseModel):
+    """What the search costs, and what it takes to believe its answer."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
+
+    threads: int = Field(1, ge=1, le=64, description="CPU threads of a search")
+    cache_mib: int = Field(128, ge=16, le=1 << 20, description="resident tiles, MiB")
+    spectra_mib: int = Field(
+        256, ge=0, le=1 << 20, description="the map's transforms that are kept between searches"
+    )
+    heading_step_deg: float = Field(10.0, ge=1, le=45, description="between headings tried")
+    heading_reach: float = Field(
+        2.0, ge=0.5, le=6, description="headings tried to either side, in sigmas"
+    )
+    scale_step: float = Field(
+        1.15, ge=1.02, le=1.5, description="ratio of neighbouring heights above ground tried"
+    )
+    extraction_ratio: float = Field(
+        1.35, ge=1.0, le=2.0, description="of heights that share one extraction of features"
+    )
+    patch_m: float = Field(
+        170.0, ge=40, le=2000, description="largest side of the ground compared, at 0.5 m a pixel"
+    )
+    candidates: int = Field(5, ge=1, le=100, description="places that are rendered and registered")
+    passes: int = Field(
+        3, ge=1, le=10, description="renderings of a place, each from the last pose"
+    )
+    min_quality: float = Field(0.2, ge=0, le=1, description="registration quality of an answer")
+    min_overlap: float = Field(0.5, ge=0, le=1, description="share of the anchors in view")
+    max_sigma_m: float = Field(2.0, ge=0.01, le=100, description="position sigma of an answer")
+    tilt_gate_deg: float = Field(
+        2.0, ge=0.1, le=90, description="added to three sigmas of roll and pitch"
+    )
+    height_gate_m: float = Field(
+        4.0, ge=0.1, le=1000, description="added to three sigmas of height"
+    )
+    decisive_quality: float = Field(
+        0.35, ge=0, le=1, description="quality at which no other candidate is looked at"
+    )
+    margin: float = Field(
+        0.05, ge=0, le=1, description="quality by which an answer must lead every other place"
+    )

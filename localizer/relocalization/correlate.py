@@ -1,0 +1,195 @@
+"""Normalised correlation of one patch with a level of the overview, block by block, by FFT.
+
+A block is `SIZE` cells wide; the patch, smaller than `SIZE - STEP`, is compared at `STEP` by `STEP`
+origins of each, which tile the map. What is summed over channels is a product of spectra, so that a
+patch costs one transform per channel and each block one inverse transform; the blocks' own spectra
+are kept within a budget.
+"""
+
+from __future__ import annotations
+
+import threading
+from collections import OrderedDict
+from dataclasses import dataclass
+
+import numpy as np
+import scipy.fft
+from numba import njit
+from numpy.typing import NDArray
+
+from localizer.relocalization.overview import OverviewLevel
+from localizer.types import Float32
+
+SIZE = 256
+STEP = 160
+_COARSE = 8  # cells of the map's energy that are summed before it is correlated
+_LEAST_ENERGY = 0.3  # of the map's usual one under a patch: bare or missing ground scores less
+
+Complex64 = NDArray[np.complex64]
+
+
+@dataclass(frozen=True)
+class Block:
+    """Origins row to row + STEP and column to column + STEP of the map, in cells; may be < 0."""
+
+    row: int
+    column: int
+
+
+@dataclass(frozen=True)
+class _Spectra:
+    """features: (K, SIZE, SIZE/2+1) complex64; energy: (SIZE/8, SIZE/16+1) complex64."""
+
+    features: Complex64
+    energy: Complex64
+
+    @property
+    def nbytes(self) -> int:
+        return self.features.nbytes + self.energy.nbytes
+
+
+@dataclass(frozen=True)
+class PatchSpectra:
+    """A patch, transformed. features: (K, SIZE, SIZE/2+1); mask: as `_Spectra.energy`; norm: the
+    root of its energy; cells: its side; weight: share of its cells that are seen.
+    """
+
+    features: Complex64
+    mask: Complex64
+    norm: float
+    cells: int
+    weight: float
+
+
+def transform_patch(features: Float32, mask: Float32) -> PatchSpectra:
+    """features: (n, n, K) weighted; mask: (n, n) in [0, 1], where they count."""
+    n = features.shape[0]
+    # Row by row first: most rows are empty and stay so.
+    lines = np.zeros((features.shape[2], n, SIZE), np.float32)
+    lines[:, :, :n] = features.transpose(2, 0, 1)
+    half = scipy.fft.rfft(lines, axis=2, workers=1, overwrite_x=True)
+    spectra = scipy.fft.fft(half, SIZE, axis=1, workers=1, overwrite_x=True)
+    padded = np.zeros((SIZE, SIZE), np.float32)
+    padded[:n, :n] = mask
+    coarse = scipy.fft.rfft2(_summed(padded) / _COARSE**2, workers=1)
+    norm = float(np.sqrt((features**2).sum()))
+    return PatchSpectra(
+        np.ascontiguousarray(spectra, np.complex64),
+        np.ascontiguousarray(coarse, np.complex64),
+        norm,
+        n,
+        float(mask.mean()),
+    )
+
+
+class LevelCorrelator:
+    """Correlates patches with one level; keeps spectra of `byte_budget`. Safe to share."""
+
+    def __init__(self, level: OverviewLevel, byte_budget: int) -> None:
+        self.level = level
+        self._budget = byte_budget
+        self._kept: OrderedDict[Block, _Spectra] = OrderedDict()
+        self._bytes = 0
+        self._lock = threading.Lock()
+        # int8 squares summed as such would wrap.
+        sample = level.features[:, ::4, ::4].astype(np.float32) * level.quantum
+        energy = (sample**2).sum(axis=0)
+        self._usual = float(energy[energy > 0].mean()) if (energy > 0).any() else 1.0
+
+    def blocks(self) -> list[Block]:
+        """Every block: patches may begin half a block outside the map."""
+        rows, columns = self.level.shape
+        lead = (SIZE - STEP) // 2
+        return [
+            Block(r, c) for r in range(-lead, rows - lead, STEP)
+            for c in range(-lead, columns - lead, STEP)
+        ]  # fmt: skip
+
+    def correlate(self, patch: PatchSpectra, block: Block) -> Float32:
+        """Scores (STEP, STEP) of the patch at the block's origins."""
+        spectra = self._spectra(block)
+        product = np.empty((SIZE, SIZE // 2 + 1), np.complex64)
+        _multiplied(spectra.features, patch.features, product)
+        raw = scipy.fft.irfft2(product, (SIZE, SIZE), workers=1, overwrite_x=True)
+        small = SIZE // _COARSE
+        energy = scipy.fft.irfft2(spectra.energy * patch.mask.conj(), (small, small), workers=1)
+        least = _LEAST_ENERGY * self._usual * patch.weight * patch.cells**2
+        scores = np.empty((STEP, STEP), np.float32)
+        _normalised(raw, energy, np.float32(least), np.float32(max(patch.norm, 1e-9)), scores)
+        return scores
+
+    def warm_up(self) -> None:
+        """Compile what a search needs."""
+        channels = self.level.features.shape[0]
+        patch = transform_patch(np.ones((8, 8, channels), np.float32), np.ones((8, 8), np.float32))
+        self.correlate(patch, self.blocks()[0])
+
+    def _spectra(self, block: Block) -> _Spectra:
+        with self._lock:
+            kept = self._kept.get(block)
+            if kept is not None:
+                self._kept.move_to_end(block)
+                return kept
+        made = self._transform(block)
+        with self._lock:
+            if made.nbytes <= self._budget and block not in self._kept:
+                self._kept[block] = made
+                self._bytes += made.nbytes
+                while self._bytes > self._budget:
+                    _, oldest = self._kept.popitem(last=False)
+                    self._bytes -= oldest.nbytes
+        return made
+
+    def _transform(self, block: Block) -> _Spectra:
+        level = self.level
+        rows, columns = level.shape
+        window = np.zeros((level.features.shape[0], SIZE, SIZE), np.float32)
+        r0, r1 = max(block.row, 0), min(block.row + SIZE, rows)
+        c0, c1 = max(block.column, 0), min(block.column + SIZE, columns)
+        if r1 > r0 and c1 > c0:
+            inside = level.features[:, r0:r1, c0:c1].astype(np.float32)
+            window[:, r0 - block.row : r1 - block.row, c0 - block.column : c1 - block.column] = (
+                inside * np.float32(level.quantum)
+            )
+        energy = _summed((window**2).sum(axis=0))
+        return _Spectra(
+            scipy.fft.rfft2(window, workers=1).astype(np.complex64, copy=False),
+            scipy.fft.rfft2(energy, workers=1).astype(np.complex64, copy=False),
+        )
+
+
+def _summed(values: Float32) -> Float32:
+    n = values.shape[0] // _COARSE
+    sums: Float32 = values.reshape(n, _COARSE, n, _COARSE).sum(axis=(1, 3)).astype(np.float32)
+    return sums
+
+
+@njit(cache=True, fastmath=True, nogil=True)
+def _multiplied(a, b, out):  # type: ignore[no-untyped-def]
+    """Sum over channels of a * conj(b)."""
+    channels, rows, columns = a.shape
+    for i in range(rows):
+        for j in range(columns):
+            out[i, j] = 0
+        for k in range(channels):
+            for j in range(columns):
+                x, y = a[k, i, j], b[k, i, j]
+                out[i, j] += np.complex64(
+                    complex(x.real * y.real + x.imag * y.imag, x.imag * y.real - x.real * y.imag)
+                )
+
+
+@njit(cache=True, fastmath=True, nogil=True)
+def _normalised(raw, energy, least, norm, out):  # type: ignore[no-untyped-def]
+    """Sample k of the coarse energy belongs to origin 8 k: between them it is interpolated."""
+    step = np.float32(1.0 / _COARSE)
+    for i in range(out.shape[0]):
+        p = i // _COARSE
+        a = (i - p * _COARSE) * step
+        for j in range(out.shape[1]):
+            q = j // _COARSE
+            b = (j - q * _COARSE) * step
+            top = energy[p, q] + b * (energy[p, q + 1] - energy[p, q])
+            low = energy[p + 1, q] + b * (energy[p + 1, q + 1] - energy[p + 1, q])
+            under = max(top + a * (low - top), least)
+            out[i, j] = raw[i, j] / (np.sqrt(under) * norm)

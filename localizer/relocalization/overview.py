@@ -1,0 +1,337 @@
+"""The map's features seen from above: computed once, kept beside the tiles.
+
+Squares of the map are drawn from above, the network's features of each are projected onto the
+map's own principal components, weighted by confidence, and stored as bytes. One file per scale in
+the cache's folder, ``overview/KEY/LEVEL.safetensors``; KEY names the map, the model and this
+format, so that another model or a rebuilt map makes a file of its own.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import logging
+import math
+import os
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+import safetensors
+import safetensors.numpy
+from numpy.typing import NDArray
+
+from localizer.errors import MapCacheError
+from localizer.features.extractor import FeatureExtractor
+from localizer.geometry.pose import Array
+from localizer.map.cache.cache import TileCache
+from localizer.relocalization.topview import render_top_view
+from localizer.render.base import MapRenderer
+from localizer.types import FeatureLevel, Float32, Image
+
+logger = logging.getLogger(__name__)
+
+GSD_M = (0.5, 1.0, 2.0)  # metres per pixel of the levels
+STRIDE = 4  # pixels per cell: the network's level whose features are compared
+CHANNELS = 16  # principal components that are kept
+GROUND_CELLS = 16  # cells per sample of the ground's height
+
+_FORMAT = 1
+_SQUARE_CELLS = 128  # drawn at a time
+_MARGIN_CELLS = 16  # around it, which the network needs to see and whose features are dropped
+_QUANTUM = 0.01  # of a stored feature
+_SAMPLE_SQUARES = 24  # that the principal components are computed from
+_GROUND_PERCENTILE = 30  # of the heights in a sample: lower than roofs and trees
+_LEAST_SHARE = 0.9  # of a square's cell that the map must cover to be compared
+
+Progress = Callable[[int, int], None]
+
+
+@dataclass(frozen=True)
+class Projection:
+    """From a network's features (..., C) to the stored ones. mean: (C,); basis: (C, K)."""
+
+    mean: Float32
+    basis: Float32
+
+    def __call__(self, features: Float32) -> Float32:
+        """(..., K)."""
+        return np.asarray((features - self.mean) @ self.basis, np.float32)
+
+
+@dataclass(frozen=True, eq=False)
+class OverviewLevel:
+    """One scale. features: (K, H, W) int8 times `quantum`, confidence included, row 0 in the north;
+    ground: (H / 16, W / 16) float32 world z, NaN without map; west, north: world m of the corner.
+    """
+
+    features: NDArray[np.int8]
+    ground: Float32
+    projection: Projection
+    west: float
+    north: float
+    gsd_m: float
+    quantum: float = _QUANTUM
+
+    @property
+    def cell_m(self) -> float:
+        """Side of a cell, m."""
+        return self.gsd_m * STRIDE
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """Rows and columns of cells."""
+        return self.features.shape[1], self.features.shape[2]
+
+
+@dataclass(frozen=True)
+class MapOverview:
+    """A map's features from above at every scale, finest first."""
+
+    levels: tuple[OverviewLevel, ...]
+    key: str
+
+    @property
+    def area_km2(self) -> float:
+        """Of the ground that is covered."""
+        level = self.levels[0]
+        cell = (level.cell_m * GROUND_CELLS) ** 2
+        return float(np.isfinite(level.ground).sum()) * cell / 1e6
+
+    @property
+    def nbytes(self) -> int:
+        """In memory."""
+        return sum(level.features.nbytes + level.ground.nbytes for level in self.levels)
+
+
+def comparable_level(extractor: FeatureExtractor, rgb: Image) -> FeatureLevel:
+    """The features of an image that are compared: the level whose stride is `STRIDE`."""
+    for level in extractor.extract(rgb).levels:
+        if level.stride == STRIDE:
+            return level
+    raise MapCacheError(f"{extractor.name}: no features of stride {STRIDE} to compare places with")
+
+
+def overview_folder(cache: TileCache, model_key: str) -> Path:
+    """Where a map's overview by a model is kept."""
+    return cache.path / "overview" / overview_key(cache, model_key)
+
+
+def overview_key(cache: TileCache, model_key: str) -> str:
+    """Of map, model and format."""
+    settings = (_FORMAT, GSD_M, STRIDE, CHANNELS, GROUND_CELLS, _QUANTUM)
+    text = f"{cache.manifest.index_sha256} {model_key} {settings}"
+    return hashlib.sha256(text.encode()).hexdigest()[:16]
+
+
+def open_overview(
+    cache: TileCache,
+    renderer: MapRenderer,
+    extractor: FeatureExtractor,
+    *,
+    progress: Progress = lambda _done, _total: None,
+    should_stop: Callable[[], bool] = lambda: False,
+) -> MapOverview | None:
+    """The map's overview from the disk, or computed and put there; None if stopped before its end.
+
+    A file that is damaged is named in the log and made again. A folder that cannot be written costs
+    the time of computing it at every start, and the log says so.
+    """
+    key = overview_key(cache, extractor.name)
+    folder = cache.path / "overview" / key
+    levels = []
+    squares = [_squares(cache, gsd) for gsd in GSD_M]
+    total, done = sum(len(s.corners) for s in squares), 0
+    for plan in squares:
+        path = folder / f"{plan.gsd_m:g}.safetensors"
+        level = _read(path, plan.gsd_m)
+        if level is None:
+            level = _compute(
+                plan,
+                renderer,
+                extractor,
+                partial(_advance, progress, done, total),
+                should_stop,
+            )
+            if level is None:
+                return None
+            _write(path, level)
+        done += len(plan.corners)
+        progress(done, total)
+        levels.append(level)
+    return MapOverview(tuple(levels), key)
+
+
+def _advance(progress: Progress, before: int, total: int, done: int) -> None:
+    progress(before + done, total)
+
+
+@dataclass(frozen=True)
+class _Squares:
+    """The squares of a level. corners: their first row and column, in cells."""
+
+    rows: int
+    columns: int
+    west: float
+    north: float
+    base_m: float
+    gsd_m: float
+    corners: tuple[tuple[int, int], ...]
+
+    def centre(self, corner: tuple[int, int]) -> Array:
+        """(2,) world m."""
+        half = _SQUARE_CELLS / 2
+        cell = self.gsd_m * STRIDE
+        return np.array(
+            [self.west + (corner[1] + half) * cell, self.north - (corner[0] + half) * cell]
+        )
+
+
+def _squares(cache: TileCache, gsd_m: float) -> _Squares:
+    low, high = cache.index.box_min[0], cache.index.box_max[0]
+    side = _SQUARE_CELLS * STRIDE * gsd_m
+    columns, rows = (max(1, math.ceil((high[k] - low[k]) / side)) for k in (0, 1))
+    n = _SQUARE_CELLS
+    corners = tuple((n * r, n * c) for r in range(rows) for c in range(columns))
+    return _Squares(
+        rows * n, columns * n, float(low[0]), float(high[1]), float(low[2]), gsd_m, corners
+    )
+
+
+@dataclass(frozen=True)
+class _Raw:
+    """Features (n, n, C) float16 of a square, their weights (n, n), and the ground's heights."""
+
+    features: NDArray[np.float16]
+    weight: Float32
+    ground: Float32
+
+
+def _raw(plan: _Squares, corner: tuple[int, int], r: MapRenderer, e: FeatureExtractor) -> _Raw:
+    m, n = _MARGIN_CELLS, _SQUARE_CELLS
+    side = (n + 2 * m) * STRIDE
+    view = render_top_view(r, plan.centre(corner), side, plan.gsd_m, plan.base_m)
+    level = comparable_level(e, view.rgb)
+    inner = slice(m, m + n)
+    known = np.isfinite(view.height[m * STRIDE : -m * STRIDE, m * STRIDE : -m * STRIDE])
+    share = known.reshape(n, STRIDE, n, STRIDE).mean(axis=(1, 3))
+    weight = level.confidence[inner, inner] * (share > _LEAST_SHARE)
+    return _Raw(
+        level.features[inner, inner].astype(np.float16),
+        weight.astype(np.float32),
+        _ground(view.height[m * STRIDE : -m * STRIDE, m * STRIDE : -m * STRIDE]),
+    )
+
+
+def _ground(height: Float32) -> Float32:
+    side = GROUND_CELLS * STRIDE
+    n = height.shape[0] // side
+    samples = height.reshape(n, side, n, side).transpose(0, 2, 1, 3).reshape(n, n, -1)
+    ground = np.full((n, n), np.nan, np.float32)
+    some = np.isfinite(samples).mean(axis=2) > 0.1
+    ground[some] = np.nanpercentile(samples[some], _GROUND_PERCENTILE, axis=1)
+    return ground
+
+
+def _compute(
+    plan: _Squares,
+    renderer: MapRenderer,
+    extractor: FeatureExtractor,
+    progress: Callable[[int], None],
+    should_stop: Callable[[], bool],
+) -> OverviewLevel | None:
+    chosen = np.linspace(0, len(plan.corners) - 1, _SAMPLE_SQUARES).round().astype(int)
+    kept: dict[int, _Raw] = {}
+    for k in np.unique(chosen).tolist():
+        if should_stop():
+            return None
+        kept[k] = _raw(plan, plan.corners[k], renderer, extractor)
+    projection = _principal(kept.values())
+    n, g = _SQUARE_CELLS, _SQUARE_CELLS // GROUND_CELLS
+    features = np.zeros((projection.basis.shape[1], plan.rows, plan.columns), np.int8)
+    ground = np.full((plan.rows // GROUND_CELLS, plan.columns // GROUND_CELLS), np.nan, np.float32)
+    for k, (row, column) in enumerate(plan.corners):
+        if should_stop():
+            return None
+        raw = kept.pop(k, None) or _raw(plan, (row, column), renderer, extractor)
+        values = projection(raw.features.astype(np.float32)) * (raw.weight[..., None] / _QUANTUM)
+        square = np.rint(values).clip(-127, 127).astype(np.int8)
+        features[:, row : row + n, column : column + n] = square.transpose(2, 0, 1)
+        i, j = row // GROUND_CELLS, column // GROUND_CELLS
+        ground[i : i + g, j : j + g] = raw.ground
+        progress(k + 1)
+    return OverviewLevel(features, ground, projection, plan.west, plan.north, plan.gsd_m)
+
+
+def _principal(squares: Iterable[_Raw]) -> Projection:
+    """The leading components of the features, each counted with its weight squared."""
+    total, mean, second = 0.0, None, None
+    for raw in squares:
+        x = raw.features.reshape(-1, raw.features.shape[-1]).astype(np.float64)
+        w = raw.weight.reshape(-1).astype(np.float64) ** 2
+        s1, s2 = w @ x, (x * w[:, None]).T @ x
+        mean = s1 if mean is None else mean + s1
+        second = s2 if second is None else second + s2
+        total += float(w.sum())
+    if mean is None or second is None or total <= 0:
+        raise MapCacheError("the map shows nothing from above: no overview can be made of it")
+    mean = mean / total
+    _, vectors = np.linalg.eigh(second / total - np.outer(mean, mean))
+    basis = vectors[:, ::-1][:, :CHANNELS]
+    return Projection(mean.astype(np.float32), np.ascontiguousarray(basis, np.float32))
+
+
+def _read(path: Path, gsd_m: float) -> OverviewLevel | None:
+    """A level from the disk; None where there is none, or (named in the log) a damaged one."""
+    try:
+        data = path.read_bytes()
+    except FileNotFoundError:
+        return None
+    except OSError as error:
+        logger.warning("%s: cannot be read (%s): the overview is made again", path, error)
+        return None
+    digest, content = data[:32], data[32:]
+    if hashlib.sha256(content).digest() != digest:
+        logger.warning("%s: damaged: the overview is made again", path)
+        return None
+    try:
+        a = safetensors.numpy.load(content)
+        corner = a["corner"].astype(np.float64)
+        return OverviewLevel(
+            a["features"],
+            a["ground"],
+            Projection(a["mean"], a["basis"]),
+            float(corner[0]),
+            float(corner[1]),
+            gsd_m,
+        )
+    except (safetensors.SafetensorError, KeyError, IndexError) as error:
+        logger.warning("%s: no overview (%s): it is made again", path, error)
+        return None
+
+
+def _write(path: Path, level: OverviewLevel) -> None:
+    """Whole or not at all: the hash, then the arrays, under another name until they are written."""
+    content = safetensors.numpy.save(
+        {
+            "features": np.ascontiguousarray(level.features),
+            "ground": np.ascontiguousarray(level.ground),
+            "mean": level.projection.mean,
+            "basis": level.projection.basis,
+            "corner": np.array([level.west, level.north], np.float64),
+        }
+    )
+    new = path.with_name(f"{path.name}.{os.getpid()}.new")
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        with new.open("wb") as file:
+            file.write(hashlib.sha256(content).digest() + content)
+            file.flush()
+            os.fsync(file.fileno())
+        new.replace(path)
+    except OSError as error:
+        logger.warning(
+            "%s: the overview cannot be kept (%s): it is computed at every start", path, error
+        )
+        new.unlink(missing_ok=True)

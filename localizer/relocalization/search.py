@@ -1,0 +1,317 @@
+"""The exhaustive search: every heading, every height above ground, every place of the region."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from localizer.features.extractor import FeatureExtractor
+from localizer.geometry.camera import Camera
+from localizer.geometry.pose import Array, Pose
+from localizer.relocalization.config import RelocalizationConfig
+from localizer.relocalization.correlate import (
+    SIZE,
+    STEP,
+    Block,
+    LevelCorrelator,
+    transform_patch,
+)
+from localizer.relocalization.overview import (
+    GROUND_CELLS,
+    STRIDE,
+    OverviewLevel,
+    comparable_level,
+)
+from localizer.relocalization.patch import Footprint, footprint, patch_side, rectify, turned
+from localizer.relocalization.types import PlaceCandidate, PlaceQuery, SearchRegion
+from localizer.types import Float32, Image
+
+_MOST_PX = (SIZE - STEP) * STRIDE  # of a patch's side, so that blocks overlap by it
+_UNSEEN_PX = 9  # next to what is not seen, features are of the filling
+_SUPPRESSED_M = 12.0  # about a candidate, whose neighbours are no other place
+_LEAST_HEIGHT_M = 10.0
+
+
+@dataclass(frozen=True)
+class View:
+    """The frame as the search uses it: image (H, W, 3) of a pinhole camera."""
+
+    image: Image
+    camera: Camera
+
+
+@dataclass(frozen=True)
+class Trial:
+    """One rectification. heading_rad: turn of the query's rotation, counter-clockwise; height_m:
+    above the ground; centre: (2,) m of the patch from the point below the camera; cells: its side.
+    """
+
+    heading_rad: float
+    height_m: float
+    centre: Array
+    cells: int
+
+
+def headings(query: PlaceQuery, config: RelocalizationConfig) -> Array:
+    """Turns (rad) of the query's rotation to try, (n,)."""
+    step = math.radians(config.heading_step_deg)
+    if query.heading_sigma_rad is None:
+        reach = math.pi
+    else:
+        reach = min(config.heading_reach * query.heading_sigma_rad, math.pi)
+    if reach >= math.pi - step / 2:
+        count = math.ceil(2 * math.pi / step - 1e-9)
+        return np.arange(count, dtype=np.float64) * (2 * math.pi / count)
+    count = max(1, math.ceil(2 * reach / step - 1e-9))
+    return (np.arange(count, dtype=np.float64) + 0.5) * (2 * reach / count) - reach
+
+
+def level_for(levels: tuple[OverviewLevel, ...], side_m: float) -> OverviewLevel:
+    """The finest level of which a patch of `side_m` is not larger than can be compared."""
+    for level in levels:
+        if side_m / level.gsd_m <= _MOST_PX:
+            return level
+    return levels[-1]
+
+
+def scales(query: PlaceQuery, ground: Float32, config: RelocalizationConfig) -> Array:
+    """Heights above ground (n,) to rectify for, so that each place has one close to its own."""
+    known = ground[np.isfinite(ground)]
+    if len(known) == 0:
+        return np.empty(0)
+    low = query.height_m - query.height_sigma_m - float(known.max())
+    high = query.height_m + query.height_sigma_m - float(known.min())
+    low, high = max(low, _LEAST_HEIGHT_M), max(high, _LEAST_HEIGHT_M)
+    count = max(1, math.ceil(math.log(high / low) / math.log(config.scale_step)))
+    edges = np.geomspace(low, high, count + 1)
+    result: Array = np.sqrt(edges[:-1] * edges[1:])
+    return result
+
+
+@dataclass
+class Scores:
+    """Best score of each patch origin so far (rows, columns), and the trial it came from."""
+
+    best: Float32
+    trial: NDArray[np.int32]
+
+
+def search(
+    view: View,
+    query: PlaceQuery,
+    correlators: tuple[LevelCorrelator, ...],
+    extractor: FeatureExtractor,
+    config: RelocalizationConfig,
+    *,
+    pool: ThreadPoolExecutor | None = None,
+    should_stop: Callable[[], bool] = lambda: False,
+) -> list[PlaceCandidate] | None:
+    """The places that look most like the frame from above, best first; None if stopped."""
+    ground = correlators[0].level.ground
+    heights = scales(query, ground, config)
+    if len(heights) == 0:
+        return []
+    largest = config.patch_m * max(1.0, float(np.median(heights)) / 120.0)
+    seen = footprint(view.camera, query.rotation, 1.0, largest / float(heights[-1]))
+    level = level_for(tuple(c.level for c in correlators), seen.side_m * float(heights[0]))
+    correlator = next(c for c in correlators if c.level is level)
+    run = _Search(view, query, correlator, extractor, config, seen, heights)
+    groups = shared_extractions(heights, config.extraction_ratio)
+    jobs = [(float(a), g) for g in groups for a in headings(query, config)]
+    trials: list[Trial] = []
+    scores = run.empty()
+
+    def work(job: tuple[float, list[int]]) -> list[Found] | None:
+        return None if should_stop() else run.at_heading(*job, should_stop)
+
+    results = map(work, jobs) if pool is None else pool.map(work, jobs)
+    for result in results:
+        if result is None or should_stop():
+            return None
+        for found in result:
+            run.merge(scores, len(trials), found.blocks)
+            trials.append(found.trial)
+    return run.candidates(scores, trials)
+
+
+def shared_extractions(heights: Array, ratio: float) -> list[list[int]]:
+    """Indices of heights in groups whose ends are no farther apart than `ratio`."""
+    groups: list[list[int]] = []
+    for i, height in enumerate(heights):
+        if groups and height <= heights[groups[-1][0]] * ratio:
+            groups[-1].append(i)
+        else:
+            groups.append([i])
+    return groups
+
+
+@dataclass(frozen=True)
+class Found:
+    """Scores (STEP, STEP) of one trial at the origins of each block that it can lie in."""
+
+    trial: Trial
+    blocks: list[tuple[Block, Float32]]
+
+
+@dataclass(frozen=True)
+class _Search:
+    view: View
+    query: PlaceQuery
+    correlator: LevelCorrelator
+    extractor: FeatureExtractor
+    config: RelocalizationConfig
+    seen: Footprint
+    heights: Array
+
+    def empty(self) -> Scores:
+        rows, columns = self.correlator.level.shape
+        lead = SIZE - STEP
+        shape = (rows + lead, columns + lead)
+        return Scores(np.full(shape, -1.0, np.float32), np.zeros(shape, np.int32))
+
+    def at_heading(
+        self, heading: float, group: list[int], should_stop: Callable[[], bool]
+    ) -> list[Found] | None:
+        """One heading at heights that share an extraction, against every block of theirs."""
+        wanted = []
+        for scale in group:
+            trial = self.trial(heading, float(self.heights[scale]))
+            blocks = [b for b in self.correlator.blocks() if self.meets(b, trial, scale)]
+            if blocks:
+                wanted.append((scale, trial, blocks))
+        if not wanted:
+            return []
+        features, mask = self.patch(wanted[len(wanted) // 2][1])
+        found = []
+        for scale, trial, blocks in wanted:
+            patch = transform_patch(_resized(features, trial.cells), _resized(mask, trial.cells))
+            scores = []
+            for block in blocks:
+                if should_stop():
+                    return None
+                raw = self.correlator.correlate(patch, block)
+                scores.append((block, self.masked(raw, block, trial, scale)))
+            found.append(Found(trial, scores))
+        return found
+
+    def trial(self, heading: float, height: float) -> Trial:
+        c, s = np.cos(heading), np.sin(heading)
+        offset = np.array([[c, -s], [s, c]]) @ self.seen.centre * height
+        side = self.seen.side_m * height / self.correlator.level.cell_m
+        return Trial(heading, height, offset, int(np.clip(round(side), 8, SIZE - STEP)))
+
+    def patch(self, trial: Trial) -> tuple[Float32, Float32]:
+        """Features (n, n, K), weighted, and where they count (n, n), of one rectification."""
+        level = self.correlator.level
+        side_px = patch_side(self.seen.side_m * trial.height_m, level.gsd_m, _MOST_PX)
+        # Exactly the trial's ground, whatever the network's input has to be divisible by.
+        gsd = trial.cells * level.cell_m / side_px
+        patch = rectify(
+            self.view.image, self.view.camera, turned(self.query.rotation, trial.heading_rad),
+            trial.height_m, trial.centre, side_px, gsd,
+        )  # fmt: skip
+        features = comparable_level(self.extractor, patch.rgb)
+        inner = cv2.erode(patch.seen.astype(np.uint8), np.ones((_UNSEEN_PX, _UNSEEN_PX), np.uint8))
+        n = side_px // STRIDE
+        mask = cv2.resize(inner.astype(np.float32), (n, n), interpolation=cv2.INTER_AREA)
+        weighted = level.projection(features.features) * (mask * features.confidence)[..., None]
+        return weighted.astype(np.float32), (mask > 0.05).astype(np.float32)
+
+    def meets(self, block: Block, trial: Trial, scale: int) -> bool:
+        """Whether any origin of a block is a place of the region at about the trial's height."""
+        region = self.query.region
+        if region is not None:
+            low, high = region.bounds
+            first = self.camera_at(np.array([block.row + STEP, block.column]), trial)
+            last = self.camera_at(np.array([block.row, block.column + STEP]), trial)
+            if (first > high).any() or (last < low).any():
+                return False
+        return bool(self.suits(self.ground(block, trial), scale).any())
+
+    def ground(self, block: Block, trial: Trial) -> Float32:
+        """Heights of the ground under the middles of the patches, every `GROUND_CELLS`."""
+        ground = self.correlator.level.ground
+        at = np.arange(0, STEP, GROUND_CELLS) + (GROUND_CELLS + trial.cells) // 2
+        rows, columns = at + block.row, at + block.column
+        i, j = rows // GROUND_CELLS, columns // GROUND_CELLS
+        inside = np.ix_(i.clip(0, ground.shape[0] - 1), j.clip(0, ground.shape[1] - 1))
+        out = ((i < 0) | (i >= ground.shape[0]))[:, None] | ((j < 0) | (j >= ground.shape[1]))
+        return np.where(out, np.nan, ground[inside]).astype(np.float32)
+
+    def suits(self, ground: Float32, scale: int) -> NDArray[np.bool_]:
+        """Where a scale is within its step of what the query's height says, errors included."""
+        reach = math.sqrt(self.config.scale_step)
+        above = self.query.height_m - ground
+        sigma = self.query.height_sigma_m
+        low = np.maximum(above - sigma, _LEAST_HEIGHT_M) / reach
+        high = np.maximum(above + sigma, _LEAST_HEIGHT_M) * reach
+        height = self.heights[scale]
+        return np.asarray((low <= height) & (height <= high))
+
+    def masked(self, scores: Float32, block: Block, trial: Trial, scale: int) -> Float32:
+        suits = self.suits(self.ground(block, trial), scale)
+        if not suits.all():
+            fine = np.kron(suits, np.ones((GROUND_CELLS, GROUND_CELLS), np.bool_))
+            scores = np.where(fine, scores, np.float32(-1.0))
+        if self.query.region is not None:
+            scores = np.where(self.inside(block, trial, self.query.region), scores, -1.0)
+        return scores.astype(np.float32, copy=False)
+
+    def inside(self, block: Block, trial: Trial, region: SearchRegion) -> NDArray[np.bool_]:
+        rows, columns = np.arange(STEP) + block.row, np.arange(STEP) + block.column
+        grid = np.stack(np.meshgrid(rows, columns, indexing="ij"), axis=-1)
+        return region.contains(self.camera_at(grid, trial))
+
+    def camera_at(self, origin: NDArray[np.int64], trial: Trial) -> Array:
+        """East and north (..., 2) of the camera whose patch begins at cell (..., 2)."""
+        level = self.correlator.level
+        middle = (np.asarray(origin, np.float64) + trial.cells / 2) * level.cell_m
+        east = level.west + middle[..., 1] - trial.centre[0]
+        north = level.north - middle[..., 0] - trial.centre[1]
+        return np.stack([east, north], axis=-1)
+
+    def merge(self, scores: Scores, trial: int, blocks: list[tuple[Block, Float32]]) -> None:
+        lead = (SIZE - STEP) // 2
+        rows, columns = scores.best.shape
+        for block, values in blocks:
+            r, c = block.row + lead, block.column + lead
+            h, w = min(STEP, rows - r), min(STEP, columns - c)
+            window = np.s_[r : r + h, c : c + w]
+            better = values[:h, :w] > scores.best[window]
+            scores.best[window][better] = values[:h, :w][better]
+            scores.trial[window][better] = trial
+
+    def candidates(self, scores: Scores, trials: list[Trial]) -> list[PlaceCandidate]:
+        """The highest peaks, no two closer than `_SUPPRESSED_M`."""
+        lead = (SIZE - STEP) // 2
+        best = scores.best.copy()
+        reach = max(2, round(_SUPPRESSED_M / self.correlator.level.cell_m))
+        found: list[PlaceCandidate] = []
+        while len(found) < self.config.candidates + 1:
+            i, j = np.unravel_index(int(np.argmax(best)), best.shape)
+            score = float(best[i, j])
+            if score <= 0:
+                break
+            trial = trials[int(scores.trial[i, j])]
+            place = self.camera_at(np.array([i - lead, j - lead]), trial)
+            pose = Pose(
+                turned(self.query.rotation, trial.heading_rad),
+                np.array([*place, self.query.height_m]),
+            )
+            found.append(PlaceCandidate(pose, score))
+            best[max(i - reach, 0) : i + reach + 1, max(j - reach, 0) : j + reach + 1] = -1.0
+        return found
+
+
+def _resized(values: Float32, n: int) -> Float32:
+    """(m, m) or (m, m, K) to n cells a side."""
+    if values.shape[0] == n:
+        return values
+    resized: Float32 = cv2.resize(values, (n, n), interpolation=cv2.INTER_LINEAR)
+    return resized

@@ -1,0 +1,96 @@
+"""What goes into a search for a place and what comes out."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from localizer.geometry.pose import Array, Pose
+from localizer.types import Frame
+
+
+@dataclass(frozen=True)
+class SearchRegion:
+    """An ellipse in which the camera is. centre: (2,) east and north, m; shape: (2, 2) m², positive
+    definite: inside is where ``(x - centre)' shape^-1 (x - centre) <= 1``.
+    """
+
+    centre: Array
+    shape: Array
+
+    @classmethod
+    def circle(cls, centre: Array, radius_m: float) -> SearchRegion:
+        """All places up to `radius_m` from `centre` (2,)."""
+        return cls(np.asarray(centre, np.float64)[:2], np.eye(2) * radius_m**2)
+
+    @classmethod
+    def from_covariance(cls, mean: Array, covariance: Array, sigmas: float = 3.0) -> SearchRegion:
+        """The ellipse of so many sigmas of a position (2,) with its covariance (2, 2)."""
+        return cls(np.asarray(mean, np.float64)[:2], np.asarray(covariance)[:2, :2] * sigmas**2)
+
+    @property
+    def bounds(self) -> tuple[Array, Array]:
+        """Least and greatest east and north, (2,) each."""
+        reach = np.sqrt(np.diag(self.shape))
+        return self.centre - reach, self.centre + reach
+
+    def contains(self, places: Array) -> NDArray[np.bool_]:
+        """Which of the places (..., 2) lie inside."""
+        d = np.asarray(places, np.float64) - self.centre
+        inside = np.einsum("...i,ij,...j->...", d, np.linalg.inv(self.shape), d) <= 1.0
+        return np.asarray(inside)
+
+
+@dataclass(frozen=True)
+class PlaceQuery:
+    """One frame and what other sensors say of its camera.
+
+    rotation: (3, 3) world_from_camera by autopilot and gimbal, of which roll and pitch are known to
+    tilt_sigma_rad, and the heading to heading_sigma_rad, or not at all where that is None.
+    height_m: the camera's world z (barometer, m). region: where it can be, None for the whole map.
+    """
+
+    frame: Frame
+    rotation: Array
+    tilt_sigma_rad: float
+    heading_sigma_rad: float | None
+    height_m: float
+    height_sigma_m: float
+    region: SearchRegion | None = None
+
+
+@dataclass(frozen=True)
+class PlaceCandidate:
+    """A place that looks like the frame from above. score: normalised correlation, -1 to 1."""
+
+    world_from_camera: Pose
+    score: float
+
+
+@dataclass(frozen=True)
+class Relocalization:
+    """A place that was found and confirmed by registration.
+
+    covariance: (6, 6) as `PosePrior`'s. quality, overlap: of the registration; score: correlation
+    of the candidate it came from, runner_up: of the best candidate elsewhere; rank: of the
+    candidate, from 0; rival_quality: of the best registration elsewhere, 0 where there is none;
+    cpu_s: processor time by stage.
+    """
+
+    world_from_camera: Pose
+    covariance: Array
+    exposure_time_ns: int
+    quality: float
+    overlap: float
+    score: float
+    runner_up: float
+    rank: int
+    rival_quality: float
+    stage_s: dict[str, float]
+
+    @property
+    def separation(self) -> float:
+        """Score over the runner-up's: 1 is no separation at all."""
+        return self.score / max(self.runner_up, 1e-6)

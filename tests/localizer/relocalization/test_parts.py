@@ -1,0 +1,139 @@
+"""The search's parts, each against what it should be by definition."""
+
+import numpy as np
+import pytest
+
+from localizer.geometry.camera import Camera
+from localizer.geometry.pose import so3_exp
+from localizer.relocalization.config import RelocalizationConfig
+from localizer.relocalization.correlate import STEP, LevelCorrelator, transform_patch
+from localizer.relocalization.overview import OverviewLevel, Projection
+from localizer.relocalization.patch import footprint, rectify, turned
+from localizer.relocalization.search import headings, scales, shared_extractions
+from localizer.relocalization.topview import DOWN
+from localizer.relocalization.types import PlaceQuery, SearchRegion
+from localizer.relocalization.verify import tilt_and_heading
+from localizer.types import Frame
+
+CAMERA = Camera.from_fov(160, 120, 60.0)
+CONFIG = RelocalizationConfig()
+
+
+def query(heading_sigma_rad=None, height_m=100.0, height_sigma_m=2.0):
+    frame = Frame(np.zeros((120, 160, 3), np.uint8), 1, CAMERA, 0)
+    return PlaceQuery(frame, DOWN, 0.01, heading_sigma_rad, height_m, height_sigma_m)
+
+
+def level(features):
+    side = features.shape[1] // 16
+    ground = np.zeros((side, features.shape[2] // 16), np.float32)
+    none = Projection(np.zeros(3, np.float32), np.eye(3, dtype=np.float32))
+    return OverviewLevel(features, ground, none, 0.0, 0.0, 0.5)
+
+
+def test_a_region_is_an_ellipse():
+    region = SearchRegion.from_covariance(np.array([10.0, -5.0]), np.diag([4.0, 100.0]), 3.0)
+    assert region.contains(np.array([[10, 24], [15.9, -5], [16.1, -5], [10, 26]])).tolist() == [
+        True, True, False, False,
+    ]  # fmt: skip
+    low, high = region.bounds
+    np.testing.assert_allclose((*low, *high), (4, -35, 16, 25))
+
+
+def test_scores_are_normalised_correlations():
+    rng = np.random.default_rng(0)
+    features = rng.integers(-60, 60, (3, 288, 288)).astype(np.int8)
+    n = 24
+    mask = (rng.random((n, n)) > 0.2).astype(np.float32)
+    patch = rng.normal(size=(n, n, 3)).astype(np.float32) * mask[..., None]
+    correlator = LevelCorrelator(level(features), 1 << 26)
+    spectra = transform_patch(patch, mask)
+    checked = 0
+    for block in correlator.blocks():
+        scores = correlator.correlate(spectra, block)
+        for i, j in ((3, 5), (77, 120), (STEP - 1, 40)):
+            r, c = block.row + i, block.column + j
+            if min(r, c) < 0 or max(r, c) + n > 288:
+                continue
+            window = features[:, r : r + n, c : c + n].transpose(1, 2, 0) * 0.01
+            energy = ((window**2).sum(-1) * mask).sum()
+            expected = (window * patch).sum() / np.sqrt(energy * (patch**2).sum())
+            # The energy under the patch is summed over 8 cells and interpolated: a few per cent.
+            assert scores[i, j] == pytest.approx(expected, rel=0.1, abs=0.003)
+            checked += 1
+    assert checked >= 6
+
+
+def test_a_cut_from_the_map_scores_one_where_it_was_cut_and_nowhere_else():
+    rng = np.random.default_rng(1)
+    features = rng.integers(-60, 60, (3, 320, 320)).astype(np.int8)
+    r, c, n = 150, 201, 40
+    cut = features[:, r : r + n, c : c + n].transpose(1, 2, 0).astype(np.float32) * 0.01
+    correlator = LevelCorrelator(level(features), 0)  # no budget: nothing is kept
+    spectra = transform_patch(cut, np.ones((n, n), np.float32))
+    best = []
+    for block in correlator.blocks():
+        scores = correlator.correlate(spectra, block)
+        i, j = np.unravel_index(int(np.argmax(scores)), scores.shape)
+        best.append((float(scores[i, j]), block.row + i, block.column + j))
+    best.sort(reverse=True)
+    assert best[0][1:] == (r, c)
+    assert best[0][0] == pytest.approx(1.0, abs=0.05)
+    assert best[1][0] < 0.3
+
+
+def test_rectified_ground_lies_where_it_is():
+    """A camera that looks down obliquely, turned to the north-east: a spot on the ground."""
+    rotation = turned(so3_exp((np.radians(25), 0, 0)) @ DOWN, np.radians(-40))
+    height, spot = 80.0, np.array([13.0, 31.0])
+    pixel, inside = CAMERA.project(rotation.T @ np.array([*spot, -height]))
+    assert inside
+    image = np.zeros((CAMERA.height, CAMERA.width, 3), np.uint8)
+    u, v = pixel.astype(int)
+    image[v - 1 : v + 2, u - 1 : u + 2] = 255
+    centre = np.array([10.0, 40.0])
+    patch = rectify(image, CAMERA, rotation, height, centre, 128, 0.5)
+    rows, columns = np.nonzero(patch.rgb[..., 0] > 100)
+    east = centre[0] + (columns.mean() + 0.5 - 64) * 0.5
+    north = centre[1] - (rows.mean() + 0.5 - 64) * 0.5
+    np.testing.assert_allclose((east, north), spot, atol=0.8)
+    assert patch.seen[int(rows[0]), int(columns[0])]
+
+
+def test_the_footprint_holds_what_is_seen():
+    found = footprint(CAMERA, DOWN, 100.0, 500.0)
+    corner = CAMERA.rays(np.zeros(2)) * 100.0
+    np.testing.assert_allclose(found.centre, 0, atol=1e-9)
+    assert found.side_m == pytest.approx(2 * np.hypot(*corner[:2]), rel=1e-6)
+    assert footprint(CAMERA, DOWN, 100.0, 90.0).side_m == 90.0
+
+
+def test_headings_cover_what_is_not_known():
+    all_round = headings(query(), CONFIG)
+    np.testing.assert_allclose(np.diff(np.append(all_round, 2 * np.pi)), np.radians(10))
+    few = headings(query(np.radians(7.5)), CONFIG)
+    assert np.abs(few).max() + np.radians(CONFIG.heading_step_deg) / 2 >= np.radians(15)
+    assert len(few) <= 4
+
+
+def test_heights_cover_the_ground_and_its_error():
+    ground = np.array([[0.0, 20.0], [np.nan, -5.0]], np.float32)
+    found = scales(query(), ground, CONFIG)
+    reach = np.sqrt(CONFIG.scale_step)
+    assert found[0] <= 78 * reach
+    assert found[-1] >= 107 / reach
+    assert (found[1:] / found[:-1] <= CONFIG.scale_step + 1e-9).all()
+    assert len(scales(query(), np.full((2, 2), np.nan, np.float32), CONFIG)) == 0
+
+
+def test_extractions_are_shared_within_a_ratio():
+    heights = np.array([50.0, 60.0, 70.0, 80.0, 200.0])
+    assert shared_extractions(heights, 1.35) == [[0, 1], [2, 3], [4]]
+
+
+def test_tilt_and_heading_of_a_turn():
+    reference = so3_exp((0.4, -0.2, 1.0))
+    turn = turned(np.eye(3), np.radians(130)) @ so3_exp((np.radians(2), 0, 0))
+    tilt, heading = tilt_and_heading(turn @ reference, reference)
+    assert np.degrees(tilt) == pytest.approx(2.0, abs=0.01)
+    assert np.degrees(heading) == pytest.approx(130.0, abs=0.05)

@@ -1,0 +1,143 @@
+"""A frame of another day, found on a small world of 400 m: and what is not there is not found."""
+
+import logging
+import shutil
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from localizer.config import LocalizerConfig
+from localizer.geometry.camera import Camera
+from localizer.geometry.pose import Pose, so3_exp
+from localizer.map.cache.cache import TileCache
+from localizer.map.cache.stream import TileStreamer
+from localizer.relocalization.overview import open_overview, overview_key
+from localizer.relocalization.patch import turned
+from localizer.relocalization.relocalizer import open_relocalizer
+from localizer.relocalization.topview import DOWN
+from localizer.relocalization.types import PlaceQuery, SearchRegion
+from localizer.render.numba_raster import NumbaRenderer
+from localizer.types import Frame
+
+CONFIG = LocalizerConfig(renderer="numba", threads=1)
+CAMERA = Camera.from_fov(320, 240, 65.0)
+PLACE = np.array([40.0, -35.0])
+
+
+@pytest.fixture(scope="module")
+def cache(small_assets, tmp_path_factory):
+    """A copy, so that the overview is put nowhere else."""
+    folder = tmp_path_factory.mktemp("overview") / "map"
+    shutil.copytree(small_assets.map_cache, folder)
+    return TileCache.open(folder)
+
+
+@pytest.fixture(scope="module")
+def opened(cache):
+    opened = open_relocalizer(cache, CONFIG)
+    yield opened
+    opened.close()
+
+
+@pytest.fixture(scope="module")
+def truth(small_assets):
+    ground = float(small_assets.world.ground_height(*PLACE))
+    rotation = turned(so3_exp((np.radians(20), 0, 0)) @ DOWN, np.radians(143))
+    return Pose(rotation, np.array([*PLACE, ground + 110.0]))
+
+
+@pytest.fixture(scope="module")
+def query(small_assets, truth):
+    """The frame of another day; the heading that is given is 100 degrees off, the height 2 m."""
+    with TileStreamer(TileCache.open(small_assets.live_cache)) as streamer:
+        renderer = NumbaRenderer(streamer, 1)
+        rgb = renderer.render(truth, CAMERA, wait=True).rgb
+        renderer.close()
+    return PlaceQuery(
+        Frame(rgb, 123, CAMERA, 7),
+        turned(so3_exp((0.005, -0.004, 0)) @ truth.rotation, np.radians(100)),
+        tilt_sigma_rad=np.radians(0.7),
+        heading_sigma_rad=None,
+        height_m=float(truth.translation[2]) + 2.0,
+        height_sigma_m=2.0,
+    )
+
+
+def test_found_with_no_idea_of_place_or_heading(opened, query, truth):
+    found = opened.relocalizer.find(query)
+    assert found is not None
+    metres, degrees = found.world_from_camera.distance_to(truth)
+    assert (metres < 1.0, degrees < 0.5) == (True, True)
+    assert found.exposure_time_ns == 123
+    assert found.quality > found.rival_quality + CONFIG.relocalization.margin
+    assert found.separation > 1.0
+    off = found.world_from_camera.translation - truth.translation
+    assert off @ np.linalg.solve(found.covariance[:3, :3], off) < 30
+
+
+def test_the_region_is_kept(opened, query, truth):
+    near = SearchRegion.circle(truth.translation + 20.0, 60.0)
+    places = opened.relocalizer.search(replace(query, region=near))
+    xy = np.array([c.world_from_camera.translation[:2] for c in places])
+    assert near.contains(xy).all()
+    assert np.linalg.norm(xy[0] - PLACE) < 15
+    elsewhere = SearchRegion.circle(-truth.translation, 40.0)
+    assert opened.relocalizer.find(replace(query, region=elsewhere)) is None
+
+
+def test_a_heading_that_is_known_is_kept(opened, query, truth):
+    wrong = replace(query, heading_sigma_rad=np.radians(5))  # it is 100 degrees off
+    assert opened.relocalizer.find(wrong) is None
+
+
+def test_a_frame_of_nowhere_is_not_found(opened, query):
+    noise = np.random.default_rng(3).integers(0, 255, (15, 20, 3)).astype(np.uint8)
+    blocks = np.kron(noise, np.ones((16, 16, 1), np.uint8))
+    frame = replace(query.frame, image=blocks)
+    near = SearchRegion.circle(PLACE, 80.0)
+    assert opened.relocalizer.find(replace(query, frame=frame, region=near)) is None
+
+
+def test_stops_when_told(opened, query):
+    calls = []
+
+    def stop():
+        calls.append(1)
+        return len(calls) > 3
+
+    assert opened.relocalizer.find(query, stop) is None
+    assert len(calls) <= 6  # at the next heading, not at the end
+
+
+def test_the_overview_is_kept_and_a_damaged_one_is_made_again(cache, opened, caplog):
+    first = opened.relocalizer.overview
+    folder = cache.path / "overview" / first.key
+    files = sorted(folder.iterdir())
+    assert [f.suffix for f in files] == [".safetensors"] * 3
+    small = folder / "2.safetensors"
+    stamps = {f: f.stat().st_mtime_ns for f in files}
+    content = bytearray(small.read_bytes())
+    content[500] ^= 255
+    small.write_bytes(content)
+    with TileStreamer(cache) as streamer, caplog.at_level(logging.WARNING):
+        renderer = NumbaRenderer(streamer, 1)
+        extractor = opened.relocalizer.extractor
+        again = open_overview(cache, renderer, extractor)
+        assert "2.safetensors: damaged" in caplog.text
+        for a, b in zip(first.levels, again.levels, strict=True):
+            np.testing.assert_array_equal(a.features, b.features)
+            np.testing.assert_array_equal(a.ground, b.ground)
+        caplog.clear()
+        open_overview(cache, renderer, extractor)
+        assert not caplog.records
+        renderer.close()
+    assert stamps[files[0]] == files[0].stat().st_mtime_ns  # the whole ones were left alone
+
+
+def test_another_map_or_model_has_an_overview_of_its_own(cache):
+    other = TileCache(
+        cache.path, cache.manifest.model_copy(update={"index_sha256": "0" * 64}), cache.index
+    )
+    keys = {overview_key(c, m) for c in (cache, other) for m in ("tiny", "another")}
+    assert len(keys) == 4
