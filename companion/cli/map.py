@@ -61,6 +61,13 @@ def build(
     scheduler: Annotated[
         str | None, typer.Option(help="address of a Dask scheduler that shares the file system")
     ] = None,
+    overview: Annotated[
+        bool,
+        typer.Option(
+            "--overview",
+            help="compute now what finding a place without a prior needs, not on first use",
+        ),
+    ] = False,
 ) -> None:
     """Import a source into a tile cache; goes on where an interrupted build stopped."""
     from localizer.map.building.build import build_cache
@@ -92,6 +99,8 @@ def build(
     )
     if manifest.skipped:
         Console().print(f"[yellow]{len(manifest.skipped)} source tiles were left out")
+    if overview:
+        _make_overview(out)
 
 
 @app.command("info")
@@ -205,6 +214,27 @@ def export(
     with _written(out):
         triangles = export_glb(opened, out, level)
     Console().print(f"{out}: {triangles} triangles, {out.stat().st_size / 1e6:.1f} MB")
+
+
+def _make_overview(cache: Path) -> None:
+    """The map's features from above, with a bar."""
+    from rich.progress import Progress
+
+    from localizer.config import LocalizerConfig
+    from localizer.map.cache.cache import TileCache
+    from localizer.relocalization.relocalizer import open_relocalizer
+
+    with Progress() as bar:
+        task = bar.add_task("overview", total=None)
+        opened = open_relocalizer(
+            TileCache.open(cache),
+            LocalizerConfig(),
+            progress=lambda done, total: bar.update(task, completed=done, total=total),
+        )
+    if opened is not None:
+        with opened as relocalizer:
+            view = relocalizer.overview
+            Console().print(f"overview: {view.area_km2:.2f} km², {view.nbytes / 1e6:.1f} MB")
 
 
 def _require_place(*files: Path) -> None:
