@@ -13,7 +13,7 @@ from typing import Any
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from mavlink_bridge import quaternion as quat
-from mavlink_bridge.camera.messages import cursor_on_target
+from mavlink_bridge.camera.cursor_on_target import cursor_on_target
 from mavlink_bridge.components import COMMANDS_IN, Components
 from mavlink_bridge.config import BridgeConfig, SigningConfig
 from mavlink_bridge.errors import BridgeStateError

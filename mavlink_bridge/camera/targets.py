@@ -1,0 +1,111 @@
+"""A target in MAVLink: its coordinates, its place in the picture, and its mark on the map.
+
+CAMERA_TRACKING_GEO_STATUS is the standard for a target's coordinates;
+CAMERA_TRACKING_IMAGE_STATUS is what QGroundControl and Mission Planner draw; ADSB_VEHICLE is what
+all three draw on the map (ground link only: ArduPilot ingests it as traffic).
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+from pymavlink.dialects.v20 import ardupilotmega as mavlink
+
+from mavlink_bridge.messages import Origin, TargetReport
+from mavlink_bridge.vehicle.origin import north_east
+
+NAN = math.nan
+_ADSB_FLAGS = (
+    mavlink.ADSB_FLAGS_VALID_COORDS
+    | mavlink.ADSB_FLAGS_VALID_ALTITUDE
+    | mavlink.ADSB_FLAGS_VALID_CALLSIGN
+)
+_ICAO_BASE = 0xF00000  # unassigned block; the low bits carry the target's number
+
+
+def tracking_image_status(report: TargetReport | None) -> Any:
+    """CAMERA_TRACKING_IMAGE_STATUS (275): where the target is in the picture; None: idle."""
+    if report is None or (report.pixel is None and report.rectangle is None):
+        active, mode = mavlink.CAMERA_TRACKING_STATUS_FLAGS_IDLE, 0
+        point, rectangle = (NAN, NAN), (NAN,) * 4
+    elif report.rectangle is not None:
+        active = mavlink.CAMERA_TRACKING_STATUS_FLAGS_ACTIVE
+        mode, point, rectangle = (
+            mavlink.CAMERA_TRACKING_MODE_RECTANGLE,
+            (NAN, NAN),
+            report.rectangle,
+        )
+    else:
+        active = mavlink.CAMERA_TRACKING_STATUS_FLAGS_ACTIVE
+        mode, rectangle = mavlink.CAMERA_TRACKING_MODE_POINT, (NAN,) * 4
+        point = report.pixel or (NAN, NAN)
+    return mavlink.MAVLink_camera_tracking_image_status_message(
+        active,
+        mode,
+        mavlink.CAMERA_TRACKING_TARGET_DATA_IN_STATUS if mode else 0,
+        *point,
+        NAN,
+        *rectangle,
+    )
+
+
+def tracking_geo_status(
+    report: TargetReport, geoid_separation_m: float, camera: Origin | None
+) -> Any:
+    """CAMERA_TRACKING_GEO_STATUS (276): the target's coordinates with accuracies.
+
+    camera: the aircraft's position, for distance; altitudes are AMSL.
+    """
+    altitude = report.height_m - geoid_separation_m
+    velocity = report.velocity_ned or (NAN, NAN, NAN)
+    heading = NAN
+    if math.hypot(velocity[0], velocity[1]) > 0.5:
+        heading = math.atan2(velocity[1], velocity[0]) % (2.0 * math.pi)
+    distance = NAN
+    if camera is not None:
+        n, e = north_east(
+            camera.latitude_deg, camera.longitude_deg, report.latitude_deg, report.longitude_deg
+        )
+        distance = math.sqrt(n * n + e * e + (altitude - camera.altitude_amsl_m) ** 2)
+    return mavlink.MAVLink_camera_tracking_geo_status_message(
+        mavlink.CAMERA_TRACKING_STATUS_FLAGS_ACTIVE,
+        round(report.latitude_deg * 1e7),
+        round(report.longitude_deg * 1e7),
+        altitude,
+        report.h_accuracy_m,
+        report.v_accuracy_m,
+        *velocity,
+        NAN,
+        distance,
+        heading,
+        NAN,
+    )
+
+
+def adsb_vehicle(report: TargetReport, geoid_separation_m: float) -> Any:
+    """ADSB_VEHICLE (246) for a target, so that every ground station draws it."""
+    velocity = report.velocity_ned
+    flags, heading, speed, climb = _ADSB_FLAGS, 0, 0, 0
+    if velocity is not None:
+        flags |= mavlink.ADSB_FLAGS_VALID_HEADING | mavlink.ADSB_FLAGS_VALID_VELOCITY
+        heading = round(math.degrees(math.atan2(velocity[1], velocity[0])) % 360.0 * 100) % 36000
+        speed = min(round(math.hypot(velocity[0], velocity[1]) * 100), 65535)
+        climb = max(-32768, min(32767, round(-velocity[2] * 100)))
+    return mavlink.MAVLink_adsb_vehicle_message(
+        _ICAO_BASE | (report.target_id & 0xFFFF),
+        round(report.latitude_deg * 1e7),
+        round(report.longitude_deg * 1e7),
+        mavlink.ADSB_ALTITUDE_TYPE_GEOMETRIC,
+        round((report.height_m - geoid_separation_m) * 1e3),
+        heading,
+        speed,
+        climb,
+        f"TGT{report.target_id % 10000:04d}".encode(),
+        mavlink.ADSB_EMITTER_TYPE_POINT_OBSTACLE
+        if velocity is None
+        else mavlink.ADSB_EMITTER_TYPE_SERVICE_SURFACE,
+        1,
+        flags,
+        0,
+    )
