@@ -32,6 +32,7 @@ from mavlink_bridge.messages import (
     CameraView,
     GimbalAttitude,
     HealthLevel,
+    TargetEnd,
     TargetReport,
     TrackRequest,
     VehicleState,
@@ -168,11 +169,15 @@ class Bridge:
             except OSError as error:
                 _log.debug("Cursor-on-Target not sent: %s", error)
 
+    def forget(self, target_id: int) -> None:
+        """Tell the ground of that target no more; never blocks."""
+        self._to_ground(TargetEnd(target_id))
+
     def look(self, view: CameraView) -> None:
         """Tell the ground where the camera looks (CAMERA_FOV_STATUS); never blocks."""
         self._to_ground(view)
 
-    def _to_ground(self, item: TargetReport | CameraView) -> None:
+    def _to_ground(self, item: TargetReport | TargetEnd | CameraView) -> None:
         self._ground.show(item)
         self._ground_link.wake()
 

@@ -10,7 +10,14 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from mavlink_bridge.camera.component import CameraComponent
 from mavlink_bridge.link.link import Link
-from mavlink_bridge.messages import CameraView, HealthLevel, Origin, TargetReport, VehicleState
+from mavlink_bridge.messages import (
+    CameraView,
+    HealthLevel,
+    Origin,
+    TargetEnd,
+    TargetReport,
+    VehicleState,
+)
 from mavlink_bridge.shared import Shared
 
 COMMANDS_IN = ("COMMAND_LONG", "COMMAND_INT")
@@ -35,14 +42,14 @@ class Components:
     def __init__(self, shared: Shared, *, ground: bool) -> None:
         self._shared = shared
         self._config = shared.config
-        self._outbound: deque[TargetReport | CameraView] = deque(maxlen=_QUEUE)
+        self._outbound: deque[TargetReport | TargetEnd | CameraView] = deque(maxlen=_QUEUE)
         self._camera = CameraComponent(
             self._config, shared.geoid_separation_m, shared.on_track, ground_link=ground
         )
         self._next_heartbeat_ns = 0
 
-    def show(self, item: TargetReport | CameraView) -> None:
-        """Queue a target or a camera pose for the ground; the oldest go first when it is full."""
+    def show(self, item: TargetReport | TargetEnd | CameraView) -> None:
+        """Queue what the ground is to be told; the oldest go first when it is full."""
         self._outbound.append(item)
 
     def waiting(self) -> dict[str, int]:
@@ -80,6 +87,8 @@ class Components:
             item = self._outbound.popleft()
             if isinstance(item, TargetReport):
                 self._camera.report(item)
+            elif isinstance(item, TargetEnd):
+                self._camera.forget(item.target_id)
             else:
                 self._camera.look(item)
         position = None

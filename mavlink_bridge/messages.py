@@ -145,6 +145,13 @@ class TargetReport:
 
 
 @dataclass(frozen=True)
+class TargetEnd:
+    """Nothing is to be told of that target any more."""
+
+    target_id: int
+
+
+@dataclass(frozen=True)
 class CameraView:
     """Where the camera is and what it looks at, for CAMERA_FOV_STATUS.
 

@@ -50,6 +50,8 @@ class Channels:
     """Every estimate, accepted or not, with its reference view, on the localization thread."""
     targets: Channel[[Target]] = field(default_factory=Channel)
     """Every located target, on the targets' thread."""
+    gone: Channel[[str]] = field(default_factory=Channel)
+    """The name of every target that was ended by order, on the targets' thread."""
     clicks: Channel[[TrackRequest]] = field(default_factory=Channel)
     """What the ground station asks the camera to track, on a MAVLink link's thread."""
     texts: Channel[[int, str]] = field(default_factory=Channel)

@@ -146,19 +146,22 @@ def vehicle_prior(
 
 
 def target_report(
-    fix: TargetFix, velocity: Array, camera: Camera, frame: LocalFrame, number: int
+    fix: TargetFix, velocity: Array | None, camera: Camera, frame: LocalFrame, number: int
 ) -> TargetReport:
-    """A located target for the ground. velocity: (3,) m/s, world axes; camera: that of the frame
-    in which it was seen.
+    """A located target for the ground. velocity: (3,) m/s, world axes, None where it is unknown;
+    camera: that of the frame in which it was seen.
     """
     position = frame.position(fix.position_world)
-    east, north, up = velocity
+    velocity_ned = None
+    if velocity is not None:
+        east, north, up = (float(v) for v in velocity)
+        velocity_ned = (north, east, -up)
     return TargetReport(
         time_ns=fix.exposure_time_ns,
         latitude_deg=position.latitude_deg,
         longitude_deg=position.longitude_deg,
         height_m=position.height_m,
-        velocity_ned=(float(north), float(east), float(-up)),
+        velocity_ned=velocity_ned,
         h_accuracy_m=float(np.sqrt(fix.covariance[0, 0] + fix.covariance[1, 1])),
         v_accuracy_m=float(np.sqrt(fix.covariance[2, 2])),
         pixel=(fix.pixel[0] / camera.width, fix.pixel[1] / camera.height),

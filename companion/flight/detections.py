@@ -19,6 +19,8 @@ from companion.errors import ConfigError, DetectionError
 _log = logging.getLogger(__name__)
 _MAX_DATAGRAM = 2048
 _MAX_NAME = 64
+# What the targets that the operator clicked at are called: a number follows.
+CLICKED = "ground station "
 _PAUSE_S = 0.001  # at most a thousand detections a second: a flood must not take the interpreter
 
 
@@ -49,6 +51,8 @@ def parse_detection(data: bytes) -> Detection:
     name = detection.target_id
     if not 0 < len(name) <= _MAX_NAME or not name.isprintable():
         raise DetectionError(f"target_id must have 1 to {_MAX_NAME} printable characters")
+    if name.startswith(CLICKED):
+        raise DetectionError(f"target_id {name!r}: names that begin so are the operator's clicks")
     return detection
 
 

@@ -116,7 +116,7 @@ def _estimate_row(estimate: PoseEstimate, frame: LocalFrame) -> tuple[Any, ...]:
     )  # fmt: skip
 
 
-def _target_row(fix: TargetFix, velocity: Array, frame: LocalFrame) -> tuple[Any, ...]:
+def _target_row(fix: TargetFix, velocity: Array | None, frame: LocalFrame) -> tuple[Any, ...]:
     """What stands in `TARGET_COLUMNS` for a target's fix."""
     position = frame.position(fix.position_world)
     horizontal = (fix.covariance[0, 0] + fix.covariance[1, 1]) ** 0.5
@@ -124,7 +124,8 @@ def _target_row(fix: TargetFix, velocity: Array, frame: LocalFrame) -> tuple[Any
         fix.exposure_time_ns, fix.target_id, *(f"{x:.4f}" for x in fix.position_world),
         f"{position.latitude_deg:.9f}", f"{position.longitude_deg:.9f}",
         f"{position.height_m:.4f}", f"{horizontal:.3f}", f"{fix.covariance[2, 2] ** 0.5:.3f}",
-        *(f"{x:.3f}" for x in velocity), *(f"{x:.2f}" for x in fix.pixel),
+        *(("",) * 3 if velocity is None else (f"{x:.3f}" for x in velocity)),
+        *(f"{x:.2f}" for x in fix.pixel),
         *(f"{x:.5f}" for x in fix.covariance[np.triu_indices(3)]), f"{fix.elsewhere:.3f}",
     )  # fmt: skip
 
@@ -171,8 +172,8 @@ class Recorder:
         """Record one estimate (accepted or not)."""
         self._put("estimates", lambda: _estimate_row(estimate, self._frame))
 
-    def target(self, fix: TargetFix, velocity: Array) -> None:
-        """Record one target fix with its filtered velocity (3,) in world axes."""
+    def target(self, fix: TargetFix, velocity: Array | None) -> None:
+        """Record one target fix with its filtered velocity (3,) in world axes, if it has one."""
         self._put("targets", lambda: _target_row(fix, velocity, self._frame))
 
     def event(self, level: str, text: str) -> None:

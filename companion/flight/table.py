@@ -118,7 +118,9 @@ def _health(making: Making) -> HealthMonitor:
 def _targets(making: Making) -> TargetReporter:
     channels, bridge = making.channels, making[Bridge]
     cache, numbers = making[MapStack].cache, TargetNumbers()
-    reporter = TargetReporter(making.config.targets, MapSurface(cache).cast, channels.targets.send)
+    reporter = TargetReporter(
+        making.config.targets, MapSurface(cache).cast, channels.targets.send, channels.gone.send
+    )
 
     def report(target: Target) -> None:
         camera, number = target.estimate.camera, numbers.of(target.fix.target_id)
@@ -126,11 +128,12 @@ def _targets(making: Making) -> TargetReporter:
 
     channels.estimates.subscribe(lambda estimate, _: reporter.add_estimate(estimate))
     channels.targets.subscribe(report)
+    channels.gone.subscribe(lambda name: bridge.forget(numbers.of(name)))
     return reporter
 
 
 def _clicks(making: Making) -> ClickPolicy:
-    clicks = ClickPolicy(making[TargetReporter].add_detection, making[Bridge].say)
+    clicks = ClickPolicy(making[TargetReporter], making[Bridge].say)
     making.channels.estimates.subscribe(clicks.add_estimate)
     making.channels.clicks.subscribe(clicks.on_request)
     return clicks

@@ -25,26 +25,34 @@ _GONE_NS = 10_000_000_000
 
 @dataclass(frozen=True)
 class Target:
-    """A filtered fix. velocity: (3,) m/s, world axes."""
+    """A filtered fix. velocity: (3,) m/s, world axes; None of what was located once."""
 
     fix: TargetFix
-    velocity: Array
+    velocity: Array | None
     estimate: PoseEstimate
 
 
 class TargetReporter:
     """Pairs detections with accepted estimates, casts the rays, filters, and hands the target on.
 
+    on_gone: called on the targets' thread with each name that `forget` ended, after the last
+    on_target of that name.
     missed counts detections that show no map: beside the picture, or in the sky; failed what
     raised an error, of which the first is logged; refused those of targets beyond the 32nd.
     """
 
     def __init__(
-        self, config: TargetConfig, cast: RayCaster, on_target: Callable[[Target], None]
+        self,
+        config: TargetConfig,
+        cast: RayCaster,
+        on_target: Callable[[Target], None],
+        on_gone: Callable[[str], None] = lambda _name: None,
     ) -> None:
         self._config = config
         self._cast = cast
         self._on_target = on_target
+        self._on_gone = on_gone
+        self._forgotten: tuple[str, ...] = ()
         self._estimates: deque[PoseEstimate] = deque(maxlen=_KEPT)
         self._detections: deque[Detection] = deque(maxlen=_KEPT)
         self._filters: dict[str, TargetFilter] = {}
@@ -80,22 +88,44 @@ class TargetReporter:
             self._detections.append(detection)
             self._condition.notify()
 
+    def forget(self, names: tuple[str, ...]) -> None:
+        """End these targets: what was seen of them is dropped. Never blocks."""
+        with self._condition:
+            self._forgotten += names
+            kept = (d for d in self._detections if d.target_id not in names)
+            self._detections = deque(kept, maxlen=_KEPT)
+            self._condition.notify()
+
     def _run(self) -> None:
         while True:
             with self._condition:
                 pairs = self._take_pairs()
-                if not pairs and not self._stopping:
+                if not pairs and not self._forgotten and not self._stopping:
                     self._condition.wait(0.5)
                     pairs = self._take_pairs()
                 if self._stopping:
                     return
+                forgotten, self._forgotten = self._forgotten, ()
+            self._end(forgotten)
             for detection, estimate in pairs:
+                if detection.target_id in forgotten:
+                    continue
                 try:
                     self._locate(detection, estimate)
                 except Exception:  # a target must not end the flight
                     self.failed += 1
                     if self.failed == 1:
                         _log.exception("target %s could not be located", detection.target_id)
+
+    def _end(self, names: tuple[str, ...]) -> None:
+        for name in names:
+            self._filters.pop(name, None)
+            if self._reported_ns.pop(name, None) is None:
+                continue
+            try:
+                self._on_gone(name)
+            except Exception:
+                _log.exception("the end of target %s could not be told", name)
 
     def _take_pairs(self) -> list[tuple[Detection, PoseEstimate]]:
         """Detections whose frame has an estimate; the rest wait until newer frames pass them."""

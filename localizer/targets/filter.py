@@ -34,11 +34,14 @@ _H = np.hstack([np.eye(3), np.zeros((3, 3))])
 
 @dataclass(frozen=True)
 class _Track:
-    """A hypothesis. mean: (6,) position m and velocity m/s, world axes; covariance: (6, 6)."""
+    """A hypothesis. mean: (6,) position m and velocity m/s, world axes; covariance: (6, 6);
+    sightings: how many it was made of.
+    """
 
     weight: float
     mean: Array
     covariance: Array
+    sightings: int = 1
 
 
 class TargetFilter:
@@ -50,9 +53,11 @@ class TargetFilter:
         self._outliers = 0
 
     @property
-    def velocity(self) -> Array:
-        """Velocity (3,) in m/s, world axes; zero before the first sighting."""
-        return self._tracks[0].mean[3:].copy() if self._tracks else np.zeros(3)
+    def velocity(self) -> Array | None:
+        """Velocity (3,) in m/s, world axes; None until a second sighting has measured one."""
+        if not self._tracks or self._tracks[0].sightings < 2:
+            return None
+        return self._tracks[0].mean[3:].copy()
 
     def update(self, sighting: TargetSighting) -> TargetFix:
         """Fuse a sighting of at least one surface. Three that fit no track restart the filter."""
@@ -120,7 +125,7 @@ def _met(tracks: list[_Track], surfaces: tuple[TargetSurface, ...]) -> list[_Tra
             mean, P = kalman_update(
                 track.mean, track.covariance, surface.position, surface.covariance, _H
             )
-            met.append(_Track(weight, np.asarray(mean), np.asarray(P)))
+            met.append(_Track(weight, np.asarray(mean), np.asarray(P), track.sightings + 1))
         if not pairs:
             lonely.append(track)
     heaviest = max((t.weight for t in met), default=0.0)
@@ -162,4 +167,4 @@ def _merged(tracks: list[_Track]) -> _Track:
     covariance = np.zeros((6, 6))
     for t in tracks:
         covariance += t.weight / weight * (t.covariance + np.outer(t.mean - mean, t.mean - mean))
-    return _Track(weight, mean, covariance)
+    return _Track(weight, mean, covariance, max(t.sightings for t in tracks))

@@ -80,6 +80,11 @@ class CameraComponent:
         """The newest fix of a target."""
         self._targets[target.target_id] = target
 
+    def forget(self, target_id: int) -> None:
+        """Report on that target no more."""
+        self._targets.pop(target_id, None)
+        self._sent_ns.pop(target_id, None)
+
     def look(self, view: CameraView) -> None:
         """The newest camera pose."""
         self._view = view

@@ -16,8 +16,9 @@ Columns = Mapping[str, Array]
 
 
 def read_csv(path: Path, text: Sequence[str] = ()) -> dict[str, np.ndarray]:
-    """Columns of a CSV file as float64 arrays; those named in `text` as strings, those that end in
-    ``_ns`` as int64 (a float64 would round nanoseconds).
+    """Columns of a CSV file as float64 arrays, NaN where a field is empty.
+
+    Those named in `text` are strings, those that end in ``_ns`` int64 (a float64 would round them).
     """
     with path.open(newline="", encoding="utf-8") as file:
         rows = list(csv.DictReader(file))
@@ -30,7 +31,7 @@ def read_csv(path: Path, text: Sequence[str] = ()) -> dict[str, np.ndarray]:
         elif name.endswith("_ns"):
             columns[name] = np.array([int(v) for v in values], dtype=np.int64)
         else:
-            columns[name] = np.array([float(v) for v in values])
+            columns[name] = np.array([float(v) if v else np.nan for v in values])
     return columns
 
 

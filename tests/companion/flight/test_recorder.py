@@ -36,6 +36,7 @@ def test_what_is_recorded_can_be_read_back(tmp_path):
     recorder.target(
         TargetFix("car", np.zeros(3), np.eye(3), (3.0, 4.0), 5), np.array([1.0, 2.0, 0.0])
     )
+    recorder.target(CAR, None)
     recorder.event("warning", 'a, "quoted" text\nof two lines')
     image = np.full((48, 64, 3), 200, np.uint8)
     for time_ns in (10**9, 1_500_000_000, 2 * 10**9):
@@ -47,6 +48,8 @@ def test_what_is_recorded_can_be_read_back(tmp_path):
     translation, rotation = poses(columns)[0].distance_to(pose)
     assert translation < 1e-3
     assert rotation < 1e-5
+    velocity = read_csv(tmp_path / "targets.csv", text=("target_id",))["velocity_north"]
+    np.testing.assert_array_equal(velocity, [2.0, np.nan])  # the second was located once
     with (tmp_path / "events.csv").open(newline="") as file:
         assert next(iter(csv.DictReader(file)))["text"] == 'a, "quoted" text\nof two lines'
     names = sorted(p.stem for p in (tmp_path / "snapshots").glob("*.jpg"))

@@ -32,6 +32,18 @@ def test_it_follows_a_moving_target_and_survives_an_outlier():
     assert fix.elsewhere == 0.0
 
 
+def test_what_was_seen_once_has_no_velocity():
+    target = TargetFilter()
+    assert target.velocity is None
+    target.update(_sighting(0, (1.0, GROUND, 0.3)))
+    assert target.velocity is None
+    target.update(_sighting(1, (1.0, GROUND, 0.3)))
+    assert np.linalg.norm(target.velocity) < 0.1
+    for k in range(2, 5):  # elsewhere: the third time it begins anew
+        target.update(_sighting(k, (1.0, ROOF + 200.0, 0.3)))
+    assert target.velocity is None
+
+
 def test_it_restarts_on_a_target_that_really_moved():
     target = TargetFilter()
     for k in range(20):
