@@ -31,11 +31,11 @@ from localizer.features import load_extractor
 from localizer.features.detail import DetailExtractor
 from localizer.map.cache.cache import TileCache
 from localizer.map.cache.stream import TileStreamer
-from localizer.registration import JNGO, Registration, select_anchors
+from localizer.registration import JNGO, Registration
 from localizer.render.base import SKY
-from localizer.render.holes import fill_holes
 from localizer.render.numba_raster import NumbaRenderer
 from localizer.tracking.integrity import IntegrityConfig, is_acceptable
+from localizer.tracking.pipeline import reference_anchors
 from localizer.types import RegistrationStatus, RenderedView
 
 PARTS = ("whole", "half", "quarter", "band", "discs")
@@ -102,9 +102,7 @@ def trials(
                 for part in parts:
                     rng = np.random.default_rng((7, _SEEDS[part], index))
                     shown = covered(reference, part_of(part, reference.depth.shape, rng))
-                    anchors = select_anchors(
-                        shown, extractor.extract(fill_holes(shown)), 4000, index
-                    )
+                    anchors = reference_anchors(shown, extractor, 4000, index)
                     found = optimizer.register(
                         query, view.camera, anchors, prior, motion=prior, seed=index
                     )

@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 
 from localizer.features import FeatureExtractor
 from localizer.geometry.pose import Pose
-from localizer.registration import JNGO, select_anchors
-from localizer.render.holes import fill_holes
+from localizer.registration import JNGO
+from localizer.tracking.pipeline import reference_anchors
 from localizer.types import FeatureLevel, FeaturePyramid, Image, PosePrior, RenderedView
 
 Method = Callable[[RenderedView, Image, PosePrior, int], Pose]
@@ -45,8 +45,7 @@ class Direct:
         self._extractor, self._optimizer, self._anchors = extractor, JNGO(), anchors
 
     def __call__(self, view: RenderedView, query: Image, prior: PosePrior, seed: int) -> Pose:
-        reference = self._extractor.extract(fill_holes(view))
-        anchors = select_anchors(view, reference, self._anchors, seed=seed)
+        anchors = reference_anchors(view, self._extractor, self._anchors, seed)
         found = self._optimizer.register(
             self._extractor.extract(query), view.camera, anchors, prior, seed=seed
         )

@@ -88,16 +88,18 @@ def convert_command(
     typer.echo(f"{out}: {len(poses)} poses")
 
 
-def _frame(map_cache: Path | None, origin: str | None) -> tuple[LocalFrame, float | None]:
-    """The ENU frame, and the geoid's separation there if a map says it."""
-    if (map_cache is None) == (origin is None):
-        raise ConfigError("poses need a frame: give either --map or --origin LAT,LON,HEIGHT")
+def _frame(map_cache: Path | None, origin: str | None) -> tuple[LocalFrame | None, float | None]:
+    """The ENU frame and the geoid's separation there, as far as they are told."""
+    if map_cache is not None and origin is not None:
+        raise ConfigError("give either --map or --origin LAT,LON,HEIGHT")
     if origin is not None:
         lat, lon, height = numbers(origin, "--origin", ("LAT", "LON", "HEIGHT"))
         return LocalFrame(Geodetic(lat, lon, height)), None
+    if map_cache is None:
+        return None, None
     from localizer.map.cache.cache import TileCache
 
-    cache = TileCache.open(Path(str(map_cache)))
+    cache = TileCache.open(map_cache)
     return cache.frame, cache.manifest.geoid_separation_m
 
 

@@ -20,6 +20,7 @@ from companion.convert.angles import (
     pose_of_autopilot,
 )
 from companion.convert.photos import Heights, read_photos, write_sidecars
+from companion.errors import ConfigError
 from companion.geometry import GimbalFrame
 from localizer.errors import GeoreferenceError, PoseFileError
 from localizer.geometry.geo import Geodetic, LocalFrame
@@ -37,10 +38,19 @@ _IMAGES_TXT = "IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME"
 
 @dataclass(frozen=True)
 class Place:
-    """What a conversion needs to know of the map. heights: of photos' tags, None if not known."""
+    """What is known of the map. heights: of photos' tags, None if not known."""
 
-    frame: LocalFrame
+    map_frame: LocalFrame | None
     heights: Heights | None = None
+
+    @property
+    def frame(self) -> LocalFrame:
+        """The ENU frame: between formats in map metres and such in latitude and longitude."""
+        if self.map_frame is None:
+            raise ConfigError(
+                "these formats need the map's frame: give --map or --origin LAT,LON,HEIGHT"
+            )
+        return self.map_frame
 
 
 Reader = Callable[[Path, Place], tuple[StampedPose, ...]]

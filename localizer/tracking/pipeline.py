@@ -40,6 +40,7 @@ from localizer.types import (
     PosePrior,
     ReferenceBundle,
     RegistrationStatus,
+    RenderedView,
     TrackingState,
 )
 
@@ -103,6 +104,13 @@ def _shrink(image: Image, camera: Camera) -> Image:
         return image
     resized = cv2.resize(image, (camera.width, camera.height), interpolation=cv2.INTER_AREA)
     return resized.astype(np.uint8, copy=False)
+
+
+def reference_anchors(
+    view: RenderedView, extractor: FeatureExtractor, count: int, seed: int
+) -> Anchors:
+    """At most `count` geo-anchors of a rendered view, the map's holes painted over (Eq. 1)."""
+    return select_anchors(view, extractor.extract(fill_holes(view)), count, seed)
 
 
 class Localizer:
@@ -254,8 +262,7 @@ class Localizer:
                 "the map, as far as it is loaded: if it stays so, check the prior, the map's "
                 "extent and the camera's direction"
             )
-        features = self._extractor.extract(fill_holes(view))
-        anchors = select_anchors(view, features, self._config.anchors, self._config.seed)
+        anchors = reference_anchors(view, self._extractor, self._config.anchors, self._config.seed)
         return ReferenceBundle(view, anchors, prior.time_ns)
 
     def prefetch(self, time_ns: int) -> None:

@@ -200,7 +200,7 @@ def test_a_flights_record_becomes_a_trajectory(tmp_path):
             pose = dict(zip(("qw", "qx", "qy", "qz"), q, strict=True))
             writer.writerow(pose | {"exposure_time_ns": 10**9 + k, "sequence": k, "east_m": k,
                                     "latency_ms": 50, "accepted": accepted})  # fmt: skip
-    _convert(record, tmp_path / "x.tum", "--from", "record", "--to", "tum", *PLACE)
+    _convert(record, tmp_path / "x.tum", "--from", "record", "--to", "tum")
     lines = np.loadtxt(tmp_path / "x.tum")
     assert lines[:, 1] == pytest.approx([0, 2])  # the rejected one is none
     assert lines[:, 4:] == pytest.approx(np.tile(q[[1, 2, 3, 0]], (2, 1)), abs=1e-8)
@@ -232,5 +232,8 @@ def test_a_gimbal_straight_down_keeps_its_heading():
 
 
 def test_a_map_or_an_origin_is_needed(poses, tmp_path):
-    with pytest.raises(ConfigError, match="--map or --origin"):
+    with pytest.raises(ConfigError, match="give --map or --origin"):
         _convert(poses, tmp_path / "x", "--from", "poses", "--to", "colmap")
+    with pytest.raises(ConfigError, match="either --map or --origin"):
+        _convert(poses, tmp_path / "x", "--from", "poses", "--to", "colmap", "--map", tmp_path,
+                 *PLACE)  # fmt: skip
