@@ -51,22 +51,12 @@ def _section(name: str, value: Any) -> str:
         lines += [f"- `{member.name}`: {member.value}" for member in value]
     elif issubclass(value, BaseModel):
         lines += [
-            "| setting | default | |",
-            "|---|---|---|",
-            *map(_setting, value.model_fields.items()),
+            "Every key with its default: [configs/deployment.yaml](../configs/deployment.yaml)."
         ]
     else:
         lines.insert(1, _code(f"{name}{_signature(value.__init__)}"))
         lines += [line for member in _members(value) for line in member]
     return "\n".join(lines) + "\n"
-
-
-def _setting(item: tuple[str, Any]) -> str:
-    name, field = item
-    default = field.default
-    if isinstance(default, BaseModel):
-        return f"| `{name}` | | `{type(default).__name__}` |"
-    return f"| `{name}` | `{default}` | {field.description or ''} |"
 
 
 def _members(kind: type) -> Iterator[list[str]]:

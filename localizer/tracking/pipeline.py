@@ -30,7 +30,7 @@ from localizer.render.base import MapRenderer
 from localizer.render.holes import fill_holes
 from localizer.tracking import motion
 from localizer.tracking.integrity import Integrity, is_acceptable, judge
-from localizer.tracking.motion import MotionState
+from localizer.tracking.motion import MotionConfig, MotionState
 from localizer.types import (
     Anchors,
     FeaturePyramid,
@@ -113,6 +113,30 @@ def reference_anchors(
     return select_anchors(view, extractor.extract(fill_holes(view)), count, seed)
 
 
+class MeasuredMotion:
+    """The motion model, turned by another sensor's account of the camera's rotation."""
+
+    def __init__(self, config: MotionConfig, rotation_at: RotationAt) -> None:
+        self._config, self._rotation_at = config, rotation_at
+
+    def ahead(self, state: MotionState, time_ns: int) -> MotionState:
+        """The state moved to `time_ns`."""
+        turn = self._turn(state.time_ns, time_ns)
+        return motion.predict(state, time_ns, self._config, turn)
+
+    def at_frame(self, state: MotionState, time_ns: int) -> MotionState:
+        """The state at a frame's exposure."""
+        if time_ns >= state.time_ns:
+            return self.ahead(state, time_ns)
+        # The camera's clock jumped: by its velocity the state would be moved the wrong way.
+        turn = self._turn(state.time_ns, time_ns)
+        return motion.kept(state, time_ns, self._config, turn)
+
+    def _turn(self, begin_ns: int, end_ns: int) -> Array | None:
+        begin, end = self._rotation_at(begin_ns), self._rotation_at(end_ns)
+        return end @ begin.T if begin is not None and end is not None else None
+
+
 class Localizer:
     """The algorithm for one camera. `open_localizer` makes one; `set_prior`, then `track` frames.
 
@@ -142,6 +166,7 @@ class Localizer:
         self._optimizer = optimizer
         self._config = config
         self._rotation_at = rotation_at
+        self._motion = MeasuredMotion(config.motion, rotation_at)
         self.camera = working_camera(camera, config.width)
         self._undistorter = Undistorter(camera, self.camera)
         self._lock = threading.Lock()
@@ -228,22 +253,7 @@ class Localizer:
     def predict(self, time_ns: int) -> PosePrior | None:
         """The motion model's prediction at `time_ns`; None before the first prior."""
         state = self.tracker.motion
-        return self._ahead(state, time_ns).prior if state else None
-
-    def _ahead(self, state: MotionState, time_ns: int) -> MotionState:
-        turn = self._turn(state.time_ns, time_ns)
-        return motion.predict(state, time_ns, self._config.motion, turn)
-
-    def _turn(self, begin_ns: int, end_ns: int) -> Array | None:
-        begin, end = self._rotation_at(begin_ns), self._rotation_at(end_ns)
-        return end @ begin.T if begin is not None and end is not None else None
-
-    def _at_frame(self, state: MotionState, time_ns: int) -> MotionState:
-        if time_ns >= state.time_ns:
-            return self._ahead(state, time_ns)
-        # The camera's clock jumped: by its velocity the state would be moved the wrong way.
-        turn = self._turn(state.time_ns, time_ns)
-        return motion.kept(state, time_ns, self._config.motion, turn)
+        return self._motion.ahead(state, time_ns).prior if state else None
 
     def _attitude(self, time_ns: int) -> PoseConstraint | None:
         sigma, rotation = self._config.attitude, self._rotation_at(time_ns)
@@ -289,7 +299,7 @@ class Localizer:
         if tracker.motion is None:
             raise OutsideMapError(_NO_PRIOR)
         config = self._config
-        ahead = self._at_frame(tracker.motion, frame.exposure_time_ns)
+        ahead = self._motion.at_frame(tracker.motion, frame.exposure_time_ns)
         started = time.perf_counter()
         result = self._optimizer.register(
             query,
