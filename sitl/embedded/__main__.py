@@ -84,7 +84,7 @@ def _run(
 def _compile(home: Location) -> None:
     """Fly a moment without links, so that no client waits for the kernels' first compilation."""
     vehicle = Vehicle(home, 0.0, Parameters(), MavlinkServer((), 1))
-    vehicle.modes.arm()
+    vehicle.aircraft.modes.arm()
     for _ in range(60):
         vehicle.step()
 

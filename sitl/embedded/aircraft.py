@@ -8,6 +8,7 @@ import numpy as np
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from sitl.embedded.control.arming import ArmingContext, arming_failures
+from sitl.embedded.control.loop import advance
 from sitl.embedded.control.mission import MissionStore
 from sitl.embedded.control.modes import FlightModes
 from sitl.embedded.ekf.estimator import Estimator
@@ -18,7 +19,7 @@ from sitl.embedded.parameters import Parameters
 from sitl.embedded.physics import dynamics
 from sitl.embedded.physics.dynamics import TICK_S
 from sitl.embedded.physics.gimbal import Gimbal
-from sitl.embedded.physics.rotation import Array
+from sitl.embedded.physics.rotation import Array, euler
 from sitl.embedded.physics.sensors import GpsSample, Sensors
 from sitl.embedded.severity import CRITICAL, INFO
 from sitl.geodesy import Location
@@ -29,7 +30,10 @@ _GUST_CORRELATION_S = 3.0
 
 
 class Aircraft:
-    """A quadrotor at `home` (AMSL), heading `heading_deg`, and the autopilot's parts in it."""
+    """A quadrotor at `home` (AMSL), heading `heading_deg`, and the autopilot's parts in it.
+
+    Above 200 lines: commands and telemetry read all of it, as ArduPilot's do of `copter`.
+    """
 
     def __init__(
         self,
@@ -71,6 +75,38 @@ class Aircraft:
     def time_ms(self) -> int:
         """Simulated milliseconds since boot."""
         return round(self.tick * TICK_S * 1000)
+
+    # --- a tick ------------------------------------------------------------------------------
+
+    def begin_tick(self) -> None:
+        """What the commands of this tick need to know."""
+        simulated = self.parameters["GPS1_TYPE"] in GPS_SIMULATED
+        self.injection.receiver_has_fix = simulated and self.gps_has_fix
+
+    def step(self) -> None:
+        """10 ms: control, physics, sensors, estimator, gimbal."""
+        self.tick += 1
+        target = self.modes.update(self.time_s)
+        advance(
+            self.truth,
+            self.estimator.output,
+            target,
+            self._integrator,
+            self.wind(),
+            self.sensors.imu_bias,
+            self.sensors.imu_noise(),
+            self._increment,
+            self.modes.armed,
+        )
+        self.modes.on_ground = bool(self.truth[2] >= 0.0)
+        self.sense()
+        self.estimator.update(self._increment, self.time_ms)
+        vehicle_yaw = euler(self.estimator.output[0:4])[2]
+        self.gimbal.update(self.estimator.location, vehicle_yaw, TICK_S)
+        if self.tick % 10 == 0:
+            self.modes.check_ekf()
+        if self.tick % 3000 == 0 and not self.modes.armed:
+            self.report_failures("PreArm")
 
     # --- physics and sensors -----------------------------------------------------------------
 

@@ -67,7 +67,8 @@ class Bench:
         table = Parameters()
         for name, value in parameters.items():
             assert table.set(name, value), name
-        self.vehicle = Vehicle(HOME, 30.0, table, MavlinkServer((), 1), seed)
+        self.whole = Vehicle(HOME, 30.0, table, MavlinkServer((), 1), seed)
+        self.vehicle = self.whole.aircraft
         self.texts: list[tuple[float, str]] = []
         v = self.vehicle
         v.notify = v.estimator.notify = v.modes.notify = self._note  # type: ignore[method-assign]
@@ -86,7 +87,7 @@ class Bench:
         for _ in range(round(seconds * 100)):
             for hook in self.each_tick:
                 hook()
-            self.vehicle.step()
+            self.whole.step()
             if until():
                 return True
         return False

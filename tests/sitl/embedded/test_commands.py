@@ -46,7 +46,7 @@ def told(bench, message):
     """The link after the vehicle has handled the message."""
     message._header.srcSystem, message._header.srcComponent = 255, 190
     link = SerialPort()
-    bench.vehicle.commands.handle(link, message)
+    bench.whole.commands.handle(link, message)
     return link
 
 

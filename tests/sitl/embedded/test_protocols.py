@@ -197,7 +197,7 @@ def test_looks_at_a_place():
 def test_without_a_mount_nothing_is_reported(bench):
     b = bench({})
     b.run(1)
-    assert b.vehicle.telemetry.message(mavlink.MAVLINK_MSG_ID_GIMBAL_DEVICE_ATTITUDE_STATUS) is None
+    assert b.whole.telemetry.message(mavlink.MAVLINK_MSG_ID_GIMBAL_DEVICE_ATTITUDE_STATUS) is None
 
 
 # --- links and routing -------------------------------------------------------------------------
@@ -249,7 +249,7 @@ def linked():
         return gcs.received(), companion.received()
 
     run(3)
-    yield vehicle, gcs, companion, run
+    yield vehicle.aircraft, gcs, companion, run
     server.close()
 
 
