@@ -6,11 +6,11 @@ from pathlib import Path
 
 from pydantic import BaseModel, ConfigDict, Field
 
+from localizer.integrity.acceptance import IntegrityConfig
 from localizer.registration.config import JNGOConfig
 from localizer.registration.devices import DeviceChoice
 from localizer.relocalization.config import RelocalizationConfig
 from localizer.render.select import RendererName
-from localizer.tracking.integrity import IntegrityConfig
 from localizer.tracking.motion import MotionConfig
 
 

@@ -90,13 +90,15 @@ class ReferenceBundle:
 class PosePrior:
     """A predicted camera pose. covariance: (6, 6) over (position in world axes, m; rotation as a
     left-multiplied small rotation vector in world axes, rad). velocity: (3,) in world axes, m/s,
-    if it is known.
+    if it is known. independent: whether it owes our own fixes nothing (GNSS is in it, an operator
+    gave it); under denial an autopilot's position is our own last fix, carried on.
     """
 
     world_from_camera: Pose
     covariance: Array
     time_ns: int
     velocity: Array | None = None
+    independent: bool = True
 
     @classmethod
     def around(
@@ -122,7 +124,7 @@ class RegistrationStatus(Enum):
 
 
 class TrackingState(Enum):
-    """State of the tracking state machine (`localizer.tracking.integrity`)."""
+    """State of the tracking state machine (`localizer.tracking.states`)."""
 
     INITIALIZING = "initializing"
     TRACKING = "tracking"
@@ -135,7 +137,8 @@ class PoseEstimate:
     """The localizer's answer for one frame.
 
     covariance: (6, 6) as in `PosePrior`. quality: 0 to 1. accepted: whether integrity lets it be
-    used. stage_ms: latency of each stage in milliseconds.
+    used. stage_ms: latency of each stage in milliseconds. last_fix_ns: exposure of the newest
+    accepted estimate, this one included; None before the first.
     """
 
     world_from_camera: Pose
@@ -148,6 +151,7 @@ class PoseEstimate:
     sequence: int
     camera: Camera
     stage_ms: dict[str, float] = field(default_factory=dict)
+    last_fix_ns: int | None = None
 
 
 @dataclass(frozen=True)

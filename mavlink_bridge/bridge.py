@@ -223,6 +223,10 @@ class Bridge:
         """The camera's attitude to NED at a time: gimbal or body, and mounting."""
         return self._tracker.gimbal_at(time_ns)
 
+    def local_at(self, time_ns: int) -> tuple[float, ...] | None:
+        """The EKF's position (north, east, down) from its origin at a time, m; None: unknown."""
+        return self._tracker.local_at(time_ns)
+
     def texts(self) -> list[str]:
         """The last lines told to the operator, oldest first."""
         return [text for _, text in list(self._texts)]

@@ -31,6 +31,8 @@ from sitl.demo.scenario import (
 )
 from sitl.errors import SimulationError
 from sitl.suite.case import SCENARIOS, load_cases
+from sitl.suite.loop.case import LOOP_SCENARIOS, load_loop_cases
+from sitl.suite.loop.runner import fly_loop
 from sitl.suite.report import print_row, print_table, write_report
 from sitl.suite.runner import run_suite
 from sitl.vehicles.process import VehicleKind
@@ -140,6 +142,26 @@ def suite(
     rows = run_suite(cases, _SUITE_KINDS[fc], jobs, seed, lambda row: print_row(console, row))
     print_table(console, rows)
     write_report(rows, out)
+    raise typer.Exit(0 if all(row.ok for row in rows) else 1)
+
+
+@app.command()
+def loop(
+    fc: Annotated[str, typer.Option(help="embedded or ardupilot")] = "embedded",
+    only: Annotated[list[str] | None, typer.Option(help="flight; may be repeated")] = None,
+    out: Annotated[Path, typer.Option(help="folder of the records")] = Path("report-loop"),
+    seed: Annotated[int, typer.Option(min=0, help="world, light and noise")] = 5,
+    size: Annotated[float, typer.Option(min=400, max=4000, help="metres of the world")] = 400.0,
+    worlds: Annotated[Path | None, typer.Option(help="folder of generated worlds")] = None,
+    scenarios: Annotated[Path, typer.Option(help="folder of flights")] = LOOP_SCENARIOS,
+) -> None:
+    """Fly the whole companion through its faults, one flight after the other; exit 1: one fails."""
+    if fc not in ("embedded", "ardupilot"):
+        raise ScenarioError(f"--fc is embedded or ardupilot, not {fc!r}")
+    kind: VehicleKind = "ardupilot" if fc == "ardupilot" else "embedded"
+    cases = load_loop_cases(only or (), scenarios)
+    console = Console()
+    rows = fly_loop(cases, kind, seed, size, out, worlds, console)
     raise typer.Exit(0 if all(row.ok for row in rows) else 1)
 
 

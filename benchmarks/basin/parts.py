@@ -29,12 +29,12 @@ from numpy.typing import NDArray
 from benchmarks.features.report import wilson
 from localizer.features import load_extractor
 from localizer.features.detail import DetailExtractor
+from localizer.integrity.acceptance import IntegrityConfig, is_acceptable
 from localizer.map.cache.cache import TileCache
 from localizer.map.cache.stream import TileStreamer
 from localizer.registration import JNGO, Registration
 from localizer.render.base import SKY
 from localizer.render.numba_raster import NumbaRenderer
-from localizer.tracking.integrity import IntegrityConfig, is_acceptable
 from localizer.tracking.pipeline import reference_anchors
 from localizer.types import RegistrationStatus, RenderedView
 

@@ -51,12 +51,14 @@ class HealthMonitor:
         event: Callable[[str, str], None],
         record_folder: Path | None,
         is_recorded: Callable[[], bool] = lambda: True,
+        position_sigma_m: Callable[[], float | None] = lambda: None,
     ) -> None:
         self._engine_health = engine_health
         self._bridge = bridge
         self._feed_state = feed_state
         self._event = event
         self._is_recorded = is_recorded
+        self._position_sigma_m = position_sigma_m
         self._file = record_folder / "health.json" if record_folder else None
         self._estimates: deque[tuple[float, PoseEstimate]] = deque(maxlen=_WINDOW)
         self._write_failed = False
@@ -102,19 +104,33 @@ class HealthMonitor:
             return _OF_FEED[feed]
         if not self._bridge.state().connected:
             return HealthLevel.DEGRADED, _SILENT_VEHICLE
-        error = self._engine_health().last_error
+        engine = self._engine_health()
+        error = engine.last_error
         if not self._estimates:
-            seen = self._engine_health().frames_in > 0
+            if engine.searching:
+                return HealthLevel.STARTING, "searching the map"
+            seen = engine.frames_in > 0
             return (
                 HealthLevel.STARTING,
                 error or f"waiting for {'a pose prior' if seen else 'video'}",
             )
         arrived, estimate = self._estimates[-1]
         if time.monotonic() - arrived > _STALE_S:
-            return HealthLevel.DEGRADED, error or "no frame is being localized"
+            level = HealthLevel.FAILED if _is_lost(estimate) else HealthLevel.DEGRADED
+            return level, error or "no frame is being localized"
         level, text = _OF_STATE[estimate.state]
+        if _is_lost(estimate):
+            text += self._since(estimate) + (", searching" if engine.searching else "")
         text += ", video scaled" if feed is StreamState.SCALED else ""
         return level, text + ("" if self._is_recorded() else ", record incomplete")
+
+    def _since(self, estimate: PoseEstimate) -> str:
+        """Since when there is no fix, and how far off the autopilot may be by now."""
+        text = ""
+        if estimate.last_fix_ns is not None:
+            text = f" {(time.monotonic_ns() - estimate.last_fix_ns) * 1e-9:.0f} s"
+        sigma_m = self._position_sigma_m()
+        return text + (f", +-{2.0 * sigma_m:.0f} m" if sigma_m is not None else "")
 
     def _write(self, level: HealthLevel, text: str) -> None:
         if self._file is None:
@@ -154,6 +170,10 @@ class HealthMonitor:
             }
             for name in sorted(stages)
         }
+
+
+def _is_lost(estimate: PoseEstimate) -> bool:
+    return estimate.state is TrackingState.LOST
 
 
 def _without_nan(value: Any) -> Any:

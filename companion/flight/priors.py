@@ -2,39 +2,173 @@
 
 from __future__ import annotations
 
+import math
+import threading
+import time
+from dataclasses import dataclass, replace
+from typing import Protocol
+
 import numpy as np
 
 from companion.config import PriorConfig
 from companion.flight.conversions import Installation, camera_rotation, vehicle_prior
+from localizer.geometry.geo import NED_FROM_ENU
 from localizer.geometry.pose import Array
 from localizer.tracking.engine import PriorProvider
-from localizer.types import PosePrior
-from mavlink_bridge.bridge import Bridge
+from localizer.types import PoseEstimate, PosePrior, ReferenceBundle
+from mavlink_bridge.injection.shadow import gnss_healthy
+from mavlink_bridge.messages import Attitude, GimbalAttitude, VehicleState
+
+_CONST_POSITION = 128  # EKF_CONST_POS_MODE of EKF_STATUS_REPORT (193): it only knows that it is
+_GLITCH = 32768  # EKF_GPS_GLITCHING
+_HORIZONTAL = 8 | 16  # EKF_POS_HORIZ_REL | EKF_POS_HORIZ_ABS
+
+# How an EKF without a position drifts: an unknown velocity error grows from the loss on, and a
+# bias of the accelerometers and of the tilt under it (0.3 degrees) on top. ArduPilot SITL was 0.8 m
+# off at most after 5 s without fixes; the model's sigma is 2.0 m then.
+_DRIFT_SPEED_M_S = 0.15
+_DRIFT_ACCELERATION_M_S2 = 0.05
+_LARGEST_SIGMA_M = 5000.0
+_UNTOLD_SIGMA_M = 25.0  # of a position of which nobody says where it comes from
+
+
+class Autopilot(Protocol):
+    """What is asked of the autopilot: the bridge in flight, a record's messages afterwards."""
+
+    def state(self) -> VehicleState:
+        """What the vehicle says about itself."""
+        ...
+
+    def attitude_at(self, time_ns: int) -> Attitude | None:
+        """The vehicle's attitude at a CLOCK_MONOTONIC time."""
+        ...
+
+    def gimbal_at(self, time_ns: int) -> GimbalAttitude | None:
+        """The camera's attitude to NED at a CLOCK_MONOTONIC time."""
+        ...
+
+    def local_at(self, time_ns: int) -> tuple[float, ...] | None:
+        """The EKF's position (north, east, down) from its origin, m."""
+        ...
+
+
+def drift_sigma_m(seconds: float) -> float:
+    """Sigma of an EKF's position, horizontal, so long after its last absolute measurement."""
+    t = max(seconds, 0.0)
+    return min(_DRIFT_SPEED_M_S * t + _DRIFT_ACCELERATION_M_S2 * t * t, _LARGEST_SIGMA_M)
+
+
+@dataclass(frozen=True)
+class Belief:
+    """How well the autopilot's position may be believed. independent: it owes our own fixes
+    nothing. sigma_m: horizontal, one sigma; None: nothing is known.
+    """
+
+    sigma_m: float | None
+    independent: bool
+
+
+class PositionBelief:
+    """Follows GNSS and our own fixes: what the EKF's position is worth at any time.
+
+    Thread-safe: estimates come on the localization thread, states from the bridge's.
+    """
+
+    def __init__(self, config: PriorConfig) -> None:
+        self._base_m = config.position_sigma_m
+        self._lock = threading.Lock()
+        self._gnss_ns: int | None = None
+        self._fix_ns: int | None = None
+
+    def note_fix(self, time_ns: int) -> None:
+        """A fix of ours was accepted; it may have gone to the EKF."""
+        with self._lock:
+            self._fix_ns = time_ns
+
+    def at(self, state: VehicleState, now_ns: int) -> Belief:
+        """What the position of this state is worth now."""
+        healthy = gnss_healthy(state, now_ns) and not state.ekf_flags & _GLITCH
+        with self._lock:
+            if healthy:
+                self._gnss_ns = now_ns
+            known = [t for t in (self._gnss_ns, self._fix_ns) if t is not None]
+        if healthy:
+            accuracy_m = state.gps_h_accuracy_m
+            own = accuracy_m if math.isfinite(accuracy_m) else 0.0
+            return Belief(max(self._base_m, own), independent=True)
+        if state.ekf_flags and not state.ekf_flags & _HORIZONTAL:
+            return Belief(None, independent=False)
+        if not known:
+            return Belief(_UNTOLD_SIGMA_M, independent=False)
+        return Belief(
+            math.hypot(self._base_m, drift_sigma_m((now_ns - max(known)) * 1e-9)),
+            independent=False,
+        )
 
 
 class AutopilotPose:
     """The camera's pose as the autopilot's position, attitude and gimbal tell it."""
 
-    def __init__(self, bridge: Bridge, installation: Installation, config: PriorConfig) -> None:
-        self._bridge = bridge
+    def __init__(
+        self, autopilot: Autopilot, installation: Installation, config: PriorConfig
+    ) -> None:
+        self._autopilot = autopilot
         self._installation = installation
-        self._sigma = config.position_sigma_m, float(np.radians(config.rotation_sigma_deg))
+        self._config = config
+        self.belief = PositionBelief(config)
+
+    def add_estimate(self, estimate: PoseEstimate, _: ReferenceBundle) -> None:
+        """Note a fix of ours. Never blocks."""
+        if estimate.accepted:
+            self.belief.note_fix(estimate.exposure_time_ns)
+
+    @property
+    def sigma_m(self) -> float | None:
+        """Horizontal sigma of the autopilot's position now; None where it is not known."""
+        return self.belief.at(self._autopilot.state(), time.monotonic_ns()).sigma_m
 
     def prior(self, time_ns: int) -> PosePrior | None:
         """The camera's pose at a CLOCK_MONOTONIC time; None while the autopilot does not know."""
-        return vehicle_prior(
-            self._bridge.state(),
-            self._bridge.attitude_at(time_ns),
-            self._bridge.gimbal_at(time_ns),
+        state = self._autopilot.state()
+        belief = self.belief.at(state, time_ns)
+        if belief.sigma_m is None:
+            return None
+        prior = vehicle_prior(
+            state,
+            self._autopilot.attitude_at(time_ns),
+            self._autopilot.gimbal_at(time_ns),
             self._installation,
-            self._sigma,
+            (belief.sigma_m, float(np.radians(self._config.rotation_sigma_deg))),
             time_ns,
         )
+        return replace(prior, independent=belief.independent) if prior is not None else None
 
     def rotation(self, time_ns: int) -> Array | None:
         """The camera's rotation (3, 3) in the map's axes by the autopilot's attitude and gimbal."""
-        gimbal = self._bridge.gimbal_at(time_ns)
+        gimbal = self._autopilot.gimbal_at(time_ns)
         return camera_rotation(gimbal) if gimbal is not None else None
+
+    def displacement(self, begin_ns: int, end_ns: int) -> tuple[Array, float] | None:
+        """The way (3,) in the map's axes between two times by the EKF, and its sigma (m).
+
+        Inertial as long as none of our fixes goes to the EKF: while a place is on trial. The map
+        origin's axes stand for the vehicle's, 0.1° at 10 km.
+        """
+        state = self._autopilot.state()
+        if state.ekf_flags & _CONST_POSITION or not state.ekf_flags & _HORIZONTAL:
+            return None
+        begin, end = self._autopilot.local_at(begin_ns), self._autopilot.local_at(end_ns)
+        if begin is None or end is None:
+            return None
+        way = NED_FROM_ENU.T @ (np.array(end[:3]) - np.array(begin[:3]))
+        belief = self.belief.at(state, end_ns)
+        if belief.sigma_m is None:
+            return None
+        # The position's sigma now against that at the begin is what the velocity may be off.
+        elapsed_s = (end_ns - begin_ns) * 1e-9
+        since_s = max(elapsed_s, math.sqrt(belief.sigma_m / _DRIFT_ACCELERATION_M_S2))
+        speed_error = _DRIFT_SPEED_M_S + 2.0 * _DRIFT_ACCELERATION_M_S2 * since_s
+        return way, 0.5 + speed_error * elapsed_s
 
 
 class PriorSources:

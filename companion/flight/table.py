@@ -102,6 +102,7 @@ def _source(making: Making) -> FrameSource:
 
 def _health(making: Making) -> HealthMonitor:
     engine, keeper = making.later(DualThreadEngine), making[RecordKeeper]
+    autopilot = making.later(AutopilotPose)
     source = making[FrameSource]  # type: ignore[type-abstract]  # whichever of its kinds
     health = HealthMonitor(
         lambda: engine().health,
@@ -110,6 +111,7 @@ def _health(making: Making) -> HealthMonitor:
         making.channels.events.send,
         keeper.folder,
         lambda: keeper.is_complete,
+        lambda: autopilot().sigma_m,
     )
     making.channels.estimates.subscribe(lambda estimate, _: health.add_estimate(estimate))
     return health
@@ -154,14 +156,18 @@ def _view(making: Making) -> ViewReporter:
 
 
 def _autopilot(making: Making) -> AutopilotPose:
-    return AutopilotPose(making[Bridge], making[Installation], making.config.prior)
+    autopilot = AutopilotPose(making[Bridge], making[Installation], making.config.prior)
+    making.channels.estimates.subscribe(autopilot.add_estimate)
+    return autopilot
 
 
 def _localizer(making: Making) -> Localizer:
     _log.info("making the localizer ready; the first start on a machine compiles its kernels")
     config, autopilot = making.config, making[AutopilotPose]
     camera = config.camera.model.camera()
-    return build_localizer(making[MapStack], camera, config.localizer, autopilot.rotation)
+    return build_localizer(
+        making[MapStack], camera, config.localizer, autopilot.rotation, autopilot.displacement
+    )
 
 
 def _injection(making: Making) -> FixInjection:
@@ -202,7 +208,7 @@ PARTS: tuple[Part[Any], ...] = (
     Part("source", FrameSource, _source),
     Part(
         "health", HealthMonitor, _health, depends=(Bridge, RecordKeeper, FrameSource),
-        later=(DualThreadEngine,), start=HealthMonitor.start, stop=HealthMonitor.stop,
+        later=(DualThreadEngine, AutopilotPose), start=HealthMonitor.start, stop=HealthMonitor.stop,
     ),
     Part(
         "targets", TargetReporter, _targets, depends=(MapStack, Bridge),

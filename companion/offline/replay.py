@@ -20,7 +20,8 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from companion.config import CompanionConfig, parse_config
 from companion.errors import RecordError, StreamDecodeError
-from companion.flight.conversions import Installation, camera_rotation, vehicle_prior
+from companion.flight.conversions import Installation
+from companion.flight.priors import AutopilotPose
 from companion.flight.recorder import MANIFEST_NAME
 from companion.sources.base import fitted_camera
 from companion.sources.folder_source import read_image
@@ -31,6 +32,7 @@ from localizer.tracking.opening import MapStack, build_localizer
 from localizer.tracking.pipeline import Localizer
 from localizer.types import Frame, PoseEstimate
 from mavlink_bridge import quaternion as quat
+from mavlink_bridge.messages import Attitude, GimbalAttitude, VehicleState
 from mavlink_bridge.vehicle.tracker import VehicleTracker
 
 _log = logging.getLogger(__name__)
@@ -200,7 +202,8 @@ class _Autopilot:
                 ]
             )
         )
-        self.tracker = VehicleTracker(bridge.system_id, mount, bridge.camera.mount == "fixed")
+        self._now_ns = record.start_ns
+        self._tracker = VehicleTracker(bridge.system_id, mount, bridge.camera.mount == "fixed")
         dated = ((utc - record.utc_minus_monotonic_ns, m) for utc, m in read_tlog(tlog))
         # A .tlog is appended to: earlier flights may stand before this one.
         self._messages = (item for item in dated if item[0] >= record.start_ns)
@@ -208,18 +211,27 @@ class _Autopilot:
 
     def advance(self, time_ns: int) -> None:
         """Take in everything that had arrived by `time_ns`, CLOCK_MONOTONIC."""
+        self._now_ns = time_ns
         while self._next is not None and self._next[0] <= time_ns:
             received_ns, message = self._next
-            if self.tracker.accepts(message):
+            if self._tracker.accepts(message):
                 if message.get_type() != "TIMESYNC":
-                    self.tracker.handle(message, received_ns)
+                    self._tracker.handle(message, received_ns)
                 elif message.tc1 != 0:  # an answer; ts1 is our own time of the question
-                    self.tracker.timesync(message.tc1, message.ts1, received_ns)
+                    self._tracker.timesync(message.tc1, message.ts1, received_ns)
             self._next = next(self._messages, None)
 
-    def rotation_at(self, time_ns: int) -> Array | None:
-        gimbal = self.tracker.gimbal_at(time_ns)
-        return camera_rotation(gimbal) if gimbal is not None else None
+    def state(self) -> VehicleState:
+        return self._tracker.snapshot(self._now_ns)
+
+    def attitude_at(self, time_ns: int) -> Attitude | None:
+        return self._tracker.attitude_at(time_ns)
+
+    def gimbal_at(self, time_ns: int) -> GimbalAttitude | None:
+        return self._tracker.gimbal_at(time_ns)
+
+    def local_at(self, time_ns: int) -> tuple[float, ...] | None:
+        return self._tracker.local_at(time_ns)
 
 
 def replay(
@@ -231,31 +243,30 @@ def replay(
     stack = MapStack(config.map, config.localizer)
     try:
         camera = config.camera.model.camera()
-        localizer = build_localizer(stack, camera, config.localizer, autopilot.rotation_at)
-        cache, sigma = stack.cache, config.prior
+        cache = stack.cache
         arm = np.array(config.camera.lever_arm_m)
         installation = Installation(cache.frame, cache.manifest.geoid_separation_m, arm)
-        sigmas = (sigma.position_sigma_m, float(np.radians(sigma.rotation_sigma_deg)))
+        pose = AutopilotPose(autopilot, installation, config.prior)
+        localizer = build_localizer(
+            stack, camera, config.localizer, pose.rotation, pose.displacement
+        )
         frames = []
         for recorded in record.estimates:
             progress()
             if not (path := _image_path(record.folder, recorded)).is_file():
                 continue
             autopilot.advance(recorded.known_ns)
-            time_ns = recorded.exposure_time_ns
-            if localizer.tracker.integrity.wants_prior:
-                tracker = autopilot.tracker
-                prior = vehicle_prior(
-                    tracker.snapshot(recorded.known_ns), tracker.attitude_at(time_ns),
-                    tracker.gimbal_at(time_ns), installation, sigmas, time_ns,
-                )  # fmt: skip
+            if localizer.tracker.standing.wants_prior:
+                prior = pose.prior(recorded.exposure_time_ns)
                 if prior is not None:
-                    localizer.set_prior(prior)
+                    localizer.offer(prior)
             try:
                 again = _localize(localizer, camera, recorded, path)
             except StreamDecodeError as error:  # power may have gone while it was written
                 _log.warning("left out: %s", error)
                 continue
+            if again is not None and again.accepted:
+                pose.belief.note_fix(again.exposure_time_ns)
             frames.append(ReplayedFrame(recorded, again))
         if len(frames) < _MIN_IMAGES * len(record.estimates):
             raise RecordError(

@@ -223,7 +223,7 @@ def _not_localized(localizer: Localizer, frame: Frame) -> PoseEstimate:
         world_from_camera=prior.world_from_camera,
         covariance=prior.covariance,
         quality=0.0,
-        state=localizer.tracker.integrity.state,
+        state=localizer.tracker.standing.state,
         status=RegistrationStatus.TOO_FEW_ANCHORS,
         accepted=False,
         exposure_time_ns=frame.exposure_time_ns,

@@ -4,15 +4,18 @@ The localization thread takes the newest frame, registers it against the newest 
 publishes the estimate. Each estimate wakes the render thread, which predicts the pose at the next
 exposure, renders the reference for it and has the map loaded along the way ahead. Neither waits for
 a subscriber, and neither dies of an error: errors are counted, logged and reported as the engine's
-health.
+health. While no place is known a third thread, below both in priority, searches for one; what it
+finds is tried by the localization thread, which goes on trying meanwhile.
 """
 
 from __future__ import annotations
 
 import logging
+import os
 import threading
 import time
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import dataclass, replace
 
 from localizer.errors import LocalizerError
@@ -27,12 +30,19 @@ _DEFAULT_INTERVAL_NS = 100_000_000
 
 Subscriber = Callable[[PoseEstimate, ReferenceBundle], None]
 PriorProvider = Callable[[int], PosePrior | None]
+# Searches for a place in one frame; None when none was found. It is told by the callable when to
+# stop: the place was found otherwise, or the engine ends.
+Searcher = Callable[[Frame, Callable[[], bool]], PosePrior | None]
+
+_TRIED_FRAMES = 5  # with what is known outside, before a search begins
+_SEARCH_NICE = 15  # of the search thread: its seconds must not cost the tracker frames
 
 
 @dataclass(frozen=True)
 class EngineHealth:
-    """Counters since the start, the last error's text ("" when none is standing), and which
-    renderer, feature network and optimizer serve.
+    """Counters since the start, the text of the error that stands ("" when none does), and which
+    renderer, feature network and optimizer serve. searches, found: of places without a prior;
+    searching: whether one is under way.
     """
 
     frames_in: int = 0
@@ -41,6 +51,9 @@ class EngineHealth:
     accepted: int = 0
     references: int = 0
     errors: int = 0
+    searches: int = 0
+    found: int = 0
+    searching: bool = False
     last_error: str = ""
     renderer: str = ""
     features: str = ""
@@ -52,7 +65,7 @@ class DualThreadEngine:
 
     subscribers: called on the localization thread with every estimate; they must not block.
     prior_provider: asked, with a time in ns, for a pose from outside when there is none or when
-    tracking is LOST.
+    tracking is LOST. searcher: finds a place without a prior, on a thread of its own.
     """
 
     def __init__(
@@ -60,10 +73,16 @@ class DualThreadEngine:
         localizer: Localizer,
         subscribers: tuple[Subscriber, ...],
         prior_provider: PriorProvider,
+        searcher: Searcher | None = None,
     ) -> None:
         self._localizer = localizer
         self._subscribers = subscribers
         self._prior_provider = prior_provider
+        self._searcher = searcher
+        self._sought: Mailbox[Frame] = Mailbox()
+        self._found: PosePrior | None = None
+        self._unknown_frames = 0
+        self._errors: dict[str, str] = {}
         self._frames: Mailbox[Frame] = Mailbox()
         self._render_times: Mailbox[int] = Mailbox()
         self._bundle: ReferenceBundle | None = None
@@ -80,6 +99,9 @@ class DualThreadEngine:
             threading.Thread(target=self._run, args=(self._render_once,), name="render"),
             threading.Thread(target=self._run, args=(self._localize_once,), name="localize"),
         ]
+        if searcher is not None:
+            search = threading.Thread(target=self._search, name="search")
+            self._threads.append(search)
 
     def start(self) -> None:
         """Start both threads."""
@@ -91,6 +113,7 @@ class DualThreadEngine:
         self._stop.set()
         self._frames.close()
         self._render_times.close()
+        self._sought.close()
         for thread in self._threads:
             thread.join()
 
@@ -107,6 +130,7 @@ class DualThreadEngine:
                 self._health,
                 frames_dropped=self._frames.dropped,
                 optimizer=self._localizer.optimizer_name,
+                last_error=next(iter(self._errors.values()), ""),
             )
 
     def _run(self, once: Callable[[], None]) -> None:
@@ -119,6 +143,33 @@ class DualThreadEngine:
                 _log.exception("unexpected error on the %s thread", threading.current_thread().name)
                 self._report(f"unexpected {type(error).__name__}: {error}")
 
+    def _search(self) -> None:
+        with suppress(OSError):  # on Linux a thread has a priority of its own
+            os.setpriority(os.PRIO_PROCESS, threading.get_native_id(), _SEARCH_NICE)
+        self._run(self._search_once)
+
+    def _search_once(self) -> None:
+        """Search for the newest frame's place, as long as nobody knows it."""
+        frame = self._sought.take(_IDLE_S)
+        if frame is None or self._searcher is None or self._knows_place():
+            return
+        self._set_searching(True)
+        try:
+            found = self._searcher(frame, self._knows_place)
+        finally:
+            self._set_searching(False)
+        self._count(searches=1, found=int(found is not None))
+        self._clear_error()
+        self._found = found
+
+    def _knows_place(self) -> bool:
+        """Whether a search has become idle: the place is known or on probation, or we end."""
+        return self._stop.is_set() or not self._localizer.tracker.standing.wants_prior
+
+    def _set_searching(self, searching: bool) -> None:
+        with self._health_lock:
+            self._health = replace(self._health, searching=searching)
+
     def _render_once(self) -> None:
         time_ns = self._render_times.take(_IDLE_S)
         if time_ns is None or (prior := self._localizer.predict(time_ns)) is None:
@@ -127,16 +178,20 @@ class DualThreadEngine:
         with stopwatch(stage_ms, "reference"):
             bundle = self._localizer.make_reference(prior)
         self._bundle, self._reference_ms = bundle, stage_ms
+        self._clear_error()
         self._count(references=1)
         self._localizer.prefetch(time_ns)  # last: nothing waits for it
 
     def _localize_once(self) -> None:
         frame = self._frames.take(_IDLE_S)
-        if frame is None or not self._has_prior(frame.exposure_time_ns):
+        if frame is None:
+            return
+        self._seek(frame)
+        if not self._has_prior(frame.exposure_time_ns):
             return
         bundle, stage_ms = self._bundle, dict(self._reference_ms)
         try:
-            if bundle is None:
+            if bundle is None or self._is_stale(bundle, frame):
                 return
             with stopwatch(stage_ms, "extract"):
                 query = self._localizer.extract_query(frame)
@@ -150,17 +205,37 @@ class DualThreadEngine:
     def _has_prior(self, time_ns: int) -> bool:
         """Whether there is a prediction to start from.
 
-        Until the first acceptance, and again when LOST, the pose known outside is the better one.
+        Until the first acceptance, and again when LOST, a place that was found or the pose known
+        outside is the better one. Only the latter, where it owes our own fixes nothing, begins
+        anew at once; anything else is on trial until it is confirmed.
         """
         tracker = self._localizer.tracker
         known = tracker.motion is not None
-        if known and not tracker.integrity.wants_prior:
+        if known and not tracker.standing.wants_prior:
             return True
-        prior = self._prior_provider(time_ns)
+        found, self._found = self._found, None
+        prior = found or self._prior_provider(time_ns)
         if prior is None:
             return known
-        self._localizer.set_prior(prior)
+        self._localizer.offer(prior)
         return True
+
+    def _seek(self, frame: Frame) -> None:
+        """Offer the frame to the search, once the poses known outside have led nowhere."""
+        if self._searcher is None:
+            return
+        wanting = self._localizer.tracker.standing.wants_prior
+        self._unknown_frames = self._unknown_frames + 1 if wanting else 0
+        if self._unknown_frames > _TRIED_FRAMES:
+            self._sought.put(frame)
+
+    def _is_stale(self, bundle: ReferenceBundle, frame: Frame) -> bool:
+        """Whether the reference is of long ago; a render thread that fails for good is no secret.
+
+        Its error stands. Without one the reference of the place that is tried now is under way.
+        """
+        age_s = (frame.exposure_time_ns - bundle.time_ns) * 1e-9
+        return abs(age_s) > self._localizer.reference_age_s
 
     def _next_exposure(self, frame: Frame) -> int:
         """When the frame after this one is expected, from a smoothed frame interval."""
@@ -172,20 +247,24 @@ class DualThreadEngine:
         return frame.exposure_time_ns + self._interval_ns
 
     def _publish(self, estimate: PoseEstimate, bundle: ReferenceBundle) -> None:
-        with self._health_lock:
-            self._health = replace(self._health, last_error="")
+        self._clear_error()
         self._count(localized=1, accepted=int(estimate.accepted))
         for subscriber in self._subscribers:
             subscriber(estimate, bundle)
 
     def _report(self, text: str) -> None:
         with self._health_lock:
-            self._health = replace(self._health, last_error=text)
+            self._errors[threading.current_thread().name] = text
         self._count(errors=1)
         now = time.monotonic()
         if now - self._reported_s > _REPORT_EVERY_S:
             self._reported_s = now
             _log.warning("%s", text)
+
+    def _clear_error(self) -> None:
+        """This thread has done its work: an error of its own is over, another thread's is not."""
+        with self._health_lock:
+            self._errors.pop(threading.current_thread().name, None)
 
     def _count(self, **increments: int) -> None:
         with self._health_lock:

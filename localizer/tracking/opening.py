@@ -12,6 +12,7 @@ from localizer.errors import ModelError
 from localizer.features.detail import DetailExtractor
 from localizer.features.extractor import DeviceExtractor, FeatureExtractor, load_extractor
 from localizer.geometry.camera import Camera
+from localizer.integrity.confirmation import DisplacementBetween
 from localizer.map.cache.cache import TileCache
 from localizer.map.cache.stream import TileStreamer
 from localizer.registration.devices import open_backend
@@ -66,12 +67,13 @@ def build_localizer(
     camera: Camera,
     config: LocalizerConfig,
     rotation_at: RotationAt = lambda _time_ns: None,
+    displacement_between: DisplacementBetween = lambda _begin_ns, _end_ns: None,
     *,
     on_close: Callable[[], None] = lambda: None,
 ) -> Localizer:
     """A localizer for one camera over an open map, which stays the caller's to close.
 
-    rotation_at, on_close: see `Localizer`.
+    rotation_at, displacement_between, on_close: see `Localizer`.
     """
     size = working_camera(camera, config.width)
     features = load_extractor(
@@ -87,7 +89,7 @@ def build_localizer(
     _warm_up(stack.renderer, extractor, optimizer, camera, config)
     return Localizer(
         stack.renderer, extractor, optimizer, camera, config, rotation_at,
-        map_frame=stack.cache.frame, on_close=on_close,
+        displacement_between=displacement_between, map_frame=stack.cache.frame, on_close=on_close,
     )  # fmt: skip
 
 

@@ -22,6 +22,8 @@ from localizer.features.extractor import DeviceExtractor, FeatureExtractor
 from localizer.geometry.camera import Camera
 from localizer.geometry.geo import LocalFrame
 from localizer.geometry.pose import Array
+from localizer.integrity.acceptance import is_acceptable
+from localizer.integrity.confirmation import DisplacementBetween, Witness
 from localizer.registration.anchors import select_anchors
 from localizer.registration.jngo import JNGO
 from localizer.registration.priors import PoseConstraint, attitude_constraint
@@ -29,8 +31,8 @@ from localizer.registration.result import Registration
 from localizer.render.base import MapRenderer
 from localizer.render.holes import fill_holes
 from localizer.tracking import motion
-from localizer.tracking.integrity import Integrity, is_acceptable, judge
 from localizer.tracking.motion import MotionConfig, MotionState
+from localizer.tracking.states import Outcome, Standing, judge
 from localizer.types import (
     Anchors,
     FeaturePyramid,
@@ -62,7 +64,7 @@ class TrackerState:
     """What the two halves share; replaced as a whole, never changed."""
 
     motion: MotionState | None = None
-    integrity: Integrity = field(default_factory=Integrity)
+    standing: Standing = field(default_factory=Standing)
 
 
 def working_camera(camera: Camera, width: int) -> Camera:
@@ -144,8 +146,9 @@ class Localizer:
 
     rotation_at: the camera's attitude by another sensor's account (autopilot and gimbal). Its turns
     replace the constant angular rate of the motion model, and it enters the registration as a
-    weak prior (`AttitudePrior`). map_frame: the map's. on_close: releases what was opened for this
-    localizer alone.
+    weak prior (`AttitudePrior`). displacement_between: the way between two times by another
+    sensor's account; with the attitude it confirms or refutes a place that was found by searching.
+    map_frame: the map's. on_close: releases what was opened for this localizer alone.
     """
 
     def __init__(
@@ -157,6 +160,7 @@ class Localizer:
         config: LocalizerConfig,
         rotation_at: RotationAt = lambda _time_ns: None,
         *,
+        displacement_between: DisplacementBetween = lambda _begin_ns, _end_ns: None,
         map_frame: LocalFrame | None = None,
         on_close: Callable[[], None] = lambda: None,
     ) -> None:
@@ -167,6 +171,7 @@ class Localizer:
         self._config = config
         self._rotation_at = rotation_at
         self._motion = MeasuredMotion(config.motion, rotation_at)
+        self._displacement_between = displacement_between
         self.camera = working_camera(camera, config.width)
         self._undistorter = Undistorter(camera, self.camera)
         self._lock = threading.Lock()
@@ -206,6 +211,11 @@ class Localizer:
             return self._tracker
 
     @property
+    def reference_age_s(self) -> float:
+        """A reference view older than this says nothing of a frame."""
+        return self._config.integrity.reference_age_s
+
+    @property
     def renderer_name(self) -> str:
         """Which renderer draws the references."""
         return self._renderer.name
@@ -214,7 +224,27 @@ class Localizer:
         """Begin (again) from a pose known from outside, e.g. the autopilot's."""
         state = motion.start(prior, self._config.motion)
         with self._lock:
-            self._tracker = TrackerState(state, Integrity())
+            self._tracker = TrackerState(state, self._tracker.standing.begun())
+
+    def offer(self, prior: PosePrior) -> None:
+        """Take a pose that is known outside, as it deserves: before the first fix one that owes
+        our own fixes nothing begins the tracking; any other place is on trial (`propose`).
+        """
+        begins = self.tracker.standing.state is TrackingState.INITIALIZING
+        if prior.independent and begins:
+            self.set_prior(prior)
+        else:
+            self.propose(prior)
+
+    def propose(self, prior: PosePrior) -> None:
+        """Try a place: it is given out only once it is confirmed (`localizer.integrity`).
+
+        The state stays what it is: a guess does not end LOST.
+        """
+        state = motion.start(prior, self._config.motion)
+        with self._lock:
+            standing = self._tracker.standing.proposed(prior.independent)
+            self._tracker = TrackerState(state, standing)
 
     def track(
         self,
@@ -306,15 +336,30 @@ class Localizer:
             self.camera,
             anchors,
             ahead.prior,
-            motion=ahead.prior if tracker.integrity.trusts_prediction else None,
+            motion=ahead.prior if tracker.standing.trusts_prediction else None,
             constraint=self._attitude(frame.exposure_time_ns),
             seed=config.seed + frame.sequence,
         )
         elapsed_ms = (time.perf_counter() - started) * 1e3
         acceptable = self._acceptable(result, ahead.prior)
-        integrity = judge(tracker.integrity, config.integrity, acceptable)
-        self._store(tracker, self._next_motion(ahead, result, acceptable), integrity)
-        return _estimate(frame, result, integrity, acceptable, {"register": elapsed_ms})
+        outcome = Outcome(
+            acceptable, result.world_from_camera, result.covariance, frame.exposure_time_ns
+        )
+        standing = judge(
+            tracker.standing, config.integrity, outcome, self._witness(tracker.standing, outcome)
+        )
+        self._store(tracker, self._next_motion(ahead, result, acceptable), standing)
+        return _estimate(frame, result, standing, acceptable, {"register": elapsed_ms})
+
+    def _witness(self, standing: Standing, outcome: Outcome) -> Witness:
+        """What other sensors say of a place on trial."""
+        if not standing.on_trial or not outcome.acceptable:
+            return Witness()
+        rotation = self._rotation_at(outcome.time_ns)
+        if standing.probation is None:
+            return Witness(rotation)
+        way = self._displacement_between(standing.probation.time_ns, outcome.time_ns)
+        return Witness(rotation, way)
 
     def _acceptable(self, result: Registration, prior: PosePrior) -> bool:
         # Also before tracking: the gate is against the prior's own covariance, which is wide then.
@@ -329,32 +374,33 @@ class Localizer:
             return motion.inflated(ahead, self._config.motion) if credible else ahead
         return motion.update(ahead, result.world_from_camera, result.covariance)
 
-    def _store(self, seen: TrackerState, state: MotionState, integrity: Integrity) -> None:
+    def _store(self, seen: TrackerState, state: MotionState, standing: Standing) -> None:
         """Keep the new state unless a prior from outside replaced it meanwhile."""
         with self._lock:
             if self._tracker is seen:
-                self._tracker = TrackerState(state, integrity)
+                self._tracker = TrackerState(state, standing)
 
 
 def _estimate(
     frame: Frame,
     result: Registration,
-    integrity: Integrity,
+    standing: Standing,
     acceptable: bool,
     stage_ms: dict[str, float],
 ) -> PoseEstimate:
-    usable = acceptable and integrity.state is not TrackingState.LOST
+    usable = acceptable and not standing.on_trial
     return PoseEstimate(
         world_from_camera=result.world_from_camera,
         covariance=result.covariance,
         quality=result.quality if result.status is RegistrationStatus.OK else 0.0,
-        state=integrity.state,
+        state=standing.state,
         status=result.status,
         accepted=usable,
         exposure_time_ns=frame.exposure_time_ns,
         sequence=frame.sequence,
         camera=frame.camera,
         stage_ms=stage_ms,
+        last_fix_ns=standing.last_fix_ns,
     )
 
 

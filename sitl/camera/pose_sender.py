@@ -32,7 +32,7 @@ def truth_feed(
 ) -> Iterator[None]:
     """Tells the world camera where the vehicle is, 50 times a second, on a thread.
 
-    map_shift_m: how far the map lies east, north and up of where GNSS says it should.
+    map_shift_m: how far east, north and up of its true place the map shows what is on the ground.
     """
     shift = np.array(map_shift_m)
     stop = threading.Event()
@@ -44,7 +44,7 @@ def truth_feed(
             if sample is not None and sample.time_ns > last_ns:
                 last_ns = sample.time_ns
                 angles = gimbal_error.true_angles(sample.gimbal, last_ns)
-                place = sample.position - shift  # over that place of a map that lies off
+                place = sample.position + shift  # where that map has what is below the vehicle
                 sample = replace(sample, position=place, gimbal=angles)
                 try:
                     camera.send(sample)

@@ -41,7 +41,7 @@ def _one_report(folder, state, connected, tracking=None, frames_in=0, **options)
         lambda *e: events.append(e), folder, **options,
     )  # fmt: skip
     if tracking is not None:
-        monitor.add_estimate(SimpleNamespace(state=tracking, stage_ms={}))
+        monitor.add_estimate(SimpleNamespace(state=tracking, stage_ms={}, last_fix_ns=None))
     monitor.start()
     monitor.stop()
     return bridge.told, events
@@ -117,3 +117,20 @@ def test_a_report_that_fails_is_not_the_last(tmp_path, monkeypatch, caplog):
     assert sleep_until(lambda: bool(bridge.told), 30.0)
     monitor.stop()
     assert sum("could not be reported" in r.message for r in caplog.records) == 1
+
+
+def test_a_loss_says_how_long_and_how_far(tmp_path):
+    lost = SimpleNamespace(
+        state=TrackingState.LOST, stage_ms={}, last_fix_ns=time.monotonic_ns() - 23 * 10**9
+    )
+    bridge = FakeBridge(True)
+    monitor = HealthMonitor(
+        lambda: EngineHealth(frames_in=9, searching=True), bridge, lambda: StreamState.LIVE,
+        lambda *_: None, tmp_path, position_sigma_m=lambda: 20.0,
+    )  # fmt: skip
+    monitor.add_estimate(lost)
+    monitor.start()
+    monitor.stop()
+    level, text = bridge.told[-1]
+    assert level is HealthLevel.FAILED
+    assert text.startswith("localization lost 23 s, +-40 m, searching")

@@ -59,6 +59,11 @@ class Autopilot(threading.Thread):
                 )
             self._send(mavlink.MAVLink_attitude_message(ms, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0))
             self._send(mavlink.MAVLink_global_position_int_message(ms, *self._place, 0, 0, 0, 0, 0))
+            self._send(  # healthy GNSS
+                mavlink.MAVLink_gps_raw_int_message(
+                    ms * 1000, 3, *self._place, 80, 80, 0, 0, 12, h_acc=800, v_acc=1200
+                )
+            )
             self._send(mavlink.MAVLink_gimbal_device_attitude_status_message(
                 0, 0, ms, mavlink.GIMBAL_DEVICE_FLAGS_YAW_IN_EARTH_FRAME, list(self._q),
                 0.0, 0.0, 0.0, 0))  # fmt: skip

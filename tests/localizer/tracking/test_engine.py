@@ -110,10 +110,14 @@ def _prior(time_ns: int) -> PosePrior:
 class Flight:
     """An engine, its estimates, and frames on demand."""
 
-    def __init__(self, localizer: Localizer, provider=_prior) -> None:
+    def __init__(self, localizer: Localizer, provider=_prior, searcher=None) -> None:
         self.estimates = []
+        self.localizer, self.provider = localizer, provider
         self.engine = DualThreadEngine(
-            localizer, (lambda e, _: self.estimates.append(e),), provider
+            localizer,
+            (lambda e, _: self.estimates.append(e),),
+            lambda time_ns: self.provider(time_ns),  # noqa: PLW0108 (a test replaces it)
+            searcher,
         )
         self.sequence = 0
         self.engine.start()
@@ -213,10 +217,13 @@ def test_a_lost_tracker_asks_outside_and_comes_back(flight):
     f.feed_until(lambda: f.estimates and f.estimates[-1].state is TrackingState.TRACKING)
     before = len(asked)
     optimizer.status = RegistrationStatus.NO_OVERLAP
-    # A single estimate says LOST: the next frame begins anew from the pose asked for.
     f.feed_until(lambda: any(e.state is TrackingState.LOST for e in f.estimates))
     assert not next(e for e in f.estimates if e.state is TrackingState.LOST).accepted
     f.feed_until(lambda: len(asked) > before)
+    # It stays lost while the pose asked for is tried and does not hold.
+    count = len(f.estimates)
+    f.feed_until(lambda: len(f.estimates) > count + 5)
+    assert {e.state for e in f.estimates[count:]} == {TrackingState.LOST}
     optimizer.status = RegistrationStatus.OK
     f.feed_until(lambda: f.estimates[-1].state is TrackingState.TRACKING)
 
@@ -263,7 +270,7 @@ def test_a_frame_is_tracked_in_one_call_as_in_its_two_halves():
     again.set_prior(_prior(10**9))
     assert again.track(_frame(0), passes=3, query=lambda: whole.extract_query(_frame(0))).accepted
     assert len(renderer.poses) == 3
-    assert again.tracker.integrity.accepted_in_row == 1
+    assert again.tracker.standing.accepted_in_row == 1
 
 
 def test_a_frame_of_another_size_is_named():
@@ -368,3 +375,52 @@ def test_frames_of_a_wrong_time_are_got_over(jump_s, frames):
     state = localizer.tracker.motion
     assert state.velocity[0] == pytest.approx(10.0, abs=1.0)
     assert np.sqrt(state.covariance[0, 0]) < 0.2
+
+
+def test_a_render_thread_that_fails_for_good_is_no_secret(flight):
+    """Rejected frames went on with the last reference for ever, and cleared the error each time."""
+    renderer = FakeRenderer()
+    f = flight(_localizer(renderer))
+    f.feed_until(lambda: f.estimates and f.estimates[-1].state is TrackingState.TRACKING)
+    renderer.depth = 0.0  # every view from now on is outside the map
+    f.feed_until(lambda: "does not meet" in f.engine.health.last_error)
+    seen = len(f.estimates)
+    f.feed_until(lambda: len(f.estimates) > seen + 3)
+    assert "does not meet" in f.engine.health.last_error
+    # A reference older than its use is refused, and the error goes on standing.
+    f.sequence += 3 * 10**9 // INTERVAL_NS
+    begun, errors = f.sequence, f.engine.health.errors
+    f.feed_until(lambda: f.engine.health.errors > errors + 5)
+    assert not any(e.sequence >= begun for e in f.estimates)
+    assert "does not meet" in f.engine.health.last_error
+
+
+def test_while_lost_a_search_finds_the_place_and_the_way_flown_confirms_it(flight):
+    optimizer, searched = FakeOptimizer(), []
+    elsewhere = np.array([300.0, 0.0, 0.0])
+
+    def search(frame, is_idle):
+        searched.append(threading.current_thread().name)
+        if is_idle() or np.linalg.norm(optimizer.offset) < 100.0:
+            return None
+        pose = Pose(NADIR.rotation, NADIR.translation + elsewhere)
+        return PosePrior(pose, np.eye(6), frame.exposure_time_ns, independent=False)
+
+    f = flight(_localizer(optimizer=optimizer), searcher=search)
+    f.feed_until(lambda: f.estimates and f.estimates[-1].state is TrackingState.TRACKING)
+    assert not searched
+    f.provider = lambda _: None
+    optimizer.offset = elsewhere  # the vehicle is 300 m off at once: every frame is refused
+    f.feed_until(lambda: f.estimates[-1].state is TrackingState.LOST)
+    f.feed_until(lambda: f.engine.health.found > 0)
+    f.feed_until(lambda: f.localizer.tracker.standing.probation is not None)
+    assert f.estimates[-1].state is TrackingState.LOST
+    assert not f.estimates[-1].accepted
+    for step in range(12):  # it flies on, and the map goes on matching
+        optimizer.offset = elsewhere + np.array([0.6 * step, 0.0, 0.0])
+        count = len(f.estimates)
+        f.feed_until(lambda count=count: len(f.estimates) > count + 1)
+    f.feed_until(lambda: f.estimates[-1].state is TrackingState.TRACKING)
+    assert f.estimates[-1].accepted
+    assert set(searched) == {"search"}
+    assert f.engine.health.searches >= f.engine.health.found > 0

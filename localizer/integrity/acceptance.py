@@ -1,0 +1,59 @@
+"""Which estimates may be used.
+
+An estimate is acceptable when the registration succeeded, enough anchors were seen, its quality is
+high enough and it agrees with the prediction (Mahalanobis gate). What runs of acceptances and
+rejections make of the tracker's state stands in `localizer.tracking.states`.
+"""
+
+from __future__ import annotations
+
+from pydantic import BaseModel, ConfigDict, Field
+
+from localizer.registration.result import Registration
+from localizer.types import RegistrationStatus
+
+
+class IntegrityConfig(BaseModel):
+    """Thresholds of the acceptance test, of the state machine and of confirmation."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
+
+    min_overlap: float = Field(0.35, ge=0, le=1, description="share of anchors in view")
+    min_quality: float = Field(0.15, ge=0, le=1, description="registration quality")
+    max_sigma_m: float = Field(
+        4.0, ge=0.01, le=100, description="position sigma of a usable estimate"
+    )
+    gate: float = Field(40.0, ge=1, le=1e4, description="squared Mahalanobis distance, 6 dof")
+    confirmations: int = Field(
+        3, ge=1, le=1000, description="acceptances in a row that begin TRACKING"
+    )
+    degraded_after: int = Field(
+        3, ge=1, le=1000, description="rejections in a row that end TRACKING"
+    )
+    lost_after: int = Field(10, ge=1, le=1000, description="rejections in a row until LOST")
+    confirm_distance_m: float = Field(
+        5.0, ge=0.1, le=1000, description="way over which a place found without GNSS must hold"
+    )
+    confirm_still_s: float = Field(
+        3.0, ge=0.1, le=60, description="the same for a vehicle that does not move"
+    )
+    confirm_tilt_deg: float = Field(
+        6.0, ge=0.1, le=90, description="roll and pitch of a found place against the autopilot's"
+    )
+    confirm_heading_deg: float = Field(
+        30.0, ge=0.1, le=180, description="heading of a found place against the autopilot's"
+    )
+    reference_age_s: float = Field(
+        2.0, ge=0.1, le=60, description="a reference view older than this is not registered to"
+    )
+
+
+def is_acceptable(config: IntegrityConfig, result: Registration, distance_squared: float) -> bool:
+    """Whether one registration may be used; distance_squared: Mahalanobis, from the prediction."""
+    if result.status is not RegistrationStatus.OK:
+        return False
+    if result.overlap < config.min_overlap or result.quality < config.min_quality:
+        return False
+    if result.covariance.diagonal()[:3].max() > config.max_sigma_m**2:
+        return False
+    return distance_squared <= config.gate

@@ -1,0 +1,98 @@
+"""Whether a place that was found by searching holds: evidence that does not come from the search.
+
+A wrong place that looks right looks right again in the next frame of the same view: three
+acceptances in a row are one piece of evidence. Independent of the search are the way that the
+vehicle flies on while the map still matches, the attitude that the autopilot knows by gravity and
+compass, and the displacement that it measures inertially.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from enum import Enum
+
+import numpy as np
+
+from localizer.geometry.pose import Array, Pose, so3_log
+from localizer.integrity.acceptance import IntegrityConfig
+
+# By another sensor's account: displacement (3,) in world axes (m) between two times (ns), and its
+# sigma (m); None where it does not know.
+DisplacementBetween = Callable[[int, int], "tuple[Array, float] | None"]
+
+_SIGMAS = 3.0
+_SLACK_M = 1.5  # of two displacements over seconds, beside what their sigmas say
+_TURN_RAD = np.radians(15.0)  # a view that turned by this shows other ground
+
+
+class Verdict(Enum):
+    """What the evidence says of a found place so far."""
+
+    PENDING = "pending"
+    CONFIRMED = "confirmed"
+    CONTRADICTED = "contradicted"
+
+
+@dataclass(frozen=True)
+class Probation:
+    """The first acceptance of a run at a found place. covariance: (6, 6); time_ns: its exposure.
+
+    independent_prior: the place was proposed by something that owes our own fixes nothing, such as
+    an autopilot with healthy GNSS; agreeing with that is evidence enough.
+    """
+
+    world_from_camera: Pose
+    covariance: Array
+    time_ns: int
+    independent_prior: bool = False
+
+
+@dataclass(frozen=True)
+class Witness:
+    """What other sensors say. rotation: (3, 3) world_from_camera at the newest acceptance, or None;
+    displacement: (3,) metres since the probation began with its sigma (m), or None.
+    """
+
+    rotation: Array | None = None
+    displacement: tuple[Array, float] | None = None
+
+
+def weigh(
+    probation: Probation,
+    pose: Pose,
+    covariance: Array,
+    time_ns: int,
+    witness: Witness,
+    config: IntegrityConfig,
+) -> Verdict:
+    """The evidence after another acceptance at `pose`, covariance (6, 6)."""
+    if witness.rotation is not None and not _attitude_agrees(pose, witness.rotation, config):
+        return Verdict.CONTRADICTED
+    moved = pose.translation - probation.world_from_camera.translation
+    if witness.displacement is not None:
+        seen, sigma_m = witness.displacement
+        own = np.sqrt((probation.covariance + covariance).diagonal()[:3].max())
+        limit = _SLACK_M + _SIGMAS * (sigma_m + own)
+        if np.linalg.norm(moved - seen) > limit:
+            return Verdict.CONTRADICTED
+    if probation.independent_prior:
+        return Verdict.CONFIRMED
+    turned = so3_log(pose.rotation @ probation.world_from_camera.rotation.T)
+    has_moved = np.linalg.norm(moved) >= config.confirm_distance_m
+    has_moved = has_moved or np.linalg.norm(turned) >= _TURN_RAD
+    has_stayed = (time_ns - probation.time_ns) * 1e-9 >= config.confirm_still_s
+    # A hovering camera sees the same ground again: without the autopilot's attitude beside it,
+    # that the map goes on matching says nothing new.
+    has_stayed = has_stayed and witness.rotation is not None
+    return Verdict.CONFIRMED if has_moved or has_stayed else Verdict.PENDING
+
+
+def _attitude_agrees(pose: Pose, rotation: Array, config: IntegrityConfig) -> bool:
+    """Tilt and heading of the pose against another sensor's rotation (3, 3)."""
+    turn = so3_log(pose.rotation @ rotation.T)
+    tilt, heading = np.hypot(turn[0], turn[1]), abs(turn[2])
+    return bool(
+        tilt <= np.radians(config.confirm_tilt_deg)
+        and heading <= np.radians(config.confirm_heading_deg)
+    )

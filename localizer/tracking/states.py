@@ -1,0 +1,133 @@
+"""The tracker's state: what runs of acceptances and rejections make of it.
+
+Rejections lead from TRACKING over DEGRADED to LOST. LOST lasts until a place was found again
+and confirmed (`localizer.integrity.confirmation`): a new guess is tried, it does not end it.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+from localizer.geometry.pose import Array, Pose
+from localizer.integrity.acceptance import IntegrityConfig
+from localizer.integrity.confirmation import Probation, Verdict, Witness, weigh
+from localizer.types import TrackingState
+
+_SEES = (TrackingState.TRACKING, TrackingState.DEGRADED)
+
+
+@dataclass(frozen=True)
+class Standing:
+    """State of the machine: immutable, `judge` returns the next one.
+
+    on_trial: the place was proposed, and counts only once it is confirmed. probation: the run of
+    acceptances there. independent: of the newest proposal, see `Probation`. last_fix_ns: exposure
+    of the newest fix that was given out, None before the first.
+    """
+
+    state: TrackingState = TrackingState.INITIALIZING
+    accepted_in_row: int = 0
+    rejected_in_row: int = 0
+    on_trial: bool = False
+    independent: bool = True
+    probation: Probation | None = None
+    last_fix_ns: int | None = None
+
+    @property
+    def trusts_prediction(self) -> bool:
+        """Whether the prediction may reject an estimate."""
+        return self.state in _SEES
+
+    @property
+    def wants_prior(self) -> bool:
+        """Whether a pose known outside is better than the prediction: before the first acceptance,
+        and when LOST, as long as nothing is on probation.
+        """
+        return self.state not in _SEES and self.accepted_in_row == 0
+
+    def begun(self) -> Standing:
+        """Begun anew from a pose that is known."""
+        return Standing(last_fix_ns=self.last_fix_ns)
+
+    def proposed(self, independent: bool) -> Standing:
+        """The same state, with a new place on trial. independent: see `Probation`."""
+        return replace(
+            self, accepted_in_row=0, on_trial=True, independent=independent, probation=None
+        )
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """A registration that was judged. covariance: (6, 6); time_ns: the frame's exposure."""
+
+    acceptable: bool
+    world_from_camera: Pose
+    covariance: Array
+    time_ns: int
+
+
+_NO_WITNESS = Witness()
+
+
+def judge(
+    standing: Standing, config: IntegrityConfig, outcome: Outcome, witness: Witness = _NO_WITNESS
+) -> Standing:
+    """The machine after one more frame; witness: what other sensors say, for a place on trial."""
+    if not outcome.acceptable:
+        return _after_rejection(standing, config)
+    if standing.on_trial:
+        return _on_trial(standing, config, outcome, witness)
+    count = standing.accepted_in_row + 1
+    state = standing.state
+    if state is TrackingState.DEGRADED or count >= config.confirmations:
+        state = TrackingState.TRACKING
+    return replace(
+        standing,
+        state=state,
+        accepted_in_row=count,
+        rejected_in_row=0,
+        last_fix_ns=outcome.time_ns if state is not TrackingState.LOST else standing.last_fix_ns,
+    )
+
+
+def _on_trial(
+    standing: Standing, config: IntegrityConfig, outcome: Outcome, witness: Witness
+) -> Standing:
+    probation = standing.probation or Probation(
+        outcome.world_from_camera, outcome.covariance, outcome.time_ns, standing.independent
+    )
+    count = standing.accepted_in_row + 1
+    tried = replace(standing, accepted_in_row=count, rejected_in_row=0, probation=probation)
+    verdict = weigh(
+        probation, outcome.world_from_camera, outcome.covariance, outcome.time_ns, witness, config
+    )
+    if verdict is Verdict.CONTRADICTED:
+        return _after_rejection(replace(standing, probation=None), config)
+    if verdict is Verdict.PENDING or count < config.confirmations:
+        return tried
+    return replace(
+        tried,
+        state=TrackingState.TRACKING,
+        on_trial=False,
+        probation=None,
+        last_fix_ns=outcome.time_ns,
+    )
+
+
+def _after_rejection(standing: Standing, config: IntegrityConfig) -> Standing:
+    count = standing.rejected_in_row + 1
+    state = standing.state
+    if count >= config.lost_after:
+        state = TrackingState.LOST
+    elif state is TrackingState.TRACKING and count >= config.degraded_after:
+        state = TrackingState.DEGRADED
+    trial = standing.on_trial or state is TrackingState.LOST
+    return replace(
+        standing,
+        state=state,
+        accepted_in_row=0,
+        rejected_in_row=count,
+        on_trial=trial,
+        independent=standing.independent and not trial,
+        probation=None,
+    )
