@@ -20,6 +20,7 @@ from mavlink_bridge.injection.shadow import gnss_healthy
 from mavlink_bridge.messages import Attitude, GimbalAttitude, VehicleState
 
 _CONST_POSITION = 128  # EKF_CONST_POS_MODE of EKF_STATUS_REPORT (193): it only knows that it is
+_ATTITUDE = 1
 _GLITCH = 32768  # EKF_GPS_GLITCHING
 _HORIZONTAL = 8 | 16  # EKF_POS_HORIZ_REL | EKF_POS_HORIZ_ABS
 
@@ -126,6 +127,27 @@ class AutopilotPose:
     def sigma_m(self) -> float | None:
         """Horizontal sigma of the autopilot's position now; None where it is not known."""
         return self.belief.at(self._autopilot.state(), time.monotonic_ns()).sigma_m
+
+    @property
+    def height_m(self) -> float | None:
+        """The vehicle's height above the ellipsoid by its barometer; None while it says none."""
+        altitude_m = self._autopilot.state().altitude_amsl_m
+        if altitude_m is None or not math.isfinite(altitude_m):
+            return None
+        return altitude_m + self._installation.geoid_separation_m
+
+    @property
+    def velocity(self) -> Array | None:
+        """The EKF's velocity (3,) in the map's axes, m/s; None while it knows none."""
+        state = self._autopilot.state()
+        if state.local_velocity_ned is None or state.ekf_flags & _CONST_POSITION:
+            return None
+        return np.asarray(NED_FROM_ENU.T @ np.array(state.local_velocity_ned))
+
+    @property
+    def knows_heading(self) -> bool:
+        """Whether the EKF's attitude, heading included, is valid (EKF_ATTITUDE)."""
+        return bool(self._autopilot.state().ekf_flags & _ATTITUDE)
 
     def prior(self, time_ns: int) -> PosePrior | None:
         """The camera's pose at a CLOCK_MONOTONIC time; None while the autopilot does not know."""

@@ -23,6 +23,7 @@ from companion.flight.injection import FixInjection
 from companion.flight.parts import Making, Part
 from companion.flight.priors import AutopilotPose, PriorSources
 from companion.flight.recorder import RecordKeeper, remove_empty
+from companion.flight.search import PlaceSearch
 from companion.flight.target_numbers import TargetNumbers
 from companion.flight.target_reporter import Target, TargetReporter
 from companion.flight.view_reporter import ViewReporter
@@ -181,10 +182,18 @@ def _feed(making: Making) -> Feed:
     return Feed(source, making.channels.frames.send)
 
 
+def _search(making: Making) -> PlaceSearch:
+    cache, event = making[MapStack].cache, making.channels.events.send
+    return PlaceSearch(cache, making.config.localizer, making[AutopilotPose], event)
+
+
 def _engine(making: Making) -> DualThreadEngine:
     channels = making.channels
     engine = DualThreadEngine(
-        making[Localizer], (channels.estimates.send,), making[PriorSources].at
+        making[Localizer],
+        (channels.estimates.send,),
+        making[PriorSources].at,
+        making[PlaceSearch].search,
     )
     channels.frames.subscribe(engine.submit)
     return engine
@@ -231,7 +240,11 @@ PARTS: tuple[Part[Any], ...] = (
         wanted=lambda config: config.bridge.camera.announce,
     ),
     Part(
-        "engine", DualThreadEngine, _engine, depends=(Localizer, PriorSources),
+        "search", PlaceSearch, _search, depends=(MapStack, AutopilotPose),
+        start=PlaceSearch.start, stop=PlaceSearch.stop, close=PlaceSearch.close,
+    ),
+    Part(
+        "engine", DualThreadEngine, _engine, depends=(Localizer, PriorSources, PlaceSearch),
         start=DualThreadEngine.start, stop=DualThreadEngine.stop,
     ),
     Part(

@@ -1,0 +1,147 @@
+"""Where are we, while nobody knows: the map is searched in one frame, on a thread of low priority.
+
+The answer is no fix: it is a place that the tracker puts on trial (`PosePrior.independent`).
+"""
+
+from __future__ import annotations
+
+import logging
+import math
+import os
+import threading
+import time
+from collections.abc import Callable
+from contextlib import suppress
+from dataclasses import dataclass
+
+import numpy as np
+
+from companion.flight.priors import AutopilotPose
+from localizer.config import LocalizerConfig
+from localizer.errors import LocalizerError
+from localizer.map.cache.cache import TileCache
+from localizer.relocalization.relocalizer import OpenRelocalizer, open_relocalizer
+from localizer.relocalization.types import PlaceQuery, SearchRegion
+from localizer.types import Frame, PosePrior
+
+_log = logging.getLogger(__name__)
+_NICE = 15  # of the preparing thread: the overview's seconds must not cost the tracker frames
+_HINT_S = 120.0  # after which an operator's word is of another place
+_STOP_S = 10.0
+
+# What the autopilot knows of the camera while it does not know where it is.
+_TILT_SIGMA_RAD = math.radians(2.0)  # with the gimbal's own error
+_HEADING_SIGMA_RAD = math.radians(10.0)  # of a compass over a town
+_HEIGHT_SIGMA_M = 6.0  # of the barometer since the take-off
+_SIGMAS = 3.0
+_PLACE_SIGMA_M, _PLACE_SIGMA_RAD = 2.0, math.radians(1.0)  # of a found place, at the least
+
+Event = Callable[[str, str], None]
+
+
+@dataclass(frozen=True)
+class Hint:
+    """Where the operator says that we are: east and north in the map's frame, metres."""
+
+    centre: tuple[float, float]
+    radius_m: float
+    time_s: float
+
+
+class PlaceSearch:
+    """Finds a place in a frame with what the autopilot knows besides.
+
+    The map's overview is opened (or, the first time, computed) on a thread of its own, so that
+    neither the start nor a search waits for it.
+    """
+
+    def __init__(
+        self, cache: TileCache, config: LocalizerConfig, autopilot: AutopilotPose, event: Event
+    ) -> None:
+        self._cache, self._config = cache, config
+        self._autopilot, self._event = autopilot, event
+        self._hint: Hint | None = None
+        self._open: OpenRelocalizer | None = None
+        self._stop = threading.Event()
+        self._thread = threading.Thread(target=self._prepare, name="overview")
+
+    def start(self) -> None:
+        """Begin to make the search ready."""
+        self._thread.start()
+
+    def stop(self) -> None:
+        """Give up what is being prepared."""
+        self._stop.set()
+        if self._thread.ident is not None:
+            self._thread.join(_STOP_S)
+
+    def close(self) -> None:
+        """Release the renderer and its loader; no search runs any more."""
+        self.stop()
+        if self._open is not None:
+            self._open.close()
+            self._open = None
+
+    def hint(self, east_m: float, north_m: float, radius_m: float) -> None:
+        """The operator says where we are, map frame: the next searches look there. Never a fix."""
+        self._hint = Hint((east_m, north_m), radius_m, time.monotonic())
+
+    def search(self, frame: Frame, should_stop: Callable[[], bool]) -> PosePrior | None:
+        """The camera's pose at the frame's exposure, to be tried; None where nothing convinces."""
+        if self._open is None:
+            return None
+        query = self._query(frame)
+        if query is None:
+            return None
+        began = time.monotonic()
+        found = self._open.relocalizer.find(query, should_stop)
+        if found is None:
+            return None
+        seconds = time.monotonic() - began
+        self._event("info", f"place found by search in {seconds:.1f} s, to be confirmed")
+        least = np.repeat([_PLACE_SIGMA_M, _PLACE_SIGMA_RAD], 3) ** 2
+        return PosePrior(
+            found.world_from_camera,
+            found.covariance + np.diag(least),
+            found.exposure_time_ns,
+            self._autopilot.velocity,
+            independent=False,
+        )
+
+    def _query(self, frame: Frame) -> PlaceQuery | None:
+        """What the autopilot knows; None while it knows neither attitude nor height."""
+        rotation = self._autopilot.rotation(frame.exposure_time_ns)
+        height_m = self._autopilot.height_m
+        if rotation is None or height_m is None:
+            return None
+        return PlaceQuery(
+            frame,
+            rotation,
+            _TILT_SIGMA_RAD,
+            _HEADING_SIGMA_RAD if self._autopilot.knows_heading else None,
+            height_m,
+            _HEIGHT_SIGMA_M,
+            self._region(frame.exposure_time_ns),
+        )
+
+    def _region(self, time_ns: int) -> SearchRegion | None:
+        """The operator's word, else where the autopilot can be; None: the whole map."""
+        hint = self._hint
+        if hint is not None and time.monotonic() - hint.time_s < _HINT_S:
+            return SearchRegion.circle(np.array(hint.centre), hint.radius_m)
+        prior = self._autopilot.prior(time_ns)
+        if prior is None:
+            return None
+        sigma_m = float(np.sqrt(prior.covariance[0, 0]))
+        return SearchRegion.circle(prior.world_from_camera.translation, _SIGMAS * sigma_m)
+
+    def _prepare(self) -> None:
+        with suppress(OSError):  # on Linux a thread has a priority of its own
+            os.setpriority(os.PRIO_PROCESS, threading.get_native_id(), _NICE)
+        try:
+            self._open = open_relocalizer(self._cache, self._config, should_stop=self._stop.is_set)
+        except (LocalizerError, OSError) as error:
+            self._event("warning", f"no search for a lost place: {error}")
+        except Exception as error:  # the flight goes on without it, and says so
+            _log.exception("the search could not be made ready")
+            self._event("warning", f"no search for a lost place: {type(error).__name__}: {error}")
