@@ -9,9 +9,9 @@ from typing import Annotated, Any
 from pydantic import BaseModel, ConfigDict, Field, field_validator, model_validator
 
 from companion.errors import ConfigError
-from companion.flight.detections import parse_host_port
 from companion.settings_file import SettingsError, read_settings, validated
 from companion.sources.base import SourceSettings
+from companion.targets.detections import parse_host_port
 from localizer.config import LocalizerConfig
 from localizer.errors import CameraError
 from localizer.geometry.camera import Camera

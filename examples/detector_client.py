@@ -20,8 +20,8 @@ import numpy as np
 
 from companion.config import load_config
 from companion.errors import CompanionError, ConfigError
-from companion.flight.detections import parse_host_port
 from companion.sources import open_source
+from companion.targets.detections import parse_host_port
 from localizer.types import Image
 
 SMALLEST_PX = 12  # area; below it, red is noise

@@ -9,7 +9,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Generic, ParamSpec
 
-from companion.flight.target_reporter import Target
+from companion.targets.reporter import Target
 from localizer.types import Frame, PoseEstimate, ReferenceBundle
 from mavlink_bridge.messages import TrackRequest
 

@@ -14,9 +14,7 @@ import numpy as np
 
 from companion.config import CompanionConfig
 from companion.errors import ConfigError
-from companion.flight.clicks import ClickPolicy
 from companion.flight.conversions import Installation, target_report
-from companion.flight.detections import DetectionListener
 from companion.flight.feed import Feed
 from companion.flight.health import HealthMonitor
 from companion.flight.injection import FixInjection
@@ -24,11 +22,13 @@ from companion.flight.parts import Making, Part
 from companion.flight.priors import AutopilotPose, PriorSources
 from companion.flight.recorder import RecordKeeper, remove_empty
 from companion.flight.search import PlaceSearch
-from companion.flight.target_numbers import TargetNumbers
-from companion.flight.target_reporter import Target, TargetReporter
 from companion.flight.view_reporter import ViewReporter
 from companion.preflight.coverage import check_origin
 from companion.sources import FrameSource, StreamState, open_source
+from companion.targets.clicks import ClickPolicy
+from companion.targets.detections import DetectionListener
+from companion.targets.numbers import TargetNumbers
+from companion.targets.reporter import Target, TargetReporter
 from localizer.map.cache.cache import TileCache
 from localizer.map.cache.surface import MapSurface
 from localizer.tracking.engine import DualThreadEngine

@@ -13,7 +13,7 @@ from typing import Protocol
 
 import numpy as np
 
-from companion.flight.detections import Detection, encode_detection, parse_host_port
+from companion.targets.detections import Detection, encode_detection, parse_host_port
 from localizer.geometry.camera import Camera
 from localizer.geometry.pose import Array, Pose
 from localizer.types import Float32

@@ -7,8 +7,8 @@ from pathlib import Path
 
 import pytest
 
-from companion.flight.detections import Detection, parse_detection
 from companion.flight.recorder import ESTIMATE_COLUMNS, EVENT_COLUMNS, TARGET_COLUMNS
+from companion.targets.detections import Detection, parse_detection
 from localizer.evaluation.metrics import LocalizationMetrics
 from localizer.evaluation.sequences import CSV_COLUMNS
 from localizer.tracking.engine import EngineHealth

@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 import yaml
 
-from companion.flight.detections import DetectionListener
+from companion.targets.detections import DetectionListener
 from mavlink_bridge.link.link import sleep_until
 
 EXAMPLE = Path(__file__).parents[2] / "examples" / "detector_client.py"

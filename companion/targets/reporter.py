@@ -9,7 +9,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 from companion.config import TargetConfig
-from companion.flight.detections import Detection
+from companion.targets.detections import Detection
 from localizer.geometry.pose import Array
 from localizer.targets.filter import TargetFilter
 from localizer.targets.locate import RayCaster, locate

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from companion.config import TargetConfig
-from companion.flight.clicks import ClickPolicy
-from companion.flight.detections import Detection
-from companion.flight.target_reporter import TargetReporter
+from companion.targets.clicks import ClickPolicy
+from companion.targets.detections import Detection
+from companion.targets.reporter import TargetReporter
 from localizer.geometry.camera import Camera
 from localizer.geometry.pose import Pose
 from localizer.map.cache.pick import BundleHits

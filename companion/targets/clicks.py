@@ -12,8 +12,8 @@ from collections.abc import Callable
 
 import numpy as np
 
-from companion.flight.detections import CLICKED, Detection
-from companion.flight.target_reporter import TargetReporter
+from companion.targets.detections import CLICKED, Detection
+from companion.targets.reporter import TargetReporter
 from localizer.types import PoseEstimate, ReferenceBundle, TrackingState
 from mavlink_bridge.messages import TrackRequest
 

@@ -4,7 +4,7 @@ import time
 import pytest
 
 from companion.errors import ConfigError, DetectionError
-from companion.flight.detections import (
+from companion.targets.detections import (
     Detection,
     DetectionListener,
     encode_detection,

@@ -4,8 +4,8 @@ import time
 import numpy as np
 
 from companion.config import TargetConfig
-from companion.flight.detections import Detection
-from companion.flight.target_reporter import TargetReporter
+from companion.targets.detections import Detection
+from companion.targets.reporter import TargetReporter
 from localizer.geometry.camera import Camera
 from localizer.geometry.pose import Pose
 from localizer.map.cache.pick import BundleHits

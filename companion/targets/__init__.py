@@ -1,0 +1,1 @@
+"""An operator's clicks and a detector's pixels become target coordinates."""
