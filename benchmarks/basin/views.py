@@ -23,6 +23,7 @@ from localizer.geometry.pose import Pose
 from localizer.map.building.build import build_cache
 from localizer.map.cache.cache import TileCache
 from localizer.map.cache.stream import TileStreamer
+from localizer.map.importers.rules import ImportRules
 from localizer.render.numba_raster import NumbaRenderer
 from localizer.synth.appearance.model import CONDITIONS, apply_appearance, sample_appearance
 from localizer.synth.config import SURVEY, WorldConfig
@@ -146,6 +147,7 @@ def _make_real(source: Path, home: Path, count: int) -> None:
         cache,
         geoid_separation_m=0.0,
         vertical_datum="ellipsoidal",
+        rules=ImportRules(trusted=frozenset({"geoid"})),
         origin=Geodetic(origin["lat"], origin["lon"], origin["height"]) if origin else None,
         overwrite=True,
     )

@@ -25,6 +25,7 @@ from localizer.geometry.pose import Pose
 from localizer.map.building.build import build_cache
 from localizer.map.cache.cache import TileCache
 from localizer.map.cache.stream import TileStreamer
+from localizer.map.importers.rules import ImportRules
 from localizer.render.numba_raster import NumbaRenderer
 from localizer.synth.appearance.model import CONDITIONS, apply_appearance, sample_appearance
 from localizer.training.data.batches import tamed
@@ -63,6 +64,7 @@ def _map(folder: Path, cache: Path, origin: Geodetic | None) -> Path:
             built,
             geoid_separation_m=0.0,
             vertical_datum="ellipsoidal",
+            rules=ImportRules(trusted=frozenset({"geoid"})),
             origin=origin,
         )
     return built

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Annotated, Literal
@@ -38,7 +38,7 @@ def build(
     out: Annotated[Path, typer.Option(help="folder of the cache to make")],
     geoid_separation: Annotated[
         float | None,
-        typer.Option(help="geoid above the ellipsoid, metres; needed unless the source says it"),
+        typer.Option(help="geoid above the ellipsoid, metres; else the source's, else EGM96's"),
     ] = None,
     vertical_datum: Annotated[
         Literal["ellipsoidal", "amsl"] | None,
@@ -51,6 +51,12 @@ def build(
     ] = None,
     up_axis: Annotated[
         Literal["y", "z"] | None, typer.Option(help="of a mesh: y (glTF's default) or z (OBJ's)")
+    ] = None,
+    height_unit: Annotated[
+        str | None, typer.Option(help="of a DSM that does not say it: m, ft or us-ft")
+    ] = None,
+    nodata: Annotated[
+        float | None, typer.Option(help="of a DSM that does not say it: what missing heights are")
     ] = None,
     attribution: Annotated[str | None, typer.Option(help="who made the source")] = None,
     skip_bad_tiles: Annotated[
@@ -68,10 +74,20 @@ def build(
             help="compute now what finding a place without a prior needs, not on first use",
         ),
     ] = False,
+    limit: Annotated[
+        list[str] | None,
+        typer.Option(help="NAME=NUMBER: what a source may ask for; the limit's error names it"),
+    ] = None,
+    trust: Annotated[
+        list[str] | None,
+        typer.Option(help="a doubt that is set aside; the error that it stops with names it"),
+    ] = None,
 ) -> None:
     """Import a source into a tile cache; goes on where an interrupted build stopped."""
     from localizer.map.building.build import build_cache
+    from localizer.map.importers.rules import ImportRules
 
+    rules = ImportRules.of(limit or (), trust or ())
     try:
         with ImportBar() as bar:
             manifest = build_cache(
@@ -81,12 +97,16 @@ def build(
                 vertical_datum=vertical_datum,
                 georeference=georeference,
                 up_axis=up_axis,
+                height_unit=height_unit,
+                nodata=nodata,
                 attribution=attribution,
                 skip_bad_tiles=skip_bad_tiles,
                 overwrite=overwrite,
                 workers=workers,
+                apart=True,
                 scheduler=scheduler,
                 progress=bar,
+                rules=rules,
             )
     except KeyboardInterrupt:
         Console(stderr=True).print("interrupted: the same command goes on with what is done")
@@ -99,25 +119,44 @@ def build(
     )
     if manifest.skipped:
         Console().print(f"[yellow]{len(manifest.skipped)} source tiles were left out")
+    _print_warnings(manifest.warnings)
     if overview:
         _make_overview(out)
 
 
+def _print_warnings(warnings: Iterable[str]) -> None:
+    for text in warnings:
+        Console().print(f"[yellow]warning:[/] {escape(text)}", soft_wrap=True)
+
+
 @app.command("info")
-def info(cache: CachePath) -> None:
-    """Coverage, texel size, levels and sizes."""
+def info(
+    cache: CachePath,
+    geojson: Annotated[Path | None, typer.Option(help="write the map's outline there")] = None,
+    kml: Annotated[Path | None, typer.Option(help="write the map's outline there")] = None,
+) -> None:
+    """Coverage, heights, texel size, levels and sizes."""
+    outlines = [file for file in (geojson, kml) if file is not None]
+    _require_place(*outlines)
+    from localizer.geometry.geoid import geoid_separation
     from localizer.map.cache.cache import TileCache
+    from localizer.map.inspection.footprint import as_geojson, as_kml
     from localizer.map.inspection.inspect import levels
 
     opened = TileCache.open(cache)
     m = opened.manifest
+    south_north, west_east = zip(*m.extent, strict=True)
+    egm96 = geoid_separation(m.origin.latitude_deg, m.origin.longitude_deg)
     box = opened.index.box_max[0] - opened.index.box_min[0]
     facts = {
         "source": m.source,
         "attribution": m.attribution or "not given",
         "origin": f"{m.origin.latitude_deg:.7f}, {m.origin.longitude_deg:.7f}, "
         f"{m.origin.height_m:.2f} m (ellipsoidal)",
-        "heights of the source": f"{m.vertical_datum}, geoid separation {m.geoid_separation_m} m",
+        "latitude": f"{min(south_north):.6f} to {max(south_north):.6f}",
+        "longitude": f"{min(west_east):.6f} to {max(west_east):.6f}",
+        "heights of the source": m.vertical_datum,
+        "geoid separation": f"{m.geoid_separation_m:.2f} m (EGM96 there: {egm96:.2f} m)",
         "extent": f"{box[0]:.0f} x {box[1]:.0f} m, {m.height_range_m[0]:.1f} to "
         f"{m.height_range_m[1]:.1f} m (ellipsoidal)",
         "texel size": f"{m.gsd_m:.3f} m",
@@ -136,6 +175,11 @@ def info(cache: CachePath) -> None:
         row = (level.gsd_m, level.geometric_error_m, level.megabytes)
         table.add_row(str(level.level), str(level.tiles), *(f"{x:.2f}" for x in row))
     Console().print(table)
+    _print_warnings(m.warnings)
+    for file, written in ((geojson, as_geojson), (kml, as_kml)):
+        if file is not None:
+            with _written(file):
+                file.write_text(written(m, opened.path.name), encoding="utf-8")
 
 
 @app.command("verify")
@@ -148,8 +192,10 @@ def verify(cache: CachePath) -> None:
     from localizer.map.cache.cache import TileCache
     from localizer.map.inspection.inspect import verify as check
 
-    result = check(TileCache.open(cache))
+    opened = TileCache.open(cache)
+    result = check(opened)
     console = Console()
+    _print_warnings(opened.manifest.warnings)
     for line in result.damaged:
         console.print(f"[red]{line}")
     for hole in result.holes[:10]:

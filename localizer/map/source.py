@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Literal, Protocol
 
@@ -76,7 +76,8 @@ class SourceTree:
 
     centre: (3,) ECEF metres; geoid_separation_m, attribution, vertical_datum: as far as the source
     tells; files: everything it is made of, so that a change of the source can be seen; options:
-    what else decided the tree.
+    what else decided the tree; vertical_crs: the source's own statement of `vertical_datum`, empty
+    where that only follows from the format; warnings: doubts that did not stop the import.
     """
 
     root: SourceNode
@@ -86,3 +87,32 @@ class SourceTree:
     files: tuple[Path, ...]
     vertical_datum: VerticalDatum | None = None
     options: str = ""
+    vertical_crs: str = ""
+    warnings: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True, eq=False)
+class FlatTree:
+    """A source tree without nesting, which pickles however deep it is. nodes: parents first,
+    without their children; counts: how many children each has.
+    """
+
+    source: SourceTree
+    nodes: tuple[SourceNode, ...]
+    counts: tuple[int, ...]
+
+    @classmethod
+    def of(cls, source: SourceTree) -> FlatTree:
+        """Of a tree."""
+        nodes = list(source.root.walk())
+        bare = tuple(replace(node, children=[]) for node in nodes)
+        counts = tuple(len(node.children) for node in nodes)
+        return cls(replace(source, root=bare[0]), bare, counts)
+
+    def tree(self) -> SourceTree:
+        """The tree again."""
+        done: list[SourceNode] = []  # children before their parents, the first on top
+        for node, count in zip(reversed(self.nodes), reversed(self.counts), strict=True):
+            children = [done.pop() for _ in range(count)]
+            done.append(replace(node, children=children))
+        return replace(self.source, root=done[0])

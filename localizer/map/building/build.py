@@ -12,12 +12,15 @@ import numpy as np
 from localizer.errors import GeoreferenceError, MapSourceError
 from localizer.geometry.geo import Geodetic, LocalFrame, geodetic_from_ecef
 from localizer.map.building.assembly import assemble
-from localizer.map.building.sources import find_source, read_source
+from localizer.map.building.heights import extent_warnings, heights_of
+from localizer.map.building.isolation import call_apart
+from localizer.map.building.sources import SourceOptions, find_source, read_source
 from localizer.map.building.staging import Record, publish, staging
-from localizer.map.building.workers import ImportJob, Progress, import_all, tiles_of
-from localizer.map.cache.cache import HIGHEST_GEOID_M, LOWEST_GEOID_M, Manifest
+from localizer.map.building.workers import ImportJob, Progress, Workers, import_all, tiles_of
+from localizer.map.cache.cache import Manifest
 from localizer.map.importers.georeference import Georeference, UpAxis
-from localizer.map.source import SourceNode, SourceTree, VerticalDatum
+from localizer.map.importers.rules import ImportRules
+from localizer.map.source import FlatTree, SourceNode, SourceTree, VerticalDatum
 
 _NAMED_FAILURES = 20  # how many bad tiles an error message lists
 
@@ -30,34 +33,50 @@ def build_cache(
     vertical_datum: VerticalDatum | None = None,
     georeference: Georeference | Path | None = None,
     up_axis: UpAxis | None = None,
+    height_unit: str | None = None,
+    nodata: float | None = None,
     origin: Geodetic | None = None,
     attribution: str | None = None,
     skip_bad_tiles: bool = False,
     overwrite: bool = False,
     workers: int | None = None,
+    apart: bool | None = None,
     progress: Progress | None = None,
     scheduler: str | None = None,
+    rules: ImportRules | None = None,
 ) -> Manifest:
     """Import a map source into a tile cache at `out`.
 
     source: a `tileset.json`, a mesh (glTF, GLB, OBJ), a DSM and an orthophoto, or a folder that
     holds one of these.
     geoid_separation_m: height of the geoid above the ellipsoid at the map (MAVLink altitudes are
-    above the geoid); needed unless the source carries it. vertical_datum: what the source's heights
-    are; "amsl" ones are lifted by the separation; needed unless the source's format fixes it.
-    georeference, up_axis: of a mesh, see `read_georeference` and `mesh_tree`. origin: of the world
+    above the geoid), else the source's own, else EGM96's. vertical_datum: what the source's heights
+    are; "amsl" ones are lifted by the separation; needed unless the source's format or CRS says it.
+    georeference, up_axis: of a mesh, see `read_georeference` and `mesh_tree`. height_unit, nodata:
+    of a DSM, see `read_rasters`. origin: of the world
     frame, else the source's centre. skip_bad_tiles: leave out tiles that cannot be imported (their
     parents are shown there) instead of failing. workers: processes, else one per core; more than
-    one needs the usual ``if __name__ == "__main__"`` guard in a script. scheduler: address of a
+    one needs the usual ``if __name__ == "__main__"`` guard in a script. apart: read the source in
+    processes with limits of memory and time, else unless workers is 1. scheduler: address of a
     Dask scheduler whose workers share the file system, instead of local processes. progress: told
-    the number of imported tiles and of all, at the start and after each. An interrupted build goes
-    on where it stopped.
+    the number of imported tiles and of all, at the start and after each. rules: what a source may
+    ask for, and which doubts about it are meant. An interrupted build goes on where it stopped.
     """
+    rules = rules or ImportRules()
+    apart = workers != 1 if apart is None else apart
     given = [Path(source)] if isinstance(source, str | Path) else [Path(s) for s in source]
     sources, georeference = find_source(given, georeference)
+    options = SourceOptions(up_axis, height_unit, nodata, rules)
     named = " ".join(map(str, sources))
+    if apart:
+        flat = call_apart(
+            _read_flat, sources, georeference, options, rules=rules, what=f"{named}: its reading"
+        )
+        tree = flat.tree()
+    else:
+        tree = read_source(sources, georeference, options)
     return build_tree(
-        read_source(sources, georeference, up_axis),
+        tree,
         out,
         name=named,
         geoid_separation_m=geoid_separation_m,
@@ -67,9 +86,17 @@ def build_cache(
         skip_bad_tiles=skip_bad_tiles,
         overwrite=overwrite,
         workers=workers,
+        apart=apart,
         progress=progress,
         scheduler=scheduler,
+        rules=rules,
     )
+
+
+def _read_flat(
+    sources: Sequence[Path], georeference: Georeference | Path | None, options: SourceOptions
+) -> FlatTree:
+    return FlatTree.of(read_source(sources, georeference, options))
 
 
 def build_tree(
@@ -84,11 +111,15 @@ def build_tree(
     skip_bad_tiles: bool = False,
     overwrite: bool = False,
     workers: int | None = None,
+    apart: bool | None = None,
     progress: Progress | None = None,
     scheduler: str | None = None,
+    rules: ImportRules | None = None,
 ) -> Manifest:
     """Build a cache from any importer's tree; see `build_cache`. name: of the source."""
-    separation, datum = _heights(tree, geoid_separation_m, vertical_datum, name)
+    rules = rules or ImportRules()
+    _require_on_earth(tree)
+    separation, datum, doubts = heights_of(tree, geoid_separation_m, vertical_datum, name, rules)
     lift = separation if datum == "amsl" else 0.0
     frame = LocalFrame(origin or _origin(tree, lift))
     parameters = {
@@ -99,13 +130,20 @@ def build_tree(
         "source_fingerprint": _fingerprint(tree.files),
     }
     with staging(Path(out), parameters, overwrite=overwrite) as staged:
-        job = ImportJob(staged, frame, lift)
-        tell = progress or (lambda _done, _total: None)
-        records = import_all(tree.root, job, workers or os.cpu_count() or 1, scheduler, tell)
+        job = ImportJob(staged, frame, lift, rules)
+        how = Workers(
+            workers or os.cpu_count() or 1,
+            apart=workers != 1 if apart is None else apart,
+            scheduler=scheduler,
+        )
+        records = import_all(tree.root, job, how, progress or (lambda _done, _total: None))
         skipped = _failures(tree.root, records)
         if skipped and not skip_bad_tiles:
             raise MapSourceError(_failure_text(name, skipped))
         index, manifest = assemble(tree, records, staged, frame)
+        doubts += extent_warnings(
+            manifest.extent, manifest.height_range_m, separation, name, rules
+        )  # fmt: skip
         manifest = manifest.model_copy(
             update={
                 "vertical_datum": datum,
@@ -114,6 +152,7 @@ def build_tree(
                 "attribution": tree.attribution if attribution is None else attribution,
                 "build": parameters,
                 "skipped": skipped,
+                "warnings": (*tree.warnings, *doubts),
             }
         )
         return publish(staged, Path(out), index, manifest)
@@ -137,40 +176,15 @@ def _failure_text(source: str, failures: dict[str, str]) -> str:
     )
 
 
-def _heights(
-    tree: SourceTree, separation_m: float | None, datum: VerticalDatum | None, source: str
-) -> tuple[float, VerticalDatum]:
-    """Geoid separation and vertical datum, as given or as the source says; all that is missing is
-    named at once.
-    """
-    if datum not in (None, "ellipsoidal", "amsl"):
-        raise GeoreferenceError(f"vertical datum {datum!r}: ellipsoidal and amsl are known")
-    separation_m = tree.geoid_separation_m if separation_m is None else separation_m
-    datum = datum or tree.vertical_datum
-    missing = []
-    if datum is None:
-        missing.append(
-            "what its heights are above: give the vertical datum (--vertical-datum), ellipsoidal "
-            "(WGS84) or amsl (the geoid)"
-        )
-    if separation_m is None:
-        missing.append(
-            "how high the geoid is above the WGS84 ellipsoid there: give the geoid separation in "
-            "metres (--geoid-separation), from an EGM96 or EGM2008 calculator"
-        )
-    if datum is None or separation_m is None:
-        raise GeoreferenceError(f"{source} does not say " + "; nor ".join(missing))
-    if not LOWEST_GEOID_M <= separation_m <= HIGHEST_GEOID_M:
-        raise GeoreferenceError(f"a geoid separation of {separation_m} m does not occur on Earth")
-    return separation_m, datum
-
-
-def _origin(tree: SourceTree, lift: float) -> Geodetic:
+def _require_on_earth(tree: SourceTree) -> None:
     if not 6.2e6 < np.linalg.norm(tree.centre) < 6.5e6:
         raise GeoreferenceError(
             "the source is not placed on Earth: its root transform or volume does not lead to ECEF "
             "coordinates; it needs a georeference"
         )
+
+
+def _origin(tree: SourceTree, lift: float) -> Geodetic:
     lat, lon, h = geodetic_from_ecef(tree.centre)
     return Geodetic(round(float(lat), 9), round(float(lon), 9), round(float(h) + lift, 4))
 

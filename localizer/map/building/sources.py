@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -14,7 +15,8 @@ from localizer.map.importers.folder import MESHES, RASTERS, FoundSource, source_
 from localizer.map.importers.georeference import Georeference, UpAxis, read_georeference
 from localizer.map.importers.mesh import MeshFile
 from localizer.map.importers.raster import read_rasters
-from localizer.map.importers.referenced_files import files_beside
+from localizer.map.importers.referenced_files import files_beside, missing_pictures
+from localizer.map.importers.rules import DEFAULT_RULES, ImportRules, require_plain_file
 from localizer.map.importers.tiles3d import read_tileset
 from localizer.map.source import SourceTree
 
@@ -24,6 +26,18 @@ _IMPORTABLE = (
 )
 
 
+@dataclass(frozen=True)
+class SourceOptions:
+    """How a source is to be read, beyond what it says. up_axis: of a mesh; height_unit, nodata: of
+    a DSM, see `read_rasters`.
+    """
+
+    up_axis: UpAxis | None = None
+    height_unit: str | None = None
+    nodata: float | None = None
+    rules: ImportRules = DEFAULT_RULES
+
+
 def find_source(
     sources: Sequence[Path], georeference: Georeference | Path | None
 ) -> tuple[tuple[Path, ...], Georeference | Path | None]:
@@ -31,6 +45,8 @@ def find_source(
     for path in sources:
         if not path.exists():
             raise MapSourceError(f"{path}: no such file or folder")
+        if not path.is_dir():
+            require_plain_file(path)
     found = FoundSource(tuple(sources))
     if len(sources) == 1 and sources[0].is_dir():
         found = source_in(sources[0], georeference is not None)
@@ -40,22 +56,24 @@ def find_source(
 def read_source(
     sources: Sequence[Path],
     georeference: Georeference | Path | None = None,
-    up_axis: UpAxis | None = None,
+    options: SourceOptions | None = None,
 ) -> SourceTree:
     """The tile tree of what `find_source` found."""
+    options = options or SourceOptions()
+    rules = options.rules
     if all(path.suffix.lower() in RASTERS for path in sources):
-        return read_rasters(sources)
+        return read_rasters(sources, rules, height_unit=options.height_unit, nodata=options.nodata)
     if len(sources) > 1:
         raise MapSourceError("several sources can only be a DSM and an orthophoto")
     if sources[0].suffix.lower() in MESHES:
-        return _read_mesh(sources[0], georeference, up_axis)
+        return _read_mesh(sources[0], georeference, options)
     if sources[0].is_dir() or sources[0].suffix.lower() == ".json":
-        return with_levels(read_tileset(sources[0]))
+        return with_levels(read_tileset(sources[0], rules))
     raise MapSourceError(f"{sources[0]}: not a source that can be imported: {_IMPORTABLE}")
 
 
 def _read_mesh(
-    source: Path, georeference: Georeference | Path | None, up_axis: UpAxis | None
+    source: Path, georeference: Georeference | Path | None, options: SourceOptions
 ) -> SourceTree:
     if georeference is None:
         raise GeoreferenceError(
@@ -63,18 +81,28 @@ def _read_mesh(
             "file (--georeference)"
         )
     if isinstance(georeference, Path):
+        require_plain_file(georeference)
         georeference = read_georeference(georeference)
-    return mesh_tree(source, georeference, up_axis)
+    return mesh_tree(source, georeference, options)
 
 
-def mesh_tree(path: Path, georeference: Georeference, up_axis: UpAxis | None) -> SourceTree:
-    """The tree of a mesh. up_axis: else y for glTF and z for OBJ."""
-    axis: UpAxis = up_axis or ("z" if path.suffix.lower() == ".obj" else "y")
-    model = MeshFile(path, axis, georeference)
+def mesh_tree(path: Path, georeference: Georeference, options: SourceOptions) -> SourceTree:
+    """The tree of a mesh. Its up axis is else y for glTF and z for OBJ."""
+    axis: UpAxis = options.up_axis or ("z" if path.suffix.lower() == ".obj" else "y")
+    model = MeshFile(path, axis, georeference, options.rules)
     low, high = bounds(model)
     # A mesh about an origin keeps that as the world's; one in a CRS is given its middle.
     middle = [*(0.5 * (low + high))[:2], low[2]] if georeference.origin is None else [0.0, 0.0, 0.0]
     centre = georeference.ecef(np.array([middle]))[0]
-    options = f"{georeference} {axis}"
     files = (path, *files_beside(path))
-    return SourceTree(quadtree(model), centre, None, "", files, options=options)
+    missing = missing_pictures(path) if path.suffix.lower() == ".obj" else ()
+    warnings = tuple(f"{path.name}: its texture {name!r} is not there" for name in missing)
+    return SourceTree(
+        quadtree(model),
+        centre,
+        None,
+        "",
+        files,
+        options=f"{georeference} {axis}",
+        warnings=warnings,
+    )

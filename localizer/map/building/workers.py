@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 import multiprocessing
-import multiprocessing.connection
-import os
-import threading
+import signal
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
@@ -17,8 +15,10 @@ import numpy as np
 
 from localizer.errors import MapSourceError
 from localizer.geometry.geo import LocalFrame, geodetic_from_ecef
+from localizer.map.building.isolation import call_apart, confine, out_of_memory
 from localizer.map.building.staging import Record, Staging
 from localizer.map.cache.tile import mesh_fault
+from localizer.map.importers.rules import DEFAULT_RULES, ImportRules
 from localizer.map.source import SourceMesh, SourceNode, TileSource
 
 Progress = Callable[[int, int], None]
@@ -31,6 +31,7 @@ class ImportJob:
     staged: Staging
     frame: LocalFrame
     lift_m: float
+    rules: ImportRules = DEFAULT_RULES
 
     def run(self, key: int, tile: TileSource) -> Record:
         """Import one tile; a bad one is recorded, not raised."""
@@ -39,8 +40,18 @@ class ImportJob:
         except MapSourceError as error:
             return self.staged.reject(key, str(error))
         except MemoryError:
-            return self.staged.reject(key, "does not fit into memory")
+            return self.staged.reject(key, out_of_memory(self.rules))
         return self.staged.store(key, meshes)
+
+    def run_in_time(self, key: int, tile: TileSource) -> Record:
+        """`run` in a process of a pool, which dies when the time is up: a decoder that does not
+        come back cannot be stopped otherwise.
+        """
+        signal.setitimer(signal.ITIMER_REAL, self.rules.seconds)
+        try:
+            return self.run(key, tile)
+        finally:
+            signal.setitimer(signal.ITIMER_REAL, 0)
 
     def _to_enu(self, mesh: SourceMesh) -> SourceMesh:
         positions = mesh.positions
@@ -57,6 +68,17 @@ class ImportJob:
         return replace(mesh, positions=enu)
 
 
+@dataclass(frozen=True)
+class Workers:
+    """Who imports. count: of processes; apart: in processes of their own, even one; scheduler:
+    address of a Dask scheduler instead.
+    """
+
+    count: int
+    apart: bool = True
+    scheduler: str | None = None
+
+
 def tiles_of(root: SourceNode) -> Iterator[TileSource]:
     """Every tile of a tree, in the order that numbers them."""
     for node in root.walk():
@@ -64,12 +86,10 @@ def tiles_of(root: SourceNode) -> Iterator[TileSource]:
 
 
 def import_all(
-    root: SourceNode, job: ImportJob, workers: int, scheduler: str | None, progress: Progress
+    root: SourceNode, job: ImportJob, workers: Workers, progress: Progress
 ) -> dict[int, Record]:
-    """Records of every source tile, by its place in `tiles_of` order.
-
-    workers: local processes; scheduler: address of a Dask scheduler instead. progress: called here,
-    in the caller's thread, with the number of tiles that are done and of all.
+    """Records of every source tile, by its place in `tiles_of` order. progress: called here, in the
+    caller's thread, with the number of tiles that are done and of all.
     """
     records: dict[int, Record] = {}
     todo: list[tuple[int, TileSource]] = []
@@ -83,10 +103,10 @@ def import_all(
         raise MapSourceError("the source has no tile with content")
     total = len(records) + len(todo)
     progress(len(records), total)
-    if scheduler is not None:
-        run = _run_dask(job, todo, scheduler)
+    if workers.scheduler is not None:
+        run = _run_dask(job, todo, workers.scheduler)
     else:
-        run = _run_here(job, todo) if workers == 1 else _run_pool(job, todo, workers)
+        run = _run_pool(job, todo, workers.count) if workers.apart else _run_here(job, todo)
     for key, record in run:
         records[key] = record
         progress(len(records), total)
@@ -131,12 +151,12 @@ def _run_pool(
     pending: dict[Future[Record], tuple[int, TileSource]] = {}
     queue = iter(todo)
     suspects: list[tuple[int, TileSource]] = []
-    pool = _pool(min(workers, max(1, len(todo))))
+    pool = _pool(min(workers, max(1, len(todo))), job.rules)
     try:
         while True:
             # A short queue bounds memory: each pending tile is at most one decoded tile.
             for item in queue:
-                pending[pool.submit(job.run, *item)] = item
+                pending[pool.submit(job.run_in_time, *item)] = item
                 if len(pending) >= 2 * workers:
                     break
             if not pending:
@@ -150,7 +170,7 @@ def _run_pool(
                 suspects += pending.values()
                 pending.clear()
                 pool.shutdown(wait=False)
-                pool = _pool(workers)
+                pool = _pool(workers, job.rules)
     finally:
         pool.shutdown(wait=False, cancel_futures=True)
     for item in suspects:
@@ -159,27 +179,20 @@ def _run_pool(
 
 def _run_alone(job: ImportJob, key: int, tile: TileSource) -> Record:
     """A tile that was in flight when a worker died: does it kill this one too?"""
-    with _pool(1) as pool:
-        try:
-            return pool.submit(job.run, key, tile).result()
-        except BrokenProcessPool:
-            return job.staged.reject(key, "its decoder crashed: the file is damaged")
+    try:
+        return call_apart(job.run, key, tile, rules=job.rules, what="its decoder")
+    except MapSourceError as error:
+        return job.staged.reject(key, str(error))
 
 
-def _pool(workers: int) -> ProcessPoolExecutor:
+def _pool(workers: int, rules: ImportRules) -> ProcessPoolExecutor:
     # Not fork: OpenCV's and the caller's threads do not survive it.
     context = multiprocessing.get_context("spawn")
-    return ProcessPoolExecutor(workers, mp_context=context, initializer=_start_worker)
+    return ProcessPoolExecutor(
+        workers, mp_context=context, initializer=_start_worker, initargs=(rules,)
+    )
 
 
-def _start_worker() -> None:
+def _start_worker(rules: ImportRules) -> None:
     cv2.setNumThreads(1)
-    threading.Thread(target=_end_with_parent, daemon=True).start()
-
-
-def _end_with_parent() -> None:
-    """A worker waits for tasks for ever; nobody sends any once the parent was killed."""
-    parent = multiprocessing.parent_process()
-    if parent is not None:
-        multiprocessing.connection.wait([parent.sentinel])
-        os._exit(1)
+    confine(rules)

@@ -39,7 +39,8 @@ class Manifest(BaseModel):
 
     gsd_m: texel size of the finest tiles; levels: depth of the tile tree; extent: outline of the
     map as (latitude_deg, longitude_deg) corners; skipped: source tiles that could not be imported,
-    with the reason; index_sha256: hash of the index, which holds the tiles' hashes.
+    with the reason; warnings: doubts about the source that did not stop the import; index_sha256:
+    hash of the index, which holds the tiles' hashes.
     """
 
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
@@ -59,6 +60,7 @@ class Manifest(BaseModel):
     height_range_m: tuple[float, float]
     build: dict[str, Any]
     skipped: dict[str, str]
+    warnings: tuple[str, ...] = ()
     index_sha256: str
 
 

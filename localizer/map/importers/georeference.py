@@ -16,6 +16,7 @@ from pyproj.exceptions import CRSError
 from localizer.errors import GeoreferenceError
 from localizer.geometry.geo import Geodetic, LocalFrame, ecef_from_geodetic
 from localizer.geometry.pose import Array, so3_exp
+from localizer.map.importers.height_crs import horizontal_unit_m
 
 UpAxis = Literal["y", "z"]
 
@@ -64,6 +65,8 @@ def _from_json(data: dict[str, Any]) -> Georeference:
         crs = CRS.from_epsg(int(data["epsg"]))
         if not crs.is_projected:
             raise ValueError(f"EPSG:{data['epsg']} is not a projected CRS")
+        if horizontal_unit_m(crs) != 1.0:
+            raise ValueError(f"EPSG:{data['epsg']} is in feet: a mesh must be in metres")
         return Georeference(crs.to_2d().to_wkt(), (x, y, z))
     o = data["origin"]
     origin = Geodetic(float(o["lat"]), float(o["lon"]), float(o["height"]))

@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 
 from localizer.errors import MapSourceError
 from localizer.geometry.pose import Array, matrix_from_quaternion
+from localizer.map.importers.rules import ImportRules
 from localizer.map.importers.textures import (
     decode_image,
     merged_by_picture,
@@ -65,29 +66,33 @@ _MALFORMED = (AttributeError, IndexError, KeyError, OverflowError, TypeError, Va
 Reader = Callable[[str], bytes]  # resolves a relative URI of the file; raises MapSourceError
 
 
-def read_gltf(data: bytes, read_uri: Reader) -> tuple[list[SourceMesh], Array]:
+def read_gltf(
+    data: bytes, read_uri: Reader, rules: ImportRules | None = None
+) -> tuple[list[SourceMesh], Array]:
     """Meshes of a GLB or glTF document, and its CESIUM_RTC centre (3,), zero when it has none.
 
     Meshes of one image are merged. Positions are in the document's axes (y up), nodes applied.
     """
     try:
-        document = _Document(data, read_uri)
+        document = _Document(data, read_uri, rules or ImportRules())
         return document.meshes(), document.rtc_center()
-    except _MALFORMED as error:
+    except (*_MALFORMED, RecursionError) as error:
         raise MapSourceError(f"malformed glTF: {error!r}") from error
 
 
-def gltf_weight(data: bytes, read_uri: Reader) -> tuple[int, int]:
+def gltf_weight(data: bytes, read_uri: Reader, rules: ImportRules | None = None) -> tuple[int, int]:
     """Triangles and texels of a document, from its headers alone; see `read_gltf`."""
     try:
-        return _Document(data, read_uri).weight()
+        return _Document(data, read_uri, rules or ImportRules()).weight()
     except _MALFORMED as error:
         raise MapSourceError(f"malformed glTF: {error!r}") from error
 
 
 class _Document:
-    def __init__(self, data: bytes, read_uri: Reader) -> None:
+    def __init__(self, data: bytes, read_uri: Reader, rules: ImportRules) -> None:
         self._read_uri = read_uri
+        self._rules = rules
+        self._visits = self._vertices = 0
         self._json, self._binary = _split_glb(data)
         self._buffers: dict[int, bytes] = {}
         self._images: dict[int, tuple[Image, bytes | None]] = {}
@@ -126,8 +131,12 @@ class _Document:
     def _walk(self, index: int, parent: Array, depth: int, parts: list[SourceMesh]) -> None:
         if depth > MAX_NODE_DEPTH:
             raise MapSourceError("nodes are nested too deeply or in a cycle")
+        self._visits += 1  # a node with several parents counts for each
+        self._rules.require("nodes", self._visits, "the glTF")
         node = _item(self._json.get("nodes", []), index, "node")
         T = parent @ _node_matrix(node)
+        if "mesh" in node and np.linalg.det(T[:3, :3]) < 0:
+            self._rules.doubt("mirrored", f"node {index} mirrors its mesh: left becomes right")
         if "EXT_mesh_gpu_instancing" in node.get("extensions", {}):
             raise MapSourceError("uses EXT_mesh_gpu_instancing, not supported")
         if "mesh" in node:
@@ -135,6 +144,8 @@ class _Document:
             for primitive in mesh.get("primitives", []):
                 part = self._primitive(primitive)
                 if part is not None:
+                    self._vertices += len(part.positions)
+                    self._rules.require("vertices", self._vertices, "the glTF")
                     positions = part.positions @ T[:3, :3].T + T[:3, 3]
                     parts.append(_with_positions(part, positions))
         for child in node.get("children", []):
@@ -255,7 +266,7 @@ class _Document:
             sampler = _item(self._json.get("samplers", []), texture["sampler"], "sampler")
         wraps = sampler.get("wrapS", _WRAP_REPEAT) == _WRAP_REPEAT
         if source not in self._images:
-            self._images[source] = decode_image(self._picture(source))
+            self._images[source] = decode_image(self._picture(source), self._rules)
         return (*self._images[source], wraps)
 
     def _picture(self, index: int) -> bytes:

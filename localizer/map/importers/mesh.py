@@ -14,6 +14,8 @@ from localizer.geometry.pose import Array
 from localizer.map.cache.tile import mesh_fault
 from localizer.map.importers.georeference import Georeference, UpAxis
 from localizer.map.importers.gltf import read_gltf
+from localizer.map.importers.referenced_files import files_beside
+from localizer.map.importers.rules import DEFAULT_RULES, ImportRules, require_plain_file
 from localizer.map.importers.textures import palette_mesh
 from localizer.map.importers.tiles3d import inside, read_file
 from localizer.map.source import SourceMesh
@@ -28,6 +30,7 @@ class MeshFile:
     path: Path
     up_axis: UpAxis
     georeference: Georeference
+    rules: ImportRules = DEFAULT_RULES
 
     @property
     def name(self) -> str:
@@ -37,11 +40,14 @@ class MeshFile:
     def load(self) -> list[SourceMesh]:
         """See `Model.load`."""
         if self.path.suffix.lower() == ".obj":
-            meshes = _read_obj(self.path)
+            meshes = _read_obj(self.path, self.rules)
         else:
             folder = self.path.parent.resolve()
-            data = read_file(self.path)
-            meshes, rtc = read_gltf(data, lambda uri: read_file(inside(folder, folder, uri)))
+            rules = self.rules
+            data = read_file(self.path, rules)
+            meshes, rtc = read_gltf(
+                data, lambda uri: read_file(inside(folder, folder, uri), rules), rules
+            )
             meshes = [replace(m, positions=m.positions + rtc) for m in meshes]
         meshes = [m for m in meshes if len(m.faces)]
         if not meshes:
@@ -59,12 +65,22 @@ class MeshFile:
         return self.georeference.ecef(points)
 
 
-def _read_obj(path: Path) -> list[SourceMesh]:
+def _read_obj(path: Path, rules: ImportRules) -> list[SourceMesh]:
+    require_plain_file(path)
+    rules.require("file_bytes", path.stat().st_size, path)
+    for beside in files_beside(path):
+        if beside.exists() and not beside.is_dir():
+            require_plain_file(beside)
+            rules.require("file_bytes", beside.stat().st_size, beside)
     try:
         loaded = trimesh.load_scene(path, process=False)
+        meshes = [_from_trimesh(g) for g in loaded.geometry.values() if hasattr(g, "faces")]
+    except MapSourceError:
+        raise
     except Exception as error:  # trimesh raises whatever its readers meet
         raise MapSourceError(f"{path}: cannot be read as OBJ: {error!r}") from error
-    return [_from_trimesh(g) for g in loaded.geometry.values() if hasattr(g, "faces")]
+    rules.require("vertices", sum(len(m.positions) for m in meshes), path)
+    return meshes
 
 
 def _from_trimesh(mesh: Any) -> SourceMesh:

@@ -12,11 +12,9 @@ import math
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
-from functools import lru_cache
 from pathlib import Path
 
 import numpy as np
-import rasterio
 import rasterio.warp
 from affine import Affine
 from numpy.typing import NDArray
@@ -28,8 +26,29 @@ from rasterio.io import DatasetReader
 from rasterio.vrt import WarpedVRT
 
 from localizer.errors import GeoreferenceError, MapSourceError
+from localizer.geometry.pose import Array
 from localizer.map.importers.georeference import ecef_from_crs
+from localizer.map.importers.height_crs import (
+    StatedHeights,
+    horizontal_unit_m,
+    stated_heights,
+    unit_of,
+)
 from localizer.map.importers.heightmesh import ERROR_PER_STEP, height_mesh
+from localizer.map.importers.raster_checks import check_heights, check_overlap
+from localizer.map.importers.raster_file import (
+    METRES,
+    HeightBand,
+    colour_bands,
+    has_own_mask,
+    has_separate_mask,
+    inside,
+    offline,
+    open_raster,
+    opened,
+    require_sane,
+)
+from localizer.map.importers.rules import DEFAULT_RULES, HIGHEST_M, LOWEST_M, ImportRules
 from localizer.map.source import SourceMesh, SourceNode, SourceTree
 from localizer.types import Image
 
@@ -53,7 +72,9 @@ class Grid:
 
 @dataclass(frozen=True)
 class RasterTile:
-    """Tile (column, row) of a level, 0 the coarsest; one `TileSource`."""
+    """Tile (column, row) of a level, 0 the coarsest; one `TileSource`. colours: the orthophoto's
+    bands of red, green and blue.
+    """
 
     dsm: Path
     ortho: Path
@@ -61,6 +82,9 @@ class RasterTile:
     level: int
     column: int
     row: int
+    band: HeightBand = METRES
+    colours: tuple[int, int, int] = (1, 2, 3)
+    rules: ImportRules = DEFAULT_RULES
 
     @property
     def name(self) -> str:
@@ -76,10 +100,11 @@ class RasterTile:
     def load(self) -> Sequence[SourceMesh]:
         """See `TileSource.load`."""
         try:
-            heights = self._heights()
-            if heights.mask.all():
-                return []
-            image, shown = self._image()
+            with offline():
+                heights = self._heights()
+                if heights.mask.all():
+                    return []
+                image, shown = self._image()
         except (RasterioError, CPLE_BaseError, OSError, ValueError) as error:
             raise MapSourceError(f"cannot be read: {error}") from error
         mesh = height_mesh(heights, shown, self.step, lossless=self._finest)
@@ -108,10 +133,34 @@ class RasterTile:
         transform = Affine(east, 0, left - east / 2, 0, -south, top + south / 2)
         how = Resampling.bilinear if self._finest else Resampling.average
         n = self.grid.cells + 1
-        with _warped(self.dsm, self.grid.crs, transform, n, how) as vrt:
-            heights = vrt.read(1, masked=True).astype(np.float64)
-            bad = ~np.isfinite(heights.filled(np.nan)) | (vrt.dataset_mask() == 0)
-        return np.ma.masked_array(heights.data, bad)
+        with _warped(self.dsm, self.grid.crs, transform, n, how, self.band.missing) as vrt:
+            raw = vrt.read(1, masked=True).astype(np.float64)
+            bad = ~np.isfinite(raw.filled(np.nan)) | (vrt.dataset_mask() == 0)
+        if self.band.missing is None:
+            bad |= ~self._on(self.dsm, left + east * np.arange(n), top - south * np.arange(n))
+        heights = self.band.metres(raw.data)
+        self._require_ground(heights[~bad])
+        return np.ma.masked_array(heights, bad)
+
+    def _require_ground(self, heights: Array) -> None:
+        """What the samples of the whole surface missed."""
+        odd = heights[(heights < LOWEST_M) | (heights > HIGHEST_M)]
+        if len(odd):
+            self.rules.doubt("heights", f"a height of {odd[0]:g} m, which no ground on Earth has")
+
+    def _on(
+        self, path: Path, x: NDArray[np.floating], y: NDArray[np.floating]
+    ) -> NDArray[np.bool_]:
+        """Which points of a grid, (len(y), len(x)), lie on a raster that does not say so itself."""
+        data = opened(path)
+        if has_own_mask(data):
+            return np.ones((len(y), len(x)), bool)
+        grid_x, grid_y = np.meshgrid(x, y)
+        rim = np.ones(grid_x.shape, bool)
+        rim[1:-1, 1:-1] = False
+        if inside(data, self.grid.crs, grid_x[rim], grid_y[rim]).all():
+            return np.ones(grid_x.shape, bool)
+        return inside(data, self.grid.crs, grid_x, grid_y)
 
     def _image(self) -> tuple[Image, NDArray[np.bool_]]:
         """Texture (TEXELS, TEXELS, 3), and per texel whether the orthophoto shows something."""
@@ -119,51 +168,127 @@ class RasterTile:
         size = self.grid.cells / TEXELS
         transform = Affine(east * size, 0, left, 0, -south * size, top)
         with _warped(self.ortho, self.grid.crs, transform, TEXELS, Resampling.average) as vrt:
-            bands = (1, 2, 3) if vrt.count >= 3 else (1, 1, 1)
-            image = np.moveaxis(vrt.read(bands), 0, -1)
+            image = np.moveaxis(vrt.read(self.colours), 0, -1)
             shown = vrt.dataset_mask() > 0
+        middles = size * (np.arange(TEXELS) + 0.5)
+        shown &= self._on(self.ortho, left + east * middles, top - south * middles)
         return np.ascontiguousarray(image, np.uint8), shown
 
 
-def read_rasters(paths: Sequence[Path]) -> SourceTree:
-    """The tree of a DSM (one band of heights) and an orthophoto (bands of colours)."""
-    dsm, ortho = _told_apart(paths)
-    with rasterio.open(dsm) as heights, rasterio.open(ortho) as colours:
+def read_rasters(
+    paths: Sequence[Path],
+    rules: ImportRules | None = None,
+    *,
+    height_unit: str | None = None,
+    nodata: float | None = None,
+) -> SourceTree:
+    """The tree of a DSM (one band of heights) and an orthophoto (bands of colours).
+
+    height_unit: of the DSM where it does not say it, see `UNITS`; nodata: the number that stands
+    for a missing height where the DSM does not say it.
+    """
+    rules = rules or ImportRules()
+    with offline():
+        return _read_rasters(paths, rules, height_unit, nodata)
+
+
+def _read_rasters(
+    paths: Sequence[Path], rules: ImportRules, height_unit: str | None, nodata: float | None
+) -> SourceTree:
+    dsm, ortho = _told_apart(paths, rules)
+    with open_raster(dsm) as heights, open_raster(ortho) as colours:
+        stated = stated_heights(CRS(heights.crs), heights.units[0], dsm)
+        band, warnings = _height_band(dsm, heights, stated, height_unit, nodata, rules)
+        warnings += check_heights(dsm, heights, band, rules)
+        warnings += check_overlap(heights, band, colours, rules)
         grid = _grid(heights, colours)
         centre = ecef_from_crs(grid.crs, np.array([[*_centre(heights, grid.crs), 0.0]]))[0]
-        bounds = rasterio.warp.transform_bounds(heights.crs, grid.crs, *heights.bounds)
-        # With what lies beside them: world files, statistics, overviews, masks, a mosaic's parts.
+        bounds = rasterio.warp.transform_bounds(_flat_crs(heights), grid.crs, *heights.bounds)
+        left, right = sorted(bounds[::2])
+        bottom, top = sorted(bounds[1::2])
+        # With what lies beside them: world files, statistics, overviews, masks.
         beside = {Path(name) for data in (heights, colours) for name in data.files}
+        root = RasterTile(
+            dsm, ortho, grid, 0, 0, 0, band, colour_bands(ortho, colours), rules
+        )  # fmt: skip
     files = (dsm, ortho, *sorted(beside - {dsm, ortho}))
-    return SourceTree(_node(RasterTile(dsm, ortho, grid, 0, 0, 0), bounds), centre, None, "", files)
+    if stated.other_geoid:
+        warnings.append(
+            f"{dsm.name}: heights above {stated.crs}; they are lifted by EGM96, which may differ "
+            "from it by a metre or two: give --geoid-separation from its own calculator"
+        )
+    node = _Tree(rules, (left, bottom, right, top)).node(root)
+    options = "" if band == METRES else str(band)
+    return SourceTree(
+        node, centre, None, "", files, stated.datum, options, stated.crs, tuple(warnings)
+    )
 
 
-def _node(tile: RasterTile, bounds: tuple[float, float, float, float]) -> SourceNode:
-    """The subtree of a tile. bounds: the DSM's left, bottom, right, top in the grid's CRS."""
-    grid = tile.grid
-    children = []
-    if tile.level < grid.levels - 1:
-        for row in (2 * tile.row, 2 * tile.row + 1):
-            for column in (2 * tile.column, 2 * tile.column + 1):
-                child = replace(tile, level=tile.level + 1, column=column, row=row)
-                left, top = child.corner
-                # The last vertex sits half a step inside the DSM's edge.
-                if left < bounds[2] - grid.step[0] and top > bounds[1] + grid.step[1]:
-                    children.append(_node(child, bounds))
-    error = ERROR_PER_STEP * max(tile.step) if children else 0.0
-    return SourceNode(error, True, (tile,), children)
+def _height_band(
+    path: Path,
+    data: DatasetReader,
+    stated: StatedHeights,
+    height_unit: str | None,
+    nodata: float | None,
+    rules: ImportRules,
+) -> tuple[HeightBand, list[str]]:
+    """How the DSM's numbers become metres; a unit that nothing tells is an error."""
+    unit, warnings = stated.unit_m, []
+    if height_unit is not None:
+        given = unit_of(height_unit)
+        if unit is not None and abs(given / unit - 1) > 1e-4:
+            warnings.append(
+                rules.doubt(
+                    "datum",
+                    f"{path}: --height-unit {height_unit}, but the file says units of {unit:g} m",
+                )
+            )
+        unit = given
+    if unit is None:
+        if horizontal_unit_m(CRS(data.crs)) != 1.0:
+            raise GeoreferenceError(
+                f"{path}: its CRS is in feet and it does not say whether its heights are; give "
+                "--height-unit m, ft or us-ft"
+            )
+        unit = 1.0
+    gain, offset = float(data.scales[0] or 1.0), float(data.offsets[0])
+    if nodata is not None and data.nodata is not None and nodata != data.nodata:
+        warnings.append(f"{path.name}: --nodata {nodata:g} instead of its own {data.nodata:g}")
+    return HeightBand(gain * unit, offset * unit, nodata), warnings
 
 
-def _told_apart(paths: Sequence[Path]) -> tuple[Path, Path]:
+class _Tree:
+    """Makes the quadtree's nodes, and counts them. bounds: the DSM's left, bottom, right, top in
+    the grid's CRS.
+    """
+
+    def __init__(self, rules: ImportRules, bounds: tuple[float, float, float, float]) -> None:
+        self._rules, self._bounds, self._count = rules, bounds, 0
+
+    def node(self, tile: RasterTile) -> SourceNode:
+        """The subtree of a tile."""
+        self._count += 1
+        self._rules.require("nodes", self._count, tile.dsm)
+        grid, bounds = tile.grid, self._bounds
+        children = []
+        if tile.level < grid.levels - 1:
+            for row in (2 * tile.row, 2 * tile.row + 1):
+                for column in (2 * tile.column, 2 * tile.column + 1):
+                    child = replace(tile, level=tile.level + 1, column=column, row=row)
+                    left, top = child.corner
+                    # The last vertex sits half a step inside the DSM's edge.
+                    if left < bounds[2] - grid.step[0] and top > bounds[1] + grid.step[1]:
+                        children.append(self.node(child))
+        error = ERROR_PER_STEP * max(tile.step) if children else 0.0
+        return SourceNode(error, True, (tile,), children)
+
+
+def _told_apart(paths: Sequence[Path], rules: ImportRules) -> tuple[Path, Path]:
     found: dict[str, Path] = {}
     for path in paths:
-        try:
-            with rasterio.open(path) as data:
-                if data.crs is None:
-                    raise GeoreferenceError(f"{path}: the raster has no CRS; assign it one")
-                kind = _kind(data)
-        except RasterioError as error:
-            raise MapSourceError(f"{path}: cannot be read as a raster: {error}") from error
+        with open_raster(path) as data:
+            require_sane(path, data, rules)
+            kind = _kind(data)
         if kind in found:
             raise MapSourceError(f"{path}: a second {kind}; give one DSM and one orthophoto")
         found[kind] = path
@@ -193,12 +318,13 @@ def _kind(data: DatasetReader) -> str:
 
 def _grid(dsm: DatasetReader, ortho: DatasetReader) -> Grid:
     crs = _metric_crs(dsm)
-    if CRS(dsm.crs) == crs and not dsm.transform.b and not dsm.transform.d:
+    if _flat_crs(dsm) == crs and not dsm.transform.b and not dsm.transform.d:
         step = abs(dsm.transform.a), abs(dsm.transform.e)
-        left, bottom, right, top = dsm.bounds
+        left, right = sorted((dsm.bounds.left, dsm.bounds.right))  # rows may run northwards
+        bottom, top = sorted((dsm.bounds.bottom, dsm.bounds.top))
     else:
         transform, width, height = rasterio.warp.calculate_default_transform(
-            dsm.crs, crs.to_wkt(), dsm.width, dsm.height, *dsm.bounds
+            _flat_crs(dsm), crs.to_wkt(), dsm.width, dsm.height, *dsm.bounds
         )
         step = abs(transform.a), abs(transform.e)
         left, top = transform.c, transform.f
@@ -211,10 +337,16 @@ def _grid(dsm: DatasetReader, ortho: DatasetReader) -> Grid:
     return Grid(crs.to_wkt(), left + step[0] / 2, top - step[1] / 2, step, cells, levels)
 
 
-def _metric_crs(data: DatasetReader) -> CRS:
-    """The raster's own horizontal CRS where that is in metres, else the UTM zone of its centre."""
+def _flat_crs(data: DatasetReader) -> CRS:
+    """A raster's horizontal CRS: the heights are ours, not GDAL's, to convert."""
     own = CRS(data.crs)
     flat = own.sub_crs_list[0] if own.is_compound else own
+    return flat.to_2d() if len(flat.axis_info) == 3 else flat
+
+
+def _metric_crs(data: DatasetReader) -> CRS:
+    """The raster's own horizontal CRS where that is in metres, else the UTM zone of its centre."""
+    flat = _flat_crs(data)
     metric = all(axis.unit_name in ("metre", "meter", "m") for axis in flat.axis_info[:2])
     if flat.is_projected and metric:
         return flat
@@ -231,31 +363,37 @@ def _centre(data: DatasetReader, crs: str) -> tuple[float, float]:
 
 def _texel_size(ortho: DatasetReader, crs: CRS) -> float:
     transform, _, _ = rasterio.warp.calculate_default_transform(
-        ortho.crs, crs.to_wkt(), ortho.width, ortho.height, *ortho.bounds
+        _flat_crs(ortho), crs.to_wkt(), ortho.width, ortho.height, *ortho.bounds
     )
     return float(math.sqrt(abs(transform.a * transform.e)))
 
 
-@lru_cache(maxsize=4)
-def _opened(path: Path) -> DatasetReader:
-    return rasterio.open(path)
-
-
 @contextmanager
 def _warped(
-    path: Path, crs: str, transform: Affine, size: int, how: Resampling
+    path: Path,
+    crs: str,
+    transform: Affine,
+    size: int,
+    how: Resampling,
+    missing: float | None = None,
 ) -> Iterator[WarpedVRT]:
-    """A raster resampled to a square grid."""
-    data = _opened(path)
-    same = CRS(data.crs) == CRS(crs)
+    """A raster resampled to a square grid. missing: its number without a meaning, if it is told."""
+    data = opened(path)
+    flat = _flat_crs(data)
+    same = flat == CRS(crs)
+    own = data.crs if flat == CRS(data.crs) else flat.to_wkt()
+    marks: dict[str, float | bool] = {"add_alpha": True} if has_separate_mask(data) else {}
+    if missing is not None:
+        marks = {"src_nodata": missing, "nodata": missing}
     with WarpedVRT(
         data,
-        src_crs=data.crs,
-        crs=data.crs if same else crs,
+        src_crs=own,
+        crs=own if same else crs,
         transform=transform,
         width=size,
         height=size,
         resampling=how,
         tolerance=0.01,  # of a pixel; 0 is refused
+        **marks,
     ) as vrt:
         yield vrt

@@ -21,14 +21,29 @@ _LIBRARY = re.compile(rb"^[ \t]*mtllib[ \t]+([^\r\n]+)", re.MULTILINE)
 _PICTURE = re.compile(rb"^[ \t]*(?:map_\w+|bump|disp|decal|norm|refl)[ \t]+([^\r\n]+)",
                       re.MULTILINE | re.IGNORECASE)  # fmt: skip
 
+_COLOURS = re.compile(rb"^[ \t]*map_Kd[ \t]+([^\r\n]+)", re.MULTILINE | re.IGNORECASE)
+
 
 def files_beside(path: Path) -> tuple[Path, ...]:
     """What an OBJ, glTF, GLB or b3dm file refers to, each once, in order of name."""
+    if not path.is_file():  # a pipe would never end
+        return ()
     try:
         found = set(_of_obj(path) if path.suffix.lower() == ".obj" else _of_gltf(path))
     except (OSError, ValueError, RecursionError, struct.error):
         return ()
     return tuple(sorted(found))
+
+
+def missing_pictures(path: Path) -> tuple[str, ...]:
+    """Colour textures that an OBJ's materials name and that are not there."""
+    missing = []
+    for library in files_beside(path):
+        if library.suffix.lower() == ".mtl" and library.is_file():
+            for match in _COLOURS.finditer(library.read_bytes()):
+                if not any(p.is_file() for p in _named(path.parent, match[1])):
+                    missing.append(match[1].decode("utf-8", "replace").strip())
+    return tuple(dict.fromkeys(missing))
 
 
 def _of_obj(path: Path) -> Iterator[Path]:

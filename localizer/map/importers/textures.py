@@ -11,10 +11,10 @@ from PIL import Image as PillowImage
 
 from localizer.errors import MapSourceError
 from localizer.geometry.pose import Array
+from localizer.map.importers.rules import ImportRules
 from localizer.map.source import SourceMesh
 from localizer.types import Image
 
-MAX_TEXTURE_PIXELS = 1 << 27
 _BLOCK = 4  # texels per colour of a palette, so that bilinear look-up at its centre mixes nothing
 
 
@@ -27,11 +27,10 @@ def picture_size(data: bytes) -> tuple[tuple[int, int], str | None]:
         raise MapSourceError(f"a texture is not a picture that can be read: {error}") from error
 
 
-def decode_image(data: bytes) -> tuple[Image, bytes | None]:
+def decode_image(data: bytes, rules: ImportRules) -> tuple[Image, bytes | None]:
     """RGB image (h, w, 3) of JPEG, PNG or WebP bytes, and the bytes again when they are JPEG."""
     (width, height), kind = picture_size(data)
-    if width * height > MAX_TEXTURE_PIXELS:
-        raise MapSourceError(f"a texture of {width}x{height} pixels is too large")
+    rules.require("texels", float(width) * height, f"a texture of {width}x{height}")
     image = cv2.imdecode(
         np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION
     )

@@ -16,11 +16,11 @@ from localizer.geometry.geo import ecef_from_geodetic
 from localizer.geometry.pose import Array
 from localizer.map.importers.gltf import gltf_weight, read_gltf
 from localizer.map.importers.referenced_files import files_beside
+from localizer.map.importers.rules import DEFAULT_RULES, ImportRules, require_plain_file
 from localizer.map.source import SourceMesh, SourceNode, SourceTree
 
-MAX_TILES = 5_000_000
-MAX_DEPTH = 200
-MAX_CONTENT_BYTES = 1 << 30
+_MAX_USES = 64  # of one tileset: each of a few that name each other multiplies their tiles
+_SCALE_SLACK = 0.01  # of a transform: a map's projection may be left in it
 
 # glTF is y up, 3D Tiles z up: (x, y, z) -> (x, -z, y).
 _Z_UP = {
@@ -38,6 +38,7 @@ class ContentFile:
     folder: Path
     ecef_from_tile: Array
     up_axis: str
+    rules: ImportRules = DEFAULT_RULES
 
     @property
     def name(self) -> str:
@@ -53,12 +54,12 @@ class ContentFile:
 
     def weight(self) -> tuple[int, int]:
         """Triangles and texels by the file's headers."""
-        return gltf_weight(self._gltf()[0], self._beside)
+        return gltf_weight(self._gltf()[0], self._beside, self.rules)
 
     def load(self) -> list[SourceMesh]:
         """Meshes with positions in ECEF metres (float64)."""
         data, rtc = self._gltf()
-        meshes, gltf_rtc = read_gltf(data, self._beside)
+        meshes, gltf_rtc = read_gltf(data, self._beside, self.rules)
         # Tile transform, then RTC_CENTER (in z-up axes), then the turn of the glTF's up axis.
         centred = np.eye(4)
         centred[:3, 3] = rtc + gltf_rtc
@@ -67,7 +68,7 @@ class ContentFile:
 
     def _gltf(self) -> tuple[bytes, Array]:
         """The glTF or GLB of the content, and the centre (3,) that it is relative to."""
-        data = read_file(self.path)
+        data = read_file(self.path, self.rules)
         if data[:4] == b"b3dm":
             return _unwrap_b3dm(data)
         if data[:4] in (b"i3dm", b"pnts", b"cmpt"):
@@ -77,20 +78,20 @@ class ContentFile:
         return data, np.zeros(3)
 
     def _beside(self, uri: str) -> bytes:
-        return read_file(inside(self.folder, self.path.parent, uri))
+        return read_file(inside(self.folder, self.path.parent, uri), self.rules)
 
 
-def read_tileset(path: Path) -> SourceTree:
+def read_tileset(path: Path, rules: ImportRules | None = None) -> SourceTree:
     """Read `tileset.json` (or the folder that holds it) and every tileset it refers to."""
     try:
-        return _read_tileset(path)
+        return _read_tileset(path, rules or ImportRules())
     except (AttributeError, KeyError, OverflowError, TypeError, ValueError) as error:
         raise MapSourceError(f"{path}: malformed tileset: {error!r}") from error
 
 
-def _read_tileset(path: Path) -> SourceTree:
+def _read_tileset(path: Path, rules: ImportRules) -> SourceTree:
     path = (path / "tileset.json" if path.is_dir() else path).resolve()
-    reader = _Reader(path.parent)
+    reader = _Reader(path.parent, rules)
     document = reader.load(path)
     root_json = _object(document.get("root"), f"{path}: root")
     extras: dict[str, Any] = {}
@@ -109,14 +110,15 @@ def _read_tileset(path: Path) -> SourceTree:
         str(asset.get("copyright", extras.get("attribution", ""))),
         tuple(reader.files),
         "ellipsoidal",  # by the specification
+        warnings=tuple(dict.fromkeys(reader.warnings)),
     )
 
 
-def read_file(path: Path) -> bytes:
+def read_file(path: Path, rules: ImportRules) -> bytes:
     """Bytes of a source file, which must exist and be of a sane size."""
+    require_plain_file(path)
     try:
-        if path.stat().st_size > MAX_CONTENT_BYTES:
-            raise MapSourceError(f"{path} is larger than {MAX_CONTENT_BYTES} bytes")
+        rules.require("file_bytes", path.stat().st_size, path)
         return path.read_bytes()
     except OSError as error:
         raise MapSourceError(f"{path} cannot be read: {error.strerror or error}") from error
@@ -137,15 +139,18 @@ def inside(folder: Path, base: Path, uri: str) -> Path:
 
 
 class _Reader:
-    def __init__(self, folder: Path) -> None:
+    def __init__(self, folder: Path, rules: ImportRules) -> None:
         self.folder = folder
+        self.rules = rules
+        self.warnings: list[str] = []
+        self._uses: dict[Path, int] = {}
         self._open: list[Path] = []  # tilesets being read, to find cycles
         self._count = 0
         self.files: list[Path] = []
 
     def load(self, path: Path) -> dict[str, Any]:
         try:
-            document = json.loads(read_file(path))
+            document = json.loads(read_file(path, self.rules))
         except (ValueError, RecursionError) as error:
             raise MapSourceError(f"{path}: cannot be read as JSON: {error}") from error
         return _object(document, f"{path}: the document")
@@ -154,6 +159,12 @@ class _Reader:
         """The root node of a tileset file, placed under `parent` (4, 4)."""
         if path in self._open:
             raise MapSourceError(f"{path}: external tilesets refer to each other in a cycle")
+        self._uses[path] = self._uses.get(path, 0) + 1
+        if self._uses[path] > _MAX_USES:
+            raise MapSourceError(
+                f"{path}: referred to more than {_MAX_USES} times by other tilesets, whose number "
+                "of tiles grows without bound that way"
+            )
         document = self.load(path)
         version = _object(document.get("asset", {}), f"{path}: asset").get("version")
         if version not in ("1.0", "1.1"):
@@ -172,13 +183,11 @@ class _Reader:
         self, data: dict[str, Any], parent: Array, replaces: bool, up: str, path: Path, depth: int
     ) -> SourceNode:
         self._count += 1
-        if self._count > MAX_TILES or depth > MAX_DEPTH:
-            raise MapSourceError(
-                f"{path}: more than {MAX_TILES} tiles or {MAX_DEPTH} levels; is it in a cycle?"
-            )
+        self.rules.require("nodes", self._count, path)
+        self.rules.require("depth", depth, path)
         if "implicitTiling" in data or "3DTILES_implicit_tiling" in data.get("extensions", {}):
             raise MapSourceError(f"{path}: implicit tiling is not supported, explicit tiles are")
-        T = parent @ _transform(data, str(path))
+        T = parent @ self._doubted(_transform(data, str(path)), path)
         refine = str(data.get("refine", "REPLACE" if replaces else "ADD")).upper()
         if refine not in ("REPLACE", "ADD"):
             raise MapSourceError(f"{path}: refine is {refine!r}, neither REPLACE nor ADD")
@@ -189,7 +198,7 @@ class _Reader:
             if file.suffix.lower() == ".json":
                 children.append(self.tileset(file, T, depth + 1, replaces=refine == "REPLACE"))
             else:
-                tiles.append(ContentFile(file, self.folder, T, up))
+                tiles.append(ContentFile(file, self.folder, T, up, self.rules))
                 self.files += [file, *files_beside(file)]
         for item in data.get("children", []):
             child = _object(item, f"{path}: a child")
@@ -198,6 +207,26 @@ class _Reader:
         scale = float(np.linalg.norm(T[:3, :3], axis=0).max())
         corners = _corners(data.get("boundingVolume"), T)
         return SourceNode(error * scale, refine == "REPLACE", tuple(tiles), children, corners)
+
+    def _doubted(self, T: Array, path: Path) -> Array:
+        """A tile's transform, which should move and turn only."""
+        text = stretched(T)
+        if text is not None:
+            name = "mirrored" if np.linalg.det(T[:3, :3]) < 0 else "scaled"
+            self.warnings.append(self.rules.doubt(name, f"{path}: a tile's transform {text}"))
+        return T
+
+
+def stretched(T: Array) -> str | None:
+    """What a transform (4, 4) does besides moving and turning; None where that is nothing."""
+    sizes = np.linalg.svd(T[:3, :3], compute_uv=False)
+    if sizes[-1] <= 1e-12 * max(sizes[0], 1e-300) or not np.allclose(T[3], (0, 0, 0, 1)):
+        raise MapSourceError("a transform flattens space or projects it")
+    if np.linalg.det(T[:3, :3]) < 0:
+        return "mirrors what it places: left becomes right"
+    if np.abs(sizes - 1).max() > _SCALE_SLACK:
+        return f"stretches what it places, by {sizes[-1]:.4g} to {sizes[0]:.4g}"
+    return None
 
 
 def _content_uris(data: dict[str, Any], path: Path) -> list[str]:

@@ -14,6 +14,7 @@ from localizer.errors import GeoreferenceError, MapCacheError, MapSourceError
 from localizer.geometry.pose import Pose
 from localizer.map.building.build import build_cache
 from localizer.map.importers.gltf import read_gltf
+from localizer.map.importers.rules import ImportRules
 from localizer.map.importers.tiles3d import read_tileset
 
 
@@ -34,7 +35,7 @@ def single_tile(make, folder, content: bytes, name="tile.glb", **root):
     (folder / name).write_bytes(content)
     T = LocalFrame(make.origin).ecef_from_enu.matrix.T.ravel().tolist()
     document = {
-        "asset": {"version": "1.0", "extras": {"geoid_separation_m": 10.0}},
+        "asset": {"version": "1.0", "extras": {"geoid_separation_m": make.separation}},
         "geometricError": 10,
         "root": {
             "transform": T,
@@ -207,7 +208,9 @@ def test_missing_children_leave_the_parent_in_view(tmp_path, make, build):
 
 
 def test_amsl_heights_are_lifted_by_the_separation(source, make, build, cache):
-    lifted = build(source, vertical_datum="amsl", geoid_separation_m=20.0)
+    rules = ImportRules(trusted=frozenset({"geoid"}))
+    lifted = build(source, vertical_datum="amsl", geoid_separation_m=20.0, rules=rules)
+    assert "EGM96's at 47.2000, 8.2000 is 47.75 m" in lifted.manifest.warnings[0]
     raised = lifted.manifest.origin.height_m - cache.manifest.origin.height_m
     assert raised == pytest.approx(20, abs=1e-3)
     assert np.allclose(world_vertices(lifted), world_vertices(cache), atol=2e-3)
@@ -222,13 +225,15 @@ def test_origin_can_be_chosen(source, make, build):
     assert np.abs(points[:, 2] - z).max() < 1e-3
 
 
-def test_unknown_geoid_separation_is_an_error(tmp_path, make):
+def test_the_geoid_separation_is_computed_and_compared(tmp_path, make):
     source = make.tileset(tmp_path / "s")
     document = json.loads(source.read_text())
     del document["asset"]["extras"]
     source.write_text(json.dumps(document))
-    with pytest.raises(GeoreferenceError, match="geoid separation"):
-        build_cache(source, tmp_path / "c", workers=1)
+    manifest = build_cache(source, tmp_path / "none given", workers=1)
+    assert manifest.geoid_separation_m == pytest.approx(47.75, abs=0.01)
+    with pytest.raises(GeoreferenceError, match=r"given .* is 20.00 m, EGM96's .* is 47.75 m"):
+        build_cache(source, tmp_path / "c", geoid_separation_m=20, workers=1)
     with pytest.raises(GeoreferenceError, match="does not occur"):
         build_cache(source, tmp_path / "c", geoid_separation_m=900, workers=1)
 

@@ -1,0 +1,103 @@
+"""A call in a process of its own: its crashes, hangs and hunger for memory are named errors."""
+
+from __future__ import annotations
+
+import multiprocessing
+import multiprocessing.connection
+import os
+import resource
+import signal
+import threading
+from collections.abc import Callable
+from multiprocessing.connection import Connection
+from typing import Any, TypeVar
+
+from localizer.errors import MapSourceError
+from localizer.map.importers.rules import ImportRules
+
+_Result = TypeVar("_Result")
+_PAGE = resource.getpagesize()
+# Formats that fetch from the network or start other programs; read when GDAL first registers its
+# drivers, so before that.
+_NO_DRIVERS = "HTTP,WMS,WCS,WMTS,WFS,OAPIF,OGCAPI,DAAS,EEDAI,PLMOSAIC,STACTA,STACIT,NGW,PLSCENES"
+
+
+def call_apart(
+    function: Callable[..., _Result], *args: object, rules: ImportRules, what: str
+) -> _Result:
+    """The function's result, or the exception that it raised; `MapSourceError` where its process
+    died or took too long. what: that it does, for the message.
+    """
+    context = multiprocessing.get_context("spawn")  # OpenCV's threads do not survive a fork
+    here, there = context.Pipe(duplex=False)
+    process = context.Process(target=_answer, args=(there, rules, function, args), daemon=True)
+    process.start()
+    there.close()
+    try:
+        if not here.poll(rules.seconds):
+            raise MapSourceError(
+                f"{what} takes longer than {rules.seconds} s (--limit seconds=NUMBER)"
+            )
+        try:
+            good, value = here.recv()
+        except EOFError:
+            process.join()
+            raise MapSourceError(
+                f"{what} {_death(process.exitcode, rules)}; the file is damaged, or asks for too "
+                "much"
+            ) from None
+    finally:
+        here.close()
+        process.kill()
+        process.join()
+    if not good:
+        raise value
+    return value
+
+
+def _death(code: int | None, rules: ImportRules) -> str:
+    if code == -signal.SIGKILL:
+        return f"was killed, as the system does when memory ends (limit: {rules.memory_mb} MiB)"
+    if code is not None and code < 0:
+        name = signal.Signals(-code).name
+        return f"crashed ({name}; memory limit: {rules.memory_mb} MiB, --limit memory_mb=NUMBER)"
+    return f"ended with exit code {code}"
+
+
+def _answer(
+    there: Connection, rules: ImportRules, function: Callable[..., Any], args: tuple[object, ...]
+) -> None:
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent ends this process
+    confine(rules)
+    try:
+        answer: tuple[bool, Any] = True, function(*args)
+    except MemoryError:
+        answer = False, MapSourceError(out_of_memory(rules))
+    except Exception as error:
+        answer = False, error
+    there.send(answer)
+
+
+def confine(rules: ImportRules) -> None:
+    """Limit this process's memory, keep GDAL off the network, end with the parent."""
+    os.environ["GDAL_SKIP"] = _NO_DRIVERS
+    with open("/proc/self/statm") as statm:
+        used = int(statm.read().split()[5]) * _PAGE  # data and stacks
+    _, hard = resource.getrlimit(resource.RLIMIT_DATA)
+    limit = used + rules.memory_mb * 2**20
+    if hard == resource.RLIM_INFINITY or limit < hard:
+        resource.setrlimit(resource.RLIMIT_DATA, (limit, hard))
+    threading.Thread(target=_end_with_parent, daemon=True).start()
+
+
+def out_of_memory(rules: ImportRules) -> str:
+    """What a `MemoryError` means here."""
+    return f"does not fit into memory ({rules.memory_mb} MiB; --limit memory_mb=NUMBER)"
+
+
+def _end_with_parent() -> None:
+    """A worker waits for tasks for ever; nobody sends any once the parent was killed."""
+    parent = multiprocessing.parent_process()
+    if parent is not None:
+        multiprocessing.connection.wait([parent.sentinel])
+        os._exit(1)

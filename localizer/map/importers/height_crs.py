@@ -1,0 +1,80 @@
+"""What a CRS and a raster's tags say of heights: their unit, and what they are above."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from pyproj import CRS
+
+from localizer.errors import GeoreferenceError
+from localizer.map.source import VerticalDatum
+
+_FOOT, _US_FOOT = 0.3048, 1200 / 3937
+# As GDAL, GeoTIFF writers and the command line spell them.
+UNITS = {
+    "m": 1.0, "metre": 1.0, "meter": 1.0, "metres": 1.0, "meters": 1.0,
+    "ft": _FOOT, "foot": _FOOT, "feet": _FOOT, "international foot": _FOOT,
+    "us-ft": _US_FOOT, "ftus": _US_FOOT, "us survey foot": _US_FOOT, "us survey feet": _US_FOOT,
+    "foot_us": _US_FOOT, "survey foot": _US_FOOT, "cm": 0.01, "centimetre": 0.01,
+    "mm": 0.001, "millimetre": 0.001,
+}  # fmt: skip
+_EGM96 = "EGM96"
+
+
+@dataclass(frozen=True)
+class StatedHeights:
+    """What a source says of its heights. unit_m: metres per unit, None where it is not told;
+    datum: None where it is not told; crs: name of the vertical CRS, empty without one.
+    """
+
+    unit_m: float | None
+    datum: VerticalDatum | None
+    crs: str
+
+    @property
+    def other_geoid(self) -> bool:
+        """Heights above sea level that are not EGM96's, which the lift is computed with."""
+        return self.datum == "amsl" and _EGM96 not in self.crs.upper()
+
+
+def stated_heights(crs: CRS, band_unit: str | None, where: object) -> StatedHeights:
+    """Of a source's CRS and its band's unit tag; `GeoreferenceError` where they contradict."""
+    unit: float | None = None
+    datum: VerticalDatum | None = None
+    name = ""
+    vertical = next((c for c in crs.sub_crs_list if c.is_vertical), None)
+    if vertical is not None:
+        axis, name = vertical.axis_info[0], vertical.name
+        if axis.direction != "up":
+            raise GeoreferenceError(f"{where}: {name} counts depths, not heights; convert it")
+        unit, datum = float(axis.unit_conversion_factor), "amsl"
+        if "ellips" in name.lower():
+            datum = "ellipsoidal"
+    elif len(crs.axis_info) == 3:
+        axis, name = crs.axis_info[2], crs.name
+        unit, datum = float(axis.unit_conversion_factor), "ellipsoidal"
+    tagged = _unit(band_unit)
+    if tagged is not None and unit is not None and abs(tagged / unit - 1) > 1e-4:
+        raise GeoreferenceError(
+            f"{where}: the band's unit is {band_unit!r}, {name} has units of {unit:g} m; correct "
+            "one of them"
+        )
+    return StatedHeights(tagged if unit is None else unit, datum, name)
+
+
+def horizontal_unit_m(crs: CRS) -> float:
+    """Metres per unit of a projected CRS; 1 for degrees, which say nothing of heights."""
+    flat = crs.sub_crs_list[0] if crs.is_compound else crs
+    return float(flat.axis_info[0].unit_conversion_factor) if flat.is_projected else 1.0
+
+
+def unit_of(name: str) -> float:
+    """Metres per unit of a name; `GeoreferenceError` for one that is not known."""
+    found = _unit(name)
+    if found is None:
+        raise GeoreferenceError(f"height unit {name!r}: m, ft, us-ft, cm and mm are known")
+    return found
+
+
+def _unit(name: str | None) -> float | None:
+    return UNITS.get((name or "").strip().lower())

@@ -1,0 +1,140 @@
+"""Doubts about a DSM and an orthophoto that can be seen before they are imported."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import rasterio.enums
+from rasterio.io import DatasetReader
+from rasterio.windows import Window
+
+from localizer.errors import MapSourceError
+from localizer.geometry.pose import Array
+from localizer.map.importers.raster_file import HeightBand, applied, has_own_mask, inside
+from localizer.map.importers.rules import HIGHEST_M, LOWEST_M, ImportRules
+
+_SAMPLES = 4000  # of a side
+_FILL_SHARE, _FILL_GAP_M = 1e-3, 30.0
+_WINDOW = 1500  # cells of a side, where slopes are measured
+_STEEP, _STEEP_SHARE = 5.7, 0.25  # 80 degrees; photogrammetry of a dense town has 0.05 of it
+_LEAST_OVERLAP, _GOOD_OVERLAP = 0.05, 0.5
+
+
+def check_heights(
+    path: Path, data: DatasetReader, band: HeightBand, rules: ImportRules
+) -> list[str]:
+    """Warnings about a DSM's numbers; `MapSourceError` where they cannot be heights."""
+    raw = _sampled(data, band)
+    known = raw.compressed()
+    if not len(known):
+        raise MapSourceError(
+            f"{path}: holds no height at all: every cell is nodata or not a number"
+        )
+    metres = band.metres(known)
+    warnings = []
+    odd = known[(metres < LOWEST_M) | (metres > HIGHEST_M)]
+    if len(odd):
+        values, counts = np.unique(odd, return_counts=True)
+        value = float(values[counts.argmax()])
+        warnings.append(
+            rules.doubt(
+                "heights",
+                f"{path}: {100 * len(odd) / len(known):.2g} % of its heights occur nowhere on "
+                f"Earth, most often {value:g}: missing heights that are not marked so (--nodata="
+                f"{value:g}), or another unit (--height-unit)",
+            )
+        )
+    elif not has_own_mask(data) and band.missing is None:
+        warnings += _fill(path, known, band, rules)
+    return warnings + _steepness(path, data, band, rules)
+
+
+def _sampled(data: DatasetReader, band: HeightBand) -> np.ma.MaskedArray:
+    """The DSM's own numbers, (h, w) float64, thinned out where it is large."""
+    shape = min(data.height, _SAMPLES), min(data.width, _SAMPLES)
+    return _masked(data, band, out_shape=shape, resampling=rasterio.enums.Resampling.nearest)
+
+
+def _masked(data: DatasetReader, band: HeightBand, **how: object) -> np.ma.MaskedArray:
+    raw = data.read(1, masked=True, **how).astype(np.float64)
+    bad = ~np.isfinite(raw.filled(np.nan))
+    if band.missing is not None:
+        bad |= np.isclose(raw.data, band.missing, rtol=1e-6)
+    return np.ma.masked_array(raw.data, bad)
+
+
+def _fill(path: Path, known: Array, band: HeightBand, rules: ImportRules) -> list[str]:
+    """One number at the end of the range, often, with nothing near it: no ground is like that."""
+    warnings = []
+    for extreme in (known.min(), known.max()):
+        rest = known[known != extreme]
+        share = 1 - len(rest) / len(known)
+        if share < _FILL_SHARE or not len(rest):
+            continue
+        gap = abs(band.gain) * float(np.abs(rest - extreme).min())
+        if gap > _FILL_GAP_M:
+            warnings.append(
+                rules.doubt(
+                    "nodata",
+                    f"{path}: {100 * share:.2g} % of its heights are {extreme:g}, with nothing "
+                    f"within {gap:.0f} m of it: missing heights that are not marked so? (--nodata="
+                    f"{extreme:g})",
+                )
+            )
+    return warnings
+
+
+def _steepness(path: Path, data: DatasetReader, band: HeightBand, rules: ImportRules) -> list[str]:
+    """Noise, or a unit that makes cliffs of slopes. At the DSM's own cells about its middle."""
+    width, height = min(data.width, _WINDOW), min(data.height, _WINDOW)
+    window = Window((data.width - width) // 2, (data.height - height) // 2, width, height)
+    raw = _masked(data, band, window=window)
+    metres = band.metres(raw.filled(np.nan))
+    step = abs(data.transform.determinant) ** 0.5
+    if data.crs.is_geographic:
+        step *= 111_000.0
+    rises = np.abs(np.diff(metres, axis=1)) / step
+    rises = rises[np.isfinite(rises)]
+    share = float((rises > _STEEP).mean()) if len(rises) else 0.0
+    if share < _STEEP_SHARE:
+        return []
+    return [
+        rules.doubt(
+            "slope",
+            f"{path}: {100 * share:.0f} % of its cells rise by more than 80 degrees: noise, "
+            "another unit (--height-unit), or not heights",
+        )
+    ]
+
+
+def check_overlap(
+    dsm: DatasetReader, band: HeightBand, ortho: DatasetReader, rules: ImportRules
+) -> list[str]:
+    """Warnings where the orthophoto shows little of the DSM's ground; an error where nothing."""
+    share = _covered_share(dsm, band, ortho)
+    if share >= _GOOD_OVERLAP:
+        return []
+    text = f"{ortho.name}: shows {100 * share:.1f} % of the ground of {dsm.name}"
+    if share == 0.0:
+        raise MapSourceError(f"{text}: it lies beside it; check both places and CRS")
+    if share < _LEAST_OVERLAP:
+        return [rules.doubt("overlap", f"{text}; check both places and CRS")]
+    return [text]
+
+
+def _covered_share(dsm: DatasetReader, band: HeightBand, ortho: DatasetReader) -> float:
+    shape = min(dsm.height, 512), min(dsm.width, 512)
+    known = ~_masked(
+        dsm, band, out_shape=shape, resampling=rasterio.enums.Resampling.nearest
+    ).mask  # fmt: skip
+    rows, columns = np.nonzero(known)
+    if not len(rows):
+        return 0.0
+    x, y = applied(
+        dsm.transform,
+        (columns + 0.5) * dsm.width / shape[1],
+        (rows + 0.5) * dsm.height / shape[0],
+    )
+    on = inside(ortho, dsm.crs.to_wkt(), x, y)
+    return float(on.mean())

@@ -1,0 +1,171 @@
+"""One GeoTIFF as it is on disk: opened without GDAL's other formats, and what it says of itself."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from functools import lru_cache
+from pathlib import Path
+
+import numpy as np
+import rasterio
+from affine import Affine
+from numpy.typing import NDArray
+from pyproj import CRS, Transformer
+from rasterio.enums import ColorInterp, MaskFlags
+from rasterio.errors import RasterioError
+from rasterio.io import DatasetReader
+
+from localizer.errors import GeoreferenceError, MapSourceError
+from localizer.geometry.pose import Array
+from localizer.map.importers.rules import ImportRules, require_plain_file
+
+_TIFF = (b"II*\0", b"MM\0*", b"II+\0", b"MM\0+")
+_MAX_SIDECAR_BYTES = 16 << 20
+# What sidecar files may name is not fetched: no address of the network is one of these.
+_NO_NETWORK = {
+    "CPL_VSIL_CURL_ALLOWED_FILENAME": "/vsicurl/none",
+    "CPL_VSIL_CURL_USE_HEAD": "NO",
+    "GDAL_HTTP_MAX_RETRY": "0",
+    "GDAL_HTTP_TIMEOUT": "1",
+    "GDAL_HTTP_CONNECTTIMEOUT": "1",
+}
+
+
+@contextmanager
+def offline() -> Iterator[None]:
+    """Around every use of GDAL: it does not go to the network."""
+    with rasterio.Env(**_NO_NETWORK):
+        yield
+
+
+def open_raster(path: Path) -> DatasetReader:
+    """A GeoTIFF; `MapSourceError` for what only bears its name. Use under `offline`."""
+    require_plain_file(path)
+    _require_tiff(path)
+    for beside in (f"{path}.ovr", f"{path}.msk"):
+        if Path(beside).exists():
+            require_plain_file(Path(beside))
+            _require_tiff(Path(beside))
+    _require_plain_sidecar(Path(f"{path}.aux.xml"))
+    try:
+        return rasterio.open(path, driver="GTiff")
+    except RasterioError as error:
+        raise MapSourceError(f"{path}: cannot be read as a raster: {error}") from error
+
+
+@lru_cache(maxsize=4)
+def opened(path: Path) -> DatasetReader:
+    """`open_raster`, kept for the next tile of the same process."""
+    return open_raster(path)
+
+
+def _require_tiff(path: Path) -> None:
+    with path.open("rb") as file:
+        start = file.read(4)
+    if start not in _TIFF:
+        raise MapSourceError(
+            f"{path}: cannot be read as a raster: it is no GeoTIFF, whatever its name; GDAL's "
+            "other formats are not opened (gdal_translate -of COG makes one of them a GeoTIFF)"
+        )
+
+
+def _require_plain_sidecar(path: Path) -> None:
+    """Statistics and georeferences are fine; another file to be opened instead is not."""
+    if not path.exists():
+        return
+    require_plain_file(path)
+    if path.stat().st_size > _MAX_SIDECAR_BYTES:
+        raise MapSourceError(f"{path}: larger than {_MAX_SIDECAR_BYTES} bytes; remove it")
+    text = path.read_bytes().lower()
+    if any(word in text for word in (b"overview_file", b"/vsi", b"://", b"<!entity")):
+        raise MapSourceError(f"{path}: names other files or addresses; remove it")
+
+
+def require_sane(path: Path, data: DatasetReader, rules: ImportRules) -> None:
+    """What every raster of a map must have: a size within the limits, a CRS and a place."""
+    rules.require("pixels", float(data.width) * data.height, path)
+    if data.crs is None:
+        raise GeoreferenceError(f"{path}: the raster has no CRS; assign it one")
+    numbers = np.array(data.transform[:6], np.float64)
+    if data.transform.is_identity:
+        what = "only control points" if data.gcps[0] else "no place"
+        raise GeoreferenceError(
+            f"{path}: the raster has {what} (no geotransform); warp it first (gdalwarp)"
+        )
+    if not np.isfinite(numbers).all() or abs(data.transform.determinant) < 1e-18:
+        raise GeoreferenceError(f"{path}: the raster's geotransform {numbers.tolist()} is singular")
+
+
+def has_own_mask(data: DatasetReader) -> bool:
+    """Whether the file itself says which pixels are missing: nodata, alpha or a mask."""
+    return MaskFlags.all_valid not in data.mask_flag_enums[0]
+
+
+def colour_bands(path: Path, data: DatasetReader) -> tuple[int, int, int]:
+    """Red, green and blue of an orthophoto, by what its bands are called."""
+    meaning = list(data.colorinterp)
+    if meaning[0] == ColorInterp.palette:
+        raise MapSourceError(
+            f"{path}: its colours are indices into a palette; expand them (gdal_translate -expand "
+            "rgb)"
+        )
+    if data.count < 3 or meaning[1] == ColorInterp.alpha:
+        return 1, 1, 1
+    wanted = (ColorInterp.red, ColorInterp.green, ColorInterp.blue)
+    if all(meaning.count(colour) == 1 for colour in wanted):
+        red, green, blue = (meaning.index(colour) + 1 for colour in wanted)
+        return red, green, blue
+    return 1, 2, 3
+
+
+def has_separate_mask(data: DatasetReader) -> bool:
+    """Whether the missing pixels stand in a mask, which warping does not carry on by itself."""
+    flags = data.mask_flag_enums[0]
+    return MaskFlags.per_dataset in flags and MaskFlags.alpha not in flags
+
+
+def applied(transform: Affine, x: Array, y: Array) -> tuple[Array, Array]:
+    """A transform of points; affine's own operator for it depends on its version."""
+    t = transform
+    return t.a * x + t.b * y + t.c, t.d * x + t.e * y + t.f
+
+
+def inside(data: DatasetReader, crs: str, x: Array, y: Array) -> NDArray[np.bool_]:
+    """Which points of a CRS lie on the raster's pixels. x, y: of one shape."""
+    transformer = _flat(crs, CRS(data.crs).to_wkt())
+    source_x, source_y = transformer.transform(x, y)
+    column, row = applied(~data.transform, np.asarray(source_x), np.asarray(source_y))
+    slack = 1e-3  # of a pixel
+    return np.asarray(
+        (column >= -slack)
+        & (row >= -slack)
+        & (column <= data.width + slack)
+        & (row <= data.height + slack)
+    )
+
+
+@lru_cache(maxsize=8)
+def _flat(source: str, target: str) -> Transformer:
+    return Transformer.from_crs(CRS(source).to_2d(), CRS(target).to_2d(), always_xy=True)
+
+
+@dataclass(frozen=True)
+class HeightBand:
+    """How a DSM's numbers become metres: value * gain + offset; missing: a number that means
+    nothing, besides what the file says.
+    """
+
+    gain: float = 1.0
+    offset: float = 0.0
+    missing: float | None = None
+
+    def metres(self, values: Array) -> Array:
+        """Of the file's numbers; the same array where they are metres."""
+        if (self.gain, self.offset) == (1.0, 0.0):
+            return values
+        return values * self.gain + self.offset
+
+
+METRES = HeightBand()
