@@ -92,7 +92,8 @@ class _Document:
     def __init__(self, data: bytes, read_uri: Reader, rules: ImportRules) -> None:
         self._read_uri = read_uri
         self._rules = rules
-        self._visits = self._vertices = 0
+        self._walked: set[int] = set()
+        self._vertices = 0
         self._json, self._binary = _split_glb(data)
         self._buffers: dict[int, bytes] = {}
         self._images: dict[int, tuple[Image, bytes | None]] = {}
@@ -131,8 +132,10 @@ class _Document:
     def _walk(self, index: int, parent: Array, depth: int, parts: list[SourceMesh]) -> None:
         if depth > MAX_NODE_DEPTH:
             raise MapSourceError("nodes are nested too deeply or in a cycle")
-        self._visits += 1  # a node with several parents counts for each
-        self._rules.require("nodes", self._visits, "the glTF")
+        if index in self._walked:  # glTF 2.0, 3.5.2: strict trees; others grow without bound
+            raise MapSourceError(f"node {index} has several parents, or is in a cycle")
+        self._walked.add(index)
+        self._rules.require("nodes", len(self._walked), "the glTF")
         node = _item(self._json.get("nodes", []), index, "node")
         T = parent @ _node_matrix(node)
         if "mesh" in node and np.linalg.det(T[:3, :3]) < 0:

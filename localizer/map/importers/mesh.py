@@ -14,9 +14,9 @@ from localizer.geometry.pose import Array
 from localizer.map.cache.tile import mesh_fault
 from localizer.map.importers.georeference import Georeference, UpAxis
 from localizer.map.importers.gltf import read_gltf
-from localizer.map.importers.referenced_files import files_beside
+from localizer.map.importers.referenced_files import colour_pictures, files_beside
 from localizer.map.importers.rules import DEFAULT_RULES, ImportRules, require_plain_file
-from localizer.map.importers.textures import palette_mesh
+from localizer.map.importers.textures import palette_mesh, require_readable
 from localizer.map.importers.tiles3d import inside, read_file
 from localizer.map.source import SourceMesh
 
@@ -72,6 +72,8 @@ def _read_obj(path: Path, rules: ImportRules) -> list[SourceMesh]:
         if beside.exists() and not beside.is_dir():
             require_plain_file(beside)
             rules.require("file_bytes", beside.stat().st_size, beside)
+    for picture in colour_pictures(path)[0].values():
+        require_readable(picture, rules)
     try:
         loaded = trimesh.load_scene(path, process=False)
         meshes = [_from_trimesh(g) for g in loaded.geometry.values() if hasattr(g, "faces")]

@@ -55,9 +55,14 @@ def open_raster(path: Path) -> DatasetReader:
         raise MapSourceError(f"{path}: cannot be read as a raster: {error}") from error
 
 
-@lru_cache(maxsize=4)
 def opened(path: Path) -> DatasetReader:
-    """`open_raster`, kept for the next tile of the same process."""
+    """`open_raster`, kept for the next tile of the same process while the file is the same."""
+    stat = path.stat()
+    return _kept(path, stat.st_mtime_ns, stat.st_size)
+
+
+@lru_cache(maxsize=4)
+def _kept(path: Path, _modified_ns: int, _size: int) -> DatasetReader:
     return open_raster(path)
 
 

@@ -35,15 +35,22 @@ def files_beside(path: Path) -> tuple[Path, ...]:
     return tuple(sorted(found))
 
 
-def missing_pictures(path: Path) -> tuple[str, ...]:
-    """Colour textures that an OBJ's materials name and that are not there."""
+def colour_pictures(path: Path) -> tuple[dict[str, Path], tuple[str, ...]]:
+    """The colour textures that an OBJ's materials name: those that are there, by their name, and
+    the names of those that are not.
+    """
+    found: dict[str, Path] = {}
     missing = []
     for library in files_beside(path):
         if library.suffix.lower() == ".mtl" and library.is_file():
             for match in _COLOURS.finditer(library.read_bytes()):
-                if not any(p.is_file() for p in _named(path.parent, match[1])):
-                    missing.append(match[1].decode("utf-8", "replace").strip())
-    return tuple(dict.fromkeys(missing))
+                name = match[1].decode("utf-8", "replace").strip()
+                file = next((p for p in _named(path.parent, match[1]) if p.is_file()), None)
+                if file is None:
+                    missing.append(name)
+                else:
+                    found[name] = file
+    return found, tuple(dict.fromkeys(missing))
 
 
 def _of_obj(path: Path) -> Iterator[Path]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+from pathlib import Path
 
 import cv2
 import numpy as np
@@ -25,6 +26,17 @@ def picture_size(data: bytes) -> tuple[tuple[int, int], str | None]:
             return header.size, header.format
     except (OSError, ValueError, SyntaxError, PillowImage.DecompressionBombError) as error:
         raise MapSourceError(f"a texture is not a picture that can be read: {error}") from error
+
+
+def require_readable(path: Path, rules: ImportRules) -> None:
+    """`MapSourceError` for a picture that does not decode: trimesh would show the mesh grey."""
+    try:
+        with PillowImage.open(path) as picture:
+            width, height = picture.size
+            rules.require("texels", float(width) * height, path)
+            picture.load()
+    except (OSError, ValueError, SyntaxError, PillowImage.DecompressionBombError) as error:
+        raise MapSourceError(f"{path}: a texture that cannot be read: {error}") from error
 
 
 def decode_image(data: bytes, rules: ImportRules) -> tuple[Image, bytes | None]:

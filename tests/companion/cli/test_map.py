@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import json
 import os
+from xml.etree import ElementTree
 
 import cv2
+import numpy as np
 import pytest
 from typer.testing import CliRunner
 
@@ -95,3 +98,23 @@ def test_progress_is_told_from_the_start_to_all_tiles(source, tmp_path):
         source, tmp_path / "c", workers=1, progress=lambda done, total: told.append((done, total))
     )
     assert told == [(done, 21) for done in range(22)]
+
+
+def test_info_says_where_the_map_is_and_writes_its_outline(cache, tmp_path):
+    geojson, kml = tmp_path / "area.geojson", tmp_path / "area.kml"
+    result = run("info", cache.path, "--geojson", geojson, "--kml", kml)
+    assert result.exit_code == 0
+    assert "47.19" in result.output
+    assert "EGM96 there: 47.75" in result.output
+    (feature,) = json.loads(geojson.read_text())["features"]
+    ring = np.array(feature["geometry"]["coordinates"][0])
+    assert ring[0].tolist() == ring[-1].tolist()
+    x, y = ring.T
+    assert (x[:-1] * y[1:] - x[1:] * y[:-1]).sum() > 0  # counter-clockwise, as RFC 7946 asks
+    assert ring.mean(axis=0) == pytest.approx([8.2, 47.2], abs=2e-3)
+    east, north = np.ptp(ring, axis=0) * 111_200 * [np.cos(np.radians(47.2)), 1]
+    assert (east, north) == pytest.approx((400, 400), rel=0.01)
+    root = ElementTree.parse(kml).getroot()
+    text = root.findtext(".//{http://www.opengis.net/kml/2.2}coordinates")
+    corners = np.array([place.split(",") for place in text.split()], float)
+    assert corners == pytest.approx(ring, abs=1e-7)

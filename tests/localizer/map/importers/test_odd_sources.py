@@ -1,0 +1,701 @@
+"""Odd sources: each is a named error, a warning, or handled right; none is silently wrong."""
+
+from __future__ import annotations
+
+import base64
+import http.server
+import json
+import os
+import threading
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+import pytest
+import rasterio
+from pyproj import CRS, Transformer
+from rasterio.enums import ColorInterp
+from rasterio.transform import Affine, from_origin
+
+from localizer.errors import GeoreferenceError, LocalizerError, MapSourceError
+from localizer.geometry.geo import Geodetic, LocalFrame
+from localizer.geometry.geoid import geoid_separation
+from localizer.map.building.build import build_cache
+from localizer.map.building.isolation import call_apart
+from localizer.map.cache.cache import TileCache
+from localizer.map.importers.georeference import Georeference, ecef_from_crs
+from localizer.map.importers.raster_file import offline, open_raster
+from localizer.map.importers.rules import ImportRules
+
+UTM = "EPSG:32632"
+LEFT, TOP, STEP, CELLS = 500_100.0, 5_228_300.0, 1.0, 48
+ORIGIN = Geodetic(47.2, 9.0, 400.0)
+TILESET_ORIGIN = Geodetic(47.2, 8.2, 430.0)
+ELLIPSOIDAL = {"vertical_datum": "ellipsoidal"}
+
+
+def ground(n=CELLS, m=None):
+    y, x = np.mgrid[0 : m or n, 0:n]
+    return (400 + 3 * np.sin(x / 9) + 2 * np.cos(y / 7)).astype(np.float32)
+
+
+def write(path, data, crs=UTM, step=STEP, place=(LEFT, TOP), **options):
+    data = data if data.ndim == 3 else data[None]
+    tags = {
+        k: options.pop(k) for k in ("units", "scales", "offsets", "colorinterp") if k in options
+    }
+    profile = {
+        "driver": "GTiff", "width": data.shape[2], "height": data.shape[1], "count": data.shape[0],
+        "dtype": data.dtype, "crs": crs, "transform": from_origin(*place, step, step),
+    } | options  # fmt: skip
+    with rasterio.open(path, "w", **profile) as out:
+        for name, value in tags.items():
+            setattr(out, name, value)
+        out.write(data)
+    return path
+
+
+def picture(n=CELLS, seed=0):
+    return np.random.default_rng(seed).integers(30, 220, (3, n, n), dtype=np.uint8)
+
+
+def dsm_of(folder, data=None, **options):
+    return write(folder / "dsm.tif", ground() if data is None else data, **options)
+
+
+def rasters(folder, data=None, ortho=None, **options):
+    """A DSM as told, and an honest orthophoto."""
+    ortho = ortho or {}
+    colours = ortho.pop("data", picture())
+    return [dsm_of(folder, data, **options), write(folder / "ortho.tif", colours, **ortho)]
+
+
+def with_hole(value, dtype=np.float32):
+    data = ground().astype(dtype)
+    data[:16, :16] = value
+    return data
+
+
+# --- rasters ------------------------------------------------------------------------------------
+
+
+def all_nan(folder):
+    return rasters(folder, np.full((CELLS, CELLS), np.nan, np.float32))
+
+
+def all_nodata(folder):
+    return rasters(folder, np.full((CELLS, CELLS), -9999, np.float32), nodata=-9999)
+
+
+def beside(folder):
+    return rasters(folder, ortho={"place": (LEFT + 5000, TOP)})
+
+
+def a_strip_in_common(folder):
+    return rasters(folder, ortho={"place": (LEFT + 47, TOP)})
+
+
+def other_continent(folder):
+    return rasters(folder, ortho={"crs": "EPSG:32755"})
+
+
+def in_feet_untold(folder):
+    place = (985_000.0, 210_000.0)  # New York, US survey feet
+    return rasters(folder, crs="EPSG:2263", place=place, ortho={"crs": "EPSG:2263", "place": place})
+
+
+def unit_against_crs(folder):
+    return rasters(folder, crs=f"{UTM}+5773", units=["ft"])
+
+
+def depths(folder):
+    return rasters(folder, crs=f"{UTM}+5715")
+
+
+def untagged_minus_9999(folder):
+    return rasters(folder, with_hole(-9999))
+
+
+def other_than_tagged(folder):
+    return rasters(folder, with_hole(-9999), nodata=-32768)
+
+
+def untagged_lowest_float(folder):
+    return rasters(folder, with_hole(np.finfo(np.float32).min))
+
+
+def untagged_zero(folder):
+    return rasters(folder, with_hole(0))
+
+
+def centimetres(folder):
+    return rasters(folder, (100 * ground()).astype(np.int32))
+
+
+def noise(folder):
+    return rasters(
+        folder, (400 + 200 * np.random.default_rng(1).random((CELLS, CELLS))).astype("f4")
+    )
+
+
+def sparse(folder):
+    side = 400_000
+    path = folder / "dsm.tif"
+    with rasterio.open(
+        path, "w", driver="GTiff", width=side, height=side, count=1, dtype="float32", crs=UTM,
+        transform=from_origin(LEFT, TOP, 0.1, 0.1), tiled=True, blockxsize=4096, blockysize=4096,
+        SPARSE_OK=True, BIGTIFF=True,
+    ):  # fmt: skip
+        pass
+    return [path, write(folder / "ortho.tif", picture())]
+
+
+def no_place(folder):
+    return rasters(folder, transform=Affine.identity())
+
+
+def singular(folder):
+    return rasters(folder, transform=Affine(1, 0, LEFT, 1, 0, TOP))
+
+
+def no_crs(folder):
+    return rasters(folder, crs=None)
+
+
+def palette(folder):
+    one = picture()[:1]
+    paths = rasters(folder, ortho={"data": one, "photometric": "palette"})
+    with rasterio.open(paths[1], "r+") as data:
+        data.write_colormap(1, {i: (i, 255 - i, 0, 255) for i in range(256)})
+    return paths
+
+
+def empty_file(folder):
+    paths = rasters(folder)
+    paths[0].write_bytes(b"")
+    return paths
+
+
+def text_named_tif(folder):
+    paths = rasters(folder)
+    paths[0].write_text("these are the heights")
+    return paths
+
+
+def a_vrt(folder):
+    paths = rasters(folder)
+    paths[0].write_text('<VRTDataset rasterXSize="4" rasterYSize="4"></VRTDataset>')
+    return paths
+
+
+def overview_elsewhere(folder):
+    paths = rasters(folder)
+    Path(f"{paths[0]}.ovr").write_text("<VRTDataset></VRTDataset>")
+    return paths
+
+
+def statistics_elsewhere(folder):
+    paths = rasters(folder)
+    mdi = '<MDI key="OVERVIEW_FILE">http://127.0.0.1/x.tif</MDI>'
+    Path(f"{paths[0]}.aux.xml").write_text(
+        f'<PAMDataset><Metadata domain="OVERVIEWS">{mdi}</Metadata></PAMDataset>'
+    )
+    return paths
+
+
+def pipe(folder):
+    paths = rasters(folder)
+    paths[1].unlink()
+    os.mkfifo(paths[1])
+    return paths
+
+
+def device(folder):
+    return [rasters(folder)[0], Path("/dev/zero")]
+
+
+# --- tilesets and meshes --------------------------------------------------------------------------
+
+
+def tileset(folder, transform=None, name="tileset.json", **root):
+    T = LocalFrame(TILESET_ORIGIN).ecef_from_enu.matrix if transform is None else transform
+    document = {
+        "asset": {"version": "1.1"},
+        "geometricError": 10,
+        "root": {
+            "transform": np.asarray(T).T.ravel().tolist(),
+            "boundingVolume": {"sphere": [0, 0, 0, 100]},
+            "geometricError": 0,
+        }
+        | root,
+    }
+    path = folder / name
+    path.write_text(json.dumps(document))
+    return path
+
+
+def content(folder, make, scale=1.0, lift=0.0, **extra):
+    positions, uvs, faces = make.patch(-50, -50, 100, 4)
+    positions = scale * positions + [0, 0, lift]
+    glb = make.glb(make.y_up(positions), uvs, faces, make.picture(1), **extra)
+    (folder / "t.glb").write_bytes(glb)
+    return {"content": {"uri": "t.glb"}}
+
+
+def turned(scale):
+    T = LocalFrame(TILESET_ORIGIN).ecef_from_enu.matrix.copy()
+    T[:3, :3] = T[:3, :3] @ np.diag(scale)
+    return T
+
+
+def mirrored_tileset(folder, make):
+    return tileset(folder, turned((-1, 1, 1)), **content(folder, make))
+
+
+def doubled_tileset(folder, make):
+    return tileset(folder, turned((2, 2, 2)), **content(folder, make))
+
+
+def squeezed_tileset(folder, make):
+    return tileset(folder, turned((1, 1, 0.5)), **content(folder, make))
+
+
+def flattened_tileset(folder, make):
+    return tileset(folder, turned((1, 1, 0)), **content(folder, make))
+
+
+def mirrored_node(folder, make):
+    nodes = [{"mesh": 0, "scale": [-1, 1, 1]}]
+    return tileset(folder, **content(folder, make, nodes=nodes))
+
+
+def node_fan_out(folder, make):
+    nodes = [{"children": [i + 1] * 4} for i in range(40)] + [{"mesh": 0}]
+    return tileset(folder, **content(folder, make, nodes=nodes))
+
+
+def tileset_dag(folder, make):
+    for i in range(8):
+        child = {
+            "boundingVolume": {"sphere": [0, 0, 0, 100]}, "geometricError": 0,
+            "content": {"uri": f"t{i + 1}.json" if i < 7 else "t.glb"},
+        }  # fmt: skip
+        name = "tileset.json" if i == 0 else f"t{i}.json"
+        tileset(folder, None if i == 0 else np.eye(4), name, children=[child] * 10)
+    content(folder, make)
+    return folder / "tileset.json"
+
+
+def tileset_cycle(folder, make):
+    tileset(folder, np.eye(4), "a.json", content={"uri": "tileset.json"})
+    return tileset(folder, content={"uri": "a.json"})
+
+
+def deep_tileset(folder, make):
+    node = content(folder, make) | {"boundingVolume": {"sphere": [0, 0, 0, 9]}, "geometricError": 0}
+    for _ in range(250):
+        node = {"boundingVolume": {"sphere": [0, 0, 0, 9]}, "geometricError": 1, "children": [node]}
+    return tileset(folder, children=[node])
+
+
+def content_is_a_pipe(folder, make):
+    os.mkfifo(folder / "t.glb")
+    return tileset(folder, content={"uri": "t.glb"})
+
+
+def content_elsewhere(folder, make):
+    return tileset(folder, content={"uri": "http://127.0.0.1:9/t.glb"})
+
+
+def texture_bomb(folder, make):
+    import struct
+    import zlib
+
+    def chunk(kind, data):
+        return (
+            struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data))
+        )
+
+    header = struct.pack(">2I5B", 60_000, 60_000, 8, 2, 0, 0, 0)
+    png = b"\x89PNG\r\n\x1a\n" + chunk(b"IHDR", header) + chunk(b"IDAT", b"") + chunk(b"IEND", b"")
+    uri = "data:image/png;base64," + base64.b64encode(png).decode()
+    return tileset(folder, **content(folder, make, images=[{"uri": uri}]))
+
+
+def in_space(folder, make):
+    return tileset(folder, **content(folder, make, lift=20_000.0))
+
+
+def wrong_geoid_stated(folder, make):
+    path = tileset(folder, **content(folder, make))
+    document = json.loads(path.read_text())
+    document["asset"]["extras"] = {"geoid_separation_m": 5.0}
+    path.write_text(json.dumps(document))
+    return path
+
+
+def obj(folder, material="map_Kd t.png\n"):
+    path = folder / "m.obj"
+    path.write_text(
+        "mtllib m.mtl\nv 0 0 0\nv 20 0 0\nv 0 20 0\nvt 0 0\nvt 1 0\nvt 0 1\nusemtl a\n"
+        "f 1/1 2/2 3/3\n"
+    )
+    (folder / "m.mtl").write_text(f"newmtl a\n{material}")
+    return path
+
+
+def obj_bad_texture(folder, make):
+    (folder / "t.png").write_bytes(b"not a picture")
+    return obj(folder)
+
+
+def obj_cut_texture(folder, make):
+    (folder / "t.png").write_bytes(make.picture(0, 64, ".png")[:700])
+    return obj(folder)
+
+
+def obj_device_texture(folder, make):
+    return obj(folder, "map_Kd /dev/zero\n")
+
+
+def obj_pipe_texture(folder, make):
+    os.mkfifo(folder / "t.png")
+    return obj(folder)
+
+
+MESH = {"georeference": Georeference(origin=ORIGIN), "vertical_datum": "ellipsoidal"}
+
+
+@dataclass(frozen=True)
+class Refused:
+    """A source, what the error says, and the doubt that may be trusted."""
+
+    make: object
+    says: str
+    options: dict = field(default_factory=lambda: dict(ELLIPSOIDAL))
+    trust: str | None = None
+
+    def __str__(self):
+        return self.make.__name__
+
+
+RASTERS = [
+    Refused(all_nan, "holds no height at all"),
+    Refused(all_nodata, "holds no height at all"),
+    Refused(beside, "shows 0.0 % of the ground .* it lies beside it"),
+    Refused(a_strip_in_common, "shows 2.1 % of the ground", trust="overlap"),
+    Refused(other_continent, "it lies beside it"),
+    Refused(in_feet_untold, "CRS is in feet .* --height-unit"),
+    Refused(unit_against_crs, "the band's unit is 'ft'"),
+    Refused(depths, "counts depths"),
+    Refused(untagged_minus_9999, "occur nowhere on Earth, most often -9999.*--nodata=-9999"),
+    Refused(other_than_tagged, "occur nowhere on Earth, most often -9999"),
+    Refused(untagged_lowest_float, "occur nowhere on Earth, most often -3.4"),
+    Refused(untagged_zero, r"11 % of its heights are 0, .*--nodata=0", trust="nodata"),
+    Refused(centimetres, "occur nowhere on Earth.*--height-unit"),
+    Refused(noise, "rise by more than 80 degrees", trust="slope"),
+    Refused(sparse, r"more than 20,000,000,000 pixels .*--limit pixels=160000000000"),
+    Refused(no_place, "no geotransform"),
+    Refused(singular, "singular"),
+    Refused(no_crs, "no CRS"),
+    Refused(palette, "indices into a palette"),
+    Refused(empty_file, "no GeoTIFF"),
+    Refused(text_named_tif, "no GeoTIFF"),
+    Refused(a_vrt, "no GeoTIFF"),
+    Refused(overview_elsewhere, "dsm.tif.ovr: .*no GeoTIFF"),
+    Refused(statistics_elsewhere, "names other files"),
+    Refused(pipe, "not a plain file"),
+    Refused(device, "not a plain file"),
+]
+OTHERS = [
+    Refused(mirrored_tileset, "mirrors what it places", {}, "mirrored"),
+    Refused(doubled_tileset, "stretches what it places, by 2 to 2", {}, "scaled"),
+    Refused(squeezed_tileset, "stretches what it places, by 0.5 to 1", {}, "scaled"),
+    Refused(flattened_tileset, "flattens space", {}),
+    Refused(mirrored_node, "node 0 mirrors its mesh", {}, "mirrored"),
+    Refused(node_fan_out, "several parents, or is in a cycle", {}),
+    Refused(tileset_dag, "referred to more than 64 times", {}),
+    Refused(tileset_cycle, "in a cycle", {}),
+    Refused(deep_tileset, "more than 200 levels .*--limit depth", {}),
+    Refused(content_is_a_pipe, "not a plain file", {}),
+    Refused(content_elsewhere, "not a local file", {}),
+    Refused(texture_bomb, "decompression bomb", {}),
+    Refused(in_space, "occur nowhere on Earth", {}, "heights"),
+    Refused(wrong_geoid_stated, "stated geoid separation is 5.00 m, EGM96's", {}, "geoid"),
+    Refused(obj_bad_texture, "t.png: a texture that cannot be read", MESH),
+    Refused(obj_cut_texture, "t.png: a texture that cannot be read", MESH),
+    Refused(obj_device_texture, "/dev/zero is not a plain file", MESH),
+    Refused(obj_pipe_texture, "t.png is not a plain file", MESH),
+]
+
+
+@pytest.mark.parametrize("case", [*RASTERS, *OTHERS], ids=str)
+def test_an_odd_source_is_refused_by_name_or_trusted(case, tmp_path, make):
+    source = case.make(tmp_path) if case in RASTERS else case.make(tmp_path, make)
+    options = {"workers": 1} | case.options
+    with pytest.raises(LocalizerError, match=case.says) as refusal:
+        build_cache(source, tmp_path / "c", **options)
+    assert not (tmp_path / "c").exists()
+    if case.trust is not None:
+        assert f"--trust {case.trust}" in str(refusal.value)
+        trusting = ImportRules(trusted=frozenset({case.trust}))
+        build_cache(source, tmp_path / "c", rules=trusting, **options)
+
+
+# --- odd, and handled right -----------------------------------------------------------------------
+
+
+@pytest.fixture
+def built(tmp_path):
+    def run(source, **options):
+        options = {"workers": 1} | options
+        build_cache(source, tmp_path / "c", **options)
+        return TileCache.open(tmp_path / "c")
+
+    return run
+
+
+def heights_of(cache):
+    """(lowest, highest) height of the finest surface without its skirts: above the ellipsoid."""
+    index = cache.index
+    found = []
+    for node in np.flatnonzero((index.child_count == 0) & (index.tile_count > 0)):
+        mesh = cache.load_tile(int(index.tile_start[node]))
+        up = np.unique(mesh.faces[mesh.faces[:, 0] < len(mesh.positions)])
+        points = mesh.world_from_tile.apply(mesh.positions[up])
+        found.append(cache.frame.geodetic_from_enu(points)[:, 2])
+    return np.concatenate(found).min(), np.concatenate(found).max()
+
+
+def test_outside_a_dsm_without_a_nodata_tag_is_no_ground(tmp_path, built):
+    narrow = ground(90, 40)  # 40 rows of 90: most of the square about it is outside
+    cache = built(rasters(tmp_path, narrow, ortho={"data": picture(96)}), **ELLIPSOIDAL)
+    low, high = heights_of(cache)
+    assert 385 < low < high < 406  # with the coarse levels' skirts; it was -2
+    box = cache.index.box_max[0] - cache.index.box_min[0]
+    assert box[:2] == pytest.approx([89, 39], abs=1.5)
+
+
+def test_outside_the_orthophoto_is_no_map(tmp_path, built):
+    cache = built(rasters(tmp_path, ortho={"data": picture(30)}), **ELLIPSOIDAL)
+    box = cache.index.box_max[0] - cache.index.box_min[0]
+    assert box[:2] == pytest.approx([30, 30], abs=1.5)
+    cache.manifest.model_dump_json()
+    assert any("shows 39" in text for text in cache.manifest.warnings)
+
+
+def test_what_a_mask_hides_is_no_map(tmp_path, built):
+    paths = rasters(tmp_path)
+    shown = np.full((CELLS, CELLS), 255, np.uint8)
+    shown[:, 20:] = 0
+    with rasterio.Env(GDAL_TIFF_INTERNAL_MASK=True), rasterio.open(paths[1], "r+") as data:
+        data.write_mask(shown)
+    box = np.ptp([*zip(*built(paths, **ELLIPSOIDAL).manifest.extent, strict=True)], axis=1)
+    assert box[1] * 75_600 == pytest.approx(20, abs=1.5)  # metres of longitude there
+
+
+@pytest.mark.parametrize(
+    ("value", "dtype"), [(-9999, np.float32), (-32768, np.int16), (0, np.float32)]
+)
+def test_nodata_that_is_told_is_left_out(tmp_path, built, value, dtype):
+    cache = built(rasters(tmp_path, with_hole(value, dtype)), nodata=value, **ELLIPSOIDAL)
+    low, high = heights_of(cache)
+    assert 385 < low < high < 406
+
+
+@pytest.mark.parametrize("where", ["crs", "tag", "option", "scale"])
+def test_feet_become_metres(tmp_path, built, where):
+    feet = ground() / 0.3048
+    if where == "crs":
+        paths = rasters(tmp_path, feet, crs=f"{UTM}+8228")  # NAVD88 height (ft)
+        low, high = heights_of(built(paths))
+        lift = geoid_separation(47.2, 9.0)
+    else:
+        tags = {"tag": {"units": ["ft"]}, "option": {}, "scale": {"scales": [0.3048]}}[where]
+        options = ELLIPSOIDAL | ({"height_unit": "ft"} if where == "option" else {})
+        low, high = heights_of(built(rasters(tmp_path, feet, **tags), **options))
+        lift = 0.0
+    assert 390 < low - lift < high - lift < 406
+
+
+def test_a_dsm_in_feet_stands_where_it_says(tmp_path, built):
+    """Horizontal and vertical US survey feet: New York, 400 ft high, 48 ft wide."""
+    crs = "EPSG:2263+6360"
+    place = (985_000.0, 210_000.0)
+    paths = rasters(
+        tmp_path, crs=crs, place=place, ortho={"crs": "EPSG:2263", "place": place}
+    )  # fmt: skip
+    cache = built(paths)
+    lon, lat = Transformer.from_crs("EPSG:2263", "EPSG:4326", always_xy=True).transform(
+        place[0] + 24, place[1] - 24
+    )
+    assert cache.manifest.origin.latitude_deg == pytest.approx(lat, abs=1e-5)
+    assert cache.manifest.origin.longitude_deg == pytest.approx(lon, abs=1e-5)
+    box = cache.index.box_max[0] - cache.index.box_min[0]
+    assert box[:2] == pytest.approx(48 * 1200 / 3937, abs=1.0)
+    lift = geoid_separation(lat, lon)
+    _, high = heights_of(cache)
+    assert high == pytest.approx(405 * 1200 / 3937 + lift, abs=0.6)
+    assert any("NAVD88" in text for text in cache.manifest.warnings)
+
+
+def test_a_compound_crs_says_what_heights_are_above(tmp_path, built):
+    paths = rasters(tmp_path, crs=f"{UTM}+3855")  # EGM2008
+    with pytest.raises(GeoreferenceError, match=r"amsl by its CRS \(EGM2008 height\).*datum"):
+        built(paths, **ELLIPSOIDAL)
+    cache = built(paths)
+    assert cache.manifest.vertical_datum == "amsl"
+    assert any("lifted by EGM96" in text for text in cache.manifest.warnings)
+    assert heights_of(cache)[1] == pytest.approx(405 + geoid_separation(47.2, 9.0), abs=0.1)
+
+
+def test_a_three_dimensional_crs_is_ellipsoidal(tmp_path, built):
+    paths = rasters(tmp_path, crs=CRS(UTM).to_3d().to_wkt())
+    with pytest.raises(GeoreferenceError, match="ellipsoidal by its CRS"):
+        built(paths, vertical_datum="amsl")
+    assert built(paths).manifest.vertical_datum == "ellipsoidal"
+
+
+@pytest.mark.parametrize("flip", ["rows", "columns"])
+def test_rasters_that_run_the_other_way_lie_the_same(tmp_path, built, flip):
+    honest = built(rasters(tmp_path), **ELLIPSOIDAL)
+    seen = honest.load_tile(0).mips[0]
+    if flip == "rows":
+        options = {"transform": Affine(STEP, 0, LEFT, 0, STEP, TOP - CELLS * STEP)}
+        turn = (..., slice(None, None, -1), slice(None))
+    else:
+        options = {"transform": Affine(-STEP, 0, LEFT + CELLS * STEP, 0, -STEP, TOP)}
+        turn = (..., slice(None, None, -1))
+    paths = rasters(tmp_path, ground()[turn], ortho={"data": picture()[turn]} | options, **options)
+    other = built(paths, overwrite=True, **ELLIPSOIDAL)
+    assert np.allclose(other.index.box_min[0], honest.index.box_min[0], atol=0.01)
+    assert np.allclose(other.index.box_max[0], honest.index.box_max[0], atol=0.01)
+    difference = np.abs(other.load_tile(0).mips[0].astype(int) - seen)
+    assert difference.mean() < 2  # a mirrored picture's is 40
+
+
+def test_colours_in_another_order_are_put_right(tmp_path, built):
+    honest = built(rasters(tmp_path), **ELLIPSOIDAL).load_tile(0).mips[0]
+    order = [ColorInterp.blue, ColorInterp.green, ColorInterp.red]
+    swapped = {"data": picture()[::-1], "colorinterp": order, "photometric": "minisblack"}
+    other = built(rasters(tmp_path, ortho=swapped), overwrite=True, **ELLIPSOIDAL)
+    assert np.array_equal(other.load_tile(0).mips[0], honest)
+
+
+def test_only_control_points_are_no_place(tmp_path):
+    paths = rasters(tmp_path)
+    with rasterio.open(paths[0], "r+") as data:
+        corner = rasterio.control.GroundControlPoint
+        points = [corner(0, 0, LEFT, TOP), corner(0, 9, LEFT + 9, TOP), corner(9, 0, LEFT, TOP - 9)]
+        data.transform = Affine.identity()
+        data.gcps = points, CRS(UTM).to_wkt()
+    with pytest.raises(LocalizerError, match=r"no CRS|only control points"):
+        build_cache(paths, tmp_path / "c", workers=1, **ELLIPSOIDAL)
+
+
+def test_no_name_makes_gdal_fetch_anything(tmp_path):
+    asked = []
+
+    class Listening(http.server.BaseHTTPRequestHandler):
+        def do_GET(self):
+            asked.append(self.path)
+            self.send_error(404)
+
+        def do_HEAD(self):
+            self.do_GET()
+
+        def log_message(self, *_):
+            pass
+
+    server = http.server.ThreadingHTTPServer(("127.0.0.1", 0), Listening)
+    threading.Thread(target=server.serve_forever, daemon=True).start()
+    address = f"http://127.0.0.1:{server.server_port}/x.tif"
+    vrt = (
+        '<VRTDataset rasterXSize="48" rasterYSize="48"><VRTRasterBand dataType="Float32" band="1">'
+        f"<SimpleSource><SourceFilename>/vsicurl/{address}</SourceFilename><SourceBand>1"
+        "</SourceBand></SimpleSource></VRTRasterBand></VRTDataset>"
+    )
+    try:
+        (tmp_path / "v.vrt").write_text(vrt)
+        with pytest.raises(rasterio.errors.RasterioError), rasterio.open(tmp_path / "v.vrt") as v:
+            v.read(1)
+        assert asked  # what GDAL does when it is let
+        asked.clear()
+        for name in ("dsm.tif", "dsm.tif.ovr", "dsm.tif.msk"):
+            paths = rasters(tmp_path)
+            (tmp_path / name).write_text(vrt)
+            with pytest.raises(MapSourceError, match="no GeoTIFF"):
+                build_cache(paths, tmp_path / "c", workers=1, **ELLIPSOIDAL)
+            (tmp_path / name).unlink()
+        with offline(), pytest.raises(rasterio.errors.RasterioError):
+            rasterio.open(f"/vsicurl/{address}")
+    finally:
+        server.shutdown()
+        server.server_close()
+    assert not asked
+
+
+# --- processes with limits ---------------------------------------------------------------
+
+
+def eat_memory():
+    return len(np.ones(2**31, np.uint8))
+
+
+def crash():
+    os.abort()
+
+
+def hang():
+    threading.Event().wait()
+
+
+def fail():
+    raise MapSourceError("as it said")
+
+
+@pytest.mark.parametrize(
+    ("what", "limits", "says"),
+    [
+        (eat_memory, {"memory_mb": 300}, "does not fit into memory"),
+        (crash, {}, "it crashed .SIGABRT.*|its part crashed"),
+        (hang, {"seconds": 4}, "longer than 4 s"),
+        (fail, {}, "^as it said$"),
+    ],
+)
+def test_what_a_process_does_is_a_named_error_here(what, limits, says):
+    with pytest.raises(MapSourceError, match=says):
+        call_apart(what, rules=ImportRules(**limits), what="its part")
+
+
+def test_limits_and_doubts_are_named():
+    rules = ImportRules.of(["pixels=1e6", "nodes=7"], ["geoid"])
+    assert (rules.pixels, rules.nodes, rules.trusted) == (1_000_000, 7, {"geoid"})
+    for text in ("pixels", "pixels=many", "stars=3", "nodes=0", "depth=1e6"):
+        with pytest.raises(MapSourceError, match="--limit"):
+            ImportRules.of([text])
+    with pytest.raises(MapSourceError, match="no such doubt; there are datum"):
+        ImportRules.of(trusted=["everything"])
+
+
+def test_a_honest_source_is_read_apart_without_a_warning(source, cache, tmp_path):
+    manifest = build_cache(source, tmp_path / "c", workers=1, apart=True)
+    assert manifest == cache.manifest
+    assert manifest.warnings == ()
+
+
+def test_a_mesh_in_feet_is_refused(tmp_path):
+    path = tmp_path / "georef.json"
+    path.write_text(json.dumps({"epsg": 2263, "offset": [985000, 210000, 0]}))
+    with pytest.raises(GeoreferenceError, match="in feet"):
+        build_cache(
+            obj(tmp_path), tmp_path / "c", georeference=path, workers=1,
+            **ELLIPSOIDAL,
+        )  # fmt: skip
+
+
+def test_a_raster_on_this_disk_is_still_opened(tmp_path):
+    with offline(), open_raster(rasters(tmp_path)[0]) as data:
+        assert data.read(1).shape == (CELLS, CELLS)
+    ends = ecef_from_crs(UTM, np.array([[LEFT, TOP, 0.0]]))
+    assert 6.2e6 < np.linalg.norm(ends) < 6.5e6
