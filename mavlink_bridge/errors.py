@@ -32,7 +32,7 @@ class ParameterError(BridgeError):
 
 
 class RecordError(BridgeError):
-    """A .tlog file that cannot be opened."""
+    """A .tlog file that cannot be opened, or is none."""
 
 
 class MissionError(BridgeError):

@@ -9,14 +9,12 @@ from __future__ import annotations
 import csv
 import json
 import logging
-import struct
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, TextIO
+from typing import TextIO
 
 import numpy as np
-from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from companion.config import CompanionConfig, parse_config
 from companion.errors import RecordError, StreamDecodeError
@@ -32,13 +30,12 @@ from localizer.tracking.opening import MapStack, build_localizer
 from localizer.tracking.pipeline import Localizer
 from localizer.types import Frame, PoseEstimate
 from mavlink_bridge import quaternion as quat
+from mavlink_bridge.link.tlog import read_tlog
 from mavlink_bridge.messages import Attitude, GimbalAttitude, VehicleState
 from mavlink_bridge.vehicle.tracker import VehicleTracker
 
 _log = logging.getLogger(__name__)
 _MIN_IMAGES = 0.9  # share of the localized frames
-_FRAME_START = {0xFE: (8, 1), 0xFD: (12, 1)}  # bytes beside the payload, place of its length
-_SIGNATURE_BYTES = 13
 
 
 @dataclass(frozen=True)
@@ -157,35 +154,6 @@ def _estimate(row: dict[str, str]) -> RecordedEstimate:
 
 def _image_path(folder: Path, estimate: RecordedEstimate) -> Path:
     return folder / "snapshots" / f"{estimate.exposure_time_ns}.jpg"
-
-
-def read_tlog(path: Path) -> Iterator[tuple[int, Any]]:
-    """(UTC in ns, message) of every frame of a .tlog, in its order; damaged frames are left out."""
-    try:
-        data = path.read_bytes()
-    except OSError as error:
-        raise RecordError(f"{path}: cannot be read: {error.strerror}") from error
-    codec = mavlink.MAVLink(None)
-    codec.robust_parsing = True
-    at = 0
-    while at + 10 <= len(data):
-        (time_us,) = struct.unpack_from(">Q", data, at)
-        size = _frame_size(data, at + 8)
-        frame = data[at + 8 : at + 8 + size]
-        at += 8 + size
-        for message in codec.parse_buffer(frame) or []:
-            if message.get_type() != "BAD_DATA":
-                yield time_us * 1000, message
-    if at == 0:
-        raise RecordError(f"{path}: holds no MAVLink frame")
-
-
-def _frame_size(data: bytes, at: int) -> int:
-    if data[at] not in _FRAME_START:
-        raise RecordError(f"tlog: no MAVLink frame at byte {at}; the file is damaged")
-    overhead, length_at = _FRAME_START[data[at]]
-    is_signed = data[at] == 0xFD and at + 2 < len(data) and data[at + 2] & 1
-    return overhead + data[at + length_at] + (_SIGNATURE_BYTES if is_signed else 0)
 
 
 class _Autopilot:

@@ -1,4 +1,4 @@
-"""Raw .tlog recorder: each frame behind its UTC time, as every MAVLink ground tool reads it.
+"""Raw .tlog, written and read: each frame behind its UTC time, as every MAVLink ground tool has it.
 
 Writing has a thread of its own: a memory card that stalls for a second must not delay an injection.
 """
@@ -10,9 +10,11 @@ import logging
 import struct
 import threading
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Protocol
+from typing import Any, Protocol
+
+from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from mavlink_bridge.errors import RecordError
 
@@ -22,6 +24,8 @@ _MAX_BYTES = 2 << 30
 _MAX_WAITING = 8192  # frames: 10 s of five times the usual traffic
 _WRITE_EVERY_S = 0.2
 _CLOSE_S = 5.0
+_FRAME_START = {0xFE: (8, 1), 0xFD: (12, 1)}  # bytes beside the payload, place of its length
+_SIGNATURE_BYTES = 13
 
 _DISK_FAULTS = (errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.EIO)
 
@@ -149,3 +153,35 @@ class TlogRecorder:
             self._failed = True
             _log.warning("%s: the record is incomplete: %s", self._path, why)
             self._on_failure(why)
+
+
+def read_tlog(path: Path) -> Iterator[tuple[int, Any]]:
+    """(UTC in ns, message) of every frame of a .tlog, in its order; damaged frames are left out.
+
+    Raises `RecordError` where the file cannot be read or holds something else.
+    """
+    try:
+        data = path.read_bytes()
+    except OSError as error:
+        raise RecordError(f"{path}: cannot be read: {error.strerror}") from error
+    codec = mavlink.MAVLink(None)
+    codec.robust_parsing = True
+    at = 0
+    while at + 10 <= len(data):
+        (time_us,) = struct.unpack_from(">Q", data, at)
+        size = _frame_size(data, at + 8)
+        frame = data[at + 8 : at + 8 + size]
+        at += 8 + size
+        for message in codec.parse_buffer(frame) or []:
+            if message.get_type() != "BAD_DATA":
+                yield time_us * 1000, message
+    if at == 0:
+        raise RecordError(f"{path}: holds no MAVLink frame")
+
+
+def _frame_size(data: bytes, at: int) -> int:
+    if data[at] not in _FRAME_START:
+        raise RecordError(f"tlog: no MAVLink frame at byte {at}; the file is damaged")
+    overhead, length_at = _FRAME_START[data[at]]
+    is_signed = data[at] == 0xFD and at + 2 < len(data) and data[at + 2] & 1
+    return overhead + data[at + length_at] + (_SIGNATURE_BYTES if is_signed else 0)

@@ -17,12 +17,14 @@ from companion.config import parse_config
 from companion.errors import RecordError
 from companion.flight.app import Companion
 from companion.geometry import GIMBAL_FROM_CAMERA
-from companion.offline.replay import load_record, read_tlog, replay, summarize
+from companion.offline.replay import load_record, replay, summarize
 from localizer.geometry.camera import Camera
 from localizer.geometry.geo import NED_FROM_ENU
 from localizer.geometry.pose import quaternion_from_matrix
 from localizer.geometry.posefile import read_poses, world_from_camera
 from localizer.map.cache.cache import TileCache
+from mavlink_bridge.errors import RecordError as TlogError
+from mavlink_bridge.link.tlog import read_tlog
 from sitl.demo.kinematic import record_scenario
 from sitl.demo.scenario import CameraSpec, Leg, Scenario
 
@@ -162,7 +164,7 @@ def test_what_a_record_lacks_is_named(record, tmp_path):
     (tmp_path / "estimates.csv").symlink_to(record / "estimates.csv")
     with pytest.raises(RecordError, match=r"have no image.*snapshot_interval_s"):
         load_record(tmp_path)
-    with pytest.raises(RecordError, match=r"no\.tlog: cannot be read"):
+    with pytest.raises(TlogError, match=r"no\.tlog: cannot be read"):
         list(read_tlog(tmp_path / "no.tlog"))
 
 
@@ -232,5 +234,5 @@ def test_damaged_images_are_no_agreement(record, tmp_path):
 def test_a_damaged_tlog_is_told(tmp_path):
     path = tmp_path / "bad.tlog"
     path.write_bytes(struct.pack(">Q", 1) + b"no frame at all")
-    with pytest.raises(RecordError, match="damaged"):
+    with pytest.raises(TlogError, match="damaged"):
         list(read_tlog(path))
