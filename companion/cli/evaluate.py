@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import csv
 import json
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from tempfile import TemporaryFile
 from typing import Annotated
@@ -21,6 +23,7 @@ from companion.offline.trajectories import stamped, write_trajectory
 from companion.versions import versions
 from localizer.config import LocalizerConfig
 from localizer.evaluation.metrics import LocalizationMetrics
+from localizer.evaluation.places import KnownOfPlace, PlaceFinder
 from localizer.evaluation.sequences import (
     CSV_COLUMNS,
     EvaluatedFrame,
@@ -38,6 +41,7 @@ from localizer.geometry.camera import Camera
 from localizer.geometry.geo import LocalFrame
 from localizer.geometry.trajectory import StampedPose, write_tum
 from localizer.registration.devices import DeviceChoice
+from localizer.relocalization.relocalizer import open_relocalizer
 from localizer.render.base import MapRenderer
 from localizer.render.select import RendererName
 from localizer.tracking.opening import MapStack, build_localizer
@@ -54,8 +58,14 @@ def evaluate_command(
     name: Annotated[str | None, typer.Option(help="which sequence of a PiLoT data set")] = None,
     prior: Annotated[
         str,
-        typer.Option(help="first: one prior, for video; each: one per frame, for single photos"),
+        typer.Option(
+            help="first: one prior, for video; each: one per frame, for single photos; lost: one "
+            "100 to 500 m off, none: no place at all, found by search, and again after each loss"
+        ),
     ] = "first",
+    known_heading: Annotated[
+        bool, typer.Option("--known-heading", help="of lost and none: to 15 degrees, else unknown")
+    ] = False,
     seed: Annotated[int, typer.Option(min=0, help="seed of the prior's noise")] = 0,
     noise_m: Annotated[float, typer.Option(min=0, max=1e6, help="prior noise up to, m")] = 10.0,
     noise_deg: Annotated[
@@ -72,10 +82,13 @@ def evaluate_command(
     limit: Annotated[int | None, typer.Option(min=1, help="only the first N frames")] = None,
 ) -> None:
     """Localize every frame of a recorded sequence from a perturbed prior and measure it."""
-    if prior not in ("first", "each"):
-        raise ConfigError(f"--prior is first or each, not {prior!r}")
+    if prior not in ("first", "each", "lost", "none"):
+        raise ConfigError(f"--prior is first, each, lost or none, not {prior!r}")
+    searched = prior in ("lost", "none")
+    if known_heading and not searched:
+        raise ConfigError("--known-heading goes with --prior lost or none")
     _prepare(report)
-    mode: PriorMode = "first" if prior == "first" else "each"
+    mode: PriorMode = "each" if prior == "each" else "first"
     config = LocalizerConfig(
         width=width, model=model, seed=seed, renderer=renderer, device=device, feature_threads=2
     )
@@ -84,7 +97,8 @@ def evaluate_command(
         data = load_sequence(sequence, stack.cache.frame, name)
         data = data if limit is None else data.first(limit)
         localizer = build_localizer(stack, data.camera, config)
-        with Progress() as bar:
+        known = KnownOfPlace(prior == "lost", known_heading, seed=seed) if searched else None
+        with place_finder(stack, config, known) as find, Progress() as bar:
             task = bar.add_task("localizing", total=len(data.images))
             frames, metrics = evaluate(
                 localizer,
@@ -92,15 +106,17 @@ def evaluate_command(
                 Perturbation(noise_m, noise_deg, seed),
                 mode,
                 progress=lambda _: bar.advance(task),
+                find=find,
             )
         settings = {
             "sequence": str(sequence), "map": str(map_cache), "prior": prior, "seed": seed,
+            "known_heading": known_heading,
             "noise_m": noise_m, "noise_deg": noise_deg, "width": localizer.camera.width,
             "height": localizer.camera.height, "features": load_extractor(model).name,
             "renderer": stack.renderer.name, "optimizer": localizer.optimizer_name,
         }  # fmt: skip
         _print_problems(frames)
-        unusable = sum(f.estimate is None for f in frames)
+        unusable = sum(f.unusable for f in frames)
         # Before the files: they are told even if the disk is full.
         print_metrics(metrics, unusable, str(sequence))
         try:
@@ -111,6 +127,19 @@ def evaluate_command(
             raise ReportError(f"--report {report}: cannot be written: {error}") from error
     finally:
         stack.close()
+
+
+@contextmanager
+def place_finder(
+    stack: MapStack, config: LocalizerConfig, known: KnownOfPlace | None
+) -> Iterator[PlaceFinder | None]:
+    """Who finds a place without a prior, where that is asked for."""
+    opened = None if known is None else open_relocalizer(stack.cache, config)
+    if known is None or opened is None:
+        yield None
+        return
+    with opened as relocalizer:
+        yield PlaceFinder(relocalizer, known)
 
 
 def _print_problems(frames: list[EvaluatedFrame]) -> None:
@@ -165,7 +194,7 @@ def _write_report(
     settings: dict[str, object],
     local: LocalFrame,
 ) -> None:
-    unusable = [f.name for f in frames if f.estimate is None]
+    unusable = [f.name for f in frames if f.unusable]
     report = metrics.to_dict() | {
         "unusable_images": unusable, "settings": settings, "versions": versions()
     }  # fmt: skip

@@ -24,9 +24,11 @@ from localizer.geometry.geo import LocalFrame
 from localizer.geometry.pose import Array, Pose, so3_exp
 from localizer.geometry.posefile import read_poses, world_from_camera
 from localizer.tracking.pipeline import Localizer
-from localizer.types import Frame, Image, PoseEstimate, PosePrior, RegistrationStatus
+from localizer.types import Frame, Image, PoseEstimate, PosePrior, RegistrationStatus, TrackingState
 
 PriorMode = Literal["first", "each"]
+# (frame, its truth, its index) -> the prior to begin from, None where no place is found.
+FindPlace = Callable[[Frame, Pose, int], PosePrior | None]
 
 # Video that says nothing of time is taken as 30 frames per second (the paper's data sets).
 _FRAME_INTERVAL_NS = 33_333_333
@@ -73,7 +75,8 @@ class Sequence:
 class EvaluatedFrame:
     """One frame's outcome. Errors are None where integrity accepted no estimate.
 
-    estimate: None for an image that cannot be used; `problem` says why then.
+    estimate: None for an image that cannot be used (`problem` says why), or where no place is known
+    (`searching`).
     """
 
     name: str
@@ -81,6 +84,12 @@ class EvaluatedFrame:
     translation_error_m: float | None = None
     rotation_error_deg: float | None = None
     problem: str = ""
+    searching: bool = False
+
+    @property
+    def unusable(self) -> bool:
+        """Whether the image itself could not be used."""
+        return self.estimate is None and not self.searching
 
 
 @dataclass(frozen=True)
@@ -167,6 +176,7 @@ def evaluate(
     mode: PriorMode = "first",
     passes: int = 3,
     progress: Callable[[int], None] = lambda _: None,
+    find: FindPlace | None = None,
 ) -> tuple[list[EvaluatedFrame], LocalizationMetrics]:
     """Localize every frame and measure it.
 
@@ -174,7 +184,8 @@ def evaluate(
     starts from its own perturbed truth. passes: how often a frame that starts from a perturbed
     prior is rendered and registered, each time from the last result. A frame that is predicted
     outside the map, or whose image cannot be used, counts as not localized; `OutsideMapError` or
-    `SequenceError` if that befalls every frame.
+    `SequenceError` if that befalls every frame. find: who is asked for a prior at the beginning and
+    whenever tracking is lost, instead of the perturbed truth.
     """
     frames: list[EvaluatedFrame] = []
     errors: list[LocalizerError] = []
@@ -190,9 +201,21 @@ def evaluate(
                 progress(index)
                 continue
             started = time.perf_counter()
-            fresh = mode == "each" or not has_prior
+            lost = not has_prior or localizer.tracker.integrity.state is TrackingState.LOST
+            fresh = (mode == "each" or not has_prior) if find is None else lost
             if fresh:
-                prior = perturbation.prior(sequence.truth[index], index, frame.exposure_time_ns)
+                truth = sequence.truth[index]
+                if find is None:
+                    prior = perturbation.prior(truth, index, frame.exposure_time_ns)
+                else:
+                    found = find(frame, truth, index)
+                    if found is None:
+                        seconds += time.perf_counter() - started
+                        name = sequence.images[index].name
+                        frames.append(EvaluatedFrame(name, None, searching=True))
+                        progress(index)
+                        continue
+                    prior = found
                 localizer.set_prior(prior)
                 has_prior = True
             try:
@@ -202,7 +225,9 @@ def evaluate(
                     frame, passes=passes if fresh else 1, query=pending.result
                 )
             except OutsideMapError as error:
-                if mode == "first" and fresh:  # every other frame hangs on this prior
+                if (
+                    mode == "first" and fresh and find is None
+                ):  # every other frame hangs on this prior
                     raise
                 errors.append(error)
                 outcome = _not_localized(localizer, frame)
@@ -243,7 +268,7 @@ def _measure(sequence: Sequence, index: int, estimate: PoseEstimate) -> Evaluate
 def _summary(frames: list[EvaluatedFrame], seconds: float) -> LocalizationMetrics:
     """seconds: spent on the frames whose image could be used; the rate is theirs."""
     translation, rotation = error_arrays(frames)
-    usable = sum(f.estimate is not None for f in frames)
+    usable = sum(not f.unusable for f in frames)
     metrics = localization_metrics(translation, rotation, seconds)
     return replace(metrics, fps=metrics.fps * usable / len(frames))
 

@@ -28,7 +28,7 @@ class RelocalizationConfig(BaseModel):
     patch_m: float = Field(
         170.0, ge=40, le=2000, description="largest side of the ground compared, at 0.5 m a pixel"
     )
-    candidates: int = Field(5, ge=1, le=100, description="places that are rendered and registered")
+    candidates: int = Field(8, ge=1, le=100, description="places that are rendered and registered")
     passes: int = Field(
         3, ge=1, le=10, description="renderings of a place, each from the last pose"
     )

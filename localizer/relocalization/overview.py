@@ -17,6 +17,7 @@ from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 
+import cv2
 import numpy as np
 import safetensors
 import safetensors.numpy
@@ -37,10 +38,13 @@ STRIDE = 4  # pixels per cell: the network's level whose features are compared
 CHANNELS = 16  # principal components that are kept
 GROUND_CELLS = 16  # cells per sample of the ground's height
 
-_FORMAT = 1
+_FORMAT = 2
 _SQUARE_CELLS = 128  # drawn at a time
 _MARGIN_CELLS = 16  # around it, which the network needs to see and whose features are dropped
 _QUANTUM = 0.01  # of a stored feature
+# Cells (sigma) of the mean that is taken away: what kind of land it is says little of where it is,
+# and without this one meadow scores as any other. Found in time: 12 of 12 instead of 9 among five.
+_LOCAL_CELLS = 8.0
 _SAMPLE_SQUARES = 24  # that the principal components are computed from
 _GROUND_PERCENTILE = 30  # of the heights in a sample: lower than roofs and trees
 _LEAST_SHARE = 0.9  # of a square's cell that the map must cover to be compared
@@ -62,7 +66,8 @@ class Projection:
 
 @dataclass(frozen=True, eq=False)
 class OverviewLevel:
-    """One scale. features: (K, H, W) int8 times `quantum`, confidence included, row 0 in the north;
+    """One scale. features: (K, H, W) int8 times `quantum`, confidence included, less their local
+    mean, row 0 in the north;
     ground: (H / 16, W / 16) float32 world z, NaN without map; west, north: world m of the corner.
     """
 
@@ -83,6 +88,15 @@ class OverviewLevel:
     def shape(self) -> tuple[int, int]:
         """Rows and columns of cells."""
         return self.features.shape[1], self.features.shape[2]
+
+
+def without_local_mean(values: Float32, known: Float32) -> Float32:
+    """Values (h, w) or (h, w, K) less their mean about each cell over what is known (h, w)."""
+    total = cv2.GaussianBlur(values, (0, 0), _LOCAL_CELLS, borderType=cv2.BORDER_CONSTANT)
+    share = cv2.GaussianBlur(known, (0, 0), _LOCAL_CELLS, borderType=cv2.BORDER_CONSTANT)
+    if values.ndim == 3:
+        share, known = share[..., None], known[..., None]
+    return np.asarray((values - total / np.maximum(share, 1e-3)) * known, np.float32)
 
 
 @dataclass(frozen=True)
@@ -250,6 +264,7 @@ def _compute(
     projection = _principal(kept.values())
     n, g = _SQUARE_CELLS, _SQUARE_CELLS // GROUND_CELLS
     features = np.zeros((projection.basis.shape[1], plan.rows, plan.columns), np.int8)
+    known = np.zeros((plan.rows, plan.columns), np.float32)
     ground = np.full((plan.rows // GROUND_CELLS, plan.columns // GROUND_CELLS), np.nan, np.float32)
     for k, (row, column) in enumerate(plan.corners):
         if should_stop():
@@ -258,9 +273,13 @@ def _compute(
         values = projection(raw.features.astype(np.float32)) * (raw.weight[..., None] / _QUANTUM)
         square = np.rint(values).clip(-127, 127).astype(np.int8)
         features[:, row : row + n, column : column + n] = square.transpose(2, 0, 1)
+        known[row : row + n, column : column + n] = raw.weight > 0
         i, j = row // GROUND_CELLS, column // GROUND_CELLS
         ground[i : i + g, j : j + g] = raw.ground
         progress(k + 1)
+    for channel in features:
+        local = without_local_mean(channel.astype(np.float32), known)
+        channel[:] = np.rint(local).clip(-127, 127).astype(np.int8)
     return OverviewLevel(features, ground, projection, plan.west, plan.north, plan.gsd_m)
 
 

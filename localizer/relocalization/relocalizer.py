@@ -8,7 +8,7 @@ import math
 import time
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
@@ -83,15 +83,24 @@ class Relocalizer:
         self, query: PlaceQuery, should_stop: Callable[[], bool] = lambda: False
     ) -> Relocalization | None:
         """The camera's pose with the evidence for it; None where nothing convinces, or stopped."""
-        stages: dict[str, float] = {}
         began = time.perf_counter()
         candidates = self.search(query, should_stop)
-        stages["search"] = time.perf_counter() - began
-        if not candidates:
+        searched = time.perf_counter() - began
+        found = self.confirm(query, candidates, should_stop)
+        if found is None:
             return None
+        return replace(found, stage_s={"search": searched, **found.stage_s})
+
+    def confirm(
+        self,
+        query: PlaceQuery,
+        candidates: list[PlaceCandidate],
+        should_stop: Callable[[], bool] = lambda: False,
+    ) -> Relocalization | None:
+        """The candidate that registration confirms, if it does so for one."""
         began = time.perf_counter()
-        judged = self.verify(query, candidates, should_stop)
-        stages["verify"] = time.perf_counter() - began
+        judged = self.verify(query, candidates, should_stop) if candidates else []
+        stages = {"confirm": time.perf_counter() - began}
         return self._answer(query, candidates, judged, stages) if judged else None
 
     def search(

@@ -27,6 +27,7 @@ from localizer.relocalization.overview import (
     STRIDE,
     OverviewLevel,
     comparable_level,
+    without_local_mean,
 )
 from localizer.relocalization.patch import Footprint, footprint, patch_side, rectify, turned
 from localizer.relocalization.types import PlaceCandidate, PlaceQuery, SearchRegion
@@ -221,7 +222,8 @@ class _Search:
         n = side_px // STRIDE
         mask = cv2.resize(inner.astype(np.float32), (n, n), interpolation=cv2.INTER_AREA)
         weighted = level.projection(features.features) * (mask * features.confidence)[..., None]
-        return weighted.astype(np.float32), (mask > 0.05).astype(np.float32)
+        known = (mask > 0.05).astype(np.float32)
+        return without_local_mean(weighted.astype(np.float32), known), known
 
     def meets(self, block: Block, trial: Trial, scale: int) -> bool:
         """Whether any origin of a block is a place of the region at about the trial's height."""

@@ -50,6 +50,19 @@ def test_report_has_the_papers_columns(recorded, tmp_path, prior):
     _is_a_trajectory_as_evo_reads_it(tmp_path, errors)
 
 
+@pytest.mark.parametrize("prior", ["lost", "none"])
+def test_a_place_is_found_without_a_prior(recorded, tmp_path, prior):
+    """With the prior 100 m and more off, or none, tracking begins at the place that is found."""
+    assets, sequence = recorded
+    _run(sequence, "--map", assets.map_cache, "--report", tmp_path, "--limit", 6,
+         "--prior", prior, "--known-heading")  # fmt: skip
+    report = json.loads((tmp_path / "report.json").read_text())
+    assert report["settings"]["prior"] == prior
+    assert report["unusable_images"] == []
+    assert report["recall_1"] >= 80
+    assert report["median_translation_m"] < 0.5
+
+
 def _is_a_trajectory_as_evo_reads_it(report, errors):
     """By evo's own definition of the absolute error: same times, distance of the positions."""
     truth, found = (np.loadtxt(report / name) for name in ("truth.tum", "trajectory.tum"))
