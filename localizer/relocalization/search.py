@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
@@ -97,7 +97,9 @@ def scales(query: PlaceQuery, ground: Float32, config: RelocalizationConfig) -> 
 
 @dataclass
 class Scores:
-    """Best score of each patch origin so far (rows, columns), and the trial it came from."""
+    """Best score over its trial's noise at each patch origin so far (rows, columns), and the number
+    of that trial.
+    """
 
     best: Float32
     trial: NDArray[np.int32]
@@ -125,7 +127,7 @@ def search(
     run = _Search(view, query, correlator, extractor, config, seen, heights)
     groups = shared_extractions(heights, config.extraction_ratio)
     jobs = [(float(a), g) for g in groups for a in headings(query, config)]
-    trials: list[Trial] = []
+    trials: list[Found] = []
     scores = run.empty()
 
     def work(job: tuple[float, list[int]]) -> list[Found] | None:
@@ -136,8 +138,8 @@ def search(
         if result is None or should_stop():
             return None
         for found in result:
-            run.merge(scores, len(trials), found.blocks)
-            trials.append(found.trial)
+            run.merge(scores, len(trials), found)
+            trials.append(replace(found, blocks=[]))
     return run.candidates(scores, trials)
 
 
@@ -154,9 +156,14 @@ def shared_extractions(heights: Array, ratio: float) -> list[list[int]]:
 
 @dataclass(frozen=True)
 class Found:
-    """Scores (STEP, STEP) of one trial at the origins of each block that it can lie in."""
+    """Scores (STEP, STEP) of one trial at the origins of each block that it can lie in.
+
+    noise: root mean square of the trial's scores. A score over it is what competes: on a hill close
+    below the camera few cells are seen, of which some place or other always looks the same.
+    """
 
     trial: Trial
+    noise: float
     blocks: list[tuple[Block, Float32]]
 
 
@@ -192,13 +199,15 @@ class _Search:
         found = []
         for scale, trial, blocks in wanted:
             patch = transform_patch(_resized(features, trial.cells), _resized(mask, trial.cells))
-            scores = []
+            scores, power = [], 0.0
             for block in blocks:
                 if should_stop():
                     return None
                 raw = self.correlator.correlate(patch, block)
+                power += float(np.vdot(raw, raw)) / raw.size
                 scores.append((block, self.masked(raw, block, trial, scale)))
-            found.append(Found(trial, scores))
+            noise = max(math.sqrt(power / len(blocks)), 1e-6)
+            found.append(Found(trial, noise, scores))
         return found
 
     def trial(self, heading: float, height: float) -> Trial:
@@ -278,18 +287,19 @@ class _Search:
         north = level.north - middle[..., 0] - trial.centre[1]
         return np.stack([east, north], axis=-1)
 
-    def merge(self, scores: Scores, trial: int, blocks: list[tuple[Block, Float32]]) -> None:
+    def merge(self, scores: Scores, trial: int, found: Found) -> None:
         lead = (SIZE - STEP) // 2
         rows, columns = scores.best.shape
-        for block, values in blocks:
+        for block, values in found.blocks:
             r, c = block.row + lead, block.column + lead
             h, w = min(STEP, rows - r), min(STEP, columns - c)
             window = np.s_[r : r + h, c : c + w]
-            better = values[:h, :w] > scores.best[window]
-            scores.best[window][better] = values[:h, :w][better]
+            weighed = values[:h, :w] / np.float32(found.noise)
+            better = weighed > scores.best[window]
+            scores.best[window][better] = weighed[better]
             scores.trial[window][better] = trial
 
-    def candidates(self, scores: Scores, trials: list[Trial]) -> list[PlaceCandidate]:
+    def candidates(self, scores: Scores, trials: list[Found]) -> list[PlaceCandidate]:
         """The highest peaks, no two closer than `_SUPPRESSED_M`."""
         lead = (SIZE - STEP) // 2
         best = scores.best.copy()
@@ -297,10 +307,10 @@ class _Search:
         found: list[PlaceCandidate] = []
         while len(found) < self.config.candidates + 1:
             i, j = np.unravel_index(int(np.argmax(best)), best.shape)
-            score = float(best[i, j])
-            if score <= 0:
+            if best[i, j] <= 0:
                 break
-            trial = trials[int(scores.trial[i, j])]
+            chosen = trials[int(scores.trial[i, j])]
+            trial, score = chosen.trial, float(best[i, j]) * chosen.noise
             place = self.camera_at(np.array([i - lead, j - lead]), trial)
             pose = Pose(
                 turned(self.query.rotation, trial.heading_rad),
