@@ -24,7 +24,7 @@ from localizer.geometry.geo import LocalFrame
 from localizer.geometry.pose import Array, Pose, so3_exp
 from localizer.geometry.posefile import read_poses, world_from_camera
 from localizer.tracking.pipeline import Localizer
-from localizer.types import Frame, Image, PoseEstimate, PosePrior, RegistrationStatus, TrackingState
+from localizer.types import Frame, Image, PoseEstimate, PosePrior, RegistrationStatus
 
 PriorMode = Literal["first", "each"]
 # (frame, its truth, its index) -> the prior to begin from, None where no place is found.
@@ -185,7 +185,7 @@ def evaluate(
     prior is rendered and registered, each time from the last result. A frame that is predicted
     outside the map, or whose image cannot be used, counts as not localized; `OutsideMapError` or
     `SequenceError` if that befalls every frame. find: who is asked for a prior at the beginning and
-    whenever tracking is lost, instead of the perturbed truth.
+    whenever it is lost or led nowhere, instead of the perturbed truth.
     """
     frames: list[EvaluatedFrame] = []
     errors: list[LocalizerError] = []
@@ -201,7 +201,7 @@ def evaluate(
                 progress(index)
                 continue
             started = time.perf_counter()
-            lost = not has_prior or localizer.tracker.integrity.state is TrackingState.LOST
+            lost = not has_prior or localizer.tracker.standing.wants_prior
             fresh = (mode == "each" or not has_prior) if find is None else lost
             if fresh:
                 truth = sequence.truth[index]
@@ -216,7 +216,10 @@ def evaluate(
                         progress(index)
                         continue
                     prior = found
-                localizer.set_prior(prior)
+                if find is None:
+                    localizer.set_prior(prior)
+                else:
+                    localizer.offer(prior)
                 has_prior = True
             try:
                 # Reference and query features side by side.
