@@ -9,6 +9,7 @@ from typing import Annotated, Any
 from pydantic import BaseModel, ConfigDict, Field, field_validator, model_validator
 
 from companion.errors import ConfigError
+from companion.guardian.config import GuardianConfig
 from companion.settings_file import SettingsError, read_settings, validated
 from companion.sources.base import SourceSettings
 from companion.targets.detections import parse_host_port
@@ -139,6 +140,7 @@ class CompanionConfig(_Model):
     bridge: BridgeConfig = BridgeConfig()
     targets: TargetConfig = TargetConfig()
     prior: PriorConfig = PriorConfig()
+    guardian: GuardianConfig = GuardianConfig()
     record: RecordConfig | None = None
 
 

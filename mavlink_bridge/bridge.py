@@ -32,6 +32,7 @@ from mavlink_bridge.messages import (
     CameraView,
     GimbalAttitude,
     HealthLevel,
+    InertialSample,
     TargetEnd,
     TargetReport,
     TrackRequest,
@@ -173,6 +174,10 @@ class Bridge:
         """Tell the ground of that target no more; never blocks."""
         self._to_ground(TargetEnd(target_id))
 
+    def doubt(self, why: str) -> None:
+        """Until it is called with an empty text, "the EKF follows" is not said."""
+        self._fc.outcome.doubt = why
+
     def look(self, view: CameraView) -> None:
         """Tell the ground where the camera looks (CAMERA_FOV_STATUS); never blocks."""
         self._to_ground(view)
@@ -226,6 +231,10 @@ class Bridge:
     def local_at(self, time_ns: int) -> tuple[float, ...] | None:
         """The EKF's position (north, east, down) from its origin at a time, m; None: unknown."""
         return self._tracker.local_at(time_ns)
+
+    def inertial_since(self, time_ns: int) -> tuple[InertialSample, ...]:
+        """What the vehicle's IMU read after a CLOCK_MONOTONIC time, oldest first."""
+        return self._tracker.inertial_since(time_ns)
 
     def texts(self) -> list[str]:
         """The last lines told to the operator, oldest first."""

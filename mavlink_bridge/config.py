@@ -73,6 +73,15 @@ class InjectionConfig(_Model):
     max_sigma_m: float = Field(
         default=10.0, gt=0.0, le=100.0, description="nothing is sent above it"
     )
+    alert_limit_m: float = Field(
+        default=10.0,
+        gt=0.0,
+        le=1000.0,
+        description="a fix whose protection level is beyond it is not injected",
+    )
+    time_to_alert_s: float = Field(
+        default=3.0, ge=0.2, le=60.0, description="within which that is told and takes effect"
+    )
     max_extrapolation_s: float = Field(
         default=0.5,
         gt=0.0,

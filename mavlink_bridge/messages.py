@@ -208,6 +208,18 @@ class Attitude:
 
 
 @dataclass(frozen=True)
+class InertialSample:
+    """What the IMU read (RAW_IMU, HIGHRES_IMU), before any estimator: body axes FRD.
+
+    specific_force: m/s^2, about (0, 0, -9.8) at rest; rates: rad/s, biases included.
+    """
+
+    time_ns: int
+    specific_force: tuple[float, float, float]
+    rates: tuple[float, float, float]
+
+
+@dataclass(frozen=True)
 class GimbalAttitude:
     """The gimbal's attitude at a time, to NED, resolved from whatever frame the message used.
 
@@ -276,3 +288,6 @@ class VehicleState:
     clock_offset_ns: int | None = None
     clock_source: str = "none"
     last_text: str = ""
+    pressure_altitude_m: float = NAN
+    """Of the barometer alone in the standard atmosphere: only its changes mean something."""
+    pressure_time_ns: int = 0

@@ -15,6 +15,7 @@ from typing import Any
 
 import numpy as np
 
+from companion.guardian.guardian import Guardian
 from companion.sources import StreamState
 from localizer.tracking.engine import EngineHealth
 from localizer.types import PoseEstimate, TrackingState
@@ -52,6 +53,7 @@ class HealthMonitor:
         record_folder: Path | None,
         is_recorded: Callable[[], bool] = lambda: True,
         position_sigma_m: Callable[[], float | None] = lambda: None,
+        guardian: Guardian | None = None,
     ) -> None:
         self._engine_health = engine_health
         self._bridge = bridge
@@ -59,6 +61,7 @@ class HealthMonitor:
         self._event = event
         self._is_recorded = is_recorded
         self._position_sigma_m = position_sigma_m
+        self._guardian = guardian
         self._file = record_folder / "health.json" if record_folder else None
         self._estimates: deque[tuple[float, PoseEstimate]] = deque(maxlen=_WINDOW)
         self._write_failed = False
@@ -119,6 +122,9 @@ class HealthMonitor:
             level = HealthLevel.FAILED if _is_lost(estimate) else HealthLevel.DEGRADED
             return level, error or "no frame is being localized"
         level, text = _OF_STATE[estimate.state]
+        withheld = self._guardian.reason if self._guardian is not None else ""
+        if withheld and not _is_lost(estimate):
+            level, text = HealthLevel.FAILED, withheld
         if _is_lost(estimate):
             text += self._since(estimate) + (", searching" if engine.searching else "")
         text += ", video scaled" if feed is StreamState.SCALED else ""
@@ -144,6 +150,7 @@ class HealthMonitor:
             "stages_ms": self._stages(),
             "bridge": self._bridge.counters(),
             "shadow": self._bridge.shadow_score().line(),
+            "guardian": self._guardian_report(),
         }
         temporary = self._file.with_suffix(".tmp")
         try:
@@ -153,6 +160,17 @@ class HealthMonitor:
             if not self._write_failed:
                 self._event("warning", f"{self._file} cannot be written: {error}")
             self._write_failed = True
+
+    def _guardian_report(self) -> dict[str, Any] | None:
+        """Standing findings with their figures, and the newest protection level."""
+        if self._guardian is None:
+            return None
+        level = self._guardian.level
+        return {
+            "findings": self._guardian.standing(),
+            "hpl_m": None if level is None else level.horizontal_m,
+            "vpl_m": None if level is None else level.vertical_m,
+        }
 
     def _rate(self) -> float:
         """Localized frames per second over the last few seconds."""

@@ -23,6 +23,8 @@ from companion.flight.priors import AutopilotPose, PriorSources
 from companion.flight.recorder import RecordKeeper, remove_empty
 from companion.flight.search import PlaceSearch
 from companion.flight.view_reporter import ViewReporter
+from companion.guardian.guardian import Guardian
+from companion.guardian.monitor import Limits
 from companion.preflight.coverage import check_origin
 from companion.sources import FrameSource, StreamState, open_source
 from companion.targets.clicks import ClickPolicy
@@ -113,6 +115,7 @@ def _health(making: Making) -> HealthMonitor:
         keeper.folder,
         lambda: keeper.is_complete,
         lambda: autopilot().sigma_m,
+        making.get(Guardian),
     )
     making.channels.estimates.subscribe(lambda estimate, _: health.add_estimate(estimate))
     return health
@@ -177,6 +180,20 @@ def _injection(making: Making) -> FixInjection:
     return injection
 
 
+def _guardian(making: Making) -> Guardian:
+    config, injection = making.config, making.config.bridge.injection
+    limits = Limits(
+        injection.alert_limit_m,
+        injection.time_to_alert_s,
+        gnss_is_ours=injection.message == "gps_input",
+        horizontal_fov_deg=config.camera.model.camera().horizontal_fov_deg,
+    )
+    guardian = Guardian(config.guardian, limits, making[Bridge])
+    making[FixInjection].add_judge(lambda _, fix: guardian.judge(fix))
+    making.channels.frames.subscribe(lambda f: guardian.see(f.exposure_time_ns, f.image))
+    return guardian
+
+
 def _feed(making: Making) -> Feed:
     source = making[FrameSource]  # type: ignore[type-abstract]  # whichever of its kinds
     return Feed(source, making.channels.frames.send)
@@ -212,11 +229,16 @@ PARTS: tuple[Part[Any], ...] = (
     ),
     Part("injection", FixInjection, _injection, depends=(Bridge, Installation)),
     Part(
+        "guardian", Guardian, _guardian, depends=(Bridge, FixInjection),
+        start=Guardian.start, stop=Guardian.stop, wanted=lambda config: config.guardian.enabled,
+    ),
+    Part(
         "record", RecordKeeper, _record, depends=(MapStack, Bridge), close=RecordKeeper.close
     ),
     Part("source", FrameSource, _source),
     Part(
-        "health", HealthMonitor, _health, depends=(Bridge, RecordKeeper, FrameSource),
+        "health", HealthMonitor, _health,
+        depends=(Bridge, RecordKeeper, FrameSource, Guardian),
         later=(DualThreadEngine, AutopilotPose), start=HealthMonitor.start, stop=HealthMonitor.stop,
     ),
     Part(

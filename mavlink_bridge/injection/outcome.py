@@ -21,7 +21,8 @@ _REFERENCE_WAIT_NS = 500_000_000
 class InjectionOutcome:
     """Remembers what was made and sent, and judges; one thread.
 
-    verdict: the last one; None while nothing is sent or it is too early.
+    verdict: the last one; None while nothing is sent or it is too early. doubt: set from outside,
+    why its following must not be called good.
     """
 
     def __init__(
@@ -29,6 +30,7 @@ class InjectionOutcome:
     ) -> None:
         self.shadow = ShadowScorer(shared.geoid_separation_m)
         self.verdict: LoopVerdict | None = None
+        self.doubt = ""
         self._loop = ClosedLoopCheck(shared.config.injection.message)
         self._tracker = shared.tracker
         self._origin = origin
@@ -72,7 +74,7 @@ class InjectionOutcome:
     def judge(self, state: VehicleState, now_ns: int) -> bool:
         """Whether the EKF follows, told; True when a jump must be announced again."""
         self.verdict = self._loop.verdict(now_ns, state, self._tracker.local_at)
-        if self.verdict is not None:
+        if self.verdict is not None and (self.verdict.reason or not self.doubt):
             self._teller.tell("loop", self.verdict.reason, "the EKF follows")
         if not self._loop.jump_missed():
             return False

@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 import math
-from bisect import bisect_left
+from bisect import bisect_left, bisect_right
 from collections import deque
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
 from mavlink_bridge import quaternion as quat
-from mavlink_bridge.messages import Attitude
+from mavlink_bridge.messages import Attitude, InertialSample
 
 _LENGTH = 512
 MAX_GAP_NS = 500_000_000
@@ -137,6 +137,27 @@ class AttitudeBuffer:
         q = quat.slerp(before.quaternion, after.quaternion, t)
         heading = before.gyro_heading_rad + t * (after.gyro_heading_rad - before.gyro_heading_rad)
         return attitude(time_ns, q, after.rates if t > 0.5 else before.rates, heading)
+
+
+class InertialBuffer:
+    """The last samples of the IMU, in the order of their times."""
+
+    def __init__(self) -> None:
+        self._samples: deque[InertialSample] = deque(maxlen=_LENGTH)
+
+    def clear(self) -> None:
+        """Forget all."""
+        self._samples.clear()
+
+    def add(self, sample: InertialSample) -> None:
+        """Append; one that is not newer than the newest is dropped."""
+        if not self._samples or sample.time_ns > self._samples[-1].time_ns:
+            self._samples.append(sample)
+
+    def since(self, time_ns: int) -> tuple[InertialSample, ...]:
+        """The samples after a time, oldest first."""
+        samples = list(self._samples)
+        return tuple(samples[bisect_right(samples, time_ns, key=lambda s: s.time_ns) :])
 
 
 class GimbalBuffer:

@@ -10,16 +10,20 @@ from pymavlink import mavutil
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from mavlink_bridge import quaternion as quat
-from mavlink_bridge.messages import Attitude, Origin, VehicleState
+from mavlink_bridge.messages import Attitude, InertialSample, Origin, VehicleState
 from mavlink_bridge.vehicle.buffers import (
     GIMBAL_SOURCES,
     AttitudeBuffer,
     GimbalBuffer,
     GimbalSample,
+    InertialBuffer,
     VectorBuffer,
     attitude,
 )
 from mavlink_bridge.vehicle.profile import autopilot_name, decode_version, select_profile
+
+_MILLI_G = 9.80665e-3  # m/s^2
+_SEA_LEVEL_HPA = 1013.25
 
 
 def is_autopilot(message: Any) -> bool:
@@ -54,6 +58,7 @@ class VehicleReadings:
         self.gimbals = GimbalBuffer()
         self.globals = VectorBuffer()
         self.locals = VectorBuffer()
+        self.inertial = InertialBuffer()
 
     def take(self, message: Any, time_ns: int) -> None:
         """One of MESSAGES_IN. Raises ValueError where it is not finite or no rotation."""
@@ -65,7 +70,13 @@ class VehicleReadings:
 
     def forget(self) -> None:
         """What was dated by the clock before a reboot, and the origin, are void."""
-        for buffer in (self.attitudes, self.gimbals, self.globals, self.locals):
+        for buffer in (
+            self.attitudes,
+            self.gimbals,
+            self.globals,
+            self.locals,
+            self.inertial,
+        ):
             buffer.clear()
         self.set_origin(None)
 
@@ -183,8 +194,34 @@ class VehicleReadings:
         channels = tuple(getattr(m, f"chan{i}_raw") for i in range(1, 19))
         self.state = replace(self.state, rc_channels_us=channels, rc_time_ns=time_ns)
 
+    def _raw_imu(self, m: Any, time_ns: int) -> None:
+        force = (_MILLI_G * m.xacc, _MILLI_G * m.yacc, _MILLI_G * m.zacc)
+        rates = (1e-3 * m.xgyro, 1e-3 * m.ygyro, 1e-3 * m.zgyro)
+        self.inertial.add(InertialSample(time_ns, force, rates))
+
+    def _highres_imu(self, m: Any, time_ns: int) -> None:
+        force, rates = (m.xacc, m.yacc, m.zacc), (m.xgyro, m.ygyro, m.zgyro)
+        _check_finite(*force, *rates)
+        self.inertial.add(InertialSample(time_ns, force, rates))
+
+    def _pressure(self, m: Any, time_ns: int) -> None:
+        if not m.press_abs > 0.0:
+            raise ValueError(f"{m.press_abs} hPa is no pressure")
+        altitude = 44_330.77 * (1.0 - (m.press_abs / _SEA_LEVEL_HPA) ** 0.190263)
+        self.state = replace(self.state, pressure_altitude_m=altitude, pressure_time_ns=time_ns)
+
     def _text(self, m: Any, _: int) -> None:
         self.state = replace(self.state, last_text=str(m.text))
+
+
+def boot_time_ns(message: Any) -> int | None:
+    """The sender's boot time in a message; None where it has none (or another clock's)."""
+    boot_ms = getattr(message, "time_boot_ms", None)
+    if boot_ms is not None:
+        return int(boot_ms) * 1_000_000
+    if message.get_type() in ("RAW_IMU", "HIGHRES_IMU"):
+        return int(message.time_usec) * 1000
+    return None
 
 
 def _check_finite(*values: float) -> None:
@@ -207,5 +244,8 @@ _HANDLERS = {
     "GPS_RAW_INT": VehicleReadings._gps,
     "RC_CHANNELS": VehicleReadings._rc,
     "STATUSTEXT": VehicleReadings._text,
+    "RAW_IMU": VehicleReadings._raw_imu,
+    "HIGHRES_IMU": VehicleReadings._highres_imu,
+    "SCALED_PRESSURE": VehicleReadings._pressure,
 }
 MESSAGES_IN: tuple[str, ...] = tuple(_HANDLERS)

@@ -41,6 +41,9 @@ def wanted_streams(config: BridgeConfig, autopilot: str) -> tuple[Stream, ...]:
         Stream("GLOBAL_POSITION_INT", 5.0),
         Stream("GPS_RAW_INT", 5.0),
         Stream(estimator, 2.0),
+        # Evidence of its own for whoever watches the fixes: what no estimator has touched.
+        Stream("HIGHRES_IMU" if autopilot == "px4" else "RAW_IMU", 50.0, optional=True),
+        Stream("SCALED_PRESSURE", 5.0, optional=True),
     ]
     if config.camera.mount == "gimbal":
         device = "GIMBAL_DEVICE_ATTITUDE_STATUS"

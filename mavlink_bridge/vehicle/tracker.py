@@ -9,9 +9,20 @@ from typing import Any
 
 from mavlink_bridge import quaternion as quat
 from mavlink_bridge.link.clock import BootClock
-from mavlink_bridge.messages import Attitude, GimbalAttitude, Origin, VehicleState
+from mavlink_bridge.messages import (
+    Attitude,
+    GimbalAttitude,
+    InertialSample,
+    Origin,
+    VehicleState,
+)
 from mavlink_bridge.vehicle.buffers import GIMBAL_SOURCES
-from mavlink_bridge.vehicle.readings import MESSAGES_IN, VehicleReadings, is_autopilot
+from mavlink_bridge.vehicle.readings import (
+    MESSAGES_IN,
+    VehicleReadings,
+    boot_time_ns,
+    is_autopilot,
+)
 
 _HEARTBEAT_LOST_NS = 3_000_000_000
 _OLD_NS = 2_000_000_000
@@ -80,6 +91,11 @@ class VehicleTracker:
         with self._lock:
             return self._readings.locals.at(time_ns)
 
+    def inertial_since(self, time_ns: int) -> tuple[InertialSample, ...]:
+        """What the IMU read after a time, oldest first; at most the last 10 s."""
+        with self._lock:
+            return self._readings.inertial.since(time_ns)
+
     def set_origin(self, origin: Origin | None) -> None:
         """What the origin keeper read."""
         with self._lock:
@@ -100,10 +116,10 @@ class VehicleTracker:
         """Take in one accepted message; True if it shows that the flight controller rebooted."""
         rebooted = False
         stamp_ns = received_ns
-        boot_ms = getattr(message, "time_boot_ms", None)
-        if boot_ms is not None and message.get_srcComponent() == self._readings.state.component_id:
-            rebooted = self.clock.observe(boot_ms * 1_000_000, received_ns)
-            stamp_ns = self.clock.to_monotonic(boot_ms * 1_000_000, received_ns)
+        boot_ns = boot_time_ns(message)
+        if boot_ns is not None and message.get_srcComponent() == self._readings.state.component_id:
+            rebooted = self.clock.observe(boot_ns, received_ns)
+            stamp_ns = self.clock.to_monotonic(boot_ns, received_ns)
         if rebooted:
             self._forget()
         with self._lock:

@@ -61,6 +61,7 @@ class Aircraft:
         self.injection = Injection(parameters, self.estimator)
         self.gps_sample: GpsSample | None = None
         self._gps_sample_at = -1e9
+        self.barometer_m = 0.0
         self._integrator = np.zeros(3)
         self._increment = np.zeros(7)
 
@@ -75,6 +76,16 @@ class Aircraft:
     def time_ms(self) -> int:
         """Simulated milliseconds since boot."""
         return round(self.tick * TICK_S * 1000)
+
+    @property
+    def angular_rate(self) -> Array:
+        """What the gyros read, rad/s (3,), body axes: mean of the last tick, biases included."""
+        return self._increment[0:3] / TICK_S
+
+    @property
+    def specific_force(self) -> Array:
+        """What the accelerometers read, m/s² (3,), body axes: mean of the last tick."""
+        return self._increment[3:6] / TICK_S
 
     # --- a tick ------------------------------------------------------------------------------
 
@@ -128,7 +139,8 @@ class Aircraft:
         if self.tick == 1:
             self.estimator.align(self.sensors.compass(self.truth))
         if self.tick % 10 == 0:
-            self.estimator.add(Baro(self.sensors.barometer(self.truth, 0.1)), now)
+            self.barometer_m = self.sensors.barometer(self.truth, 0.1)
+            self.estimator.add(Baro(self.barometer_m), now)
         if self.tick % 10 == 5:
             self.estimator.add(Compass(self.sensors.compass(self.truth)), now)
         p = self.parameters

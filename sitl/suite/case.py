@@ -8,6 +8,7 @@ from typing import Annotated, Any, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
+from companion.guardian.config import GuardianConfig
 from companion.settings_file import SettingsError, read_settings, validated
 from mavlink_bridge import BridgeConfig
 from sitl.demo.scenario import ScenarioError
@@ -119,7 +120,7 @@ class Ground(_Model):
 
 class Case(_Model):
     """One scenario. Exactly one of bridge (our bridge's configuration, without the connection) and
-    raw (a bare MAVLink sender) injects.
+    raw (a bare MAVLink sender) injects. guardian: watches what goes to our bridge.
 
     ci: among the few that every test run flies on the embedded vehicle.
     """
@@ -130,6 +131,7 @@ class Case(_Model):
     vehicle: VehicleSpec
     fixes: FixModel = FixModel()
     bridge: dict[str, Any] | None = None
+    guardian: GuardianConfig = GuardianConfig()
     raw: RawMessage | None = None
     flight: Flight = Flight()
     before: Ground = Ground()

@@ -167,6 +167,33 @@ class Says(_Span):
         return CheckResult(bool(times) != self.absent, what)
 
 
+class Alerted(_Span):
+    """An EKF error beyond a limit is told by our bridge at latest within_s after it began."""
+
+    check: Literal["alerted"]
+    limit_m: float = Field(gt=0)
+    within_s: float = Field(ge=0)
+    contains: str
+
+    def judge(self, record: Record) -> CheckResult:
+        """See `_Expectation.judge`."""
+        beyond = [
+            t
+            for t, north, east in record.errors
+            if self.from_s <= t <= self.to_s and math.hypot(north, east) > self.limit_m
+        ]
+        told = [
+            t.at_s
+            for t in record.texts
+            if t.sender == "bridge" and self.contains in t.text and t.at_s >= self.from_s
+        ]
+        said = f"told at {told[0]:.1f} s" if told else "never told"
+        if not beyond:
+            return CheckResult(True, f"never beyond {self.limit_m:g} m; {said}")
+        ok = bool(told) and told[0] <= beyond[0] + self.within_s
+        return CheckResult(ok, f"beyond {self.limit_m:g} m at {beyond[0]:.1f} s, {said}")
+
+
 class Silent(_Span):
     """The vehicle says nothing of a severity that an operator would act on: no text contains any
     of the words.
@@ -302,6 +329,7 @@ Check = (
     | Jumps
     | Lags
     | Says
+    | Alerted
     | Silent
     | InMode
     | Moved

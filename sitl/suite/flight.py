@@ -10,6 +10,8 @@ from typing import Any
 
 import numpy as np
 
+from companion.guardian.guardian import Guardian
+from companion.guardian.monitor import Limits
 from mavlink_bridge import Bridge, BridgeConfig
 from mavlink_bridge.link.link import sleep_until
 from sitl.errors import PilotError
@@ -18,7 +20,7 @@ from sitl.ground.pilot import Pilot
 from sitl.suite.case import Case, Event
 from sitl.suite.doctor import consult
 from sitl.suite.record import Record, Sample, Text
-from sitl.suite.simulated_localizer import BridgeFeed, FixModel, TruthFeed
+from sitl.suite.simulated_localizer import BridgeFeed, FixModel, FixSink, TruthFeed
 from sitl.vehicles.launch import open_vehicle
 from sitl.vehicles.process import VehicleKind, VehicleProcess, VehicleProcessError
 
@@ -133,8 +135,24 @@ class _CaseFlight:
         self._bridge = Bridge(config, GEOID_M)
         self._bridge.start()
         self._stack.callback(self._bridge.stop)
-        self._feed = BridgeFeed(self._pilot, self._bridge, case.fixes, HOME, GEOID_M, self._seed)
+        sink = self._guarded(self._bridge, config)
+        self._feed = BridgeFeed(self._pilot, sink, case.fixes, HOME, GEOID_M, self._seed)
         self._stack.callback(self._feed.close)
+
+    def _guarded(self, bridge: Bridge, config: BridgeConfig) -> FixSink:
+        """The bridge behind the guardian, as in the companion; there are no pictures here."""
+        if not self._case.guardian.enabled:
+            return bridge
+        injection = config.injection
+        limits = Limits(
+            injection.alert_limit_m,
+            injection.time_to_alert_s,
+            gnss_is_ours=injection.message == "gps_input",
+        )
+        guardian = Guardian(self._case.guardian, limits, bridge)
+        guardian.start()
+        self._stack.callback(guardian.stop)
+        return guardian
 
     def _take_off(self) -> None:
         self._pilot.wait_ready()

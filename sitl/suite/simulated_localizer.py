@@ -12,14 +12,14 @@ import threading
 import time
 from collections import deque
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Any, Literal, Protocol
 
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field
 from pymavlink import mavutil
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
-from mavlink_bridge import Bridge, VisionFix
+from mavlink_bridge import VisionFix
 from sitl.embedded.physics.rotation import matrix, quaternion
 from sitl.geodesy import Location
 from sitl.ground.pilot import Pilot
@@ -29,6 +29,7 @@ _COMPONENT = 197
 _GPS_EPOCH_S = 1.4e9  # an arbitrary GPS time at boot
 _LOCAL_FRD, _BODY_FRD = 20, 12
 _IGNORE_VELOCITY = 8 | 16 | 32
+_FROZEN_SHARE = 0.2  # of sigma_m
 _HALF_TICK_S = 0.005  # truth comes in whole ticks: what is due within half of one is due
 
 Vector = tuple[float, float, float]
@@ -38,7 +39,9 @@ class FixModel(BaseModel):
     """How the fixes differ from the truth, when they come, and what is wrong with them.
 
     velocity_sigma_mps: None where no velocity is measured. rotation_deg turns the whole vision
-    frame (positions and yaw) about the origin, yaw_error_deg the yaw alone.
+    frame (positions and yaw) about the origin, yaw_error_deg the yaw alone. frozen: the truth of
+    the moment it began, again and again under fresh time stamps, as from a picture that hangs; it
+    is registered to a fifth of `sigma_m`, since its errors are always the same.
     """
 
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
@@ -52,6 +55,7 @@ class FixModel(BaseModel):
     yaw_error_deg: float = 0.0
     offset_north_m: float = 0.0
     silent: bool = False
+    frozen: bool = False
 
 
 class RawMessage(BaseModel):
@@ -100,8 +104,16 @@ class Observer:
         )
 
 
+class FixSink(Protocol):
+    """Takes fixes: our bridge, or the guardian in front of it."""
+
+    def submit(self, fix: VisionFix) -> None:
+        """One fix; never blocks."""
+        ...
+
+
 class BridgeFeed:
-    """Submits fixes to a bridge, in a thread and in real time, until it is closed.
+    """Submits fixes, in a thread and in real time, until it is closed.
 
     home: the map's origin, altitude AMSL; geoid_m: the map's geoid separation there.
     """
@@ -109,15 +121,16 @@ class BridgeFeed:
     def __init__(
         self,
         pilot: Pilot,
-        bridge: Bridge,
+        sink: FixSink,
         model: FixModel,
         home: Location,
         geoid_m: float,
         seed: int = 1,
     ) -> None:
         self.pilot = pilot
-        self._bridge, self._home, self._geoid_m = bridge, home, geoid_m
+        self._sink, self._home, self._geoid_m = sink, home, geoid_m
         self._model, self._reset = model, False
+        self._hung: Truth | None = None
         self._observer = Observer(seed)
         self._lock = threading.Lock()
         self._stop = threading.Event()
@@ -145,12 +158,17 @@ class BridgeFeed:
                 return
             truth = self.pilot.truth_at(int(exposure * 1e9))
             if truth is not None and not model.silent:
-                self._bridge.submit(self._fix(truth))
+                self._sink.submit(self._fix(truth))
 
     def _fix(self, truth: Truth) -> VisionFix:
         with self._lock:
             model, reset, self._reset = self._model, self._reset, False
-        seen = self._observer.observe(truth, self._home, model)
+        self._hung = (self._hung or truth) if model.frozen else None
+        shown, seen_as = truth, model
+        if self._hung is not None:
+            shown = self._hung
+            seen_as = model.model_copy(update={"sigma_m": _FROZEN_SHARE * model.sigma_m})
+        seen = self._observer.observe(shown, self._home, seen_as)
         where = self._home.offset(*seen.position_ned)
         measured = model.velocity_sigma_mps
         return VisionFix(

@@ -11,6 +11,7 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 from sitl.embedded.aircraft import Aircraft
 from sitl.embedded.ekf.estimator import EkfFlags
 from sitl.embedded.mavlink.server import SerialPort
+from sitl.embedded.physics.dynamics import GRAVITY
 from sitl.embedded.physics.rotation import euler
 
 FIRMWARE_VERSION = (4, 7, 0, 0)  # major, minor, patch, FIRMWARE_VERSION_TYPE_DEV
@@ -38,6 +39,8 @@ class Telemetry:
             m.MAVLINK_MSG_ID_ATTITUDE: self._attitude,
             m.MAVLINK_MSG_ID_ATTITUDE_QUATERNION: self._attitude_quaternion,
             m.MAVLINK_MSG_ID_LOCAL_POSITION_NED: self._local_position,
+            m.MAVLINK_MSG_ID_RAW_IMU: self._raw_imu,
+            m.MAVLINK_MSG_ID_SCALED_PRESSURE: self._pressure,
             m.MAVLINK_MSG_ID_GLOBAL_POSITION_INT: self._global_position,
             m.MAVLINK_MSG_ID_GPS_RAW_INT: self._gps_raw,
             m.MAVLINK_MSG_ID_VFR_HUD: self._vfr_hud,
@@ -132,6 +135,20 @@ class Telemetry:
         v = self._vehicle
         q = (float(c) for c in v.estimator.output[0:4])
         return mavlink.MAVLink_attitude_quaternion_message(v.time_ms, *q, *self._rates())
+
+    def _raw_imu(self) -> Any:
+        """Mean of the last tick, as ArduPilot's filtered sample: milli-g and mrad/s, body axes."""
+        v = self._vehicle
+        rates = (round(1000.0 * float(c)) for c in v.angular_rate)
+        forces = (round(1000.0 * float(c) / GRAVITY) for c in v.specific_force)
+        return mavlink.MAVLink_raw_imu_message(v.time_ms * 1000, *forces, *rates, 0, 0, 0)
+
+    def _pressure(self) -> Any:
+        """Of the standard atmosphere at the barometer's height."""
+        v = self._vehicle
+        altitude = v.launch.altitude_m + v.barometer_m
+        pressure = 1013.25 * (1.0 - altitude / 44_330.77) ** 5.25588
+        return mavlink.MAVLink_scaled_pressure_message(v.time_ms, pressure, 0.0, 2000)
 
     def _local_position(self) -> Any | None:
         v = self._vehicle

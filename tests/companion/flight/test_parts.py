@@ -107,7 +107,9 @@ def test_what_is_not_wanted_is_not_made():
 def test_the_process_starts_and_stops_in_this_order():
     """The bridge speaks before anything could have something to say, the feed comes last."""
     started = [part.name for part in PARTS if part.start is not None]
-    assert started == ["bridge", "health", "targets", "view", "search", "engine", "feed"]
+    assert started == [
+        "bridge", "guardian", "health", "targets", "view", "search", "engine", "feed"
+    ]  # fmt: skip
     made = [part.name for part in PARTS]
     # A wrong source and a port in use are told before anything is compiled.
     assert made.index("source") < made.index("detections") < made.index("localizer")

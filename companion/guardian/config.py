@@ -1,0 +1,85 @@
+"""The guardian's keys in a deployment's configuration."""
+
+from __future__ import annotations
+
+from pydantic import BaseModel, ConfigDict, Field
+
+
+class _Model(BaseModel):
+    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
+
+
+class PictureConfig(_Model):
+    """Limits of the check of the pictures themselves."""
+
+    still_share: float = Field(
+        default=3e-4,
+        gt=0.0,
+        le=0.01,
+        description="a picture that moved by less than this share of its width stands still",
+    )
+    still_s: float = Field(
+        default=3.0, ge=0.2, le=60.0, description="a picture that stands still so long is frozen"
+    )
+    repeat_memory_s: float = Field(
+        default=60.0, ge=5.0, le=600.0, description="how far back repeated pictures are looked for"
+    )
+    repeat_s: float = Field(
+        default=2.0, ge=0.5, le=30.0, description="pictures that repeat for so long are a loop"
+    )
+
+
+class MotionConfig(_Model):
+    """Limits of vision's motion against the IMU's, as mean deviations over 1, 3 and 10 s."""
+
+    limit_1s_m: float = Field(default=1.5, gt=0.0, le=50.0)
+    limit_3s_m: float = Field(default=1.0, gt=0.0, le=50.0)
+    limit_10s_m: float = Field(default=0.8, gt=0.0, le=50.0)
+    still_m: float = Field(
+        default=0.1, ge=0.0, le=5.0, description="a position within this stands still; 0: unused"
+    )
+    still_s: float = Field(
+        default=15.0, ge=2.0, le=300.0, description="in the air nothing stands still so long"
+    )
+
+
+class ProtectionConfig(_Model):
+    """The budget of a protection level: what a fix's covariance does not know of."""
+
+    risk: float = Field(
+        default=1e-3, gt=0.0, le=0.1, description="probability of an error beyond the level"
+    )
+    map_m: float = Field(default=0.5, ge=0.0, le=100.0, description="the map's own error")
+    calibration_share: float = Field(
+        default=0.005, ge=0.0, le=0.5, description="of the height above take-off"
+    )
+    time_bias_s: float = Field(
+        default=0.02, ge=0.0, le=1.0, description="of the time stamps, times the speed"
+    )
+
+
+class GuardianConfig(_Model):
+    """The independent monitor: what it watches and when it withholds fixes."""
+
+    enabled: bool = True
+    picture: PictureConfig = PictureConfig()
+    motion: MotionConfig = MotionConfig()
+    protection: ProtectionConfig = ProtectionConfig()
+    height_m: float = Field(
+        default=8.0, gt=0.0, le=200.0, description="vision's height against the barometer's, drift"
+    )
+    jump_m: float = Field(
+        default=10.0, gt=0.0, le=1000.0, description="an announced jump beyond it is held"
+    )
+    untold_jump_m: float = Field(
+        default=3.0, gt=0.0, le=1000.0, description="a jump without a reset beyond it is held"
+    )
+    jump_hold_s: float = Field(
+        default=5.0, ge=0.0, le=60.0, description="a jumped position must agree in motion so long"
+    )
+    gnss_accuracy_cap_m: float = Field(
+        default=3.0, gt=0.0, le=50.0, description="a receiver's own error is believed up to this"
+    )
+    gnss_repeat_s: float = Field(
+        default=10.0, ge=1.0, le=600.0, description="GNSS apart from vision is told this often"
+    )

@@ -1,0 +1,115 @@
+"""What the guardian may find: limits in time, texts, actions, and latches that do not flap."""
+
+from __future__ import annotations
+
+import enum
+from dataclasses import dataclass
+
+PREFIX = "PiLoT: "
+TEXT_LENGTH = 50  # STATUSTEXT.text
+
+
+class Action(enum.IntEnum):
+    """What a finding does to the fixes, mildest first.
+
+    WITHDRAW is WITHHOLD with a reset announced on the return: the EKF holds what was wrong.
+    """
+
+    NONE = 0
+    WITHHOLD = 1
+    WITHDRAW = 2
+
+
+@dataclass(frozen=True)
+class Rule:
+    """One line of the table in docs/safety.md.
+
+    text: for the operator, with one figure {0:.0f}. alert_s: how long the evidence must last;
+    release_s: how long it must be over. repeat_s: told again as long as it lasts; 0: once.
+    """
+
+    name: str
+    text: str
+    action: Action
+    alert_s: float
+    release_s: float
+    repeat_s: float = 0.0
+
+    def line(self, figure: float) -> str:
+        """The STATUSTEXT."""
+        what = self.text.format(figure)
+        return PREFIX + (f"withheld: {what}" if self.action is not Action.NONE else what)
+
+
+VIDEO_FROZEN = Rule("video_frozen", "video frozen {0:.0f} s", Action.WITHDRAW, 0.0, 2.0)
+VIDEO_REPEATS = Rule("video_repeats", "video repeats, {0:.0f} s old", Action.WITHDRAW, 0.0, 5.0)
+MOTION = Rule("motion", "motion is not the IMU's ({0:.0f} m)", Action.WITHDRAW, 0.2, 5.0)
+STANDS_STILL = Rule("stands_still", "position stands still {0:.0f} s", Action.WITHDRAW, 0.0, 5.0)
+HEIGHT = Rule("height", "height {0:.0f} m off barometer", Action.WITHDRAW, 2.0, 5.0)
+JUMP = Rule("jump", "position jumped {0:.0f} m", Action.WITHDRAW, 0.0, 0.0)
+GNSS = Rule("gnss", "GNSS {0:.0f} m from vision: neither proven", Action.NONE, 2.0, 5.0, 10.0)
+EKF_REFUSES = Rule("ekf_refuses", "EKF refuses vision ({0:.1f})", Action.NONE, 2.0, 3.0, 10.0)
+EKF_JUMPED = Rule("ekf_jumped", "EKF jumped {0:.0f} m: unconfirmed", Action.NONE, 0.0, 0.0)
+CLOCK = Rule("clock", "video clock ran back or stands", Action.WITHHOLD, 0.5, 3.0)
+LIMIT = Rule("limit", "position only to {0:.0f} m", Action.WITHHOLD, 1.0, 3.0)
+RULES = (
+    VIDEO_FROZEN,
+    VIDEO_REPEATS,
+    MOTION,
+    STANDS_STILL,
+    HEIGHT,
+    JUMP,
+    GNSS,
+    EKF_REFUSES,
+    EKF_JUMPED,
+    CLOCK,
+    LIMIT,
+)
+
+
+@dataclass(frozen=True)
+class Reading:
+    """A detector's answer. bad: None where there is no evidence, which changes nothing."""
+
+    bad: bool | None
+    figure: float = 0.0
+
+
+class Latch:
+    """A rule over time: raised after alert_s of bad evidence, released after release_s of good."""
+
+    def __init__(self, rule: Rule) -> None:
+        self.rule = rule
+        self.raised = False
+        self.figure = 0.0
+        self._since_ns: int | None = None
+        self._told_ns = 0
+
+    def update(self, now_ns: int, reading: Reading) -> str | None:
+        """Take in a reading; the line to tell the operator, if there is news."""
+        if reading.bad is None:
+            self._since_ns = None if not self.raised else self._since_ns
+            return self._again(now_ns)
+        if reading.bad:
+            self.figure = reading.figure
+        if reading.bad == self.raised:
+            self._since_ns = None
+            return self._again(now_ns)
+        if self._since_ns is None:
+            self._since_ns = now_ns
+        wait_s = self.rule.release_s if self.raised else self.rule.alert_s
+        if now_ns - self._since_ns < wait_s * 1e9:
+            return self._again(now_ns)
+        self._since_ns, self.raised, self._told_ns = None, not self.raised, now_ns
+        return self.line() if self.raised else f"{PREFIX}over: {self.rule.name.replace('_', ' ')}"
+
+    def line(self) -> str:
+        """The operator's line, with the newest figure."""
+        return self.rule.line(self.figure)
+
+    def _again(self, now_ns: int) -> str | None:
+        repeats = self.raised and self.rule.repeat_s > 0.0
+        if not repeats or now_ns - self._told_ns < self.rule.repeat_s * 1e9:
+            return None
+        self._told_ns = now_ns
+        return self.line()

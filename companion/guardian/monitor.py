@@ -1,0 +1,269 @@
+"""All checks together: evidence in, findings out. No threads and no clock of its own."""
+
+from __future__ import annotations
+
+import math
+from collections import deque
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import Protocol
+
+from companion.guardian import findings as f
+from companion.guardian.config import GuardianConfig
+from companion.guardian.ekf import EkfWatch
+from companion.guardian.findings import Action, Latch, Reading
+from companion.guardian.inertial import InertialTrack
+from companion.guardian.motion import MotionCheck, MotionVerdict
+from companion.guardian.picture import PictureVerdict, PictureWatch
+from companion.guardian.place_checks import GnssCheck, HeightCheck, JumpCheck
+from companion.guardian.protection import ProtectionLevel, protection_level
+from localizer.types import Image
+from mavlink_bridge.messages import Attitude, InertialSample, VehicleState, VisionFix
+
+_AIRBORNE_M = 3.0
+_IDENTICAL_S = 1.5
+_STILL_PER_M = 90.0  # s/m: how much longer where the limit is more metres on the ground
+_STILL_FIRST_S = 2.0
+_WAITS_NS = 500_000_000  # for the IMU's record to reach a fix
+_FRESH_NS = 1_000_000_000
+_PICTURE_FRESH_NS = 2_000_000_000
+_CALM_SHARE = 0.5  # of a motion limit, below which vision agrees with the IMU
+_MOVES_S = 5.0  # a position that stood still for less moves
+_BACKWARDS = 5  # pictures or fixes in a row whose stamps do not advance
+_QUEUE = 256
+
+
+class Vehicle(Protocol):
+    """Where the guardian's own evidence comes from; the bridge is one."""
+
+    def state(self) -> VehicleState:
+        """What the vehicle says about itself."""
+        ...
+
+    def attitude_at(self, time_ns: int) -> Attitude | None:
+        """Its attitude at a time."""
+        ...
+
+    def inertial_since(self, time_ns: int) -> tuple[InertialSample, ...]:
+        """What its IMU read after a time, oldest first."""
+        ...
+
+
+@dataclass(frozen=True)
+class Limits:
+    """What stands in other parts of the configuration. gnss_is_ours: the receiver that the vehicle
+    reports is our own injection; horizontal_fov_deg: of the camera.
+    """
+
+    alert_limit_m: float = 10.0
+    time_to_alert_s: float = 3.0
+    gnss_is_ours: bool = False
+    horizontal_fov_deg: float = 60.0
+
+
+@dataclass(frozen=True)
+class Line:
+    """A line for the operator. bad: a finding began or lasts; else it is over."""
+
+    text: str
+    bad: bool
+    withholds: bool
+
+
+class Monitor:
+    """Every method is called under one lock, or from one thread."""
+
+    def __init__(self, config: GuardianConfig, limits: Limits) -> None:
+        self._config, self._limits = config, limits
+        self._pictures = PictureWatch(config.picture)
+        self._track = InertialTrack()
+        self._motion = MotionCheck(config.motion, self._track)
+        self._height = HeightCheck(config)
+        self._gnss = GnssCheck(config)
+        self._jumps = JumpCheck(config)
+        self._ekf = EkfWatch()
+        alert_s = min(f.LIMIT.alert_s, limits.time_to_alert_s)
+        changed = {
+            f.GNSS.name: replace(f.GNSS, repeat_s=config.gnss_repeat_s),
+            f.LIMIT.name: replace(f.LIMIT, alert_s=alert_s),
+        }
+        self._latches = {r.name: Latch(changed.get(r.name, r)) for r in f.RULES}
+        self._picture: tuple[int, PictureVerdict] | None = None
+        self._verdict: MotionVerdict | None = None
+        self._height_reading = Reading(None)
+        self._waiting: deque[VisionFix] = deque(maxlen=_QUEUE)
+        self._newest: VisionFix | None = None
+        self._level: ProtectionLevel | None = None
+        self._jump_held = self._was_held = False
+        self._reset_due = False
+        self._backwards = 0
+
+    # --- what there is ------------------------------------------------------------------------
+
+    @property
+    def action(self) -> Action:
+        """The strongest action of all findings that stand."""
+        raised = (latch.rule.action for latch in self._latches.values() if latch.raised)
+        return max(raised, default=Action.NONE)
+
+    @property
+    def reason(self) -> str:
+        """Why fixes are withheld, in words; empty while they are not."""
+        for latch in self._latches.values():
+            if latch.raised and latch.rule.action is self.action is not Action.NONE:
+                return latch.line().removeprefix(f.PREFIX)
+        return ""
+
+    @property
+    def doubt(self) -> str:
+        """Why the EKF's following must not be called good; empty where nothing speaks against."""
+        latch = self._latches[f.EKF_JUMPED.name]
+        return latch.line().removeprefix(f.PREFIX) if latch.raised else ""
+
+    @property
+    def level(self) -> ProtectionLevel | None:
+        """The newest fix's protection level."""
+        return self._level
+
+    def standing(self) -> dict[str, float]:
+        """The findings that stand, by name, with their figures."""
+        return {name: latch.figure for name, latch in self._latches.items() if latch.raised}
+
+    # --- evidence -----------------------------------------------------------------------------
+
+    def see(self, time_ns: int, image: Image) -> None:
+        """A picture (H, W, 3) uint8 at its exposure time."""
+        if self._picture is not None and time_ns <= self._picture[0]:
+            self._backwards += 1
+            return
+        self._backwards = 0
+        self._picture = (time_ns, self._pictures.add(time_ns, image))
+
+    def admit(self, fix: VisionFix, state: VehicleState) -> VisionFix | None:
+        """The fix, if it may be injected; with a reset where the last ones were wrong."""
+        self._level = protection_level(fix, state, self._config.protection)
+        verdict = self._verdict
+        agrees = verdict is None or not verdict.settled or verdict.share < _CALM_SHARE
+        admitted = self._jumps.admit(fix, state, agrees=agrees)
+        self._jump_held = not admitted
+        # The jump has a line of its own; how the place moves after it is judged anew.
+        leaps = self._jump_held != self._was_held
+        self._was_held = self._jump_held
+        self._waiting.append(replace(fix, reset=True) if leaps else fix)
+        self._newest = fix
+        if self.action >= Action.WITHHOLD or not admitted:
+            self._reset_due = self._reset_due or self._jump_held or self.action is Action.WITHDRAW
+            return None
+        if self._reset_due:
+            self._reset_due = False
+            return replace(fix, reset=True)
+        return fix
+
+    def step(self, now_ns: int, vehicle: Vehicle) -> list[Line]:
+        """Look at everything, a few times a second; the lines to be told."""
+        state = vehicle.state()
+        for sample in vehicle.inertial_since(self._track.newest_ns):
+            self._track.add(sample, vehicle.attitude_at)
+        self._follow(now_ns, state)
+        lines = []
+        readings = self._readings(now_ns, state)
+        for name, latch in self._latches.items():
+            text = latch.update(now_ns, readings[name])
+            if text is not None:
+                withholds = latch.rule.action is not Action.NONE
+                lines.append(Line(text, latch.raised, withholds))
+        return lines
+
+    def _follow(self, now_ns: int, state: VehicleState) -> None:
+        """Fixes whose time the IMU's record has reached, in order."""
+        while self._waiting:
+            fix = self._waiting[0]
+            if not self._motion.ready(fix) and now_ns - fix.time_ns < _WAITS_NS:
+                return
+            self._waiting.popleft()
+            self._verdict = self._motion.add(fix)
+            self._height_reading = self._height.add(fix, state)
+
+    # --- judgement ----------------------------------------------------------------------------
+
+    def _readings(self, now_ns: int, state: VehicleState) -> dict[str, Reading]:
+        newest = self._newest
+        fresh = newest is not None and now_ns - newest.time_ns < _FRESH_NS
+        flies = state.armed and not state.altitude_relative_m < _AIRBORNE_M
+        none = Reading(None)
+        checks: dict[str, Callable[[], Reading]] = {
+            f.VIDEO_FROZEN.name: lambda: self._frozen(now_ns, state) if flies else Reading(False),
+            f.VIDEO_REPEATS.name: lambda: self._repeats(now_ns) if flies else Reading(False),
+            f.MOTION.name: lambda: self._moves_otherwise() if fresh else none,
+            f.STANDS_STILL.name: lambda: self._stands_still(flies) if fresh else none,
+            f.HEIGHT.name: lambda: self._height_reading if fresh else none,
+            f.JUMP.name: lambda: Reading(self._jump_held, self._jumps.distance_m),
+            f.GNSS.name: lambda: self._against_gnss(state, now_ns) if fresh else none,
+            f.EKF_REFUSES.name: lambda: self._ekf.refuses(state) if fresh else Reading(False),
+            f.EKF_JUMPED.name: lambda: self._ekf_jump(state, now_ns),
+            f.CLOCK.name: lambda: Reading(self._backwards >= _BACKWARDS),
+            f.LIMIT.name: lambda: self._beyond_limit() if fresh else none,
+        }
+        return {name: check() for name, check in checks.items()}
+
+    def _frozen(self, now_ns: int, state: VehicleState) -> Reading:
+        if self._picture is None or now_ns - self._picture[0] > _PICTURE_FRESH_NS:
+            return Reading(None)  # a feed that ended is told as such
+        verdict = self._picture[1]
+        identical = verdict.identical_s >= _IDENTICAL_S
+        return Reading(identical or verdict.still_s >= self._still_s(state), verdict.still_s)
+
+    def _still_s(self, state: VehicleState) -> float:
+        """How long a hover may look still: the limit in the picture is metres on the ground."""
+        height = state.altitude_relative_m
+        height = height if math.isfinite(height) else 100.0
+        half = math.tan(math.radians(self._limits.horizontal_fov_deg) / 2.0)
+        ground_m = self._config.picture.still_share * 2.0 * max(height, 0.0) * half
+        return max(self._config.picture.still_s, _STILL_FIRST_S + _STILL_PER_M * ground_m)
+
+    def _repeats(self, now_ns: int) -> Reading:
+        if self._picture is None or now_ns - self._picture[0] > _PICTURE_FRESH_NS:
+            return Reading(None)
+        lag_s = self._picture[1].repeat_lag_s
+        return Reading(lag_s > 0.0, lag_s)
+
+    def _moves_otherwise(self) -> Reading:
+        verdict = self._verdict
+        if verdict is None or not verdict.settled:
+            return Reading(None)
+        if not self._latches[f.MOTION.name].raised:
+            return Reading(verdict.share > 1.0, verdict.deviation_m)
+        # A filter follows even a frozen position in the end: it must move before it is believed.
+        calm = verdict.share < _CALM_SHARE and verdict.still_s < _MOVES_S
+        return Reading(not calm, verdict.deviation_m)
+
+    def _stands_still(self, flies: bool) -> Reading:
+        verdict = self._verdict
+        if verdict is None or self._config.motion.still_m == 0.0:
+            return Reading(None)
+        if self._latches[f.STANDS_STILL.name].raised:
+            return Reading(verdict.still_s >= _MOVES_S, verdict.still_s)
+        return Reading(flies and verdict.still_s >= self._config.motion.still_s, verdict.still_s)
+
+    def _against_gnss(self, state: VehicleState, now_ns: int) -> Reading:
+        if self._newest is None or self._level is None or self._limits.gnss_is_ours:
+            return Reading(None)
+        return self._gnss.read(self._newest, state, self._level.horizontal_m, now_ns)
+
+    def _ekf_jump(self, state: VehicleState, now_ns: int) -> Reading:
+        verdict = self._verdict
+        agrees = (
+            verdict is not None
+            and verdict.settled
+            and verdict.share < _CALM_SHARE
+            and verdict.still_s < _MOVES_S
+            and self.action is Action.NONE
+        )
+        reading = self._ekf.jumped(state, now_ns, agrees=agrees)
+        return reading if state.armed else Reading(False)
+
+    def _beyond_limit(self) -> Reading:
+        if self._level is None:
+            return Reading(None)
+        level_m = self._level.horizontal_m
+        return Reading(level_m > self._limits.alert_limit_m, level_m)

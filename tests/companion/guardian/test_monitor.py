@@ -1,0 +1,142 @@
+"""The monitor against attacks on fixes, and in honest flights."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from companion.guardian.config import GuardianConfig
+from companion.guardian.monitor import Limits, Monitor
+from tests.companion.guardian.simulated import Flight, Path, hover, leg
+
+
+def monitor(**limits: float) -> Monitor:
+    """With the shipped limits."""
+    return Monitor(GuardianConfig(), Limits(**limits))
+
+
+def frozen(path: Path, since_s: float) -> Path:
+    """What a hung camera shows of a path."""
+    return lambda at_s: path(min(at_s, since_s))
+
+
+@pytest.mark.parametrize("path", [hover, leg])
+@pytest.mark.parametrize("noise_m", [0.02, 0.16, 0.5])
+def test_an_honest_flight_is_left_alone(path: Path, noise_m: float) -> None:
+    """Neither a hover nor a start to 10 m/s costs a fix or a text."""
+    flight = Flight(monitor(), path, noise_m=noise_m, claimed_m=noise_m).fly(40.0)
+    assert flight.lines == []
+    assert flight.withheld == []
+    assert len(flight.passed) == 400
+
+
+def test_a_position_that_freezes_in_flight_is_told_within_two_seconds() -> None:
+    """At 10 m/s: the IMU felt nothing that would have stopped the aircraft."""
+    flight = Flight(monitor(), leg, frozen(leg, 12.0), noise_m=0.03).fly(40.0)
+    assert flight.told("withheld: motion is not the IMU's") < 14.0
+    assert max(flight.withheld) > 39.0
+    assert min(flight.withheld) < 14.0
+    assert not [fix for fix in flight.passed if fix.time_ns > 14.5e9]
+
+
+def test_a_position_that_freezes_in_a_hover_is_told_before_it_is_far() -> None:
+    """Nothing contradicts it, but an aircraft in the air does not stand still."""
+    flight = Flight(monitor(), hover, frozen(hover, 10.0), noise_m=0.03).fly(60.0)
+    assert 10.0 < flight.told("withheld: position stands still") < 28.0
+    assert max(flight.withheld) > 59.0
+
+
+def test_what_moves_again_is_believed_again_with_a_reset() -> None:
+    """The EKF holds what was wrong: the first fix afterwards must not be fought."""
+
+    def thaws(at_s: float) -> tuple[float, float]:
+        return hover(10.0 if 10.0 < at_s < 40.0 else at_s)
+
+    flight = Flight(monitor(), hover, thaws, noise_m=0.03).fly(60.0)
+    assert flight.told("over: stands still") < 55.0
+    back = [fix for fix in flight.passed if fix.time_ns > 40e9]
+    assert back[0].reset
+    assert not any(fix.reset for fix in back[1:])
+
+
+def test_a_60_m_reset_does_not_pass_unquestioned() -> None:
+    """Held and told at once; what comes back in time is not."""
+
+    def relocalized(at_s: float) -> tuple[float, float]:
+        north, east = hover(at_s)
+        return north + (60.0 if 10.0 <= at_s < 13.0 else 0.0), east
+
+    flight = Flight(monitor(), hover, relocalized, reset_at_s=10.0).fly(20.0)
+    assert flight.told("withheld: position jumped 5") < 10.2
+    assert min(flight.withheld) == pytest.approx(10.0)
+    assert max(flight.withheld) <= 13.1  # until the next step
+    assert len(flight.passed) >= 168
+
+
+def test_a_jump_that_agrees_in_motion_is_taken_with_a_reset() -> None:
+    """The old place may have been the wrong one: after 5 s it is believed, and announced."""
+
+    def relocalized(at_s: float) -> tuple[float, float]:
+        north, east = hover(at_s)
+        return north + (60.0 if at_s >= 10.0 else 0.0), east
+
+    flight = Flight(monitor(), hover, relocalized).fly(30.0)
+    back = [fix for fix in flight.passed if fix.time_ns > 10e9]
+    assert 15e9 <= back[0].time_ns < 16e9
+    assert back[0].reset
+
+
+def test_a_jump_within_the_alert_limit_passes_if_it_is_announced() -> None:
+    """A relocalization after bridging; without a word it is held."""
+
+    def relocalized(at_s: float) -> tuple[float, float]:
+        north, east = hover(at_s)
+        return north + (8.0 if at_s >= 10.0 else 0.0), east
+
+    assert Flight(monitor(), hover, relocalized, reset_at_s=10.0).fly(12.0).withheld == []
+    assert Flight(monitor(), hover, relocalized).fly(12.0).withheld != []
+
+
+@pytest.mark.parametrize("accuracy_m", [1.0, 12.0])
+def test_gnss_apart_from_vision_is_told_as_long_as_it_lasts(accuracy_m: float) -> None:
+    """However bad the receiver claims to be: 12 m times a number of sigma would excuse 60 m."""
+    flight = Flight(monitor(), gnss_north_m=lambda _: 20.0, gnss_accuracy_m=accuracy_m).fly(35.0)
+    told = [at_s for at_s, text in flight.lines if "from vision: neither proven" in text]
+    assert told[0] < 4.0
+    assert np.diff(told) == pytest.approx(10.0, abs=0.5)
+    assert len(told) == 4
+    assert flight.withheld == []  # neither is said to be right
+
+
+def test_gnss_that_is_dragged_away_slowly_is_told_below_the_alert_limit() -> None:
+    """0.6 m/s from 5 s on."""
+    flight = Flight(monitor(), gnss_north_m=lambda at_s: 0.6 * max(at_s - 5.0, 0.0)).fly(40.0)
+    away_m = 0.6 * (flight.told("from vision: neither proven") - 5.0)
+    assert 3.0 < away_m < 10.0
+
+
+def test_our_own_gps_input_is_no_gnss() -> None:
+    """Agreement or not with what we fed ourselves is no evidence."""
+    own = Monitor(GuardianConfig(), Limits(gnss_is_ours=True))
+    assert Flight(own, gnss_north_m=lambda _: 20.0).fly(10.0).lines == []
+
+
+def test_a_height_that_leaves_the_barometers_is_withheld() -> None:
+    """By a focal length that is wrong, or another place's ground."""
+    flight = Flight(monitor(), height_m=lambda at_s: 2.0 * max(at_s - 10.0, 0.0)).fly(25.0)
+    assert 14.0 < flight.told("off barometer") < 18.0
+    assert max(flight.withheld) > 24.0
+
+
+def test_a_barometer_that_drifts_is_no_finding() -> None:
+    """1.5 m a minute, as a front or a warming sensor makes it."""
+    assert Flight(monitor(), height_m=lambda at_s: 0.025 * at_s).fly(60.0).lines == []
+
+
+def test_beyond_the_alert_limit_nothing_is_injected() -> None:
+    """A sigma of 3 m is honest, and too much for the risk."""
+    flight = Flight(monitor(), noise_m=0.2, claimed_m=3.0).fly(10.0)
+    assert flight.told("withheld: position only to") <= 3.0
+    assert max(flight.withheld) > 9.8
+    relaxed = Flight(monitor(alert_limit_m=20.0), noise_m=0.2, claimed_m=3.0).fly(10.0)
+    assert relaxed.withheld == []
