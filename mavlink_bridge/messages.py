@@ -279,6 +279,8 @@ class VehicleState:
     gps_satellites: int = 0
     gps_latitude_deg: float = NAN
     gps_longitude_deg: float = NAN
+    gps_altitude_amsl_m: float = NAN
+    gps_height_m: float = NAN  # above the ellipsoid, where the receiver says it
     gps_h_accuracy_m: float = NAN
     gps_time_ns: int = 0
     rc_channels_us: tuple[int, ...] = ()

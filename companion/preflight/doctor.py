@@ -9,6 +9,7 @@ from pathlib import Path
 from companion.config import CompanionConfig
 from companion.errors import CompanionError
 from companion.preflight.coverage import check_mission, check_origin
+from companion.preflight.heights import check_heights
 from companion.sources import SourceSettings, open_source
 from localizer.errors import LocalizerError
 from localizer.features.extractor import load_extractor
@@ -31,8 +32,11 @@ def examine_deployment(config: CompanionConfig, *, vehicle: bool = True) -> Diag
     if cache is not None and config.bridge.origin is not None:
         findings.append(check_origin(config.bridge.origin, cache))
     if vehicle:
-        found = examine(config.bridge).findings
+        diagnosis = examine(config.bridge)
+        found = diagnosis.findings
         findings += found
+        if cache is not None and diagnosis.state is not None:
+            findings += check_heights(cache, diagnosis.state)
         if cache is not None and found[0].ok:
             findings.append(_check_mission(config, cache))
     return Diagnosis(tuple(findings))

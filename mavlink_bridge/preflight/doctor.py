@@ -49,9 +49,12 @@ class Finding:
 
 @dataclass(frozen=True)
 class Diagnosis:
-    """All lines; a flight may begin when none that is required fails."""
+    """All lines; a flight may begin when none that is required fails. state: what the vehicle said
+    of itself meanwhile, None where it was not asked.
+    """
 
     findings: tuple[Finding, ...]
+    state: VehicleState | None = None
 
     @property
     def ok(self) -> bool:
@@ -255,7 +258,7 @@ def examine(config: BridgeConfig) -> Diagnosis:
     findings, state = check_link(config)
     findings += check_computer_clock(config)
     if not findings[0].ok or any(f.name == "vehicles" and not f.ok for f in findings):
-        return Diagnosis(tuple(findings))
+        return Diagnosis(tuple(findings), state)
     with ParameterClient(config) as client:
         if state.autopilot == "px4":
             rules: Sequence[Rule] = px4_rules(config)
@@ -266,7 +269,7 @@ def examine(config: BridgeConfig) -> Diagnosis:
                 *arming_rules(config, source_set, client.read),
             ]
         findings += check_parameters(rules, client.read)
-    return Diagnosis(tuple(findings))
+    return Diagnosis(tuple(findings), state)
 
 
 def repair(config: BridgeConfig, findings: Iterable[Finding]) -> bool:

@@ -180,12 +180,15 @@ class VehicleReadings:
 
     def _gps(self, m: Any, time_ns: int) -> None:
         accuracy = getattr(m, "h_acc", 0)
+        height = getattr(m, "alt_ellipsoid", 0)  # an extension: 0 where it is not sent
         self.state = replace(
             self.state,
             gps_fix_type=m.fix_type,
             gps_satellites=0 if m.satellites_visible == 255 else m.satellites_visible,
             gps_latitude_deg=m.lat * 1e-7,
             gps_longitude_deg=m.lon * 1e-7,
+            gps_altitude_amsl_m=m.alt * 1e-3,
+            gps_height_m=height * 1e-3 if height else math.nan,
             gps_h_accuracy_m=accuracy * 1e-3 if accuracy else math.nan,
             gps_time_ns=time_ns,
         )
