@@ -14,6 +14,9 @@ class GrowthModel(BaseModel):
 
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
 
+    registration: float = Field(
+        1.0, ge=1, le=1e4, description="variance factor of each registration's covariance"
+    )
     scale: float = Field(ge=0, le=1, description="sigma of the way's length, as a share of it")
     horizontal: float = Field(ge=0, le=10, description="walk of east and north, m per root m")
     vertical: float = Field(ge=0, le=10, description="walk of the height, m per root m")
@@ -52,11 +55,24 @@ class OdometryConfig(BaseModel):
     acceleration_sigma: float = Field(
         2.0, ge=0.01, le=100, description="m/s² of the motion while nothing is seen"
     )
+    turn_sigma_deg: float = Field(
+        0.2, ge=0.01, le=90, description="of the autopilot's tilt since the keyframe, per axis"
+    )
+    heading_turn_sigma_deg: float = Field(
+        0.6, ge=0.01, le=90, description="of its heading since the keyframe"
+    )
+    rise_sigma_m: float = Field(
+        0.3, ge=0.01, le=100, description="of the barometer's rise since the keyframe"
+    )
     with_map: GrowthModel = Field(
-        GrowthModel(scale=0.001, horizontal=0.02, vertical=0.02, tilt=1e-4, heading=1e-4),
+        GrowthModel(
+            registration=16.0, scale=0.001, horizontal=0.02, vertical=0.02, tilt=2e-4, heading=4e-4
+        ),
         description="growth with depth from the map's geometry",
     )
     with_ground: GrowthModel = Field(
-        GrowthModel(scale=0.02, horizontal=0.05, vertical=0.05, tilt=3e-4, heading=3e-4),
+        GrowthModel(
+            registration=49.0, scale=0.005, horizontal=0.04, vertical=0.03, tilt=2e-4, heading=1e-3
+        ),
         description="growth with depth from the ground's height alone",
     )

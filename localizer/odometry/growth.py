@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 
 from localizer.geometry.pose import Array, Pose, hat, quaternion_from_matrix, so3_exp, so3_log
@@ -37,32 +39,102 @@ def scaled(model: GrowthModel, displacement: Array) -> Array:
 
 
 def fused(pose: Pose, covariance: Array, constraint: PoseConstraint | None) -> tuple[Pose, Array]:
-    """The pose after another sensor's word on it (height, roll and pitch, heading).
+    """The pose after another sensor's word on it (height, roll and pitch, heading), axis by axis.
 
-    Such a sensor's error stays from frame to frame, so it must not average out: no variance sinks
-    below the sensor's own by its use.
+    Such a sensor's error stays from frame to frame and does not average out. So it is heard only
+    where less is known than it knows, and then no better is known than it knows: with the noise
+    ``R P / (P - R)`` instead of its own R, a variance P becomes R, however often it is asked.
     """
     if constraint is None:
         return pose, covariance
-    information = constraint.information
-    known = np.flatnonzero(np.diag(information) > 0)
-    if not len(known):
-        return pose, covariance
-    target = constraint.world_from_camera
+    information = np.diag(constraint.information)
+    target, step = constraint.world_from_camera, np.zeros(6)
     difference = np.zeros(6)
-    if information[:3, :3].any():
-        difference[:3] = target.translation - pose.translation
-    if information[3:, 3:].any():
-        difference[3:] = _tilt_and_heading(target.rotation @ pose.rotation.T)
-    noise = np.linalg.inv(information[np.ix_(known, known)])
+    difference[:3] = target.translation - pose.translation
+    if information[3:].any():
+        difference[3:] = tilt_and_heading(target.rotation @ pose.rotation.T)
+    for axis in np.flatnonzero(information > 0):
+        known, own = covariance[axis, axis], 1.0 / information[axis]
+        if known <= own:
+            continue
+        gain = covariance[:, axis] / known * (1.0 - own / known)
+        step = step + gain * (difference[axis] - step[axis])
+        covariance = covariance - np.outer(gain, covariance[axis])
+        covariance = 0.5 * (covariance + covariance.T)
+    return Pose(so3_exp(step[3:]) @ pose.rotation, pose.translation + step[:3]), covariance
+
+
+def weighed(pose: Pose, covariance: Array, constraint: PoseConstraint) -> tuple[Pose, Array]:
+    """The pose after an independent measurement of single axes: Kalman's update.
+
+    What hangs on those axes moves with them: a turn that is known better mends the position that
+    the registration took it for.
+    """
+    information = np.diag(constraint.information)
+    known = np.flatnonzero(information > 0)
+    target = constraint.world_from_camera
+    difference = np.concatenate(
+        [target.translation - pose.translation, tilt_and_heading(target.rotation @ pose.rotation.T)]
+    )[known]
+    noise = np.diag(1.0 / information[known])
     gain = covariance[:, known] @ np.linalg.inv(covariance[np.ix_(known, known)] + noise)
-    step = gain @ difference[known]
+    step = gain @ difference
     after = covariance - gain @ covariance[known]
-    floor = np.minimum(np.diag(covariance)[known], np.diag(noise))
-    lifted = np.zeros(6)
-    lifted[known] = np.maximum(floor - np.diag(after)[known], 0.0)
-    after = 0.5 * (after + after.T) + np.diag(lifted)
-    return Pose(so3_exp(step[3:]) @ pose.rotation, pose.translation + step[:3]), after
+    moved = Pose(so3_exp(step[3:]) @ pose.rotation, pose.translation + step[:3])
+    return moved, 0.5 * (after + after.T)
+
+
+def since(
+    then: PoseConstraint, now: PoseConstraint, pose: Pose, turn_sigma: Array, rise_sigma: float
+) -> PoseConstraint | None:
+    """What two sensors' words say of the way between them, as a constraint on the later pose.
+
+    pose: the earlier one, taken as exact. turn_sigma: (3,) rad, rise_sigma: m. None where they
+    have nothing in common.
+    """
+    information, rotation, height = np.zeros(6), pose.rotation, pose.translation[2]
+    if _knows_rotation(then) and _knows_rotation(now):
+        information[3:] = turn_sigma**-2
+        before = then.world_from_camera.rotation
+        rotation = now.world_from_camera.rotation @ before.T @ pose.rotation
+    if knows_height(then) and knows_height(now):
+        information[2] = rise_sigma**-2
+        rise = now.world_from_camera.translation[2] - then.world_from_camera.translation[2]
+        height = height + rise
+    if not information.any():
+        return None
+    return PoseConstraint(Pose(rotation, np.array([0.0, 0.0, height])), np.diag(information))
+
+
+def _knows_rotation(constraint: PoseConstraint) -> bool:
+    return bool(np.diag(constraint.information)[3:].all())
+
+
+def without_constant_error(
+    constraint: PoseConstraint, then: PoseConstraint, pose: Pose
+) -> PoseConstraint:
+    """A constraint less the error that its like had `then`, at the true `pose`.
+
+    Of the height; of the heading, about the vertical (compass); and of the rest of the rotation, in
+    the camera's axes (mounting of autopilot and gimbal).
+    """
+    now, before = constraint.world_from_camera, then.world_from_camera
+    rotation, translation = now.rotation, now.translation
+    if knows_height(then) and knows_height(constraint):
+        offset = pose.translation[2] - before.translation[2]
+        translation = translation + np.array([0.0, 0.0, offset])
+    if then.information[3:, 3:].any() and constraint.information[3:, 3:].any():
+        heading = tilt_and_heading(pose.rotation @ before.rotation.T)[2]
+        turn = so3_exp([0.0, 0.0, heading])
+        mounting = (turn @ before.rotation).T @ pose.rotation
+        rotation = turn @ rotation @ mounting
+    return replace(constraint, world_from_camera=Pose(rotation, translation))
+
+
+def knows_height(constraint: PoseConstraint) -> bool:
+    """Whether it knows the height, and not the place besides."""
+    information = np.diag(constraint.information)
+    return bool(information[2] > 0 and not information[:2].any())
 
 
 def distance_squared(prior: PosePrior, pose: Pose, covariance: Array) -> float:
@@ -74,7 +146,7 @@ def distance_squared(prior: PosePrior, pose: Pose, covariance: Array) -> float:
     return float(difference @ np.linalg.solve(prior.covariance + covariance, difference))
 
 
-def _tilt_and_heading(turn: Array) -> Array:
+def tilt_and_heading(turn: Array) -> Array:
     """A turn (3, 3) as a small rotation vector (x, y) followed by one about the vertical (z).
 
     A compass may be far off: the difference in tilt must not be told in its axes.

@@ -13,6 +13,7 @@ from localizer.geometry.camera import Camera
 from localizer.geometry.pose import Array, Pose
 from localizer.odometry.ground import Ground, ground_points
 from localizer.registration.anchors import anchors_at
+from localizer.registration.priors import PoseConstraint
 from localizer.types import Anchors, FeaturePyramid
 
 _BORDER_SHARE = 0.02  # of the shorter side, where features see the padding
@@ -32,7 +33,8 @@ class Keyframe:
     """A picture that later ones are registered against.
 
     anchors: its features at world points, as the map registration's. covariance: (6, 6) of its
-    pose, as `PosePrior`'s. source: of its depth. way_m: flown up to it.
+    pose, as `PosePrior`'s. source: of its depth. way_m: flown up to it. constraint: what other
+    sensors said of its pose.
     """
 
     anchors: Anchors
@@ -41,6 +43,7 @@ class Keyframe:
     time_ns: int
     source: DepthSource
     way_m: float
+    constraint: PoseConstraint | None = None
 
 
 def keyframe_anchors(

@@ -12,7 +12,16 @@ from localizer.geometry.pose import Array, Pose, so3_log
 from localizer.odometry.config import GrowthModel, OdometryConfig
 from localizer.odometry.estimate import OdometryEstimate, OdometryFrame, OdometryStatus
 from localizer.odometry.ground import FlatGround, Ground
-from localizer.odometry.growth import carried, distance_squared, fused, scaled, walked
+from localizer.odometry.growth import (
+    carried,
+    distance_squared,
+    fused,
+    scaled,
+    since,
+    walked,
+    weighed,
+    without_constant_error,
+)
 from localizer.odometry.keyframe import DepthSource, Keyframe, keyframe_anchors
 from localizer.registration.jngo import JNGO
 from localizer.registration.priors import PoseConstraint
@@ -36,8 +45,8 @@ class _Beginning:
 
 @dataclass(frozen=True)
 class _Track:
-    """The last usable estimate. covariance: without the error of scale. best: quality of the
-    keyframe's first registration.
+    """The last usable estimate. covariance: without the error of scale. constraint: what other
+    sensors said, less their constant error. best: quality of the keyframe's first registration.
     """
 
     pose: Pose
@@ -46,6 +55,7 @@ class _Track:
     time_ns: int
     way_m: float
     aided_rotation: Array | None
+    constraint: PoseConstraint | None
     best: float = 0.0
 
 
@@ -107,8 +117,8 @@ class VisualOdometry:
         self._beginning = _Beginning(frame, pose, covariance, surface, constraint)
         self._keyframe = None
         speed = np.zeros(3) if velocity is None else np.asarray(velocity, dtype=np.float64)
-        aided = _aided(constraint)
-        self._track = _Track(pose, covariance, speed, frame.time_ns, 0.0, aided)
+        aided, corrected = _aided(constraint), self._corrected(constraint)
+        self._track = _Track(pose, covariance, speed, frame.time_ns, 0.0, aided, corrected)
         if surface is not None and len(surface) > self._optimizer.config.min_anchors:
             self._plane = FlatGround.under(surface)
 
@@ -173,9 +183,11 @@ class VisualOdometry:
         return self.config.with_map if by_map else self.config.with_ground
 
     def _first_keyframe(self, beginning: _Beginning) -> Keyframe:
+        constraint = self._corrected(beginning.constraint)
         made = self._make_keyframe(
-            beginning.frame, beginning.pose, beginning.covariance, 0.0, beginning.surface
-        )
+            beginning.frame, beginning.pose, beginning.covariance, 0.0, beginning.surface,
+            constraint,
+        )  # fmt: skip
         if made is None:
             raise OdometryError(
                 "neither the map nor a ground gives the first keyframe a depth: call begin with "
@@ -186,7 +198,7 @@ class VisualOdometry:
 
     def _make_keyframe(
         self, frame: OdometryFrame, pose: Pose, covariance: Array, way_m: float,
-        surface: Array | None,
+        surface: Array | None, constraint: PoseConstraint | None,
     ) -> Keyframe | None:  # fmt: skip
         anchors, source = keyframe_anchors(
             frame.features, self._camera, pose, surface, self._ground or self._plane,
@@ -194,11 +206,13 @@ class VisualOdometry:
         )  # fmt: skip
         if len(anchors.points_world) < 2 * self._optimizer.config.min_anchors:
             return None
-        return Keyframe(anchors, pose, covariance, frame.time_ns, source, way_m)
+        return Keyframe(anchors, pose, covariance, frame.time_ns, source, way_m, constraint)
 
     def _hand_over(self, frame: OdometryFrame, track: _Track, surface: Array | None) -> None:
         """The frame becomes the keyframe, unless it has too little depth for one."""
-        made = self._make_keyframe(frame, track.pose, track.covariance, track.way_m, surface)
+        made = self._make_keyframe(
+            frame, track.pose, track.covariance, track.way_m, surface, track.constraint
+        )
         if made is not None:
             self._keyframe, self._track = made, replace(track, best=0.0)
 
@@ -238,36 +252,33 @@ class VisualOdometry:
         constraint: PoseConstraint | None,
     ) -> _Track:
         """The track after a registration against the keyframe."""
-        lever = result.world_from_camera.translation - keyframe.world_from_camera.translation
-        hop = float(np.linalg.norm(lever))
-        covariance = carried(keyframe.covariance, lever) + result.covariance + walked(model, hop)
-        corrected = self._corrected(constraint)
-        pose, covariance = fused(result.world_from_camera, covariance, corrected)
+        begun = keyframe.world_from_camera
+        hop = float(np.linalg.norm(result.world_from_camera.translation - begun.translation))
+        relative = model.registration * result.covariance + walked(model, hop)
+        pose, corrected = result.world_from_camera, self._corrected(constraint)
+        if keyframe.constraint is not None and corrected is not None:
+            c = self.config
+            turn = np.radians([c.turn_sigma_deg, c.turn_sigma_deg, c.heading_turn_sigma_deg])
+            if known := since(keyframe.constraint, corrected, begun, turn, c.rise_sigma_m):
+                pose, relative = weighed(pose, relative, known)
+        lever = pose.translation - begun.translation
+        pose, covariance = fused(pose, carried(keyframe.covariance, lever) + relative, corrected)
         dt = _seconds(track.time_ns, time_ns)
         velocity = track.velocity
         if dt > 0:
             velocity = (pose.translation - track.pose.translation) / dt
         return _Track(
             pose, covariance, velocity, time_ns, keyframe.way_m + hop, _aided(constraint),
-            track.best or result.quality,
+            corrected, track.best or result.quality,
         )  # fmt: skip
 
     def _corrected(self, constraint: PoseConstraint | None) -> PoseConstraint | None:
-        """The constraint without the constant error that it had at the beginning: of the height,
-        and of the rotation in the camera's axes, as a gimbal's mounting has it.
-        """
+        """The constraint without the constant error that it had at the beginning."""
         assert self._beginning is not None
-        then, pose = self._beginning.constraint, self._beginning.pose
+        then = self._beginning.constraint
         if constraint is None or then is None:
             return constraint
-        known = constraint.world_from_camera
-        rotation, translation = known.rotation, known.translation
-        if _knows_height(then) and _knows_height(constraint):
-            offset = pose.translation[2] - then.world_from_camera.translation[2]
-            translation = translation + np.array([0.0, 0.0, offset])
-        if _aided(then) is not None and _aided(constraint) is not None:
-            rotation = rotation @ then.world_from_camera.rotation.T @ pose.rotation
-        return replace(constraint, world_from_camera=Pose(rotation, translation))
+        return without_constant_error(constraint, then, self._beginning.pose)
 
     def _is_spent(self, keyframe: Keyframe, result: Registration, track: _Track) -> bool:
         c = self.config
@@ -336,12 +347,6 @@ def _aided(constraint: PoseConstraint | None) -> Array | None:
     """The rotation that a constraint knows."""
     known = constraint is not None and bool(np.diag(constraint.information)[3:].all())
     return constraint.world_from_camera.rotation if known and constraint is not None else None
-
-
-def _knows_height(constraint: PoseConstraint) -> bool:
-    """Whether it knows the height, and not the place besides."""
-    information = np.diag(constraint.information)
-    return bool(information[2] > 0 and not information[:2].any())
 
 
 def _seconds(begin_ns: int, end_ns: int) -> float:

@@ -5,7 +5,7 @@ import pytest
 
 from localizer.geometry.pose import Pose, so3_exp
 from localizer.odometry.config import GrowthModel
-from localizer.odometry.growth import carried, fused, scaled, walked
+from localizer.odometry.growth import carried, fused, scaled, walked, without_constant_error
 from localizer.registration import attitude_constraint, combine, height_constraint
 
 MODEL = GrowthModel(scale=0.01, horizontal=0.1, vertical=0.2, tilt=1e-3, heading=2e-3)
@@ -36,24 +36,52 @@ def test_a_walk_grows_with_the_root_of_the_way_and_a_scale_with_the_way():
 def test_a_sensor_is_weighed_against_what_is_known():
     pose = Pose(np.eye(3), np.array([1.0, 2.0, 10.0]))
     after, covariance = fused(pose, SIGMA, height_constraint(11.0, 0.5))
-    assert after.translation == pytest.approx([1.0, 2.0, 10.5])
+    assert after.translation == pytest.approx([1.0, 2.0, 10.0])  # it knows no more than we do
+    after, covariance = fused(pose, 4 * SIGMA, height_constraint(11.0, 0.5))
+    assert after.translation == pytest.approx([1.0, 2.0, 10.75])
     assert covariance[2, 2] == pytest.approx(0.25)  # the sensor's own: its error stays
-    assert covariance[0, 0] == pytest.approx(SIGMA[0, 0])
+    assert covariance[0, 0] == pytest.approx(4 * SIGMA[0, 0])
 
 
 def test_a_sensor_that_is_asked_often_does_not_average_out():
     pose, covariance = Pose(np.eye(3), np.zeros(3)), SIGMA
     for _ in range(100):
         pose, covariance = fused(pose, covariance + np.eye(6) * 0.01, height_constraint(1.0, 0.4))
-    assert covariance[2, 2] >= 0.16
+    assert covariance[2, 2] == pytest.approx(0.16)
+    assert pose.translation[2] > 0.5  # it follows the sensor nevertheless
     assert np.linalg.eigvalsh(covariance)[0] > 0
 
 
 def test_a_better_known_height_is_left_alone():
     surely = np.diag([0.01] * 6) ** 2
     after, covariance = fused(Pose.identity(), surely, height_constraint(2.0, 1.0))
-    assert abs(after.translation[2]) < 1e-3
-    assert covariance[2, 2] == pytest.approx(1e-4, rel=1e-6)
+    assert after.translation[2] == 0
+    np.testing.assert_array_equal(covariance, surely)
+
+
+def test_what_hangs_on_the_height_moves_with_it():
+    """Where east errs as the height does, a barometer mends both."""
+    tied = SIGMA.copy()
+    tied[0, 0] = tied[2, 2] = 1.0
+    tied[0, 2] = tied[2, 0] = 0.9
+    after, covariance = fused(Pose.identity(), tied, height_constraint(1.0, 0.1))
+    assert after.translation == pytest.approx([0.9 * 0.99, 0.0, 0.99])
+    assert covariance[0, 0] == pytest.approx(1 - 0.81 * 0.99)
+
+
+def test_a_constant_error_of_compass_and_mounting_is_made_up_for():
+    def sensed(pose):
+        compass, mounting = so3_exp([0, 0, 0.2]), so3_exp([0.01, -0.02, 0.0])
+        return combine(
+            attitude_constraint(compass @ pose.rotation @ mounting, 0.01, 0.1),
+            height_constraint(pose.translation[2] - 7.0, 0.5),
+        )
+
+    down = Pose(np.diag([1.0, -1.0, -1.0]), np.array([0.0, 0.0, 90.0]))
+    later = Pose(so3_exp([0.05, 0.03, 2.0]) @ down.rotation, np.array([300.0, 50.0, 95.0]))
+    mended = without_constant_error(sensed(later), sensed(down), down).world_from_camera
+    assert mended.translation[2] == pytest.approx(95.0)
+    assert mended.distance_to(later)[1] < 0.15  # degrees: tilt and compass hardly mix
 
 
 def test_attitude_turns_the_pose_and_spares_the_heading():

@@ -1,0 +1,1 @@
+"""Visual odometry: its drift, and whether its covariance is honest."""

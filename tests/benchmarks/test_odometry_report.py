@@ -1,0 +1,72 @@
+"""What the odometry's benchmark makes of known errors."""
+
+import numpy as np
+import pytest
+
+from benchmarks.odometry.flights import Flown, Step
+from benchmarks.odometry.report import fitted_growth, rows
+from benchmarks.odometry.stretches import Plan, make_stretch
+
+SIGMA = np.diag([0.05, 0.05, 0.05]) ** 2
+
+
+def step(flown_m: float, error: np.ndarray, covariance: np.ndarray, status: str = "OK") -> Step:
+    return Step(
+        status, tuple(error), tuple(map(tuple, covariance)), (flown_m, 0.0, 0.0), flown_m,
+        1.0, 0.8, 1.0, 10.0,
+    )  # fmt: skip
+
+
+def stretches(scale: float, walk: float, count: int, *, told: bool) -> list[Flown]:
+    """Stretches due east whose errors follow the model of growth; told: so does the covariance."""
+    rng = np.random.default_rng(5)
+    flown = []
+    for seed in range(count):
+        share, steps, walked = rng.normal(0, scale), [], np.zeros(2)
+        for way in np.arange(10.0, 601.0, 10.0):
+            walked = walked + rng.normal(0, walk * np.sqrt(10.0), 2)
+            error = np.array([share * way, 0.0, 0.0])
+            error[:2] += walked
+            growth = np.diag([scale**2 * way**2 + walk**2 * way, walk**2 * way, 0.0])
+            steps.append(step(way, error, SIGMA + growth * told))
+        flown.append(Flown("somewhere", "day", seed, "map", tuple(steps)))
+    return flown
+
+
+def test_the_growth_that_made_the_errors_is_found():
+    found = fitted_growth(stretches(0.01, 0.03, 60, told=False))
+    assert found["scale"] == pytest.approx(0.01, rel=0.35)
+    assert found["horizontal"] == pytest.approx(0.03, rel=0.35)
+
+
+def test_an_honest_covariance_holds_and_a_bold_one_does_not():
+    honest = rows(stretches(0.01, 0.03, 60, told=True))[-1]
+    bold = rows(stretches(0.01, 0.03, 60, told=False))[-1]
+    assert honest["inside_95_percent"] == pytest.approx(95, abs=4)
+    assert bold["inside_95_percent"] < 40
+    assert honest["end_percent_p95"] == pytest.approx(2.0, abs=0.6)
+
+
+def test_what_was_not_carried_on_is_counted():
+    lost = Flown("somewhere", "night", 0, "map", (
+        step(100.0, np.zeros(3), SIGMA),
+        step(110.0, np.array([30.0, 0, 0]), SIGMA, "LOST"),
+    ))  # fmt: skip
+    row = rows([lost])[-1]
+    assert row["carried_to_the_end"] == 0
+    assert row["usable_percent"] == 50
+    assert row["end_m_p50"] == pytest.approx(30)  # its error counts all the same
+
+
+def test_a_stretch_stays_over_the_area_at_its_speed():
+    plan = Plan(60.0, 2.0, 10.0, 110.0, (150.0, 100.0))
+    stretch = make_stretch(plan, "day", 3, 20.0)
+    places = np.array([pose.translation for pose in stretch.poses])
+    assert (np.abs(places[:, :2]) < [270, 220]).all()  # turning takes its radius
+    np.testing.assert_allclose(places[:, 2], 130.0, atol=2.01)
+    assert stretch.flown_m(len(places) - 1) == pytest.approx(600, rel=0.01)
+    assert all(pose.rotation[2, 2] < -0.8 for pose in stretch.poses)  # looks down
+    heights = np.array([c.world_from_camera.translation[2] for c in stretch.sensed])
+    assert np.std(heights - places[:, 2]) < 1.0  # the barometer drifts slowly
+    again = make_stretch(plan, "day", 3, 20.0)
+    assert np.array_equal(again.poses[-1].matrix, stretch.poses[-1].matrix)
