@@ -95,12 +95,15 @@ def _record(making: Making) -> RecordKeeper:
 
 
 def _source(making: Making) -> FrameSource:
-    camera, events = making.config.camera, making.channels.events
+    camera, events, bridge = making.config.camera, making.channels.events, making[Bridge]
 
     def on_state(state: StreamState, text: str) -> None:
         events.send("warning" if state in _BAD_FEED else "info", f"feed: {text}")
 
-    return open_source(camera.source, camera.model.camera(), camera.settings, on_state)
+    def on_stranger(text: str) -> None:
+        bridge.say(_WARNING, f"PiLoT: {text}")
+
+    return open_source(camera.source, camera.model.camera(), camera.settings, on_state, on_stranger)
 
 
 def _health(making: Making) -> HealthMonitor:
@@ -235,7 +238,7 @@ PARTS: tuple[Part[Any], ...] = (
     Part(
         "record", RecordKeeper, _record, depends=(MapStack, Bridge), close=RecordKeeper.close
     ),
-    Part("source", FrameSource, _source),
+    Part("source", FrameSource, _source, depends=(Bridge,)),
     Part(
         "health", HealthMonitor, _health,
         depends=(Bridge, RecordKeeper, FrameSource, Guardian),

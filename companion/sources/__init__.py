@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
 
 from companion.errors import StreamOpenError
@@ -36,15 +37,17 @@ def open_source(
     camera: Camera,
     settings: SourceSettings | None = None,
     on_state: StateCallback | None = None,
+    on_stranger: Callable[[str], None] | None = None,
 ) -> FrameSource:
     """The feed at `location`: ``udp://host:port``, ``rtsp://...``, ``/dev/videoN`` (or
     ``v4l2:///dev/videoN``), a video file, or a folder of images.
 
+    on_stranger: told, once for each address, that somebody else sends video to a UDP feed.
     Raises `StreamOpenError` for what is not there. A live stream may come later.
     """
     text = str(location)
     if text.startswith(_LIVE):
-        return LiveVideoSource(text, camera, settings, on_state)
+        return LiveVideoSource(text, camera, settings, on_state, on_stranger)
     if "://" in text:
         raise StreamOpenError(
             f"{text}: unknown kind of source; use udp://, rtsp://, /dev/videoN, a file or a folder"

@@ -5,10 +5,9 @@ from __future__ import annotations
 import logging
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
-from urllib.parse import urlsplit
 
 import av
 import numpy as np
@@ -22,6 +21,12 @@ from companion.sources.base import (
     StreamState,
     fitted_camera,
     scaling_text,
+)
+from companion.sources.datagrams import (
+    SenderLock,
+    SilentSenderError,
+    UdpAddress,
+    VideoDatagrams,
 )
 from companion.sources.misp import MispTime, parse_message
 from companion.sources.timing import ExposureClock, Stamps
@@ -44,6 +49,8 @@ class _Input:
     options: dict[str, str]
     format: str | None = None
     device: bool = False
+    datagrams: VideoDatagrams | None = None
+    """What is read instead of `url`, where the receiving is ours."""
 
 
 class _Decoder:
@@ -53,9 +60,16 @@ class _Decoder:
 
     def __init__(self, source: _Input, read_timeout_s: float | None) -> None:
         timeout = None if read_timeout_s is None else (_OPEN_TIMEOUT_S, read_timeout_s)
+        if source.datagrams is not None:
+            source.datagrams.begin(_OPEN_TIMEOUT_S)
         self._container = av.open(
-            source.url, format=source.format, options=source.options, timeout=timeout
+            source.datagrams or source.url,
+            format=source.format,
+            options=source.options,
+            timeout=timeout,
         )
+        if source.datagrams is not None and read_timeout_s is not None:
+            source.datagrams.patience_s = read_timeout_s
         if not self._container.streams.video:
             self._container.close()
             raise StreamOpenError(f"{source.url}: has no video stream; give a video")
@@ -211,11 +225,13 @@ class LiveVideoSource:
         camera: Camera,
         settings: SourceSettings | None = None,
         on_state: StateCallback | None = None,
+        on_stranger: Callable[[str], None] | None = None,
     ) -> None:
         self._location = location
         self._camera = camera
         self._settings = settings or SourceSettings()
-        self._input = live_input(location, camera, self._settings)
+        self._on_stranger = on_stranger
+        self._input = live_input(location, camera, self._settings, self._stranger)
         self._on_state = on_state
         self._newest: Mailbox[tuple[av.VideoFrame, Camera, int, int]] = Mailbox()
         self._closing = threading.Event()
@@ -230,7 +246,9 @@ class LiveVideoSource:
     def counters(self) -> SourceCounters:
         """Live counters; `dropped` are the pictures that a newer one overtook."""
         with self._lock:
-            return replace(self._counters, dropped=self._newest.dropped)
+            datagrams = self._input.datagrams
+            foreign = 0 if datagrams is None else datagrams.foreign
+            return replace(self._counters, dropped=self._newest.dropped, foreign=foreign)
 
     @property
     def state(self) -> StreamState:
@@ -261,6 +279,9 @@ class LiveVideoSource:
             self._closing.set()
             reader = self._reader
         self._newest.close()
+        datagrams = self._input.datagrams
+        if datagrams is not None:
+            datagrams.close()
         if reader is not None and reader is not threading.current_thread():
             reader.join(2 * _OPEN_TIMEOUT_S + self._settings.stall_timeout_s + 2.0)
         if self._state is not StreamState.CLOSED:
@@ -273,6 +294,13 @@ class LiveVideoSource:
                 self._reader.start()
 
     def _run(self) -> None:
+        try:
+            self._receive()
+        finally:
+            if self._input.datagrams is not None:
+                self._input.datagrams.release()
+
+    def _receive(self) -> None:
         wait_s = _RETRY_FIRST_S
         connections = 0
         while not self._closing.is_set():
@@ -286,9 +314,9 @@ class LiveVideoSource:
                 self._report(StreamState.FAILED, str(error))
                 self._newest.close(error)
                 return
-            except av.error.ExitError:  # the open time-out
+            except (av.error.ExitError, SilentSenderError):  # the open time-out
                 reason = f"nothing came within {_OPEN_TIMEOUT_S:g} s; is the camera sending there?"
-            except av.error.FFmpegError as error:
+            except (av.error.FFmpegError, OSError) as error:
                 reason = f"cannot connect: {error}"
             except Exception as error:  # whatever a stream may contain, the next try may be well
                 _log.exception("%s: unexpected error", self._location)
@@ -317,7 +345,7 @@ class LiveVideoSource:
                     return "closed"
                 self._take(picture, arrival_ns, clock)
             return "the sender ended the stream"
-        except av.error.ExitError:  # the read time-out
+        except (av.error.ExitError, SilentSenderError):  # the read time-out
             return f"no data for {self._settings.stall_timeout_s:g} s"
         except av.error.FFmpegError as error:
             return f"the stream broke off: {error}"
@@ -334,6 +362,8 @@ class LiveVideoSource:
                 self._report_stall("data arrives but no picture can be decoded (no key frame yet?)")
             return
         self._last_picture_ns = arrival_ns
+        if self._input.datagrams is not None:
+            self._input.datagrams.prove()
         camera = self._fitted(picture)
         if camera is None:
             return
@@ -365,6 +395,11 @@ class LiveVideoSource:
             c = self._counters
             self._counters = replace(c, **{k: getattr(c, k) + n for k, n in more.items()})
 
+    def _stranger(self, text: str) -> None:
+        _log.warning("%s: %s", self._location, text)
+        if self._on_stranger is not None:
+            self._on_stranger(text)
+
     def _report_stall(self, reason: str) -> None:
         self._report_change(StreamState.STALLED, f"{self._location}: {reason}")
 
@@ -378,17 +413,22 @@ class LiveVideoSource:
             self._on_state(state, text)
 
 
-def live_input(location: str, camera: Camera, settings: SourceSettings) -> _Input:
+def live_input(
+    location: str,
+    camera: Camera,
+    settings: SourceSettings,
+    on_stranger: Callable[[str], None] = lambda _: None,
+) -> _Input:
     """FFmpeg's options for a live location, chosen for low delay."""
     timeout_us = str(round(settings.stall_timeout_s * 1e6))
     common = {"probesize": "65536", "analyzeduration": "200000", "flags": "low_delay"}
     if location.startswith("udp://"):
         # Without noparse FFmpeg's H.264 parser holds each picture until the next one begins: one
         # frame period. MPEG-TS carries one picture per PES packet, so the parser is not needed.
-        _check_address(location)
         flags = {"fflags": "nobuffer+noparse+nofillin"}
-        udp = {"buffer_size": "2000000", "fifo_size": "32768", "overrun_nonfatal": "1"}
-        return _Input(location, common | flags | udp, format="mpegts")
+        lock = SenderLock(settings.sender, round(settings.stall_timeout_s * 1e9))
+        datagrams = VideoDatagrams(UdpAddress.parse(location), lock, on_stranger)
+        return _Input(location, common | flags, format="mpegts", datagrams=datagrams)
     if location.startswith("rtsp://"):
         rtsp = {"fflags": "nobuffer", "rtsp_transport": "tcp", "timeout": timeout_us}
         return _Input(location, common | rtsp)
@@ -399,16 +439,6 @@ def live_input(location: str, camera: Camera, settings: SourceSettings) -> _Inpu
         )
     size = {"video_size": f"{camera.width}x{camera.height}", "fflags": "nobuffer"}
     return _Input(str(device), size, format="v4l2", device=True)
-
-
-def _check_address(location: str) -> None:
-    """FFmpeg takes any port modulo 65536 and would wait for ever."""
-    try:
-        good = bool(urlsplit(location).port)
-    except ValueError:
-        good = False
-    if not good:
-        raise StreamOpenError(f"{location}: expected udp://HOST:PORT with a port of 1 to 65535")
 
 
 def _rgb(picture: av.VideoFrame, reformatter: av.video.reformatter.VideoReformatter) -> Image:

@@ -7,9 +7,10 @@ from dataclasses import dataclass
 from enum import Enum
 from typing import Protocol
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import BaseModel, ConfigDict, Field, field_validator
 
 from companion.errors import StreamSizeError
+from companion.sources.datagrams import parse_sender
 from companion.sources.timing import Timing
 from localizer.errors import CameraError
 from localizer.geometry.camera import Camera
@@ -45,7 +46,8 @@ StateCallback = Callable[[StreamState, str], None]
 class SourceCounters:
     """received: pictures decoded; delivered: handed out by `frames`; dropped: overwritten by a
     newer one before they were fetched; undecodable: packets that gave no whole picture; misfits:
-    pictures whose shape is not the calibration's; reconnects: connections after the first.
+    pictures whose shape is not the calibration's; reconnects: connections after the first; foreign:
+    datagrams of others than the feed's sender, which are not taken.
     """
 
     received: int = 0
@@ -54,6 +56,7 @@ class SourceCounters:
     undecodable: int = 0
     misfits: int = 0
     reconnects: int = 0
+    foreign: int = 0
 
 
 class SourceSettings(BaseModel):
@@ -90,6 +93,17 @@ class SourceSettings(BaseModel):
         default=False,
         description="play files and folders at their own pace instead of as fast as possible",
     )
+    sender: str | None = Field(
+        default=None,
+        description="UDP: whose video is taken, ADDRESS or ADDRESS:PORT; null: the first one's",
+    )
+
+    @field_validator("sender")
+    @classmethod
+    def _is_a_sender(cls, value: str | None) -> str | None:
+        if value is not None:
+            parse_sender(value)
+        return value
 
 
 class FrameSource(Protocol):

@@ -1,0 +1,298 @@
+"""The socket of a UDP feed: one interface, one sender, read by FFmpeg as if it were a file.
+
+FFmpeg's own ``udp://`` binds every interface whatever its HOST says, and mixes the packets of all
+who send to the port: two streams become one picture sequence.
+"""
+
+from __future__ import annotations
+
+import ipaddress
+import select
+import socket
+import struct
+import threading
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from urllib.parse import parse_qs, urlsplit
+
+from companion.errors import StreamOpenError
+from mavlink_bridge.link.waking import WakePipe
+
+_LARGEST = 65_535
+_PER_READ = 64  # datagrams; then the decoder has its turn
+_RECEIVE_BUFFER = 2_000_000
+_PACKET = 188  # bytes of an MPEG-TS packet
+_SYNC = 0x47  # which begins with it
+_UNPROVEN_NS = 6_000_000_000  # a camera gives its first picture within its key frame interval
+
+Address = tuple[str, int]
+
+
+class SilentSenderError(Exception):
+    """Nothing came from the sender within the patience."""
+
+
+@dataclass(frozen=True)
+class UdpAddress:
+    """What ``udp://HOST:PORT?localaddr=ADDRESS`` means.
+
+    host: of this computer's interface to listen on, or a multicast group. interface: by which a
+    group is joined; empty: the system's choice.
+    """
+
+    host: str
+    port: int
+    interface: str = ""
+
+    @classmethod
+    def parse(cls, location: str) -> UdpAddress:
+        """Raises `StreamOpenError` for what cannot be listened on."""
+        try:
+            parts = urlsplit(location)
+            port = parts.port
+        except ValueError:
+            port = None
+        if not port:
+            raise StreamOpenError(f"{location}: expected udp://HOST:PORT with a port of 1 to 65535")
+        options = parse_qs(parts.query, keep_blank_values=True)
+        if set(options) - {"localaddr"}:
+            unknown = ", ".join(sorted(set(options) - {"localaddr"}))
+            raise StreamOpenError(
+                f"{location}: {unknown} cannot be set here; only localaddr (the interface of a "
+                "multicast group), and camera.settings.sender says whose video is taken"
+            )
+        return cls(parts.hostname or "0.0.0.0", port, options.get("localaddr", [""])[0])
+
+    @property
+    def everywhere(self) -> bool:
+        """Whether that is every interface of this computer."""
+        return self.host in ("0.0.0.0", "::")
+
+    def bound(self) -> socket.socket:
+        """A socket that listens there and does not block; OSError where that is impossible."""
+        family, kind, _, _, where = socket.getaddrinfo(
+            self.host, self.port, type=socket.SOCK_DGRAM, flags=socket.AI_PASSIVE
+        )[0]
+        made = socket.socket(family, kind)
+        try:
+            made.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, _RECEIVE_BUFFER)
+            made.setblocking(False)
+            if ipaddress.ip_address(where[0]).is_multicast:
+                made.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+                self._join(made, str(where[0]))
+            made.bind(where)
+        except BaseException:
+            made.close()
+            raise
+        return made
+
+    def _join(self, made: socket.socket, group: str) -> None:
+        if made.family is socket.AF_INET6:
+            index = socket.if_nametoindex(self.interface) if self.interface else 0
+            request = socket.inet_pton(socket.AF_INET6, group) + struct.pack("@I", index)
+            made.setsockopt(socket.IPPROTO_IPV6, socket.IPV6_JOIN_GROUP, request)
+            return
+        member = socket.inet_aton(group) + socket.inet_aton(self.interface or "0.0.0.0")
+        made.setsockopt(socket.IPPROTO_IP, socket.IP_ADD_MEMBERSHIP, member)
+
+
+class SenderLock:
+    """Whose datagrams are taken: one sender's, the configured one's or the first one's.
+
+    A sender that is followed is kept for good once a picture of it was decoded. It may come back
+    from another port (a camera that restarts takes a new one) after `quiet_ns` of silence, and
+    never from another address. Before its first picture, a first sender that gives none makes room
+    after 6 s: a stray packet must not lock the camera out.
+
+    only: HOST or HOST:PORT, a numeric address; None: the first.
+    """
+
+    def __init__(self, only: str | None, quiet_ns: int) -> None:
+        self._only = None if only is None else parse_sender(only)
+        self._quiet_ns = quiet_ns
+        self._sender: Address | None = None
+        self._proven = False
+        self._since_ns = self._heard_ns = 0
+
+    @property
+    def sender(self) -> Address | None:
+        """Who is followed; None before the first."""
+        return self._sender
+
+    @property
+    def has_chosen(self) -> bool:
+        """Whether others are strangers: a sender is followed or configured."""
+        return self._sender is not None or self._only is not None
+
+    def prove(self) -> None:
+        """A picture of the followed sender was decoded."""
+        self._proven = True
+
+    def admits(self, sender: Address, data: bytes, now_ns: int) -> bool:
+        """Whether a datagram that came now is taken."""
+        if sender == self._sender or self._may_follow(sender, data, now_ns):
+            self._heard_ns = now_ns
+            return True
+        return False
+
+    def _may_follow(self, sender: Address, data: bytes, now_ns: int) -> bool:
+        if self._only is not None and not _is(sender, self._only):
+            return False
+        if self._sender is not None and not self._makes_room(sender, now_ns):
+            return False
+        if not _looks_like_video(data):
+            return False
+        if self._sender is None or sender[0] != self._sender[0]:
+            self._proven = False
+        self._sender, self._since_ns = sender, now_ns
+        return True
+
+    def _makes_room(self, other: Address, now_ns: int) -> bool:
+        assert self._sender is not None
+        if other[0] == self._sender[0] and now_ns - self._heard_ns >= self._quiet_ns:
+            return True
+        return not self._proven and now_ns - self._since_ns >= _UNPROVEN_NS
+
+
+class VideoDatagrams:
+    """The feed's socket, kept bound from the first open to `close`, so that the sender is, too.
+
+    FFmpeg reads it as a file (`read`) in the decoding thread; `close` may be called from any.
+
+    on_stranger: told (a text of at most 43 characters, the address) of each address that is
+    refused, once, in the reading thread.
+    """
+
+    def __init__(
+        self,
+        address: UdpAddress,
+        lock: SenderLock,
+        on_stranger: Callable[[str], None] = lambda _: None,
+    ) -> None:
+        self.patience_s = 1.0
+        self.foreign = 0
+        self._address = address
+        self._lock = lock
+        self._on_stranger = on_stranger
+        self._told: set[str] = set()
+        self._socket: socket.socket | None = None
+        self._pending = b""
+        self._closed = threading.Event()
+        self._waker = WakePipe()
+
+    def begin(self, patience_s: float) -> None:
+        """Bind it if it is not yet, and leave behind what came while nobody read.
+
+        Raises OSError while the address cannot be bound.
+        """
+        self.patience_s = patience_s
+        self._pending = b""
+        if self._socket is None:
+            self._socket = self._address.bound()
+        for _ in range(100 * _PER_READ):  # bounded: a flood would be drained for ever
+            if self._received() is None:
+                return
+
+    def prove(self) -> None:
+        """A picture was decoded: who is followed stays."""
+        self._lock.prove()
+
+    def read(self, size: int) -> bytes:
+        """What has come from the sender, at most `size` bytes, as soon as there is something.
+
+        b"" after `close`; raises `SilentSenderError` when nothing came within `patience_s`.
+        """
+        if not self._pending:
+            self._pending = self._next()
+        given, self._pending = self._pending[:size], self._pending[size:]
+        return given
+
+    def close(self) -> None:
+        """End a `read` that waits. The socket is freed by `release`, in the reading thread."""
+        self._closed.set()
+        self._waker.wake()
+
+    def release(self) -> None:
+        """Free the socket; nothing reads any more."""
+        self._waker.close()
+        if self._socket is not None:
+            self._socket.close()
+
+    def _next(self) -> bytes:
+        assert self._socket is not None
+        poller = select.poll()  # not select: a process of many files has too high descriptors
+        poller.register(self._socket, select.POLLIN)
+        poller.register(self._waker.read_end, select.POLLIN)
+        deadline = time.monotonic() + self.patience_s
+        while not self._closed.is_set():
+            data = self._drained()
+            if data:
+                return data
+            left_s = deadline - time.monotonic()
+            if left_s <= 0.0:
+                raise SilentSenderError(f"no data for {self.patience_s:g} s")
+            poller.poll(left_s * 1e3)
+        return b""
+
+    def _drained(self) -> bytes:
+        """What waits and is admitted, in order."""
+        taken = []
+        for _ in range(_PER_READ):
+            received = self._received()
+            if received is None:
+                break
+            data, sender = received
+            if self._lock.admits(sender, data, time.monotonic_ns()):
+                taken.append(data)
+            else:
+                self._refuse(sender)
+        return b"".join(taken)
+
+    def _received(self) -> tuple[bytes, Address] | None:
+        assert self._socket is not None
+        try:
+            data, sender = self._socket.recvfrom(_LARGEST)
+        except (BlockingIOError, ConnectionRefusedError):
+            return None
+        return data, (sender[0], sender[1])
+
+    def _refuse(self, sender: Address) -> None:
+        self.foreign += 1
+        host, _ = sender
+        # 16: whoever forges addresses must not fill the record.
+        if host in self._told or len(self._told) >= 16 or not self._lock.has_chosen:
+            return
+        self._told.add(host)
+        self._on_stranger(f"stranger's video ignored: {host}")
+
+
+def parse_sender(text: str) -> tuple[str, int | None]:
+    """HOST or HOST:PORT ([HOST]:PORT for IPv6) of a sender; ValueError if it is none."""
+    try:
+        return str(ipaddress.ip_address(text)), None
+    except ValueError:
+        host, _, port = text.rpartition(":")
+    try:
+        address = str(ipaddress.ip_address(host.strip("[]")))
+        number = int(port)
+    except ValueError as error:
+        raise ValueError(f"{text!r} is no sender; write ADDRESS or ADDRESS:PORT") from error
+    if not 1 <= number <= 65535:
+        raise ValueError(f"{text!r}: {number} is no port number")
+    return address, number
+
+
+def _is(sender: Address, wanted: tuple[str, int | None]) -> bool:
+    host, port = wanted
+    return sender[0] == host and port in (None, sender[1])
+
+
+def _looks_like_video(data: bytes) -> bool:
+    """Whether MPEG-TS packets follow one another in it; a datagram may begin inside one."""
+    if len(data) < _PACKET:
+        return False
+    return any(
+        data[i] == _SYNC and (i + _PACKET >= len(data) or data[i + _PACKET] == _SYNC)
+        for i in range(_PACKET)
+    )
