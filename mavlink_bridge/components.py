@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections import deque
 from typing import Any
 
@@ -92,8 +91,9 @@ class Components:
             else:
                 self._camera.look(item)
         position = None
-        if math.isfinite(state.latitude_deg):
-            position = Origin(state.latitude_deg, state.longitude_deg, state.altitude_amsl_m)
+        place = (state.latitude_deg, state.longitude_deg, state.altitude_amsl_m)
+        if place[0] is not None and place[1] is not None and place[2] is not None:
+            position = Origin(place[0], place[1], place[2])
         self._camera.tick(now_ns, position, self._shared.uptime_ms(now_ns), link.send)
 
     def command(self, link: Link, message: Any, time_ns: int) -> None:

@@ -2,6 +2,7 @@
 
 Times are CLOCK_MONOTONIC nanoseconds of the exposure or measurement; heights are above the WGS84
 ellipsoid; NED is north, east, down; angles are radians, aerospace roll, pitch, yaw from true north.
+None is what is not known; NaN says that in MAVLink's fields and in arrays only (`or_nan`).
 """
 
 from __future__ import annotations
@@ -16,7 +17,6 @@ from numpy.typing import NDArray
 from mavlink_bridge.errors import FixError
 
 Array = NDArray[np.float64]
-NAN = math.nan
 _FASTEST_MPS = 1000.0
 _LEAST_KNOWN_M = 1e5  # of a sigma or an accuracy: beyond it nothing is known, and floats overflow
 _LARGEST_SIGMA = 1e3  # of an angle or a speed
@@ -34,6 +34,11 @@ class HealthLevel(enum.Enum):
 def without_figures(text: str) -> str:
     """A line for the operator without its numbers: what changes in them only is no news."""
     return "".join(c for c in text if not c.isdigit() and c not in "+-.")
+
+
+def or_nan(value: float | None) -> float:
+    """A MAVLink field's value: NaN says there what None says here."""
+    return math.nan if value is None else value
 
 
 def _check_position(what: str, latitude_deg: float, longitude_deg: float, height_m: float) -> None:
@@ -64,24 +69,32 @@ def _is_covariance(P: Array) -> bool:
 class VisionFix:
     """One position (and attitude) of the vehicle's body, seen by the localizer.
 
-    position_covariance_ned: (3, 3) m^2. roll, pitch, yaw: body to NED; NaN where unknown.
-    velocity_ned: m/s with its sigma where it was measured; None lets the bridge derive it.
-    reset: this fix carries a jump of the localizer's own estimate. quality: 0..100.
+    Raises `FixError` for what no autopilot should be told.
     """
 
     time_ns: int
+    """Of the exposure."""
     latitude_deg: float
     longitude_deg: float
     height_m: float
-    roll_rad: float = NAN
-    pitch_rad: float = NAN
-    yaw_rad: float = NAN
+    """Of the body's origin, not of the camera, above the ellipsoid."""
+    roll_rad: float | None = None
+    """Body to NED, as the two that follow."""
+    pitch_rad: float | None = None
+    yaw_rad: float | None = None
+    """From true north; without it the yaw guard does not check the fix."""
     position_covariance_ned: Array = field(default_factory=lambda: np.eye(3))
+    """(3, 3), m^2."""
     attitude_sigma_rad: float = 0.02
+    """1 sigma of each angle."""
     reset: bool = False
+    """This fix carries a jump of the localizer's own estimate."""
     quality: int = 100
+    """0..100, for ODOMETRY."""
     velocity_ned: tuple[float, float, float] | None = None
+    """m/s, where it was measured; None lets the bridge derive it from the fixes."""
     velocity_sigma_mps: float = 0.3
+    """1 sigma along each axis of `velocity_ned`."""
 
     def __post_init__(self) -> None:
         _check_position("vision fix", self.latitude_deg, self.longitude_deg, self.height_m)
@@ -96,8 +109,8 @@ class VisionFix:
             raise FixError(f"vision fix: quality must be 0..100, got {self.quality}")
         _check_velocity("vision fix", self.velocity_ned)
         angles = (self.roll_rad, self.pitch_rad, self.yaw_rad)
-        if any(math.isinf(angle) for angle in angles):
-            raise FixError(f"vision fix: attitude {angles} is infinite; give NaN where unknown")
+        if not all(angle is None or math.isfinite(angle) for angle in angles):
+            raise FixError(f"vision fix: attitude {angles} is not finite; give None where unknown")
         sigmas = (self.attitude_sigma_rad, self.velocity_sigma_mps)
         if not all(0.0 <= sigma <= _LARGEST_SIGMA for sigma in sigmas):
             raise FixError(
@@ -108,22 +121,25 @@ class VisionFix:
 
 @dataclass(frozen=True)
 class TargetReport:
-    """A target's position for the ground station. pixel: (x, y), normalised 0..1, or None.
-
-    elsewhere: the probability that the target is on another surface than the one reported (a roof's
-    edge, say); the accuracies include it.
-    """
+    """A target's position for the ground station. Raises `FixError` for what is none."""
 
     time_ns: int
+    """Of the exposure in which it was seen."""
     latitude_deg: float
     longitude_deg: float
     height_m: float
+    """Above the ellipsoid."""
     velocity_ned: tuple[float, float, float] | None = None
-    h_accuracy_m: float = NAN
-    v_accuracy_m: float = NAN
+    """m/s."""
+    h_accuracy_m: float | None = None
+    """1 sigma, horizontal (over both directions), `elsewhere` included."""
+    v_accuracy_m: float | None = None
+    """1 sigma of the height, `elsewhere` included."""
     pixel: tuple[float, float] | None = None
+    """Its place in the picture (x, y), normalised 0..1."""
     target_id: int = 0
     elsewhere: float = 0.0
+    """Probability that it is on another surface than the one reported (a roof's edge, say)."""
     rectangle: tuple[float, float, float, float] | None = None
     """Left, top, right, bottom, normalised 0..1."""
 
@@ -131,9 +147,9 @@ class TargetReport:
         _check_position("target report", self.latitude_deg, self.longitude_deg, self.height_m)
         _check_velocity("target report", self.velocity_ned)
         accuracies = (self.h_accuracy_m, self.v_accuracy_m)
-        if not all(math.isnan(a) or 0.0 <= a <= _LEAST_KNOWN_M for a in accuracies):
+        if not all(a is None or 0.0 <= a <= _LEAST_KNOWN_M for a in accuracies):
             raise FixError(
-                f"target report: accuracies must be 0 to {_LEAST_KNOWN_M:g} m, NaN where unknown; "
+                f"target report: accuracies must be 0 to {_LEAST_KNOWN_M:g} m, None where unknown; "
                 f"got {accuracies}"
             )
         for place in (self.pixel, self.rectangle):
@@ -153,93 +169,91 @@ class TargetEnd:
 
 @dataclass(frozen=True)
 class CameraView:
-    """Where the camera is and what it looks at, for CAMERA_FOV_STATUS.
-
-    quaternion_ned: (w, x, y, z), camera body (x along the boresight, y right, z down) to NED.
-    image_*: the point on the ground in the picture's centre; NaN where the ray meets nothing.
-    """
+    """Where the camera is and what it looks at, for CAMERA_FOV_STATUS."""
 
     time_ns: int
+    """Of the exposure."""
     latitude_deg: float
     longitude_deg: float
     height_m: float
+    """Of the camera, above the ellipsoid."""
     quaternion_ned: tuple[float, float, float, float]
-    image_latitude_deg: float = NAN
-    image_longitude_deg: float = NAN
-    image_height_m: float = NAN
+    """(w, x, y, z), camera body (x along the boresight, y right, z down) to NED."""
+    image_latitude_deg: float | None = None
+    """The point on the ground in the picture's centre; None where the ray meets nothing."""
+    image_longitude_deg: float | None = None
+    image_height_m: float | None = None
 
     def __post_init__(self) -> None:
         _check_position("camera view", self.latitude_deg, self.longitude_deg, self.height_m)
         image = (self.image_latitude_deg, self.image_longitude_deg, self.image_height_m)
-        if all(math.isfinite(value) for value in image):
-            _check_position("camera view's picture", *image)
+        _check_position("camera view's picture", *(value or 0.0 for value in image))
         if not all(abs(q) <= 1.001 for q in self.quaternion_ned):
             raise FixError(f"camera view: {self.quaternion_ned} is no rotation")
 
 
 @dataclass(frozen=True)
 class TrackRequest:
-    """What the operator asked the camera component to track; normalised image coordinates 0..1.
-
-    kind: "point" with (x, y), "rectangle" with (left, top, right, bottom), "stop" with ().
-    """
+    """What the operator asked the camera component to track."""
 
     kind: str
+    """"point", "rectangle" or "stop"."""
     time_ns: int
+    """When the command came."""
     coordinates: tuple[float, ...] = ()
+    """Normalised 0..1: (x, y) of a point; left, top, right, bottom; () of a stop."""
     radius: float = 0.0
+    """Of a point, normalised 0..1."""
 
 
 @dataclass(frozen=True)
 class Attitude:
-    """The vehicle's attitude at a time. quaternion: (w, x, y, z), body (FRD) to NED.
-
-    rates: body angular rates (roll, pitch, yaw) in rad/s. gyro_heading_rad: the heading's rate
-    integrated since the link began, unwrapped; it has no reference but no resets either.
-    """
+    """The vehicle's attitude at a time, body (FRD) to NED."""
 
     time_ns: int
     roll_rad: float
     pitch_rad: float
     yaw_rad: float
     quaternion: tuple[float, float, float, float]
+    """(w, x, y, z)."""
     rates: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    """Of the body (roll, pitch, yaw), rad/s."""
     gyro_heading_rad: float = 0.0
+    """The heading's rate integrated since the link began, unwrapped: no reference, no resets."""
 
 
 @dataclass(frozen=True)
 class InertialSample:
-    """What the IMU read (RAW_IMU, HIGHRES_IMU), before any estimator: body axes FRD.
-
-    specific_force: m/s^2, about (0, 0, -9.8) at rest; rates: rad/s, biases included.
-    """
+    """What the IMU read (RAW_IMU, HIGHRES_IMU), before any estimator: body axes FRD."""
 
     time_ns: int
     specific_force: tuple[float, float, float]
+    """m/s^2, about (0, 0, -9.8) at rest."""
     rates: tuple[float, float, float]
+    """rad/s, biases included."""
 
 
 @dataclass(frozen=True)
 class GimbalAttitude:
-    """The gimbal's attitude at a time, to NED, resolved from whatever frame the message used.
-
-    roll and pitch are relative to the horizon, yaw to true north; yaw_vehicle is relative to the
-    vehicle's heading. quaternion: (w, x, y, z), gimbal (x forward, y right, z down) to NED.
-    source: the message it came from.
-    """
+    """The gimbal's attitude at a time, to NED, resolved from whatever frame the message used."""
 
     time_ns: int
     roll_rad: float
+    """From the horizon, as pitch."""
     pitch_rad: float
     yaw_rad: float
+    """From true north."""
     yaw_vehicle_rad: float
+    """From the vehicle's heading."""
     quaternion: tuple[float, float, float, float]
+    """(w, x, y, z), gimbal (x forward, y right, z down) to NED."""
     source: str
+    """The message it came from; "fixed" of a camera without gimbal."""
 
 
 @dataclass(frozen=True)
 class Origin:
-    """The EKF origin: WGS84 degrees, metres AMSL."""
+    """The EKF origin, or another place in the autopilot's terms: WGS84."""
 
     latitude_deg: float
     longitude_deg: float
@@ -248,48 +262,73 @@ class Origin:
 
 @dataclass(frozen=True)
 class VehicleState:
-    """A snapshot of what the vehicle says about itself; None or NaN where it has not said it."""
+    """A snapshot of what the vehicle says about itself; None where it has not said it.
+
+    Times are those of the message on CLOCK_MONOTONIC, 0 before the first.
+    """
 
     connected: bool = False
+    """A heartbeat came in the last 3 s."""
     system_id: int | None = None
     component_id: int | None = None
     autopilot: str = "unknown"
+    """"ardupilot", "px4" or another name."""
     version: tuple[int, int, int] | None = None
     profile: str = "generic"
+    """Name of the firmware's profile (mavlink_bridge/vehicle/profile.py)."""
     vehicle_type: int = 0
+    """MAV_TYPE."""
     armed: bool = False
     custom_mode: int = 0
     mode: str = ""
+    """The flight mode's name."""
     system_status: int = 0
+    """MAV_STATE."""
     ekf_flags: int = 0
-    ekf_velocity_variance: float = NAN
-    ekf_horizontal_variance: float = NAN
-    ekf_vertical_variance: float = NAN
-    ekf_compass_variance: float = NAN
+    """EKF_STATUS_FLAGS; PX4's ESTIMATOR_STATUS_FLAGS share their first bits."""
+    ekf_velocity_variance: float | None = None
+    """The innovations' test ratio, rejected above 1; as the three that follow."""
+    ekf_horizontal_variance: float | None = None
+    ekf_vertical_variance: float | None = None
+    ekf_compass_variance: float | None = None
     origin: Origin | None = None
-    latitude_deg: float = NAN
-    longitude_deg: float = NAN
-    altitude_amsl_m: float = NAN
-    altitude_relative_m: float = NAN
+    """Of the EKF, as it was read."""
+    latitude_deg: float | None = None
+    """The EKF's position (GLOBAL_POSITION_INT), with the three that follow."""
+    longitude_deg: float | None = None
+    altitude_amsl_m: float | None = None
+    altitude_relative_m: float | None = None
+    """Above the home position."""
     position_time_ns: int = 0
     local_position_ned: tuple[float, float, float] | None = None
+    """Metres from the EKF's origin."""
     local_velocity_ned: tuple[float, float, float] | None = None
+    """m/s."""
     local_time_ns: int = 0
     gps_fix_type: int = 0
+    """GPS_FIX_TYPE; 3 is a 3D fix."""
     gps_satellites: int = 0
-    gps_latitude_deg: float = NAN
-    gps_longitude_deg: float = NAN
-    gps_altitude_amsl_m: float = NAN
-    gps_height_m: float = NAN  # above the ellipsoid, where the receiver says it
-    gps_h_accuracy_m: float = NAN
+    gps_latitude_deg: float | None = None
+    """The receiver's own position (GPS_RAW_INT)."""
+    gps_longitude_deg: float | None = None
+    gps_altitude_amsl_m: float | None = None
+    gps_height_m: float | None = None
+    """Above the ellipsoid, where the receiver says it."""
+    gps_h_accuracy_m: float | None = None
+    """As the receiver claims it."""
     gps_time_ns: int = 0
     rc_channels_us: tuple[int, ...] = ()
+    """Pulse widths of the pilot's channels, first to eighteenth."""
     rc_time_ns: int = 0
-    heartbeat_age_s: float = math.inf
+    heartbeat_age_s: float | None = None
     reboots: int = 0
+    """How often the autopilot started over on this link."""
     clock_offset_ns: int | None = None
+    """CLOCK_MONOTONIC minus the autopilot's boot time."""
     clock_source: str = "none"
+    """What the offset comes from."""
     last_text: str = ""
-    pressure_altitude_m: float = NAN
+    """The autopilot's newest STATUSTEXT."""
+    pressure_altitude_m: float | None = None
     """Of the barometer alone in the standard atmosphere: only its changes mean something."""
     pressure_time_ns: int = 0

@@ -66,12 +66,12 @@ def vision_fix(
     """The vehicle's position and attitude as the camera's estimate implies them.
 
     attitude and gimbal at the exposure: together they give the camera's orientation on the body.
-    Without them the vehicle's attitude is unknown (NaN) and the lever arm is not applied.
+    Without them the vehicle's attitude is unknown and the lever arm is not applied.
     """
     frame = installation.frame
     camera = frame.position(estimate.world_from_camera.translation)
     to_ned = ned_from_world(frame, camera)
-    roll = pitch = yaw = math.nan
+    roll = pitch = yaw = None
     body = estimate.world_from_camera.translation
     if attitude is not None and gimbal is not None:
         body, ned_from_body = vehicle_from_camera_pose(
@@ -126,9 +126,12 @@ def vehicle_prior(
     age_ns = time_ns - state.position_time_ns
     if attitude is None or gimbal is None or abs(age_ns) > _MAX_POSITION_AGE_NS:
         return None
-    frame, height_m = installation.frame, state.altitude_amsl_m + installation.geoid_separation_m
+    place = (state.latitude_deg, state.longitude_deg, state.altitude_amsl_m)
+    if place[0] is None or place[1] is None or place[2] is None:
+        return None
+    frame = installation.frame
     try:
-        position = Geodetic(state.latitude_deg, state.longitude_deg, height_m)
+        position = Geodetic(place[0], place[1], place[2] + installation.geoid_separation_m)
     except GeoreferenceError:
         return None
     body = frame.enu_from_geodetic(position.latitude_deg, position.longitude_deg, position.height_m)
@@ -171,22 +174,21 @@ def target_report(
 
 
 def camera_view(estimate: PoseEstimate, frame: LocalFrame, cast: RayCaster) -> CameraView:
-    """Camera and the ground in the picture's centre; NaN where that ray meets no map."""
+    """Camera and the ground in the picture's centre; None where that ray meets no map."""
     pose, camera = estimate.world_from_camera, estimate.camera
     position = frame.position(pose.translation)
     ned_from_camera = ned_from_world(frame, position) @ pose.rotation
     w, x, y, z = quaternion_from_matrix(ned_from_camera @ GIMBAL_FROM_CAMERA.T)
     eye, direction = ray_in_world(estimate, (camera.width / 2.0, camera.height / 2.0))
     distance = float(cast(eye, direction[None, :]).distances[0])
-    ground = (math.nan, math.nan, math.nan)
-    if math.isfinite(distance):
-        seen = frame.position(eye + distance * direction)
-        ground = (seen.latitude_deg, seen.longitude_deg, seen.height_m)
+    seen = frame.position(eye + distance * direction) if math.isfinite(distance) else None
     return CameraView(
         estimate.exposure_time_ns,
         position.latitude_deg,
         position.longitude_deg,
         position.height_m,
         (float(w), float(x), float(y), float(z)),
-        *ground,
+        None if seen is None else seen.latitude_deg,
+        None if seen is None else seen.longitude_deg,
+        None if seen is None else seen.height_m,
     )

@@ -94,9 +94,8 @@ class PositionBelief:
                 self._gnss_ns = now_ns
             known = [t for t in (self._gnss_ns, self._fix_ns) if t is not None]
         if healthy:
-            accuracy_m = state.gps_h_accuracy_m
-            own = accuracy_m if math.isfinite(accuracy_m) else 0.0
-            return Belief(max(self._base_m, own), independent=True)
+            own_m = state.gps_h_accuracy_m or 0.0
+            return Belief(max(self._base_m, own_m), independent=True)
         if state.ekf_flags and not state.ekf_flags & _HORIZONTAL:
             return Belief(None, independent=False)
         if not known:

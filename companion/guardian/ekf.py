@@ -25,7 +25,7 @@ class EkfWatch:
     def refuses(self, state: VehicleState) -> Reading:
         """Whether the EKF's innovation test refuses positions (EKF_STATUS_REPORT, 193)."""
         ratio = state.ekf_horizontal_variance
-        if not math.isfinite(ratio):
+        if ratio is None or math.isinf(ratio):
             return Reading(None)
         return Reading(ratio > _REFUSED, ratio)
 

@@ -189,7 +189,8 @@ class Monitor:
     def _readings(self, now_ns: int, state: VehicleState) -> dict[str, Reading]:
         newest = self._newest
         fresh = newest is not None and now_ns - newest.time_ns < _FRESH_NS
-        flies = state.armed and not state.altitude_relative_m < _AIRBORNE_M
+        height = state.altitude_relative_m
+        flies = state.armed and (height is None or height >= _AIRBORNE_M)
         none = Reading(None)
         checks: dict[str, Callable[[], Reading]] = {
             f.VIDEO_FROZEN.name: lambda: self._frozen(now_ns, state) if flies else Reading(False),
@@ -215,8 +216,7 @@ class Monitor:
 
     def _still_s(self, state: VehicleState) -> float:
         """How long a hover may look still: the limit in the picture is metres on the ground."""
-        height = state.altitude_relative_m
-        height = height if math.isfinite(height) else 100.0
+        height = 100.0 if state.altitude_relative_m is None else state.altitude_relative_m
         half = math.tan(math.radians(self._limits.horizontal_fov_deg) / 2.0)
         ground_m = self._config.picture.still_share * 2.0 * max(height, 0.0) * half
         return max(self._config.picture.still_s, _STILL_FIRST_S + _STILL_PER_M * ground_m)

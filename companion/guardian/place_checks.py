@@ -37,9 +37,10 @@ class HeightCheck:
 
     def add(self, fix: VisionFix, state: VehicleState) -> Reading:
         """One fix, and the state at about its time."""
-        if abs(fix.time_ns - state.pressure_time_ns) > _BARO_FRESH_NS:
+        altitude = state.pressure_altitude_m
+        if altitude is None or abs(fix.time_ns - state.pressure_time_ns) > _BARO_FRESH_NS:
             return Reading(None)
-        difference = fix.height_m - state.pressure_altitude_m
+        difference = fix.height_m - altitude
         self._differences.append(difference)
         median = float(np.median(self._differences))
         if self._zero is None:
@@ -66,14 +67,15 @@ class GnssCheck:
         self, fix: VisionFix, state: VehicleState, protection_m: float, now_ns: int
     ) -> Reading:
         """The newest fix against the newest report."""
-        known = gnss_healthy(state, now_ns) and math.isfinite(state.gps_latitude_deg)
-        if not known or abs(state.gps_time_ns - fix.time_ns) > _FIX_FRESH_NS:
+        latitude, longitude = state.gps_latitude_deg, state.gps_longitude_deg
+        if latitude is None or longitude is None or not gnss_healthy(state, now_ns):
+            return Reading(None)
+        if abs(state.gps_time_ns - fix.time_ns) > _FIX_FRESH_NS:
             return Reading(None)
         place = LocalPlace()
         place.ned(fix)
-        apart = math.hypot(*place.north_east(state.gps_latitude_deg, state.gps_longitude_deg))
-        accuracy = state.gps_h_accuracy_m if math.isfinite(state.gps_h_accuracy_m) else math.inf
-        accuracy = _GNSS_SIGMA_M if math.isinf(accuracy) else accuracy
+        apart = math.hypot(*place.north_east(latitude, longitude))
+        accuracy = _GNSS_SIGMA_M if state.gps_h_accuracy_m is None else state.gps_h_accuracy_m
         accuracy = min(max(accuracy, _GNSS_FLOOR_M), self._cap_m)
         velocity = state.local_velocity_ned or (0.0, 0.0, 0.0)
         limit = _SIGMAS * accuracy + protection_m + _GNSS_AGE_S * math.hypot(*velocity[:2])

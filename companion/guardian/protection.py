@@ -31,7 +31,7 @@ def protection_level(
     P = fix.position_covariance_ned
     horizontal = math.sqrt(max(float(np.linalg.eigvalsh(P[:2, :2])[-1]), 0.0))
     vertical = math.sqrt(max(float(P[2, 2]), 0.0))
-    height = state.altitude_relative_m if math.isfinite(state.altitude_relative_m) else 0.0
+    height = state.altitude_relative_m or 0.0
     velocity = state.local_velocity_ned or (0.0, 0.0, 0.0)
     bias = config.map_m + config.calibration_share * max(height, 0.0)
     return ProtectionLevel(

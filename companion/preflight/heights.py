@@ -25,12 +25,15 @@ def check_heights(cache: TileCache, state: VehicleState) -> list[Finding]:
     if state.gps_fix_type < _FIX_3D:
         return []
     findings = []
-    if math.isfinite(state.gps_height_m):
-        findings.append(_geoid(cache, state.gps_height_m - state.gps_altitude_amsl_m))
-    if not state.armed and math.isfinite(state.gps_altitude_amsl_m):
-        ground = _ground(cache, state)
-        if ground is not None:
-            findings.append(_take_off(ground, state.gps_altitude_amsl_m))
+    altitude_m, height_m = state.gps_altitude_amsl_m, state.gps_height_m
+    if altitude_m is not None and height_m is not None:
+        findings.append(_geoid(cache, height_m - altitude_m))
+    latitude_deg, longitude_deg = state.gps_latitude_deg, state.gps_longitude_deg
+    if altitude_m is None or latitude_deg is None or longitude_deg is None or state.armed:
+        return findings
+    ground_m = _ground(cache, latitude_deg, longitude_deg)
+    if ground_m is not None:
+        findings.append(_take_off(ground_m, altitude_m))
     return findings
 
 
@@ -47,10 +50,10 @@ def _geoid(cache: TileCache, receiver_m: float) -> Finding:
     )
 
 
-def _ground(cache: TileCache, state: VehicleState) -> float | None:
-    """AMSL of the map's surface where the vehicle is, metres; None beside the map."""
+def _ground(cache: TileCache, latitude_deg: float, longitude_deg: float) -> float | None:
+    """AMSL of the map's surface at a place, metres; None beside the map."""
     top = cache.manifest.height_range_m[1] + _ABOVE_M
-    place = state.gps_latitude_deg, state.gps_longitude_deg
+    place = latitude_deg, longitude_deg
     above = np.asarray(cache.frame.enu_from_geodetic(*place, top))
     below = np.asarray(cache.frame.enu_from_geodetic(*place, top - 1.0))
     try:

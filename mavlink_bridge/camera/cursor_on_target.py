@@ -21,8 +21,8 @@ def cursor_on_target(report: TargetReport, config: TargetsConfig, utc: SteadyUtc
     def stamp(moment: datetime) -> str:
         return moment.strftime("%Y-%m-%dT%H:%M:%S.%f")[:-3] + "Z"
 
-    def accuracy(value: float) -> str:
-        return f"{value:.1f}" if math.isfinite(value) else "9999999.0"  # CoT's "unknown"
+    def accuracy(value: float | None) -> str:
+        return "9999999.0" if value is None else f"{value:.1f}"  # CoT's "unknown"
 
     event = ElementTree.Element(
         "event",

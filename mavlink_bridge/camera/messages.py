@@ -75,11 +75,11 @@ def camera_fov_status(
 ) -> Any:
     """CAMERA_FOV_STATUS (271): camera position, attitude and the ground point in its centre."""
 
-    def degrees_e7(value: float) -> int:
-        return round(value * 1e7) if math.isfinite(value) else _INVALID_LATLON
+    def degrees_e7(value: float | None) -> int:
+        return _INVALID_LATLON if value is None else round(value * 1e7)
 
-    def altitude_mm(height_m: float) -> int:
-        if not math.isfinite(height_m):
+    def altitude_mm(height_m: float | None) -> int:
+        if height_m is None:
             return _INVALID_LATLON
         return round((height_m - geoid_separation_m) * 1e3)
 

@@ -12,7 +12,7 @@ from typing import Any
 
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
-from mavlink_bridge.messages import Origin, TargetReport
+from mavlink_bridge.messages import Origin, TargetReport, or_nan
 from mavlink_bridge.vehicle.origin import north_east
 
 NAN = math.nan
@@ -73,8 +73,8 @@ def tracking_geo_status(
         round(report.latitude_deg * 1e7),
         round(report.longitude_deg * 1e7),
         altitude,
-        report.h_accuracy_m,
-        report.v_accuracy_m,
+        or_nan(report.h_accuracy_m),
+        or_nan(report.v_accuracy_m),
         *velocity,
         NAN,
         distance,

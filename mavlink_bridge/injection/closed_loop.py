@@ -37,12 +37,12 @@ _SOURCE = {
 class LoopVerdict:
     """Whether the EKF follows what is sent. reason: one line; empty while all is well.
 
-    difference_m: median horizontal distance between sent and estimated position, NaN unknown.
+    difference_m: median horizontal distance between sent and estimated position.
     """
 
     used: bool
     reason: str
-    difference_m: float
+    difference_m: float | None
 
 
 class ClosedLoopCheck:
@@ -88,7 +88,7 @@ class ClosedLoopCheck:
         if not recent or self._began_ns is None or now_ns - self._began_ns < _SETTLE_NS:
             return None
         differences = sorted(d for t, d, *_ in self._differences if now_ns - t < _WINDOW_NS)
-        difference = differences[len(differences) // 2] if differences else math.nan
+        difference = differences[len(differences) // 2] if differences else None
         span_s = (recent[-1][0] - recent[0][0]) * 1e-9
         rate = (len(recent) - 1) / span_s if span_s > 0.0 else 0.0
         reason = self._reason(rate, state, difference, recent[-1][3])
@@ -131,7 +131,9 @@ class ClosedLoopCheck:
                 distance = math.hypot(local[0] - north, local[1] - east)
                 self._differences.append((now_ns, distance, sigma, stamp_ns))
 
-    def _reason(self, rate: float, state: VehicleState, difference: float, sigma: float) -> str:
+    def _reason(
+        self, rate: float, state: VehicleState, difference: float | None, sigma: float
+    ) -> str:
         wanted = _GPS_MINIMUM_HZ if self._message == "gps_input" else _MINIMUM_HZ
         flags = state.ekf_flags
         reasons = (
@@ -145,15 +147,16 @@ class ClosedLoopCheck:
                 f"the EKF has no position source; check {_SOURCE[self._message]}",
             ),
             (
-                math.isnan(difference),
+                difference is None,
                 f"the EKF reports no local position; check {_SOURCE[self._message]}",
             ),
             (
-                difference > _SIGMAS * sigma + _SLACK_M,
-                f"the EKF is {difference:.1f} m from what is sent; check frame, origin and source",
+                (difference or 0.0) > _SIGMAS * sigma + _SLACK_M,
+                f"the EKF is {difference or 0.0:.1f} m from what is sent; "
+                "check frame, origin and source",
             ),
             (
-                state.ekf_horizontal_variance > _VARIANCE_LIMIT,
+                (state.ekf_horizontal_variance or 0.0) > _VARIANCE_LIMIT,
                 "the EKF rejects positions (innovation gate); check VISO_POS_M_NSE and delay",
             ),
         )

@@ -12,6 +12,7 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 from mavlink_bridge import quaternion as quat
 from mavlink_bridge.config import InjectionConfig
 from mavlink_bridge.injection.propagate import PropagatedFix
+from mavlink_bridge.messages import or_nan
 from mavlink_bridge.vehicle.profile import CovarianceFormula, covariance_entry
 
 NAN = math.nan
@@ -28,16 +29,20 @@ _CLAIMED_HDOP = 0.8
 _CLAIMED_VDOP = 1.0
 
 
+Angles = tuple[float | None, float | None, float | None]
+
+
 @dataclass(frozen=True)
 class Estimate:
-    """What is about to be sent. position: as propagated; attitude: (roll, pitch, yaw), NaN unknown.
+    """What is about to be sent. position: as propagated; attitude: (roll, pitch, yaw), None where
+    it is not known.
 
     fresh: a fix as it came, not propagated. quality: 0..100. repeated: the fix was sent before, at
     another time: its velocity is no new measurement.
     """
 
     position: PropagatedFix
-    attitude: tuple[float, float, float]
+    attitude: Angles
     attitude_sigma_rad: float
     quality: int
     reset_counter: int
@@ -71,13 +76,15 @@ def vision_position_estimate(
 ) -> Any:
     """VISION_POSITION_ESTIMATE (102): NED metres from the EKF origin, yaw from true north."""
     covariance = pose_covariance(e.position.covariance_ned, e.attitude_sigma_rad, formula)
+    angles = (or_nan(angle) for angle in e.attitude)
     return mavlink.MAVLink_vision_position_estimate_message(
-        e.position.time_ns // 1000, *ned, *e.attitude, covariance, e.reset_counter
+        e.position.time_ns // 1000, *ned, *angles, covariance, e.reset_counter
     )
 
 
 def odometry(
     e: Estimate,
+    attitude: tuple[float, float, float],
     ned: tuple[float, float, float],
     formula: CovarianceFormula,
     frame: int,
@@ -86,7 +93,7 @@ def odometry(
 
     A repeated velocity is NaN, "unknown": the EKF would take its error for an independent one.
     """
-    q = quat.from_euler(*e.attitude)
+    q = quat.from_euler(*attitude)
     vn, ve, vd = (float(v) for v in e.position.velocity_ned)
     body = quat.rotate(quat.conjugate(q), (vn, ve, vd))
     covariance = pose_covariance(e.position.covariance_ned, e.attitude_sigma_rad, formula)
@@ -121,7 +128,7 @@ def gps_input(
     """GPS_INPUT (232), every field filled: ArduPilot never arms on one with HDOP ignored."""
     p = e.position
     yaw = 0  # 0 means none; north is 36000
-    if config.gps_yaw and math.isfinite(e.attitude[2]):
+    if config.gps_yaw and e.attitude[2] is not None:
         yaw = round(math.degrees(e.attitude[2]) % 360.0 * 100.0) or 36000
     vn, ve, vd = (float(v) for v in p.velocity_ned) if config.gps_velocity else (0.0, 0.0, 0.0)
     week, ms = week_ms

@@ -152,7 +152,7 @@ class Injector:
             fix = self._waiting.popleft()
             attitude = context.attitude_at(fix.time_ns)
             verdict = self.guard.check(fix.time_ns, fix.yaw_rad, attitude, reset=fix.reset)
-            if math.isfinite(verdict.difference_rad):
+            if verdict.difference_rad is not None:
                 self.yaw_difference_rad = verdict.difference_rad
             self._jump.note(fix)
             if not verdict.accept:

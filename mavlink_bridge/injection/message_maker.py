@@ -10,6 +10,7 @@ from typing import Any
 from mavlink_bridge import quaternion as quat
 from mavlink_bridge.config import InjectionConfig, InjectionMessage
 from mavlink_bridge.injection.encode import (
+    Angles,
     Estimate,
     global_position_sensor,
     gps_input,
@@ -21,7 +22,6 @@ from mavlink_bridge.messages import Attitude, Origin, VisionFix
 from mavlink_bridge.vehicle.origin import ned_from_origin
 from mavlink_bridge.vehicle.profile import CovarianceFormula, FirmwareProfile
 
-NAN = math.nan
 _FARTHEST_M = 100_000.0  # from the origin: farther, one of the two is wrong
 
 
@@ -50,18 +50,22 @@ class InjectionContext:
     attitude_at: Callable[[int], Attitude | None]
 
 
-def attitude_of(
-    fix: VisionFix, time_ns: int, context: InjectionContext
-) -> tuple[float, float, float]:
+def attitude_of(fix: VisionFix, time_ns: int, context: InjectionContext) -> Angles:
     """Vision attitude at time_ns: the fix's, turned as the autopilot turned since."""
-    vision = (fix.roll_rad, fix.pitch_rad, fix.yaw_rad)
-    if time_ns == fix.time_ns or not all(math.isfinite(angle) for angle in vision):
-        return vision
+    angles = (fix.roll_rad, fix.pitch_rad, fix.yaw_rad)
+    known = _all_known(angles)
+    if time_ns == fix.time_ns or known is None:
+        return angles
     then, now = context.attitude_at(fix.time_ns), context.attitude_at(time_ns)
     if then is None or now is None:
-        return vision
+        return angles
     turned = quat.multiply(quat.conjugate(then.quaternion), now.quaternion)
-    return quat.to_euler(quat.multiply(quat.from_euler(*vision), turned))
+    return quat.to_euler(quat.multiply(quat.from_euler(*known), turned))
+
+
+def _all_known(angles: Angles) -> tuple[float, float, float] | None:
+    roll, pitch, yaw = angles
+    return None if roll is None or pitch is None or yaw is None else (roll, pitch, yaw)
 
 
 class MessageMaker:
@@ -99,7 +103,7 @@ class MessageMaker:
         if kind == "odometry":
             return self._odometry(e, ned, formula, context)
         if not self._config.send_attitude:
-            e = replace(e, attitude=(NAN, NAN, NAN))
+            e = replace(e, attitude=(None, None, None))
         return Injection(vision_position_estimate(e, ned, formula), e)
 
     def _odometry(
@@ -110,9 +114,12 @@ class MessageMaker:
         context: InjectionContext,
     ) -> Injection | Withheld:
         """Velocity is rotated by the message's quaternion, so there must be one."""
-        if not all(math.isfinite(angle) for angle in e.attitude):
+        attitude = _all_known(e.attitude)
+        if attitude is None:
             now = context.attitude_at(e.position.time_ns)
             if now is None:
                 return Withheld("no attitude for ODOMETRY", "withheld_no_attitude")
-            e = replace(e, attitude=(now.roll_rad, now.pitch_rad, now.yaw_rad))
-        return Injection(odometry(e, ned, formula, context.profile.odometry_frame), e)
+            attitude = (now.roll_rad, now.pitch_rad, now.yaw_rad)
+            e = replace(e, attitude=attitude)
+        frame = context.profile.odometry_frame
+        return Injection(odometry(e, attitude, ned, formula, frame), e)

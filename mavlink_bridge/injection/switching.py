@@ -44,7 +44,7 @@ def gnss_fault(
     glitch = mavlink.EKF_GPS_GLITCHING if state.autopilot == "ardupilot" else 0
     if state.ekf_flags & glitch:
         return "GNSS glitch"
-    if vision is None or not math.isfinite(state.gps_latitude_deg):
+    if vision is None or state.gps_latitude_deg is None or state.gps_longitude_deg is None:
         return None
     apart = math.hypot(
         *north_east(
@@ -54,7 +54,7 @@ def gnss_fault(
             vision.longitude_deg,
         )
     )
-    accuracy = state.gps_h_accuracy_m if math.isfinite(state.gps_h_accuracy_m) else _GNSS_SIGMA_M
+    accuracy = _GNSS_SIGMA_M if state.gps_h_accuracy_m is None else state.gps_h_accuracy_m
     speed = math.hypot(*vision.velocity_ned[:2])
     limit = sigmas * math.hypot(accuracy, vision.horizontal_sigma_m) + speed * _SPEED_SLACK_S
     return f"GNSS {apart:.0f} m from vision" if apart > limit else None

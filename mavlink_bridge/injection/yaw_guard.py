@@ -29,10 +29,12 @@ _DRIFT_RAD_PER_S = math.radians(0.3)  # of the gyros while no fix is seen
 
 @dataclass(frozen=True)
 class YawVerdict:
-    """What the guard says of one fix. accept: send it; difference_rad: vision minus autopilot."""
+    """What the guard says of one fix. accept: send it; difference_rad: vision minus autopilot, None
+    where one of the two is not known.
+    """
 
     accept: bool
-    difference_rad: float
+    difference_rad: float | None
 
 
 class YawGuard:
@@ -65,7 +67,7 @@ class YawGuard:
     def check(
         self,
         time_ns: int,
-        vision_yaw_rad: float,
+        vision_yaw_rad: float | None,
         autopilot: Attitude | None,
         *,
         reset: bool = False,
@@ -75,11 +77,11 @@ class YawGuard:
         reset: the localizer itself says that its estimate jumps with this fix.
         """
         if not self._config.enabled:
-            return YawVerdict(True, math.nan)
-        if autopilot is None or not math.isfinite(vision_yaw_rad):
+            return YawVerdict(True, None)
+        if autopilot is None or vision_yaw_rad is None:
             self.unchecked += 1
             self._unchecked_in_a_row += 1
-            return YawVerdict(not self.blocked, math.nan)
+            return YawVerdict(not self.blocked, None)
         self._unchecked_in_a_row = 0
         difference = wrap_pi(vision_yaw_rad - autopilot.yaw_rad)
         to_gyros = wrap_pi(vision_yaw_rad - autopilot.gyro_heading_rad)

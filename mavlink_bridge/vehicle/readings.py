@@ -161,10 +161,10 @@ class VehicleReadings:
         self.state = replace(
             self.state,
             ekf_flags=m.flags,
-            ekf_velocity_variance=m.velocity_variance,
-            ekf_horizontal_variance=m.pos_horiz_variance,
-            ekf_vertical_variance=m.pos_vert_variance,
-            ekf_compass_variance=m.compass_variance,
+            ekf_velocity_variance=_known(m.velocity_variance),
+            ekf_horizontal_variance=_known(m.pos_horiz_variance),
+            ekf_vertical_variance=_known(m.pos_vert_variance),
+            ekf_compass_variance=_known(m.compass_variance),
         )
 
     def _estimator_status(self, m: Any, _: int) -> None:
@@ -172,10 +172,10 @@ class VehicleReadings:
         self.state = replace(
             self.state,
             ekf_flags=m.flags,
-            ekf_velocity_variance=m.vel_ratio,
-            ekf_horizontal_variance=m.pos_horiz_ratio,
-            ekf_vertical_variance=m.pos_vert_ratio,
-            ekf_compass_variance=m.mag_ratio,
+            ekf_velocity_variance=_known(m.vel_ratio),
+            ekf_horizontal_variance=_known(m.pos_horiz_ratio),
+            ekf_vertical_variance=_known(m.pos_vert_ratio),
+            ekf_compass_variance=_known(m.mag_ratio),
         )
 
     def _gps(self, m: Any, time_ns: int) -> None:
@@ -188,8 +188,8 @@ class VehicleReadings:
             gps_latitude_deg=m.lat * 1e-7,
             gps_longitude_deg=m.lon * 1e-7,
             gps_altitude_amsl_m=m.alt * 1e-3,
-            gps_height_m=height * 1e-3 if height else math.nan,
-            gps_h_accuracy_m=accuracy * 1e-3 if accuracy else math.nan,
+            gps_height_m=height * 1e-3 if height else None,
+            gps_h_accuracy_m=accuracy * 1e-3 if accuracy else None,
             gps_time_ns=time_ns,
         )
 
@@ -225,6 +225,11 @@ def boot_time_ns(message: Any) -> int | None:
     if message.get_type() in ("RAW_IMU", "HIGHRES_IMU"):
         return int(message.time_usec) * 1000
     return None
+
+
+def _known(value: float) -> float | None:
+    """A field's value, None where it is NaN: the estimator does not say."""
+    return None if math.isnan(value) else value
 
 
 def _check_finite(*values: float) -> None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import threading
 from dataclasses import replace
 from typing import Any
@@ -44,11 +43,11 @@ class VehicleTracker:
         """The state now."""
         with self._lock:
             heartbeat_ns = self._readings.heartbeat_ns
-            age_ns = math.inf if heartbeat_ns is None else now_ns - heartbeat_ns
+            age_ns = None if heartbeat_ns is None else now_ns - heartbeat_ns
             return replace(
                 self._readings.state,
-                connected=age_ns < _HEARTBEAT_LOST_NS,
-                heartbeat_age_s=age_ns * 1e-9,
+                connected=age_ns is not None and age_ns < _HEARTBEAT_LOST_NS,
+                heartbeat_age_s=None if age_ns is None else age_ns * 1e-9,
                 reboots=self.clock.reboots,
                 clock_offset_ns=self.clock.offset_ns,
                 clock_source=self.clock.source,

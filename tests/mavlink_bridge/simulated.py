@@ -100,7 +100,7 @@ class Flight:
         self.reset_next = False
         self.latency_ms = 50
         self.sees = True
-        self.vision_yaw: float | None = None  # None: the vehicle's
+        self.yaw_is_seen = True
         self.mangle: Callable[[bytes], bytes] = lambda frame: frame
         self._answered = 0
 
@@ -141,7 +141,7 @@ class Flight:
             988.0 + GEOID,
             0.0,
             0.0,
-            self.yaw(exposure_ns) if self.vision_yaw is None else self.vision_yaw,
+            self.yaw(exposure_ns) if self.yaw_is_seen else None,
             np.eye(3) * 0.04,
             reset=self.reset_next,
         )

@@ -564,6 +564,7 @@ def test_threads_end_with_the_bridge(autopilot: Any, run: Callable[..., Bridge])
         {"position_covariance_ned": np.array([[1.0, 5.0, 0], [5.0, 1.0, 0], [0, 0, 1.0]])},
         {"position_covariance_ned": np.array([[1.0, 0.5, 0], [0.0, 1.0, 0], [0, 0, 1.0]])},
         {"yaw_rad": math.inf},
+        {"yaw_rad": math.nan},
         {"attitude_sigma_rad": math.nan},
         {"velocity_sigma_mps": -1.0},
         {"quality": 101},

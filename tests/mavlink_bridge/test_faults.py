@@ -488,11 +488,11 @@ def test_a_blind_yaw_guard_is_told_once(monkeypatch: pytest.MonkeyPatch) -> None
     monkeypatch.setattr(flight, "yaw", lambda _: 0.0)
     flight.run(10.0)
     assert not [t for t in flight.texts if "not checked" in t]
-    flight.vision_yaw = math.nan
+    flight.yaw_is_seen = False
     flight.run(10.0)
     told = [t for t in flight.texts if "not checked" in t]
     assert told == ["PiLoT: vision yaw is not checked: no attitude or no gimbal angles"]
-    flight.vision_yaw = None
+    flight.yaw_is_seen = True
     flight.run(5.0)
     assert flight.texts[-1] == "PiLoT: vision yaw is checked"
 

@@ -28,7 +28,7 @@ def target(**fields: Any) -> TargetReport:
     return TargetReport(*PLACE, **fields)
 
 
-def view(quaternion: Any = LEVEL, *image: float) -> CameraView:
+def view(quaternion: Any = LEVEL, *image: float | None) -> CameraView:
     return CameraView(*PLACE, quaternion, *image)
 
 
@@ -54,27 +54,43 @@ def test_what_no_message_can_carry_is_named(
         make(bad)
 
 
-@pytest.mark.parametrize("bad", [math.inf, -1.0, 1e300])
+@pytest.mark.parametrize("bad", [math.nan, math.inf, -1.0, 1e300])
 @pytest.mark.parametrize("field", ["h_accuracy_m", "v_accuracy_m"])
 def test_accuracies_that_are_none_are_named(field: str, bad: float) -> None:
     with pytest.raises(FixError, match="accuracies"):
         target(**{field: bad})
 
 
-def test_a_picture_of_a_place_that_is_not_on_earth_is_named() -> None:
+@pytest.mark.parametrize("latitude", [95.0, math.nan, math.inf])
+def test_a_picture_of_a_place_that_is_not_on_earth_is_named(latitude: float) -> None:
     with pytest.raises(FixError, match="picture"):
-        view(LEVEL, 95.0, 8.0, 500.0)
+        view(LEVEL, latitude, 8.0, 500.0)
+
+
+@pytest.mark.parametrize("angle", ["roll_rad", "pitch_rad", "yaw_rad"])
+def test_an_angle_is_known_or_none(angle: str) -> None:
+    for bad in (math.nan, math.inf):
+        with pytest.raises(FixError, match="None where unknown"):
+            fix(**{angle: bad})
+    assert getattr(fix(**{angle: None}), angle) is None
+
+
+def test_what_is_unknown_goes_out_as_the_messages_define_it() -> None:
+    geo = tracking_geo_status(target(), 0.0, None)
+    assert all(math.isnan(x) for x in (geo.h_acc, geo.v_acc, geo.vel_n, geo.dist, geo.hdg))
+    looks = camera_fov_status(view(), CameraConfig(), 0.0, 0)
+    assert {looks.lat_image, looks.lon_image, looks.alt_image} == {2**31 - 1}
 
 
 def test_the_widest_that_is_accepted_can_be_packed() -> None:
     from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
-    report = target(velocity_ned=(1000.0, -1000.0, 1000.0), h_accuracy_m=1e5, v_accuracy_m=math.nan,
+    report = target(velocity_ned=(1000.0, -1000.0, 1000.0), h_accuracy_m=1e5, v_accuracy_m=None,
                     pixel=(0.0, 1.0), target_id=-(2**40))  # fmt: skip
     for message in (
         tracking_geo_status(report, -100.0, None),
         adsb_vehicle(report, -100.0),
         camera_fov_status(view(), CameraConfig(), -100.0, 0),
-        camera_fov_status(view(LEVEL, math.nan, 8.0, math.inf), CameraConfig(), 100.0, 0),
+        camera_fov_status(view(LEVEL, None, 8.0, None), CameraConfig(), 100.0, 0),
     ):
         assert message.pack(mavlink.MAVLink(None, 1, 100))

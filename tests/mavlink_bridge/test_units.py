@@ -42,6 +42,7 @@ NORTH, EAST, DOWN, HEADING = 3.0, 4.0, -2.0, 60.0
 COURSE = math.degrees(math.atan2(EAST, NORTH))
 EXPOSURE_S, NOW_S, UPTIME_S = 1000.0, 1000.2, 77.0
 WEEK_S = 345_600.5
+NOSE = (0.0, 0.0, math.radians(HEADING))
 
 
 def scaled(kind: Any, field: str, value: float) -> float:
@@ -58,7 +59,7 @@ def estimate() -> Estimate:
         round(EXPOSURE_S * 1e9), LAT, LON, HEIGHT, np.diag([4.0, 4.0, 9.0]),
         np.array([NORTH, EAST, DOWN]), np.eye(3) * 0.25,
     )  # fmt: skip
-    return Estimate(position, (0.0, 0.0, math.radians(HEADING)), 0.02, 80, 1, True)
+    return Estimate(position, NOSE, 0.02, 80, 1, True)
 
 
 REPORT = TargetReport(
@@ -90,7 +91,7 @@ SENT: list[tuple[Any, dict[str, float]]] = [
         {"usec": EXPOSURE_S, "x": 11.0, "y": 12.0, "z": 13.0, "yaw": HEADING},
     ),
     (
-        odometry(estimate(), NED, "variance", mavlink.MAV_FRAME_LOCAL_FRD),
+        odometry(estimate(), NOSE, NED, "variance", mavlink.MAV_FRAME_LOCAL_FRD),
         {"time_usec": EXPOSURE_S, "x": 11.0, "y": 12.0, "z": 13.0, "vz": DOWN},
     ),
     (

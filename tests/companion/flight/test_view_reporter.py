@@ -50,8 +50,8 @@ def test_the_picture_s_centre_falls_on_the_ground():
 
 def test_a_look_into_the_sky_has_no_ground():
     view = camera_view(estimate(10.0), FRAME, flat)
-    assert math.isnan(view.image_latitude_deg)
-    assert math.isnan(view.image_height_m)
+    assert view.image_latitude_deg is None
+    assert view.image_height_m is None
 
 
 def test_only_the_newest_accepted_estimate_is_told_and_errors_do_not_end_it():

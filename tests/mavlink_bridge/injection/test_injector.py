@@ -347,7 +347,7 @@ def test_late_future_and_unordered_fixes_are_dropped_and_counted() -> None:
 
 def test_unknown_attitude_is_sent_as_nan() -> None:
     it = injector(delay_ms=0)
-    unknown = fix(SECOND, yaw_rad=math.nan)
+    unknown = fix(SECOND, yaw_rad=None)
     it.submit(unknown, SECOND)
     message = it.step(SECOND, context()).message  # type: ignore[union-attr]
     assert math.isnan(message.yaw)
