@@ -49,9 +49,13 @@ class Guardian:
 
     def judge(self, fix: VisionFix) -> VisionFix | None:
         """The fix as it may be injected; None withholds it."""
-        state = self._bridge.state()
-        with self._lock:
-            return self._monitor.admit(fix, state)
+        try:
+            state = self._bridge.state()
+            with self._lock:
+                return self._monitor.admit(fix, state)
+        except Exception:
+            self._failed()
+            return fix
 
     def submit(self, fix: VisionFix) -> None:
         """Judge a fix and hand it to the bridge, if it may be injected."""
@@ -80,11 +84,15 @@ class Guardian:
         while not self._stop.wait(_PERIOD_S):
             try:
                 self._step()
-            except Exception:  # a guardian that died in silence would be believed
-                if not self._failures:
-                    _log.exception("the guardian failed")
-                    self._bridge.say(_ERROR, "PiLoT: guardian failed: fixes are not watched")
-                self._failures += 1
+            except Exception:
+                self._failed()
+
+    def _failed(self) -> None:
+        """A guardian that died in silence would be believed: told once, from its own exception."""
+        self._failures += 1
+        if self._failures == 1:
+            _log.exception("the guardian failed")
+            self._bridge.say(_ERROR, "PiLoT: guardian failed: fixes are not watched")
 
     def _step(self) -> None:
         picture, self._picture = self._picture, None

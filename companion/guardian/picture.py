@@ -10,6 +10,7 @@ they do not move edges.
 
 from __future__ import annotations
 
+import heapq
 import zlib
 from collections import deque
 from dataclasses import dataclass
@@ -27,6 +28,7 @@ _CRC_ROWS = 8  # every eighth row is enough to tell two pictures of a sensor apa
 _UNLIKE_GRAY = 2.0  # root mean square difference beyond which a fit need not be tried
 _SURE = 2e-4  # a fit with a larger sigma says nothing: the picture has no content
 _MEDIAN_OF = 5
+_CANDIDATES = 3  # for a loop, of a minute's pictures
 _FILLED = 0.7  # of the memory's pictures within a loop's time must match
 _MOVES = 10.0  # a path that repeats must be so many times longer than what counts as equal
 _LAG_SLACK_NS = 150_000_000
@@ -60,6 +62,16 @@ class _Seen:
     time_ns: int
     crc: int
     thumbnail: Thumbnail
+    contrast: float
+    plain: Thumbnail
+    """The thumbnail at a contrast of 1: another exposure changes nothing."""
+
+
+def _look(time_ns: int, image: Image) -> _Seen:
+    small = thumbnail(image)
+    contrast = float(small.std())
+    crc = zlib.crc32(image[::_CRC_ROWS].tobytes())
+    return _Seen(time_ns, crc, small, contrast, small / np.float32(max(contrast, 1e-3)))
 
 
 class PictureWatch:
@@ -75,7 +87,7 @@ class PictureWatch:
 
     def add(self, time_ns: int, image: Image) -> PictureVerdict:
         """One picture (H, W, 3) uint8 RGB at its exposure time; what is known with it."""
-        seen = _Seen(time_ns, zlib.crc32(image[::_CRC_ROWS].tobytes()), thumbnail(image))
+        seen = _look(time_ns, image)
         last, self._newest = self._newest, seen
         if last is None or last.crc != seen.crc:
             self._identical_since_ns = time_ns
@@ -86,7 +98,7 @@ class PictureWatch:
             max((time_ns - reference_ns) * 1e-9, identical_s),
             identical_s,
             self._loop.add(seen),
-            float(seen.thumbnail.std()),
+            seen.contrast,
         )
 
     def _keep_reference(self, seen: _Seen) -> None:
@@ -112,10 +124,10 @@ class LoopWatch:
 
     def add(self, seen: _Seen) -> float:
         """Seconds to the pictures that come again; 0 while they are new."""
-        for old in self._memory:
-            lag_ns = seen.time_ns - old.time_ns
-            if lag_ns >= self._hold_ns and resemblance(old, seen) < self._config.still_share:
-                self._matches.append((seen.time_ns, lag_ns))
+        before = [old for old in self._memory if seen.time_ns - old.time_ns >= self._hold_ns]
+        for old in heapq.nsmallest(_CANDIDATES, before, key=lambda old: unlikeness(old, seen)):
+            if resemblance(old, seen) < self._config.still_share:
+                self._matches.append((seen.time_ns, seen.time_ns - old.time_ns))
         while self._matches and seen.time_ns - self._matches[0][0] > self._hold_ns:
             self._matches.popleft()
         self._remember(seen)
@@ -147,10 +159,15 @@ def resemblance(a: _Seen, b: _Seen) -> float:
     """How far the picture moved from a to b, as a share of its width; 1 where nobody can say."""
     if a.crc == b.crc:
         return 0.0
-    if float(np.sqrt(np.mean(np.square(a.thumbnail - b.thumbnail)))) > _UNLIKE_GRAY:
+    if unlikeness(a, b) > _UNLIKE_GRAY:
         return 1.0
     moved = picture_motion(a.thumbnail, b.thumbnail)
     return moved.share if moved.sigma < _SURE else 1.0
+
+
+def unlikeness(a: _Seen, b: _Seen) -> float:
+    """Root mean square difference of two pictures of one contrast, gray levels of 255."""
+    return float(np.sqrt(np.mean(np.square(a.plain - b.plain)))) * min(a.contrast, b.contrast)
 
 
 def thumbnail(image: Image) -> Thumbnail:
