@@ -66,11 +66,11 @@ def steps(sequence: Path | None, cache: Path | None, report: Path) -> list[Step]
     found.append(Step("optimizer", (python, "-m", "benchmarks.optimizer.gpu"), 150))
     if sequence is not None and cache is not None:
         for device in ("cuda", "cpu"):
-            command = (
+            evaluation = (
                 python, "-m", "companion", "eval", str(sequence), "--map", str(cache),
                 "--device", device, "--limit", "100", "--report", str(report) + f".{device}",
             )  # fmt: skip
-            found.append(Step(f"companion eval --device {device}", command, 90))
+            found.append(Step(f"companion eval --device {device}", evaluation, 90))
     return found
 
 

@@ -134,7 +134,8 @@ def main() -> None:
     parser.add_argument("--frames", type=whole(1, 10_000), default=20, help="poses measured")
     parser.add_argument("--threads", type=whole(1, 256), default=2, help="of numba")
     options = parser.parse_args()
-    camera = Camera.from_fov(*options.size, 60.0)
+    width, height = options.size
+    camera = Camera.from_fov(width, height, 60.0)
     table = Table(
         "backend", "M triangles", "CPU ms", "wall ms", "CPU / numba", "depth median", "depth p99.9"
     )

@@ -71,7 +71,8 @@ class Mount:
 def ned_from_world(frame: LocalFrame, position: Geodetic) -> Array:
     """Rotation (3, 3) from the map's ENU axes to NED at `position` (0.5 arcmin per km apart)."""
     local = LocalFrame(position).ecef_from_enu.rotation
-    return NED_FROM_ENU @ local.T @ frame.ecef_from_enu.rotation
+    ned_from_map: Array = NED_FROM_ENU @ local.T @ frame.ecef_from_enu.rotation
+    return ned_from_map
 
 
 def heading(ned_from_body: Array) -> float:
@@ -96,7 +97,8 @@ def camera_attitude(ned_from_body: Array, gimbal: GimbalAngles, mount: Mount) ->
 
 def body_from_camera(ned_from_body: Array, ned_from_camera: Array) -> Array:
     """Rotation (3, 3) of the camera on the body, from their two attitudes."""
-    return ned_from_body.T @ ned_from_camera
+    rotation: Array = ned_from_body.T @ ned_from_camera
+    return rotation
 
 
 def world_from_camera(

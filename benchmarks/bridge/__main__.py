@@ -66,13 +66,15 @@ def autopilot(connection: Any, load: float) -> None:
     peer_socket.bind(("127.0.0.1", 0))
     connection.send(peer_socket.getsockname()[1])
     codec, reader = mavlink.MAVLink(None, 1, 1), FrameReader()
-    peer = None
+    peer: tuple[str, int] | None = None
     arrivals: list[tuple[int, int]] = []
     sent: Counter[str] = Counter()
     begun = time.monotonic()
     heartbeat = 0.0
 
     def send(message: Any) -> None:
+        if peer is None:
+            return
         peer_socket.sendto(message.pack(codec), peer)
         codec.seq = (codec.seq + 1) % 256
 

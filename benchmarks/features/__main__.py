@@ -21,6 +21,7 @@ import argparse
 import logging
 import time
 from collections.abc import Callable, Sequence
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -166,12 +167,16 @@ def make_pairs(args: argparse.Namespace) -> tuple[str, list[TestPair]]:
     return "generated", made_pairs(args.pairs, which, args.cache)
 
 
+def _with_threads(model: Path | None, threads: int) -> FeatureExtractor:
+    return load_extractor(model, threads=threads)
+
+
 def main() -> None:
     args = parser().parse_args()
     if args.speed:
         for model in args.models:
             path = None if model == SHIPPED else model
-            times = speed(lambda threads, m=path: load_extractor(m, threads=threads))
+            times = speed(partial(_with_threads, path))
             print(model, {k: f"{v:.1f} ms" for k, v in times.items()})
         return
     if args.report:

@@ -55,7 +55,7 @@ class Direct:
 def sift_pnp(view: RenderedView, query: Image, prior: PosePrior, seed: int) -> Pose:
     """SIFT matches lifted by the rendered depth, then PnP in RANSAC with refinement."""
     cv2.setRNGSeed(seed)
-    sift = cv2.SIFT_create(3000, contrastThreshold=0.01)
+    sift = cv2.SIFT.create(3000, contrastThreshold=0.01)
     keys_r, words_r = sift.detectAndCompute(cv2.cvtColor(view.rgb, cv2.COLOR_RGB2GRAY), None)
     keys_q, words_q = sift.detectAndCompute(cv2.cvtColor(query, cv2.COLOR_RGB2GRAY), None)
     if words_r is None or words_q is None or len(words_r) < 2:

@@ -80,7 +80,9 @@ def made_pairs(count: int, which: MadePlaces, cache: Path, workers: int = 2) -> 
     first = _FIRST_SEED[which.split] + 10_000 * which.seed
     places = range(first, first + round(1.1 * count / len(MADE_CONDITIONS)) + 1)
     folder = cache / which.name
-    photos = which.textures and PhotoSource(which.textures, UNSEEN_GROUPS, held_out=True)
+    photos = None
+    if which.textures is not None:
+        photos = PhotoSource(which.textures, UNSEEN_GROUPS, held_out=True)
     for _ in write_shards(folder, places, which.scenes, photos, workers):
         pass
     pairs: list[TestPair] = []

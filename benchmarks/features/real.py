@@ -31,6 +31,7 @@ from localizer.synth.appearance.model import CONDITIONS, apply_appearance, sampl
 from localizer.training.data.batches import tamed
 from localizer.training.data.pairs import SEASON, look_at, moved
 from localizer.training.places.changes import coarser, draw_texel, hard_surfaces, regrown
+from localizer.training.places.photos import read_photo
 from localizer.training.places.seasons import season_shift
 from localizer.types import Float32, Image, RenderedView
 
@@ -80,10 +81,8 @@ def _photo_pairs(renderer: NumbaRenderer, photos: Path, count: int, seed: int) -
         rng = np.random.default_rng((seed, k))
         condition, photo = kinds[k % len(kinds)], k // len(kinds) % len(names)
         truth = Pose.from_matrix(poses[names[photo]]["T_enu_from_cam"])
-        image = cv2.imread(str(photos / "images" / names[photo]))
-        query = cv2.resize(
-            cv2.cvtColor(image, cv2.COLOR_BGR2RGB), SIZE, interpolation=cv2.INTER_AREA
-        )
+        image = read_photo(photos / "images" / names[photo])
+        query = cv2.resize(image, SIZE, interpolation=cv2.INTER_AREA)
         if condition in _MADE:
             depth = renderer.render(truth, camera, wait=True).depth
             query = apply_appearance(
@@ -143,7 +142,8 @@ def _squared(rgb: Image) -> Float32:
     """An image wider than high as a square albedo, mirrored below."""
     below = max(rgb.shape[1] - rgb.shape[0], 0)
     square = cv2.copyMakeBorder(rgb, 0, below, 0, 0, cv2.BORDER_REFLECT)
-    return square.astype(np.float32) / 255.0
+    albedo: Float32 = square.astype(np.float32) / 255.0
+    return albedo
 
 
 def _image(albedo: Float32, shape: tuple[int, ...]) -> Image:
@@ -163,7 +163,7 @@ def _season_pairs(folder: Path, count: int, seed: int) -> list[TestPair]:
     for k in range(count):
         rng = np.random.default_rng((seed, 3, k))
         plot, dry_map = plots[k // 2 % len(plots)], bool(k % 2)
-        dates = [cv2.cvtColor(cv2.imread(str(p)), cv2.COLOR_BGR2RGB) for p in _dates(plot)]
+        dates = [read_photo(p) for p in _dates(plot)]
         surveyed, flown = dates[:: -1 if dry_map else 1]
         view, query, truth = _plot_pair(surveyed, flown, rng)
         seen = np.full(query.shape[:2], truth.translation[2], np.float32)
@@ -177,8 +177,8 @@ def _dates(plot: Path) -> list[Path]:
     """The green date, then the dry one."""
 
     def green(path: Path) -> float:
-        blue_green_red = cv2.imread(str(path)).reshape(-1, 3).mean(0)
-        return float(blue_green_red[2] - blue_green_red[1])
+        red_green_blue = read_photo(path).reshape(-1, 3).mean(0)
+        return float(red_green_blue[0] - red_green_blue[1])
 
     return sorted(plot.glob("*.jpg"), key=green)
 

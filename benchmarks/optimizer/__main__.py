@@ -36,7 +36,7 @@ from benchmarks.optimizer.problem import (
 from localizer.geometry.camera import Camera
 from localizer.geometry.pose import Pose
 from localizer.registration import JNGO
-from localizer.registration import anchors as anchors_module
+from localizer.registration.anchors import morton_code
 from localizer.registration.backend import Backend, LevelProblem, LMSettings, sample_bilinear
 from localizer.registration.cpu.kernel import NumbaBackend
 from localizer.registration.cpu.reference import ReferenceBackend
@@ -67,7 +67,7 @@ def whole_registration(threads: int, sigma_deg: float, repeats: int) -> tuple[fl
     ]
     nadir = Pose(np.diag([1.0, -1.0, -1.0]), np.array([0.0, 0.0, 120.0]))
     pixels = rng.uniform([10, 10], [310, 230], (4000, 2))
-    pixels = pixels[np.argsort(anchors_module._morton(*pixels.astype(np.int64).T), kind="stable")]
+    pixels = pixels[np.argsort(morton_code(*pixels.astype(np.int64).T), kind="stable")]
     points = nadir.apply(camera.rays(pixels) * rng.uniform(110, 120, (4000, 1)))
     sampled = [
         sample_bilinear(x.features, *(pixels / x.stride - 0.5).T).astype(np.float32) for x in levels
@@ -131,7 +131,7 @@ def iteration_table(problems: Problems, counts: Sequence[int], *, quick: bool) -
     swarm = make_swarm()
     rows = naive_rows(problems, counts, sizes=(256,) if quick else SIZES)
     baseline = list(rows.values())[-1] if rows else None
-    few = tuple(x[:4] for x in swarm)
+    few = (swarm[0][:4], swarm[1][:4])
     reference = ReferenceBackend()
     rows[reference.name] = [
         per_iteration(reference, problems[s], few, 3) * HYPOTHESES / len(few[0]) for s in SIZES
@@ -144,8 +144,8 @@ def iteration_table(problems: Problems, counts: Sequence[int], *, quick: bool) -
     for name, values in rows.items():
         ratio = f"{baseline[1] / values[1]:.0f}" if baseline else "-"
         table.add_row(name, *(f"{v:.2f}" if np.isfinite(v) else "-" for v in values), ratio)
-    for name, values in PAPER_TABLE_7.items():
-        table.add_row(name, *(f"{v:.2f}" for v in values), "-")
+    for name, published in PAPER_TABLE_7.items():
+        table.add_row(name, *(f"{v:.2f}" for v in published), "-")
     return table
 
 

@@ -13,6 +13,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -124,7 +125,7 @@ def fused_ms(backend: CudaBackend, problem: LevelProblem, swarm: Poses) -> float
             device.copy(int(target["translations"]), fresh[1], 24 * M)
 
         found.append(
-            median_ms(device, reset, lambda a=arguments: kernels.launch("refine_many", M, 256, a))
+            median_ms(device, reset, partial(kernels.launch, "refine_many", M, 256, arguments))
         )
     return (found[1] - found[0]) / 6
 
@@ -216,9 +217,9 @@ def torch_ms(problem: LevelProblem, swarm: Poses) -> float:
 
 def copy_bandwidth(device: Device, size: int = 2**30) -> float:
     """Bytes per second read and written by a copy of `size` bytes within the device."""
-    addresses = [device.allocate(size) for _ in range(2)]
-    ms = median_ms(device, lambda: None, lambda: device.copy(*addresses, size))
-    for address in addresses:
+    target, source = device.allocate(size), device.allocate(size)
+    ms = median_ms(device, lambda: None, lambda: device.copy(target, source, size))
+    for address in (target, source):
         device.free(address)
     return 2 * size / ms * 1e3
 
@@ -249,7 +250,9 @@ def pyramid_problem(
     )  # fmt: skip
 
 
-def schedule_ms(backend: CudaBackend, swarm: Poses, config: JNGOConfig, anchors: int = 500):
+def schedule_ms(
+    backend: CudaBackend, swarm: Poses, config: JNGOConfig, anchors: int = 500
+) -> tuple[float, float, float]:
     """(upload, graph) device milliseconds of a whole schedule, and the winner's distance (m)."""
     query, camera, reference, origin = pyramid_problem(swarm, 32, anchors)
     schedule = CudaSchedule(backend, timed=True)
@@ -274,7 +277,8 @@ def print_tables(console: Console, problems: dict[int, LevelProblem], swarm: Pos
         name: [np.nan] * len(sizes)
         for name in ("naive PyTorch", "unfused kernels", "fused float32", "fused float16")
     }
-    notes, schedules = ["GPU: -"], []
+    notes = ["GPU: -"]
+    schedules: list[tuple[str, ...]] = []
     try:
         device = Device()
     except CudaError as error:

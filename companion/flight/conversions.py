@@ -108,7 +108,10 @@ def camera_rotation(gimbal: GimbalAttitude) -> Array:
 
     The map origin's axes stand for the vehicle's: 0.1° at 10 km, far below the gimbal's own error.
     """
-    return NED_FROM_ENU.T @ matrix_from_quaternion(gimbal.quaternion) @ GIMBAL_FROM_CAMERA
+    world_from_camera: Array = (
+        NED_FROM_ENU.T @ matrix_from_quaternion(gimbal.quaternion) @ GIMBAL_FROM_CAMERA
+    )
+    return world_from_camera
 
 
 def vehicle_prior(

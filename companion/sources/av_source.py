@@ -448,7 +448,8 @@ def _rgb(picture: av.VideoFrame, reformatter: av.video.reformatter.VideoReformat
 def _pts_ns(picture: av.VideoFrame) -> int | None:
     if picture.pts is None or picture.time_base is None:
         return None
-    return round(picture.pts * picture.time_base * 1_000_000_000)
+    time_ns: int = round(picture.pts * picture.time_base * 1_000_000_000)
+    return time_ns
 
 
 def _misp_time(picture: av.VideoFrame) -> MispTime | None:

@@ -114,7 +114,8 @@ class Perturbation:
 
 def _random_vector(rng: np.random.Generator, limit: float) -> Array:
     direction = rng.standard_normal(3)
-    return direction / np.linalg.norm(direction) * rng.uniform(0.0, limit)
+    vector: Array = direction / np.linalg.norm(direction) * rng.uniform(0.0, limit)
+    return vector
 
 
 def load_sequence(path: Path, frame: LocalFrame, name: str | None = None) -> Sequence:

@@ -31,7 +31,8 @@ def so3_exp(phi: ArrayLike) -> Array:
         return np.eye(3) + K + 0.5 * K @ K
     a = np.sin(angle) / angle
     b = (1.0 - np.cos(angle)) / angle**2
-    return np.eye(3) + a * K + b * K @ K
+    rotation: Array = np.eye(3) + a * K + b * K @ K
+    return rotation
 
 
 def so3_log(R: ArrayLike) -> Array:
@@ -39,9 +40,8 @@ def so3_log(R: ArrayLike) -> Array:
     q = quaternion_from_matrix(R)
     w, v = q[0], q[1:]
     n = float(np.linalg.norm(v))
-    if n < _SMALL_ANGLE:
-        return 2.0 * v / w
-    return 2.0 * np.arctan2(n, w) * v / n
+    phi: Array = 2.0 * v / w if n < _SMALL_ANGLE else 2.0 * np.arctan2(n, w) * v / n
+    return phi
 
 
 def _left_jacobian(phi: Array) -> Array:
@@ -52,7 +52,8 @@ def _left_jacobian(phi: Array) -> Array:
         return np.eye(3) + 0.5 * K + K @ K / 6.0
     a = (1.0 - np.cos(angle)) / angle**2
     b = (angle - np.sin(angle)) / angle**3
-    return np.eye(3) + a * K + b * K @ K
+    jacobian: Array = np.eye(3) + a * K + b * K @ K
+    return jacobian
 
 
 def quaternion_from_matrix(R: ArrayLike) -> Array:
@@ -163,7 +164,8 @@ class Pose:
 
     def apply(self, points: ArrayLike) -> Array:
         """Points (..., 3) of frame b, mapped to frame a."""
-        return np.asarray(points, dtype=np.float64) @ self.rotation.T + self.translation
+        mapped: Array = np.asarray(points, dtype=np.float64) @ self.rotation.T + self.translation
+        return mapped
 
     def distance_to(self, other: Pose) -> tuple[float, float]:
         """(translation in metres, rotation in degrees) between two poses ``world_from_x``.

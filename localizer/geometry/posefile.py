@@ -96,7 +96,8 @@ def pose_row(name: str, pose: Pose, frame: LocalFrame) -> PoseRow:
 
 def _map_from_local(position: Geodetic, frame: LocalFrame) -> Array:
     """Rotation (3, 3) from the tangent plane at `position` to the map's: 0.5 arcmin per km."""
-    return frame.ecef_from_enu.rotation.T @ LocalFrame(position).ecef_from_enu.rotation
+    rotation: Array = frame.ecef_from_enu.rotation.T @ LocalFrame(position).ecef_from_enu.rotation
+    return rotation
 
 
 def _rx(a: float) -> Array:

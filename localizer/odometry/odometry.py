@@ -230,7 +230,7 @@ class VisualOdometry:
         """Why a registration is not used; "" if it is."""
         c = self.config
         if result.status is not RegistrationStatus.OK:
-            return result.status.value
+            return str(result.status.value)
         if result.quality < c.min_quality:
             return f"quality {result.quality:.2f} is below {c.min_quality:g}"
         if result.overlap < c.min_overlap:

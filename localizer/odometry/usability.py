@@ -103,7 +103,8 @@ def _shrunk(image: Image) -> Float32:
     grey = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)
     height = max(_BLOCK, round(_WIDTH * image.shape[0] / image.shape[1]))
     small = cv2.resize(grey, (_WIDTH, height), interpolation=cv2.INTER_AREA)
-    return small.astype(np.float32)
+    shrunk: Float32 = small.astype(np.float32)
+    return shrunk
 
 
 def _block_contrast(grey: Float32) -> Float32:

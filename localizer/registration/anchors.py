@@ -47,7 +47,7 @@ def anchors_at(points_world: Array, pixels: Array, features: FeaturePyramid) -> 
     They come in Morton order, see `select_anchors`.
     """
     columns, rows = np.maximum(pixels, 0).astype(np.int64).T
-    order = np.argsort(_morton(columns, rows), kind="stable")
+    order = np.argsort(morton_code(columns, rows), kind="stable")
     pixels = pixels[order]
     return Anchors(
         np.ascontiguousarray(points_world[order]),
@@ -102,7 +102,7 @@ def _stratified(cell: NDArray[np.int64], count: int, rng: np.random.Generator) -
     return chosen
 
 
-def _morton(x: NDArray[np.int64], y: NDArray[np.int64]) -> NDArray[np.int64]:
+def morton_code(x: NDArray[np.int64], y: NDArray[np.int64]) -> NDArray[np.int64]:
     """Z-order code: the bits of x and y interleaved."""
     code = np.zeros(len(x), dtype=np.int64)
     for bit in range(16):

@@ -195,7 +195,8 @@ def sandwich_covariance(
             return None
         meat = meat + sums.curvature**2 * sums.hessian @ displaced @ sums.hessian
     covariance: Array = inverse @ (meat + prior_weight * sums.prior_hessian) @ inverse
-    return 0.5 * (covariance + covariance.T)
+    symmetric: Array = 0.5 * (covariance + covariance.T)
+    return symmetric
 
 
 def _inverse(matrix: Array) -> Array | None:
@@ -240,7 +241,8 @@ def pose_covariance(tangent: Array, rotation: Array, translation: Array) -> Arra
     """`PosePrior`'s covariance (position, left rotation vector; world axes) of a tangent one."""
     J = pose_tangent_map(rotation, translation)
     covariance: Array = J @ tangent @ J.T
-    return 0.5 * (covariance + covariance.T)
+    symmetric: Array = 0.5 * (covariance + covariance.T)
+    return symmetric
 
 
 def pose_differences(rotations: Array, centres: Array, other: Pose) -> Array:

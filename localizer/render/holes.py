@@ -46,9 +46,11 @@ def _pull_push(rgb: Image, known: NDArray[np.bool_]) -> Image:
         weight, colour = weights.pop(), colours.pop()
         behind = _resized(filled, weight.shape[::-1], cv2.INTER_LINEAR)
         filled = colour + (1 - weight[..., None]) * behind
-    return np.rint(filled).clip(0, 255).astype(np.uint8)
+    picture: NDArray[np.uint8] = np.rint(filled).clip(0, 255).astype(np.uint8)
+    return picture
 
 
 def _resized(image: NDArray[np.float32], size: tuple[int, ...], how: int) -> NDArray[np.float32]:
     shape = (size[1], size[0], *image.shape[2:])
-    return cv2.resize(image, size, interpolation=how).reshape(shape).astype(np.float32, copy=False)
+    resized: NDArray[np.float32] = cv2.resize(image, size, interpolation=how).reshape(shape)
+    return resized.astype(np.float32, copy=False)

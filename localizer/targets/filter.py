@@ -57,7 +57,8 @@ class TargetFilter:
         """Velocity (3,) in m/s, world axes; None until a second sighting has measured one."""
         if not self._tracks or self._tracks[0].sightings < 2:
             return None
-        return self._tracks[0].mean[3:].copy()
+        velocity: Array = self._tracks[0].mean[3:].copy()
+        return velocity
 
     def update(self, sighting: TargetSighting) -> TargetFix:
         """Fuse a sighting of at least one surface. Three that fit no track restart the filter."""

@@ -105,7 +105,8 @@ def _shrink(image: Image, camera: Camera) -> Image:
     if image.shape[:2] == (camera.height, camera.width):
         return image
     resized = cv2.resize(image, (camera.width, camera.height), interpolation=cv2.INTER_AREA)
-    return resized.astype(np.uint8, copy=False)
+    shrunk: Image = resized.astype(np.uint8, copy=False)
+    return shrunk
 
 
 def reference_anchors(

@@ -177,7 +177,10 @@ def _cells(feature: Tensor, index: Tensor) -> tuple[Tensor, ...]:
     rows = feature.permute(0, 2, 3, 1).reshape(-1, channels)
     first = torch.arange(batch, device=feature.device) * (h * w)
     flat = (index + first[:, None, None]).permute(2, 0, 1)
-    return rows.index_select(0, flat.reshape(-1)).view(*flat.shape, channels).unbind(0)
+    cells: tuple[Tensor, ...] = (
+        rows.index_select(0, flat.reshape(-1)).view(*flat.shape, channels).unbind(0)
+    )
+    return cells
 
 
 def _projection_jacobian(local: Tensor, K: Tensor) -> Tensor:

@@ -157,14 +157,14 @@ class CameraComponent:
         }
         answer = answers.get(int(message_id)) if math.isfinite(message_id) else None
         if answer is None:
-            return mavlink.MAV_RESULT_UNSUPPORTED
+            return int(mavlink.MAV_RESULT_UNSUPPORTED)
         send(answer(), self._component)
-        return mavlink.MAV_RESULT_ACCEPTED
+        return int(mavlink.MAV_RESULT_ACCEPTED)
 
     def _interval(self, message_id: float, interval_us: float) -> int:
         """SET_MESSAGE_INTERVAL of the tracking messages; 0 is the default rate, -1 is off."""
         if not (math.isfinite(message_id) and math.isfinite(interval_us)):
-            return mavlink.MAV_RESULT_DENIED
+            return int(mavlink.MAV_RESULT_DENIED)
         interval = self._period_ns
         if interval_us > 0:
             interval = int(max(interval_us, _MIN_INTERVAL_US)) * 1000
@@ -175,5 +175,5 @@ class CameraComponent:
         elif int(message_id) == mavlink.MAVLINK_MSG_ID_CAMERA_TRACKING_GEO_STATUS:
             self._geo_ns = interval
         else:
-            return mavlink.MAV_RESULT_UNSUPPORTED
-        return mavlink.MAV_RESULT_ACCEPTED
+            return int(mavlink.MAV_RESULT_UNSUPPORTED)
+        return int(mavlink.MAV_RESULT_ACCEPTED)

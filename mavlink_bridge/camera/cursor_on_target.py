@@ -54,4 +54,5 @@ def cursor_on_target(report: TargetReport, config: TargetsConfig, utc: SteadyUtc
         ElementTree.SubElement(
             detail, "track", course=f"{course:.1f}", speed=f"{math.hypot(north, east):.2f}"
         )
-    return ElementTree.tostring(event, encoding="utf-8", xml_declaration=True)
+    document: bytes = ElementTree.tostring(event, encoding="utf-8", xml_declaration=True)
+    return document

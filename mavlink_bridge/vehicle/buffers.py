@@ -7,7 +7,7 @@ from bisect import bisect_left, bisect_right
 from collections import deque
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Protocol, TypeVar
 
 from mavlink_bridge import quaternion as quat
 from mavlink_bridge.messages import Attitude, InertialSample
@@ -19,6 +19,17 @@ _GIMBAL_FALLBACK_NS = 1_000_000_000
 
 # Best first: a poorer source is only used while no better one speaks.
 GIMBAL_SOURCES = ("GIMBAL_DEVICE_ATTITUDE_STATUS", "MOUNT_ORIENTATION", "MOUNT_STATUS")
+
+
+class Timed(Protocol):
+    """What was reported for a time."""
+
+    @property
+    def time_ns(self) -> int:
+        """On CLOCK_MONOTONIC."""
+
+
+_Sample = TypeVar("_Sample", bound=Timed)
 
 
 @dataclass(frozen=True)
@@ -56,7 +67,7 @@ def heading_rate(sample: Attitude) -> float:
     return (q * math.sin(sample.roll_rad) + r * math.cos(sample.roll_rad)) / cos_pitch
 
 
-def _around(samples: Sequence[Any], time_ns: int) -> tuple[Any, Any, float]:
+def _around(samples: Sequence[_Sample], time_ns: int) -> tuple[_Sample, _Sample, float]:
     """The samples before and after, and the share t of the way; time_ns is inside."""
     index = bisect_left(samples, time_ns, key=lambda sample: sample.time_ns)
     before, after = samples[max(index - 1, 0)], samples[index]

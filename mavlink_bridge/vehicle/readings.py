@@ -28,7 +28,7 @@ _SEA_LEVEL_HPA = 1013.25
 
 def is_autopilot(message: Any) -> bool:
     """Whether it is an autopilot's heartbeat: no ground station's, camera's or companion's."""
-    return (
+    return bool(
         message.get_type() == "HEARTBEAT"
         and message.autopilot != mavlink.MAV_AUTOPILOT_INVALID
         and message.type != mavlink.MAV_TYPE_GCS

@@ -69,7 +69,8 @@ def line_kernel(length_px: float, angle_deg: float) -> Float32:
     for dx, wx in ((0, 1 - (x - x0)), (1, x - x0)):
         for dy, wy in ((0, 1 - (y - y0)), (1, y - y0)):
             np.add.at(kernel, (y0 + dy, x0 + dx), wx * wy)
-    return kernel / kernel.sum()
+    normalised: Float32 = kernel / kernel.sum()
+    return normalised
 
 
 def _linear_tone(rgb: Image, a: Appearance) -> tuple[Float32, Float32]:

@@ -79,7 +79,7 @@ def _beside(line: Array, offset_m: float) -> Array:
     tangent = np.gradient(line[:, :2], axis=0)
     tangent /= np.maximum(np.linalg.norm(tangent, axis=1, keepdims=True), 1e-9)
     right = np.column_stack([tangent[:, 1], -tangent[:, 0]])
-    moved = line.copy()
+    moved: Array = line.copy()
     moved[:, :2] += offset_m * right
     return moved
 

@@ -131,7 +131,8 @@ class Aircraft:
         profile = min(1.0, sqrt(height / 60.0))  # ArduPilot's square law up to 60 m
         speed, source = p["SIM_WIND_SPD"], radians(p["SIM_WIND_DIR"])
         mean = np.array([-speed * cos(source), -speed * sin(source), 0.0])
-        return (mean + self._gust * np.array([1.0, 1.0, 0.4])) * profile
+        wind: Array = (mean + self._gust * np.array([1.0, 1.0, 0.4])) * profile
+        return wind
 
     def sense(self) -> None:
         """Read the sensors that are due, and hand the filter what they gave."""

@@ -9,7 +9,7 @@ import bisect
 import threading
 from collections import deque
 from dataclasses import dataclass
-from typing import Any
+from typing import Generic, Protocol, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,6 +21,17 @@ from sitl.geodesy import Location
 Array = NDArray[np.float64]
 
 _CLOCK_WINDOW = 25  # samples over which the least latency is taken
+
+
+class Timed(Protocol):
+    """What lies at a time on CLOCK_MONOTONIC."""
+
+    @property
+    def time_ns(self) -> int:
+        """When it was so."""
+
+
+_Sample = TypeVar("_Sample", bound=Timed)
 
 
 @dataclass(frozen=True)
@@ -111,16 +122,16 @@ class LeastLatencyClock:
         return round(boot_ms * self._scale + min(self._offsets, default=0.0))
 
 
-class Track:
+class Track(Generic[_Sample]):
     """Samples in time order, safe between one writer and many readers."""
 
     def __init__(self, limit: int) -> None:
         self._lock = threading.Lock()
         self._times: list[int] = []
-        self._samples: list[Any] = []
+        self._samples: list[_Sample] = []
         self._limit = limit
 
-    def add(self, sample: Any) -> None:
+    def add(self, sample: _Sample) -> None:
         """Append a sample; it must carry `time_ns`, and be newer than the last."""
         with self._lock:
             if self._times and sample.time_ns <= self._times[-1]:
@@ -131,7 +142,7 @@ class Track:
                 del self._times[: self._limit]
                 del self._samples[: self._limit]
 
-    def around(self, time_ns: int) -> tuple[Any, Any] | None:
+    def around(self, time_ns: int) -> tuple[_Sample, _Sample] | None:
         """The samples before and after a time; None outside the track."""
         with self._lock:
             i = bisect.bisect_left(self._times, time_ns)
@@ -139,13 +150,13 @@ class Track:
                 return None
             return self._samples[max(i - 1, 0)], self._samples[i]
 
-    def all(self) -> list[Any]:
+    def all(self) -> list[_Sample]:
         """A copy of the track."""
         with self._lock:
             return list(self._samples)
 
     @property
-    def newest(self) -> Any | None:
+    def newest(self) -> _Sample | None:
         """The last sample."""
         with self._lock:
             return self._samples[-1] if self._samples else None

@@ -40,9 +40,9 @@ class VehicleRecord:
         self._attitude_ms: int | None = None
         self._flags = 0
         self._subscribers: list[Callable[[Truth], None]] = []
-        self._truth = Track(_SECONDS_KEPT * 50)
-        self._gimbal = Track(_SECONDS_KEPT * 50)
-        self._ekf = Track(_SECONDS_KEPT * 25)
+        self._truth: Track[Truth] = Track(_SECONDS_KEPT * 50)
+        self._gimbal: Track[GimbalState] = Track(_SECONDS_KEPT * 50)
+        self._ekf: Track[EkfSample] = Track(_SECONDS_KEPT * 25)
         self.origin: Location | None = None
         self.latest: dict[str, Any] = {}
         self._text_log = TextLog()

@@ -70,7 +70,8 @@ class MeshTile:
     @property
     def size(self) -> float:
         """Metres of the tile's side."""
-        return self.grid.size / 2**self.level
+        side: float = self.grid.size / 2**self.level
+        return side
 
     def load(self) -> Sequence[SourceMesh]:
         """See `TileSource.load`."""

@@ -260,7 +260,8 @@ def _decode_image(data: NDArray[np.uint8]) -> Image:
     image = cv2.imdecode(data, cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION)
     if image is None:
         raise MapCacheError("a texture level cannot be decoded")
-    return image.astype(np.uint8, copy=False)
+    decoded: Image = image.astype(np.uint8, copy=False)
+    return decoded
 
 
 def _read_manifest(path: Path) -> Manifest:

@@ -52,7 +52,8 @@ class Pyramid:
     def meets_boxes(self, low: Array, high: Array) -> NDArray[np.bool_]:
         """Which boxes (N,) with corners (N, 3), from the eye, are not wholly beyond a plane."""
         corners = np.where(_CORNERS[None, :, :], high[:, None, :], low[:, None, :])
-        return np.bitwise_and.reduce(self.beyond(corners), axis=1) == 0
+        meets: NDArray[np.bool_] = np.bitwise_and.reduce(self.beyond(corners), axis=1) == 0
+        return meets
 
 
 def pick(

@@ -85,7 +85,7 @@ class TileStreamer:
         self._evicted: list[list[TileMesh]] = []  # for the loader to free
         self._bytes_per_select = bytes_per_select
         self._protected: set[int] = set()  # in the current view
-        self._closed = False
+        self._closed = self._waiting = False
         self._thread = threading.Thread(target=self._run, name="tile-loader", daemon=True)
         self._thread.start()
 
@@ -150,6 +150,12 @@ class TileStreamer:
             resident = self._bytes + self._arrived_bytes
             return StreamCounters(**self._counts | {"resident_bytes": resident})
 
+    @property
+    def idle(self) -> bool:
+        """Whether the loader waits and has nothing to load or to free."""
+        with self._lock:
+            return self._waiting and not (self._evicted or self._to_load())
+
     def close(self) -> None:
         """Stop the loader thread and drop all tiles."""
         with self._lock:
@@ -206,7 +212,9 @@ class TileStreamer:
         while True:
             with self._lock:
                 while not (self._closed or self._evicted or self._to_load()):
+                    self._waiting = True
                     self._lock.wait()
+                    self._waiting = False
                 if self._closed:
                     return
                 evicted, self._evicted = self._evicted, []

@@ -50,6 +50,12 @@ class MapSurface:
             distances[nearer], normals[nearer] = hits.distances[nearer], hits.normals[nearer]
         return BundleHits(distances, normals)
 
+    @property
+    def resident_bytes(self) -> int:
+        """Of the geometry in memory."""
+        with self._lock:
+            return sum(mesh.nbytes for mesh in self._meshes.values())
+
     def _nodes(self, origin: Array, directions: Array) -> Iterator[tuple[int, float]]:
         """Nodes that the bundle may meet and how far off (m) their boxes are, the nearest first."""
         index = self._cache.index

@@ -377,7 +377,8 @@ def _with_positions(part: SourceMesh, positions: Array) -> SourceMesh:
 
 def _node_matrix(node: dict[str, Any]) -> Array:
     if "matrix" in node:
-        return _vector(node["matrix"], 16, "node matrix").reshape(4, 4).T
+        columns: Array = _vector(node["matrix"], 16, "node matrix").reshape(4, 4).T
+        return columns
     T = np.eye(4)
     rotation = _vector(node.get("rotation", (0, 0, 0, 1)), 4, "node rotation")
     if not np.any(rotation):

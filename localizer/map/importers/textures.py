@@ -89,7 +89,8 @@ def _face_colours(part: SourceMesh) -> Image:
     h, w = part.image.shape[:2]
     first = part.uvs[part.faces[:, 0]] * (w, h)
     x, y = first.astype(np.int64).T
-    return part.image[y, x]
+    colours: Image = part.image[y, x]
+    return colours
 
 
 def _concatenated(group: list[SourceMesh]) -> SourceMesh:
@@ -112,7 +113,8 @@ def srgb(linear: Array) -> Image:
     """8-bit sRGB of linear light from 0 to 1."""
     x = np.clip(linear, 0.0, 1.0)
     encoded = np.where(x <= 0.0031308, 12.92 * x, 1.055 * x ** (1 / 2.4) - 0.055)
-    return np.rint(255 * encoded).astype(np.uint8)
+    pixels: Image = np.rint(255 * encoded).astype(np.uint8)
+    return pixels
 
 
 def tinted(image: Image, factor: Array) -> Image:

@@ -276,7 +276,8 @@ def _transform(data: dict[str, Any], where: str) -> Array:
         raise MapSourceError(f"{where}: a transform is not numbers") from error
     if T.shape != (16,) or not np.isfinite(T).all():
         raise MapSourceError(f"{where}: a transform is not 16 finite numbers")
-    return T.reshape(4, 4).T.copy()
+    columns: Array = T.reshape(4, 4).T.copy()
+    return columns
 
 
 def _centre(root: dict[str, Any], where: str) -> Array:

@@ -115,7 +115,8 @@ def _compile(nvrtc: ModuleType, sources: Mapping[str, str], main: str, options: 
 def _text(nvrtc: ModuleType, program: Any, size_of: Any, fill: Any) -> str:
     text = b" " * _checked(nvrtc, size_of(program))
     _checked(nvrtc, fill(program, text))
-    return text.rstrip(b"\0").decode(errors="replace")
+    line: str = text.rstrip(b"\0").decode(errors="replace")
+    return line
 
 
 def _checked(nvrtc: ModuleType, result: tuple[Any, ...]) -> Any:
@@ -140,7 +141,8 @@ def _nvrtc() -> ModuleType:
         ) from error
     if status != nvrtc.nvrtcResult.NVRTC_SUCCESS:
         raise CudaUnavailableError(f"the run-time compiler (NVRTC) does not start: {status.name}")
-    return nvrtc
+    compiler: ModuleType = nvrtc
+    return compiler
 
 
 def _first_line(error: Exception) -> str:

@@ -236,4 +236,5 @@ def _load_driver() -> ModuleType:
     status, count = driver.cuDeviceGetCount()
     if status != driver.CUresult.CUDA_SUCCESS or count == 0:
         raise CudaUnavailableError("the NVIDIA driver sees no GPU")
-    return driver
+    api: ModuleType = driver
+    return api

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -89,13 +90,13 @@ class FrameMemory:
         """Address of the k-th level's description."""
         return self.levels + k * layout.LEVEL.itemsize
 
-    def write(self, frame: NDArray[np.uint8], address: int, value: NDArray) -> None:
+    def write(self, frame: NDArray[np.uint8], address: int, value: NDArray[Any]) -> None:
         """Put a value into the host's copy of the block."""
         start = address - self.base
         frame[start : start + value.nbytes] = value.reshape(-1).view(np.uint8)
 
     def winner(self, swarm: NDArray[np.void]) -> NDArray[np.void]:
         """The swarm, with scores going elsewhere: sharpening does not change the ranking."""
-        out = swarm.copy()
+        out: NDArray[np.void] = swarm.copy()
         out["scores"], out["visible"] = self.trial
         return out

@@ -9,9 +9,10 @@ scores, the sums of equation 11, and the quality.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import DTypeLike, NDArray
 
 from localizer.device_array import DeviceArray
 from localizer.geometry.camera import Camera
@@ -250,11 +251,12 @@ class CudaSchedule:
         self._device.download(block, memory.prior)
         self._device.synchronize()
 
-        def read(address: int, dtype: object, shape: tuple[int, ...] = ()) -> np.ndarray:
-            kind = np.dtype(dtype)  # type: ignore[call-overload]
+        def read(address: int, dtype: DTypeLike, shape: tuple[int, ...] = ()) -> NDArray[Any]:
+            kind = np.dtype(dtype)
             start = address - memory.prior
             stop = start + kind.itemsize * int(np.prod(shape, dtype=np.int64))
-            return block[start:stop].view(kind).reshape(shape)
+            values: NDArray[Any] = block[start:stop].view(kind).reshape(shape)
+            return values
 
         state = read(memory.state, layout.STATE)
         count, swarm = int(state["count"]), memory.swarms[-1]
@@ -308,6 +310,7 @@ def _packed_motion(motion: PosePrior, origin: Array, config: JNGOConfig) -> NDAr
 
 def _symmetric(triangle: NDArray[np.float32]) -> Array:
     """(6, 6) of a lower triangle stored by rows."""
-    out = np.zeros((6, 6))
+    out: Array = np.zeros((6, 6))
     out[np.tril_indices(6)] = triangle
-    return out + np.tril(out, -1).T
+    full: Array = out + np.tril(out, -1).T
+    return full

@@ -167,7 +167,8 @@ def _snow_cover(image: Float32, depth: Float32, cover: float) -> Float32:
     level = cv2.GaussianBlur(np.exp(-200.0 * step), (0, 0), 1.0) * np.float32(cover)
     level = np.where(depth > 0, level, 0)[..., None].astype(np.float32)
     white = np.array([0.88, 0.9, 0.94], np.float32)
-    return image * (1 - level) + white * level
+    snowy: Float32 = image * (1 - level) + white * level
+    return snowy
 
 
 @dataclass(frozen=True)
@@ -202,7 +203,8 @@ def _lamps(image: Float32, count: int, rng: np.random.Generator) -> Float32:
         dy = (np.arange(y0, y1, dtype=np.float32) - cy) / radius
         pool = np.exp(-(dx[None] ** 2) - dy[:, None] ** 2)[..., None]
         light[y0:y1, x0:x1] += pool * np.array(lamp.color, np.float32) * np.float32(lamp.power)
-    return image * (1.0 + 3.0 * light) + 0.12 * light**2
+    lit: Float32 = image * (1.0 + 3.0 * light) + 0.12 * light**2
+    return lit
 
 
 def _streaks(
@@ -225,7 +227,8 @@ def streak_cover(
     for start, end in zip(starts, ends, strict=True):
         p, q = np.int32(start * 16), np.int32(end * 16)
         cv2.line(layer, p.tolist(), q.tolist(), 255, 1, cv2.LINE_AA, 4)
-    return layer.astype(np.float32) * np.float32(alpha / 255.0)
+    share: Float32 = layer.astype(np.float32) * np.float32(alpha / 255.0)
+    return share
 
 
 def _optics(image: Float32, a: Appearance) -> Float32:
@@ -251,4 +254,5 @@ def motion_kernel(length: float, angle_deg: float) -> Float32:
     kernel = np.zeros((size, size), np.float32)
     x, y = half + t * np.cos(angle), half + t * np.sin(angle)
     np.add.at(kernel, (np.rint(y).astype(int), np.rint(x).astype(int)), 1.0)
-    return kernel / kernel.sum()
+    normalised: Float32 = kernel / kernel.sum()
+    return normalised

@@ -92,4 +92,5 @@ def rectangle(
     c, s = np.cos(angle), np.sin(angle)
     a, b = length / 2 + margin, width / 2 + margin
     local = np.array([[-a, -b], [a, -b], [a, b], [-a, b]])
-    return local @ np.array([[c, s], [-s, c]]) + np.asarray(centre)
+    corners: Array = local @ np.array([[c, s], [-s, c]]) + np.asarray(centre)
+    return corners

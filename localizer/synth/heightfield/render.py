@@ -69,9 +69,10 @@ def _surface(height: Float32, x: float, y: float) -> float:
     b = min(max(_mirror(y, n) - 0.5, 0.0), n - 1.001)
     i, j = int(b), int(a)
     u, v = a - j, b - i
-    return (height[i, j] * (1 - u) + height[i, j + 1] * u) * (1 - v) + (
+    metres: float = (height[i, j] * (1 - u) + height[i, j + 1] * u) * (1 - v) + (
         height[i + 1, j] * (1 - u) + height[i + 1, j + 1] * u
     ) * v
+    return metres
 
 
 @njit(cache=True, fastmath=True, nogil=True)

@@ -51,7 +51,8 @@ class Terrain:
     @property
     def half_m(self) -> float:
         """Half the side length in metres."""
-        return (self.heights.shape[0] - 1) * self.spacing_m / 2
+        half: float = (self.heights.shape[0] - 1) * self.spacing_m / 2
+        return half
 
     def height(self, east: ArrayLike, north: ArrayLike) -> Array:
         """Height of the surface in metres; outside the grid that of the nearest edge."""

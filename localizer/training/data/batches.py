@@ -269,4 +269,5 @@ def _unoccluded(
     h, w = depth.shape
     col = np.nan_to_num(pixels[:, 0]).astype(int).clip(0, w - 1)
     row = np.nan_to_num(pixels[:, 1]).astype(int).clip(0, h - 1)
-    return np.abs(depth[row, col] - z) < 0.012 * z + 0.5
+    same: NDArray[np.bool_] = np.abs(depth[row, col] - z) < 0.012 * z + 0.5
+    return same

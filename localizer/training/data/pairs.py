@@ -319,7 +319,8 @@ def soften(rng: np.random.Generator, image: Image) -> Image:
     """A map texture somewhat coarser than the view (the easier, earlier condition)."""
     if rng.random() < 0.5:
         return image
-    return cv2.GaussianBlur(image, (0, 0), rng.uniform(0.4, 1.3))
+    soft: Image = cv2.GaussianBlur(image, (0, 0), rng.uniform(0.4, 1.3))
+    return soft
 
 
 def relative_pose(pair: Pair) -> Array:

@@ -35,7 +35,7 @@ def unfuse(model: Path, images: list[Image]) -> Network:
         raise ModelError(
             "unfusing needs training pairs to take statistics on, got no shard with any"
         )
-    network = build(_config(model)).eval()
+    network: Network = build(_config(model)).eval()
     try:
         values = {i.name: numpy_helper.to_array(i) for i in onnx.load(str(model)).graph.initializer}
     except Exception as error:  # protobuf's and onnx's own

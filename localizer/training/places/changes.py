@@ -29,7 +29,8 @@ def hard_surfaces(texture: Image) -> Float32:
     smooth = cv2.GaussianBlur(texture.astype(np.float32), (0, 0), 1.5)
     red, green, blue = smooth[..., 0], smooth[..., 1], smooth[..., 2]
     soft = np.clip((green - blue - 4.0) / 10.0, 0, 1) * np.clip((40.0 - (red - green)) / 15.0, 0, 1)
-    return (1.0 - soft).astype(np.float32)
+    hard: Float32 = (1.0 - soft).astype(np.float32)
+    return hard
 
 
 def regrown(albedo: Float32, lasting: Float32, cell_m: float, rng: np.random.Generator) -> Float32:
@@ -53,7 +54,8 @@ def regrown(albedo: Float32, lasting: Float32, cell_m: float, rng: np.random.Gen
     kept = np.maximum(lasting, np.float32(rng.uniform(0, _KEPT)))[..., None]
     fresh = np.clip(other, -3, 3) * spread * np.float32(rng.uniform(0.7, 1.4))
     out = base + kept * detail + np.sqrt(1 - kept**2) * fresh
-    return np.clip(out, 0.02, 1.2).astype(np.float32)
+    changed: Float32 = np.clip(out, 0.02, 1.2).astype(np.float32)
+    return changed
 
 
 def wetted(albedo: Float32, lasting: Float32, rng: np.random.Generator) -> Float32:
@@ -61,7 +63,8 @@ def wetted(albedo: Float32, lasting: Float32, rng: np.random.Generator) -> Float
     n = albedo.shape[0]
     patches = np.clip(0.5 + 0.6 * noise(n, rng, 8, 3, 0.6), 0, 1)
     gain = 1 + lasting * (np.float32(rng.uniform(0.5, 1.25)) - 1) * patches
-    return (albedo * gain[..., None]).astype(np.float32)
+    changed: Float32 = (albedo * gain[..., None]).astype(np.float32)
+    return changed
 
 
 def coarse_mesh(scene: LitScene, rng: np.random.Generator) -> LitScene:

@@ -113,7 +113,8 @@ def _box(
 ) -> Float32:
     c, s = np.cos(angle), np.sin(angle)
     half = np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]]) * np.asarray(size) / 2
-    return (half @ np.array([[c, s], [-s, c]]) + at).astype(np.float32)
+    corners: Float32 = (half @ np.array([[c, s], [-s, c]]) + at).astype(np.float32)
+    return corners
 
 
 def plant(

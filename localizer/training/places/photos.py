@@ -39,8 +39,8 @@ class PhotoLibrary:
             return self._seasons(rng, n, files)
         if group == "neon_forest":
             chosen = rng.choice(len(files), 9, replace=True)
-            return [_grid([_read(files[i]) for i in chosen], n, 3)]
-        image = _read(files[int(rng.integers(len(files)))])
+            return [_grid([read_photo(files[i]) for i in chosen], n, 3)]
+        image = read_photo(files[int(rng.integers(len(files)))])
         short = min(image.shape[:2])
         side = int(rng.uniform(0.55, 1.0) * short)
         y = int(rng.integers(0, image.shape[0] - side + 1))
@@ -56,15 +56,17 @@ class PhotoLibrary:
         plots = sorted({f.parent for f in files})
         chosen = [plots[i] for i in rng.choice(len(plots), 9, replace=len(plots) < 9)]
         dates = [sorted(plot.glob("*.jpg")) for plot in chosen]
-        layers = [_grid([_read(d[k]) for d in dates], n, 3) for k in (0, -1)]
+        layers = [_grid([read_photo(d[k]) for d in dates], n, 3) for k in (0, -1)]
         return layers[:: int(rng.choice((-1, 1)))]
 
 
-def _read(path: Path) -> NDArray[np.uint8]:
+def read_photo(path: Path) -> NDArray[np.uint8]:
+    """(H, W, 3) RGB of a photo's file; SequenceError where it is none."""
     image = cv2.imread(str(path), cv2.IMREAD_COLOR)
     if image is None:
         raise SequenceError(f"{path}: cannot be decoded as an image")
-    return cv2.cvtColor(image, cv2.COLOR_BGR2RGB)
+    colours: NDArray[np.uint8] = cv2.cvtColor(image, cv2.COLOR_BGR2RGB)
+    return colours
 
 
 def _grid(images: list[NDArray[np.uint8]], n: int, per_side: int) -> NDArray[np.uint8]:

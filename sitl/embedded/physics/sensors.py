@@ -106,7 +106,8 @@ class Sensors:
         """Noise of the next tick's samples (SUBSTEPS, 6); the biases take a step too."""
         draw = self._rng.standard_normal((SUBSTEPS + 1, 6))
         self.imu_bias += draw[SUBSTEPS] * self._walk
-        return draw[:SUBSTEPS] * self._scale
+        noise: Array = draw[:SUBSTEPS] * self._scale
+        return noise
 
     def barometer(self, x: Array, dt: float) -> float:
         """Height above the home plane in metres, dt seconds after the last reading."""

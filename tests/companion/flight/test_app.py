@@ -94,10 +94,11 @@ def test_the_order_to_stop_takes_no_lock(small_assets):
     config = parse_config(
         {"map": str(small_assets.map_cache), "camera": {"source": "s", "model": MODEL}}, "test"
     )
-    feed, orders = _StubFeed(), []
+    feed, orders, interrupted = _StubFeed(), [], _InterruptedWait()
+    feed.ended = interrupted
     parts = [p for p in PARTS if p.name == "map"]
     companion = Companion(config, [*parts, Part("feed", Feed, lambda _: feed)])
-    feed.ended.interrupt = lambda: orders.append(companion.stop())
+    interrupted.interrupt = lambda: orders.append(companion.stop())
     companion.run()
     assert orders == [True]
 

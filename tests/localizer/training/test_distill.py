@@ -6,16 +6,18 @@ from pathlib import Path
 
 import pytest
 
-torch = pytest.importorskip("torch", reason="needs the extra `train`")
+pytest.importorskip("torch", reason="needs the extra `train`")
 
-from localizer.errors import ModelError  # noqa: E402
-from localizer.training.config import DistillSection, TrainConfig, load_config  # noqa: E402
-from localizer.training.data.pairs import SceneConfig  # noqa: E402
-from localizer.training.data.shards import write_shard  # noqa: E402
-from localizer.training.loop.distill import Teacher, distillation_loss  # noqa: E402
-from localizer.training.loop.train import Trainer  # noqa: E402
-from localizer.training.models.s0 import S0Config  # noqa: E402
-from localizer.training.models.tiny import ModelConfig  # noqa: E402
+import torch
+
+from localizer.errors import ModelError
+from localizer.training.config import DistillSection, TrainConfig, load_config
+from localizer.training.data.pairs import SceneConfig
+from localizer.training.data.shards import write_shard
+from localizer.training.loop.distill import Teacher, distillation_loss
+from localizer.training.loop.train import Trainer
+from localizer.training.models.s0 import S0Config
+from localizer.training.models.tiny import ModelConfig
 
 CONFIGS = Path(__file__).parents[3] / "configs"
 SCENES = SceneConfig(cells=256, width=128, height=96, references=3, queries_per_light=3)

@@ -9,8 +9,10 @@ import numpy as np
 import pytest
 import yaml
 
-torch = pytest.importorskip("torch")
+pytest.importorskip("torch")
 onnx = pytest.importorskip("onnx")
+
+import torch  # noqa: E402
 
 from localizer.errors import ModelError  # noqa: E402
 from localizer.features import GradientExtractor, OnnxExtractor  # noqa: E402

@@ -13,6 +13,7 @@ from localizer.geometry.geo import LocalFrame
 from localizer.geometry.pose import Pose
 from localizer.map.building import levels, quadtree
 from localizer.map.cache.stream import TileStreamer
+from localizer.map.importers.tiles3d import ContentFile
 from localizer.map.inspection.inspect import verify
 from localizer.render.numba_raster import NumbaRenderer
 
@@ -128,5 +129,5 @@ def test_weight_tells_triangles_and_texels(make, tmp_path):
     positions, uvs, faces = make.patch(0, 0, 10, 5)
     path = tmp_path / "t.glb"
     path.write_bytes(make.glb(positions, uvs, faces, make.picture(1, 32)))
-    content = levels.ContentFile(path, tmp_path, np.eye(4), "Y")
+    content = ContentFile(path, tmp_path, np.eye(4), "Y")
     assert content.weight() == (50, 32 * 32)

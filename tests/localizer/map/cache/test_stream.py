@@ -46,12 +46,6 @@ def until(condition) -> None:
         time.sleep(0.01)
 
 
-def idle(streamer: TileStreamer) -> bool:
-    """Whether the loader waits for work and has none."""
-    with streamer._lock:
-        return bool(streamer._lock._waiters) and not streamer._to_load()
-
-
 def footprint(meshes):
     """Ground area of the meshes' boxes, m²."""
     return sum(float(np.prod((m.bounds[1] - m.bounds[0])[:2])) for m in meshes)
@@ -143,7 +137,7 @@ def test_prefetch_makes_the_next_view_complete(streamer):
     here, there = above(-150, -150, 60), above(150, 150, 60)
     streamer.select(here, CAMERA, wait=True)
     streamer.prefetch([there], CAMERA)
-    until(lambda: idle(streamer))
+    until(lambda: streamer.idle)
     before = streamer.counters()
     streamer.select(there, CAMERA)
     after = streamer.counters()
@@ -161,7 +155,7 @@ def test_prefetch_takes_the_views_in_order_and_stays_within_the_budget(cache, mo
         streamer.select(here, CAMERA, wait=True)
         del order[:]
         streamer.prefetch([soon, later], CAMERA)
-        until(lambda: idle(streamer))
+        until(lambda: streamer.idle)
         nearest = [round(np.abs(cache.world_from_tile[i].translation[:2]).max()) for i in order]
         assert len(order) >= 2
         assert nearest == sorted(nearest)  # around the origin first
@@ -201,14 +195,14 @@ def test_a_tile_that_is_asked_for_again_while_it_fails_is_read_once(cache, monke
         if tile != cache.index.tile_start[leaf]:
             return load(tile)
         read.append(tile)
-        streamer.select(pose, CAMERA)
+        running.select(pose, CAMERA)
         raise MapCacheError("damaged")
 
     monkeypatch.setattr(cache, "load_tile", damaged)
-    with TileStreamer(cache) as streamer:
-        streamer.select(pose, CAMERA)
-        until(lambda: streamer.counters().failures and idle(streamer))
-        assert len(read) == streamer.counters().failures == 1
+    with TileStreamer(cache) as running:
+        running.select(pose, CAMERA)
+        until(lambda: running.counters().failures and running.idle)
+        assert len(read) == running.counters().failures == 1
 
 
 def test_a_closed_streamer_says_so(cache):

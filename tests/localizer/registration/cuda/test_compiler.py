@@ -10,6 +10,7 @@ import pytest
 from localizer.registration.cuda import compiler
 from localizer.registration.cuda.compiler import cache_directory, compile_kernels
 from localizer.registration.cuda.errors import CudaError, CudaUnavailableError
+from localizer.registration.cuda.layout import macros
 from localizer.registration.cuda.steps import KERNELS
 
 HOT = ("refine_many", "refine_few")
@@ -92,7 +93,7 @@ def test_a_disk_that_refuses_costs_only_time(tmp_path):
 
 @pytest.mark.usefixtures("_compiler")
 def test_layouts_that_differ_do_not_compile(tmp_path, monkeypatch):
-    wrong = compiler.macros(4, False) | {"BYTES_OF_State": 8}
+    wrong = macros(4, False) | {"BYTES_OF_State": 8}
     monkeypatch.setattr(compiler, "macros", lambda *_: wrong)
     with pytest.raises(CudaError, match=r"layout\.py differs: State"):
         compile_kernels(4, False, (8, 7), tmp_path)

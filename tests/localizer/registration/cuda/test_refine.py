@@ -19,7 +19,7 @@ from localizer.registration.backend import (
     world_from_camera,
 )
 from localizer.registration.cpu.reference import ReferenceBackend
-from localizer.registration.cuda.driver import CudaError
+from localizer.registration.cuda.errors import CudaError
 from localizer.registration.hypotheses import generate_hypotheses
 
 TOLERANCE_M, TOLERANCE_DEG = 1e-3, 1e-3
