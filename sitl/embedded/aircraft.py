@@ -205,8 +205,8 @@ class Aircraft:
 
     def use_source(self, source: int) -> None:
         """Switch the filter to a source set, 1 to 3."""
-        if self.estimator.source_set != source:
-            self.estimator.source_set = source
+        if self.estimator.sources.source_set != source:
+            self.estimator.sources.source_set = source
             self.notify(INFO, f"Using EKF Source Set {source}")
 
     def arming_failures(self) -> list[str]:

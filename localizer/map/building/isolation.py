@@ -52,7 +52,8 @@ def call_apart(
         process.join()
     if not good:
         raise value
-    return value
+    result: _Result = value
+    return result
 
 
 def _death(code: int | None, rules: ImportRules) -> str:

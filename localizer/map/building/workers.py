@@ -151,7 +151,7 @@ def _run_pool(
     pending: dict[Future[Record], tuple[int, TileSource]] = {}
     queue = iter(todo)
     suspects: list[tuple[int, TileSource]] = []
-    pool = _pool(min(workers, max(1, len(todo))), job.rules)
+    pool = worker_pool(min(workers, max(1, len(todo))), job.rules)
     try:
         while True:
             # A short queue bounds memory: each pending tile is at most one decoded tile.
@@ -170,7 +170,7 @@ def _run_pool(
                 suspects += pending.values()
                 pending.clear()
                 pool.shutdown(wait=False)
-                pool = _pool(workers, job.rules)
+                pool = worker_pool(workers, job.rules)
     finally:
         pool.shutdown(wait=False, cancel_futures=True)
     for item in suspects:
@@ -185,7 +185,8 @@ def _run_alone(job: ImportJob, key: int, tile: TileSource) -> Record:
         return job.staged.reject(key, str(error))
 
 
-def _pool(workers: int, rules: ImportRules) -> ProcessPoolExecutor:
+def worker_pool(workers: int, rules: ImportRules) -> ProcessPoolExecutor:
+    """Processes that end with this one, each under the limits of the rules."""
     # Not fork: OpenCV's and the caller's threads do not survive it.
     context = multiprocessing.get_context("spawn")
     return ProcessPoolExecutor(

@@ -91,7 +91,7 @@ class FlightModes:
 
     def arm(self) -> None:
         """Arm; the caller has run the checks."""
-        self.armed = self.estimator.armed = True
+        self.armed = self.estimator.sources.armed = True
         self._armed_since = self._ground_since = self._time
         self._flying = False
         self._guidance.reset()
@@ -99,7 +99,7 @@ class FlightModes:
 
     def disarm(self) -> None:
         """Stop the motors."""
-        self.armed = self.estimator.armed = False
+        self.armed = self.estimator.sources.armed = False
         self._flying = self._guidance.landing = False
         self._guidance.carrot = None
 

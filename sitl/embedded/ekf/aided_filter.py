@@ -42,18 +42,22 @@ class Aiding(IntEnum):
     ABSOLUTE = 1
 
 
-class AidedFilter(GatedFilter):
-    """Fuses what the active source set names. `notify(severity, text)` sends a STATUSTEXT."""
+class AidedFilter:
+    """Fuses what the active source set (1 to 3) names, into `gated`, once that is `aligned`.
+
+    armed: whether the vehicle is. `notify(severity, text)` sends a STATUSTEXT.
+    """
 
     def __init__(self, parameters: Parameters, notify: Callable[[int, str], None]) -> None:
-        super().__init__(parameters)
-        self.notify = notify
+        self.gated = GatedFilter(parameters)
+        self._parameters = parameters
+        self._notify = notify
         self.origin: Location | None = None
         self.aiding = Aiding.NONE
         self.source_set = 1
         self.armed = False
         self._last_known_ne = (0.0, 0.0)
-        self._aligned = False
+        self.aligned = False
         self._last_position_source = -1
         self._last_yaw_source = -1
 
@@ -62,24 +66,23 @@ class AidedFilter(GatedFilter):
         if self.origin is not None:
             return False
         self.origin = origin
-        for lane in (0, 1):
-            self.notify(INFO, f"EKF3 IMU{lane} origin set")
+        self._tell(INFO, "origin set")
         return True
 
     def force_position(self, north_m: float, east_m: float, sigma_m: float) -> bool:
         """MAV_CMD_EXTERNAL_POSITION_ESTIMATE: a reset, taken only after 1 s without aiding."""
-        if self._now_ms - self._clock.position_pass <= 1000 or self.origin is None:
+        if self.gated.now_ms - self.gated.clock.position_pass <= 1000 or self.origin is None:
             return False
-        self._reset_position(north_m, east_m, sigma_m**2)
+        self.gated.reset_position(north_m, east_m, sigma_m**2)
         return True
 
-    def _fuse(self, measurement: Measurement) -> None:
+    def fuse(self, measurement: Measurement) -> None:
         """Use one measurement, if its source is the one that counts."""
         if isinstance(measurement, Baro):
             self._fuse_baro(measurement.height)
         elif isinstance(measurement, Compass):
-            if self._source("YAW") == COMPASS:
-                self._fuse_yaw(measurement.yaw, _COMPASS_SIGMA)
+            if self.source("YAW") == COMPASS:
+                self.gated.fuse_yaw(measurement.yaw, _COMPASS_SIGMA)
         elif isinstance(measurement, GpsData):
             self._use_gps(measurement)
         elif isinstance(measurement, ExternalPosition):
@@ -87,152 +90,155 @@ class AidedFilter(GatedFilter):
         else:
             self._use_external_velocity(measurement)
 
+    def _tell(self, severity: int, text: str) -> None:
+        for lane in (0, 1):
+            self._notify(severity, f"EKF3 IMU{lane} {text}")
+
     # --- sources and aiding ------------------------------------------------------------------
 
-    def _source(self, what: str) -> int:
-        return int(self.parameters[f"EK3_SRC{self.source_set}_{what}"])
+    def source(self, what: str) -> int:
+        """EK3_SRCn_<what> of the active set."""
+        return int(self._parameters[f"EK3_SRC{self.source_set}_{what}"])
 
-    def _check_sources(self) -> None:
-        position, yaw = self._source("POSXY"), self._source("YAW")
+    def check_sources(self) -> None:
+        """Note a change of source: position and yaw are reset to the new one."""
+        position, yaw = self.source("POSXY"), self.source("YAW")
         if position != self._last_position_source:
-            self._source_reset = self._last_position_source >= 0 and position != 0
+            self.gated.source_reset = self._last_position_source >= 0 and position != 0
             self._last_position_source = position
         if yaw != self._last_yaw_source:
-            self._yaw_reset = self._last_yaw_source >= 0
+            self.gated.yaw_reset = self._last_yaw_source >= 0
             self._last_yaw_source = yaw
 
-    def _check_gps(self, gps: GpsData) -> None:
-        now = self._now_ms
-        good = (
-            gps.satellites >= 6
-            and gps.hdop <= 2.5
-            and gps.horizontal_accuracy <= 5.0
-            and gps.speed_accuracy <= 1.5
-        )
-        if not good or now - self._clock.gps_received > 1000:
-            self._clock.gps_bad = now
-        self._clock.gps_received = now
-        self._gps_fix_good = now - self._clock.gps_bad >= _GPS_GOOD_MS
-        if self._gps_fix_good and self.origin is None:
-            height = -float(self._state[nav.P + 2])
+    def check_gps(self, gps: GpsData) -> None:
+        """EKF3's checks of a receiver; the first good fix sets the origin."""
+        now = self.gated.now_ms
+        if not gps.good or now - self.gated.clock.gps_received > 1000:
+            self.gated.clock.gps_bad = now
+        self.gated.clock.gps_received = now
+        self.gated.gps_fix_good = now - self.gated.clock.gps_bad >= _GPS_GOOD_MS
+        if self.gated.gps_fix_good and self.origin is None:
+            height = -float(self.gated.state[nav.P + 2])
             self.set_origin(Location(gps.latitude_deg, gps.longitude_deg, gps.altitude_m - height))
 
     def _start_aiding(self, source: str) -> None:
         self.aiding = Aiding.ABSOLUTE
-        self._position_timeout = self._velocity_timeout = False
-        self._clock.position_pass = self._clock.velocity_pass = self._now_ms
-        for lane in (0, 1):
-            self.notify(INFO, f"EKF3 IMU{lane} is using {source}")
+        self.gated.position_timeout = self.gated.velocity_timeout = False
+        self.gated.clock.position_pass = self.gated.clock.velocity_pass = self.gated.now_ms
+        self._tell(INFO, f"is using {source}")
 
-    def _update_aiding(self) -> None:
+    def update_aiding(self) -> None:
+        """End what has had no measurement for too long."""
         if self.aiding is not Aiding.ABSOLUTE:
             return
-        now, clock = self._now_ms, self._clock
+        now, clock = self.gated.now_ms, self.gated.clock
         position_used = now - clock.position_pass <= _POSITION_LOST_NO_VELOCITY_MS
         velocity_used = now - clock.velocity_pass <= _POSITION_LOST_NO_VELOCITY_MS
-        self._velocity_aiding = position_used or velocity_used
+        self.gated.velocity_aiding = position_used or velocity_used
         silent = now - max(clock.position_pass, clock.velocity_pass)
         if silent > _ATTITUDE_LOST_MS:
             self._stop_aiding()
         elif not position_used:
             limit = (
                 _POSITION_LOST_WITH_VELOCITY_MS
-                if self._velocity_aiding
+                if self.gated.velocity_aiding
                 else _POSITION_LOST_NO_VELOCITY_MS
             )
             if now - clock.position_pass > limit:
-                self._position_timeout = True
-                self._velocity_timeout = not velocity_used
+                self.gated.position_timeout = True
+                self.gated.velocity_timeout = not velocity_used
 
     def _stop_aiding(self) -> None:
         self.aiding = Aiding.NONE
-        self._position_timeout = self._velocity_timeout = True
-        self._last_known_ne = (float(self._state[nav.P]), float(self._state[nav.P + 1]))
-        self._state[nav.V : nav.V + 2] = 0.0
-        nav.reset_error(self._cov, 3, 2, self.parameters["EK3_VELNE_M_NSE"] ** 2)
-        self.ratios.position = self.ratios.velocity = 0.0
-        for lane in (0, 1):
-            self.notify(WARNING, f"EKF3 IMU{lane} stopped aiding")
+        self.gated.position_timeout = self.gated.velocity_timeout = True
+        self._last_known_ne = (float(self.gated.state[nav.P]), float(self.gated.state[nav.P + 1]))
+        self.gated.state[nav.V : nav.V + 2] = 0.0
+        nav.reset_error(self.gated.cov, 3, 2, self._parameters["EK3_VELNE_M_NSE"] ** 2)
+        self.gated.ratios.position = self.gated.ratios.velocity = 0.0
+        self._tell(WARNING, "stopped aiding")
 
     # --- fusion ------------------------------------------------------------------------------
 
     def _use_gps(self, gps: GpsData) -> None:
-        self._note_innovations()
-        if self._source("YAW") == 2 and gps.yaw_rad is not None:
-            self._fuse_yaw(gps.yaw_rad, radians(10.0))
-        if self._source("POSXY") != GPS or self.origin is None:
+        self.gated.note_innovations()
+        if self.source("YAW") == 2 and gps.yaw_rad is not None:
+            self.gated.fuse_yaw(gps.yaw_rad, radians(10.0))
+        if self.source("POSXY") != GPS or self.origin is None:
             return
         position = north_east(self.origin, gps.latitude_deg, gps.longitude_deg)
-        sigma = max(gps.horizontal_accuracy, self.parameters["EK3_POSNE_M_NSE"])
-        horizontal = gps.horizontal_velocity if self._source("VELXY") == GPS else None
-        vertical = gps.vertical_velocity if self._source("VELZ") == GPS else None
+        sigma = max(gps.horizontal_accuracy, self._parameters["EK3_POSNE_M_NSE"])
+        horizontal = gps.horizontal_velocity if self.source("VELXY") == GPS else None
+        vertical = gps.vertical_velocity if self.source("VELZ") == GPS else None
         if self.aiding is Aiding.NONE:
-            if not (self._gps_fix_good and self._aligned):
+            if not (self.gated.gps_fix_good and self.aligned):
                 return
             self._start_aiding("GPS")
-            self._reset_position(*position, sigma**2)
-            self._reset_velocity(horizontal or (0.0, 0.0), 0.5**2 if horizontal else 25.0)
+            self.gated.reset_position(*position, sigma**2)
+            self.gated.reset_velocity(horizontal or (0.0, 0.0), 0.5**2 if horizontal else 25.0)
             return
-        if self._source_reset:
-            self._reset_position(*position, sigma**2)
-        speed = max(gps.speed_accuracy, self.parameters["EK3_VELNE_M_NSE"])
-        self._fuse_position(position, sigma, horizontal)
+        if self.gated.source_reset:
+            self.gated.reset_position(*position, sigma**2)
+        speed = max(gps.speed_accuracy, self._parameters["EK3_VELNE_M_NSE"])
+        self.gated.fuse_position(position, sigma, horizontal)
         if horizontal is not None:
-            self._fuse_velocity(horizontal, vertical, speed, self.parameters["EK3_VELNE_M_NSE"])
+            self.gated.fuse_velocity(
+                horizontal, vertical, speed, self._parameters["EK3_VELNE_M_NSE"]
+            )
         elif vertical is not None:
-            nav.fuse(self._state, self._cov, 5, vertical - self._state[nav.V + 2], 0.5**2)
-        if self._source("POSZ") == GPS:
-            self._fuse_height(gps.altitude_m - self.origin.altitude_m, 1.5)
+            nav.fuse(
+                self.gated.state, self.gated.cov, 5, vertical - self.gated.state[nav.V + 2], 0.5**2
+            )
+        if self.source("POSZ") == GPS:
+            self.gated.fuse_height(gps.altitude_m - self.origin.altitude_m, 1.5)
 
     def _use_external(self, fix: ExternalPosition) -> None:
-        if self._source("YAW") == EXTERNAL and fix.yaw_rad is not None:
-            if self._yaw_reset:
-                self._rotate_to(fix.yaw_rad, fix.yaw_sigma)
+        if self.source("YAW") == EXTERNAL and fix.yaw_rad is not None:
+            if self.gated.yaw_reset:
+                self.gated.rotate_to(fix.yaw_rad, fix.yaw_sigma)
             else:
-                self._fuse_yaw(fix.yaw_rad, fix.yaw_sigma)
-        if self._source("POSXY") != EXTERNAL:
+                self.gated.fuse_yaw(fix.yaw_rad, fix.yaw_sigma)
+        if self.source("POSXY") != EXTERNAL:
             return
         north, east, down = fix.position
         if self.aiding is Aiding.NONE:
-            if not self._aligned:
+            if not self.aligned:
                 return
             self._start_aiding("external nav data")
-            for lane in (0, 1):
-                text = f"initial pos NED = {north:3.1f},{east:3.1f},{down:3.1f} (m)"
-                self.notify(INFO, f"EKF3 IMU{lane} {text}")
-            self._reset_position(north, east, fix.sigma**2)
-            self._reset_velocity((0.0, 0.0), 25.0)
+            self._tell(INFO, f"initial pos NED = {north:3.1f},{east:3.1f},{down:3.1f} (m)")
+            self.gated.reset_position(north, east, fix.sigma**2)
+            self.gated.reset_velocity((0.0, 0.0), 25.0)
             return
-        if fix.reset or self._source_reset:
-            self._reset_position(north, east, None)
-            if self._source("POSZ") == EXTERNAL:
-                self._state[nav.P + 2] = down
-        self._fuse_position((north, east), fix.sigma, None)
-        if self._source("POSZ") == EXTERNAL:
-            self._fuse_height(-down, max(fix.sigma, 0.1))
+        if fix.reset or self.gated.source_reset:
+            self.gated.reset_position(north, east, None)
+            if self.source("POSZ") == EXTERNAL:
+                self.gated.state[nav.P + 2] = down
+        self.gated.fuse_position((north, east), fix.sigma, None)
+        if self.source("POSZ") == EXTERNAL:
+            self.gated.fuse_height(-down, max(fix.sigma, 0.1))
 
     def _use_external_velocity(self, observed: ExternalVelocity) -> None:
-        if self._source("VELXY") != EXTERNAL or self.aiding is Aiding.NONE:
+        if self.source("VELXY") != EXTERNAL or self.aiding is Aiding.NONE:
             return
-        vertical = observed.velocity[2] if self._source("VELZ") == EXTERNAL else None
+        vertical = observed.velocity[2] if self.source("VELZ") == EXTERNAL else None
         horizontal = (observed.velocity[0], observed.velocity[1])
-        self._fuse_velocity(horizontal, vertical, observed.sigma, observed.sigma)
+        self.gated.fuse_velocity(horizontal, vertical, observed.sigma, observed.sigma)
 
     def _fuse_baro(self, height: float) -> None:
-        source = self._source("POSZ")
+        source = self.source("POSZ")
         external_fresh = (
-            source == EXTERNAL and self._now_ms - self._clock.external_received < _HEIGHT_FRESH_MS
+            source == EXTERNAL
+            and self.gated.now_ms - self.gated.clock.external_received < _HEIGHT_FRESH_MS
         )
         gps_fresh = (
             source == GPS
-            and self._now_ms - self._clock.gps_received < _HEIGHT_FRESH_MS
+            and self.gated.now_ms - self.gated.clock.gps_received < _HEIGHT_FRESH_MS
             and self.aiding is Aiding.ABSOLUTE
         )
         if not (external_fresh or gps_fresh):
-            self._fuse_height(height, self.parameters["EK3_ALT_M_NSE"])
+            self.gated.fuse_height(height, self._parameters["EK3_ALT_M_NSE"])
         if self.aiding is Aiding.NONE:
             # As EKF3: hold position with a synthetic measurement, to keep the tilt bounded.
-            sigma = self.parameters["EK3_NOAID_M_NSE"] if self.armed else 0.5
+            sigma = self._parameters["EK3_NOAID_M_NSE"] if self.armed else 0.5
             for i in range(2):
-                residual = self._last_known_ne[i] - self._state[nav.P + i]
-                nav.fuse(self._state, self._cov, 6 + i, residual, sigma**2)
+                residual = self._last_known_ne[i] - self.gated.state[nav.P + i]
+                nav.fuse(self.gated.state, self.gated.cov, 6 + i, residual, sigma**2)

@@ -24,7 +24,7 @@ class EkfCheck:
         self.failsafe = False
         self._parameters = parameters
         self._estimator = estimator
-        self.notify = notify
+        self._notify = notify
         self._fails = 0
         self._bad = False
         self._ever_good = False
@@ -51,7 +51,7 @@ class EkfCheck:
         self._bad = self._fails >= _CHECKS_TO_FAIL
         if self._bad and time_s - self._last_warning > _WARNING_PERIOD_S:
             self._last_warning = time_s
-            self.notify(CRITICAL, "EKF variance")
+            self._notify(CRITICAL, "EKF variance")
         return self._bad
 
     def watch_glitch(self) -> None:
@@ -60,7 +60,7 @@ class EkfCheck:
             return
         self._glitching = not self._glitching
         text = "GPS Glitch or Compass error" if self._glitching else "Glitch cleared"
-        self.notify(CRITICAL, text)
+        self._notify(CRITICAL, text)
 
     def _passes(self, limit: float) -> bool:
         velocity, position, _, compass = self._estimator.variances
@@ -72,4 +72,4 @@ class EkfCheck:
         self._bad = False
         if self.failsafe:
             self.failsafe = False
-            self.notify(CRITICAL, "EKF Failsafe Cleared")
+            self._notify(CRITICAL, "EKF Failsafe Cleared")

@@ -44,15 +44,17 @@ class EkfFlags(IntFlag):
     GPS_GLITCHING = 32768
 
 
-class Estimator(AidedFilter):
+class Estimator:
     """The vehicle's navigation filter.
 
-    output: the nominal state (16,) at the present, see `navigation`.
+    output: the nominal state (16,) at the present, see `navigation`; sources: what it fuses.
     """
 
     def __init__(self, parameters: Parameters, notify: Callable[[int, str], None]) -> None:
-        super().__init__(parameters, notify)
-        self.output: Array = self._state.copy()
+        self._parameters = parameters
+        self.sources = AidedFilter(parameters, notify)
+        self._gated = self.sources.gated
+        self.output: Array = self._gated.state.copy()
         self._delay_ticks = self._longest_delay_ms() // _TICK_MS  # EKF3 sizes its buffers at boot
         self._ring = np.zeros((_MAX_HORIZON_MS // _TICK_MS + 2, 7))
         self._start, self._filled = 0, 0
@@ -63,15 +65,19 @@ class Estimator(AidedFilter):
 
     def align(self, yaw_rad: float) -> None:
         """Initial attitude: level (at rest) and a compass heading."""
-        self._state[nav.Q : nav.Q + 4] = (np.cos(yaw_rad / 2), 0.0, 0.0, np.sin(yaw_rad / 2))
-        self.output[:] = self._state
-        self._cov[2, 2] = 0.1**2
-        self._aligned = True
+        self._gated.state[nav.Q : nav.Q + 4] = (np.cos(yaw_rad / 2), 0.0, 0.0, np.sin(yaw_rad / 2))
+        self.output[:] = self._gated.state
+        self._gated.cov[2, 2] = 0.1**2
+        self.sources.aligned = True
+
+    def set_origin(self, origin: Location) -> bool:
+        """Set the origin once; False for a second one."""
+        return self.sources.set_origin(origin)
 
     def add(self, measurement: Measurement, time_ms: int) -> None:
         """Queue a measurement that was taken at time_ms (ms since boot)."""
         if isinstance(measurement, GpsData):
-            self._check_gps(measurement)
+            self.sources.check_gps(measurement)
         heapq.heappush(
             self._queue,
             (max(time_ms, self._horizon_ms()), next(self._sequence), measurement),
@@ -83,23 +89,28 @@ class Estimator(AidedFilter):
         """
         if not all(isfinite(c) for c in (*fix.position, fix.sigma)):
             return False
-        if not self._spaced(stamp_ms - self._clock.external_stamp):
+        if not self._spaced(stamp_ms - self._gated.clock.external_stamp):
             return False
-        self._clock.external_stamp = stamp_ms
-        self._clock.external_received = self._now_ms
-        self.add(fix, stamp_ms - int(self.parameters["VISO_DELAY_MS"]))
+        self._gated.clock.external_stamp = stamp_ms
+        self._gated.clock.external_received = self._gated.now_ms
+        self.add(fix, stamp_ms - int(self._parameters["VISO_DELAY_MS"]))
         return True
 
     def add_external_velocity(self, velocity: ExternalVelocity, stamp_ms: int) -> None:
         """A companion's velocity with its corrected time stamp."""
         if not all(isfinite(c) for c in velocity.velocity):
             return
-        if not self._spaced(stamp_ms - self._clock.external_velocity_stamp):
+        if not self._spaced(stamp_ms - self._gated.clock.external_velocity_stamp):
             return
-        self._clock.external_velocity_stamp = stamp_ms
-        self.add(velocity, stamp_ms - int(self.parameters["VISO_DELAY_MS"]))
+        self._gated.clock.external_velocity_stamp = stamp_ms
+        self.add(velocity, stamp_ms - int(self._parameters["VISO_DELAY_MS"]))
 
     # --- output ------------------------------------------------------------------------------
+
+    @property
+    def origin(self) -> Location | None:
+        """Of the local frame; None before it is set or GNSS gave one."""
+        return self.sources.origin
 
     @property
     def position(self) -> tuple[float, float, float]:
@@ -121,25 +132,27 @@ class Estimator(AidedFilter):
     @property
     def position_valid(self) -> bool:
         """Whether a relative or absolute horizontal position is claimed."""
-        return self.aiding is Aiding.ABSOLUTE and not self._position_timeout
+        return self.sources.aiding is Aiding.ABSOLUTE and not self._gated.position_timeout
 
     @property
     def gps_glitching(self) -> bool:
         """GNSS innovations out of gate for more than a second while GNSS is the source."""
         return (
-            not self._innovations_good
-            and self.aiding is Aiding.ABSOLUTE
-            and self._source("POSXY") == GPS
+            not self._gated.innovations_good
+            and self.sources.aiding is Aiding.ABSOLUTE
+            and self.sources.source("POSXY") == GPS
         )
 
     @property
     def flags(self) -> EkfFlags:
         """EKF_STATUS_REPORT flags."""
-        if not self._aligned:
+        if not self.sources.aligned:
             return EkfFlags.UNINITIALIZED
         flags = EkfFlags.ATTITUDE | EkfFlags.VELOCITY_VERT | EkfFlags.POS_VERT_ABS
-        unaided = self.aiding is Aiding.NONE  # then a constant position is fused, and counts
-        if unaided or not (self._velocity_timeout and self._position_timeout):
+        unaided = (
+            self.sources.aiding is Aiding.NONE
+        )  # then a constant position is fused, and counts
+        if unaided or not (self._gated.velocity_timeout and self._gated.position_timeout):
             flags |= EkfFlags.VELOCITY_HORIZ
         if self.position_valid:
             flags |= (
@@ -157,12 +170,12 @@ class Estimator(AidedFilter):
     @property
     def variances(self) -> tuple[float, float, float, float]:
         """Velocity, position, height and compass variances as EKF_STATUS_REPORT carries them."""
-        r = self.ratios
+        r = self._gated.ratios
         return sqrt(r.velocity), sqrt(r.position), sqrt(r.height), sqrt(r.yaw)
 
     def accuracy(self) -> tuple[float, float, float]:
         """One-sigma horizontal position, vertical position and horizontal speed (m, m, m/s)."""
-        c = self._cov
+        c = self._gated.cov
         return (
             sqrt(c[6, 6] + c[7, 7]),
             sqrt(c[8, 8]),
@@ -173,37 +186,37 @@ class Estimator(AidedFilter):
 
     def update(self, increment: Array, now_ms: int) -> None:
         """Take one 10 ms IMU increment: advance the horizon, fuse what is due, refresh output."""
-        self._now_ms = now_ms
+        self._gated.now_ms = now_ms
         size = self._ring.shape[0]
         self._ring[(self._start + self._filled) % size] = increment
         self._filled += 1
-        p = self.parameters
+        p = self._parameters
         noise = np.array(
             [p["EK3_GYRO_P_NSE"], p["EK3_ACC_P_NSE"], p["EK3_GBIAS_P_NSE"], p["EK3_ABIAS_P_NSE"]]
         )
         while self._filled > self._delay_ticks:
-            nav.predict(self._state, self._cov, self._ring[self._start], noise)
+            nav.predict(self._gated.state, self._gated.cov, self._ring[self._start], noise)
             self._start = (self._start + 1) % size
             self._filled -= 1
             self._fuse_due()
-        nav.replay(self._state, self._ring, self._start, self._filled, self.output)
+        nav.replay(self._gated.state, self._ring, self._start, self._filled, self.output)
 
     def _longest_delay_ms(self) -> int:
         delay = _BASE_HORIZON_MS
-        if self.parameters["VISO_TYPE"] > 0:
-            delay = max(delay, int(self.parameters["VISO_DELAY_MS"]))
-        if self.parameters["GPS1_TYPE"] > 0:
-            delay = max(delay, int(self.parameters["GPS1_DELAY_MS"]), 200)
+        if self._parameters["VISO_TYPE"] > 0:
+            delay = max(delay, int(self._parameters["VISO_DELAY_MS"]))
+        if self._parameters["GPS1_TYPE"] > 0:
+            delay = max(delay, int(self._parameters["GPS1_DELAY_MS"]), 200)
         return min(delay, _MAX_HORIZON_MS)
 
     def _horizon_ms(self) -> int:
-        return self._now_ms - self._filled * _TICK_MS
+        return self._gated.now_ms - self._filled * _TICK_MS
 
     def _fuse_due(self) -> None:
-        self._check_sources()
-        self._update_aiding()
+        self.sources.check_sources()
+        self.sources.update_aiding()
         while self._queue and self._queue[0][0] <= self._horizon_ms():
-            self._fuse(heapq.heappop(self._queue)[2])
+            self.sources.fuse(heapq.heappop(self._queue)[2])
 
     @staticmethod
     def _spaced(interval_ms: int) -> bool:

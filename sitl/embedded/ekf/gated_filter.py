@@ -41,128 +41,139 @@ class FilterClock:
 
 
 class GatedFilter:
-    """State, covariance, and what may change them. Times are ms since boot."""
+    """State, covariance, and what may change them. Times are ms since boot.
+
+    state: nominal state (16,), cov: (15, 15), see `navigation`, at the delayed time horizon;
+    now_ms: the present. position_timeout, velocity_timeout: nothing was within its gate for so long
+    that the state may be reset to a measurement.
+    """
 
     def __init__(self, parameters: Parameters) -> None:
         self.parameters = parameters
         self.ratios = TestRatios()
-        self._state = np.zeros(nav.NOMINAL_SIZE)
-        self._state[nav.Q] = 1.0
-        self._cov = np.diag(
+        self.state = np.zeros(nav.NOMINAL_SIZE)
+        self.state[nav.Q] = 1.0
+        self.cov = np.diag(
             np.repeat([0.02**2, 0.5**2, 0.5**2, 0.005**2, 0.05**2], 3).astype(np.float64)
         )
-        self._now_ms = 0
-        self._clock = FilterClock()
-        self._position_timeout = True
-        self._velocity_timeout = True
-        self._velocity_aiding = False
-        self._innovations_good = True
-        self._gps_fix_good = False
-        self._source_reset = False
-        self._yaw_reset = False
+        self.now_ms = 0
+        self.clock = FilterClock()
+        self.position_timeout = True
+        self.velocity_timeout = True
+        self.velocity_aiding = False
+        self.innovations_good = True
+        self.gps_fix_good = False
+        self.source_reset = False
+        self.yaw_reset = False
 
-    def _fuse_position(
+    def fuse_position(
         self,
         position: tuple[float, float],
         sigma: float,
         velocity: tuple[float, float] | None,
     ) -> None:
+        """North and east in metres; a reset instead, where the timeout allows one."""
         p = self.parameters
-        innovation = [position[i] - float(self._state[nav.P + i]) for i in range(2)]
-        variance = self._cov[6, 6] + self._cov[7, 7]
+        innovation = [position[i] - float(self.state[nav.P + i]) for i in range(2)]
+        variance = self.cov[6, 6] + self.cov[7, 7]
         gate = max(0.01 * p["EK3_POS_I_GATE"], 1.0) ** 2
         ratio = (innovation[0] ** 2 + innovation[1] ** 2) / (gate * (variance + 2 * sigma**2))
         self.ratios.position = ratio
         passed = ratio < 1.0
         if passed:
-            self._clock.position_pass = self._now_ms
-        if not (passed or self._position_timeout):
+            self.clock.position_pass = self.now_ms
+        if not (passed or self.position_timeout):
             return
         radius = p["EK3_GLITCH_RAD"]
-        lost = self._position_timeout or variance > radius**2
-        if lost and (not self._velocity_aiding or self._gps_fix_good):
-            self._reset_position(*position, (0.5 * radius) ** 2)
-            self._position_timeout = False
-            self._clock.position_pass = self._now_ms
+        lost = self.position_timeout or variance > radius**2
+        if lost and (not self.velocity_aiding or self.gps_fix_good):
+            self.reset_position(*position, (0.5 * radius) ** 2)
+            self.position_timeout = False
+            self.clock.position_pass = self.now_ms
             self.ratios.position = 0.0
-            if self._velocity_timeout:
-                self._reset_velocity(velocity or (0.0, 0.0), 0.5**2 if velocity else 25.0**2)
+            if self.velocity_timeout:
+                self.reset_velocity(velocity or (0.0, 0.0), 0.5**2 if velocity else 25.0**2)
             return
         for i in range(2):
-            residual = position[i] - self._state[nav.P + i]
-            nav.fuse(self._state, self._cov, 6 + i, residual, sigma**2)
+            residual = position[i] - self.state[nav.P + i]
+            nav.fuse(self.state, self.cov, 6 + i, residual, sigma**2)
 
-    def _fuse_velocity(
+    def fuse_velocity(
         self,
         horizontal: tuple[float, float],
         vertical: float | None,
         sigma: float,
         gate_sigma: float,
     ) -> None:
+        """North, east and, if given, down in m/s; gate_sigma widens the gate alone."""
         observed = [*horizontal] if vertical is None else [*horizontal, vertical]
         squared, variance = 0.0, 0.0
         for i, value in enumerate(observed):
-            squared += (value - float(self._state[nav.V + i])) ** 2
-            variance += self._cov[3 + i, 3 + i] + gate_sigma**2
+            squared += (value - float(self.state[nav.V + i])) ** 2
+            variance += self.cov[3 + i, 3 + i] + gate_sigma**2
         gate = max(0.01 * self.parameters["EK3_VEL_I_GATE"], 1.0) ** 2
         self.ratios.velocity = squared / (gate * variance)
         passed = self.ratios.velocity < 1.0
         if passed:
-            self._clock.velocity_pass = self._now_ms
-        elif self._velocity_timeout:
-            self._reset_velocity(horizontal, sigma**2)
+            self.clock.velocity_pass = self.now_ms
+        elif self.velocity_timeout:
+            self.reset_velocity(horizontal, sigma**2)
             self.ratios.velocity = 0.0
             return
         else:
             return
         for i, value in enumerate(observed):
-            nav.fuse(self._state, self._cov, 3 + i, value - self._state[nav.V + i], sigma**2)
+            nav.fuse(self.state, self.cov, 3 + i, value - self.state[nav.V + i], sigma**2)
 
-    def _fuse_height(self, height: float, sigma: float) -> None:
-        innovation = -height - float(self._state[nav.P + 2])
-        variance = self._cov[8, 8] + sigma**2
+    def fuse_height(self, height: float, sigma: float) -> None:
+        """Metres above the origin, if within the gate."""
+        innovation = -height - float(self.state[nav.P + 2])
+        variance = self.cov[8, 8] + sigma**2
         gate = max(0.01 * self.parameters["EK3_HGT_I_GATE"], 1.0) ** 2
         self.ratios.height = innovation**2 / (gate * variance)
         if self.ratios.height < 1.0:
-            nav.fuse(self._state, self._cov, 8, innovation, sigma**2)
+            nav.fuse(self.state, self.cov, 8, innovation, sigma**2)
 
-    def _fuse_yaw(self, yaw_rad: float, sigma: float) -> None:
-        innovation = wrap_pi(yaw_rad - euler(self._state[nav.Q : nav.Q + 4])[2])
-        variance = self._cov[2, 2] + sigma**2
+    def fuse_yaw(self, yaw_rad: float, sigma: float) -> None:
+        """Heading, if within the gate."""
+        innovation = wrap_pi(yaw_rad - euler(self.state[nav.Q : nav.Q + 4])[2])
+        variance = self.cov[2, 2] + sigma**2
         gate = max(0.01 * self.parameters["EK3_YAW_I_GATE"], 1.0) ** 2
         self.ratios.yaw = innovation**2 / (gate * variance)
         if self.ratios.yaw < 1.0:
-            nav.fuse(self._state, self._cov, 2, innovation, sigma**2)
+            nav.fuse(self.state, self.cov, 2, innovation, sigma**2)
 
-    def _rotate_to(self, yaw_rad: float, sigma: float) -> None:
-        self._yaw_reset = False
-        change = wrap_pi(yaw_rad - euler(self._state[nav.Q : nav.Q + 4])[2])
-        rotate_world(self._state[nav.Q : nav.Q + 4], 0.0, 0.0, change)
-        nav.reset_error(self._cov, 2, 1, sigma**2)
+    def rotate_to(self, yaw_rad: float, sigma: float) -> None:
+        """Reset the heading."""
+        self.yaw_reset = False
+        change = wrap_pi(yaw_rad - euler(self.state[nav.Q : nav.Q + 4])[2])
+        rotate_world(self.state[nav.Q : nav.Q + 4], 0.0, 0.0, change)
+        nav.reset_error(self.cov, 2, 1, sigma**2)
 
-    def _reset_position(self, north: float, east: float, variance: float | None) -> None:
+    def reset_position(self, north: float, east: float, variance: float | None) -> None:
         """Jump to a position; variance None keeps the covariance, as EKF3's announced reset."""
-        self._source_reset = False
-        self._state[nav.P : nav.P + 2] = (north, east)
+        self.source_reset = False
+        self.state[nav.P : nav.P + 2] = (north, east)
         if variance is not None:
-            nav.reset_error(self._cov, 6, 2, variance)
-            self._clock.position_pass = self._now_ms
-            self._position_timeout = False
+            nav.reset_error(self.cov, 6, 2, variance)
+            self.clock.position_pass = self.now_ms
+            self.position_timeout = False
 
-    def _reset_velocity(self, horizontal: tuple[float, float], variance: float) -> None:
-        self._state[nav.V : nav.V + 2] = horizontal
-        nav.reset_error(self._cov, 3, 2, variance)
-        self._velocity_timeout = False
-        self._clock.velocity_pass = self._now_ms
+    def reset_velocity(self, horizontal: tuple[float, float], variance: float) -> None:
+        """Jump to a horizontal velocity, m/s."""
+        self.state[nav.V : nav.V + 2] = horizontal
+        nav.reset_error(self.cov, 3, 2, variance)
+        self.velocity_timeout = False
+        self.clock.velocity_pass = self.now_ms
 
-    def _note_innovations(self) -> None:
+    def note_innovations(self) -> None:
         """GNSS glitch logic: bad after 1 s out of gate, good again after 10 s inside."""
-        clock, now = self._clock, self._now_ms
+        clock, now = self.clock, self.now_ms
         if self.ratios.position < 1.0 and self.ratios.velocity < 1.0:
             clock.innovation_pass = now
         else:
             clock.innovation_fail = now
         if now - clock.innovation_pass > 1000:
-            self._innovations_good = False
+            self.innovations_good = False
         elif now - clock.innovation_fail > 10000:
-            self._innovations_good = True
+            self.innovations_good = True

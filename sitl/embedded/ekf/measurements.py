@@ -20,6 +20,16 @@ class GpsData:
     hdop: float
     yaw_rad: float | None = None
 
+    @property
+    def good(self) -> bool:
+        """By the default thresholds of EKF3's GNSS checks (EK3_GPS_CHECK)."""
+        return (
+            self.satellites >= 6
+            and self.hdop <= 2.5
+            and self.horizontal_accuracy <= 5.0
+            and self.speed_accuracy <= 1.5
+        )
+
 
 @dataclass(frozen=True)
 class ExternalPosition:

@@ -96,7 +96,7 @@ class NavigationCommands:
             return FAILED
         north, east, _ = v.estimator.origin.ned_of(Location(command.x / 1e7, command.y / 1e7, 0.0))
         sigma = command.param3 if command.param3 > 0 else 10.0
-        return ACCEPTED if v.estimator.force_position(north, east, sigma) else FAILED
+        return ACCEPTED if v.estimator.sources.force_position(north, east, sigma) else FAILED
 
     def _mission_start(self, _link: SerialPort, _command: Any) -> int:
         return ACCEPTED if self._vehicle.modes.start_mission() else FAILED

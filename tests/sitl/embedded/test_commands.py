@@ -101,7 +101,7 @@ def test_commands_on_the_ground(grounded):
     v = grounded.vehicle
     assert result(grounded, m.MAV_CMD_SET_EKF_SOURCE_SET, 4) == DENIED
     assert result(grounded, m.MAV_CMD_SET_EKF_SOURCE_SET, 2) == ACCEPTED
-    assert v.estimator.source_set == 2
+    assert v.estimator.sources.source_set == 2
     assert grounded.said("Using EKF Source Set 2")
     assert result(grounded, m.MAV_CMD_SET_EKF_SOURCE_SET, 1) == ACCEPTED
     origin = {"frame": 0, "x": PLACE[0], "y": PLACE[1]}

@@ -164,7 +164,7 @@ def at(north, east=0.0, sigma=0.5, yaw=None, reset=False):
 def test_starts_aiding_with_the_first_fix_and_says_so():
     still = Still()
     still.run(2)
-    assert still.filter.aiding is Aiding.NONE
+    assert still.filter.sources.aiding is Aiding.NONE
     assert still.filter.flags & EkfFlags.CONST_POS_MODE
     still.run(1, at(5.0))
     assert still.filter.position_valid
@@ -210,9 +210,9 @@ def test_loss_of_fixes_ends_the_position_after_7_s_and_aiding_after_15_s():
     assert still.filter.position_valid
     still.run(0.6)
     assert not still.filter.position_valid
-    assert still.filter.aiding is Aiding.ABSOLUTE
+    assert still.filter.sources.aiding is Aiding.ABSOLUTE
     still.run(8)
-    assert still.filter.aiding is Aiding.NONE
+    assert still.filter.sources.aiding is Aiding.NONE
     assert "EKF3 IMU0 stopped aiding" in still.texts
     still.run(1, at(0.0))
     assert still.filter.position_valid
@@ -252,7 +252,7 @@ ON_GPS = {"GPS1_TYPE": 1, "EK3_SRC1_POSXY": 3, "EK3_SRC1_VELXY": 3, "EK3_SRC1_VE
 def test_gps_is_used_after_ten_seconds_of_good_fixes():
     still = Still(ON_GPS)
     still.run(9.5, gps=GPS_DATA)
-    assert still.filter.aiding is Aiding.NONE
+    assert still.filter.sources.aiding is Aiding.NONE
     still.run(2, gps=GPS_DATA)
     assert still.filter.position_valid
 
@@ -263,7 +263,7 @@ def test_a_gps_of_few_satellites_or_unknown_hdop_is_never_used():
     for poor in (replace(GPS_DATA, satellites=5), replace(GPS_DATA, hdop=99.99)):
         still = Still(ON_GPS)
         still.run(20, gps=poor)
-        assert still.filter.aiding is Aiding.NONE
+        assert still.filter.sources.aiding is Aiding.NONE
 
 
 def test_a_gps_jump_glitches_and_is_taken_after_10_to_20_s():
@@ -283,9 +283,9 @@ def test_a_gps_jump_glitches_and_is_taken_after_10_to_20_s():
 def test_external_position_command_only_resets_an_unaided_filter():
     still = Still()
     still.run(3, at(0.0))
-    assert not still.filter.force_position(50.0, 0.0, 10.0)
+    assert not still.filter.sources.force_position(50.0, 0.0, 10.0)
     still.run(2)
-    assert still.filter.force_position(50.0, 0.0, 10.0)
+    assert still.filter.sources.force_position(50.0, 0.0, 10.0)
     still.run(0.02)
     assert still.filter.position[0] == pytest.approx(50.0, abs=0.5)
 

@@ -44,7 +44,7 @@ def test_vision_holds_the_vehicle_after_gps_is_gone(bench, gps_then_vision):
     b.vision()
     b.take_off(60.0)
     here = b.truth
-    b.vehicle.estimator.source_set = 2
+    b.vehicle.estimator.sources.source_set = 2
     b.run(3)
     b.vehicle.parameters.set("SIM_GPS1_ENABLE", 0)
     worst = 0.0
@@ -61,7 +61,7 @@ def test_switching_source_sets_moves_the_vehicle_little(bench, gps_then_vision):
     b.vision(offset=(1.0, 0.0, 0.0))
     b.take_off(30.0)
     here = b.truth
-    b.vehicle.estimator.source_set = 2
+    b.vehicle.estimator.sources.source_set = 2
     b.run(20)
     # The vehicle follows the new source, which is 1 m off, and no farther.
     assert 0.5 < np.hypot(*(b.truth - here)[:2]) < 2.0
@@ -245,5 +245,5 @@ def test_modes_that_need_a_position_are_refused_without(bench):
     b.vehicle.modes.arm()
     assert not b.vehicle.modes.set_mode(Mode.GUIDED)
     assert b.said("requires position")
-    assert b.vehicle.estimator.aiding is Aiding.NONE
+    assert b.vehicle.estimator.sources.aiding is Aiding.NONE
     assert EkfFlags.CONST_POS_MODE in b.vehicle.estimator.flags

@@ -239,11 +239,14 @@ def test_a_full_disk_is_named_and_the_build_goes_on_after_it(source, cache, tmp_
 
 
 ORPHANS = """
-import os, signal, time
-from localizer.map.building.workers import _pool
+import multiprocessing, os, signal
+from localizer.map.building.workers import worker_pool
+from localizer.map.importers.rules import DEFAULT_RULES
 if __name__ == "__main__":
-    pool = _pool(2)
-    print(*{pool.submit(os.getpid).result() for _ in range(8)}, *pool._processes, flush=True)
+    pool = worker_pool(2, DEFAULT_RULES)
+    answered = {pool.submit(os.getpid).result() for _ in range(8)}
+    children = {child.pid for child in multiprocessing.active_children()}
+    print(*(answered | children), flush=True)
     os.kill(os.getpid(), signal.SIGKILL)
 """
 

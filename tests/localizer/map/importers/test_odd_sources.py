@@ -7,6 +7,7 @@ import http.server
 import json
 import os
 import threading
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -370,7 +371,7 @@ MESH = {"georeference": Georeference(origin=ORIGIN), "vertical_datum": "ellipsoi
 class Refused:
     """A source, what the error says, and the doubt that may be trusted."""
 
-    make: object
+    make: Callable[..., object]
     says: str
     options: dict = field(default_factory=lambda: dict(ELLIPSOIDAL))
     trust: str | None = None
