@@ -83,7 +83,7 @@ def fly(args: argparse.Namespace, known: TileStreamer, seen: TileStreamer) -> li
                 last = one.steps[-1]
                 print(
                     f"{one.place} {one.condition:6s} seed {one.seed} depth {one.depth:6s} "
-                    f"{last.flown_m:4.0f} m: {np.hypot(*last.error[:2]):5.2f} m, "
+                    f"{last.flown_m:4.0f} m: {np.hypot(last.error[0], last.error[1]):5.2f} m, "
                     f"{last.status}, told {last.drift_m:.2f} m",
                     flush=True,
                 )

@@ -55,7 +55,7 @@ def _counted(flown: Flown) -> list[Step]:
 
 
 def _horizontal(step: Step) -> float:
-    return float(np.hypot(*step.error[:2]))
+    return float(np.hypot(step.error[0], step.error[1]))
 
 
 def _inside(step: Step) -> bool:
