@@ -60,7 +60,7 @@ class MotionCheck:
         self._P = np.zeros((3, 3))
         self._began_ns = 0
         self._restarts = 0
-        self._deviations: deque[tuple[int, float, float, float]] = deque(maxlen=1024)
+        self._deviations: deque[tuple[int, float, float, float, float]] = deque(maxlen=1024)
         self._still = StillPosition(config.still_m)
 
     def add(self, fix: VisionFix) -> MotionVerdict:
@@ -110,7 +110,7 @@ class MotionCheck:
         S = self._P[0, 0] + sigma**2
         deviation = here - self._x[0]
         north, east = float(deviation[0]), float(deviation[1])
-        self._deviations.append((moved.time_ns, north, east, float(np.sqrt(S))))
+        self._deviations.append((moved.time_ns, north, east, float(self._P[0, 0]), sigma**2))
         K = self._P[:, 0] / S
         self._x = self._x + np.outer(K, deviation)
         self._P = self._P - np.outer(K, self._P[0])
@@ -124,7 +124,9 @@ class MotionCheck:
                 continue
             mean = float(np.hypot(*inside[:, 1:3].mean(axis=0)))
             independent = min(len(inside), max(1.0, _INDEPENDENT_HZ * window_s))
-            limit = limit_m + _SIGMAS * float(inside[:, 3].mean()) / np.sqrt(independent)
+            # What the prediction is off is the same all along; only the fixes' errors average.
+            predicted, seen = inside[:, 3].mean(), inside[:, 4].mean() / independent
+            limit = limit_m + _SIGMAS * float(np.sqrt(predicted + seen))
             worst = max(worst, (float(mean / limit), mean))
         return worst
 
