@@ -7,6 +7,7 @@ from pathlib import Path
 from pydantic import BaseModel, ConfigDict, Field
 
 from localizer.integrity.acceptance import IntegrityConfig
+from localizer.odometry.config import OdometryConfig
 from localizer.registration.config import JNGOConfig
 from localizer.registration.devices import DeviceChoice
 from localizer.relocalization.config import RelocalizationConfig
@@ -50,4 +51,7 @@ class LocalizerConfig(BaseModel):
     attitude: AttitudePrior | None = None
     motion: MotionConfig = MotionConfig()
     integrity: IntegrityConfig = IntegrityConfig()
+    odometry: OdometryConfig | None = Field(
+        OdometryConfig(), description="carries on where the map does not match; none: it does not"
+    )
     relocalization: RelocalizationConfig = RelocalizationConfig()

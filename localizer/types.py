@@ -129,6 +129,7 @@ class TrackingState(Enum):
     INITIALIZING = "initializing"
     TRACKING = "tracking"
     DEGRADED = "degraded"
+    BRIDGING = "bridging"
     LOST = "lost"
 
 
@@ -138,7 +139,8 @@ class PoseEstimate:
 
     covariance: (6, 6) as in `PosePrior`. quality: 0 to 1. accepted: whether integrity lets it be
     used. stage_ms: latency of each stage in milliseconds. last_fix_ns: exposure of the newest
-    accepted estimate, this one included; None before the first.
+    estimate that the map confirmed, this one included; None before the first. BRIDGING estimates
+    are carried on by odometry, with a covariance that grows.
     """
 
     world_from_camera: Pose

@@ -37,6 +37,7 @@ _OF_STATE = {
     TrackingState.INITIALIZING: (HealthLevel.STARTING, "localization initializing"),
     TrackingState.TRACKING: (HealthLevel.OK, "localization tracking"),
     TrackingState.DEGRADED: (HealthLevel.DEGRADED, "localization degraded"),
+    TrackingState.BRIDGING: (HealthLevel.DEGRADED, "bridging"),
     TrackingState.LOST: (HealthLevel.FAILED, "localization lost"),
 }
 
@@ -122,6 +123,8 @@ class HealthMonitor:
             level = HealthLevel.FAILED if _is_lost(estimate) else HealthLevel.DEGRADED
             return level, error or "no frame is being localized"
         level, text = _OF_STATE[estimate.state]
+        if estimate.state is TrackingState.BRIDGING:
+            text += _carried(estimate)
         withheld = self._guardian.reason if self._guardian is not None else ""
         if withheld and not _is_lost(estimate):
             level, text = HealthLevel.FAILED, withheld
@@ -188,6 +191,13 @@ class HealthMonitor:
             }
             for name in sorted(stages)
         }
+
+
+def _carried(estimate: PoseEstimate) -> str:
+    """How long the odometry has carried the pose on, and how far off it may be (95 %)."""
+    since_ns = estimate.exposure_time_ns - (estimate.last_fix_ns or estimate.exposure_time_ns)
+    sigma_m = float(np.sqrt(np.linalg.eigvalsh(estimate.covariance[:2, :2])[-1]))
+    return f" {since_ns * 1e-9:.0f} s, {2.0 * sigma_m:.0f} m"
 
 
 def _is_lost(estimate: PoseEstimate) -> bool:

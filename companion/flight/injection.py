@@ -16,15 +16,19 @@ on the localization thread: it looks up what its own thread found and returns at
 """
 
 
+_INJECTED = (TrackingState.TRACKING, TrackingState.BRIDGING)
+
+
 class JumpPolicy:
     """Which fix carries a jump (`VisionFix.reset`), so that the EKF is told and does not fight it.
 
-    DEGRADED keeps the filter's track: only a new start after LOST may carry one. It stays due until
-    a fix has carried it.
+    DEGRADED keeps the filter's track: only a new start after LOST may carry one, and the map found
+    again after BRIDGING, whose drift it ends. It stays due until a fix has carried it.
     """
 
     def __init__(self) -> None:
         self._jump = PendingJump(pending=True)
+        self._was_bridging = False
 
     @property
     def is_due(self) -> bool:
@@ -33,8 +37,10 @@ class JumpPolicy:
 
     def note(self, state: TrackingState) -> None:
         """Take in the tracking state of a frame."""
-        if state is TrackingState.LOST:
+        found_again = self._was_bridging and state is TrackingState.TRACKING
+        if state is TrackingState.LOST or found_again:
             self._jump.announce()
+        self._was_bridging = state is TrackingState.BRIDGING
 
     def carried(self) -> None:
         """A fix that said so has gone out."""
@@ -62,7 +68,7 @@ class FixInjection:
     def add_estimate(self, estimate: PoseEstimate, _: ReferenceBundle) -> None:
         """Inject an estimate, if it may be. Never blocks."""
         self._jump.note(estimate.state)
-        if not estimate.accepted or estimate.state is not TrackingState.TRACKING:
+        if not estimate.accepted or estimate.state not in _INJECTED:
             return
         time_ns = estimate.exposure_time_ns
         fix: VisionFix | None = vision_fix(

@@ -52,6 +52,9 @@ class OdometryConfig(BaseModel):
     longest_gap_s: float = Field(
         3.0, ge=0.1, le=60, description="without a usable frame until the thread is lost"
     )
+    longest_sigma_m: float = Field(
+        15.0, ge=0.1, le=1000, description="of a carried position, beyond which it ends"
+    )
     acceleration_sigma: float = Field(
         2.0, ge=0.01, le=100, description="m/s² of the motion while nothing is seen"
     )

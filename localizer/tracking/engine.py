@@ -191,11 +191,15 @@ class DualThreadEngine:
             return
         bundle, stage_ms = self._bundle, dict(self._reference_ms)
         try:
-            if bundle is None or self._is_stale(bundle, frame):
+            if bundle is None:
+                return
+            # Where the map ends there is no reference of now: the odometry may carry on.
+            anchors = None if self._is_stale(bundle, frame) else bundle.anchors
+            if anchors is None and not self._localizer.can_carry:
                 return
             with stopwatch(stage_ms, "extract"):
                 query = self._localizer.extract_query(frame)
-            estimate = self._localizer.localize(frame, query, bundle.anchors)
+            estimate = self._localizer.localize(frame, query, anchors)
         finally:  # whatever became of this frame, the next one needs a reference
             self._render_times.put(self._next_exposure(frame))
         latency_ms = (time.monotonic_ns() - frame.exposure_time_ns) * 1e-6

@@ -8,6 +8,7 @@ same state that the localization thread is about to replace.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -18,6 +19,9 @@ from pydantic import BaseModel, ConfigDict, Field
 
 from localizer.geometry.pose import Array, Pose, so3_exp, so3_log
 from localizer.types import PosePrior
+
+# The camera's rotation (3, 3), world_from_camera, at a time in ns by another sensor, or None.
+RotationAt = Callable[[int], "Array | None"]
 
 _MAX_SIGMA_M = 10.0  # beyond it nothing is gained: the swarm's own limits are reached
 _MAX_SIGMA_RAD = float(np.radians(8.0))
@@ -153,6 +157,30 @@ def kept(state: MotionState, time_ns: int, config: MotionConfig, turn: Array | N
     mean = np.concatenate([state.mean[:3], np.zeros(9)])
     rotation = state.rotation if turn is None else turn @ state.rotation
     return MotionState(mean, np.diag(_limits(config) ** 2), rotation, time_ns)
+
+
+class MeasuredMotion:
+    """The motion model, turned by another sensor's account of the camera's rotation."""
+
+    def __init__(self, config: MotionConfig, rotation_at: RotationAt) -> None:
+        self._config, self._rotation_at = config, rotation_at
+
+    def ahead(self, state: MotionState, time_ns: int) -> MotionState:
+        """The state moved to `time_ns`."""
+        turn = self._turn(state.time_ns, time_ns)
+        return predict(state, time_ns, self._config, turn)
+
+    def at_frame(self, state: MotionState, time_ns: int) -> MotionState:
+        """The state at a frame's exposure."""
+        if time_ns >= state.time_ns:
+            return self.ahead(state, time_ns)
+        # The camera's clock jumped: by its velocity the state would be moved the wrong way.
+        turn = self._turn(state.time_ns, time_ns)
+        return kept(state, time_ns, self._config, turn)
+
+    def _turn(self, begin_ns: int, end_ns: int) -> Array | None:
+        begin, end = self._rotation_at(begin_ns), self._rotation_at(end_ns)
+        return end @ begin.T if begin is not None and end is not None else None
 
 
 def _limits(config: MotionConfig) -> Array:

@@ -19,7 +19,8 @@ from localizer.registration.devices import open_backend
 from localizer.registration.jngo import JNGO
 from localizer.render.base import MapRenderer
 from localizer.render.select import open_renderer
-from localizer.tracking.pipeline import Localizer, RotationAt, working_camera
+from localizer.tracking.motion import RotationAt
+from localizer.tracking.pipeline import Localizer, working_camera
 
 
 class MapStack:

@@ -7,11 +7,10 @@
 
 from __future__ import annotations
 
-import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 
 import cv2
 import numpy as np
@@ -21,18 +20,15 @@ from localizer.errors import CameraError, GeoreferenceError, OutsideMapError
 from localizer.features.extractor import DeviceExtractor, FeatureExtractor
 from localizer.geometry.camera import Camera
 from localizer.geometry.geo import LocalFrame
-from localizer.geometry.pose import Array
-from localizer.integrity.acceptance import is_acceptable
-from localizer.integrity.confirmation import DisplacementBetween, Witness
+from localizer.integrity.confirmation import DisplacementBetween
 from localizer.registration.anchors import select_anchors
 from localizer.registration.jngo import JNGO
 from localizer.registration.priors import PoseConstraint, attitude_constraint
-from localizer.registration.result import Registration
 from localizer.render.base import MapRenderer
 from localizer.render.holes import fill_holes
-from localizer.tracking import motion
-from localizer.tracking.motion import MotionConfig, MotionState
-from localizer.tracking.states import Outcome, Standing, judge
+from localizer.tracking.bridging import Bridging
+from localizer.tracking.motion import RotationAt
+from localizer.tracking.tracker import Tracker, TrackerState
 from localizer.types import (
     Anchors,
     FeaturePyramid,
@@ -46,9 +42,6 @@ from localizer.types import (
     TrackingState,
 )
 
-# The camera's rotation (3, 3), world_from_camera, at a time in ns by another sensor, or None.
-RotationAt = Callable[[int], "Array | None"]
-
 # The map is loaded for where the motion model leads in so many seconds: what comes next, and as far
 # as a turn rate can be believed at all.
 _LOOK_AHEAD_S = (1.0, 3.0)
@@ -57,14 +50,6 @@ _LOOK_AHEAD_S = (1.0, 3.0)
 _MIN_MAP_SHARE = 0.1
 
 _NO_PRIOR = "no pose prior yet: call set_prior before localizing"
-
-
-@dataclass(frozen=True)
-class TrackerState:
-    """What the two halves share; replaced as a whole, never changed."""
-
-    motion: MotionState | None = None
-    standing: Standing = field(default_factory=Standing)
 
 
 def working_camera(camera: Camera, width: int) -> Camera:
@@ -116,30 +101,6 @@ def reference_anchors(
     return select_anchors(view, extractor.extract(fill_holes(view)), count, seed)
 
 
-class MeasuredMotion:
-    """The motion model, turned by another sensor's account of the camera's rotation."""
-
-    def __init__(self, config: MotionConfig, rotation_at: RotationAt) -> None:
-        self._config, self._rotation_at = config, rotation_at
-
-    def ahead(self, state: MotionState, time_ns: int) -> MotionState:
-        """The state moved to `time_ns`."""
-        turn = self._turn(state.time_ns, time_ns)
-        return motion.predict(state, time_ns, self._config, turn)
-
-    def at_frame(self, state: MotionState, time_ns: int) -> MotionState:
-        """The state at a frame's exposure."""
-        if time_ns >= state.time_ns:
-            return self.ahead(state, time_ns)
-        # The camera's clock jumped: by its velocity the state would be moved the wrong way.
-        turn = self._turn(state.time_ns, time_ns)
-        return motion.kept(state, time_ns, self._config, turn)
-
-    def _turn(self, begin_ns: int, end_ns: int) -> Array | None:
-        begin, end = self._rotation_at(begin_ns), self._rotation_at(end_ns)
-        return end @ begin.T if begin is not None and end is not None else None
-
-
 class Localizer:
     """The algorithm for one camera. `open_localizer` makes one; `set_prior`, then `track` frames.
 
@@ -171,12 +132,17 @@ class Localizer:
         self._optimizer = optimizer
         self._config = config
         self._rotation_at = rotation_at
-        self._motion = MeasuredMotion(config.motion, rotation_at)
-        self._displacement_between = displacement_between
         self.camera = working_camera(camera, config.width)
         self._undistorter = Undistorter(camera, self.camera)
-        self._lock = threading.Lock()
-        self._tracker = TrackerState()
+        self._tracker = Tracker(
+            config, rotation_at, displacement_between, self._bridging(config, optimizer)
+        )
+
+    def _bridging(self, config: LocalizerConfig, optimizer: JNGO) -> Bridging | None:
+        # A GPU's features are valid until the next frame only: there is no keyframe to keep.
+        if config.odometry is None or optimizer.on_gpu:
+            return None
+        return Bridging(self.camera, optimizer, config.odometry, config.threads)
 
     def __enter__(self) -> Localizer:
         return self
@@ -207,9 +173,13 @@ class Localizer:
 
     @property
     def tracker(self) -> TrackerState:
-        """The current motion state and integrity."""
-        with self._lock:
-            return self._tracker
+        """The current motion state and standing."""
+        return self._tracker.state
+
+    @property
+    def can_carry(self) -> bool:
+        """Whether `localize` has an answer where there is no reference (None for its anchors)."""
+        return self._tracker.can_carry
 
     @property
     def reference_age_s(self) -> float:
@@ -223,9 +193,7 @@ class Localizer:
 
     def set_prior(self, prior: PosePrior) -> None:
         """Begin (again) from a pose known from outside, e.g. the autopilot's."""
-        state = motion.start(prior, self._config.motion)
-        with self._lock:
-            self._tracker = TrackerState(state, self._tracker.standing.begun())
+        self._tracker.set_prior(prior)
 
     def offer(self, prior: PosePrior) -> None:
         """Take a pose that is known outside, as it deserves: before the first fix one that owes
@@ -242,10 +210,7 @@ class Localizer:
 
         The state stays what it is: a guess does not end LOST.
         """
-        state = motion.start(prior, self._config.motion)
-        with self._lock:
-            standing = self._tracker.standing.proposed(prior.independent)
-            self._tracker = TrackerState(state, standing)
+        self._tracker.propose(prior)
 
     def track(
         self,
@@ -283,8 +248,7 @@ class Localizer:
 
     def predict(self, time_ns: int) -> PosePrior | None:
         """The motion model's prediction at `time_ns`; None before the first prior."""
-        state = self.tracker.motion
-        return self._motion.ahead(state, time_ns).prior if state else None
+        return self._tracker.predict(time_ns)
 
     def _attitude(self, time_ns: int) -> PoseConstraint | None:
         sigma, rotation = self._config.attitude, self._rotation_at(time_ns)
@@ -324,85 +288,32 @@ class Localizer:
             return self._extractor.extract_on_device(image)
         return self._extractor.extract(image)
 
-    def localize(self, frame: Frame, query: FeaturePyramid, anchors: Anchors) -> PoseEstimate:
-        """Register the frame against the anchors, judge the result and update the filter."""
-        tracker = self.tracker
-        if tracker.motion is None:
+    def localize(
+        self, frame: Frame, query: FeaturePyramid, anchors: Anchors | None
+    ) -> PoseEstimate:
+        """Register the frame against the anchors, judge the result and update the filter.
+
+        anchors: None where no reference can be had: the odometry answers, if it can (`can_carry`).
+        """
+        seen = self.tracker
+        ahead = self._tracker.at_frame(seen, frame.exposure_time_ns)
+        if ahead is None:
             raise OutsideMapError(_NO_PRIOR)
-        config = self._config
-        ahead = self._motion.at_frame(tracker.motion, frame.exposure_time_ns)
-        started = time.perf_counter()
-        result = self._optimizer.register(
-            query,
-            self.camera,
-            anchors,
-            ahead.prior,
-            motion=ahead.prior if tracker.standing.trusts_prediction else None,
-            constraint=self._attitude(frame.exposure_time_ns),
-            seed=config.seed + frame.sequence,
-        )
-        elapsed_ms = (time.perf_counter() - started) * 1e3
-        acceptable = self._acceptable(result, ahead.prior)
-        outcome = Outcome(
-            acceptable, result.world_from_camera, result.covariance, frame.exposure_time_ns
-        )
-        standing = judge(
-            tracker.standing, config.integrity, outcome, self._witness(tracker.standing, outcome)
-        )
-        self._store(tracker, self._next_motion(ahead, result, acceptable), standing)
-        return _estimate(frame, result, standing, acceptable, {"register": elapsed_ms})
-
-    def _witness(self, standing: Standing, outcome: Outcome) -> Witness:
-        """What other sensors say of a place on trial."""
-        if not standing.on_trial or not outcome.acceptable:
-            return Witness()
-        rotation = self._rotation_at(outcome.time_ns)
-        if standing.probation is None:
-            return Witness(rotation)
-        way = self._displacement_between(standing.probation.time_ns, outcome.time_ns)
-        return Witness(rotation, way)
-
-    def _acceptable(self, result: Registration, prior: PosePrior) -> bool:
-        # Also before tracking: the gate is against the prior's own covariance, which is wide then.
-        distance = motion.mahalanobis_squared(prior, result.world_from_camera, result.covariance)
-        return is_acceptable(self._config.integrity, result, distance)
-
-    def _next_motion(
-        self, ahead: MotionState, result: Registration, acceptable: bool
-    ) -> MotionState:
-        if not acceptable:
-            credible = is_acceptable(self._config.integrity, result, 0.0)
-            return motion.inflated(ahead, self._config.motion) if credible else ahead
-        return motion.update(ahead, result.world_from_camera, result.covariance)
-
-    def _store(self, seen: TrackerState, state: MotionState, standing: Standing) -> None:
-        """Keep the new state unless a prior from outside replaced it meanwhile."""
-        with self._lock:
-            if self._tracker is seen:
-                self._tracker = TrackerState(state, standing)
-
-
-def _estimate(
-    frame: Frame,
-    result: Registration,
-    standing: Standing,
-    acceptable: bool,
-    stage_ms: dict[str, float],
-) -> PoseEstimate:
-    usable = acceptable and not standing.on_trial
-    return PoseEstimate(
-        world_from_camera=result.world_from_camera,
-        covariance=result.covariance,
-        quality=result.quality if result.status is RegistrationStatus.OK else 0.0,
-        state=standing.state,
-        status=result.status,
-        accepted=usable,
-        exposure_time_ns=frame.exposure_time_ns,
-        sequence=frame.sequence,
-        camera=frame.camera,
-        stage_ms=stage_ms,
-        last_fix_ns=standing.last_fix_ns,
-    )
+        stage_ms: dict[str, float] = {}
+        result = None
+        if anchors is not None:
+            with stopwatch(stage_ms, "register"):
+                result = self._optimizer.register(
+                    query,
+                    self.camera,
+                    anchors,
+                    ahead.prior,
+                    motion=ahead.prior if seen.standing.trusts_prediction else None,
+                    constraint=self._attitude(frame.exposure_time_ns),
+                    seed=self._config.seed + frame.sequence,
+                )
+        estimate = self._tracker.judge(seen, ahead, frame, query, anchors, result)
+        return replace(estimate, stage_ms=stage_ms)
 
 
 @contextmanager

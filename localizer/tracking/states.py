@@ -1,6 +1,7 @@
 """The tracker's state: what runs of acceptances and rejections make of it.
 
-Rejections lead from TRACKING over DEGRADED to LOST. LOST lasts until a place was found again
+Rejections lead from TRACKING over DEGRADED to LOST, or to BRIDGING as long as the odometry carries
+the pose on; from there acceptances in a row lead back. LOST lasts until a place was found again
 and confirmed (`localizer.integrity.confirmation`): a new guess is tried, it does not end it.
 """
 
@@ -11,9 +12,10 @@ from dataclasses import dataclass, replace
 from localizer.geometry.pose import Array, Pose
 from localizer.integrity.acceptance import IntegrityConfig
 from localizer.integrity.confirmation import Probation, Verdict, Witness, weigh
+from localizer.tracking.bridging import Carry
 from localizer.types import TrackingState
 
-_SEES = (TrackingState.TRACKING, TrackingState.DEGRADED)
+_SEES = (TrackingState.TRACKING, TrackingState.DEGRADED, TrackingState.BRIDGING)
 
 
 @dataclass(frozen=True)
@@ -58,12 +60,15 @@ class Standing:
 
 @dataclass(frozen=True)
 class Outcome:
-    """A registration that was judged. covariance: (6, 6); time_ns: the frame's exposure."""
+    """A registration that was judged. covariance: (6, 6); time_ns: the frame's exposure; carry:
+    what the odometry made of a frame that the map rejected.
+    """
 
     acceptable: bool
     world_from_camera: Pose
     covariance: Array
     time_ns: int
+    carry: Carry = Carry.NONE
 
 
 _NO_WITNESS = Witness()
@@ -74,19 +79,20 @@ def judge(
 ) -> Standing:
     """The machine after one more frame; witness: what other sensors say, for a place on trial."""
     if not outcome.acceptable:
-        return _after_rejection(standing, config)
+        return _after_rejection(standing, config, outcome.carry)
     if standing.on_trial:
         return _on_trial(standing, config, outcome, witness)
     count = standing.accepted_in_row + 1
     state = standing.state
     if state is TrackingState.DEGRADED or count >= config.confirmations:
         state = TrackingState.TRACKING
+    given = state is not TrackingState.BRIDGING
     return replace(
         standing,
         state=state,
         accepted_in_row=count,
         rejected_in_row=0,
-        last_fix_ns=outcome.time_ns if state is not TrackingState.LOST else standing.last_fix_ns,
+        last_fix_ns=outcome.time_ns if given else standing.last_fix_ns,
     )
 
 
@@ -102,7 +108,7 @@ def _on_trial(
         probation, outcome.world_from_camera, outcome.covariance, outcome.time_ns, witness, config
     )
     if verdict is Verdict.CONTRADICTED:
-        return _after_rejection(replace(standing, probation=None), config)
+        return _after_rejection(replace(standing, probation=None), config, Carry.NONE)
     if verdict is Verdict.PENDING or count < config.confirmations:
         return tried
     return replace(
@@ -114,13 +120,9 @@ def _on_trial(
     )
 
 
-def _after_rejection(standing: Standing, config: IntegrityConfig) -> Standing:
+def _after_rejection(standing: Standing, config: IntegrityConfig, carry: Carry) -> Standing:
     count = standing.rejected_in_row + 1
-    state = standing.state
-    if count >= config.lost_after:
-        state = TrackingState.LOST
-    elif state is TrackingState.TRACKING and count >= config.degraded_after:
-        state = TrackingState.DEGRADED
+    state = _worse(standing.state, count, config, carry)
     trial = standing.on_trial or state is TrackingState.LOST
     return replace(
         standing,
@@ -131,3 +133,19 @@ def _after_rejection(standing: Standing, config: IntegrityConfig) -> Standing:
         independent=standing.independent and not trial,
         probation=None,
     )
+
+
+def _worse(
+    state: TrackingState, count: int, config: IntegrityConfig, carry: Carry
+) -> TrackingState:
+    """The state after `count` rejections in a row."""
+    if state is TrackingState.BRIDGING:
+        holds = carry in (Carry.CARRIED, Carry.GAP)
+        return TrackingState.BRIDGING if holds else TrackingState.LOST
+    if state in _SEES and count >= config.degraded_after and carry is Carry.CARRIED:
+        return TrackingState.BRIDGING
+    if count >= config.lost_after:
+        return TrackingState.LOST
+    if state is TrackingState.TRACKING and count >= config.degraded_after:
+        return TrackingState.DEGRADED
+    return state

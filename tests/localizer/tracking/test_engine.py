@@ -94,7 +94,7 @@ def _localizer(renderer=None, optimizer=None) -> Localizer:
         FakeExtractor(),
         optimizer or FakeOptimizer(),  # type: ignore[arg-type]
         CAMERA,
-        LocalizerConfig(),
+        LocalizerConfig(odometry=None),  # the fake optimizer registers to the map alone
     )
 
 
@@ -285,7 +285,9 @@ def test_a_stream_that_changes_its_size_is_undistorted_with_its_own_camera():
     camera = Camera(640, 480, 500.0, 500.0, 320.0, 240.0, (-0.12, 0.03, 0.001, -0.0005, 0.0))
     seen = []
     extractor = SimpleNamespace(extract=seen.append)
-    localizer = Localizer(FakeRenderer(), extractor, FakeOptimizer(), camera, LocalizerConfig())
+    localizer = Localizer(
+        FakeRenderer(), extractor, FakeOptimizer(), camera, LocalizerConfig(odometry=None)
+    )
     ramp = np.broadcast_to(np.linspace(0, 255, 640).astype(np.uint8)[None, :, None], (480, 640, 3))
     half = cv2.resize(np.ascontiguousarray(ramp), (320, 240), interpolation=cv2.INTER_AREA)
     for image, its in ((ramp, camera), (half, camera.resized(320, 240)), (ramp, camera)):
@@ -312,7 +314,9 @@ def test_features_of_a_reference_do_not_see_the_maps_holes():
             seen.append(rgb)
             return super().extract(rgb)
 
-    localizer = Localizer(Holed(), Watching(), FakeOptimizer(), CAMERA, LocalizerConfig())
+    localizer = Localizer(
+        Holed(), Watching(), FakeOptimizer(), CAMERA, LocalizerConfig(odometry=None)
+    )
     anchors = localizer.make_reference(_prior(10**9)).anchors
     assert (seen[0] == 70).all()
     assert len(anchors.points_world) > 0

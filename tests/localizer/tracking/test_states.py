@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from localizer.geometry.pose import Array, Pose, so3_exp
 from localizer.integrity.acceptance import IntegrityConfig
 from localizer.integrity.confirmation import Witness
+from localizer.tracking.bridging import Carry
 from localizer.tracking.states import Outcome, Standing, judge
 from localizer.types import TrackingState
 
@@ -116,3 +119,33 @@ def test_one_rejection_ends_a_probation() -> None:
     machine = run(lost, "++++-++", speed_m=1.0)
     assert machine.state is TrackingState.LOST
     assert machine.accepted_in_row == 2
+
+
+def carried(carry: Carry, frame: int) -> Outcome:
+    return replace(outcome(False, frame), carry=carry)
+
+
+def test_rejections_that_the_odometry_carries_are_bridged_and_not_lost() -> None:
+    machine = run(Standing(), "+++")
+    for n in range(3, 60):
+        machine = judge(machine, CONFIG, carried(Carry.CARRIED, n))
+    assert machine.state is TrackingState.BRIDGING
+    assert machine.last_fix_ns == 2 * SECOND // 10  # of the map, not of the odometry
+    assert run(machine, "++", first=60).state is TrackingState.BRIDGING
+    assert run(machine, "+++", first=60).state is TrackingState.TRACKING
+
+
+def test_a_frame_that_shows_nothing_is_a_gap_and_a_broken_thread_is_lost() -> None:
+    machine = run(Standing(), "+++")
+    for n in range(3, 9):
+        machine = judge(machine, CONFIG, carried(Carry.CARRIED, n))
+    machine = judge(machine, CONFIG, carried(Carry.GAP, 9))
+    assert machine.state is TrackingState.BRIDGING
+    machine = judge(machine, CONFIG, carried(Carry.BROKEN, 10))
+    assert machine.state is TrackingState.LOST
+    assert machine.wants_prior
+
+
+def test_a_place_on_trial_is_not_bridged() -> None:
+    lost = run(Standing(), "-----").proposed(independent=False)
+    assert judge(lost, CONFIG, carried(Carry.CARRIED, 9)).state is TrackingState.LOST

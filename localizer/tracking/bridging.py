@@ -1,0 +1,100 @@
+"""Carrying the pose on from picture to picture while the map does not match.
+
+Snow, a building site, the map's edge: the picture is good and the map says nothing. The odometry
+keeps every accepted frame as a possible beginning, which costs nothing, and steps on from it when
+frames are rejected (docs/odometry.md).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from enum import Enum
+
+import numpy as np
+
+from localizer.geometry.camera import Camera
+from localizer.geometry.pose import Array, Pose
+from localizer.odometry import (
+    OdometryConfig,
+    OdometryFrame,
+    OdometryStatus,
+    VisualOdometry,
+    examine,
+    odometry_optimizer,
+)
+from localizer.registration.jngo import JNGO
+from localizer.types import Anchors, FeaturePyramid, Frame, PoseEstimate, PosePrior
+
+
+class Carry(Enum):
+    """What the odometry makes of a frame that the map rejected."""
+
+    NONE = "nothing to carry on from"
+    CARRIED = "carried on"
+    GAP = "this frame shows nothing; the next one may"
+    BROKEN = "the thread is lost"
+
+
+@dataclass(frozen=True)
+class Carried:
+    """The odometry's answer for one frame. pose, covariance (6, 6): where it is CARRIED."""
+
+    status: Carry
+    world_from_camera: Pose | None = None
+    covariance: Array | None = None
+    quality: float = 0.0
+    reason: str = ""
+
+
+_NOTHING = Carried(Carry.NONE)
+
+
+class Bridging:
+    """The odometry beside the map's registration; one thread, the localization thread's."""
+
+    def __init__(self, camera: Camera, optimizer: JNGO, config: OdometryConfig, threads: int):
+        self._odometry = VisualOdometry(camera, odometry_optimizer(optimizer, threads), config)
+        self._longest_sigma_m = config.longest_sigma_m
+
+    @property
+    def is_ready(self) -> bool:
+        """Whether there is a pose to carry on from."""
+        return self._odometry.ready
+
+    def begin(
+        self, estimate: PoseEstimate, query: FeaturePyramid, anchors: Anchors, velocity: Array
+    ) -> None:
+        """The map has just said where this frame was: whatever was bridged before is over."""
+        frame = OdometryFrame(query, estimate.exposure_time_ns)
+        self._odometry.begin(
+            frame,
+            estimate.world_from_camera,
+            estimate.covariance,
+            velocity=velocity,
+            surface=anchors.points_world,
+        )
+
+    def carry(
+        self, frame: Frame, query: FeaturePyramid, prediction: PosePrior, anchors: Anchors | None
+    ) -> Carried:
+        """Carry the pose on to a frame. anchors: of the reference at the prediction, if any."""
+        if not self._odometry.ready:
+            return _NOTHING
+        seen = OdometryFrame(query, frame.exposure_time_ns, examine(frame.image))
+        surface = anchors.points_world if anchors is not None else None
+        estimate = self._odometry.step(seen, prediction, surface=surface)
+        if estimate.status is OdometryStatus.LOST:
+            self._odometry.forget()
+            return Carried(Carry.BROKEN, reason=estimate.reason)
+        if not estimate.usable:
+            return Carried(Carry.GAP, reason=estimate.reason)
+        if np.sqrt(estimate.covariance.diagonal()[:3].max()) > self._longest_sigma_m:
+            self._odometry.forget()
+            return Carried(Carry.BROKEN, reason="the carried position is too uncertain")
+        return Carried(
+            Carry.CARRIED, estimate.world_from_camera, estimate.covariance, estimate.quality
+        )
+
+    def forget(self) -> None:
+        """A place was given from outside: what was carried is worth nothing."""
+        self._odometry.forget()

@@ -1,0 +1,204 @@
+"""What the two halves of the algorithm share: the motion, the standing, a registration's fate."""
+
+from __future__ import annotations
+
+import threading
+from dataclasses import dataclass, field
+
+from localizer.config import LocalizerConfig
+from localizer.geometry.pose import Array, Pose
+from localizer.integrity.acceptance import is_acceptable
+from localizer.integrity.confirmation import DisplacementBetween, Witness
+from localizer.registration.result import Registration
+from localizer.tracking import motion
+from localizer.tracking.bridging import Bridging, Carried, Carry
+from localizer.tracking.motion import MeasuredMotion, MotionState, RotationAt
+from localizer.tracking.states import Outcome, Standing, judge
+from localizer.types import (
+    Anchors,
+    FeaturePyramid,
+    Frame,
+    PoseEstimate,
+    PosePrior,
+    RegistrationStatus,
+    TrackingState,
+)
+
+
+@dataclass(frozen=True)
+class TrackerState:
+    """What the two halves share; replaced as a whole, never changed."""
+
+    motion: MotionState | None = None
+    standing: Standing = field(default_factory=Standing)
+
+
+@dataclass(frozen=True)
+class _Pose:
+    """What is given out of a frame: the map's answer, or the odometry's."""
+
+    world_from_camera: Pose
+    covariance: Array
+    quality: float
+    status: RegistrationStatus
+
+
+class Tracker:
+    """Judges registrations, follows the motion, and carries the pose on where the map is silent.
+
+    `judge` belongs to the localization thread; the rest may be called from any. rotation_at,
+    displacement_between: other sensors' accounts, see `Localizer`. bridging: None where features
+    are not in host memory.
+    """
+
+    def __init__(
+        self,
+        config: LocalizerConfig,
+        rotation_at: RotationAt,
+        displacement_between: DisplacementBetween,
+        bridging: Bridging | None,
+    ) -> None:
+        self._config = config
+        self._motion = MeasuredMotion(config.motion, rotation_at)
+        self._rotation_at, self._displacement_between = rotation_at, displacement_between
+        self._bridging = bridging
+        self._lock = threading.Lock()
+        self._state = TrackerState()
+
+    @property
+    def state(self) -> TrackerState:
+        """The current motion state and standing."""
+        with self._lock:
+            return self._state
+
+    @property
+    def can_carry(self) -> bool:
+        """Whether a frame without any reference can be carried on to."""
+        trusted = self.state.standing.trusts_prediction
+        return trusted and self._bridging is not None and self._bridging.is_ready
+
+    def set_prior(self, prior: PosePrior) -> None:
+        """Begin (again) from a pose known from outside."""
+        state = motion.start(prior, self._config.motion)
+        with self._lock:
+            self._state = TrackerState(state, self._state.standing.begun())
+
+    def propose(self, prior: PosePrior) -> None:
+        """Put a place on trial; the state stays what it is."""
+        state = motion.start(prior, self._config.motion)
+        with self._lock:
+            self._state = TrackerState(state, self._state.standing.proposed(prior.independent))
+
+    def predict(self, time_ns: int) -> PosePrior | None:
+        """The motion model's prediction; None before the first prior."""
+        state = self.state.motion
+        return self._motion.ahead(state, time_ns).prior if state else None
+
+    def at_frame(self, seen: TrackerState, time_ns: int) -> MotionState | None:
+        """The motion of `seen` at a frame's exposure; None before the first prior."""
+        return self._motion.at_frame(seen.motion, time_ns) if seen.motion is not None else None
+
+    def judge(
+        self,
+        seen: TrackerState,
+        ahead: MotionState,
+        frame: Frame,
+        query: FeaturePyramid,
+        anchors: Anchors | None,
+        result: Registration | None,
+    ) -> PoseEstimate:
+        """Judge a registration and update motion and standing.
+
+        seen, ahead: the state and its motion at the frame that the registration began from.
+        anchors, result: None where there is no reference view to register against.
+        """
+        acceptable = result is not None and self._is_acceptable(result, ahead.prior)
+        carried = self._carry(seen, ahead, frame, query, anchors, acceptable)
+        if result is not None:
+            measured, covariance = result.world_from_camera, result.covariance
+        else:
+            measured, covariance = ahead.prior.world_from_camera, ahead.prior.covariance
+        outcome = Outcome(acceptable, measured, covariance, frame.exposure_time_ns, carried.status)
+        witness = self._witness(seen.standing, outcome)
+        standing = judge(seen.standing, self._config.integrity, outcome, witness)
+        bridges = standing.state is TrackingState.BRIDGING
+        moved = self._next_motion(ahead, result, acceptable and not bridges, carried)
+        self._store(seen, moved, standing)
+        given, usable = _given(outcome, result, carried, standing)
+        estimate = _estimate(frame, given, standing, usable)
+        if estimate.accepted and not bridges and self._bridging is not None and anchors is not None:
+            self._bridging.begin(estimate, query, anchors, moved.velocity)
+        return estimate
+
+    def _is_acceptable(self, result: Registration, prior: PosePrior) -> bool:
+        # Also before tracking: the gate is against the prior's own covariance, which is wide then.
+        distance = motion.mahalanobis_squared(prior, result.world_from_camera, result.covariance)
+        return is_acceptable(self._config.integrity, result, distance)
+
+    def _carry(
+        self, seen: TrackerState, ahead: MotionState, frame: Frame, query: FeaturePyramid,
+        anchors: Anchors | None, acceptable: bool,
+    ) -> Carried:  # fmt: skip
+        """The odometry's answer: for frames that the map rejected, and until it has confirmed."""
+        standing = seen.standing
+        wanted = not acceptable or standing.state is TrackingState.BRIDGING
+        if self._bridging is None or not standing.trusts_prediction or not wanted:
+            return Carried(Carry.NONE)
+        return self._bridging.carry(frame, query, ahead.prior, anchors)
+
+    def _witness(self, standing: Standing, outcome: Outcome) -> Witness:
+        """What other sensors say of a place on trial."""
+        if not standing.on_trial or not outcome.acceptable:
+            return Witness()
+        rotation = self._rotation_at(outcome.time_ns)
+        if standing.probation is None:
+            return Witness(rotation)
+        way = self._displacement_between(standing.probation.time_ns, outcome.time_ns)
+        return Witness(rotation, way)
+
+    def _next_motion(
+        self, ahead: MotionState, result: Registration | None, use_map: bool, carried: Carried
+    ) -> MotionState:
+        if use_map and result is not None:
+            return motion.update(ahead, result.world_from_camera, result.covariance)
+        if carried.world_from_camera is not None and carried.covariance is not None:
+            return motion.update(ahead, carried.world_from_camera, carried.covariance)
+        if result is not None and is_acceptable(self._config.integrity, result, 0.0):
+            return motion.inflated(ahead, self._config.motion)
+        return ahead
+
+    def _store(self, seen: TrackerState, state: MotionState, standing: Standing) -> None:
+        """Keep the new state unless a prior from outside replaced it meanwhile."""
+        with self._lock:
+            if self._state is seen:
+                self._state = TrackerState(state, standing)
+
+
+def _given(
+    outcome: Outcome, result: Registration | None, carried: Carried, standing: Standing
+) -> tuple[_Pose, bool]:
+    """What is given out, and whether it may be used."""
+    if standing.state is TrackingState.BRIDGING:
+        pose, covariance = carried.world_from_camera, carried.covariance
+        if pose is not None and covariance is not None:
+            return _Pose(pose, covariance, carried.quality, RegistrationStatus.OK), True
+    status = result.status if result is not None else RegistrationStatus.NO_OVERLAP
+    quality = result.quality if result is not None and status is RegistrationStatus.OK else 0.0
+    seen = standing.state is not TrackingState.BRIDGING and not standing.on_trial
+    given = _Pose(outcome.world_from_camera, outcome.covariance, quality, status)
+    return given, outcome.acceptable and seen
+
+
+def _estimate(frame: Frame, given: _Pose, standing: Standing, usable: bool) -> PoseEstimate:
+    return PoseEstimate(
+        world_from_camera=given.world_from_camera,
+        covariance=given.covariance,
+        quality=given.quality,
+        state=standing.state,
+        status=given.status,
+        accepted=usable,
+        exposure_time_ns=frame.exposure_time_ns,
+        sequence=frame.sequence,
+        camera=frame.camera,
+        last_fix_ns=standing.last_fix_ns,
+    )
