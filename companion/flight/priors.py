@@ -15,6 +15,7 @@ from companion.flight.conversions import Installation, camera_rotation, vehicle_
 from localizer.geometry.geo import NED_FROM_ENU
 from localizer.geometry.pose import Array
 from localizer.tracking.engine import PriorProvider
+from localizer.tracking.motion import OtherSensors
 from localizer.types import PoseEstimate, PosePrior, ReferenceBundle
 from mavlink_bridge.injection.shadow import gnss_healthy
 from mavlink_bridge.messages import Attitude, GimbalAttitude, VehicleState
@@ -128,12 +129,21 @@ class AutopilotPose:
         return self.belief.at(self._autopilot.state(), time.monotonic_ns()).sigma_m
 
     @property
+    def sensors(self) -> OtherSensors:
+        """These accounts, as the localizer asks for them."""
+        return OtherSensors(self.rotation, self.displacement, lambda _time_ns: self.height_m)
+
+    @property
     def height_m(self) -> float | None:
-        """The vehicle's height above the ellipsoid by its barometer; None while it says none."""
+        """The vehicle's height in the map's frame (world z, m) by its barometer; None: unknown.
+
+        Above the plane through the map's origin: the Earth's curve costs 0.2 m at 1.6 km.
+        """
         altitude_m = self._autopilot.state().altitude_amsl_m
         if altitude_m is None or not math.isfinite(altitude_m):
             return None
-        return altitude_m + self._installation.geoid_separation_m
+        origin_m = self._installation.frame.origin.height_m
+        return altitude_m + self._installation.geoid_separation_m - origin_m
 
     @property
     def velocity(self) -> Array | None:

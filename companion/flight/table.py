@@ -172,9 +172,7 @@ def _localizer(making: Making) -> Localizer:
     _log.info("making the localizer ready; the first start on a machine compiles its kernels")
     config, autopilot = making.config, making[AutopilotPose]
     camera = config.camera.model.camera()
-    return build_localizer(
-        making[MapStack], camera, config.localizer, autopilot.rotation, autopilot.displacement
-    )
+    return build_localizer(making[MapStack], camera, config.localizer, autopilot.sensors)
 
 
 def _injection(making: Making) -> FixInjection:

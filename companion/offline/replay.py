@@ -215,9 +215,7 @@ def replay(
         arm = np.array(config.camera.lever_arm_m)
         installation = Installation(cache.frame, cache.manifest.geoid_separation_m, arm)
         pose = AutopilotPose(autopilot, installation, config.prior)
-        localizer = build_localizer(
-            stack, camera, config.localizer, pose.rotation, pose.displacement
-        )
+        localizer = build_localizer(stack, camera, config.localizer, pose.sensors)
         frames = []
         for recorded in record.estimates:
             progress()

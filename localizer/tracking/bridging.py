@@ -23,6 +23,13 @@ from localizer.odometry import (
     odometry_optimizer,
 )
 from localizer.registration.jngo import JNGO
+from localizer.registration.priors import (
+    PoseConstraint,
+    attitude_constraint,
+    combine,
+    height_constraint,
+)
+from localizer.tracking.motion import OtherSensors
 from localizer.types import Anchors, FeaturePyramid, Frame, PoseEstimate, PosePrior
 
 
@@ -49,10 +56,22 @@ class Carried:
 _NOTHING = Carried(Carry.NONE)
 
 
-class Bridging:
-    """The odometry beside the map's registration; one thread, the localization thread's."""
+# Sigmas of what the autopilot knows absolutely; its turns and rises since a keyframe are known
+# better (`OdometryConfig`), and constant errors are taken out by the odometry.
+_TILT_RAD, _HEADING_RAD, _HEIGHT_M = float(np.radians(0.4)), float(np.radians(3.0)), 0.5
 
-    def __init__(self, camera: Camera, optimizer: JNGO, config: OdometryConfig, threads: int):
+
+class Bridging:
+    """The odometry beside the map's registration; one thread, the localization thread's.
+
+    sensors: other sensors' accounts of the camera, see `Localizer`.
+    """
+
+    def __init__(
+        self, camera: Camera, optimizer: JNGO, config: OdometryConfig, threads: int,
+        sensors: OtherSensors,
+    ) -> None:  # fmt: skip
+        self._sensors = sensors
         self._odometry = VisualOdometry(camera, odometry_optimizer(optimizer, threads), config)
         self._longest_sigma_m = config.longest_sigma_m
 
@@ -72,6 +91,7 @@ class Bridging:
             estimate.covariance,
             velocity=velocity,
             surface=anchors.points_world,
+            constraint=self._constraint(estimate.exposure_time_ns),
         )
 
     def carry(
@@ -82,7 +102,8 @@ class Bridging:
             return _NOTHING
         seen = OdometryFrame(query, frame.exposure_time_ns, examine(frame.image))
         surface = anchors.points_world if anchors is not None else None
-        estimate = self._odometry.step(seen, prediction, surface=surface)
+        constraint = self._constraint(frame.exposure_time_ns)
+        estimate = self._odometry.step(seen, prediction, surface=surface, constraint=constraint)
         if estimate.status is OdometryStatus.LOST:
             self._odometry.forget()
             return Carried(Carry.BROKEN, reason=estimate.reason)
@@ -94,6 +115,15 @@ class Bridging:
         return Carried(
             Carry.CARRIED, estimate.world_from_camera, estimate.covariance, estimate.quality
         )
+
+    def _constraint(self, time_ns: int) -> PoseConstraint | None:
+        rotation, height_m = self._sensors.rotation_at(time_ns), self._sensors.height_at(time_ns)
+        known = []
+        if rotation is not None:
+            known.append(attitude_constraint(rotation, _TILT_RAD, _HEADING_RAD))
+        if height_m is not None:
+            known.append(height_constraint(height_m, _HEIGHT_M))
+        return combine(*known) if known else None
 
     def forget(self) -> None:
         """A place was given from outside: what was carried is worth nothing."""

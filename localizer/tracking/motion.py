@@ -18,6 +18,7 @@ from filterpy.kalman import update as kalman_update
 from pydantic import BaseModel, ConfigDict, Field
 
 from localizer.geometry.pose import Array, Pose, so3_exp, so3_log
+from localizer.integrity.confirmation import DisplacementBetween
 from localizer.types import PosePrior
 
 # The camera's rotation (3, 3), world_from_camera, at a time in ns by another sensor, or None.
@@ -157,6 +158,20 @@ def kept(state: MotionState, time_ns: int, config: MotionConfig, turn: Array | N
     mean = np.concatenate([state.mean[:3], np.zeros(9)])
     rotation = state.rotation if turn is None else turn @ state.rotation
     return MotionState(mean, np.diag(_limits(config) ** 2), rotation, time_ns)
+
+
+@dataclass(frozen=True)
+class OtherSensors:
+    """What other sensors (autopilot and gimbal) say of the camera; None where they do not know.
+
+    rotation_at: (3, 3) world_from_camera at a time in ns. displacement_between: the way (3,)
+    between two times in world axes (m) with its sigma (m). height_at: the camera's world z (m),
+    which may have a constant error.
+    """
+
+    rotation_at: RotationAt = lambda _time_ns: None
+    displacement_between: DisplacementBetween = lambda _begin_ns, _end_ns: None
+    height_at: Callable[[int], float | None] = lambda _time_ns: None
 
 
 class MeasuredMotion:

@@ -12,14 +12,13 @@ from localizer.errors import ModelError
 from localizer.features.detail import DetailExtractor
 from localizer.features.extractor import DeviceExtractor, FeatureExtractor, load_extractor
 from localizer.geometry.camera import Camera
-from localizer.integrity.confirmation import DisplacementBetween
 from localizer.map.cache.cache import TileCache
 from localizer.map.cache.stream import TileStreamer
 from localizer.registration.devices import open_backend
 from localizer.registration.jngo import JNGO
 from localizer.render.base import MapRenderer
 from localizer.render.select import open_renderer
-from localizer.tracking.motion import RotationAt
+from localizer.tracking.motion import OtherSensors
 from localizer.tracking.pipeline import Localizer, working_camera
 
 
@@ -45,19 +44,19 @@ def open_localizer(
     map_cache: Path | str,
     camera: Camera,
     config: LocalizerConfig | None = None,
-    rotation_at: RotationAt = lambda _time_ns: None,
+    sensors: OtherSensors | None = None,
 ) -> Localizer:
     """A localizer for one camera over a tile cache on disk; close it, or use it in a ``with``.
 
     map_cache: folder that `build_cache` (``companion map build``) made. camera: of the frames as
-    they arrive, with its distortion. config: every setting has a default. rotation_at: see
+    they arrive, with its distortion. config: every setting has a default. sensors: see
     `Localizer`. The first call on a machine compiles for a minute. Use it on the thread that opened
     it: a GPU's renderer belongs to that one.
     """
     config = config or LocalizerConfig()
     stack = MapStack(Path(map_cache), config)
     try:
-        return build_localizer(stack, camera, config, rotation_at, on_close=stack.close)
+        return build_localizer(stack, camera, config, sensors, on_close=stack.close)
     except BaseException:
         stack.close()
         raise
@@ -67,14 +66,13 @@ def build_localizer(
     stack: MapStack,
     camera: Camera,
     config: LocalizerConfig,
-    rotation_at: RotationAt = lambda _time_ns: None,
-    displacement_between: DisplacementBetween = lambda _begin_ns, _end_ns: None,
+    sensors: OtherSensors | None = None,
     *,
     on_close: Callable[[], None] = lambda: None,
 ) -> Localizer:
     """A localizer for one camera over an open map, which stays the caller's to close.
 
-    rotation_at, displacement_between, on_close: see `Localizer`.
+    sensors, on_close: see `Localizer`.
     """
     size = working_camera(camera, config.width)
     features = load_extractor(
@@ -89,8 +87,8 @@ def build_localizer(
     )
     _warm_up(stack.renderer, extractor, optimizer, camera, config)
     return Localizer(
-        stack.renderer, extractor, optimizer, camera, config, rotation_at,
-        displacement_between=displacement_between, map_frame=stack.cache.frame, on_close=on_close,
+        stack.renderer, extractor, optimizer, camera, config, sensors,
+        map_frame=stack.cache.frame, on_close=on_close,
     )  # fmt: skip
 
 

@@ -20,14 +20,13 @@ from localizer.errors import CameraError, GeoreferenceError, OutsideMapError
 from localizer.features.extractor import DeviceExtractor, FeatureExtractor
 from localizer.geometry.camera import Camera
 from localizer.geometry.geo import LocalFrame
-from localizer.integrity.confirmation import DisplacementBetween
 from localizer.registration.anchors import select_anchors
 from localizer.registration.jngo import JNGO
 from localizer.registration.priors import PoseConstraint, attitude_constraint
 from localizer.render.base import MapRenderer
 from localizer.render.holes import fill_holes
 from localizer.tracking.bridging import Bridging
-from localizer.tracking.motion import RotationAt
+from localizer.tracking.motion import OtherSensors
 from localizer.tracking.tracker import Tracker, TrackerState
 from localizer.types import (
     Anchors,
@@ -106,10 +105,9 @@ class Localizer:
 
     Each half (`make_reference`, `localize`) may also run on its own thread, as in the engine.
 
-    rotation_at: the camera's attitude by another sensor's account (autopilot and gimbal). Its turns
-    replace the constant angular rate of the motion model, and it enters the registration as a
-    weak prior (`AttitudePrior`). displacement_between: the way between two times by another
-    sensor's account; with the attitude it confirms or refutes a place that was found by searching.
+    sensors: other sensors' accounts (autopilot and gimbal). Their turns replace the constant
+    angular rate of the motion model, their attitude enters the registration as a weak prior
+    (`AttitudePrior`), and with the displacement it confirms or refutes a place that was searched.
     map_frame: the map's. on_close: releases what was opened for this localizer alone.
     """
 
@@ -120,9 +118,8 @@ class Localizer:
         optimizer: JNGO,
         camera: Camera,
         config: LocalizerConfig,
-        rotation_at: RotationAt = lambda _time_ns: None,
+        sensors: OtherSensors | None = None,
         *,
-        displacement_between: DisplacementBetween = lambda _begin_ns, _end_ns: None,
         map_frame: LocalFrame | None = None,
         on_close: Callable[[], None] = lambda: None,
     ) -> None:
@@ -131,18 +128,16 @@ class Localizer:
         self._extractor = extractor
         self._optimizer = optimizer
         self._config = config
-        self._rotation_at = rotation_at
+        self._sensors = sensors or OtherSensors()
         self.camera = working_camera(camera, config.width)
         self._undistorter = Undistorter(camera, self.camera)
-        self._tracker = Tracker(
-            config, rotation_at, displacement_between, self._bridging(config, optimizer)
-        )
+        self._tracker = Tracker(config, self._sensors, self._bridging(config, optimizer))
 
     def _bridging(self, config: LocalizerConfig, optimizer: JNGO) -> Bridging | None:
         # A GPU's features are valid until the next frame only: there is no keyframe to keep.
         if config.odometry is None or optimizer.on_gpu:
             return None
-        return Bridging(self.camera, optimizer, config.odometry, config.threads)
+        return Bridging(self.camera, optimizer, config.odometry, config.threads, self._sensors)
 
     def __enter__(self) -> Localizer:
         return self
@@ -251,7 +246,7 @@ class Localizer:
         return self._tracker.predict(time_ns)
 
     def _attitude(self, time_ns: int) -> PoseConstraint | None:
-        sigma, rotation = self._config.attitude, self._rotation_at(time_ns)
+        sigma, rotation = self._config.attitude, self._sensors.rotation_at(time_ns)
         if sigma is None or rotation is None:
             return None
         tilt, heading = np.radians([sigma.tilt_sigma_deg, sigma.heading_sigma_deg])

@@ -8,11 +8,11 @@ from dataclasses import dataclass, field
 from localizer.config import LocalizerConfig
 from localizer.geometry.pose import Array, Pose
 from localizer.integrity.acceptance import is_acceptable
-from localizer.integrity.confirmation import DisplacementBetween, Witness
+from localizer.integrity.confirmation import Witness
 from localizer.registration.result import Registration
 from localizer.tracking import motion
 from localizer.tracking.bridging import Bridging, Carried, Carry
-from localizer.tracking.motion import MeasuredMotion, MotionState, RotationAt
+from localizer.tracking.motion import MeasuredMotion, MotionState, OtherSensors
 from localizer.tracking.states import Outcome, Standing, judge
 from localizer.types import (
     Anchors,
@@ -46,21 +46,19 @@ class _Pose:
 class Tracker:
     """Judges registrations, follows the motion, and carries the pose on where the map is silent.
 
-    `judge` belongs to the localization thread; the rest may be called from any. rotation_at,
-    displacement_between: other sensors' accounts, see `Localizer`. bridging: None where features
-    are not in host memory.
+    `judge` belongs to the localization thread; the rest may be called from any. bridging: None
+    where features are not in host memory.
     """
 
     def __init__(
         self,
         config: LocalizerConfig,
-        rotation_at: RotationAt,
-        displacement_between: DisplacementBetween,
+        sensors: OtherSensors,
         bridging: Bridging | None,
     ) -> None:
         self._config = config
-        self._motion = MeasuredMotion(config.motion, rotation_at)
-        self._rotation_at, self._displacement_between = rotation_at, displacement_between
+        self._motion = MeasuredMotion(config.motion, sensors.rotation_at)
+        self._sensors = sensors
         self._bridging = bridging
         self._lock = threading.Lock()
         self._state = TrackerState()
@@ -150,10 +148,11 @@ class Tracker:
         """What other sensors say of a place on trial."""
         if not standing.on_trial or not outcome.acceptable:
             return Witness()
-        rotation = self._rotation_at(outcome.time_ns)
+        rotation = self._sensors.rotation_at(outcome.time_ns)
         if standing.probation is None:
             return Witness(rotation)
-        way = self._displacement_between(standing.probation.time_ns, outcome.time_ns)
+        begun_ns = standing.probation.time_ns
+        way = self._sensors.displacement_between(begun_ns, outcome.time_ns)
         return Witness(rotation, way)
 
     def _next_motion(
