@@ -2,6 +2,7 @@
 
 from mavlink_bridge.bridge import Bridge
 from mavlink_bridge.config import BridgeConfig
+from mavlink_bridge.errors import BridgeError
 from mavlink_bridge.messages import (
     Attitude,
     CameraView,
@@ -18,6 +19,7 @@ __all__ = [
     "Attitude",
     "Bridge",
     "BridgeConfig",
+    "BridgeError",
     "CameraView",
     "GimbalAttitude",
     "HealthLevel",
