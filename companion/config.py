@@ -197,7 +197,11 @@ def _resolve_bridge(bridge: BridgeConfig, folder: Path) -> BridgeConfig:
         signing = getattr(bridge, name)
         if signing is not None:
             key_file = _path(folder, signing.key_file, f"bridge.{name}.key_file")
-            update[name] = signing.model_copy(update={"key_file": key_file})
+            paths = {"key_file": key_file}
+            if signing.state_file is not None:
+                where = f"bridge.{name}.state_file"
+                paths["state_file"] = _path(folder, signing.state_file, where)
+            update[name] = signing.model_copy(update=paths)
     return bridge.model_copy(update=update)
 
 

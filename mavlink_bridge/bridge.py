@@ -24,9 +24,16 @@ from mavlink_bridge.injection.rc_gate import InjectionGate
 from mavlink_bridge.injection.shadow import ShadowScore
 from mavlink_bridge.link.clock import SteadyUtc, monotonic_ns
 from mavlink_bridge.link.link import Link, LinkHandler
+from mavlink_bridge.link.replay import ReplayWindow
 from mavlink_bridge.link.signing import load_key
 from mavlink_bridge.link.tlog import TlogRecorder
-from mavlink_bridge.link.transport import Endpoint, Transport, UdpTransport, open_transport
+from mavlink_bridge.link.transport import (
+    Endpoint,
+    Transport,
+    UdpTransport,
+    open_transport,
+    parse_sender,
+)
 from mavlink_bridge.messages import (
     Attitude,
     CameraView,
@@ -55,7 +62,8 @@ _SEVERITY = {
     HealthLevel.FAILED: mavlink.MAV_SEVERITY_ERROR,
 }
 _MAX_CHUNKS = 4
-_GROUND_WANTED = frozenset(message_id(name) for name in COMMANDS_IN)
+_GROUND_WANTED = frozenset(message_id(name) for name in ("HEARTBEAT", *COMMANDS_IN))
+_NEXT_STATION_S = 10.0  # a second ground station takes over where the first one fell silent
 
 
 class Bridge:
@@ -295,12 +303,18 @@ def _make_link(
     recorder: TlogRecorder | None,
     opener: Callable[[Endpoint], Transport],
 ) -> Link:
+    key = None if signing is None else load_key(signing.key_file)
+    is_fc = name == "fc"
     return Link(
         Endpoint.parse(connection),
         handler,
         name=name,
         wanted=wanted,
-        signing_key=None if signing is None else load_key(signing.key_file),
+        signing_key=key,
+        sender=parse_sender(config.sender) if is_fc and config.sender else None,
+        # A signature says more of who speaks than an address does.
+        follow_hosts_after_s=None if is_fc and key is None else _NEXT_STATION_S,
+        window=None if signing is None else ReplayWindow(signing.state_path(name)),
         signing_link_id=1 if signing is None else signing.link_id,
         recorder=recorder,
         timeout_s=config.link_timeout_s,

@@ -7,7 +7,8 @@ from typing import Any
 
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
-from mavlink_bridge.camera.component import CameraComponent
+from mavlink_bridge.camera.component import TRACKING, CameraComponent
+from mavlink_bridge.injection.rc_gate import COMMANDS
 from mavlink_bridge.link.link import Link
 from mavlink_bridge.messages import (
     CameraView,
@@ -31,6 +32,14 @@ SYSTEM_STATUS = {
 }
 
 
+# What changes what the companion does; a question (camera information) anybody may ask.
+_ORDERS = frozenset((*COMMANDS.values(), *TRACKING))
+
+
+def _is_order(command: int) -> bool:
+    return command in _ORDERS
+
+
 class Components:
     """The bridge's components as one link sees them; its owner thread calls.
 
@@ -46,6 +55,10 @@ class Components:
             self._config, shared.geoid_separation_m, shared.on_track, ground_link=ground
         )
         self._next_heartbeat_ns = 0
+        # Where one link is signed, an order over another that is not would go round the signature.
+        signing = self._config.ground_signing if ground else self._config.signing
+        self._is_trusted = signing is not None or self._config.signing is None
+        self._refused: set[int] = set()
 
     def show(self, item: TargetReport | TargetEnd | CameraView) -> None:
         """Queue what the ground is to be told; the oldest go first when it is full."""
@@ -104,11 +117,34 @@ class Components:
         """
         if link.congested:
             return
+        if _is_order(message.command) and not self._may_order(message):
+            self._refuse(link, message)
+            return
         localizer = self._config.localizer_component
         if (message.target_system, message.target_component) == (link.system_id, localizer):
             self._localizer_command(link, message)
         elif self._config.camera.announce and message.target_system in (0, link.system_id):
             self._camera.command(message, time_ns, self._shared.uptime_ms(time_ns), link.send)
+
+    def _may_order(self, message: Any) -> bool:
+        return self._is_trusted and message.get_srcSystem() in self._config.ground_systems
+
+    def _refuse(self, link: Link, message: Any) -> None:
+        """Deny an order to one of our components, and tell of its sender once."""
+        ours = (self._config.localizer_component, self._config.camera_component)
+        if message.target_system not in (0, link.system_id) or message.target_component not in ours:
+            return
+        system = message.get_srcSystem()
+        denied = mavlink.MAV_RESULT_DENIED
+        ack = mavlink.MAVLink_command_ack_message(
+            message.command, denied, 0, 0, system, message.get_srcComponent()
+        )
+        link.send(ack, message.target_component)
+        if system not in self._refused:
+            self._refused.add(system)
+            why = "not in ground_systems" if self._is_trusted else "link not signed"
+            text = f"PiLoT: system {system} refused: {why}"
+            self._shared.say(mavlink.MAV_SEVERITY_WARNING, text)
 
     def _localizer_command(self, link: Link, message: Any) -> None:
         """The command that gates injection; every other one is refused in the protocol's way."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from pathlib import Path
-from typing import Literal
+from typing import Annotated, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, field_validator, model_validator
 
@@ -183,6 +183,18 @@ class SigningConfig(_Model):
 
     key_file: Path
     link_id: int = Field(default=1, ge=0, le=255)
+    state_file: Path | None = Field(
+        default=None,
+        description="newest time stamps, kept over restarts; None: beside the key, FILE.LINK.seen",
+    )
+
+    def state_path(self, link: str) -> Path:
+        """Where the replay window of the link of this name is kept."""
+        name = f"{self.key_file.name}.{link}.seen"
+        return self.state_file or self.key_file.with_name(name)
+
+
+SystemId = Annotated[int, Field(ge=1, le=255)]
 
 
 class BridgeConfig(_Model):
@@ -196,6 +208,16 @@ class BridgeConfig(_Model):
     ground_connection: str | None = None
     mode: Mode = "shadow"
     system_id: int | None = Field(default=None, ge=1, le=255, description="None: the vehicle's own")
+    sender: str | None = Field(
+        default=None,
+        description="udpin: whose datagrams are heard, ADDRESS or ADDRESS:PORT; None: the first "
+        "autopilot's",
+    )
+    ground_systems: tuple[SystemId, ...] = Field(
+        default=(255,),
+        max_length=32,
+        description="system ids whose commands may gate injection and start tracking",
+    )
     localizer_component: int = Field(default=197, ge=2, le=255)  # 1 is the autopilot
     companion_component: int = Field(default=191, ge=2, le=255)
     camera_component: int = Field(default=100, ge=2, le=255)
@@ -222,6 +244,26 @@ class BridgeConfig(_Model):
         if value is not None:
             _check_endpoint(value)
         return value
+
+    @field_validator("sender")
+    @classmethod
+    def _is_a_sender(cls, value: str | None) -> str | None:
+        if value is not None:
+            from mavlink_bridge.errors import EndpointError
+            from mavlink_bridge.link.transport import parse_sender
+
+            try:
+                parse_sender(value)
+            except EndpointError as error:
+                raise ValueError(str(error)) from error
+        return value
+
+    @model_validator(mode="after")
+    def _state_files_differ(self) -> BridgeConfig:
+        first, second = self.signing, self.ground_signing
+        if first and second and first.state_path("fc") == second.state_path("ground"):
+            raise ValueError("signing and ground_signing need a state_file each")
+        return self
 
     @model_validator(mode="after")
     def _links_and_components_differ(self) -> BridgeConfig:

@@ -7,6 +7,7 @@ from typing import Any
 from mavlink_bridge.components import COMMANDS_IN, Components
 from mavlink_bridge.link.link import Link
 from mavlink_bridge.shared import Shared
+from mavlink_bridge.texts import Teller
 
 _TICK_NS = 20_000_000
 
@@ -17,13 +18,18 @@ class GroundEnd:
     def __init__(self, shared: Shared) -> None:
         self.components = Components(shared, ground=True)
         self._shared = shared
+        self._teller = Teller(shared.say)
 
     def on_open(self, link: Link) -> None:
         """Announce at once."""
         self.components.announce()
 
     def on_message(self, link: Link, message: Any, time_ns: int) -> None:
-        """Commands for our components."""
+        """Commands for our components; a ground station's heartbeat says who is to be answered."""
+        if message.get_type() == "HEARTBEAT":
+            if message.get_srcSystem() in self._shared.config.ground_systems:
+                link.keep_peer()
+            return
         if message.get_type() in COMMANDS_IN:
             self.components.command(link, message, time_ns)
 
@@ -33,6 +39,8 @@ class GroundEnd:
         state = self._shared.tracker.snapshot(now_ns)
         link.system_id = config.system_id or state.system_id or 0
         self._shared.watch.check(state)
+        if link.stranger:
+            self._teller.tell("foreign", f"MAVLink of {link.stranger} ignored")
         if link.system_id:
             self.components.heartbeat(link, now_ns)
             if config.camera.announce:

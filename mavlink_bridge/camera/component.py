@@ -29,7 +29,7 @@ from mavlink_bridge.messages import CameraView, Origin, TargetReport, TrackReque
 Send = Callable[[Any, int], bool]
 _TARGET_AGE_NS = 2_000_000_000
 _IDLE_PERIOD_NS = 1_000_000_000
-_TRACKING = frozenset(
+TRACKING = frozenset(
     (
         mavlink.MAV_CMD_CAMERA_TRACK_POINT,
         mavlink.MAV_CMD_CAMERA_TRACK_RECTANGLE,
@@ -129,7 +129,7 @@ class CameraComponent:
 
     def _execute(self, message: Any, time_ns: int, uptime_ms: int, send: Send) -> int:
         command = message.command
-        if command in _TRACKING:
+        if command in TRACKING:
             request = track_request(message, time_ns)
             if request is None or self._on_track is None:
                 return int(mavlink.MAV_RESULT_DENIED)

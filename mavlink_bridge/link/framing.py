@@ -19,6 +19,7 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 from pymavlink.generator.mavcrc import x25crc
 
 from mavlink_bridge.link import signing
+from mavlink_bridge.link.replay import ReplayWindow
 
 _V1, _V2 = 0xFE, 0xFD
 _SIGNED = 0x01
@@ -46,7 +47,11 @@ class VerifyingMavlink(mavlink.MAVLink):
 
     pymavlink stores the time stamp of a frame before checking its signature, so one forged frame
     from the future would shut out the real sender.
+
+    window: remembers over restarts how far each stream was.
     """
+
+    window: ReplayWindow | None = None
 
     def check_signature(self, msgbuf: bytearray, srcSystem: int, srcComponent: int) -> bool:
         """Whether the frame is signed with our key and newer than its stream."""
@@ -62,6 +67,8 @@ class VerifyingMavlink(mavlink.MAVLink):
             return False
         self.signing.stream_timestamps[stream] = stamp
         self.signing.timestamp = max(self.signing.timestamp, stamp)
+        if self.window is not None:
+            self.window.note(stream, stamp)
         return True
 
 
@@ -69,15 +76,26 @@ class FrameReader:
     """Turns bytes, in fragments of any size, into decoded messages.
 
     wanted: message ids to decode; None decodes all of the dialect. `raw` frames of the last `feed`
-    are kept for a recorder.
+    are kept for a recorder. window: of the key's streams; what it has seen before is refused.
     """
 
-    def __init__(self, wanted: Collection[int] | None = None, key: bytes | None = None) -> None:
+    def __init__(
+        self,
+        wanted: Collection[int] | None = None,
+        key: bytes | None = None,
+        window: ReplayWindow | None = None,
+    ) -> None:
         self.counters = FramingCounters()
         self._codec = VerifyingMavlink(None)
         self._signed = key is not None
         if key is not None:
             signing.enable(self._codec, key, 0)
+        if key is not None and window is not None:
+            state = self._codec.signing
+            state.stream_timestamps.update(window.streams)
+            # With an unset clock, too, a new stream begins where the old ones were, or later.
+            state.timestamp = max(state.timestamp, window.newest)
+            self._codec.window = window
         self._wanted = None if wanted is None else frozenset(wanted)
         self._buffer = bytearray()
         self._sequences: dict[tuple[int, int], int] = {}

@@ -22,6 +22,7 @@ from mavlink_bridge.errors import BridgeStateError, EndpointError
 from mavlink_bridge.link import signing
 from mavlink_bridge.link.clock import monotonic_ns, utc_us
 from mavlink_bridge.link.framing import FrameReader
+from mavlink_bridge.link.replay import ReplayWindow
 from mavlink_bridge.link.tlog import TlogRecorder
 from mavlink_bridge.link.transport import Endpoint, Transport, UdpTransport, open_transport
 from mavlink_bridge.link.waking import WakePipe
@@ -75,7 +76,9 @@ class Link:
     min_interval_ns: shortest time between two messages of one id and component; faster ones are
     dropped and counted. timeout_s: silence after which a stream (TCP, serial) is reopened.
 
-    stop: what ends the owner thread when it is set.
+    stop: what ends the owner thread when it is set. sender, follow_hosts_after_s: UDP, who alone is
+    heard, and after which silence another host may be. window: what outlives a restart of the time
+    stamps that signed messages had.
 
     Over 200 lines, because one thread owns transport, parser, packers and what is unsent, and the
     order in which its loop serves them keeps positions first on a slow port.
@@ -95,14 +98,19 @@ class Link:
         timeout_s: float = 5.0,
         opener: Callable[[Endpoint], Transport] = open_transport,
         stop: threading.Event | None = None,
+        sender: tuple[str, int | None] | None = None,
+        follow_hosts_after_s: float | None = None,
+        window: ReplayWindow | None = None,
     ) -> None:
         self.endpoint = endpoint
         self.name = name
         self.counters = LinkCounters()
         self.system_id = 0
         self._handler = handler
-        self._reader = FrameReader(wanted, signing_key)
+        self._reader = FrameReader(wanted, signing_key, window)
         self._min_interval_ns = dict(min_interval_ns or {})
+        self._window = window
+        self._only, self._follow_hosts_after_s = sender, follow_hosts_after_s
         self._key, self._key_link = signing_key, signing_link_id
         self._recorder = recorder
         self._timeout_ns = int(timeout_s * 1e9)
@@ -137,8 +145,14 @@ class Link:
         """
         return len(self._unsent) > _CONGESTED
 
+    @property
+    def stranger(self) -> str:
+        """UDP: the address of another than the peer, who spoke last and was not heard; or empty."""
+        transport = self._transport
+        return transport.stranger if isinstance(transport, UdpTransport) else ""
+
     def keep_peer(self) -> None:
-        """Answer who sent the message that is being handled, whoever else speaks on the port."""
+        """UDP: hear and answer only who sent the message that is being handled."""
         if isinstance(self._transport, UdpTransport):
             self._transport.keep_peer()
 
@@ -155,6 +169,8 @@ class Link:
         self.wake()
         if self._thread is not None and self._thread is not threading.current_thread():
             self._thread.join(timeout=5.0)
+        if self._window is not None:
+            self._window.close()
         if self._thread is None or not self._thread.is_alive():
             self._waker.close()
 
@@ -174,7 +190,10 @@ class Link:
 
     def stats(self) -> dict[str, int]:
         """Counters of link and framing."""
-        return {**asdict(self.counters), **asdict(self._reader.counters)}
+        transport = self._transport
+        refused = transport.refused if isinstance(transport, UdpTransport) else 0
+        mine = {**asdict(self.counters), "rx_of_strangers": refused}
+        return {**mine, **asdict(self._reader.counters)}
 
     def waiting(self) -> dict[str, int]:
         """Messages of other threads, and bytes in and out, that wait here."""
@@ -202,7 +221,7 @@ class Link:
 
     def _try_open(self) -> Transport | None:
         try:
-            return self._open(self.endpoint)
+            return self._with_peer(self._open(self.endpoint))
         except (OSError, EndpointError) as error:
             self.counters.open_failures += 1
             if self.counters.open_failures == 1:
@@ -210,6 +229,14 @@ class Link:
                     "%s: %s cannot be opened (%s), retrying", self.name, self.endpoint, error
                 )
         return None
+
+    def _with_peer(self, transport: Transport) -> Transport:
+        if isinstance(transport, UdpTransport):
+            if self._only is not None:
+                transport.hear_only(*self._only)
+            if self._follow_hosts_after_s is not None:
+                transport.follow_hosts_after(self._follow_hosts_after_s)
+        return transport
 
     def _serve_until_lost(self, transport: Transport) -> None:
         self.counters.opened += 1

@@ -6,6 +6,8 @@ is there and raises OSError when the other side is gone; `write` returns how man
 
 from __future__ import annotations
 
+import ipaddress
+import math
 import os
 import socket
 import time
@@ -16,7 +18,8 @@ from mavlink_bridge.errors import EndpointError
 
 Kind = Literal["udpin", "udpout", "tcp", "tcpin", "serial"]
 _CONNECT_TIMEOUT_S = 2.0
-_KEPT_S = 5.0
+_KEPT_S = 3.0  # without a heartbeat, as long as until the vehicle counts as lost
+_MAX_REFUSED = 64
 _READ_SIZE = 65536
 _MARKERS = (b"\xfd", b"\xfe")  # of MAVLink 2 and 1
 _HIGHEST_BAUD = 12_000_000
@@ -64,6 +67,19 @@ class Endpoint:
         return f"{self.kind}:{self.address}:{self.number}"
 
 
+def parse_sender(text: str) -> tuple[str, int | None]:
+    """ADDRESS or ADDRESS:PORT (IPv4) whose datagrams are taken; EndpointError if it is neither."""
+    host, _, port = text.partition(":")
+    try:
+        address = str(ipaddress.IPv4Address(host))
+        number = int(port) if port else None
+    except ValueError as error:
+        raise EndpointError(f"{text!r} is no sender; write ADDRESS or ADDRESS:PORT") from error
+    if text.endswith(":") or (number is not None and not 1 <= number <= 65535):
+        raise EndpointError(f"{text!r}: no port number")
+    return address, number
+
+
 class Transport(Protocol):
     """An open byte stream or datagram socket."""
 
@@ -85,13 +101,19 @@ class Transport(Protocol):
 
 
 class UdpTransport:
-    """A UDP socket. With `remote` None it listens and answers whoever spoke last, or, while that
-    one speaks, whom `keep_peer` chose.
+    """A UDP socket. With `remote` None it listens and answers whoever spoke last, until
+    `keep_peer` chose one: from then on that one alone is heard and answered. With a `remote` that
+    one alone is from the start.
+
+    The peer may come back from another port of its host (a restart) once it was silent for 3 s;
+    from another host never, unless `follow_hosts_after` says after which silence.
     """
 
     stream = False
 
     def __init__(self, local: tuple[str, int] | None, remote: tuple[str, int] | None) -> None:
+        self.refused = 0
+        self.stranger = ""
         self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
         self._remote = remote
         self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 1 << 20)
@@ -105,7 +127,10 @@ class UdpTransport:
                 raise
         self._learn = remote is None
         self._sender = remote
-        self._kept_until_s = 0.0
+        self._peer = remote
+        self._only: tuple[str, int | None] | None = None
+        self._heard_s = 0.0
+        self._other_host_s = math.inf
 
     @property
     def port(self) -> int:
@@ -116,22 +141,51 @@ class UdpTransport:
         """Descriptor for select."""
         return self._socket.fileno()
 
+    def hear_only(self, host: str, port: int | None) -> None:
+        """Whoever else speaks is a stranger. port: None for any of the host's."""
+        self._only = (host, port)
+
+    def follow_hosts_after(self, silence_s: float) -> None:
+        """Another host may become the peer after so long a silence of the present one."""
+        self._other_host_s = silence_s
+
     def read(self) -> bytes:
-        """One datagram; who sends MAVLink becomes the peer when none was configured."""
-        try:
-            data, sender = self._socket.recvfrom(_READ_SIZE)
-        except (BlockingIOError, ConnectionRefusedError):
-            # Refused: an ICMP answer to something sent before the peer listened; UDP goes on.
+        """One datagram of the peer, or while there is none of anyone; b"" if nothing waits."""
+        for _ in range(_MAX_REFUSED):
+            try:
+                data, sender = self._socket.recvfrom(_READ_SIZE)
+            except (BlockingIOError, ConnectionRefusedError):
+                # Refused: an ICMP answer to something sent before the peer listened; UDP goes on.
+                return b""
+            if self._admits(sender):
+                break
+            self.refused += 1
+            self.stranger = sender[0]
+        else:
             return b""
         self._sender = sender
-        if self._learn and data[:1] in _MARKERS and time.monotonic() > self._kept_until_s:
+        if self._learn and self._peer is None and data[:1] in _MARKERS:
             self._remote = sender
         return data
 
     def keep_peer(self) -> None:
-        """The sender of what was read last is the one to answer, for the next seconds at least."""
+        """The sender of what was read last is the one to hear and to answer from now on."""
         if self._learn:
-            self._remote, self._kept_until_s = self._sender, time.monotonic() + _KEPT_S
+            self._remote = self._peer = self._sender
+            self._heard_s = time.monotonic()
+
+    def _admits(self, sender: tuple[str, int]) -> bool:
+        if self._only is not None:
+            host, port = self._only
+            if sender[0] != host or port not in (None, sender[1]):
+                return False
+        if self._peer is None or sender == self._peer:
+            return True
+        if not self._learn:
+            return False
+        silent_s = time.monotonic() - self._heard_s
+        patience_s = _KEPT_S if sender[0] == self._peer[0] else self._other_host_s
+        return silent_s >= patience_s
 
     def write(self, data: bytes) -> int:
         """One datagram to the peer."""

@@ -88,6 +88,18 @@ def ned_from_origin(
     return north, east, origin.altitude_amsl_m - altitude_amsl_m
 
 
+def _is_place(read: Origin) -> bool:
+    """Not 0, 0, which firmwares send before they have an origin, and somewhere on Earth."""
+    if read.latitude_deg == 0.0 and read.longitude_deg == 0.0:
+        return False
+    return abs(read.latitude_deg) <= 90.0 and abs(read.longitude_deg) <= 180.0
+
+
+def _distance_m(a: Origin, b: Origin) -> float:
+    north, east = north_east(a.latitude_deg, a.longitude_deg, b.latitude_deg, b.longitude_deg)
+    return math.hypot(north, east, b.altitude_amsl_m - a.altitude_amsl_m)
+
+
 class OriginKeeper:
     """Reads the vehicle's origin, and sets the configured one only when there is none.
 
@@ -101,21 +113,28 @@ class OriginKeeper:
         self._asked = 0
         self._next_ns = 0
         self._told = False
+        self.moved_m: float | None = None
+        """How far off the origin said last was, if it was refused; None: it was not."""
 
     def reset(self) -> None:
         """The flight controller rebooted, or may have while the link was lost: ask again."""
         self.origin, self._asked, self._told, self._next_ns = None, 0, False, 0
+        self.moved_m = None
 
-    def on_origin(self, message: Any) -> str | None:
-        """GPS_GLOBAL_ORIGIN; returns a line for the operator when it is news."""
+    def on_origin(self, message: Any, *, armed: bool) -> str | None:
+        """GPS_GLOBAL_ORIGIN; returns a line for the operator when it is news.
+
+        armed: an origin that is known is kept then. No EKF moves its origin in flight, and who
+        forged one would drag every position by its distance.
+        """
         read = Origin(message.latitude * 1e-7, message.longitude * 1e-7, message.altitude * 1e-3)
-        if read.latitude_deg == 0.0 and read.longitude_deg == 0.0:
-            return None  # what firmwares send before they have one
-        if abs(read.latitude_deg) > 90.0 or abs(read.longitude_deg) > 180.0:
-            return None
-        if read == self.origin:
+        self.moved_m = None
+        if not _is_place(read) or read == self.origin:
             return None
         moved = self.origin is not None
+        if self.origin is not None and armed:
+            self.moved_m = _distance_m(self.origin, read)
+            return None
         self.origin = read
         if moved:
             return "EKF origin moved; positions follow it"

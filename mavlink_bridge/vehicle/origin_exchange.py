@@ -8,6 +8,7 @@ from typing import Any
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from mavlink_bridge.config import BridgeConfig
+from mavlink_bridge.link.clock import monotonic_ns
 from mavlink_bridge.link.link import Link
 from mavlink_bridge.messages import Origin
 from mavlink_bridge.texts import Teller
@@ -41,7 +42,12 @@ class OriginExchange:
 
     def on_message(self, message: Any) -> None:
         """GPS_GLOBAL_ORIGIN (49) came."""
-        news = self._keeper.on_origin(message)
+        armed = self._tracker.snapshot(monotonic_ns()).armed
+        news = self._keeper.on_origin(message, armed=armed)
+        moved_m = self._keeper.moved_m
+        if moved_m is not None:
+            self._counters["origins_refused"] += 1
+            self._teller.tell("origin", f"EKF origin off by {moved_m:.0f} m in flight: refused")
         self._tracker.set_origin(self._keeper.origin)
         if news is not None:
             self._teller.inform(news)

@@ -49,7 +49,9 @@ class StrangerWatch:
             )
 
     def check(self, link: Link, now_ns: int) -> None:
-        """Two vehicles of the same ids: their boot times alternate."""
+        """Other hosts on the port; two vehicles of the same ids: their boot times alternate."""
+        if link.stranger:
+            self._teller.tell("foreign", f"MAVLink of {link.stranger} ignored")
         clock = self._tracker.clock
         if self._twins.two(now_ns, clock.strays + clock.reboots):
             system = link.system_id

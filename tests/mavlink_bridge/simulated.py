@@ -41,6 +41,7 @@ class SimulatedLink:
     open: bool = True
     congested: bool = False
     kept: int = 0
+    stranger: str = ""
     endpoint: Endpoint = field(default_factory=lambda: Endpoint.parse("tcp:vehicle:5760"))
     now_ns: int = 0
 

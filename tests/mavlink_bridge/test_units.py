@@ -141,7 +141,7 @@ def test_the_origin_is_set_and_read_in_the_units_of_the_definition() -> None:
     kind = mavlink.mavlink_map[mavlink.MAVLINK_MSG_ID_GPS_GLOBAL_ORIGIN]
     keeper.on_origin(mavlink.MAVLink_gps_global_origin_message(
         *(round(scaled(kind, field, value)) for field, value in wanted.items()), 0
-    ))  # fmt: skip
+    ), armed=False)  # fmt: skip
     assert keeper.origin == Origin(*map(pytest.approx, (LAT, LON, AMSL)))
 
 

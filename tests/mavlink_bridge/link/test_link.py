@@ -117,36 +117,123 @@ def test_wrong_endpoints_say_what_is_wanted(text: str) -> None:
         BridgeConfig(connection=text)
 
 
-def test_the_kept_peer_is_answered_whoever_else_speaks(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A ground station that sends to the same port must not get the positions."""
-    clock = SimpleNamespace(now_s=1000.0, monotonic=lambda: clock.now_s)
-    monkeypatch.setattr("mavlink_bridge.link.transport.time", clock)
-    ours = open_transport(Endpoint.parse("udpin:127.0.0.1:0"))
+class Speakers:
+    """A listening transport on a clock of its own, and sockets of two hosts that speak to it."""
+
+    def __init__(self, monkeypatch: pytest.MonkeyPatch, where: str = "udpin:127.0.0.1:0") -> None:
+        self.now_s = 1000.0
+        clock = SimpleNamespace(monotonic=lambda: self.now_s)
+        monkeypatch.setattr("mavlink_bridge.link.transport.time", clock)
+        opened = open_transport(Endpoint.parse(where))
+        assert isinstance(opened, UdpTransport)
+        self.ours = opened
+        self.vehicle = self.speaker("127.0.0.1")
+        self.again = self.speaker("127.0.0.1")
+        self.stranger = self.speaker("127.0.0.2")
+
+    def speaker(self, host: str) -> socket.socket:
+        made = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+        made.bind((host, 0))
+        made.settimeout(30.0)
+        return made
+
+    def is_heard(self, speaker: socket.socket) -> bool:
+        """Whether a message of it is read; on loopback it is there when sendto returns."""
+        speaker.sendto(packed(), ("127.0.0.1", self.ours.port))
+        return bool(self.ours.read())
+
+    def is_answered(self, speaker: socket.socket) -> bool:
+        self.ours.write(b"position")
+        speaker.setblocking(False)
+        try:
+            return speaker.recv(100) == b"position"
+        except BlockingIOError:
+            return False
+
+    def close(self) -> None:
+        for end in (self.ours, self.vehicle, self.again, self.stranger):
+            end.close()
+
+
+@pytest.fixture
+def speakers(monkeypatch: pytest.MonkeyPatch) -> Iterator[Speakers]:
+    made = Speakers(monkeypatch)
+    yield made
+    made.close()
+
+
+def test_who_speaks_before_the_vehicle_is_heard_and_gives_way_to_it(speakers: Speakers) -> None:
+    assert speakers.is_heard(speakers.stranger)
+    assert speakers.is_answered(speakers.stranger)
+    assert speakers.is_heard(speakers.vehicle)
+    speakers.ours.keep_peer()
+    assert speakers.is_answered(speakers.vehicle)
+
+
+def test_once_a_peer_is_kept_nobody_else_is_heard_or_answered(speakers: Speakers) -> None:
+    """A forged heartbeat of the vehicle's ids must not get the positions, after any silence."""
+    ours = speakers.ours
+    assert speakers.is_heard(speakers.vehicle)
+    ours.keep_peer()
+    for _ in range(3):
+        assert not speakers.is_heard(speakers.stranger)
+        assert not speakers.is_heard(speakers.again)
+        assert speakers.is_heard(speakers.vehicle)
+        ours.keep_peer()
+        speakers.now_s += 2.0
+    assert ours.refused == 6
+    speakers.now_s += 3600.0
+    assert not speakers.is_heard(speakers.stranger)
+    assert ours.stranger == "127.0.0.2"
+    assert speakers.is_answered(speakers.vehicle)
+
+
+def test_a_vehicle_that_restarts_may_speak_from_another_port_of_its_host(
+    speakers: Speakers,
+) -> None:
+    assert speakers.is_heard(speakers.vehicle)
+    speakers.ours.keep_peer()
+    speakers.now_s += 3.0
+    assert speakers.is_heard(speakers.again)
+    speakers.ours.keep_peer()
+    assert speakers.is_answered(speakers.again)
+    assert not speakers.is_heard(speakers.vehicle)
+
+
+def test_where_it_is_allowed_another_host_takes_over_after_silence(speakers: Speakers) -> None:
+    speakers.ours.follow_hosts_after(10.0)
+    assert speakers.is_heard(speakers.vehicle)
+    speakers.ours.keep_peer()
+    speakers.now_s += 9.0
+    assert not speakers.is_heard(speakers.stranger)
+    speakers.now_s += 1.0
+    assert speakers.is_heard(speakers.stranger)
+
+
+def test_a_configured_sender_is_heard_from_the_start_and_nobody_else(speakers: Speakers) -> None:
+    speakers.ours.hear_only("127.0.0.1", None)
+    assert not speakers.is_heard(speakers.stranger)
+    assert speakers.is_heard(speakers.vehicle)
+
+
+def test_a_link_that_sends_first_hears_only_whom_it_sends_to(
+    monkeypatch: pytest.MonkeyPatch, speakers: Speakers
+) -> None:
+    port = speakers.vehicle.getsockname()[1]
+    ours = open_transport(Endpoint.parse(f"udpout:127.0.0.1:{port}"))
     assert isinstance(ours, UdpTransport)
-    with (
-        socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as vehicle,
-        socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as station,
-    ):
-
-        def answered(*speakers: socket.socket) -> list[bool]:
-            for speaker in speakers:
-                speaker.sendto(packed(), ("127.0.0.1", ours.port))
-                assert sleep_until(lambda: bool(ours.read()), 30.0)
-                if speaker is vehicle:
-                    ours.keep_peer()
-            ours.write(b"position")
-            heard = []
-            for s in (vehicle, station):
-                s.settimeout(0.2)
-                with contextlib.suppress(TimeoutError):
-                    heard.append(s.recv(100) == b"position" and s is vehicle)
-            return heard
-
-        assert answered(station) == [False]  # the first who speaks
-        assert answered(vehicle, station, station) == [True]
-        clock.now_s += 10.0
-        assert answered(station) == [False]  # the vehicle is silent for long
+    ours.write(b"hello")
+    _, where = speakers.vehicle.recvfrom(100)
+    for speaker, heard in ((speakers.stranger, b""), (speakers.vehicle, packed())):
+        speaker.sendto(packed(), ("127.0.0.1", where[1]))
+        assert ours.read() == heard
     ours.close()
+
+
+@pytest.mark.parametrize("text", ["vehicle", "10.0.0.1:", "10.0.0.1:0", "10.0.0.1:70000", "::1"])
+def test_what_is_no_sender_is_named(text: str) -> None:
+    with pytest.raises(ValidationError, match=r"sender|port"):
+        BridgeConfig(sender=text)
 
 
 def test_a_second_process_cannot_take_a_udp_port_over() -> None:

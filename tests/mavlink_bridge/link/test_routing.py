@@ -74,7 +74,9 @@ class Station:
 def test_an_independent_client_through_the_autopilots_routing(vehicle: Any, tmp_path: Path) -> None:
     asked: list[TrackRequest] = []
     path = tmp_path / "flight.tlog"
-    config = BridgeConfig(connection=vehicle.companion_endpoint, mode="rc", tlog=path)
+    config = BridgeConfig(
+        connection=vehicle.companion_endpoint, mode="rc", tlog=path, ground_systems=(245,)
+    )
     sdk = Mavsdk(Configuration.create_with_component_type(ComponentType.GROUND_STATION))
     with Bridge(config, GEOID, on_track=asked.append) as bridge:
         try:

@@ -308,7 +308,8 @@ def test_origin_is_read_and_only_set_when_the_vehicle_has_none() -> None:
     assert messages[3].latitude == 470000000
     assert messages[3].altitude == 500000
     # The vehicle has another one: ours is ignored, and so must positions be relative to the read.
-    news = keeper.on_origin(mavlink.MAVLink_gps_global_origin_message(471000000, 80000000, 480000))
+    read = mavlink.MAVLink_gps_global_origin_message(471000000, 80000000, 480000)
+    news = keeper.on_origin(read, armed=True)
     assert news is not None
     assert "from the configured one" in news
     assert keeper.origin == Origin(pytest.approx(47.1), pytest.approx(8.0), pytest.approx(480.0))
@@ -322,7 +323,7 @@ def test_no_origin_is_set_unless_configured() -> None:
 
 def test_zero_origin_is_none() -> None:
     keeper = OriginKeeper(None)
-    keeper.on_origin(mavlink.MAVLink_gps_global_origin_message(0, 0, 0))
+    keeper.on_origin(mavlink.MAVLink_gps_global_origin_message(0, 0, 0), armed=False)
     assert keeper.origin is None
 
 

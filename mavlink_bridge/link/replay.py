@@ -1,0 +1,110 @@
+"""Replay windows of signed links that outlive a restart: how far each stream's time stamps were.
+
+Signing refuses a frame that is not newer than its stream. Kept in memory alone, that ends with the
+process: a recorded "injection on" would be taken again after a restart, and with a computer whose
+clock is not set, a month later.
+"""
+
+from __future__ import annotations
+
+import json
+import logging
+import os
+import threading
+from pathlib import Path
+
+_log = logging.getLogger(__name__)
+
+_LEASE = 200_000  # 10 us ticks: 2 s
+_MAX_SIZE = 1 << 20
+
+Stream = tuple[int, int, int]
+"""Link id, system, component of a signed frame."""
+
+
+class ReplayWindow:
+    """The newest time stamps of a link's streams, in a file of mode 0600.
+
+    What is written is 2 s ahead of what was seen, so that a second's messages need one write and
+    none of them can be repeated after a kill. After a start our own stamps begin beyond it, and a
+    peer that does not know the time follows them. A thread of its own writes: the disk cannot stop
+    a link. A file that is lost or damaged is told in the log and begun anew.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self._path = path
+        self._lock = threading.Lock()
+        self._due = threading.Event()
+        self._closing = False
+        self._failed = False
+        self.streams: dict[Stream, int] = self._read()
+        self._leases = dict(self.streams)
+        self._thread = threading.Thread(target=self._run, name="replay-window", daemon=True)
+        self._thread.start()
+
+    @property
+    def newest(self) -> int:
+        """The newest stamp that may have been seen, 10 us ticks; 0 for none."""
+        with self._lock:
+            return max(self._leases.values(), default=0)
+
+    def note(self, stream: Stream, stamp: int) -> None:
+        """A frame of a stream was taken; never blocks on the disk."""
+        with self._lock:
+            if stamp + _LEASE // 2 <= self._leases.get(stream, 0):
+                return
+            self._leases[stream] = stamp + _LEASE
+        self._due.set()
+
+    def close(self) -> None:
+        """Write what is left and end; at most about two seconds on a disk that stands still."""
+        self._closing = True
+        self._due.set()
+        self._thread.join(2.0)
+
+    def _run(self) -> None:
+        while True:
+            self._due.wait()
+            self._due.clear()
+            self._write()
+            if self._closing:
+                return
+
+    def _write(self) -> None:
+        with self._lock:
+            document = {":".join(map(str, key)): stamp for key, stamp in self._leases.items()}
+        temporary = self._path.with_name(f"{self._path.name}.tmp")
+        try:
+            descriptor = os.open(temporary, os.O_WRONLY | os.O_CREAT | os.O_TRUNC, 0o600)
+            with os.fdopen(descriptor, "w", encoding="ascii") as file:
+                json.dump(document, file)
+                file.flush()
+                os.fsync(file.fileno())
+            temporary.replace(self._path)
+        except OSError as error:
+            if not self._failed:
+                _log.warning(
+                    "%s: cannot be written (%s): signed messages of now can be repeated after a "
+                    "restart; set signing.state_file to a place that can",
+                    self._path, error,
+                )  # fmt: skip
+            self._failed = True
+
+    def _read(self) -> dict[Stream, int]:
+        try:
+            with self._path.open(encoding="ascii") as file:
+                document = json.loads(file.read(_MAX_SIZE))
+            return {_stream(key): int(stamp) for key, stamp in document.items()}
+        except FileNotFoundError:
+            return {}
+        except (OSError, ValueError, AttributeError, TypeError) as error:
+            _log.warning(
+                "%s: unreadable (%s): begun anew, messages from before can be repeated once",
+                self._path, error,
+            )  # fmt: skip
+            return {}
+
+
+def _stream(key: str) -> Stream:
+    link, system, component = (int(part) for part in key.split(":"))
+    return link, system, component

@@ -1,0 +1,238 @@
+"""Attacks on the link: each was possible once, and beside each stands what must still work."""
+
+from __future__ import annotations
+
+import logging
+from pathlib import Path
+from typing import Any
+
+import pytest
+from pymavlink.dialects.v20 import ardupilotmega as mavlink
+
+from mavlink_bridge.config import BridgeConfig, RcGateConfig, SigningConfig
+from mavlink_bridge.injection.rc_gate import InjectionGate
+from mavlink_bridge.link.framing import FrameReader
+from mavlink_bridge.link.replay import ReplayWindow
+from mavlink_bridge.link.signing import create_key
+from tests.mavlink_bridge.simulated import HOME, METRE, Flight
+
+KEY = bytes(range(1, 33))
+COMMAND = mavlink.MAV_CMD_USER_1
+
+
+def origin_message(north_m: float) -> Any:
+    latitude = HOME[0] + north_m * METRE
+    return mavlink.MAVLink_gps_global_origin_message(
+        round(latitude * 1e7), round(HOME[1] * 1e7), 488_000, 0
+    )
+
+
+def heartbeat(*, armed: bool) -> Any:
+    return mavlink.MAVLink_heartbeat_message(2, 3, 81 | (128 if armed else 0), 4, 4, 3)
+
+
+# --- the origin -------------------------------------------------------------------------------
+
+
+def test_a_forged_origin_does_not_drag_the_positions(monkeypatch: pytest.MonkeyPatch) -> None:
+    flight = Flight(monkeypatch)
+    flight.run(12.0)
+    before = flight.end.origin.origin
+    assert before is not None
+    flight.say(heartbeat(armed=True))
+    for _ in range(5):
+        flight.say(origin_message(60.0))
+    assert flight.end.origin.origin == before
+    told = [text for text in flight.texts if "origin" in text and "refused" in text]
+    assert told == ["PiLoT: EKF origin off by 60 m in flight: refused"]
+    assert flight.end.counters["origins_refused"] == 5
+    start_ns = flight.now_ns
+    flight.run(2.0)
+    sent = flight.vision(start_ns)
+    assert sent
+    assert all(abs(message.x) < 1.0 for _, message in sent)
+
+
+def test_an_origin_that_moves_on_the_ground_or_with_a_reboot_is_followed(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    flight = Flight(monkeypatch)
+    flight.run(12.0)
+    flight.say(heartbeat(armed=False))
+    flight.say(origin_message(60.0))
+    moved = flight.end.origin.origin
+    assert moved is not None
+    assert moved.latitude_deg == pytest.approx(HOME[0] + 60.0 * METRE)
+    flight.say(heartbeat(armed=True))
+    flight.end.origin.forget()  # as a reboot does
+    flight.say(origin_message(0.0))
+    assert flight.end.origin.origin is not None
+    assert flight.end.counters["origins_refused"] == 0
+
+
+# --- orders -----------------------------------------------------------------------------------
+
+
+class Orders:
+    """A flight in mode rc, and commands of other systems to its components."""
+
+    def __init__(self, monkeypatch: pytest.MonkeyPatch, **options: Any) -> None:
+        self.gate = InjectionGate(RcGateConfig(), lambda _: None)
+        self.flight = Flight(monkeypatch, self.gate, **options)
+        self.flight.run(2.0)
+
+    def command(self, system: int, command: int, component: int) -> list[int]:
+        """The results that a COMMAND_LONG is answered with."""
+        codec = mavlink.MAVLink(None, system, 190)
+        message = mavlink.MAVLink_command_long_message(1, component, command, 0, 1.0, *[0.0] * 6)
+        before = len(self.flight.link.sent)
+        for decoded in self.flight.reader.feed(bytes(message.pack(codec))):
+            self.flight.end.on_message(self.flight.link, decoded, self.flight.now_ns)
+        sent = [m for _, m, _ in self.flight.link.sent[before:]]
+        return [m.result for m in sent if m.get_type() == "COMMAND_ACK"]
+
+
+@pytest.mark.parametrize(
+    ("command", "component"), [(COMMAND, 197), (mavlink.MAV_CMD_CAMERA_TRACK_POINT, 100)]
+)
+def test_orders_of_other_systems_are_denied_and_told_once(
+    monkeypatch: pytest.MonkeyPatch, command: int, component: int
+) -> None:
+    orders = Orders(monkeypatch)
+    for _ in range(3):
+        assert orders.command(66, command, component) == [mavlink.MAV_RESULT_DENIED]
+    assert not orders.gate.open
+    told = [text for text in orders.flight.texts if "refused" in text]
+    assert told == ["PiLoT: system 66 refused: not in ground_systems"]
+    assert orders.command(66, mavlink.MAV_CMD_REQUEST_MESSAGE, 100) != []  # a question
+
+
+def test_the_ground_stations_order_is_obeyed(monkeypatch: pytest.MonkeyPatch) -> None:
+    orders = Orders(monkeypatch)
+    assert orders.command(255, COMMAND, 197) == [mavlink.MAV_RESULT_ACCEPTED]
+    assert orders.gate.open
+    second = Orders(monkeypatch, ground_systems=(254, 66))
+    assert second.command(66, COMMAND, 197) == [mavlink.MAV_RESULT_ACCEPTED]
+
+
+def test_with_signing_an_unsigned_ground_link_gives_no_orders(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    from mavlink_bridge.components import Components
+
+    signing = SigningConfig(key_file=tmp_path / "key")
+    orders = Orders(monkeypatch, signing=signing, ground_connection="udpout:127.0.0.1:1")
+    orders.flight.end.components = Components(orders.flight.shared, ground=True)
+    assert orders.command(255, COMMAND, 197) == [mavlink.MAV_RESULT_DENIED]
+    assert "PiLoT: system 255 refused: link not signed" in orders.flight.texts
+    assert not orders.gate.open
+
+
+def test_state_files_of_two_links_differ(tmp_path: Path) -> None:
+    one = SigningConfig(key_file=tmp_path / "key", state_file=tmp_path / "seen")
+    with pytest.raises(ValueError, match="state_file each"):
+        BridgeConfig(signing=one, ground_signing=one)
+    shared = SigningConfig(key_file=tmp_path / "key")
+    BridgeConfig(signing=shared, ground_signing=shared)
+
+
+# --- signatures over restarts -----------------------------------------------------------------
+
+
+def signed(stamp: int, system: int = 255) -> bytes:
+    codec = mavlink.MAVLink(None, system, 190)
+    codec.signing.secret_key, codec.signing.sign_outgoing = KEY, True
+    codec.signing.timestamp, codec.signing.link_id = stamp, 1
+    message = mavlink.MAVLink_command_long_message(1, 197, COMMAND, 0, 1.0, *[0.0] * 6)
+    return bytes(message.pack(codec))
+
+
+class Process:
+    """One life of a signed link's reader."""
+
+    def __init__(self, path: Path) -> None:
+        self.window = ReplayWindow(path)
+        self.reader = FrameReader(None, KEY, self.window)
+
+    def takes(self, frame: bytes) -> bool:
+        return bool(self.reader.feed(frame))
+
+    def end(self) -> None:
+        self.window.close()
+
+
+@pytest.fixture
+def unset_clock(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("mavlink_bridge.link.signing.time.time", lambda: 0.0)
+
+
+STAMP = 1_000_000_000
+
+
+@pytest.mark.usefixtures("unset_clock")
+def test_a_recorded_order_is_refused_after_a_restart_though_the_clock_is_unset(
+    tmp_path: Path,
+) -> None:
+    path = tmp_path / "seen"
+    first = Process(path)
+    assert first.takes(signed(STAMP))
+    first.end()
+    assert path.stat().st_mode & 0o777 == 0o600
+    second = Process(path)
+    assert not second.takes(signed(STAMP))
+    assert not second.takes(signed(STAMP - 10_000_000, system=254)), (
+        "recorded when it was not heard"
+    )
+    assert second.takes(signed(STAMP + 300_000)), "3 s later: the station goes on"
+    second.end()
+
+
+@pytest.mark.usefixtures("unset_clock")
+def test_our_own_stamps_begin_beyond_all_that_was_seen(tmp_path: Path) -> None:
+    """So that an autopilot that does not know the time follows, and is heard at once."""
+    first = Process(tmp_path / "seen")
+    assert first.takes(signed(STAMP, system=1))
+    first.end()
+    second = Process(tmp_path / "seen")
+    assert second.reader.signing_timestamp > STAMP
+    assert second.takes(signed(second.reader.signing_timestamp + 1, system=1))
+    second.end()
+
+
+@pytest.mark.usefixtures("unset_clock")
+@pytest.mark.parametrize("content", ["", "[1]", '{"a": 1}', '{"1:2:3": null}', "\0\0"])
+def test_a_damaged_state_is_told_and_begun_anew(
+    tmp_path: Path, content: str, caplog: pytest.LogCaptureFixture
+) -> None:
+    path = tmp_path / "seen"
+    path.write_text(content)
+    with caplog.at_level(logging.WARNING):
+        process = Process(path)
+    assert "begun anew" in caplog.text
+    assert process.takes(signed(STAMP))
+    process.end()
+    again = Process(path)
+    assert not again.takes(signed(STAMP))
+    again.end()
+
+
+def test_a_place_that_cannot_be_written_is_told_and_the_link_goes_on(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    process = Process(tmp_path / "none" / "seen")
+    with caplog.at_level(logging.WARNING):
+        assert process.takes(signed(10**15))
+        process.end()
+    assert caplog.text.count("set signing.state_file") == 1
+
+
+def test_mavlink_1_is_refused_where_signing_is_on(tmp_path: Path) -> None:
+    from pymavlink.dialects.v10 import ardupilotmega as first
+
+    create_key(tmp_path / "key")
+    message = first.MAVLink_command_long_message(1, 197, COMMAND, 0, 1.0, *[0.0] * 6)
+    frame = bytes(message.pack(first.MAVLink(None, 255, 190)))
+    assert FrameReader().feed(frame), "it is one that would be taken without signing"
+    reader = FrameReader(None, KEY)
+    assert not reader.feed(frame)
+    assert reader.counters.unsigned == 1
