@@ -76,7 +76,7 @@ class Expectation(_Model):
 
     told_within_s: an EKF error beyond `beyond_m` is told (health worse than ok) at latest so long
     after it began. never_modes: flight modes that must not be entered. max_error_m: of the EKF.
-    false_fixes: accepted estimates further off than 5 m. ends_tracking: the last health is ok.
+    false_fixes: injected positions further off than 5 m. ends_tracking: the last health is ok.
     says: parts of texts that must come from the companion. silent: no warning text at all.
     """
 

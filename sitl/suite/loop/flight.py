@@ -15,11 +15,11 @@ import numpy as np
 import yaml
 
 from localizer.map.cache.cache import TileCache
+from mavlink_bridge.link.tlog import read_tlog
 from sitl.camera.gimbal_error import GimbalError
 from sitl.camera.pose_sender import truth_feed
 from sitl.camera.process import WorldCameraProcess
 from sitl.camera.traffic import traffic
-from sitl.demo.analysis import frame_errors, read_csv
 from sitl.demo.assets import FlightAssets
 from sitl.demo.companion_process import Ports, free_udp_port, running_companion, write_deployment
 from sitl.demo.flight import camera_config, home_of, vehicle_parameters
@@ -68,6 +68,7 @@ class _LoopFlight:
         self._waiting = list(case.timeline)
         self._due: list[tuple[float, Callable[[], None]]] = []
         self._starts = 0
+        self._tlog = out.resolve() / "flight.tlog"
         self._start_ns = 0
 
     def prepare(self) -> None:
@@ -120,8 +121,7 @@ class _LoopFlight:
             for t in self._pilot.texts
             if t.time_ns >= self._start_ns
         )
-        errors = self._fix_errors()
-        return LoopRecord(tuple(self._samples), texts, tuple(errors), len(errors))
+        return LoopRecord(tuple(self._samples), texts, tuple(self._fix_errors()))
 
     # --- before ----------------------------------------------------------------------------------
 
@@ -144,6 +144,7 @@ class _LoopFlight:
         for axis in ("fx", "fy"):
             settings["camera"]["model"][axis] *= case.wrong.focal
         settings["record"]["snapshot_interval_s"] = 5.0
+        settings["bridge"]["tlog"] = str(self._tlog)
         path.write_text(yaml.safe_dump(_merged(settings, case.deployment), sort_keys=False))
         return path
 
@@ -244,20 +245,21 @@ class _LoopFlight:
     # --- after -----------------------------------------------------------------------------------
 
     def _fix_errors(self) -> list[float]:
-        """3-D errors of accepted estimates of the recorded part, against the camera's truth."""
-        truth = read_csv(self._out / "frames.csv")
-        shift = np.array(self._case.wrong.map_shift_m)
-        errors: list[float] = []
-        for path in sorted(self._out.glob("companion*/estimates.csv")):
-            estimates = read_csv(path, text=("state", "status"))
-            if not len(estimates) or not len(truth):
+        """Horizontal errors of every position that was injected in the recorded part, metres."""
+        origin = self._pilot.origin
+        if origin is None or not self._tlog.exists():
+            return []
+        errors = []
+        for _, message in read_tlog(self._tlog):
+            if message.get_type() != "VISION_POSITION_ESTIMATE":
                 continue
-            span = (self._start_ns, self._end_ns)
-            seen = frame_errors(truth, estimates, span)
-            found = np.isfinite(seen.translation_m)
-            errors += [float(e) for e in seen.translation_m[found]]
-        # The frames' truth lies in the shifted map; what the autopilot is told is off by the shift.
-        return [math.hypot(e, float(np.linalg.norm(shift))) if shift.any() else e for e in errors]
+            time_ns = message.usec * 1000  # CLOCK_MONOTONIC, of the exposure
+            truth = self._pilot.truth_at(time_ns)
+            if truth is None or not self._start_ns <= time_ns <= self._end_ns:
+                continue
+            true = origin.ned_of(truth.location)
+            errors.append(math.hypot(message.x - true[0], message.y - true[1]))
+        return errors
 
 
 def _merged(base: dict[str, object], over: dict[str, object]) -> dict[str, object]:
