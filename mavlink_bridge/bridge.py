@@ -2,18 +2,13 @@
 
 from __future__ import annotations
 
-import logging
 import math
-import threading
-from collections import deque
 from collections.abc import Callable
 from functools import partial
 from typing import Any
 
-from pymavlink.dialects.v20 import ardupilotmega as mavlink
-
 from mavlink_bridge import quaternion as quat
-from mavlink_bridge.camera.cursor_on_target import cursor_on_target
+from mavlink_bridge.camera.cursor_on_target import CursorOnTarget
 from mavlink_bridge.components import COMMANDS_IN, Components
 from mavlink_bridge.config import BridgeConfig, SigningConfig
 from mavlink_bridge.errors import BridgeStateError
@@ -30,7 +25,6 @@ from mavlink_bridge.link.tlog import TlogRecorder
 from mavlink_bridge.link.transport import (
     Endpoint,
     Transport,
-    UdpTransport,
     open_transport,
     parse_sender,
 )
@@ -45,29 +39,22 @@ from mavlink_bridge.messages import (
     TrackRequest,
     VehicleState,
     VisionFix,
-    without_figures,
 )
 from mavlink_bridge.shared import Shared
+from mavlink_bridge.status import OperatorStatus
+from mavlink_bridge.texts import Teller
 from mavlink_bridge.vehicle.presence import VehicleWatch
 from mavlink_bridge.vehicle.tracker import VehicleTracker
 
-_log = logging.getLogger(__name__)
-
-_TEXTS = 64
-_TEXT_LENGTH = 50  # STATUSTEXT.text
-_SEVERITY = {
-    HealthLevel.STARTING: mavlink.MAV_SEVERITY_INFO,
-    HealthLevel.OK: mavlink.MAV_SEVERITY_INFO,
-    HealthLevel.DEGRADED: mavlink.MAV_SEVERITY_WARNING,
-    HealthLevel.FAILED: mavlink.MAV_SEVERITY_ERROR,
-}
-_MAX_CHUNKS = 4
 _GROUND_WANTED = frozenset(message_id(name) for name in ("HEARTBEAT", *COMMANDS_IN))
 _NEXT_STATION_S = 10.0  # a second ground station takes over where the first one fell silent
 
 
 class Bridge:
     """Speaks MAVLink for the localizer. Every public method may be called from any thread.
+
+    It has more than 15 public methods because it is the package's whole surface: each hands one
+    thing to, or asks one thing of, the part that does the work.
 
     on_track: called (in a link's thread; must return at once) when the operator asks for tracking.
     on_text: called likewise with every line for the operator (severity, text), for a record.
@@ -87,15 +74,13 @@ class Bridge:
         self._config = config
         self._started = self._stopped = False
         self._utc = SteadyUtc()
-        self._health_lock = threading.Lock()
-        self._text_lock = threading.Lock()
-        self._health = (HealthLevel.STARTING, "")
-        self._texts: deque[tuple[int, str]] = deque(maxlen=_TEXTS)
-        self._text_id = 0
-        self._on_text = on_text
+        self._status = OperatorStatus(self._tell, on_text)
+        teller = Teller(self.say)
         self._recorder = None
         if config.tlog is not None:
-            self._recorder = TlogRecorder(config.tlog, self._record_failed)
+            self._recorder = TlogRecorder(
+                config.tlog, lambda why: teller.warn(f"tlog is incomplete: {why}")
+            )
         self._tracker = VehicleTracker(
             config.system_id, _mount(config), config.camera.mount == "fixed"
         )
@@ -105,11 +90,11 @@ class Bridge:
             self._utc,
             self._tracker,
             monotonic_ns(),
-            lambda: self._health[0],
+            lambda: self._status.level,
             self.say,
             on_track,
             VehicleWatch(self.say),
-            InjectionGate(config.rc, self._gate_changed) if config.mode == "rc" else None,
+            InjectionGate(config.rc, teller.notice) if config.mode == "rc" else None,
         )
         self._fc = FlightControllerEnd(shared)
         make = partial(_make_link, config=config, recorder=self._recorder, opener=opener)
@@ -123,13 +108,10 @@ class Bridge:
             self._ground_link = make(
                 config.ground_connection, ground, "ground", _GROUND_WANTED, config.ground_signing
             )
-        self._cot = _cot_socket(config.targets.cot_endpoint)
-
-    @property
-    def _links(self) -> tuple[Link, ...]:
-        if self._ground_link is self._fc_link:
-            return (self._fc_link,)
-        return (self._fc_link, self._ground_link)
+        self._links = tuple(dict.fromkeys((self._fc_link, self._ground_link)))
+        self._cot = None
+        if config.targets.cot_endpoint:
+            self._cot = CursorOnTarget(config.targets, self._utc)
 
     # --- life -----------------------------------------------------------------------------------
 
@@ -173,10 +155,7 @@ class Bridge:
         """Report a target to the ground; never blocks."""
         self._to_ground(target)
         if self._cot is not None:
-            try:
-                self._cot.write(cursor_on_target(target, self._config.targets, self._utc))
-            except OSError as error:
-                _log.debug("Cursor-on-Target not sent: %s", error)
+            self._cot.send(target)
 
     def forget(self, target_id: int) -> None:
         """Tell the ground of that target no more; never blocks."""
@@ -199,28 +178,14 @@ class Bridge:
 
         tell: false for what the bridge tells by itself.
         """
-        with self._health_lock:
-            news = (level, without_figures(text)) != self._health
-            self._health = (level, without_figures(text))
-        if news and tell:
-            self.say(_SEVERITY[level], f"PiLoT: {text or level.value}")
+        self._status.set_health(level, text, tell=tell)
 
     def say(self, severity: int, text: str) -> None:
         """A line for the operator: STATUSTEXT on the ground side, and the log."""
-        self._texts.append((severity, text))
-        grave = severity <= mavlink.MAV_SEVERITY_WARNING
-        _log.log(logging.WARNING if grave else logging.INFO, text)
-        self._on_text(severity, text)
-        with self._text_lock:  # two threads' texts under one id would be mixed at the receiver
-            self._text_id = text_id = self._text_id % 0xFFFF + 1
-        for message in status_texts(severity, text, text_id):
-            self._ground_link.send(message, self._config.companion_component)
+        self._status.say(severity, text)
 
-    def _gate_changed(self, text: str) -> None:
-        self.say(mavlink.MAV_SEVERITY_NOTICE, f"PiLoT: {text}")
-
-    def _record_failed(self, why: str) -> None:
-        self.say(mavlink.MAV_SEVERITY_WARNING, f"PiLoT: tlog is incomplete: {why}")
+    def _tell(self, message: Any) -> None:
+        self._ground_link.send(message, self._config.companion_component)
 
     # --- out ------------------------------------------------------------------------------------
 
@@ -246,7 +211,7 @@ class Bridge:
 
     def texts(self) -> list[str]:
         """The last lines told to the operator, oldest first."""
-        return [text for _, text in list(self._texts)]
+        return self._status.texts()
 
     @property
     def port(self) -> int | None:
@@ -284,7 +249,7 @@ class Bridge:
 
     def waiting(self) -> dict[str, int]:
         """Messages and bytes that wait anywhere in the bridge, by where they do."""
-        result = {"texts": len(self._texts), **self._fc.waiting()}
+        result = {"texts": len(self._status.texts()), **self._fc.waiting()}
         if self._ground is not self._fc.components:
             result.update({f"ground {name}": n for name, n in self._ground.waiting().items()})
         for link in self._links:
@@ -322,21 +287,6 @@ def _make_link(
     )
 
 
-def status_texts(severity: int, text: str, text_id: int) -> list[Any]:
-    """STATUSTEXT (253) of a line, in chunks of 50 characters under one id where it is longer."""
-    raw = text.encode("ascii", "replace")[: _MAX_CHUNKS * _TEXT_LENGTH]
-    chunks = [raw[i : i + _TEXT_LENGTH] for i in range(0, max(len(raw), 1), _TEXT_LENGTH)]
-    if len(chunks) == 1:
-        return [mavlink.MAVLink_statustext_message(severity, raw)]
-    if len(chunks[-1]) == _TEXT_LENGTH:
-        # A receiver knows the end by a chunk that is not full.
-        chunks.append(b"")
-    return [
-        mavlink.MAVLink_statustext_message(severity, chunk, text_id, i)
-        for i, chunk in enumerate(chunks)
-    ]
-
-
 def _mount(config: BridgeConfig) -> quat.Quaternion:
     camera = config.camera
     return quat.from_euler(
@@ -344,10 +294,3 @@ def _mount(config: BridgeConfig) -> quat.Quaternion:
         math.radians(camera.mount_pitch_deg),
         math.radians(camera.mount_yaw_deg),
     )
-
-
-def _cot_socket(endpoint: str) -> UdpTransport | None:
-    if not endpoint:
-        return None
-    where = Endpoint.parse(f"udpout:{endpoint}")
-    return UdpTransport(None, (where.address, where.number))

@@ -2,16 +2,41 @@
 
 from __future__ import annotations
 
+import logging
 import math
 from datetime import datetime, timedelta, timezone
 from xml.etree import ElementTree
 
 from mavlink_bridge.config import TargetsConfig
 from mavlink_bridge.link.clock import SteadyUtc
+from mavlink_bridge.link.transport import Endpoint, UdpTransport
 from mavlink_bridge.messages import TargetReport
+
+_log = logging.getLogger(__name__)
 
 _COT_TYPE = "a-u-G"  # atom, unknown affiliation, ground
 _TOLD_ELSEWHERE = 0.05  # from here on a target's other surface is worth a remark
+
+
+class CursorOnTarget:
+    """Sends targets to `cot_endpoint` over a socket of its own. Any thread may call it."""
+
+    def __init__(self, config: TargetsConfig, utc: SteadyUtc) -> None:
+        self._config = config
+        self._utc = utc
+        where = Endpoint.parse(f"udpout:{config.cot_endpoint}")
+        self._socket = UdpTransport(None, (where.address, where.number))
+
+    def send(self, target: TargetReport) -> None:
+        """One event; what the network refuses is lost."""
+        try:
+            self._socket.write(cursor_on_target(target, self._config, self._utc))
+        except OSError as error:
+            _log.debug("Cursor-on-Target not sent: %s", error)
+
+    def close(self) -> None:
+        """Close the socket."""
+        self._socket.close()
 
 
 def cursor_on_target(report: TargetReport, config: TargetsConfig, utc: SteadyUtc) -> bytes:

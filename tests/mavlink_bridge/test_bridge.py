@@ -16,11 +16,11 @@ from pymavlink import mavutil
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from mavlink_bridge import Bridge, BridgeConfig, HealthLevel, TargetReport, TrackRequest, VisionFix
-from mavlink_bridge.bridge import status_texts
 from mavlink_bridge.config import InjectionConfig, OriginConfig, SigningConfig, TargetsConfig
 from mavlink_bridge.errors import BridgeStateError, FixError
 from mavlink_bridge.link.link import sleep_until
 from mavlink_bridge.link.signing import create_key
+from mavlink_bridge.status import status_texts
 
 HOME = (47.397742, 8.545594)
 GEOID = 47.0

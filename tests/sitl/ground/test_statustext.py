@@ -2,7 +2,7 @@
 
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
-from mavlink_bridge.bridge import status_texts
+from mavlink_bridge.status import status_texts
 from sitl.ground.statustext import TextLog
 
 LONG = "not sent: vision yaw differs from the autopilot's by +5.1 deg, and this line goes on"

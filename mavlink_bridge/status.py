@@ -1,0 +1,84 @@
+"""The lines for the operator and the localizer's health, as they go to the ground side."""
+
+from __future__ import annotations
+
+import logging
+import threading
+from collections import deque
+from collections.abc import Callable
+from typing import Any
+
+from pymavlink.dialects.v20 import ardupilotmega as mavlink
+
+from mavlink_bridge.messages import HealthLevel, without_figures
+
+_log = logging.getLogger(__name__)
+
+_TEXTS = 64
+_TEXT_LENGTH = 50  # STATUSTEXT.text
+_MAX_CHUNKS = 4
+_SEVERITY = {
+    HealthLevel.STARTING: mavlink.MAV_SEVERITY_INFO,
+    HealthLevel.OK: mavlink.MAV_SEVERITY_INFO,
+    HealthLevel.DEGRADED: mavlink.MAV_SEVERITY_WARNING,
+    HealthLevel.FAILED: mavlink.MAV_SEVERITY_ERROR,
+}
+
+
+class OperatorStatus:
+    """Tells the operator. Every method may be called from any thread.
+
+    send: a message to the ground; on_text: every line (severity, text), for a record.
+    """
+
+    def __init__(self, send: Callable[[Any], None], on_text: Callable[[int, str], None]) -> None:
+        self._send = send
+        self._on_text = on_text
+        self._health_lock = threading.Lock()
+        self._text_lock = threading.Lock()
+        self._health = (HealthLevel.STARTING, "")
+        self._texts: deque[tuple[int, str]] = deque(maxlen=_TEXTS)
+        self._text_id = 0
+
+    @property
+    def level(self) -> HealthLevel:
+        """The localizer's health, as the heartbeats tell it."""
+        return self._health[0]
+
+    def set_health(self, level: HealthLevel, text: str, *, tell: bool) -> None:
+        """A change of level or text (but for its figures) is told once, if at all."""
+        with self._health_lock:
+            news = (level, without_figures(text)) != self._health
+            self._health = (level, without_figures(text))
+        if news and tell:
+            self.say(_SEVERITY[level], f"PiLoT: {text or level.value}")
+
+    def say(self, severity: int, text: str) -> None:
+        """STATUSTEXT, and the log."""
+        self._texts.append((severity, text))
+        grave = severity <= mavlink.MAV_SEVERITY_WARNING
+        _log.log(logging.WARNING if grave else logging.INFO, text)
+        self._on_text(severity, text)
+        with self._text_lock:  # two threads' texts under one id would be mixed at the receiver
+            self._text_id = text_id = self._text_id % 0xFFFF + 1
+        for message in status_texts(severity, text, text_id):
+            self._send(message)
+
+    def texts(self) -> list[str]:
+        """The last lines, oldest first."""
+        return [text for _, text in list(self._texts)]
+
+
+def status_texts(severity: int, text: str, text_id: int) -> list[Any]:
+    """STATUSTEXT (253) of a line, in chunks of 50 characters under one id where it is longer."""
+    raw = text.encode("ascii", "replace")[: _MAX_CHUNKS * _TEXT_LENGTH]
+    chunks = [raw[i : i + _TEXT_LENGTH] for i in range(0, max(len(raw), 1), _TEXT_LENGTH)]
+    if len(chunks) == 1:
+        return [mavlink.MAVLink_statustext_message(severity, raw)]
+    if len(chunks[-1]) == _TEXT_LENGTH:
+        # A receiver knows the end by a chunk that is not full.
+        chunks.append(b"")
+    return [
+        mavlink.MAVLink_statustext_message(severity, chunk, text_id, i)
+        for i, chunk in enumerate(chunks)
+    ]
