@@ -135,6 +135,11 @@ class CompanionConfig(_Model):
     """One deployment."""
 
     map: Path = Field(description="tile cache made by `companion map build`")
+    map_sha256: str | None = Field(
+        None,
+        pattern=r"^[0-9a-fA-F]{64}$",
+        description="of the map's manifest, printed by `companion map verify`; null: any map",
+    )
     camera: FeedConfig
     localizer: LocalizerConfig = LocalizerConfig()
     bridge: BridgeConfig = BridgeConfig()

@@ -189,6 +189,7 @@ def verify(cache: CachePath) -> None:
     Holes may be in the source, as under a bridge's parapet or at a ragged edge: they are listed,
     and do not count as damage.
     """
+    from companion.preflight.map_pin import map_hash
     from localizer.map.cache.cache import TileCache
     from localizer.map.inspection.inspect import verify as check
 
@@ -205,6 +206,7 @@ def verify(cache: CachePath) -> None:
         f"{result.tiles - len(result.damaged)} of {result.tiles} tiles intact, "
         f"{len(result.holes)} holes, {result.covered_m2 / 1e6:.3f} km² covered"
     )
+    console.print(f"map_sha256: {map_hash(cache)}", soft_wrap=True)
     if not result.ok:
         raise typer.Exit(1)
 

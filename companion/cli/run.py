@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import signal
 from pathlib import Path
 from typing import Annotated
@@ -14,6 +15,9 @@ from companion.config import load_config
 from localizer.registration.devices import DeviceChoice
 from localizer.render.select import RendererName
 
+# Records (positions, pictures, the deployment's settings) are for their owner and group: files
+# 0640, folders 0750.
+_UMASK = 0o027
 ENDING = (signal.SIGINT, signal.SIGTERM)
 
 
@@ -32,6 +36,7 @@ def run_command(
     for number in ENDING:
         signal.signal(number, end_at_once)
     settings = load_config(config)
+    os.umask(_UMASK)
     given = {"renderer": renderer, "device": device}
     changes = {key: value for key, value in given.items() if value is not None}
     localizer = settings.localizer.model_copy(update=changes)

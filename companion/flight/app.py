@@ -17,6 +17,7 @@ from companion.config import CompanionConfig
 from companion.flight.feed import Feed
 from companion.flight.parts import Assembly, Part
 from companion.flight.table import PARTS
+from companion.redaction import redacted
 from localizer.tracking.opening import MapStack
 
 _log = logging.getLogger(__name__)
@@ -78,7 +79,7 @@ class Companion:
 
     def _tell_what_runs(self) -> None:
         events = self._parts.channels.events
-        events.send("info", f"map {self._config.map}, feed {self._config.camera.source}")
+        events.send("info", f"map {self._config.map}, feed {redacted(self._config.camera.source)}")
         events.send("info", f"renderer {self._parts[MapStack].renderer.name}")
 
 

@@ -18,6 +18,7 @@ import numpy as np
 
 from companion.config import CompanionConfig, RecordConfig
 from companion.errors import DiskFaultError, ReportError
+from companion.redaction import redacted
 from companion.sources.timing import system_minus_monotonic
 from companion.versions import versions
 from localizer.geometry.geo import LocalFrame
@@ -84,12 +85,18 @@ def write_manifest(folder: Path, config: CompanionConfig) -> None:
         "monotonic_ns": monotonic_ns,
         "utc_ns": monotonic_ns + system_minus_monotonic(),
         "versions": versions(),
-        "config": config.model_dump(mode="json"),
+        "config": _without_credentials(config.model_dump(mode="json")),
     }
     try:
         (folder / MANIFEST_NAME).write_text(json.dumps(document, indent=1), encoding="utf-8")
     except OSError as error:
         raise _unwritable(folder, error) from error
+
+
+def _without_credentials(value: Any) -> Any:
+    if isinstance(value, dict):
+        return {key: _without_credentials(item) for key, item in value.items()}
+    return redacted(value) if isinstance(value, str) else value
 
 
 def _unwritable(folder: Path, error: OSError) -> ReportError:

@@ -26,6 +26,7 @@ from companion.flight.view_reporter import ViewReporter
 from companion.guardian.guardian import Guardian
 from companion.guardian.monitor import Limits
 from companion.preflight.coverage import check_origin
+from companion.preflight.map_pin import require_pinned
 from companion.sources import FrameSource, StreamState, open_source
 from companion.targets.clicks import ClickPolicy
 from companion.targets.detections import DetectionListener
@@ -46,6 +47,7 @@ _BAD_FEED = (StreamState.STALLED, StreamState.FAILED, StreamState.SCALED, Stream
 
 def _map(making: Making) -> MapStack:
     config = making.config
+    require_pinned(config.map, config.map_sha256)
     stack = MapStack(config.map, config.localizer)
     try:
         _require_origin_at_map(config, stack.cache)

@@ -10,6 +10,8 @@ from companion.config import CompanionConfig
 from companion.errors import CompanionError
 from companion.preflight.coverage import check_mission, check_origin
 from companion.preflight.heights import check_heights
+from companion.preflight.map_pin import require_pinned
+from companion.redaction import redacted
 from companion.sources import SourceSettings, open_source
 from localizer.errors import LocalizerError
 from localizer.features.extractor import load_extractor
@@ -45,7 +47,8 @@ def examine_deployment(config: CompanionConfig, *, vehicle: bool = True) -> Diag
 def _check_map(config: CompanionConfig) -> tuple[TileCache | None, list[Finding]]:
     try:
         cache = TileCache.open(config.map)
-    except LocalizerError as error:
+        require_pinned(config.map, config.map_sha256)
+    except (CompanionError, LocalizerError) as error:
         return None, [_failed("map", "unreadable", "a tile cache", str(error))]
     m = cache.manifest
     origin = m.origin
@@ -114,7 +117,8 @@ def _check_camera(config: CompanionConfig) -> Finding:
         timer.cancel()
         source.close()
     if len(times) < 2:
-        why = f"nothing arrived from {feed.source} in {_FEED_S:.0f} s: is the stream running?"
+        where = redacted(feed.source)
+        why = f"nothing arrived from {where} in {_FEED_S:.0f} s: is the stream running?"
         return _failed("camera", "silent", "pictures", why)
     rate = (len(times) - 1) / max((times[-1] - times[0]) * 1e-9, 1e-9)
     found = f"{seen.width}x{seen.height}, {rate:.1f} Hz"

@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 import threading
 import time
+import traceback
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -14,6 +15,7 @@ import numpy as np
 from av.sidedata.sidedata import Type as SideDataType
 
 from companion.errors import StreamDecodeError, StreamError, StreamOpenError, StreamSizeError
+from companion.redaction import redacted
 from companion.sources.base import (
     SourceCounters,
     SourceSettings,
@@ -227,7 +229,7 @@ class LiveVideoSource:
         on_state: StateCallback | None = None,
         on_stranger: Callable[[str], None] | None = None,
     ) -> None:
-        self._location = location
+        self._location = redacted(location)
         self._camera = camera
         self._settings = settings or SourceSettings()
         self._on_stranger = on_stranger
@@ -312,14 +314,15 @@ class LiveVideoSource:
                 connections += 1
             except StreamError as error:
                 self._report(StreamState.FAILED, str(error))
-                self._newest.close(error)
+                self._newest.close(type(error)(redacted(str(error))))
                 return
             except (av.error.ExitError, SilentSenderError):  # the open time-out
                 reason = f"nothing came within {_OPEN_TIMEOUT_S:g} s; is the camera sending there?"
             except (av.error.FFmpegError, OSError) as error:
                 reason = f"cannot connect: {error}"
             except Exception as error:  # whatever a stream may contain, the next try may be well
-                _log.exception("%s: unexpected error", self._location)
+                trace = redacted(traceback.format_exc())
+                _log.error("%s: unexpected error\n%s", self._location, trace)
                 reason = f"unexpected {type(error).__name__}: {error}"
             if self._closing.is_set():
                 return
@@ -410,7 +413,7 @@ class LiveVideoSource:
     def _report(self, state: StreamState, text: str) -> None:
         self._state = state
         if self._on_state is not None:
-            self._on_state(state, text)
+            self._on_state(state, redacted(text))  # FFmpeg's own errors name the whole address
 
 
 def live_input(
