@@ -62,9 +62,9 @@ def truth_feed(
 
 def _truth_sample(pilot: Pilot, cache: TileCache) -> TruthSample | None:
     """The newest instant at which both the vehicle and its gimbal (as it reports) are known."""
-    newest = pilot.newest_common_ns()
-    truth = pilot.truth_at(newest) if newest else None
-    gimbal = pilot.gimbal_at(newest) if newest else None
+    newest = pilot.record.newest_common_ns()
+    truth = pilot.record.truth_at(newest) if newest else None
+    gimbal = pilot.record.gimbal_at(newest) if newest else None
     if truth is None or gimbal is None:
         return None
     roll, pitch, yaw = gimbal.roll_pitch_yaw

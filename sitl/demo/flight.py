@@ -93,7 +93,7 @@ def fly(
         denied_ns = run.fly()
         home_error_m = run.distance_from_home()
         camera.stop()
-        texts = tuple(t.text for t in pilot.texts)
+        texts = tuple(t.text for t in pilot.record.texts)
         write_vehicle_csv(folder / "vehicle.csv", pilot, cache)
     if camera.statistics is None:
         raise FlightError("the world camera left no statistics")
@@ -157,7 +157,7 @@ def write_vehicle_csv(path: Path, pilot: Pilot, cache: TileCache) -> None:
         writer = csv.writer(file)
         names = ("east_m", "north_m", "up_m")
         writer.writerow(("time_ns", *names, *(f"ekf_{n}" for n in names)))
-        for sample, true in pilot.ekf_pairs():
+        for sample, true in pilot.record.ekf_pairs():
             if sample.location is not None:
                 values = (*enu(true, cache), *enu(sample.location, cache))
                 writer.writerow((sample.time_ns, *(f"{v:.4f}" for v in values)))

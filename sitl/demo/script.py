@@ -54,16 +54,16 @@ class FlightScript:
         self._progress("starting the companion", 0.0)
         self._await_companion()
         steps = mission(scenario, self._home)
-        pilot.upload_mission(steps)
+        pilot.missions.upload(steps)
         pilot.point_gimbal(scenario.legs[0].gimbal_pitch_deg, 0.0)
         self._progress("taking off on GNSS", 0.05)
         pilot.set_mode("GUIDED")
         pilot.arm()
         pilot.takeoff(scenario.takeoff_height_m)
-        at_height_s = pilot.time_s
+        at_height_s = pilot.record.time_s
         self._progress("waiting for the localizer to track", 0.15)
-        pilot.wait(self._tracking, _TRACKING_TIMEOUT_S, "the localizer to track")
-        pilot.sleep(max(0.0, scenario.deny_after_s - (pilot.time_s - at_height_s)))
+        pilot.link.wait(self._tracking, _TRACKING_TIMEOUT_S, "the localizer to track")
+        pilot.link.sleep(max(0.0, scenario.deny_after_s - (pilot.record.time_s - at_height_s)))
         self._require_companion()
         self._deny()
         begin_ns = time.monotonic_ns()
@@ -73,7 +73,7 @@ class FlightScript:
 
     def distance_from_home(self) -> float:
         """How far, horizontally and in truth, the vehicle is from where it took off."""
-        north, east, _ = self._home.ned_of(self._pilot.truth.location)
+        north, east, _ = self._home.ned_of(self._pilot.record.truth.location)
         return float(np.hypot(north, east))
 
     def _deny(self) -> None:
@@ -86,21 +86,21 @@ class FlightScript:
         legs = self._scenario.legs
         length = _mission_length(self._scenario)
         limit = length / self._scenario.speed_m_s * 1.5 + _LEG_MARGIN_S
-        started = self._pilot.time_s
-        while last_item not in self._pilot.reached:
+        started = self._pilot.record.time_s
+        while last_item not in self._pilot.record.reached:
             self._require_companion()
-            if self._pilot.mode != "AUTO":
+            if self._pilot.record.mode != "AUTO":
                 raise FlightError(
-                    f"the vehicle left AUTO for {self._pilot.mode}: "
-                    + "; ".join(t.text for t in self._pilot.texts[-4:])
+                    f"the vehicle left AUTO for {self._pilot.record.mode}: "
+                    + "; ".join(t.text for t in self._pilot.record.texts[-4:])
                 )
-            elapsed = self._pilot.time_s - started
+            elapsed = self._pilot.record.time_s - started
             if elapsed > limit:
                 raise FlightError(f"the mission took longer than {limit:.0f} s")
             share = min(0.2 + 0.8 * elapsed * self._scenario.speed_m_s / length / 1.15, 0.99)
-            done = sum(1 for item in self._pilot.reached if item > 1)
+            done = sum(1 for item in self._pilot.record.reached if item > 1)
             self._progress(f"GNSS denied: waypoint {min(done + 1, len(legs))}/{len(legs)}", share)
-            self._pilot.sleep(0.5)
+            self._pilot.link.sleep(0.5)
         self._progress("returned on vision alone", 1.0)
 
     def _await_companion(self) -> None:

@@ -8,22 +8,18 @@ from __future__ import annotations
 
 import contextlib
 import queue
-import select
-import socket
 import threading
 import time
-from collections.abc import Callable, Iterator
-from types import TracebackType
-from typing import Any, TypeVar
+from collections.abc import Callable
+from typing import Any
 
-from pymavlink import mavutil
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from sitl.errors import PilotError
-from sitl.ground.vehicle_record import VehicleRecord
+from sitl.ground.answers import Answers
+from sitl.ground.connection import Connection
+from sitl.ground.vehicle_record import AUTOPILOT, VEHICLE, VehicleRecord
 
-SYSTEM, COMPONENT = 255, 190  # of the ground station
-VEHICLE, AUTOPILOT = 1, 1
 _HEARTBEAT_S = 0.5  # wall time
 _STREAMS = {  # message id -> Hz
     mavlink.MAVLINK_MSG_ID_ATTITUDE: 50.0,
@@ -41,12 +37,11 @@ _WALL_MARGIN_S = 30.0
 _REPEAT_S = 1.5
 _TRIES = 80
 
-_Self = TypeVar("_Self", bound="GroundLink")
 
+class GroundLink:
+    """A link to a vehicle at a MAVLink endpoint ("tcp:127.0.0.1:5760"), and the record of it.
 
-class GroundLink(VehicleRecord):
-    """A connection to a vehicle at a MAVLink endpoint ("tcp:127.0.0.1:5760").
-
+    answers: what the autopilot sends, for who waits for it.
     Seconds are simulated seconds, unless they are said to be wall time.
     speedup: simulated seconds per real second, as the vehicle was started.
     alive: asked while waiting; it raises when the vehicle has died (`VehicleProcess.check`).
@@ -58,10 +53,10 @@ class GroundLink(VehicleRecord):
         speedup: float = 1.0,
         alive: Callable[[], None] = lambda: None,
     ) -> None:
-        super().__init__(speedup)
-        self._endpoint, self._speedup, self._alive = endpoint, speedup, alive
-        self._link: Any = None
-        self._send_lock = threading.Lock()
+        self.record = VehicleRecord(speedup)
+        self.speedup = speedup
+        self._connection, self._alive = Connection(endpoint), alive
+        self.answers = Answers()
         self._changed = threading.Condition()
         self._stop = threading.Event()
         self._thread: threading.Thread | None = None
@@ -71,63 +66,36 @@ class GroundLink(VehicleRecord):
     def connect(self, timeout_s: float = 90.0) -> None:
         """Connect, wait for the autopilot's heartbeat and ask for its streams."""
         deadline = time.monotonic() + timeout_s
-        while self._link is None:
-            self._alive()
-            try:
-                self._link = mavutil.mavlink_connection(
-                    self._endpoint,
-                    source_system=SYSTEM,
-                    source_component=COMPONENT,
-                    dialect="ardupilotmega",
-                    retries=0,
-                    robust_parsing=True,
-                )
-            except OSError as error:
-                if time.monotonic() > deadline:
-                    raise PilotError(
-                        f"no vehicle listens at {self._endpoint}: {error}; is it started?"
-                    ) from error
-                time.sleep(0.1)
+        self._connection.open(deadline, self._alive)
         self._thread = threading.Thread(target=self._read, name="pilot", daemon=True)
         self._thread.start()
-        if not self._wait_wall(lambda: self.mode is not None, deadline - time.monotonic()):
-            raise PilotError(f"no autopilot heartbeat at {self._endpoint} in {timeout_s:g} s")
+        if not self.wait_wall(lambda: self.record.mode is not None, deadline - time.monotonic()):
+            raise PilotError(
+                f"no autopilot heartbeat at {self._connection.endpoint} in {timeout_s:g} s"
+            )
         for message_id, hertz in _STREAMS.items():
             self._request_stream(message_id, hertz)
-        self.wait(lambda: "SIM_STATE" in self.latest, 20.0, "the vehicle's true state (SIM_STATE)")
+        self.wait(
+            lambda: "SIM_STATE" in self.record.latest, 20.0, "the vehicle's true state (SIM_STATE)"
+        )
 
     def close(self) -> None:
         """Stop reading and disconnect."""
         self._stop.set()
-        if self._link is not None:
-            with contextlib.suppress(OSError):  # the vehicle may have closed it
-                self._link.port.shutdown(socket.SHUT_RDWR)  # ends what the thread waits for
+        self._connection.shut_down()
         if self._thread is not None:
             self._thread.join()
-        if self._link is not None:
-            self._link.close()
-
-    def __enter__(self: _Self) -> _Self:
-        self.connect()
-        return self
-
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        traceback: TracebackType | None,
-    ) -> None:
-        self.close()
+        self._connection.close()
 
     # --- waiting -----------------------------------------------------------------------------
 
     def wait(self, condition: Callable[[], bool], timeout_s: float, what: str) -> None:
         """Block until a condition holds; PilotError after timeout_s simulated seconds."""
         if not self._wait(condition, timeout_s):
-            texts = "; ".join(t.text for t in self.texts[-4:])
+            texts = "; ".join(t.text for t in self.record.texts[-4:])
             raise PilotError(
-                f"waited {timeout_s:g} s in vain for {what} (mode {self.mode}, "
-                f"{'armed' if self.armed else 'disarmed'}, last texts: {texts})"
+                f"waited {timeout_s:g} s in vain for {what} (mode {self.record.mode}, "
+                f"{'armed' if self.record.armed else 'disarmed'}, last texts: {texts})"
             )
 
     def sleep(self, seconds: float) -> None:
@@ -135,11 +103,11 @@ class GroundLink(VehicleRecord):
         self._wait(lambda: False, seconds)
 
     def _wait(self, condition: Callable[[], bool], timeout_s: float) -> bool:
-        start, wall = self.time_s, time.monotonic()
-        limit = _WALL_MARGIN_S + 4.0 * timeout_s / min(self._speedup, 1.0)
+        start, wall = self.record.time_s, time.monotonic()
+        limit = _WALL_MARGIN_S + 4.0 * timeout_s / min(self.speedup, 1.0)
         while not condition():
             self._alive()
-            if self.time_s - start >= timeout_s and start > 0:
+            if self.record.time_s - start >= timeout_s and start > 0:
                 return condition()
             if time.monotonic() - wall > limit:
                 return False
@@ -147,7 +115,8 @@ class GroundLink(VehicleRecord):
                 self._changed.wait(0.05)
         return True
 
-    def _wait_wall(self, condition: Callable[[], bool], timeout_s: float) -> bool:
+    def wait_wall(self, condition: Callable[[], bool], timeout_s: float) -> bool:
+        """Block until a condition holds; False after timeout_s seconds of wall time."""
         deadline = time.monotonic() + timeout_s
         while not condition():
             self._alive()
@@ -161,9 +130,9 @@ class GroundLink(VehicleRecord):
 
     def set_parameter(self, name: str, value: float) -> None:
         """Set a parameter and wait until the vehicle confirms it."""
-        with self._expect("PARAM_VALUE") as box:
+        with self.answers.expect("PARAM_VALUE") as box:
             for _ in range(_TRIES):
-                self._send(
+                self.send(
                     mavlink.MAVLink_param_set_message(
                         VEHICLE, AUTOPILOT, name.encode(), value, mavlink.MAV_PARAM_TYPE_REAL32
                     )
@@ -174,9 +143,9 @@ class GroundLink(VehicleRecord):
 
     def parameter(self, name: str, tries: int = _TRIES) -> float:
         """Read a parameter, asking so many times: a vehicle does not answer for one it lacks."""
-        with self._expect("PARAM_VALUE") as box:
+        with self.answers.expect("PARAM_VALUE") as box:
             for _ in range(tries):
-                self._send(
+                self.send(
                     mavlink.MAVLink_param_request_read_message(
                         VEHICLE, AUTOPILOT, name.encode(), -1
                     )
@@ -201,10 +170,11 @@ class GroundLink(VehicleRecord):
                     return message
         return None
 
-    def _set_speed(self, speedup: float) -> None:
+    def set_speed(self, speedup: float) -> None:
+        """Run simulated time at another speed (SIM_SPEEDUP)."""
         self.set_parameter("SIM_SPEEDUP", speedup)
-        self._speedup = speedup
-        self._clock.restart(speedup)
+        self.speedup = speedup
+        self.record.restart_clock(speedup)
 
     # --- commands ----------------------------------------------------------------------------
 
@@ -213,15 +183,15 @@ class GroundLink(VehicleRecord):
         started = time.monotonic_ns()
         result = self.try_command(number, *parameters)
         if result != mavlink.MAV_RESULT_ACCEPTED:
-            texts = "; ".join(t.text for t in self.texts if t.time_ns > started)
+            texts = "; ".join(t.text for t in self.record.texts if t.time_ns > started)
             raise PilotError(f"command {number} was refused (MAV_RESULT {result}): {texts}")
 
     def try_command(self, number: int, *parameters: float) -> int | None:
         """COMMAND_LONG; its MAV_RESULT, or None without an answer."""
         filled = [*parameters, *([0.0] * (7 - len(parameters)))]
-        with self._expect("COMMAND_ACK") as box:
+        with self.answers.expect("COMMAND_ACK") as box:
             for attempt in range(_TRIES):
-                self._send(
+                self.send(
                     mavlink.MAVLink_command_long_message(
                         VEHICLE, AUTOPILOT, number, attempt, *filled
                     )
@@ -234,27 +204,17 @@ class GroundLink(VehicleRecord):
     def _request_stream(self, message_id: int, hertz: float) -> None:
         self.command(mavlink.MAV_CMD_SET_MESSAGE_INTERVAL, message_id, 1e6 / hertz)
 
-    @contextlib.contextmanager
-    def _expect(self, *kinds: str) -> Iterator[queue.SimpleQueue[Any]]:
-        """A box that receives the autopilot's messages of some kinds from now on."""
-        box: queue.SimpleQueue[Any] = queue.SimpleQueue()
-        entry = (frozenset(kinds), box)
-        self._boxes = [*self._boxes, entry]
-        try:
-            yield box
-        finally:
-            self._boxes = [e for e in self._boxes if e is not entry]
-
-    def _next(self, box: queue.SimpleQueue[Any], what: str) -> Any:
+    def next_of(self, box: queue.SimpleQueue[Any], what: str) -> Any:
+        """The next message in a box of `answers`; PilotError where none comes during `what`."""
         try:
             return box.get(timeout=_TRIES * _REPEAT_S)
         except queue.Empty:
             self._alive()
             raise PilotError(f"the vehicle was silent during {what}") from None
 
-    def _send(self, message: Any) -> None:
-        with self._send_lock:
-            self._link.mav.send(message)
+    def send(self, message: Any) -> None:
+        """Send one message."""
+        self._connection.send(message)
 
     # --- the reading thread ------------------------------------------------------------------
 
@@ -264,36 +224,16 @@ class GroundLink(VehicleRecord):
             now = time.monotonic()
             if now >= next_heartbeat:
                 next_heartbeat = now + _HEARTBEAT_S
-                self._beat()
+                self._connection.beat()
             try:
-                messages = self._receive()
+                messages = self._connection.receive()
             except OSError:  # the socket is being closed, or the vehicle died
                 if not self._stop.is_set():
                     time.sleep(0.05)
                 continue
             for message in messages:
-                self._take(message, time.monotonic_ns())
+                self.record.take(message, time.monotonic_ns())
+                self.answers.take(message)
             if messages:
                 with self._changed:
                     self._changed.notify_all()
-
-    def _receive(self) -> list[Any]:
-        """What has come, after waiting for up to 0.1 s."""
-        port = self._link.port
-        if port.fileno() < 0 or not select.select([port], [], [], 0.1)[0]:
-            return []
-        if not port.recv(1, socket.MSG_PEEK):
-            time.sleep(0.05)  # closed by the vehicle; pymavlink would report that in a tight loop
-            return []
-        messages = []
-        while (message := self._link.recv_msg()) is not None:
-            messages.append(message)
-        return messages
-
-    def _beat(self) -> None:
-        with contextlib.suppress(OSError):
-            self._send(
-                mavlink.MAVLink_heartbeat_message(
-                    mavlink.MAV_TYPE_GCS, mavlink.MAV_AUTOPILOT_INVALID, 0, 0, 4, 3
-                )
-            )

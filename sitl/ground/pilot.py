@@ -9,44 +9,63 @@ from __future__ import annotations
 import contextlib
 import math
 import time
-from collections.abc import Iterator, Sequence
-from typing import Any
+from collections.abc import Callable, Iterator
 
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from sitl.errors import PilotError
 from sitl.geodesy import Location
-from sitl.ground.link import AUTOPILOT, VEHICLE, GroundLink
-from sitl.ground.mission_steps import MissionStep
-from sitl.ground.vehicle_record import MODES
+from sitl.ground.link import GroundLink
+from sitl.ground.mission_client import MissionClient
+from sitl.ground.vehicle_record import AUTOPILOT, MODES, VEHICLE
 
 _GUIDED_POSITION = 0xDF8  # position only
 _GIMBAL_YAW_LOCK = 16.0
 _SHOWN_S = 30.0  # simulated, until the next heartbeat shows what was accepted
 
 
-class Pilot(GroundLink):
-    """Flies a vehicle."""
+class Pilot:
+    """Flies a vehicle: `link` asks it, `record` is what it said, `missions` its stored mission.
+
+    The arguments are those of `GroundLink`; as a context it is connected.
+    """
+
+    def __init__(
+        self,
+        endpoint: str,
+        speedup: float = 1.0,
+        alive: Callable[[], None] = lambda: None,
+    ) -> None:
+        self.link = GroundLink(endpoint, speedup, alive)
+        self.record = self.link.record
+        self.missions = MissionClient(self.link)
+
+    def __enter__(self) -> Pilot:
+        self.link.connect()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.link.close()
 
     # --- flying ------------------------------------------------------------------------------
 
     @contextlib.contextmanager
     def fast_forward(self, speedup: float = 10.0) -> Iterator[None]:
         """Run simulated time faster for a while (SIM_SPEEDUP), as for waiting on the ground."""
-        normal = self._speedup
-        self._set_speed(speedup)
+        normal = self.link.speedup
+        self.link.set_speed(speedup)
         try:
             yield
         finally:
-            self._set_speed(normal)
+            self.link.set_speed(normal)
 
     def wait_ready(self, timeout_s: float = 120.0) -> None:
         """Wait until the EKF has a position and the vehicle would arm in GUIDED."""
-        self.wait(self._has_position, timeout_s, "an EKF position")
+        self.link.wait(self._has_position, timeout_s, "an EKF position")
         self.set_mode("GUIDED")
         bit = mavlink.MAV_SYS_STATUS_PREARM_CHECK
-        self.wait(
-            lambda: bool(self.latest["SYS_STATUS"].onboard_control_sensors_health & bit),
+        self.link.wait(
+            lambda: bool(self.record.latest["SYS_STATUS"].onboard_control_sensors_health & bit),
             timeout_s,
             "the pre-arm checks",
         )
@@ -54,46 +73,51 @@ class Pilot(GroundLink):
 
     def _has_position(self) -> bool:
         wanted = mavlink.ESTIMATOR_POS_HORIZ_ABS | mavlink.ESTIMATOR_POS_HORIZ_REL
-        return bool(self._flags & wanted) and not self._flags & mavlink.ESTIMATOR_CONST_POS_MODE
+        return (
+            bool(self.record.ekf_flags & wanted)
+            and not self.record.ekf_flags & mavlink.ESTIMATOR_CONST_POS_MODE
+        )
 
     def set_mode(self, name: str) -> None:
         """Change mode and wait until the heartbeat says so."""
-        self.command(mavlink.MAV_CMD_DO_SET_MODE, 1, MODES[name])
-        self.wait(lambda: self.mode == name, _SHOWN_S, f"mode {name}")
+        self.link.command(mavlink.MAV_CMD_DO_SET_MODE, 1, MODES[name])
+        self.link.wait(lambda: self.record.mode == name, _SHOWN_S, f"mode {name}")
 
     def arm(self, timeout_s: float = 60.0) -> None:
         """Arm, asking again until the checks pass; PilotError with the refusals otherwise."""
-        start_s, start_ns = self.time_s, time.monotonic_ns()
+        start_s, start_ns = self.record.time_s, time.monotonic_ns()
         while True:
-            if self.try_command(mavlink.MAV_CMD_COMPONENT_ARM_DISARM, 1) == 0:
+            if self.link.try_command(mavlink.MAV_CMD_COMPONENT_ARM_DISARM, 1) == 0:
                 break
-            if self.time_s - start_s > timeout_s:
-                reasons = {t.text for t in self.texts if t.time_ns > start_ns and "rm: " in t.text}
+            if self.record.time_s - start_s > timeout_s:
+                reasons = {
+                    t.text for t in self.record.texts if t.time_ns > start_ns and "rm: " in t.text
+                }
                 raise PilotError(f"not armed in {timeout_s:g} s: {'; '.join(sorted(reasons))}")
-            self.sleep(1.0)
-        self.wait(lambda: self.armed, _SHOWN_S, "the armed heartbeat")
+            self.link.sleep(1.0)
+        self.link.wait(lambda: self.record.armed, _SHOWN_S, "the armed heartbeat")
 
     def disarm(self, *, force: bool = False) -> None:
         """Disarm; `force` also in flight."""
-        self.command(mavlink.MAV_CMD_COMPONENT_ARM_DISARM, 0, 21196.0 if force else 0.0)
+        self.link.command(mavlink.MAV_CMD_COMPONENT_ARM_DISARM, 0, 21196.0 if force else 0.0)
 
     def reboot(self) -> None:
         """Reboot the autopilot (disarmed); it is another vehicle's life then: connect anew."""
-        self.command(mavlink.MAV_CMD_PREFLIGHT_REBOOT_SHUTDOWN, 1)
+        self.link.command(mavlink.MAV_CMD_PREFLIGHT_REBOOT_SHUTDOWN, 1)
 
     def takeoff(self, height_m: float, timeout_s: float = 120.0) -> None:
         """Take off in GUIDED and wait for the height (above the launch place, in truth)."""
-        ground = self.truth.altitude_m
-        self.command(mavlink.MAV_CMD_NAV_TAKEOFF, 0, 0, 0, 0, 0, 0, height_m)
-        self.wait(
-            lambda: self.truth.altitude_m > ground + height_m - 2.0,
+        ground = self.record.truth.altitude_m
+        self.link.command(mavlink.MAV_CMD_NAV_TAKEOFF, 0, 0, 0, 0, 0, 0, height_m)
+        self.link.wait(
+            lambda: self.record.truth.altitude_m > ground + height_m - 2.0,
             timeout_s,
             f"the take-off to {height_m:g} m",
         )
 
     def go_to(self, latitude_deg: float, longitude_deg: float, height_m: float) -> None:
         """Send the vehicle to a place at a height above home, in GUIDED; does not wait."""
-        self._send(
+        self.link.send(
             mavlink.MAVLink_set_position_target_global_int_message(
                 0,
                 VEHICLE,
@@ -110,19 +134,19 @@ class Pilot(GroundLink):
     def land(self, timeout_s: float = 180.0) -> None:
         """Land and wait until the vehicle has disarmed."""
         self.set_mode("LAND")
-        self.wait(lambda: not self.armed, timeout_s, "the landing")
+        self.link.wait(lambda: not self.record.armed, timeout_s, "the landing")
 
     def gps(self, on: bool) -> None:
         """Switch the simulated receiver."""
-        self.set_parameter("SIM_GPS1_ENABLE", 1.0 if on else 0.0)
+        self.link.set_parameter("SIM_GPS1_ENABLE", 1.0 if on else 0.0)
 
     def use_source_set(self, number: int) -> None:
         """MAV_CMD_SET_EKF_SOURCE_SET."""
-        self.command(mavlink.MAV_CMD_SET_EKF_SOURCE_SET, number)
+        self.link.command(mavlink.MAV_CMD_SET_EKF_SOURCE_SET, number)
 
     def set_origin(self, origin: Location) -> None:
         """Set the EKF origin (needed where there is no GNSS), and read back which one holds."""
-        self._send(
+        self.link.send(
             mavlink.MAVLink_set_gps_global_origin_message(
                 VEHICLE,
                 round(origin.latitude_deg * 1e7),
@@ -130,18 +154,20 @@ class Pilot(GroundLink):
                 round(origin.altitude_m * 1000),
             )
         )
-        if not self._wait_wall(lambda: self.read_origin() is not None, 60.0):
+        if not self.link.wait_wall(lambda: self.read_origin() is not None, 60.0):
             raise PilotError("the vehicle took no EKF origin")
 
     def read_origin(self) -> Location | None:
         """The EKF origin; None while there is none."""
-        self.try_command(mavlink.MAV_CMD_REQUEST_MESSAGE, mavlink.MAVLINK_MSG_ID_GPS_GLOBAL_ORIGIN)
-        return self.origin
+        self.link.try_command(
+            mavlink.MAV_CMD_REQUEST_MESSAGE, mavlink.MAVLINK_MSG_ID_GPS_GLOBAL_ORIGIN
+        )
+        return self.record.origin
 
     def point_gimbal(self, pitch_deg: float, yaw_deg: float, *, earth_yaw: bool = False) -> None:
         """MAV_CMD_DO_GIMBAL_MANAGER_PITCHYAW; yaw from the nose, or from north."""
         flags = _GIMBAL_YAW_LOCK if earth_yaw else 0.0
-        self.command(
+        self.link.command(
             mavlink.MAV_CMD_DO_GIMBAL_MANAGER_PITCHYAW,
             pitch_deg,
             yaw_deg,
@@ -150,55 +176,7 @@ class Pilot(GroundLink):
             flags,
         )
 
-    # --- missions ----------------------------------------------------------------------------
-
-    def upload_mission(self, steps: Sequence[MissionStep]) -> None:
-        """Replace the vehicle's mission; the first step becomes item 1, after home."""
-        home = MissionStep(mavlink.MAV_CMD_NAV_WAYPOINT)
-        items = [home, *steps]
-        kinds = ("MISSION_REQUEST", "MISSION_REQUEST_INT", "MISSION_ACK")
-        with self._expect(*kinds) as box:
-            self._send(mavlink.MAVLink_mission_count_message(VEHICLE, AUTOPILOT, len(items)))
-            while True:
-                message = self._next(box, "the mission upload")
-                if message.get_type() == "MISSION_ACK":
-                    if message.type != mavlink.MAV_MISSION_ACCEPTED:
-                        raise PilotError(f"the mission was refused (MISSION_ACK {message.type})")
-                    return
-                self._send_item(message.seq, items[message.seq])
-
-    def _send_item(self, sequence: int, step: MissionStep) -> None:
-        x = step.raw_x if step.raw_x is not None else round(step.latitude_deg * 1e7)
-        self._send(
-            mavlink.MAVLink_mission_item_int_message(
-                VEHICLE,
-                AUTOPILOT,
-                sequence,
-                mavlink.MAV_FRAME_GLOBAL_RELATIVE_ALT,
-                step.command,
-                0,
-                1,
-                *step.parameters,
-                x,
-                round(step.longitude_deg * 1e7),
-                step.altitude_m,
-            )
-        )
-
-    def download_mission(self) -> list[Any]:
-        """The vehicle's mission as MISSION_ITEM_INT messages, home first."""
-        with self._expect("MISSION_COUNT", "MISSION_ITEM_INT") as box:
-            self._send(mavlink.MAVLink_mission_request_list_message(VEHICLE, AUTOPILOT))
-            size = self._next(box, "the mission's size").count
-            items = []
-            for sequence in range(size):
-                self._send(
-                    mavlink.MAVLink_mission_request_int_message(VEHICLE, AUTOPILOT, sequence)
-                )
-                items.append(self._next(box, f"mission item {sequence}"))
-        return items
-
     def start_mission(self) -> None:
         """Fly the uploaded mission in AUTO from its first step."""
-        self.reached.clear()
+        self.record.reached.clear()
         self.set_mode("AUTO")

@@ -175,3 +175,17 @@ def slerp(a: Array, b: Array, t: float) -> Array:
         b = -b
     q = a + t * (b - a)
     return np.asarray(q / np.linalg.norm(q))
+
+
+def between(a: Truth, b: Truth, time_ns: int) -> Truth:
+    """The true state at a time between two others, interpolated."""
+    t = share(a.time_ns, b.time_ns, time_ns)
+    return Truth(
+        time_ns,
+        a.boot_s + t * (b.boot_s - a.boot_s),
+        a.latitude_deg + t * (b.latitude_deg - a.latitude_deg),
+        a.longitude_deg + t * (b.longitude_deg - a.longitude_deg),
+        a.altitude_m + t * (b.altitude_m - a.altitude_m),
+        slerp(a.quaternion, b.quaternion, t),
+        a.velocity_ned + t * (b.velocity_ned - a.velocity_ned),
+    )

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import queue
 from collections.abc import Callable, Iterator
 from typing import Any
 
@@ -19,26 +18,35 @@ from sitl.ground.tracks import (
     LeastLatencyClock,
     Track,
     Truth,
+    between,
     share,
     slerp,
 )
 
-_VEHICLE, _AUTOPILOT = 1, 1
+VEHICLE, AUTOPILOT = 1, 1  # system and component
 _SECONDS_KEPT = 60 * 60
 
 MODES = {"STABILIZE": 0, "AUTO": 3, "GUIDED": 4, "LOITER": 5, "RTL": 6, "LAND": 9}
 _MODE_NAMES = {number: name for name, number in MODES.items()}
 
 
+def from_autopilot(message: Any) -> bool:
+    """Whether the vehicle's autopilot sent it, not another component."""
+    return bool(message.get_srcSystem() == VEHICLE and message.get_srcComponent() == AUTOPILOT)
+
+
 class VehicleRecord:
-    """Takes in a vehicle's messages on one thread; any thread may look things up."""
+    """Takes in a vehicle's messages on one thread; any thread may look things up.
+
+    latest: the autopilot's newest message of each type; ekf_flags: EKF_STATUS_FLAGS; reached: the
+    mission items, in order; origin: of the EKF; mode: None before the first heartbeat.
+    """
 
     def __init__(self, speedup: float) -> None:
-        self._boxes: list[tuple[frozenset[str], queue.SimpleQueue[Any]]] = []
         self._clock = LeastLatencyClock(speedup)
         self._boot_ms = 0
         self._attitude_ms: int | None = None
-        self._flags = 0
+        self.ekf_flags = 0
         self._subscribers: list[Callable[[Truth], None]] = []
         self._truth: Track[Truth] = Track(_SECONDS_KEPT * 50)
         self._gimbal: Track[GimbalState] = Track(_SECONDS_KEPT * 50)
@@ -49,6 +57,16 @@ class VehicleRecord:
         self.reached: list[int] = []
         self.mode: str | None = None
         self.armed = False
+        self._handlers: dict[str, Callable[[Any, int], None]] = {
+            "HEARTBEAT": self._take_heartbeat,
+            "ATTITUDE": self._take_attitude,
+            "SIM_STATE": self._take_sim_state,
+            "GIMBAL_DEVICE_ATTITUDE_STATUS": self._take_gimbal,
+            "LOCAL_POSITION_NED": self._take_position,
+            "EKF_STATUS_REPORT": self._take_ekf,
+            "GPS_GLOBAL_ORIGIN": self._take_origin,
+            "MISSION_ITEM_REACHED": self._take_reached,
+        }
 
     # --- what is known -----------------------------------------------------------------------
 
@@ -75,27 +93,12 @@ class VehicleRecord:
         """The newest position that the EKF reports; None while it reports none."""
         return self._ekf.newest
 
-    @property
-    def ekf_flags(self) -> int:
-        """EKF_STATUS_FLAGS as last reported."""
-        return self._flags
-
     def truth_at(self, time_ns: int) -> Truth | None:
         """The true state at a CLOCK_MONOTONIC time, interpolated; None outside the record."""
         pair = self._truth.around(time_ns)
         if pair is None:
             return None
-        a, b = pair
-        t = share(a.time_ns, b.time_ns, time_ns)
-        return Truth(
-            time_ns,
-            a.boot_s + t * (b.boot_s - a.boot_s),
-            a.latitude_deg + t * (b.latitude_deg - a.latitude_deg),
-            a.longitude_deg + t * (b.longitude_deg - a.longitude_deg),
-            a.altitude_m + t * (b.altitude_m - a.altitude_m),
-            slerp(a.quaternion, b.quaternion, t),
-            a.velocity_ned + t * (b.velocity_ned - a.velocity_ned),
-        )
+        return between(*pair, time_ns)
 
     def gimbal_at(self, time_ns: int) -> GimbalState | None:
         """The gimbal at a CLOCK_MONOTONIC time, interpolated; None outside the record."""
@@ -152,19 +155,21 @@ class VehicleRecord:
 
     # --- messages ----------------------------------------------------------------------------
 
-    def _take(self, message: Any, received_ns: int) -> None:
+    def restart_clock(self, speedup: float) -> None:
+        """Simulated time runs at another speed from now on."""
+        self._clock.restart(speedup)
+
+    def take(self, message: Any, received_ns: int) -> None:
+        """Take in what was received at a CLOCK_MONOTONIC time."""
         kind = message.get_type()
         if kind == "STATUSTEXT":
             self._text_log.take(message, received_ns)
-        if message.get_srcSystem() != _VEHICLE or message.get_srcComponent() != _AUTOPILOT:
+        if not from_autopilot(message):
             return
         self.latest[kind] = message
-        for kinds, box in self._boxes:
-            if kind in kinds:
-                box.put(message)
-        handler = _HANDLERS.get(kind)
+        handler = self._handlers.get(kind)
         if handler is not None:
-            handler(self, message, received_ns)
+            handler(message, received_ns)
 
     def _take_heartbeat(self, message: Any, _received_ns: int) -> None:
         self.mode = _MODE_NAMES.get(message.custom_mode, str(message.custom_mode))
@@ -208,12 +213,12 @@ class VehicleRecord:
                 (message.x, message.y, message.z),
                 (message.vx, message.vy, message.vz),
                 self.origin,
-                self._flags,
+                self.ekf_flags,
             )
         )
 
     def _take_ekf(self, message: Any, _received_ns: int) -> None:
-        self._flags = message.flags
+        self.ekf_flags = message.flags
 
     def _take_origin(self, message: Any, _received_ns: int) -> None:
         self.origin = Location(
@@ -222,15 +227,3 @@ class VehicleRecord:
 
     def _take_reached(self, message: Any, _received_ns: int) -> None:
         self.reached.append(message.seq)
-
-
-_HANDLERS: dict[str, Callable[[VehicleRecord, Any, int], None]] = {
-    "HEARTBEAT": VehicleRecord._take_heartbeat,
-    "ATTITUDE": VehicleRecord._take_attitude,
-    "SIM_STATE": VehicleRecord._take_sim_state,
-    "GIMBAL_DEVICE_ATTITUDE_STATUS": VehicleRecord._take_gimbal,
-    "LOCAL_POSITION_NED": VehicleRecord._take_position,
-    "EKF_STATUS_REPORT": VehicleRecord._take_ekf,
-    "GPS_GLOBAL_ORIGIN": VehicleRecord._take_origin,
-    "MISSION_ITEM_REACHED": VehicleRecord._take_reached,
-}

@@ -79,7 +79,7 @@ class _CaseFlight:
             self._happen()
             self._sample()
             self._steer()
-            self._pilot.sleep(_STEP_S)
+            self._pilot.link.sleep(_STEP_S)
         if case.flight.ground:
             self._record.refusals = self._refusals()
         for pilot in self._pilots:
@@ -94,8 +94,8 @@ class _CaseFlight:
 
     def _connect(self) -> Pilot:
         pilot = Pilot(self._vehicle.gcs_endpoint, self._vehicle.speedup, self._vehicle.check)
-        pilot.connect()
-        self._stack.callback(pilot.close)
+        pilot.link.connect()
+        self._stack.callback(pilot.link.close)
         self._pilots.append(pilot)
         return pilot
 
@@ -113,7 +113,7 @@ class _CaseFlight:
 
     def _wait_for_gyros(self) -> None:
         pilot = self._pilot
-        pilot.wait(lambda: pilot.time_s > _GYROS_SETTLED_S, 60.0, "the gyros to settle")
+        pilot.link.wait(lambda: pilot.record.time_s > _GYROS_SETTLED_S, 60.0, "the gyros to settle")
 
     def _inject(self) -> None:
         case, endpoint = self._case, self._vehicle.companion_endpoint
@@ -126,7 +126,7 @@ class _CaseFlight:
             self._record.doctor = consult(config)
             boots = self._vehicle.boots
             self._pilot.reboot()
-            self._pilot.close()
+            self._pilot.link.close()
             if not sleep_until(lambda: self._vehicle.boots > boots, _REBOOT_S):
                 raise VehicleProcessError(f"the vehicle did not reboot in {_REBOOT_S:g} s")
             self._pilot = self._connect()
@@ -158,7 +158,7 @@ class _CaseFlight:
         self._pilot.wait_ready()
         self._pilot.arm()
         self._pilot.takeoff(self._case.flight.height_m)
-        self._pilot.sleep(_SETTLE_S)
+        self._pilot.link.sleep(_SETTLE_S)
 
     # --- during ----------------------------------------------------------------------------------
 
@@ -175,7 +175,7 @@ class _CaseFlight:
         if limit is not None:
             return self._now_s >= limit
         self._record.closed = not self._corners
-        lost = self._pilot.mode != "GUIDED" and not self._waiting
+        lost = self._pilot.record.mode != "GUIDED" and not self._waiting
         return self._record.closed or lost or self._now_s > _LONGEST_S
 
     def _happen(self) -> None:
@@ -189,7 +189,7 @@ class _CaseFlight:
             self._model = Case.changed(self._model, event)
             self._feed.change(self._model, reset=event.reset)
         for name, value in event.vehicle.items():
-            self._pilot.set_parameter(name, value)
+            self._pilot.link.set_parameter(name, value)
         if event.source_set is not None:
             self._pilot.use_source_set(event.source_set)
         if event.reboot:
@@ -199,7 +199,7 @@ class _CaseFlight:
 
     def _reboot(self) -> None:
         """The simulator starts anew with it: on the ground, at home."""
-        self._pilot.close()
+        self._pilot.link.close()
         self._vehicle.restart()
         self._pilot = self._connect()
         if isinstance(self._feed, BridgeFeed):
@@ -207,24 +207,24 @@ class _CaseFlight:
 
     def _sample(self) -> None:
         pilot = self._pilot
-        north, east, _ = HOME.ned_of(pilot.truth.location)
-        self._ticks.append((self._now_s, pilot.time_s))
+        north, east, _ = HOME.ned_of(pilot.record.truth.location)
+        self._ticks.append((self._now_s, pilot.record.time_s))
         counters = self._bridge.counters() if self._bridge is not None else {}
         self._record.samples.append(
             Sample(
                 self._now_s,
                 north,
                 east,
-                pilot.mode or "",
-                pilot.armed,
+                pilot.record.mode or "",
+                pilot.record.armed,
                 int(counters.get("bridge_injected", 0)),
                 int(counters.get("ekf_source_set", 0)),
-                pilot.time_s,
+                pilot.record.time_s,
             )
         )
 
     def _steer(self) -> None:
-        ekf = self._pilot.ekf
+        ekf = self._pilot.record.ekf
         if not self._corners or ekf is None or ekf.location is None:
             return
         north, east, _ = HOME.ned_of(ekf.location)
@@ -233,7 +233,7 @@ class _CaseFlight:
             self._send_to_corner()
 
     def _send_to_corner(self) -> None:
-        if self._corners and self._pilot.mode == "GUIDED" and not self._case.flight.ground:
+        if self._corners and self._pilot.record.mode == "GUIDED" and not self._case.flight.ground:
             where = HOME.offset(*self._corners[0], 0.0)
             height = self._case.flight.height_m
             self._pilot.go_to(where.latitude_deg, where.longitude_deg, height)
@@ -246,7 +246,7 @@ class _CaseFlight:
         try:
             pilot.arm(timeout_s=float(_ARMING_TRIES))
         except PilotError:
-            texts = [t.text for t in pilot.texts if t.time_ns > since and "rm: " in t.text]
+            texts = [t.text for t in pilot.record.texts if t.time_ns > since and "rm: " in t.text]
             return sorted(set(texts))
         return None
 
@@ -261,12 +261,12 @@ class _CaseFlight:
                 "vehicle" if t.component == _AUTOPILOT else "bridge",
                 t.text,
             )
-            for t in pilot.texts
+            for t in pilot.record.texts
         ]
-        truth = pilot.truth_track()
+        truth = pilot.record.truth_track()
         times = np.array([t.boot_s for t in truth])
         true = np.array([HOME.ned_of(t.location)[:2] for t in truth]).reshape(-1, 2)
-        for sample in pilot.ekf_track():
+        for sample in pilot.record.ekf_track():
             at_s = self._seconds(sample.time_ns)
             i = int(np.searchsorted(times, sample.boot_s))
             if at_s < 0 or sample.location is None or not 0 < i < len(times):

@@ -156,7 +156,7 @@ class BridgeFeed:
             due = exposure + model.latency_ms * 1e-3
             if self._stop.wait(max(0.0, due - time.monotonic())):
                 return
-            truth = self.pilot.truth_at(int(exposure * 1e9))
+            truth = self.pilot.record.truth_at(int(exposure * 1e9))
             if truth is not None and not model.silent:
                 self._sink.submit(self._fix(truth))
 
@@ -222,7 +222,7 @@ class TruthFeed:
             dialect="ardupilotmega",
             robust_parsing=True,
         )
-        pilot.subscribe(self._on_truth)
+        pilot.record.subscribe(self._on_truth)
 
     def change(self, model: FixModel, *, reset: bool = False) -> None:
         """Another model from now on; reset: with the next reset_counter on its first fix."""
@@ -253,7 +253,7 @@ class TruthFeed:
             pass
 
     def _observe(self, truth: Truth) -> None:
-        origin, model = self._origin or self._pilot.origin, self._model
+        origin, model = self._origin or self._pilot.record.origin, self._model
         if origin is None or model.silent:
             return
         seen = self._observer.observe(truth, origin, model)
@@ -310,7 +310,7 @@ class TruthFeed:
         )
 
     def _send_gps(self, due: _Due) -> None:
-        origin = self._origin or self._pilot.origin
+        origin = self._origin or self._pilot.record.origin
         if origin is None:
             return
         where = origin.offset(*due.seen.position_ned)

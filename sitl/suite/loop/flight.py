@@ -84,17 +84,17 @@ class _LoopFlight:
         self._start_companion()
         pilot = self._pilot
         if not case.hover:
-            pilot.upload_mission(mission(case.scenario, self._home))
+            pilot.missions.upload(mission(case.scenario, self._home))
         pilot.point_gimbal(case.scenario.legs[0].gimbal_pitch_deg, 0.0)
         pilot.set_mode("GUIDED")
         pilot.arm()
         pilot.takeoff(case.height_m)
         if not case.wrong.other_map:
-            pilot.wait(self._is_tracking, _TRACKING_S, "the localizer to track")
+            pilot.link.wait(self._is_tracking, _TRACKING_S, "the localizer to track")
         if case.wind_m_s:
-            pilot.set_parameter("SIM_WIND_DIR", 270.0)
-            pilot.set_parameter("SIM_WIND_SPD", case.wind_m_s)
-            pilot.sleep(8.0)
+            pilot.link.set_parameter("SIM_WIND_DIR", 270.0)
+            pilot.link.set_parameter("SIM_WIND_SPD", case.wind_m_s)
+            pilot.link.sleep(8.0)
 
     def run(self) -> None:
         """The recorded part: faults, samples, until the time is over."""
@@ -110,7 +110,7 @@ class _LoopFlight:
             while self._due and self._due[0][0] <= self._now_s:
                 self._due.pop(0)[1]()
             self._sample()
-            self._pilot.sleep(_STEP_S)
+            self._pilot.link.sleep(_STEP_S)
         self._end_ns = time.monotonic_ns()
         self._camera.stop()
 
@@ -118,7 +118,7 @@ class _LoopFlight:
         """Everything that the judge needs, after the processes have ended."""
         texts = tuple(
             LoopText((t.time_ns - self._start_ns) * 1e-9, t.component, t.severity, t.text)
-            for t in self._pilot.texts
+            for t in self._pilot.record.texts
             if t.time_ns >= self._start_ns
         )
         return LoopRecord(tuple(self._samples), texts, tuple(self._fix_errors()))
@@ -188,7 +188,7 @@ class _LoopFlight:
 
     def _happen(self, event: LoopEvent) -> None:
         for name, value in event.vehicle.items():
-            self._pilot.set_parameter(name, value)
+            self._pilot.link.set_parameter(name, value)
         if event.picture is not None:
             self._camera.fault(event.picture.fault)
             self._later(event.picture.for_s, lambda: self._camera.fault(None))
@@ -207,14 +207,16 @@ class _LoopFlight:
         level, text, age_s = self._health()
         error_m, north_m, east_m = self._ekf_error()
         self._samples.append(
-            LoopSample(self._now_s, error_m, north_m, east_m, pilot.mode or "", level, text, age_s)
+            LoopSample(
+                self._now_s, error_m, north_m, east_m, pilot.record.mode or "", level, text, age_s
+            )
         )
 
     def _ekf_error(self) -> tuple[float, float, float]:
         """Horizontal error of the EKF's position now, and where the vehicle truly is."""
-        north, east, _ = self._home.ned_of(self._pilot.truth.location)
-        ekf = self._pilot.ekf
-        truth = self._pilot.truth_at(ekf.time_ns) if ekf is not None else None
+        north, east, _ = self._home.ned_of(self._pilot.record.truth.location)
+        ekf = self._pilot.record.ekf
+        truth = self._pilot.record.truth_at(ekf.time_ns) if ekf is not None else None
         if ekf is None or ekf.location is None or truth is None:
             return math.inf, north, east
         true = self._home.ned_of(truth.location)

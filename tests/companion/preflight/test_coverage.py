@@ -84,14 +84,14 @@ def test_doctor_against_the_embedded_vehicle(cache, small_assets, tmp_path, monk
     start = Location(home.latitude_deg, home.longitude_deg, 50.0)
     with EmbeddedSitl(start, parameters={**vision_only_parameters(), **GIMBAL}) as vehicle:
         pilot = Pilot(vehicle.gcs_endpoint, alive=vehicle.check)
-        pilot.connect()
+        pilot.link.connect()
         outside = start.offset(900.0, 0.0, 0.0)
         steps = [
             takeoff_step(40.0),
             waypoint_step(outside.latitude_deg, outside.longitude_deg, 40.0),
         ]
-        pilot.upload_mission(steps)
-        pilot.close()
+        pilot.missions.upload(steps)
+        pilot.link.close()
         model = {"width": 160, "height": 120, "fx": 140, "fy": 140, "cx": 80, "cy": 60}
         settings = {"rate_hz": 20.0}
         origin = {"latitude_deg": 12.0, "longitude_deg": 8.0, "altitude_amsl_m": 9000.0}

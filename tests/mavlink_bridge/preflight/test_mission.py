@@ -164,10 +164,10 @@ def upload_and_download(vehicle: Any) -> None:
     ]
     assert not [w for w in download_mission(config(vehicle.companion_endpoint)) if w.number > 0]
     pilot = Pilot(vehicle.gcs_endpoint, alive=vehicle.check)
-    pilot.connect()
-    pilot.upload_mission(steps)
+    pilot.link.connect()
+    pilot.missions.upload(steps)
     found = download_mission(config(vehicle.companion_endpoint))
-    pilot.close()
+    pilot.link.close()
     flown = [w for w in found if w.number > 0]
     same(flown, [Waypoint(2 + i, p.latitude_deg, p.longitude_deg) for i, p in enumerate(places)])
 

@@ -165,7 +165,7 @@ def test_no_endpoint_before_the_start():
 
 def test_no_vehicle_at_the_endpoint():
     with pytest.raises(PilotError, match="no vehicle listens"):
-        Pilot("tcp:127.0.0.1:9").connect(timeout_s=0.5)
+        Pilot("tcp:127.0.0.1:9").link.connect(timeout_s=0.5)
 
 
 def test_a_missing_arducopter_is_a_named_error(monkeypatch, tmp_path):
@@ -237,58 +237,58 @@ def test_flies_a_mission_on_gps_and_then_on_vision(real_time, kind):
                 waypoint_step(turn.latitude_deg, turn.longitude_deg, 50.0),
                 return_step(),
             ]
-            pilot.upload_mission(steps)
-            assert [i.command for i in pilot.download_mission()][1:] == [s.command for s in steps]
+            pilot.missions.upload(steps)
+            assert [i.command for i in pilot.missions.download()][1:] == [s.command for s in steps]
             pilot.use_source_set(2)
             denied = time.monotonic_ns()
             pilot.gps(on=False)
             pilot.start_mission()
-            pilot.wait(lambda: 5 in pilot.reached, 120.0, "the last waypoint")
-            assert horizontal(pilot.truth.location, turn) < 6.0
-            errors = pilot.ekf_errors(denied)
+            pilot.link.wait(lambda: 5 in pilot.record.reached, 120.0, "the last waypoint")
+            assert horizontal(pilot.record.truth.location, turn) < 6.0
+            errors = pilot.record.ekf_errors(denied)
             flat = np.hypot(errors[:, 0], errors[:, 1])
             assert len(flat) > 100
             assert np.percentile(flat, 95) < 2.0
             _check_gimbal(pilot)
-            pilot.wait(lambda: not pilot.armed, 180.0, "the landing")
-            assert horizontal(pilot.truth.location, HOME) < 4.0
+            pilot.link.wait(lambda: not pilot.record.armed, 180.0, "the landing")
+            assert horizontal(pilot.record.truth.location, HOME) < 4.0
             feed.close()
             assert feed.sent > 500
 
 
 def _check_gimbal(pilot):
-    newest = pilot.gimbal_track()[-1]
+    newest = pilot.record.gimbal_track()[-1]
     roll, pitch, yaw = (math.degrees(a) for a in newest.roll_pitch_yaw)
     assert (roll, pitch, yaw) == pytest.approx((0.0, -60.0, 20.0), abs=1.0)
     assert newest.yaw_in_vehicle_frame
-    state = pilot.gimbal_at(newest.time_ns - 10_000_000)
+    state = pilot.record.gimbal_at(newest.time_ns - 10_000_000)
     assert state is not None
-    assert pilot.truth_at(newest.time_ns - 50_000_000) is not None
+    assert pilot.record.truth_at(newest.time_ns - 50_000_000) is not None
 
 
 def test_a_vehicle_comes_back_on_its_ports(kind):
     with open_vehicle(kind, HOME, 0.0, {}, speedup=SPEEDUP) as vehicle:
         endpoint = vehicle.gcs_endpoint
         with Pilot(endpoint, SPEEDUP, vehicle.check) as pilot:
-            pilot.sleep(5)
-            before = pilot.time_s
+            pilot.link.sleep(5)
+            before = pilot.record.time_s
         vehicle.restart()
         assert vehicle.gcs_endpoint == endpoint
         with Pilot(endpoint, SPEEDUP, vehicle.check) as pilot:
-            assert 0 < pilot.time_s < before + 5
+            assert 0 < pilot.record.time_s < before + 5
 
 
 def test_a_reboot_by_command_keeps_the_parameters(kind):
     with open_vehicle(kind, HOME, 0.0, {}, speedup=SPEEDUP) as vehicle:
         with Pilot(vehicle.gcs_endpoint, SPEEDUP, vehicle.check) as pilot:
-            pilot.set_parameter("VISO_TYPE", 1)
-            pilot.sleep(5)
-            before = pilot.time_s
+            pilot.link.set_parameter("VISO_TYPE", 1)
+            pilot.link.sleep(5)
+            before = pilot.record.time_s
             pilot.reboot()
         assert sleep_until(lambda: vehicle.boots == 2, 60.0)
         with Pilot(vehicle.gcs_endpoint, SPEEDUP, vehicle.check) as pilot:
-            assert 0 < pilot.time_s < before + 10
-            assert pilot.parameter("VISO_TYPE") == 1
+            assert 0 < pilot.record.time_s < before + 10
+            assert pilot.link.parameter("VISO_TYPE") == 1
 
 
 def test_waiting_for_a_vehicle_that_died_ends_at_once():
@@ -298,7 +298,7 @@ def test_waiting_for_a_vehicle_that_died_ends_at_once():
             vehicle.stop()
             start = time.monotonic()
             with pytest.raises(VehicleProcessError, match="died"):
-                pilot.sleep(600)
+                pilot.link.sleep(600)
             assert time.monotonic() - start < 60.0  # of the 600 / SPEEDUP
 
 
@@ -306,14 +306,14 @@ def test_refusals_reach_the_pilot(kind):
     with open_vehicle(kind, HOME, 0.0, {"SIM_GPS1_ENABLE": 0}, speedup=SPEEDUP) as vehicle:
         pilot = Pilot(vehicle.gcs_endpoint, SPEEDUP, vehicle.check)
         with pilot:
-            pilot.sleep(26)
+            pilot.link.sleep(26)
             pilot.set_mode("GUIDED")
             with pytest.raises(PilotError, match=r"GPS 1: Bad fix|Need Position Estimate"):
                 pilot.arm(timeout_s=6.0)
             with pytest.raises(PilotError, match="NO_SUCH_PARAM"):
-                pilot.parameter("NO_SUCH_PARAM", tries=2)
+                pilot.link.parameter("NO_SUCH_PARAM", tries=2)
             with pilot.fast_forward(8.0):
-                assert pilot.parameter("SIM_SPEEDUP") == 8.0
-            assert pilot.parameter("SIM_SPEEDUP") == SPEEDUP
+                assert pilot.link.parameter("SIM_SPEEDUP") == 8.0
+            assert pilot.link.parameter("SIM_SPEEDUP") == SPEEDUP
     with pytest.raises(VehicleProcessError, match="died"):
         vehicle.check()

@@ -1,0 +1,85 @@
+"""The ground station's socket: opening, sending, receiving, its heartbeat."""
+
+from __future__ import annotations
+
+import contextlib
+import select
+import socket
+import threading
+import time
+from collections.abc import Callable
+from typing import Any
+
+from pymavlink import mavutil
+from pymavlink.dialects.v20 import ardupilotmega as mavlink
+
+from sitl.errors import PilotError
+
+SYSTEM, COMPONENT = 255, 190  # of the ground station
+
+
+class Connection:
+    """A MAVLink connection over TCP; any thread sends, one receives."""
+
+    def __init__(self, endpoint: str) -> None:
+        self.endpoint = endpoint
+        self._link: Any = None
+        self._send_lock = threading.Lock()
+
+    def open(self, deadline: float, alive: Callable[[], None]) -> None:
+        """Connect, trying again until time.monotonic() is the deadline."""
+        while self._link is None:
+            alive()
+            try:
+                self._link = mavutil.mavlink_connection(
+                    self.endpoint,
+                    source_system=SYSTEM,
+                    source_component=COMPONENT,
+                    dialect="ardupilotmega",
+                    retries=0,
+                    robust_parsing=True,
+                )
+            except OSError as error:
+                if time.monotonic() > deadline:
+                    raise PilotError(
+                        f"no vehicle listens at {self.endpoint}: {error}; is it started?"
+                    ) from error
+                time.sleep(0.1)
+
+    def shut_down(self) -> None:
+        """End what the receiving thread waits for."""
+        if self._link is not None:
+            with contextlib.suppress(OSError):  # the vehicle may have closed it
+                self._link.port.shutdown(socket.SHUT_RDWR)
+
+    def close(self) -> None:
+        """Disconnect, once nobody receives any more."""
+        if self._link is not None:
+            self._link.close()
+
+    def send(self, message: Any) -> None:
+        """Send one message."""
+        with self._send_lock:
+            self._link.mav.send(message)
+
+    def beat(self) -> None:
+        """Send the ground station's heartbeat, where there is somebody to hear it."""
+        with contextlib.suppress(OSError):
+            self.send(
+                mavlink.MAVLink_heartbeat_message(
+                    mavlink.MAV_TYPE_GCS, mavlink.MAV_AUTOPILOT_INVALID, 0, 0, 4, 3
+                )
+            )
+
+    def receive(self) -> list[Any]:
+        """What has come, after waiting for up to 0.1 s."""
+        port = self._link.port
+        if port.fileno() < 0 or not select.select([port], [], [], 0.1)[0]:
+            return []
+        if not port.recv(1, socket.MSG_PEEK):
+            time.sleep(0.05)  # closed by the vehicle; pymavlink would report that in a tight loop
+            return []
+        messages = []
+        while (message := self._link.recv_msg()) is not None:
+            messages.append(message)
+        return messages
