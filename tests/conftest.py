@@ -146,11 +146,11 @@ class Processors:
 
 @contextmanager
 def _watched_processors() -> Iterator[Processors]:
-    readings, ended = [_reading()], threading.Event()
+    readings, ended = [read_processors()], threading.Event()
 
     def watch() -> None:
         while not ended.wait(1.0):
-            readings.append(_reading())
+            readings.append(read_processors())
 
     watcher = threading.Thread(target=watch, daemon=True)
     watcher.start()
@@ -161,7 +161,7 @@ def _watched_processors() -> Iterator[Processors]:
         watcher.join()
 
 
-def _reading() -> Reading:
+def read_processors() -> Reading:
     """Of Linux's /proc; what a hypervisor took away counts as work of others."""
     tick_s = 1.0 / os.sysconf("SC_CLK_TCK")
     user, nice, system, idle, waiting, *rest = (

@@ -110,6 +110,8 @@ class OnnxExtractor:
 
     size: width and height of the images to come, for which it is warmed up. half: TensorRT may
     compute in float16. only: TensorRT, CUDA or CPU, instead of the best.
+    bound_to: onnxruntime's name of the device where `extract_on_device` leaves its outputs; None:
+    the provider's.
     """
 
     def __init__(
@@ -120,6 +122,7 @@ class OnnxExtractor:
         size: tuple[int, int] | None = None,
         half: bool = False,
         only: str | None = None,
+        bound_to: str | None = None,
     ) -> None:
         self.info = read_model_info(model)
         options = ort.SessionOptions()
@@ -142,9 +145,8 @@ class OnnxExtractor:
             lambda session: self._check(session, model, width, height),
             only,
         )
-        self._bound = (
-            None if self.provider == "CPU" else BoundSession(self._session, self._outputs, "cuda")
-        )
+        device = bound_to or ("cuda" if self.provider != "CPU" else None)
+        self._bound = None if device is None else BoundSession(self._session, self._outputs, device)
         _log.info("features: %s", self.name)
 
     @property

@@ -181,7 +181,7 @@ def _write_visit(
     waiting: dict[tuple[int, int], list[Part]] = defaultdict(list)
     tops: dict[tuple[int, int], Part] = {}
     per_top = round(TOP_M / BLOCK_M)
-    with _blocks(scene, folder, places, processes) as done:
+    with painted_blocks(scene, folder, places, processes) as done:
         for (column, row), part in done:
             key = (column // per_top, row // per_top)
             waiting[key].append(part)
@@ -195,7 +195,7 @@ def _write_visit(
 
 
 @contextmanager
-def _blocks(
+def painted_blocks(
     scene: Scene, folder: Path, places: list[tuple[int, int]], processes: int
 ) -> Iterator[Iterable[tuple[tuple[int, int], Part]]]:
     """Painted blocks as they are finished, in this process or in a pool."""

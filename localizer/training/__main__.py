@@ -112,10 +112,10 @@ def unfuse(
 ) -> None:
     """Make a published model trainable again."""
     from localizer.training.checkpoint import write_checkpoint
-    from localizer.training.export.from_published import unfuse as load
+    from localizer.training.export.from_published import trainable_network
     from localizer.training.export.quantize import calibration_images
 
-    network = load(model, list(calibration_images(shards)))
+    network = trainable_network(model, list(calibration_images(shards)))
     write_checkpoint(out, {"average": network.state_dict()})
 
 

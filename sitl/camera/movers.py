@@ -72,10 +72,11 @@ def there_and_back(lane: ArrayLike, out_m: float, back_m: float) -> Array:
     `back_m` to the right of that way.
     """
     lane = np.asarray(lane, dtype=np.float64)
-    return np.vstack([_beside(lane, out_m), _beside(lane[::-1], back_m)])
+    return np.vstack([_parallel(lane, out_m), _parallel(lane[::-1], back_m)])
 
 
-def _beside(line: Array, offset_m: float) -> Array:
+def _parallel(line: Array, offset_m: float) -> Array:
+    """The line (N, 3), moved to its right."""
     tangent = np.gradient(line[:, :2], axis=0)
     tangent /= np.maximum(np.linalg.norm(tangent, axis=1, keepdims=True), 1e-9)
     right = np.column_stack([tangent[:, 1], -tangent[:, 0]])

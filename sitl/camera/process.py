@@ -10,6 +10,7 @@ import multiprocessing
 import queue
 import threading
 import time
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from multiprocessing.connection import Connection
 from pathlib import Path
@@ -31,7 +32,7 @@ from sitl.camera.faults import FaultyLens, PictureFault
 from sitl.camera.movers import Mover
 from sitl.camera.stream import VideoSender
 from sitl.camera.true_motion import PoseTrack, TruthSample, camera_pose
-from sitl.camera.world_camera import FrameLog, WorldCamera
+from sitl.camera.world_camera import CameraOptions, FrameLog, WorldCamera
 from sitl.errors import WorldCameraError
 
 Command = Literal["pause", "resume", "stop"]
@@ -85,9 +86,13 @@ class CameraStatistics:
 class WorldCameraProcess:
     """The parent's handle. `send` truth samples at 20 Hz or more, in order of time."""
 
-    def __init__(self, config: WorldCameraConfig) -> None:
+    def __init__(
+        self,
+        config: WorldCameraConfig,
+        pipe: Callable[[], tuple[Connection, Connection]] = multiprocessing.Pipe,
+    ) -> None:
         context = multiprocessing.get_context("spawn")
-        self._connection, child = context.Pipe()
+        self._connection, child = pipe()
         self._process = context.Process(
             target=_run, args=(config, child), name="world-camera", daemon=True
         )
@@ -210,10 +215,12 @@ class _Studio:
             self._renderer,
             c.camera,
             c.appearance,
-            c.movers,
-            scene_from_world=cache.frame.ecef_from_enu.inverse @ self._frame.ecef_from_enu,
-            shutter_s=c.shutter_s,
-            seed=c.seed,
+            CameraOptions(
+                c.movers,
+                cache.frame.ecef_from_enu.inverse @ self._frame.ecef_from_enu,
+                c.shutter_s,
+                c.seed,
+            ),
         )
         self._log = FrameLog(c.log)
         self._sender = VideoSender(

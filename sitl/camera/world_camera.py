@@ -8,8 +8,7 @@ from __future__ import annotations
 
 import csv
 import time
-from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from types import TracebackType
 
@@ -57,32 +56,39 @@ class Exposure:
     stage_ms: dict[str, float]
 
 
-class WorldCamera:
-    """Renders the live world as a real camera would show it.
+@dataclass(frozen=True)
+class CameraOptions:
+    """What moves before a `WorldCamera`, and how it exposes.
 
     scene_from_world: from the map's ENU, in which poses and movers are given, to that of the
     renderer's own cache (the two caches may have different origins). shutter_s: the motion during
-    it blurs the picture.
+    it blurs the picture. seed: of the sensor's noise.
     """
+
+    movers: tuple[Mover, ...] = ()
+    scene_from_world: Pose = field(default_factory=Pose.identity)
+    shutter_s: float = 0.005
+    seed: int = 0
+
+
+class WorldCamera:
+    """Renders the live world as a real camera would show it."""
 
     def __init__(
         self,
         renderer: MapRenderer,
         camera: Camera,
         appearance: Appearance,
-        movers: Sequence[Mover] = (),
-        *,
-        scene_from_world: Pose | None = None,
-        shutter_s: float = 0.005,
-        seed: int = 0,
+        options: CameraOptions | None = None,
     ) -> None:
+        options = options or CameraOptions()
         self.camera = camera
         self._renderer = renderer
         self._lens = Lens.of(camera)
-        self._sensor = Sensor(appearance, seed)
-        self._movers = tuple(movers)
-        self._scene_from_world = scene_from_world or Pose.identity()
-        self._shutter_ns = round(shutter_s * 1e9)
+        self._sensor = Sensor(appearance, options.seed)
+        self._movers = options.movers
+        self._scene_from_world = options.scene_from_world
+        self._shutter_ns = round(options.shutter_s * 1e9)
 
     def expose(self, time_ns: int, track: PoseTrack) -> Exposure | None:
         """The picture at a time; None where the track has no pose."""

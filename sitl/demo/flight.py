@@ -83,9 +83,8 @@ def fly(
         targets = observed_targets(assets, scenario, movers)
         config = write_deployment(folder, assets, scenario, vehicle, ports)
         progress("starting the world camera", 0.0)
-        camera = WorldCameraProcess(
-            camera_config(folder, assets, scenario, movers, targets, ports, seed)
-        )
+        filmed = FilmedFlight(assets, scenario, ports, seed, movers, targets)
+        camera = WorldCameraProcess(camera_config(filmed, folder))
         stack.enter_context(camera)
         stack.enter_context(truth_feed(pilot, camera, cache, GimbalError(seed)))
         companion = stack.enter_context(running_companion(config, folder))
@@ -126,28 +125,35 @@ def vehicle_parameters(scenario: Scenario) -> dict[str, float]:
     return injection | GIMBAL | SPEEDS | {"WPNAV_SPEED": 100 * scenario.speed_m_s}
 
 
-def camera_config(
-    folder: Path,
-    assets: FlightAssets,
-    scenario: Scenario,
-    movers: tuple[Mover, ...],
-    targets: tuple[Observed, ...],
-    ports: Ports,
-    seed: int,
-) -> WorldCameraConfig:
-    """The world camera of a flight; its frames' true poses go to ``frames.csv``."""
+@dataclass(frozen=True)
+class FilmedFlight:
+    """What the world camera of a flight sees, and where it sends it. targets: what the detector
+    watches.
+    """
+
+    assets: FlightAssets
+    scenario: Scenario
+    ports: Ports
+    seed: int
+    movers: tuple[Mover, ...] = ()
+    targets: tuple[Observed, ...] = ()
+
+
+def camera_config(flight: FilmedFlight, folder: Path) -> WorldCameraConfig:
+    """The world camera of a flight; its frames' true poses go to ``frames.csv`` in the folder."""
+    assets, look = flight.assets, np.random.default_rng([flight.seed, 11])
     return WorldCameraConfig(
         cache=assets.live_cache,
         origin=TileCache.open(assets.map_cache).manifest.origin,
-        camera=scenario.camera.camera(),
-        url=f"udp://127.0.0.1:{ports.video}",
+        camera=flight.scenario.camera.camera(),
+        url=f"udp://127.0.0.1:{flight.ports.video}",
         log=folder / "frames.csv",
-        rate_hz=scenario.camera.rate_hz,
-        appearance=sample_appearance(np.random.default_rng([seed, 11]), scenario.condition),
-        movers=movers,
-        seed=seed,
-        targets=targets,
-        detections=f"127.0.0.1:{ports.detections}",
+        rate_hz=flight.scenario.camera.rate_hz,
+        appearance=sample_appearance(look, flight.scenario.condition),
+        movers=flight.movers,
+        seed=flight.seed,
+        targets=flight.targets,
+        detections=f"127.0.0.1:{flight.ports.detections}",
     )
 
 

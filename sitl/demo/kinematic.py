@@ -16,7 +16,7 @@ from localizer.render.numba_raster import NumbaRenderer
 from localizer.synth.appearance.model import sample_appearance
 from sitl.camera.traffic import traffic
 from sitl.camera.true_motion import PoseTrack
-from sitl.camera.world_camera import WorldCamera
+from sitl.camera.world_camera import CameraOptions, WorldCamera
 from sitl.demo.assets import FlightAssets
 from sitl.demo.scenario import Scenario
 from sitl.demo.sequence import record_sequence
@@ -65,9 +65,9 @@ def record_scenario(assets: FlightAssets, scenario: Scenario, seed: int, out: Pa
             NumbaRenderer(streamer),
             scenario.camera.camera(),
             sample_appearance(np.random.default_rng([seed, 11]), scenario.condition),
-            movers,
-            scene_from_world=live.frame.ecef_from_enu.inverse @ cache.frame.ecef_from_enu,
-            seed=seed,
+            CameraOptions(
+                movers, live.frame.ecef_from_enu.inverse @ cache.frame.ecef_from_enu, seed=seed
+            ),
         )
         period_ns = round(1e9 / scenario.camera.rate_hz)
         times = range(path[0][0] + period_ns, path[-1][0] - period_ns, period_ns)

@@ -47,7 +47,10 @@ def fly(case: Case, kind: VehicleKind, seed: int = 0) -> Record:
 
 
 class _CaseFlight:
-    """The running of one scenario; everything it opens is closed by `stack`."""
+    """The running of one scenario; everything it opens is closed by `stack`.
+
+    Above 200 lines: the steps of a flight, read from top to bottom, share all that is open.
+    """
 
     def __init__(self, case: Case, vehicle: VehicleProcess, stack: ExitStack, seed: int) -> None:
         self._case, self._vehicle, self._stack, self._seed = case, vehicle, stack, seed

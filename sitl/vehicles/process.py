@@ -98,6 +98,16 @@ class VehicleProcess(ABC):
         return self._process is not None and self._process.poll() is None
 
     @property
+    def folder(self) -> Path | None:
+        """In which it runs; None before it was started."""
+        return self._folder
+
+    @property
+    def processes(self) -> tuple[subprocess.Popen[bytes], ...]:
+        """The vehicle's, and the one that ends it once we are gone."""
+        return tuple(p for p in (self._process, self._lifeline) if p is not None)
+
+    @property
     def boots(self) -> int:
         """How often it has opened its ports since it was launched: once more after a reboot."""
         # The log is watched, as a probing connection would take the port's only client slot.

@@ -57,7 +57,7 @@ def compile_sources(
     cache: Path | None = None,
 ) -> Image:
     """As `compile_kernels`, for any sources by name, of which `main` includes the others."""
-    nvrtc = _nvrtc()
+    nvrtc = load_nvrtc()
     options = [f"--gpu-architecture=sm_{architecture[0]}{architecture[1]}", *_OPTIONS]
     options += [f"-D{name}={value}" for name, value in defined.items()]
     version = _checked(nvrtc, nvrtc.nvrtcVersion())
@@ -126,7 +126,8 @@ def _checked(nvrtc: ModuleType, result: tuple[Any, ...]) -> Any:
     return values[0] if values else None
 
 
-def _nvrtc() -> ModuleType:
+def load_nvrtc() -> ModuleType:
+    """NVIDIA's run-time compiler; CudaUnavailableError where there is none."""
     try:
         from cuda.bindings import nvrtc
 

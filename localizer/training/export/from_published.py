@@ -22,7 +22,7 @@ from localizer.types import Image
 _KINDS = ("weight", "bias")
 
 
-def unfuse(model: Path, images: list[Image]) -> Network:
+def trainable_network(model: Path, images: list[Image]) -> Network:
     """The network of an exported `model`, the same function in evaluation mode.
 
     Every fused convolution becomes a convolution with batch normalisation whose statistics are

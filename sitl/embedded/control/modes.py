@@ -33,7 +33,10 @@ class RtlStage(Enum):
 
 @dataclass
 class FlightModes:
-    """What the vehicle is doing, and the attitude and thrust that follow from it."""
+    """What the vehicle is doing, and the attitude and thrust that follow from it.
+
+    Above 200 lines: a few lines for each mode, which share home, target and the way down.
+    """
 
     parameters: Parameters
     estimator: Estimator

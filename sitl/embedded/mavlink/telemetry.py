@@ -27,7 +27,10 @@ DEFAULT_STREAMS = {mavlink.MAVLINK_MSG_ID_HEARTBEAT: 1.0}
 
 
 class Telemetry:
-    """Builds messages from the vehicle's present state."""
+    """Builds messages from the vehicle's present state.
+
+    Above 200 lines: one short method for each of its messages, and their table.
+    """
 
     def __init__(self, vehicle: Aircraft) -> None:
         self._vehicle = vehicle

@@ -22,7 +22,7 @@ from sitl.camera.process import WorldCameraProcess
 from sitl.camera.traffic import traffic
 from sitl.demo.assets import FlightAssets
 from sitl.demo.companion_process import Ports, free_udp_port, running_companion, write_deployment
-from sitl.demo.flight import camera_config, home_of, vehicle_parameters
+from sitl.demo.flight import FilmedFlight, camera_config, home_of, vehicle_parameters
 from sitl.demo.script import FlightError, mission
 from sitl.ground.pilot import Pilot
 from sitl.suite.loop.case import LoopCase, LoopEvent
@@ -55,7 +55,10 @@ def fly(case: LoopCase, assets: LoopAssets, kind: VehicleKind, seed: int, out: P
 
 
 class _LoopFlight:
-    """The running of one case; everything it opens is closed by `stack`."""
+    """The running of one case; everything it opens is closed by `stack`.
+
+    Above 200 lines: the steps of a flight, read from top to bottom, share all that is open.
+    """
 
     def __init__(
         self, case: LoopCase, assets: LoopAssets, kind: VehicleKind, seed: int, out: Path,
@@ -155,7 +158,8 @@ class _LoopFlight:
             world.world, cache.frame, cars=3, people=3, seed=self._seed,
             epoch_ns=time.monotonic_ns(),
         )  # fmt: skip
-        config = camera_config(self._out, world, case.scenario, movers, (), self._ports, self._seed)
+        filmed = FilmedFlight(world, case.scenario, self._ports, self._seed, movers)
+        config = camera_config(filmed, self._out)
         self._camera = WorldCameraProcess(config)
         self._stack.enter_context(self._camera)
         fault = np.radians(case.wrong.gimbal_deg)

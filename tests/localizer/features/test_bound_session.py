@@ -7,7 +7,6 @@ import pytest
 
 from localizer.device_array import DeviceArray
 from localizer.errors import DeviceArrayError
-from localizer.features.bound_session import BoundSession
 from localizer.features.detail import DetailExtractor
 from localizer.features.extractor import SHIPPED_MODEL, DeviceExtractor, OnnxExtractor
 
@@ -22,9 +21,7 @@ def content(array: DeviceArray) -> np.ndarray:
 @pytest.fixture(scope="module")
 def bound():
     """The shipped network as it would be on a GPU, its outputs bound to memory of the CPU."""
-    made = OnnxExtractor(SHIPPED_MODEL, threads=1)
-    made._bound = BoundSession(made._session, made._outputs, "cpu")
-    return made
+    return OnnxExtractor(SHIPPED_MODEL, threads=1, bound_to="cpu")
 
 
 def image(height, width, seed=0):

@@ -170,7 +170,10 @@ def test_a_world_that_is_interrupted_paints_no_more_blocks(tmp_path, monkeypatch
 
     monkeypatch.setattr(world, "ProcessPoolExecutor", Pool)
     places = [(column, 0) for column in range(20)]
-    with pytest.raises(KeyboardInterrupt), world._blocks(None, tmp_path, places, processes=2):
+    with (
+        pytest.raises(KeyboardInterrupt),
+        world.painted_blocks(None, tmp_path, places, processes=2),
+    ):
         raise KeyboardInterrupt
     assert len(pools[0].painted) <= 1
 

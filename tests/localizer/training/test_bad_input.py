@@ -21,7 +21,7 @@ from localizer.training.data.pairs import SceneConfig  # noqa: E402
 from localizer.training.data.shards import read_shard, store  # noqa: E402
 from localizer.training.export import quantize as quantization  # noqa: E402
 from localizer.training.export.export import export, load_network  # noqa: E402
-from localizer.training.export.from_published import unfuse  # noqa: E402
+from localizer.training.export.from_published import trainable_network  # noqa: E402
 from localizer.training.export.quantize import quantize  # noqa: E402
 from localizer.training.loop.curves import plot  # noqa: E402
 from localizer.training.loop.train import Trainer  # noqa: E402
@@ -222,7 +222,7 @@ def test_a_model_is_tried_before_it_is_quantised(tmp_path: Path) -> None:
 
 def test_unfusing_needs_pairs() -> None:
     with pytest.raises(ModelError, match="needs training pairs"):
-        unfuse(SHIPPED_MODEL, [])
+        trainable_network(SHIPPED_MODEL, [])
 
 
 def test_every_number_of_a_run_has_its_bounds() -> None:

@@ -22,7 +22,7 @@ from localizer.training.data.batches import LoaderConfig, collate, crop_pair, mi
 from localizer.training.data.pairs import SceneConfig, scene_pairs  # noqa: E402
 from localizer.training.data.shards import write_shard  # noqa: E402
 from localizer.training.export.export import export  # noqa: E402
-from localizer.training.export.from_published import unfuse  # noqa: E402
+from localizer.training.export.from_published import trainable_network  # noqa: E402
 from localizer.training.export.quantize import quantize  # noqa: E402
 from localizer.training.loop.ablation import ablations  # noqa: E402
 from localizer.training.loop.curves import plot  # noqa: E402
@@ -268,7 +268,7 @@ def test_a_published_model_becomes_trainable_again(config: TrainConfig, tmp_path
     export(trainer.checkpoint, model)
     rng = np.random.default_rng(0)
     images = [rng.integers(0, 256, (64, 96, 3), dtype=np.uint8) for _ in range(4)]
-    network = unfuse(model, images)
+    network = trainable_network(model, images)
     tensor = torch.from_numpy(np.stack(images).transpose(0, 3, 1, 2)).float() / 255.0
     with torch.no_grad():
         restored = network(tensor)

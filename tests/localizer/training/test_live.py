@@ -46,8 +46,8 @@ def test_anchors_project_where_the_query_shows_them(stream: LiveStream) -> None:
 
 def test_depth_and_poses_bring_the_query_into_the_reference(stream: LiveStream) -> None:
     clear = opened(LoaderConfig(3, 64, (96, 64), appearance=False))
-    clear._places, clear._pool = stream._places, stream._pool  # the same places, no processes
     stream.batch(0)
+    clear.show_places_of(stream)
     noise = torch.Generator()
     pairs = list(clear.pairs(0, 6, np.random.default_rng(0), noise))
     clear.close()

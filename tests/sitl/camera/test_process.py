@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import json
+import multiprocessing
 import socket
 import threading
 import time
@@ -180,6 +181,7 @@ class _Watched:
     def __init__(self, connection: Connection, other: threading.Thread) -> None:
         self._connection, self._other = connection, other
         self.users: list[str] = []
+        self.stopping = False
 
     def send(self, message: object) -> None:
         self.users.append(threading.current_thread().name)
@@ -191,7 +193,7 @@ class _Watched:
 
     def poll(self, timeout: float = 0.0) -> bool:
         self.users.append(threading.current_thread().name)
-        if timeout > 0:
+        if self.stopping and timeout > 0:
             self._other.start()
             self._other.join(0.3)
         return self._connection.poll(timeout)
@@ -204,11 +206,15 @@ def test_nobody_else_is_on_the_pipe_while_the_camera_stops(cache: Path, tmp_path
         with contextlib.suppress(WorldCameraError):  # when the process is gone already
             process.send(_sample(0, 0))
 
-    process = WorldCameraProcess(_config(cache, tmp_path / "frames.csv", _free_url()))
-    process.start()
+    ours, its = multiprocessing.Pipe()
     sender = threading.Thread(target=send, name="sender")
-    pipe = _Watched(process._connection, sender)
-    process._connection = pipe  # type: ignore[assignment]
+    pipe = _Watched(ours, sender)
+    process = WorldCameraProcess(
+        _config(cache, tmp_path / "frames.csv", _free_url()), lambda: (pipe, its)
+    )
+    process.start()
+    pipe.users.clear()
+    pipe.stopping = True
     process.stop()
     sender.join()
     assert process.statistics is not None
@@ -224,7 +230,8 @@ def test_a_missing_cache_is_an_error_in_the_parent(tmp_path: Path) -> None:
 def test_a_process_that_died_is_an_error_at_the_next_sample(cache: Path, tmp_path: Path) -> None:
     config = _config(cache, tmp_path / "frames.csv", _free_url())
     with WorldCameraProcess(config) as process:
-        process._process.kill()
-        process._process.join()
+        (child,) = (c for c in multiprocessing.active_children() if c.name == "world-camera")
+        child.kill()
+        child.join()
         with pytest.raises(WorldCameraError, match="died"):
             process.send(_sample(0, 0))

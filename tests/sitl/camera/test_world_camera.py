@@ -21,7 +21,7 @@ from localizer.synth.appearance.model import Appearance
 from sitl.camera.distortion import Lens
 from sitl.camera.movers import Mover
 from sitl.camera.true_motion import PoseTrack
-from sitl.camera.world_camera import FrameLog, WorldCamera, centre_flow
+from sitl.camera.world_camera import CameraOptions, FrameLog, WorldCamera, centre_flow
 from sitl.demo.analysis import poses, read_csv
 from sitl.demo.sequence import record_sequence
 
@@ -128,7 +128,7 @@ def test_a_mover_is_drawn_at_its_true_place(renderer: NumbaRenderer) -> None:
     square = TileMesh(corners, np.zeros((4, 2), np.float32), faces, (red,), Pose.identity())
     path = np.array([[-20.0, 10, 0], [20, 10, 0], [20, 14, 0], [-20, 14, 0]])
     mover = Mover("car", path, speed_mps=10.0, phase_m=0.0, mesh=square)
-    camera = WorldCamera(renderer, CAMERA, Appearance(), [mover])
+    camera = WorldCamera(renderer, CAMERA, Appearance(), CameraOptions((mover,)))
     track = PoseTrack([(0, _pose()), (10 * 10**9, _pose())])
     for time_ns in (500_000_000, 3_000_000_000):
         exposure = camera.expose(time_ns, track)
@@ -145,9 +145,9 @@ def test_the_caches_origin_may_differ_from_the_maps(renderer: NumbaRenderer) -> 
     shift = Pose(so3_exp([0, 0, 0.3]), np.array([15.0, -7.0, 3.0]))
     pose = _pose()
     here = WorldCamera(renderer, CAMERA, Appearance()).expose(0, _track(pose))
-    there = WorldCamera(renderer, CAMERA, Appearance(), scene_from_world=shift).expose(
-        0, _track(shift.inverse @ pose)
-    )
+    there = WorldCamera(
+        renderer, CAMERA, Appearance(), CameraOptions(scene_from_world=shift)
+    ).expose(0, _track(shift.inverse @ pose))
     assert here is not None
     assert there is not None
     assert np.abs(here.image.astype(int) - there.image).max() <= 2
@@ -163,7 +163,7 @@ def test_the_blur_is_the_motion_during_the_shutter(renderer: NumbaRenderer) -> N
     assert abs(flow[1]) < 0.01
 
     def sharpness(track: PoseTrack, shutter_s: float) -> float:
-        camera = WorldCamera(renderer, CAMERA, Appearance(), shutter_s=shutter_s)
+        camera = WorldCamera(renderer, CAMERA, Appearance(), CameraOptions(shutter_s=shutter_s))
         exposure = camera.expose(50_000_000, track)
         assert exposure is not None
         return float(np.abs(np.diff(exposure.image.astype(float), axis=1)).max())
@@ -183,7 +183,7 @@ def test_a_recorded_sequence_is_read_back_as_it_was(
 ) -> None:
     frame = LocalFrame(Geodetic(47.0, 8.0, 430.0))
     track = _track(_pose(30), _pose(33, -70), _pose(35, -60))
-    camera = WorldCamera(renderer, CAMERA, Appearance(read_noise=0.01), seed=4)
+    camera = WorldCamera(renderer, CAMERA, Appearance(read_noise=0.01), CameraOptions(seed=4))
     times = [0, 70_000_000, 140_000_000, 999_000_000_000]
     assert record_sequence(camera, track, times, frame, tmp_path) == 3
     read_camera = Camera.from_json(tmp_path / "camera.json")

@@ -44,7 +44,7 @@ def grounded(bench):
 
 def told(bench, message):
     """The link after the vehicle has handled the message."""
-    message._header.srcSystem, message._header.srcComponent = 255, 190
+    message.pack(mavlink.MAVLink(None, 255, 190))  # which names the sender
     link = SerialPort()
     bench.whole.commands.handle(link, message)
     return link

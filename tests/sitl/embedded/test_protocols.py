@@ -73,7 +73,7 @@ class Replies(list):
 
 
 def sent_by_gcs(message):
-    message._header.srcSystem, message._header.srcComponent = 255, 190
+    message.pack(mavlink.MAVLink(None, 255, 190))  # which names the sender
     return message
 
 

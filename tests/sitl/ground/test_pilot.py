@@ -128,7 +128,7 @@ def test_a_start_that_is_interrupted_leaves_neither_process_nor_folder(folders, 
 def test_a_vehicle_does_not_outlive_a_killed_parent():
     script = (
         "import time; from tests.sitl.ground.test_pilot import _Idle; v = _Idle(); v.start();"
-        "print(v._process.pid, v._folder, flush=True); time.sleep(600)"
+        "print(v.processes[0].pid, v.folder, flush=True); time.sleep(600)"
     )
     root = Path(__file__).resolve().parents[3]
     parent = subprocess.Popen(
@@ -152,7 +152,7 @@ def _ended(pid: str) -> bool:
 
 def test_a_stopped_vehicle_leaves_no_process_behind():
     with _Idle() as vehicle:
-        children = [vehicle._process, vehicle._lifeline]
+        children = vehicle.processes
         assert [c.poll() for c in children] == [None, None]
     assert None not in [c.poll() for c in children]
 

@@ -43,7 +43,7 @@ def resources(log: str) -> dict[str, Resources]:
 @pytest.fixture(scope="module")
 def _compiler():
     try:
-        compiler._nvrtc()
+        compiler.load_nvrtc()
     except CudaUnavailableError as error:
         pytest.skip(str(error))
 
