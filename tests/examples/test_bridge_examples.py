@@ -103,7 +103,7 @@ class Feed:
 
     def _run(self) -> None:
         while not self._stop.wait(1.0 / 15.0):
-            truth = self._pilot.truth_at(time.monotonic_ns() - 60_000_000)
+            truth = self._pilot.record.truth_at(time.monotonic_ns() - 60_000_000)
             if truth is None:
                 continue
             north, east, down = HOME.ned_of(truth.location)
@@ -123,9 +123,11 @@ def test_the_ekf_is_where_my_fixes_say(kind: Any, run: Callable[..., Example]) -
     """No receiver: without them there is no position; 20 m beside the truth, so is the EKF."""
     with kind(HOME, parameters=vision_only_parameters()) as vehicle:
         pilot = Pilot(vehicle.gcs_endpoint, vehicle.speedup, vehicle.check)
-        pilot.connect()
+        pilot.link.connect()
         with pilot.fast_forward():
-            pilot.wait(lambda: pilot.time_s > GYROS_SETTLED_S, 60.0, "the gyros to settle")
+            pilot.link.wait(
+                lambda: pilot.record.time_s > GYROS_SETTLED_S, 60.0, "the gyros to settle"
+            )
         place = (HOME.latitude_deg, HOME.longitude_deg, HOME.altitude_m, GEOID)
         example = run("inject_my_fixes.py", vehicle.companion_endpoint, *place)
         example.write("hello")
@@ -133,14 +135,14 @@ def test_the_ekf_is_where_my_fixes_say(kind: Any, run: Callable[..., Example]) -
         try:
             pilot.wait_ready()
             pilot.arm()
-            ekf = pilot.ekf
+            ekf = pilot.record.ekf
             assert ekf is not None
             assert ekf.location is not None
             north, east, _ = HOME.ned_of(ekf.location)
             assert math.hypot(north - 20.0, east) < 1.0
         finally:
             feed.stop()
-            pilot.close()
+            pilot.link.close()
     assert example.end() == 0
     assert "PiLoT: injecting" in example.lines
     # The line that is no fix was told, and it was the only one.

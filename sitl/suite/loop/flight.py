@@ -252,7 +252,7 @@ class _LoopFlight:
 
     def _fix_errors(self) -> list[float]:
         """Horizontal errors of every position that was injected in the recorded part, metres."""
-        origin = self._pilot.origin
+        origin = self._pilot.record.origin
         if origin is None or not self._tlog.exists():
             return []
         errors = []
@@ -260,7 +260,7 @@ class _LoopFlight:
             if message.get_type() != "VISION_POSITION_ESTIMATE":
                 continue
             time_ns = message.usec * 1000  # CLOCK_MONOTONIC, of the exposure
-            truth = self._pilot.truth_at(time_ns)
+            truth = self._pilot.record.truth_at(time_ns)
             if truth is None or not self._start_ns <= time_ns <= self._end_ns:
                 continue
             true = origin.ned_of(truth.location)

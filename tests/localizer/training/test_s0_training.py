@@ -16,7 +16,7 @@ from localizer.training.config import TrainConfig, load_config  # noqa: E402
 from localizer.training.data.pairs import SceneConfig  # noqa: E402
 from localizer.training.data.shards import write_shard  # noqa: E402
 from localizer.training.export.export import export  # noqa: E402
-from localizer.training.export.from_published import unfuse  # noqa: E402
+from localizer.training.export.from_published import trainable_network  # noqa: E402
 from localizer.training.export.quantize import quantize  # noqa: E402
 from localizer.training.loop.train import Trainer, alignment_ramp  # noqa: E402
 from localizer.training.models.s0 import S0Config, S0Net  # noqa: E402
@@ -139,7 +139,7 @@ def test_int8_keeps_heads_in_float(model: Path, shards: Path, tmp_path: Path) ->
 def test_a_published_model_becomes_trainable_again(trainer: Trainer, model: Path) -> None:
     rng = np.random.default_rng(0)
     images = [rng.integers(0, 256, (64, 64, 3), dtype=np.uint8) for _ in range(4)]
-    network = unfuse(model, images)
+    network = trainable_network(model, images)
     tensor = torch.from_numpy(np.stack(images).transpose(0, 3, 1, 2)).float() / 255.0
     with torch.no_grad():
         restored, expected = network(tensor), trainer.average(tensor)
