@@ -53,8 +53,8 @@ _NEXT_STATION_S = 10.0  # a second ground station takes over where the first one
 class Bridge:
     """Speaks MAVLink for the localizer. Every public method may be called from any thread.
 
-    It has more than 15 public methods because it is the package's whole surface: each hands one
-    thing to, or asks one thing of, the part that does the work.
+    It has more than 15 public methods and 200 lines because it is the package's whole surface: each
+    method hands one thing to, or asks one thing of, the part that does the work.
 
     on_track: called (in a link's thread; must return at once) when the operator asks for tracking.
     on_text: called likewise with every line for the operator (severity, text), for a record.
