@@ -98,11 +98,6 @@ class VehicleProcess(ABC):
         return self._process is not None and self._process.poll() is None
 
     @property
-    def folder(self) -> Path | None:
-        """In which it runs; None before it was started."""
-        return self._folder
-
-    @property
     def processes(self) -> tuple[subprocess.Popen[bytes], ...]:
         """The vehicle's, and the one that ends it once we are gone."""
         return tuple(p for p in (self._process, self._lifeline) if p is not None)
