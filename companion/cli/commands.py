@@ -1,4 +1,5 @@
-"""The command line: ``companion run | eval | localize | convert | replay | map | world | doctor``.
+"""The command line: ``companion run | eval | localize | convert | replay | map | world | doctor |
+key``.
 
 Exit codes: 0 done; 1 `doctor` found advice, `replay` differs, `localize` localized nothing or `map
 verify` found damage; 2 wrong usage, a named error, or `doctor` found the vehicle not fit to fly;
@@ -19,6 +20,7 @@ from companion.cli.convert import convert_command
 from companion.cli.doctor import doctor_command
 from companion.cli.evaluate import evaluate_command
 from companion.cli.interrupts import INTERRUPTED
+from companion.cli.key import key_command
 from companion.cli.localize import localize_command
 from companion.cli.map import app as map_app
 from companion.cli.replay import replay_command
@@ -60,6 +62,7 @@ app.command("localize")(localize_command)
 app.command("convert")(convert_command)
 app.command("replay")(replay_command)
 app.command("doctor")(doctor_command)
+app.command("key")(key_command)
 app.add_typer(map_app, name="map", help="Build and inspect tile caches.")
 app.add_typer(world_app, name="world", help="Generated worlds for tests and demos.")
 

@@ -44,6 +44,8 @@ class VehicleClient:
         self.system = 0
         self.component = mavlink.MAV_COMP_ID_AUTOPILOT1
         self.autopilot = mavlink.MAV_AUTOPILOT_INVALID
+        self.armed = False
+        """As the heartbeat said that began the conversation."""
         self._next_heartbeat_ns = 0
 
     def __enter__(self: _Self) -> _Self:
@@ -97,9 +99,11 @@ class VehicleClient:
             if not is_autopilot(message):
                 return
             link.system_id = system
+            link.keep_peer()
             with self._changed:
                 self.system, self.component = system, message.get_srcComponent()
                 self.autopilot = message.autopilot
+                self.armed = bool(message.base_mode & mavlink.MAV_MODE_FLAG_SAFETY_ARMED)
                 self._changed.notify_all()
         elif (system, message.get_srcComponent()) == (self.system, self.component):
             with self._changed:

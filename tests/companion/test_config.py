@@ -161,6 +161,15 @@ def test_the_shipped_deployment_file_lists_every_key_and_is_valid():
         assert told, ".".join(path)
 
 
+def test_the_signed_example_is_valid_and_leaves_no_door_open():
+    config = load_config(DEPLOYMENT.with_name("signed.yaml"))
+    assert config.camera.settings.sender is not None
+    assert config.bridge.sender is not None
+    assert config.bridge.signing is not None
+    assert config.bridge.ground_signing is not None
+    assert "0.0.0.0" not in config.camera.source + config.bridge.connection
+
+
 def test_every_key_of_the_bridge_is_explained_where_it_stands():
     lines = DEPLOYMENT.read_text().splitlines()
     begun = lines.index("bridge:")

@@ -1,0 +1,42 @@
+"""``companion key``: makes the key that MAVLink links are signed with, and installs it."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+from rich.console import Console
+
+from companion.errors import ConfigError
+from mavlink_bridge.link.signing import create_key
+
+
+def key_command(
+    file: Annotated[Path, typer.Argument(help="key file to make, mode 0600")],
+    install: Annotated[
+        str | None,
+        typer.Option(help="connection of the disarmed flight controller that is given the key"),
+    ] = None,
+) -> None:
+    """Make a signing key; --install gives it (or the one that FILE holds) to the autopilot."""
+    console = Console()
+    if not file.exists():
+        create_key(file)
+        console.print(f"{file}: made; keep a copy, and keep it from others", soft_wrap=True)
+    elif install is None:
+        raise ConfigError(f"{file}: is there already and not overwritten; give another name")
+    if install is not None:
+        from mavlink_bridge.preflight.signing_setup import install_key
+
+        console.print("the key goes over this connection in clear: use a cable", soft_wrap=True)
+        if install_key(install, file):
+            console.print("installed: the autopilot's heartbeat is signed with it")
+        else:
+            console.print(
+                "[yellow]sent, not confirmed[/]: no signed heartbeat came. ArduPilot's USB port "
+                "stays unsigned (check on the companion's port); or another key is in force",
+                soft_wrap=True,
+            )
+    console.print(f"deployment: bridge.signing: {{key_file: {file}}}", soft_wrap=True)
+    console.print("ground stations need the same key before they connect: docs/bridge.md, Signing")

@@ -1,0 +1,55 @@
+"""Giving the flight controller the key that its links are signed with (SETUP_SIGNING, 256)."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+from pymavlink.dialects.v20 import ardupilotmega as mavlink
+
+from mavlink_bridge.config import BridgeConfig, SigningConfig
+from mavlink_bridge.errors import BridgeStateError, ConnectionSilentError
+from mavlink_bridge.link.signing import load_key, signing_timestamp
+from mavlink_bridge.preflight.client import VehicleClient
+
+_REPEATS = 3
+_APART_S = 0.3
+
+
+class _KeyGiver(VehicleClient):
+    """Speaks without a signature: the autopilot has no key yet."""
+
+    def __init__(self, config: BridgeConfig) -> None:
+        super().__init__(config, "signing", ())
+
+    def take(self, message: Any) -> None:
+        """Nothing answers SETUP_SIGNING."""
+
+    def give(self, key: bytes) -> None:
+        """The key and the time, a few times: nothing acknowledges them."""
+        message = mavlink.MAVLink_setup_signing_message(
+            self.system, self.component, list(key), signing_timestamp()
+        )
+        for _ in range(_REPEATS):
+            self.ask(message)
+            self.wait_for(lambda: False, _APART_S)
+
+
+def install_key(connection: str, key_file: Path) -> bool:
+    """Give the autopilot the key of a file; whether its heartbeat comes signed with it then.
+
+    False on ArduPilot's USB port, which stays unsigned, and where another key was in force before.
+    Raises `BridgeStateError` when the vehicle is armed (ArduPilot would ignore the key).
+    """
+    key = load_key(key_file)
+    config = BridgeConfig(connection=connection)
+    with _KeyGiver(config) as client:
+        if client.armed:
+            raise BridgeStateError(f"{connection}: the vehicle is armed; disarm it, then install")
+        client.give(key)
+    signed = config.model_copy(update={"signing": SigningConfig(key_file=key_file)})
+    try:
+        with _KeyGiver(signed):
+            return True
+    except ConnectionSilentError:
+        return False
