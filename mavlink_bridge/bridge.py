@@ -223,15 +223,13 @@ class Bridge:
 
     @property
     def injecting(self) -> bool:
-        """Whether fixes are sent to the flight controller right now (mode and gate)."""
-        return self._shared.mode() == "inject"
+        """Whether fixes are sent to the flight controller right now (mode, gate and
+        shadow score)."""
+        return self._fc.injecting
 
     def shadow_score(self) -> ShadowScore:
         """How vision compared with GNSS while that was healthy: the go or no-go before denial."""
-        injector = self._fc.sender.injector
-        return self._fc.outcome.shadow.score(
-            monotonic_ns(), injector.yaw_difference_rad, injector.guard.blocked
-        )
+        return self._fc.shadow_score(monotonic_ns())
 
     def loop_verdict(self) -> LoopVerdict | None:
         """Whether the EKF follows what is sent; None while nothing is sent or it is too early."""

@@ -95,6 +95,10 @@ class InjectionConfig(_Model):
         description="nothing is sent once no fix came for so many of their usual intervals",
     )
     acceleration_sigma_mps2: float = Field(default=2.0, ge=0.001, le=50.0)
+    force: bool = Field(
+        default=False,
+        description="inject and switch without a go of the shadow score; told as a warning",
+    )
     send_attitude: bool = True
     covariance: Literal["profile", "cbrt", "sqrt", "variance"] = "profile"
     gps_id: int = Field(default=0, ge=0, le=3, description="0-based GPS instance of GPS_INPUT")

@@ -9,12 +9,16 @@ from typing import Any
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from mavlink_bridge.components import COMMANDS_IN, Components
+from mavlink_bridge.config import Mode
 from mavlink_bridge.injection.fix_sender import FixSender
 from mavlink_bridge.injection.fix_warnings import FixWarnings
+from mavlink_bridge.injection.interlock import ShadowInterlock
 from mavlink_bridge.injection.outcome import InjectionOutcome
+from mavlink_bridge.injection.shadow import ShadowScore
 from mavlink_bridge.injection.switching import SourceOrders
 from mavlink_bridge.link.link import Link
 from mavlink_bridge.messages import VehicleState
+from mavlink_bridge.news import VehicleNews
 from mavlink_bridge.shared import Shared
 from mavlink_bridge.texts import Teller
 from mavlink_bridge.vehicle.commands import Commander, accepted
@@ -49,7 +53,7 @@ class FlightControllerEnd:
         self.components = Components(shared, ground=False)
         self._shared = shared
         self._tracker = shared.tracker
-        self._teller = teller = Teller(shared.say, {"inject": "nothing yet"})
+        self._teller = teller = Teller(shared.say, {"inject": "nothing yet", "loop": "nothing yet"})
         self._commander = commander = Commander(config.companion_component)
         self.requests = VehicleRequests(config, commander)
         self.time_sync = TimeSync(shared.tracker, config.companion_component)
@@ -57,10 +61,27 @@ class FlightControllerEnd:
         self.outcome = InjectionOutcome(shared, self.origin, teller, self.counters)
         self.sender = FixSender(shared, self.origin, self.outcome, teller, self.counters)
         self.sources = SourceOrders(config.switch, commander, teller, self.counters)
+        self._interlock = ShadowInterlock(
+            config.injection.force, self.shadow_score, lambda: self.outcome.compared_ns, teller
+        )
+        self.news = VehicleNews(teller)
         self._warnings = FixWarnings(shared, self.sender.injector, teller)
         self._strangers = StrangerWatch(config, shared.tracker, teller, self.counters)
         self._next_check_ns = 0
         self._connected = False
+        self._mode: Mode = "off"
+
+    def shadow_score(self, now_ns: int) -> ShadowScore:
+        """How vision compared with GNSS over the last two minutes."""
+        guard = self.sender.injector.guard
+        return self.outcome.shadow.score(
+            now_ns, self.sender.injector.yaw_difference_rad, guard.blocked
+        )
+
+    @property
+    def injecting(self) -> bool:
+        """Whether fixes are sent right now: mode, gate and the shadow score's interlock."""
+        return self._mode == self._shared.mode() == "inject"
 
     def figures(self) -> dict[str, int | float | str]:
         """Counters and measures for a record; keys are prefixed by where they come from."""
@@ -151,7 +172,7 @@ class FlightControllerEnd:
         if state.connected:
             self.requests.tick(link, state, now_ns)
             self.time_sync.tick(link, now_ns)
-            self.origin.tick(link, now_ns, may_set=self._shared.mode() == "inject")
+            self.origin.tick(link, now_ns, may_set=self.injecting)
             if config.ground_connection is None and config.camera.announce:
                 self.components.serve_camera(link, state, now_ns)
         return due_ns
@@ -171,7 +192,10 @@ class FlightControllerEnd:
     def _inject(self, link: Link, state: VehicleState, now_ns: int) -> int:
         sender = self.sender
         sender.take(now_ns)
-        mode = self._shared.mode()
+        shared = self._shared
+        mode = self._mode = self._interlock.mode(
+            shared.mode(), state, now_ns, by_pilot=shared.gate is not None
+        )
         if mode == "off" or not state.connected:
             sender.injector.skip()
             return now_ns + _IDLE_NS
@@ -191,5 +215,12 @@ class FlightControllerEnd:
         self._strangers.check(link, now_ns)
         if self.outcome.judge(state, now_ns):
             sender.injector.announce_jump()
-        good = sender.is_good(now_ns) and self._shared.mode() == "inject"
-        self.sources.tick(link, state, sender.vision, vision_good=good, now_ns=now_ns)
+        came = sender.is_good(now_ns)
+        may_switch = self._interlock.may_switch(now_ns)
+        good = came and self.injecting
+        self.sources.tick(
+            link, state, sender.vision, good=good, may_switch=may_switch, now_ns=now_ns
+        )
+        held = came and self._shared.mode() == "inject"
+        self.news.held(self._interlock.reason if held else "", now_ns)
+        self.news.look(state, now_ns, injecting=good)

@@ -9,6 +9,40 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 from mavlink_bridge.messages import without_figures
 
 
+_RELAPSE_NS = 8_000_000_000
+
+
+class Settling:
+    """Good news that may not last: told after a while without trouble, later with each relapse.
+
+    An overloaded computer is well and ill by turns, every second. Each relapse soon after
+    doubles the wait, and what recurs meanwhile counts as the same trouble: it was told.
+    """
+
+    def __init__(self, wait_s: float = 1.5, longest_s: float = 60.0) -> None:
+        self._shortest_ns = self._wait_ns = int(wait_s * 1e9)
+        self._longest_ns = int(longest_s * 1e9)
+        self._bad_ns: int | None = None
+        self._over_ns: int | None = None
+
+    def is_over(self, now_ns: int, *, bad: bool) -> bool:
+        """Take in whether there is trouble now; whether there is and was none for long enough."""
+        if bad:
+            if self._over_ns is not None:
+                relapsed = now_ns - self._over_ns < _RELAPSE_NS + 2 * self._wait_ns
+                longer_ns = min(2 * self._wait_ns, self._longest_ns)
+                self._wait_ns = longer_ns if relapsed else self._shortest_ns
+                self._over_ns = None
+            self._bad_ns = now_ns
+            return False
+        if self._bad_ns is None:
+            return True
+        if now_ns - self._bad_ns < self._wait_ns:
+            return False
+        self._bad_ns, self._over_ns = None, now_ns
+        return True
+
+
 class Teller:
     """Remembers by topic what the operator was told, so that nothing is told twice.
 
@@ -20,6 +54,8 @@ class Teller:
     ) -> None:
         self._say = say
         self._told = dict(known or {})
+        self._settling: dict[str, Settling] = {}
+        self._since_relief: dict[str, set[str]] = {}
 
     def told(self, topic: str) -> str:
         """What was told last of a topic, without its figures; empty when all is well."""
@@ -43,6 +79,22 @@ class Teller:
             self.warn(problem)
         elif relief and known and prefix in ("", "inject"):
             self.inform(relief)
+
+    def tell_settled(
+        self, topic: str, problem: str, relief: str, now_ns: int, *, prefix: str = ""
+    ) -> None:
+        """As `tell`, for what comes and goes: each problem once until the relief, and that only
+        once it has lasted.
+        """
+        settling = self._settling.setdefault(topic, Settling())
+        over = settling.is_over(now_ns, bad=bool(problem))
+        told = self._since_relief.setdefault(topic, set())
+        if problem and without_figures(problem) not in told:
+            told.add(without_figures(problem))
+            self.tell(topic, problem, relief, prefix=prefix)
+        elif over:
+            told.clear()
+            self.tell(topic, "", relief, prefix=prefix)
 
     def warn(self, text: str) -> None:
         """A warning, whatever was told before."""

@@ -63,7 +63,7 @@ class FixSender:
         brief = reason == NO_FRESH_FIX and now_ns - self._delivered_ns < _NEWS_AFTER_NS
         if reason != NO_FIX_YET and not brief:
             problem = f"not sent: {reason}" if reason else ""
-            self._teller.tell("inject", problem, "injecting", prefix=mode)
+            self._teller.tell_settled("inject", problem, "injecting", now_ns, prefix=mode)
 
     def is_good(self, now_ns: int) -> bool:
         """Whether positions came of late, and the yaw guard is content."""

@@ -22,7 +22,8 @@ class InjectionOutcome:
     """Remembers what was made and sent, and judges; one thread.
 
     verdict: the last one; None while nothing is sent or it is too early. doubt: set from outside,
-    why its following must not be called good.
+    why its following must not be called good. compared_ns: exposure of the last fix that was
+    compared with GNSS, 0 for none.
     """
 
     def __init__(
@@ -31,6 +32,7 @@ class InjectionOutcome:
         self.shadow = ShadowScorer(shared.geoid_separation_m)
         self.verdict: LoopVerdict | None = None
         self.doubt = ""
+        self.compared_ns = 0
         self._loop = ClosedLoopCheck(shared.config.injection.message)
         self._tracker = shared.tracker
         self._origin = origin
@@ -70,12 +72,13 @@ class InjectionOutcome:
             reference = self._tracker.global_at(fix.time_ns)
             if reference is not None and on_gnss and gnss_healthy(state, now_ns):
                 self.shadow.compare(fix, reference)
+                self.compared_ns = fix.time_ns
 
     def judge(self, state: VehicleState, now_ns: int) -> bool:
         """Whether the EKF follows, told; True when a jump must be announced again."""
         self.verdict = self._loop.verdict(now_ns, state, self._tracker.local_at)
         if self.verdict is not None and (self.verdict.reason or not self.doubt):
-            self._teller.tell("loop", self.verdict.reason, "the EKF follows")
+            self._teller.tell_settled("loop", self.verdict.reason, "the EKF follows", now_ns)
         if not self._loop.jump_missed():
             return False
         self._counters["jumps_repeated"] += 1

@@ -22,7 +22,7 @@ _LENGTH = 4096
 _GNSS_FRESH_NS = 1_500_000_000
 _MINIMUM_FIX = 3
 _REFERENCE_SIGMA_M = 1.5  # the EKF on GNSS, horizontally
-_MINIMUM_SAMPLES = 50
+MINIMUM_SAMPLES = 50
 _MEDIAN_LIMIT_M = 3.0
 _P95_LIMIT_M = 6.0
 _RATE_LIMIT_HZ = 4.0
@@ -98,8 +98,8 @@ class ShadowScorer:
         span_s = float(samples[-1, 0] - samples[0, 0]) * 1e-9
         rate = (len(samples) - 1) / span_s if span_s > 0 else 0.0
         reasons = []
-        if len(samples) < _MINIMUM_SAMPLES:
-            reasons.append(f"only {len(samples)} fixes of {_MINIMUM_SAMPLES}")
+        if len(samples) < MINIMUM_SAMPLES:
+            reasons.append(f"only {len(samples)} fixes of {MINIMUM_SAMPLES}")
         elif rate < _RATE_LIMIT_HZ:
             reasons.append(f"{rate:.1f} Hz, needs {_RATE_LIMIT_HZ:.0f}")
         if median > _MEDIAN_LIMIT_M:

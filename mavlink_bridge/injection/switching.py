@@ -2,6 +2,9 @@
 
 Measured: switched before GNSS goes the vehicle moves 1.2 m at most; a jammed receiver without a
 switch ends in LAND after 4.6 s with up to 87 m of error.
+
+Where GNSS and vision contradict each other, the EKF has the third vote: its inertial navigation
+refuses a receiver that jumps, and stays with one from which a wrong map differs.
 """
 
 from __future__ import annotations
@@ -25,6 +28,11 @@ _RETRY_NS = 1_000_000_000
 _GNSS_SIGMA_M = 2.5  # where the receiver does not say
 _SPEED_SLACK_S = 0.4  # a receiver's report is this much older than its time of arrival
 _VISION_FRESH_NS = 1_000_000_000
+_LARGEST_SIGMA_M = 5.0  # a receiver that claims to be bad must not hide an error in its claim
+_VISION_GONE_NS = 3_000_000_000
+_GNSS_BACK_NS = 3_000_000_000  # ArduPilot's failsafe comes 8 s after the last position
+_RETURN_M = 25.0  # of GNSS from where the EKF has come by itself
+_AGAIN_NS = 10_000_000_000
 
 
 @dataclass(frozen=True)
@@ -35,46 +43,91 @@ class SwitchOrder:
     reason: str
 
 
-def gnss_fault(
-    state: VehicleState, vision: PropagatedFix | None, sigmas: float, now_ns: int
-) -> str | None:
-    """Why GNSS is bad: lost, glitching, or away from vision by more than both errors; or None."""
-    if not gnss_healthy(state, now_ns):
-        return "GNSS lost"
-    glitch = mavlink.EKF_GPS_GLITCHING if state.autopilot == "ardupilot" else 0
-    if state.ekf_flags & glitch:
-        return "GNSS glitch"
-    if vision is None or state.gps_latitude_deg is None or state.gps_longitude_deg is None:
+_Place = tuple[float, float]  # latitude and longitude, degrees
+
+
+def _receiver(state: VehicleState) -> _Place | None:
+    if state.gps_latitude_deg is None or state.gps_longitude_deg is None:
         return None
-    apart = math.hypot(
-        *north_east(
-            state.gps_latitude_deg,
-            state.gps_longitude_deg,
-            vision.latitude_deg,
-            vision.longitude_deg,
-        )
-    )
-    accuracy = _GNSS_SIGMA_M if state.gps_h_accuracy_m is None else state.gps_h_accuracy_m
+    return state.gps_latitude_deg, state.gps_longitude_deg
+
+
+def _ekf(state: VehicleState) -> _Place | None:
+    if state.latitude_deg is None or state.longitude_deg is None:
+        return None
+    return state.latitude_deg, state.longitude_deg
+
+
+def _apart_m(a: _Place, b: _Place) -> float:
+    """Horizontal distance."""
+    return math.hypot(*north_east(*a, *b))
+
+
+def _inconsistent_m(state: VehicleState, vision: PropagatedFix | None, sigmas: float) -> float:
+    """How far GNSS and vision are apart where that is more than both errors allow, else 0."""
+    receiver = _receiver(state)
+    if vision is None or receiver is None:
+        return 0.0
+    apart = _apart_m(receiver, (vision.latitude_deg, vision.longitude_deg))
+    claimed = _GNSS_SIGMA_M if state.gps_h_accuracy_m is None else state.gps_h_accuracy_m
+    accuracy = min(claimed, _LARGEST_SIGMA_M)
     speed = math.hypot(*vision.velocity_ned[:2])
     limit = sigmas * math.hypot(accuracy, vision.horizontal_sigma_m) + speed * _SPEED_SLACK_S
-    return f"GNSS {apart:.0f} m from vision" if apart > limit else None
+    return apart if apart > limit else 0.0
+
+
+def _ekf_is_with_vision(state: VehicleState, vision: PropagatedFix) -> bool:
+    """Whether the EKF, which uses GNSS, is nearer to vision than to the receiver's position."""
+    receiver, ekf = _receiver(state), _ekf(state)
+    if receiver is None or ekf is None:
+        return False
+    return _apart_m((vision.latitude_deg, vision.longitude_deg), ekf) < _apart_m(receiver, ekf)
+
+
+@dataclass(frozen=True)
+class GnssFault:
+    """What is wrong with GNSS. proven: more than vision speaks against it."""
+
+    reason: str
+    proven: bool
+
+
+def gnss_fault(
+    state: VehicleState, vision: PropagatedFix | None, sigmas: float, now_ns: int
+) -> GnssFault | None:
+    """Why GNSS is bad: lost, glitching, or away from vision by more than both errors; or None."""
+    if not gnss_healthy(state, now_ns):
+        return GnssFault("GNSS lost", proven=True)
+    glitch = mavlink.EKF_GPS_GLITCHING if state.autopilot == "ardupilot" else 0
+    if state.ekf_flags & glitch:
+        return GnssFault("GNSS glitch", proven=True)
+    apart = _inconsistent_m(state, vision, sigmas)
+    if vision is None or not apart:
+        return None
+    return GnssFault(f"GNSS {apart:.0f} m from vision", _ekf_is_with_vision(state, vision))
 
 
 class SourceSwitch:
-    """Decides; the caller sends and reports the acknowledgement. One thread."""
+    """Decides; the caller sends and reports the acknowledgement. One thread.
+
+    refusal: why GNSS that is bad is not left for vision; empty when that is not so.
+    """
 
     def __init__(self, config: SourceSwitchConfig) -> None:
         self._config = config
         self.current = config.gnss_set
+        self.refusal = ""
         self._bad_since_ns: int | None = None
         self._good_since_ns: int | None = None
+        self._sound_since_ns: int | None = None
+        self._vision_ns: int | None = None
         self._ordered: int | None = None
         self._next_ns = 0
 
     def reset(self) -> None:
         """The flight controller rebooted: it starts with its first set."""
         self.current, self._ordered = self._config.gnss_set, None
-        self._bad_since_ns = self._good_since_ns = None
+        self._bad_since_ns = self._good_since_ns = self._sound_since_ns = None
 
     def acknowledged(self, accepted: bool) -> None:
         """COMMAND_ACK of the order."""
@@ -83,9 +136,18 @@ class SourceSwitch:
         self._ordered = None
 
     def decide(
-        self, now_ns: int, state: VehicleState, vision: PropagatedFix | None, vision_good: bool
+        self,
+        now_ns: int,
+        state: VehicleState,
+        vision: PropagatedFix | None,
+        *,
+        good: bool,
+        may_switch: bool,
     ) -> SwitchOrder | None:
-        """What to order now. vision_good: fixes are being sent, and the yaw guard is content."""
+        """What to order now. good: fixes are being sent, and the yaw guard is content. may_switch:
+        the shadow score of this flight was a go.
+        """
+        self.refusal = ""
         if not self._config.enabled:
             return None
         fresh = vision is not None and now_ns - vision.time_ns < _VISION_FRESH_NS
@@ -98,29 +160,55 @@ class SourceSwitch:
         else:
             self._good_since_ns = None
             self._bad_since_ns = self._bad_since_ns or now_ns
+        # As far as GNSS alone is asked: vision's word against it does not count once that is gone.
+        sound = fault is None or not fault.reason.startswith(("GNSS lost", "GNSS glitch"))
+        self._sound_since_ns = (self._sound_since_ns or now_ns) if sound else None
+        if self._vision_ns is None or (fresh and good):
+            self._vision_ns = now_ns
         if now_ns < self._next_ns:
             return None
-        order = self._to_vision(now_ns, fault, fresh and vision_good) or self._to_gnss(now_ns)
+        order = self._to_vision(now_ns, fault, fresh and good, may_switch) or self._to_gnss(
+            now_ns, state
+        )
         if order is not None:
             self._next_ns = now_ns + _RETRY_NS
             self._ordered = order.source_set
         return order
 
-    def _to_vision(self, now_ns: int, fault: str | None, vision_good: bool) -> SwitchOrder | None:
-        if self.current == self._config.vision_set or fault is None or not vision_good:
+    def _to_vision(
+        self, now_ns: int, fault: GnssFault | None, vision_good: bool, may_switch: bool
+    ) -> SwitchOrder | None:
+        if self.current == self._config.vision_set or fault is None:
             return None
         since = self._bad_since_ns
         if since is None or now_ns - since < self._config.bad_after_s * 1e9:
             return None
-        return SwitchOrder(self._config.vision_set, fault)
+        if not fault.proven:
+            self.refusal = f"{fault.reason}, EKF with GNSS"
+        elif not may_switch:
+            self.refusal = f"{fault.reason}, no go from shadow"
+        elif vision_good:
+            return SwitchOrder(self._config.vision_set, fault.reason)
+        return None
 
-    def _to_gnss(self, now_ns: int) -> SwitchOrder | None:
-        if self.current != self._config.vision_set or not self._config.return_to_gnss:
+    def _to_gnss(self, now_ns: int, state: VehicleState) -> SwitchOrder | None:
+        if self.current != self._config.vision_set:
             return None
         since = self._good_since_ns
-        if since is None or now_ns - since < self._config.good_after_s * 1e9:
+        waited = since is not None and now_ns - since >= self._config.good_after_s * 1e9
+        if waited and self._config.return_to_gnss:
+            return SwitchOrder(self._config.gnss_set, "GNSS good again")
+        if self._vision_ns is None or now_ns - self._vision_ns < _VISION_GONE_NS:
             return None
-        return SwitchOrder(self._config.gnss_set, "GNSS good again")
+        since = self._sound_since_ns
+        if since is None or now_ns - since < _GNSS_BACK_NS:
+            return None
+        # Without any position the vehicle lands after 8 s. A receiver that is not where the EKF
+        # went by itself may be the one that was left.
+        receiver, ekf = _receiver(state), _ekf(state)
+        if receiver is None or ekf is None or _apart_m(receiver, ekf) > _RETURN_M:
+            return None
+        return SwitchOrder(self._config.gnss_set, "vision gone, GNSS is there")
 
 
 class SourceOrders:
@@ -138,6 +226,7 @@ class SourceOrders:
         self._commander = commander
         self._teller = teller
         self._counters = counters
+        self._refused_ns: int | None = None
 
     @property
     def current(self) -> int:
@@ -166,11 +255,16 @@ class SourceOrders:
         state: VehicleState,
         vision: PropagatedFix | None,
         *,
-        vision_good: bool,
+        good: bool,
+        may_switch: bool,
         now_ns: int,
     ) -> None:
-        """Order a change if it is time for one. vision_good: positions are sent and trusted."""
-        order = self._switch.decide(now_ns, state, vision, vision_good)
+        """Order a change if it is time for one. good: positions are sent and trusted."""
+        order = self._switch.decide(now_ns, state, vision, good=good, may_switch=may_switch)
+        refusal = self._switch.refusal
+        if refusal and now_ns - (self._refused_ns or 0) >= _AGAIN_NS:
+            self._refused_ns = now_ns  # again as long as it lasts: the operator decides
+            self._teller.warn(f"no switch: {refusal}")
         if order is None:
             return
         self._counters["source_switches"] += 1

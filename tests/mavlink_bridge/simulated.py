@@ -67,7 +67,8 @@ class Flight:
     ) -> None:
         options.setdefault("injection", InjectionConfig(rate_hz=10, delay_ms=100))
         options.setdefault("origin", ORIGIN)
-        config = BridgeConfig(mode="inject", **options)
+        options.setdefault("mode", "inject")
+        config = BridgeConfig(**options)
         self.now_ns = 1_000 * SECOND
         for module in ("vehicle.timesync", "vehicle.presence", "link.clock"):
             monkeypatch.setattr(f"mavlink_bridge.{module}.monotonic_ns", lambda: self.now_ns)
@@ -98,6 +99,8 @@ class Flight:
         self.origin: tuple[float, float, float] | None = None
         self.north_m = 0.0
         self.ekf_north_m = 0.0
+        self.gnss_north_m: float | None = None  # None: no receiver
+        self.armed = False
         self.reset_next = False
         self.latency_ms = 50
         self.sees = True
@@ -152,7 +155,9 @@ class Flight:
     def _vehicle(self, step: int) -> None:
         boot_ms = self.boot_ns(self.now_ns) // MS
         if step % 100 == 0:
-            self.say(mavlink.MAVLink_heartbeat_message(2, 3, 81, 4, 4, 3))
+            self.say(mavlink.MAVLink_heartbeat_message(2, 3, 209 if self.armed else 81, 4, 4, 3))
+        if step % 20 == 0 and self.gnss_north_m is not None:
+            self._gnss(boot_ms, self.gnss_north_m)
         if step % 4 == 0:
             yaw = self.yaw(self.now_ns)
             self.say(mavlink.MAVLink_attitude_message(boot_ms, 0.0, 0.0, yaw, 0.0, 0.0, TURN_RATE))
@@ -165,6 +170,21 @@ class Flight:
             _, message, _ = self.link.sent[self._answered]
             self._answered += 1
             self._answer(message)
+
+    def _gnss(self, boot_ms: int, north_m: float) -> None:
+        """The receiver's position, and the EKF's."""
+        receiver, ekf = (round((HOME[0] + n * METRE) * 1e7) for n in (north_m, self.ekf_north_m))
+        east = round(HOME[1] * 1e7)
+        self.say(
+            mavlink.MAVLink_gps_raw_int_message(
+                0, 3, receiver, east, 988_000, 80, 100, 0, 0, 12, 0, 0, 1000
+            )
+        )
+        self.say(
+            mavlink.MAVLink_global_position_int_message(
+                boot_ms, ekf, east, 988_000, 500_000, 0, 0, 0, 0
+            )
+        )
 
     def _answer(self, m: Any) -> None:
         kind = m.get_type()

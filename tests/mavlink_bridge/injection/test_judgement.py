@@ -184,9 +184,15 @@ def drive(switch: SourceSwitch, seconds: float, start: float = 0.0, **how: Any) 
             now if gps else 0,
             gps_fix_type=3 if gps else 0,
             ekf_flags=GOOD_FLAGS | how.get("flags", 0),
+            gps_h_accuracy_m=how.get("claimed", 1.0),
+            latitude_deg=HOME[0] + how.get("ekf", how.get("north", 0.0)) * METRE,
+            longitude_deg=HOME[1],
         )
-        vision = position(now - 100 * MS, how.get("north", 0.0), speed=how.get("speed", 0.0))
-        order = switch.decide(now, state, vision, how.get("good", True))
+        seen = now - (100 * MS if how.get("seen", True) else 60 * SECOND)
+        vision = position(seen, how.get("north", 0.0), speed=how.get("speed", 0.0))
+        order = switch.decide(
+            now, state, vision, good=how.get("good", True), may_switch=how.get("proven", True)
+        )
         if order is not None:
             orders.append((start + i / 10, order))
             if how.get("acknowledge", True):
@@ -243,6 +249,43 @@ def test_back_to_gnss_only_if_configured_and_after_long_health() -> None:
         assert drive(back, 1.0, 14.0 + 10 * i, gps=False) == []
     orders = drive(back, 12.0, 55.0)
     assert [order.source_set for _, order in orders] == [1]
+
+
+def test_healthy_gnss_is_not_left_for_a_wrong_map() -> None:
+    """The EKF's inertial navigation is with the receiver: two against one."""
+    switch = SourceSwitch(CONFIG)
+    assert drive(switch, 20.0, north=20.0, ekf=0.5) == []
+    assert switch.refusal == "GNSS 20 m from vision, EKF with GNSS"
+    assert drive(switch, 5.0, 20.0) == []
+    assert switch.refusal == ""
+
+
+@pytest.mark.parametrize("how", [{"gps": False}, {"flags": 32768}, {"north": 12.0}])
+def test_no_switch_without_a_go_of_the_shadow_score(how: dict[str, Any]) -> None:
+    switch = SourceSwitch(CONFIG)
+    assert drive(switch, 10.0, proven=False, **how) == []
+    assert switch.refusal.endswith("no go from shadow")
+
+
+def test_a_receiver_that_claims_to_be_bad_hides_nothing() -> None:
+    orders = drive(SourceSwitch(CONFIG), 5.0, north=60.0, claimed=12.0)
+    assert [order.reason for _, order in orders] == ["GNSS 60 m from vision"]
+    assert drive(SourceSwitch(CONFIG), 5.0, north=20.0, claimed=12.0) == []
+
+
+def test_back_to_sound_gnss_once_vision_is_gone() -> None:
+    switch = SourceSwitch(CONFIG)
+    drive(switch, 5.0, gps=False)
+    assert drive(switch, 20.0, 5.0, gps=False, seen=False) == []
+    orders = drive(switch, 6.0, 25.0, seen=False)
+    assert [order.source_set for _, order in orders] == [1]
+    assert orders[0][0] == pytest.approx(28.0, abs=0.2)
+    other = SourceSwitch(CONFIG)
+    drive(other, 5.0, gps=False)
+    # Not to one that is far from where the vehicle went by itself, and not for a gap in vision.
+    assert drive(other, 20.0, 5.0, seen=False, ekf=60.0) == []
+    drive(other, 5.0, 25.0, ekf=60.0)
+    assert drive(other, 2.0, 30.0, seen=False) == []
 
 
 def test_disabled_does_nothing() -> None:

@@ -1,0 +1,110 @@
+"""Who flies on vision has seen it agree with GNSS first: the shadow score's word before injection.
+
+A map that lies 20 m off is followed by the EKF without a complaint. While GNSS is there, nothing is
+sent before the shadow score is a go. Where there is none from the start (an indoor vehicle, a
+restart under denial) nothing can be compared: then it begins, and the operator is told so.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+from mavlink_bridge.config import Mode
+from mavlink_bridge.injection.shadow import MINIMUM_SAMPLES, ShadowScore, gnss_healthy
+from mavlink_bridge.messages import VehicleState
+from mavlink_bridge.texts import Teller
+
+_PERIOD_NS = 1_000_000_000
+_WITHOUT_GNSS_NS = 2_000_000_000  # GPS_RAW_INT comes five times a second
+_BEFORE_LAST_NS = 30_000_000_000  # a jammed receiver spoils the score's end
+_GO_NS = 600_000_000_000
+
+
+class ShadowInterlock:
+    """Judges with each step of the injection; one thread.
+
+    force: `bridge.injection.force`. score: the shadow's verdict now. compared_ns: when a fix was
+    last compared with GNSS, 0 never.
+    """
+
+    def __init__(
+        self,
+        force: bool,
+        score: Callable[[int], ShadowScore],
+        compared_ns: Callable[[], int],
+        teller: Teller,
+    ) -> None:
+        self._force = force
+        self._score = score
+        self._compared_ns = compared_ns
+        self._teller = teller
+        self._next_ns = 0
+        self._without_since_ns: int | None = None
+        self._go_ns: int | None = None
+        self._against = ""
+        self._reason = "not compared with GNSS yet"
+        self._open = False
+
+    def mode(self, wanted: Mode, state: VehicleState, now_ns: int, *, by_pilot: bool) -> Mode:
+        """What may be done of what is wanted. by_pilot: the gate of mode ``rc`` is a person's word:
+        it is obeyed, and told where the score is no go.
+        """
+        self._judge(state, now_ns)
+        if wanted != "inject":
+            if by_pilot:
+                self._open = False  # its next opening is told again
+            return wanted
+        if not self._open and state.connected:
+            self._open = self._may_begin(now_ns, by_pilot=by_pilot)
+        return "inject" if self._open else "shadow"
+
+    @property
+    def reason(self) -> str:
+        """Why nothing is injected in mode ``inject``; empty when that is not the reason."""
+        return "" if self._open or not self._reason else f"no go: {self._reason}"
+
+    def may_switch(self, now_ns: int) -> bool:
+        """Whether vision may be switched to: proven lately, or there is nothing to prove it by."""
+        if self._force:
+            return True
+        unproven = self._open and not self._compared_ns() and not self._against
+        return self._recent_go(now_ns) if self._go_ns is not None else unproven
+
+    def _recent_go(self, now_ns: int) -> bool:
+        if self._go_ns is None:
+            return False
+        before_last_ns = self._compared_ns() - self._go_ns
+        return before_last_ns <= _BEFORE_LAST_NS and now_ns - self._go_ns <= _GO_NS
+
+    def _may_begin(self, now_ns: int, *, by_pilot: bool) -> bool:
+        """Whether injection may begin, told; a beginning is not taken back."""
+        since_ns = self._without_since_ns
+        without = since_ns is not None and now_ns - since_ns >= _WITHOUT_GNSS_NS
+        if self._recent_go(now_ns):
+            return True
+        if self._force:
+            self._teller.warn("injection forced, no shadow check")
+        elif by_pilot:
+            self._teller.warn("injecting without a go from shadow")
+        elif without and not self._against:
+            self._teller.warn("injecting without shadow check")
+        else:
+            return False
+        return True
+
+    def _judge(self, state: VehicleState, now_ns: int) -> None:
+        """Take in GNSS, and the score once a second."""
+        if gnss_healthy(state, now_ns) or not state.connected:
+            self._without_since_ns = None
+        elif self._without_since_ns is None:
+            self._without_since_ns = now_ns
+        if now_ns < self._next_ns:
+            return
+        self._next_ns = now_ns + _PERIOD_NS
+        score = self._score(now_ns)
+        if score.go:
+            self._go_ns, self._against = self._compared_ns(), ""
+        elif score.samples >= MINIMUM_SAMPLES:
+            # It stays when its samples have aged: what was wrong with GNSS is wrong without.
+            self._against = score.reasons[0]
+        self._reason = self._against or (score.reasons[0] if score.reasons else "")

@@ -1,0 +1,178 @@
+"""No switch to vision and no injection before vision was seen to agree with GNSS; what is told."""
+
+from __future__ import annotations
+
+from collections import Counter
+from typing import Any
+
+import pytest
+
+from mavlink_bridge.config import InjectionConfig, RcGateConfig, SourceSwitchConfig
+from mavlink_bridge.injection.rc_gate import InjectionGate
+from tests.mavlink_bridge.simulated import SECOND, Flight
+
+SWITCH = SourceSwitchConfig(enabled=True)
+
+
+def orders(flight: Flight) -> list[float]:
+    sent = [m for _, m, _ in flight.link.sent if getattr(m, "command", 0) == 42007]
+    return [m.param1 for m in sent]
+
+
+def told(flight: Flight, *words: str) -> list[str]:
+    return [t.removeprefix("PiLoT: ") for t in flight.texts if any(w in t for w in words)]
+
+
+def on_gnss(monkeypatch: pytest.MonkeyPatch, **options: Any) -> Flight:
+    """A vehicle with a healthy receiver, at home."""
+    flight = Flight(monkeypatch, **options)
+    flight.gnss_north_m = 0.0
+    flight.origin = (47.397742, 8.545594, 488.0)
+    return flight
+
+
+def test_a_map_20_m_off_is_neither_injected_nor_switched_to(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    flight = on_gnss(monkeypatch, switch=SWITCH)
+    flight.north_m = 20.0
+    flight.run(45.0)
+    assert flight.vision() == []
+    assert orders(flight) == []
+    refused = told(flight, "no switch")
+    assert 4 <= len(refused) <= 5  # again every 10 s
+    assert set(refused) == {"no switch: GNSS 20 m from vision, EKF with GNSS"}
+    assert told(flight, "not sent: no go") == ["not sent: no go: median error 20.0 m"]
+    # Nor once GNSS is lost, however long ago: what was wrong stays wrong.
+    flight.gnss_north_m = None
+    flight.run(150.0)
+    assert flight.vision() == []
+    assert orders(flight) == []
+    assert told(flight, "GNSS lost")[0] == "GNSS lost, nothing is injected"
+
+
+def test_a_right_map_is_injected_after_the_go_and_switched_to_when_gnss_is_lost(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    flight = on_gnss(monkeypatch, switch=SWITCH)
+    begun_ns = flight.now_ns
+    flight.run(20.0)
+    assert 5 * SECOND < flight.vision()[0][0] - begun_ns < 10 * SECOND
+    assert orders(flight) == []
+    flight.gnss_north_m = None
+    flight.run(6.0)
+    assert orders(flight)
+    assert set(orders(flight)) == {2.0}
+    assert told(flight, "injecting", "GNSS", "go", "EKF source") == [
+        "injecting",
+        "GNSS lost, injecting",
+        "EKF source set 2: GNSS lost",
+    ]
+    flight.gnss_north_m = 0.0
+    flight.run(8.0)
+    assert told(flight, "GNSS is back") == ["GNSS is back"]
+
+
+def test_a_spoofed_receiver_that_the_ekf_refuses_is_left(monkeypatch: pytest.MonkeyPatch) -> None:
+    flight = on_gnss(monkeypatch, switch=SWITCH)
+    flight.run(20.0)
+    flight.gnss_north_m = 40.0  # the EKF, inertial, stays
+    flight.run(4.0)
+    assert set(orders(flight)) == {2.0}
+    assert told(flight, "source set", "no switch") == ["EKF source set 2: GNSS 40 m from vision"]
+
+
+def test_without_gnss_it_begins_and_says_that_nothing_was_compared(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    flight = Flight(monkeypatch)
+    begun_ns = flight.now_ns
+    flight.run(15.0)
+    assert flight.vision()[0][0] - begun_ns < 5 * SECOND  # a restart under denial
+    assert told(flight, "shadow") == ["injecting without shadow check"]
+
+
+def test_force_overrules_and_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
+    injection = InjectionConfig(rate_hz=10, delay_ms=100, force=True)
+    flight = on_gnss(monkeypatch, injection=injection)
+    flight.north_m = 20.0
+    flight.run(15.0)
+    assert len(flight.vision()) > 50
+    assert told(flight, "shadow") == ["injection forced, no shadow check"]
+
+
+def test_the_pilots_gate_is_obeyed_and_told_without_a_go(monkeypatch: pytest.MonkeyPatch) -> None:
+    gate = InjectionGate(RcGateConfig(), lambda _: None)
+    flight = Flight(monkeypatch, gate, mode="rc")
+    flight.gnss_north_m, flight.north_m, flight.origin = 0.0, 20.0, (47.397742, 8.545594, 488.0)
+    flight.run(15.0)
+    assert flight.vision() == []
+    assert gate.command(31010, 1.0) == 0
+    flight.run(5.0)
+    assert flight.vision()
+    assert told(flight, "go from") == ["injecting without a go from shadow"]
+
+
+@pytest.mark.parametrize(
+    ("gnss", "text"),
+    [(None, ["armed without GNSS, injecting"]), (0.0, [])],
+)
+def test_arming_without_gnss_tells_whether_positions_flow(
+    monkeypatch: pytest.MonkeyPatch, gnss: float | None, text: list[str]
+) -> None:
+    flight = on_gnss(monkeypatch)
+    flight.gnss_north_m = gnss
+    flight.run(10.0)
+    flight.armed = True
+    flight.run(5.0)
+    assert told(flight, "armed") == text
+
+
+def test_a_flight_by_the_book_in_texts(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Each event once, in its order, and nothing else."""
+    flight = on_gnss(monkeypatch, switch=SWITCH)
+    flight.armed = True
+    flight.run(30.0)  # shadow, go, injecting
+    flight.gnss_north_m = None
+    flight.run(1.0)
+    flight.gnss_north_m = 0.0  # a second without a report is none
+    flight.run(10.0)
+    flight.gnss_north_m = None
+    flight.run(20.0)
+    flight.sees = False
+    flight.run(5.0)
+    flight.sees = True
+    flight.run(20.0)
+    texts = [t.removeprefix("PiLoT: ") for t in flight.texts]
+    assert all(len(f"PiLoT: {t}") <= 50 for t in texts), texts
+    assert texts == [
+        "flight controller found",
+        "EKF origin known",
+        "vision yaw is checked",
+        "injecting",
+        "the EKF follows",
+        "GNSS lost, injecting",
+        "EKF source set 2: GNSS lost",
+        "not sent: no fresh fix",
+        "injecting",
+    ]
+
+
+def test_an_overloaded_computer_does_not_fill_the_operators_screen(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """A second and a half of fixes, as long without, for three minutes: 42 texts before."""
+    flight = Flight(monkeypatch)
+    flight.run(20.0)
+    before = len(flight.texts)
+    for _ in range(60):
+        flight.sees = False
+        flight.run(1.6)
+        flight.sees = True
+        flight.run(1.9)
+    counts = Counter(flight.texts[before:])
+    assert max(counts.values()) <= 6, counts
+    assert sum(counts.values()) <= 12, counts
+    flight.run(70.0)
+    # And it is told that it is over.
+    assert flight.texts[-1] in ("PiLoT: injecting", "PiLoT: the EKF follows")
