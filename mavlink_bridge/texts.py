@@ -8,7 +8,6 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from mavlink_bridge.messages import without_figures
 
-
 _RELAPSE_NS = 8_000_000_000
 
 

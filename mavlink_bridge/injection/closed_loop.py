@@ -14,6 +14,7 @@ from mavlink_bridge.messages import VehicleState
 
 _SETTLE_NS = 3_000_000_000
 _WINDOW_NS = 3_000_000_000
+_SILENT_NS = 1_000_000_000
 _COMPARE_AFTER_NS = 300_000_000
 _SIGMAS = 5.0
 _SLACK_M = 2.0
@@ -87,6 +88,8 @@ class ClosedLoopCheck:
         recent = [s for s in self._sent if now_ns - s[0] < _WINDOW_NS]
         if not recent or self._began_ns is None or now_ns - self._began_ns < _SETTLE_NS:
             return None
+        if now_ns - recent[-1][0] > _SILENT_NS:
+            return None  # that nothing is sent is told by who does not send it
         differences = sorted(d for t, d, *_ in self._differences if now_ns - t < _WINDOW_NS)
         difference = differences[len(differences) // 2] if differences else None
         span_s = (recent[-1][0] - recent[0][0]) * 1e-9
