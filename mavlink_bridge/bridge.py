@@ -124,12 +124,16 @@ class Bridge:
             self._recorder.start()
         for link in self._links:
             link.start()
+        if self._shared.gate is not None:
+            self._shared.gate.recall()
 
     def stop(self) -> None:
         """Close the links; the bridge cannot be started again. Harmless when called again."""
         if self._stopped:
             return
         self._stopped = True
+        if self._shared.gate is not None:
+            self._shared.gate.stop()
         for link in self._links:
             link.stop()
         if self._cot is not None:

@@ -235,6 +235,10 @@ class BridgeConfig(_Model):
     signing: SigningConfig | None = None
     ground_signing: SigningConfig | None = None
     tlog: Path | None = None
+    state_file: Path | None = Field(
+        default=None,
+        description="where mode rc remembers an open gate over a restart, for 10 minutes",
+    )
     link_timeout_s: float = Field(default=5.0, ge=1.0, le=60.0)
 
     @field_validator("mode", mode="before")

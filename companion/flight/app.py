@@ -15,6 +15,7 @@ from typing import Any
 
 from companion.config import CompanionConfig
 from companion.flight.feed import Feed
+from companion.flight.health import HealthMonitor
 from companion.flight.parts import Assembly, Part
 from companion.flight.table import PARTS
 from companion.redaction import redacted
@@ -61,6 +62,10 @@ class Companion:
             # In slices: signals are handled between them.
             while not (self._is_stopping or feed.ended.wait(0.2)):
                 pass
+            health = self._parts.get(HealthMonitor)
+            if health is not None:
+                error = "" if feed.error is None else f": {feed.error}"
+                health.end("stopped" if self._is_stopping else f"the feed ended{error}")
         if feed.error is not None:
             raise feed.error
 

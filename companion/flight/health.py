@@ -26,6 +26,7 @@ _log = logging.getLogger(__name__)
 _PERIOD_S = 1.0
 _WINDOW = 200
 _STALE_S = 2.0
+_NOTICE = 5  # MAV_SEVERITY_NOTICE
 _SILENT_VEHICLE = "no heartbeat from the flight controller"
 
 _OF_FEED = {
@@ -55,6 +56,7 @@ class HealthMonitor:
         is_recorded: Callable[[], bool] = lambda: True,
         position_sigma_m: Callable[[], float | None] = lambda: None,
         guardian: Guardian | None = None,
+        unreadable_nodes: Callable[[], int] = lambda: 0,
     ) -> None:
         self._engine_health = engine_health
         self._bridge = bridge
@@ -63,6 +65,8 @@ class HealthMonitor:
         self._is_recorded = is_recorded
         self._position_sigma_m = position_sigma_m
         self._guardian = guardian
+        self._unreadable_nodes = unreadable_nodes
+        self._ended = ""
         self._file = record_folder / "health.json" if record_folder else None
         self._estimates: deque[tuple[float, PoseEstimate]] = deque(maxlen=_WINDOW)
         self._write_failed = False
@@ -78,6 +82,10 @@ class HealthMonitor:
         """Stop, after one last report."""
         self._stop.set()
         self._thread.join()
+
+    def end(self, how: str) -> None:
+        """The flight ends, and how: the last report says it instead of what was true until then."""
+        self._ended = how
 
     def add_estimate(self, estimate: PoseEstimate) -> None:
         """Note an estimate. Never blocks."""
@@ -98,8 +106,13 @@ class HealthMonitor:
     def _report(self) -> None:
         level, text = self._assess()
         # The bridge logs and records what it tells; a silent vehicle it tells by itself.
+        if self._ended:
+            if self._stop.is_set():
+                self._bridge.say(_NOTICE, "PiLoT: ending, nothing is injected any more")
+                self._write("ended", f"{self._ended}; {text} until then")
+            return
         self._bridge.set_health(level, text, tell=text != _SILENT_VEHICLE)
-        self._write(level, text)
+        self._write(level.value, text)
 
     def _assess(self) -> tuple[HealthLevel, str]:
         """The worst thing that is true now, in one line."""
@@ -130,6 +143,8 @@ class HealthMonitor:
             level, text = HealthLevel.FAILED, withheld
         if _is_lost(estimate):
             text += self._since(estimate) + (", searching" if engine.searching else "")
+        # The map stands in by coarser levels, as far as they are in memory.
+        text += ", map unreadable" if self._unreadable_nodes() else ""
         text += ", video scaled" if feed is StreamState.SCALED else ""
         return level, text + ("" if self._is_recorded() else ", record incomplete")
 
@@ -141,11 +156,11 @@ class HealthMonitor:
         sigma_m = self._position_sigma_m()
         return text + (f", +-{2.0 * sigma_m:.0f} m" if sigma_m is not None else "")
 
-    def _write(self, level: HealthLevel, text: str) -> None:
+    def _write(self, level: str, text: str) -> None:
         if self._file is None:
             return
         report = {
-            "level": level.value,
+            "level": level,
             "text": text,
             "time_ns": time.monotonic_ns(),
             "engine": asdict(self._engine_health()),

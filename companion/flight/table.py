@@ -110,6 +110,7 @@ def _source(making: Making) -> FrameSource:
 
 def _health(making: Making) -> HealthMonitor:
     engine, keeper = making.later(DualThreadEngine), making[RecordKeeper]
+    streamer = making[MapStack].streamer
     autopilot = making.later(AutopilotPose)
     source = making[FrameSource]  # type: ignore[type-abstract]  # whichever of its kinds
     health = HealthMonitor(
@@ -121,6 +122,7 @@ def _health(making: Making) -> HealthMonitor:
         lambda: keeper.is_complete,
         lambda: autopilot().sigma_m,
         making.get(Guardian),
+        lambda: streamer.counters().unreadable,
     )
     making.channels.estimates.subscribe(lambda estimate, _: health.add_estimate(estimate))
     return health
@@ -241,7 +243,7 @@ PARTS: tuple[Part[Any], ...] = (
     Part("source", FrameSource, _source, depends=(Bridge,)),
     Part(
         "health", HealthMonitor, _health,
-        depends=(Bridge, RecordKeeper, FrameSource, Guardian),
+        depends=(MapStack, Bridge, RecordKeeper, FrameSource, Guardian),
         later=(DualThreadEngine, AutopilotPose), start=HealthMonitor.start, stop=HealthMonitor.stop,
     ),
     Part(
@@ -291,7 +293,7 @@ def _require_origin_at_map(config: CompanionConfig, cache: TileCache) -> None:
 
 
 def _bridge_config(config: CompanionConfig) -> BridgeConfig:
-    """The bridge announces the camera that the feed really has."""
+    """The bridge announces the feed's real camera, and keeps its state beside the record."""
     camera = config.camera.model.camera()
     announced = config.bridge.camera.model_copy(
         update={
@@ -300,4 +302,7 @@ def _bridge_config(config: CompanionConfig) -> BridgeConfig:
             "horizontal_fov_deg": camera.horizontal_fov_deg,
         }
     )
-    return config.bridge.model_copy(update={"camera": announced})
+    state_file = config.bridge.state_file
+    if state_file is None and config.record is not None:
+        state_file = config.record.folder.parent / "injection-gate.json"
+    return config.bridge.model_copy(update={"camera": announced, "state_file": state_file})

@@ -9,6 +9,7 @@ from collections.abc import Callable, Sequence
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from mavlink_bridge.config import RcGateConfig
+from mavlink_bridge.injection.gate_memory import GateMemory
 
 _HYSTERESIS_US = 50
 _PULSE_US = (800, 2200)  # outside it no receiver speaks; 65535 means "no such channel"
@@ -28,15 +29,38 @@ class InjectionGate:
     A receiver that falls silent changes nothing: to take the position from the EKF at that moment
     would turn the vehicle's way home into a landing. Any thread may call.
 
-    changed: called with a line for the operator when it opens or closes.
+    changed: called with a line for the operator when it opens or closes. memory: of the gate that
+    a process before this one left open.
     """
 
-    def __init__(self, config: RcGateConfig, changed: Callable[[str], None]) -> None:
+    def __init__(
+        self,
+        config: RcGateConfig,
+        changed: Callable[[str], None],
+        memory: GateMemory | None = None,
+    ) -> None:
         self._config = config
         self._changed = changed
         self._lock = threading.Lock()
         self._open = False
         self._high: bool | None = None
+        self._memory = memory
+
+    def recall(self) -> None:
+        """Open it if it was left open by a process that did not end in order; told in any case."""
+        remembered = self._memory.recall() if self._memory is not None else None
+        if remembered is None:
+            self._changed("injection off, shadow (at the start)")
+            return
+        by_channel, age_s = remembered
+        if by_channel:
+            self._high = True  # a switch that was turned off meanwhile closes it at its first look
+        self._set(True, f"restored, {age_s:.0f} s old", by_channel=by_channel)
+
+    def stop(self) -> None:
+        """An orderly end: nothing is remembered."""
+        if self._memory is not None:
+            self._memory.stop()
 
     @property
     def open(self) -> bool:
@@ -56,7 +80,7 @@ class InjectionGate:
             # At the first look only a switch that is on counts: a command may have come before.
             moved = self._high if before is None else self._high != before
         if moved:
-            self._set(bool(self._high), f"channel {number}")
+            self._set(bool(self._high), f"channel {number}", by_channel=True)
 
     def command(self, command: int, wanted: float) -> int:
         """A command to the localizer's component; the MAV_RESULT to acknowledge it with.
@@ -67,12 +91,17 @@ class InjectionGate:
             return int(mavlink.MAV_RESULT_UNSUPPORTED)
         if not math.isfinite(wanted) or wanted not in (0.0, 1.0):
             return int(mavlink.MAV_RESULT_DENIED)
-        self._set(wanted == 1.0, "command")
+        self._set(wanted == 1.0, "command", by_channel=False)
         return int(mavlink.MAV_RESULT_ACCEPTED)
 
-    def _set(self, wanted: bool, by: str) -> None:
+    def _set(self, wanted: bool, by: str, *, by_channel: bool) -> None:
         with self._lock:
             if wanted == self._open:
                 return
             self._open = wanted
+            if self._memory is not None:
+                if wanted:
+                    self._memory.opened(by_channel=by_channel)
+                else:
+                    self._memory.closed()
         self._changed(f"injection {'on' if wanted else 'off, shadow'} ({by})")

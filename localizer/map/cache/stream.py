@@ -9,8 +9,9 @@ from __future__ import annotations
 
 import logging
 import threading
+import time
 from collections import OrderedDict
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -25,7 +26,17 @@ from localizer.map.cache.tile import TileMesh
 
 _log = logging.getLogger(__name__)
 
+_RETRY_S, _RETRY_MOST_S = 0.5, 30.0  # between attempts at a node that could not be read
 _RELAX = 1.4  # step by which detail is reduced when a view does not fit into the budget
+
+
+@dataclass(frozen=True)
+class _Failure:
+    """Why a node could not be read, how often in a row, and when it is tried again."""
+
+    error: MapCacheError
+    count: int
+    again_s: float
 
 
 @dataclass(frozen=True)
@@ -33,8 +44,8 @@ class StreamCounters:
     """Since the streamer was made.
 
     hits, misses: wanted nodes that were in memory or not; complete: selections at the wanted detail
-    throughout; stalls: selections with a hole; failures: nodes that could not be read; loaded,
-    evicted: nodes; resident_bytes: now.
+    throughout; stalls: selections with a hole; failures: attempts at nodes that could not be read;
+    unreadable: nodes whose last attempt failed, now; loaded, evicted: nodes; resident_bytes: now.
     """
 
     selections: int = 0
@@ -45,6 +56,7 @@ class StreamCounters:
     loaded: int = 0
     evicted: int = 0
     failures: int = 0
+    unreadable: int = 0
     resident_bytes: int = 0
 
 
@@ -58,12 +70,14 @@ class TileStreamer:
         max_error_px: float = DetailLimits.max_error_px,
         max_texel_px: float = DetailLimits.max_texel_px,
         bytes_per_select: int = 64 << 20,
+        clock: Callable[[], float] = time.monotonic,
     ) -> None:
         """Start the loader thread.
 
         byte_budget: of decoded tiles. max_error_px, max_texel_px: see `DetailLimits`.
         bytes_per_select: how much new data one selection may bring in, so that a renderer that has
-        to upload it keeps its pace; a selection that waits is not bounded.
+        to upload it keeps its pace; a selection that waits is not bounded. clock: in seconds, by
+        which nodes that could not be read are tried again.
         """
         self.cache = cache
         self._index = cache.index
@@ -74,7 +88,8 @@ class TileStreamer:
         self._meshes: OrderedDict[int, list[TileMesh]] = OrderedDict()  # least recent first
         self._current: list[TileMesh] = []
         self._resident = np.zeros(len(self._node_bytes), np.bool_)
-        self._failed: dict[int, MapCacheError] = {}
+        self._failed: dict[int, _Failure] = {}
+        self._clock = clock
         self._bytes = 0
         self._counts = dict.fromkeys(StreamCounters.__dataclass_fields__, 0)
         self._lock = threading.Condition()
@@ -104,8 +119,8 @@ class TileStreamer:
             while wait and not self._resident[choice.wanted].all():
                 missing = choice.wanted[~self._resident[choice.wanted]].tolist()
                 for node in missing:
-                    if node in self._failed:
-                        raise self._failed[node]
+                    if self._is_waiting(node):
+                        raise self._failed[node].error
                 self._queue = missing
                 self._lock.notify_all()
                 self._lock.wait()
@@ -140,7 +155,7 @@ class TileStreamer:
                         break
                     if self._resident[node]:
                         self._meshes.move_to_end(node)
-                    elif node not in self._failed:
+                    elif not self._is_waiting(node):
                         self._ahead.append(node)
             self._lock.notify_all()
 
@@ -192,7 +207,7 @@ class TileStreamer:
             raise RuntimeError("the tile streamer is closed")
         choice = self._selector.select(world_from_camera, camera, self._resident, limits)
         self._protected = {0, *choice.wanted.tolist(), *choice.shown.tolist()}
-        self._queue = [n for n in choice.requests.tolist() if n not in self._failed]
+        self._queue = [n for n in choice.requests.tolist() if not self._is_waiting(n)]
         self._lock.notify_all()
         return choice
 
@@ -226,7 +241,7 @@ class TileStreamer:
                     continue
                 node = nodes.pop(0)
                 # A node may have been asked for again while it was being loaded.
-                if node in self._failed or self._resident[node] or self._has_arrived(node):
+                if self._is_waiting(node) or self._resident[node] or self._has_arrived(node):
                     continue
             meshes: list[TileMesh] | None = None
             failure: MapCacheError | None = None
@@ -236,16 +251,34 @@ class TileStreamer:
                 meshes = [_ready(self.cache.load_tile(t)) for t in tiles]
             except MapCacheError as error:
                 failure = error
+            except Exception as error:  # or nothing would be loaded ever again
+                failure = MapCacheError(f"node {node} of the map: {type(error).__name__}: {error}")
+                _log.debug("unexpected, while loading the map", exc_info=True)
             with self._lock:
                 if meshes is not None:
                     self._arrived.append((node, meshes))
                     self._arrived_bytes += int(self._node_bytes[node])
                     self._counts["loaded"] += 1
+                    self._failed.pop(node, None)
                 elif failure is not None:
-                    _log.error("%s", failure)
-                    self._failed[node] = failure
-                    self._counts["failures"] += 1
+                    self._note_failure(node, failure)
+                self._counts["unreadable"] = len(self._failed)
                 self._lock.notify_all()
+
+    def _note_failure(self, node: int, error: MapCacheError) -> None:
+        """Try it again later, and later still: a disk may come back. The lock is held."""
+        before = self._failed.get(node)
+        if before is None:
+            _log.error("%s", error)
+        count = 1 if before is None else before.count + 1
+        wait_s = min(_RETRY_S * 2.0 ** min(count - 1, 10), _RETRY_MOST_S)
+        self._failed[node] = _Failure(error, count, self._clock() + wait_s)
+        self._counts["failures"] += 1
+
+    def _is_waiting(self, node: int) -> bool:
+        """Whether a node could not be read and it is not time to try again."""
+        failure = self._failed.get(node)
+        return failure is not None and self._clock() < failure.again_s
 
     def _has_arrived(self, node: int) -> bool:
         return any(node == arrived for arrived, _ in self._arrived)

@@ -18,6 +18,10 @@ class FakeBridge:
     def __init__(self, connected):
         self._connected = connected
         self.told = []
+        self.said = []
+
+    def say(self, severity, text):
+        self.said.append(text)
 
     def state(self):
         return SimpleNamespace(connected=self._connected)
@@ -134,3 +138,20 @@ def test_a_loss_says_how_long_and_how_far(tmp_path):
     level, text = bridge.told[-1]
     assert level is HealthLevel.FAILED
     assert text.startswith("localization lost 23 s, +-40 m, searching")
+
+
+def test_after_the_end_the_file_says_that_it_ended_and_how(tmp_path):
+    bridge = FakeBridge(True)
+    monitor = HealthMonitor(
+        lambda: EngineHealth(frames_in=9), bridge, lambda: StreamState.LIVE, lambda *_: None,
+        tmp_path, unreadable_nodes=lambda: 3,
+    )  # fmt: skip
+    tracking = SimpleNamespace(state=TrackingState.TRACKING, stage_ms={}, last_fix_ns=None)
+    monitor.add_estimate(tracking)
+    monitor.start()
+    monitor.end("stopped")
+    monitor.stop()
+    report = json.loads((tmp_path / "health.json").read_text())
+    assert report["level"] == "ended"
+    assert report["text"] == "stopped; localization tracking, map unreadable until then"
+    assert bridge.said == ["PiLoT: ending, nothing is injected any more"]

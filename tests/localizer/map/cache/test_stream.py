@@ -205,6 +205,33 @@ def test_a_tile_that_is_asked_for_again_while_it_fails_is_read_once(cache, monke
         assert len(read) == running.counters().failures == 1
 
 
+@pytest.mark.parametrize("error", [MapCacheError("gone"), RuntimeError("decoder")])
+def test_a_map_that_comes_back_is_read_again_and_nothing_ends_the_loader(cache, monkeypatch, error):
+    load, now, read = cache.load_tile, [0.0], []
+    pose = above(0, 0, 60)
+
+    def gone(tile):
+        read.append(tile)
+        raise error
+
+    with TileStreamer(cache, clock=lambda: now[0]) as running:
+        running.select(above(0, 0, 20_000), CAMERA, wait=True)
+        monkeypatch.setattr(cache, "load_tile", gone)
+        for _ in range(5):  # no more often than the wait allows, whoever asks
+            running.select(pose, CAMERA)
+            until(lambda: running.idle)
+        lost = running.counters().unreadable
+        assert 0 < lost == running.counters().failures == len(set(read)) == len(read)
+        assert running.counters().complete == 1
+        monkeypatch.setattr(cache, "load_tile", load)
+        running.select(pose, CAMERA)
+        until(lambda: running.idle)
+        assert running.counters().unreadable == lost  # not yet
+        now[0] = 1.0
+        assert len(running.select(pose, CAMERA, wait=True)) > 0
+        assert running.counters().unreadable < lost
+
+
 def test_a_closed_streamer_says_so(cache):
     streamer = TileStreamer(cache)
     streamer.close()

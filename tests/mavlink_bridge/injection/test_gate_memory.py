@@ -1,0 +1,96 @@
+"""Mode rc over a restart: the gate that the pilot opened is open again, and not for ever."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from mavlink_bridge.config import RcGateConfig
+from mavlink_bridge.injection.gate_memory import GateMemory
+from mavlink_bridge.injection.rc_gate import InjectionGate
+
+_CHILD = """
+import sys, time
+from pathlib import Path
+from mavlink_bridge.config import RcGateConfig
+from mavlink_bridge.injection.gate_memory import GateMemory
+from mavlink_bridge.injection.rc_gate import InjectionGate
+path = Path(sys.argv[1])
+gate = InjectionGate(RcGateConfig(), lambda _: None, GateMemory(path))
+if sys.argv[2] == "command":
+    gate.command(31010, 1.0)
+else:
+    gate.channels([1900] * 18)
+while not path.exists():
+    time.sleep(0.01)
+print("open", flush=True)
+time.sleep(600)
+"""
+LOW = [1100] * 18
+
+
+def killed(path: Path, by: str) -> None:
+    """A process whose gate was opened, after kill -9."""
+    child = subprocess.Popen(
+        [sys.executable, "-c", _CHILD, str(path), by], stdout=subprocess.PIPE, text=True
+    )
+    assert child.stdout is not None
+    assert child.stdout.readline() == "open\n"
+    os.kill(child.pid, signal.SIGKILL)
+    child.wait()
+    child.stdout.close()
+
+
+def restarted(path: Path, later_s: float = 4.0) -> tuple[InjectionGate, list[str]]:
+    told: list[str] = []
+    utc_s = json.loads(path.read_text())["utc_s"] if path.exists() else 0.0
+    gate = InjectionGate(RcGateConfig(), told.append, GateMemory(path, lambda: utc_s + later_s))
+    gate.recall()
+    return gate, told
+
+
+@pytest.mark.parametrize("by", ["command", "channel"])
+def test_a_killed_process_leaves_the_gate_open(tmp_path: Path, by: str) -> None:
+    path = tmp_path / "gate.json"
+    killed(path, by)
+    assert path.stat().st_mode & 0o777 == 0o600
+    gate, told = restarted(path)
+    assert gate.open
+    assert told == ["injection on (restored, 4 s old)"]
+    gate.channels(LOW)
+    # The switch was turned off meanwhile; a low channel says nothing against a command.
+    assert gate.open is (by == "command")
+    gate.stop()
+    assert not path.exists()  # an orderly end is not a restart in the air
+
+
+@pytest.mark.parametrize("later_s", [601.0, -5.0])
+def test_an_old_file_and_one_from_the_future_count_for_nothing(
+    tmp_path: Path, later_s: float
+) -> None:
+    path = tmp_path / "gate.json"
+    path.write_text(json.dumps({"open": True, "by_channel": False, "utc_s": 1000.0}))
+    path.chmod(0o600)
+    gate, told = restarted(path, later_s)
+    assert not gate.open
+    assert told == ["injection off, shadow (at the start)"]
+    gate.stop()
+
+
+@pytest.mark.parametrize("text", ["", "[]", "nonsense", '{"open": 1}', "{" * 5000])
+def test_a_damaged_file_or_another_users_is_ignored(tmp_path: Path, text: str) -> None:
+    path = tmp_path / "gate.json"
+    path.write_text(text)
+    path.chmod(0o600)
+    memory = GateMemory(path)
+    assert memory.recall() is None
+    path.write_text(json.dumps({"open": True, "by_channel": False, "utc_s": 1000.0}))
+    path.chmod(0o666)
+    assert memory.recall() is None
+    memory.stop()
