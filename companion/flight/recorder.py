@@ -31,6 +31,7 @@ _QUEUE_SIZE = 4096
 _FLUSH_S = 1.0
 _CLOSE_S = 5.0
 MANIFEST_NAME = "record.json"
+LATEST_NAME = "latest"
 
 ESTIMATE_COLUMNS = (
     "exposure_time_ns", "sequence", "east_m", "north_m", "up_m", "qw", "qx", "qy", "qz",
@@ -283,6 +284,21 @@ class RecordKeeper:
         except BaseException:
             self.close()
             raise
+
+    def link(self) -> None:
+        """Let ``latest`` beside the record point to it, unless a record itself has that name."""
+        if self.folder is None or self.folder.name.startswith(LATEST_NAME):
+            return
+        link = self.folder.parent / LATEST_NAME
+        if link.exists() and not link.is_symlink():
+            return
+        try:
+            fresh = link.with_name(f".{LATEST_NAME}.new")
+            fresh.unlink(missing_ok=True)
+            fresh.symlink_to(self.folder.name)
+            fresh.replace(link)
+        except OSError as error:  # a stick's file system may have no links
+            _log.info("no link to the newest record: %s", error)
 
     def close(self) -> None:
         """Write what is queued and close the files."""

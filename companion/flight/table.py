@@ -238,7 +238,8 @@ PARTS: tuple[Part[Any], ...] = (
         start=Guardian.start, stop=Guardian.stop, wanted=lambda config: config.guardian.enabled,
     ),
     Part(
-        "record", RecordKeeper, _record, depends=(MapStack, Bridge), close=RecordKeeper.close
+        "record", RecordKeeper, _record, depends=(MapStack, Bridge), start=RecordKeeper.link,
+        close=RecordKeeper.close,
     ),
     Part("source", FrameSource, _source, depends=(Bridge,)),
     Part(

@@ -13,7 +13,13 @@ import pytest
 
 from companion.config import RecordConfig
 from companion.errors import DiskFaultError, ReportError
-from companion.flight.recorder import ESTIMATE_COLUMNS, Recorder, fresh_folder, remove_empty
+from companion.flight.recorder import (
+    ESTIMATE_COLUMNS,
+    Recorder,
+    RecordKeeper,
+    fresh_folder,
+    remove_empty,
+)
 from localizer.geometry.camera import Camera
 from localizer.geometry.geo import Geodetic, LocalFrame
 from localizer.geometry.pose import Pose, so3_exp
@@ -181,3 +187,16 @@ def test_a_disk_that_stands_still_is_left_behind(tmp_path, monkeypatch):
     still.set()  # and its thread ends
     monkeypatch.setattr("companion.flight.recorder._CLOSE_S", 30.0)
     recorder.close()
+
+
+def test_latest_is_the_newest_record_and_never_somebodys_folder(tmp_path):
+    keeper = RecordKeeper(FRAME, lambda _: None)
+    for name in ("flight", "flight-2"):
+        (tmp_path / name).mkdir()
+        keeper.folder = tmp_path / name
+        keeper.link()
+        assert (tmp_path / "latest").resolve().name == name
+    (tmp_path / "other" / "latest").mkdir(parents=True)
+    keeper.folder = tmp_path / "other" / "flight"
+    keeper.link()
+    assert not (tmp_path / "other" / "latest").is_symlink()
