@@ -26,6 +26,7 @@ _log = logging.getLogger(__name__)
 _PERIOD_S = 1.0
 _WINDOW = 200
 _STALE_S = 2.0
+_SHORT_BRIDGE_NS = 2_000_000_000
 _NOTICE = 5  # MAV_SEVERITY_NOTICE
 _SILENT_VEHICLE = "no heartbeat from the flight controller"
 
@@ -122,39 +123,34 @@ class HealthMonitor:
         if not self._bridge.state().connected:
             return HealthLevel.DEGRADED, _SILENT_VEHICLE
         engine = self._engine_health()
-        error = engine.last_error
         if not self._estimates:
-            if engine.searching:
-                return HealthLevel.STARTING, "searching the map"
-            seen = engine.frames_in > 0
-            return (
-                HealthLevel.STARTING,
-                error or f"waiting for {'a pose prior' if seen else 'video'}",
-            )
+            return HealthLevel.STARTING, _waiting_for(engine)
         arrived, estimate = self._estimates[-1]
         if time.monotonic() - arrived > _STALE_S:
-            level = HealthLevel.FAILED if _is_lost(estimate) else HealthLevel.DEGRADED
-            return level, error or "no frame is being localized"
+            if _is_lost(estimate):  # the error stands in health.json; this is what to act on
+                return HealthLevel.FAILED, "localization lost" + self._since(estimate, engine)
+            return HealthLevel.DEGRADED, engine.last_error or "no frame is being localized"
         level, text = _OF_STATE[estimate.state]
         if estimate.state is TrackingState.BRIDGING:
-            text += _carried(estimate)
+            level, text = _bridging(estimate)
         withheld = self._guardian.reason if self._guardian is not None else ""
         if withheld and not _is_lost(estimate):
             level, text = HealthLevel.FAILED, withheld
         if _is_lost(estimate):
-            text += self._since(estimate) + (", searching" if engine.searching else "")
+            text += self._since(estimate, engine)
         # The map stands in by coarser levels, as far as they are in memory.
         text += ", map unreadable" if self._unreadable_nodes() else ""
         text += ", video scaled" if feed is StreamState.SCALED else ""
         return level, text + ("" if self._is_recorded() else ", record incomplete")
 
-    def _since(self, estimate: PoseEstimate) -> str:
-        """Since when there is no fix, and how far off the autopilot may be by now."""
+    def _since(self, estimate: PoseEstimate, engine: EngineHealth) -> str:
+        """Since when there is no fix, how far off the autopilot may be, and what is done."""
         text = ""
         if estimate.last_fix_ns is not None:
             text = f" {(time.monotonic_ns() - estimate.last_fix_ns) * 1e-9:.0f} s"
         sigma_m = self._position_sigma_m()
-        return text + (f", +-{2.0 * sigma_m:.0f} m" if sigma_m is not None else "")
+        text += f", +-{2.0 * sigma_m:.0f} m" if sigma_m is not None else ""
+        return text + (", searching" if engine.searching else "")
 
     def _write(self, level: str, text: str) -> None:
         if self._file is None:
@@ -208,11 +204,25 @@ class HealthMonitor:
         }
 
 
-def _carried(estimate: PoseEstimate) -> str:
-    """How long the odometry has carried the pose on, and how far off it may be (95 %)."""
+def _waiting_for(engine: EngineHealth) -> str:
+    """What is missing before the first estimate."""
+    if engine.searching:
+        return "searching the map"
+    seen = engine.frames_in > 0
+    return engine.last_error or f"waiting for {'a pose prior' if seen else 'video'}"
+
+
+def _bridging(estimate: PoseEstimate) -> tuple[HealthLevel, str]:
+    """How long the odometry has carried the pose on, and how far off it may be (95 %).
+
+    A second or two is no news: a shadow of a cloud, a car that fills the picture.
+    """
     since_ns = estimate.exposure_time_ns - (estimate.last_fix_ns or estimate.exposure_time_ns)
+    if since_ns < _SHORT_BRIDGE_NS:
+        return _OF_STATE[TrackingState.TRACKING]
     sigma_m = float(np.sqrt(np.linalg.eigvalsh(estimate.covariance[:2, :2])[-1]))
-    return f" {since_ns * 1e-9:.0f} s, {2.0 * sigma_m:.0f} m"
+    text = f"bridging {since_ns * 1e-9:.0f} s, {2.0 * sigma_m:.0f} m"
+    return HealthLevel.DEGRADED, text
 
 
 def _is_lost(estimate: PoseEstimate) -> bool:

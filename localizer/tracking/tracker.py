@@ -120,7 +120,8 @@ class Tracker:
         witness = self._witness(seen.standing, outcome)
         standing = judge(seen.standing, self._config.integrity, outcome, witness)
         bridges = standing.state is TrackingState.BRIDGING
-        moved = self._next_motion(ahead, result, acceptable and not bridges, carried)
+        lost = standing.state is TrackingState.LOST
+        moved = self._next_motion(ahead, result, acceptable and not bridges, carried, lost)
         self._store(seen, moved, standing)
         given, usable = _given(outcome, result, carried, standing)
         estimate = _estimate(frame, given, standing, usable)
@@ -156,14 +157,17 @@ class Tracker:
         return Witness(rotation, way)
 
     def _next_motion(
-        self, ahead: MotionState, result: Registration | None, use_map: bool, carried: Carried
-    ) -> MotionState:
+        self, ahead: MotionState, result: Registration | None, use_map: bool, carried: Carried,
+        lost: bool,
+    ) -> MotionState:  # fmt: skip
         if use_map and result is not None:
             return motion.update(ahead, result.world_from_camera, result.covariance)
         if carried.world_from_camera is not None and carried.covariance is not None:
             return motion.update(ahead, carried.world_from_camera, carried.covariance)
         if result is not None and is_acceptable(self._config.integrity, result, 0.0):
             return motion.inflated(ahead, self._config.motion)
+        if lost:  # its velocity is of long ago, and would carry the search out of the map
+            return motion.kept(ahead, ahead.time_ns, self._config.motion, None)
         return ahead
 
     def _store(self, seen: TrackerState, state: MotionState, standing: Standing) -> None:

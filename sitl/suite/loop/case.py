@@ -93,7 +93,8 @@ class Expectation(_Model):
 class LoopCase(_Model):
     """One flight. seconds: length of the recorded part. hover: stay; else the legs are flown in
     AUTO. wind_m_s: from the west. deny: GNSS is switched off when it begins. ci: flown in every
-    test run on the embedded vehicle. deployment: keys that differ from the demo's deployment file.
+    test run on the embedded vehicle. deployment: keys that differ from the demo's deployment file;
+    vehicle: parameters likewise (FS_EKF_ACTION 0: no landing while the place is searched).
     """
 
     name: str
@@ -106,6 +107,7 @@ class LoopCase(_Model):
     wind_m_s: float = Field(0.0, ge=0, le=15)
     deny: bool = True
     deployment: dict[str, Any] = {}
+    vehicle: dict[str, float] = {}
     wrong: Wrong = Wrong()
     timeline: tuple[LoopEvent, ...] = ()
     expect: Expectation = Expectation()

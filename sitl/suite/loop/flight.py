@@ -130,7 +130,7 @@ class _LoopFlight:
 
     def _open_vehicle(self) -> VehicleProcess:
         log = self._out / "vehicle.log"
-        parameters = vehicle_parameters(self._case.scenario)
+        parameters = vehicle_parameters(self._case.scenario) | self._case.vehicle
         vehicle = open_vehicle(self._kind, self._home, 0.0, parameters, seed=self._seed, log=log)
         return self._stack.enter_context(vehicle)
 

@@ -4,6 +4,7 @@ import json
 import time
 from types import SimpleNamespace
 
+import numpy as np
 import pytest
 
 from companion.flight.health import HealthMonitor
@@ -155,3 +156,29 @@ def test_after_the_end_the_file_says_that_it_ended_and_how(tmp_path):
     assert report["level"] == "ended"
     assert report["text"] == "stopped; localization tracking, map unreadable until then"
     assert bridge.said == ["PiLoT: ending, nothing is injected any more"]
+
+
+@pytest.mark.parametrize(
+    ("seconds", "level", "text"),
+    [
+        (1, HealthLevel.OK, "localization tracking"),
+        (23, HealthLevel.DEGRADED, "bridging 23 s, 4 m"),
+    ],
+)
+def test_bridging_is_told_once_it_lasts(tmp_path, seconds, level, text):
+    bridged = SimpleNamespace(
+        state=TrackingState.BRIDGING, stage_ms={}, exposure_time_ns=100 * 10**9,
+        last_fix_ns=(100 - seconds) * 10**9, covariance=np.eye(6) * 4.0,
+    )  # fmt: skip
+    bridge = FakeBridge(True)
+    monitor = HealthMonitor(
+        lambda: EngineHealth(frames_in=9),
+        bridge,
+        lambda: StreamState.LIVE,
+        lambda *_: None,
+        tmp_path,
+    )
+    monitor.add_estimate(bridged)
+    monitor.start()
+    monitor.stop()
+    assert bridge.told[0] == (level, text)
