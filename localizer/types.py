@@ -137,10 +137,14 @@ class TrackingState(Enum):
 class PoseEstimate:
     """The localizer's answer for one frame.
 
-    covariance: (6, 6) as in `PosePrior`. quality: 0 to 1. accepted: whether integrity lets it be
-    used. stage_ms: latency of each stage in milliseconds. last_fix_ns: exposure of the newest
-    estimate that the map confirmed, this one included; None before the first. BRIDGING estimates
-    are carried on by odometry, with a covariance that grows.
+    covariance: (6, 6) as in `PosePrior`, so east, north, up (m) and rotation about them (rad).
+    quality: 0 to 1. status: whether the registration gave a pose; accepted: whether integrity lets
+    it be used, so OK and not accepted go together where integrity refuses it. stage_ms: latency of
+    each stage in milliseconds. last_fix_ns: exposure of the newest estimate that the map confirmed,
+    this one included; None before the first.
+
+    state: INITIALIZING for a single photo, which confirms nothing, however good it is. BRIDGING
+    estimates are carried on by odometry, with a covariance that grows.
     """
 
     world_from_camera: Pose
