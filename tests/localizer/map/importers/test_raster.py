@@ -203,7 +203,7 @@ def test_truncated_rasters_are_named_errors(rasters, build, tmp_path, keep):
 @pytest.mark.real
 def test_portugal_heights_agree_with_its_dsm(real_data, build):
     folder = real_data("portugal")
-    cache = build([folder / "dsm.tif", folder / "ortho.tif"], **DATUM)
+    cache = build([folder / "dsm.tif", folder / "ortho.tif"], vertical_datum="ellipsoidal")
     with rasterio.open(folder / "dsm.tif") as data:
         dsm, transform = data.read(1), data.transform
     rng = np.random.default_rng(1)
