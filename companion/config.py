@@ -198,6 +198,8 @@ def _resolve_bridge(bridge: BridgeConfig, folder: Path) -> BridgeConfig:
     update: dict[str, Any] = {}
     if bridge.tlog is not None:
         update["tlog"] = _path(folder, bridge.tlog, "bridge.tlog")
+    if bridge.state_file is not None:
+        update["state_file"] = _path(folder, bridge.state_file, "bridge.state_file")
     for name in ("signing", "ground_signing"):
         signing = getattr(bridge, name)
         if signing is not None:

@@ -52,7 +52,7 @@ class GateMemory:
             opened, channel = content["open"] is True, content["by_channel"] is True
         except FileNotFoundError:
             return None
-        except (OSError, ValueError, KeyError, TypeError) as error:
+        except (OSError, ValueError, KeyError, TypeError, OverflowError, RecursionError) as error:
             _log.warning("%s cannot be used: %s", self._path, error)
             return None
         return (channel, age_s) if opened and 0.0 <= age_s <= _OLDEST_S else None

@@ -24,6 +24,14 @@ from mavlink_bridge.vehicle.profile import autopilot_name, decode_version, selec
 
 _MILLI_G = 9.80665e-3  # m/s^2
 _SEA_LEVEL_HPA = 1013.25
+_PRESSURE_HPA = (1.0, 1200.0)  # of air that an aircraft flies in
+# Beyond these no sensor measures and no aircraft flies. One such value would stay for good in what
+# is integrated (the heading of the gyros, the way of the IMU) or make a flight look like a jump.
+_ANGLE_RAD = 10.0
+_RATE_RADPS = 100.0
+_FORCE_MPS2 = 1_000.0
+_DISTANCE_M = 1e6
+_SPEED_MPS = 1_000.0
 
 
 def is_autopilot(message: Any) -> bool:
@@ -61,7 +69,7 @@ class VehicleReadings:
         self.inertial = InertialBuffer()
 
     def take(self, message: Any, time_ns: int) -> None:
-        """One of MESSAGES_IN. Raises ValueError where it is not finite or no rotation."""
+        """One of MESSAGES_IN. Raises ValueError where no sensor says that, or no rotation."""
         _HANDLERS[message.get_type()](self, message, time_ns)
 
     def set_origin(self, origin: Origin | None) -> None:
@@ -104,13 +112,14 @@ class VehicleReadings:
         self.state = replace(self.state, version=version, profile=name)
 
     def _attitude_euler(self, m: Any, time_ns: int) -> None:
-        _check_finite(m.roll, m.pitch, m.yaw, m.rollspeed, m.pitchspeed, m.yawspeed)
+        _check_within(_ANGLE_RAD, m.roll, m.pitch, m.yaw)
+        _check_within(_RATE_RADPS, m.rollspeed, m.pitchspeed, m.yawspeed)
         q = quat.from_euler(m.roll, m.pitch, m.yaw)
         rates = (m.rollspeed, m.pitchspeed, m.yawspeed)
         self.attitudes.add(Attitude(time_ns, m.roll, m.pitch, m.yaw, q, rates))
 
     def _attitude_quaternion(self, m: Any, time_ns: int) -> None:
-        _check_finite(m.rollspeed, m.pitchspeed, m.yawspeed)
+        _check_within(_RATE_RADPS, m.rollspeed, m.pitchspeed, m.yawspeed)
         q = quat.normalise((m.q1, m.q2, m.q3, m.q4))
         self.attitudes.add(attitude(time_ns, q, (m.rollspeed, m.pitchspeed, m.yawspeed)))
 
@@ -119,8 +128,8 @@ class VehicleReadings:
         self.gimbals.add(GimbalSample(time_ns, quat.normalise(m.q), earth, GIMBAL_SOURCES[0]))
 
     def _mount_orientation(self, m: Any, time_ns: int) -> None:
-        _check_finite(m.roll, m.pitch, m.yaw)
         roll, pitch, yaw = (math.radians(a) for a in (m.roll, m.pitch, m.yaw))
+        _check_within(_ANGLE_RAD, roll, pitch, yaw)
         q = quat.from_euler(roll, pitch, yaw)
         self.gimbals.add(GimbalSample(time_ns, q, False, GIMBAL_SOURCES[1]))
 
@@ -133,7 +142,8 @@ class VehicleReadings:
         self.gimbals.add(GimbalSample(time_ns, q, False, GIMBAL_SOURCES[2]))
 
     def _local_position(self, m: Any, time_ns: int) -> None:
-        _check_finite(m.x, m.y, m.z, m.vx, m.vy, m.vz)
+        _check_within(_DISTANCE_M, m.x, m.y, m.z)
+        _check_within(_SPEED_MPS, m.vx, m.vy, m.vz)
         self.locals.add(time_ns, (m.x, m.y, m.z))
         self.state = replace(
             self.state,
@@ -204,12 +214,13 @@ class VehicleReadings:
 
     def _highres_imu(self, m: Any, time_ns: int) -> None:
         force, rates = (m.xacc, m.yacc, m.zacc), (m.xgyro, m.ygyro, m.zgyro)
-        _check_finite(*force, *rates)
+        _check_within(_FORCE_MPS2, *force)
+        _check_within(_RATE_RADPS, *rates)
         self.inertial.add(InertialSample(time_ns, force, rates))
 
     def _pressure(self, m: Any, time_ns: int) -> None:
-        if not m.press_abs > 0.0:
-            raise ValueError(f"{m.press_abs} hPa is no pressure")
+        if not _PRESSURE_HPA[0] <= m.press_abs <= _PRESSURE_HPA[1]:
+            raise ValueError(f"{m.press_abs} hPa is no pressure of air")
         altitude = 44_330.77 * (1.0 - (m.press_abs / _SEA_LEVEL_HPA) ** 0.190263)
         self.state = replace(self.state, pressure_altitude_m=altitude, pressure_time_ns=time_ns)
 
@@ -232,9 +243,9 @@ def _known(value: float) -> float | None:
     return None if math.isnan(value) else value
 
 
-def _check_finite(*values: float) -> None:
-    if not all(math.isfinite(value) for value in values):
-        raise ValueError(f"{values} is not finite")
+def _check_within(limit: float, *values: float) -> None:
+    if not all(abs(value) <= limit for value in values):  # NaN is within nothing
+        raise ValueError(f"{values}: not finite, or beyond {limit:g}")
 
 
 _HANDLERS = {

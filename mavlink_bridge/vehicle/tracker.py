@@ -129,7 +129,7 @@ class VehicleTracker:
                 return rebooted
             try:
                 self._readings.take(message, stamp_ns)
-            except ValueError:  # not finite, or no rotation: estimators start up like that
+            except ValueError:  # no measurement, or no rotation: estimators start up like that
                 self.ignored += 1
         return rebooted
 

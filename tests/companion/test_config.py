@@ -23,10 +23,12 @@ def _write(tmp_path: Path, data: object) -> Path:
 
 
 def test_minimal_config_and_paths_relative_to_the_file(tmp_path):
-    config = load_config(_write(tmp_path, MINIMAL | {"record": {"folder": "out"}}))
+    given = {"record": {"folder": "out"}, "bridge": {"state_file": "state/gate.json"}}
+    config = load_config(_write(tmp_path, MINIMAL | given))
     assert config.map == tmp_path / "cache"
     assert config.record is not None
     assert config.record.folder == tmp_path / "out"
+    assert config.bridge.state_file == tmp_path / "state/gate.json"
     assert config.camera.model.camera().fx == 550
 
 

@@ -83,7 +83,10 @@ def test_an_old_file_and_one_from_the_future_count_for_nothing(
     gate.stop()
 
 
-@pytest.mark.parametrize("text", ["", "[]", "nonsense", '{"open": 1}', "{" * 5000])
+@pytest.mark.parametrize(
+    "text",
+    ["", "[]", "nonsense", '{"open": 1}', "{" * 5000, '{"utc_s": 1' + "0" * 400 + "}"],
+)
 def test_a_damaged_file_or_another_users_is_ignored(tmp_path: Path, text: str) -> None:
     path = tmp_path / "gate.json"
     path.write_text(text)

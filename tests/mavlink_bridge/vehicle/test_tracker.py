@@ -268,6 +268,56 @@ def test_what_is_not_finite_or_old_is_ignored() -> None:
     assert it.snapshot(now).local_position_ned == (5.0, 0.0, 0.0)
 
 
+@pytest.mark.parametrize(
+    "nonsense",
+    [
+        mavlink.MAVLink_attitude_message(960, 0.0, 0.0, 1e38, 0.0, 0.0, 0.0),
+        mavlink.MAVLink_attitude_message(960, 0.0, 0.0, 0.0, 0.0, 0.0, 1e38),
+        mavlink.MAVLink_attitude_quaternion_message(960, 1.0, 0.0, 0.0, 0.0, 0.0, -1e38, 0.0),
+        mavlink.MAVLink_mount_orientation_message(960, 0.0, 1e38, 0.0),
+        mavlink.MAVLink_local_position_ned_message(960, 1e38, 0.0, 0.0, 0.0, 0.0, 0.0),
+        mavlink.MAVLink_local_position_ned_message(960, 1.0, 0.0, 0.0, -1e38, 0.0, 0.0),
+        mavlink.MAVLink_highres_imu_message(960_000, 1e38, *[0.0] * 12, 63),
+        mavlink.MAVLink_highres_imu_message(960_000, *[0.0] * 3, 1e38, *[0.0] * 9, 63),
+        mavlink.MAVLink_scaled_pressure_message(960, math.inf, 0.0, 2000),
+        mavlink.MAVLink_scaled_pressure_message(960, 1e38, 0.0, 2000),
+        mavlink.MAVLink_scaled_pressure_message(960, 1e-30, 0.0, 2000),
+    ],
+    ids=lambda m: f"{m.get_type()}",
+)
+def test_what_no_sensor_measures_is_ignored(nonsense: Any) -> None:
+    it = tracker()
+    feed_yaw(it, 10.0, 1.0, 0.1)
+    before = it.snapshot(11 * SECOND)
+    it.handle(sent(nonsense), 10 * SECOND + 960 * MS)
+    assert it.ignored == 1
+    assert it.snapshot(11 * SECOND) == before
+    # The gyros' heading is a sum: one such rate would have drowned all that come after it.
+    for ms, yaw in ((980, 0.098), (1000, 0.100)):
+        m = mavlink.MAVLink_attitude_message(ms, 0.0, 0.0, yaw, 0.0, 0.0, 0.1)
+        it.handle(sent(m), 10 * SECOND + ms * MS)
+    at = it.attitude_at(11 * SECOND)
+    assert at is not None
+    assert at.gyro_heading_rad == pytest.approx(0.1, abs=1e-3)
+
+
+def test_what_a_hard_flight_measures_is_taken() -> None:
+    it = tracker()
+    rates = (20.0, -20.0, 35.0)  # rad/s: past the end of a common gyro's scale
+    for m in (
+        mavlink.MAVLink_attitude_message(20, -3.1, 1.5, 6.2, *rates),
+        mavlink.MAVLink_highres_imu_message(40_000, 300.0, -300.0, 300.0, *rates, *[0.0] * 7, 63),
+        mavlink.MAVLink_scaled_pressure_message(60, 265.0, 0.0, -5000),  # at 10 km
+        mavlink.MAVLink_local_position_ned_message(80, 9e4, -9e4, -9e3, 200.0, 200.0, 50.0),
+    ):
+        it.handle(sent(m), 10 * SECOND)
+    state = it.snapshot(10 * SECOND)
+    assert it.ignored == 0
+    assert state.local_position_ned == (9e4, -9e4, -9e3)
+    assert state.pressure_altitude_m == pytest.approx(10_000.0, abs=50.0)
+    assert len(it.inertial_since(0)) == 1
+
+
 # --- origin -----------------------------------------------------------------------------------
 
 
