@@ -1,4 +1,4 @@
-"""Is this deployment ready? The bridge's examination plus map, model, camera and machine."""
+"""Is this deployment ready? The bridge's examination plus map, model, camera, files and machine."""
 
 from __future__ import annotations
 
@@ -11,6 +11,7 @@ from companion.errors import CompanionError
 from companion.preflight.coverage import check_mission, check_origin
 from companion.preflight.heights import check_heights
 from companion.preflight.map_pin import require_pinned
+from companion.preflight.places import check_places
 from companion.redaction import redacted
 from companion.sources import SourceSettings, open_source
 from localizer.errors import LocalizerError
@@ -31,6 +32,7 @@ def examine_deployment(config: CompanionConfig, *, vehicle: bool = True) -> Diag
     """Every check; `vehicle` false leaves out what needs the flight controller."""
     cache, findings = _check_map(config)
     findings += [_check_localizer(config, cache is not None), _check_camera(config), _check_power()]
+    findings += check_places(config)
     if cache is not None and config.bridge.origin is not None:
         findings.append(check_origin(config.bridge.origin, cache))
     if vehicle:

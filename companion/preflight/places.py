@@ -1,0 +1,55 @@
+"""What a flight reads its keys from and writes its records to, seen without making any of it."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+from companion.config import CompanionConfig
+from mavlink_bridge.errors import BridgeError
+from mavlink_bridge.link.signing import load_key
+from mavlink_bridge.preflight.doctor import Finding
+
+
+def check_places(config: CompanionConfig) -> list[Finding]:
+    """Folders of records and signing keys that a start would refuse; empty where none is named."""
+    bridge = config.bridge
+    written = {"bridge.tlog": bridge.tlog, "bridge.state_file": bridge.state_file}
+    faults = []
+    if config.record is not None:
+        faults.append(_unwritable("record.folder", config.record.folder))
+    faults += [_no_file(key, path) for key, path in written.items() if path is not None]
+    keys = {"bridge.signing": bridge.signing, "bridge.ground_signing": bridge.ground_signing}
+    for key, signing in keys.items():
+        if signing is not None:
+            try:
+                load_key(signing.key_file)
+            except BridgeError as error:
+                faults.append(f"{key}: {error}")
+    needed = "folders to write to, keys to read"
+    return [Finding("files", "unusable", needed, fault, False, True) for fault in faults if fault]
+
+
+def _no_file(key: str, path: Path) -> str:
+    """Why the file cannot be made or written, "" if it can."""
+    try:
+        if path.is_dir():
+            return f"{key} {path}: a folder, not a file"
+    except OSError as error:
+        return f"{key} {path}: {error.strerror}"
+    return _unwritable(key, path.parent)
+
+
+def _unwritable(key: str, folder: Path) -> str:
+    """Why the folder, or the nearest above it that there is, cannot be written; "" if it can."""
+    try:
+        place = folder
+        while not place.exists() and place != place.parent:
+            place = place.parent
+        if not place.is_dir():
+            return f"{key} {folder}: {place} is not a folder"
+        if not os.access(place, os.W_OK | os.X_OK):
+            return f"{key} {folder}: {place} cannot be written"
+    except OSError as error:
+        return f"{key} {folder}: {error.strerror}"
+    return ""
