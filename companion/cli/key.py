@@ -10,6 +10,7 @@ from rich.console import Console
 
 from companion.errors import ConfigError
 from mavlink_bridge.link.signing import create_key
+from mavlink_bridge.link.transport import Endpoint
 
 
 def key_command(
@@ -20,6 +21,11 @@ def key_command(
     ] = None,
 ) -> None:
     """Make a signing key; --install gives it (or the one that FILE holds) to the autopilot."""
+    if install is not None:
+        try:  # before a key is made that cannot be installed
+            Endpoint.parse(install)
+        except ValueError as error:
+            raise ConfigError(f"--install {install}: {error}") from error
     console = Console()
     if not file.exists():
         create_key(file)

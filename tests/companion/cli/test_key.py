@@ -47,6 +47,14 @@ def test_a_key_is_made_for_its_owner_and_never_overwritten(tmp_path: Path) -> No
     assert key.hex() not in result.output
 
 
+def test_a_connection_that_is_none_is_told_before_a_key_is_made(tmp_path: Path) -> None:
+    path = tmp_path / "mavlink.key"
+    result = CliRunner().invoke(app, ["key", str(path), "--install", "pigeon:1"])
+    assert isinstance(result.exception, ConfigError)
+    assert "--install pigeon:1" in str(result.exception)
+    assert not path.exists()
+
+
 def test_the_vehicle_signs_with_the_installed_key(tmp_path: Path) -> None:
     path, vehicle = tmp_path / "mavlink.key", Vehicle()
     try:
