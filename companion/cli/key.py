@@ -9,6 +9,7 @@ import typer
 from rich.console import Console
 
 from companion.errors import ConfigError
+from mavlink_bridge.errors import EndpointError
 from mavlink_bridge.link.signing import create_key
 from mavlink_bridge.link.transport import Endpoint
 
@@ -24,7 +25,7 @@ def key_command(
     if install is not None:
         try:  # before a key is made that cannot be installed
             Endpoint.parse(install)
-        except ValueError as error:
+        except EndpointError as error:
             raise ConfigError(f"--install {install}: {error}") from error
     console = Console()
     if not file.exists():
