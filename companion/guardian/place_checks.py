@@ -130,7 +130,10 @@ class JumpCheck:
         led = [p + v * dt for p, v in zip(there[:2], last.velocity_ned[:2], strict=True)]
         apart = math.hypot(here[0] - led[0], here[1] - led[1])
         sigma = math.hypot(_sigma(last.fix), _sigma(fix))
-        reach = math.hypot(*last.velocity_ned[:2]) * dt if dt > 1.0 else 0.0
+        # After a gap the way may have turned. A fix that is held is no gap: its jump would pass by
+        # waiting for a second (5 degrees of a turned frame, 10 m at 120 m from home).
+        gap = dt > 1.0 and self._held is None
+        reach = math.hypot(*last.velocity_ned[:2]) * dt if gap else 0.0
         allowed = _SIGMAS * sigma + _SPEED_MPS * dt + 0.5 * _DRIFT_MPS2 * dt * dt + reach
         return apart - allowed
 

@@ -73,6 +73,21 @@ def test_a_60_m_reset_does_not_pass_unquestioned() -> None:
     assert len(flight.passed) >= 168
 
 
+def test_a_jump_in_fast_flight_does_not_pass_by_waiting_a_second() -> None:
+    """10 m aside at 10 m/s, as of a frame that turns by 5 degrees 120 m from home."""
+
+    def cruise(at_s: float) -> tuple[float, float]:
+        return 10.0 * at_s, 0.0
+
+    def turned(at_s: float) -> tuple[float, float]:
+        north, east = cruise(at_s)
+        return north, east + (10.0 if 10.0 <= at_s < 14.0 else 0.0)
+
+    flight = Flight(monitor(), cruise, turned).fly(20.0)
+    assert flight.told("withheld: position jumped") < 10.5
+    assert not [fix for fix in flight.passed if 10e9 <= fix.time_ns < 14e9]
+
+
 def test_a_jump_that_agrees_in_motion_is_taken_with_a_reset() -> None:
     """The old place may have been the wrong one: after 5 s it is believed, and announced."""
 
