@@ -239,7 +239,9 @@ class Monitor:
 
     def _stands_still(self, flies: bool) -> Reading:
         verdict = self._verdict
-        if verdict is None or self._config.motion.still_m == 0.0:
+        # A calm hover on good fixes stands still, too: where there are pictures, they tell.
+        seen = self._picture is not None
+        if verdict is None or seen or self._config.motion.still_m == 0.0:
             return Reading(None)
         if self._latches[f.STANDS_STILL.name].raised:
             return Reading(verdict.still_s >= _MOVES_S, verdict.still_s)
