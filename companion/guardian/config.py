@@ -36,10 +36,7 @@ class MotionConfig(_Model):
     limit_3s_m: float = Field(default=1.0, gt=0.0, le=50.0)
     limit_10s_m: float = Field(default=0.8, gt=0.0, le=50.0)
     still_m: float = Field(
-        default=0.1, ge=0.0, le=5.0, description="a position within this stands still; 0: unused"
-    )
-    still_s: float = Field(
-        default=15.0, ge=2.0, le=300.0, description="in the air nothing stands still so long"
+        default=0.1, ge=0.0, le=5.0, description="a position within this is no proof of motion"
     )
 
 

@@ -44,7 +44,6 @@ class Rule:
 VIDEO_FROZEN = Rule("video_frozen", "video frozen {0:.0f} s", Action.WITHDRAW, 0.0, 2.0)
 VIDEO_REPEATS = Rule("video_repeats", "video repeats, {0:.0f} s old", Action.WITHDRAW, 0.0, 5.0)
 MOTION = Rule("motion", "motion is not the IMU's ({0:.0f} m)", Action.WITHDRAW, 0.2, 5.0)
-STANDS_STILL = Rule("stands_still", "position stands still {0:.0f} s", Action.WITHDRAW, 0.0, 5.0)
 HEIGHT = Rule("height", "height {0:.0f} m off barometer", Action.WITHDRAW, 2.0, 5.0)
 JUMP = Rule("jump", "position jumped {0:.0f} m", Action.WITHDRAW, 0.0, 0.0)
 GNSS = Rule("gnss", "GNSS {0:.0f} m from vision: neither proven", Action.NONE, 2.0, 5.0, 10.0)
@@ -56,7 +55,6 @@ RULES = (
     VIDEO_FROZEN,
     VIDEO_REPEATS,
     MOTION,
-    STANDS_STILL,
     HEIGHT,
     JUMP,
     GNSS,

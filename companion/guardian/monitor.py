@@ -196,7 +196,6 @@ class Monitor:
             f.VIDEO_FROZEN.name: lambda: self._frozen(now_ns, state) if flies else Reading(False),
             f.VIDEO_REPEATS.name: lambda: self._repeats(now_ns) if flies else Reading(False),
             f.MOTION.name: lambda: self._moves_otherwise() if fresh else none,
-            f.STANDS_STILL.name: lambda: self._stands_still(flies) if fresh else none,
             f.HEIGHT.name: lambda: self._height_reading if fresh else none,
             f.JUMP.name: lambda: Reading(self._jump_held, self._jumps.distance_m),
             f.GNSS.name: lambda: self._against_gnss(state, now_ns) if fresh else none,
@@ -236,16 +235,6 @@ class Monitor:
         # A filter follows even a frozen position in the end: it must move before it is believed.
         calm = verdict.share < _CALM_SHARE and verdict.still_s < _MOVES_S
         return Reading(not calm, verdict.deviation_m)
-
-    def _stands_still(self, flies: bool) -> Reading:
-        verdict = self._verdict
-        # A calm hover on good fixes stands still, too: where there are pictures, they tell.
-        seen = self._picture is not None
-        if verdict is None or seen or self._config.motion.still_m == 0.0:
-            return Reading(None)
-        if self._latches[f.STANDS_STILL.name].raised:
-            return Reading(verdict.still_s >= _MOVES_S, verdict.still_s)
-        return Reading(flies and verdict.still_s >= self._config.motion.still_s, verdict.still_s)
 
     def _against_gnss(self, state: VehicleState, now_ns: int) -> Reading:
         if self._newest is None or self._level is None or self._limits.gnss_is_ours:
