@@ -178,70 +178,76 @@ def _accumulate(n, t, focal, buf, sums):  # type: ignore[no-untyped-def]
     sums[15], sums[16], sums[17], sums[18], sums[19], sums[20] = h50, h51, h52, h53, h54, h55
 
 
+@njit(forceinline=True, **JIT)
+def _sample(C, n, w, features, anchor_features, buf, index):  # type: ignore[no-untyped-def]
+    """Equations 3 and 7: reduce the channels of each anchor in view to rows 10 to 15."""
+    ka, kb = buf[8], buf[9]
+    kA, kB, kD, kp, kq, ke = buf[10], buf[11], buf[12], buf[13], buf[14], buf[15]
+    anchor, cell = index[0], index[1]
+    row = w * C
+    for k in range(n):
+        ahead = cell[min(k + _AHEAD, n - 1)] * C
+        for c in range(0, 2 * C, _LINE):
+            prefetch(features, ahead + c)
+            prefetch(features, ahead + row + c)
+        a, b = ka[k], kb[k]
+        i, j = cell[k] * C, anchor[k] * C
+        f00, f01 = features[i : i + C], features[i + C : i + 2 * C]
+        f10 = features[i + row : i + row + C]
+        f11 = features[i + row + C : i + row + 2 * C]
+        fr = anchor_features[j : j + C]
+        A, B, D, p, q, e = _F(0), _F(0), _F(0), _F(0), _F(0), _F(0)
+        for c in range(C):
+            v00, v10 = f00[c], f10[c]
+            d0, d1 = f01[c] - v00, f11[c] - v10
+            top = v00 + a * d0
+            gy = v10 + a * d1 - top
+            gx = d0 + b * (d1 - d0)
+            r = top + b * gy - fr[c]
+            A += gx * gx
+            B += gx * gy
+            D += gy * gy
+            p += gx * r
+            q += gy * r
+            e += r * r
+        kA[k], kB[k], kD[k], kp[k], kq[k], ke[k] = A, B, D, p, q, e
+
+
+@njit(forceinline=True, **JIT)
+def _evaluate(  # type: ignore[no-untyped-def]
+    C, R, t, focal, centre, points, features, confidence, anchor_features, anchor_confidence,
+    h, w, delta, redescending, min_visible, prior_R, prior_t, information, prior_weight,
+    buf, index, work, sums,
+):  # fmt: skip
+    """Score of a pose and the count of anchors in view; sums gets H and g."""
+    _project(R, t, points, focal, centre, buf)
+    n = _compact(points.shape[1], h, w, buf, index)
+    if n < min_visible:
+        return np.inf, n
+    _sample(C, n, w, features, anchor_features, buf, index)
+    cost, total = _weigh(n, w, confidence, anchor_confidence, _F(delta), redescending, buf, index)
+    if not total > _F(0):
+        return np.inf, n
+    _accumulate(n, t, focal, buf, sums)
+    inverse = 1.0 / total
+    for i in range(27):
+        sums[i] *= inverse
+    score = cost * inverse
+    if prior_weight > 0.0:
+        score += add_prior(R, t, prior_R, prior_t, information, prior_weight, sums, work)
+    return score, n
+
+
 @lru_cache
 def refine_kernel(channels: int) -> Callable[..., int]:
-    """The compiled kernel for feature maps of `channels` channels."""
+    """The compiled kernel for feature maps of `channels` channels.
+
+    It closes over the number alone: numba's cache on disk tells closures apart by their pickled
+    variables, and a compiled function among them is pickled with a number of its process's own, so
+    that the kernel would be compiled anew in every process. The functions that need the number as a
+    constant are inlined instead.
+    """
     C = channels
-
-    @njit(**JIT)
-    def sample(n, w, features, anchor_features, buf, index):  # type: ignore[no-untyped-def]
-        """Equations 3 and 7: reduce the channels of each anchor in view to rows 10 to 15."""
-        ka, kb = buf[8], buf[9]
-        kA, kB, kD, kp, kq, ke = buf[10], buf[11], buf[12], buf[13], buf[14], buf[15]
-        anchor, cell = index[0], index[1]
-        row = w * C
-        for k in range(n):
-            ahead = cell[min(k + _AHEAD, n - 1)] * C
-            for c in range(0, 2 * C, _LINE):
-                prefetch(features, ahead + c)
-                prefetch(features, ahead + row + c)
-            a, b = ka[k], kb[k]
-            i, j = cell[k] * C, anchor[k] * C
-            f00, f01 = features[i : i + C], features[i + C : i + 2 * C]
-            f10 = features[i + row : i + row + C]
-            f11 = features[i + row + C : i + row + 2 * C]
-            fr = anchor_features[j : j + C]
-            A, B, D, p, q, e = _F(0), _F(0), _F(0), _F(0), _F(0), _F(0)
-            for c in range(C):
-                v00, v10 = f00[c], f10[c]
-                d0, d1 = f01[c] - v00, f11[c] - v10
-                top = v00 + a * d0
-                gy = v10 + a * d1 - top
-                gx = d0 + b * (d1 - d0)
-                r = top + b * gy - fr[c]
-                A += gx * gx
-                B += gx * gy
-                D += gy * gy
-                p += gx * r
-                q += gy * r
-                e += r * r
-            kA[k], kB[k], kD[k], kp[k], kq[k], ke[k] = A, B, D, p, q, e
-
-    @njit(**JIT)
-    def evaluate(  # type: ignore[no-untyped-def]
-        R, t, focal, centre, points, features, confidence, anchor_features, anchor_confidence,
-        h, w, delta, redescending, min_visible, prior_R, prior_t, information, prior_weight,
-        buf, index, work, sums,
-    ):  # fmt: skip
-        """Score of a pose and the count of anchors in view; sums gets H and g."""
-        _project(R, t, points, focal, centre, buf)
-        n = _compact(points.shape[1], h, w, buf, index)
-        if n < min_visible:
-            return np.inf, n
-        sample(n, w, features, anchor_features, buf, index)
-        cost, total = _weigh(
-            n, w, confidence, anchor_confidence, _F(delta), redescending, buf, index
-        )
-        if not total > _F(0):
-            return np.inf, n
-        _accumulate(n, t, focal, buf, sums)
-        inverse = 1.0 / total
-        for i in range(27):
-            sums[i] *= inverse
-        score = cost * inverse
-        if prior_weight > 0.0:
-            score += add_prior(R, t, prior_R, prior_t, information, prior_weight, sums, work)
-        return score, n
 
     @njit(**JIT)
     def refine(  # type: ignore[no-untyped-def]
@@ -254,31 +260,28 @@ def refine_kernel(channels: int) -> Callable[..., int]:
         scale, step, L, t_try = work[14], work[15], work[16:22], work[22, :3]
         evaluations = 0
         for m in range(start, stop):
-            damping = damping0
-            scores[m], visible[m] = evaluate(
-                R[m], t[m], focal, centre, points, features, confidence, anchor_features,
-                anchor_confidence, h, w, delta, redescending, min_visible, prior_R, prior_t,
-                information, prior_weight, buf, index, work, best,
-            )  # fmt: skip
-            evaluations += 1
-            if not scores[m] < np.inf:
-                scores[m] = np.inf
-                continue
-            for _ in range(iterations):
-                if not solve(best, t[m], damping, work, scale, L, step):
-                    break
-                retract(R[m], t[m], step, R_try, t_try)
-                score, n = evaluate(
-                    R_try, t_try, focal, centre, points, features, confidence, anchor_features,
+            damping, scores[m] = damping0, np.inf
+            R_try[:], t_try[:] = R[m], t[m]
+            for k in range(iterations + 1):  # one call, since it is inlined: the first scores only
+                if k > 0:
+                    if not solve(best, t[m], damping, work, scale, L, step):
+                        break
+                    retract(R[m], t[m], step, R_try, t_try)
+                score, n = _evaluate(
+                    C, R_try, t_try, focal, centre, points, features, confidence, anchor_features,
                     anchor_confidence, h, w, delta, redescending, min_visible, prior_R, prior_t,
                     information, prior_weight, buf, index, work, sums,
                 )  # fmt: skip
                 evaluations += 1
+                if k == 0:
+                    visible[m] = n
+                    if not score < np.inf:
+                        break
                 if score < scores[m]:
                     scores[m], visible[m] = score, n
                     R[m], t[m] = R_try, t_try
                     best, sums = sums, best
-                    damping *= down
+                    damping *= down if k > 0 else 1.0
                 else:
                     damping *= up
         return evaluations

@@ -20,7 +20,7 @@ from localizer.registration.backend import (
     local_origin,
     world_from_camera,
 )
-from localizer.registration.cpu.kernel import NumbaBackend
+from localizer.registration.cpu.kernel import NumbaBackend, refine_kernel
 from localizer.registration.cpu.reference import (
     ReferenceBackend,
     linearize,
@@ -296,3 +296,10 @@ def test_no_allocation_per_iteration_or_frame(scene, problems, swarm):
     tracemalloc.stop()
     results = sum(a.nbytes for a in swarm) + 3 * 8 * len(swarm[0])
     assert peak < results + 10_000
+
+
+def test_what_a_kernel_closes_over_is_the_same_in_every_process():
+    # Numba finds a compiled closure on disk by its pickled variables: a compiled function among
+    # them has a number of its process's own, and everything is compiled anew in each.
+    closure = refine_kernel(16).py_func.__closure__  # type: ignore[attr-defined]
+    assert [cell.cell_contents for cell in closure] == [16]
