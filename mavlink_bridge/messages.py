@@ -95,6 +95,9 @@ class VisionFix:
     """m/s, where it was measured; None lets the bridge derive it from the fixes."""
     velocity_sigma_mps: float = 0.3
     """1 sigma along each axis of `velocity_ned`."""
+    protection_m: tuple[float, float] | None = None
+    """What the horizontal and the vertical error exceed at the stated risk at most; None where
+    nobody says."""
 
     def __post_init__(self) -> None:
         _check_position("vision fix", self.latitude_deg, self.longitude_deg, self.height_m)
@@ -111,6 +114,10 @@ class VisionFix:
         angles = (self.roll_rad, self.pitch_rad, self.yaw_rad)
         if not all(angle is None or math.isfinite(angle) for angle in angles):
             raise FixError(f"vision fix: attitude {angles} is not finite; give None where unknown")
+        if self.protection_m is not None and not all(p >= 0.0 for p in self.protection_m):
+            raise FixError(
+                f"vision fix: protection levels must not be negative, got {self.protection_m}"
+            )
         sigmas = (self.attitude_sigma_rad, self.velocity_sigma_mps)
         if not all(0.0 <= sigma <= _LARGEST_SIGMA for sigma in sigmas):
             raise FixError(

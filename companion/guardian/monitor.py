@@ -141,7 +141,8 @@ class Monitor:
 
     def admit(self, fix: VisionFix, state: VehicleState) -> VisionFix | None:
         """The fix, if it may be injected; with a reset where the last ones were wrong."""
-        self._level = protection_level(fix, state, self._config.protection)
+        self._level = level = protection_level(fix, state, self._config.protection)
+        fix = replace(fix, protection_m=(level.horizontal_m, level.vertical_m))
         verdict = self._verdict
         agrees = verdict is None or not verdict.settled or verdict.share < _CALM_SHARE
         admitted = self._jumps.admit(fix, state, agrees=agrees)

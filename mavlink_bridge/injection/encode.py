@@ -24,9 +24,12 @@ _IGNORE_VELOCITY = (
     | mavlink.GPS_INPUT_IGNORE_FLAG_SPEED_ACCURACY
 )
 GLOBAL_SENSOR_ID = 1  # EKF2_AGP0_ID; 0 may stand for "no sensor"
-_CLAIMED_SATELLITES = 12  # ArduPilot refuses to arm below 6, or with hdop ignored
-_CLAIMED_HDOP = 0.8
-_CLAIMED_VDOP = 1.0
+# What a receiver would claim of such an error. ArduPilot refuses to arm with hdop ignored, above
+# GPS_HDOP_GOOD (1.4: a protection level of 3.5 m) or below 6 satellites.
+_METRES_PER_DOP = 2.5
+_LEAST_DOP, _MOST_DOP = 0.5, 99.0
+_BEST_SATELLITES, _ENOUGH_SATELLITES = 12, 6
+_RISK_SIGMAS = 3.7  # of 1e-3, where nobody gives a protection level
 
 
 Angles = tuple[float | None, float | None, float | None]
@@ -38,7 +41,7 @@ class Estimate:
     it is not known.
 
     fresh: a fix as it came, not propagated. quality: 0..100. repeated: the fix was sent before, at
-    another time: its velocity is no new measurement.
+    another time: its velocity is no new measurement. protection_m: horizontal and vertical level.
     """
 
     position: PropagatedFix
@@ -48,6 +51,28 @@ class Estimate:
     reset_counter: int
     fresh: bool
     repeated: bool = False
+    protection_m: tuple[float, float] | None = None
+
+    @property
+    def levels_m(self) -> tuple[float, float]:
+        """Horizontal and vertical protection level; from the covariance where nobody gave one."""
+        if self.protection_m is not None:
+            return self.protection_m
+        p = self.position
+        return _RISK_SIGMAS * p.horizontal_sigma_m, _RISK_SIGMAS * p.vertical_sigma_m
+
+
+def claimed_dilution(level_m: float) -> float:
+    """The dilution of precision that a receiver with such a protection level would report."""
+    return min(max(level_m / _METRES_PER_DOP, _LEAST_DOP), _MOST_DOP)
+
+
+def claimed_satellites(level_m: float, alert_limit_m: float) -> int:
+    """12 of a sure position down to 6 at the alert limit; 5, too few to arm, beyond it."""
+    if level_m > alert_limit_m:
+        return _ENOUGH_SATELLITES - 1
+    spare = _BEST_SATELLITES - _ENOUGH_SATELLITES
+    return _BEST_SATELLITES - round(spare * level_m / alert_limit_m)
 
 
 def pose_covariance(
@@ -125,8 +150,12 @@ def odometry(
 def gps_input(
     e: Estimate, altitude_amsl_m: float, week_ms: tuple[int, int], config: InjectionConfig
 ) -> Any:
-    """GPS_INPUT (232), every field filled: ArduPilot never arms on one with HDOP ignored."""
+    """GPS_INPUT (232), every field filled: ArduPilot never arms on one with HDOP ignored.
+
+    Dilution and satellites follow from the protection level: they are what ArduPilot judges by.
+    """
     p = e.position
+    horizontal_m, vertical_m = e.levels_m
     yaw = 0  # 0 means none; north is 36000
     if config.gps_yaw and e.attitude[2] is not None:
         yaw = round(math.degrees(e.attitude[2]) % 360.0 * 100.0) or 36000
@@ -142,15 +171,15 @@ def gps_input(
         round(p.latitude_deg * 1e7),
         round(p.longitude_deg * 1e7),
         altitude_amsl_m,
-        _CLAIMED_HDOP,
-        _CLAIMED_VDOP,
+        claimed_dilution(horizontal_m),
+        claimed_dilution(vertical_m),
         vn,
         ve,
         vd,
         p.speed_sigma_mps,
         p.horizontal_sigma_m,
         p.vertical_sigma_m,
-        _CLAIMED_SATELLITES,
+        claimed_satellites(horizontal_m, config.alert_limit_m),
         yaw,
     )
 

@@ -24,7 +24,7 @@ from mavlink_bridge.injection.message_maker import (
     Withheld,
     attitude_of,
 )
-from mavlink_bridge.injection.propagate import FixPropagator
+from mavlink_bridge.injection.propagate import FixPropagator, grown_protection
 from mavlink_bridge.injection.yaw_guard import YawGuard
 from mavlink_bridge.link.clock import SteadyUtc
 from mavlink_bridge.messages import VisionFix
@@ -229,6 +229,7 @@ class Injector:
             counter,
             fresh,
             repeated=fix.time_ns == self._sent_fix_ns,
+            protection_m=grown_protection(fix, position),
         )
         outcome = self._maker.make(estimate, now_ns, context)
         if isinstance(outcome, Injection):

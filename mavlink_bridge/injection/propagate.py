@@ -19,6 +19,7 @@ Array = NDArray[np.float64]
 
 _UNKNOWN_SPEED_MPS = 15.0  # 1 sigma before two fixes were seen
 _FORGET_AFTER_S = 3.0
+_RISK_SIGMAS = 3.7  # of a risk of 1e-3
 
 
 @dataclass(frozen=True)
@@ -47,6 +48,20 @@ class PropagatedFix:
     def speed_sigma_mps(self) -> float:
         """1 sigma of the speed along the worst direction."""
         return float(np.sqrt(np.linalg.eigvalsh(self.velocity_covariance_ned)[-1]))
+
+
+def grown_protection(fix: VisionFix, carried: PropagatedFix) -> tuple[float, float] | None:
+    """The fix's protection levels, grown as its sigmas grew on the way to another time."""
+    if fix.protection_m is None:
+        return None
+    P = fix.position_covariance_ned
+    begun = (float(np.sqrt(np.linalg.eigvalsh(P[:2, :2])[-1])), float(np.sqrt(P[2, 2])))
+    now = (carried.horizontal_sigma_m, carried.vertical_sigma_m)
+    horizontal, vertical = (
+        level + _RISK_SIGMAS * max(after - before, 0.0)
+        for level, before, after in zip(fix.protection_m, begun, now, strict=True)
+    )
+    return horizontal, vertical
 
 
 class FixPropagator:

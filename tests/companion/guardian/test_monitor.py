@@ -155,3 +155,28 @@ def test_beyond_the_alert_limit_nothing_is_injected() -> None:
     assert max(flight.withheld) > 9.8
     relaxed = Flight(monitor(alert_limit_m=20.0), noise_m=0.2, claimed_m=3.0).fly(10.0)
     assert relaxed.withheld == []
+
+
+@pytest.mark.parametrize("alert_s", [0.3, 3.0])
+def test_the_alert_limit_is_told_within_the_time_to_alert(alert_s: float) -> None:
+    """What passes says how wrong it may be; what may be more wrong than the limit does not pass."""
+    flight = Flight(monitor(time_to_alert_s=alert_s), claimed_m=0.3, noise_m=0.1).fly(5.0)
+    levels = [fix.protection_m for fix in flight.passed]
+    assert all(level is not None and 0.0 < level[0] < 10.0 for level in levels)
+    flight.claimed_m = 3.5
+    flight.fly(12.0)
+    assert 5.0 < flight.told("withheld: position only to") <= 5.0 + min(alert_s, 1.0) + 0.21
+    flight.claimed_m = 0.3
+    flight.fly(20.0)
+    assert 15.0 <= flight.told("over: limit") < 15.5  # 3 s below it, or it would flap
+    assert max(flight.withheld) < 15.5
+
+
+def test_an_alert_limit_that_is_touched_now_and_then_does_not_flap() -> None:
+    """One fix in ten beyond it: neither told nor withheld."""
+    flight = Flight(monitor(), noise_m=0.1)
+    for tenth in range(1, 100):
+        flight.claimed_m = 3.5 if tenth % 10 == 0 else 0.3
+        flight.fly(0.1 * tenth)
+    assert flight.lines == []
+    assert flight.withheld == []

@@ -416,6 +416,31 @@ def test_gps_input_fills_every_field() -> None:
     assert (t - injection.estimate.position.time_ns) / MS == pytest.approx(100.0, abs=1.0)
 
 
+def test_gps_input_claims_no_more_than_its_protection_level() -> None:
+    """12 satellites and a dilution of 0.8 were claimed of anything, 9 m of error included."""
+    said = []
+    for level_m in (1.0, 3.0, 6.0, 9.0, 11.0):
+        it = injector(message="gps_input", rate_hz=5, delay_ms=0, alert_limit_m=10.0)
+        it.submit(fix(SECOND, protection_m=(level_m, 2.0 * level_m)), SECOND)
+        m = it.step(SECOND, context()).message  # type: ignore[union-attr]
+        said.append((m.satellites_visible, m.hdop, m.vdop))
+    satellites, hdop, vdop = zip(*said, strict=True)
+    assert satellites == (11, 10, 8, 7, 5)  # ArduPilot arms with 6 and more
+    assert list(hdop) == sorted(set(hdop))
+    assert hdop[0] < 1.4 < hdop[2]  # GPS_HDOP_GOOD
+    assert vdop[1] > hdop[1]
+
+
+def test_the_claim_of_a_carried_fix_grows_with_its_sigma() -> None:
+    """Half a second without a fix is no better known than it was."""
+    it = injector(message="gps_input", rate_hz=5, delay_ms=0, overdue_intervals=100.0)
+    it.submit(fix(SECOND, protection_m=(1.5, 1.5)), SECOND)
+    fresh = it.step(SECOND, context()).message  # type: ignore[union-attr]
+    carried = it.step(SECOND + 400 * MS, context()).message  # type: ignore[union-attr]
+    assert carried.hdop > fresh.hdop + 1.0
+    assert carried.satellites_visible < fresh.satellites_visible
+
+
 def test_gps_input_without_velocity_sets_the_ignore_flags() -> None:
     it = injector(message="gps_input", rate_hz=5, delay_ms=0, gps_velocity=False)
     sent = fly(it, seconds=1, fix_hz=5, latency_ms=0)
