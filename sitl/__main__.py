@@ -40,8 +40,8 @@ from sitl.vehicles.process import VehicleKind
 # What a flight and its report leave in their folder.
 _REPORT_FILES = (
     "companion", "companion.log", "companion.yaml", "errors.png", "frames.csv",
-    "frames_report.csv", "overlay-*", "report.json", "tracks.png", "vehicle.csv",
-    "vehicle.log",
+    "frames_report.csv", "overlay-*", "report.json", "tracks.png", "truth.tum",
+    "vehicle.csv", "vehicle.log",
 )  # fmt: skip
 
 _LOG_WIDTH = 200

@@ -19,7 +19,7 @@ from rich.table import Table
 
 from companion.errors import ConfigError, ReportError
 from companion.offline.plots import ErrorSeries, overlay_sheet, plot_errors, save_image
-from companion.offline.trajectories import stamped, write_trajectory
+from companion.trajectory import stamped, write_trajectory
 from companion.versions import versions
 from localizer.config import LocalizerConfig
 from localizer.evaluation.metrics import LocalizationMetrics

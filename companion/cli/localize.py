@@ -16,8 +16,8 @@ from rich.progress import Progress
 from companion.cli.geographic import numbers
 from companion.errors import ConfigError, ReportError
 from companion.offline.localize import LocalizedImage, Sigmas, image_times, localize_images
-from companion.offline.trajectories import stamped, write_trajectory
 from companion.sources.folder_source import list_images
+from companion.trajectory import stamped, write_trajectory
 from localizer.config import LocalizerConfig
 from localizer.geometry.camera import Camera
 from localizer.geometry.geo import Geodetic, LocalFrame

@@ -22,6 +22,7 @@ from companion.convert.angles import (
 from companion.convert.photos import Heights, read_photos, write_sidecars
 from companion.errors import ConfigError
 from companion.geometry import GimbalFrame
+from companion.trajectory import snapshot_name
 from localizer.errors import GeoreferenceError, PoseFileError
 from localizer.geometry.geo import Geodetic, LocalFrame
 from localizer.geometry.pose import Pose, matrix_from_quaternion, quaternion_from_matrix
@@ -172,7 +173,7 @@ def _read_record(path: Path, place: Place) -> tuple[StampedPose, ...]:
 
     file = path / "estimates.csv" if path.is_dir() else path
     return tuple(
-        StampedPose(f"{e.exposure_time_ns}.jpg", e.world_from_camera, e.exposure_time_ns)
+        StampedPose(snapshot_name(e.exposure_time_ns), e.world_from_camera, e.exposure_time_ns)
         for e in read_estimates(file)
         if e.accepted
     )

@@ -20,6 +20,7 @@ from companion.config import CompanionConfig, RecordConfig
 from companion.errors import DiskFaultError, ReportError
 from companion.redaction import redacted
 from companion.sources.timing import system_minus_monotonic
+from companion.trajectory import TrajectoryFiles, snapshot_name, stamped
 from companion.versions import versions
 from localizer.geometry.geo import LocalFrame
 from localizer.geometry.pose import Array, quaternion_from_matrix
@@ -139,7 +140,8 @@ def _target_row(fix: TargetFix, velocity: Array | None, frame: LocalFrame) -> tu
 
 
 class Recorder:
-    """Writes ``estimates.csv``, ``targets.csv`` and ``events.csv`` in a folder.
+    """Writes ``estimates.csv``, ``targets.csv`` and ``events.csv`` in a folder, and the accepted
+    estimates as a trajectory (`TrajectoryFiles`, made at the first of them).
 
     Nothing here blocks its callers: rows beyond a bounded queue are dropped and counted. So is what
     the disk does not take (full, gone): the flight goes on without its record, and on_failure is
@@ -162,7 +164,9 @@ class Recorder:
         self.dropped = 0
         self._on_failure = on_failure
         self._failed = False
-        self._files: dict[str, TextIO] = {}
+        self._folder = folder
+        self._files: list[TextIO | TrajectoryFiles] = []
+        self._trajectory: TrajectoryFiles | None = None
         try:
             self._snapshots.mkdir(parents=True, exist_ok=True)
             self._writers = {
@@ -177,8 +181,10 @@ class Recorder:
         self._thread.start()
 
     def estimate(self, estimate: PoseEstimate) -> None:
-        """Record one estimate (accepted or not)."""
+        """Record one estimate (accepted or not; the trajectory has the accepted ones)."""
         self._put("estimates", lambda: _estimate_row(estimate, self._frame))
+        if estimate.accepted:
+            self._put("trajectory", lambda: (estimate,))
 
     def target(self, fix: TargetFix, velocity: Array | None) -> None:
         """Record one target fix with its filtered velocity (3,) in world axes, if it has one."""
@@ -203,12 +209,12 @@ class Recorder:
         if self._thread.is_alive():
             _log.warning("the record is incomplete, its disk does not answer")
             return
-        for file in self._files.values():
+        for file in self._files:
             self._guarded(file.close)
 
     def _open(self, path: Path, columns: tuple[str, ...]) -> Any:
         file = path.open("w", newline="", encoding="utf-8")
-        self._files[path.stem] = file
+        self._files.append(file)
         writer = csv.writer(file)
         writer.writerow(columns)
         return writer
@@ -225,9 +231,18 @@ class Recorder:
             (frame,) = row()
             # Not imwrite, which does not tell why it could not.
             _, jpeg = cv2.imencode(".jpg", cv2.cvtColor(frame.image, cv2.COLOR_RGB2BGR))
-            (self._snapshots / f"{frame.exposure_time_ns}.jpg").write_bytes(jpeg.tobytes())
+            (self._snapshots / snapshot_name(frame.exposure_time_ns)).write_bytes(jpeg.tobytes())
+        elif name == "trajectory":
+            (estimate,) = row()
+            self._append(estimate)
         elif name:
             self._writers[name].writerow(row())
+
+    def _append(self, estimate: PoseEstimate) -> None:
+        if self._trajectory is None:
+            self._trajectory = TrajectoryFiles(self._folder, self._frame)
+            self._files.append(self._trajectory)
+        self._trajectory.append(stamped(snapshot_name(estimate.exposure_time_ns), estimate))
 
     def _run(self) -> None:
         flushed = time.monotonic()
@@ -241,7 +256,7 @@ class Recorder:
             self._guarded(self._write, *item)
             if time.monotonic() - flushed > _FLUSH_S:
                 flushed = time.monotonic()
-                for file in self._files.values():
+                for file in self._files:
                     self._guarded(file.flush)
 
     def _guarded(self, write: Callable[..., None], *arguments: Any) -> None:

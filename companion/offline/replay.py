@@ -23,6 +23,7 @@ from companion.flight.priors import AutopilotPose
 from companion.flight.recorder import MANIFEST_NAME
 from companion.sources.base import fitted_camera
 from companion.sources.folder_source import read_image
+from companion.trajectory import snapshot_name
 from localizer.errors import OutsideMapError
 from localizer.geometry.camera import Camera
 from localizer.geometry.pose import Array, Pose, matrix_from_quaternion
@@ -153,7 +154,7 @@ def _estimate(row: dict[str, str]) -> RecordedEstimate:
 
 
 def _image_path(folder: Path, estimate: RecordedEstimate) -> Path:
-    return folder / "snapshots" / f"{estimate.exposure_time_ns}.jpg"
+    return folder / "snapshots" / snapshot_name(estimate.exposure_time_ns)
 
 
 class _Autopilot:

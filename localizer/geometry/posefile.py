@@ -65,12 +65,16 @@ def _parse(line: str, where: str) -> PoseRow:
 
 def write_poses(path: Path, rows: Iterable[PoseRow]) -> None:
     """Write a pose file: 1e-9 degrees of position (0.1 mm), 1e-4 m, 1e-6 degrees of angle."""
-    lines = [
-        f"{r.name} {r.position.longitude_deg:.9f} {r.position.latitude_deg:.9f} "
-        f"{r.position.height_m:.4f} {r.roll_deg:.6f} {r.pitch_deg:.6f} {r.yaw_deg:.6f}\n"
-        for r in rows
-    ]
-    path.write_text("".join(lines), encoding="utf-8")
+    path.write_text("".join(f"{pose_line(row)}\n" for row in rows), encoding="utf-8")
+
+
+def pose_line(row: PoseRow) -> str:
+    """The line of a pose file that `read_poses` reads, without its end."""
+    p = row.position
+    return (
+        f"{row.name} {p.longitude_deg:.9f} {p.latitude_deg:.9f} {p.height_m:.4f} "
+        f"{row.roll_deg:.6f} {row.pitch_deg:.6f} {row.yaw_deg:.6f}"
+    )
 
 
 def world_from_camera(row: PoseRow, frame: LocalFrame) -> Pose:

@@ -39,12 +39,17 @@ class StampedPose:
 
 def write_tum(path: Path, poses: Iterable[StampedPose]) -> None:
     """Write TUM lines: nanoseconds of time, 0.1 µm of position, 1e-9 of the quaternion."""
-    path.write_text("".join(f"{_tum_line(path, pose)}\n" for pose in poses), encoding="utf-8")
+    try:
+        lines = [f"{tum_line(pose)}\n" for pose in poses]
+    except PoseFileError as error:
+        raise PoseFileError(f"{path}: {error}") from error
+    path.write_text("".join(lines), encoding="utf-8")
 
 
-def _tum_line(path: Path, pose: StampedPose) -> str:
+def tum_line(pose: StampedPose) -> str:
+    """The line of a TUM file, without its end. `PoseFileError` if the pose has no time."""
     if pose.time_ns is None:
-        raise PoseFileError(f"{path}: {pose.name} has no time; TUM's lines need one")
+        raise PoseFileError(f"{pose.name} has no time; TUM's lines need one")
     w, x, y, z = quaternion_from_matrix(pose.world_from_camera.rotation)
     seconds, rest = divmod(pose.time_ns, 10**9)
     position = " ".join(f"{value:.7f}" for value in pose.world_from_camera.translation)
@@ -88,12 +93,19 @@ def write_covariances(path: Path, poses: Iterable[StampedPose]) -> None:
 
     Axes 0 to 2: position east, north, up (m); 3 to 5: rotation vector about them (rad).
     """
-    upper = np.triu_indices(6)
     with path.open("w", newline="", encoding="utf-8") as file:
         writer = csv.writer(file)
         writer.writerow(COVARIANCE_COLUMNS)
         for pose in poses:
-            if pose.covariance is not None:
-                time_ns = "" if pose.time_ns is None else pose.time_ns
-                values = (f"{value:.6e}" for value in pose.covariance[upper])
-                writer.writerow([pose.name, time_ns, *values])
+            row = covariance_row(pose)
+            if row is not None:
+                writer.writerow(row)
+
+
+def covariance_row(pose: StampedPose) -> tuple[str, ...] | None:
+    """What stands in `COVARIANCE_COLUMNS` for a pose; None if its covariance is not known."""
+    if pose.covariance is None:
+        return None
+    time_ns = "" if pose.time_ns is None else str(pose.time_ns)
+    values = (f"{value:.6e}" for value in pose.covariance[np.triu_indices(6)])
+    return (pose.name, time_ns, *values)

@@ -16,6 +16,7 @@ import numpy as np
 
 from localizer.geometry.camera import Camera
 from localizer.geometry.pose import Array, Pose, quaternion_from_matrix
+from localizer.geometry.trajectory import StampedPose, tum_line
 from localizer.render.base import MapRenderer
 from localizer.synth.appearance.model import Appearance
 from localizer.types import Float32, Image, RenderedView
@@ -145,11 +146,12 @@ def _typical_depth(depth: Float32) -> float:
 
 
 class FrameLog:
-    """``frames.csv``: the true camera pose of every exposed frame."""
+    """``frames.csv``: the true camera pose of every exposed frame, also as ``truth.tum``."""
 
     def __init__(self, path: Path) -> None:
         path.parent.mkdir(parents=True, exist_ok=True)
         self._file = path.open("w", newline="", encoding="utf-8")
+        self._tum = path.with_name("truth.tum").open("w", encoding="utf-8")
         self._writer = csv.writer(self._file)
         self._writer.writerow(FRAME_COLUMNS)
 
@@ -159,10 +161,13 @@ class FrameLog:
         row = (time_ns, sequence, *(f"{x:.5f}" for x in t), *(f"{x:.9f}" for x in q))
         self._writer.writerow(row)
         self._file.flush()
+        self._tum.write(tum_line(StampedPose("", world_from_camera, time_ns)) + "\n")
+        self._tum.flush()
 
     def close(self) -> None:
-        """Close the file."""
+        """Close the files."""
         self._file.close()
+        self._tum.close()
 
     def __enter__(self) -> FrameLog:
         return self

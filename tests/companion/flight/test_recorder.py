@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 
 from companion.config import RecordConfig
+from companion.convert.formats import READERS, WRITERS, Place
 from companion.errors import DiskFaultError, ReportError
 from companion.flight.recorder import (
     ESTIMATE_COLUMNS,
@@ -60,6 +61,62 @@ def test_what_is_recorded_can_be_read_back(tmp_path):
         assert next(iter(csv.DictReader(file)))["text"] == 'a, "quoted" text\nof two lines'
     names = sorted(p.stem for p in (tmp_path / "snapshots").glob("*.jpg"))
     assert names == ["1000000000", "2000000000"]
+
+
+def _estimates(count):
+    for n in range(count):
+        pose = Pose(so3_exp([2.0, 0.5, -0.3 * n]), np.array([1.25, -3.5 + n, 120.0]))
+        yield PoseEstimate(
+            pose, np.eye(6) * 0.04, 0.8, TrackingState.TRACKING, RegistrationStatus.OK, n != 1,
+            1_700_000_000_123_456_789 + n * 10**8, n, CAMERA, {},
+        )  # fmt: skip
+
+
+def test_the_accepted_estimates_are_a_trajectory_as_convert_makes_it(tmp_path):
+    recorder = Recorder(RecordConfig(folder=tmp_path), FRAME)
+    estimates = list(_estimates(4))
+    for estimate in estimates:
+        recorder.estimate(estimate)
+    recorder.close()
+    place = Place(FRAME)
+    converted = READERS["record"](tmp_path, place)
+    assert len(converted) == 3  # the second was rejected
+    for kind, name in (("poses", "poses.txt"), ("tum", "trajectory.tum")):
+        written = READERS[kind](tmp_path / name, place)
+        WRITERS[kind](tmp_path / "converted", converted, place)
+        assert [p.time_ns for p in written] == [
+            p.time_ns for p in READERS[kind](tmp_path / "converted", place)
+        ]
+        for ours, theirs in zip(written, converted, strict=True):
+            assert kind == "tum" or ours.name == theirs.name
+            translation, rotation = ours.world_from_camera.distance_to(theirs.world_from_camera)
+            assert translation < 2e-4  # estimates.csv rounds to 0.1 mm
+            assert rotation < 1e-6
+    with (tmp_path / "covariances.csv").open(newline="") as file:
+        rows = list(csv.DictReader(file))
+    assert [int(row["exposure_time_ns"]) for row in rows] == [p.time_ns for p in converted]
+    assert {float(row["c00"]) for row in rows} == {0.04}
+
+
+def test_a_flight_without_an_accepted_estimate_leaves_no_trajectory(tmp_path):
+    recorder = Recorder(RecordConfig(folder=tmp_path), FRAME)
+    recorder.estimate(list(_estimates(2))[1])
+    recorder.close()
+    assert sorted(p.name for p in tmp_path.iterdir()) == [
+        "estimates.csv", "events.csv", "snapshots", "targets.csv",
+    ]  # fmt: skip
+
+
+def test_a_trajectory_that_cannot_be_written_costs_itself_only(tmp_path):
+    (tmp_path / "poses.txt").mkdir()
+    told = []
+    recorder = Recorder(RecordConfig(folder=tmp_path), FRAME, told.append)
+    for estimate in _estimates(4):
+        recorder.estimate(estimate)
+    recorder.close()
+    assert told == ["Is a directory"]
+    assert recorder.dropped == 3
+    assert len((tmp_path / "estimates.csv").read_text().splitlines()) == 5
 
 
 @pytest.mark.parametrize(

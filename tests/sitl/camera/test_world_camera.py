@@ -15,6 +15,7 @@ from localizer.geometry.geo import Geodetic, LocalFrame
 from localizer.geometry.pose import Pose, matrix_from_euler, matrix_from_quaternion, so3_exp
 from localizer.geometry.posefile import read_poses
 from localizer.geometry.posefile import world_from_camera as pose_of_row
+from localizer.geometry.trajectory import read_tum
 from localizer.map.cache.tile import TileMesh, build_mips
 from localizer.render.numba_raster import NumbaRenderer
 from localizer.synth.appearance.model import Appearance
@@ -215,3 +216,6 @@ def test_the_frame_log_is_read_by_the_analysis(tmp_path: Path) -> None:
     assert degrees < 1e-5
     assert np.allclose(matrix_from_quaternion([columns[k][0] for k in ("qw", "qx", "qy", "qz")]),
                        pose.rotation, atol=1e-7)  # fmt: skip
+    tum = read_tum(tmp_path / "truth.tum")
+    assert [p.time_ns for p in tum] == columns["exposure_time_ns"].tolist()
+    assert tum[1].world_from_camera.distance_to(pose)[0] < 1e-6

@@ -1,0 +1,78 @@
+"""The files of a trajectory, whole or while it is flown: pose lines, TUM, covariances."""
+
+from __future__ import annotations
+
+import contextlib
+import csv
+from collections.abc import Iterable
+from pathlib import Path
+
+from localizer.geometry.geo import LocalFrame
+from localizer.geometry.posefile import pose_line, pose_row
+from localizer.geometry.trajectory import (
+    COVARIANCE_COLUMNS,
+    StampedPose,
+    covariance_row,
+    tum_line,
+)
+from localizer.types import PoseEstimate
+
+
+def stamped(name: str, estimate: PoseEstimate) -> StampedPose:
+    """An estimate as a trajectory's pose."""
+    return StampedPose(
+        name, estimate.world_from_camera, estimate.exposure_time_ns, estimate.covariance
+    )
+
+
+def snapshot_name(exposure_time_ns: int) -> str:
+    """What a record calls the frame of that time, in its snapshots and in its trajectory."""
+    return f"{exposure_time_ns}.jpg"
+
+
+class TrajectoryFiles:
+    """``poses.txt`` (our pose lines), ``trajectory.tum`` and ``covariances.csv``, in one order.
+
+    Raises OSError where the disk does not take them.
+    """
+
+    def __init__(self, folder: Path, frame: LocalFrame) -> None:
+        self._frame = frame
+        with contextlib.ExitStack() as stack:
+            self._poses, self._tum, self._covariances = (
+                stack.enter_context((folder / name).open("w", newline="", encoding="utf-8"))
+                for name in ("poses.txt", "trajectory.tum", "covariances.csv")
+            )
+            self._rows = csv.writer(self._covariances)
+            self._rows.writerow(COVARIANCE_COLUMNS)
+            self._stack = stack.pop_all()
+
+    def append(self, pose: StampedPose) -> None:
+        """Write one pose behind the others. `PoseFileError` without a time: TUM needs one."""
+        # All three lines are made before the first is written: the files stay in one order.
+        line, tum = (
+            pose_line(pose_row(pose.name, pose.world_from_camera, self._frame)),
+            tum_line(pose),
+        )
+        row = covariance_row(pose)
+        self._poses.write(line + "\n")
+        self._tum.write(tum + "\n")
+        if row is not None:
+            self._rows.writerow(row)
+
+    def flush(self) -> None:
+        """Hand what is buffered to the disk."""
+        for file in (self._poses, self._tum, self._covariances):
+            file.flush()
+
+    def close(self) -> None:
+        """Close the files."""
+        self._stack.close()
+
+
+def write_trajectory(folder: Path, poses: Iterable[StampedPose], frame: LocalFrame) -> None:
+    """The files of a whole trajectory (`TrajectoryFiles`)."""
+    files = TrajectoryFiles(folder, frame)
+    with contextlib.closing(files):
+        for pose in poses:
+            files.append(pose)
