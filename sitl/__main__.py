@@ -32,7 +32,8 @@ from sitl.demo.scenario import (
 from sitl.errors import SimulationError
 from sitl.suite.case import SCENARIOS, load_cases
 from sitl.suite.loop.case import LOOP_SCENARIOS, load_loop_cases
-from sitl.suite.loop.runner import fly_loop
+from sitl.suite.loop.report import markdown, print_loop_row
+from sitl.suite.loop.runner import LoopOptions, fly_loop, parse_seeds
 from sitl.suite.report import print_row, print_table, write_report
 from sitl.suite.runner import run_suite
 from sitl.vehicles.process import VehicleKind
@@ -147,21 +148,35 @@ def suite(
 
 @app.command()
 def loop(
-    fc: Annotated[str, typer.Option(help="embedded or ardupilot")] = "embedded",
-    only: Annotated[list[str] | None, typer.Option(help="flight; may be repeated")] = None,
+    fc: Annotated[str, typer.Option(help="embedded, ardupilot or both")] = "embedded",
+    only: Annotated[
+        list[str] | None,
+        typer.Option(help="flight, or `normal` for all without a fault; may be repeated"),
+    ] = None,
     out: Annotated[Path, typer.Option(help="folder of the records")] = Path("report-loop"),
-    seed: Annotated[int, typer.Option(min=0, help="world, light and noise")] = 5,
-    size: Annotated[float, typer.Option(min=400, max=4000, help="metres of the world")] = 400.0,
+    seeds: Annotated[str, typer.Option(help="world, light and noise: 5, or 1..10")] = "5",
     worlds: Annotated[Path | None, typer.Option(help="folder of generated worlds")] = None,
     scenarios: Annotated[Path, typer.Option(help="folder of flights")] = LOOP_SCENARIOS,
 ) -> None:
     """Fly the whole companion through its faults, one flight after the other; exit 1: one fails."""
-    if fc not in ("embedded", "ardupilot"):
-        raise ScenarioError(f"--fc is embedded or ardupilot, not {fc!r}")
-    kind: VehicleKind = "ardupilot" if fc == "ardupilot" else "embedded"
+    if fc not in _SUITE_KINDS:
+        raise ScenarioError(f"--fc is embedded, ardupilot or both, not {fc!r}")
     cases = load_loop_cases(only or (), scenarios)
+    if out.exists() and not out.is_dir():
+        raise ScenarioError(f"{out}: is a file; give a folder as --out")
     console = Console()
-    rows = fly_loop(cases, kind, seed, size, out, worlds, console)
+    if not console.is_terminal:
+        console = Console(width=_LOG_WIDTH)
+    options = LoopOptions(
+        _SUITE_KINDS[fc],
+        out,
+        parse_seeds(seeds),
+        worlds,
+        lambda line: console.print(f"[dim]{escape(line)}[/]"),
+        lambda row: print_loop_row(console, row),
+    )
+    rows = fly_loop(cases, options)
+    console.print(escape(markdown(rows)))
     raise typer.Exit(0 if all(row.ok for row in rows) else 1)
 
 

@@ -21,8 +21,8 @@ from sitl.suite.flight import fly
 from sitl.suite.record import Array, Record
 from sitl.vehicles.process import VehicleKind
 
-_PACE_LIMIT = 0.98
-_STALL_LIMIT_S = 0.05  # on a machine with room it is below 0.01 s
+PACE_LIMIT = 0.98
+STALL_LIMIT_S = 0.05  # on a machine with room it is below 0.01 s
 _LANDING_S = 15.0  # in which an interrupted flight ends its vehicle
 Figures = tuple[float, float, float]
 
@@ -56,7 +56,7 @@ class Row:
     def slow(self) -> bool:
         """Whether the machine could not keep the vehicle in real time, which costs accuracy."""
         r = self.record
-        return r is not None and (r.pace < _PACE_LIMIT or r.stall_s > _STALL_LIMIT_S)
+        return r is not None and (r.pace < PACE_LIMIT or r.stall_s > STALL_LIMIT_S)
 
     @property
     def reference(self) -> Reference | None:

@@ -16,14 +16,8 @@ LOOP_SCENARIOS = Path(__file__).parents[2] / "scenarios" / "loop"
 
 # Light, because it flies in real time on what may be two cores.
 _CAMERA = CameraSpec(width=480, height=360, rate_hz=8)
-_LEGS = (
-    Leg(east_m=0, north_m=60, height_m=80, gimbal_pitch_deg=-80),
-    Leg(east_m=60, north_m=60, height_m=80, gimbal_pitch_deg=-80),
-    Leg(east_m=60, north_m=-60, height_m=80, gimbal_pitch_deg=-80),
-    Leg(east_m=-60, north_m=-60, height_m=80, gimbal_pitch_deg=-80),
-    Leg(east_m=-60, north_m=60, height_m=80, gimbal_pitch_deg=-80),
-    Leg(east_m=0, north_m=0, height_m=80, gimbal_pitch_deg=-80),
-)
+_CORNERS = ((0, 60), (60, 60), (60, -60), (-60, -60), (-60, 60), (0, 0))  # east, north; metres
+_PITCH_DEG = -80.0
 
 
 class _Model(BaseModel):
@@ -43,15 +37,36 @@ class Picture(_Model):
         return PictureFault(self.kind, self.late_s)
 
 
+class Drag(_Model):
+    """A receiver's position that moves away from the true one, so fast, for so long; it stays."""
+
+    north_m_s: float = Field(0.0, ge=-10, le=10)
+    east_m_s: float = Field(0.0, ge=-10, le=10)
+    for_s: float = Field(gt=0, le=600)
+
+
+class Load(_Model):
+    """Other work on the companion's computer: processes that compute, for so long, all of them and
+    the companion on one processor.
+    """
+
+    processes: int = Field(ge=1, le=32)
+    for_s: float = Field(gt=0, le=300)
+
+
 class LoopEvent(_Model):
-    """Something that happens at_s seconds after GNSS was denied (or the hover began).
+    """Something that happens at_s seconds after the recorded part began (and GNSS was denied).
 
     picture: a fault of the video. kill: SIGKILL to the companion, which is started again
-    restart_after_s later. vehicle: parameters that the ground station sets.
+    restart_after_s later. start: of a companion that did not run until now (`cold`). vehicle:
+    parameters that the ground station sets.
     """
 
     at_s: float = Field(ge=0)
     picture: Picture | None = None
+    drag: Drag | None = None
+    load: Load | None = None
+    start: bool = False
     kill: bool = False
     restart_after_s: float = Field(1.0, ge=0, le=60)
     vehicle: dict[str, float] = {}
@@ -62,22 +77,25 @@ class Wrong(_Model):
 
     map_shift_m: east, north, up of where the map shows the ground. gimbal_deg: roll, pitch, yaw
     that the gimbal does not report. focal: the calibration's focal length over the true one.
-    other_map: the map of another generated place.
+    other_map: the map of another generated place. map_reach_m: nothing is in the map further east,
+    west, north or south of home; a multiple of 200 m.
     """
 
     map_shift_m: tuple[float, float, float] = (0.0, 0.0, 0.0)
     gimbal_deg: tuple[float, float, float] = (0.0, 0.0, 0.0)
     focal: float = Field(1.0, gt=0.5, lt=2.0)
     other_map: bool = False
+    map_reach_m: float | None = Field(None, ge=200, multiple_of=200)
 
 
 class Expectation(_Model):
     """What must hold between the start and the end of the recorded part.
 
-    told_within_s: an EKF error beyond `beyond_m` is told (health worse than ok) at latest so long
-    after it began. never_modes: flight modes that must not be entered. max_error_m: of the EKF.
-    false_fixes: injected positions further off than 5 m. ends_tracking: the last health is ok.
-    says: parts of texts that must come from the companion. silent: no warning text at all.
+    told_within_s: an EKF error beyond `beyond_m` is told (health worse than ok, or a finding of the
+    guardian that stands) at latest so long after it began. never_modes: flight modes that must not
+    be entered. max_error_m: of the EKF. false_fixes: injected positions further off than 5 m.
+    ends_tracking: the last health is ok. says: parts of texts that must come from the companion.
+    silent: no warning text, no finding of the guardian, and a health that is ok throughout.
     """
 
     beyond_m: float = Field(10.0, gt=0)
@@ -91,10 +109,12 @@ class Expectation(_Model):
 
 
 class LoopCase(_Model):
-    """One flight. seconds: length of the recorded part. hover: stay; else the legs are flown in
-    AUTO. wind_m_s: from the west. deny: GNSS is switched off when it begins. ci: flown in every
-    test run on the embedded vehicle. deployment: keys that differ from the demo's deployment file;
-    vehicle: parameters likewise (FS_EKF_ACTION 0: no landing while the place is searched).
+    """One flight. seconds: length of the recorded part. hover: stay; else the corners are flown in
+    AUTO (metres east and north of home, at `height_m`). wind_m_s: from the west. deny: GNSS is
+    switched off when it begins. cold: no companion runs until an event starts it. size_m: of the
+    world. ci: flown in every test run on the embedded vehicle. deployment: keys that differ from
+    the demo's deployment file; vehicle: parameters likewise (FS_EKF_ACTION 0: no landing while the
+    place is searched).
     """
 
     name: str
@@ -104,8 +124,11 @@ class LoopCase(_Model):
     hover: bool = False
     height_m: float = Field(80.0, gt=10, le=300)
     speed_m_s: float = Field(6.0, gt=0, le=25)
+    corners_m: tuple[tuple[float, float], ...] = Field(_CORNERS, min_length=1)
+    size_m: float = Field(400.0, ge=400, le=4000, multiple_of=400)
     wind_m_s: float = Field(0.0, ge=0, le=15)
     deny: bool = True
+    cold: bool = False
     deployment: dict[str, Any] = {}
     vehicle: dict[str, float] = {}
     wrong: Wrong = Wrong()
@@ -119,11 +142,26 @@ class LoopCase(_Model):
             raise ValueError("timeline: events must be in order, and before the end")
         return self
 
+    @model_validator(mode="after")
+    def _starts_once(self) -> LoopCase:
+        if sum(event.start for event in self.timeline) != self.cold:
+            raise ValueError("timeline: a cold flight needs exactly one `start`, any other none")
+        return self
+
+    @property
+    def is_normal(self) -> bool:
+        """Whether nothing is wrong: whatever is told then is a false alarm."""
+        return self.wrong == Wrong() and not self.timeline and not self.cold
+
     @property
     def scenario(self) -> Scenario:
         """The demo's scenario that this flight begins with."""
+        legs = tuple(
+            Leg(east_m=east, north_m=north, height_m=self.height_m, gimbal_pitch_deg=_PITCH_DEG)
+            for east, north in self.corners_m
+        )
         return Scenario(
-            takeoff_height_m=self.height_m, deny_after_s=3, speed_m_s=self.speed_m_s, legs=_LEGS,
+            takeoff_height_m=self.height_m, deny_after_s=3, speed_m_s=self.speed_m_s, legs=legs,
             cars=3, people=3, camera=_CAMERA, localizer_width=256,
         )  # fmt: skip
 
@@ -131,13 +169,19 @@ class LoopCase(_Model):
 def load_loop_cases(
     names: Iterable[str] = (), folder: Path = LOOP_SCENARIOS
 ) -> tuple[LoopCase, ...]:
-    """All flights of a folder, or those named; ScenarioError names what is wrong with a file."""
+    """All flights of a folder, or those named; ScenarioError names what is wrong with a file.
+
+    ``normal`` names all flights in which nothing is wrong.
+    """
     files = {path.stem: path for path in sorted(folder.glob("*.yaml"))}
+    cases = {name: _load(path) for name, path in files.items()}
+    groups = {"normal": tuple(name for name, case in cases.items() if case.is_normal)}
     chosen = list(names) or list(files)
-    unknown = [name for name in chosen if name not in files]
+    unknown = [name for name in chosen if name not in cases and name not in groups]
     if unknown:
         raise ScenarioError(f"no {', '.join(unknown)} in {folder}; there are: {', '.join(files)}")
-    return tuple(_load(files[name]) for name in chosen)
+    wanted = [single for name in chosen for single in groups.get(name, (name,))]
+    return tuple(cases[name] for name in dict.fromkeys(wanted))
 
 
 def _load(path: Path) -> LoopCase:

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import json
 import math
-import signal
 import time
 from collections.abc import Callable
 from contextlib import ExitStack
@@ -21,27 +19,29 @@ from sitl.camera.pose_sender import truth_feed
 from sitl.camera.process import WorldCameraProcess
 from sitl.camera.traffic import traffic
 from sitl.demo.assets import FlightAssets
-from sitl.demo.companion_process import Ports, free_udp_port, running_companion, write_deployment
+from sitl.demo.companion_process import Ports, free_udp_port, write_deployment
 from sitl.demo.flight import FilmedFlight, camera_config, home_of, vehicle_parameters
-from sitl.demo.script import FlightError, mission
+from sitl.demo.script import mission
 from sitl.ground.pilot import Pilot
+from sitl.suite.flight import longest_stall, slowest_pace
 from sitl.suite.loop.case import LoopCase, LoopEvent
+from sitl.suite.loop.companion import LoopCompanion
+from sitl.suite.loop.disturbances import GnssDrag, OtherWork
 from sitl.suite.loop.judge import LoopRecord, LoopSample, LoopText
 from sitl.vehicles.launch import VISION_SOURCE, open_vehicle
 from sitl.vehicles.process import VehicleKind, VehicleProcess
 
 _STEP_S = 0.25
-_START_S = 300.0  # of the companion: its first start on a machine compiles
 _TRACKING_S = 90.0
-_FRESH_S = 2.0  # a health report that is written every second
+_DRAG_STEP_S = 0.5
 
 
 @dataclass(frozen=True)
 class LoopAssets:
-    """The world that is flown, and another place's map."""
+    """The world that is flown, and the map that the companion gets where it is not that one's."""
 
     world: FlightAssets
-    other: FlightAssets | None = None
+    wrong_map: Path | None = None
 
 
 def fly(case: LoopCase, assets: LoopAssets, kind: VehicleKind, seed: int, out: Path) -> LoopRecord:
@@ -70,7 +70,8 @@ class _LoopFlight:
         self._samples: list[LoopSample] = []
         self._waiting = list(case.timeline)
         self._due: list[tuple[float, Callable[[], None]]] = []
-        self._starts = 0
+        self._drag: GnssDrag | None = None
+        self._ticks: list[tuple[float, float]] = []
         self._tlog = out.resolve() / "flight.tlog"
         self._start_ns = 0
 
@@ -82,9 +83,12 @@ class _LoopFlight:
         self._pilot = self._stack.enter_context(Pilot(vehicle.gcs_endpoint, alive=vehicle.check))
         with self._pilot.fast_forward():
             self._pilot.wait_ready()
-        self._config = self._write_deployment(vehicle)
+        config = self._write_deployment(vehicle)
         self._open_camera()
-        self._start_companion()
+        self._companion = LoopCompanion(config, self._out, self._stack)
+        if not case.cold:
+            self._companion.start()
+            self._companion.wait_up()
         pilot = self._pilot
         if not case.hover:
             pilot.missions.upload(mission(case.scenario, self._home))
@@ -92,7 +96,7 @@ class _LoopFlight:
         pilot.set_mode("GUIDED")
         pilot.arm()
         pilot.takeoff(case.height_m)
-        if not case.wrong.other_map:
+        if not case.wrong.other_map and not case.cold:
             pilot.link.wait(self._is_tracking, _TRACKING_S, "the localizer to track")
         if case.wind_m_s:
             pilot.link.set_parameter("SIM_WIND_DIR", 270.0)
@@ -124,7 +128,13 @@ class _LoopFlight:
             for t in self._pilot.record.texts
             if t.time_ns >= self._start_ns
         )
-        return LoopRecord(tuple(self._samples), texts, tuple(self._fix_errors()))
+        return LoopRecord(
+            tuple(self._samples),
+            texts,
+            tuple(self._fix_errors()),
+            slowest_pace(self._ticks),
+            longest_stall(self._ticks),
+        )
 
     # --- before ----------------------------------------------------------------------------------
 
@@ -138,10 +148,8 @@ class _LoopFlight:
         """The demo's deployment file, with what this case has wrong or different."""
         case, assets = self._case, self._assets
         flown = assets.world
-        if case.wrong.other_map:
-            if assets.other is None:
-                raise FlightError(f"{case.name}: needs the map of another place, which is not here")
-            flown = replace(flown, map_cache=assets.other.map_cache)
+        if assets.wrong_map is not None:
+            flown = replace(flown, map_cache=assets.wrong_map)
         path = write_deployment(self._out, flown, case.scenario, vehicle, self._ports)
         settings = yaml.safe_load(path.read_text(encoding="utf-8"))
         for axis in ("fx", "fy"):
@@ -167,23 +175,6 @@ class _LoopFlight:
         shift = case.wrong.map_shift_m
         self._stack.enter_context(truth_feed(self._pilot, self._camera, cache, gimbal, shift))
 
-    def _start_companion(self) -> None:
-        self._run_companion()
-        started = time.monotonic()
-        while self._health()[2] > _FRESH_S:
-            self._require_companion()
-            if time.monotonic() - started > _START_S:
-                raise FlightError(
-                    f"the companion is not up after {_START_S:.0f} s: see {self._out}"
-                )
-            time.sleep(0.2)
-
-    def _run_companion(self) -> None:
-        folder = self._out / f"log-{self._starts}"
-        folder.mkdir()
-        self._starts += 1
-        self._companion = self._stack.enter_context(running_companion(self._config, folder))
-
     # --- during ----------------------------------------------------------------------------------
 
     @property
@@ -196,10 +187,23 @@ class _LoopFlight:
         if event.picture is not None:
             self._camera.fault(event.picture.fault)
             self._later(event.picture.for_s, lambda: self._camera.fault(None))
+        if event.drag is not None:
+            self._drag = GnssDrag(event.drag, self._pilot.link, self._home, self._now_s)
+            self._drag_on()
+        if event.load is not None:
+            work = OtherWork(event.load, self._companion)
+            self._stack.callback(work.end)
+            self._later(event.load.for_s, work.end)
+        if event.start:
+            self._companion.start()
         if event.kill:
-            self._companion.send_signal(signal.SIGKILL)
-            self._companion.wait()
-            self._later(event.restart_after_s, self._run_companion)
+            self._companion.kill()
+            self._later(event.restart_after_s, self._companion.start)
+
+    def _drag_on(self) -> None:
+        if self._drag is not None and not self._drag.is_over(self._now_s):
+            self._drag.step(self._now_s)
+            self._later(_DRAG_STEP_S, self._drag_on)
 
     def _later(self, seconds: float, do: Callable[[], None]) -> None:
         """Have something done by the flight's own loop, so many seconds from now."""
@@ -207,14 +211,15 @@ class _LoopFlight:
         self._due.sort(key=lambda item: item[0])
 
     def _sample(self) -> None:
-        pilot = self._pilot
-        level, text, age_s = self._health()
+        record, health = self._pilot.record, self._companion.health()
         error_m, north_m, east_m = self._ekf_error()
+        self._ticks.append((self._now_s, record.time_s))
         self._samples.append(
             LoopSample(
-                self._now_s, error_m, north_m, east_m, pilot.record.mode or "", level, text, age_s
+                self._now_s, error_m, north_m, east_m, record.mode or "", health.level,
+                health.text, health.age_s, health.findings, health.rate_hz,
             )
-        )
+        )  # fmt: skip
 
     def _ekf_error(self) -> tuple[float, float, float]:
         """Horizontal error of the EKF's position now, and where the vehicle truly is."""
@@ -227,26 +232,9 @@ class _LoopFlight:
         seen = self._home.ned_of(ekf.location)
         return math.hypot(seen[0] - true[0], seen[1] - true[1]), north, east
 
-    def _health(self) -> tuple[str, str, float]:
-        """(level, text, age in s) of the companion's newest report; infinite age without one."""
-        try:
-            reports = self._out.glob("companion*/health.json")
-            newest = max(reports, key=lambda path: path.stat().st_mtime)
-            report = json.loads(newest.read_text(encoding="utf-8"))
-        except (OSError, ValueError):
-            return "starting", "", math.inf
-        age_s = (time.monotonic_ns() - int(report["time_ns"])) * 1e-9
-        return str(report["level"]), str(report["text"]), age_s
-
     def _is_tracking(self) -> bool:
-        self._require_companion()
-        level, text, _ = self._health()
-        return level == "ok" and text.startswith("localization tracking")
-
-    def _require_companion(self) -> None:
-        code = self._companion.poll()
-        if code is not None:
-            raise FlightError(f"the companion ended with code {code}: see {self._out}")
+        self._companion.require()
+        return self._companion.health().is_tracking
 
     # --- after -----------------------------------------------------------------------------------
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -10,6 +11,9 @@ import numpy as np
 from sitl.suite.loop.case import Expectation
 
 _STALE_S = 2.0  # a health report older than this is none: the process is gone, and its heartbeat
+_AUTOPILOT = 1  # component id
+_WARNING = 4  # MAV_SEVERITY; lower is worse
+_FALSE_M = 5.0
 
 
 @dataclass(frozen=True)
@@ -17,7 +21,7 @@ class LoopSample:
     """A moment of the recorded part, seconds since it began.
 
     error_m: the EKF's horizontal error. level, health: the companion's health; age_s: of that
-    report. mode: the autopilot's.
+    report; findings: of its guardian, that stand; rate_hz: localized frames. mode: the autopilot's.
     """
 
     at_s: float
@@ -28,11 +32,13 @@ class LoopSample:
     level: str
     health: str
     age_s: float
+    findings: tuple[str, ...] = ()
+    rate_hz: float = 0.0
 
     @property
     def is_told(self) -> bool:
         """Whether the operator can see that something is wrong."""
-        return self.level != "ok" or self.age_s > _STALE_S
+        return self.level != "ok" or self.age_s > _STALE_S or bool(self.findings)
 
 
 @dataclass(frozen=True)
@@ -44,14 +50,41 @@ class LoopText:
     severity: int
     text: str
 
+    @property
+    def is_warning(self) -> bool:
+        """Whether the companion says that something is wrong."""
+        return self.component != _AUTOPILOT and self.severity <= _WARNING
+
 
 @dataclass(frozen=True)
 class LoopRecord:
-    """What a flight left. fix_errors_m: horizontal, of every position that was injected."""
+    """What a flight left. fix_errors_m: horizontal, of every position that was injected.
+
+    pace, stall_s: how far the simulated vehicle was from real time, see `sitl.suite.record`.
+    """
 
     samples: tuple[LoopSample, ...]
     texts: tuple[LoopText, ...]
     fix_errors_m: tuple[float, ...]
+    pace: float = 1.0
+    stall_s: float = 0.0
+
+
+@dataclass(frozen=True)
+class LoopFigures:
+    """A flight in numbers, metres and seconds. max_error_m: of the EKF, horizontal; untold_s: see
+    `untold_s`; false: injected positions further off than 5 m, of `sent`, the worst max_fix_m;
+    told_s: of health worse than ok or a finding; rate_hz: median of localized frames.
+    """
+
+    max_error_m: float
+    untold_s: float
+    false: int
+    sent: int
+    max_fix_m: float
+    told_s: float
+    rate_hz: float
+    seconds: float
 
 
 @dataclass(frozen=True)
@@ -75,40 +108,66 @@ def untold_s(samples: Sequence[LoopSample], beyond_m: float) -> float:
     return longest
 
 
+def figures(record: LoopRecord, beyond_m: float) -> LoopFigures:
+    """The flight's numbers."""
+    samples, fixes = record.samples, np.asarray(record.fix_errors_m)
+    ends = [s.at_s for s in samples[1:]]
+    told = [end - s.at_s for s, end in zip(samples, ends, strict=False) if s.is_told]
+    return LoopFigures(
+        max_error_m=max((s.error_m for s in samples), default=math.nan),
+        untold_s=untold_s(samples, beyond_m),
+        false=int(np.sum(fixes > _FALSE_M)),
+        sent=len(fixes),
+        max_fix_m=float(fixes.max()) if len(fixes) else math.nan,
+        told_s=sum(told),
+        rate_hz=float(np.median([s.rate_hz for s in samples])) if samples else 0.0,
+        seconds=samples[-1].at_s if samples else 0.0,
+    )
+
+
+def false_alarms(record: LoopRecord) -> tuple[str, ...]:
+    """Everything that was told in a flight in which nothing was wrong, in order of time."""
+    told = [(t.at_s, t.text) for t in record.texts if t.is_warning]
+    before: set[str] = set()
+    for sample in record.samples:
+        now = {f"finding {name}" for name in sample.findings}
+        if sample.level != "ok" or sample.age_s > _STALE_S:
+            now.add(f"health {sample.level}")
+        told += [(sample.at_s, f"{what}: {sample.health}") for what in sorted(now - before)]
+        before = now
+    return tuple(f"{at_s:.1f} s: {text}" for at_s, text in sorted(told))
+
+
 def judge(record: LoopRecord, expect: Expectation) -> tuple[Held, ...]:
     """Every expectation, held against the record."""
-    samples, errors = record.samples, [s.error_m for s in record.samples]
-    longest = untold_s(samples, expect.beyond_m)
-    worst = max(errors, default=float("nan"))
+    samples, flown = record.samples, figures(record, expect.beyond_m)
     held = [
         Held(
             f"beyond {expect.beyond_m:g} m told within {expect.told_within_s:g} s",
-            bool(samples) and longest <= expect.told_within_s,
-            f"untold for {longest:.1f} s at most; error up to {worst:.1f} m",
+            bool(samples) and flown.untold_s <= expect.told_within_s,
+            f"untold for {flown.untold_s:.1f} s at most; error up to {flown.max_error_m:.1f} m",
         )
     ]
     for mode in expect.never_modes:
         seen = [s.at_s for s in samples if s.mode == mode]
         held.append(Held(f"never {mode}", not seen, f"from {seen[0]:.0f} s" if seen else "never"))
     if expect.max_error_m is not None:
-        ok = worst <= expect.max_error_m
-        held.append(Held(f"EKF within {expect.max_error_m:g} m", ok, f"{worst:.1f} m"))
+        ok = flown.max_error_m <= expect.max_error_m
+        held.append(Held(f"EKF within {expect.max_error_m:g} m", ok, f"{flown.max_error_m:.1f} m"))
     if expect.false_fixes is not None:
-        false = int(np.sum(np.asarray(record.fix_errors_m) > 5.0))
-        sent = len(record.fix_errors_m)
-        ok = false <= expect.false_fixes and sent > 0
-        held.append(Held("false fixes injected", ok, f"{false} of {sent}"))
+        ok = flown.false <= expect.false_fixes and flown.sent > 0
+        held.append(Held("false fixes injected", ok, f"{flown.false} of {flown.sent}"))
     if expect.ends_tracking:
         last = samples[-1] if samples else None
         ok = last is not None and last.level == "ok" and not last.age_s > _STALE_S
         held.append(Held("tracks at the end", ok, last.health if last else "no samples"))
     held += [_said(record.texts, part) for part in expect.says]
     if expect.silent:
-        told = [t.text for t in record.texts if t.component != 1 and t.severity <= 4]
+        told = false_alarms(record)
         held.append(Held("no warning", not told, "; ".join(told) or "none"))
     return tuple(held)
 
 
 def _said(texts: Sequence[LoopText], part: str) -> Held:
-    found = [t for t in texts if t.component != 1 and part in t.text]
+    found = [t for t in texts if t.component != _AUTOPILOT and part in t.text]
     return Held(f"says {part!r}", bool(found), f"at {found[0].at_s:.1f} s" if found else "never")

@@ -4,79 +4,97 @@ from __future__ import annotations
 
 import json
 import shutil
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
+from itertools import product
 from pathlib import Path
 
-from rich.console import Console
-from rich.markup import escape
-
 from sitl.demo.assets import prepare
+from sitl.demo.scenario import ScenarioError
 from sitl.errors import SimulationError
 from sitl.suite.loop.case import LoopCase
 from sitl.suite.loop.flight import LoopAssets, fly
-from sitl.suite.loop.judge import Held, judge
+from sitl.suite.loop.inner_map import inner_map
+from sitl.suite.loop.judge import false_alarms, figures, judge
+from sitl.suite.loop.report import LoopRow, as_data, markdown
 from sitl.vehicles.process import VehicleKind
 
 _OTHER_SEED = 100  # of the place whose map is wrong here, beyond the flown world's seed
 
 
 @dataclass(frozen=True)
-class LoopRow:
-    """One flight's outcome; error says why it could not be flown."""
+class LoopOptions:
+    """On which vehicles, over which worlds (one for each seed), and where records and worlds are
+    kept. say: progress, one line at a time; landed: every flight's outcome as it comes.
+    """
 
-    name: str
-    vehicle: VehicleKind
-    held: tuple[Held, ...]
-    error: str = ""
-
-    @property
-    def ok(self) -> bool:
-        """Whether it was flown and everything holds."""
-        return not self.error and all(held.ok for held in self.held)
+    vehicles: tuple[VehicleKind, ...]
+    out: Path
+    seeds: tuple[int, ...] = (5,)
+    worlds: Path | None = None
+    say: Callable[[str], None] = lambda _: None
+    landed: Callable[[LoopRow], None] = lambda _: None
 
 
-def fly_loop(
-    cases: Sequence[LoopCase],
-    kind: VehicleKind,
-    seed: int,
-    size_m: float,
-    out: Path,
-    worlds: Path | None,
-    console: Console,
-) -> tuple[LoopRow, ...]:
-    """Fly all cases over one world; ``out/NAME`` holds each flight, ``out/loop.json`` the table."""
-    world = prepare(seed, worlds, console.print, size_m)
-    other = None
-    if any(case.wrong.other_map for case in cases):
-        other = prepare(seed + _OTHER_SEED, worlds, console.print, size_m)
+def fly_loop(cases: Sequence[LoopCase], options: LoopOptions) -> tuple[LoopRow, ...]:
+    """Fly all cases with every seed; ``out/VEHICLE-NAME-SEED`` holds each flight, ``out/loop.json``
+    and ``out/loop.md`` the table.
+    """
+    options.out.mkdir(parents=True, exist_ok=True)
     rows: list[LoopRow] = []
-    for case in cases:
-        folder = out / case.name
-        shutil.rmtree(folder, ignore_errors=True)
-        console.print(f"[dim]flying {case.name}: {escape(case.title)}[/]")
-        rows.append(_flown(case, LoopAssets(world, other), kind, seed, folder))
-        _show(console, rows[-1])
-        report = [asdict(row) | {"ok": row.ok} for row in rows]
-        (out / "loop.json").write_text(json.dumps(report, indent=1), encoding="utf-8")
+    for kind, seed, case in product(options.vehicles, options.seeds, cases):
+        options.say(f"flying {case.name} on {kind}, seed {seed}: {case.title}")
+        row = _flown(case, kind, seed, options)
+        rows.append(row)
+        options.landed(row)
+        report = json.dumps(as_data(rows), indent=1, allow_nan=False)
+        (options.out / "loop.json").write_text(report, encoding="utf-8")
+        (options.out / "loop.md").write_text(markdown(rows), encoding="utf-8")
     return tuple(rows)
 
 
-def _flown(
-    case: LoopCase, assets: LoopAssets, kind: VehicleKind, seed: int, folder: Path
-) -> LoopRow:
+def loop_assets(
+    case: LoopCase, seed: int, worlds: Path | None, say: Callable[[str], None]
+) -> LoopAssets:
+    """What a case flies over, and the map that it gives the companion; made where missing."""
+    world = prepare(seed, worlds, say, case.size_m)
+    if case.wrong.other_map:
+        other = prepare(seed + _OTHER_SEED, worlds, say, case.size_m)
+        return LoopAssets(world, other.map_cache)
+    if case.wrong.map_reach_m is not None:
+        return LoopAssets(world, inner_map(world.map_cache, case.wrong.map_reach_m))
+    return LoopAssets(world)
+
+
+def parse_seeds(text: str) -> tuple[int, ...]:
+    """``5``, or ``1..10`` for both and all between; ScenarioError for anything else."""
+    first, dots, last = text.partition("..")
+    if not (first.isdecimal() and (last.isdecimal() or not dots)):
+        raise ScenarioError(f"--seeds is a number or FIRST..LAST, not {text!r}")
+    seeds = range(int(first), int(last or first) + 1)
+    if not seeds:
+        raise ScenarioError(f"--seeds {text}: the last seed is before the first")
+    return tuple(seeds)
+
+
+def _flown(case: LoopCase, kind: VehicleKind, seed: int, options: LoopOptions) -> LoopRow:
+    assets = loop_assets(case, seed, options.worlds, options.say)
+    folder = options.out / f"{kind}-{case.name}-{seed}"
+    shutil.rmtree(folder, ignore_errors=True)
     try:
         record = fly(case, assets, kind, seed, folder)
     except SimulationError as error:
-        return LoopRow(case.name, kind, (), f"{type(error).__name__}: {error}")
+        why = f"{type(error).__name__}: {error}"
+        return LoopRow(case.name, kind, seed, (), error=why)
     text = json.dumps(asdict(record), indent=1, default=str)
     (folder / "flight.json").write_text(text, encoding="utf-8")
-    return LoopRow(case.name, kind, judge(record, case.expect))
-
-
-def _show(console: Console, row: LoopRow) -> None:
-    if row.error:
-        console.print(f"[red]ERROR[/] {row.name}: {escape(row.error)}")
-    for held in row.held:
-        mark = "[green]ok[/]" if held.ok else "[red]MISSED[/]"
-        console.print(f"  {mark} {escape(held.what)}: {escape(held.seen)}")
+    return LoopRow(
+        case.name,
+        kind,
+        seed,
+        judge(record, case.expect),
+        figures(record, case.expect.beyond_m),
+        false_alarms(record) if case.is_normal else None,
+        record.pace,
+        record.stall_s,
+    )

@@ -2,13 +2,26 @@
 
 from __future__ import annotations
 
+import json
 from dataclasses import replace
+from typing import Any
 
 import pytest
 
 from sitl.demo.scenario import ScenarioError
 from sitl.suite.loop.case import Expectation, load_loop_cases
-from sitl.suite.loop.judge import LoopRecord, LoopSample, LoopText, judge, untold_s
+from sitl.suite.loop.judge import (
+    Held,
+    LoopRecord,
+    LoopSample,
+    LoopText,
+    false_alarms,
+    figures,
+    judge,
+    untold_s,
+)
+from sitl.suite.loop.report import LoopRow, as_data, false_alarm_rate, markdown
+from sitl.suite.loop.runner import parse_seeds
 
 GOOD = LoopSample(0.0, 0.3, 0.0, 0.0, "AUTO", "ok", "localization tracking", 0.5)
 
@@ -25,9 +38,9 @@ def test_an_error_with_every_light_green_is_untold() -> None:
     assert untold_s(flight([0.5] * 4 + [20.0] * 11), 10.0) == pytest.approx(5.0)
 
 
-@pytest.mark.parametrize("told", [{"level": "failed"}, {"age_s": 5.0}])
-def test_a_bad_health_or_a_silent_companion_tells_it(told: dict[str, float]) -> None:
-    assert untold_s(flight([20.0] * 11, **told), 10.0) == 0.0  # type: ignore[arg-type]
+@pytest.mark.parametrize("told", [{"level": "failed"}, {"age_s": 5.0}, {"findings": ("gnss",)}])
+def test_a_bad_health_a_finding_or_a_silent_companion_tells_it(told: dict[str, Any]) -> None:
+    assert untold_s(tuple(replace(s, **told) for s in flight([20.0] * 11)), 10.0) == 0.0
 
 
 def record(samples: tuple[LoopSample, ...], errors: tuple[float, ...] = (0.2,)) -> LoopRecord:
@@ -55,9 +68,70 @@ def replace_says(expect: Expectation) -> Expectation:
     return expect.model_copy(update={"says": ("another text",)})
 
 
+def test_whatever_is_told_of_a_good_flight_is_a_false_alarm() -> None:
+    quiet = LoopRecord(flight([0.5] * 4), (LoopText(1.0, 1, 3, "EKF3 IMU0 yaw"),), (0.2,))
+    assert false_alarms(quiet) == ()
+    degraded = (*flight([0.5] * 4), replace(GOOD, at_s=2.0, level="degraded"))
+    assert false_alarms(replace(quiet, samples=degraded)) == (
+        "2.0 s: health degraded: localization tracking",
+    )
+    found = tuple(replace(s, findings=("motion",)) for s in flight([0.5] * 4))
+    assert len(false_alarms(replace(quiet, samples=found))) == 1  # told once, not at every sample
+    assert false_alarms(record(flight([0.5] * 4))) == ("1.0 s: PiLoT: withheld: video frozen 5 s",)
+
+
+def row(alarms: tuple[str, ...] | None) -> LoopRow:
+    one = record(flight([0.5] * 41))
+    return LoopRow("normal", "embedded", 5, (), figures(one, 10.0), alarms)
+
+
+def test_the_rate_of_false_alarms_has_its_exact_interval() -> None:
+    """Against the tables of Clopper and Pearson: 0 of 20, and 1 of 20."""
+    quiet = false_alarm_rate([row(())] * 20 + [row(None)])
+    assert quiet is not None
+    assert (quiet.flights, quiet.with_alarm) == (20, 0)
+    assert (quiet.low, quiet.high) == (0.0, pytest.approx(0.1684, abs=1e-4))
+    assert quiet.hours == pytest.approx(20 * 20 / 3600)
+    loud = false_alarm_rate([row(())] * 19 + [row(("1.0 s: PiLoT: withheld",))])
+    assert loud is not None
+    assert (loud.low, loud.high) == (
+        pytest.approx(0.0013, abs=1e-4),
+        pytest.approx(0.2487, abs=1e-4),
+    )
+    assert false_alarm_rate([row(None)]) is None
+
+
+def test_what_was_missed_stands_first_and_the_json_is_strict() -> None:
+    missed = replace(row(()), name="z", held=(Held("told", False, "untold for 9 s"),))
+    lost = LoopRow("a", "ardupilot", 1, (), error="FlightError: no arducopter")
+    lines = markdown([row(()), missed, lost]).splitlines()
+    assert lines[2].startswith("| a | ardupilot, 1 |")
+    assert "NOT FLOWN: FlightError" in lines[2]
+    assert lines[3].startswith("| z | ")
+    assert "MISSED told: untold for 9 s" in lines[3]
+    unknown = LoopRecord(flight([float("inf")] * 3), (), ())
+    bad = LoopRow("b", "embedded", 1, (), figures(unknown, 10.0))
+    assert json.loads(json.dumps(as_data([bad]), allow_nan=False))["flights"][0]["ok"]
+
+
+@pytest.mark.parametrize(("text", "seeds"), [("5", (5,)), ("1..3", (1, 2, 3))])
+def test_seeds_are_one_or_a_range(text: str, seeds: tuple[int, ...]) -> None:
+    assert parse_seeds(text) == seeds
+
+
+@pytest.mark.parametrize("text", ["", "1..", "3..1", "-1", "1...3", "a"])
+def test_other_seeds_are_refused(text: str) -> None:
+    with pytest.raises(ScenarioError, match="seeds"):
+        parse_seeds(text)
+
+
 def test_the_shipped_flights_hold_together() -> None:
     cases = {case.name: case for case in load_loop_cases()}
-    assert {"normal", "frozen-hover", "covered-30s", "killed", "other-map"} <= set(cases)
+    assert {"normal-60s", "frozen-hover", "covered-30s", "killed", "other-map"} <= set(cases)
     assert sum(case.ci for case in cases.values()) == 3
+    normal = load_loop_cases(["normal"])
+    assert len(normal) >= 6
+    assert all(case.name.startswith("normal") for case in normal)
+    assert all(case.expect.silent for case in normal)
     with pytest.raises(ScenarioError, match="no nowhere"):
         load_loop_cases(["nowhere"])

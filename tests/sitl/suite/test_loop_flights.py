@@ -24,10 +24,12 @@ def test_nothing_wrong_is_believed_untold(
     tmp_path_factory: pytest.TempPathFactory,
     tmp_path: Path,
 ) -> None:
-    other = None
+    wrong_map = None
     if case.wrong.other_map:
         other = prepare(105, tmp_path_factory.mktemp("elsewhere"), size_m=400.0)
+        wrong_map = other.map_cache
+    assets = LoopAssets(small_assets, wrong_map)
     with real_time():
-        record = fly(case, LoopAssets(small_assets, other), "embedded", 5, tmp_path / case.name)
+        record = fly(case, assets, "embedded", 5, tmp_path / case.name)
         missed = [f"{held.what}: {held.seen}" for held in judge(record, case.expect) if not held.ok]
         assert missed == []

@@ -1,0 +1,99 @@
+"""The companion of a flight of the loop: started, killed, started again, and what it reports."""
+
+from __future__ import annotations
+
+import json
+import math
+import os
+import signal
+import subprocess
+import time
+from contextlib import ExitStack, suppress
+from dataclasses import dataclass
+from pathlib import Path
+
+from sitl.demo.companion_process import running_companion
+from sitl.demo.script import FlightError
+
+_START_S = 300.0  # of the companion: its first start on a machine compiles
+_FRESH_S = 2.0  # a health report that is written every second
+
+
+@dataclass(frozen=True)
+class Health:
+    """The newest ``health.json``: level and text, its age in seconds (infinite without one), names
+    of the guardian's findings that stand, and localized frames per second.
+    """
+
+    level: str = "starting"
+    text: str = ""
+    age_s: float = math.inf
+    findings: tuple[str, ...] = ()
+    rate_hz: float = 0.0
+
+    @property
+    def is_tracking(self) -> bool:
+        """Whether all is well."""
+        return self.level == "ok" and self.text.startswith("localization tracking")
+
+
+class LoopCompanion:
+    """`companion run` with one deployment file; each start has its log in a folder of its own."""
+
+    def __init__(self, config: Path, out: Path, stack: ExitStack) -> None:
+        self._config, self._out, self._stack = config, out, stack
+        self._process: subprocess.Popen[bytes] | None = None
+        self._starts = 0
+
+    def start(self) -> None:
+        """Start it, and return at once."""
+        folder = self._out / f"log-{self._starts}"
+        folder.mkdir()
+        self._starts += 1
+        self._process = self._stack.enter_context(running_companion(self._config, folder))
+
+    def wait_up(self) -> None:
+        """Wait until it reports its health; FlightError when it does not."""
+        started = time.monotonic()
+        while self.health().age_s > _FRESH_S:
+            self.require()
+            if time.monotonic() - started > _START_S:
+                raise FlightError(
+                    f"the companion is not up after {_START_S:.0f} s: see {self._out}"
+                )
+            time.sleep(0.2)
+
+    def kill(self) -> None:
+        """SIGKILL, and wait until it is gone."""
+        if self._process is not None:
+            self._process.send_signal(signal.SIGKILL)
+            self._process.wait()
+
+    def require(self) -> None:
+        """FlightError when it has ended by itself."""
+        code = None if self._process is None else self._process.poll()
+        if code is not None:
+            raise FlightError(f"the companion ended with code {code}: see {self._out}")
+
+    def confine(self, processors: set[int]) -> None:
+        """Let all of its threads, and those to come, run on these processors only."""
+        if self._process is None:
+            return
+        for thread in Path(f"/proc/{self._process.pid}/task").glob("*"):
+            with suppress(ProcessLookupError):  # it may end meanwhile
+                os.sched_setaffinity(int(thread.name), processors)
+
+    def health(self) -> Health:
+        """Its newest report."""
+        try:
+            reports = self._out.glob("companion*/health.json")
+            newest = max(reports, key=lambda path: path.stat().st_mtime)
+            report = json.loads(newest.read_text(encoding="utf-8"))
+        except (OSError, ValueError):
+            return Health()
+        age_s = (time.monotonic_ns() - int(report["time_ns"])) * 1e-9
+        guardian = report.get("guardian") or {}
+        findings = tuple(guardian.get("findings", {}))
+        return Health(
+            str(report["level"]), str(report["text"]), age_s, findings, float(report["rate_hz"])
+        )

@@ -1,0 +1,143 @@
+"""The flights of the loop as a table for a document, and as JSON: what was missed stands first."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from typing import Any
+
+from rich.console import Console
+from rich.markup import escape
+from scipy.stats import beta
+
+from sitl.suite.loop.judge import Held, LoopFigures
+from sitl.suite.runner import PACE_LIMIT, STALL_LIMIT_S
+from sitl.vehicles.process import VehicleKind
+
+_COLUMNS = (
+    "flight", "vehicle, seed", "EKF at most, m", "untold, s", "false of sent", "worst fix, m",
+    "told, s", "frames/s", "held",
+)  # fmt: skip
+
+
+@dataclass(frozen=True)
+class LoopRow:
+    """One flight's outcome; error says why it could not be flown.
+
+    alarms: what was told although nothing was wrong; None where something was. pace, stall_s: of
+    the simulated vehicle.
+    """
+
+    name: str
+    vehicle: VehicleKind
+    seed: int
+    held: tuple[Held, ...]
+    figures: LoopFigures | None = None
+    alarms: tuple[str, ...] | None = None
+    pace: float = 1.0
+    stall_s: float = 0.0
+    error: str = ""
+
+    @property
+    def ok(self) -> bool:
+        """Whether it was flown and everything holds."""
+        return not self.error and all(held.ok for held in self.held)
+
+    @property
+    def slow(self) -> bool:
+        """Whether the machine could not keep the vehicle in real time: it says little then."""
+        return self.pace < PACE_LIMIT or self.stall_s > STALL_LIMIT_S
+
+
+@dataclass(frozen=True)
+class FalseAlarms:
+    """Over the flights in which nothing was wrong. low, high: of the share of flights with an
+    alarm, exact 95 % (Clopper and Pearson). hours: recorded; told_s: of them, with something told.
+    """
+
+    flights: int
+    with_alarm: int
+    low: float
+    high: float
+    hours: float
+    told_s: float
+
+
+def false_alarm_rate(rows: Sequence[LoopRow]) -> FalseAlarms | None:
+    """Of the normal flights that were flown; None without any."""
+    normal = [row for row in rows if row.alarms is not None and row.figures is not None]
+    if not normal:
+        return None
+    n, hits = len(normal), sum(bool(row.alarms) for row in normal)
+    flown = [row.figures for row in normal if row.figures is not None]
+    return FalseAlarms(
+        flights=n,
+        with_alarm=hits,
+        low=0.0 if hits == 0 else float(beta.ppf(0.025, hits, n - hits + 1)),
+        high=1.0 if hits == n else float(beta.ppf(0.975, hits + 1, n - hits)),
+        hours=sum(f.seconds for f in flown) / 3600.0,
+        told_s=sum(f.told_s for f in flown),
+    )
+
+
+def as_data(rows: Sequence[LoopRow]) -> dict[str, Any]:
+    """For JSON, which has neither NaN nor infinity."""
+    rate = false_alarm_rate(rows)
+    flights = [asdict(row) | {"ok": row.ok, "slow": row.slow} for row in rows]
+    data = {"flights": flights, "false_alarms": None if rate is None else asdict(rate)}
+    finite = _finite(data)
+    assert isinstance(finite, dict)
+    return finite
+
+
+def markdown(rows: Sequence[LoopRow]) -> str:
+    """The table; flights that do not hold come first."""
+    ordered = sorted(rows, key=lambda row: (row.ok, row.name, row.vehicle, row.seed))
+    lines = ["| " + " | ".join(_COLUMNS) + " |", "|" + "---|" * len(_COLUMNS)]
+    lines += ["| " + " | ".join(_cells(row)) + " |" for row in ordered]
+    rate = false_alarm_rate(rows)
+    if rate is not None:
+        share = f"{rate.with_alarm} of {rate.flights} normal flights with a false alarm"
+        low, high = 100 * rate.low, 100 * rate.high
+        lines += ["", f"{share} ({low:.0f} to {high:.0f} %, exact 95 %), {rate.told_s:.0f} s told"]
+        lines[-1] += f" of {3600 * rate.hours:.0f} s."
+    return "\n".join([*lines, ""])
+
+
+def print_loop_row(console: Console, row: LoopRow) -> None:
+    """A flight's outcome as soon as it has landed."""
+    if row.error:
+        console.print(f"[red]ERROR[/] {row.name}: {escape(row.error)}", highlight=False)
+    for held in row.held:
+        mark = "[green]ok[/]" if held.ok else "[red]MISSED[/]"
+        console.print(f"  {mark} {escape(held.what)}: {escape(held.seen)}", highlight=False)
+
+
+def _cells(row: LoopRow) -> tuple[str, ...]:
+    who = f"{row.vehicle}, {row.seed}" + (f" (pace {row.pace:.2f})" if row.slow else "")
+    flown = row.figures
+    if flown is None:
+        return (row.name, who, *["-"] * 6, f"NOT FLOWN: {row.error.splitlines()[0]}")
+    missed = "; ".join(f"MISSED {held.what}: {held.seen}" for held in row.held if not held.ok)
+    return (
+        row.name,
+        who,
+        f"{flown.max_error_m:.1f}",
+        f"{flown.untold_s:.1f}",
+        f"{flown.false} of {flown.sent}",
+        f"{flown.max_fix_m:.1f}" if flown.sent else "-",
+        f"{flown.told_s:.0f}",
+        f"{flown.rate_hz:.1f}",
+        missed.replace("|", "/") or "all",
+    )
+
+
+def _finite(value: Any) -> Any:
+    if isinstance(value, dict):
+        return {key: _finite(item) for key, item in value.items()}
+    if isinstance(value, list | tuple):
+        return [_finite(item) for item in value]
+    if isinstance(value, float) and not math.isfinite(value):
+        return None
+    return value
