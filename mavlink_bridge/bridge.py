@@ -31,6 +31,7 @@ from mavlink_bridge.link.transport import (
 from mavlink_bridge.messages import (
     Attitude,
     CameraView,
+    Figures,
     GimbalAttitude,
     HealthLevel,
     InertialSample,
@@ -239,9 +240,11 @@ class Bridge:
         """Whether the EKF follows what is sent; None while nothing is sent or it is too early."""
         return self._fc.outcome.verdict
 
-    def counters(self) -> dict[str, int | float | str]:
-        """Counters of links and injection; keys are prefixed by where they come from."""
-        result: dict[str, int | float | str] = {}
+    def counters(self) -> Figures:
+        """Counters of links and injection, None where a figure is not known; keys are prefixed by
+        where they come from.
+        """
+        result: Figures = {}
         for link in self._links:
             result.update({f"{link.name}_{k}": v for k, v in link.stats().items()})
         result.update(self._fc.figures())

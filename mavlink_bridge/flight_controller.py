@@ -17,7 +17,7 @@ from mavlink_bridge.injection.outcome import InjectionOutcome
 from mavlink_bridge.injection.shadow import ShadowScore
 from mavlink_bridge.injection.switching import SourceOrders
 from mavlink_bridge.link.link import Link
-from mavlink_bridge.messages import VehicleState
+from mavlink_bridge.messages import Figures, VehicleState
 from mavlink_bridge.news import VehicleNews
 from mavlink_bridge.shared import Shared
 from mavlink_bridge.texts import Teller
@@ -73,28 +73,29 @@ class FlightControllerEnd:
 
     def shadow_score(self, now_ns: int) -> ShadowScore:
         """How vision compared with GNSS over the last two minutes."""
-        guard = self.sender.injector.guard
-        return self.outcome.shadow.score(
-            now_ns, self.sender.injector.yaw_difference_rad, guard.blocked
-        )
+        return self.outcome.shadow.score(now_ns, self.sender.injector.refused_yaw_rad)
 
     @property
     def injecting(self) -> bool:
         """Whether fixes are sent right now: mode, gate and the shadow score's interlock."""
         return self._mode == self._shared.mode() == "inject"
 
-    def figures(self) -> dict[str, int | float | str]:
-        """Counters and measures for a record; keys are prefixed by where they come from."""
+    def figures(self) -> Figures:
+        """Counters and measures for a record, None where one is not known; keys are prefixed by
+        where they come from.
+        """
         injector, clock = self.sender.injector, self._tracker.clock
-        result: dict[str, int | float | str] = {}
+        result: Figures = {}
         result.update({f"inject_{k}": v for k, v in dict(injector.counters).items()})
         result.update({f"bridge_{k}": v for k, v in dict(self.counters).items()})
         result.update({f"rx_{k}": v for k, v in dict(self.requests.streams.counts).items()})
         result["inject_reason"] = injector.reason
         result["reset_counter"] = injector.reset_counter
-        result["yaw_difference_deg"] = math.degrees(injector.yaw_difference_rad)
+        yaw = injector.yaw_difference_rad
+        result["yaw_difference_deg"] = None if yaw is None else math.degrees(yaw)
         result["fix_latency_ms"] = injector.latency_ms
-        result["clock_round_trip_ms"] = (clock.round_trip_ns or 0) * 1e-6
+        trip = clock.round_trip_ns
+        result["clock_round_trip_ms"] = None if trip is None else trip * 1e-6
         result["clock_rate"] = clock.rate
         result["clock_steps"] = clock.steps
         result["ignored_messages"] = self._tracker.ignored

@@ -31,6 +31,10 @@ class HealthLevel(enum.Enum):
     FAILED = "failed"
 
 
+Figures = dict[str, int | float | str | None]
+"""Counters and measures by name, for a record; None where one is not known."""
+
+
 def without_figures(text: str) -> str:
     """A line for the operator without its numbers: what changes in them only is no news."""
     return "".join(c for c in text if not c.isdigit() and c not in "+-.")

@@ -58,13 +58,14 @@ def ablation(args: argparse.Namespace) -> list[Outcome]:
         groups(outcomes), key=lambda g: [v.name for v in rows].index(g[0])
     ):
         s = summary(mine, full)
+        nees = "    -" if s["nees"] is None else f"{s['nees']:5.1f}"
         label, last = ("" if variant == last else variant), variant
         print(
             f"{label:34s} {start:9s} n={s['n']:<4.0f} R@1 {s['r1']:5.1f} "
             f"[{s['r1_low']:4.1f}, {s['r1_high']:5.1f}]  change {s['change']:+5.1f} "
             f"[{s['change_low']:+5.1f}, {s['change_high']:+5.1f}]  R@3 {s['r3']:5.1f}  "
             f"median {s['median']:5.2f} m [{s['median_low']:.2f}, {s['median_high']:.2f}]  "
-            f"NEES {s['nees']:5.1f}  {s['ms']:5.1f} ms"
+            f"NEES {nees}  {s['ms']:5.1f} ms"
         )
     return outcomes
 

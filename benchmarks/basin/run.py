@@ -41,7 +41,7 @@ _LEAST_DEPTH = 0.5  # share of a reference view that must show the map
 @dataclass(frozen=True)
 class Outcome:
     """One registration: who, which view, which start, and its errors; sigma: of the position
-    by its own covariance, m; nees: against that covariance, NaN where it failed.
+    by its own covariance, m; nees: against that covariance, None where it failed.
     """
 
     variant: str
@@ -51,7 +51,7 @@ class Outcome:
     metres: float
     degrees: float
     sigma: float
-    nees: float
+    nees: float | None
     milliseconds: float
 
     @property
@@ -167,7 +167,7 @@ class Trial:
             metres,
             degrees,
             float(np.sqrt(np.trace(found.covariance[:3, :3]))),
-            squared_error(pose, found.covariance, truth) if ok else np.nan,
+            squared_error(pose, found.covariance, truth) if ok else None,
             ms,
         )
 
@@ -207,7 +207,7 @@ def bootstrap(values: np.ndarray, statistic: Callable[..., np.ndarray]) -> tuple
     return float(low), float(high)
 
 
-def summary(outcomes: list[Outcome], full: list[Outcome]) -> dict[str, float]:
+def summary(outcomes: list[Outcome], full: list[Outcome]) -> dict[str, float | None]:
     """Shares in per cent with intervals, and the paired difference to `full`, same views."""
     hits = sum(o.hit for o in outcomes)
     three = sum(o.metres < 3 and o.degrees < 3 for o in outcomes)
@@ -218,13 +218,13 @@ def summary(outcomes: list[Outcome], full: list[Outcome]) -> dict[str, float]:
     low, high = wilson(hits, len(outcomes))
     median = bootstrap(errors, np.median)
     change = bootstrap(difference, np.mean)
-    near = np.array([o.nees for o in outcomes if o.metres < 3 and o.degrees < 3])
+    near = [o.nees for o in outcomes if o.nees is not None and o.metres < 3 and o.degrees < 3]
     return {
         "n": len(outcomes), "r1": 100 * hits / len(outcomes), "r1_low": low, "r1_high": high,
         "r3": 100 * three / len(outcomes), "median": float(np.median(errors)),
         "median_low": median[0], "median_high": median[1], "change": float(difference.mean()),
         "change_low": change[0], "change_high": change[1],
-        "nees": float(np.nanmean(near)) if len(near) else np.nan,
+        "nees": float(np.mean(near)) if near else None,
         "ms": float(np.median([o.milliseconds for o in outcomes])),
     }  # fmt: skip
 

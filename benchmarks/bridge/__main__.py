@@ -159,14 +159,16 @@ def measure(load: float, seconds: float) -> dict[str, float]:
     arrivals, _ = here.recv()
     process.join()
     delays = np.array([t - submitted[s] for t, s in arrivals if s in submitted]) * 1e-6
-    received = float(after["fc_messages"]) - float(before["fc_messages"])
+    received, lost = (
+        float(after[name] or 0) - float(before[name] or 0) for name in ("fc_messages", "fc_lost")
+    )
     return {
         "received": received / elapsed,
         "fixes": fixes / elapsed,
         "cpu": used / elapsed,
         "p50": float(np.percentile(delays, 50)),
         "p99": float(np.percentile(delays, 99)),
-        "lost": float(after["fc_lost"]) - float(before["fc_lost"]),
+        "lost": lost,
     }
 
 

@@ -54,7 +54,7 @@ def feed(bridge: Bridge, stop: threading.Event) -> None:
         latitude = HOME.latitude_deg + north * metre
         longitude = HOME.longitude_deg + east * metre * 1.48
         height = HOME.altitude_m + GEOID_M + up
-        yaw = float("nan") if attitude is None else attitude.yaw_rad
+        yaw = None if attitude is None else attitude.yaw_rad
         P = np.eye(3) * 0.04
         bridge.submit(VisionFix(now, latitude, longitude, height, 0.0, 0.0, yaw, P))
         if count % 4 == 0:
@@ -73,7 +73,7 @@ def take(bridge: Bridge, begun: float) -> Sample:
         threading.active_count(),
         len(os.listdir("/proc/self/fd")),
         sum(bridge.waiting().values()),
-        int(bridge.counters().get("bridge_injected", 0)),
+        int(bridge.counters().get("bridge_injected") or 0),
     )
 
 

@@ -130,7 +130,7 @@ def iteration_table(problems: Problems, counts: Sequence[int], *, quick: bool) -
         table.add_column(heading, justify="right")
     swarm = make_swarm()
     rows = naive_rows(problems, counts, sizes=(256,) if quick else SIZES)
-    baseline = list(rows.values())[-1] if rows else None
+    baseline = list(rows.values())[-1][1] if rows else None
     few = (swarm[0][:4], swarm[1][:4])
     reference = ReferenceBackend()
     rows[reference.name] = [
@@ -142,8 +142,8 @@ def iteration_table(problems: Problems, counts: Sequence[int], *, quick: bool) -
             per_iteration(backend, problems[s], swarm, repeats_of(quick)) for s in SIZES
         ]
     for name, values in rows.items():
-        ratio = f"{baseline[1] / values[1]:.0f}" if baseline else "-"
-        table.add_row(name, *(f"{v:.2f}" if np.isfinite(v) else "-" for v in values), ratio)
+        ratio = f"{baseline / values[1]:.0f}" if baseline and values[1] else "-"
+        table.add_row(name, *("-" if v is None else f"{v:.2f}" for v in values), ratio)
     for name, published in PAPER_TABLE_7.items():
         table.add_row(name, *(f"{v:.2f}" for v in published), "-")
     return table
@@ -151,16 +151,18 @@ def iteration_table(problems: Problems, counts: Sequence[int], *, quick: bool) -
 
 def naive_rows(
     problems: Problems, counts: Sequence[int], sizes: Sequence[int]
-) -> dict[str, list[float]]:
-    """Milliseconds of one naive iteration by threads and size; none without PyTorch."""
-    rows: dict[str, list[float]] = {}
+) -> dict[str, list[float | None]]:
+    """Milliseconds of one naive iteration by threads and size, None of what was not measured; no
+    row without PyTorch.
+    """
+    rows: dict[str, list[float | None]] = {}
     for threads in counts:
         name = f"naive PyTorch ({threads} thread{'s' if threads > 1 else ''})"
         try:
             rows[name] = [
                 milliseconds(naive_torch(problems[s], make_swarm(), threads), 3)
                 if s in sizes
-                else np.nan
+                else None
                 for s in SIZES
             ]
         except ImportError:

@@ -193,14 +193,14 @@ def unfused_kernels(device: Device, channels: int) -> Kernels:
     return device.load(image.code)
 
 
-def torch_ms(problem: LevelProblem, swarm: Poses) -> float:
-    """The naive batched PyTorch on the same GPU; NaN without a PyTorch that sees it."""
+def torch_ms(problem: LevelProblem, swarm: Poses) -> float | None:
+    """The naive batched PyTorch on the same GPU; None without a PyTorch that sees it."""
     try:
         import torch
     except ImportError:
-        return np.nan
+        return None
     if not torch.cuda.is_available():
-        return np.nan
+        return None
 
     step = naive_torch(problem, swarm, 1, "cuda")
     times = []
@@ -273,8 +273,8 @@ def schedule_ms(
 def print_tables(console: Console, problems: dict[int, LevelProblem], swarm: Poses) -> None:
     """The GPU tables; without a GPU the same tables with '-' and the reason."""
     sizes = tuple(problems)
-    rows: dict[str, list[float]] = {
-        name: [np.nan] * len(sizes)
+    rows: dict[str, list[float | None]] = {
+        name: [None] * len(sizes)
         for name in ("naive PyTorch", "unfused kernels", "fused float32", "fused float16")
     }
     notes = ["GPU: -"]
@@ -290,7 +290,7 @@ def print_tables(console: Console, problems: dict[int, LevelProblem], swarm: Pos
     for heading in ("backend", *(f"{s} x {s}" for s in sizes)):
         table.add_column(heading, justify="right")
     for name, values in rows.items():
-        table.add_row(name, *(f"{v:.4f}" if np.isfinite(v) else "-" for v in values))
+        table.add_row(name, *("-" if v is None else f"{v:.4f}" for v in values))
     table.add_row("paper: CUDA port (RTX)", "5.21", "5.24", "5.72")
     table.add_row("paper: CUDA fused kernel (RTX)", "0.44", "0.47", "0.49")
     console.print(table)
@@ -308,7 +308,7 @@ def measure(
     device: Device,
     problems: dict[int, LevelProblem],
     swarm: Poses,
-    rows: dict[str, list[float]],
+    rows: dict[str, list[float | None]],
     notes: list[str],
     schedules: list[tuple[str, ...]],
 ) -> None:

@@ -168,7 +168,7 @@ class HealthMonitor:
         }
         temporary = self._file.with_suffix(".tmp")
         try:
-            temporary.write_text(json.dumps(_without_nan(report), indent=1, default=str))
+            temporary.write_text(json.dumps(_finite(report), indent=1, default=str))
             temporary.replace(self._file)
         except OSError as error:  # a full disk must not end the reports to the vehicle
             if not self._write_failed:
@@ -229,10 +229,10 @@ def _is_lost(estimate: PoseEstimate) -> bool:
     return estimate.state is TrackingState.LOST
 
 
-def _without_nan(value: Any) -> Any:
-    """Numbers that are not known as null: JSON has no NaN, and strict readers refuse it."""
+def _finite(value: Any) -> Any:
+    """What is no finite number as null: JSON has none, and strict readers refuse it."""
     if isinstance(value, dict):
-        return {k: _without_nan(v) for k, v in value.items()}
+        return {k: _finite(v) for k, v in value.items()}
     if isinstance(value, float) and not math.isfinite(value):
         return None
     return value

@@ -300,7 +300,7 @@ def worst_first(frames: list[EvaluatedFrame]) -> list[int]:
 
 
 def csv_rows(frames: list[EvaluatedFrame], frame: LocalFrame) -> Iterator[dict[str, str]]:
-    """One dictionary per frame for a CSV file; what an unusable image has no value for is ""."""
+    """One dictionary per frame for a CSV file; a cell whose value is not known is ""."""
     for f in frames:
         row = dict.fromkeys(CSV_COLUMNS, "") | {"name": f.name, "problem": f.problem}
         if f.estimate is not None:
@@ -320,4 +320,4 @@ def csv_rows(frames: list[EvaluatedFrame], frame: LocalFrame) -> Iterator[dict[s
 
 
 def _error_text(error: float | None) -> str:
-    return "nan" if error is None else f"{error:.4f}"  # so that a column reads as numbers
+    return "" if error is None else f"{error:.4f}"

@@ -44,7 +44,7 @@ class FixWarnings:
 
     def _latency(self, profile: FirmwareProfile) -> str:
         latency, delay = self._injector.latency_ms, self._config.delay_ms
-        if not self._injector.latency_is_known:
+        if latency is None or not self._injector.latency_is_known:
             return ""
         name = profile.delay_parameter
         if self._config.message == "gps_input":

@@ -29,7 +29,6 @@ from mavlink_bridge.injection.yaw_guard import YawGuard
 from mavlink_bridge.link.clock import SteadyUtc
 from mavlink_bridge.messages import VisionFix
 
-NAN = math.nan
 NO_FIX_YET = "no fix yet"
 NO_FRESH_FIX = "no fresh fix"
 _QUEUE = 32
@@ -60,7 +59,8 @@ class Injector:
         self._last_was_fill = False
         self._intervals_ns: deque[int] = deque(maxlen=_INTERVALS)
         self._taken_ns = self._sent_fix_ns = 0
-        self.yaw_difference_rad = NAN
+        self.yaw_difference_rad: float | None = None
+        """The last fix's yaw minus the autopilot's; None while none could be compared."""
         self.reason = NO_FIX_YET
         self.counters: Counter[str] = Counter()
 
@@ -75,9 +75,14 @@ class Injector:
         return len(self._waiting)
 
     @property
-    def latency_ms(self) -> float:
-        """Median age of the last 50 fixes when they came; NaN before the first."""
-        return statistics.median(self._latencies_ms) if self._latencies_ms else NAN
+    def refused_yaw_rad(self) -> float | None:
+        """The yaw difference for which the guard blocks injection; None while it does not."""
+        return self.yaw_difference_rad if self.guard.blocked else None
+
+    @property
+    def latency_ms(self) -> float | None:
+        """Median age of the last 50 fixes when they came; None before the first."""
+        return statistics.median(self._latencies_ms) if self._latencies_ms else None
 
     @property
     def latency_is_known(self) -> bool:
@@ -191,9 +196,9 @@ class Injector:
         if self._propagator.fix is None and not self.guard.blocked:
             return None
         fill_due = now_ns >= self._fill_due_ns()
-        if self.guard.blocked:
+        if (refused := self.refused_yaw_rad) is not None:
             self._fresh = None
-            degrees = math.degrees(self.yaw_difference_rad)
+            degrees = math.degrees(refused)
             reason = f"vision yaw differs from the autopilot's by {degrees:+.1f} deg"
             return Withheld(reason, "withheld_yaw") if fill_due else None
         if self._fresh is not None and now_ns >= self._earliest_ns():

@@ -35,24 +35,24 @@ _CONSISTENCY_LIMIT = 9.0 * 1.39
 class ShadowScore:
     """How vision compared with GNSS over the last two minutes; errors are horizontal.
 
-    bias_ne_m: mean north and east difference. height_m: median difference of the heights.
-    consistency: median squared Mahalanobis distance (1.4 is ideal). reasons: why it is a no-go;
-    empty if it is a go.
+    Without samples nothing of that is known: None. bias_ne_m: mean north and east difference.
+    height_m: median difference of the heights. consistency: median squared Mahalanobis distance
+    (1.4 is ideal). reasons: why it is a no-go; empty if it is a go.
     """
 
     go: bool
     samples: int
-    median_m: float
-    p95_m: float
-    bias_ne_m: tuple[float, float]
-    height_m: float
-    consistency: float
-    rate_hz: float
     reasons: tuple[str, ...]
+    median_m: float | None = None
+    p95_m: float | None = None
+    bias_ne_m: tuple[float, float] | None = None
+    height_m: float | None = None
+    consistency: float | None = None
+    rate_hz: float | None = None
 
     def line(self) -> str:
         """One line for the operator."""
-        if not self.samples:
+        if self.median_m is None or self.p95_m is None:
             return f"{'go' if self.go else 'no-go'}: {'; '.join(self.reasons)}"
         figures = f"median {self.median_m:.1f} m, p95 {self.p95_m:.1f} m, n {self.samples}"
         return f"go: {figures}" if self.go else f"no-go: {'; '.join(self.reasons)} ({figures})"
@@ -84,14 +84,12 @@ class ShadowScorer:
         with self._lock:
             self._samples.append((fix.time_ns, north, east, distance, up))
 
-    def score(self, now_ns: int, yaw_difference_rad: float, yaw_blocked: bool) -> ShadowScore:
-        """The verdict on the last two minutes."""
+    def score(self, now_ns: int, refused_yaw_rad: float | None) -> ShadowScore:
+        """The verdict on the last two minutes. refused_yaw_rad: `Injector.refused_yaw_rad`."""
         with self._lock:
             samples = np.array([s for s in self._samples if now_ns - s[0] < _WINDOW_NS])
         if not len(samples):
-            reason = "no fix could be compared with GNSS"
-            nan = math.nan
-            return ShadowScore(False, 0, nan, nan, (nan, nan), nan, nan, 0.0, (reason,))
+            return ShadowScore(False, 0, ("no fix could be compared with GNSS",))
         errors = np.hypot(samples[:, 1], samples[:, 2])
         median, p95 = float(np.median(errors)), float(np.percentile(errors, 95))
         consistency = float(np.median(samples[:, 3]))
@@ -111,9 +109,9 @@ class ShadowScorer:
         height = float(np.median(samples[:, 4]))
         if abs(height) > _HEIGHT_LIMIT_M:
             reasons.append(f"height differs by {height:+.0f} m; check geoid, datum, barometer")
-        if yaw_blocked:
-            reasons.append(f"yaw differs by {math.degrees(yaw_difference_rad):+.1f} deg")
+        if refused_yaw_rad is not None:
+            reasons.append(f"yaw differs by {math.degrees(refused_yaw_rad):+.1f} deg")
         bias = (float(samples[:, 1].mean()), float(samples[:, 2].mean()))
         return ShadowScore(
-            not reasons, len(samples), median, p95, bias, height, consistency, rate, tuple(reasons)
+            not reasons, len(samples), tuple(reasons), median, p95, bias, height, consistency, rate
         )

@@ -10,7 +10,7 @@ from mavlink_bridge.bridge import Bridge
 from mavlink_bridge.config import BridgeConfig
 from mavlink_bridge.link.clock import SteadyUtc, monotonic_ns
 from mavlink_bridge.link.link import sleep_until
-from mavlink_bridge.messages import GimbalAttitude, VehicleState
+from mavlink_bridge.messages import Figures, GimbalAttitude, VehicleState
 from mavlink_bridge.preflight.parameters import ParameterClient
 from mavlink_bridge.preflight.rules import (
     Read,
@@ -21,8 +21,6 @@ from mavlink_bridge.preflight.rules import (
     px4_rules,
 )
 from mavlink_bridge.vehicle.profile import select_profile
-
-Counters = dict[str, int | float | str]
 
 _CONNECT_S = 15.0
 _MEASURE_S = 4.0
@@ -103,14 +101,14 @@ class _Measurement:
     """What came over the link in so many seconds, and the vehicle at their end."""
 
     state: VehicleState
-    before: Counters
-    after: Counters
+    before: Figures
+    after: Figures
     seconds: float
     gimbal: GimbalAttitude | None
 
     def grown(self, key: str) -> float:
         """By how much a counter grew."""
-        return float(self.after.get(key, 0)) - float(self.before.get(key, 0))
+        return float(self.after.get(key) or 0) - float(self.before.get(key) or 0)
 
 
 def check_link(config: BridgeConfig) -> tuple[list[Finding], VehicleState]:
@@ -125,7 +123,7 @@ def check_link(config: BridgeConfig) -> tuple[list[Finding], VehicleState]:
     return findings, measured.state
 
 
-def _no_connection(config: BridgeConfig, counters: Counters) -> Finding:
+def _no_connection(config: BridgeConfig, counters: Figures) -> Finding:
     found, why = "silence", "wiring, port, SERIALn_PROTOCOL=2, signing key"
     if counters["fc_open_failures"] and not counters["fc_opened"]:
         found = "cannot be opened"
@@ -198,7 +196,7 @@ def _vehicle_findings(config: BridgeConfig, measured: _Measurement) -> list[Find
 def _stream_findings(config: BridgeConfig, measured: _Measurement) -> list[Finding]:
     """Whether what localization needs comes often enough, in time and whole."""
     source = measured.state.clock_source
-    round_trip = float(measured.after["clock_round_trip_ms"])
+    round_trip = float(measured.after["clock_round_trip_ms"] or 0)
     attitude = measured.grown("rx_ATTITUDE") / measured.seconds
     wanted = config.attitude_rate_hz * _RATE_SHARE
     received = measured.grown("fc_messages") + measured.grown("fc_skipped_messages")

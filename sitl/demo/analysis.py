@@ -98,18 +98,18 @@ def localization_summary(errors: FrameErrors) -> LocalizationMetrics:
 
 @dataclass(frozen=True)
 class Spread:
-    """Median, 95th percentile and maximum of an error."""
+    """Median, 95th percentile and maximum of an error; None where nothing was measured."""
 
-    median: float
-    p95: float
-    maximum: float
+    median: float | None
+    p95: float | None
+    maximum: float | None
 
     @classmethod
     def of(cls, values: Array) -> Spread:
-        """Of the finite values; NaN when there is none."""
+        """Of the finite values."""
         finite = np.asarray(values)[np.isfinite(values)]
         if not len(finite):
-            return cls(float("nan"), float("nan"), float("nan"))
+            return cls(None, None, None)
         return cls(*(float(x) for x in (*np.percentile(finite, [50, 95]), finite.max())))
 
 

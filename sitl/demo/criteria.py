@@ -22,7 +22,7 @@ class Criterion:
 
     @property
     def ok(self) -> bool:
-        """Whether it holds; a value that is not known (None, NaN) does not."""
+        """Whether it holds; a value that is not known does not."""
         if self.value is None:
             return False
         if self.at_least:
@@ -50,10 +50,11 @@ def latency_warning(latency_ms: Spread, delay_ms: float) -> str | None:
     a fix is sent and which VISO_DELAY_MS tells the EKF.
     """
     limit = min(delay_ms, _MAX_LATENCY_MS)
-    if not latency_ms.p95 > limit:
+    p95 = latency_ms.p95
+    if p95 is None or p95 <= limit:
         return None
     return (
-        f"exposure to estimate takes {latency_ms.p95:.0f} ms at p95, above {limit:.0f} ms "
+        f"exposure to estimate takes {p95:.0f} ms at p95, above {limit:.0f} ms "
         f"(bridge.injection.delay_ms {delay_ms:.0f}, ArduPilot's limit {_MAX_LATENCY_MS:.0f}): "
         "later fixes are older than the EKF was told, and beyond its limit only extrapolated ones "
         "are sent; give the companion more processor, lower localizer.width or raise the delay"

@@ -179,7 +179,11 @@ def _write_frames(path: Path, errors: FrameErrors) -> None:
         )  # fmt: skip
         values = (errors.translation_m, errors.horizontal_m, errors.rotation_deg)
         for time_ns, processed, *row in zip(errors.time_ns, errors.processed, *values, strict=True):
-            writer.writerow((int(time_ns), int(processed), *(f"{x:.4f}" for x in row)))
+            writer.writerow((int(time_ns), int(processed), *(_cell(x) for x in row)))
+
+
+def _cell(value: float) -> str:
+    return f"{value:.4f}" if np.isfinite(value) else ""
 
 
 def _plot(
@@ -305,7 +309,7 @@ def print_report(report: FlightReport, folder: Path) -> None:
     stages.add_column("p50", justify="right")
     stages.add_column("p95", justify="right")
     for name, spread in report.stages_ms.items():
-        stages.add_row(name, f"{spread.median:.0f}", f"{spread.p95:.0f}")
+        stages.add_row(name, _figure(spread.median, 0), _figure(spread.p95, 0))
     for name, (p50, p95) in report.camera_ms.items():
         stages.add_row(f"world camera: {name}", f"{p50:.0f}", f"{p95:.0f}")
     console.print(stages)
@@ -330,4 +334,8 @@ def _verdict(report: FlightReport) -> Table:
 
 def _add(table: Table, name: str, spread: Spread, note: str) -> None:
     figures = (spread.median, spread.p95, spread.maximum)
-    table.add_row(name, *("none" if np.isnan(x) else f"{x:.2f}" for x in figures), note)
+    table.add_row(name, *(_figure(x, 2) for x in figures), note)
+
+
+def _figure(value: float | None, digits: int) -> str:
+    return "none" if value is None else f"{value:.{digits}f}"

@@ -220,8 +220,8 @@ class _CaseFlight:
                 east,
                 pilot.record.mode or "",
                 pilot.record.armed,
-                int(counters.get("bridge_injected", 0)),
-                int(counters.get("ekf_source_set", 0)),
+                int(counters.get("bridge_injected") or 0),
+                int(counters.get("ekf_source_set") or 0),
                 pilot.record.time_s,
             )
         )

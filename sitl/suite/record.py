@@ -11,6 +11,8 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
+from mavlink_bridge.messages import Figures
+
 Array = NDArray[np.float64]
 
 
@@ -67,7 +69,7 @@ class Record:
     events: list[tuple[float, str]] = field(default_factory=list)
     refusals: list[str] | None = None
     doctor: Doctor | None = None
-    counters: dict[str, float | int | str] = field(default_factory=dict)
+    counters: Figures = field(default_factory=dict)
     closed: bool = False
     pace: float = 1.0
     stall_s: float = 0.0

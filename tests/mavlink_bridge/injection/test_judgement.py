@@ -63,7 +63,7 @@ def scored(error_m: float, *, sigma: float = 0.5, hz: float = 10.0, seconds: flo
     for i in range(int(hz * seconds)):
         north = error_m + rng.normal(0.0, 0.2)
         scorer.compare(position(int(i * SECOND / hz), north, sigma), (*HOME, 500.0))
-    return scorer.score(int(seconds * SECOND), 0.0, False)
+    return scorer.score(int(seconds * SECOND), None)
 
 
 def test_good_vision_is_a_go() -> None:
@@ -101,15 +101,16 @@ def test_a_wrong_geoid_is_seen_in_the_heights(altitude: float, go: bool) -> None
     scorer = ShadowScorer(100.0)
     for i in range(100):
         scorer.compare(position(i * 100 * MS), (*HOME, altitude))
-    score = scorer.score(10 * SECOND, 0.0, False)
+    score = scorer.score(10 * SECOND, None)
     assert score.height_m == pytest.approx(500.0 - altitude)
     assert score.go is go
     assert any("check geoid" in reason for reason in score.reasons) is not go
 
 
 def test_nothing_compared_is_a_no_go() -> None:
-    score = ShadowScorer(100.0).score(SECOND, 0.0, False)
+    score = ShadowScorer(100.0).score(SECOND, None)
     assert not score.go
+    assert score.median_m is score.height_m is score.rate_hz is None
     assert "no fix could be compared" in score.line()
 
 
@@ -117,9 +118,7 @@ def test_blocked_yaw_is_a_no_go() -> None:
     scorer = ShadowScorer(100.0)
     for i in range(100):
         scorer.compare(position(i * 100 * MS), (*HOME, 500.0))
-    assert scorer.score(10 * SECOND, math.radians(5.0), True).reasons == (
-        "yaw differs by +5.0 deg",
-    )
+    assert scorer.score(10 * SECOND, math.radians(5.0)).reasons == ("yaw differs by +5.0 deg",)
 
 
 # --- closed loop --------------------------------------------------------------------------------

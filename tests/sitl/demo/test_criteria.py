@@ -23,7 +23,7 @@ def _missed(localizer=None, ekf=1.0, fixed=1.0):
         ({"localizer": {"fps": 7.9}}, ["localized frames"]),
         ({"ekf": 3.01}, ["EKF horizontal p95"]),
         ({"fixed": 3.01}, ["fixed targets p95"]),
-        ({"fixed": float("nan")}, ["fixed targets p95"]),
+        ({"fixed": None}, ["fixed targets p95"]),
     ],
 )
 def test_each_target_is_missed_for_its_own_reason(changes, missed):
