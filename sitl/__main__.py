@@ -41,7 +41,8 @@ from sitl.vehicles.process import VehicleKind
 # What a flight and its report leave in their folder.
 _REPORT_FILES = (
     "companion", "companion.log", "companion.yaml", "errors.png", "frames.csv",
-    "frames_report.csv", "overlay-*", "report.json", "tracks.png", "truth.tum",
+    "frames_report.csv", "latest", "overlay-*", "report.html", "report.json", "tracks.png",
+    "truth.tum",
     "vehicle.csv", "vehicle.log",
 )  # fmt: skip
 

@@ -12,6 +12,7 @@ from rich.markup import escape
 from rich.table import Table
 from rich.text import Text
 
+from companion.cli.steps import shown_steps
 from companion.config import load_config
 from mavlink_bridge.preflight.doctor import Diagnosis, Finding
 
@@ -25,20 +26,22 @@ def doctor_command(
     vehicle: Annotated[bool, typer.Option(help="examine the flight controller too")] = True,
 ) -> None:
     """Check a deployment; exit code 0 good, 1 advice, 2 not fit to fly."""
-    from companion.preflight.doctor import examine_deployment
-    from mavlink_bridge.preflight.doctor import repair
-
     settings = load_config(config)
     console = Console()
-    with console.status("examining"):
-        diagnosis = examine_deployment(settings, vehicle=vehicle)
+    with shown_steps(console) as say:
+        say(f"examining {config}")  # the imports take seconds, too
+        from companion.preflight.doctor import examine_deployment
+        from mavlink_bridge.preflight.doctor import repair
+
+        diagnosis = examine_deployment(settings, vehicle=vehicle, say=say)
     print_diagnosis(console, diagnosis)
     if fix and diagnosis.fixable:
         names = ", ".join(f"{f.name} = {f.fix:.7g}" for f in diagnosis.fixable if f.fix is not None)
         if yes or typer.confirm(f"Write {names}?"):
             reboot = repair(settings.bridge, diagnosis.fixable)
             console.print("written" + ("; reboot the flight controller" if reboot else ""))
-            diagnosis = examine_deployment(settings, vehicle=vehicle)
+            with shown_steps(console) as say:
+                diagnosis = examine_deployment(settings, vehicle=vehicle, say=say)
             print_diagnosis(console, diagnosis)
     raise typer.Exit(diagnosis.exit_code)
 

@@ -17,6 +17,7 @@ from companion.config import CompanionConfig
 from companion.flight.feed import Feed
 from companion.flight.health import HealthMonitor
 from companion.flight.parts import Assembly, Part
+from companion.flight.recorder import RecordKeeper
 from companion.flight.table import PARTS
 from companion.redaction import redacted
 from localizer.tracking.opening import MapStack
@@ -86,6 +87,9 @@ class Companion:
         events = self._parts.channels.events
         events.send("info", f"map {self._config.map}, feed {redacted(self._config.camera.source)}")
         events.send("info", f"renderer {self._parts[MapStack].renderer.name}")
+        keeper = self._parts.get(RecordKeeper)
+        if keeper is not None and keeper.folder is not None:
+            events.send("info", f"record {keeper.folder}")
 
 
 def _log_event(level: str, text: str) -> None:

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import threading
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 from companion.config import CompanionConfig
@@ -23,25 +24,41 @@ from mavlink_bridge.errors import BridgeError
 from mavlink_bridge.preflight.doctor import Diagnosis, Finding, examine
 from mavlink_bridge.preflight.mission import download_mission
 
-_FEED_S = 8.0
+_FEED_S = 8.0  # without any picture
+_FEED_ENOUGH_S = 3.0  # of pictures: their rate is known
 _MIN_RATE_HZ = 5.0
 _GOVERNOR = Path("/sys/devices/system/cpu/cpu0/cpufreq/scaling_governor")
 
 
-def examine_deployment(config: CompanionConfig, *, vehicle: bool = True) -> Diagnosis:
-    """Every check; `vehicle` false leaves out what needs the flight controller."""
+def examine_deployment(
+    config: CompanionConfig, *, vehicle: bool = True, say: Callable[[str], None] = lambda _: None
+) -> Diagnosis:
+    """Every check; `vehicle` false leaves out what needs the flight controller.
+
+    The feed is read while the vehicle is listened to: both are waiting. The localizer comes before,
+    alone: its compilers hold the interpreter, and the link's round trip would be theirs. say: takes
+    what is being done now.
+    """
+    say("reading the map")
     cache, findings = _check_map(config)
-    findings += [_check_localizer(config, cache is not None), _check_camera(config), _check_power()]
+    say("making the localizer; the first time on a machine compiles its kernels")
+    findings.append(_check_localizer(config, cache is not None))
+    listening = f" and listening to the vehicle at {config.bridge.connection}" if vehicle else ""
+    say(f"reading the feed {redacted(config.camera.source)}{listening}")
+    with ThreadPoolExecutor(1) as aside:
+        camera = aside.submit(_check_camera, config)
+        diagnosis = examine(config.bridge, say) if vehicle else None
+        findings += [camera.result(), _check_power()]
     findings += check_places(config)
     if cache is not None and config.bridge.origin is not None:
         findings.append(check_origin(config.bridge.origin, cache))
-    if vehicle:
-        diagnosis = examine(config.bridge)
+    if diagnosis is not None:
         found = diagnosis.findings
         findings += found
         if cache is not None and diagnosis.state is not None:
             findings += check_heights(cache, diagnosis.state)
         if cache is not None and found[0].ok:
+            say("reading the mission")
             findings.append(_check_mission(config, cache))
     return Diagnosis(tuple(findings))
 
@@ -98,7 +115,9 @@ def _localizer_name(config: CompanionConfig) -> str:
 
 
 def _check_camera(config: CompanionConfig) -> Finding:
-    """Read the feed for a few seconds: pictures of the calibrated size, often enough."""
+    """Read the feed for a few seconds: pictures of the calibrated size, often enough. A feed that
+    delivers is read for less time than one that must be called silent.
+    """
     feed = config.camera
     settings = SourceSettings.model_validate(feed.settings.model_dump() | {"realtime": True})
     try:
@@ -113,6 +132,8 @@ def _check_camera(config: CompanionConfig) -> Finding:
         for frame in source.frames():
             times.append(frame.exposure_time_ns)
             seen = frame.camera
+            if times[-1] - times[0] > _FEED_ENOUGH_S * 1e9:
+                break
     except (CompanionError, LocalizerError) as error:
         return _failed("camera", "refused", "pictures of the calibrated size", str(error))
     finally:

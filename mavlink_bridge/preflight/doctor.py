@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 
 from mavlink_bridge.bridge import Bridge
@@ -251,12 +251,13 @@ def check_computer_clock(config: BridgeConfig) -> list[Finding]:
     return [Finding("computer clock", str(year), "the present", why, utc.is_set, True)]
 
 
-def examine(config: BridgeConfig) -> Diagnosis:
-    """Connect, measure the link, read the parameters and judge."""
+def examine(config: BridgeConfig, say: Callable[[str], None] = lambda _: None) -> Diagnosis:
+    """Connect, measure the link, read the parameters and judge. say: takes what is done now."""
     findings, state = check_link(config)
     findings += check_computer_clock(config)
     if not findings[0].ok or any(f.name == "vehicles" and not f.ok for f in findings):
         return Diagnosis(tuple(findings), state)
+    say("reading the vehicle's parameters")
     with ParameterClient(config) as client:
         if state.autopilot == "px4":
             rules: Sequence[Rule] = px4_rules(config)

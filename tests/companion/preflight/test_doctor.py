@@ -8,8 +8,10 @@ import pytest
 from rich.console import Console
 
 from companion.cli.doctor import print_diagnosis
-from companion.config import parse_config
+from companion.cli.steps import shown_steps
+from companion.config import CameraModel, parse_config
 from companion.preflight.doctor import examine_deployment
+from localizer.types import Frame
 from mavlink_bridge.preflight.doctor import Diagnosis, Finding
 
 SIZE = (160, 120)
@@ -81,6 +83,46 @@ def test_a_localizer_that_a_flight_could_not_make_is_wrong(
     findings = _findings(map_cache, feed, localizer=localizer)
     assert (findings["localizer"].ok, findings["localizer"].required) == (False, True)
     assert why in findings["localizer"].why
+
+
+def test_a_feed_that_delivers_is_left_after_three_seconds_of_pictures(map_cache, feed, monkeypatch):
+    """A live feed never ends: it was read for eight seconds, however good it was."""
+    taken = []
+
+    class Endless:
+        def frames(self):
+            for i in range(10_000):
+                taken.append(i)
+                image = np.zeros((SIZE[1], SIZE[0], 3), np.uint8)
+                yield Frame(image, i * 50_000_000, CameraModel(**MODEL).camera(), i)
+
+        def close(self):
+            pass
+
+    monkeypatch.setattr("companion.preflight.doctor.open_source", lambda *_: Endless())
+    finding = _findings(map_cache, feed)["camera"]
+    assert (finding.ok, finding.found) == (True, "160x120, 20.0 Hz")
+    assert len(taken) == 62
+
+
+def test_what_is_being_done_is_told_before_it_takes_time(map_cache, feed):
+    said = []
+    camera = {"source": str(feed), "model": MODEL, "settings": {"rate_hz": 20.0}}
+    config = parse_config({"map": str(map_cache), "camera": camera}, "test")
+    examine_deployment(config, vehicle=False, say=said.append)
+    assert [text.split()[0] for text in said] == ["reading", "making", "reading"]
+    assert str(feed) in said[-1]
+
+
+def test_steps_are_lines_with_seconds_where_there_is_no_terminal(capsys):
+    now = iter([10.0, 10.4, 15.0])
+    with shown_steps(Console(force_terminal=False), lambda: next(now)) as say:
+        say("reading [the] map")
+        say("reading the feed")
+    assert capsys.readouterr().out.splitlines() == [
+        "   0 s reading [the] map",
+        "   5 s reading the feed",
+    ]
 
 
 def test_the_table_fits_a_terminal_of_80_columns_and_reasons_come_last(capsys):
