@@ -14,6 +14,7 @@ from rich.console import Console
 from rich.markup import escape
 
 from companion.errors import CompanionError
+from companion.reporting.report import write_page
 from localizer.errors import LocalizerError
 from localizer.synth.appearance.model import CONDITIONS
 from sitl.demo.assets import prepare
@@ -42,8 +43,7 @@ from sitl.vehicles.process import VehicleKind
 _REPORT_FILES = (
     "companion", "companion.log", "companion.yaml", "errors.png", "frames.csv",
     "frames_report.csv", "latest", "overlay-*", "report.html", "report.json", "tracks.png",
-    "truth.tum",
-    "vehicle.csv", "vehicle.log",
+    "truth.tum", "vehicle.csv", "vehicle.log",
 )  # fmt: skip
 
 _LOG_WIDTH = 200
@@ -94,6 +94,7 @@ def demo(
     with shown_progress(console) as progress:
         record = fly(assets, script, kinds[fc], seed, out, progress)
     print_report(make_report(record, script, seed), out)
+    console.print(f"open: [green]{write_page(out).resolve()}", soft_wrap=True)
 
 
 @app.command()

@@ -1,5 +1,5 @@
-"""The command line: ``companion run | eval | localize | convert | replay | map | world | doctor |
-key``.
+"""The command line: ``companion run | eval | localize | convert | replay | report | map | world |
+doctor | key``.
 
 Exit codes: 0 done; 1 `doctor` found advice, `replay` differs, `localize` localized nothing or `map
 verify` found damage; 2 wrong usage, a named error, or `doctor` found the vehicle not fit to fly;
@@ -24,6 +24,7 @@ from companion.cli.key import key_command
 from companion.cli.localize import localize_command
 from companion.cli.map import app as map_app
 from companion.cli.replay import replay_command
+from companion.cli.report import report_command
 from companion.cli.run import run_command
 from companion.cli.world import app as world_app
 from companion.errors import CompanionError
@@ -61,6 +62,7 @@ app.command("eval")(evaluate_command)
 app.command("localize")(localize_command)
 app.command("convert")(convert_command)
 app.command("replay")(replay_command)
+app.command("report")(report_command)
 app.command("doctor")(doctor_command)
 app.command("key")(key_command)
 app.add_typer(map_app, name="map", help="Build and inspect tile caches.")

@@ -19,6 +19,7 @@ from rich.table import Table
 
 from companion.errors import ConfigError, ReportError
 from companion.offline.plots import ErrorSeries, overlay_sheet, plot_errors, save_image
+from companion.reporting.report import write_page
 from companion.trajectory import stamped, write_trajectory
 from companion.versions import versions
 from localizer.config import LocalizerConfig
@@ -127,6 +128,8 @@ def evaluate_command(
             raise ReportError(f"--report {report}: cannot be written: {error}") from error
     finally:
         stack.close()
+    page = write_page(report)
+    Console().print(f"report: [green]{escape(str(page))}[/]", soft_wrap=True, highlight=False)
 
 
 @contextmanager

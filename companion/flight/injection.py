@@ -19,6 +19,11 @@ on the localization thread: it looks up what its own thread found and returns at
 _INJECTED = (TrackingState.TRACKING, TrackingState.BRIDGING)
 
 
+def is_for_injection(estimate: PoseEstimate) -> bool:
+    """Whether a fix is made of the estimate, and judged, at all."""
+    return estimate.accepted and estimate.state in _INJECTED
+
+
 class JumpPolicy:
     """Which fix carries a jump (`VisionFix.reset`), so that the EKF is told and does not fight it.
 
@@ -68,7 +73,7 @@ class FixInjection:
     def add_estimate(self, estimate: PoseEstimate, _: ReferenceBundle) -> None:
         """Inject an estimate, if it may be. Never blocks."""
         self._jump.note(estimate.state)
-        if not estimate.accepted or estimate.state not in _INJECTED:
+        if not is_for_injection(estimate):
             return
         time_ns = estimate.exposure_time_ns
         fix: VisionFix | None = vision_fix(

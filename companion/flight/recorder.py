@@ -38,7 +38,7 @@ ESTIMATE_COLUMNS = (
     "exposure_time_ns", "sequence", "east_m", "north_m", "up_m", "qw", "qx", "qy", "qz",
     "latitude_deg", "longitude_deg", "height_m", "sigma_east_m", "sigma_north_m", "sigma_up_m",
     "sigma_rotation_rad", "quality", "state", "status", "accepted",
-    "reference_ms", "extract_ms", "register_ms", "latency_ms",
+    "reference_ms", "extract_ms", "register_ms", "latency_ms", "hpl_m", "vpl_m",
 )  # fmt: skip
 TARGET_COLUMNS = (
     "exposure_time_ns", "target_id", "east_m", "north_m", "up_m",
@@ -106,7 +106,9 @@ def _unwritable(folder: Path, error: OSError) -> ReportError:
     return kind(f"record.folder {folder}: cannot be written: {error}")
 
 
-def _estimate_row(estimate: PoseEstimate, frame: LocalFrame) -> tuple[Any, ...]:
+def _estimate_row(
+    estimate: PoseEstimate, levels: tuple[float, float] | None, frame: LocalFrame
+) -> tuple[Any, ...]:
     """What stands in `ESTIMATE_COLUMNS` for an estimate."""
     pose = estimate.world_from_camera
     position = frame.position(pose.translation)
@@ -122,6 +124,7 @@ def _estimate_row(estimate: PoseEstimate, frame: LocalFrame) -> tuple[Any, ...]:
         f"{estimate.quality:.4f}", estimate.state.value, estimate.status.name,
         int(estimate.accepted), *(f"{x:.2f}" for x in stages),
         f"{estimate.stage_ms.get('latency', 0.0):.2f}",
+        *(("", "") if levels is None else (f"{x:.3f}" for x in levels)),
     )  # fmt: skip
 
 
@@ -180,9 +183,11 @@ class Recorder:
         self._thread = threading.Thread(target=self._run, name="recorder", daemon=True)
         self._thread.start()
 
-    def estimate(self, estimate: PoseEstimate) -> None:
-        """Record one estimate (accepted or not; the trajectory has the accepted ones)."""
-        self._put("estimates", lambda: _estimate_row(estimate, self._frame))
+    def estimate(self, estimate: PoseEstimate, levels: tuple[float, float] | None = None) -> None:
+        """Record one estimate (accepted or not; the trajectory has the accepted ones). levels: its
+        protection levels, horizontal and vertical, m; None where none was computed.
+        """
+        self._put("estimates", lambda: _estimate_row(estimate, levels, self._frame))
         if estimate.accepted:
             self._put("trajectory", lambda: (estimate,))
 

@@ -17,7 +17,7 @@ from companion.errors import ConfigError
 from companion.flight.conversions import Installation, target_report
 from companion.flight.feed import Feed
 from companion.flight.health import HealthMonitor
-from companion.flight.injection import FixInjection
+from companion.flight.injection import FixInjection, is_for_injection
 from companion.flight.parts import Making, Part
 from companion.flight.priors import AutopilotPose, PriorSources
 from companion.flight.recorder import RecordKeeper, remove_empty
@@ -37,6 +37,7 @@ from localizer.map.cache.surface import MapSurface
 from localizer.tracking.engine import DualThreadEngine
 from localizer.tracking.opening import MapStack, build_localizer
 from localizer.tracking.pipeline import Localizer
+from localizer.types import PoseEstimate, ReferenceBundle
 from mavlink_bridge.bridge import Bridge
 from mavlink_bridge.config import BridgeConfig
 
@@ -88,7 +89,12 @@ def _record(making: Making) -> RecordKeeper:
     recorder = keeper.recorder
     if recorder is not None:
         channels.frames.subscribe(recorder.snapshot)
-        channels.estimates.subscribe(lambda estimate, _: recorder.estimate(estimate))
+        guardian = making.get(Guardian)
+
+        def record(estimate: PoseEstimate, _: ReferenceBundle) -> None:
+            recorder.estimate(estimate, _levels(guardian, estimate))
+
+        channels.estimates.subscribe(record)
         channels.targets.subscribe(lambda target: recorder.target(target.fix, target.velocity))
         channels.events.subscribe(recorder.event)
         # What the operator was told belongs in the record; the bridge has logged it.
@@ -238,7 +244,8 @@ PARTS: tuple[Part[Any], ...] = (
         start=Guardian.start, stop=Guardian.stop, wanted=lambda config: config.guardian.enabled,
     ),
     Part(
-        "record", RecordKeeper, _record, depends=(MapStack, Bridge), start=RecordKeeper.link,
+        "record", RecordKeeper, _record, depends=(MapStack, Bridge, Guardian),
+        start=RecordKeeper.link,
         close=RecordKeeper.close,
     ),
     Part("source", FrameSource, _source, depends=(Bridge,)),
@@ -279,6 +286,16 @@ PARTS: tuple[Part[Any], ...] = (
         "feed", Feed, _feed, depends=(FrameSource,), start=Feed.start, stop=Feed.stop
     ),
 )  # fmt: skip
+
+
+def _levels(guardian: Guardian | None, estimate: PoseEstimate) -> tuple[float, float] | None:
+    """The estimate's protection levels: injection, which is served before, had the guardian judge
+    it in this same call. What is not for injection was not judged.
+    """
+    level = None if guardian is None else guardian.level
+    if level is None or not is_for_injection(estimate):
+        return None
+    return level.horizontal_m, level.vertical_m
 
 
 def _level(severity: int) -> str:

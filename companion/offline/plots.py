@@ -62,8 +62,10 @@ def plot_tracks(
     tracks: Mapping[str, Array],
     background: MapPicture | None,
     marks: Mapping[str, Array],
+    located: Mapping[str, Array] | None = None,
 ) -> None:
-    """Tracks (N, 2+) in ENU metres and named marks (2+,) over the map.
+    """Tracks (N, 2+) in ENU metres and named marks (2+,) over the map; located: every fix (M, 2+)
+    of each target.
 
     Each is thinner than the one before: tracks that coincide are seen, one inside the other.
     """
@@ -75,6 +77,8 @@ def plot_tracks(
     for i, (name, track) in enumerate(tracks.items()):
         width, colour = TRACK_STYLES[min(i, len(TRACK_STYLES) - 1)]
         axes.plot(track[:, 0], track[:, 1], color=colour, linewidth=width, label=name)
+    for name, track in (located or {}).items():
+        axes.plot(track[:, 0], track[:, 1], "o", markersize=5, mfc="none", label=name)
     for name, mark in marks.items():
         axes.plot(mark[0], mark[1], "k+", markersize=9)
         axes.annotate(name, (mark[0], mark[1]), textcoords="offset points", xytext=(5, 5))
@@ -82,7 +86,7 @@ def plot_tracks(
     low, high = points.min(axis=0) - 80, points.max(axis=0) + 80
     axes.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]), xlabel="east, m", ylabel="north, m")
     axes.set_aspect("equal")
-    axes.legend(loc="upper right")
+    axes.legend(loc="upper right", facecolor="0.7", framealpha=1.0)  # a white line is seen on grey
     figure.savefig(path, dpi=110)
 
 
@@ -122,7 +126,13 @@ def plot_errors(
         for begin, end, name in shaded:
             axes.axvspan(begin, end, color="tab:gray", alpha=0.15, label=name)
         axes.set(xlabel=abscissa, ylabel=panel)
-        axes.set_ylim(0, _limit([s for s in series if s.panel == panel], shaded))
+        shown = [s for s in series if s.panel == panel]
+        limit = _limit(shown, shaded)
+        axes.set_ylim(0, limit)
+        beyond = max(float(s.error[np.isfinite(s.error)].max(initial=0.0)) for s in shown)
+        if limit is not None and beyond > limit:  # cut off, and not in silence
+            text = f"outside the shaded span up to {beyond:.3g}"
+            axes.text(0.01, 0.93, text, transform=axes.transAxes, fontsize="small", va="top")
         axes.grid(alpha=0.3)
         axes.legend(loc="upper right", fontsize="small")
     figure.savefig(path, dpi=110)

@@ -2,37 +2,14 @@
 
 from __future__ import annotations
 
-import csv
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
-from pathlib import Path
 
 import numpy as np
 
+from companion.offline.tables import Columns, poses
 from localizer.evaluation.metrics import LocalizationMetrics, localization_metrics
-from localizer.geometry.pose import Array, Pose, matrix_from_quaternion
-
-Columns = Mapping[str, Array]
-
-
-def read_csv(path: Path, text: Sequence[str] = ()) -> dict[str, np.ndarray]:
-    """Columns of a CSV file as float64 arrays, NaN where a field is empty.
-
-    Those named in `text` are strings, those that end in ``_ns`` int64 (a float64 would round them).
-    """
-    with path.open(newline="", encoding="utf-8") as file:
-        rows = list(csv.DictReader(file))
-        names = rows[0].keys() if rows else []
-    columns: dict[str, np.ndarray] = {}
-    for name in names:
-        values = [row[name] for row in rows]
-        if name in text:
-            columns[name] = np.array(values)
-        elif name.endswith("_ns"):
-            columns[name] = np.array([int(v) for v in values], dtype=np.int64)
-        else:
-            columns[name] = np.array([float(v) if v else np.nan for v in values])
-    return columns
+from localizer.geometry.pose import Array
 
 
 @dataclass(frozen=True)
@@ -48,13 +25,6 @@ class FrameErrors:
     horizontal_m: Array
     rotation_deg: Array
     processed: np.ndarray
-
-
-def poses(columns: Columns) -> list[Pose]:
-    """Rows with east_m, north_m, up_m and qw..qz as poses world_from_camera."""
-    t = np.column_stack([columns[k] for k in ("east_m", "north_m", "up_m")])
-    q = np.column_stack([columns[k] for k in ("qw", "qx", "qy", "qz")])
-    return [Pose(matrix_from_quaternion(qi), ti) for qi, ti in zip(q, t, strict=True)]
 
 
 def frame_errors(

@@ -22,6 +22,8 @@ from companion.offline.plots import (
     plot_tracks,
     save_image,
 )
+from companion.offline.tables import Columns, poses, read_columns
+from companion.reporting.verdicts import advice
 from companion.versions import versions
 from localizer.evaluation.metrics import LocalizationMetrics
 from localizer.features.extractor import load_extractor
@@ -34,14 +36,11 @@ from localizer.tracking.pipeline import Undistorter
 from localizer.types import Frame
 from sitl.camera.detector import FixedPoint
 from sitl.demo.analysis import (
-    Columns,
     FrameErrors,
     Spread,
     ekf_errors,
     frame_errors,
     localization_summary,
-    poses,
-    read_csv,
     stage_latencies,
     target_errors,
 )
@@ -89,19 +88,17 @@ class FlightReport:
 def make_report(record: FlightRecord, scenario: Scenario, seed: int) -> FlightReport:
     """Measure the records and write report.json, frames, plots and overlays into their folder."""
     folder, span = record.folder, record.denied_ns
-    truth = read_csv(folder / "frames.csv")
-    estimates = read_csv(folder / "companion" / "estimates.csv", text=("state", "status"))
-    targets = read_csv(folder / "companion" / "targets.csv", text=("target_id",))
-    vehicle = read_csv(folder / "vehicle.csv")
+    truth = read_columns(folder / "frames.csv")
+    estimates = read_columns(folder / "companion" / "estimates.csv", text=("state", "status"))
+    targets = read_columns(folder / "companion" / "targets.csv", text=("target_id",))
+    vehicle = read_columns(folder / "vehicle.csv")
     errors = frame_errors(truth, estimates, span)
     ekf_times, horizontal, vertical = ekf_errors(vehicle, span)
     by_target = _target_errors(record, targets)
     still = {t.name for t in record.targets if isinstance(t, FixedPoint)}
     fixed = [e for name, e in by_target.items() if name in still]
     moving = {name: e for name, e in by_target.items() if name not in still}
-    # Every car that was seen is in `moving_targets_m`; one line of the table is the longest seen.
-    longest = max(moving, key=lambda name: len(moving[name]), default="")
-    by_target = {n: e for n, e in by_target.items() if n not in moving or n == longest}
+    by_target = {n: e for n, e in by_target.items() if n in still or len(e)}
     accepted = np.isfinite(errors.translation_m)
     config = load_config(folder / "companion.yaml")
     summary = localization_summary(errors)
@@ -132,7 +129,7 @@ def make_report(record: FlightRecord, scenario: Scenario, seed: int) -> FlightRe
     )
     _write_json(folder, report, record, scenario, seed, config)
     _write_frames(folder / "frames_report.csv", errors)
-    _plot(folder, record, truth, estimates, vehicle, errors, (ekf_times, horizontal), config)
+    _plot(folder, record, truth, (estimates, targets), vehicle, (ekf_times, horizontal), config)
     return report
 
 
@@ -190,12 +187,13 @@ def _plot(
     folder: Path,
     record: FlightRecord,
     truth: Columns,
-    estimates: Columns,
+    recorded: tuple[Columns, Columns],
     vehicle: Columns,
-    errors: FrameErrors,
     ekf: tuple[Array, Array],
     config: CompanionConfig,
 ) -> None:
+    """recorded: the companion's estimates and targets."""
+    estimates, targets = recorded
     start = record.denied_ns[0]
     all_errors = frame_errors(truth, estimates, (0, 2**62))
     exposed_s = _seconds(all_errors.time_ns, start)
@@ -224,8 +222,8 @@ def _plot(
         denied = min(int(np.searchsorted(vehicle["time_ns"], start)), len(tracks["truth"]) - 1)
         marks["GNSS off"] = tracks["truth"][denied]
         picture = _map_picture(renderer, tracks.values())
-        plot_tracks(folder / "tracks.png", tracks, picture, marks)
-        _overlays(folder, estimates, renderer, config, start)
+        plot_tracks(folder / "tracks.png", tracks, picture, marks, _located(targets))
+        _overlays(folder, (estimates, all_errors), renderer, config, start)
     finally:
         streamer.close()
 
@@ -249,30 +247,45 @@ def _map_picture(renderer: NumbaRenderer, tracks: Iterable[Array]) -> MapPicture
     return MapPicture(view.rgb, -size, size, -size, size)
 
 
+def _located(targets: Columns) -> dict[str, Array]:
+    """Every fix of each target."""
+    if not len(targets):
+        return {}
+    names = np.asarray(targets["target_id"])
+    places = _track(targets, "")
+    return {f"{name}, located": places[names == name] for name in dict.fromkeys(map(str, names))}
+
+
 def _overlays(
-    folder: Path, estimates: Columns, renderer: NumbaRenderer, config: CompanionConfig, start: int
+    folder: Path,
+    measured: tuple[Columns, FrameErrors],
+    renderer: NumbaRenderer,
+    config: CompanionConfig,
+    start: int,
 ) -> None:
-    """Recorded video frames against the map rendered at their estimated poses; times from start."""
+    """The recorded video frames with the largest errors against the map rendered at their estimated
+    poses; times from start.
+    """
+    estimates, errors = measured
     stamps = np.asarray(estimates["exposure_time_ns"])
     accepted = np.asarray(estimates["accepted"]) > 0
     estimated = poses(estimates)
     camera = config.camera.model.camera()
     target = camera.without_distortion()
     undistort = Undistorter(camera, target)
-    snapshots = sorted((folder / "companion" / "snapshots").glob("*.jpg"))
     usable = []
-    for path in snapshots:
+    for path in sorted((folder / "companion" / "snapshots").glob("*.jpg")):
         k = int(np.argmin(np.abs(stamps - int(path.stem))))
+        i = int(np.argmin(np.abs(errors.time_ns - int(path.stem))))
+        error_m = float(errors.translation_m[i])
         if accepted[k] and abs(int(stamps[k]) - int(path.stem)) < 2_000_000:
-            usable.append((path, k))
-    chosen = np.unique(np.linspace(0, max(len(usable) - 1, 0), _OVERLAYS).astype(int))
-    for number, i in enumerate(chosen if usable else []):
-        path, k = usable[i]
+            usable.append((path, k, error_m if np.isfinite(error_m) else 0.0))
+    usable.sort(key=lambda item: -item[2])
+    for number, (path, k, error_m) in enumerate(usable[:_OVERLAYS]):
         image = cv2.cvtColor(cv2.imread(str(path)), cv2.COLOR_BGR2RGB).astype(np.uint8)
         video = undistort(Frame(image, int(path.stem), camera, 0))
         view = renderer.render(estimated[k], target, wait=True)
-        time_s = (int(path.stem) - start) * 1e-9
-        caption = f"t = {time_s:.1f} s"
+        caption = f"t = {(int(path.stem) - start) * 1e-9:.1f} s, {error_m:.2f} m off"
         save_image(folder / f"overlay-{number}.png", overlay_sheet(video, view.rgb, caption))
 
 
@@ -314,6 +327,10 @@ def print_report(report: FlightReport, folder: Path) -> None:
         stages.add_row(f"world camera: {name}", f"{p50:.0f}", f"{p95:.0f}")
     console.print(stages)
     console.print(_verdict(report))
+    for criterion in (c for c in report.criteria if not c.ok):
+        known = advice(criterion.name)
+        console.print(f"[red]{criterion.name}[/]: {known.meaning}. Look at: {known.look}.",
+                      highlight=False)  # fmt: skip
     if report.warning is not None:
         console.print(f"[yellow]warning:[/] {report.warning}", highlight=False)
     console.print(f"report: [green]{folder}[/]/report.json, tracks.png, errors.png, overlay-*.png")

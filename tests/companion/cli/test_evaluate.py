@@ -48,6 +48,7 @@ def test_report_has_the_papers_columns(recorded, tmp_path, prior):
     assert shown == worst
     assert report["max_translation_m"] == pytest.approx(max(errors), abs=1e-4)
     _is_a_trajectory_as_evo_reads_it(tmp_path, errors)
+    assert (tmp_path / "report.html").read_text().count("<figure") == 4
 
 
 @pytest.mark.parametrize("prior", ["lost", "none"])

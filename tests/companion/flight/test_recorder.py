@@ -21,11 +21,11 @@ from companion.flight.recorder import (
     fresh_folder,
     remove_empty,
 )
+from companion.offline.tables import poses, read_columns
 from localizer.geometry.camera import Camera
 from localizer.geometry.geo import Geodetic, LocalFrame
 from localizer.geometry.pose import Pose, so3_exp
 from localizer.types import Frame, PoseEstimate, RegistrationStatus, TargetFix, TrackingState
-from sitl.demo.analysis import poses, read_csv
 
 FRAME = LocalFrame(Geodetic(47.3, 8.5, 450.0))
 CAMERA = Camera.from_fov(64, 48, 60)
@@ -49,13 +49,13 @@ def test_what_is_recorded_can_be_read_back(tmp_path):
     for time_ns in (10**9, 1_500_000_000, 2 * 10**9):
         recorder.snapshot(Frame(image, time_ns, CAMERA, 0))
     recorder.close()
-    columns = read_csv(tmp_path / "estimates.csv", text=("state", "status"))
+    columns = read_columns(tmp_path / "estimates.csv", text=("state", "status"))
     assert tuple(columns) == ESTIMATE_COLUMNS
     assert columns["exposure_time_ns"][0] == 1_700_000_000_123_456_789
     translation, rotation = poses(columns)[0].distance_to(pose)
     assert translation < 1e-3
     assert rotation < 1e-5
-    velocity = read_csv(tmp_path / "targets.csv", text=("target_id",))["velocity_north"]
+    velocity = read_columns(tmp_path / "targets.csv", text=("target_id",))["velocity_north"]
     np.testing.assert_array_equal(velocity, [2.0, np.nan])  # the second was located once
     with (tmp_path / "events.csv").open(newline="") as file:
         assert next(iter(csv.DictReader(file)))["text"] == 'a, "quoted" text\nof two lines'

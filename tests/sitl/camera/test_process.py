@@ -17,6 +17,7 @@ import trimesh
 from PIL import Image as PilImage
 
 from companion.geometry import GimbalAngles
+from companion.offline.tables import poses, read_columns
 from companion.sources import SourceSettings, StreamState, open_source
 from localizer.geometry.camera import Camera
 from localizer.geometry.geo import Geodetic, LocalFrame
@@ -29,7 +30,6 @@ from localizer.synth.appearance.model import Appearance
 from localizer.types import Frame
 from sitl.camera.process import WorldCameraConfig, WorldCameraProcess
 from sitl.camera.true_motion import TruthSample
-from sitl.demo.analysis import poses, read_csv
 from sitl.errors import WorldCameraError
 
 ORIGIN = Geodetic(47.05, 8.31, 440.0)
@@ -149,7 +149,7 @@ def test_streams_what_the_true_pose_sees_and_stops_and_resumes(cache: Path, tmp_
     statistics = process.statistics
     assert statistics is not None
     print(f"\n{statistics}")
-    truth = read_csv(log)
+    truth = read_columns(log)
     true_poses = poses(truth)
     times = truth["exposure_time_ns"]
     assert len(times) == statistics.frames >= len(received)

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from companion.geometry import GimbalAngles, Mount, camera_attitude, world_from_camera
+from companion.offline.tables import poses, read_columns
 from companion.sources import open_source
 from localizer.geometry.camera import Camera
 from localizer.geometry.geo import Geodetic, LocalFrame
@@ -23,7 +24,6 @@ from sitl.camera.distortion import Lens
 from sitl.camera.movers import Mover
 from sitl.camera.true_motion import PoseTrack
 from sitl.camera.world_camera import CameraOptions, FrameLog, WorldCamera, centre_flow
-from sitl.demo.analysis import poses, read_csv
 from sitl.demo.sequence import record_sequence
 
 CAMERA = Camera(320, 240, 230.0, 232.0, 163.0, 118.0, (-0.12, 0.03, 0.002, -0.001, -0.004))
@@ -206,7 +206,7 @@ def test_the_frame_log_is_read_by_the_analysis(tmp_path: Path) -> None:
     with FrameLog(tmp_path / "frames.csv") as log:
         log.add(0, 123_456_789_012_345_678, pose)
         log.add(1, 123_456_789_112_345_678, pose)
-    columns = read_csv(tmp_path / "frames.csv")
+    columns = read_columns(tmp_path / "frames.csv")
     assert columns["exposure_time_ns"].tolist() == [
         123_456_789_012_345_678,
         123_456_789_112_345_678,

@@ -1,13 +1,13 @@
 import numpy as np
 import pytest
 
+from companion.offline.tables import read_columns
 from localizer.geometry.pose import Pose, quaternion_from_matrix, so3_exp
 from sitl.demo.analysis import (
     Spread,
     ekf_errors,
     frame_errors,
     localization_summary,
-    read_csv,
     stage_latencies,
     target_errors,
 )
@@ -84,6 +84,6 @@ def test_spread_ignores_gaps_and_survives_nothing():
 def test_nanoseconds_survive_the_csv(tmp_path):
     path = tmp_path / "a.csv"
     path.write_text("time_ns,x,name\n1234567890123456789,1.5,n\n")
-    columns = read_csv(path, text=("name",))
+    columns = read_columns(path, text=("name",))
     assert columns["time_ns"][0] == 1234567890123456789
     assert columns["name"][0] == "n"

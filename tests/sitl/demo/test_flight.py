@@ -7,6 +7,7 @@ from typing import get_args
 import pytest
 
 from companion.config import load_config
+from companion.reporting.report import write_page
 from mavlink_bridge.preflight.rules import ardupilot_rules, find_source_set
 from sitl.demo import flight
 from sitl.demo.companion_process import Ports, write_deployment
@@ -68,5 +69,8 @@ def test_a_short_flight_without_gnss_comes_home(real_time, small_assets, tmp_pat
         assert report.fixed_targets_m.median < 5.0
     written = json.loads((folder / "report.json").read_text())
     assert written["report"]["frames_sent"] == report.frames_sent > 100
+    page = write_page(folder).read_text()
+    assert "GNSS denied" in page
+    assert "point A" in page
     for name in ("tracks.png", "errors.png", "frames_report.csv", "overlay-0.png"):
         assert (folder / name).stat().st_size > 0

@@ -1,0 +1,30 @@
+"""``companion report``: one HTML file about a flight, a demo or an evaluation."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+from rich.console import Console
+from rich.markup import escape
+
+from companion.cli.steps import shown_steps
+
+
+def report_command(
+    folder: Annotated[
+        Path, typer.Argument(help="record, or the folder of a demo or of `companion eval`")
+    ],
+    out: Annotated[
+        Path | None, typer.Option(help="file to write; none: report.html in the folder")
+    ] = None,
+) -> None:
+    """Write one self-contained HTML file and print its path."""
+    console = Console()
+    with shown_steps(console) as say:
+        say(f"reading {folder} and drawing its map")
+        from companion.reporting.report import write_page
+
+        path = write_page(folder, out)
+    console.print(f"report: [green]{escape(str(path))}[/]", soft_wrap=True, highlight=False)

@@ -1,0 +1,91 @@
+"""The autopilot's and the receiver's tracks from the .tlog of a flight, if it was recorded."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from companion.offline.tables import Columns
+from localizer.geometry.geo import LocalFrame
+from mavlink_bridge.errors import BridgeError
+from mavlink_bridge.link.tlog import read_tlog
+
+if TYPE_CHECKING:
+    from companion.reporting.pictures import MapPictures
+    from companion.reporting.record import RecordTables
+
+_WITHIN_S = 0.5
+_FIX_3D = 3
+
+
+@dataclass(frozen=True)
+class TimedTrack:
+    """time_ns: (N,), CLOCK_MONOTONIC, when it was received; points: (N, 2) east, north, m."""
+
+    time_ns: np.ndarray
+    points: np.ndarray
+
+    def distance_to(self, estimates: Columns) -> np.ndarray:
+        """Horizontal distance (E,) of each accepted estimate, interpolated; NaN where none is near.
+
+        Between the camera and the vehicle: the lever arm is in it, and the message's own delay
+        times the speed.
+        """
+        times = np.asarray(estimates["exposure_time_ns"])
+        begin = int(self.time_ns[0])
+        known, wanted = (self.time_ns - begin) * 1e-9, (times - begin) * 1e-9
+        at = [np.interp(wanted, known, self.points[:, i]) for i in (0, 1)]
+        gap = np.abs(known[np.clip(np.searchsorted(known, wanted), 0, len(known) - 1)] - wanted)
+        distance = np.hypot(estimates["east_m"] - at[0], estimates["north_m"] - at[1])
+        usable = (gap < _WITHIN_S) & (np.asarray(estimates["accepted"]) > 0)
+        return np.where(usable, distance, np.nan)
+
+
+@dataclass(frozen=True)
+class AutopilotTracks:
+    """None where nothing was recorded."""
+
+    ekf: TimedTrack | None = None
+    gnss: TimedTrack | None = None
+
+
+def read_autopilot(tables: RecordTables, pictures: MapPictures) -> AutopilotTracks:
+    """From the record's `bridge.tlog`; a flight without one has none."""
+    path = tables.tlog
+    if path is None or pictures.cache is None or "utc_ns" not in tables.manifest:
+        return AutopilotTracks()
+    offset_ns = int(tables.manifest["utc_ns"]) - tables.start_ns
+    try:
+        return _tracks(path, offset_ns, tables.start_ns, pictures.cache.frame)
+    except (BridgeError, OSError) as error:
+        pictures.notes.append(f"no track of the autopilot: {error}")
+        return AutopilotTracks()
+
+
+def _tracks(path: Path, offset_ns: int, start_ns: int, frame: LocalFrame) -> AutopilotTracks:
+    rows: dict[str, list[tuple[int, float, float]]] = {"GLOBAL_POSITION_INT": [], "GPS_RAW_INT": []}
+    for utc_ns, message in read_tlog(path):
+        kind = message.get_type()
+        if kind not in rows or utc_ns - offset_ns < start_ns:
+            continue
+        if kind == "GPS_RAW_INT" and message.fix_type < _FIX_3D:
+            continue
+        rows[kind].append((utc_ns - offset_ns, message.lat * 1e-7, message.lon * 1e-7))
+    return AutopilotTracks(
+        _track(rows["GLOBAL_POSITION_INT"], frame), _track(rows["GPS_RAW_INT"], frame)
+    )
+
+
+def _track(rows: list[tuple[int, float, float]], frame: LocalFrame) -> TimedTrack | None:
+    height = frame.origin.height_m
+    places = [
+        (t, frame.enu_from_geodetic(lat, lon, height)[:2])
+        for t, lat, lon in sorted(rows)
+        if abs(lat) <= 90.0 and (lat, lon) != (0.0, 0.0)
+    ]
+    if not places:
+        return None
+    return TimedTrack(np.array([t for t, _ in places]), np.array([p for _, p in places]))

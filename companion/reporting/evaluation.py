@@ -1,0 +1,132 @@
+"""The report of `companion eval`: a sequence with its truth."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from companion.errors import RecordError
+from companion.offline.tables import read_columns
+from companion.reporting.content import Curve, MapSheet, Overlay, Plot, Report, Span, Track, Verdict
+from companion.reporting.pictures import map_pictures
+from companion.reporting.record import VISION
+from companion.reporting.verdicts import advice
+
+_TEXT = ("name", "state", "status", "problem")
+_SHEETS = 3  # pictures side by side on an overlay sheet: video, render, checkerboard
+
+
+def evaluation_report(folder: Path) -> Report:
+    """The report of `companion eval --report folder`."""
+    try:
+        document = json.loads((folder / "report.json").read_text(encoding="utf-8"))
+        frames = read_columns(folder / "frames.csv", _TEXT)
+        settings = document["settings"]
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        raise RecordError(f"{folder}: not an evaluation's folder: {error}") from error
+    if not frames:
+        raise RecordError(f"{folder}: frames.csv holds no frame")
+    number = np.arange(len(frames["name"]), dtype=np.float64)
+    accepted = np.nan_to_num(np.asarray(frames["accepted"], dtype=np.float64)) > 0
+    position = np.where(accepted, frames["translation_error_m"], np.nan)
+    rotation = np.where(accepted, frames["rotation_error_deg"], np.nan)
+    sheet, notes = _sheet(Path(settings["map"]), frames, accepted)
+    return Report(
+        f"Evaluation of {Path(settings['sequence']).name}",
+        f"{document['frames']} frames, median {_text(document['median_translation_m'], 'm')} "
+        f"{_text(document['median_rotation_deg'], 'degrees')}, prior {settings['prior']}, seed "
+        f"{settings['seed']}",
+        _first_fault(frames, accepted, position),
+        _verdicts(document),
+        sheet,
+        (
+            Plot("position error, m", number, (Curve("3-D", position),)),
+            Plot("rotation error, degrees", number, (Curve("rotation", rotation),)),
+            Plot("quality", number, (Curve("quality", np.asarray(frames["quality"])),)),
+        ),
+        lanes=(("frames", _spans(number, accepted)),),
+        overlays=_overlays(folder),
+        abscissa="frame",
+        settings=settings,
+        versions=document.get("versions", {}),
+        notes=notes,
+    )
+
+
+def _verdicts(document: dict[str, float]) -> tuple[Verdict, ...]:
+    """The same targets as a demo flight's localizer."""
+    wanted = (
+        ("localizer median", document["median_translation_m"], 1.0, "m", False),
+        ("localizer R@3", document["recall_3"], 95.0, "%", True),
+        ("completeness", document["completeness"], 99.0, "%", True),
+    )
+    verdicts = []
+    for name, value, limit, unit, at_least in wanted:
+        ok = value is not None and (value >= limit if at_least else value <= limit)
+        known = advice(name)
+        needed = f"{'>=' if at_least else '<='} {limit:g} {unit}"
+        verdicts.append(
+            Verdict(name, _text(value, unit), needed, bool(ok), known.meaning, known.look)
+        )
+    return tuple(verdicts)
+
+
+def _first_fault(frames: dict[str, np.ndarray], accepted: np.ndarray, position: np.ndarray) -> str:
+    bad = np.flatnonzero(~accepted | (position > 3.0))
+    if not len(bad):
+        return "nothing: every frame was localized within 3 m"
+    i = int(bad[0])
+    problem = str(frames["problem"][i])
+    why = (
+        f"{position[i]:.1f} m off" if accepted[i] else problem or f"refused ({frames['status'][i]})"
+    )
+    return f"frame {frames['name'][i]}: {why}; {len(bad)} such frames in all"
+
+
+def _spans(number: np.ndarray, accepted: np.ndarray) -> tuple[Span, ...]:
+    spans: list[Span] = []
+    for i, good in zip(number, accepted, strict=True):
+        name = "accepted" if good else "refused"
+        if spans and spans[-1].name == name:
+            spans[-1] = Span(spans[-1].begin_s, float(i) + 1, name)
+        else:
+            spans.append(Span(float(i), float(i) + 1, name))
+    return tuple(spans)
+
+
+def _sheet(
+    path: Path, frames: dict[str, np.ndarray], accepted: np.ndarray
+) -> tuple[MapSheet | None, list[str]]:
+    with map_pictures(path) as pictures:
+        if pictures.cache is None:
+            return None, pictures.notes
+        local, known = pictures.cache.frame, np.isfinite(frames["latitude_deg"]) & accepted
+        rows = zip(frames["latitude_deg"], frames["longitude_deg"], frames["height_m"], strict=True)
+        points = [
+            local.enu_from_geodetic(*(float(x) for x in row))[:2] if k else np.full(2, np.nan)
+            for row, k in zip(rows, known, strict=True)
+        ]
+        sheet = pictures.sheet([Track("vision (camera)", VISION, 2.5, np.array(points))], ())
+        return sheet, pictures.notes
+
+
+def _overlays(folder: Path) -> tuple[Overlay, ...]:
+    """The sheets that `companion eval` wrote of the worst frames, taken apart again."""
+    sheets = []
+    for path in sorted(folder.glob("overlay-*.png")):
+        image = cv2.imread(str(path))
+        if image is None:
+            continue
+        rgb = cv2.cvtColor(image, cv2.COLOR_BGR2RGB).astype(np.uint8)
+        width = rgb.shape[1] // _SHEETS
+        body = rgb[22:]  # under the caption
+        number = path.stem.removeprefix("overlay-")
+        sheets.append(Overlay(body[:, :width], body[:, width : 2 * width], f"frame {number}"))
+    return tuple(sheets)
+
+
+def _text(value: float | None, unit: str) -> str:
+    return "-" if value is None else f"{value:.2f} {unit}"

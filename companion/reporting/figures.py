@@ -1,0 +1,165 @@
+"""From a record's columns to what a report shows: pure functions over arrays."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+
+from companion.offline.tables import Columns
+from companion.reporting.content import Curve, Event, Mark, Plot, Span, Table, Track
+
+STAGES = ("reference", "extract", "register", "latency")
+_GAP_S = 1.0  # without an estimate: the state before is not carried on over it
+_HARMLESS = ("PiLoT: injection forced", "PiLoT: GNSS lost", "PiLoT: ending")
+_NEAR_NS = 2_000_000
+
+
+def seconds(time_ns: np.ndarray, start_ns: int) -> np.ndarray:
+    """Since the start."""
+    return np.asarray((np.asarray(time_ns) - start_ns) * 1e-9, dtype=np.float64)
+
+
+def track(name: str, colour: str, width: float, columns: Columns, prefix: str = "") -> Track:
+    """The way of a table's positions."""
+    points = np.column_stack([columns[f"{prefix}{k}_m"] for k in ("east", "north")])
+    return Track(name, colour, width, points)
+
+
+def nearest(times: np.ndarray, wanted: np.ndarray, within_ns: int = _NEAR_NS) -> np.ndarray:
+    """For each wanted time the number of the nearest of `times` (sorted), -1 where none is near."""
+    if not len(times):
+        return np.full(len(wanted), -1)
+    right = np.clip(np.searchsorted(times, wanted), 0, len(times) - 1)
+    left = np.maximum(right - 1, 0)
+    nearer = np.where(np.abs(times[left] - wanted) < np.abs(times[right] - wanted), left, right)
+    return np.where(np.abs(times[nearer] - wanted) <= within_ns, nearer, -1)
+
+
+def state_spans(time_s: np.ndarray, states: np.ndarray) -> tuple[Span, ...]:
+    """Stretches of one state; where no estimate came there is none."""
+    spans: list[Span] = []
+    for i, (t, state) in enumerate(zip(time_s, states, strict=True)):
+        until = time_s[i + 1] if i + 1 < len(time_s) else t
+        end = float(min(until, t + _GAP_S))
+        if spans and spans[-1].name == str(state) and t - spans[-1].end_s < 1e-6:
+            spans[-1] = Span(spans[-1].begin_s, end, str(state))
+        else:
+            spans.append(Span(float(t), end, str(state)))
+    return tuple(spans)
+
+
+def events(columns: Columns, start_ns: int) -> tuple[Event, ...]:
+    """The record's events, in seconds since the start."""
+    if not columns:
+        return ()
+    times = seconds(columns["time_ns"], start_ns)
+    rows = zip(times, columns["level"], columns["text"], strict=True)
+    return tuple(Event(float(t), str(level), str(text)) for t, level, text in rows)
+
+
+def stage_table(estimates: Columns, abscissa: str = "") -> Table:
+    """Median, 95 % and largest of each stage."""
+    rows = []
+    for name in STAGES:
+        values = np.asarray(estimates[f"{name}_ms"])
+        values = values[np.isfinite(values)]
+        if len(values):
+            spread = (*np.percentile(values, [50, 95]), values.max())
+            label = "exposure to estimate" if name == "latency" else name
+            rows.append((label, *(f"{v:.0f}" for v in spread)))
+    return Table(("stage" + abscissa, "median", "p95", "max"), tuple(rows))
+
+
+def stage_plot(estimates: Columns, time_s: np.ndarray, limit_ms: float | None) -> Plot:
+    """Latency by stage over time."""
+    curves = tuple(Curve(name, np.asarray(estimates[f"{name}_ms"])) for name in STAGES)
+    return Plot("latency by stage, ms", time_s, curves, limit_ms)
+
+
+def first_fault(
+    estimates: Columns, time_s: np.ndarray, happened: Sequence[Event], large_error: str = ""
+) -> str:
+    """What went wrong first once the place was known, in words. large_error: the first time that
+    the position was off, where the truth is known, with its time in front.
+    """
+    states = np.asarray(estimates.get("state", np.empty(0)))
+    began = np.flatnonzero(states == "tracking")
+    if not len(began):
+        last = next((e.text for e in reversed(happened) if e.level == "warning"), "")
+        return "never localized" + (f"; the last warning: {last}" if last else "")
+    begin_s = float(time_s[began[0]])
+    found: list[tuple[float, str]] = []
+    left = np.flatnonzero((states != "tracking") & (time_s > begin_s))
+    if len(left):
+        t = float(time_s[left[0]])
+        found.append((t, f"tracking ended in state {states[left[0]]}"))
+    for event in happened:
+        if event.level == "warning" and event.time_s >= begin_s:
+            if event.text.startswith(_HARMLESS):
+                continue
+            found.append((event.time_s, event.text))
+            break
+    if large_error:
+        when, _, text = large_error.partition(" ")
+        found.append((float(when), text))
+    if not found:
+        return "nothing: tracking from the first fix to the end, and no warning"
+    t, text = min(found)
+    return f"at {t:.1f} s: {text}"
+
+
+def target_marks(targets: Columns) -> tuple[Mark, ...]:
+    """Where each target was located last, with its sigma."""
+    marks = []
+    for name, rows in by_name(targets).items():
+        i = rows[-1]
+        place = float(targets["east_m"][i]), float(targets["north_m"][i])
+        marks.append(Mark(name, *place, "target", float(targets["sigma_horizontal_m"][i])))
+    return tuple(marks)
+
+
+def by_name(targets: Columns) -> dict[str, np.ndarray]:
+    """Each target's row numbers, in the order in which they were first seen."""
+    if not targets:
+        return {}
+    names = np.asarray(targets["target_id"])
+    return {str(n): np.flatnonzero(names == n) for n in dict.fromkeys(names)}
+
+
+def target_table(
+    targets: Columns, errors: Mapping[str, np.ndarray] | None = None, limit_m: float | None = None
+) -> Table | None:
+    """Each target on its own line: its last place, and its errors where the truth is known."""
+    grouped = by_name(targets)
+    known = errors or {}
+    names = [*grouped, *(n for n in known if n not in grouped)]
+    if not names:
+        return None
+    rows: list[tuple[str, ...]] = []
+    bad = set()
+    for name in names:
+        cells = [name, *_last_place(targets, grouped.get(name))]
+        if errors is not None:
+            spread = known.get(name, np.full(3, np.nan))
+            cells += [f"{v:.2f}" if np.isfinite(v) else "-" for v in spread]
+            if limit_m is not None and spread[1] > limit_m:
+                bad.add(len(rows))
+        rows.append(tuple(cells))
+    headings = ("target", "fixes", "latitude", "longitude", "height, m", "sigma, m", "elsewhere")
+    more = ("median error, m", "p95, m", "max, m") if errors is not None else ()
+    return Table((*headings, *more), tuple(rows), frozenset(bad))
+
+
+def _last_place(targets: Columns, rows: np.ndarray | None) -> tuple[str, ...]:
+    if rows is None:
+        return ("0", "-", "-", "-", "-", "-")
+    i = rows[-1]
+    return (
+        str(len(rows)),
+        f"{targets['latitude_deg'][i]:.7f}",
+        f"{targets['longitude_deg'][i]:.7f}",
+        f"{targets['height_m'][i]:.1f}",
+        f"{targets['sigma_horizontal_m'][i]:.2f}",
+        f"{100 * targets['elsewhere'][i]:.0f} %",
+    )

@@ -1,0 +1,105 @@
+"""The pictures of a report: the map from above, and frames beside the map as it was seen there."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+
+from companion.errors import StreamDecodeError
+from companion.reporting.content import MapSheet, Mark, Overlay, Track
+from companion.sources.folder_source import read_image
+from localizer.errors import LocalizerError
+from localizer.geometry.camera import Camera
+from localizer.geometry.pose import Pose
+from localizer.map.cache.cache import TileCache
+from localizer.map.cache.stream import TileStreamer
+from localizer.relocalization.topview import render_top_view
+from localizer.render.base import MapRenderer
+from localizer.render.numba_raster import NumbaRenderer
+from localizer.tracking.pipeline import Undistorter
+from localizer.types import Frame, Image
+
+_SHEET_PX = 900
+_MARGIN_M = 60.0
+
+
+@dataclass(frozen=True)
+class ShownFrame:
+    """A recorded picture with the pose that was estimated for it."""
+
+    path: Path
+    world_from_camera: Pose
+    caption: str
+
+
+@dataclass(frozen=True)
+class MapPictures:
+    """Draws from one map. notes: what could not be drawn, and why."""
+
+    cache: TileCache | None
+    renderer: MapRenderer | None
+    notes: list[str] = field(default_factory=list)
+
+    def sheet(self, tracks: Sequence[Track], marks: Sequence[Mark]) -> MapSheet | None:
+        """The square about all tracks and marks; None without any."""
+        places = [t.points[np.isfinite(t.points).all(axis=1)] for t in tracks]
+        points = np.vstack([*places, *([[m.east_m, m.north_m]] for m in marks), np.empty((0, 2))])
+        if not len(points):
+            return None
+        low, high = points.min(axis=0), points.max(axis=0)
+        half = float((high - low).max()) / 2 + _MARGIN_M
+        east, north = (low + high) / 2
+        rgb = self._from_above(np.array([east, north]), half)
+        west, south = float(east) - half, float(north) - half
+        edges = (west, west + 2 * half, south, south + 2 * half)
+        return MapSheet(rgb, *edges, tuple(tracks), tuple(marks))
+
+    def _from_above(self, centre: np.ndarray, half_m: float) -> Image | None:
+        if self.renderer is None or self.cache is None:
+            return None
+        base_m = float(self.cache.index.box_min[0, 2])
+        gsd_m = 2 * half_m / _SHEET_PX
+        return render_top_view(self.renderer, centre, _SHEET_PX, gsd_m, base_m).rgb
+
+    def overlays(self, frames: Sequence[ShownFrame], camera: Camera) -> tuple[Overlay, ...]:
+        """Each frame, freed of its distortion, and the map rendered at its pose."""
+        if self.renderer is None:
+            return ()
+        target = camera.without_distortion()
+        undistort = Undistorter(camera, target)
+        sheets = []
+        for shown in frames:
+            try:
+                image = read_image(shown.path)
+            except (StreamDecodeError, OSError) as error:  # power may have gone while written
+                self.notes.append(f"left out: {error}")
+                continue
+            if image.shape[:2] != (camera.height, camera.width):
+                self.notes.append(f"left out: {shown.path.name} is not of the calibrated size")
+                continue
+            video = undistort(Frame(image, 0, camera, 0))
+            view = self.renderer.render(shown.world_from_camera, target, wait=True)
+            sheets.append(Overlay(video, view.rgb, shown.caption))
+        return tuple(sheets)
+
+
+@contextmanager
+def map_pictures(path: Path | None) -> Iterator[MapPictures]:
+    """Pictures of the map in that folder; without one, the report says so and goes on."""
+    if path is None:
+        yield MapPictures(None, None, ["the map is not named: no pictures of it"])
+        return
+    try:
+        cache = TileCache.open(path)
+    except (LocalizerError, OSError) as error:
+        yield MapPictures(None, None, [f"no pictures of the map: {error}"])
+        return
+    streamer = TileStreamer(cache)
+    try:
+        yield MapPictures(cache, NumbaRenderer(streamer))
+    finally:
+        streamer.close()

@@ -1,0 +1,285 @@
+"""The report of a flight's record: what the companion knew, without the truth."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from pydantic import ValidationError
+
+from companion.config import CameraModel
+from companion.errors import RecordError
+from companion.flight.recorder import MANIFEST_NAME
+from companion.offline.tables import Columns, poses, read_columns
+from companion.reporting import figures
+from companion.reporting.autopilot import AutopilotTracks, read_autopilot
+from companion.reporting.content import Curve, Overlay, Plot, Report, Track, Verdict
+from companion.reporting.pictures import ShownFrame, map_pictures
+from localizer.errors import CameraError
+from localizer.geometry.camera import Camera
+
+_OVERLAYS = 8
+_LATEST_MS = 250.0  # the oldest measurement that ArduPilot fuses
+VISION = "#ff8c1a"
+AUTOPILOT = "#1fd1ff"
+GNSS = "#ffffff"
+
+
+@dataclass(frozen=True)
+class RecordTables:
+    """A record's folder, read. health: the last health.json, {} without one; notes: what lacks.
+
+    Of the settings only what a report needs is read, so that a record of an older or newer version,
+    with keys that this one does not know, can still be shown.
+    """
+
+    folder: Path
+    estimates: Columns
+    targets: Columns
+    events: Columns
+    manifest: Mapping[str, Any]
+    health: Mapping[str, Any]
+    notes: tuple[str, ...]
+
+    @property
+    def start_ns(self) -> int:
+        """Of the record, CLOCK_MONOTONIC."""
+        return int(self.manifest.get("monotonic_ns", 0)) or int(
+            next(iter(self.estimates.get("exposure_time_ns", ())), 0)
+        )
+
+    @property
+    def map_path(self) -> Path | None:
+        """Of the map that was flown on; None where the record does not say."""
+        named = self._setting("map")
+        return Path(named) if isinstance(named, str) else None
+
+    @property
+    def camera(self) -> Camera | None:
+        """As it was calibrated; None where the record does not say."""
+        try:
+            return CameraModel.model_validate(self._setting("camera", "model")).camera()
+        except (ValidationError, CameraError):
+            return None
+
+    @property
+    def tlog(self) -> Path | None:
+        """The flight's MAVLink log, if one was kept."""
+        named = self._setting("bridge", "tlog")
+        return Path(named) if isinstance(named, str) else None
+
+    @property
+    def delay_ms(self) -> float | None:
+        """The age at which a fix was sent."""
+        return self._number("bridge", "injection", "delay_ms")
+
+    @property
+    def alert_limit_m(self) -> float | None:
+        """The protection level beyond which nothing was injected."""
+        return self._number("bridge", "injection", "alert_limit_m")
+
+    def _number(self, *keys: str) -> float | None:
+        value = self._setting(*keys)
+        return float(value) if isinstance(value, int | float) else None
+
+    def _setting(self, *keys: str) -> Any:
+        value: Any = self.manifest.get("config")
+        for key in keys:
+            value = value.get(key) if isinstance(value, dict) else None
+        return value
+
+
+def read_record(folder: Path) -> RecordTables:
+    """Read what `companion run` left; `RecordError` for a folder that is no record."""
+    try:
+        estimates = read_columns(folder / "estimates.csv", ("state", "status"))
+        targets = read_columns(folder / "targets.csv", ("target_id",))
+        events = read_columns(folder / "events.csv", ("level", "text"))
+    except (OSError, UnicodeDecodeError) as error:
+        raise RecordError(f"{folder}: not a flight's record: {error}") from error
+    notes = []
+    manifest, health = _document(folder / MANIFEST_NAME), _document(folder / "health.json")
+    if not manifest:
+        notes.append(f"{MANIFEST_NAME} cannot be read: no settings, no map")
+    if not estimates:
+        notes.append("the record holds no estimate: nothing was localized in that flight")
+    return RecordTables(folder, estimates, targets, events, manifest, health, tuple(notes))
+
+
+def record_report(folder: Path) -> Report:
+    """The report of one record."""
+    tables = read_record(folder)
+    camera, estimates = tables.camera, tables.estimates
+    start_ns = tables.start_ns
+    happened = figures.events(tables.events, start_ns)
+    if not estimates:
+        return Report(
+            f"Flight {folder.name}", _how_it_ended(tables), "never localized",
+            verdicts=_verdicts(tables), events=happened, notes=tables.notes,
+            settings=dict(tables.manifest.get("config", {})),
+            versions=dict(tables.manifest.get("versions", {})),
+        )  # fmt: skip
+    time_s = figures.seconds(estimates["exposure_time_ns"], start_ns)
+    with map_pictures(tables.map_path) as pictures:
+        autopilot = read_autopilot(tables, pictures)
+        tracks = _tracks(estimates, autopilot)
+        sheet = pictures.sheet(tracks, figures.target_marks(tables.targets))
+        overlays: tuple[Overlay, ...] = ()
+        if camera is not None:
+            shown = worst_frames(tables, estimates["quality"] * 1.0, "quality", time_s)
+            overlays = pictures.overlays(shown, camera)
+        return Report(
+            f"Flight {folder.name}",
+            _how_it_ended(tables),
+            figures.first_fault(estimates, time_s, happened),
+            _verdicts(tables),
+            sheet,
+            _plots(tables, time_s, autopilot),
+            None,
+            (("state", figures.state_spans(time_s, estimates["state"])),),
+            happened,
+            overlays,
+            figures.target_table(tables.targets),
+            figures.stage_table(estimates),
+            "time since the start, s",
+            dict(tables.manifest.get("config", {})),
+            dict(tables.manifest.get("versions", {})),
+            (*tables.notes, *pictures.notes),
+        )
+
+
+def worst_frames(
+    tables: RecordTables, goodness: np.ndarray, what: str, time_s: np.ndarray
+) -> list[ShownFrame]:
+    """The kept pictures in which `goodness` (per estimate) was least, worst first; NaN is worst.
+
+    Frames of a refused estimate take at most half the places, if others are there.
+    """
+    estimates = tables.estimates
+    paths = sorted((tables.folder / "snapshots").glob("*.jpg"))
+    paths = [p for p in paths if p.stem.isdigit()]
+    stamps = np.asarray(estimates["exposure_time_ns"])
+    order = np.argsort(stamps)
+    found = figures.nearest(stamps[order], np.array([int(p.stem) for p in paths], dtype=np.int64))
+    pairs = [(p, int(order[k])) for p, k in zip(paths, found, strict=True) if k >= 0]
+    key = np.where(np.isfinite(goodness), goodness, -np.inf)
+    pairs.sort(key=lambda pair: float(key[pair[1]]))
+    accepted = np.asarray(estimates["accepted"]) > 0
+    good = [p for p in pairs if accepted[p[1]]]
+    refused = [p for p in pairs if not accepted[p[1]]]
+    few = refused[: max(_OVERLAYS // 2, _OVERLAYS - len(good))]
+    chosen = good[: _OVERLAYS - len(few)] + few
+    placed = poses({k: v[[k for _, k in chosen]] for k, v in estimates.items()})
+    return [
+        ShownFrame(
+            path,
+            pose,
+            f"t = {time_s[k]:.1f} s, {what} {abs(goodness[k]):.2f}, {estimates['state'][k]}, "
+            + ("accepted" if accepted[k] else f"refused ({estimates['status'][k]})"),
+        )
+        for (path, k), pose in zip(chosen, placed, strict=True)
+    ]
+
+
+def uncertainty_plots(estimates: Columns, time_s: np.ndarray) -> tuple[Plot, ...]:
+    """Sigma, protection level and quality over time."""
+    horizontal = np.hypot(estimates["sigma_east_m"], estimates["sigma_north_m"])
+    accepted = np.asarray(estimates["accepted"]) > 0
+    curves = [Curve("sigma horizontal", np.where(accepted, horizontal, np.nan))]
+    if "hpl_m" in estimates:
+        curves.append(Curve("protection level", np.asarray(estimates["hpl_m"])))
+    quality = np.asarray(estimates["quality"])
+    return (
+        Plot("how sure it was, m", time_s, tuple(curves)),
+        Plot("quality of the registration", time_s, (Curve("quality", quality),)),
+    )
+
+
+def _plots(
+    tables: RecordTables, time_s: np.ndarray, autopilot: AutopilotTracks
+) -> tuple[Plot, ...]:
+    plots = []
+    for name, track in (("GNSS", autopilot.gnss), ("the autopilot's EKF", autopilot.ekf)):
+        if track is not None:
+            residual = track.distance_to(tables.estimates)
+            plots.append(Plot(f"vision against {name}, horizontal, m", time_s,
+                              (Curve(f"from {name}", residual),)))  # fmt: skip
+    return (
+        *plots,
+        *uncertainty_plots(tables.estimates, time_s),
+        figures.stage_plot(tables.estimates, time_s, tables.delay_ms),
+    )
+
+
+def _tracks(estimates: Columns, autopilot: AutopilotTracks) -> list[Track]:
+    accepted = np.asarray(estimates["accepted"]) > 0
+    vision = figures.track("vision (camera)", VISION, 2.5, estimates)
+    points = np.where(accepted[:, None], vision.points, np.nan)
+    tracks = []
+    if autopilot.gnss is not None:
+        tracks.append(Track("GNSS", GNSS, 5.0, autopilot.gnss.points))
+    if autopilot.ekf is not None:
+        tracks.append(Track("autopilot's EKF", AUTOPILOT, 3.5, autopilot.ekf.points))
+    return [*tracks, Track(vision.name, vision.colour, vision.width, points)]
+
+
+def _verdicts(tables: RecordTables) -> tuple[Verdict, ...]:
+    """What can be judged without the truth."""
+    health, estimates = tables.health, tables.estimates
+    ended = health.get("level") == "ended"
+    verdicts = [
+        Verdict(
+            "ended in order", str(health.get("text", "no health.json")), "an orderly end", ended,
+            "the process died, was killed, or the computer lost power: the last seconds may lack",
+            "the log of that time, power supply, `dmesg` for memory",
+        )
+    ]  # fmt: skip
+    if estimates:
+        accepted = np.asarray(estimates["accepted"]) > 0
+        began = np.flatnonzero(np.asarray(estimates["state"]) == "tracking")
+        share = 100.0 * float(accepted[began[0] :].mean()) if len(began) else 0.0
+        verdicts.append(
+            Verdict(
+                "frames accepted once tracking", f"{share:.1f} %", ">= 95 %", share >= 95.0,
+                "frames were refused, so there was no position for them",
+                "quality over time and the worst frames",
+            )
+        )  # fmt: skip
+        latency = np.asarray(estimates["latency_ms"])
+        p95 = float(np.percentile(latency[np.isfinite(latency)], 95))
+        limit = tables.delay_ms or _LATEST_MS
+        verdicts.append(
+            Verdict(
+                "exposure to estimate p95", f"{p95:.0f} ms", f"<= {limit:.0f} ms", p95 <= limit,
+                "fixes are older than the EKF was told",
+                "latency by stage; more processor, lower localizer.width, higher delay_ms",
+            )
+        )  # fmt: skip
+    shadow = str(health.get("shadow", ""))
+    if shadow:
+        verdicts.append(
+            Verdict(
+                "shadow score at the end", shadow, "go", shadow.startswith("go"),
+                "vision was not shown to agree with GNSS for long enough",
+                "the reasons after the colon, and vision against GNSS",
+            )
+        )  # fmt: skip
+    return tuple(verdicts)
+
+
+def _how_it_ended(tables: RecordTables) -> str:
+    if tables.health.get("level") == "ended":
+        return f"{tables.folder}: {tables.health.get('text', '')}"
+    return f"{tables.folder}: the end was not written"
+
+
+def _document(path: Path) -> dict[str, Any]:
+    try:
+        value = json.loads(path.read_text(encoding="utf-8"))
+    except (OSError, ValueError, RecursionError):
+        return {}
+    return value if isinstance(value, dict) else {}

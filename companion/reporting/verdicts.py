@@ -1,0 +1,51 @@
+"""What it means when a target is missed, and where to look first."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+
+@dataclass(frozen=True)
+class Advice:
+    """meaning: of a miss, to somebody who flies; look: what to open first."""
+
+    meaning: str
+    look: str
+
+
+_UNKNOWN = Advice("outside what was asked for", "the plots and the timeline")
+
+# By the beginning of the target's name.
+_ADVICE = {
+    "localizer median": Advice(
+        "most positions are further off than they should be: calibration or map rather than noise",
+        "the worst overlays: edges that run beside each other everywhere mean focal length, "
+        "distortion or a shifted map",
+    ),
+    "localizer R@": Advice(
+        "too many frames are outright wrong or missing",
+        "when it happens: the timeline's states, then the worst overlays",
+    ),
+    "completeness": Advice(
+        "frames were refused, so there was no position for them",
+        "quality over time, and the overlays of refused frames: map too old, too coarse, or "
+        "motion blur",
+    ),
+    "localized frames": Advice(
+        "the computer is too slow, or the feed delivers too few frames",
+        "latency by stage; lower localizer.width, or raise the camera's rate",
+    ),
+    "EKF horizontal": Advice(
+        "the autopilot's position is off although vision may be right: late, refused or withheld",
+        "events of injection, latency against bridge.injection.delay_ms, `companion doctor`",
+    ),
+    "fixed targets": Advice(
+        "coordinates given for places that stand still are off",
+        "the targets' own lines: one bad target is an edge or a roof, all of them are the pose",
+    ),
+}
+
+
+def advice(name: str) -> Advice:
+    """Of the target with that name."""
+    return next((a for begin, a in _ADVICE.items() if name.startswith(begin)), _UNKNOWN)

@@ -1,0 +1,20 @@
+"""Other people's code for browsers, kept in the package with its licences."""
+
+from __future__ import annotations
+
+from importlib import resources
+
+
+def vendored(name: str) -> str:
+    """The text of a file of companion/console/static/vendor."""
+    return _file(name)
+
+
+def licence_of(package: str) -> str:
+    """The licence that comes with the package's files."""
+    return _file(f"LICENSE.{package}.txt")
+
+
+def _file(name: str) -> str:
+    folder = resources.files("companion") / "console" / "static" / "vendor"
+    return (folder / name).read_text(encoding="utf-8")

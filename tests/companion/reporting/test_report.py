@@ -1,0 +1,156 @@
+"""One HTML file about a flight: what it says, and that it needs nothing else."""
+
+import csv
+import json
+import re
+
+import cv2
+import numpy as np
+import pytest
+
+from companion.errors import RecordError
+from companion.flight.recorder import ESTIMATE_COLUMNS, EVENT_COLUMNS, TARGET_COLUMNS
+from companion.reporting.content import Stanford
+from companion.reporting.layout import render
+from companion.reporting.record import read_record, record_report, worst_frames
+from companion.reporting.report import report_of, write_page
+
+MODEL = {"width": 64, "height": 48, "fx": 60, "fy": 60, "cx": 32, "cy": 24}
+START_NS = 1_000_000_000
+
+
+def _rows(path, columns, rows):
+    with path.open("w", newline="") as file:
+        writer = csv.DictWriter(file, columns, restval="0")
+        writer.writeheader()
+        writer.writerows(rows)
+
+
+def _estimate(i, state="tracking", accepted=1, **more):
+    return {
+        "exposure_time_ns": START_NS + i * 100_000_000, "sequence": i, "east_m": 2.0 * i,
+        "qw": 1.0, "quality": 0.8, "state": state, "status": "OK", "accepted": accepted,
+        "latency_ms": 90.0, "hpl_m": 2.0, "vpl_m": 2.0, "sigma_east_m": 0.1, "sigma_north_m": 0.1,
+    } | more  # fmt: skip
+
+
+@pytest.fixture
+def record(small_assets, tmp_path):
+    """A flight that was lost after two seconds, with a target and a picture per frame."""
+    folder = tmp_path / "flight"
+    (folder / "snapshots").mkdir(parents=True)
+    rows = [_estimate(i) for i in range(20)]
+    rows += [_estimate(i, "lost", 0, quality=0.1) for i in range(20, 25)]
+    rows[7]["quality"] = 0.3
+    _rows(folder / "estimates.csv", ESTIMATE_COLUMNS, rows)
+    targets = [
+        {"exposure_time_ns": START_NS, "target_id": n, "sigma_horizontal_m": 1} for n in "AB"
+    ]
+    _rows(folder / "targets.csv", TARGET_COLUMNS, targets)
+    events = [
+        {"time_ns": START_NS, "level": "warning", "text": "PiLoT: injection forced, no check"},
+        {"time_ns": START_NS + 2_500_000_000, "level": "warning", "text": "<script>alert(1)"},
+    ]
+    _rows(folder / "events.csv", EVENT_COLUMNS, events)
+    for i in range(25):
+        picture = np.full((48, 64, 3), 10 * i, np.uint8)
+        name = f"{START_NS + i * 100_000_000}.jpg"
+        cv2.imwrite(str(folder / "snapshots" / name), picture)
+    document = {
+        "monotonic_ns": START_NS, "utc_ns": 2 * START_NS, "versions": {"python": "3"},
+        "config": {
+            "map": str(small_assets.map_cache), "camera": {"model": MODEL}, "of": "another version",
+            "bridge": {"injection": {"delay_ms": 80.0, "alert_limit_m": 10.0}},
+        },
+    }  # fmt: skip
+    (folder / "record.json").write_text(json.dumps(document))
+    (folder / "health.json").write_text(json.dumps({"level": "ended", "text": "stopped"}))
+    return folder
+
+
+def test_it_says_what_went_wrong_first_and_what_each_miss_means(record):
+    report = record_report(record)
+    assert report.first == "at 2.0 s: tracking ended in state lost"
+    verdicts = {v.name: v for v in report.verdicts}
+    assert verdicts["ended in order"].ok
+    late = verdicts["exposure to estimate p95"]
+    assert (late.ok, late.value, late.needed) == (False, "90 ms", "<= 80 ms")
+    assert "older than the EKF was told" in render(report)
+    assert not verdicts["frames accepted once tracking"].ok  # 20 of 25
+
+
+def test_a_flight_without_fault_names_none(record):
+    _rows(record / "estimates.csv", ESTIMATE_COLUMNS, [_estimate(i) for i in range(20)])
+    _rows(record / "events.csv", EVENT_COLUMNS, [])
+    report = record_report(record)
+    assert report.first.startswith("nothing: ")
+
+
+def test_the_page_needs_nothing_else_and_runs_nothing_of_the_record(record):
+    path = write_page(record)
+    text = path.read_text()
+    assert path == record / "report.html"
+    addresses = set(re.findall(r"""(?:src|href)=["']?([^"'\s>]{0,12})""", text))
+    assert {a[:5] for a in addresses} == {"data:"}
+    assert "default-src 'none'" in text
+    assert "<script>alert(1)" not in text
+    assert "&lt;script&gt;alert(1)" in text
+    assert text.count("<figure") == 8
+
+
+def test_a_name_from_the_record_cannot_leave_the_data(record):
+    """The plots' data stand in a script element."""
+    settings = json.loads((record / "record.json").read_text())
+    settings["versions"] = {"python": "</script><script>alert(2)</script>"}
+    (record / "record.json").write_text(json.dumps(settings))
+    assert "<script>alert(2)" not in render(record_report(record))
+
+
+def test_the_worst_frames_come_first_and_refused_ones_take_half_the_places(record):
+    tables = read_record(record)
+    quality = tables.estimates["quality"]
+    seconds = (tables.estimates["exposure_time_ns"] - START_NS) * 1e-9
+    shown = worst_frames(tables, quality, "quality", seconds)
+    assert shown[0].caption == "t = 0.7 s, quality 0.30, tracking, accepted"
+    assert sum("refused" in s.caption for s in shown) == 4
+    assert shown[0].world_from_camera.translation[0] == 14.0
+
+
+def test_each_target_has_its_own_line_and_its_place_on_the_map(record):
+    report = record_report(record)
+    assert [row[:2] for row in report.targets.rows] == [("A", "1"), ("B", "1")]
+    assert [m.name for m in report.sheet.marks] == ["A", "B"]
+    assert report.sheet.rgb.std() > 5  # the map was drawn
+
+
+def test_a_damaged_record_still_gives_what_it_holds(record):
+    """Power is lost in flight: a half row, no health, no settings."""
+    with (record / "estimates.csv").open("a") as file:
+        file.write("12345,2")
+    (record / "record.json").write_text("{")
+    (record / "health.json").unlink()
+    report = record_report(record)
+    assert not report.verdicts[0].ok
+    assert any("record.json cannot be read" in note for note in report.notes)
+    assert any("map" in note for note in report.notes)
+    assert "no health.json" in render(report)
+
+
+def test_a_flight_that_localized_nothing_has_a_report(record):
+    _rows(record / "estimates.csv", ESTIMATE_COLUMNS, [])
+    assert "never localized" in render(record_report(record))
+
+
+def test_a_folder_that_is_none_is_named(tmp_path):
+    with pytest.raises(RecordError, match="neither a flight's record"):
+        report_of(tmp_path)
+
+
+def test_the_stanford_diagram_counts_what_misleads():
+    from companion.reporting.content import Report
+
+    levels = np.array([2.0, 2.0, 2.0, 15.0, np.nan])
+    errors = np.array([1.0, 3.0, 12.0, 20.0, 1.0])
+    text = render(Report("t", "s", "f", stanford=Stanford(errors, levels, 10.0)))
+    assert "4 fixes: 3 within the alert limit of 10 m; 2 of them are further off" in text
+    assert "(misleading), 1 beyond the limit (hazardous)" in text
