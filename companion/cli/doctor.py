@@ -12,8 +12,8 @@ from rich.markup import escape
 from rich.table import Table
 from rich.text import Text
 
-from companion.cli.steps import shown_steps
 from companion.config import load_config
+from companion.terminal.steps import shown_steps
 from mavlink_bridge.preflight.doctor import Diagnosis, Finding
 
 

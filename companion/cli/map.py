@@ -13,8 +13,8 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
-from companion.cli.import_bar import ImportBar
 from companion.errors import ReportError
+from companion.terminal.import_bar import ImportBar
 
 app = typer.Typer(no_args_is_help=True)
 

@@ -9,7 +9,7 @@ import typer
 from rich.console import Console
 from rich.markup import escape
 
-from companion.cli.steps import shown_steps
+from companion.terminal.steps import shown_steps
 
 
 def report_command(

@@ -9,9 +9,9 @@ from typing import Annotated
 
 import typer
 
-from companion.cli.console_log import console_log
 from companion.cli.interrupts import end_at_once
 from companion.config import load_config
+from companion.terminal.console_log import console_log
 from localizer.registration.devices import DeviceChoice
 from localizer.render.select import RendererName
 

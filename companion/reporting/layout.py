@@ -203,7 +203,7 @@ def _kept(count: int) -> np.ndarray:
 
 def _thinned(points: np.ndarray) -> np.ndarray:
     points = points[np.isfinite(points).all(axis=1)]
-    return points[_kept(len(points))]
+    return np.asarray(points[_kept(len(points))])
 
 
 def _stanford(data: Stanford) -> str:

@@ -8,9 +8,9 @@ import pytest
 from rich.console import Console
 
 from companion.cli.doctor import print_diagnosis
-from companion.cli.steps import shown_steps
 from companion.config import CameraModel, parse_config
 from companion.preflight.doctor import examine_deployment
+from companion.terminal.steps import shown_steps
 from localizer.types import Frame
 from mavlink_bridge.preflight.doctor import Diagnosis, Finding
 

@@ -8,7 +8,7 @@ from contextlib import contextmanager
 
 import pytest
 
-from companion.cli.console_log import _WAITING, OURS, console_log
+from companion.terminal.console_log import _WAITING, OURS, console_log
 
 _log = logging.getLogger("companion.test")
 
