@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections import deque
+from collections.abc import Callable
 from typing import Any
 
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
@@ -14,10 +15,12 @@ from mavlink_bridge.messages import (
     CameraView,
     HealthLevel,
     Origin,
+    PlaceHint,
     TargetEnd,
     TargetReport,
     VehicleState,
 )
+from mavlink_bridge.place_hint import PLACE_HINT, place_hint
 from mavlink_bridge.shared import Shared
 
 COMMANDS_IN = ("COMMAND_LONG", "COMMAND_INT")
@@ -33,7 +36,7 @@ SYSTEM_STATUS = {
 
 
 # What changes what the companion does; a question (camera information) anybody may ask.
-_ORDERS = frozenset((*COMMANDS.values(), *TRACKING))
+_ORDERS = frozenset((*COMMANDS.values(), *TRACKING, PLACE_HINT))
 
 
 def _is_order(command: int) -> bool:
@@ -147,12 +150,25 @@ class Components:
             self._shared.say(mavlink.MAV_SEVERITY_WARNING, text)
 
     def _localizer_command(self, link: Link, message: Any) -> None:
-        """The command that gates injection; every other one is refused in the protocol's way."""
+        """What gates injection and what hints at the place; others are refused in the protocol's
+        way.
+        """
         gate = self._shared.gate
         result = mavlink.MAV_RESULT_UNSUPPORTED
-        if gate is not None:
+        if message.command == PLACE_HINT and self._shared.on_hint is not None:
+            result = self._hint(message, self._shared.on_hint)
+        elif gate is not None:
             result = gate.command(message.command, message.param1)
         ack = mavlink.MAVLink_command_ack_message(
             message.command, result, 0, 0, message.get_srcSystem(), message.get_srcComponent()
         )
         link.send(ack, self._config.localizer_component)
+
+    def _hint(self, message: Any, on_hint: Callable[[PlaceHint], None]) -> int:
+        hint = place_hint(message)
+        if hint is None:
+            return int(mavlink.MAV_RESULT_DENIED)
+        on_hint(hint)
+        text = f"PiLoT: search {hint.radius_m:.0f} m about the place given"
+        self._shared.say(mavlink.MAV_SEVERITY_NOTICE, text)
+        return int(mavlink.MAV_RESULT_ACCEPTED)

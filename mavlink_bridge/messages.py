@@ -218,6 +218,16 @@ class TrackRequest:
 
 
 @dataclass(frozen=True)
+class PlaceHint:
+    """Where the operator says that the vehicle is: a place to look at first, never a position."""
+
+    latitude_deg: float
+    longitude_deg: float
+    radius_m: float
+    """About so far off it may be (1 sigma)."""
+
+
+@dataclass(frozen=True)
 class Attitude:
     """The vehicle's attitude at a time, body (FRD) to NED."""
 

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from mavlink_bridge.config import BridgeConfig, Mode
 from mavlink_bridge.injection.rc_gate import InjectionGate
 from mavlink_bridge.link.clock import SteadyUtc
-from mavlink_bridge.messages import HealthLevel, TrackRequest
+from mavlink_bridge.messages import HealthLevel, PlaceHint, TrackRequest
 from mavlink_bridge.vehicle.presence import VehicleWatch
 from mavlink_bridge.vehicle.tracker import VehicleTracker
 
@@ -28,6 +28,7 @@ class Shared:
     health: Callable[[], HealthLevel]
     say: Callable[[int, str], None]
     on_track: Callable[[TrackRequest], None] | None
+    on_hint: Callable[[PlaceHint], None] | None
     watch: VehicleWatch
     gate: InjectionGate | None
 

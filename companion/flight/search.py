@@ -23,9 +23,11 @@ from localizer.map.cache.cache import TileCache
 from localizer.relocalization.relocalizer import OpenRelocalizer, open_relocalizer
 from localizer.relocalization.types import PlaceQuery, SearchRegion
 from localizer.types import Frame, PosePrior
+from mavlink_bridge.messages import PlaceHint
 
 _log = logging.getLogger(__name__)
 _NICE = 15  # of the preparing thread: the overview's seconds must not cost the tracker frames
+_HINT_SIGMAS = 2.0
 _HINT_S = 120.0  # after which an operator's word is of another place
 _STOP_S = 10.0
 
@@ -85,6 +87,13 @@ class PlaceSearch:
     def hint(self, east_m: float, north_m: float, radius_m: float) -> None:
         """The operator says where we are, map frame: the next searches look there. Never a fix."""
         self._hint = Hint((east_m, north_m), radius_m, time.monotonic())
+
+    def hint_at(self, hint: PlaceHint) -> None:
+        """The same in WGS84, with twice the operator's sigma."""
+        height_m = self._cache.manifest.origin.height_m
+        at = self._cache.frame.enu_from_geodetic(hint.latitude_deg, hint.longitude_deg, height_m)
+        self.hint(float(at[0]), float(at[1]), _HINT_SIGMAS * hint.radius_m)
+        self._event("info", f"search about {at[0]:.0f} m east, {at[1]:.0f} m north: operator")
 
     def search(self, frame: Frame, should_stop: Callable[[], bool]) -> PosePrior | None:
         """The camera's pose at the frame's exposure, to be tried; None where nothing convinces."""

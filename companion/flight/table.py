@@ -69,6 +69,7 @@ def _bridge(making: Making) -> Bridge:
         _bridge_config(making.config),
         making[MapStack].cache.manifest.geoid_separation_m,
         on_track=making.channels.clicks.send,
+        on_hint=making.channels.hints.send,
         on_text=making.channels.texts.send,
     )
 
@@ -212,7 +213,9 @@ def _feed(making: Making) -> Feed:
 
 def _search(making: Making) -> PlaceSearch:
     cache, event = making[MapStack].cache, making.channels.events.send
-    return PlaceSearch(cache, making.config.localizer, making[AutopilotPose], event)
+    search = PlaceSearch(cache, making.config.localizer, making[AutopilotPose], event)
+    making.channels.hints.subscribe(search.hint_at)
+    return search
 
 
 def _engine(making: Making) -> DualThreadEngine:

@@ -54,6 +54,13 @@ class Load(_Model):
     for_s: float = Field(gt=0, le=300)
 
 
+class PlaceHint(_Model):
+    """The operator tells the companion where the vehicle is, off_north_m beside it."""
+
+    radius_m: float = Field(gt=0, le=5000)
+    off_north_m: float = Field(0.0, ge=-2000, le=2000)
+
+
 class LoopEvent(_Model):
     """Something that happens at_s seconds after the recorded part began (and GNSS was denied).
 
@@ -66,6 +73,7 @@ class LoopEvent(_Model):
     picture: Picture | None = None
     drag: Drag | None = None
     load: Load | None = None
+    hint: PlaceHint | None = None
     start: bool = False
     kill: bool = False
     restart_after_s: float = Field(1.0, ge=0, le=60)

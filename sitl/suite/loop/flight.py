@@ -11,6 +11,7 @@ from pathlib import Path
 
 import numpy as np
 import yaml
+from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from localizer.map.cache.cache import TileCache
 from mavlink_bridge.link.tlog import read_tlog
@@ -23,8 +24,9 @@ from sitl.demo.companion_process import Ports, free_udp_port, write_deployment
 from sitl.demo.flight import FilmedFlight, camera_config, home_of, vehicle_parameters
 from sitl.demo.script import mission
 from sitl.ground.pilot import Pilot
+from sitl.ground.vehicle_record import VEHICLE
 from sitl.suite.flight import longest_stall, slowest_pace
-from sitl.suite.loop.case import LoopCase, LoopEvent
+from sitl.suite.loop.case import LoopCase, LoopEvent, PlaceHint
 from sitl.suite.loop.companion import LoopCompanion
 from sitl.suite.loop.disturbances import GnssDrag, OtherWork
 from sitl.suite.loop.judge import LoopRecord, LoopSample, LoopText
@@ -33,7 +35,9 @@ from sitl.vehicles.process import VehicleKind, VehicleProcess
 
 _STEP_S = 0.25
 _TRACKING_S = 90.0
+_LOCALIZER = 197  # component
 _DRAG_STEP_S = 0.5
+_POSITION_FRESH_S = 1.0  # LOCAL_POSITION_NED comes 25 times a second, while there is a position
 
 
 @dataclass(frozen=True)
@@ -129,7 +133,7 @@ class _LoopFlight:
             if t.time_ns >= self._start_ns
         )
         return LoopRecord(
-            tuple(self._samples),
+            self._with_errors(),
             texts,
             tuple(self._fix_errors()),
             slowest_pace(self._ticks),
@@ -194,11 +198,23 @@ class _LoopFlight:
             work = OtherWork(event.load, self._companion)
             self._stack.callback(work.end)
             self._later(event.load.for_s, work.end)
+        if event.hint is not None:
+            self._tell_place(event.hint)
         if event.start:
             self._companion.start()
         if event.kill:
             self._companion.kill()
             self._later(event.restart_after_s, self._companion.start)
+
+    def _tell_place(self, hint: PlaceHint) -> None:
+        place = self._pilot.record.truth.location.offset(hint.off_north_m, 0.0, 0.0)
+        self._pilot.link.send(
+            mavlink.MAVLink_command_int_message(
+                VEHICLE, _LOCALIZER, mavlink.MAV_FRAME_GLOBAL,
+                mavlink.MAV_CMD_EXTERNAL_POSITION_ESTIMATE, 0, 0, 0.0, 0.0, hint.radius_m, 0.0,
+                round(place.latitude_deg * 1e7), round(place.longitude_deg * 1e7), math.nan,
+            )
+        )  # fmt: skip
 
     def _drag_on(self) -> None:
         if self._drag is not None and not self._drag.is_over(self._now_s):
@@ -212,31 +228,35 @@ class _LoopFlight:
 
     def _sample(self) -> None:
         record, health = self._pilot.record, self._companion.health()
-        error_m, north_m, east_m = self._ekf_error()
+        north_m, east_m, _ = self._home.ned_of(record.truth.location)
         self._ticks.append((self._now_s, record.time_s))
         self._samples.append(
             LoopSample(
-                self._now_s, error_m, north_m, east_m, record.mode or "", health.level,
+                self._now_s, math.inf, north_m, east_m, record.mode or "", health.level,
                 health.text, health.age_s, health.findings, health.rate_hz,
             )
         )  # fmt: skip
-
-    def _ekf_error(self) -> tuple[float, float, float]:
-        """Horizontal error of the EKF's position now, and where the vehicle truly is."""
-        north, east, _ = self._home.ned_of(self._pilot.record.truth.location)
-        ekf = self._pilot.record.ekf
-        truth = self._pilot.record.truth_at(ekf.time_ns) if ekf is not None else None
-        if ekf is None or ekf.location is None or truth is None:
-            return math.inf, north, east
-        true = self._home.ned_of(truth.location)
-        seen = self._home.ned_of(ekf.location)
-        return math.hypot(seen[0] - true[0], seen[1] - true[1]), north, east
 
     def _is_tracking(self) -> bool:
         self._companion.require()
         return self._companion.health().is_tracking
 
     # --- after -----------------------------------------------------------------------------------
+
+    def _with_errors(self) -> tuple[LoopSample, ...]:
+        """The samples with the EKF's horizontal error at their times."""
+        pairs = list(self._pilot.record.ekf_pairs())
+        times = np.array([(ekf.time_ns - self._start_ns) * 1e-9 for ekf, _ in pairs])
+        samples = []
+        for sample in self._samples:
+            i = int(np.searchsorted(times, sample.at_s, side="right")) - 1
+            error_m = math.inf
+            if i >= 0 and sample.at_s - times[i] < _POSITION_FRESH_S:
+                ekf, true = pairs[i]
+                north_m, east_m, _ = true.ned_of(ekf.location) if ekf.location else (math.inf,) * 3
+                error_m = math.hypot(north_m, east_m)
+            samples.append(replace(sample, error_m=error_m))
+        return tuple(samples)
 
     def _fix_errors(self) -> list[float]:
         """Horizontal errors of every position that was injected in the recorded part, metres."""

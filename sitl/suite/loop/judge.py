@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 
@@ -14,14 +15,16 @@ _STALE_S = 2.0  # a health report older than this is none: the process is gone, 
 _AUTOPILOT = 1  # component id
 _WARNING = 4  # MAV_SEVERITY; lower is worse
 _FALSE_M = 5.0
+_GNSS_LOST = "GNSS lost"
 
 
 @dataclass(frozen=True)
 class LoopSample:
     """A moment of the recorded part, seconds since it began.
 
-    error_m: the EKF's horizontal error. level, health: the companion's health; age_s: of that
-    report; findings: of its guardian, that stand; rate_hz: localized frames. mode: the autopilot's.
+    error_m: the EKF's horizontal error, infinite while it reports no position. level, health: the
+    companion's health; age_s: of that report; findings: of its guardian, that stand; rate_hz:
+    localized frames. mode: the autopilot's.
     """
 
     at_s: float
@@ -72,12 +75,14 @@ class LoopRecord:
 
 @dataclass(frozen=True)
 class LoopFigures:
-    """A flight in numbers, metres and seconds. max_error_m: of the EKF, horizontal; untold_s: see
-    `untold_s`; false: injected positions further off than 5 m, of `sent`, the worst max_fix_m;
-    told_s: of health worse than ok or a finding; rate_hz: median of localized frames.
+    """A flight in numbers, metres and seconds. max_error_m: of the EKF, horizontal, while it
+    reports a position (it reports none for blind_s); untold_s: see `untold_s`; false: injected
+    positions further off than 5 m, of `sent`, the worst max_fix_m; told_s: of health worse than ok
+    or a finding; rate_hz: median of localized frames.
     """
 
     max_error_m: float
+    blind_s: float
     untold_s: float
     false: int
     sent: int
@@ -111,23 +116,31 @@ def untold_s(samples: Sequence[LoopSample], beyond_m: float) -> float:
 def figures(record: LoopRecord, beyond_m: float) -> LoopFigures:
     """The flight's numbers."""
     samples, fixes = record.samples, np.asarray(record.fix_errors_m)
-    ends = [s.at_s for s in samples[1:]]
-    told = [end - s.at_s for s, end in zip(samples, ends, strict=False) if s.is_told]
+    spans = [(s, after.at_s - s.at_s) for s, after in pairwise(samples)]
+    known = [s.error_m for s in samples if math.isfinite(s.error_m)]
     return LoopFigures(
-        max_error_m=max((s.error_m for s in samples), default=math.nan),
+        max_error_m=max(known, default=math.nan),
+        blind_s=sum(length for s, length in spans if not math.isfinite(s.error_m)),
         untold_s=untold_s(samples, beyond_m),
         false=int(np.sum(fixes > _FALSE_M)),
         sent=len(fixes),
         max_fix_m=float(fixes.max()) if len(fixes) else math.nan,
-        told_s=sum(told),
+        told_s=sum(length for s, length in spans if s.is_told),
         rate_hz=float(np.median([s.rate_hz for s in samples])) if samples else 0.0,
         seconds=samples[-1].at_s if samples else 0.0,
     )
 
 
-def false_alarms(record: LoopRecord) -> tuple[str, ...]:
-    """Everything that was told in a flight in which nothing was wrong, in order of time."""
-    told = [(t.at_s, t.text) for t in record.texts if t.is_warning]
+def false_alarms(record: LoopRecord, *, denied: bool = False) -> tuple[str, ...]:
+    """Everything that was told in a flight in which nothing was wrong, in order of time.
+
+    denied: GNSS was switched off, and that it is lost is true.
+    """
+    told = [
+        (t.at_s, t.text)
+        for t in record.texts
+        if t.is_warning and not (denied and _GNSS_LOST in t.text)
+    ]
     before: set[str] = set()
     for sample in record.samples:
         now = {f"finding {name}" for name in sample.findings}
@@ -138,8 +151,8 @@ def false_alarms(record: LoopRecord) -> tuple[str, ...]:
     return tuple(f"{at_s:.1f} s: {text}" for at_s, text in sorted(told))
 
 
-def judge(record: LoopRecord, expect: Expectation) -> tuple[Held, ...]:
-    """Every expectation, held against the record."""
+def judge(record: LoopRecord, expect: Expectation, *, denied: bool = False) -> tuple[Held, ...]:
+    """Every expectation, held against the record. denied: GNSS was switched off as it began."""
     samples, flown = record.samples, figures(record, expect.beyond_m)
     held = [
         Held(
@@ -163,7 +176,7 @@ def judge(record: LoopRecord, expect: Expectation) -> tuple[Held, ...]:
         held.append(Held("tracks at the end", ok, last.health if last else "no samples"))
     held += [_said(record.texts, part) for part in expect.says]
     if expect.silent:
-        told = false_alarms(record)
+        told = false_alarms(record, denied=denied)
         held.append(Held("no warning", not told, "; ".join(told) or "none"))
     return tuple(held)
 

@@ -92,9 +92,9 @@ def _flown(case: LoopCase, kind: VehicleKind, seed: int, options: LoopOptions) -
         case.name,
         kind,
         seed,
-        judge(record, case.expect),
+        judge(record, case.expect, denied=case.deny),
         figures(record, case.expect.beyond_m),
-        false_alarms(record) if case.is_normal else None,
+        false_alarms(record, denied=case.deny) if case.is_normal else None,
         record.pace,
         record.stall_s,
     )

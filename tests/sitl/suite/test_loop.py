@@ -71,6 +71,9 @@ def replace_says(expect: Expectation) -> Expectation:
 def test_whatever_is_told_of_a_good_flight_is_a_false_alarm() -> None:
     quiet = LoopRecord(flight([0.5] * 4), (LoopText(1.0, 1, 3, "EKF3 IMU0 yaw"),), (0.2,))
     assert false_alarms(quiet) == ()
+    lost = replace(quiet, texts=(LoopText(1.5, 191, 4, "PiLoT: GNSS lost, injecting"),))
+    assert false_alarms(lost, denied=True) == ()
+    assert len(false_alarms(lost)) == 1
     degraded = (*flight([0.5] * 4), replace(GOOD, at_s=2.0, level="degraded"))
     assert false_alarms(replace(quiet, samples=degraded)) == (
         "2.0 s: health degraded: localization tracking",
