@@ -24,6 +24,7 @@ _AIRBORNE_M = 3.0
 _IDENTICAL_S = 1.5
 _STILL_PER_M = 90.0  # s/m: how much longer where the limit is more metres on the ground
 _STILL_FIRST_S = 2.0
+_MOVED_M, _MOVED_SPEED_MPS, _MOVED_LEAST_S = 2.0, 1.5, 0.35
 _WAITS_NS = 500_000_000  # for the IMU's record to reach a fix
 _FRESH_NS = 1_000_000_000
 _PICTURE_FRESH_NS = 2_000_000_000
@@ -212,7 +213,19 @@ class Monitor:
             return Reading(None)  # a feed that ended is told as such
         verdict = self._picture[1]
         identical = verdict.identical_s >= _IDENTICAL_S
-        return Reading(identical or verdict.still_s >= self._still_s(state), verdict.still_s)
+        still = verdict.still_s >= self._still_s(state) or self._should_have_moved(state, verdict)
+        return Reading(identical or still, verdict.still_s)
+
+    @staticmethod
+    def _should_have_moved(state: VehicleState, verdict: PictureVerdict) -> bool:
+        """Whether the EKF flew metres while the picture stood still; a hover is too slow to tell.
+
+        The EKF still has its speed then: it takes a second or two to follow a frozen position.
+        """
+        if state.local_velocity_ned is None or verdict.still_s < _MOVED_LEAST_S:
+            return False
+        speed = math.hypot(*state.local_velocity_ned[:2])
+        return speed >= _MOVED_SPEED_MPS and speed * verdict.still_s >= _MOVED_M
 
     def _still_s(self, state: VehicleState) -> float:
         """How long a hover may look still: the limit in the picture is metres on the ground."""

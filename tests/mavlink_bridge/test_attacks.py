@@ -93,7 +93,12 @@ class Orders:
 
 
 @pytest.mark.parametrize(
-    ("command", "component"), [(COMMAND, 197), (mavlink.MAV_CMD_CAMERA_TRACK_POINT, 100)]
+    ("command", "component"),
+    [
+        (COMMAND, 197),
+        (mavlink.MAV_CMD_CAMERA_TRACK_POINT, 100),
+        (mavlink.MAV_CMD_EXTERNAL_POSITION_ESTIMATE, 197),
+    ],
 )
 def test_orders_of_other_systems_are_denied_and_told_once(
     monkeypatch: pytest.MonkeyPatch, command: int, component: int
