@@ -86,6 +86,7 @@ class Flight:
             lambda: HealthLevel.OK,
             say,
             None,
+            None,
             VehicleWatch(say),
             gate,
         )
