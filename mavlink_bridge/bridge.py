@@ -236,6 +236,13 @@ class Bridge:
         shadow score)."""
         return self._fc.injecting
 
+    @property
+    def trouble(self) -> str:
+        """Why the EKF does not have what it should while injecting: positions are not sent, or not
+        followed; empty while all is well. The operator was told.
+        """
+        return self._fc.trouble
+
     def shadow_score(self) -> ShadowScore:
         """How vision compared with GNSS while that was healthy: the go or no-go before denial."""
         return self._fc.shadow_score(monotonic_ns())

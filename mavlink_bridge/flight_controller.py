@@ -80,6 +80,16 @@ class FlightControllerEnd:
         """Whether fixes are sent right now: mode, gate and the shadow score's interlock."""
         return self._mode == self._shared.mode() == "inject"
 
+    @property
+    def trouble(self) -> str:
+        """Why the EKF does not have what it should, as it was told: positions are not sent, or are
+        not followed. Empty while all is well, and in other modes than ``inject``.
+        """
+        if not self.injecting:
+            return ""
+        verdict = self.outcome.verdict
+        return self.sender.refusal or (verdict.reason if verdict is not None else "")
+
     def figures(self) -> Figures:
         """Counters and measures for a record, None where one is not known; keys are prefixed by
         where they come from.

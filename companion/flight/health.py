@@ -28,6 +28,8 @@ _WINDOW = 200
 _STALE_S = 2.0
 _SHORT_BRIDGE_NS = 2_000_000_000
 _NOTICE = 5  # MAV_SEVERITY_NOTICE
+_NOT_USED = "vision not used: "
+_TOLD = (_NOT_USED, "withheld: ")
 _SILENT_VEHICLE = "no heartbeat from the flight controller"
 
 _OF_FEED = {
@@ -106,13 +108,15 @@ class HealthMonitor:
 
     def _report(self) -> None:
         level, text = self._assess()
-        # The bridge logs and records what it tells; a silent vehicle it tells by itself.
+        # The bridge logs and records what it tells; a silent vehicle it tells by itself, and what
+        # keeps positions from the EKF; the guardian tells what it withholds.
         if self._ended:
             if self._stop.is_set():
                 self._bridge.say(_NOTICE, "PiLoT: ending, nothing is injected any more")
                 self._write("ended", f"{self._ended}; {text} until then")
             return
-        self._bridge.set_health(level, text, tell=text != _SILENT_VEHICLE)
+        known = text == _SILENT_VEHICLE or text.startswith(_TOLD)
+        self._bridge.set_health(level, text, tell=not known)
         self._write(level.value, text)
 
     def _assess(self) -> tuple[HealthLevel, str]:
@@ -133,6 +137,9 @@ class HealthMonitor:
         level, text = _OF_STATE[estimate.state]
         if estimate.state is TrackingState.BRIDGING:
             level, text = _bridging(estimate)
+        trouble = self._bridge.trouble
+        if level is HealthLevel.OK and trouble:
+            level, text = HealthLevel.DEGRADED, _NOT_USED + trouble
         withheld = self._guardian.reason if self._guardian is not None else ""
         if withheld and not _is_lost(estimate):
             level, text = HealthLevel.FAILED, withheld

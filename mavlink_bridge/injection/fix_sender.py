@@ -18,6 +18,7 @@ from mavlink_bridge.vehicle.profile import FirmwareProfile
 
 _QUEUE = 64
 _NEWS_AFTER_NS = 1_000_000_000  # a gap in the fixes that is told
+_NOT_SENT = "not sent: "
 _GOOD_NS = 1_000_000_000
 
 
@@ -62,12 +63,18 @@ class FixSender:
         # A late fix or two is no news: the texts would follow every hiccup of a busy computer.
         brief = reason == NO_FRESH_FIX and now_ns - self._delivered_ns < _NEWS_AFTER_NS
         if reason != NO_FIX_YET and not brief:
-            problem = f"not sent: {reason}" if reason else ""
+            problem = f"{_NOT_SENT}{reason}" if reason else ""
             self._teller.tell_settled("inject", problem, "injecting", now_ns, prefix=mode)
 
     def is_good(self, now_ns: int) -> bool:
         """Whether positions came of late, and the yaw guard is content."""
         return not self.injector.guard.blocked and now_ns - self._delivered_ns < _GOOD_NS
+
+    @property
+    def refusal(self) -> str:
+        """Why positions that are due are not made, once it has lasted and was told; else empty."""
+        told = self._teller.told("inject").startswith(_NOT_SENT)
+        return f"{_NOT_SENT}{self.injector.reason}" if told and self.injector.reason else ""
 
     def waiting(self) -> dict[str, int]:
         """Lengths of everything that waits here."""

@@ -16,8 +16,9 @@ from mavlink_bridge.messages import HealthLevel
 
 
 class FakeBridge:
-    def __init__(self, connected):
+    def __init__(self, connected, trouble=""):
         self._connected = connected
+        self.trouble = trouble
         self.told = []
         self.said = []
 
@@ -28,7 +29,8 @@ class FakeBridge:
         return SimpleNamespace(connected=self._connected)
 
     def set_health(self, level, text, *, tell):
-        assert tell is self._connected  # a silent vehicle is told by the bridge itself
+        known = text.startswith(("vision not used", "withheld"))  # told by bridge and guardian
+        assert tell is (self._connected and not known)  # as is a silent vehicle
         self.told.append((level, text))
 
     def counters(self):
@@ -38,9 +40,9 @@ class FakeBridge:
         return SimpleNamespace(line=lambda: "no comparison yet")
 
 
-def _one_report(folder, state, connected, tracking=None, frames_in=0, **options):
+def _one_report(folder, state, connected, tracking=None, frames_in=0, trouble="", **options):
     """What the bridge is told, and the events, of a monitor that is started and stopped."""
-    bridge, events = FakeBridge(connected), []
+    bridge, events = FakeBridge(connected, trouble), []
     monitor = HealthMonitor(
         lambda: EngineHealth(frames_in=frames_in), bridge, lambda: state,
         lambda *e: events.append(e), folder, **options,
@@ -86,6 +88,19 @@ def test_what_is_waited_for_is_told(tmp_path):
     """With pictures and no estimate it is the autopilot's position or attitude that is missing."""
     told, _ = _one_report(tmp_path, StreamState.LIVE, True, frames_in=3)
     assert told[-1] == (HealthLevel.STARTING, "waiting for a pose prior")
+
+
+def test_tracking_that_the_ekf_does_not_get_is_not_ok(tmp_path):
+    """Found on ArduPilot: the yaw guard refused every fix, LAND without a position, health ok."""
+    trouble = "not sent: vision yaw differs from the autopilot's by +8.7 deg"
+    told, _ = _one_report(
+        tmp_path, StreamState.LIVE, True, tracking=TrackingState.TRACKING, trouble=trouble
+    )
+    assert told[-1] == (HealthLevel.DEGRADED, f"vision not used: {trouble}")
+    lost, _ = _one_report(
+        tmp_path, StreamState.LIVE, True, tracking=TrackingState.LOST, trouble=trouble
+    )
+    assert lost[-1][0] is HealthLevel.FAILED  # the worse news
 
 
 def test_scaled_video_is_told_beside_what_localization_makes_of_it(tmp_path):
