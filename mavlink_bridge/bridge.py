@@ -16,7 +16,7 @@ from mavlink_bridge.flight_controller import FC_WANTED, FlightControllerEnd, mes
 from mavlink_bridge.ground import GroundEnd
 from mavlink_bridge.injection.closed_loop import LoopVerdict
 from mavlink_bridge.injection.rc_gate import InjectionGate
-from mavlink_bridge.injection.shadow import ShadowScore
+from mavlink_bridge.injection.shadow import ShadowScore, gnss_healthy
 from mavlink_bridge.link.clock import SteadyUtc, monotonic_ns
 from mavlink_bridge.link.link import Link, LinkHandler
 from mavlink_bridge.link.replay import ReplayWindow
@@ -174,6 +174,10 @@ class Bridge:
         """Until it is called with an empty text, "the EKF follows" is not said."""
         self._fc.outcome.doubt = why
 
+    def forbid(self, why: str) -> None:
+        """Until it is called with an empty text, injection and a switch to vision do not begin."""
+        self._fc.forbid(why)
+
     def look(self, view: CameraView) -> None:
         """Tell the ground where the camera looks (CAMERA_FOV_STATUS); never blocks."""
         self._to_ground(view)
@@ -213,6 +217,14 @@ class Bridge:
     def local_at(self, time_ns: int) -> tuple[float, ...] | None:
         """The EKF's position (north, east, down) from its origin at a time, m; None: unknown."""
         return self._tracker.local_at(time_ns)
+
+    def gnss_place_at(self, time_ns: int) -> tuple[float, ...] | None:
+        """The EKF's (latitude, longitude, altitude AMSL) at a time; None while it does not follow a
+        healthy GNSS, or where that is not known.
+        """
+        if not self._fc.sources.on_gnss or not gnss_healthy(self.state(), monotonic_ns()):
+            return None
+        return self._tracker.global_at(time_ns)
 
     def inertial_since(self, time_ns: int) -> tuple[InertialSample, ...]:
         """What the vehicle's IMU read after a CLOCK_MONOTONIC time, oldest first."""

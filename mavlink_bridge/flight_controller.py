@@ -75,6 +75,10 @@ class FlightControllerEnd:
         """How vision compared with GNSS over the last two minutes."""
         return self.outcome.shadow.score(now_ns, self.sender.injector.refused_yaw_rad)
 
+    def forbid(self, why: str) -> None:
+        """Until it is called with an empty text, nothing begins."""
+        self._interlock.forbidden = why
+
     @property
     def injecting(self) -> bool:
         """Whether fixes are sent right now: mode, gate and the shadow score's interlock."""

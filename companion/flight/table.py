@@ -22,6 +22,7 @@ from companion.flight.parts import Making, Part
 from companion.flight.priors import AutopilotPose, PriorSources
 from companion.flight.recorder import RecordKeeper, remove_empty
 from companion.flight.search import PlaceSearch
+from companion.flight.sightings import Sightings
 from companion.flight.view_reporter import ViewReporter
 from companion.guardian.guardian import Guardian
 from companion.guardian.monitor import Limits
@@ -203,6 +204,9 @@ def _guardian(making: Making) -> Guardian:
     guardian = Guardian(config.guardian, limits, making[Bridge])
     making[FixInjection].add_judge(lambda _, fix: guardian.judge(fix))
     making.channels.frames.subscribe(lambda f: guardian.see(f.exposure_time_ns, f.image))
+    if config.guardian.calibration.enabled:
+        sightings = Sightings(making[Bridge], making[Installation], guardian.sight)
+        making.channels.estimates.subscribe(sightings.add_estimate)
     return guardian
 
 
@@ -243,7 +247,7 @@ PARTS: tuple[Part[Any], ...] = (
     ),
     Part("injection", FixInjection, _injection, depends=(Bridge, Installation)),
     Part(
-        "guardian", Guardian, _guardian, depends=(Bridge, FixInjection),
+        "guardian", Guardian, _guardian, depends=(Bridge, Installation, FixInjection),
         start=Guardian.start, stop=Guardian.stop, wanted=lambda config: config.guardian.enabled,
     ),
     Part(

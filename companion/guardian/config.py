@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from pydantic import BaseModel, ConfigDict, Field
 
+from companion.calibration.config import CalibrationLimits
+
 
 class _Model(BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
@@ -41,17 +43,20 @@ class MotionConfig(_Model):
 
 
 class ProtectionConfig(_Model):
-    """The budget of a protection level: what a fix's covariance does not know of."""
+    """The budget of a protection level: what a fix's covariance does not know of, each as one
+    standard deviation along an axis.
+    """
 
     risk: float = Field(
         default=1e-3, gt=0.0, le=0.1, description="probability of an error beyond the level"
     )
-    map_m: float = Field(default=0.5, ge=0.0, le=100.0, description="the map's own error")
+    map_m: float = Field(default=0.3, ge=0.0, le=100.0, description="the map, north and east")
+    map_height_m: float = Field(default=0.4, ge=0.0, le=100.0, description="the map's height")
     calibration_share: float = Field(
-        default=0.005, ge=0.0, le=0.5, description="of the height above take-off"
+        default=0.004, ge=0.0, le=0.5, description="the camera's, of the height above take-off"
     )
     time_bias_s: float = Field(
-        default=0.02, ge=0.0, le=1.0, description="of the time stamps, times the speed"
+        default=0.01, ge=0.0, le=1.0, description="the time stamps', times the speed"
     )
 
 
@@ -62,6 +67,7 @@ class GuardianConfig(_Model):
     picture: PictureConfig = PictureConfig()
     motion: MotionConfig = MotionConfig()
     protection: ProtectionConfig = ProtectionConfig()
+    calibration: CalibrationLimits = CalibrationLimits()
     height_m: float = Field(
         default=8.0, gt=0.0, le=200.0, description="vision's height against the barometer's, drift"
     )

@@ -24,8 +24,9 @@ class Action(enum.IntEnum):
 class Rule:
     """One line of the table in docs/safety.md.
 
-    text: for the operator, with one figure {0:.0f}. alert_s: how long the evidence must last;
-    release_s: how long it must be over. repeat_s: told again as long as it lasts; 0: once.
+    text: for the operator, with one figure {0:.0f} and a word {1}. alert_s: how long the evidence
+    must last; release_s: how long it must be over. repeat_s: told again as long as it lasts; 0:
+    once. forbids: while it stands, injection and a switch to vision do not begin.
     """
 
     name: str
@@ -34,10 +35,11 @@ class Rule:
     alert_s: float
     release_s: float
     repeat_s: float = 0.0
+    forbids: bool = False
 
-    def line(self, figure: float) -> str:
+    def line(self, figure: float, word: str = "") -> str:
         """The STATUSTEXT."""
-        what = self.text.format(figure)
+        what = self.text.format(figure, word)
         return PREFIX + (f"withheld: {what}" if self.action is not Action.NONE else what)
 
 
@@ -51,6 +53,16 @@ EKF_REFUSES = Rule("ekf_refuses", "EKF refuses vision ({0:.1f})", Action.NONE, 2
 EKF_JUMPED = Rule("ekf_jumped", "EKF jumped {0:.0f} m: unconfirmed", Action.NONE, 0.0, 0.0)
 CLOCK = Rule("clock", "video clock ran back or stands", Action.WITHHOLD, 0.5, 3.0)
 LIMIT = Rule("limit", "position only to {0:.0f} m", Action.WITHHOLD, 1.0, 3.0)
+FOCAL = Rule(
+    "focal_length", "focal length looks {0:.1f} % {1}", Action.NONE, 2.0, 10.0, 60.0, forbids=True
+)
+BORESIGHT = Rule(
+    "boresight", "camera {0:.0f} deg off in {1}", Action.NONE, 3.0, 10.0, 60.0,
+    forbids=True,
+)  # fmt: skip
+TIME_OFFSET = Rule(
+    "time_offset", "pictures stamped {0:.0f} ms {1}", Action.NONE, 1.0, 10.0, 60.0, forbids=True
+)
 RULES = (
     VIDEO_FROZEN,
     VIDEO_REPEATS,
@@ -62,6 +74,9 @@ RULES = (
     EKF_JUMPED,
     CLOCK,
     LIMIT,
+    FOCAL,
+    BORESIGHT,
+    TIME_OFFSET,
 )
 
 
@@ -71,6 +86,7 @@ class Reading:
 
     bad: bool | None
     figure: float = 0.0
+    word: str = ""
 
 
 class Latch:
@@ -80,6 +96,7 @@ class Latch:
         self.rule = rule
         self.raised = False
         self.figure = 0.0
+        self.word = ""
         self._since_ns: int | None = None
         self._told_ns = 0
 
@@ -89,7 +106,7 @@ class Latch:
             self._since_ns = None if not self.raised else self._since_ns
             return self._again(now_ns)
         if reading.bad:
-            self.figure = reading.figure
+            self.figure, self.word = reading.figure, reading.word
         if reading.bad == self.raised:
             self._since_ns = None
             return self._again(now_ns)
@@ -103,7 +120,7 @@ class Latch:
 
     def line(self) -> str:
         """The operator's line, with the newest figure."""
-        return self.rule.line(self.figure)
+        return self.rule.line(self.figure, self.word)
 
     def _again(self, now_ns: int) -> str | None:
         repeats = self.raised and self.rule.repeat_s > 0.0

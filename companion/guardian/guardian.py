@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 import threading
 
+from companion.calibration.sighting import Sighting
 from companion.guardian.config import GuardianConfig
 from companion.guardian.monitor import Limits, Monitor
 from companion.guardian.protection import ProtectionLevel
@@ -46,6 +47,11 @@ class Guardian:
     def see(self, time_ns: int, image: Image) -> None:
         """Offer a picture; the newest is looked at. Never blocks."""
         self._picture = (time_ns, image)
+
+    def sight(self, sighting: Sighting) -> None:
+        """Offer a registered picture as evidence of the calibration."""
+        with self._lock:
+            self._monitor.sight(sighting)
 
     def judge(self, fix: VisionFix) -> VisionFix | None:
         """The fix as it may be injected; None withholds it."""
@@ -100,8 +106,9 @@ class Guardian:
             if picture is not None:
                 self._monitor.see(*picture)
             lines = self._monitor.step(monotonic_ns(), self._bridge)
-            doubt = self._monitor.doubt
+            doubt, forbids = self._monitor.doubt, self._monitor.forbids
         self._bridge.doubt(doubt)
+        self._bridge.forbid(forbids)
         for line in lines:
             severity = _ERROR if line.withholds else _WARNING
             self._bridge.say(severity if line.bad else _NOTICE, line.text)

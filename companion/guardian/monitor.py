@@ -8,6 +8,8 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Protocol
 
+from companion.calibration.sighting import Figure, Sighting
+from companion.calibration.watch import CalibrationWatch
 from companion.guardian import findings as f
 from companion.guardian.config import GuardianConfig
 from companion.guardian.ekf import EkfWatch
@@ -18,7 +20,13 @@ from companion.guardian.picture import PictureVerdict, PictureWatch
 from companion.guardian.place_checks import GnssCheck, HeightCheck, JumpCheck
 from companion.guardian.protection import ProtectionLevel, protection_level
 from localizer.types import Image
-from mavlink_bridge.messages import Attitude, InertialSample, VehicleState, VisionFix
+from mavlink_bridge.messages import (
+    Attitude,
+    GimbalAttitude,
+    InertialSample,
+    VehicleState,
+    VisionFix,
+)
 
 _AIRBORNE_M = 3.0
 _IDENTICAL_S = 1.5
@@ -47,6 +55,14 @@ class Vehicle(Protocol):
 
     def inertial_since(self, time_ns: int) -> tuple[InertialSample, ...]:
         """What its IMU read after a time, oldest first."""
+        ...
+
+    def gimbal_at(self, time_ns: int) -> GimbalAttitude | None:
+        """The camera's attitude to NED at a time."""
+        ...
+
+    def gnss_place_at(self, time_ns: int) -> tuple[float, ...] | None:
+        """The EKF's latitude, longitude and altitude at a time, while GNSS is what it follows."""
         ...
 
 
@@ -83,6 +99,7 @@ class Monitor:
         self._gnss = GnssCheck(config)
         self._jumps = JumpCheck(config)
         self._ekf = EkfWatch()
+        self._calibration = CalibrationWatch(config.calibration)
         alert_s = min(f.LIMIT.alert_s, limits.time_to_alert_s)
         changed = {
             f.GNSS.name: replace(f.GNSS, repeat_s=config.gnss_repeat_s),
@@ -122,6 +139,14 @@ class Monitor:
         return latch.line().removeprefix(f.PREFIX) if latch.raised else ""
 
     @property
+    def forbids(self) -> str:
+        """Why injection must not begin, in words; empty where nothing speaks against."""
+        for latch in self._latches.values():
+            if latch.raised and latch.rule.forbids:
+                return latch.line().removeprefix(f.PREFIX)
+        return ""
+
+    @property
     def level(self) -> ProtectionLevel | None:
         """The newest fix's protection level."""
         return self._level
@@ -140,9 +165,14 @@ class Monitor:
         self._backwards = 0
         self._picture = (time_ns, self._pictures.add(time_ns, image))
 
+    def sight(self, sighting: Sighting) -> None:
+        """A registered picture, for what it says of the camera."""
+        self._calibration.add(sighting)
+
     def admit(self, fix: VisionFix, state: VehicleState) -> VisionFix | None:
         """The fix, if it may be injected; with a reset where the last ones were wrong."""
-        self._level = level = protection_level(fix, state, self._config.protection)
+        known_m = self._known_m(state)
+        self._level = level = protection_level(fix, state, self._config.protection, known_m)
         fix = replace(fix, protection_m=(level.horizontal_m, level.vertical_m))
         verdict = self._verdict
         agrees = verdict is None or not verdict.settled or verdict.share < _CALM_SHARE
@@ -167,6 +197,7 @@ class Monitor:
         for sample in vehicle.inertial_since(self._track.newest_ns):
             self._track.add(sample, vehicle.attitude_at)
         self._follow(now_ns, state)
+        self._calibration.step(now_ns, vehicle, self._track)
         lines = []
         readings = self._readings(now_ns, state)
         for name, latch in self._latches.items():
@@ -205,8 +236,31 @@ class Monitor:
             f.EKF_JUMPED.name: lambda: self._ekf_jump(state, now_ns),
             f.CLOCK.name: lambda: Reading(self._backwards >= _BACKWARDS),
             f.LIMIT.name: lambda: self._beyond_limit() if fresh else none,
+            **self._calibration_checks(),
         }
         return {name: check() for name, check in checks.items()}
+
+    def _calibration_checks(self) -> dict[str, Callable[[], Reading]]:
+        limits, known = self._config.calibration, self._calibration.figures()
+        share, late = known.focal, known.late_s
+        long = "long" if share.value > 0.0 else "short"
+        when = "late" if late.value > 0.0 else "early"
+        return {
+            f.FOCAL.name: lambda: _beyond(share, limits.focal_share, 100.0, long),
+            f.BORESIGHT.name: lambda: _beyond(
+                known.boresight_deg, limits.boresight_deg, 1.0, known.axis
+            ),
+            f.TIME_OFFSET.name: lambda: _beyond(late, limits.time_s, 1e3, when),
+        }
+
+    def _known_m(self, state: VehicleState) -> float:
+        """By how much a fix is wrong for what was found of the calibration, metres."""
+        velocity = state.local_velocity_ned or (0.0, 0.0, 0.0)
+        return self._calibration.known_m(
+            math.hypot(*velocity[:2]),
+            focal=self._latches[f.FOCAL.name].raised,
+            time=self._latches[f.TIME_OFFSET.name].raised,
+        )
 
     def _frozen(self, now_ns: int, state: VehicleState) -> Reading:
         if self._picture is None or now_ns - self._picture[0] > _PICTURE_FRESH_NS:
@@ -272,3 +326,11 @@ class Monitor:
             return Reading(None)
         level_m = self._level.horizontal_m
         return Reading(level_m > self._limits.alert_limit_m, level_m)
+
+
+def _beyond(figure: Figure, limit: float, scale: float, word: str) -> Reading:
+    """Beyond its limit for sure, surely not, or not known."""
+    bad = figure.exceeds(limit)
+    if not bad and not figure.is_within(limit):
+        return Reading(None)
+    return Reading(bad, abs(figure.value) * scale, word)

@@ -20,21 +20,36 @@ class ProtectionLevel:
 
 
 def protection_level(
-    fix: VisionFix, state: VehicleState, config: ProtectionConfig
+    fix: VisionFix, state: VehicleState, config: ProtectionConfig, known_m: float = 0.0
 ) -> ProtectionLevel:
-    """The level of a fix: noise at the risk, plus map, calibration and time, as if they added up.
-
-    Horizontally the noise is that of a circular distribution of the worst axis: exp(-k^2/2) = risk;
-    vertically a normal one, bounded by the same exponential.
-    """
-    k = math.sqrt(-2.0 * math.log(config.risk))
+    """The level of a fix. known_m: what another watch found to be wrong, added as it is."""
     P = fix.position_covariance_ned
     horizontal = math.sqrt(max(float(np.linalg.eigvalsh(P[:2, :2])[-1]), 0.0))
     vertical = math.sqrt(max(float(P[2, 2]), 0.0))
-    height = state.altitude_relative_m or 0.0
-    velocity = state.local_velocity_ned or (0.0, 0.0, 0.0)
-    bias = config.map_m + config.calibration_share * max(height, 0.0)
-    return ProtectionLevel(
-        k * horizontal + bias + config.time_bias_s * math.hypot(*velocity[:2]),
-        k * vertical + bias + config.time_bias_s * abs(velocity[2]),
+    north, east, down = state.local_velocity_ned or (0.0, 0.0, 0.0)
+    height = max(state.altitude_relative_m or 0.0, 0.0)
+    speeds = (math.hypot(north, east), abs(down))
+    across, up = budget((horizontal, vertical), height, speeds, config)
+    return ProtectionLevel(across + known_m, up + known_m)
+
+
+def budget(
+    sigma_m: tuple[float, float],
+    height_m: float,
+    speeds_mps: tuple[float, float],
+    config: ProtectionConfig,
+) -> tuple[float, float]:
+    """Horizontal and vertical level, metres: k times the root of the summed variances.
+
+    Noise, map, calibration and time fail independently. Horizontally the error is that of a
+    circular distribution of the worst axis: exp(-k^2/2) = risk; vertically a normal one, bounded by
+    the same exponential. sigma_m, speeds_mps: horizontal and vertical; height_m: above take-off.
+    """
+    k = math.sqrt(-2.0 * math.log(config.risk))
+    maps = (config.map_m, config.map_height_m)
+    calibration = config.calibration_share * height_m
+    across, up = (
+        k * math.hypot(sigma, of_map, calibration, config.time_bias_s * speed)
+        for sigma, of_map, speed in zip(sigma_m, maps, speeds_mps, strict=True)
     )
+    return across, up

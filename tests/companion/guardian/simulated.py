@@ -9,7 +9,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from companion.guardian.monitor import Line, Monitor
-from mavlink_bridge.messages import Attitude, InertialSample, VehicleState, VisionFix
+from mavlink_bridge.messages import (
+    Attitude,
+    GimbalAttitude,
+    InertialSample,
+    VehicleState,
+    VisionFix,
+)
 from mavlink_bridge.vehicle.origin import offset
 
 Array = NDArray[np.float64]
@@ -113,6 +119,16 @@ class Flight:
         """Level but for an error that the EKF does not know of."""
         half = 0.5 * self.tilt_rad
         return Attitude(time_ns, 0.0, self.tilt_rad, 0.0, (np.cos(half), 0.0, np.sin(half), 0.0))
+
+    def gimbal_at(self, time_ns: int) -> GimbalAttitude | None:
+        """A camera that looks straight north and 45 degrees down, as it is reported."""
+        half = -np.pi / 8.0
+        q = (float(np.cos(half)), 0.0, float(np.sin(half)), 0.0)
+        return GimbalAttitude(time_ns, 0.0, 2.0 * half, 0.0, 0.0, q, "test")
+
+    def gnss_place_at(self, time_ns: int) -> tuple[float, ...] | None:
+        """The EKF follows vision here."""
+        return None
 
     def inertial_since(self, time_ns: int) -> tuple[InertialSample, ...]:
         """As the tracker keeps them."""

@@ -8,9 +8,21 @@ import cv2
 import numpy as np
 import pytest
 
+from companion.calibration.sighting import Sighting
+from companion.geometry import GIMBAL_FROM_CAMERA
 from companion.guardian.config import GuardianConfig
 from companion.guardian.monitor import Limits, Monitor
-from tests.companion.guardian.simulated import Flight, Path, hover, leg, second
+from localizer.geometry.pose import matrix_from_quaternion, so3_exp
+from tests.companion.guardian.simulated import (
+    HEIGHT,
+    LATITUDE,
+    LONGITUDE,
+    Flight,
+    Path,
+    hover,
+    leg,
+    second,
+)
 
 
 def monitor(**limits: float) -> Monitor:
@@ -222,3 +234,37 @@ def test_an_alert_limit_that_is_touched_now_and_then_does_not_flap() -> None:
         flight.fly(0.1 * tenth)
     assert flight.lines == []
     assert flight.withheld == []
+
+
+def looking(flight: Flight, yaw_off_deg: float) -> Sighting:
+    """What the map says of a camera that looks 45 degrees down, north but for an angle."""
+    now_ns = second(flight.at_s)
+    gimbal = flight.gimbal_at(now_ns)
+    assert gimbal is not None
+    reported = matrix_from_quaternion(gimbal.quaternion) @ GIMBAL_FROM_CAMERA
+    turned = so3_exp(np.array([0.0, 0.0, np.radians(yaw_off_deg)])) @ reported
+    return Sighting(now_ns, (LATITUDE, LONGITUDE, HEIGHT), 0.1, turned, 85.0)
+
+
+@pytest.mark.parametrize(("off_deg", "told"), [(4.0, True), (-12.0, True), (1.5, False)])
+def test_a_camera_that_is_mounted_wrong_is_told_and_injection_does_not_begin(
+    off_deg: float, told: bool
+) -> None:
+    """It is no reason to take back what already flies: positions do not depend on it."""
+    watched = monitor()
+    flight = Flight(watched, noise_m=0.1)
+    for quarter in range(1, 37):
+        flight.fly(0.25 * quarter)
+        watched.sight(looking(flight, off_deg))
+    text = f"PiLoT: camera {abs(off_deg):.0f} deg off in yaw"
+    assert [line for _, line in flight.lines] == ([text] if told else [])
+    assert watched.forbids == (text.removeprefix("PiLoT: ") if told else "")
+    assert flight.withheld == []
+    if told:
+        assert flight.told(text) < 9.0
+    if off_deg == 4.0:
+        for quarter in range(37, 110):  # put right
+            flight.fly(0.25 * quarter)
+            watched.sight(looking(flight, 0.0))
+        assert flight.told("over: boresight") < 27.0
+        assert watched.forbids == ""

@@ -102,6 +102,29 @@ def test_force_overrules_and_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
     assert told(flight, "shadow") == ["injection forced, no shadow check"]
 
 
+def test_what_is_forbidden_does_not_begin_and_goes_on_where_it_flies(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """A calibration that was found wrong: no injection, no switch, until it is over."""
+    flight = on_gnss(monkeypatch, switch=SWITCH)
+    flight.end.forbid("focal length looks 5.0 % long")
+    flight.run(18.0)
+    assert flight.vision() == []
+    assert told(flight, "not sent") == ["not sent: focal length looks 5.0 % long"]
+    flight.gnss_north_m = None
+    flight.run(5.0)
+    assert flight.vision() == []
+    assert orders(flight) == []
+    flight.gnss_north_m = 0.0
+    flight.end.forbid("")
+    flight.run(3.0)
+    assert flight.vision()
+    begun_ns = flight.now_ns
+    flight.end.forbid("focal length looks 5.0 % long")
+    flight.run(2.0)
+    assert flight.vision(begun_ns)  # taking it back would leave the vehicle without a position
+
+
 def test_the_pilots_gate_is_obeyed_and_told_without_a_go(monkeypatch: pytest.MonkeyPatch) -> None:
     gate = InjectionGate(RcGateConfig(), lambda _: None)
     flight = Flight(monkeypatch, gate, mode="rc")

@@ -1,0 +1,1 @@
+"""How wrong positions are when the installation is as a calibration leaves it."""

@@ -1,0 +1,98 @@
+"""Registers unseen frames with a camera that is not quite the calibrated one."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from itertools import groupby
+
+import numpy as np
+
+from benchmarks.basin.views import View
+from benchmarks.protection.draws import Fault, drawn
+from localizer.config import LocalizerConfig
+from localizer.features import load_extractor
+from localizer.features.detail import DetailExtractor
+from localizer.geometry.pose import Pose, so3_exp
+from localizer.map.cache.cache import TileCache
+from localizer.map.cache.stream import TileStreamer
+from localizer.registration import JNGO
+from localizer.render.numba_raster import NumbaRenderer
+from localizer.tracking.pipeline import Localizer
+from localizer.types import Frame, PosePrior
+
+_START_M, _START_DEG = 1.5, 1.0  # sigmas per axis of where tracking expects the camera
+_PASSES = 2  # in flight each reference is rendered where the last frame was found
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """One frame with one fault. error_m: east, north, up of the registration alone; beside_m: of
+    map, lever arm and time; axis: the true optical axis; sigma_m: by the covariance, worst
+    horizontal and vertical; depth_m: of the ground along the axis.
+    """
+
+    set: str
+    view: int
+    condition: str
+    height_m: float
+    depth_m: float
+    fov_deg: float
+    speed_mps: float
+    focal: float
+    accepted: bool
+    sigma_m: tuple[float, float]
+    error_m: tuple[float, float, float]
+    beside_m: tuple[float, float, float]
+    axis: tuple[float, float, float]
+
+
+def run(
+    name: str, views: Sequence[View], draws: int, seed: int, focal: float | None, *, skip: int = 0
+) -> Iterator[Outcome]:
+    """Every view from number `skip` on with so many faults; each view's are the same whatever else
+    is run.
+    """
+    extractor, optimizer = DetailExtractor(load_extractor(None, threads=1)), JNGO(threads=1)
+    config = LocalizerConfig(odometry=None)
+    numbered = list(enumerate(views))[skip:]
+    for cache, some in groupby(numbered, key=lambda item: item[1].map_cache):
+        with TileStreamer(TileCache.open(cache)) as streamer:
+            renderer = NumbaRenderer(streamer, 1)
+            for k, view in some:
+                seen = renderer.render(view.truth, view.camera, wait=True).depth
+                depth_m = float(np.median(seen[seen > 0]))
+                rng = np.random.default_rng((seed, k))
+                for _ in range(draws):
+                    fault = drawn(rng, focal=focal)
+                    camera = fault.calibrated(view.camera)
+                    localizer = Localizer(renderer, extractor, optimizer, camera, config)
+                    yield _one(name, k, view, fault, localizer, depth_m, rng)
+
+
+def _one(
+    name: str,
+    k: int,
+    view: View,
+    fault: Fault,
+    localizer: Localizer,
+    depth_m: float,
+    rng: np.random.Generator,
+) -> Outcome:
+    truth = view.truth
+    start = Pose(
+        so3_exp(np.radians(rng.normal(0.0, _START_DEG, 3))) @ truth.rotation,
+        truth.translation + rng.normal(0.0, _START_M, 3),
+    )
+    localizer.set_prior(PosePrior.around(start, 2.0 * _START_M, 2.0 * _START_DEG, 1))
+    frame = Frame(view.query, 1, fault.calibrated(view.camera), k)
+    estimate = localizer.track(frame, passes=_PASSES)
+    east, north, up = (float(e) for e in estimate.world_from_camera.translation - truth.translation)
+    P = estimate.covariance
+    sigma = (float(np.sqrt(np.linalg.eigvalsh(P[:2, :2])[-1])), float(np.sqrt(P[2, 2])))
+    ax, ay, az = (float(a) for a in truth.rotation[:, 2])
+    return Outcome(
+        name, k, view.condition, view.height, depth_m, view.camera.horizontal_fov_deg,
+        float(np.hypot(*fault.velocity)), fault.focal, estimate.accepted, sigma,
+        (east, north, up), fault.beside_m, (ax, ay, az),
+    )  # fmt: skip

@@ -1,0 +1,89 @@
+"""Boresight and time offset from how the registered camera looks, against gimbal and autopilot.
+
+What is mounted wrong, or what the gimbal or compass gets wrong, is off by the same angle always;
+what is stamped late is off by the turn rate times the delay.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from companion.calibration.sighting import Evidence, Figure, Sighting
+from localizer.geometry.pose import so3_log
+
+Array = NDArray[np.float64]
+AXES = ("yaw", "pitch", "roll")
+_LATE = 3  # index of the delay; before it the angles, rad
+_SIGMAS = np.array([*np.radians([10.0, 5.0, 5.0]), 0.3])
+_WALKS = np.array([*np.radians([0.15, 0.05, 0.05]), 0.006])  # per root second
+_NOISE_RAD = np.radians([1.0, 0.6, 0.6])  # compass, gimbal and vision, from one to the next
+_ANEW = 4  # outliers in a row, after which what was learned is void
+_TURNS_RADPS = 0.1
+_LEVEL_TURN = 0.2  # below this horizontal part of the axis "forward" is the picture's top
+
+
+class AttitudeFilter:
+    """Takes sightings in the order of their times, a few times a second; one thread."""
+
+    def __init__(self) -> None:
+        self._x = np.zeros(4)
+        self._cov = np.diag(np.square(_SIGMAS))
+        self._outliers = 0
+
+    @property
+    def boresight_rad(self) -> tuple[Figure, Figure, Figure]:
+        """By which the camera is off in yaw (about the vertical), pitch and roll."""
+        return self._figure(0), self._figure(1), self._figure(2)
+
+    @property
+    def late_s(self) -> Figure:
+        """By how much pictures are stamped late, s."""
+        return self._figure(_LATE)
+
+    def take(self, seen: Sighting, known: Evidence, seconds: float) -> None:
+        """A sighting so many seconds after the one before."""
+        self._cov = self._cov + np.diag(np.square(_WALKS) * min(seconds, 10.0))
+        if known.ned_from_camera is None or known.turn is None:
+            return
+        axes = level_axes(known.ned_from_camera)
+        off = axes @ so3_log(seen.ned_from_camera @ known.ned_from_camera.T)
+        turn = axes @ known.turn
+        agreed = True
+        for i in range(3):
+            H = np.zeros(4)
+            H[i], H[_LATE] = 1.0, -turn[i]
+            PH = self._cov @ H
+            S = float(H @ PH) + _NOISE_RAD[i] ** 2
+            innovation = float(off[i] - H @ self._x)
+            if innovation**2 > 25.0 * S:
+                agreed = False
+                continue
+            K = PH / S
+            self._x = self._x + K * innovation
+            self._cov = self._cov - np.outer(K, PH)
+        self._outliers = 0 if agreed else self._outliers + 1
+        if self._outliers >= _ANEW:
+            # In a turn a stream that began to lag looks like this, else a gimbal that was knocked.
+            lags = float(np.linalg.norm(known.turn)) > _TURNS_RADPS
+            self._forget([_LATE] if lags else [0, 1, 2])
+            self._outliers = 0
+
+    def _forget(self, states: list[int]) -> None:
+        for i in states:
+            self._cov[i, :] = self._cov[:, i] = 0.0
+            self._cov[i, i] = _SIGMAS[i] ** 2
+
+    def _figure(self, at: int) -> Figure:
+        return Figure(float(self._x[at]), float(np.sqrt(max(self._cov[at, at], 0.0))))
+
+
+def level_axes(ned_from_camera: Array) -> Array:
+    """Rows: down (yaw), right (pitch), forward (roll) of a camera, each level or plumb, NED."""
+    forward = ned_from_camera[:, 2] * np.array([1.0, 1.0, 0.0])
+    if np.linalg.norm(forward) < _LEVEL_TURN:
+        forward = -ned_from_camera[:, 1] * np.array([1.0, 1.0, 0.0])
+    norm = float(np.linalg.norm(forward))
+    forward = forward / norm if norm > 1e-6 else np.array([1.0, 0.0, 0.0])
+    down = np.array([0.0, 0.0, 1.0])
+    return np.stack([down, np.cross(down, forward), forward])

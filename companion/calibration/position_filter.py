@@ -1,0 +1,146 @@
+"""Focal length and time offset from where vision says the vehicle is.
+
+A focal length that is long by a share e puts the camera e times the ground's distance too far back
+along its optical axis: the error changes with the axis (a turn, another gimbal pitch) and with the
+height, and a shifted map's or a biased receiver's does not. Stamps that are late by tau put
+the vehicle v tau behind: with the velocity the error changes. One Kalman filter holds both against
+the IMU, against the EKF's position while that is GNSS's, and against the heights of GNSS and the
+barometer, with the biases of all of them as states. Nothing that vision fed to the EKF is evidence.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from companion.calibration.sighting import Evidence, Figure, Sighting
+
+Array = NDArray[np.float64]
+
+# States, by index: position, velocity, acceleration bias (north, east); map against GNSS (north,
+# east); focal share; lateness; heights of GNSS and of the barometer against vision's; the
+# barometer's scale (a warm day lifts it by per cents).
+_P, _V, _A, _B, _F, _T, _U, _C, _S = 0, 2, 4, 6, 8, 9, 10, 11, 12
+_SIZE = 13
+_SIGMAS = np.array([1e3, 1e3, 15, 15, 0.3, 0.3, 2.0, 2.0, 0.03, 0.15, 100.0, 100.0, 0.04])
+# Random walks, per root second: tilt errors of turns; GNSS wander; the barometer's drift; a clock.
+_WALKS = np.array([0, 0, 0, 0, 0.02, 0.02, 0.15, 0.15, 3e-4, 0.006, 0.25, 0.15, 1e-4])
+_ACCELERATION = 0.1  # m/s^2/sqrt(Hz), of the IMU's integral
+_VISION_M = 0.25  # errors of vision that last longer than from one sighting to the next
+_GNSS_M, _GNSS_HEIGHT_M, _PRESSURE_M = 0.5, 1.0, 0.5
+_OUTLIER = 5.0  # sigmas; one is dropped, several in a row begin anew
+_ANEW = 8
+
+
+class PositionFilter:
+    """Takes sightings in the order of their times, a few times a second; one thread."""
+
+    def __init__(self) -> None:
+        self._x = np.zeros(_SIZE)
+        self._cov = np.diag(np.square(_SIGMAS))
+        self._outliers = 0
+        self._height0: float | None = None
+        self._zeros: dict[int, float] = {}
+
+    @property
+    def focal(self) -> Figure:
+        """Share by which the focal length is long."""
+        return self._figure(_F)
+
+    @property
+    def late_s(self) -> Figure:
+        """By how much pictures are stamped late, s."""
+        return self._figure(_T)
+
+    def forget_motion(self) -> None:
+        """The way since the last sighting is not known: a gap, or a jump of vision's own."""
+        for at in (_P, _V, _A):
+            self._loosen(at, 2)
+
+    def predict(self, moved: Array, faster: Array, seconds: float) -> None:
+        """What the IMU says: displacement beyond what the velocity leads to, and change of
+        velocity, (2,) each, over so many seconds.
+        """
+        h = seconds
+        transition = np.eye(_SIZE)
+        noise = np.diag(np.square(_WALKS) * h)
+        q = _ACCELERATION**2
+        for axis in (0, 1):
+            p, v, a = _P + axis, _V + axis, _A + axis
+            transition[p, v], transition[p, a], transition[v, a] = h, -0.5 * h * h, -h
+            noise[p, p] += h**3 / 3.0 * q
+            noise[p, v] += h * h / 2.0 * q
+            noise[v, p] += h * h / 2.0 * q
+            noise[v, v] += h * q
+        self._x = transition @ self._x
+        self._x[_P : _P + 2] += moved
+        self._x[_V : _V + 2] += faster
+        self._cov = transition @ self._cov @ transition.T + noise
+
+    def take(self, place: Array, seen: Sighting, known: Evidence, climb_mps: float) -> None:
+        """A sighting at `place` (2,), north and east of a fixed point, m."""
+        axis = seen.ned_from_camera[:, 2]
+        behind = seen.depth_m * axis  # by which a share of 1 would put the camera back
+        agreed = True
+        for i in (0, 1):
+            H = np.zeros(_SIZE)
+            H[_P + i], H[_V + i] = 1.0, -self._x[_T]
+            H[_F], H[_T] = -behind[i], -self._x[_V + i]
+            # v tau is bilinear: its value is subtracted once, its two slopes are in H.
+            predicted = float(H @ self._x) + self._x[_T] * self._x[_V + i]
+            sigma = float(np.hypot(seen.sigma_m, _VISION_M))
+            agreed &= self._correct(H, place[i] - predicted, sigma)
+        self._outliers = 0 if agreed else self._outliers + 1
+        if self._outliers >= _ANEW:
+            self.forget_motion()
+            self._loosen(_T, 1)  # a stream that began to lag looks like this
+            self._outliers = 0
+        if known.north_east_m is not None:
+            for i in (0, 1):
+                H = np.zeros(_SIZE)
+                H[_P + i] = H[_B + i] = 1.0
+                measured = place[i] + known.north_east_m[i]
+                self._correct(H, measured - float(H @ self._x), _GNSS_M)
+        self._heights(seen, known, behind[2], climb_mps)
+
+    def _heights(self, seen: Sighting, known: Evidence, down_m: float, climb_mps: float) -> None:
+        """Vision's height is `focal x down_m` too large, and behind a climb by what it is late."""
+        height = seen.place[2]
+        if self._height0 is None:
+            self._height0 = height
+        others = (
+            (_U, known.gnss_height_m, _GNSS_HEIGHT_M),
+            (_C, known.pressure_height_m, _PRESSURE_M),
+        )
+        for state, other, sigma in others:
+            if other is None:
+                continue
+            difference = height - other
+            zero = self._zeros.setdefault(state, difference)
+            H = np.zeros(_SIZE)
+            H[_F], H[_T], H[state] = down_m, -climb_mps, 1.0
+            if state == _C:
+                H[_S] = height - self._height0
+            self._correct(H, difference - zero - float(H @ self._x), sigma)
+
+    def _correct(self, H: Array, innovation: float, sigma: float) -> bool:
+        """One scalar measurement; False if it is an outlier, which is left out."""
+        PH = self._cov @ H
+        S = float(H @ PH) + sigma**2
+        if innovation**2 > _OUTLIER**2 * S:
+            return False
+        K = PH / S
+        self._x = self._x + K * innovation
+        self._cov = self._cov - np.outer(K, PH)
+        self._cov = 0.5 * (self._cov + self._cov.T)
+        return True
+
+    def _loosen(self, at: int, count: int) -> None:
+        """Forget some states, and how they are tied to the others."""
+        for i in range(at, at + count):
+            self._cov[i, :] = self._cov[:, i] = 0.0
+            self._cov[i, i] = _SIGMAS[i] ** 2
+            self._x[i] = 0.0
+
+    def _figure(self, at: int) -> Figure:
+        return Figure(float(self._x[at]), float(np.sqrt(max(self._cov[at, at], 0.0))))

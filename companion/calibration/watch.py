@@ -1,0 +1,248 @@
+"""The watch: sightings in, figures out. No threads and no clock of its own."""
+
+from __future__ import annotations
+
+import math
+from collections import deque
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from companion.calibration.attitude_filter import AXES, AttitudeFilter
+from companion.calibration.config import CalibrationLimits
+from companion.calibration.position_filter import PositionFilter
+from companion.calibration.sighting import Evidence, Figure, Sighting
+from companion.geometry import GIMBAL_FROM_CAMERA
+from localizer.geometry.pose import matrix_from_quaternion, so3_log
+from mavlink_bridge.messages import GimbalAttitude, VehicleState
+from mavlink_bridge.vehicle.origin import north_east
+
+Array = NDArray[np.float64]
+_WAITS_NS = 700_000_000  # until what the vehicle says of the exposure is there
+_GAP_S = 3.0
+_RATE_NS = 100_000_000  # to both sides of an exposure, for the turn rate
+_QUEUE = 64
+_HISTORY = 64
+_STALE_NS = 1_500_000_000
+_FROM_GNSS_M = 3.0  # an EKF farther from the receiver follows something else
+_LOW_M = 10.0  # above ground; the first metres show neither focal length nor place
+
+
+class Moved(Protocol):
+    """The IMU's free integral at a time; velocity, position: (2,), north and east, m/s, m."""
+
+    @property
+    def time_ns(self) -> int:
+        """On CLOCK_MONOTONIC."""
+
+    @property
+    def velocity(self) -> Array:
+        """m/s."""
+
+    @property
+    def position(self) -> Array:
+        """m."""
+
+
+class Track(Protocol):
+    """The IMU, integrated on its own. restarts counts the gaps."""
+
+    @property
+    def restarts(self) -> int:
+        """How often it began anew."""
+
+    @property
+    def newest_ns(self) -> int:
+        """Until when it reaches."""
+
+    def at(self, time_ns: int) -> Moved | None:
+        """The integral at a time."""
+
+
+class Vehicle(Protocol):
+    """What is asked of the vehicle; the bridge is one."""
+
+    def state(self) -> VehicleState:
+        """What it says about itself."""
+        ...
+
+    def gimbal_at(self, time_ns: int) -> GimbalAttitude | None:
+        """The camera's attitude to NED at a time."""
+        ...
+
+    def gnss_place_at(self, time_ns: int) -> tuple[float, ...] | None:
+        """The EKF's latitude, longitude and altitude at a time, while GNSS is what it follows."""
+        ...
+
+
+@dataclass(frozen=True)
+class CalibrationFigures:
+    """What is known by now. focal: share by which it is long; late_s: of the stamps, the surer of
+    two accounts; boresight_deg: the worst angle, about `axis`.
+    """
+
+    focal: Figure
+    late_s: Figure
+    boresight_deg: Figure
+    axis: str
+
+
+class CalibrationWatch:
+    """One thread. `add` sightings, then `step`."""
+
+    def __init__(self, limits: CalibrationLimits) -> None:
+        self._limits = limits
+        self._position, self._attitude = PositionFilter(), AttitudeFilter()
+        self._waiting: deque[Sighting] = deque(maxlen=_QUEUE)
+        self._last: Moved | None = None
+        self._last_ns = 0
+        self._restarts = 0
+        self._anchor: tuple[float, float] | None = None
+        self._gnss_heights = _History()
+        self._pressures = _History()
+        self._depth_m = 0.0
+        self._fixed = False
+
+    def add(self, sighting: Sighting) -> None:
+        """A registered picture that was accepted against the map."""
+        self._waiting.append(sighting)
+
+    def step(self, now_ns: int, vehicle: Vehicle, track: Track) -> None:
+        """Take in what has come; a few times a second."""
+        if not self._limits.enabled:
+            return
+        state = vehicle.state()
+        gnss_m = state.gps_height_m if state.gps_height_m is not None else state.gps_altitude_amsl_m
+        if state.gps_fix_type >= 3:
+            self._gnss_heights.add(state.gps_time_ns, gnss_m)
+        self._pressures.add(state.pressure_time_ns, state.pressure_altitude_m)
+        while self._waiting and now_ns - self._waiting[0].time_ns >= _WAITS_NS:
+            seen = self._waiting.popleft()
+            if seen.time_ns > self._last_ns and seen.depth_m >= _LOW_M:
+                self._take(seen, state, vehicle, track)
+
+    def figures(self) -> CalibrationFigures:
+        """What is known by now."""
+        angles = self._attitude.boresight_rad
+        worst = max(range(3), key=lambda i: abs(angles[i].value) / max(angles[i].sigma, 1e-6))
+        angle = angles[worst]
+        return CalibrationFigures(
+            self._position.focal,
+            self._lateness(),
+            Figure(math.degrees(angle.value), math.degrees(angle.sigma)),
+            AXES[worst],
+        )
+
+    def known_m(self, speed_mps: float, *, focal: bool, time: bool) -> float:
+        """By how much a position is wrong for what was found, metres."""
+        focal_m = abs(self._position.focal.value) * self._depth_m if focal else 0.0
+        return focal_m + (abs(self._lateness().value) * speed_mps if time else 0.0)
+
+    def _lateness(self) -> Figure:
+        """The way over ground counts; the turns of the camera only where they say the same.
+
+        A gimbal's angles may be late themselves. A camera without gimbal turns with the autopilot's
+        own attitude: there the surer account counts, if the other does not speak against it.
+        """
+        way, turns = self._position.late_s, self._attitude.late_s
+        if not self._fixed:
+            tells = abs(way.value) > 2.0 * way.sigma
+            return _fused(way, turns) if tells and _agree(way, turns) else way
+        surer, other = (way, turns) if way.sigma <= turns.sigma else (turns, way)
+        limit = self._limits.time_s
+        contradicted = surer.exceeds(limit) and other.is_within(limit)
+        return Figure(0.0, math.inf) if contradicted else surer
+
+    def _take(self, seen: Sighting, state: VehicleState, vehicle: Vehicle, track: Track) -> None:
+        gap_s = (seen.time_ns - self._last_ns) * 1e-9
+        self._last_ns = seen.time_ns
+        self._depth_m = seen.depth_m
+        known = self._evidence(seen, state, vehicle)
+        self._attitude.take(seen, known, gap_s)
+        moved = track.at(seen.time_ns)
+        if moved is None:
+            self._last = None
+            return
+        last, self._last = self._last, moved
+        if last is None or gap_s > _GAP_S or track.restarts != self._restarts:
+            self._position.forget_motion()
+        else:
+            h = (moved.time_ns - last.time_ns) * 1e-9
+            way = moved.position - last.position - last.velocity * h
+            self._position.predict(way, moved.velocity - last.velocity, h)
+        self._restarts = track.restarts
+        if self._anchor is None:
+            self._anchor = seen.place[:2]
+        place = np.array(north_east(*self._anchor, *seen.place[:2]))
+        climb = -(state.local_velocity_ned or (0.0, 0.0, 0.0))[2]
+        self._position.take(place, seen, known, climb)
+
+    def _evidence(self, seen: Sighting, state: VehicleState, vehicle: Vehicle) -> Evidence:
+        t = seen.time_ns
+        reported = [vehicle.gimbal_at(t + dt) for dt in (0, -_RATE_NS, _RATE_NS)]
+        self._fixed = reported[0] is not None and reported[0].source == "fixed"
+        now, before, after = (_camera(gimbal) for gimbal in reported)
+        turn = None
+        if before is not None and after is not None:
+            turn = so3_log(after @ before.T) * (1e9 / (2 * _RATE_NS))
+        return Evidence(
+            now,
+            turn,
+            _gnss_offset(seen, state, vehicle.gnss_place_at(t)),
+            self._gnss_heights.at(t),
+            self._pressures.at(t),
+        )
+
+
+class _History:
+    """A height over time, linear between reports."""
+
+    def __init__(self) -> None:
+        self._rows: deque[tuple[int, float]] = deque(maxlen=_HISTORY)
+
+    def add(self, time_ns: int, value: float | None) -> None:
+        if value is not None and (not self._rows or time_ns > self._rows[-1][0]):
+            self._rows.append((time_ns, value))
+
+    def at(self, time_ns: int) -> float | None:
+        """The value; None where no report is near."""
+        if not self._rows or not self._rows[0][0] <= time_ns <= self._rows[-1][0] + _STALE_NS:
+            return None
+        times, values = zip(*self._rows, strict=True)
+        return float(np.interp(time_ns, times, values))
+
+
+def _agree(a: Figure, b: Figure) -> bool:
+    return abs(a.value - b.value) < 3.0 * math.hypot(a.sigma, b.sigma)
+
+
+def _fused(a: Figure, b: Figure) -> Figure:
+    """Both accounts, each by its variance."""
+    wa, wb = 1.0 / a.sigma**2, 1.0 / b.sigma**2
+    return Figure((wa * a.value + wb * b.value) / (wa + wb), 1.0 / math.sqrt(wa + wb))
+
+
+def _camera(gimbal: GimbalAttitude | None) -> Array | None:
+    if gimbal is None:
+        return None
+    return np.asarray(matrix_from_quaternion(gimbal.quaternion) @ GIMBAL_FROM_CAMERA)
+
+
+def _gnss_offset(
+    seen: Sighting, state: VehicleState, place: tuple[float, ...] | None
+) -> tuple[float, float] | None:
+    """North and east of the EKF from the sighting, if the EKF is where the receiver is."""
+    if place is None or state.gps_latitude_deg is None or state.gps_longitude_deg is None:
+        return None
+    if state.latitude_deg is None or state.longitude_deg is None:
+        return None
+    apart = north_east(
+        state.latitude_deg, state.longitude_deg, state.gps_latitude_deg, state.gps_longitude_deg
+    )
+    speed = math.hypot(*(state.local_velocity_ned or (0.0, 0.0, 0.0))[:2])
+    if math.hypot(*apart) > _FROM_GNSS_M + 0.5 * speed:
+        return None
+    north, east = north_east(*seen.place[:2], place[0], place[1])
+    return north, east

@@ -1,0 +1,116 @@
+"""The calibration watch: each fault found within a minute, honest flights left alone."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from companion.calibration.config import CalibrationLimits
+from companion.calibration.watch import CalibrationFigures
+from tests.companion.calibration.simulated import Flown, Wrong, square
+
+LIMITS = CalibrationLimits()
+SURVEYED = square(60.0)  # climbs to its height on GNSS, then turns
+DENIED = square(60.0, climb_s=0.0)
+
+
+def findings(figures: CalibrationFigures) -> set[str]:
+    """What is beyond its limit."""
+    found = {
+        "focal": figures.focal.exceeds(LIMITS.focal_share),
+        "time": figures.late_s.exceeds(LIMITS.time_s),
+        "boresight": figures.boresight_deg.exceeds(LIMITS.boresight_deg),
+    }
+    return {name for name, is_found in found.items() if is_found}
+
+
+def ever(flown: Flown) -> set[str]:
+    """What was found at any time."""
+    return set().union(*(findings(figures) for _, figures in flown.found))
+
+
+def lost(_: float) -> bool:
+    """GNSS, all the time."""
+    return False
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_an_honest_flight_has_no_finding(seed: int) -> None:
+    """With what sensors are honestly off by, each flight its own: a receiver 2 m, a compass 2
+    degrees, a barometer on a hot day 7 %, a tilt of half a degree, a map 1 m. Half of them denied.
+    """
+    rng = np.random.default_rng(seed)
+    gnss, shift = rng.normal(0.0, 1.0, 2), rng.normal(0.0, 0.7, 2)
+    wrong = Wrong(
+        focal=float(rng.normal(0.0, 0.003)),
+        boresight_deg=(float(rng.normal(0.0, 0.5)), float(rng.normal(0.0, 0.5))),
+        late_s=float(rng.normal(0.0, 0.01)),
+        pressure_scale=float(rng.uniform(-0.07, 0.07)),
+        gnss_m=(float(gnss[0]), float(gnss[1])),
+        compass_deg=float(rng.uniform(-2.0, 2.0)),
+        map_m=(float(shift[0]), float(shift[1])),
+        tilt_deg=float(rng.uniform(-0.5, 0.5)),
+    )
+    denied = seed % 2 == 1
+    flown = Flown(
+        wrong, DENIED if denied else SURVEYED, lost if denied else lambda _: True, seed=seed
+    ).fly()
+    assert ever(flown) == set()
+
+
+@pytest.mark.parametrize(
+    ("wrong", "finding", "denied"),
+    [
+        (Wrong(focal=0.05), "focal", False),
+        (Wrong(focal=-0.05, pressure_scale=0.05), "focal", True),
+        (Wrong(late_s=0.12), "time", False),
+        (Wrong(late_s=0.3, late_from_s=8.0), "time", True),
+        (Wrong(boresight_deg=(4.0, 0.0)), "boresight", False),
+    ],
+)
+def test_a_wrong_calibration_is_found_within_a_minute(
+    wrong: Wrong, finding: str, denied: bool
+) -> None:
+    """And nothing else is; under denial from the IMU, the turns and the barometer alone."""
+    flown = Flown(wrong, DENIED if denied else SURVEYED, lost if denied else lambda _: True).fly()
+    assert ever(flown) == {finding}
+    at_s, figures = next(row for row in flown.found if finding in findings(row[1]))
+    assert at_s < 60.0
+    last = flown.found[-1][1]
+    true, said = {
+        "focal": (wrong.focal, last.focal.value),
+        "time": (wrong.late_s, last.late_s.value),
+        "boresight": (wrong.boresight_deg[0], last.boresight_deg.value),
+    }[finding]
+    assert said == pytest.approx(true, rel=0.35)
+    assert figures.axis == "yaw" or finding != "boresight"
+
+
+def test_a_shifted_map_and_a_biased_receiver_are_no_focal_length() -> None:
+    """4 m apart in a turning flight: whoever is wrong, it is not the lens."""
+    assert ever(Flown(Wrong(map_m=(3.0, 2.0), gnss_m=(0.0, 1.0)), SURVEYED).fly()) == set()
+
+
+def test_where_nothing_can_be_told_nothing_is_said() -> None:
+    """A hover without turns shows neither a focal length nor a delay."""
+    still = square(30.0, leg_s=1e3, climb_s=0.0, hold=True)
+    flown = Flown(Wrong(focal=0.05, late_s=0.3), still, lost).fly()
+    assert ever(flown) == set()
+    last = flown.found[-1][1]
+    assert last.focal.sigma > 0.02
+    assert last.late_s.sigma > 0.1
+
+
+def test_what_contradicts_itself_is_not_told() -> None:
+    """A gimbal that reports late turns late; the way over ground says that pictures are in time."""
+
+    class Lagging(Flown):
+        def gimbal_at(self, time_ns: int):  # type: ignore[no-untyped-def]
+            return super().gimbal_at(time_ns - 200_000_000)
+
+    assert "time" not in ever(Lagging(Wrong(), square(60.0, leg_s=10.0)).fly())
+
+
+def test_switched_off_it_says_nothing() -> None:
+    flown = Flown(Wrong(focal=0.05), square(30.0), limits=CalibrationLimits(enabled=False)).fly()
+    assert ever(flown) == set()
