@@ -36,7 +36,7 @@ from localizer.types import Image, RenderedView
 SIZE = (320, 240)
 WORLD_SEED = 2_000_000  # training and the feature benchmark stay below
 VIEWS_PER_WORLD = 40
-_WORLD_M = 800.0
+WORLD_M = 800.0
 _PLAIN_FROM = 8  # candidates for each view of the set "plain"
 _DULL = ("fog", "dusk", "night")
 _LEAST_MAP = 0.9  # share of the true view that shows the map
@@ -67,24 +67,24 @@ def load_views(name: str, folder: Path, data: Path, count: int) -> list[View]:
         places = [home / f"{WORLD_SEED + k}" for k in range(-(-count // VIEWS_PER_WORLD))]
         with ProcessPoolExecutor(2) as pool:
             list(pool.map(_make_world, [p for p in places if not (p / "views.npz").exists()]))
-        return [v for p in places for v in _load(p)][:count]
+        return [v for p in places for v in load_kept(p)][:count]
     if not (home / "views.npz").exists():
         _make_real(data / name, home, count)
-    return _load(home)[:count]
+    return load_kept(home)[:count]
 
 
 def _make_world(home: Path) -> None:
     seed = int(home.name)
     rng = np.random.default_rng(seed)
     visits = {home / "survey": ("survey", SURVEY), home / "day": ("live", random_look(rng))}
-    info = build_visits(WorldConfig(seed, _WORLD_M), visits, processes=1)[0]
+    info = build_visits(WorldConfig(seed, WORLD_M), visits, processes=1)[0]
     for folder in visits:
         build_cache(
             folder, home / f"{folder.name}.cache", origin=info.origin, workers=1,
             overwrite=True,
         )  # fmt: skip
-    half = 0.36 * _WORLD_M
-    _store_renders(home, home / "survey.cache", home / "day.cache", (half, half), rng,
+    half = 0.36 * WORLD_M
+    store_renders(home, home / "survey.cache", home / "day.cache", (half, half), rng,
                    VIEWS_PER_WORLD)  # fmt: skip
 
 
@@ -98,12 +98,12 @@ def _plain_views(views: list[View], home: Path, count: int) -> list[View]:
         share = -(-count // len(worlds))
         made = [v for k, world in enumerate(worlds) for v in _plain_of(world, share, 10 + k)]
         _store(home, made)
-    return _load(home)[:count]
+    return load_kept(home)[:count]
 
 
 def _plain_of(world: Path, count: int, seed: int) -> list[View]:
     rng = np.random.default_rng(seed)
-    half = 0.36 * _WORLD_M
+    half = 0.36 * WORLD_M
     with (
         TileStreamer(TileCache.open(world / "survey.cache")) as survey,
         TileStreamer(TileCache.open(world / "day.cache")) as day,
@@ -155,7 +155,7 @@ def _make_real(source: Path, home: Path, count: int) -> None:
         _store(home, photo_views(cache, source / "queries"))
     else:
         halves = {"quito": (220.0, 130.0), "portugal": (100.0, 110.0)}
-        _store_renders(home, cache, cache, halves[source.name], rng, count)
+        store_renders(home, cache, cache, halves[source.name], rng, count)
 
 
 def photo_views(cache: Path, photos: Path, size: tuple[int, int] = SIZE) -> list[View]:
@@ -171,7 +171,7 @@ def photo_views(cache: Path, photos: Path, size: tuple[int, int] = SIZE) -> list
     return views
 
 
-def _store_renders(
+def store_renders(
     home: Path,
     map_cache: Path,
     day_cache: Path,
@@ -234,7 +234,8 @@ def _store(home: Path, views: list[View]) -> None:
     )
 
 
-def _load(home: Path) -> list[View]:
+def load_kept(home: Path) -> list[View]:
+    """The views that a folder keeps."""
     with np.load(home / "views.npz") as f:
         return [
             View((home / str(m)).resolve(), q, Pose.from_matrix(t),

@@ -8,9 +8,9 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from scipy.stats import beta
 
 from benchmarks.basin.views import View
+from benchmarks.common.shares import exact_interval
 from localizer.config import LocalizerConfig
 from localizer.evaluation.places import KnownOfPlace
 from localizer.map.cache.cache import TileCache
@@ -84,13 +84,6 @@ def _one(name: str, view: View, opened: OpenRelocalizer, known: KnownOfPlace, k:
     )  # fmt: skip
 
 
-def interval(hits: int, count: int) -> tuple[float, float]:
-    """Exact 95 % interval of a share (Clopper and Pearson), in per cent."""
-    low = 0.0 if hits == 0 else float(beta.ppf(0.025, hits, count - hits + 1))
-    high = 100.0 if hits == count else 100 * float(beta.ppf(0.975, hits + 1, count - hits))
-    return 100 * low, high
-
-
 def table(outcomes: Sequence[Outcome]) -> str:
     """One line per condition and for all, each with the exact interval."""
     rows = [
@@ -108,7 +101,7 @@ def table(outcomes: Sequence[Outcome]) -> str:
 
 def _row(name: str, known: bool, condition: str, some: Sequence[Outcome]) -> str:
     n, hits = len(some), sum(o.found for o in some)
-    low, high = interval(hits, n)
+    low, high = exact_interval(hits, n)
     cpu, confirm, wall = (
         float(np.median([getattr(o, k) for o in some]))
         for k in ("search_cpu_s", "verify_cpu_s", "wall_s")

@@ -132,7 +132,7 @@ class HealthMonitor:
         arrived, estimate = self._estimates[-1]
         if time.monotonic() - arrived > _STALE_S:
             if _is_lost(estimate):  # the error stands in health.json; this is what to act on
-                return HealthLevel.FAILED, "localization lost" + self._since(estimate, engine)
+                return HealthLevel.FAILED, "localization lost" + self._since(estimate)
             return HealthLevel.DEGRADED, engine.last_error or "no frame is being localized"
         level, text = _OF_STATE[estimate.state]
         if estimate.state is TrackingState.BRIDGING:
@@ -144,20 +144,23 @@ class HealthMonitor:
         if withheld and not _is_lost(estimate):
             level, text = HealthLevel.FAILED, withheld
         if _is_lost(estimate):
-            text += self._since(estimate, engine)
+            text += self._since(estimate)
         # The map stands in by coarser levels, as far as they are in memory.
         text += ", map unreadable" if self._unreadable_nodes() else ""
         text += ", video scaled" if feed is StreamState.SCALED else ""
         return level, text + ("" if self._is_recorded() else ", record incomplete")
 
-    def _since(self, estimate: PoseEstimate, engine: EngineHealth) -> str:
-        """Since when there is no fix, how far off the autopilot may be, and what is done."""
+    def _since(self, estimate: PoseEstimate) -> str:
+        """Since when there is no fix, and how far off the autopilot may be.
+
+        Not whether the map is being searched: that begins and ends every few seconds, and each time
+        the loss would be told again (`engine.searching` in health.json has it).
+        """
         text = ""
         if estimate.last_fix_ns is not None:
             text = f" {(time.monotonic_ns() - estimate.last_fix_ns) * 1e-9:.0f} s"
         sigma_m = self._position_sigma_m()
-        text += f", +-{2.0 * sigma_m:.0f} m" if sigma_m is not None else ""
-        return text + (", searching" if engine.searching else "")
+        return text + (f", +-{2.0 * sigma_m:.0f} m" if sigma_m is not None else "")
 
     def _write(self, level: str, text: str) -> None:
         if self._file is None:

@@ -1,7 +1,8 @@
 """Which estimates may be used.
 
 An estimate is acceptable when the registration succeeded, enough anchors were seen, its quality is
-high enough and it agrees with the prediction (Mahalanobis gate). What runs of acceptances and
+high enough, the image's parts agree on it one by one, and it agrees with the prediction
+(Mahalanobis gate). What runs of acceptances and
 rejections make of the tracker's state stands in `localizer.tracking.states`.
 """
 
@@ -20,6 +21,12 @@ class IntegrityConfig(BaseModel):
 
     min_overlap: float = Field(0.35, ge=0, le=1, description="share of anchors in view")
     min_quality: float = Field(0.15, ge=0, le=1, description="registration quality")
+    min_agreement: float = Field(
+        0.55, ge=0, le=1, description="share of the image's parts that match best where they lie"
+    )
+    min_parts: int = Field(
+        8, ge=0, le=1000, description="parts of the image that can say so, of 32 px"
+    )
     max_sigma_m: float = Field(
         4.0, ge=0.01, le=100, description="position sigma of a usable estimate"
     )
@@ -56,4 +63,16 @@ def is_acceptable(config: IntegrityConfig, result: Registration, distance_square
         return False
     if result.covariance.diagonal()[:3].max() > config.max_sigma_m**2:
         return False
+    if not parts_agree(config, result):
+        return False
     return distance_squared <= config.gate
+
+
+def parts_agree(config: IntegrityConfig, result: Registration) -> bool:
+    """Whether enough parts of the image vote for the pose; a registration on a GPU has no votes and
+    passes.
+    """
+    votes = result.agreement
+    if votes is None:
+        return True
+    return votes.parts >= config.min_parts and votes.share >= config.min_agreement

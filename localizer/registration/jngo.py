@@ -17,6 +17,7 @@ from localizer.device_array import DeviceArray
 from localizer.errors import BackendError
 from localizer.geometry.camera import Camera
 from localizer.geometry.pose import Array, Pose
+from localizer.registration.agreement import agreement
 from localizer.registration.backend import (
     Backend,
     LevelProblem,
@@ -54,6 +55,7 @@ from localizer.types import Anchors, FeaturePyramid, PosePrior, RegistrationStat
 _log = logging.getLogger(__name__)
 
 _COVARIANCE_ANCHORS = 1000  # enough for a covariance, cheap enough for every frame
+_VOTING_ANCHORS = 1000  # likewise
 _LEAST_SCALE = 0.02  # of the sharpening loss, where features fit perfectly
 
 
@@ -120,7 +122,7 @@ class JNGO:
         if not np.isfinite(swarm.scores[0]):
             return failure(prior, RegistrationStatus.NO_OVERLAP, swarm.evaluations)
         winner = self._sharpen(swarm, problems[searched - 1 :], constraint, origin)
-        found = self._found(swarm, winner, query.levels[-1].stride)
+        found = self._found(swarm, winner, problems[searched - 1], query.levels[-1].stride)
         return registration(found, self.config, prior, origin)
 
     def _refine(
@@ -217,8 +219,10 @@ class JNGO:
         totals: Array = scores + self.config.motion_weight * best * squared
         return totals
 
-    def _found(self, swarm: _Swarm, winner: _Winner, stride: int) -> Found:
-        """The survivors with the winner in the first's place, and the sums at its pose."""
+    def _found(self, swarm: _Swarm, winner: _Winner, level: LevelProblem, stride: int) -> Found:
+        """The survivors with the winner in the first's place, and the sums at its pose; level: the
+        network's finest, on which the image's parts vote.
+        """
         c, problem, R, t = self.config, winner.problem, winner.rotation, winner.translation
         return Found(
             np.concatenate([R[None], swarm.rotations[1:]]),
@@ -229,6 +233,7 @@ class JNGO:
             0.0 if problem.prior is None else problem.prior.weight,
             quality(swarm.problem, R, t, c.settings),
             swarm.evaluations + winner.evaluations,
+            agreement(thinned(level, _VOTING_ANCHORS), R, t),
         )
 
     def _sums(self, winner: _Winner, cell_px: float) -> CovarianceSums | None:

@@ -5,8 +5,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from localizer.geometry.pose import Array, Pose
+from localizer.registration.agreement import Agreement
 from localizer.registration.backend import world_from_camera
 from localizer.registration.config import JNGOConfig
 from localizer.registration.covariance import (
@@ -17,7 +19,7 @@ from localizer.registration.covariance import (
     pose_differences,
     sandwich_covariance,
 )
-from localizer.registration.selection import mode_probabilities
+from localizer.registration.selection import LEAST_SCORE, mode_probabilities
 from localizer.types import PosePrior, RegistrationStatus
 
 
@@ -28,7 +30,9 @@ class Registration:
     covariance: (6, 6) as `PosePrior`'s. score: mean Huber cost, lower is
     better, inf on failure.
     overlap: share of the anchors in view. quality: 0 (no better than chance) to 1.
-    evaluations: cost evaluations spent.
+    evaluations: cost evaluations spent. agreement: of the image's parts, None where it is not
+    known (a registration on a GPU, or one that failed). lead: by how much the best other mode of
+    the swarm is worse, as a share of the score, inf without another.
     """
 
     world_from_camera: Pose
@@ -38,6 +42,8 @@ class Registration:
     quality: float
     status: RegistrationStatus
     evaluations: int
+    agreement: Agreement | None = None
+    lead: float = np.inf
 
 
 @dataclass(frozen=True)
@@ -45,7 +51,7 @@ class Found:
     """What a search ends with. rotations (K, 3, 3), translations (K, 3): the survivors,
     camera_from_local, best first, the first one sharpened; scores and overlaps (K,): as the search
     left them; sums: of equation 11 at the first one, None where no anchor has weight;
-    prior_weight: of a constraint, 0 without.
+    prior_weight: of a constraint, 0 without; agreement: as `Registration`'s.
     """
 
     rotations: Array
@@ -56,6 +62,7 @@ class Found:
     prior_weight: float
     quality: float
     evaluations: int
+    agreement: Agreement | None = None
 
 
 def registration(found: Found, config: JNGOConfig, prior: PosePrior, origin: Array) -> Registration:
@@ -83,7 +90,17 @@ def registration(found: Found, config: JNGOConfig, prior: PosePrior, origin: Arr
         found.quality,
         RegistrationStatus.OK,
         found.evaluations,
+        found.agreement,
+        _lead(found.scores, other),
     )
+
+
+def _lead(scores: Array, other: NDArray[np.bool_]) -> float:
+    """By how much the best of the `other` modes (M,) is worse than the first, over its score."""
+    rivals = scores[other & np.isfinite(scores)]
+    if len(rivals) == 0:
+        return np.inf
+    return float((rivals.min() - scores[0]) / max(scores[0], LEAST_SCORE))
 
 
 def failure(prior: PosePrior, status: RegistrationStatus, evaluations: int = 0) -> Registration:

@@ -2,6 +2,7 @@
 
 import json
 import time
+from functools import partial
 from types import SimpleNamespace
 
 import numpy as np
@@ -12,7 +13,7 @@ from companion.sources import StreamState
 from localizer.tracking.engine import EngineHealth
 from localizer.types import TrackingState
 from mavlink_bridge.link.link import sleep_until
-from mavlink_bridge.messages import HealthLevel
+from mavlink_bridge.messages import HealthLevel, without_figures
 
 
 class FakeBridge:
@@ -139,21 +140,25 @@ def test_a_report_that_fails_is_not_the_last(tmp_path, monkeypatch, caplog):
     assert sum("could not be reported" in r.message for r in caplog.records) == 1
 
 
-def test_a_loss_says_how_long_and_how_far(tmp_path):
+def test_a_loss_says_how_long_and_how_far_and_is_no_news_when_a_search_ends(tmp_path):
     lost = SimpleNamespace(
         state=TrackingState.LOST, stage_ms={}, last_fix_ns=time.monotonic_ns() - 23 * 10**9
     )
-    bridge = FakeBridge(True)
-    monitor = HealthMonitor(
-        lambda: EngineHealth(frames_in=9, searching=True), bridge, lambda: StreamState.LIVE,
-        lambda *_: None, tmp_path, position_sigma_m=lambda: 20.0,
-    )  # fmt: skip
-    monitor.add_estimate(lost)
-    monitor.start()
-    monitor.stop()
-    level, text = bridge.told[-1]
-    assert level is HealthLevel.FAILED
-    assert text.startswith("localization lost 23 s, +-40 m, searching")
+    texts = set()
+    for searching in (True, False):
+        bridge = FakeBridge(True)
+        monitor = HealthMonitor(
+            partial(EngineHealth, frames_in=9, searching=searching), bridge,
+            lambda: StreamState.LIVE, lambda *_: None, tmp_path, position_sigma_m=lambda: 20.0,
+        )  # fmt: skip
+        monitor.add_estimate(lost)
+        monitor.start()
+        monitor.stop()
+        level, text = bridge.told[-1]
+        assert level is HealthLevel.FAILED
+        assert text.startswith("localization lost 23 s, +-40 m")
+        texts.add(without_figures(text))
+    assert len(texts) == 1
 
 
 def test_after_the_end_the_file_says_that_it_ended_and_how(tmp_path):

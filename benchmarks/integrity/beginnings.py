@@ -1,0 +1,80 @@
+"""Where registrations begin: near the truth, or wrong in every way that a flight can be."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+
+from benchmarks.basin.views import View
+from localizer.geometry.camera import Camera
+from localizer.geometry.pose import Array, Pose, so3_exp
+from localizer.relocalization.patch import turned
+from localizer.types import PosePrior
+
+NEAR = ((3.0, 3.0), (3.0, 3.0), (8.0, 8.0), (8.0, 8.0))  # metres and degrees of heading
+FAR = (
+    (20.0, 5.0), (20.0, 180.0), (50.0, 10.0), (50.0, 45.0), (100.0, 5.0), (100.0, 20.0),
+    (100.0, 90.0), (200.0, 10.0), (200.0, 60.0), (350.0, 120.0), (500.0, 20.0), (500.0, 180.0),
+)  # fmt: skip
+ELSEWHERE = 12  # beginnings on other maps
+FOCAL = ((20.0, 5.0), (50.0, 20.0), (100.0, 45.0), (200.0, 120.0))
+_FOCAL_ERROR = 0.05
+_TILT_DEG, _HEIGHT_M = 2.0, 5.0  # sigma, by the autopilot and its barometer
+
+WRONG = ("far", "elsewhere", "focal")  # kinds that begin wrong; "near" and "focal near" do not
+
+
+@dataclass(frozen=True)
+class Beginning:
+    """One registration to try. camera: as it is believed; prior: told with an honest covariance;
+    map_cache: what it is registered to; other: the view of another place, from whose pose the
+    reference is rendered; None where the place is on the map.
+    """
+
+    kind: str
+    start_m: float
+    start_deg: float
+    map_cache: Path
+    camera: Camera
+    prior: PosePrior
+    other: View | None = None
+
+
+def beginnings(view: View, index: int, others: Sequence[View]) -> Iterator[Beginning]:
+    """All of one view; others: views of other places, at which it is tried, too."""
+    rng = np.random.default_rng((31, index))
+    for kind, starts in (("near", NEAR), ("far", FAR)):
+        for metres, degrees in starts:
+            prior = _off(view.truth, metres, degrees, rng)
+            yield Beginning(kind, metres, degrees, view.map_cache, view.camera, prior)
+    for k in rng.permutation(len(others))[:ELSEWHERE]:
+        place = others[int(k)]
+        sigma = np.array([20.0, 20.0, _HEIGHT_M, *np.radians([_TILT_DEG, _TILT_DEG, 180.0])])
+        prior = PosePrior(place.truth, np.diag(sigma**2), 0)
+        yield Beginning("elsewhere", 1e6, 180.0, place.map_cache, view.camera, prior, place)
+    for metres, degrees in (*FOCAL, NEAR[0]):
+        factor = 1.0 + _FOCAL_ERROR * float(rng.choice((-1.0, 1.0)))
+        camera = view.camera
+        camera = replace(camera, fx=factor * camera.fx, fy=factor * camera.fy)
+        kind = "focal near" if metres == NEAR[0][0] else "focal"
+        prior = _off(view.truth, metres, degrees, rng)
+        yield Beginning(kind, metres, degrees, view.map_cache, camera, prior)
+
+
+def _off(truth: Pose, metres: float, degrees: float, rng: np.random.Generator) -> PosePrior:
+    """So many metres away in a random direction and so many degrees turned; roll, pitch and height
+    as the autopilot has them.
+    """
+    angle = rng.uniform(0, 2 * np.pi)
+    near = metres <= NEAR[-1][0]
+    height_m, tilt_deg = (metres / 4, degrees / 4) if near else (_HEIGHT_M, _TILT_DEG)
+    shift = np.array([metres * np.cos(angle), metres * np.sin(angle), rng.normal(0, height_m)])
+    tilt = np.array([*rng.normal(0, np.radians(tilt_deg), 2), 0.0])
+    turn = np.radians(degrees) * rng.choice((-1.0, 1.0))
+    rotation = turned(so3_exp(tilt) @ truth.rotation, float(turn))
+    level, tilted = metres / np.sqrt(2), np.radians(tilt_deg)
+    sigma: Array = np.array([level, level, height_m, tilted, tilted, np.radians(degrees)])
+    return PosePrior(Pose(rotation, truth.translation + shift), np.diag(sigma**2), 0)

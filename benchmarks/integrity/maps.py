@@ -1,0 +1,196 @@
+"""The sets of the integrity benchmark: maps with query views, kept in a folder between runs.
+
+"tuning" and "generated" are worlds of different seeds. The made maps are hard on purpose: forest
+(few photographs of crowns, turned and mirrored, over and over), water (nothing but waves, others
+in the query), roofs (one house on equal lots), "outdated" (a generated world of which three
+buildings in ten are gone on another day), "shifted" (portugal's orthophoto 5 m off its heights).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+import rasterio
+from rasterio.transform import Affine, from_origin
+
+from benchmarks.basin.views import (
+    VIEWS_PER_WORLD,
+    WORLD_M,
+    WORLD_SEED,
+    View,
+    load_kept,
+    load_views,
+    store_renders,
+)
+from localizer.map.building.build import build_cache
+from localizer.map.importers.rules import ImportRules
+from localizer.synth.config import WorldConfig
+from localizer.synth.world import build_visits
+from localizer.training.data.worlds import random_look
+from localizer.types import Float32, Image
+
+TUNING = "tuning"  # thresholds may be chosen on it, figures are those of the others
+SETS = {
+    TUNING: 40, "generated": 80, "outdated": 40, "quito": 60, "portugal": 40, "caliterra": 50,
+    "shifted": 30, "forest": 30, "water": 15, "roofs": 30,
+}  # fmt: skip
+_GONE = 0.3  # of the buildings of an outdated map
+SHIFT_M = (4.0, -3.0)  # of the orthophoto, east and north
+_SIDE_M, _GSD_M, _POST_M = 480.0, 0.2, 0.8  # of a made map, its picture and its heights
+_HALF_M = 140.0  # within which its views look
+_WEST, _NORTH, _CRS = 465_000.0, 5_250_000.0, "EPSG:32632"
+
+
+def load_set(name: str, folder: Path, data: Path, count: int) -> list[View]:
+    """The views of a set, made on the first call; a few photos are given again."""
+    home = folder / name
+    if name == TUNING:
+        return load_views("generated", folder, data, count)[:VIEWS_PER_WORLD]
+    if name == "generated":
+        return load_views("generated", folder, data, VIEWS_PER_WORLD + count)[VIEWS_PER_WORLD:]
+    if name in ("quito", "portugal", "caliterra"):
+        views = load_views(name, folder, data, count)
+        return (views * -(-count // len(views)))[:count]
+    if not (home / "views.npz").exists():
+        home.mkdir(parents=True, exist_ok=True)
+        {"outdated": _outdated, "shifted": _shifted}.get(name, _made)(home, folder, data, count)
+    return load_kept(home)[:count]
+
+
+def place_of(view: View) -> Path:
+    """What tells places apart: the map's folder; the shifted map is of its origin's place."""
+    home = view.map_cache.parent
+    return home.parent / "portugal" if home.name == "shifted" else home
+
+
+def _outdated(home: Path, folder: Path, data: Path, count: int) -> None:
+    """World 1's survey, seen when many of its buildings are gone."""
+    load_views("generated", folder, data, 2 * VIEWS_PER_WORLD)
+    seed = WORLD_SEED + 1
+    rng = np.random.default_rng((seed, 3))
+    look = replace(random_look(rng), changed_buildings=_GONE)
+    day = home / "day"
+    info = build_visits(WorldConfig(seed, WORLD_M), {day: ("live", look)}, processes=1)[0]
+    build_cache(day, home / "day.cache", origin=info.origin, workers=1, overwrite=True)
+    survey = folder / "generated" / f"{seed}" / "survey.cache"
+    half = 0.36 * WORLD_M
+    store_renders(home, survey, home / "day.cache", (half, half), rng, count)
+
+
+def _shifted(home: Path, folder: Path, data: Path, count: int) -> None:
+    """Portugal with its orthophoto moved against its heights; queries from the map as it is."""
+    load_views("portugal", folder, data, count)
+    source = data / "portugal"
+    with rasterio.open(source / "ortho.tif") as ortho:
+        profile = ortho.profile | {"transform": Affine.translation(*SHIFT_M) @ ortho.transform}
+        with rasterio.open(home / "ortho.tif", "w", **profile) as moved:
+            moved.write(ortho.read())
+    cache = home / "map.cache"
+    _build([source / "dsm.tif", home / "ortho.tif"], cache)
+    true = folder / "portugal" / "map.cache"
+    rng = np.random.default_rng(3)
+    store_renders(home, cache, true, (100.0, 110.0), rng, count)
+
+
+def _made(home: Path, _folder: Path, data: Path, count: int) -> None:
+    """A made map, and, where the ground itself moves, another one that the queries see."""
+    paint: Callable[[Path, int], tuple[Image, Float32]] = {
+        "forest": _forest, "water": _water, "roofs": _roofs,
+    }[home.name]  # fmt: skip
+    moves = home.name == "water"
+    for name, seed in (("map", 0), ("day", 1)) if moves else (("map", 0),):
+        rgb, height = paint(data, seed)
+        sources = [home / f"{name}-dsm.tif", home / f"{name}-ortho.tif"]
+        _write(sources[0], height[None], _POST_M)
+        _write(sources[1], rgb.transpose(2, 0, 1), _GSD_M)
+        _build(sources, home / f"{name}.cache")
+    day = home / ("day.cache" if moves else "map.cache")
+    rng = np.random.default_rng(11)
+    store_renders(home, home / "map.cache", day, (_HALF_M, _HALF_M), rng, count)
+
+
+def _build(sources: list[Path], cache: Path) -> None:
+    build_cache(
+        sources,
+        cache,
+        geoid_separation_m=0.0,
+        vertical_datum="ellipsoidal",
+        rules=ImportRules(trusted=frozenset({"geoid"})),
+        overwrite=True,
+        workers=1,
+    )
+
+
+def _write(path: Path, data: np.ndarray, step: float) -> None:
+    profile = {
+        "driver": "GTiff", "width": data.shape[2], "height": data.shape[1], "count": data.shape[0],
+        "dtype": data.dtype, "crs": _CRS, "transform": from_origin(_WEST, _NORTH, step, step),
+    }  # fmt: skip
+    with rasterio.open(path, "w", **profile) as out:
+        out.write(data)
+
+
+def _noise(rng: np.random.Generator, side: int, wave_px: float) -> Float32:
+    """Smooth noise (side, side) of sigma 1."""
+    coarse = max(4, round(side / wave_px))
+    small = rng.standard_normal((coarse, coarse)).astype(np.float32)
+    full = cv2.resize(small, (side, side), interpolation=cv2.INTER_CUBIC)
+    return np.asarray(full / full.std(), np.float32)
+
+
+def _posts(height: Float32) -> Float32:
+    side = round(_SIDE_M / _POST_M)
+    return np.asarray(cv2.resize(height, (side, side), interpolation=cv2.INTER_AREA), np.float32)
+
+
+def _forest(data: Path, seed: int) -> tuple[Image, Float32]:
+    """Crowns of the NEON plots (40 m, 0.1 m a pixel, CC0), as heights by their brightness."""
+    rng = np.random.default_rng((21, seed))
+    plots = sorted((data / "textures" / "neon_forest").glob("HARV_*.jpg"))[:12]
+    side, part = round(_SIDE_M / _GSD_M), round(40.0 / _GSD_M)
+    rgb = np.zeros((side, side, 3), np.uint8)
+    pictures = [cv2.cvtColor(cv2.imread(str(p)), cv2.COLOR_BGR2RGB) for p in plots]
+    pictures = [cv2.resize(p, (part, part), interpolation=cv2.INTER_AREA) for p in pictures]
+    for i in range(0, side, part):
+        for j in range(0, side, part):
+            tile = np.rot90(pictures[int(rng.integers(len(pictures)))], int(rng.integers(4)))
+            tile = tile[:, ::-1] if rng.random() < 0.5 else tile
+            rgb[i : i + part, j : j + part] = tile[: side - i, : side - j]
+    grey = cv2.GaussianBlur(rgb.astype(np.float32).mean(axis=2), (0, 0), 4.0)
+    height = 18.0 + 2.0 * (grey - grey.mean()) / grey.std() + 3.0 * _noise(rng, side, 400)
+    return rgb, _posts(height.astype(np.float32))
+
+
+def _water(_data: Path, seed: int) -> tuple[Image, Float32]:
+    rng = np.random.default_rng((22, seed))
+    side = round(_SIDE_M / _GSD_M)
+    waves = 5.0 * _noise(rng, side, 12) + 3.0 * _noise(rng, side, 60) + 3.0 * _noise(rng, side, 500)
+    rgb = np.array([38.0, 62.0, 70.0]) + waves[..., None]
+    return rgb.clip(0, 255).astype(np.uint8), np.zeros((round(_SIDE_M / _POST_M),) * 2, np.float32)
+
+
+def _roofs(_data: Path, seed: int) -> tuple[Image, Float32]:
+    """A colony of one house: lots of 24 by 20 m, a road every fourth row, a tree in a third."""
+    rng = np.random.default_rng((23, seed))
+    side = round(_SIDE_M / _GSD_M)
+    lawn = np.array([96.0, 112.0, 72.0]) + 6.0 * _noise(rng, side, 8)[..., None]
+    height = np.zeros((side, side), np.float32)
+    lot_x, lot_y = round(24 / _GSD_M), round(20 / _GSD_M)
+    for row, y in enumerate(range(0, side, lot_y)):
+        if row % 4 == 0:
+            lawn[y : y + lot_y // 3] = (118, 116, 112)
+        for x in range(0, side, lot_x):
+            house = np.s_[y + lot_y // 2 : y + lot_y - 6, x + 15 : x + 75]
+            depth = lawn[house].shape[0]
+            lawn[house] = np.array([150.0, 82.0, 62.0])
+            lawn[house][: depth // 2] *= 0.78  # the roof's other slope
+            height[house] = 6.0
+            if rng.random() < 0.33:
+                at = (int(rng.integers(x + 80, x + 110)), int(rng.integers(y + 30, y + 80)))
+                cv2.circle(lawn, at, 14, (52.0, 78.0, 40.0), -1)
+                cv2.circle(height, at, 14, 7.0, -1)
+    return lawn.clip(0, 255).astype(np.uint8), _posts(height)

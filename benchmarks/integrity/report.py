@@ -1,0 +1,141 @@
+"""What each acceptance lets through and what it costs, with exact intervals; table, JSON, plot."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import matplotlib.pyplot as plt
+import numpy as np
+
+from benchmarks.common.shares import exact_interval
+from benchmarks.integrity.beginnings import WRONG
+from benchmarks.integrity.run import Outcome
+from localizer.integrity.acceptance import IntegrityConfig
+
+Acceptance = Callable[[Outcome], bool]
+
+
+def acceptances(config: IntegrityConfig) -> dict[str, Acceptance]:
+    """What was accepted without the parts' votes, that with each test added, and all of them."""
+    c = config
+
+    def plain(o: Outcome) -> bool:
+        good = o.ok and o.overlap >= c.min_overlap and o.quality >= c.min_quality
+        return good and o.sigma_m <= c.max_sigma_m and o.gate <= c.gate
+
+    def votes(o: Outcome) -> bool:
+        return o.parts >= c.min_parts and o.votes >= c.min_agreement * o.parts
+
+    return {
+        "without": plain,
+        "lead over the second mode 5 %": lambda o: plain(o) and o.lead >= 0.05,
+        "quality at least 0.3": lambda o: plain(o) and o.quality >= 0.3,
+        "peak at least 4.5": lambda o: plain(o) and o.peak >= 4.5,
+        "parts agree": lambda o: plain(o) and votes(o),
+        "parts agree, lead 5 %": lambda o: plain(o) and votes(o) and o.lead >= 0.05,
+    }
+
+
+@dataclass(frozen=True)
+class Rate:
+    """So many of so many, with the exact 95 % interval of the share in per cent."""
+
+    hits: int
+    count: int
+    low: float
+    high: float
+
+    @classmethod
+    def of(cls, hits: int, count: int) -> Rate:
+        """With its interval."""
+        return cls(hits, count, *exact_interval(hits, count))
+
+    def __str__(self) -> str:
+        share = 100 * self.hits / max(self.count, 1)
+        return f"{self.hits} of {self.count}, {share:.2f} [{self.low:.2f}, {self.high:.2f}]"
+
+
+@dataclass(frozen=True)
+class Row:
+    """One acceptance on one set. false: accepted, and off by more than 3 m or 3 degrees, of wrong
+    beginnings; false_far: by more than 10 m; lost: of the right results that are accepted without
+    any added test, those that this one rejects.
+    """
+
+    set: str
+    acceptance: str
+    false: Rate
+    false_far: Rate
+    lost: Rate
+
+
+def rows(outcomes: Sequence[Outcome], config: IntegrityConfig) -> list[Row]:
+    """Every acceptance, on each set and on all of them."""
+    made = []
+    tests = acceptances(config)
+    for name in [*dict.fromkeys(o.set for o in outcomes), "all"]:
+        mine = [o for o in outcomes if name in (o.set, "all")]
+        wrong = [o for o in mine if o.kind in WRONG]
+        right = [o for o in mine if o.right and tests["without"](o)]
+        for label, accepts in tests.items():
+            false = [o for o in wrong if not o.right and accepts(o)]
+            lost = sum(not accepts(o) for o in right)
+            made.append(
+                Row(
+                    name,
+                    label,
+                    Rate.of(len(false), len(wrong)),
+                    Rate.of(sum(o.far for o in false), len(wrong)),
+                    Rate.of(lost, len(right)),
+                )
+            )
+    return made
+
+
+def table(made: Sequence[Row]) -> str:
+    """Shares in per cent with their intervals."""
+    lines = [
+        "| set | acceptance | accepted, > 3 m or 3° off | > 10 m off | right ones lost |",
+        "|---|---|---|---|---|",
+    ]
+    lines += [f"| {r.set} | {r.acceptance} | {r.false} | {r.false_far} | {r.lost} |" for r in made]
+    return "\n".join(lines)
+
+
+def by_condition(outcomes: Sequence[Outcome], config: IntegrityConfig) -> str:
+    """Right results lost by the votes, of each condition, and of a focal length that is 5 % off."""
+    tests = acceptances(config)
+    lines = ["| right results | lost by the votes, % |", "|---|---|"]
+    for condition in sorted({o.condition for o in outcomes}):
+        mine = [o for o in outcomes if o.condition == condition and o.right and tests["without"](o)]
+        lost = sum(not tests["parts agree"](o) for o in mine)
+        lines.append(f"| {condition} | {Rate.of(lost, len(mine))} |")
+    focal = [o for o in outcomes if o.kind == "focal near"]
+    for label in ("without", "parts agree"):
+        false = sum(tests[label](o) and not o.right for o in focal)
+        lines.append(
+            f"| focal length 5 % off, begun right: accepted > 3 m off, {label} "
+            f"| {Rate.of(false, len(focal))} |"
+        )
+    return "\n".join(lines)
+
+
+def plot(outcomes: Sequence[Outcome], config: IntegrityConfig, path: Path) -> None:
+    """Share of agreeing parts over quality, of right and of wrong results."""
+    figure, axes = plt.subplots(figsize=(7, 5))
+    seen = [o for o in outcomes if o.ok and o.parts]
+    for label, right, colour in (("wrong", False, "tab:red"), ("right", True, "tab:green")):
+        mine = [o for o in seen if o.right is right and (right or o.far)]
+        x, y = [o.quality for o in mine], [o.votes / o.parts for o in mine]
+        axes.scatter(np.array(x), np.array(y), s=3, color=colour, label=f"{label}, {len(mine)}")
+    axes.axhline(config.min_agreement, color="black", ls="--", lw=0.8)
+    axes.axvline(config.min_quality, color="black", ls=":", lw=0.8)
+    axes.set_xlabel("registration quality")
+    axes.set_ylabel("share of the image's parts that agree")
+    axes.legend()
+    axes.grid(alpha=0.3)
+    figure.tight_layout()
+    figure.savefig(path, dpi=90)
+    plt.close(figure)

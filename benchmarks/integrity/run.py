@@ -1,0 +1,207 @@
+"""Registrations from all beginnings of a set, one line of JSON each, so that a run can go on."""
+
+from __future__ import annotations
+
+import json
+import time
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import ExitStack
+from dataclasses import asdict, dataclass, fields, replace
+from pathlib import Path
+
+import numpy as np
+
+from benchmarks.basin.views import View
+from benchmarks.integrity.beginnings import Beginning, beginnings
+from benchmarks.integrity.maps import place_of
+from localizer.config import LocalizerConfig
+from localizer.errors import SequenceError
+from localizer.features import load_extractor
+from localizer.features.detail import DetailExtractor
+from localizer.geometry.camera import Camera
+from localizer.map.cache.cache import TileCache
+from localizer.map.cache.stream import TileStreamer
+from localizer.registration import JNGO, Registration
+from localizer.render.numba_raster import NumbaRenderer
+from localizer.tracking.motion import mahalanobis_squared
+from localizer.tracking.pipeline import reference_anchors
+from localizer.types import Anchors, FeaturePyramid, RegistrationStatus
+
+_LEAST_MAP = 0.1  # of a reference view, as in flight: with less there is no registration
+_BYTES = 96 * 2**20  # of a map's resident tiles
+_PLACES = 48  # at which views of other places are tried
+_FAR_M = 1e6  # error where the place is not on the map
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """One registration. metres, degrees: its error, and off_map_m: against the picture of a map
+    whose picture is shifted; sigma_m: the largest of its position; gate: squared Mahalanobis
+    distance from the prior; the rest as `Registration` has it.
+    """
+
+    set: str
+    view: int
+    condition: str
+    kind: str
+    start_m: float
+    start_deg: float
+    ok: bool
+    metres: float = _FAR_M
+    degrees: float = 180.0
+    off_map_m: float = _FAR_M
+    overlap: float = 0.0
+    quality: float = 0.0
+    sigma_m: float = 1e3
+    gate: float = 1e9
+    parts: int = 0
+    votes: int = 0
+    peak: float = 0.0
+    lead: float = 0.0
+
+    @property
+    def right(self) -> bool:
+        """Within 3 m and 3 degrees, of the place that the map's picture shows."""
+        return min(self.metres, self.off_map_m) <= 3 and self.degrees <= 3
+
+    @property
+    def far(self) -> bool:
+        """More than 10 m wrong."""
+        return min(self.metres, self.off_map_m) > 10
+
+
+class Registrar:
+    """Registers views to whichever map a beginning names; close it when done."""
+
+    def __init__(self, config: LocalizerConfig) -> None:
+        self._config = config
+        self._extractor = DetailExtractor(load_extractor(config.model, threads=1))
+        self._optimizer = JNGO(config.registration, threads=1)
+        self._renderers: dict[Path, NumbaRenderer] = {}
+        self._elsewhere: dict[int, Anchors | None] = {}
+        self._stack = ExitStack()
+
+    def __enter__(self) -> Registrar:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._stack.close()
+
+    def outcomes(
+        self, name: str, view: View, index: int, others: Sequence[View], shift: tuple[float, float]
+    ) -> Iterator[Outcome]:
+        """Of every beginning of a view that meets the map; shift: of the map's picture, m."""
+        query = self._extractor.extract(view.query)
+        for begun in beginnings(view, index, others):
+            found = self._register(query, begun, index)
+            if found is not None:
+                yield _outcome(name, view, index, begun, found, shift)
+
+    def _register(self, query: FeaturePyramid, begun: Beginning, index: int) -> Registration | None:
+        if begun.other is not None:  # the same few places for every view: rendered once
+            key = id(begun.other)
+            if key not in self._elsewhere:
+                self._elsewhere[key] = self._anchors(begun, begun.other.camera, index)
+            anchors = self._elsewhere[key]
+        else:
+            anchors = self._anchors(begun, begun.camera, index)
+        if anchors is None:
+            return None
+        return self._optimizer.register(query, begun.camera, anchors, begun.prior, seed=index)
+
+    def _anchors(self, begun: Beginning, camera: Camera, seed: int) -> Anchors | None:
+        pose = begun.prior.world_from_camera
+        reference = self._renderer(begun.map_cache).render(pose, camera, wait=True)
+        if (reference.depth > 0).mean() < _LEAST_MAP:
+            return None
+        return reference_anchors(reference, self._extractor, self._config.anchors, seed)
+
+    def _renderer(self, cache: Path) -> NumbaRenderer:
+        if cache not in self._renderers:
+            streamer = self._stack.enter_context(
+                TileStreamer(TileCache.open(cache), byte_budget=_BYTES)
+            )
+            self._renderers[cache] = NumbaRenderer(streamer, 1)
+        return self._renderers[cache]
+
+
+def _outcome(
+    name: str, view: View, index: int, begun: Beginning, found: Registration,
+    shift: tuple[float, float],
+) -> Outcome:  # fmt: skip
+    head = Outcome(
+        name, index, view.condition, begun.kind, begun.start_m, begun.start_deg,
+        found.status is RegistrationStatus.OK,
+    )  # fmt: skip
+    if not head.ok:
+        return head
+    metres, degrees, off_map = _FAR_M, 180.0, _FAR_M
+    pose, truth = found.world_from_camera, view.truth
+    if begun.other is None:
+        metres, degrees = pose.distance_to(truth)
+        off_map = float(np.linalg.norm(pose.translation - truth.translation - [*shift, 0.0]))
+    votes = found.agreement
+    if votes is None:
+        raise SequenceError("the registration did not say how the image's parts voted")
+    return replace(
+        head,
+        metres=metres,
+        degrees=degrees,
+        off_map_m=off_map,
+        overlap=found.overlap,
+        quality=found.quality,
+        sigma_m=float(np.sqrt(found.covariance.diagonal()[:3].max())),
+        gate=mahalanobis_squared(begun.prior, pose, found.covariance),
+        parts=votes.parts,
+        votes=votes.votes,
+        peak=votes.peak,
+        lead=min(found.lead, 1e3),
+    )
+
+
+def run_set(
+    name: str,
+    views: Sequence[View],
+    everywhere: Sequence[View],
+    path: Path,
+    shift: tuple[float, float],
+    more_time: Callable[[], bool],
+) -> int:
+    """Append the views that `path` lacks, as long as there is time; how many are left.
+
+    everywhere: views, of which some of other places serve as wrong beginnings.
+    """
+    chosen = np.random.default_rng(37).permutation(len(everywhere))[:_PLACES]
+    places = [everywhere[int(k)] for k in chosen]
+    done = {o.view for o in read(path)} if path.exists() else set()
+    left = [k for k in range(len(views)) if k not in done]
+    with Registrar(LocalizerConfig()) as registrar, path.open("a") as file:
+        while left and more_time():
+            k = left.pop(0)
+            here = place_of(views[k])
+            others = [v for v in places if place_of(v) != here]
+            rows = list(registrar.outcomes(name, views[k], k, others, shift))
+            # A view whole or not at all: an interrupted run tries it again.
+            file.write("".join(json.dumps(asdict(o)) + "\n" for o in rows))
+            file.flush()
+    return len(left)
+
+
+def read(path: Path) -> list[Outcome]:
+    """The outcomes of a file; a line that an interrupt cut short is left out with its view."""
+    rows, cut = [], set()
+    for line in path.read_text().splitlines():
+        try:
+            rows.append(json.loads(line))
+        except json.JSONDecodeError:
+            cut.add(rows[-1]["view"] if rows else 0)
+    names = {f.name for f in fields(Outcome)}
+    if any(set(row) != names for row in rows):
+        raise SequenceError(f"{path}: not a file of this benchmark: begin anew without it")
+    return [Outcome(**row) for row in rows if row["view"] not in cut]
+
+
+def deadline(minutes: float) -> Callable[[], bool]:
+    """Whether so many minutes from now have not passed."""
+    end = time.monotonic() + 60.0 * minutes
+    return lambda: time.monotonic() < end
