@@ -5,10 +5,11 @@
 
 FOLDER keeps worlds, maps, views and one file of outcomes a set (`integrity/SET.jsonl`); a run goes
 on where the last one ended, and ends after so many minutes. Every view begins near the truth (3 m,
-8 m), 20 to 500 m and 5 to 180 degrees off, on the maps of other sets, and with a focal length that
-is 5 % off. Roll, pitch and height are known as an autopilot knows them, and every prior tells its
-own error, so that the gate against the prior is as wide as it deserves. A false accept is a wrong
-beginning that ends accepted and more than 3 m or 3 degrees off (beside it: more than 10 m). The set
+8 m), 20 to 200 m and 5 to 180 degrees off, at 20 other places of its map, at 13 of other maps, and
+with a focal length that is 5 % off. Roll, pitch and height are known as an autopilot knows them,
+and every prior tells its own error, so that the gate against the prior is as wide as it deserves. A
+false accept is a wrong beginning that ends accepted and more than 3 m or 3 degrees off (beside it:
+more than 10 m). The set
 "tuning" is for choosing thresholds and in no figure of the report. On "shifted" a result counts by
 the place that the map's picture shows: no single picture tells that a map is shifted.
 """

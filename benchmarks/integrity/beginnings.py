@@ -14,24 +14,22 @@ from localizer.geometry.pose import Array, Pose, so3_exp
 from localizer.relocalization.patch import turned
 from localizer.types import PosePrior
 
-NEAR = ((3.0, 3.0), (3.0, 3.0), (8.0, 8.0), (8.0, 8.0))  # metres and degrees of heading
-FAR = (
-    (20.0, 5.0), (20.0, 180.0), (50.0, 10.0), (50.0, 45.0), (100.0, 5.0), (100.0, 20.0),
-    (100.0, 90.0), (200.0, 10.0), (200.0, 60.0), (350.0, 120.0), (500.0, 20.0), (500.0, 180.0),
-)  # fmt: skip
-ELSEWHERE = 12  # beginnings on other maps
-FOCAL = ((20.0, 5.0), (50.0, 20.0), (100.0, 45.0), (200.0, 120.0))
+NEAR = ((3.0, 3.0), (3.0, 3.0), (8.0, 8.0))  # metres and degrees of heading
+FAR = ((20.0, 5.0), (20.0, 180.0), (50.0, 20.0), (100.0, 10.0), (100.0, 90.0), (200.0, 45.0))
+LOST, ELSEWHERE = 20, 13  # beginnings at other places of the map, and on other maps
+FOCAL = ((20.0, 5.0), (100.0, 45.0))
+_LEAST_LOST_M = 20.0
 _FOCAL_ERROR = 0.05
 _TILT_DEG, _HEIGHT_M = 2.0, 5.0  # sigma, by the autopilot and its barometer
 
-WRONG = ("far", "elsewhere", "focal")  # kinds that begin wrong; "near" and "focal near" do not
+WRONG = ("far", "lost", "elsewhere", "focal")  # "near" and "focal near" begin right
 
 
 @dataclass(frozen=True)
 class Beginning:
     """One registration to try. camera: as it is believed; prior: told with an honest covariance;
-    map_cache: what it is registered to; other: the view of another place, from whose pose the
-    reference is rendered; None where the place is on the map.
+    map_cache: what it is registered to; other: the view from whose pose the reference is rendered,
+    where that serves several beginnings; has_truth: whether the place is on that map.
     """
 
     kind: str
@@ -41,20 +39,25 @@ class Beginning:
     camera: Camera
     prior: PosePrior
     other: View | None = None
+    has_truth: bool = True
 
 
-def beginnings(view: View, index: int, others: Sequence[View]) -> Iterator[Beginning]:
-    """All of one view; others: views of other places, at which it is tried, too."""
+def beginnings(
+    view: View, index: int, here: Sequence[View], others: Sequence[View]
+) -> Iterator[Beginning]:
+    """All of one view; here, others: views of its own map and of other places, where it is tried,
+    too.
+    """
     rng = np.random.default_rng((31, index))
     for kind, starts in (("near", NEAR), ("far", FAR)):
         for metres, degrees in starts:
             prior = _off(view.truth, metres, degrees, rng)
             yield Beginning(kind, metres, degrees, view.map_cache, view.camera, prior)
+    away = [v for v in here if view.truth.distance_to(v.truth)[0] >= _LEAST_LOST_M]
+    for k in rng.permutation(len(away))[:LOST]:
+        yield _at(away[int(k)], view, "lost")
     for k in rng.permutation(len(others))[:ELSEWHERE]:
-        place = others[int(k)]
-        sigma = np.array([20.0, 20.0, _HEIGHT_M, *np.radians([_TILT_DEG, _TILT_DEG, 180.0])])
-        prior = PosePrior(place.truth, np.diag(sigma**2), 0)
-        yield Beginning("elsewhere", 1e6, 180.0, place.map_cache, view.camera, prior, place)
+        yield _at(others[int(k)], view, "elsewhere")
     for metres, degrees in (*FOCAL, NEAR[0]):
         factor = 1.0 + _FOCAL_ERROR * float(rng.choice((-1.0, 1.0)))
         camera = view.camera
@@ -62,6 +65,18 @@ def beginnings(view: View, index: int, others: Sequence[View]) -> Iterator[Begin
         kind = "focal near" if metres == NEAR[0][0] else "focal"
         prior = _off(view.truth, metres, degrees, rng)
         yield Beginning(kind, metres, degrees, view.map_cache, camera, prior)
+
+
+def _at(place: View, view: View, kind: str) -> Beginning:
+    """Where another view was taken, the prior as wide as the way there; no heading is known."""
+    on_map = kind == "lost"
+    metres, degrees = view.truth.distance_to(place.truth) if on_map else (20.0, 180.0)
+    tilt = np.radians(max(_TILT_DEG, degrees)) if on_map else np.radians(_TILT_DEG)
+    sigma = np.array([metres, metres, metres, tilt, tilt, np.pi])
+    prior = PosePrior(place.truth, np.diag(sigma**2), 0)
+    return Beginning(
+        kind, metres, degrees, place.map_cache, view.camera, prior, other=place, has_truth=on_map
+    )
 
 
 def _off(truth: Pose, metres: float, degrees: float, rng: np.random.Generator) -> PosePrior:

@@ -2,14 +2,13 @@
 
 "tuning" and "generated" are worlds of different seeds. The made maps are hard on purpose: forest
 (few photographs of crowns, turned and mirrored, over and over), water (nothing but waves, others
-in the query), roofs (one house on equal lots), "outdated" (a generated world of which three
-buildings in ten are gone on another day), "shifted" (portugal's orthophoto 5 m off its heights).
+in the query), roofs (one house on equal lots), "outdated" (portugal, of which three squares in ten
+show other ground, heights included), "shifted" (portugal's orthophoto 5 m off its heights).
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -19,8 +18,6 @@ from rasterio.transform import Affine, from_origin
 
 from benchmarks.basin.views import (
     VIEWS_PER_WORLD,
-    WORLD_M,
-    WORLD_SEED,
     View,
     load_kept,
     load_views,
@@ -28,17 +25,14 @@ from benchmarks.basin.views import (
 )
 from localizer.map.building.build import build_cache
 from localizer.map.importers.rules import ImportRules
-from localizer.synth.config import WorldConfig
-from localizer.synth.world import build_visits
-from localizer.training.data.worlds import random_look
 from localizer.types import Float32, Image
 
 TUNING = "tuning"  # thresholds may be chosen on it, figures are those of the others
 SETS = {
-    TUNING: 40, "generated": 80, "outdated": 40, "quito": 60, "portugal": 40, "caliterra": 50,
-    "shifted": 30, "forest": 30, "water": 15, "roofs": 30,
+    TUNING: 40, "generated": 40, "quito": 40, "portugal": 40, "caliterra": 50, "outdated": 30,
+    "shifted": 20, "forest": 30, "water": 15, "roofs": 30,
 }  # fmt: skip
-_GONE = 0.3  # of the buildings of an outdated map
+_CHANGED, _CHANGE_M = 0.3, 24.0  # share of an outdated map that has changed, side of a change
 SHIFT_M = (4.0, -3.0)  # of the orthophoto, east and north
 _SIDE_M, _GSD_M, _POST_M = 480.0, 0.2, 0.8  # of a made map, its picture and its heights
 _HALF_M = 140.0  # within which its views look
@@ -62,23 +56,40 @@ def load_set(name: str, folder: Path, data: Path, count: int) -> list[View]:
 
 
 def place_of(view: View) -> Path:
-    """What tells places apart: the map's folder; the shifted map is of its origin's place."""
+    """What tells places apart: the folder of the map, or of the one that it was made from."""
     home = view.map_cache.parent
-    return home.parent / "portugal" if home.name == "shifted" else home
+    return home.parent / "portugal" if home.name in ("shifted", "outdated") else home
 
 
 def _outdated(home: Path, folder: Path, data: Path, count: int) -> None:
-    """World 1's survey, seen when many of its buildings are gone."""
-    load_views("generated", folder, data, 2 * VIEWS_PER_WORLD)
-    seed = WORLD_SEED + 1
-    rng = np.random.default_rng((seed, 3))
-    look = replace(random_look(rng), changed_buildings=_GONE)
-    day = home / "day"
-    info = build_visits(WorldConfig(seed, WORLD_M), {day: ("live", look)}, processes=1)[0]
-    build_cache(day, home / "day.cache", origin=info.origin, workers=1, overwrite=True)
-    survey = folder / "generated" / f"{seed}" / "survey.cache"
-    half = 0.36 * WORLD_M
-    store_renders(home, survey, home / "day.cache", (half, half), rng, count)
+    """Portugal with squares exchanged for others of it; queries from the map as it is."""
+    load_views("portugal", folder, data, count)
+    rng = np.random.default_rng(5)
+    sources = [home / "dsm.tif", home / "ortho.tif"]
+    with rasterio.open(data / "portugal" / "dsm.tif") as heights:
+        bounds = heights.bounds
+    west, north = np.meshgrid(
+        np.arange(bounds.left, bounds.right - _CHANGE_M, _CHANGE_M),
+        np.arange(bounds.top, bounds.bottom + _CHANGE_M, -_CHANGE_M),
+    )
+    corners = np.stack([west.ravel(), north.ravel()], axis=1)
+    new = rng.permutation(len(corners))[: round(_CHANGED * len(corners))]
+    old = rng.permutation(len(corners))[: len(new)]
+    for out in sources:
+        with rasterio.open(data / "portugal" / out.name) as given:
+            profile, array = given.profile, given.read()
+            side = round(_CHANGE_M / given.res[0])
+            cells = [given.index(*corner) for corner in corners]
+        changed = array.copy()
+        for to, source in zip(new, old, strict=True):
+            (i, j), (k, m) = cells[int(to)], cells[int(source)]
+            h, w = (min(side, array.shape[a] - max(b, c)) for a, b, c in ((1, i, k), (2, j, m)))
+            changed[:, i : i + h, j : j + w] = array[:, k : k + h, m : m + w]
+        with rasterio.open(out, "w", **profile) as file:
+            file.write(changed)
+    _build(sources, home / "map.cache")
+    true = folder / "portugal" / "map.cache"
+    store_renders(home, home / "map.cache", true, (100.0, 110.0), rng, count)
 
 
 def _shifted(home: Path, folder: Path, data: Path, count: int) -> None:

@@ -88,11 +88,12 @@ class Registrar:
         self._stack.close()
 
     def outcomes(
-        self, name: str, view: View, index: int, others: Sequence[View], shift: tuple[float, float]
-    ) -> Iterator[Outcome]:
+        self, name: str, view: View, index: int, here: Sequence[View], others: Sequence[View],
+        shift: tuple[float, float],
+    ) -> Iterator[Outcome]:  # fmt: skip
         """Of every beginning of a view that meets the map; shift: of the map's picture, m."""
         query = self._extractor.extract(view.query)
-        for begun in beginnings(view, index, others):
+        for begun in beginnings(view, index, here, others):
             found = self._register(query, begun, index)
             if found is not None:
                 yield _outcome(name, view, index, begun, found, shift)
@@ -137,7 +138,7 @@ def _outcome(
         return head
     metres, degrees, off_map = _FAR_M, 180.0, _FAR_M
     pose, truth = found.world_from_camera, view.truth
-    if begun.other is None:
+    if begun.has_truth:
         metres, degrees = pose.distance_to(truth)
         off_map = float(np.linalg.norm(pose.translation - truth.translation - [*shift, 0.0]))
     votes = found.agreement
@@ -178,9 +179,10 @@ def run_set(
     with Registrar(LocalizerConfig()) as registrar, path.open("a") as file:
         while left and more_time():
             k = left.pop(0)
-            here = place_of(views[k])
-            others = [v for v in places if place_of(v) != here]
-            rows = list(registrar.outcomes(name, views[k], k, others, shift))
+            own, at = views[k].map_cache, place_of(views[k])
+            here = [v for v in views if v.map_cache == own]
+            others = [v for v in places if place_of(v) != at]
+            rows = list(registrar.outcomes(name, views[k], k, here, others, shift))
             # A view whole or not at all: an interrupted run tries it again.
             file.write("".join(json.dumps(asdict(o)) + "\n" for o in rows))
             file.flush()
