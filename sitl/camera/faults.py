@@ -9,7 +9,7 @@ import numpy as np
 
 from localizer.types import Image
 
-PictureFaultKind = Literal["covered", "blinded", "frozen", "stamped_late", "silent"]
+PictureFaultKind = Literal["covered", "blinded", "frozen", "stamped_late", "late", "silent"]
 
 _COVERED_LEVEL, _COVERED_NOISE = 9.0, 4.0  # of 255: a lens cap, and the sensor's read noise
 _BLINDED_LEVEL, _BLINDED_NOISE = 205.0, 3.0  # inside a cloud: bright, even, next to no contrast
@@ -21,7 +21,8 @@ class PictureFault:
 
     covered: a lens cap. blinded: cloud or fog that shows nothing. frozen: the last picture again
     and again under fresh stamps, encoded anew each time, as a hung sensor does. stamped_late: by
-    `seconds` after the true exposure. silent: nothing is sent.
+    `seconds` after the true exposure. late: sent so late, and stamped when it is sent, as by a
+    camera that does not know of its own latency. silent: nothing is sent.
     """
 
     kind: PictureFaultKind
@@ -59,10 +60,16 @@ class FaultyLens:
 
     def stamp(self, exposure_ns: int) -> int:
         """The time that the picture is stamped with."""
-        late = self._fault is not None and self._fault.kind == "stamped_late"
-        return (
-            exposure_ns + round(self._fault.seconds * 1e9) if late and self._fault else exposure_ns
-        )
+        return exposure_ns + self._ns_of("stamped_late", "late")
+
+    @property
+    def delay_ns(self) -> int:
+        """How long a picture waits before it is sent."""
+        return self._ns_of("late")
+
+    def _ns_of(self, *kinds: PictureFaultKind) -> int:
+        fault = self._fault
+        return round(fault.seconds * 1e9) if fault is not None and fault.kind in kinds else 0
 
     def _even(self, image: Image, level: float, noise: float) -> Image:
         values = self._rng.normal(level, noise, image.shape)

@@ -10,6 +10,7 @@ import multiprocessing
 import queue
 import threading
 import time
+from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from multiprocessing.connection import Connection
@@ -27,6 +28,7 @@ from localizer.map.cache.cache import TileCache
 from localizer.map.cache.stream import TileStreamer
 from localizer.render.numba_raster import NumbaRenderer
 from localizer.synth.appearance.model import Appearance
+from localizer.types import Image
 from sitl.camera.detector import Detector, Observed
 from sitl.camera.faults import FaultyLens, PictureFault
 from sitl.camera.movers import Mover
@@ -201,6 +203,16 @@ def _listen(connection: Connection, inbox: queue.SimpleQueue[Message]) -> None:
         inbox.put("stop")
 
 
+@dataclass(frozen=True)
+class _Waiting:
+    """A picture that is sent when it is due."""
+
+    due_ns: int
+    exposure_ns: int
+    stamped_ns: int
+    image: Image
+
+
 class _Studio:
     """Owns renderer, encoder and log for the life of the process."""
 
@@ -230,6 +242,7 @@ class _Studio:
             Detector(c.detections, c.camera, c.targets, seed=c.seed) if c.detections else None
         )
         self._lens = FaultyLens(c.seed)
+        self._outbox: deque[_Waiting] = deque()
         self._track = PoseTrack()
         self._paused = self._stopped = False
         self._frames = self._skipped = 0
@@ -268,6 +281,8 @@ class _Studio:
             if newest >= due + margin_ns:
                 self._expose(due)
                 due += period_ns
+            while self._outbox and self._outbox[0].due_ns <= newest:
+                self._send(self._outbox.popleft())
 
     def _handle(self, message: Message) -> None:
         if isinstance(message, TruthSample):
@@ -288,15 +303,25 @@ class _Studio:
         if exposure is None:
             self._skipped += 1
             return
-        start = time.perf_counter()
-        self._sender.send(self._lens.picture(exposure.image), self._lens.stamp(time_ns))
+        self._outbox.append(
+            _Waiting(
+                time_ns + self._lens.delay_ns,
+                time_ns,
+                self._lens.stamp(time_ns),
+                self._lens.picture(exposure.image),
+            )
+        )
         if self._detector is not None:
             self._detector.observe(time_ns, exposure.world_from_camera, exposure.depth)
         self._log.add(self._frames, time_ns, exposure.world_from_camera)
         self._frames += 1
-        stages = exposure.stage_ms | {"encode": 1e3 * (time.perf_counter() - start)}
-        for name, value in stages.items():
+        for name, value in exposure.stage_ms.items():
             self._stages.setdefault(name, []).append(value)
+
+    def _send(self, waiting: _Waiting) -> None:
+        start = time.perf_counter()
+        self._sender.send(waiting.image, waiting.exposure_ns, waiting.stamped_ns)
+        self._stages.setdefault("encode", []).append(1e3 * (time.perf_counter() - start))
 
     def _statistics(self) -> CameraStatistics:
         stages = {

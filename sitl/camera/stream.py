@@ -58,13 +58,17 @@ class VideoSender:
         """Size of all pictures sent, without the transport's overhead."""
         return self._bytes
 
-    def send(self, image: Image, exposure_ns: int) -> None:
-        """Sends an RGB image (H, W, 3) uint8 exposed at `exposure_ns` on CLOCK_MONOTONIC."""
+    def send(self, image: Image, exposure_ns: int, stamped_ns: int | None = None) -> None:
+        """Sends an RGB image (H, W, 3) uint8 exposed at `exposure_ns` on CLOCK_MONOTONIC.
+
+        stamped_ns: what a camera with a wrong clock says instead; the presentation time, of the
+        encoder's own clock, stays right.
+        """
         picture = av.VideoFrame.from_ndarray(np.ascontiguousarray(image), format="rgb24")
         picture = picture.reformat(format="yuv420p")
         picture.pts = round(exposure_ns / _NS_PER_TICK)
         picture.time_base = _CLOCK
-        stamp = self._stamp(exposure_ns) if self._misp else b""
+        stamp = self._stamp(stamped_ns or exposure_ns) if self._misp else b""
         for encoded in self._encoder.encode(picture):
             packet = av.Packet(stamp + bytes(encoded))
             packet.pts, packet.dts, packet.time_base = encoded.pts, encoded.dts, _CLOCK

@@ -29,7 +29,7 @@ class Picture(_Model):
 
     kind: PictureFaultKind
     for_s: float = Field(gt=0, le=300)
-    late_s: float = Field(0.0, ge=0, le=2, description="of stamped_late")
+    late_s: float = Field(0.0, ge=0, le=2, description="of stamped_late and late")
 
     @property
     def fault(self) -> PictureFault:

@@ -31,6 +31,15 @@ def test_a_covered_or_blinded_camera_shows_nothing(kind: str, low: int, high: in
     assert shown.std() < 8
 
 
+def test_late_pictures_are_stamped_as_they_are_sent() -> None:
+    lens = FaultyLens(1)
+    assert lens.delay_ns == 0
+    lens.set(PictureFault("late", 0.3))
+    assert (lens.delay_ns, lens.stamp(1_000_000_000)) == (300_000_000, 1_300_000_000)
+    lens.set(None)
+    assert (lens.delay_ns, lens.stamp(1_000_000_000)) == (0, 1_000_000_000)
+
+
 def test_late_stamps_move_the_time_alone() -> None:
     lens = FaultyLens(0)
     lens.set(PictureFault("stamped_late", 0.3))
