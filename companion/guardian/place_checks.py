@@ -21,7 +21,7 @@ _FIX_FRESH_NS = 500_000_000
 _SIGMAS = 4.0
 _GNSS_FLOOR_M = 1.0
 _GNSS_SIGMA_M = 2.5  # where the receiver does not say
-_GNSS_AGE_S = 0.5  # report and fix are apart by at most so long, times the speed
+_GNSS_AGE_S = 0.2  # of a report when it comes, beyond what its four sigmas cover
 _DRIFT_MPS2 = 0.2  # what dead reckoning may be wrong by, as an acceleration
 _SPEED_MPS = 1.0  # and of its speed
 
@@ -74,11 +74,13 @@ class GnssCheck:
             return Reading(None)
         place = LocalPlace()
         place.ned(fix)
-        apart = math.hypot(*place.north_east(latitude, longitude))
+        north, east = place.north_east(latitude, longitude)
         accuracy = _GNSS_SIGMA_M if state.gps_h_accuracy_m is None else state.gps_h_accuracy_m
         accuracy = min(max(accuracy, _GNSS_FLOOR_M), self._cap_m)
-        velocity = state.local_velocity_ned or (0.0, 0.0, 0.0)
-        limit = _SIGMAS * accuracy + protection_m + _GNSS_AGE_S * math.hypot(*velocity[:2])
+        v_north, v_east, _ = state.local_velocity_ned or (0.0, 0.0, 0.0)
+        later_s = (fix.time_ns - state.gps_time_ns) * 1e-9
+        apart = math.hypot(north + v_north * later_s, east + v_east * later_s)
+        limit = _SIGMAS * accuracy + protection_m + _GNSS_AGE_S * math.hypot(v_north, v_east)
         return Reading(apart > limit, apart)
 
 

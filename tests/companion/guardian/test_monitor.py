@@ -184,6 +184,21 @@ def test_gnss_that_is_dragged_away_slowly_is_told_below_the_alert_limit() -> Non
     assert 3.0 < away_m < 10.0
 
 
+def test_a_receiver_that_lags_is_left_alone_and_a_dragged_one_is_told_at_speed() -> None:
+    """At 10 m/s a report that is 0.3 s old when it comes is 3 m behind; 10 m are told all the same.
+
+    Found on ArduPilot: 0.6 m/s of spoofing was told at 13 m in flight, at 8 m in a hover.
+    """
+
+    def behind(at_s: float) -> float:
+        return leg(at_s - 0.3)[0] - leg(at_s)[0]
+
+    honest = Flight(monitor(), leg, gnss_north_m=behind).fly(16.0)
+    assert honest.lines == []
+    dragged = Flight(monitor(), leg, gnss_north_m=lambda at_s: -0.6 * max(at_s - 10.0, 0.0))
+    assert 0.6 * (dragged.fly(40.0).told("GNSS") - 10.0) < 10.0
+
+
 def test_our_own_gps_input_is_no_gnss() -> None:
     """Agreement or not with what we fed ourselves is no evidence."""
     own = Monitor(GuardianConfig(), Limits(gnss_is_ours=True))
