@@ -101,7 +101,8 @@ class Expectation(_Model):
 
     told_within_s: an EKF error beyond `beyond_m` is told (health worse than ok, or a finding of the
     guardian that stands) at latest so long after it began. never_modes: flight modes that must not
-    be entered. max_error_m: of the EKF. false_fixes: injected positions further off than 5 m.
+    be entered. max_error_m: of the EKF. false_fixes: injected positions further off than 5 m;
+    injects: and some are injected.
     ends_tracking: the last health is ok. says: parts of texts that must come from the companion.
     silent: no warning text, no finding of the guardian, and a health that is ok throughout.
     """
@@ -111,6 +112,7 @@ class Expectation(_Model):
     never_modes: tuple[str, ...] = ()
     max_error_m: float | None = Field(None, gt=0)
     false_fixes: int | None = Field(0, ge=0)
+    injects: bool = True
     ends_tracking: bool = False
     says: tuple[str, ...] = ()
     silent: bool = False

@@ -26,7 +26,7 @@ from sitl.demo.script import mission
 from sitl.ground.pilot import Pilot
 from sitl.ground.vehicle_record import VEHICLE
 from sitl.suite.flight import longest_stall, slowest_pace
-from sitl.suite.loop.case import LoopCase, LoopEvent, PlaceHint
+from sitl.suite.loop.case import LoopCase, LoopEvent, PlaceHint, Wrong
 from sitl.suite.loop.companion import LoopCompanion
 from sitl.suite.loop.disturbances import GnssDrag, OtherWork
 from sitl.suite.loop.judge import LoopRecord, LoopSample, LoopText
@@ -34,7 +34,7 @@ from sitl.vehicles.launch import VISION_SOURCE, open_vehicle
 from sitl.vehicles.process import VehicleKind, VehicleProcess
 
 _STEP_S = 0.25
-_TRACKING_S = 90.0
+_TRACKING_S, _WRONG_S = 90.0, 15.0
 _LOCALIZER = 197  # component
 _DRAG_STEP_S = 0.5
 _POSITION_FRESH_S = 1.0  # LOCAL_POSITION_NED comes 25 times a second, while there is a position
@@ -100,12 +100,19 @@ class _LoopFlight:
         pilot.set_mode("GUIDED")
         pilot.arm()
         pilot.takeoff(case.height_m)
-        if not case.wrong.other_map and not case.cold:
-            pilot.link.wait(self._is_tracking, _TRACKING_S, "the localizer to track")
+        self._wait_tracking()
         if case.wind_m_s:
             pilot.link.set_parameter("SIM_WIND_DIR", 270.0)
             pilot.link.set_parameter("SIM_WIND_SPD", case.wind_m_s)
             pilot.link.sleep(8.0)
+
+    def _wait_tracking(self) -> None:
+        """Wait for a health that is ok; where something is wrong it may never be, or say why."""
+        case, link = self._case, self._pilot.link
+        if case.wrong == Wrong() and not case.cold:
+            link.wait(self._is_tracking, _TRACKING_S, "the localizer to track")
+        elif not case.wrong.other_map and not case.cold:
+            link.wait_wall(self._is_tracking, _WRONG_S)
 
     def run(self) -> None:
         """The recorded part: faults, samples, until the time is over."""
