@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import logging
 import shutil
 import signal
@@ -33,7 +34,7 @@ from sitl.demo.scenario import (
 from sitl.errors import SimulationError
 from sitl.suite.case import SCENARIOS, load_cases
 from sitl.suite.loop.case import LOOP_SCENARIOS, load_loop_cases
-from sitl.suite.loop.report import markdown, print_loop_row
+from sitl.suite.loop.report import as_data, markdown, print_loop_row, read_rows
 from sitl.suite.loop.runner import LoopOptions, fly_loop, parse_seeds
 from sitl.suite.report import print_row, print_table, write_report
 from sitl.suite.runner import run_suite
@@ -180,6 +181,18 @@ def loop(
     rows = fly_loop(cases, options)
     console.print(escape(markdown(rows)))
     raise typer.Exit(0 if all(row.ok for row in rows) else 1)
+
+
+@app.command()
+def loop_table(
+    folders: Annotated[list[Path], typer.Argument(help="--out folders of `loop`")],
+    out: Annotated[Path | None, typer.Option(help="file for all flights as one JSON")] = None,
+) -> None:
+    """Print one table of the flights of several runs of `loop`."""
+    rows = [row for folder in folders for row in read_rows(folder / "loop.json")]
+    if out is not None:
+        out.write_text(json.dumps(as_data(rows), indent=1, allow_nan=False), encoding="utf-8")
+    print(markdown(rows))
 
 
 def _clear(out: Path) -> None:

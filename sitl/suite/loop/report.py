@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
+import json
 import math
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
+from pathlib import Path
 from typing import Any
 
 from rich.console import Console
 from rich.markup import escape
 from scipy.stats import beta
 
+from sitl.demo.scenario import ScenarioError
 from sitl.suite.loop.judge import Held, LoopFigures
 from sitl.suite.runner import PACE_LIMIT, STALL_LIMIT_S
 from sitl.vehicles.process import VehicleKind
@@ -89,6 +92,25 @@ def as_data(rows: Sequence[LoopRow]) -> dict[str, Any]:
     finite = _finite(data)
     assert isinstance(finite, dict)
     return finite
+
+
+def read_rows(path: Path) -> tuple[LoopRow, ...]:
+    """The flights of a ``loop.json``; ScenarioError where it is none."""
+    try:
+        flights = json.loads(path.read_text(encoding="utf-8"))["flights"]
+        return tuple(_row(flight) for flight in flights)
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        raise ScenarioError(f"{path}: not a loop.json of this version: {error}") from error
+
+
+def _row(flight: dict[str, Any]) -> LoopRow:
+    known = {k: v for k, v in flight.items() if k not in ("ok", "slow")}
+    figures, alarms = known.pop("figures"), known.pop("alarms")
+    if figures is not None:
+        unknown = {k: math.nan for k, v in figures.items() if v is None}
+        figures = LoopFigures(**(figures | unknown))
+    known["held"] = tuple(Held(**one) for one in known["held"])
+    return LoopRow(**known, figures=figures, alarms=None if alarms is None else tuple(alarms))
 
 
 def markdown(rows: Sequence[LoopRow]) -> str:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import pytest
@@ -20,7 +21,7 @@ from sitl.suite.loop.judge import (
     judge,
     untold_s,
 )
-from sitl.suite.loop.report import LoopRow, as_data, false_alarm_rate, markdown
+from sitl.suite.loop.report import LoopRow, as_data, false_alarm_rate, markdown, read_rows
 from sitl.suite.loop.runner import parse_seeds
 
 GOOD = LoopSample(0.0, 0.3, 0.0, 0.0, "AUTO", "ok", "localization tracking", 0.5)
@@ -115,6 +116,17 @@ def test_what_was_missed_stands_first_and_the_json_is_strict() -> None:
     unknown = LoopRecord(flight([float("inf")] * 3), (), ())
     bad = LoopRow("b", "embedded", 1, (), figures(unknown, 10.0))
     assert json.loads(json.dumps(as_data([bad]), allow_nan=False))["flights"][0]["ok"]
+
+
+def test_the_flights_of_several_runs_make_one_table(tmp_path: Path) -> None:
+    rows = [row(("1.0 s: x",)), replace(row(None), held=(Held("told", False, "no"),))]
+    rows.append(LoopRow("b", "ardupilot", 1, (), figures(LoopRecord((), (), ()), 10.0)))
+    path = tmp_path / "loop.json"
+    path.write_text(json.dumps(as_data(rows), allow_nan=False), encoding="utf-8")
+    assert markdown(read_rows(path)) == markdown(rows)
+    path.write_text("[]", encoding="utf-8")
+    with pytest.raises(ScenarioError, match=r"not a loop\.json"):
+        read_rows(path)
 
 
 @pytest.mark.parametrize(("text", "seeds"), [("5", (5,)), ("1..3", (1, 2, 3))])
