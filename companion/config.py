@@ -120,6 +120,12 @@ class PriorConfig(_Model):
 
     position_sigma_m: float = Field(5.0, ge=0.01, le=1000)
     rotation_sigma_deg: float = Field(4.0, ge=0.01, le=180)
+    recall_s: float = Field(
+        20.0, ge=0.0, le=120.0, description="a restart goes on from a place found so long ago"
+    )
+    state_file: Path | None = Field(
+        None, description="where that place is kept; null: last-fix.json beside the record"
+    )
 
 
 class RecordConfig(_Model):
@@ -189,9 +195,17 @@ def _resolve(config: CompanionConfig, folder: Path) -> CompanionConfig:
         "camera": camera,
         "localizer": localizer,
         "bridge": _resolve_bridge(config.bridge, folder),
+        "prior": _resolve_prior(config.prior, folder),
         "record": record,
     }
     return config.model_copy(update=update)
+
+
+def _resolve_prior(prior: PriorConfig, folder: Path) -> PriorConfig:
+    if prior.state_file is None:
+        return prior
+    path = _path(folder, prior.state_file, "prior.state_file")
+    return prior.model_copy(update={"state_file": path})
 
 
 def _resolve_bridge(bridge: BridgeConfig, folder: Path) -> BridgeConfig:

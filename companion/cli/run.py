@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import os
 import signal
+import sys
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
 from companion.cli.interrupts import end_at_once
-from companion.config import load_config
+from companion.config import CompanionConfig, load_config
 from companion.terminal.console_log import console_log
 from localizer.registration.devices import DeviceChoice
 from localizer.render.select import RendererName
@@ -29,6 +30,10 @@ def run_command(
     device: Annotated[
         DeviceChoice | None, typer.Option(help="instead of the configuration's localizer.device")
     ] = None,
+    supervised: Annotated[
+        bool, typer.Option(help="restart it when it dies, and tell the operator")
+    ] = False,
+    standby: Annotated[bool, typer.Option(hidden=True)] = False,
     verbose: Annotated[bool, typer.Option("--verbose", "-v", help="log more")] = False,
 ) -> None:
     """Localize the camera feed and inject positions until interrupted."""
@@ -37,13 +42,21 @@ def run_command(
         signal.signal(number, end_at_once)
     settings = load_config(config)
     os.umask(_UMASK)
+    if supervised:
+        arguments = [str(config), *(["--verbose"] if verbose else [])]
+        arguments += [f"--renderer={renderer}"] if renderer is not None else []
+        arguments += [f"--device={device}"] if device is not None else []
+        with console_log(verbose):
+            raise typer.Exit(_supervise(settings, arguments))
     given = {"renderer": renderer, "device": device}
     changes = {key: value for key, value in given.items() if value is not None}
     localizer = settings.localizer.model_copy(update=changes)
     settings = settings.model_copy(update={"localizer": localizer})
-    from companion.flight.app import Companion
+    from companion.flight.standby import ready
 
-    companion = Companion(settings)
+    companion = ready(settings, standby=standby)
+    if companion is None:
+        return
 
     def interrupt(*_: object) -> None:
         if not companion.stop():  # the way up takes seconds, and is not waited for
@@ -60,3 +73,26 @@ def run_command(
         finally:  # what is down needs no second order; the interpreter's own end would die of one
             for number in ENDING:
                 signal.signal(number, signal.SIG_IGN)
+
+
+def _supervise(settings: CompanionConfig, arguments: list[str]) -> int:
+    """The exit code of the flight process, or of the last one."""
+    from companion.supervision.processes import FlightProcess
+    from companion.supervision.supervisor import Supervisor, mark_dead
+    from mavlink_bridge.vehicle.last_words import say_without_bridge
+
+    command = [sys.executable, "-m", "companion", "run", *arguments]
+    record = settings.record
+
+    def tell(severity: int, text: str) -> None:
+        say_without_bridge(settings.bridge, severity, text)
+
+    supervisor = Supervisor(
+        lambda standby: FlightProcess(command, standby=standby),
+        tell,
+        lambda text: mark_dead(record.folder, text) if record is not None else None,
+    )
+    for number in ENDING:
+        signal.signal(number, lambda received, _: supervisor.stop(received))
+    signal.signal(signal.SIGHUP, signal.SIG_IGN)
+    return supervisor.run()

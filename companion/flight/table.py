@@ -18,6 +18,7 @@ from companion.flight.conversions import Installation, target_report
 from companion.flight.feed import Feed
 from companion.flight.health import HealthMonitor
 from companion.flight.injection import FixInjection, is_for_injection
+from companion.flight.last_fix import FixMemory
 from companion.flight.parts import Making, Part
 from companion.flight.priors import AutopilotPose, PriorSources
 from companion.flight.recorder import RecordKeeper, remove_empty
@@ -180,6 +181,23 @@ def _autopilot(making: Making) -> AutopilotPose:
     return autopilot
 
 
+def _last_fix(making: Making) -> FixMemory:
+    config, guardian = making.config, making.get(Guardian)
+    path = config.prior.state_file
+    if path is None and config.record is not None:
+        path = config.record.folder.parent / "last-fix.json"
+    memory = FixMemory(
+        path,
+        config.prior,
+        making[AutopilotPose],
+        making[Installation],
+        making[Bridge].local_at,
+        lambda: guardian is None or not guardian.reason,
+    )
+    making.channels.estimates.subscribe(memory.add_estimate)
+    return memory
+
+
 def _localizer(making: Making) -> Localizer:
     _log.info("making the localizer ready; the first start on a machine compiles its kernels")
     config, autopilot = making.config, making[AutopilotPose]
@@ -272,8 +290,14 @@ PARTS: tuple[Part[Any], ...] = (
     ),
     Part("autopilot", AutopilotPose, _autopilot, depends=(Bridge, Installation)),
     Part(
-        "priors", PriorSources, lambda making: PriorSources(making[AutopilotPose].prior),
-        depends=(AutopilotPose,),
+        "last fix", FixMemory, _last_fix,
+        depends=(Bridge, Installation, Guardian, AutopilotPose),
+        start=FixMemory.start, stop=FixMemory.stop,
+    ),
+    Part(
+        "priors", PriorSources,
+        lambda making: PriorSources(making[FixMemory].prior, making[AutopilotPose].prior),
+        depends=(FixMemory, AutopilotPose),
     ),
     Part("localizer", Localizer, _localizer, depends=(MapStack, AutopilotPose)),
     Part(

@@ -1,0 +1,181 @@
+"""Where the camera was last found, kept in a small file: a restart in the air goes on from there.
+
+A process that died a few seconds ago has lost its memory, not the place: the tracker itself would
+have coasted over such a gap. What the EKF moved since then is added. Older than `prior.recall_s`,
+of another boot of this computer, or where the EKF knows no way, the file is not used, and the place
+is searched and confirmed as after any loss.
+"""
+
+from __future__ import annotations
+
+import json
+import logging
+import math
+import os
+import threading
+from collections.abc import Callable
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+import numpy as np
+
+from companion.config import PriorConfig
+from companion.flight.conversions import Installation
+from companion.flight.priors import AutopilotPose, drift_sigma_m
+from localizer.geometry.geo import NED_FROM_ENU
+from localizer.geometry.pose import Pose
+from localizer.types import PoseEstimate, PosePrior, ReferenceBundle, TrackingState
+
+_log = logging.getLogger(__name__)
+_WRITE_S = 0.5
+_FASTEST_MPS = 40.0  # a way beyond it is a jump of the EKF
+_LEAST_SIGMA_M = 0.5
+_BOOT = Path("/proc/sys/kernel/random/boot_id")
+LocalAt = Callable[[int], tuple[float, ...] | None]
+
+
+@dataclass(frozen=True)
+class LastFix:
+    """time_ns: CLOCK_MONOTONIC of `boot`. The camera's WGS84 place; sigma_m: worst axis. local_ned:
+    the EKF's position at that time, m.
+    """
+
+    boot: str
+    time_ns: int
+    latitude_deg: float
+    longitude_deg: float
+    height_m: float
+    sigma_m: float
+    local_ned: tuple[float, float, float]
+
+
+def boot_id() -> str:
+    """Of this computer's present run: CLOCK_MONOTONIC begins anew with each."""
+    try:
+        return _BOOT.read_text(encoding="ascii").strip()
+    except OSError:
+        return ""
+
+
+def read_last_fix(path: Path, boot: str) -> LastFix | None:
+    """What a process of this boot left; None where nothing may be trusted."""
+    try:
+        status = os.lstat(path)
+        if status.st_uid != os.geteuid() or status.st_mode & 0o022:
+            _log.warning("%s may be written by others: ignored", path)
+            return None
+        row = json.loads(path.read_text(encoding="utf-8")[:1000])
+        north, east, down = (float(v) for v in row["local_ned"])
+        found = LastFix(
+            str(row["boot"]), int(row["time_ns"]), float(row["latitude_deg"]),
+            float(row["longitude_deg"]), float(row["height_m"]), float(row["sigma_m"]),
+            (north, east, down),
+        )  # fmt: skip
+    except FileNotFoundError:
+        return None
+    except (OSError, ValueError, KeyError, TypeError, OverflowError, RecursionError) as error:
+        _log.warning("%s cannot be used: %s", path, error)
+        return None
+    numbers = (found.latitude_deg, found.longitude_deg, found.height_m, found.sigma_m)
+    sane = all(math.isfinite(v) for v in (*numbers, *found.local_ned)) and found.sigma_m > 0.0
+    return found if sane and boot and found.boot == boot else None
+
+
+class FixMemory:
+    """Keeps the newest confirmed place while flying, and knows that of the process before.
+
+    trusted: whether nobody withholds fixes now. Thread-safe: estimates come on the localization
+    thread, which only leaves them here; the file is written on a thread of its own.
+    """
+
+    def __init__(
+        self,
+        path: Path | None,
+        config: PriorConfig,
+        autopilot: AutopilotPose,
+        installation: Installation,
+        local_at: LocalAt,
+        trusted: Callable[[], bool] = lambda: True,
+    ) -> None:
+        self._path, self._config = path, config
+        self._autopilot, self._installation = autopilot, installation
+        self._local_at, self._trusted = local_at, trusted
+        self._boot = boot_id()
+        self._before = None if path is None else read_last_fix(path, self._boot)
+        self._newest: PoseEstimate | None = None
+        self._failed = False
+        self._stop = threading.Event()
+        self._thread = threading.Thread(target=self._run, name="last-fix")
+
+    def start(self) -> None:
+        """Start keeping."""
+        self._thread.start()
+
+    def stop(self) -> None:
+        """Stop keeping; a flight that ended in order leaves nothing to go on from."""
+        self._stop.set()
+        self._thread.join()
+        if self._path is not None:
+            self._path.unlink(missing_ok=True)
+
+    def add_estimate(self, estimate: PoseEstimate, _: ReferenceBundle) -> None:
+        """Note a place that the map confirmed. Never blocks."""
+        if estimate.accepted and estimate.state is TrackingState.TRACKING:
+            self._newest, self._before = estimate, None
+
+    def prior(self, time_ns: int) -> PosePrior | None:
+        """Where the camera is by the process before, until this one has found it itself."""
+        last = self._before
+        if last is None:
+            return None
+        age_s = (time_ns - last.time_ns) * 1e-9
+        if not 0.0 <= age_s <= self._config.recall_s:
+            self._before = None
+            return None
+        local, rotation = self._local_at(time_ns), self._autopilot.rotation(time_ns)
+        if local is None or rotation is None:
+            return None
+        way = np.array(local[:3]) - np.array(last.local_ned)
+        if float(np.linalg.norm(way)) > _FASTEST_MPS * age_s + 1.0:
+            self._before = None
+            return None
+        begun = self._installation.frame.enu_from_geodetic(
+            last.latitude_deg, last.longitude_deg, last.height_m
+        )
+        sigma_m = math.hypot(max(last.sigma_m, _LEAST_SIGMA_M), drift_sigma_m(age_s))
+        pose = Pose(rotation, np.asarray(begun) + NED_FROM_ENU.T @ way)
+        degrees = self._config.rotation_sigma_deg
+        prior = PosePrior.around(pose, sigma_m, degrees, time_ns)
+        return PosePrior(
+            pose, prior.covariance, time_ns, self._autopilot.velocity, independent=True
+        )
+
+    def _run(self) -> None:
+        while not self._stop.wait(_WRITE_S):
+            newest, self._newest = self._newest, None
+            if newest is None or self._path is None or not self._trusted():
+                continue
+            try:
+                self._write(newest, self._path)
+                self._failed = False
+            except OSError as error:
+                if not self._failed:
+                    _log.warning("the last fix is not kept: %s: %s", self._path, error)
+                self._failed = True
+
+    def _write(self, estimate: PoseEstimate, path: Path) -> None:
+        """Whole or not at all. No fsync: a computer that loses its power starts another boot."""
+        local = self._local_at(estimate.exposure_time_ns)
+        if local is None:
+            return
+        place = self._installation.frame.position(estimate.world_from_camera.translation)
+        row = LastFix(
+            self._boot, estimate.exposure_time_ns, place.latitude_deg, place.longitude_deg,
+            place.height_m, float(np.sqrt(np.linalg.eigvalsh(estimate.covariance[:3, :3])[-1])),
+            (local[0], local[1], local[2]),
+        )  # fmt: skip
+        temporary = path.with_suffix(".tmp")
+        temporary.unlink(missing_ok=True)
+        with open(os.open(temporary, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600), "w") as file:
+            file.write(json.dumps(asdict(row)))
+        temporary.replace(path)

@@ -1,0 +1,1 @@
+"""Who notices that the flight process died: told, marked, restarted."""

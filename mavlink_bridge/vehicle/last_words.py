@@ -1,0 +1,98 @@
+"""A line to the operator from a process that has no bridge: over the links that another one left.
+
+The flight process died, so its ports are free. The link is opened, the autopilot's next message
+says where it is and which system it is, the line goes out, and the link is closed again before the
+restarted process wants it.
+"""
+
+from __future__ import annotations
+
+import threading
+from typing import Any
+
+from pymavlink.dialects.v20 import ardupilotmega as mavlink
+
+from mavlink_bridge.config import BridgeConfig, SigningConfig
+from mavlink_bridge.link.clock import monotonic_ns
+from mavlink_bridge.link.link import Link
+from mavlink_bridge.link.signing import load_key
+from mavlink_bridge.link.transport import Endpoint
+
+_PATIENCE_NS = 400_000_000  # for the autopilot to be heard; a guess is better than silence
+_TICK_NS = 50_000_000
+_FIRST_GUESS = 1
+# What an autopilot sends often: the first of them tells its system id.
+_HEARD = frozenset(
+    {
+        mavlink.MAVLINK_MSG_ID_HEARTBEAT,
+        mavlink.MAVLINK_MSG_ID_ATTITUDE,
+        mavlink.MAVLINK_MSG_ID_LOCAL_POSITION_NED,
+        mavlink.MAVLINK_MSG_ID_GLOBAL_POSITION_INT,
+        mavlink.MAVLINK_MSG_ID_RAW_IMU,
+    }
+)
+
+
+class _Speaker:
+    """The handler of one link: says the line once it knows as whom. told: when it has."""
+
+    def __init__(self, message: Any, component: int, system: int | None, *, hears: bool) -> None:
+        self.told = threading.Event()
+        self._message, self._component = message, component
+        self._system, self._hears = system, hears
+        self._opened_ns = 0
+
+    def on_open(self, link: Link) -> None:
+        """From now on the autopilot is waited for."""
+        self._opened_ns = monotonic_ns()
+
+    def on_message(self, link: Link, message: Any, time_ns: int) -> None:
+        """The autopilot's message: its system is ours."""
+        if message.get_srcComponent() == mavlink.MAV_COMP_ID_AUTOPILOT1:
+            link.keep_peer()
+            self._say(link, self._system or message.get_srcSystem())
+
+    def on_tick(self, link: Link, now_ns: int) -> int:
+        """Where nobody speaks, or nobody needs to, it is said as the configured system."""
+        waited = self._opened_ns and now_ns - self._opened_ns > _PATIENCE_NS
+        if self._opened_ns and (waited or not self._hears):
+            self._say(link, self._system or _FIRST_GUESS)
+        return now_ns + _TICK_NS
+
+    def _say(self, link: Link, system: int) -> None:
+        if not self.told.is_set():
+            link.system_id = system
+            link.send(self._message, self._component)
+            self.told.set()
+
+
+def say_without_bridge(
+    config: BridgeConfig, severity: int, text: str, timeout_s: float = 0.8
+) -> bool:
+    """Say a line on every link of the bridge; whether it went out on one of them in time."""
+    message = mavlink.MAVLink_statustext_message(severity, text.encode()[:50])
+    spoken = []
+    ends = [(config.connection, config.signing, True)]
+    if config.ground_connection is not None:
+        ends.append((config.ground_connection, config.ground_signing, False))
+    for connection, signing, hears in ends:
+        speaker = _Speaker(message, config.companion_component, config.system_id, hears=hears)
+        link = _link(connection, signing, speaker)
+        link.start()
+        spoken.append((speaker, link))
+    end_ns = monotonic_ns() + int(timeout_s * 1e9)
+    told = [s.told.wait(max(end_ns - monotonic_ns(), 0) * 1e-9) for s, _ in spoken]
+    for _, link in spoken:
+        link.stop()
+    return any(told)
+
+
+def _link(connection: str, signing: SigningConfig | None, speaker: _Speaker) -> Link:
+    return Link(
+        Endpoint.parse(connection),
+        speaker,
+        name="last words",
+        wanted=_HEARD,
+        signing_key=None if signing is None else load_key(signing.key_file),
+        signing_link_id=1 if signing is None else signing.link_id,
+    )

@@ -1,0 +1,114 @@
+"""A restart in the air goes on from the last place, if it is young and the EKF knows the way."""
+
+from __future__ import annotations
+
+import json
+import os
+from dataclasses import asdict, replace
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from companion.config import PriorConfig
+from companion.flight.conversions import Installation
+from companion.flight.last_fix import FixMemory, LastFix, boot_id, read_last_fix
+from localizer.geometry.camera import Camera
+from localizer.geometry.geo import Geodetic, LocalFrame
+from localizer.geometry.pose import Pose
+from localizer.types import PoseEstimate, RegistrationStatus, TrackingState
+
+FRAME = LocalFrame(Geodetic(47.0, 8.0, 500.0))
+INSTALLATION = Installation(FRAME, 47.0, np.zeros(3))
+DOWN = np.diag([1.0, -1.0, -1.0])
+AUTOPILOT: Any = SimpleNamespace(rotation=lambda _: DOWN, velocity=np.array([1.0, 0.0, 0.0]))
+SECOND = 10**9
+BEGUN = LastFix(boot_id(), 100 * SECOND, 47.0, 8.0, 580.0, 0.3, (10.0, 20.0, -80.0))
+
+
+def kept(tmp_path: Path, fix: LastFix = BEGUN) -> Path:
+    path = tmp_path / "last-fix.json"
+    path.write_text(json.dumps(asdict(fix)))
+    path.chmod(0o600)
+    return path
+
+
+def memory(path: Path, local: tuple[float, float, float] | None = (13.0, 24.0, -85.0)) -> FixMemory:
+    return FixMemory(path, PriorConfig(), AUTOPILOT, INSTALLATION, lambda _: local)
+
+
+def tracked(time_ns: int) -> PoseEstimate:
+    return PoseEstimate(
+        Pose(DOWN, np.array([5.0, 6.0, 80.0])), np.eye(6) * 0.04, 1.0, TrackingState.TRACKING,
+        RegistrationStatus.OK, True, time_ns, 0, Camera.from_fov(640, 480, 60),
+    )  # fmt: skip
+
+
+def test_the_way_that_the_ekf_flew_since_is_added(tmp_path: Path) -> None:
+    prior = memory(kept(tmp_path)).prior(103 * SECOND)
+    assert prior is not None
+    # 3 m north, 4 m east, 5 m up: the map's axes are east, north, up.
+    assert prior.world_from_camera.translation == pytest.approx([4.0, 3.0, 85.0], abs=0.01)
+    assert prior.independent  # it begins tracking without a search
+    sigma = float(np.sqrt(prior.covariance[0, 0]))
+    assert 0.5 < sigma < 2.0
+
+
+@pytest.mark.parametrize(
+    ("at_s", "local"),
+    [
+        (121.0, (10.0, 20.0, -80.0)),  # too old
+        (99.0, (10.0, 20.0, -80.0)),  # of the future
+        (103.0, None),  # no way known
+        (103.0, (510.0, 20.0, -80.0)),  # the EKF jumped
+    ],
+)
+def test_what_may_not_be_trusted_is_not_used(
+    tmp_path: Path, at_s: float, local: tuple[float, float, float] | None
+) -> None:
+    assert memory(kept(tmp_path), local).prior(round(at_s * SECOND)) is None
+
+
+@pytest.mark.parametrize(
+    "content",
+    [
+        "", "{}", "[" * 2000, '{"boot": 1}',
+        json.dumps(asdict(replace(BEGUN, boot="another"))),
+        json.dumps({**asdict(BEGUN), "height_m": "NaN"}),
+        json.dumps({**asdict(BEGUN), "sigma_m": 0.0}),
+        json.dumps({**asdict(BEGUN), "local_ned": [1.0]}),
+    ],
+)  # fmt: skip
+def test_a_file_of_another_boot_or_without_sense_is_none(tmp_path: Path, content: str) -> None:
+    path = kept(tmp_path)
+    path.write_text(content)
+    assert read_last_fix(path, boot_id()) is None
+
+
+def test_a_file_that_others_may_write_is_none(tmp_path: Path) -> None:
+    path = kept(tmp_path)
+    assert read_last_fix(path, boot_id()) == BEGUN
+    path.chmod(0o666)
+    assert read_last_fix(path, boot_id()) is None
+    os.remove(path)
+    assert read_last_fix(path, boot_id()) is None
+
+
+def test_once_found_the_memory_is_its_own(tmp_path: Path) -> None:
+    """And an end in order leaves nothing behind; a kill would."""
+    path = kept(tmp_path)
+    kept_on = memory(path, (1.0, 2.0, 3.0))
+    kept_on.start()
+    kept_on.add_estimate(tracked(104 * SECOND), None)  # type: ignore[arg-type]
+    assert kept_on.prior(105 * SECOND) is None
+    while (now := read_last_fix(path, boot_id())) == BEGUN:
+        pass
+    assert now is not None
+    assert (now.time_ns, now.local_ned) == (104 * SECOND, (1.0, 2.0, 3.0))
+    assert FRAME.enu_from_geodetic(
+        now.latitude_deg, now.longitude_deg, now.height_m
+    ) == pytest.approx([5.0, 6.0, 80.0], abs=1e-3)
+    kept_on.stop()
+    assert not path.exists()

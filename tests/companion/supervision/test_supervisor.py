@@ -1,0 +1,196 @@
+"""The flight process dies: told, marked, taken over by the standby, and not for ever."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import sys
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import pytest
+
+from companion.supervision.processes import FlightProcess
+from companion.supervision.supervisor import RestartPolicy, Supervisor, described, mark_dead
+
+
+@dataclass
+class Scripted:
+    """A process that flies for so many looks and ends with a code."""
+
+    looks: int
+    code: int
+    standby: bool = False
+    pid: int = 1
+    released: bool = False
+    dismissed: bool = False
+    signals: list[int] = field(default_factory=list)
+
+    def release(self) -> None:
+        self.released = True
+
+    def wait(self, _: float) -> int | None:
+        self.looks -= 1
+        return None if self.looks >= 0 else self.code
+
+    def interrupt(self, number: int) -> None:
+        self.signals.append(number)
+        self.looks, self.code = 0, 0
+
+    def dismiss(self) -> None:
+        self.dismissed = True
+
+
+class Stage:
+    """Hands out processes in order; each look takes half a second."""
+
+    def __init__(self, flights: Sequence[Scripted], **policy: float) -> None:
+        self.waiting = list(flights)
+        self.spawned: list[Scripted] = []
+        self.told: list[tuple[int, str]] = []
+        self.marked: list[str] = []
+        self._now_s = 0.0
+        self.supervisor = Supervisor(
+            self._spawn,
+            lambda severity, text: self.told.append((severity, text)),
+            self.marked.append,
+            RestartPolicy(**policy),  # type: ignore[arg-type]
+            self._clock,
+        )
+
+    def _spawn(self, standby: bool) -> Scripted:
+        process = self.waiting.pop(0)
+        process.standby = standby
+        self.spawned.append(process)
+        return process
+
+    def _clock(self) -> float:
+        self._now_s += 0.5
+        return self._now_s
+
+
+def test_a_death_is_told_marked_and_the_standby_flies_on() -> None:
+    stage = Stage([Scripted(30, -9), Scripted(20, 0), Scripted(9, 0)], standby_after_s=5.0)
+    assert stage.supervisor.run() == 0
+    first, second, third = stage.spawned
+    assert (first.standby, second.standby, third.standby) == (False, True, True)
+    assert second.released
+    assert third.dismissed  # the second's own
+    assert not third.released
+    assert stage.told == [(2, "PiLoT: companion died (SIGKILL), restarting")]
+    assert stage.marked == ["companion died (SIGKILL), restarting"]
+
+
+def test_a_death_before_there_is_a_standby_starts_a_cold_one() -> None:
+    stage = Stage([Scripted(3, -11), Scripted(3, 0)], standby_after_s=60.0)
+    assert stage.supervisor.run() == 0
+    assert [p.standby for p in stage.spawned] == [False, False]
+
+
+def test_after_too_many_deaths_it_gives_up_and_says_so() -> None:
+    stage = Stage([Scripted(2, 1) for _ in range(9)], deaths=3, standby_after_s=1e3)
+    assert stage.supervisor.run() == 1
+    assert len(stage.spawned) == 3
+    assert [text.split("), ")[1] for _, text in stage.told] == [
+        "restarting", "restarting", "not restarted",
+    ]  # fmt: skip
+    assert all(len(text) <= 50 for _, text in stage.told)
+
+
+def test_deaths_that_are_far_apart_are_each_mended() -> None:
+    flights = [*(Scripted(300, 1) for _ in range(4)), Scripted(2, 0)]
+    stage = Stage(flights, deaths=3, window_s=200.0, standby_after_s=1e6)
+    assert stage.supervisor.run() == 0
+    assert len(stage.told) == 4
+
+
+def test_a_wrong_configuration_is_not_tried_again() -> None:
+    stage = Stage([Scripted(2, 2)])
+    assert stage.supervisor.run() == 2
+    assert stage.told == []
+
+
+def test_an_order_to_end_is_passed_on_and_the_standby_dismissed() -> None:
+    stage = Stage([Scripted(10**6, -9), Scripted(10**6, 0)], standby_after_s=2.0)
+    looked = Scripted.wait
+
+    class Ordered(Scripted):
+        def wait(self, timeout_s: float) -> int | None:
+            if self.looks == 10**6 - 20:
+                stage.supervisor.stop(signal.SIGTERM)
+            return looked(self, timeout_s)
+
+    stage.waiting[0] = Ordered(10**6, -9)
+    assert stage.supervisor.run() == 0
+    assert stage.spawned[0].signals == [signal.SIGTERM]
+    assert stage.spawned[1].dismissed
+    assert stage.told == []
+
+
+def test_what_cannot_be_told_does_not_keep_it_from_flying() -> None:
+    flights = [Scripted(1, -9), Scripted(1, 0)]
+
+    def fails(*_: object) -> None:
+        raise OSError("no such port")
+
+    supervisor = Supervisor(lambda _: flights.pop(0), fails, fails)
+    assert supervisor.run() == 0
+
+
+_CHILD = """
+import os, pathlib, signal, sys, time
+folder = pathlib.Path(sys.argv[1])
+if "--standby" in sys.argv:
+    (folder / "ready").touch()
+    sys.exit(0 if sys.stdin.readline() == "fly\\n" else 7)
+while not (folder / "ready").exists():
+    time.sleep(0.01)
+os.kill(os.getpid(), signal.SIGKILL)
+"""
+
+
+def test_real_processes_killed_and_released(tmp_path: Path) -> None:
+    """kill -9 on the one that flies; the standby takes over and ends in order."""
+    told: list[str] = []
+    command = [sys.executable, "-S", "-c", _CHILD, str(tmp_path)]
+    supervisor = Supervisor(
+        lambda standby: FlightProcess(command, standby=standby),
+        lambda _, text: told.append(text),
+        lambda _: None,
+        RestartPolicy(standby_after_s=0.0),
+    )
+    assert supervisor.run() == 0
+    assert told == ["PiLoT: companion died (SIGKILL), restarting"]
+
+
+def test_a_standby_whose_supervisor_is_gone_ends(tmp_path: Path) -> None:
+    (tmp_path / "ready").touch()
+    standby = FlightProcess([sys.executable, "-S", "-c", _CHILD, str(tmp_path)], standby=True)
+    standby.dismiss()
+    assert standby.wait(0.0) == 7
+    standby.release()  # harmless
+    standby.interrupt(signal.SIGTERM)
+
+
+@pytest.mark.parametrize(("code", "said"), [(-9, "SIGKILL"), (1, "exit 1"), (-200, "signal 200")])
+def test_codes_in_words(code: int, said: str) -> None:
+    assert described(code) == said
+
+
+def test_the_newest_health_says_dead(tmp_path: Path) -> None:
+    """Of a restarted flight the record that `latest` points to; without a record nothing."""
+    for name in ("flight", "flight-2"):
+        (tmp_path / name).mkdir()
+        (tmp_path / name / "health.json").write_text('{"level": "ok"}')
+    os.symlink("flight-2", tmp_path / "latest")
+    before_ns = time.monotonic_ns()
+    mark_dead(tmp_path / "flight", "companion died (SIGKILL), restarting")
+    report = json.loads((tmp_path / "flight-2" / "health.json").read_text())
+    assert (report["level"], report["text"]) == ("failed", "companion died (SIGKILL), restarting")
+    assert report["time_ns"] >= before_ns
+    assert json.loads((tmp_path / "flight" / "health.json").read_text())["level"] == "ok"
+    mark_dead(tmp_path / "nowhere" / "flight", "dead")
+    assert not (tmp_path / "nowhere").exists()
