@@ -33,6 +33,7 @@ _IDENTICAL_S = 1.5
 _STILL_PER_M = 90.0  # s/m: how much longer where the limit is more metres on the ground
 _STILL_FIRST_S = 2.0
 _MOVED_M, _MOVED_SPEED_MPS, _MOVED_LEAST_S = 2.0, 1.5, 0.35
+_SHOWS_GRAY = 2.0  # contrast below which a picture shows nothing, gray levels of 255
 _WAITS_NS = 500_000_000  # for the IMU's record to reach a fix
 _FRESH_NS = 1_000_000_000
 _PICTURE_FRESH_NS = 2_000_000_000
@@ -266,6 +267,8 @@ class Monitor:
         if self._picture is None or now_ns - self._picture[0] > _PICTURE_FRESH_NS:
             return Reading(None)  # a feed that ended is told as such
         verdict = self._picture[1]
+        if verdict.contrast < _SHOWS_GRAY:
+            return Reading(False)  # fog, a covered lens: the localizer says that it sees nothing
         identical = verdict.identical_s >= _IDENTICAL_S
         still = verdict.still_s >= self._still_s(state) or self._should_have_moved(state, verdict)
         return Reading(identical or still, verdict.still_s)

@@ -86,6 +86,14 @@ def test_a_picture_that_freezes_on_the_way_is_told_before_5_m() -> None:
     assert not [fix for fix in flight.flight.passed if fix.time_ns > 12.5e9]
 
 
+def test_fog_is_no_frozen_video() -> None:
+    """Found on ArduPilot: a bank of fog was told as a feed that hangs."""
+    fog = Flight(monitor(), leg, noise_m=0.03)
+    while fog.fly(fog.at_s + 0.1).at_s < 12.0:
+        fog.monitor.see(second(fog.at_s), np.full((240, 320, 3), 205, np.uint8))
+    assert fog.lines == []
+
+
 def test_a_filmed_flight_is_left_alone() -> None:
     """Hover, start, 10 m/s."""
     flight = Filmed(Flight(monitor(), leg, noise_m=0.03), leg).fly(14.0)
