@@ -103,6 +103,22 @@ class TargetConfig(_Model):
     map_sigma_m: float = Field(
         0.3, ge=0.001, le=100, description="error of the map's surface, metres"
     )
+    bias_sigma_m: float = Field(
+        0.2, ge=0.0, le=100, description="error that all targets of a flight share, metres"
+    )
+    max_sigma_m: float = Field(
+        50.0, ge=0.1, le=10_000, description="what is known worse is not told, metres"
+    )
+    operator_delay_ms: float = Field(
+        250.0,
+        ge=0,
+        le=5000,
+        description="exposure to the operator's click, video downlink included",
+    )
+    operator_delay_sigma_ms: float = Field(100.0, ge=0, le=5000, description="its error, 1 sigma")
+    timeout_s: float = Field(
+        300.0, ge=1, le=86400, description="a clicked target out of the picture for so long ends"
+    )
 
     @field_validator("detections")
     @classmethod

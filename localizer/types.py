@@ -160,15 +160,22 @@ class PoseEstimate:
     last_fix_ns: int | None = None
 
 
+def _up() -> Array:
+    return np.array([0.0, 0.0, 1.0])
+
+
 @dataclass(frozen=True)
 class TargetSurface:
     """A surface that a target's pixel may show. probability: 0 to 1; position: (3,) world metres;
-    covariance: (3, 3) m², world axes, if it is this one.
+    covariance: (3, 3) m², world axes, if it is this one; normal: (3,) unit, world axes;
+    roughness_m: how far the surface strays from its tangent plane.
     """
 
     probability: float
     position: Array
     covariance: Array
+    normal: Array = field(default_factory=_up)
+    roughness_m: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -181,16 +188,37 @@ class TargetSighting:
     time_ns: int
 
 
+class Visibility(Enum):
+    """How a target's place is known in a frame."""
+
+    SEEN = "seen"
+    """Its pixel was measured in this frame."""
+    HELD = "held"
+    """It stands in the picture where the pose projects it; nobody looked."""
+    HIDDEN = "hidden"
+    """Something of the map stands before it, or the image no longer shows it."""
+    OUTSIDE = "outside"
+    """It is beside the picture."""
+
+
 @dataclass(frozen=True)
 class TargetFix:
-    """A pixel's place on Earth. position_world: (3,) metres; covariance: (3, 3) m², world axes, the
-    mean square about the position, other surfaces included. elsewhere: the probability, 0 to 1,
+    """A target's place on Earth. position_world: (3,) metres; covariance: (3, 3) m², world axes,
+    the mean square about the position, other surfaces included. elsewhere: the probability, 0 to 1,
     that the target is on another surface than the reported one.
+
+    pixel: its place in the frame; None beside the picture. velocity: (3,) m/s, world axes, with its
+    covariance (3, 3); None of what stands still or was seen once. extent: its width and height in
+    the frame, pixels, where they are known.
     """
 
     target_id: str
     position_world: Array
     covariance: Array
-    pixel: tuple[float, float]
+    pixel: tuple[float, float] | None
     exposure_time_ns: int
     elsewhere: float = 0.0
+    velocity: Array | None = None
+    velocity_covariance: Array | None = None
+    visibility: Visibility = Visibility.SEEN
+    extent: tuple[float, float] | None = None

@@ -55,7 +55,11 @@ class Components:
         self._config = shared.config
         self._outbound: deque[TargetReport | TargetEnd | CameraView] = deque(maxlen=_QUEUE)
         self._camera = CameraComponent(
-            self._config, shared.geoid_separation_m, shared.on_track, ground_link=ground
+            self._config,
+            shared.geoid_separation_m,
+            shared.on_track,
+            shared.target_numbers,
+            ground_link=ground,
         )
         self._next_heartbeat_ns = 0
         # Where one link is signed, an order over another that is not would go round the signature.

@@ -153,11 +153,17 @@ class TargetReport:
     """Probability that it is on another surface than the one reported (a roof's edge, say)."""
     rectangle: tuple[float, float, float, float] | None = None
     """Left, top, right, bottom, normalised 0..1."""
+    velocity_accuracy_mps: float | None = None
+    """1 sigma, horizontal (over both directions)."""
+    clicked: bool = False
+    """The operator pointed at it (and no detector)."""
+    coasting: bool = False
+    """Nothing of it is seen now; its place is known from before."""
 
     def __post_init__(self) -> None:
         _check_position("target report", self.latitude_deg, self.longitude_deg, self.height_m)
         _check_velocity("target report", self.velocity_ned)
-        accuracies = (self.h_accuracy_m, self.v_accuracy_m)
+        accuracies = (self.h_accuracy_m, self.v_accuracy_m, self.velocity_accuracy_mps)
         if not all(a is None or 0.0 <= a <= _LEAST_KNOWN_M for a in accuracies):
             raise FixError(
                 f"target report: accuracies must be 0 to {_LEAST_KNOWN_M:g} m, None where unknown; "
@@ -215,6 +221,8 @@ class TrackRequest:
     """Normalised 0..1: (x, y) of a point; left, top, right, bottom; () of a stop."""
     radius: float = 0.0
     """Of a point, normalised 0..1."""
+    number: int = 0
+    """Of the target that a point or rectangle begins; of the one that a stop ends, 0: of all."""
 
 
 @dataclass(frozen=True)

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field
+from itertools import count
 
 from mavlink_bridge.config import BridgeConfig, Mode
 from mavlink_bridge.injection.rc_gate import InjectionGate
@@ -31,6 +32,8 @@ class Shared:
     on_hint: Callable[[PlaceHint], None] | None
     watch: VehicleWatch
     gate: InjectionGate | None
+    target_numbers: Iterator[int] = field(default_factory=lambda: count(1))
+    """Of clicked targets, over all links; none is given twice."""
 
     def uptime_ms(self, now_ns: int) -> int:
         """Milliseconds since the bridge began: its own time_boot_ms."""

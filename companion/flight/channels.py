@@ -9,7 +9,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Generic, ParamSpec
 
-from companion.targets.reporter import Target
+from companion.targets.population import Target
 from localizer.types import Frame, PoseEstimate, ReferenceBundle
 from mavlink_bridge.messages import PlaceHint, TrackRequest
 
@@ -51,7 +51,7 @@ class Channels:
     targets: Channel[[Target]] = field(default_factory=Channel)
     """Every located target, on the targets' thread."""
     gone: Channel[[str]] = field(default_factory=Channel)
-    """The name of every target that was ended by order, on the targets' thread."""
+    """The name of every target that ended, on the targets' thread."""
     clicks: Channel[[TrackRequest]] = field(default_factory=Channel)
     """What the ground station asks the camera to track, on a MAVLink link's thread."""
     hints: Channel[[PlaceHint]] = field(default_factory=Channel)

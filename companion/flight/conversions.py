@@ -21,6 +21,7 @@ from companion.geometry import (
     vehicle_from_camera_pose,
     world_from_camera,
 )
+from companion.targets.detections import CLICKED
 from localizer.errors import GeoreferenceError
 from localizer.geometry.camera import Camera
 from localizer.geometry.geo import NED_FROM_ENU, Geodetic, LocalFrame
@@ -31,7 +32,7 @@ from localizer.geometry.pose import (
     quaternion_from_matrix,
 )
 from localizer.targets.locate import RayCaster, ray_in_world
-from localizer.types import PoseEstimate, PosePrior, TargetFix
+from localizer.types import PoseEstimate, PosePrior, TargetFix, Visibility
 from mavlink_bridge.messages import (
     Attitude,
     CameraView,
@@ -151,17 +152,22 @@ def vehicle_prior(
     return PosePrior(camera, covariance, time_ns, velocity)
 
 
-def target_report(
-    fix: TargetFix, velocity: Array | None, camera: Camera, frame: LocalFrame, number: int
-) -> TargetReport:
-    """A located target for the ground. velocity: (3,) m/s, world axes, None where it is unknown;
-    camera: that of the frame in which it was seen.
-    """
+def target_report(fix: TargetFix, camera: Camera, frame: LocalFrame, number: int) -> TargetReport:
+    """A located target for the ground. camera: that of the frame that it is told for."""
     position = frame.position(fix.position_world)
-    velocity_ned = None
-    if velocity is not None:
-        east, north, up = (float(v) for v in velocity)
+    velocity_ned = velocity_sigma = None
+    if fix.velocity is not None:
+        east, north, up = (float(v) for v in fix.velocity)
         velocity_ned = (north, east, -up)
+    if fix.velocity_covariance is not None:
+        velocity_sigma = float(np.sqrt(np.trace(fix.velocity_covariance[:2, :2])))
+    pixel = rectangle = None
+    if fix.pixel is not None:
+        pixel = (fix.pixel[0] / camera.width, fix.pixel[1] / camera.height)
+        if fix.extent is not None:
+            w, h = fix.extent[0] / camera.width / 2.0, fix.extent[1] / camera.height / 2.0
+            x, y = pixel
+            rectangle = (max(x - w, 0.0), max(y - h, 0.0), min(x + w, 1.0), min(y + h, 1.0))
     return TargetReport(
         time_ns=fix.exposure_time_ns,
         latitude_deg=position.latitude_deg,
@@ -170,9 +176,13 @@ def target_report(
         velocity_ned=velocity_ned,
         h_accuracy_m=float(np.sqrt(fix.covariance[0, 0] + fix.covariance[1, 1])),
         v_accuracy_m=float(np.sqrt(fix.covariance[2, 2])),
-        pixel=(fix.pixel[0] / camera.width, fix.pixel[1] / camera.height),
+        pixel=pixel,
         target_id=number,
         elsewhere=fix.elsewhere,
+        rectangle=rectangle,
+        velocity_accuracy_mps=velocity_sigma,
+        clicked=fix.target_id.startswith(CLICKED),
+        coasting=fix.visibility is Visibility.HIDDEN,
     )
 
 

@@ -23,7 +23,7 @@ from companion.sources.timing import system_minus_monotonic
 from companion.trajectory import TrajectoryFiles, snapshot_name, stamped
 from companion.versions import versions
 from localizer.geometry.geo import LocalFrame
-from localizer.geometry.pose import Array, quaternion_from_matrix
+from localizer.geometry.pose import quaternion_from_matrix
 from localizer.types import Frame, PoseEstimate, TargetFix
 from mavlink_bridge.link.tlog import is_disk_fault
 
@@ -44,7 +44,7 @@ TARGET_COLUMNS = (
     "exposure_time_ns", "target_id", "east_m", "north_m", "up_m",
     "latitude_deg", "longitude_deg", "height_m", "sigma_horizontal_m", "sigma_up_m",
     "velocity_east", "velocity_north", "velocity_up", "u", "v",
-    "cov_ee", "cov_en", "cov_eu", "cov_nn", "cov_nu", "cov_uu", "elsewhere",
+    "cov_ee", "cov_en", "cov_eu", "cov_nn", "cov_nu", "cov_uu", "elsewhere", "visibility",
 )  # fmt: skip
 EVENT_COLUMNS = ("time_ns", "level", "text")
 
@@ -128,7 +128,7 @@ def _estimate_row(
     )  # fmt: skip
 
 
-def _target_row(fix: TargetFix, velocity: Array | None, frame: LocalFrame) -> tuple[Any, ...]:
+def _target_row(fix: TargetFix, frame: LocalFrame) -> tuple[Any, ...]:
     """What stands in `TARGET_COLUMNS` for a target's fix."""
     position = frame.position(fix.position_world)
     horizontal = (fix.covariance[0, 0] + fix.covariance[1, 1]) ** 0.5
@@ -136,9 +136,10 @@ def _target_row(fix: TargetFix, velocity: Array | None, frame: LocalFrame) -> tu
         fix.exposure_time_ns, fix.target_id, *(f"{x:.4f}" for x in fix.position_world),
         f"{position.latitude_deg:.9f}", f"{position.longitude_deg:.9f}",
         f"{position.height_m:.4f}", f"{horizontal:.3f}", f"{fix.covariance[2, 2] ** 0.5:.3f}",
-        *(("",) * 3 if velocity is None else (f"{x:.3f}" for x in velocity)),
-        *(f"{x:.2f}" for x in fix.pixel),
+        *(("",) * 3 if fix.velocity is None else (f"{x:.3f}" for x in fix.velocity)),
+        *(("",) * 2 if fix.pixel is None else (f"{x:.2f}" for x in fix.pixel)),
         *(f"{x:.5f}" for x in fix.covariance[np.triu_indices(3)]), f"{fix.elsewhere:.3f}",
+        fix.visibility.value,
     )  # fmt: skip
 
 
@@ -191,9 +192,9 @@ class Recorder:
         if estimate.accepted:
             self._put("trajectory", lambda: (estimate,))
 
-    def target(self, fix: TargetFix, velocity: Array | None) -> None:
-        """Record one target fix with its filtered velocity (3,) in world axes, if it has one."""
-        self._put("targets", lambda: _target_row(fix, velocity, self._frame))
+    def target(self, fix: TargetFix) -> None:
+        """Record one target fix."""
+        self._put("targets", lambda: _target_row(fix, self._frame))
 
     def event(self, level: str, text: str) -> None:
         """Record something that happened, at the current time."""

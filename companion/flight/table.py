@@ -33,7 +33,8 @@ from companion.sources import FrameSource, StreamState, open_source
 from companion.targets.clicks import ClickPolicy
 from companion.targets.detections import DetectionListener
 from companion.targets.numbers import TargetNumbers
-from companion.targets.reporter import Target, TargetReporter
+from companion.targets.population import Target
+from companion.targets.reporter import TargetReporter
 from localizer.map.cache.cache import TileCache
 from localizer.map.cache.surface import MapSurface
 from localizer.tracking.engine import DualThreadEngine
@@ -98,7 +99,7 @@ def _record(making: Making) -> RecordKeeper:
             recorder.estimate(estimate, _levels(guardian, estimate))
 
         channels.estimates.subscribe(record)
-        channels.targets.subscribe(lambda target: recorder.target(target.fix, target.velocity))
+        channels.targets.subscribe(lambda target: recorder.target(target.fix))
         channels.events.subscribe(recorder.event)
         # What the operator was told belongs in the record; the bridge has logged it.
         channels.texts.subscribe(lambda severity, text: recorder.event(_level(severity), text))
@@ -141,12 +142,16 @@ def _targets(making: Making) -> TargetReporter:
     channels, bridge = making.channels, making[Bridge]
     cache, numbers = making[MapStack].cache, TargetNumbers()
     reporter = TargetReporter(
-        making.config.targets, MapSurface(cache).cast, channels.targets.send, channels.gone.send
+        making.config.targets,
+        MapSurface(cache).cast,
+        channels.targets.send,
+        channels.gone.send,
+        bridge.say,
     )
 
     def report(target: Target) -> None:
         camera, number = target.estimate.camera, numbers.of(target.fix.target_id)
-        bridge.report(target_report(target.fix, target.velocity, camera, cache.frame, number))
+        bridge.report(target_report(target.fix, camera, cache.frame, number))
 
     channels.estimates.subscribe(lambda estimate, _: reporter.add_estimate(estimate))
     channels.targets.subscribe(report)
@@ -155,9 +160,10 @@ def _targets(making: Making) -> TargetReporter:
 
 
 def _clicks(making: Making) -> ClickPolicy:
-    clicks = ClickPolicy(making[TargetReporter], making[Bridge].say)
+    clicks = ClickPolicy(making[TargetReporter], making[Bridge].say, making.config.targets)
     making.channels.estimates.subscribe(clicks.add_estimate)
     making.channels.clicks.subscribe(clicks.on_request)
+    making.channels.gone.subscribe(clicks.on_gone)
     return clicks
 
 

@@ -97,7 +97,7 @@ def read_record(folder: Path) -> RecordTables:
     """Read what `companion run` left; `RecordError` for a folder that is no record."""
     try:
         estimates = read_columns(folder / "estimates.csv", ("state", "status"))
-        targets = read_columns(folder / "targets.csv", ("target_id",))
+        targets = read_columns(folder / "targets.csv", ("target_id", "visibility"))
         events = read_columns(folder / "events.csv", ("level", "text"))
     except (OSError, UnicodeDecodeError) as error:
         raise RecordError(f"{folder}: not a flight's record: {error}") from error

@@ -1,76 +1,127 @@
 """The ground station's clicks: which frame they point into, and when they are refused.
 
-Each click is a target of its own: what was clicked before says nothing about it.
+Each click is a target of its own: what was clicked before says nothing about it. The operator
+points into the picture that he sees, which is older than the one that the camera takes: the click
+belongs to the frame `targets.operator_delay_ms` before it came.
 """
 
 from __future__ import annotations
 
-import itertools
 import threading
-from collections import deque
 from collections.abc import Callable
 
-import numpy as np
-
-from companion.targets.detections import CLICKED, Detection
+from companion.config import TargetConfig
+from companion.targets.history import PoseHistory
+from companion.targets.population import Click, clicked_name
 from companion.targets.reporter import TargetReporter
 from localizer.types import PoseEstimate, ReferenceBundle, TrackingState
 from mavlink_bridge.messages import TrackRequest
 
-_OLDEST_NS = 2_000_000_000  # how old the pose may be that an operator's click is placed by
-_WARNING = 4  # MAV_SEVERITY_WARNING
-_REMEMBERED = 64  # clicked targets that a stop ends; each is shown for some seconds
-_UNKNOWN = "PiLoT: no target: the camera's position is not known"
-_UNCONFIRMED = "PiLoT: no target: the camera's position is not confirmed yet"
+_OLDEST_NS = 2_000_000_000  # how long the pose of a click's frame is waited for
+_FRAME_NS = 60_000_000  # a frame so near to the wanted time is the one that was seen
+_MOST = 8  # clicked targets at a time
+_WARNING, _INFO = 4, 6  # MAV_SEVERITY
+_UNKNOWN = "the camera's position is not known"
+_UNCONFIRMED = "the camera's position is not confirmed yet"
 
 
 class ClickPolicy:
-    """A click is the place under that pixel of the newest localized frame.
+    """Finds each click's frame in the poses that were flown, and begins or ends its target.
 
     say: tells the operator (MAV_SEVERITY, text).
     """
 
-    def __init__(self, targets: TargetReporter, say: Callable[[int, str], None]) -> None:
+    def __init__(
+        self, targets: TargetReporter, say: Callable[[int, str], None], config: TargetConfig
+    ) -> None:
         self._targets = targets
         self._say = say
-        self._newest: PoseEstimate | None = None
-        self._refused_ns: int | None = None
-        self._numbers = itertools.count(1)
-        self._clicked: deque[str] = deque(maxlen=_REMEMBERED)
+        self._delay_ns = round(config.operator_delay_ms * 1e6)
+        self._sigma_ns = round(config.operator_delay_sigma_ms * 1e6)
+        self._history = PoseHistory()
+        self._waiting: list[TrackRequest] = []
+        self._alive: list[int] = []
+        self._refused: tuple[int, str] | None = None
         self._lock = threading.Lock()  # two links may both have a ground station
 
     def add_estimate(self, estimate: PoseEstimate, _: ReferenceBundle | None = None) -> None:
-        """Note an estimate. Never blocks."""
+        """Note an estimate; clicks that waited for it are placed. Never blocks."""
         if estimate.accepted:
-            self._newest = estimate
+            self._history.add(estimate)
+        if not self._waiting:
+            return
+        with self._lock:
+            self._waiting = [
+                r for r in self._waiting if not self._place(r, estimate.exposure_time_ns)
+            ]
 
     def on_request(self, request: TrackRequest) -> None:
         """Take the operator's wish. Never blocks."""
         with self._lock:
             if request.kind == "stop":
-                self._targets.forget(tuple(self._clicked))
-                self._clicked.clear()
-            else:
-                self._begin(request)
+                self._stop(request.number)
+            elif not self._place(request, request.time_ns):
+                self._waiting.append(request)
 
-    def _begin(self, request: TrackRequest) -> None:
-        newest = self._newest
-        if newest is None or request.time_ns - newest.exposure_time_ns > _OLDEST_NS:
+    def on_gone(self, name: str) -> None:
+        """A target ended by itself."""
+        with self._lock:
+            self._alive = [n for n in self._alive if clicked_name(n) != name]
+
+    def _stop(self, number: int) -> None:
+        """End one clicked target, or with 0 all of them."""
+        self._waiting = [r for r in self._waiting if number not in (0, r.number)]
+        ended = [n for n in self._alive if number in (0, n)]
+        self._alive = [n for n in self._alive if n not in ended]
+        self._targets.forget(tuple(clicked_name(n) for n in ended))
+
+    def _place(self, request: TrackRequest, now_ns: int) -> bool:
+        """Begin or refuse the request's target; False while its frame's pose may still come."""
+        wanted_ns = request.time_ns - self._delay_ns
+        newest = self._history.newest
+        if newest is None or now_ns - newest.exposure_time_ns > _OLDEST_NS:
             # The operator points into the present picture; an old pose would place it elsewhere.
-            self._refuse(_UNKNOWN, request.time_ns)
-            return
-        if newest.state is not TrackingState.TRACKING:
+            self._refuse(request, _UNKNOWN)
+            return True
+        estimate = self._history.at(wanted_ns)
+        if estimate is None and abs(newest.exposure_time_ns - wanted_ns) <= _FRAME_NS:
+            estimate = newest
+        is_early = estimate is None and newest.exposure_time_ns < wanted_ns
+        if is_early and now_ns - request.time_ns <= _OLDEST_NS:
+            return False
+        if estimate is None:
+            self._refuse(request, _UNKNOWN)
+        elif estimate.state is not TrackingState.TRACKING:
             # One picture has found a place, and the next ones may still find another.
-            self._refuse(_UNCONFIRMED, request.time_ns)
-            return
-        x, y = np.array(request.coordinates).reshape(-1, 2).mean(axis=0)
-        u, v = x * newest.camera.width, y * newest.camera.height
-        name = f"{CLICKED}{next(self._numbers)}"
-        self._clicked.append(name)
-        self._targets.add_detection(Detection(name, newest.exposure_time_ns, float(u), float(v)))
+            self._refuse(request, _UNCONFIRMED)
+        else:
+            self._begin(request, estimate)
+        return True
 
-    def _refuse(self, why: str, time_ns: int) -> None:
+    def _begin(self, request: TrackRequest, estimate: PoseEstimate) -> None:
+        camera = estimate.camera
+        x, y = request.coordinates[0::2], request.coordinates[1::2]
+        extent = None
+        if request.kind == "rectangle":
+            extent = ((x[1] - x[0]) * camera.width, (y[1] - y[0]) * camera.height)
+        pixel = (sum(x) / len(x) * camera.width, sum(y) / len(y) * camera.height)
+        frame_ns = estimate.exposure_time_ns
+        around = tuple(
+            at
+            for at in (self._history.at(frame_ns + s * self._sigma_ns) for s in (-1, 1))
+            if at is not None
+        )
+        self._alive.append(request.number)
+        if len(self._alive) > _MOST:
+            oldest = self._alive.pop(0)
+            self._targets.forget((clicked_name(oldest),))
+            self._say(_INFO, f"PiLoT: target {oldest} ended: more than {_MOST}")
+        self._targets.begin(Click(request.number, estimate, pixel, around, extent))
+
+    def _refuse(self, request: TrackRequest, why: str) -> None:
         """Say it once to an impatient operator."""
-        if self._refused_ns is None or time_ns - self._refused_ns > _OLDEST_NS:
-            self._refused_ns = time_ns
-            self._say(_WARNING, why)
+        if self._refused is None or (
+            request.time_ns - self._refused[0] > _OLDEST_NS or self._refused[1] != why
+        ):
+            self._refused = (request.time_ns, why)
+            self._say(_WARNING, f"PiLoT: no target: {why}")

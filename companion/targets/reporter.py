@@ -1,4 +1,4 @@
-"""Detections and estimates of the same frame become target coordinates, on a thread of its own."""
+"""Clicks, detections and estimates become target coordinates, on a thread of its own."""
 
 from __future__ import annotations
 
@@ -6,39 +6,29 @@ import logging
 import threading
 from collections import deque
 from collections.abc import Callable
-from dataclasses import dataclass
+from typing import Any
 
 from companion.config import TargetConfig
 from companion.targets.detections import Detection
-from localizer.geometry.pose import Array
-from localizer.targets.filter import TargetFilter
-from localizer.targets.locate import RayCaster, locate
-from localizer.types import PoseEstimate, TargetFix, TargetSighting
+from companion.targets.population import Click, Population, Target
+from localizer.targets.locate import RayCaster
+from localizer.types import PoseEstimate
 
 _log = logging.getLogger(__name__)
 _KEPT = 64
 _MATCH_NS = 5_000_000  # detection and estimate must be of the same frame
-_MAX_TARGETS = 32  # at a time: what a telemetry link bears
-# A target unseen for so long makes room for another.
-_GONE_NS = 10_000_000_000
 
 
-@dataclass(frozen=True)
-class Target:
-    """A filtered fix. velocity: (3,) m/s, world axes; None of what was located once."""
-
-    fix: TargetFix
-    velocity: Array | None
-    estimate: PoseEstimate
+def _say_nothing(_severity: int, _text: str) -> None:
+    pass
 
 
 class TargetReporter:
-    """Pairs detections with accepted estimates, casts the rays, filters, and hands the target on.
+    """Pairs detections with accepted estimates, and lets the population of targets live on them.
 
-    on_gone: called on the targets' thread with each name that `forget` ended, after the last
-    on_target of that name.
-    missed counts detections that show no map: beside the picture, or in the sky; failed what
-    raised an error, of which the first is logged; refused those of targets beyond the 32nd.
+    on_gone: called on the targets' thread with each name that ended, after the last on_target of
+    that name. say: tells the operator (MAV_SEVERITY, text). failed counts what raised an error, of
+    which the first is logged.
     """
 
     def __init__(
@@ -47,22 +37,33 @@ class TargetReporter:
         cast: RayCaster,
         on_target: Callable[[Target], None],
         on_gone: Callable[[str], None] = lambda _name: None,
+        say: Callable[[int, str], None] = _say_nothing,
     ) -> None:
-        self._config = config
-        self._cast = cast
-        self._on_target = on_target
-        self._on_gone = on_gone
+        self._population = Population(config, cast, on_target, on_gone, say)
         self._forgotten: tuple[str, ...] = ()
+        self._clicks: list[Click] = []
         self._estimates: deque[PoseEstimate] = deque(maxlen=_KEPT)
         self._detections: deque[Detection] = deque(maxlen=_KEPT)
-        self._filters: dict[str, TargetFilter] = {}
-        self._reported_ns: dict[str, int] = {}
+        self._held: PoseEstimate | None = None
         self._condition = threading.Condition()
         self._stopping = False
-        self.missed = 0
         self.failed = 0
-        self.refused = 0
         self._thread = threading.Thread(target=self._run, name="targets")
+
+    @property
+    def missed(self) -> int:
+        """Clicks and detections that show no map: beside the picture, or in the sky."""
+        return self._population.missed
+
+    @property
+    def doubted(self) -> int:
+        """Detections whose place may not be told (`TargetTrack.refusal`)."""
+        return self._population.doubted
+
+    @property
+    def refused(self) -> int:
+        """Detections of targets beyond the 32nd."""
+        return self._population.refused
 
     def start(self) -> None:
         """Start the thread."""
@@ -88,6 +89,12 @@ class TargetReporter:
             self._detections.append(detection)
             self._condition.notify()
 
+    def begin(self, click: Click) -> None:
+        """Begin a clicked target. Never blocks."""
+        with self._condition:
+            self._clicks.append(click)
+            self._condition.notify()
+
     def forget(self, names: tuple[str, ...]) -> None:
         """End these targets: what was seen of them is dropped. Never blocks."""
         with self._condition:
@@ -99,33 +106,38 @@ class TargetReporter:
     def _run(self) -> None:
         while True:
             with self._condition:
-                pairs = self._take_pairs()
-                if not pairs and not self._forgotten and not self._stopping:
+                if not self._has_work() and not self._stopping:
                     self._condition.wait(0.5)
-                    pairs = self._take_pairs()
                 if self._stopping:
                     return
+                pairs = self._take_pairs()
+                clicks, self._clicks = self._clicks, []
                 forgotten, self._forgotten = self._forgotten, ()
-            self._end(forgotten)
+                newest = self._estimates[-1] if self._estimates else None
+            for click in clicks:
+                self._guarded(self._population.begin, click)
+            for name in forgotten:
+                self._guarded(self._population.end, (name,))
             for detection, estimate in pairs:
-                if detection.target_id in forgotten:
-                    continue
-                try:
-                    self._locate(detection, estimate)
-                except Exception:  # a target must not end the flight
-                    self.failed += 1
-                    if self.failed == 1:
-                        _log.exception("target %s could not be located", detection.target_id)
+                if detection.target_id not in forgotten:
+                    self._guarded(self._population.see, detection, estimate)
+            if newest is not None and newest is not self._held:
+                self._held = newest
+                self._guarded(self._population.hold, newest)
 
-    def _end(self, names: tuple[str, ...]) -> None:
-        for name in names:
-            self._filters.pop(name, None)
-            if self._reported_ns.pop(name, None) is None:
-                continue
-            try:
-                self._on_gone(name)
-            except Exception:
-                _log.exception("the end of target %s could not be told", name)
+    def _guarded(self, work: Callable[..., None], *arguments: Any) -> None:
+        try:
+            work(*arguments)
+        except Exception:  # a target must not end the flight
+            self.failed += 1
+            if self.failed == 1:
+                _log.exception("a target could not be located")
+
+    def _has_work(self) -> bool:
+        newest = self._estimates[-1] if self._estimates else None
+        if self._clicks or self._forgotten or newest is not self._held:
+            return True
+        return any(self._match(d) is not None for d in self._detections)
 
     def _take_pairs(self) -> list[tuple[Detection, PoseEstimate]]:
         """Detections whose frame has an estimate; the rest wait until newer frames pass them."""
@@ -145,36 +157,3 @@ class TargetReporter:
             if abs(estimate.exposure_time_ns - detection.time_ns) <= _MATCH_NS:
                 return estimate
         return None
-
-    def _locate(self, detection: Detection, estimate: PoseEstimate) -> None:
-        last = self._reported_ns.get(detection.target_id)
-        wait_ns = 0.9e9 / self._config.rate_hz  # frames do not fall on the period exactly
-        if last is not None and estimate.exposure_time_ns - last < wait_ns:
-            return
-        if last is None and not self._has_room(estimate.exposure_time_ns):
-            return  # before the work: a flood of names must cost next to nothing
-        pixel = (detection.u, detection.v)
-        sigmas = self._config.pixel_sigma, self._config.map_sigma_m
-        inside = 0 <= pixel[0] <= estimate.camera.width and 0 <= pixel[1] <= estimate.camera.height
-        surfaces = locate(estimate, pixel, self._cast, *sigmas) if inside else ()
-        if not surfaces:
-            self.missed += 1
-            return
-        time_ns = estimate.exposure_time_ns
-        self._reported_ns[detection.target_id] = time_ns
-        target_filter = self._filters.setdefault(detection.target_id, TargetFilter())
-        fix = target_filter.update(TargetSighting(detection.target_id, surfaces, pixel, time_ns))
-        self._on_target(Target(fix, target_filter.velocity, estimate))
-
-    def _has_room(self, now_ns: int) -> bool:
-        """Whether one more target can be followed, once those that are gone are forgotten."""
-        if len(self._reported_ns) < _MAX_TARGETS:
-            return True
-        for name in [n for n, t in self._reported_ns.items() if now_ns - t > _GONE_NS]:
-            del self._reported_ns[name], self._filters[name]
-        if len(self._reported_ns) < _MAX_TARGETS:
-            return True
-        self.refused += 1
-        if self.refused == 1:
-            _log.warning("more than %d targets at a time: the newest are left out", _MAX_TARGETS)
-        return False

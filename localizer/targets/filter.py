@@ -60,8 +60,20 @@ class TargetFilter:
         velocity: Array = self._tracks[0].mean[3:].copy()
         return velocity
 
-    def update(self, sighting: TargetSighting) -> TargetFix:
-        """Fuse a sighting of at least one surface. Three that fit no track restart the filter."""
+    @property
+    def velocity_covariance(self) -> Array | None:
+        """Of `velocity`, (3, 3) m²/s²."""
+        if self.velocity is None:
+            return None
+        covariance: Array = self._tracks[0].covariance[3:, 3:].copy()
+        return covariance
+
+    def update(self, sighting: TargetSighting) -> TargetFix | None:
+        """Fuse a sighting of at least one surface. Three that fit no track restart the filter.
+
+        None for a sighting that fits none: where the target would be by its motion is no place at
+        which it was seen.
+        """
         tracks = [_predicted(t, sighting.time_ns - self._time_ns) for t in self._tracks]
         met = _met(tracks, sighting.surfaces)
         self._outliers = 0 if met else self._outliers + 1
@@ -70,7 +82,7 @@ class TargetFilter:
             self._outliers = 0
         self._tracks = _reduced(met or tracks)
         self._time_ns = sighting.time_ns
-        return self._fix(sighting)
+        return self._fix(sighting) if met else None
 
     def _fix(self, sighting: TargetSighting) -> TargetFix:
         """The most probable track; the covariance is the mean square about it of all of them."""
@@ -89,6 +101,8 @@ class TargetFilter:
             sighting.pixel,
             sighting.time_ns,
             elsewhere,
+            self.velocity,
+            self.velocity_covariance,
         )
 
 

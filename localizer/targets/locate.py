@@ -8,7 +8,7 @@ cast that samples these errors, and every surface that it meets is told with its
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -31,12 +31,19 @@ _MIN_COSINE = 0.05
 
 @dataclass(frozen=True)
 class RaySpread:
-    """Uncertainty of a ray's direction. sideways: (2, 3) unit vectors across the ray; covariance:
-    (2, 2) rad² along them, of pose and pixel together, for a point at the given distance.
+    """Uncertainty of a ray's direction. sideways: (2, 3) unit vectors across the ray; pose, pixel:
+    (2, 2) rad² along them, what each of the two errs by, for a point at the given distance.
     """
 
     sideways: Array
-    covariance: Array
+    pose: Array
+    pixel: Array
+
+    @property
+    def covariance(self) -> Array:
+        """Of both together, (2, 2) rad²."""
+        total: Array = self.pose + self.pixel
+        return total
 
 
 def ray_in_world(estimate: PoseEstimate, pixel: tuple[float, float]) -> tuple[Array, Array]:
@@ -46,20 +53,27 @@ def ray_in_world(estimate: PoseEstimate, pixel: tuple[float, float]) -> tuple[Ar
 
 
 def ray_spread(
-    estimate: PoseEstimate, pixel: tuple[float, float], pixel_sigma: float, distance: float
+    estimate: PoseEstimate,
+    pixel: tuple[float, float],
+    pixel_sigma: float,
+    distance: float,
+    drift: tuple[float, float] = (0.0, 0.0),
 ) -> RaySpread:
     """How far off the ray of a pixel may be, first order.
 
     A point at ``s d`` from the camera moves across the ray by ``dC + s [phi]x d``; a pixel's error
-    turns the ray by the camera model's own derivative.
+    turns the ray by the camera model's own derivative. drift: one sigma of an error (pixels) along
+    a line, as of a click whose frame is not quite known.
     """
     _, d = ray_in_world(estimate, pixel)
     sideways = np.linalg.svd(d[None, :])[2][1:]
     from_pose = np.hstack([sideways / distance, -sideways @ hat(d)])
     moved = [ray_in_world(estimate, (pixel[0] + du, pixel[1] + 1 - du))[1] for du in (1, 0)]
-    from_pixel = pixel_sigma * sideways @ (np.array(moved) - d).T
-    covariance = from_pose @ estimate.covariance @ from_pose.T + from_pixel @ from_pixel.T
-    return RaySpread(sideways, covariance)
+    turn = sideways @ (np.array(moved) - d).T
+    pixels = pixel_sigma**2 * np.eye(2) + np.outer(drift, drift)
+    return RaySpread(
+        sideways, from_pose @ estimate.covariance @ from_pose.T, turn @ pixels @ turn.T
+    )
 
 
 def surface_covariance(
@@ -86,17 +100,18 @@ def locate(
     cast: RayCaster,
     pixel_sigma: float,
     map_sigma_m: float,
+    drift: tuple[float, float] = (0.0, 0.0),
 ) -> tuple[TargetSurface, ...]:
     """The surfaces that a pixel may show, the most probable one first; none if it shows no map.
 
     Where the whole bundle meets one surface, its position is the exact hit of the pixel's ray; else
-    a surface's is the mean of its own hits.
+    a surface's is the mean of its own hits. drift: as of `ray_spread`.
     """
     eye, d = ray_in_world(estimate, pixel)
     distance = float(cast(eye, d[None, :]).distances[0])
     if not np.isfinite(distance):
         return ()
-    spread = ray_spread(estimate, pixel, pixel_sigma, distance)
+    spread = ray_spread(estimate, pixel, pixel_sigma, distance, drift)
     nodes, weights = _nodes()
     offsets = nodes @ np.linalg.cholesky(spread.covariance).T @ spread.sideways
     directions = d + offsets
@@ -113,12 +128,17 @@ def locate(
         offset = points[group == centre][0] if exact else share @ points
         normal = share @ hits.normals[group]
         normal = normal / max(float(np.linalg.norm(normal)), 1e-9)
-        own = ray_spread(estimate, pixel, pixel_sigma, float(np.linalg.norm(offset)))
+        own = ray_spread(estimate, pixel, pixel_sigma, float(np.linalg.norm(offset)), drift)
         covariance = surface_covariance(offset, normal, own, map_sigma_m)
-        covariance += _roughness(points - offset, share, normal, d)
-        surfaces.append(TargetSurface(float(weights[group].sum()), eye + offset, covariance))
+        rough = float(share @ ((points - offset) @ normal) ** 2)
+        cosine = max(abs(float(normal @ d)), _MIN_COSINE)
+        covariance += np.outer(d, d) * rough / cosine**2
+        probability = float(weights[group].sum())
+        surfaces.append(
+            TargetSurface(probability, eye + offset, covariance, normal, float(np.sqrt(rough)))
+        )
     total = sum(s.probability for s in surfaces)
-    found = (TargetSurface(s.probability / total, s.position, s.covariance) for s in surfaces)
+    found = (replace(s, probability=s.probability / total) for s in surfaces)
     return tuple(sorted(found, key=lambda s: -s.probability))
 
 
@@ -134,9 +154,3 @@ def _surfaces(distances: Array, step: float) -> list[np.ndarray]:
     order = np.argsort(distances)
     order = order[np.isfinite(distances[order])]
     return np.split(order, np.flatnonzero(np.diff(distances[order]) > step) + 1)
-
-
-def _roughness(offsets: Array, share: Array, normal: Array, d: Array) -> Array:
-    """What a surface's hits, (N, 3) from its point, stray from the tangent plane: (3, 3) m²."""
-    cosine = max(abs(float(normal @ d)), _MIN_COSINE)
-    return np.outer(d, d) * float(share @ (offsets @ normal) ** 2) / cosine**2

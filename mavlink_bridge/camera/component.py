@@ -7,7 +7,8 @@ that are addressed to the autopilot.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from dataclasses import replace
 from typing import Any
 
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
@@ -29,6 +30,8 @@ from mavlink_bridge.messages import CameraView, Origin, TargetReport, TrackReque
 Send = Callable[[Any, int], bool]
 _TARGET_AGE_NS = 2_000_000_000
 _IDLE_PERIOD_NS = 1_000_000_000
+_IDLE_TIMES = 3  # "idle" is told when tracking ends, not for ever
+_REPEATED_NS = 10_000_000_000  # how long a station repeats a command that nobody answered
 TRACKING = frozenset(
     (
         mavlink.MAV_CMD_CAMERA_TRACK_POINT,
@@ -55,6 +58,7 @@ class CameraComponent:
         config: BridgeConfig,
         geoid_separation_m: float,
         on_track: Callable[[TrackRequest], None] | None,
+        numbers: Iterator[int],
         *,
         ground_link: bool,
     ) -> None:
@@ -63,13 +67,16 @@ class CameraComponent:
         self._adsb = config.targets.adsb and ground_link
         self._geoid_m = geoid_separation_m
         self._on_track = on_track
+        self._numbers = numbers
+        self._last_click: tuple[Any, int, TrackRequest] | None = None
         self._period_ns = int(1e9 / config.targets.rate_hz)
         self._image_ns = self._geo_ns = self._period_ns
         self._targets: dict[int, TargetReport] = {}
-        self._sent_ns: dict[int, int] = {}
+        self._sent_ns: dict[tuple[str, int], int] = {}
         self._view: CameraView | None = None
         self._view_sent_ns = 0
         self._idle_ns = 0
+        self._idle_left = _IDLE_TIMES
 
     @property
     def targets(self) -> int:
@@ -83,7 +90,8 @@ class CameraComponent:
     def forget(self, target_id: int) -> None:
         """Report on that target no more."""
         self._targets.pop(target_id, None)
-        self._sent_ns.pop(target_id, None)
+        for kind in ("image", "geo", "adsb"):
+            self._sent_ns.pop((kind, target_id), None)
 
     def look(self, view: CameraView) -> None:
         """The newest camera pose."""
@@ -94,15 +102,21 @@ class CameraComponent:
         for target_id in [
             i for i, t in self._targets.items() if abs(now_ns - t.time_ns) > _TARGET_AGE_NS
         ]:
-            del self._targets[target_id]
-            self._sent_ns.pop(target_id, None)
-        sent = {target_id: self._sent_ns.get(target_id, 0) for target_id in self._targets}
-        due = [i for i, t in sent.items() if now_ns - t >= min(self._geo_ns, self._image_ns)]
-        for target_id in sorted(due, key=lambda i: sent[i])[:_PER_TICK]:
-            self._sent_ns[target_id] = now_ns
-            self._send_target(self._targets[target_id], vehicle, send)
-        if not self._targets and now_ns - self._idle_ns >= _IDLE_PERIOD_NS:
+            self.forget(target_id)
+        told = self._told()
+        for number in self._due("image", told, self._image_ns, now_ns):
+            send(tracking_image_status(self._targets[number]), self._component)
+        for number in self._due("geo", told, self._geo_ns, now_ns):
+            message = tracking_geo_status(self._targets[number], self._geoid_m, vehicle)
+            send(message, self._component)
+        if self._adsb:
+            for number in self._due("adsb", list(self._targets), self._period_ns, now_ns):
+                send(adsb_vehicle(self._targets[number], self._geoid_m), self._component)
+        if self._targets:
+            self._idle_left = _IDLE_TIMES
+        elif self._idle_left > 0 and now_ns - self._idle_ns >= _IDLE_PERIOD_NS:
             self._idle_ns = now_ns
+            self._idle_left -= 1
             send(tracking_image_status(None), self._component)
         if self._view is not None and now_ns - self._view_sent_ns >= self._period_ns:
             self._view_sent_ns = now_ns
@@ -110,19 +124,32 @@ class CameraComponent:
             send(message, self._component)
             self._view = None
 
-    def _send_target(self, target: TargetReport, vehicle: Origin | None, send: Send) -> None:
-        send(tracking_geo_status(target, self._geoid_m, vehicle), self._component)
-        send(tracking_image_status(target), self._component)
-        if self._adsb:
-            send(adsb_vehicle(target, self._geoid_m), self._component)
+    def _told(self) -> list[int]:
+        """Whom the camera protocol tells of: it knows one target, and no number of it.
+
+        The one that the operator clicked last; without a click those that a detector sees take
+        turns.
+        """
+        clicked = [number for number, target in self._targets.items() if target.clicked]
+        return [max(clicked)] if clicked else list(self._targets)
+
+    def _due(self, kind: str, numbers: list[int], period_ns: int, now_ns: int) -> list[int]:
+        """Those whose message of that kind is due, the longest waiting first; noted as sent."""
+        sent = {number: self._sent_ns.get((kind, number), 0) for number in numbers}
+        waited = sorted(sent, key=lambda number: sent[number])
+        due = [number for number in waited if now_ns - sent[number] >= period_ns][:_PER_TICK]
+        self._sent_ns.update({(kind, number): now_ns for number in due})
+        return due
 
     def command(self, message: Any, time_ns: int, uptime_ms: int, send: Send) -> bool:
         """Answer a COMMAND_LONG to the camera; False when it is not for it."""
         if message.target_component != self._component:
             return False
-        result = self._execute(message, time_ns, uptime_ms, send)
+        result, number = self._execute(message, time_ns, uptime_ms, send), 0
+        if result == mavlink.MAV_RESULT_ACCEPTED and message.command in TRACKING:
+            number = self._last_click[2].number if self._last_click is not None else 0
         ack = mavlink.MAVLink_command_ack_message(
-            message.command, result, 0, 0, message.get_srcSystem(), message.get_srcComponent()
+            message.command, result, 0, number, message.get_srcSystem(), message.get_srcComponent()
         )
         send(ack, self._component)
         return True
@@ -130,11 +157,7 @@ class CameraComponent:
     def _execute(self, message: Any, time_ns: int, uptime_ms: int, send: Send) -> int:
         command = message.command
         if command in TRACKING:
-            request = track_request(message, time_ns)
-            if request is None or self._on_track is None:
-                return int(mavlink.MAV_RESULT_DENIED)
-            self._on_track(request)
-            return int(mavlink.MAV_RESULT_ACCEPTED)
+            return self._track(message, time_ns)
         if command == mavlink.MAV_CMD_REQUEST_MESSAGE:
             return self._request(message.param1, uptime_ms, send)
         if command in _OLD_REQUESTS:
@@ -142,6 +165,31 @@ class CameraComponent:
         if command == mavlink.MAV_CMD_SET_MESSAGE_INTERVAL:
             return self._interval(message.param1, message.param2)
         return int(mavlink.MAV_RESULT_UNSUPPORTED)
+
+    def _track(self, message: Any, time_ns: int) -> int:
+        request = track_request(message, time_ns)
+        if request is None or self._on_track is None:
+            return int(mavlink.MAV_RESULT_DENIED)
+        if request.kind == "stop":
+            self._last_click = None
+        else:
+            if self._is_repeated(message, request):
+                return int(mavlink.MAV_RESULT_ACCEPTED)
+            request = replace(request, number=next(self._numbers))
+            self._last_click = (message.get_srcSystem(), message.command, request)
+        self._on_track(request)
+        return int(mavlink.MAV_RESULT_ACCEPTED)
+
+    def _is_repeated(self, message: Any, request: TrackRequest) -> bool:
+        """Whether a station that heard no answer asks again for what was begun already."""
+        if self._last_click is None or not getattr(message, "confirmation", 0):
+            return False
+        system, command, last = self._last_click
+        return (
+            (system, command) == (message.get_srcSystem(), message.command)
+            and last.coordinates == request.coordinates
+            and request.time_ns - last.time_ns < _REPEATED_NS
+        )
 
     def _request(self, message_id: float, uptime_ms: int, send: Send) -> int:
         answers: dict[int, Callable[[], Any]] = {
@@ -152,7 +200,7 @@ class CameraComponent:
                 self._camera
             ),
             mavlink.MAVLINK_MSG_ID_CAMERA_TRACKING_IMAGE_STATUS: lambda: tracking_image_status(
-                next(iter(self._targets.values()), None)
+                next((self._targets[number] for number in self._told()), None)
             ),
         }
         answer = answers.get(int(message_id)) if math.isfinite(message_id) else None

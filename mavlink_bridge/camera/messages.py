@@ -112,5 +112,7 @@ def track_request(message: Any, time_ns: int) -> TrackRequest | None:
             return None
         return TrackRequest("rectangle", time_ns, rectangle)
     if message.command == mavlink.MAV_CMD_CAMERA_STOP_TRACKING:
-        return TrackRequest("stop", time_ns)
+        # Ours: the number of a target, where the standard has a reserved 0.
+        number = message.param1 if math.isfinite(message.param1) else 0.0
+        return TrackRequest("stop", time_ns, number=max(0, min(int(number), 1 << 24)))
     return None

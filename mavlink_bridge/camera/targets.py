@@ -30,14 +30,14 @@ def tracking_image_status(report: TargetReport | None) -> Any:
         active, mode = mavlink.CAMERA_TRACKING_STATUS_FLAGS_IDLE, 0
         point, rectangle = (NAN, NAN), (NAN,) * 4
     elif report.rectangle is not None:
-        active = mavlink.CAMERA_TRACKING_STATUS_FLAGS_ACTIVE
+        active = _status(report)
         mode, point, rectangle = (
             mavlink.CAMERA_TRACKING_MODE_RECTANGLE,
             (NAN, NAN),
             report.rectangle,
         )
     else:
-        active = mavlink.CAMERA_TRACKING_STATUS_FLAGS_ACTIVE
+        active = _status(report)
         mode, rectangle = mavlink.CAMERA_TRACKING_MODE_POINT, (NAN,) * 4
         point = report.pixel or (NAN, NAN)
     return mavlink.MAVLink_camera_tracking_image_status_message(
@@ -69,18 +69,24 @@ def tracking_geo_status(
         )
         distance = math.sqrt(n * n + e * e + (altitude - camera.altitude_amsl_m) ** 2)
     return mavlink.MAVLink_camera_tracking_geo_status_message(
-        mavlink.CAMERA_TRACKING_STATUS_FLAGS_ACTIVE,
+        _status(report),
         round(report.latitude_deg * 1e7),
         round(report.longitude_deg * 1e7),
         altitude,
         or_nan(report.h_accuracy_m),
         or_nan(report.v_accuracy_m),
         *velocity,
-        NAN,
+        or_nan(report.velocity_accuracy_mps),
         distance,
         heading,
         NAN,
     )
+
+
+def _status(report: TargetReport) -> int:
+    """CAMERA_TRACKING_STATUS_FLAGS of a target that is alive."""
+    active = int(mavlink.CAMERA_TRACKING_STATUS_FLAGS_ACTIVE)
+    return active | (mavlink.CAMERA_TRACKING_STATUS_FLAGS_COASTING if report.coasting else 0)
 
 
 def adsb_vehicle(report: TargetReport, geoid_separation_m: float) -> Any:

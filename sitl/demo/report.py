@@ -90,7 +90,7 @@ def make_report(record: FlightRecord, scenario: Scenario, seed: int) -> FlightRe
     folder, span = record.folder, record.denied_ns
     truth = read_columns(folder / "frames.csv")
     estimates = read_columns(folder / "companion" / "estimates.csv", text=("state", "status"))
-    targets = read_columns(folder / "companion" / "targets.csv", text=("target_id",))
+    targets = read_columns(folder / "companion" / "targets.csv", text=("target_id", "visibility"))
     vehicle = read_columns(folder / "vehicle.csv")
     errors = frame_errors(truth, estimates, span)
     ekf_times, horizontal, vertical = ekf_errors(vehicle, span)

@@ -18,7 +18,8 @@ import pytest
 from companion.config import TargetConfig
 from companion.flight.conversions import target_report
 from companion.targets.clicks import ClickPolicy
-from companion.targets.reporter import Target, TargetReporter
+from companion.targets.population import Target
+from companion.targets.reporter import TargetReporter
 from localizer.geometry.camera import Camera
 from localizer.geometry.geo import Geodetic, LocalFrame
 from localizer.geometry.pose import Array, Pose
@@ -175,7 +176,7 @@ class Clicked:
 
     def __init__(self, config: BridgeConfig) -> None:
         self._targets = TargetReporter(TargetConfig(rate_hz=10.0), flat, self._tell)
-        self._clicks = ClickPolicy(self._targets, lambda *_: None)
+        self._clicks = ClickPolicy(self._targets, lambda *_: None, TargetConfig(rate_hz=10.0))
         self._bridge = Bridge(config, GEOID, on_track=self._clicks.on_request)
         self._stop = threading.Event()
         self._thread = threading.Thread(target=self._localize)
@@ -203,7 +204,7 @@ class Clicked:
 
     def _tell(self, target: Target) -> None:
         camera = target.estimate.camera
-        self._bridge.report(target_report(target.fix, None, camera, FRAME, 1))
+        self._bridge.report(target_report(target.fix, camera, FRAME, 1))
 
 
 @pytest.mark.parametrize("kind", BOTH)

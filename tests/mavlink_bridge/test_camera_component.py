@@ -1,5 +1,9 @@
 """What the camera component tells of targets, and that an ended one is told no more."""
 
+from itertools import count
+
+from pymavlink.dialects.v20 import ardupilotmega as mavlink
+
 from mavlink_bridge.camera.component import CameraComponent
 from mavlink_bridge.config import BridgeConfig
 from mavlink_bridge.messages import TargetReport
@@ -8,7 +12,7 @@ SECOND = 10**9
 
 
 def test_a_target_that_is_forgotten_is_told_no_more_and_the_others_are():
-    component = CameraComponent(BridgeConfig(), 47.5, None, ground_link=True)
+    component = CameraComponent(BridgeConfig(), 47.5, None, count(1), ground_link=True)
     sent = []
 
     def told(now_ns):
@@ -25,3 +29,80 @@ def test_a_target_that_is_forgotten_is_told_no_more_and_the_others_are():
     component.forget(4)
     assert told(11 * SECOND + SECOND // 2) == []
     assert component.targets == 0
+
+
+class Station:
+    """A ground station's commands to the camera, and what it hears."""
+
+    def __init__(self):
+        self.asked, self.heard = [], []
+        self.camera = CameraComponent(
+            BridgeConfig(), 47.5, self.asked.append, count(1), ground_link=True
+        )
+
+    def send(self, command, *parameters, confirmation=0, time_ns=SECOND):
+        padded = [*parameters, *([0.0] * (7 - len(parameters)))]
+        message = mavlink.MAVLink_command_long_message(1, 100, command, confirmation, *padded)
+        message.get_srcSystem, message.get_srcComponent = lambda: 255, lambda: 190
+        self.heard.clear()
+        self.camera.command(message, time_ns, 0, self._hear)
+        return self.heard[-1]
+
+    def hears(self, now_ns):
+        self.heard.clear()
+        self.camera.tick(now_ns, None, 0, self._hear)
+        return self.heard
+
+    def _hear(self, message, _):
+        self.heard.append(message)
+        return True
+
+
+POINT, STOP = mavlink.MAV_CMD_CAMERA_TRACK_POINT, mavlink.MAV_CMD_CAMERA_STOP_TRACKING
+
+
+def test_the_answer_to_a_click_says_its_number_and_a_repeated_command_begins_no_other():
+    station = Station()
+    assert station.send(POINT, 0.25, 0.5).result_param2 == 1
+    assert station.send(POINT, 0.25, 0.5, confirmation=1).result_param2 == 1  # its ack was lost
+    assert station.send(POINT, 0.25, 0.5).result_param2 == 2  # clicked again
+    assert station.send(POINT, 0.75, 0.5, confirmation=1).result_param2 == 3
+    assert [r.number for r in station.asked] == [1, 2, 3]
+    station.send(STOP)
+    station.send(STOP, 2.0)
+    station.send(STOP, float("nan"))
+    assert [r.number for r in station.asked[3:]] == [0, 2, 0]
+
+
+def test_one_target_is_told_the_one_clicked_last_and_idle_only_when_it_ends():
+    """The protocol has no number of a target: two boxes in turn are one box that jumps."""
+    station = Station()
+    for number, x in ((1, 0.1), (2, 0.2), (1001, 0.9)):
+        report = TargetReport(
+            SECOND, 47.0 + x, 8.5, 450.0, pixel=(x, 0.5), target_id=number, clicked=number < 1000
+        )
+        station.camera.report(report)
+
+    def boxes(now_ns):
+        told = [m for m in station.hears(now_ns) if m.get_type().startswith("CAMERA_TRACKING")]
+        return [(m.get_type()[16:], round(getattr(m, "point_x", 0.0), 3)) for m in told]
+
+    both = [("IMAGE_STATUS", 0.2), ("GEO_STATUS", 0.0)]
+    assert boxes(SECOND) == both
+    assert boxes(SECOND + SECOND // 4) == both
+    station.camera.forget(2)
+    assert boxes(SECOND + SECOND // 2) == [("IMAGE_STATUS", 0.1), ("GEO_STATUS", 0.0)]
+    station.camera.forget(1)
+    assert boxes(2 * SECOND)[0] == ("IMAGE_STATUS", 0.9)
+    station.camera.forget(1001)
+    idle = [len(boxes((3 + k) * SECOND)) for k in range(8)]
+    assert sum(idle) == 3
+
+
+def test_what_is_hidden_is_told_as_coasting():
+    station = Station()
+    station.camera.report(
+        TargetReport(SECOND, 47.0, 8.5, 450.0, pixel=(0.5, 0.5), target_id=1, coasting=True)
+    )
+    coasting = mavlink.CAMERA_TRACKING_STATUS_FLAGS_COASTING
+    assert [m.tracking_status & coasting for m in station.hears(SECOND)] == [coasting] * 2

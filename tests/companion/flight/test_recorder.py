@@ -6,6 +6,7 @@ import os
 import sys
 import threading
 import time
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -25,7 +26,14 @@ from companion.offline.tables import poses, read_columns
 from localizer.geometry.camera import Camera
 from localizer.geometry.geo import Geodetic, LocalFrame
 from localizer.geometry.pose import Pose, so3_exp
-from localizer.types import Frame, PoseEstimate, RegistrationStatus, TargetFix, TrackingState
+from localizer.types import (
+    Frame,
+    PoseEstimate,
+    RegistrationStatus,
+    TargetFix,
+    TrackingState,
+    Visibility,
+)
 
 FRAME = LocalFrame(Geodetic(47.3, 8.5, 450.0))
 CAMERA = Camera.from_fov(64, 48, 60)
@@ -40,10 +48,8 @@ def test_what_is_recorded_can_be_read_back(tmp_path):
         1_700_000_000_123_456_789, 7, CAMERA, {"register": 12.5},
     )  # fmt: skip
     recorder.estimate(estimate)
-    recorder.target(
-        TargetFix("car", np.zeros(3), np.eye(3), (3.0, 4.0), 5), np.array([1.0, 2.0, 0.0])
-    )
-    recorder.target(CAR, None)
+    recorder.target(replace(CAR, velocity=np.array([1.0, 2.0, 0.0])))
+    recorder.target(replace(CAR, pixel=None, visibility=Visibility.OUTSIDE))
     recorder.event("warning", 'a, "quoted" text\nof two lines')
     image = np.full((48, 64, 3), 200, np.uint8)
     for time_ns in (10**9, 1_500_000_000, 2 * 10**9):
@@ -55,8 +61,10 @@ def test_what_is_recorded_can_be_read_back(tmp_path):
     translation, rotation = poses(columns)[0].distance_to(pose)
     assert translation < 1e-3
     assert rotation < 1e-5
-    velocity = read_columns(tmp_path / "targets.csv", text=("target_id",))["velocity_north"]
-    np.testing.assert_array_equal(velocity, [2.0, np.nan])  # the second was located once
+    targets = read_columns(tmp_path / "targets.csv", text=("target_id", "visibility"))
+    np.testing.assert_array_equal(targets["velocity_north"], [2.0, np.nan])
+    np.testing.assert_array_equal(targets["u"], [3.0, np.nan])
+    assert list(targets["visibility"]) == ["seen", "outside"]
     with (tmp_path / "events.csv").open(newline="") as file:
         assert next(iter(csv.DictReader(file)))["text"] == 'a, "quoted" text\nof two lines'
     names = sorted(p.stem for p in (tmp_path / "snapshots").glob("*.jpg"))
@@ -149,9 +157,7 @@ def test_a_full_disk_costs_rows_and_not_the_recorder(tmp_path, caplog):
     with caplog.at_level(logging.WARNING):
         for _ in range(2000):  # more than a file's buffer holds
             recorder.event("info", "x" * 100)
-        recorder.target(
-            TargetFix("car", np.zeros(3), np.eye(3), (3.0, 4.0), 5), np.array([1.0, 2.0, 0.0])
-        )
+        recorder.target(CAR)
         recorder.close()
     assert recorder.dropped > 0
     assert told == ["No space left on device"]

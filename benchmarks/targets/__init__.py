@@ -1,0 +1,1 @@
+"""Targets: places and velocities against the truth, at edges, on plain ground, and of cars."""

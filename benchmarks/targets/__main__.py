@@ -1,0 +1,166 @@
+"""Targets against the truth: standing ones on plain ground and at edges, and moving cars.
+
+    python -m benchmarks.targets SEED [--scenario FILE] [--method track|filter] [--json out.json]
+
+Flies a scenario over a generated world (`python -m sitl world` or the demo makes it) without
+pictures: the poses err as a registration's do, the pixels as a detector's; an edge's pixel is
+within four of a leap in depth. Rays are cast into the survey's finest tiles, truth is on those of
+today's world. filter is what flew before: one pixel after the other in `TargetFilter` alone.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+from dataclasses import asdict
+from pathlib import Path
+
+import numpy as np
+
+from benchmarks.common.arguments import Parser, existing, number, output, whole
+from benchmarks.common.named_errors import named_errors
+from benchmarks.targets.flights import PoseErrors, Step, Thing, sightings, standing, steps
+from benchmarks.targets.report import Sample, rows
+from localizer.geometry.pose import Array
+from localizer.map.cache.cache import TileCache
+from localizer.map.cache.surface import MapSurface
+from localizer.targets.filter import TargetFilter
+from localizer.targets.locate import RayCaster, locate
+from localizer.targets.track import TargetSettings, TargetTrack
+from localizer.types import PoseEstimate, TargetFix, TargetSighting
+from sitl.camera.traffic import traffic
+from sitl.demo.assets import prepare
+from sitl.demo.kinematic import camera_path
+from sitl.demo.scenario import load_scenario
+
+_SETTINGS = TargetSettings()
+_LOOKED_S = 20.0  # at most: a target is looked at, then left
+_NEW_S = 10.0  # out of sight for so long, a target is looked at anew
+
+
+class _Before:
+    """The filter alone, with every sighting's rays, as it flew before tracks."""
+
+    refusal = ""
+
+    def __init__(self, name: str, cast: RayCaster) -> None:
+        self._name, self._cast, self._filter = name, cast, TargetFilter()
+
+    def see(self, estimate: PoseEstimate, pixel: tuple[float, float]) -> TargetFix | None:
+        sigmas = _SETTINGS.pixel_sigma, _SETTINGS.map_sigma_m
+        surfaces = locate(estimate, pixel, self._cast, *sigmas)
+        if not surfaces:
+            return None
+        time_ns = estimate.exposure_time_ns
+        return self._filter.update(TargetSighting(self._name, surfaces, pixel, time_ns))
+
+
+def measure(
+    thing: Thing, flown: list[Step], seen: MapSurface, known: MapSurface, args: argparse.Namespace
+) -> tuple[list[Sample], int, int]:
+    """The thing's fixes, how many sightings gave none, and how many there were."""
+    rng = np.random.default_rng([args.draw, len(thing.name), hash_of(thing.name)])
+    samples, refused, count = [], 0, 0
+    track: TargetTrack | _Before | None = None
+    began_ns = last_ns = 0
+    for k, pixel in sightings(thing, flown, seen.cast, args.noise, rng):
+        told = flown[k].told
+        time_ns = told.exposure_time_ns
+        if track is None or time_ns - last_ns > _NEW_S * 1e9:
+            began_ns = time_ns
+            track = (
+                TargetTrack(thing.name, _SETTINGS, known.cast)
+                if args.method == "track"
+                else _Before(thing.name, known.cast)
+            )
+        last_ns = time_ns
+        if time_ns - began_ns > _LOOKED_S * 1e9:
+            continue
+        count += 1
+        fix = track.see(told, pixel)
+        if fix is None:
+            refused += 1
+            continue
+        samples.append(_sample(thing, k, (time_ns - began_ns) * 1e-9, fix))
+    return samples, refused, count
+
+
+def hash_of(name: str) -> int:
+    """The same in every process."""
+    return int.from_bytes(name.encode(), "little") % (1 << 31)
+
+
+def _sample(thing: Thing, k: int, looked_s: float, fix: TargetFix) -> Sample:
+    error = fix.position_world - thing.positions[k]
+    velocity_error, velocity_nees = float("nan"), float("nan")
+    if fix.velocity is not None and fix.velocity_covariance is not None:
+        off: Array = (fix.velocity - thing.velocities[k])[:2]
+        velocity_error = float(np.linalg.norm(off))
+        velocity_nees = float(off @ np.linalg.solve(fix.velocity_covariance[:2, :2], off))
+    return Sample(
+        thing.name, thing.kind, looked_s, float(np.linalg.norm(error)),
+        float(error @ np.linalg.solve(fix.covariance, error)),
+        float(np.sqrt(np.trace(fix.covariance))), fix.elsewhere,
+        fix.velocity is not None, velocity_error, velocity_nees,
+    )  # fmt: skip
+
+
+def fly(args: argparse.Namespace) -> list[dict[str, object]]:
+    """All targets of one seed; the file is written as they come."""
+    assets, scenario = prepare(args.seed, size_m=args.size), load_scenario(args.scenario)
+    live, survey = TileCache.open(assets.live_cache), TileCache.open(assets.map_cache)
+    camera = scenario.camera.camera()
+    path = list(camera_path(scenario, float(assets.world.ground_height(0.0, 0.0))))
+    every = max(1, round(50 / args.rate))
+    rng = np.random.default_rng([args.draw, args.seed])
+    errors = PoseErrors(args.pose_m, args.pose_deg, bias_m=(args.bias_m, 0.0))
+    flown = steps(path[::every], camera, errors, rng)
+    seen, known = MapSurface(live), MapSurface(survey)
+    things = list(standing(flown, seen.cast, args.points, rng))
+    times = [s.true.exposure_time_ns for s in flown]
+    cars = traffic(assets.world, survey.frame, cars=args.cars, people=0, seed=args.seed)
+    for car in cars:
+        positions = np.array([car.position_at(t) for t in times])
+        velocities = np.array([car.velocity_at(t) for t in times])
+        things.append(Thing(car.name, "car", positions, velocities))
+    samples: list[Sample] = []
+    refused = count = 0
+    found: list[dict[str, object]] = []
+    for thing in things:
+        new, not_told, of = measure(thing, flown, seen, known, args)
+        samples, refused, count = samples + new, refused + not_told, count + of
+        found = rows(samples, refused, count)
+        if args.json:
+            document = {"arguments": _plain(args), "rows": found}
+            document["samples"] = [asdict(s) for s in samples]
+            args.json.write_text(json.dumps(document))
+    return found
+
+
+def _plain(args: argparse.Namespace) -> dict[str, object]:
+    return {key: str(v) if isinstance(v, Path) else v for key, v in vars(args).items()}
+
+
+def main() -> None:
+    parser = Parser(__doc__)
+    parser.add_argument("seed", type=whole(0, 10**6), help="of the world, its cars and its points")
+    parser.add_argument("--scenario", type=existing, default=Path("configs/demo_short.yaml"),
+                        help="flight that is flown over it")  # fmt: skip
+    parser.add_argument("--size", type=number(100, 10_000), default=1600.0, help="of the world, m")
+    parser.add_argument("--method", choices=("track", "filter"), default="track", help="see above")
+    parser.add_argument("--points", type=whole(0, 1000), default=20, help="plain, and at edges")
+    parser.add_argument("--cars", type=whole(0, 200), default=10, help="in the world")
+    parser.add_argument("--rate", type=number(0.5, 30), default=5.0, help="sightings per second")
+    parser.add_argument("--noise", type=number(0, 50), default=1.0, help="of a pixel, px")
+    parser.add_argument("--pose-m", type=number(0, 10), default=0.06, help="sigma per axis, m")
+    parser.add_argument("--pose-deg", type=number(0, 5), default=0.025, help="likewise, degrees")
+    parser.add_argument("--bias-m", type=number(0, 20), default=0.0, help="of every pose, east, m")
+    parser.add_argument("--draw", type=whole(0, 10**6), default=0, help="of noise and points")
+    parser.add_argument("--json", type=output, help="rows and every fix")
+    for row in fly(parser.parse_args()):
+        print(json.dumps(row))
+
+
+if __name__ == "__main__":
+    with named_errors():
+        main()

@@ -1,0 +1,191 @@
+"""One target's life: standing or moving, seen, held by geometry, hidden; never told elsewhere.
+
+A sighting feeds both what it would be if it stood still (`StaticTarget`) and if it moved
+(`TargetFilter`). It stands still until its rays deny that, and again after it has stood a while:
+a velocity is told of what was measured to move, and of nothing else.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from localizer.geometry.pose import Array
+from localizer.targets.bias import SharedBias
+from localizer.targets.filter import TargetFilter
+from localizer.targets.locate import RayCaster, locate, ray_in_world, ray_spread
+from localizer.targets.static import Place, SightedRay, StaticTarget
+from localizer.types import PoseEstimate, TargetFix, TargetSighting, Visibility
+
+_STANDS_S = 2.0  # for so long it must agree with standing before it stands again
+_STANDS_MPS = 1.0
+_GAP_S = 5.0  # a moving target unseen for so long may be anywhere: it begins anew
+_FASTEST_MPS = 60.0
+_ELSEWHERE = 9.0
+_OUTLIERS = 3
+_REPROJECTED = 5.0  # sigmas of pixel and pose between a fix and the pixel that it was seen at
+_HIDDEN_M = 1.5  # what stands before a place by more than this hides it
+
+
+@dataclass(frozen=True)
+class TargetSettings:
+    """pixel_sigma: of a sighting, pixels; map_sigma_m: of the map's surface; max_sigma_m: nothing
+    is told that may be off by more; max_range_m: nor what is farther away.
+    """
+
+    pixel_sigma: float = 1.5
+    map_sigma_m: float = 0.3
+    bias: SharedBias = field(default_factory=SharedBias)
+    max_sigma_m: float = 50.0
+    max_range_m: float = 5000.0
+
+
+class TargetTrack:
+    """One target over time; not thread-safe. refusal: why the last `see` told nothing."""
+
+    def __init__(self, target_id: str, settings: TargetSettings, cast: RayCaster) -> None:
+        self._id = target_id
+        self._settings = settings
+        self._cast = cast
+        self._static = StaticTarget(settings.map_sigma_m)
+        self._moving = TargetFilter()
+        self._moves = False
+        self._stands_since_ns = 0
+        self._outliers = 0
+        self._last: TargetFix | None = None
+        self._seen_ns = 0
+        self.refusal = ""
+
+    @property
+    def moves(self) -> bool:
+        """Whether it was measured to move."""
+        return self._moves
+
+    def see(
+        self,
+        estimate: PoseEstimate,
+        pixel: tuple[float, float],
+        *,
+        drift: tuple[float, float] = (0.0, 0.0),
+        pixel_sigma: float | None = None,
+    ) -> TargetFix | None:
+        """Add the pixel of an accepted frame; None, and `refusal`, where nothing may be told."""
+        settings, sigma = self._settings, pixel_sigma or self._settings.pixel_sigma
+        time_ns, self.refusal = estimate.exposure_time_ns, ""
+        eye, d = ray_in_world(estimate, pixel)
+        surfaces = locate(estimate, pixel, self._cast, sigma, settings.map_sigma_m, drift)
+        if not surfaces:
+            return self._refuse("no map under it")
+        distance = float(np.linalg.norm(surfaces[0].position - eye))
+        if distance > settings.max_range_m:
+            return self._refuse(f"{distance:.0f} m away")
+        if self._moves and time_ns - self._seen_ns > _GAP_S * 1e9:
+            self._moving = TargetFilter()
+        ray = SightedRay(eye, d, ray_spread(estimate, pixel, sigma, distance, drift))
+        moving = self._moving.update(TargetSighting(self._id, surfaces, pixel, time_ns))
+        fits = self._static.update(ray, surfaces)
+        self._outliers = 0 if fits else self._outliers + 1
+        if (fits and self._static.moves) or self._outliers >= _OUTLIERS:
+            self._moves = True
+            self._stands_since_ns = time_ns
+            self._outliers = 0
+            self._static = StaticTarget(settings.map_sigma_m)
+            fits = self._static.update(ray, surfaces)
+        elif self._moves and time_ns - self._stands_since_ns > _STANDS_S * 1e9:
+            velocity = self._moving.velocity
+            self._moves = velocity is None or float(np.hypot(*velocity[:2])) > _STANDS_MPS
+        fix = moving if self._moves else self._standing(estimate, pixel) if fits else None
+        if fix is None:
+            return self._refuse("elsewhere than before: one such sighting is not believed")
+        if self._moves:
+            bias = settings.bias.covariance(fix.position_world - eye)
+            fix = replace(fix, covariance=fix.covariance + bias)
+        why = self._objection(fix, estimate, ray)
+        if why:
+            return self._refuse(why)
+        self._last, self._seen_ns = fix, time_ns
+        return fix
+
+    def hold(self, estimate: PoseEstimate) -> TargetFix | None:
+        """A standing target where the pose projects it; None of one that moves, or before one."""
+        if self._moves or self._last is None:
+            return None
+        fix = self._standing(estimate, None)
+        away = fix.position_world - estimate.world_from_camera.translation
+        pixel = projected(estimate, fix.position_world)
+        if pixel is None:
+            return replace(fix, visibility=Visibility.OUTSIDE)
+        distance = float(np.linalg.norm(away))
+        hits = self._cast(estimate.world_from_camera.translation, away[None] / distance)
+        first = float(hits.distances[0])
+        sigma = float(np.sqrt(away @ fix.covariance @ away)) / distance
+        is_hidden = distance - first > max(_HIDDEN_M, 3.0 * sigma)
+        seen = Visibility.HIDDEN if is_hidden else Visibility.HELD
+        return replace(fix, pixel=pixel, visibility=seen)
+
+    def places(self) -> tuple[Place, ...]:
+        """Where it may stand, the reported place first; none of one that moves."""
+        return self._static.places() if self._last is not None and not self._moves else ()
+
+    def _standing(self, estimate: PoseEstimate, pixel: tuple[float, float] | None) -> TargetFix:
+        """The place of the smallest expected error; the others widen its covariance."""
+        places = self._static.places()
+        best = places[0]
+        eye = estimate.world_from_camera.translation
+        bias = self._settings.bias.covariance(best.position - eye)
+        covariance, elsewhere = bias.copy(), 0.0
+        for place in places:
+            offset = place.position - best.position
+            covariance += place.weight * (place.covariance + np.outer(offset, offset))
+            if offset @ np.linalg.solve(best.covariance + bias, offset) > _ELSEWHERE:
+                elsewhere += place.weight
+        return TargetFix(
+            self._id, best.position, covariance, pixel, estimate.exposure_time_ns, elsewhere
+        )
+
+    def _objection(self, fix: TargetFix, estimate: PoseEstimate, ray: SightedRay) -> str:
+        """Why this may not be told; empty if it may.
+
+        A fix lies under the pixel that it was seen at, is known to some metres, and is no farther
+        from the last one than both errors and a vehicle's speed allow.
+        """
+        P, sigma = fix.covariance, float(np.sqrt(np.trace(fix.covariance)))
+        if not np.isfinite(sigma) or sigma > self._settings.max_sigma_m:
+            return f"known to {sigma:.0f} m only"
+        away = fix.position_world - ray.eye
+        distance = float(np.linalg.norm(away))
+        S = ray.spread.sideways
+        r = S @ (away / distance - ray.direction)
+        C = ray.spread.covariance + S @ P @ S.T / distance**2
+        if float(r @ np.linalg.solve(C, r)) > _REPROJECTED**2:
+            return "its place is not under its pixel"
+        if self._last is not None:
+            moved = float(np.linalg.norm(fix.position_world - self._last.position_world))
+            both = sigma + float(np.sqrt(np.trace(self._last.covariance)))
+            speed = _FASTEST_MPS if fix.velocity is not None or self._moves else 0.0
+            elapsed_s = abs(estimate.exposure_time_ns - self._last.exposure_time_ns) * 1e-9
+            if moved > 3.0 * both + speed * elapsed_s:
+                self._last = None  # the next one is judged by itself
+                return f"{moved:.0f} m from where it was, which its error does not cover"
+        return ""
+
+    def _refuse(self, why: str) -> TargetFix | None:
+        self.refusal = why
+        return None
+
+
+def projected(estimate: PoseEstimate, point: Array) -> tuple[float, float] | None:
+    """The pixel of a world point (3,) in a frame; None beside the picture.
+
+    The lens model folds what is far beside the picture back into it: what does not come back to
+    itself as a ray is not in view.
+    """
+    at = estimate.world_from_camera.inverse.apply(point)
+    pixel, inside = estimate.camera.project(at)
+    if not bool(inside):
+        return None
+    ray = estimate.camera.rays(pixel)
+    if float(np.abs(ray[:2] - at[:2] / at[2]).max()) > 0.01:
+        return None
+    return float(pixel[0]), float(pixel[1])
