@@ -11,6 +11,7 @@ from mavlink_bridge.config import BridgeConfig
 from mavlink_bridge.link.clock import SteadyUtc, monotonic_ns
 from mavlink_bridge.link.link import sleep_until
 from mavlink_bridge.messages import Figures, GimbalAttitude, VehicleState
+from mavlink_bridge.preflight.failsafes import PARAMETERS, failsafes
 from mavlink_bridge.preflight.parameters import ParameterClient
 from mavlink_bridge.preflight.rules import (
     Read,
@@ -94,6 +95,14 @@ def check_parameters(rules: Iterable[Rule], read: Read) -> list[Finding]:
             )
         findings.append(finding)
     return findings
+
+
+def check_failsafes(config: BridgeConfig, read: Read) -> list[Finding]:
+    """What the autopilot does once vision ends: advice, which is never written."""
+    return [
+        Finding(line.name, line.found, line.needed, line.why, line.ok, required=False)
+        for line in failsafes(config, read)
+    ]
 
 
 @dataclass(frozen=True)
@@ -268,6 +277,8 @@ def examine(config: BridgeConfig, say: Callable[[str], None] = lambda _: None) -
                 *arming_rules(config, source_set, client.read),
             ]
         findings += check_parameters(rules, client.read)
+        if state.autopilot != "px4":
+            findings += check_failsafes(config, client.read_known(PARAMETERS).get)
     return Diagnosis(tuple(findings), state)
 
 

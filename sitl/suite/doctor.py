@@ -10,7 +10,7 @@ from pathlib import Path
 import yaml
 
 from mavlink_bridge import BridgeConfig
-from mavlink_bridge.preflight.doctor import examine
+from mavlink_bridge.preflight.doctor import Diagnosis, examine
 from sitl.errors import SimulationError
 from sitl.suite.record import Doctor
 
@@ -31,8 +31,10 @@ def consult(config: BridgeConfig) -> Doctor:
     found = tuple(f.name for f in before.findings if not f.ok and f.fix is not None)
     _fix(config)
     after = examine(config)
-    left = tuple(f"{f.name} {f.found}" for f in after.findings if not f.ok)
-    return Doctor(found, left, before.exit_code, after.exit_code)
+    # A failsafe is the pilot's decision: told, and never written.
+    mended = Diagnosis(tuple(f for f in after.findings if f.required or f.fix is not None))
+    left = tuple(f"{f.name} {f.found}" for f in mended.findings if not f.ok)
+    return Doctor(found, left, before.exit_code, mended.exit_code)
 
 
 def _fix(config: BridgeConfig) -> None:

@@ -13,7 +13,12 @@ from mavlink_bridge import Bridge, BridgeConfig
 from mavlink_bridge.config import InjectionConfig, OriginConfig
 from mavlink_bridge.errors import ParameterError
 from mavlink_bridge.link.link import sleep_until
-from mavlink_bridge.preflight.doctor import check_parameters, examine, repair
+from mavlink_bridge.preflight.doctor import (
+    check_failsafes,
+    check_parameters,
+    examine,
+    repair,
+)
 from mavlink_bridge.preflight.parameters import ParameterClient, decode_value, encode_value
 from mavlink_bridge.preflight.rules import ardupilot_rules, arming_rules, find_source_set, px4_rules
 
@@ -34,6 +39,12 @@ GOOD = {
     "VISO_POS_Z": 0.0,
     "VISO_QUAL_MIN": 0.0,
     "GPS1_TYPE": 0.0,
+    "FS_EKF_ACTION": 1.0,
+    "FS_EKF_THRESH": 0.8,
+    "FS_DR_ENABLE": 0.0,
+    "FENCE_ENABLE": 1.0,
+    "FENCE_TYPE": 5.0,
+    "FENCE_ACTION": 2.0,
 }
 
 
@@ -281,3 +292,35 @@ def test_two_vehicles_on_the_link_are_a_required_failure(
     assert not autopilot.of("PARAM_REQUEST_READ")
     chosen = examine(config(autopilot.port).model_copy(update={"system_id": 1}))
     assert next(f for f in chosen.findings if f.name == "vehicles").ok
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "told"),
+    [
+        ("FS_EKF_ACTION", 0.0, {"FS_EKF_ACTION", "when vision ends"}),
+        ("FS_EKF_ACTION", 2.0, set()),
+        ("FS_EKF_ACTION", 3.0, {"FS_EKF_ACTION", "when vision ends"}),
+        ("FS_EKF_THRESH", 0.0, {"FS_EKF_THRESH"}),
+        ("FS_DR_ENABLE", 2.0, {"FS_DR_ENABLE"}),
+        ("FENCE_ENABLE", 0.0, {"FENCE_ENABLE"}),
+        ("FENCE_TYPE", 4.0, {"FENCE_TYPE"}),
+        ("FENCE_ACTION", 1.0, {"FENCE_ACTION"}),
+    ],
+)
+def test_what_happens_when_vision_ends_is_told_and_never_written(
+    name: str, value: float, told: set[str]
+) -> None:
+    findings = check_failsafes(config(), {**GOOD, name: value}.get)
+    assert {f.name for f in findings if not f.ok} == told
+    assert not any(f.required or f.fix is not None for f in findings)
+    ends = next(f for f in findings if f.name == "when vision ends")
+    lands = {0.0: "drifts on", 2.0: "ALT_HOLD"} if name == "FS_EKF_ACTION" else {}
+    assert lands.get(value, "LAND") in ends.found
+
+
+def test_a_vehicle_without_these_parameters_gets_no_such_line(autopilot: Any) -> None:
+    assert check_failsafes(config(), {}.get) == []
+    assert check_failsafes(config().model_copy(update={"mode": "off"}), GOOD.get) == []
+    autopilot.parameters = {"FS_EKF_ACTION": 1.0}
+    with ParameterClient(config(autopilot.port)) as client:
+        assert client.read_known(("FS_EKF_ACTION", "NO_SUCH")) == {"FS_EKF_ACTION": 1.0}
