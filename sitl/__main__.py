@@ -29,7 +29,8 @@ from sitl.demo.scenario import (
     ScenarioError,
     VehicleChoice,
     check_inside,
-    load_scenario,
+    named_scenario,
+    scenario_names,
 )
 from sitl.errors import SimulationError
 from sitl.suite.case import SCENARIOS, load_cases
@@ -47,6 +48,7 @@ _REPORT_FILES = (
     "truth.tum", "vehicle.csv", "vehicle.log",
 )  # fmt: skip
 
+_IDEAL = "a map that shares geometry and texture with the world, a perfect camera, no errors drawn"
 _LOG_WIDTH = 200
 _SUITE_KINDS: dict[str, tuple[VehicleKind, ...]] = {
     "embedded": ("embedded",),
@@ -66,7 +68,9 @@ def _group() -> None:
 def demo(
     seed: Annotated[int, typer.Option(min=0, help="world, traffic, light and noise")] = 0,
     fc: Annotated[str, typer.Option(help="auto, ardupilot or embedded")] = "auto",
-    scenario: Annotated[Path | None, typer.Option(help="scenario YAML; none: the default")] = None,
+    scenario: Annotated[
+        str | None, typer.Option(help="scenario YAML, or one of " + ", ".join(scenario_names()))
+    ] = None,
     injection: Annotated[
         str | None,
         typer.Option(
@@ -75,6 +79,7 @@ def demo(
     ] = None,
     out: Annotated[Path, typer.Option(help="folder of the report")] = Path("report"),
     worlds: Annotated[Path | None, typer.Option(help="folder of generated worlds")] = None,
+    ideal: Annotated[bool, typer.Option("--ideal", help=_IDEAL)] = False,
 ) -> None:
     """Fly a GNSS-denied mission on vision alone and report its accuracy."""
     kinds: dict[str, VehicleChoice] = {
@@ -82,14 +87,17 @@ def demo(
     }  # fmt: skip
     if fc not in kinds:
         raise ScenarioError(f"--fc is auto, ardupilot or embedded, not {fc!r}")
-    script = load_scenario(scenario) if scenario else Scenario()
+    script = named_scenario(scenario) if scenario else Scenario()
+    script = script.ideal() if ideal else script
     if injection is not None:
         if injection not in get_args(Injection):
             known = ", ".join(get_args(Injection))
             raise ScenarioError(f"--injection is one of {known}, not {injection!r}")
         script = Scenario.model_validate(script.model_dump() | {"injection": injection})
     console = Console()
-    assets = prepare(seed, worlds, lambda text: console.print(f"[dim]{text}[/]"))
+    assets = prepare(
+        seed, worlds, lambda text: console.print(f"[dim]{text}[/]"), script.world_m, ideal
+    )
     check_inside(script, assets.world.size_m)
     _clear(out)
     with shown_progress(console) as progress:
@@ -102,15 +110,19 @@ def demo(
 def sequence(
     out: Annotated[Path, typer.Argument(help="folder of the sequence")],
     seed: Annotated[int, typer.Option(min=0, help="world, traffic, light and noise")] = 0,
-    scenario: Annotated[Path | None, typer.Option(help="scenario YAML; none: the default")] = None,
+    scenario: Annotated[
+        str | None, typer.Option(help="scenario YAML, or one of " + ", ".join(scenario_names()))
+    ] = None,
     condition: Annotated[
         str | None,
         typer.Option(help="light and weather instead of the scenario's: " + ", ".join(CONDITIONS)),
     ] = None,
     worlds: Annotated[Path | None, typer.Option(help="folder of generated worlds")] = None,
+    ideal: Annotated[bool, typer.Option("--ideal", help=_IDEAL)] = False,
 ) -> None:
     """Record the scenario's path, flown without dynamics, as a sequence for `companion eval`."""
-    script = load_scenario(scenario) if scenario else Scenario()
+    script = named_scenario(scenario) if scenario else Scenario()
+    script = script.ideal() if ideal else script
     if condition is not None:
         if condition not in CONDITIONS:
             raise ScenarioError(f"--condition is one of {', '.join(CONDITIONS)}, not {condition!r}")
@@ -118,7 +130,9 @@ def sequence(
     if out.exists() and (not out.is_dir() or any(out.iterdir())):
         raise ScenarioError(f"{out}: exists already and is not empty; give another folder")
     console = Console()
-    assets = prepare(seed, worlds, lambda text: console.print(f"[dim]{text}[/]"))
+    assets = prepare(
+        seed, worlds, lambda text: console.print(f"[dim]{text}[/]"), script.world_m, ideal
+    )
     check_inside(script, assets.world.size_m)
     with console.status("rendering"):
         count = record_scenario(assets, script, seed, out)

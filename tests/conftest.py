@@ -58,7 +58,7 @@ def real_data() -> Callable[[str], Path]:
 @pytest.fixture(scope="session")
 def small_assets(tmp_path_factory: pytest.TempPathFactory) -> FlightAssets:
     """A 400 m world with both caches: 12 s of processor, so all tests share it."""
-    return prepare(5, tmp_path_factory.mktemp("worlds"), size_m=400.0)
+    return prepare(5, tmp_path_factory.mktemp("worlds"), size_m=400.0, ideal=True)
 
 
 @pytest.fixture(scope="session")
@@ -67,7 +67,7 @@ def small_sequence(small_assets: FlightAssets, tmp_path_factory: pytest.TempPath
     leg = Leg(east_m=0, north_m=26, height_m=80, gimbal_pitch_deg=-85)
     scenario = Scenario(
         takeoff_height_m=80, legs=(leg,), cars=2, people=2, camera=CameraSpec(rate_hz=5)
-    )
+    ).ideal()
     out = tmp_path_factory.mktemp("sequence")
     assert record_scenario(small_assets, scenario, 5, out) >= 25
     return out

@@ -27,10 +27,10 @@ from localizer.map.importers.rules import ImportRules
 from localizer.render.numba_raster import NumbaRenderer
 from localizer.synth.appearance.model import CONDITIONS, apply_appearance, sample_appearance
 from localizer.synth.config import SURVEY, WorldConfig
+from localizer.synth.visits.visit import Visit, draw_look
 from localizer.synth.world import build_visits
 from localizer.training.data.batches import tamed
 from localizer.training.data.pairs import look_at, soften
-from localizer.training.data.worlds import random_look
 from localizer.types import Image, RenderedView
 
 SIZE = (320, 240)
@@ -76,7 +76,7 @@ def load_views(name: str, folder: Path, data: Path, count: int) -> list[View]:
 def _make_world(home: Path) -> None:
     seed = int(home.name)
     rng = np.random.default_rng(seed)
-    visits = {home / "survey": ("survey", SURVEY), home / "day": ("live", random_look(rng))}
+    visits = {home / "survey": Visit("survey", SURVEY), home / "day": Visit("live", draw_look(rng))}
     info = build_visits(WorldConfig(seed, WORLD_M), visits, processes=1)[0]
     for folder in visits:
         build_cache(

@@ -28,9 +28,9 @@ from localizer.map.cache.stream import TileStreamer
 from localizer.map.importers.rules import ImportRules
 from localizer.render.numba_raster import NumbaRenderer
 from localizer.synth.appearance.model import CONDITIONS, apply_appearance, sample_appearance
+from localizer.synth.visits.texture import coarser, draw_texel, hard_surfaces, regrown
 from localizer.training.data.batches import tamed
 from localizer.training.data.pairs import SEASON, look_at, moved
-from localizer.training.places.changes import coarser, draw_texel, hard_surfaces, regrown
 from localizer.training.places.photos import read_photo
 from localizer.training.places.seasons import season_shift
 from localizer.types import Float32, Image, RenderedView

@@ -39,6 +39,10 @@ _ADVICE = {
         "the autopilot's position is off although vision may be right: late, refused or withheld",
         "events of injection, latency against bridge.injection.delay_ms, `companion doctor`",
     ),
+    "fixes in": Advice(
+        "fixes are further off than their own 95 % bound says, more often than 5 in 100",
+        "calibration and time stamps, which no single picture shows, and localizer.map_error_m",
+    ),
     "fixed targets": Advice(
         "coordinates given for places that stand still are off",
         "the targets' own lines: one bad target is an edge or a roof, all of them are the pose",

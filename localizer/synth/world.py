@@ -27,6 +27,7 @@ from localizer.synth.tiles.bake import Baker, Part, bake_block, start_worker
 from localizer.synth.tiles.coarse import assemble_root, assemble_top
 from localizer.synth.tiles.scene import Scene, make_scene
 from localizer.synth.tiles.write import write_tileset
+from localizer.synth.visits.visit import Visit
 
 _FORMAT = 1
 _INFO, _HEIGHTS = "world.json", "heights.npy"
@@ -137,18 +138,19 @@ def build_world(
     ``if __name__ == "__main__"`` guard in a script.
     """
     config = config or WorldConfig(seed, size_m)
-    return build_visits(config, {Path(out): (variant, look or look_of(variant))}, processes)[0]
+    visit = Visit(variant, look or look_of(variant))
+    return build_visits(config, {Path(out): visit}, processes)[0]
 
 
 def build_visits(
-    config: WorldConfig, visits: dict[Path, tuple[str, Look]], processes: int = 2
+    config: WorldConfig, visits: dict[Path, Visit], processes: int = 2
 ) -> list[WorldInfo]:
     """Several visits to one world: the plan is made once, each visit is painted to its folder."""
     plan = plan_world(config)
     infos = []
-    for folder, (name, look) in visits.items():
-        info = _info(plan, name)
-        _write_visit(plan, look, folder, info, processes)
+    for folder, visit in visits.items():
+        info = _info(plan, visit.name)
+        _write_visit(plan, visit, folder, info, processes)
         infos.append(info)
     return infos
 
@@ -169,12 +171,12 @@ def _info(plan: WorldPlan, variant: str) -> WorldInfo:
 
 
 def _write_visit(
-    plan: WorldPlan, look: Look, folder: Path, info: WorldInfo, processes: int
+    plan: WorldPlan, visit: Visit, folder: Path, info: WorldInfo, processes: int
 ) -> None:
     folder.mkdir(parents=True, exist_ok=True)
     for stale in (*folder.glob("*.glb"), folder / "tileset.json", folder / _INFO):
         stale.unlink(missing_ok=True)
-    scene = make_scene(plan, look)
+    scene = make_scene(plan, visit)
     baker = Baker(scene, folder)
     count = round(plan.config.size_m / BLOCK_M)
     places = [(column, row) for row in range(count) for column in range(count)]

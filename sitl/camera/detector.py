@@ -1,14 +1,14 @@
 """The operator's eye, simulated: pixels of known targets in each frame, sent as detections.
 
-It knows the truth, adds a pixel's noise and reports only what a viewer could see: in the picture
-and not hidden behind something nearer.
+It knows the truth and reports only what a viewer could see: in the picture and not hidden behind
+something nearer. It errs as detectors do (`DetectorErrors`).
 """
 
 from __future__ import annotations
 
 import socket
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
 from typing import Protocol
 
 import numpy as np
@@ -43,8 +43,34 @@ class FixedPoint:
         return self.position
 
 
+@dataclass(frozen=True)
+class DetectorErrors:
+    """noise_px: of a pixel, per axis. Shares of what is seen, each frame: missed; false, a
+    detection of nothing, anywhere in the picture, under a name of its own; swapped, two targets under each other's
+    names. box_centre: what moves is reported at the middle of its box, not where it stands.
+    """
+
+    noise_px: float = 1.0
+    missed: float = 0.0
+    false: float = 0.0
+    swapped: float = 0.0
+    box_centre: bool = False
+
+
 _MARGIN_PX = 6.0
+_HALF_HEIGHT_M = 0.75  # of a car, a person: the middle of its box above the ground
 _DEPTH_TOLERANCE = 0.02  # of the distance; a target lies on a surface that is drawn
+
+
+@dataclass(frozen=True)
+class DetectorView:
+    """A frame as the detector is given it. depth: (H, W) of the distorted picture; pose_of_row:
+    world_from_camera while a row is exposed.
+    """
+
+    time_ns: int
+    depth: Float32
+    pose_of_row: Callable[[float], Pose]
 
 
 class Detector:
@@ -55,35 +81,67 @@ class Detector:
         address: str,
         camera: Camera,
         targets: Sequence[Observed],
-        noise_px: float = 1.0,
+        errors: DetectorErrors | None = None,
         seed: int = 0,
     ) -> None:
         self._address = parse_host_port(address)
         self._camera = camera
         self._targets = tuple(targets)
-        self._noise_px = noise_px
+        self._errors = errors or DetectorErrors()
+        self._false = 0
         self._rng = np.random.default_rng([seed, 5])
         self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
 
-    def observe(self, time_ns: int, world_from_camera: Pose, depth: Float32) -> list[Detection]:
-        """Send and return what is visible in a frame. depth: (H, W) of the distorted picture."""
-        seen = []
-        for target in self._targets:
-            point = world_from_camera.inverse.apply(target.position_at(time_ns))
-            pixel = self._visible(point, depth)
-            if pixel is not None:
-                u, v = pixel + self._rng.normal(0.0, self._noise_px, 2)
-                seen.append(Detection(target.name, time_ns, float(u), float(v)))
-        for detection in seen:
+    def observe(self, view: DetectorView, stamp_ns: int | None = None) -> list[Detection]:
+        """Send and return what is reported of a frame. stamp_ns: of the frame in the stream, which
+        the detections carry; none: its true time.
+        """
+        stamp_ns = view.time_ns if stamp_ns is None else stamp_ns
+        seen = [d for t in self._targets if (d := self._detected(t, view, stamp_ns)) is not None]
+        reported = self._mistaken(seen, stamp_ns)
+        for detection in reported:
             self._socket.sendto(encode_detection(detection), self._address)
-        return seen
+        return reported
 
     def close(self) -> None:
         """Close the socket."""
         self._socket.close()
 
-    def _visible(self, point: Array, depth: Float32) -> Array | None:
+    def _detected(self, target: Observed, view: DetectorView, stamp_ns: int) -> Detection | None:
+        errors = self._errors
+        place = target.position_at(view.time_ns)
+        if errors.box_centre and not isinstance(target, FixedPoint):
+            place = place + np.array([0.0, 0.0, _HALF_HEIGHT_M])
+        pixel = self._visible(place, view)
+        if pixel is None or self._rng.random() < errors.missed:
+            return None
+        u, v = pixel + self._rng.normal(0.0, errors.noise_px, 2)
+        return Detection(target.name, stamp_ns, float(u), float(v))
+
+    def _mistaken(self, seen: list[Detection], stamp_ns: int) -> list[Detection]:
+        """What was seen, with two names exchanged or one too many, as often as `DetectorErrors`
+        says.
+        """
+        if not seen:
+            return seen
+        found = list(seen)
+        if len(found) > 1 and self._rng.random() < self._errors.swapped:
+            i, k = self._rng.choice(len(found), 2, replace=False)
+            a, b = found[i], found[k]
+            found[i], found[k] = replace(a, u=b.u, v=b.v), replace(b, u=a.u, v=a.v)
+        if self._rng.random() < self._errors.false:
+            u, v = self._rng.uniform((0, 0), (self._camera.width, self._camera.height))
+            self._false += 1
+            found.append(Detection(f"false{self._false}", stamp_ns, float(u), float(v)))
+        return found
+
+    def _visible(self, place: Array, view: DetectorView) -> Array | None:
+        depth = view.depth
+        point = view.pose_of_row(self._camera.height / 2 - 0.5).inverse.apply(place)
         pixel, inside = self._camera.project(point)
+        if inside:  # where it is while its own row is exposed
+            point = view.pose_of_row(float(pixel[1]) - 0.5).inverse.apply(place)
+            pixel, inside = self._camera.project(point)
         size = (self._camera.width, self._camera.height)
         if not inside or (pixel < _MARGIN_PX).any() or (pixel > np.array(size) - _MARGIN_PX).any():
             return None

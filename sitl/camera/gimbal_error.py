@@ -28,6 +28,12 @@ class GimbalError:
         self._wander = self._rng.normal(0.0, _WANDER_SIGMA, 3)
         self._time_ns: int | None = None
 
+    @property
+    def alignment_deg(self) -> tuple[float, float, float]:
+        """The constant part: roll, pitch, yaw."""
+        roll, pitch, yaw = np.degrees(self._alignment)
+        return float(roll), float(pitch), float(yaw)
+
     def true_angles(self, reported: GimbalAngles, time_ns: int) -> GimbalAngles:
         """The true angles at a time; times must not decrease."""
         self._advance(time_ns)

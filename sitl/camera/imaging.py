@@ -22,11 +22,19 @@ _NOISE_SIZE = 1 << 20
 _GRAY = (0.299, 0.587, 0.114)
 
 
-class Sensor:
-    """Applies one appearance to frame after frame; only the motion blur changes."""
+_BRIGHTNESS = 0.42  # of full scale: what automatic exposure aims at
+_FOLLOWS = 0.25  # of the way there that the gain goes from one picture to the next
+_GAIN = (0.5, 3.0)
 
-    def __init__(self, appearance: Appearance, seed: int = 0) -> None:
+
+class Sensor:
+    """Applies one appearance to frame after frame; the motion blur changes, and the gain where it
+    is automatic: it follows the last picture's brightness, and noise grows with it.
+    """
+
+    def __init__(self, appearance: Appearance, seed: int = 0, auto_exposure: bool = False) -> None:
         self._appearance = appearance
+        self._auto, self._gain = auto_exposure, 1.0
         self._rng = np.random.default_rng(seed)
         a = appearance
         self._is_simple = not (a.lamps or a.rain_streaks or a.snow_flakes or a.snow_cover)
@@ -37,6 +45,20 @@ class Sensor:
     def apply(self, rgb: Image, depth: Float32, blur_px: float, blur_deg: float) -> Image:
         """The picture (H, W, 3) of a rendered one; depth (H, W) in metres, 0 for sky."""
         a = replace(self._appearance, motion_blur_px=blur_px, motion_blur_deg=blur_deg)
+        if not self._auto:
+            return self._developed(rgb, depth, a)
+        gain = self._gain
+        gained = replace(
+            a, exposure=a.exposure * gain, shot_noise=a.shot_noise * float(np.sqrt(gain)),
+            read_noise=a.read_noise * gain,
+        )  # fmt: skip
+        image = self._developed(rgb, depth, gained)
+        level = max(float(image[::8, ::8].mean()) / 255.0, 1e-3)
+        wanted = gain * (_BRIGHTNESS / level) ** _FOLLOWS
+        self._gain = min(max(wanted, _GAIN[0]), _GAIN[1])
+        return image
+
+    def _developed(self, rgb: Image, depth: Float32, a: Appearance) -> Image:
         if not self._is_simple:
             return apply_appearance(rgb, depth, a, self._rng)
         gain, offset = _linear_tone(rgb, a)

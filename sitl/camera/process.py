@@ -29,10 +29,11 @@ from localizer.map.cache.stream import TileStreamer
 from localizer.render.numba_raster import NumbaRenderer
 from localizer.synth.appearance.model import Appearance
 from localizer.types import Image
-from sitl.camera.detector import Detector, Observed
+from sitl.camera.detector import Detector, DetectorErrors, DetectorView, Observed
 from sitl.camera.faults import FaultyLens, PictureFault
 from sitl.camera.movers import Mover
-from sitl.camera.stream import VideoSender
+from sitl.camera.realism import CameraRealism, Stamps
+from sitl.camera.stream import LossyLink, VideoSender
 from sitl.camera.true_motion import PoseTrack, TruthSample, camera_pose
 from sitl.camera.world_camera import CameraOptions, FrameLog, WorldCamera
 from sitl.errors import WorldCameraError
@@ -52,6 +53,7 @@ class WorldCameraConfig:
     cache: tiles of the live world. origin: of the map's ENU frame, in which truth samples and
     movers are given. log: where the true pose of every frame is written. threads: of the
     rasteriser. targets: what a `Detector` watches and reports to the address `detections`.
+    realism, detector_errors: what camera and detector have of a real one.
     """
 
     cache: Path
@@ -70,11 +72,14 @@ class WorldCameraConfig:
     misp: bool = True
     targets: tuple[Observed, ...] = ()
     detections: str | None = None
+    realism: CameraRealism = field(default_factory=CameraRealism)
+    detector_errors: DetectorErrors = field(default_factory=DetectorErrors)
 
 
 @dataclass(frozen=True)
 class CameraStatistics:
-    """What the process did. skipped: exposures left out because it was behind or paused.
+    """What the process did. skipped: exposures left out because it was behind or paused. lost:
+    datagrams of the stream.
 
     stage_ms: (p50, p95) of render, distort, appearance and encode.
     """
@@ -83,6 +88,7 @@ class CameraStatistics:
     skipped: int
     sent_bytes: int
     stage_ms: dict[str, tuple[float, float]]
+    lost: int = 0
 
 
 class WorldCameraProcess:
@@ -232,14 +238,21 @@ class _Studio:
                 cache.frame.ecef_from_enu.inverse @ self._frame.ecef_from_enu,
                 c.shutter_s,
                 c.seed,
+                c.realism,
             ),
         )
         self._log = FrameLog(c.log)
+        loss = c.realism.packet_loss
+        self._link = LossyLink(c.url, loss, c.seed) if loss > 0 else None
         self._sender = VideoSender(
-            c.url, c.camera.width, c.camera.height, c.rate_hz, bit_rate=c.bit_rate, misp=c.misp
-        )
+            c.url, c.camera.width, c.camera.height, c.rate_hz, bit_rate=c.bit_rate, misp=c.misp,
+            link=self._link,
+        )  # fmt: skip
+        self._stamps = Stamps(c.realism, c.seed)
         self._detector = (
-            Detector(c.detections, c.camera, c.targets, seed=c.seed) if c.detections else None
+            Detector(c.detections, c.camera, c.targets, c.detector_errors, c.seed)
+            if c.detections
+            else None
         )
         self._lens = FaultyLens(c.seed)
         self._outbox: deque[_Waiting] = deque()
@@ -253,6 +266,8 @@ class _Studio:
 
     def __exit__(self, *_: object) -> None:
         self._sender.close()
+        if self._link is not None:
+            self._link.close()
         if self._detector is not None:
             self._detector.close()
         self._log.close()
@@ -262,7 +277,8 @@ class _Studio:
     def run(self, inbox: queue.SimpleQueue[Message]) -> CameraStatistics:
         """Exposes at the configured rate as far as the truth is known, until told to stop."""
         period_ns = round(1e9 / self._config.rate_hz)
-        margin_ns = round(self._config.shutter_s * 0.5e9)
+        real = self._config.realism
+        margin_ns = round(max(self._config.shutter_s * 0.5e9, real.readout_ms * 0.5e6))
         due: int | None = None
         while True:
             self._handle(inbox.get())
@@ -303,17 +319,19 @@ class _Studio:
         if exposure is None:
             self._skipped += 1
             return
+        stamp_ns = self._stamps.of(time_ns)
         self._outbox.append(
             _Waiting(
                 time_ns + self._lens.delay_ns,
                 time_ns,
-                self._lens.stamp(time_ns),
+                self._lens.stamp(stamp_ns),
                 self._lens.picture(exposure.image),
             )
         )
         if self._detector is not None:
-            self._detector.observe(time_ns, exposure.world_from_camera, exposure.depth)
-        self._log.add(self._frames, time_ns, exposure.world_from_camera)
+            view = DetectorView(time_ns, exposure.depth, exposure.pose_of_row)
+            self._detector.observe(view, stamp_ns)
+        self._log.add(self._frames, stamp_ns, exposure.world_from_camera, time_ns)
         self._frames += 1
         for name, value in exposure.stage_ms.items():
             self._stages.setdefault(name, []).append(value)
@@ -328,4 +346,5 @@ class _Studio:
             name: (float(np.percentile(values, 50)), float(np.percentile(values, 95)))
             for name, values in self._stages.items()
         }
-        return CameraStatistics(self._frames, self._skipped, self._sender.sent_bytes, stages)
+        lost = self._link.lost if self._link is not None else 0
+        return CameraStatistics(self._frames, self._skipped, self._sender.sent_bytes, stages, lost)

@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import socket
 from fractions import Fraction
+from typing import Any
+from urllib.parse import urlsplit
 
 import av
 import numpy as np
@@ -13,13 +16,47 @@ from localizer.types import Image
 
 _CLOCK = Fraction(1, 90_000)  # MPEG-TS presentation clock, Hz
 _NS_PER_TICK = Fraction(1_000_000_000) * _CLOCK
+_DATAGRAM = 1316  # bytes: seven TS packets, what fits an Ethernet frame
+
+
+class LossyLink:
+    """A file that FFmpeg writes to: datagrams to ``udp://host:port``, some of which are lost."""
+
+    def __init__(self, url: str, loss: float, seed: int = 0) -> None:
+        parts = urlsplit(url)
+        if parts.scheme != "udp" or parts.hostname is None or parts.port is None:
+            raise ValueError(f"{url}: packets are lost on udp://host:port only")
+        self._address = (parts.hostname, parts.port)
+        self._loss = loss
+        self._rng = np.random.default_rng([seed, 37])
+        self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+        self._lost = 0
+
+    @property
+    def lost(self) -> int:
+        """Datagrams that were not sent."""
+        return self._lost
+
+    def write(self, data: bytes) -> int:
+        """Send the bytes, whole TS packets, in datagrams."""
+        for start in range(0, len(data), _DATAGRAM):
+            if self._rng.random() < self._loss:
+                self._lost += 1
+                continue
+            self._socket.sendto(data[start : start + _DATAGRAM], self._address)
+        return len(data)
+
+    def close(self) -> None:
+        """Close the socket."""
+        self._socket.close()
 
 
 class VideoSender:
     """Encodes and sends frames as they come.
 
     misp: stamp each picture with its exposure time (MISB ST 0604); without it the presentation
-    times are all that a receiver has. Every key frame (one a second) carries the headers, so that a
+    times are all that a receiver has. link: what the stream goes over instead of the url, to lose
+    packets on. Every key frame (one a second) carries the headers, so that a
     receiver may join at any time.
     """
 
@@ -32,15 +69,20 @@ class VideoSender:
         *,
         bit_rate: int = 4_000_000,
         misp: bool = True,
+        link: LossyLink | None = None,
     ) -> None:
         self._misp = misp
         self._encoder = _encoder(width, height, rate_hz, bit_rate)
         # The PES length lets a receiver end a picture with its last byte, not at the next one's
-        # first. 1316 bytes are seven TS packets, what fits an Ethernet frame.
+        # first.
         separator = "&" if "?" in url else "?"
+        target: Any = f"{url}{separator}pkt_size={_DATAGRAM}" if link is None else link
+        # Whole datagrams at once: FFmpeg hands its buffer over when it is full, or flushed.
+        buffer = 24 * _DATAGRAM
         self._container = av.open(
-            f"{url}{separator}pkt_size=1316",
+            target,
             "w",
+            buffer_size=buffer,
             format="mpegts",
             options={
                 "omit_video_pes_length": "0",

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import csv
 import time
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
 from types import TracebackType
@@ -20,13 +21,15 @@ from localizer.geometry.trajectory import StampedPose, tum_line
 from localizer.render.base import MapRenderer
 from localizer.synth.appearance.model import Appearance
 from localizer.types import Float32, Image, RenderedView
-from sitl.camera.distortion import Lens
+from sitl.camera.distortion import Lens, row_motion
 from sitl.camera.imaging import Sensor
 from sitl.camera.movers import Mover
+from sitl.camera.realism import CameraRealism, ShakenTrack, Vibration
 from sitl.camera.true_motion import PoseTrack
 
 FRAME_COLUMNS = (
     "exposure_time_ns", "sequence", "east_m", "north_m", "up_m", "qw", "qx", "qy", "qz",
+    "true_time_ns",
 )  # fmt: skip
 
 # A hazy late afternoon through a small sensor. The stream's own compression comes on top.
@@ -47,7 +50,8 @@ HAZY_AFTERNOON = Appearance(
 @dataclass(frozen=True)
 class Exposure:
     """One picture and its truth. image: (H, W, 3) uint8, distorted, with all of the appearance;
-    depth: (H, W), metres along the optical axis, distorted alike.
+    depth: (H, W), metres along the optical axis, distorted alike. world_from_camera: of the middle
+    row's exposure at time_ns; pose_of_row: of any row's.
     """
 
     image: Image
@@ -55,6 +59,7 @@ class Exposure:
     time_ns: int
     world_from_camera: Pose
     stage_ms: dict[str, float]
+    pose_of_row: Callable[[float], Pose]
 
 
 @dataclass(frozen=True)
@@ -63,13 +68,15 @@ class CameraOptions:
 
     scene_from_world: from the map's ENU, in which poses and movers are given, to that of the
     renderer's own cache (the two caches may have different origins). shutter_s: the motion during
-    it blurs the picture. seed: of the sensor's noise.
+    it blurs the picture. seed: of the sensor's noise and the vibration. realism: what a real camera
+    adds.
     """
 
     movers: tuple[Mover, ...] = ()
     scene_from_world: Pose = field(default_factory=Pose.identity)
     shutter_s: float = 0.005
     seed: int = 0
+    realism: CameraRealism = field(default_factory=CameraRealism)
 
 
 class WorldCamera:
@@ -85,24 +92,36 @@ class WorldCamera:
         options = options or CameraOptions()
         self.camera = camera
         self._renderer = renderer
-        self._lens = Lens.of(camera)
-        self._sensor = Sensor(appearance, options.seed)
+        real = options.realism
+        self._lens = Lens.of(camera, real.supersample, real.readout_ms > 0)
+        self._sensor = Sensor(appearance, options.seed, real.auto_exposure)
+        self._vibration = Vibration(real.vibration_deg, options.seed)
+        self._row_ns = real.readout_ms * 1e6 / camera.height
         self._movers = options.movers
         self._scene_from_world = options.scene_from_world
         self._shutter_ns = round(options.shutter_s * 1e9)
 
     def expose(self, time_ns: int, track: PoseTrack) -> Exposure | None:
         """The picture at a time; None where the track has no pose."""
-        pose = track.at(time_ns)
+        shaken = ShakenTrack(track, self._vibration)
+        pose = shaken.at(time_ns)
         if pose is None:
             return None
+
+        def pose_of_row(row: float) -> Pose:
+            away_ns = round((row + 0.5 - self.camera.height / 2) * self._row_ns)
+            return shaken.at(time_ns + away_ns) or pose
+
         start = time.perf_counter()
         view = self._render(pose, time_ns)
         rendered = time.perf_counter()
-        image = self._lens.distort(view.rgb)
-        depth = self._lens.distort_depth(view.depth)
+        if self._row_ns:
+            motion = row_motion(pose, pose_of_row, self.camera.height)
+            image, depth = self._lens.roll(view.rgb, view.depth, motion)
+        else:
+            image, depth = self._lens.distort(view.rgb), self._lens.distort_depth(view.depth)
         bent = time.perf_counter()
-        length_px, angle_deg = self._blur(track, pose, depth, time_ns)
+        length_px, angle_deg = self._blur(shaken, pose, depth, time_ns)
         image = self._sensor.apply(image, depth, length_px, angle_deg)
         done = time.perf_counter()
         stages = {
@@ -110,7 +129,7 @@ class WorldCamera:
             "distort": 1e3 * (bent - rendered),
             "appearance": 1e3 * (done - bent),
         }
-        return Exposure(image, depth, time_ns, pose, stages)
+        return Exposure(image, depth, time_ns, pose, stages, pose_of_row)
 
     def _render(self, pose: Pose, time_ns: int) -> RenderedView:
         extra = []
@@ -122,7 +141,7 @@ class WorldCamera:
         return self._renderer.render(scene, self._lens.pinhole, extra, wait=True)
 
     def _blur(
-        self, track: PoseTrack, pose: Pose, depth: Float32, time_ns: int
+        self, track: ShakenTrack, pose: Pose, depth: Float32, time_ns: int
     ) -> tuple[float, float]:
         """Length (pixels) and direction (degrees) of the motion during the shutter."""
         before = track.at(time_ns - self._shutter_ns // 2) or pose
@@ -155,10 +174,15 @@ class FrameLog:
         self._writer = csv.writer(self._file)
         self._writer.writerow(FRAME_COLUMNS)
 
-    def add(self, sequence: int, time_ns: int, world_from_camera: Pose) -> None:
-        """Append one frame; it is on disk when this returns."""
+    def add(
+        self, sequence: int, time_ns: int, world_from_camera: Pose, true_ns: int | None = None
+    ) -> None:
+        """Append one frame; it is on disk when this returns. time_ns: as the stream says, by which
+        estimates are matched; true_ns: of the exposure, where that is another.
+        """
         t, q = world_from_camera.translation, quaternion_from_matrix(world_from_camera.rotation)
         row = (time_ns, sequence, *(f"{x:.5f}" for x in t), *(f"{x:.9f}" for x in q))
+        row = (*row, time_ns if true_ns is None else true_ns)
         self._writer.writerow(row)
         self._file.flush()
         self._tum.write(tum_line(StampedPose("", world_from_camera, time_ns)) + "\n")

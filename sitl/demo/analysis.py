@@ -11,6 +11,9 @@ from companion.offline.tables import Columns, poses
 from localizer.evaluation.metrics import LocalizationMetrics, localization_metrics
 from localizer.geometry.pose import Array
 
+_MATCH_NS = 2_000_000
+_CHI2_95 = 5.991  # of two degrees of freedom
+
 
 @dataclass(frozen=True)
 class FrameErrors:
@@ -28,7 +31,7 @@ class FrameErrors:
 
 
 def frame_errors(
-    truth: Columns, estimates: Columns, span_ns: tuple[int, int], tolerance_ns: int = 2_000_000
+    truth: Columns, estimates: Columns, span_ns: tuple[int, int], tolerance_ns: int = _MATCH_NS
 ) -> FrameErrors:
     """Match estimates to exposed frames by exposure time and measure them."""
     inside = (truth["exposure_time_ns"] >= span_ns[0]) & (truth["exposure_time_ns"] <= span_ns[1])
@@ -83,12 +86,43 @@ class Spread:
         return cls(*(float(x) for x in (*np.percentile(finite, [50, 95]), finite.max())))
 
 
-def ekf_errors(vehicle: Columns, span_ns: tuple[int, int]) -> tuple[np.ndarray, Array, Array]:
-    """(times, horizontal error, vertical error) of the autopilot's position against the truth."""
+def ekf_errors(
+    vehicle: Columns, span_ns: tuple[int, int], shift_m: tuple[float, float, float] = (0, 0, 0)
+) -> tuple[np.ndarray, Array, Array]:
+    """(times, horizontal error, vertical error) of the autopilot's position against the truth, or
+    against where a map shows the truth that is shifted east, north and up.
+    """
     t = vehicle["time_ns"]
     inside = (t >= span_ns[0]) & (t <= span_ns[1])
-    d = [vehicle[f"ekf_{a}_m"][inside] - vehicle[f"{a}_m"][inside] for a in ("east", "north", "up")]
+    d = [
+        vehicle[f"ekf_{a}_m"][inside] - vehicle[f"{a}_m"][inside] - s
+        for a, s in zip(("east", "north", "up"), shift_m, strict=True)
+    ]
     return t[inside], np.hypot(d[0], d[1]), np.abs(d[2])
+
+
+def inside_bounds(truth: Columns, estimates: Columns, span_ns: tuple[int, int]) -> float | None:
+    """Per cent of accepted estimates whose horizontal error is within their own 95 % ellipse, by
+    the east and north sigmas that were reported; None without any.
+    """
+    stamps = np.asarray(truth["exposure_time_ns"])
+    if not len(estimates) or not len(stamps):
+        return None
+    accepted = np.asarray(estimates["accepted"]) > 0
+    times = np.asarray(estimates["exposure_time_ns"])
+    rows = np.flatnonzero(accepted & (times >= span_ns[0]) & (times <= span_ns[1]))
+    after = np.clip(np.searchsorted(stamps, times[rows]), 1, max(len(stamps) - 1, 1))
+    nearest = np.where(times[rows] - stamps[after - 1] < stamps[after] - times[rows],
+                       after - 1, after)  # fmt: skip
+    known = np.abs(stamps[nearest] - times[rows]) < _MATCH_NS
+    rows, nearest = rows[known], nearest[known]
+    if not len(rows):
+        return None
+    scaled = [
+        (estimates[f"{a}_m"][rows] - truth[f"{a}_m"][nearest]) / estimates[f"sigma_{a}_m"][rows]
+        for a in ("east", "north")
+    ]
+    return 100.0 * float((scaled[0] ** 2 + scaled[1] ** 2 <= _CHI2_95).mean())
 
 
 def target_errors(

@@ -1,4 +1,8 @@
-"""What a flight needs on disk: the world as surveyed and as it is today, and the caches of both."""
+"""What a flight needs on disk: the world as surveyed and as it is today, and the caches of both.
+
+By default what is flown over is another visit than the survey, with what changes between two visits
+and with a survey's own errors. The ideal world differs from its map by light, season and cars only.
+"""
 
 from __future__ import annotations
 
@@ -11,10 +15,11 @@ from pathlib import Path
 from localizer.map.building.build import build_cache
 from localizer.map.cache.cache import TileCache
 from localizer.synth.config import WorldConfig, look_of
+from localizer.synth.visits.visit import Visit, surveyed_and_lived
 from localizer.synth.world import WorldInfo, build_visits
 
 # Raised when generated worlds change, so that old ones are not flown by mistake.
-_GENERATION = 1
+_GENERATION, _IDEAL_GENERATION = 2, 1
 
 
 @dataclass(frozen=True)
@@ -39,9 +44,14 @@ def prepare(
     folder: Path | None = None,
     say: Callable[[str], None] = lambda _: None,
     size_m: float = 1600.0,
+    ideal: bool = False,
 ) -> FlightAssets:
-    """Build what is missing of a world, by the importer that users use; the rest is reused."""
-    home = (folder or default_folder()) / f"world-{_GENERATION}-{seed}-{size_m:.0f}"
+    """Build what is missing of a world, by the importer that users use; the rest is reused.
+
+    ideal: the map shares geometry and fine texture with what is flown over.
+    """
+    generation = _IDEAL_GENERATION if ideal else _GENERATION
+    home = (folder or default_folder()) / f"world-{generation}-{seed}-{size_m:.0f}"
     done = home / "complete"
     survey, live = home / "survey", home / "live"
     if not done.exists():
@@ -49,7 +59,11 @@ def prepare(
         home.mkdir(parents=True)
         say(f"generating world {seed} (a few minutes, once)")
         config = WorldConfig(seed, size_m)
-        visits = {survey: ("survey", look_of("survey")), live: ("live", look_of("live"))}
+        if ideal:
+            then, now = Visit("survey", look_of("survey")), Visit("live", look_of("live"))
+        else:
+            then, now = surveyed_and_lived(config)
+        visits = {survey: then, live: now}
         build_visits(config, visits)
         for visit in visits:
             say(f"importing the {visit.name} tileset")

@@ -30,17 +30,42 @@ class Criterion:
         return self.value <= self.limit
 
 
-def judge(localizer: LocalizationMetrics, ekf: Spread, fixed: Spread) -> tuple[Criterion, ...]:
-    """The targets of a flight. ekf: horizontal, m; fixed: 3-D errors of targets that stand, m."""
-    m = localizer
+@dataclass(frozen=True)
+class Judged:
+    """What is judged of a flight. ekf_m: horizontal, in the map's frame; fixed_m: 3-D errors of
+    targets that stand; inside: per cent of fixes within their own 95 % bound.
+    """
+
+    localizer: LocalizationMetrics
+    ekf_m: Spread
+    fixed_m: Spread
+    inside: float | None
+
+
+def judge(flight: Judged) -> tuple[Criterion, ...]:
+    """The targets of a flight."""
+    m = flight.localizer
     return (
-        Criterion("localizer median", m.median_translation_m, 1.0, "m"),
-        Criterion("localizer R@3", m.recall_3, 95.0, "%", at_least=True),
+        Criterion("localizer median", m.median_translation_m, 0.25, "m"),
+        Criterion("localizer R@3", m.recall_3, 100.0, "%", at_least=True),
         Criterion("completeness", m.completeness, 99.0, "%", at_least=True),
         Criterion("localized frames", m.fps, 8.0, "/s", at_least=True),
-        Criterion("EKF horizontal p95", ekf.p95, 3.0, "m"),
-        Criterion("fixed targets p95", fixed.p95, 3.0, "m"),
+        Criterion("EKF horizontal p95", flight.ekf_m.p95, 0.6, "m"),
+        Criterion("fixed targets p95", flight.fixed_m.p95, 3.0, "m"),
+        Criterion("fixes in their bound", flight.inside, 95.0, "%", at_least=True),
     )
+
+
+def headline(flight: Judged, home_error_m: float, denied_s: float) -> str:
+    """What was won, in one line: before anything that was missed."""
+    m, p95 = flight.localizer, flight.ekf_m.p95
+    median = m.median_translation_m
+    said = [f"came home on vision alone after {denied_s:.0f} s, {home_error_m:.1f} m from home"]
+    if p95 is not None:
+        said.append(f"EKF p95 {p95:.2f} m")
+    if median is not None:
+        said.append(f"localizer {median:.2f} m in the median, {m.completeness:.1f} % of frames")
+    return "; ".join(said)
 
 
 def latency_warning(latency_ms: Spread, delay_ms: float) -> str | None:

@@ -15,6 +15,7 @@ from pathlib import Path
 
 import numpy as np
 
+from companion.geometry import Mount
 from localizer.map.cache.cache import TileCache
 from localizer.synth.appearance.model import sample_appearance
 from sitl.camera.detector import Observed
@@ -24,6 +25,7 @@ from sitl.camera.pose_sender import enu, truth_feed
 from sitl.camera.process import CameraStatistics, WorldCameraConfig, WorldCameraProcess
 from sitl.camera.traffic import traffic
 from sitl.demo.assets import FlightAssets
+from sitl.demo.budget import FlightErrors, draw_errors
 from sitl.demo.companion_process import Ports, free_udp_port, running_companion, write_deployment
 from sitl.demo.scenario import Scenario, VehicleChoice
 from sitl.demo.script import FlightError, FlightScript, Progress
@@ -41,7 +43,9 @@ from sitl.vehicles.launch import (
 
 @dataclass(frozen=True)
 class FlightRecord:
-    """What a flight left behind. denied_ns: from GNSS off to the end of the mission."""
+    """What a flight left behind. denied_ns: from GNSS off to the end of the mission. errors: what
+    was drawn; gimbal_alignment_deg: roll, pitch, yaw that the gimbal does not report.
+    """
 
     folder: Path
     vehicle: str
@@ -50,6 +54,8 @@ class FlightRecord:
     home_error_m: float
     targets: tuple[Observed, ...]
     texts: tuple[str, ...]
+    errors: FlightErrors
+    gimbal_alignment_deg: tuple[float, float, float]
 
 
 def fly(
@@ -84,9 +90,10 @@ def fly(
         config = write_deployment(folder, assets, scenario, vehicle, ports)
         progress("starting the world camera", 0.0)
         filmed = FilmedFlight(assets, scenario, ports, seed, movers, targets)
+        errors, gimbal_error = draw_errors(scenario, seed), GimbalError(seed)
         camera = WorldCameraProcess(camera_config(filmed, folder))
         stack.enter_context(camera)
-        stack.enter_context(truth_feed(pilot, camera, cache, GimbalError(seed)))
+        stack.enter_context(truth_feed(pilot, camera, cache, gimbal_error, errors.map_shift_m))
         companion = stack.enter_context(running_companion(config, folder))
         run = FlightScript(pilot, scenario, home, folder, companion, progress)
         denied_ns = run.fly()
@@ -104,6 +111,8 @@ def fly(
         home_error_m,
         targets,
         texts,
+        errors,
+        gimbal_error.alignment_deg,
     )
 
 
@@ -142,16 +151,21 @@ class FilmedFlight:
 def camera_config(flight: FilmedFlight, folder: Path) -> WorldCameraConfig:
     """The world camera of a flight; its frames' true poses go to ``frames.csv`` in the folder."""
     assets, look = flight.assets, np.random.default_rng([flight.seed, 11])
+    errors = draw_errors(flight.scenario, flight.seed)
     return WorldCameraConfig(
         cache=assets.live_cache,
         origin=TileCache.open(assets.map_cache).manifest.origin,
-        camera=flight.scenario.camera.camera(),
+        camera=errors.camera,
         url=f"udp://127.0.0.1:{flight.ports.video}",
         log=folder / "frames.csv",
         rate_hz=flight.scenario.camera.rate_hz,
         appearance=sample_appearance(look, flight.scenario.condition),
         movers=flight.movers,
+        mount=Mount.from_degrees(lever_arm_m=errors.lever_arm_m),
         seed=flight.seed,
+        bit_rate=1000 * flight.scenario.camera.bit_rate_kbps,
+        realism=errors.realism,
+        detector_errors=errors.detector,
         targets=flight.targets,
         detections=f"127.0.0.1:{flight.ports.detections}",
     )

@@ -18,6 +18,7 @@ from sitl.camera.traffic import traffic
 from sitl.camera.true_motion import PoseTrack
 from sitl.camera.world_camera import CameraOptions, WorldCamera
 from sitl.demo.assets import FlightAssets
+from sitl.demo.budget import draw_errors
 from sitl.demo.scenario import Scenario
 from sitl.demo.sequence import record_sequence
 
@@ -59,19 +60,24 @@ def record_scenario(assets: FlightAssets, scenario: Scenario, seed: int, out: Pa
     movers = traffic(
         assets.world, cache.frame, cars=scenario.cars, people=scenario.people, seed=seed
     )
+    errors = draw_errors(scenario, seed)
     streamer = TileStreamer(live)
     try:
         camera = WorldCamera(
             NumbaRenderer(streamer),
-            scenario.camera.camera(),
+            errors.camera,
             sample_appearance(np.random.default_rng([seed, 11]), scenario.condition),
             CameraOptions(
-                movers, live.frame.ecef_from_enu.inverse @ cache.frame.ecef_from_enu, seed=seed
+                movers,
+                live.frame.ecef_from_enu.inverse @ cache.frame.ecef_from_enu,
+                seed=seed,
+                realism=errors.realism,
             ),
         )
         period_ns = round(1e9 / scenario.camera.rate_hz)
         times = range(path[0][0] + period_ns, path[-1][0] - period_ns, period_ns)
-        return record_sequence(camera, track, times, cache.frame, out)
+        calibrated = scenario.camera.camera()
+        return record_sequence(camera, track, times, cache.frame, out, calibrated)
     finally:
         streamer.close()
 

@@ -40,11 +40,12 @@ from sitl.demo.analysis import (
     Spread,
     ekf_errors,
     frame_errors,
+    inside_bounds,
     localization_summary,
     stage_latencies,
     target_errors,
 )
-from sitl.demo.criteria import Criterion, judge, latency_warning
+from sitl.demo.criteria import Criterion, Judged, headline, judge, latency_warning
 from sitl.demo.flight import FlightRecord
 from sitl.demo.scenario import Scenario
 
@@ -59,9 +60,13 @@ class FlightReport:
 
     localizer: the paper's columns over processed frames, and the spreads of its accepted estimates'
     errors; completeness_sent: per cent of all frames that the camera sent in the span with an
-    accepted estimate. targets: name to 3-D error. warning: of late estimates.
+    accepted estimate. ekf_in_map_m: against where the map shows the vehicle, ekf_horizontal_m:
+    against where GNSS would have it; the map lies map_shift_m beside GNSS. inside_bound: per cent
+    of fixes within their own 95 % ellipse. targets: name to 3-D error, in the map's frame. warning:
+    of late estimates. won: the flight in one line.
     """
 
+    won: str
     vehicle: str
     denied_s: float
     flown_m: float
@@ -73,6 +78,9 @@ class FlightReport:
     frames_sent: int
     frames_dropped: int
     ekf_horizontal_m: Spread
+    ekf_in_map_m: Spread
+    map_shift_m: tuple[float, float, float]
+    inside_bound: float | None
     ekf_vertical_m: Spread
     home_error_m: float
     fixed_targets_m: Spread
@@ -93,7 +101,9 @@ def make_report(record: FlightRecord, scenario: Scenario, seed: int) -> FlightRe
     targets = read_columns(folder / "companion" / "targets.csv", text=("target_id", "visibility"))
     vehicle = read_columns(folder / "vehicle.csv")
     errors = frame_errors(truth, estimates, span)
-    ekf_times, horizontal, vertical = ekf_errors(vehicle, span)
+    shift_m = record.errors.map_shift_m
+    _, absolute, _ = ekf_errors(vehicle, span)
+    ekf_times, horizontal, vertical = ekf_errors(vehicle, span, shift_m)
     by_target = _target_errors(record, targets)
     still = {t.name for t in record.targets if isinstance(t, FixedPoint)}
     fixed = [e for name, e in by_target.items() if name in still]
@@ -102,11 +112,15 @@ def make_report(record: FlightRecord, scenario: Scenario, seed: int) -> FlightRe
     accepted = np.isfinite(errors.translation_m)
     config = load_config(folder / "companion.yaml")
     summary = localization_summary(errors)
-    ekf, fixed_targets = Spread.of(horizontal), Spread.of(np.concatenate([*fixed, np.empty(0)]))
+    fixed_targets = Spread.of(np.concatenate([*fixed, np.empty(0)]))
+    inside = inside_bounds(truth, estimates, span)
+    judged = Judged(summary, Spread.of(horizontal), fixed_targets, inside)
+    denied_s = (span[1] - span[0]) * 1e-9
     stages = stage_latencies(estimates, span)
     report = FlightReport(
+        won=headline(judged, record.home_error_m, denied_s),
         vehicle=record.vehicle,
-        denied_s=(span[1] - span[0]) * 1e-9,
+        denied_s=denied_s,
         flown_m=_flown(vehicle, span),
         localizer=summary,
         localizer_m=Spread.of(errors.translation_m),
@@ -115,7 +129,10 @@ def make_report(record: FlightRecord, scenario: Scenario, seed: int) -> FlightRe
         completeness_sent=100.0 * float(accepted.mean()) if len(accepted) else 0.0,
         frames_sent=len(accepted),
         frames_dropped=int((~errors.processed).sum()),
-        ekf_horizontal_m=ekf,
+        ekf_horizontal_m=Spread.of(absolute),
+        ekf_in_map_m=judged.ekf_m,
+        map_shift_m=shift_m,
+        inside_bound=inside,
         ekf_vertical_m=Spread.of(vertical),
         home_error_m=record.home_error_m,
         fixed_targets_m=fixed_targets,
@@ -124,7 +141,7 @@ def make_report(record: FlightRecord, scenario: Scenario, seed: int) -> FlightRe
         target_fixes={name: len(e) for name, e in by_target.items()},
         stages_ms=stages,
         camera_ms=record.camera.stage_ms,
-        criteria=judge(summary, ekf, fixed_targets),
+        criteria=judge(judged),
         warning=latency_warning(stages["latency"], config.bridge.injection.delay_ms),
     )
     _write_json(folder, report, record, scenario, seed, config)
@@ -161,6 +178,7 @@ def _write_json(
         "seed": seed,
         "features": load_extractor(config.localizer.model).name,
         "scenario": scenario.model_dump(mode="json"),
+        "errors": asdict(record.errors) | {"gimbal_alignment_deg": record.gimbal_alignment_deg},
         "config": config.model_dump(mode="json"),
         "texts": list(record.texts),
     }
@@ -292,6 +310,7 @@ def _overlays(
 def print_report(report: FlightReport, folder: Path) -> None:
     """The tables that end a flight."""
     console = Console()
+    console.print(f"[bold green]{report.won}[/]", highlight=False)
     m = report.localizer
     table = Table(title=f"GNSS denied for {report.denied_s:.0f} s, {report.flown_m:.0f} m flown "
                         f"({report.vehicle})")  # fmt: skip
@@ -307,9 +326,13 @@ def print_report(report: FlightReport, folder: Path) -> None:
     _add(
         table,
         "EKF horizontal, m",
-        report.ekf_horizontal_m,
+        report.ekf_in_map_m,
         f"{report.home_error_m:.1f} m from home at end",
     )
+    shift_m = float(np.hypot(*report.map_shift_m[:2]))
+    if shift_m > 0:
+        _add(table, "EKF against GNSS, m", report.ekf_horizontal_m,
+             f"the map lies {shift_m:.1f} m beside GNSS")  # fmt: skip
     _add(table, "EKF vertical, m", report.ekf_vertical_m, "")
     _add(table, "fixed targets, m", report.fixed_targets_m, "3-D")
     _add(table, "moving targets, m", report.moving_targets_m, "3-D, every car seen")

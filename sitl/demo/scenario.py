@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Literal
+from typing import Annotated, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
@@ -13,7 +13,11 @@ from localizer.geometry.camera import Camera
 from sitl.errors import SimulationError
 
 VehicleChoice = Literal["auto", "ardupilot", "embedded"]
+Shift = Annotated[float, Field(ge=0, le=50)]
 Injection = Literal["vision_position_estimate", "odometry", "gps_input"]
+
+
+DEMO_SCENARIOS = Path(__file__).parents[1] / "scenarios" / "demo"
 
 
 class ScenarioError(SimulationError):
@@ -35,6 +39,44 @@ class Leg(_Model):
     gimbal_pitch_deg: float = Field(-75.0, ge=-90, le=0)
 
 
+class ErrorSpec(_Model):
+    """How wrong the deployment is about the aircraft: standard deviations (`map_shift_m`: least and
+    most) from which each flight draws. The defaults are what a careful calibration leaves.
+    """
+
+    focal_percent: float = Field(0.1, ge=0, le=5, description="of the focal length")
+    principal_px: float = Field(0.7, ge=0, le=50, description="of the principal point, per axis")
+    distortion: float = Field(0.003, ge=0, le=0.1, description="of k1; k2 as much, p1, p2 a tenth")
+    lever_arm_m: float = Field(0.05, ge=0, le=2, description="camera to autopilot, per axis")
+    stamp_offset_ms: float = Field(3.0, ge=0, le=200, description="of the camera's clock")
+    stamp_jitter_ms: float = Field(2.0, ge=0, le=100, description="from picture to picture")
+    map_shift_m: tuple[Shift, Shift] = Field(
+        (0.3, 1.5), description="least and most that the map lies beside GNSS, horizontally"
+    )
+    map_shift_up_m: float = Field(0.3, ge=0, le=10)
+    detector_px: float = Field(1.0, ge=0, le=50)
+    detector_missed: float = Field(0.1, ge=0, lt=1, description="share of frames, per target")
+    detector_false: float = Field(0.02, ge=0, lt=1, description="share of frames")
+    detector_swapped: float = Field(0.01, ge=0, lt=1, description="share of frames")
+    detector_box_centre: bool = Field(True, description="of what moves, not its ground point")
+
+    @classmethod
+    def none(cls) -> ErrorSpec:
+        """A deployment that knows the aircraft exactly, and an eye that errs by a pixel."""
+        return cls(
+            focal_percent=0, principal_px=0, distortion=0, lever_arm_m=0, stamp_offset_ms=0,
+            stamp_jitter_ms=0, map_shift_m=(0.0, 0.0), map_shift_up_m=0, detector_missed=0,
+            detector_false=0, detector_swapped=0, detector_box_centre=False,
+        )  # fmt: skip
+
+    @model_validator(mode="after")
+    def _in_order(self) -> ErrorSpec:
+        least, most = self.map_shift_m
+        if least > most:
+            raise ValueError(f"map_shift_m: the least, {least:g}, is more than the most, {most:g}")
+        return self
+
+
 class CameraSpec(_Model):
     """The world camera's video. H.264 of this chroma format takes even sizes only."""
 
@@ -43,6 +85,12 @@ class CameraSpec(_Model):
     horizontal_fov_deg: float = Field(65.0, gt=20, lt=120)
     distortion: tuple[float, float, float, float, float] = (-0.09, 0.02, 0.0006, -0.0004, 0.0)
     rate_hz: float = Field(10.0, ge=0.5, le=60)
+    bit_rate_kbps: int = Field(2500, ge=200, le=50_000)
+    packet_loss: float = Field(1e-4, ge=0, le=0.2, description="share of the stream's datagrams")
+    readout_ms: float = Field(20.0, ge=0, le=60, description="rolling shutter, first to last row")
+    vibration_deg: float = Field(0.02, ge=0, le=1, description="root mean square per axis")
+    auto_exposure: bool = True
+    supersample: float = Field(1.25, ge=1, le=4, description="rendered pixels per pixel and axis")
 
     @model_validator(mode="after")
     def _is_a_lens(self) -> CameraSpec:
@@ -71,7 +119,7 @@ _LEGS = (
 
 
 class Scenario(_Model):
-    """One GNSS-denied flight."""
+    """One GNSS-denied flight, by default as wrong and rough as a real one (`ideal` is neither)."""
 
     takeoff_height_m: float = Field(120.0, gt=20, le=1000)
     deny_after_s: float = Field(
@@ -79,13 +127,26 @@ class Scenario(_Model):
     )
     speed_m_s: float = Field(10.0, ge=0.5, le=25)
     legs: tuple[Leg, ...] = Field(_LEGS, min_length=1)
+    world_m: float = Field(
+        1600.0, ge=400, le=8000, multiple_of=400, description="side of the world"
+    )
     camera: CameraSpec = CameraSpec()
+    errors: ErrorSpec = ErrorSpec()
     condition: Literal["day", "dusk", "night", "fog", "rain", "snow"] = "day"
     cars: int = Field(30, ge=1, le=2000)
     people: int = Field(40, ge=0, le=2000)
     localizer_width: int = Field(320, ge=64, le=2048, description="the localizer's working width")
     injection: Injection = "vision_position_estimate"
     injection_delay_ms: float = Field(220.0, ge=0, le=250, description="VISO_DELAY_MS")
+
+    def ideal(self) -> Scenario:
+        """The same flight with a perfect camera and a deployment that knows it."""
+        perfect = {
+            "bit_rate_kbps": 4000, "packet_loss": 0.0, "readout_ms": 0.0, "vibration_deg": 0.0,
+            "auto_exposure": False, "supersample": 1.0,
+        }  # fmt: skip
+        camera = self.camera.model_copy(update=perfect)
+        return self.model_copy(update={"camera": camera, "errors": ErrorSpec.none()})
 
 
 def load_scenario(path: Path) -> Scenario:
@@ -94,6 +155,23 @@ def load_scenario(path: Path) -> Scenario:
         return validated(Scenario, read_settings(path, ScenarioError))
     except SettingsError as error:
         raise ScenarioError(f"{path}:\n{error}") from error
+
+
+def scenario_names() -> tuple[str, ...]:
+    """The flights that are shipped."""
+    return tuple(sorted(path.stem for path in DEMO_SCENARIOS.glob("*.yaml")))
+
+
+def named_scenario(name: str) -> Scenario:
+    """A scenario file by its path, or a shipped one by its name."""
+    shipped = DEMO_SCENARIOS / f"{name}.yaml"
+    if shipped.exists() and not Path(name).exists():
+        return load_scenario(shipped)
+    if Path(name).suffix in (".yaml", ".yml") or Path(name).exists():
+        return load_scenario(Path(name))
+    raise ScenarioError(
+        f"no scenario {name!r}; there are: {', '.join(scenario_names())}, or give a file.yaml"
+    )
 
 
 def check_inside(scenario: Scenario, size_m: float) -> None:

@@ -8,6 +8,7 @@ from pathlib import Path
 
 import cv2
 
+from localizer.geometry.camera import Camera
 from localizer.geometry.geo import LocalFrame
 from localizer.geometry.posefile import PoseRow, pose_row, write_poses
 from sitl.camera.true_motion import PoseTrack
@@ -17,11 +18,17 @@ _JPEG_QUALITY = 92
 
 
 def record_sequence(
-    camera: WorldCamera, track: PoseTrack, times_ns: Iterable[int], frame: LocalFrame, out: Path
+    camera: WorldCamera,
+    track: PoseTrack,
+    times_ns: Iterable[int],
+    frame: LocalFrame,
+    out: Path,
+    calibrated: Camera | None = None,
 ) -> int:
     """Writes the pictures at the given times; returns how many (times off the track have none).
 
-    frame: the ENU frame of the track. ``images/timestamps.txt`` keeps the exposure times.
+    calibrated: what the evaluation is told of the camera, where that is not the truth. frame: the
+    ENU frame of the track. ``images/timestamps.txt`` keeps the exposure times.
     """
     images = out / "images"
     images.mkdir(parents=True, exist_ok=True)
@@ -38,5 +45,6 @@ def record_sequence(
         stamps.append(f"{name} {time_ns}\n")
     write_poses(out / "poses.txt", rows)
     (images / "timestamps.txt").write_text("".join(stamps), encoding="utf-8")
-    (out / "camera.json").write_text(json.dumps(camera.camera.to_dict(), indent=2) + "\n")
+    told = (calibrated or camera.camera).to_dict()
+    (out / "camera.json").write_text(json.dumps(told, indent=2) + "\n")
     return len(rows)

@@ -183,12 +183,10 @@ def _ground_albedo(material, x, y, angle, spacing, seed, dryness, crop, leaf, rg
 
 
 @njit(cache=True, nogil=True, fastmath=True)
-def paint_ground(  # type: ignore[no-untyped-def]
-    region, material, tint, shape, west, north, gsd,
-    heights, slope_e, slope_n, spacing, half,
-    ceiling, ambient, light_west, light_north, light_gsd, sun, sun_rgb, sky_rgb, season, out,
-):  # fmt: skip
-    """Colour and light of a ground window: region ids (H, W) to out (H, W, 3) uint8."""
+def paint_albedo(region, material, tint, shape, west, north, gsd, season, moved, out):  # type: ignore[no-untyped-def]
+    """Colour of a ground window without its light: region ids (H, W) to out (H, W, 3) float32 in
+    0 to 255. moved: (2,) metres by which the fine texture is another place's.
+    """
     rgb = np.empty(3)
     for i in range(region.shape[0]):
         y = north - (i + 0.5) * gsd
@@ -196,9 +194,23 @@ def paint_ground(  # type: ignore[no-untyped-def]
             x = west + (j + 0.5) * gsd
             k = region[i, j]
             _ground_albedo(
-                material[k], x, y, shape[k, 0], shape[k, 1], shape[k, 2],
+                material[k], x + moved[0], y + moved[1], shape[k, 0], shape[k, 1], shape[k, 2],
                 season[0], season[1], season[2], rgb,
             )  # fmt: skip
+            for c in range(3):
+                out[i, j, c] = rgb[c] * tint[k, c]
+
+
+@njit(cache=True, nogil=True, fastmath=True)
+def light_ground(  # type: ignore[no-untyped-def]
+    albedo, west, north, gsd, heights, slope_e, slope_n, spacing, half,
+    ceiling, ambient, light_west, light_north, light_gsd, sun, sun_rgb, sky_rgb, out,
+):  # fmt: skip
+    """A ground window in its light: albedo (H, W, 3) as of `paint_albedo` to out uint8."""
+    for i in range(albedo.shape[0]):
+        y = north - (i + 0.5) * gsd
+        for j in range(albedo.shape[1]):
+            x = west + (j + 0.5) * gsd
             u, v = (x + half) / spacing, (y + half) / spacing
             z = bilinear(heights, u, v)
             ge, gn = bilinear(slope_e, u, v), bilinear(slope_n, u, v)
@@ -210,4 +222,4 @@ def paint_ground(  # type: ignore[no-untyped-def]
             direct = cosine * (1 - shadow)
             for c in range(3):
                 light = sky_rgb[c] * sky + sun_rgb[c] * direct
-                out[i, j, c] = as_byte(rgb[c] * tint[k, c] * light)
+                out[i, j, c] = as_byte(albedo[i, j, c] * light)

@@ -54,6 +54,9 @@ from localizer.synth.plan.town import (
     plant_street_trees,
 )
 
+_SITES = 0.06  # of the buildings
+_SITE_TRIES = 40  # most ground is taken
+
 
 def assign_zones(config: WorldConfig, lattice: Lattice, terrain: Terrain
            ) -> dict[tuple[int, int], Zone]:  # fmt: skip
@@ -176,8 +179,28 @@ def _finish(planner: Planner) -> WorldPlan:
     ]
     return WorldPlan(
         config, terrain, planner.ground.regions(), planner.ground.shapes(), planner.buildings,
-        trees, hedges, slots, _targets(planner), _roads(planner),
+        trees, hedges, slots, _targets(planner), _roads(planner), _sites(planner),
     )  # fmt: skip
+
+
+def _sites(planner: Planner) -> tuple[Building, ...]:
+    """Free plots near houses, with what may be built there; the plan itself has none of it."""
+    rng = planner.config.rng(60)
+    standing = list(planner.buildings)
+    if not standing:
+        return ()
+    for _ in range(_SITE_TRIES * max(1, round(_SITES * len(standing)))):
+        beside = standing[int(rng.integers(len(standing)))]
+        turn, reach = rng.uniform(0, 2 * np.pi), rng.uniform(14, 45)
+        at = np.array(beside.centre) + reach * np.array([np.cos(turn), np.sin(turn)])
+        kind = Kind(rng.choice(["gable", "hip", "flat", "barn"]))
+        length, width = rng.uniform(9, 18), rng.uniform(8, 12)
+        planner.place(rng, kind, at, beside.angle, length, width, rng.uniform(3, 8), 2.5)
+        if len(planner.buildings) >= (1 + _SITES) * len(standing):
+            break
+    sites = tuple(planner.buildings[len(standing) :])
+    del planner.buildings[len(standing) :]
+    return sites
 
 
 def _roads(planner: Planner) -> tuple[Array, ...]:

@@ -74,7 +74,8 @@ class Target:
 @dataclass(frozen=True)
 class WorldPlan:
     """Everything static, before it is meshed and painted. slots: (N, 4) parking places: x, y,
-    heading, readiness (share of visits at which it tends to be taken)."""
+    heading, readiness (share of visits at which it tends to be taken). sites: free ground where
+    something may be built later."""
 
     config: WorldConfig
     terrain: Terrain
@@ -86,3 +87,4 @@ class WorldPlan:
     slots: Array
     targets: tuple[Target, ...]
     roads: tuple[Array, ...]
+    sites: tuple[Building, ...] = ()

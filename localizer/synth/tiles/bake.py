@@ -17,8 +17,8 @@ from localizer.synth.buildings.model import LEAF, MID, NEAR_LEVELS, ROOT, TOP, B
 from localizer.synth.config import BLOCK_M, LEAF_GSD_M, LEAF_M, TOP_M
 from localizer.synth.paint.covers import Cover, Light, new_image
 from localizer.synth.paint.facades import paint_surface
-from localizer.synth.paint.ground import paint_ground
-from localizer.synth.paint.ground_plan import Shape, rasterize, shape_bounds
+from localizer.synth.paint.ground import light_ground, paint_albedo
+from localizer.synth.paint.ground_plan import Material, Shape, rasterize, shape_bounds
 from localizer.synth.paint.lighting import DSM_GSD_M, make_light
 from localizer.synth.tiles.charts import ChartedMesh, pack
 from localizer.synth.tiles.props import CAR_COLOURS, car_image, car_shape
@@ -26,15 +26,23 @@ from localizer.synth.tiles.scene import Scene, car_positions, hedge_quads
 from localizer.synth.tiles.terrain_mesh import terrain_mesh
 from localizer.synth.tiles.vegetation import crown_images, tree_meshes
 from localizer.synth.tiles.write import TileNode, glb_bytes
-from localizer.types import Image
+from localizer.synth.visits.noise import noise
+from localizer.synth.visits.texture import regrown, wetted
+from localizer.types import Float32, Image
 
 _LIGHT_MARGIN_M = 60.0  # objects belong to the tile of their middle and reach out of it
 _GUTTER_PX, _PAD_PX = 16, 4
 _MAX_CHART_PX = 800
 _CAR_PX_PER_M = 16
+_PATCH_M = 2.0  # resolution of wet and dry patches
 _GRID = {LEAF: 1, MID: 2, TOP: 4, ROOT: 8}  # terrain cells merged per side
 _NAMES = {LEAF: "leaf", MID: "mid", TOP: "top", ROOT: "root"}
 _SIDE_M = {LEAF: LEAF_M, MID: BLOCK_M, TOP: TOP_M}
+_SOFT = (
+    Material.MEADOW, Material.LAWN, Material.TURF, Material.CROP, Material.SOIL, Material.GRAIN,
+    Material.FOREST, Material.WATER, Material.BED, Material.BANK,
+)  # fmt: skip
+_IS_SOFT = np.isin(np.arange(len(Material)), _SOFT)  # by material: its fine texture does not last
 
 
 @dataclass(frozen=True)
@@ -110,13 +118,19 @@ class Baker:
         uv = (st * ground.shape[0] + atlas.ground) / size
         uv_shown = (shown.st + atlas.offsets[shown.chart]) / size if len(shown.st) else shown.st
         positions = np.concatenate([points, shown.positions])
+        faces = np.concatenate([faces, shown.faces + len(points)])
+        survey = self.scene.visit.survey
+        if survey is not None:
+            if level & NEAR_LEVELS:
+                world_m = self.scene.plan.config.size_m
+                faces = faces[survey.without_holes(positions, faces, world_m)]
+            positions = survey.displaced(positions)
         origin = np.array([west + side / 2, north - side / 2, float(points[:, 2].mean())])
         origin = np.round(origin, 3)
         local = (positions - origin).astype(np.float32)
         data = glb_bytes(
-            local, np.concatenate([uv, uv_shown]).astype(np.float32),
-            np.concatenate([faces, shown.faces + len(points)]), atlas.image,
-        )  # fmt: skip
+            local, np.concatenate([uv, uv_shown]).astype(np.float32), faces, atlas.image
+        )
         uri = f"{_NAMES[level]}_{place[0]}_{place[1]}.glb"
         (self.folder / uri).write_bytes(data)
         low, high = local.min(0).astype(float), local.max(0).astype(float)
@@ -146,7 +160,8 @@ class Baker:
         right = min(n, int((west + BLOCK_M + margin - scene.west) / DSM_GSD_M))
         bottom = min(n, int((scene.north - north + BLOCK_M + margin) / DSM_GSD_M))
         window = (top, left, bottom - top, right - left)
-        return make_light(scene.dsm, scene.ground, scene.west, scene.north, window, scene.look)
+        look = scene.visit.look
+        return make_light(scene.dsm, scene.ground, scene.west, scene.north, window, look)
 
     def _ground(self, west: float, north: float, light: Light) -> Image:
         plan = self.scene.plan
@@ -156,14 +171,56 @@ class Baker:
         near &= (b[:, 1] < north) & (b[:, 3] > north - BLOCK_M)
         shapes: list[Shape] = [plan.shapes[k] for k in np.flatnonzero(near)]
         region = rasterize(shapes, west, north, LEAF_GSD_M, (n, n))
+        albedo = self._albedo(region, west, north, light)
         out = new_image(n, n)
-        paint_ground(
-            region, plan.regions.material, plan.regions.tint, plan.regions.shape,
-            west, north, LEAF_GSD_M, plan.terrain.heights, *self._slopes,
+        light_ground(
+            albedo, west, north, LEAF_GSD_M, plan.terrain.heights, *self._slopes,
             plan.terrain.spacing_m, plan.terrain.half_m, light.ceiling, light.ambient, light.west,
-            light.north, light.gsd_m, light.sun, light.sun_rgb, light.sky_rgb, light.season, out,
+            light.north, light.gsd_m, light.sun, light.sun_rgb, light.sky_rgb, out,
+        )  # fmt: skip
+        survey = self.scene.visit.survey
+        return out if survey is None else survey.photographed(out, LEAF_GSD_M)
+
+    def _albedo(self, region: NDArray[np.uint16], west: float, north: float, light: Light
+                ) -> Float32:  # fmt: skip
+        """Colours (n, n, 3) of a block's ground, 0 to 255, with what grew anew at this visit."""
+        albedo = self._painted(region, west, north, light, np.zeros(2))
+        changes = self.scene.visit.changes
+        if changes is None or not changes.regrown:
+            return albedo
+        plan = self.scene.plan
+        # The same draw in every block, so that what is drawn does not change at its border.
+        rng = plan.config.rng(63, changes.seed)
+        anew = self._painted(region, west, north, light, rng.uniform(2000, 9000, 2))
+        lasting = np.where(_IS_SOFT[plan.regions.material], np.float32(0), np.float32(1))[region]
+        scale = np.float32(255)
+        albedo = regrown(albedo / scale, lasting, LEAF_GSD_M, rng, anew / scale)
+        wet = wetted(albedo, lasting, rng, self._patches(west, north, len(region)))
+        return np.asarray(wet * scale, np.float32)
+
+    def _painted(
+        self, region: NDArray[np.uint16], west: float, north: float, light: Light, moved: Array
+    ) -> Float32:
+        out = np.empty((*region.shape, 3), np.float32)
+        regions = self.scene.plan.regions
+        paint_albedo(
+            region, regions.material, regions.tint, regions.shape, west, north, LEAF_GSD_M,
+            light.season, moved, out,
         )  # fmt: skip
         return out
+
+    def _patches(self, west: float, north: float, side: int) -> Float32:
+        """The window of the world's noise (side, side) over a block: patches have no seams."""
+        config, changes = self.scene.plan.config, self.scene.visit.changes
+        rng = config.rng(64, 0 if changes is None else changes.seed)
+        field = noise(round(config.size_m / _PATCH_M), rng, round(config.size_m / 25.0), 3, 0.6)
+        axis = (np.arange(side, dtype=np.float32) + 0.5) * LEAF_GSD_M
+        u = (west + config.half_m + axis) / _PATCH_M - 0.5
+        v = (config.half_m - north + axis) / _PATCH_M - 0.5
+        grid = np.meshgrid(u.astype(np.float32), v.astype(np.float32))
+        return np.asarray(
+            cv2.remap(field, *grid, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+        )
 
     def _objects(self, leaf: tuple[int, int], light: Light) -> ChartedMesh:
         """Everything that stands on a leaf tile."""
@@ -186,6 +243,9 @@ class Baker:
             surface.eaves_z, surface.seed, light.ceiling, light.ambient, light.west, light.north,
             light.gsd_m, light.sun, light.sun_rgb, light.sky_rgb, light.season, out,
         )  # fmt: skip
+        survey = self.scene.visit.survey
+        if survey is not None:
+            out = survey.photographed(out, gsd, float(surface.normal[2]))
         n = len(surface.polygon)
         away = surface.polygon - surface.origin
         st = np.stack([away @ surface.right, away @ surface.down], -1) / gsd
@@ -231,8 +291,11 @@ class Baker:
         row = ((light.north - xy[chosen, 1]) / light.gsd_m).astype(int)
         top = z + 0.75 * trees.height[chosen]
         shaded = light.ceiling[row, column] > top
-        rng = self.scene.plan.config.rng(50, leaf[0] + 500, leaf[1] + 500)
-        return tree_meshes(trees, chosen, z, shaded, crown_images(rng, self.scene.look, light))
+        changes = self.scene.visit.changes
+        leaves = () if changes is None else (changes.seed,)  # other leaves, another texture
+        rng = self.scene.plan.config.rng(50, leaf[0] + 500, leaf[1] + 500, *leaves)
+        look = self.scene.visit.look
+        return tree_meshes(trees, chosen, z, shaded, crown_images(rng, look, light))
 
     def _cars(self, west: float, south: float, light: Light) -> ChartedMesh:
         cars = self.scene.cars
@@ -250,7 +313,7 @@ class Baker:
         used, chart = np.unique(colours * 2 + shaded, return_inverse=True)
         images = []
         for key in used:
-            image = car_image(CAR_COLOURS[key // 2], int(key), self.scene.look)
+            image = car_image(CAR_COLOURS[key // 2], int(key), self.scene.visit.look)
             shade = 0.45 if key % 2 else 1.0
             image = np.asarray(image * shade, np.uint8)
             size = (image.shape[1] * 5 // 8, image.shape[0] * 5 // 8)

@@ -11,12 +11,14 @@ from numpy.typing import NDArray
 from localizer.geometry.pose import Array
 from localizer.synth.buildings.kinds import build
 from localizer.synth.buildings.model import LEAF, MID, Building
-from localizer.synth.config import TERRAIN_SPACING_M, Look
+from localizer.synth.config import TERRAIN_SPACING_M
 from localizer.synth.paint.lighting import DSM_GSD_M, raise_surface
 from localizer.synth.plan.plan import Hedge, WorldPlan
 from localizer.synth.plan.terrain import Terrain
 from localizer.synth.tiles.props import PropShape, car_shape
 from localizer.synth.tiles.vegetation import hedge_corners, tree_meshes
+from localizer.synth.visits.changes import changed
+from localizer.synth.visits.visit import Visit
 
 _DSM_MARGIN_M = 20.0
 
@@ -25,11 +27,12 @@ _DSM_MARGIN_M = 20.0
 class Scene:
     """One visit to a planned world: what stands there, and the surface model that throws shadows.
 
-    cars: (C, 4) x, y, heading, seed; dsm, ground: (H, W) float32 heights, row 0 = north.
+    plan: with the visit's changes. cars: (C, 4) x, y, heading, seed; dsm, ground: (H, W) float32
+    heights, row 0 = north.
     """
 
     plan: WorldPlan
-    look: Look
+    visit: Visit
     buildings: list[Building]
     cars: Array
     dsm: NDArray[np.float32]
@@ -38,8 +41,11 @@ class Scene:
     north: float
 
 
-def make_scene(plan: WorldPlan, look: Look) -> Scene:
-    """Fill parking places, take away changed buildings, and model the surface."""
+def make_scene(plan: WorldPlan, visit: Visit) -> Scene:
+    """Change what changed, fill parking places, take away gone buildings, and model the surface."""
+    look = visit.look
+    if visit.changes is not None:
+        plan = changed(plan, visit.changes)
     rng = plan.config.rng(40, look.parking_seed)
     buildings = plan.buildings
     if look.changed_buildings > 0:
@@ -75,7 +81,7 @@ def make_scene(plan: WorldPlan, look: Look) -> Scene:
         shape = car_shape()
         body = car_positions(plan.terrain, cars, shape)[:, shape.faces].reshape(-1, 3, 3)
         raise_surface(dsm, body, -half, half, DSM_GSD_M)
-    return Scene(plan, look, buildings, cars, dsm, ground, -half, half)
+    return Scene(plan, visit, buildings, cars, dsm, ground, -half, half)
 
 
 def _fan(polygon: Array) -> Array:

@@ -27,7 +27,8 @@ from localizer.synth.heightfield.scene import (
     light_scene,
     without,
 )
-from localizer.training.places.changes import coarse_mesh, draw_texel, plain_walls, regrown, wetted
+from localizer.synth.visits.texture import draw_texel, regrown, wetted
+from localizer.training.places.changes import coarse_mesh, plain_walls
 from localizer.training.places.land import generated_place, photo_place
 from localizer.training.places.objects import new_buildings, parked_cars
 from localizer.training.places.photos import PhotoLibrary

@@ -19,11 +19,12 @@ from localizer.map.building.build import build_cache
 from localizer.map.cache.cache import TileCache
 from localizer.map.cache.stream import TileStreamer
 from localizer.render.numba_raster import NumbaRenderer
-from localizer.synth.config import SURVEY, Look, WorldConfig
+from localizer.synth.config import SURVEY, WorldConfig
+from localizer.synth.visits.texture import coarser, draw_texel
+from localizer.synth.visits.visit import Visit, draw_look
 from localizer.synth.world import WorldInfo, build_visits
 from localizer.training.data.pairs import Pair, SceneConfig, draw_condition, look_at, moved
 from localizer.training.data.seeds import FIRST_WORLD_SEED
-from localizer.training.places.changes import coarser, draw_texel
 
 
 def world_pairs(
@@ -35,8 +36,8 @@ def world_pairs(
     rng = np.random.default_rng((seed, 7))
     with tempfile.TemporaryDirectory() as temporary, ExitStack() as stack:
         root = Path(temporary)
-        looks = {root / "survey": ("survey", SURVEY)}
-        looks |= {root / f"day{k}": ("live", random_look(rng)) for k in range(visits)}
+        looks = {root / "survey": Visit("survey", SURVEY)}
+        looks |= {root / f"day{k}": Visit("live", draw_look(rng)) for k in range(visits)}
         info = build_visits(WorldConfig(seed, size_m), looks, processes=1)[0]
         renderers = []
         for folder in looks:
@@ -51,25 +52,6 @@ def world_pairs(
             if pair is not None:
                 made += 1
                 yield pair
-
-
-def random_look(rng: np.random.Generator) -> Look:
-    """A visit on a random day: sun, season, traffic, a few buildings gone."""
-    strength = rng.uniform(0.0, 1.0)
-    warm = rng.uniform(0.8, 1.05)
-    sky = 0.75 - 0.42 * strength
-    return Look(
-        sun_azimuth_deg=float(rng.uniform(0, 360)),
-        sun_elevation_deg=float(rng.uniform(12, 65)),
-        sun_rgb=(0.95 * strength, 0.9 * strength * warm**0.5, 0.85 * strength * warm),
-        sky_rgb=(sky * 0.93, sky, sky * 1.08),
-        dryness=float(rng.uniform(0, 1)),
-        crop=float(rng.uniform(0, 1)),
-        leaf=float(rng.uniform(0, 1)),
-        occupancy=float(rng.uniform(0.1, 0.9)),
-        parking_seed=int(rng.integers(2, 1_000_000)),
-        changed_buildings=float(rng.choice((0.0, 0.05))),
-    )
 
 
 def _pair(

@@ -8,8 +8,8 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from localizer.synth.heightfield.scene import Land, Prism
-from localizer.training.places.changes import hard_surfaces
-from localizer.training.places.noise import noise
+from localizer.synth.visits.noise import noise
+from localizer.synth.visits.texture import hard_surfaces
 from localizer.training.places.objects import building, buildings_along, plant, with_ground_color
 from localizer.training.places.place import Place
 from localizer.types import Float32

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from localizer.training.places.noise import noise
+from localizer.synth.visits.noise import noise
 from localizer.types import Float32
 
 Color = tuple[float, float, float]

@@ -173,7 +173,7 @@ class LoopCase(_Model):
         return Scenario(
             takeoff_height_m=self.height_m, deny_after_s=3, speed_m_s=self.speed_m_s, legs=legs,
             cars=3, people=3, camera=_CAMERA, localizer_width=256,
-        )  # fmt: skip
+        ).ideal()  # fmt: skip
 
 
 def load_loop_cases(

@@ -57,9 +57,9 @@ def loop_assets(
     case: LoopCase, seed: int, worlds: Path | None, say: Callable[[str], None]
 ) -> LoopAssets:
     """What a case flies over, and the map that it gives the companion; made where missing."""
-    world = prepare(seed, worlds, say, case.size_m)
+    world = prepare(seed, worlds, say, case.size_m, ideal=True)
     if case.wrong.other_map:
-        other = prepare(seed + _OTHER_SEED, worlds, say, case.size_m)
+        other = prepare(seed + _OTHER_SEED, worlds, say, case.size_m, ideal=True)
         return LoopAssets(world, other.map_cache)
     if case.wrong.map_reach_m is not None:
         return LoopAssets(world, inner_map(world.map_cache, case.wrong.map_reach_m))

@@ -93,7 +93,7 @@ def record(small_assets, tmp_path_factory):
     folder = tmp_path_factory.mktemp("flight")
     leg = Leg(east_m=0, north_m=16, height_m=80, gimbal_pitch_deg=-85)
     camera = CameraSpec(width=480, height=360, rate_hz=5)
-    scenario = Scenario(takeoff_height_m=80, legs=(leg,), cars=1, people=0, camera=camera)
+    scenario = Scenario(takeoff_height_m=80, legs=(leg,), cars=1, people=0, camera=camera).ideal()
     sequence = folder / "sequence"
     record_scenario(small_assets, scenario, 5, sequence)
     (sequence / "images" / "timestamps.txt").unlink()  # of another clock

@@ -5,15 +5,8 @@ import numpy as np
 import pytest
 
 from localizer.synth.heightfield.scene import Land, Light, LitScene, Prism, compose, light_scene
-from localizer.training.places.changes import (
-    coarse_mesh,
-    coarser,
-    draw_texel,
-    hard_surfaces,
-    plain_walls,
-    regrown,
-    wetted,
-)
+from localizer.synth.visits.texture import coarser, draw_texel, hard_surfaces, regrown, wetted
+from localizer.training.places.changes import coarse_mesh, plain_walls
 
 N, CELL = 256, 0.3
 

@@ -26,7 +26,7 @@ def test_nothing_wrong_is_believed_untold(
 ) -> None:
     wrong_map = None
     if case.wrong.other_map:
-        other = prepare(105, tmp_path_factory.mktemp("elsewhere"), size_m=400.0)
+        other = prepare(105, tmp_path_factory.mktemp("elsewhere"), size_m=400.0, ideal=True)
         wrong_map = other.map_cache
     assets = LoopAssets(small_assets, wrong_map)
     with real_time():

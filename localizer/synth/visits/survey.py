@@ -1,0 +1,84 @@
+"""What a photogrammetric survey makes of a place: bumps, holes, blurred walls, coarse texels.
+
+Its edges stay sharp and its triangles those of the place: the README says so.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from localizer.geometry.pose import Array
+from localizer.synth.visits.texture import coarser
+from localizer.types import Image
+
+_BUMP_WAVES = 6  # plane waves whose sum is the surface's error
+_BUMP_M = (5.0, 25.0)  # their lengths
+_HOLE_M = (1.0, 3.5)  # radius of a hole
+_WALL = 0.35  # height of a wall's unit normal at most
+
+
+@dataclass(frozen=True)
+class SurveyErrors:
+    """A survey's own errors. bumps_m: standard deviation of the surface per axis; holes_per_km2;
+    wall_blur_m: of facades, seen only aslant from above; texel_m: ground size of a texel; seed: of
+    where the bumps and holes are.
+    """
+
+    bumps_m: float = 0.0
+    holes_per_km2: float = 0.0
+    wall_blur_m: float = 0.0
+    texel_m: float = 0.0
+    seed: int = 0
+
+    @classmethod
+    def draw(cls, rng: np.random.Generator) -> SurveyErrors:
+        """One survey: a good one to a poor one."""
+        return cls(
+            bumps_m=float(np.exp(rng.uniform(*np.log((0.03, 0.12))))),
+            holes_per_km2=float(rng.uniform(20.0, 80.0)),
+            wall_blur_m=float(rng.uniform(0.2, 0.8)),
+            texel_m=float(np.exp(rng.uniform(*np.log((0.15, 0.4))))),
+            seed=int(rng.integers(1 << 30)),
+        )
+
+    def displaced(self, positions: Array) -> Array:
+        """The surface's points (V, 3) ENU where the survey has them: smooth, so nothing tears."""
+        if self.bumps_m <= 0:
+            return positions
+        rng = np.random.default_rng([self.seed, 1])
+        direction = rng.standard_normal((_BUMP_WAVES, 3))
+        direction /= np.linalg.norm(direction, axis=1, keepdims=True)
+        shortest, longest = np.log(_BUMP_M)
+        lengths = np.exp(rng.uniform(shortest, longest, _BUMP_WAVES))
+        phase = rng.uniform(0, 2 * np.pi, (3, _BUMP_WAVES))
+        along = positions @ (2 * np.pi * direction / lengths[:, None]).T
+        scale = self.bumps_m * np.sqrt(2.0 / _BUMP_WAVES)
+        moved = [np.sin(along + phase[axis]).sum(axis=1) * scale for axis in range(3)]
+        return np.asarray(positions + np.stack(moved, axis=1))
+
+    def without_holes(self, positions: Array, faces: NDArray[np.int64], side_m: float) -> Array:
+        """Which faces (F,) bool the survey has, in a world of a side: holes are where pictures did
+        not match.
+        """
+        rng = np.random.default_rng([self.seed, 2])
+        count = rng.poisson(self.holes_per_km2 * (side_m / 1000.0) ** 2)
+        centres = rng.uniform(-side_m / 2, side_m / 2, (count, 2))
+        radii = rng.uniform(*_HOLE_M, count)
+        middle = positions[faces][:, :, :2].mean(axis=1)
+        low, high = positions[:, :2].min(axis=0) - _HOLE_M[1], positions[:, :2].max(axis=0)
+        near = ((centres >= low) & (centres <= high + _HOLE_M[1])).all(axis=1)
+        kept = np.ones(len(faces), bool)
+        for centre, radius in zip(centres[near], radii[near], strict=True):
+            kept &= np.linalg.norm(middle - centre, axis=1) > radius
+        return kept
+
+    def photographed(self, chart: Image, gsd_m: float, normal_up: float = 1.0) -> Image:
+        """A surface's image as the survey has it; normal_up: z of the surface's unit normal."""
+        if abs(normal_up) < _WALL and self.wall_blur_m > 0:
+            sigma = self.wall_blur_m / gsd_m
+            chart = np.asarray(cv2.GaussianBlur(chart, (0, 0), sigma), np.uint8)
+        return coarser(chart, self.texel_m / gsd_m) if min(chart.shape[:2]) > 8 else chart

@@ -1,0 +1,84 @@
+"""Two visits to one place: what changed between them, and what a survey makes of it."""
+
+import numpy as np
+import pytest
+
+from localizer.synth.config import WorldConfig
+from localizer.synth.plan.layout import plan_world
+from localizer.synth.plan.plan import WorldPlan
+from localizer.synth.visits.changes import Changes, changed
+from localizer.synth.visits.survey import SurveyErrors
+from localizer.synth.visits.visit import surveyed_and_lived
+
+
+@pytest.fixture(scope="module")
+def plan() -> WorldPlan:
+    return plan_world(WorldConfig(5, 400.0))
+
+
+def test_what_is_built_later_stands_on_free_ground(plan: WorldPlan) -> None:
+    assert len(plan.sites) >= 4
+    for site in plan.sites:
+        for other in [*plan.buildings, *(s for s in plan.sites if s is not site)]:
+            away = np.hypot(*np.subtract(site.centre, other.centre))
+            assert away > 0.5 * min(site.width, other.width)
+
+
+def test_buildings_go_change_and_come_in_the_shares_that_are_said(plan: WorldPlan) -> None:
+    after = changed(plan, Changes(gone=0.2, rebuilt=0.2, new=0.04, felled=0.3, seed=3))
+    before = {b.centre: b for b in plan.buildings}
+    count = len(before)
+    kept = [b for b in after.buildings if before.get(b.centre) == b]
+    rebuilt = [b for b in after.buildings if b.centre in before and before[b.centre] != b]
+    new = [b for b in after.buildings if b.centre not in before]
+    assert len(new) == min(round(0.04 * count), len(plan.sites))
+    assert count - len(kept) - len(rebuilt) == pytest.approx(0.2 * count, rel=0.5)
+    assert len(rebuilt) == pytest.approx(0.2 * count, rel=0.5)
+    assert all(b.eaves_m != before[b.centre].eaves_m for b in rebuilt)
+    assert len(after.trees.xy) == pytest.approx(0.7 * len(plan.trees.xy), rel=0.15)
+    assert after.trees.radius.mean() > plan.trees.radius.mean()
+    assert after.shapes is plan.shapes  # streets and fields stay
+    again = changed(plan, Changes(gone=0.2, rebuilt=0.2, new=0.04, felled=0.3, seed=3))
+    assert again.buildings == after.buildings
+
+
+def test_a_survey_moves_its_surface_smoothly_and_by_what_is_said() -> None:
+    survey = SurveyErrors(bumps_m=0.1, seed=4)
+    points = np.random.default_rng(0).uniform(-200, 200, (4000, 3))
+    off = survey.displaced(points) - points
+    np.testing.assert_allclose(off.std(axis=0), 0.1, rtol=0.35)
+    beside = survey.displaced(points + 0.2) - points - 0.2
+    assert np.abs(beside - off).max() < 0.1  # no tears
+    assert SurveyErrors().displaced(points) is points
+
+
+def test_a_survey_has_the_holes_that_are_said_and_few() -> None:
+    step = np.arange(-200, 200, 2.0)
+    x, y = np.meshgrid(step, step)
+    corners = np.stack([x, y, 0 * x], -1).reshape(-1, 1, 3) + np.array(
+        [[0, 0, 0], [2, 0, 0], [0, 2, 0]]
+    )
+    positions, faces = corners.reshape(-1, 3), np.arange(3 * len(corners)).reshape(-1, 3)
+    kept = SurveyErrors(holes_per_km2=60.0, seed=1).without_holes(positions, faces, 400.0)
+    holes_m2 = (~kept).sum() * 4.0
+    assert 4 * np.pi < holes_m2 < 20 * 40.0
+    assert SurveyErrors(seed=1).without_holes(positions, faces, 400.0).all()
+
+
+def test_walls_blur_more_than_roofs_and_texels_are_coarse() -> None:
+    chart = (np.random.default_rng(2).random((120, 160, 3)) * 255).astype(np.uint8)
+    survey = SurveyErrors(wall_blur_m=0.5, texel_m=0.25)
+    roof, wall = (survey.photographed(chart, 0.125, up) for up in (0.8, 0.0))
+    assert roof.shape == wall.shape == chart.shape
+    assert wall.std() < 0.5 * roof.std() < 0.5 * chart.std()
+
+
+def test_every_place_is_surveyed_and_lived_in_its_own_way() -> None:
+    pairs = [surveyed_and_lived(WorldConfig(seed, 400.0)) for seed in range(6)]
+    assert len({survey.survey for survey, _ in pairs}) == 6
+    for survey, live in pairs:
+        assert survey.changes is None
+        assert live.survey is None
+        assert live.changes is not None
+        assert min(live.changes.gone, live.changes.rebuilt, live.changes.new) >= 0.01
+        assert live.look.changed_buildings == 0.0
