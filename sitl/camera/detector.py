@@ -46,8 +46,9 @@ class FixedPoint:
 @dataclass(frozen=True)
 class DetectorErrors:
     """noise_px: of a pixel, per axis. Shares of what is seen, each frame: missed; false, a
-    detection of nothing, anywhere in the picture, under a name of its own; swapped, two targets under each other's
-    names. box_centre: what moves is reported at the middle of its box, not where it stands.
+    detection of nothing, anywhere in the picture, under a name of its own; swapped, two targets
+    under each other's names. box_centre: what moves is reported at the middle of its box, not
+    where it stands.
     """
 
     noise_px: float = 1.0
