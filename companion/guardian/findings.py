@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import enum
+import re
 from dataclasses import dataclass
 
 PREFIX = "PiLoT: "
@@ -37,10 +38,19 @@ class Rule:
     repeat_s: float = 0.0
     forbids: bool = False
 
+    @property
+    def _template(self) -> str:
+        withheld = "withheld: " if self.action is not Action.NONE else ""
+        return f"{PREFIX}{withheld}{self.text}"
+
     def line(self, figure: float, word: str = "") -> str:
         """The STATUSTEXT."""
-        what = self.text.format(figure, word)
-        return PREFIX + (f"withheld: {what}" if self.action is not Action.NONE else what)
+        return self._template.format(figure, word)
+
+    def is_line(self, text: str) -> bool:
+        """Whether a STATUSTEXT is this rule's, whatever its figure and word."""
+        fixed = re.split(r"\{[^}]*\}", self._template)
+        return re.fullmatch(".+".join(re.escape(part) for part in fixed), text) is not None
 
 
 VIDEO_FROZEN = Rule("video_frozen", "video frozen {0:.0f} s", Action.WITHDRAW, 0.0, 2.0)

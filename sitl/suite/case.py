@@ -143,6 +143,14 @@ class Case(_Model):
         """Who injects."""
         return "bridge" if self.raw is None else "raw"
 
+    @property
+    def is_honest(self) -> bool:
+        """Whether the guardian watches, and has nothing to find."""
+        f = self.fixes
+        wrong = f.rotation_deg or f.yaw_error_deg or f.offset_north_m or f.silent or f.frozen
+        watched = self.bridge is not None and self.guardian.enabled and not self.flight.ground
+        return watched and not wrong and not self.timeline
+
     @model_validator(mode="after")
     def _is_whole(self) -> Case:
         if (self.bridge is None) == (self.raw is None):

@@ -51,10 +51,16 @@ def print_table(console: Console, rows: Sequence[Row]) -> None:
 
 
 def summary(rows: Iterable[Row]) -> str:
-    """How many of what."""
+    """How many of what, and how often the guardian spoke where it had nothing to find."""
+    rows = list(rows)
     verdicts = [row.verdict for row in rows]
     counts = (f"{verdicts.count(v)} {v}" for v in _COLOURS if v in verdicts)
-    return f"{len(verdicts)} flights: {', '.join(counts)}"
+    honest = [row for row in rows if row.case.is_honest and row.record is not None]
+    spoke = sum(bool(row.guardian_lines) for row in honest)
+    return (
+        f"{len(verdicts)} flights: {', '.join(counts)}; the guardian spoke in {spoke} of "
+        f"{len(honest)} with honest fixes"
+    )
 
 
 def write_report(rows: Sequence[Row], folder: Path) -> None:
@@ -157,6 +163,8 @@ def _as_data(row: Row) -> dict[str, Any]:
         "title": row.case.title,
         "vehicle": row.vehicle,
         "verdict": row.verdict,
+        "honest": row.case.is_honest,
+        "guardian": row.guardian_lines,
         "error": row.error,
         "measured": row.measured,
         "measured_paired_as_reference": paired,

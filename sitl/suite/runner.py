@@ -14,6 +14,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from companion.guardian.findings import RULES
 from sitl.errors import SimulationError
 from sitl.suite.case import Case
 from sitl.suite.checks import CheckResult, Reference
@@ -57,6 +58,13 @@ class Row:
         """Whether the machine could not keep the vehicle in real time, which costs accuracy."""
         r = self.record
         return r is not None and (r.pace < PACE_LIMIT or r.stall_s > STALL_LIMIT_S)
+
+    @property
+    def guardian_lines(self) -> tuple[str, ...]:
+        """What the guardian told, with seconds; the bridge's own lines are others."""
+        texts = self.record.texts if self.record is not None else []
+        its = [t for t in texts if any(rule.is_line(t.text) for rule in RULES)]
+        return tuple(f"{t.at_s:.1f} s: {t.text}" for t in its)
 
     @property
     def reference(self) -> Reference | None:

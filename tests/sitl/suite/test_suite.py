@@ -258,6 +258,10 @@ def row(name: str, flown: Record | None, error: str = "") -> Row:
 def test_the_report_holds_every_flight(tmp_path: Path) -> None:
     flown = record(0.20)
     flown.events.append((3.0, "silent=True"))
+    flown.texts += [
+        Text(2.0, "bridge", "PiLoT: withheld: position jumped 7 m"),
+        Text(3.0, "bridge", "PiLoT: GNSS lost, injecting"),
+    ]
     rows = [
         row("vpe", flown),
         row("odometry", record(0.20)),
@@ -265,7 +269,10 @@ def test_the_report_holds_every_flight(tmp_path: Path) -> None:
         row("doctor", None, "PilotError: not armed | or so\nmore"),
     ]
     assert [r.verdict for r in rows] == ["pass", "FAIL", "better", "ERROR"]
-    assert summary(rows) == "4 flights: 1 pass, 1 better, 1 FAIL, 1 ERROR"
+    assert summary(rows) == (
+        "4 flights: 1 pass, 1 better, 1 FAIL, 1 ERROR; "
+        "the guardian spoke in 1 of 3 with honest fixes"
+    )
     write_report(rows, tmp_path / "out")
     text = (tmp_path / "out/suite.md").read_text()
     assert text == markdown(rows)
