@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import logging
 import math
+import os
 import threading
 import time
 from collections import deque
@@ -169,6 +170,7 @@ class HealthMonitor:
             "level": level,
             "text": text,
             "time_ns": time.monotonic_ns(),
+            "pid": os.getpid(),
             "engine": asdict(self._engine_health()),
             "rate_hz": self._rate(),
             "stages_ms": self._stages(),

@@ -166,6 +166,10 @@ def mark_dead(folder: Path, text: str, latest: str = "latest") -> None:
     if not path.parent.is_dir():
         return
     temporary = path.with_suffix(".dead")
-    report = {"level": "failed", "text": text, "time_ns": time.monotonic_ns()}
+    try:
+        report = dict(json.loads(path.read_text(encoding="utf-8")))
+    except (OSError, ValueError, TypeError):
+        report = {}
+    report.update(level="failed", text=text, time_ns=time.monotonic_ns())
     temporary.write_text(json.dumps(report, indent=1), encoding="utf-8")
     temporary.replace(path)

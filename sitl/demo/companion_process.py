@@ -73,12 +73,14 @@ def write_deployment(
 
 
 @contextmanager
-def running_companion(config: Path, folder: Path) -> Iterator[subprocess.Popen[bytes]]:
+def running_companion(
+    config: Path, folder: Path, *options: str
+) -> Iterator[subprocess.Popen[bytes]]:
     """``companion run`` as a process; interrupted, as an operator would, at the end."""
     environment = os.environ | {"PYTHONUNBUFFERED": "1", "COLUMNS": "160"}
     with (folder / "companion.log").open("wb") as log:
         process = subprocess.Popen(
-            [sys.executable, "-m", "companion", "run", str(config.resolve())],
+            [sys.executable, "-m", "companion", "run", str(config.resolve()), *options],
             stdout=log, stderr=subprocess.STDOUT, env=environment,
             cwd=Path(__file__).resolve().parents[2],
         )  # fmt: skip

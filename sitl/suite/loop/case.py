@@ -65,8 +65,8 @@ class LoopEvent(_Model):
     """Something that happens at_s seconds after the recorded part began (and GNSS was denied).
 
     picture: a fault of the video. kill: SIGKILL to the companion, which is started again
-    restart_after_s later. start: of a companion that did not run until now (`cold`). vehicle:
-    parameters that the ground station sets.
+    restart_after_s later, or by its supervisor. start: of a companion that did not run until now
+    (`cold`). vehicle: parameters that the ground station sets.
     """
 
     at_s: float = Field(ge=0)
@@ -121,10 +121,10 @@ class Expectation(_Model):
 class LoopCase(_Model):
     """One flight. seconds: length of the recorded part. hover: stay; else the corners are flown in
     AUTO (metres east and north of home, at `height_m`). wind_m_s: from the west. deny: GNSS is
-    switched off when it begins. cold: no companion runs until an event starts it. size_m: of the
-    world. ci: flown in every test run on the embedded vehicle. deployment: keys that differ from
-    the demo's deployment file; vehicle: parameters likewise (FS_EKF_ACTION 0: no landing while the
-    place is searched).
+    switched off when it begins. cold: no companion runs until an event starts it. supervised: by
+    `companion run --supervised`. size_m: of the world. ci: flown in every test run on the embedded
+    vehicle. deployment: keys that differ from the demo's deployment file; vehicle: parameters
+    likewise (FS_EKF_ACTION 0: no landing while the place is searched).
     """
 
     name: str
@@ -139,6 +139,7 @@ class LoopCase(_Model):
     wind_m_s: float = Field(0.0, ge=0, le=15)
     deny: bool = True
     cold: bool = False
+    supervised: bool = False
     deployment: dict[str, Any] = {}
     vehicle: dict[str, float] = {}
     wrong: Wrong = Wrong()

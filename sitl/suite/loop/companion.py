@@ -22,7 +22,7 @@ _FRESH_S = 2.0  # a health report that is written every second
 @dataclass(frozen=True)
 class Health:
     """The newest ``health.json``: level and text, its age in seconds (infinite without one), names
-    of the guardian's findings that stand, and localized frames per second.
+    of the guardian's findings that stand, localized frames per second, and whose report it is.
     """
 
     level: str = "starting"
@@ -30,6 +30,7 @@ class Health:
     age_s: float = math.inf
     findings: tuple[str, ...] = ()
     rate_hz: float = 0.0
+    pid: int = 0
 
     @property
     def is_tracking(self) -> bool:
@@ -38,9 +39,15 @@ class Health:
 
 
 class LoopCompanion:
-    """`companion run` with one deployment file; each start has its log in a folder of its own."""
+    """`companion run` with one deployment file; each start has its log in a folder of its own.
 
-    def __init__(self, config: Path, out: Path, stack: ExitStack) -> None:
+    supervised: its supervisor is started, which starts it again when it is killed.
+    """
+
+    def __init__(
+        self, config: Path, out: Path, stack: ExitStack, *, supervised: bool = False
+    ) -> None:
+        self._supervised = supervised
         self._config, self._out, self._stack = config, out, stack
         self._process: subprocess.Popen[bytes] | None = None
         self._starts = 0
@@ -50,7 +57,9 @@ class LoopCompanion:
         folder = self._out / f"log-{self._starts}"
         folder.mkdir()
         self._starts += 1
-        self._process = self._stack.enter_context(running_companion(self._config, folder))
+        options = ("--supervised",) if self._supervised else ()
+        companion = running_companion(self._config, folder, *options)
+        self._process = self._stack.enter_context(companion)
 
     def wait_up(self) -> None:
         """Wait until it reports its health; FlightError when it does not."""
@@ -64,8 +73,10 @@ class LoopCompanion:
             time.sleep(0.2)
 
     def kill(self) -> None:
-        """SIGKILL, and wait until it is gone."""
-        if self._process is not None:
+        """SIGKILL, and wait until it is gone; for a supervised one its supervisor waits."""
+        if self._supervised:
+            os.kill(self.health().pid, signal.SIGKILL)
+        elif self._process is not None:
             self._process.send_signal(signal.SIGKILL)
             self._process.wait()
 
@@ -95,5 +106,6 @@ class LoopCompanion:
         guardian = report.get("guardian") or {}
         findings = tuple(guardian.get("findings", {}))
         return Health(
-            str(report["level"]), str(report["text"]), age_s, findings, float(report["rate_hz"])
-        )
+            str(report["level"]), str(report["text"]), age_s, findings, float(report["rate_hz"]),
+            int(report["pid"]),
+        )  # fmt: skip

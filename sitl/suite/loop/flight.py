@@ -89,7 +89,7 @@ class _LoopFlight:
             self._pilot.wait_ready()
         config = self._write_deployment(vehicle)
         self._open_camera()
-        self._companion = LoopCompanion(config, self._out, self._stack)
+        self._companion = LoopCompanion(config, self._out, self._stack, supervised=case.supervised)
         if not case.cold:
             self._companion.start()
             self._companion.wait_up()
@@ -211,6 +211,7 @@ class _LoopFlight:
             self._companion.start()
         if event.kill:
             self._companion.kill()
+        if event.kill and not self._case.supervised:
             self._later(event.restart_after_s, self._companion.start)
 
     def _tell_place(self, hint: PlaceHint) -> None:
