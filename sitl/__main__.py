@@ -18,7 +18,7 @@ from companion.errors import CompanionError
 from companion.reporting.report import write_page
 from localizer.errors import LocalizerError
 from localizer.synth.appearance.model import CONDITIONS
-from sitl.demo.assets import prepare
+from sitl.demo.assets import FlightAssets, prepare
 from sitl.demo.flight import fly
 from sitl.demo.kinematic import record_scenario
 from sitl.demo.progress import shown_progress
@@ -33,6 +33,7 @@ from sitl.demo.scenario import (
     scenario_names,
 )
 from sitl.errors import SimulationError
+from sitl.rehearsal.rehearse import rehearse
 from sitl.suite.case import SCENARIOS, load_cases
 from sitl.suite.loop.case import LOOP_SCENARIOS, load_loop_cases
 from sitl.suite.loop.report import as_data, markdown, print_loop_row, read_rows
@@ -80,6 +81,15 @@ def demo(
     out: Annotated[Path, typer.Option(help="folder of the report")] = Path("report"),
     worlds: Annotated[Path | None, typer.Option(help="folder of generated worlds")] = None,
     ideal: Annotated[bool, typer.Option("--ideal", help=_IDEAL)] = False,
+    map_: Annotated[
+        Path | None, typer.Option("--map", help="your own tile cache, instead of a generated world")
+    ] = None,
+    live: Annotated[
+        Path | None, typer.Option(help="tile cache that the camera sees; none: the map's own")
+    ] = None,
+    mission: Annotated[
+        Path | None, typer.Option(help=".plan or .waypoints over --map; none: a triangle")
+    ] = None,
 ) -> None:
     """Fly a GNSS-denied mission on vision alone and report its accuracy."""
     kinds: dict[str, VehicleChoice] = {
@@ -95,10 +105,16 @@ def demo(
             raise ScenarioError(f"--injection is one of {known}, not {injection!r}")
         script = Scenario.model_validate(script.model_dump() | {"injection": injection})
     console = Console()
-    assets = prepare(
-        seed, worlds, lambda text: console.print(f"[dim]{text}[/]"), script.world_m, ideal
-    )
-    check_inside(script, assets.world.size_m)
+    if map_ is not None:
+        rehearsal = rehearse(map_, live, mission, script)
+        assets, script = rehearsal.assets, rehearsal.scenario
+        for note in rehearsal.notes:
+            console.print(f"[yellow]{escape(note)}", highlight=False)
+    elif live is not None or mission is not None:
+        raise ScenarioError("--live and --mission belong to a --map")
+    else:
+        assets = _world_of(script, seed, worlds, ideal, console)
+        check_inside(script, assets.world.size_m)
     _clear(out)
     with shown_progress(console) as progress:
         record = fly(assets, script, kinds[fc], seed, out, progress)
@@ -130,9 +146,7 @@ def sequence(
     if out.exists() and (not out.is_dir() or any(out.iterdir())):
         raise ScenarioError(f"{out}: exists already and is not empty; give another folder")
     console = Console()
-    assets = prepare(
-        seed, worlds, lambda text: console.print(f"[dim]{text}[/]"), script.world_m, ideal
-    )
+    assets = _world_of(script, seed, worlds, ideal, console)
     check_inside(script, assets.world.size_m)
     with console.status("rendering"):
         count = record_scenario(assets, script, seed, out)
@@ -207,6 +221,15 @@ def loop_table(
     if out is not None:
         out.write_text(json.dumps(as_data(rows), indent=1, allow_nan=False), encoding="utf-8")
     print(markdown(rows))
+
+
+def _world_of(
+    script: Scenario, seed: int, worlds: Path | None, ideal: bool, console: Console
+) -> FlightAssets:
+    def say(text: str) -> None:
+        console.print(f"[dim]{text}[/]")
+
+    return prepare(seed, worlds, say, script.world_m, ideal, script.world)
 
 
 def _clear(out: Path) -> None:

@@ -10,6 +10,7 @@ import numpy as np
 from localizer.errors import MapSourceError
 
 Variant = Literal["survey", "live"]
+Character = Literal["mixed", "forest", "fields", "industrial", "dense"]
 
 LEAF_M = 100.0  # finest tile
 BLOCK_M = 200.0  # middle tile, also the unit of work of one process
@@ -20,13 +21,17 @@ TERRAIN_SPACING_M = 5.0
 
 @dataclass(frozen=True)
 class WorldConfig:
-    """A world's geometry. `relief_m` and `town_radius_m` follow from size and seed when None."""
+    """A world's geometry. `relief_m` and `town_radius_m` follow from size and seed when None.
+
+    character: what nearly every cell is used for; mixed has a town in the country.
+    """
 
     seed: int
     size_m: float = 1600.0
     relief_m: float | None = None
     town_radius_m: float | None = None
     geoid_separation_m: float = 47.5
+    character: Character = "mixed"
 
     def __post_init__(self) -> None:
         if self.size_m < TOP_M or self.size_m % TOP_M:

@@ -33,6 +33,8 @@ def traffic(
     frame: the map's ENU, in which they are given. The same arguments give the same traffic, so the
     truth of every object is known at every time.
     """
+    if not world.roads:  # a map of the user's has none that are known
+        return ()
     rng = np.random.default_rng([seed, 71])
     driving = [_path(world, frame, lane, 0.0, _OTHER_LANE_M) for lane in world.roads]
     walking = [

@@ -14,7 +14,7 @@ from pathlib import Path
 
 from localizer.map.building.build import build_cache
 from localizer.map.cache.cache import TileCache
-from localizer.synth.config import WorldConfig, look_of
+from localizer.synth.config import Character, WorldConfig, look_of
 from localizer.synth.visits.visit import Visit, surveyed_and_lived
 from localizer.synth.world import WorldInfo, build_visits
 
@@ -45,20 +45,22 @@ def prepare(
     say: Callable[[str], None] = lambda _: None,
     size_m: float = 1600.0,
     ideal: bool = False,
+    character: Character = "mixed",
 ) -> FlightAssets:
     """Build what is missing of a world, by the importer that users use; the rest is reused.
 
     ideal: the map shares geometry and fine texture with what is flown over.
     """
     generation = _IDEAL_GENERATION if ideal else _GENERATION
-    home = (folder or default_folder()) / f"world-{generation}-{seed}-{size_m:.0f}"
+    name = f"world-{generation}-{seed}-{size_m:.0f}"
+    home = (folder or default_folder()) / (name if character == "mixed" else f"{name}-{character}")
     done = home / "complete"
     survey, live = home / "survey", home / "live"
     if not done.exists():
         shutil.rmtree(home, ignore_errors=True)
         home.mkdir(parents=True)
         say(f"generating world {seed} (a few minutes, once)")
-        config = WorldConfig(seed, size_m)
+        config = WorldConfig(seed, size_m, character=character)
         if ideal:
             then, now = Visit("survey", look_of("survey")), Visit("live", look_of("live"))
         else:

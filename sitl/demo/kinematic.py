@@ -55,7 +55,9 @@ def camera_path(scenario: Scenario, ground_m: float) -> Iterator[tuple[int, Pose
 def record_scenario(assets: FlightAssets, scenario: Scenario, seed: int, out: Path) -> int:
     """Render the path as today's world shows itself; returns the number of frames."""
     cache, live = TileCache.open(assets.map_cache), TileCache.open(assets.live_cache)
-    path = list(camera_path(scenario, float(assets.world.ground_height(0.0, 0.0))))
+    map_from_world = cache.frame.ecef_from_enu.inverse @ assets.world.frame.ecef_from_enu
+    ground_m = float(assets.world.ground_height(0.0, 0.0))
+    path = [(time_ns, map_from_world @ p) for time_ns, p in camera_path(scenario, ground_m)]
     track = PoseTrack(path, keep=None)
     movers = traffic(
         assets.world, cache.frame, cars=scenario.cars, people=scenario.people, seed=seed

@@ -10,6 +10,7 @@ from pydantic import BaseModel, ConfigDict, Field, model_validator
 from companion.config import CameraModel
 from companion.settings_file import SettingsError, read_settings, validated
 from localizer.geometry.camera import Camera
+from localizer.synth.config import Character
 from sitl.errors import SimulationError
 
 VehicleChoice = Literal["auto", "ardupilot", "embedded"]
@@ -127,12 +128,14 @@ class Scenario(_Model):
     )
     speed_m_s: float = Field(10.0, ge=0.5, le=25)
     legs: tuple[Leg, ...] = Field(_LEGS, min_length=1)
+    world: Character = "mixed"
     world_m: float = Field(
         1600.0, ge=400, le=8000, multiple_of=400, description="side of the world"
     )
     camera: CameraSpec = CameraSpec()
     errors: ErrorSpec = ErrorSpec()
     condition: Literal["day", "dusk", "night", "fog", "rain", "snow"] = "day"
+    land: bool = Field(False, description="at home, on vision alone, before the flight ends")
     cars: int = Field(30, ge=1, le=2000)
     people: int = Field(40, ge=0, le=2000)
     localizer_width: int = Field(320, ge=64, le=2048, description="the localizer's working width")

@@ -20,6 +20,7 @@ from sitl.vehicles.launch import VISION_SOURCE
 
 _TRACKING_TIMEOUT_S = 60.0
 _LEG_MARGIN_S = 60.0
+_LANDING_TIMEOUT_S = 240.0  # 120 m at 0.5 m/s near the ground
 _COMPANION_START_S = 300.0
 
 Progress = Callable[[str, float], None]
@@ -49,7 +50,7 @@ class FlightScript:
         self._progress = progress
 
     def fly(self) -> tuple[int, int]:
-        """Returns the span without GNSS, CLOCK_MONOTONIC ns."""
+        """Returns the span without GNSS up to the last waypoint, CLOCK_MONOTONIC ns."""
         pilot, scenario = self._pilot, self._scenario
         self._progress("starting the companion", 0.0)
         self._await_companion()
@@ -69,7 +70,10 @@ class FlightScript:
         begin_ns = time.monotonic_ns()
         pilot.start_mission()
         self._follow(len(steps))
-        return begin_ns, time.monotonic_ns()
+        end_ns = time.monotonic_ns()
+        if scenario.land:
+            self._land()
+        return begin_ns, end_ns
 
     def distance_from_home(self) -> float:
         """How far, horizontally and in truth, the vehicle is from where it took off."""
@@ -102,6 +106,10 @@ class FlightScript:
             self._progress(f"GNSS denied: waypoint {min(done + 1, len(legs))}/{len(legs)}", share)
             self._pilot.link.sleep(0.5)
         self._progress("returned on vision alone", 1.0)
+
+    def _land(self) -> None:
+        self._progress("landing on vision alone", 0.99)
+        self._pilot.land(_LANDING_TIMEOUT_S)
 
     def _await_companion(self) -> None:
         """On the ground: its first start on a machine compiles for a minute or more."""

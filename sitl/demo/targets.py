@@ -35,7 +35,8 @@ def _fixed_points(assets: FlightAssets, scenario: Scenario) -> tuple[FixedPoint,
     cache, live = TileCache.open(assets.map_cache), TileCache.open(assets.live_cache)
     live_from_map = live.frame.ecef_from_enu.inverse @ cache.frame.ecef_from_enu
     ground_m = float(assets.world.ground_height(0.0, 0.0))
-    path = [pose for _, pose in camera_path(scenario, ground_m)][::_PATH_STEP]
+    map_from_world = cache.frame.ecef_from_enu.inverse @ assets.world.frame.ecef_from_enu
+    path = [map_from_world @ pose for _, pose in camera_path(scenario, ground_m)][::_PATH_STEP]
     camera = scenario.camera.camera().without_distortion()
     streamer = TileStreamer(live)
     try:
@@ -43,8 +44,10 @@ def _fixed_points(assets: FlightAssets, scenario: Scenario) -> tuple[FixedPoint,
         for number, part in enumerate(np.array_split(np.arange(len(path)), FIXED_POINTS)):
             poses = [live_from_map @ path[i] for i in part]
             found = [_flat_point(streamer, pose, camera) for pose in poses]
-            flatness, point = min((f for f in found if f is not None), key=lambda f: f[0])
-            del flatness
+            flat = [f for f in found if f is not None]
+            if not flat:
+                continue  # trees all the way, say
+            _, point = min(flat, key=lambda f: f[0])
             name = f"point {'ABC'[number]}"
             points.append(FixedPoint(name, live_from_map.inverse.apply(point)))
         return tuple(points)

@@ -54,6 +54,12 @@ from localizer.synth.plan.town import (
     plant_street_trees,
 )
 
+_USES: dict[str, tuple[tuple[Zone, float], ...]] = {
+    "forest": ((Zone.FOREST, 0.85), (Zone.MEADOW, 0.15)),
+    "fields": ((Zone.FIELD, 0.8), (Zone.MEADOW, 0.1), (Zone.FARM, 0.1)),
+    "industrial": ((Zone.INDUSTRY, 0.8), (Zone.CARPARK, 0.1), (Zone.BLOCKS, 0.1)),
+    "dense": ((Zone.CENTRE, 0.8), (Zone.BLOCKS, 0.2)),
+}
 _SITES = 0.06  # of the buildings
 _SITE_TRIES = 40  # most ground is taken
 
@@ -102,9 +108,24 @@ def assign_zones(config: WorldConfig, lattice: Lattice, terrain: Terrain
                     else Zone.ORCHARD if draw < 0.90 else Zone.FARM
                 )  # fmt: skip
             zones[i, j], distance[i, j] = zone, d
+    if config.character != "mixed":
+        return _of_one_character(config, zones)
     if radius > 150:
         _give_landmarks(zones, distance)
     return zones
+
+
+def _of_one_character(
+    config: WorldConfig, zones: dict[tuple[int, int], Zone]
+) -> dict[tuple[int, int], Zone]:
+    """Every cell but those at the river in the uses of the world's character."""
+    rng = config.rng(65)
+    uses, shares = zip(*_USES[config.character], strict=True)
+    draws = rng.choice(len(uses), len(zones), p=shares)
+    return {
+        cell: zone if zone is Zone.RIVERSIDE else uses[draw]
+        for (cell, zone), draw in zip(zones.items(), draws, strict=True)
+    }
 
 
 def _give_landmarks(

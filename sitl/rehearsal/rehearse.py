@@ -1,0 +1,147 @@
+"""A scenario and its assets from the user's cache, and from a mission that was planned over it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from companion.preflight.coverage import covered
+from localizer.geometry.geo import Geodetic, LocalFrame
+from localizer.map.cache.cache import TileCache
+from localizer.map.cache.surface import MapSurface
+from localizer.synth.plan.terrain import River, Terrain
+from localizer.synth.world import WorldInfo
+from sitl.demo.assets import FlightAssets
+from sitl.demo.scenario import Leg, Scenario, ScenarioError
+from sitl.rehearsal.mission import PlannedMission, read_mission
+
+_PITCH_DEG = -75.0  # where the mission does not say
+_SIDE = 0.5  # of the map's shorter half extent: how far the flight without a mission goes
+_HEIGHT_M = 100.0
+
+
+@dataclass(frozen=True)
+class Rehearsal:
+    """What is flown, and what of it the user should know. notes: sentences."""
+
+    assets: FlightAssets
+    scenario: Scenario
+    notes: tuple[str, ...]
+
+
+def rehearse(cache: Path, live: Path | None, mission: Path | None, scenario: Scenario) -> Rehearsal:
+    """The flight over `cache`; `live` is what the camera sees (none: the map itself).
+
+    The scenario's weather, camera and errors are kept; its legs are replaced by the mission's, or
+    by a triangle about the map's middle.
+    """
+    opened = TileCache.open(cache)
+    if live is not None:
+        TileCache.open(live)
+    planned = read_mission(mission) if mission is not None else None
+    notes = [] if live else ["the camera sees the map itself, in another light: that flatters"]
+    home = _home(opened, planned)
+    world = _world(opened, home)
+    if planned is None:
+        flown = scenario.model_copy(update=_triangle(opened))
+    else:
+        flown = _as_planned(planned, world.frame, scenario)
+        if planned.ignored:
+            numbers = ", ".join(map(str, sorted(set(planned.ignored))))
+            notes.append(f"mission commands that are not rehearsed: {numbers}")
+    _require_covered(opened, world.frame, flown)
+    return Rehearsal(FlightAssets(world, cache, live or cache), flown, tuple(notes))
+
+
+def _require_covered(cache: TileCache, home: LocalFrame, scenario: Scenario) -> None:
+    map_from_home = cache.frame.ecef_from_enu.inverse @ home.ecef_from_enu
+    corners = [(leg.east_m, leg.north_m, 0.0) for leg in scenario.legs]
+    inside = covered(cache, map_from_home.apply(np.array(corners))[:, :2])
+    if not inside.all():
+        beside = ", ".join(str(k + 1) for k in np.flatnonzero(~inside))
+        raise ScenarioError(f"waypoints {beside} are not over the map {cache.path}")
+
+
+def _home(cache: TileCache, planned: PlannedMission | None) -> Geodetic:
+    """On the map's surface: the mission's home, its first waypoint, or the map's middle."""
+    if planned is not None:
+        first = planned.waypoints[0]
+        latitude, longitude = planned.home or (first.latitude_deg, first.longitude_deg)
+        east, north, _ = cache.frame.enu_from_geodetic(latitude, longitude, 0.0)
+    else:
+        low, high = _bounds(cache)
+        east, north = (low + high)[:2] / 2
+    return cache.frame.position([east, north, _surface_m(cache, east, north)])
+
+
+def _bounds(cache: TileCache) -> tuple[np.ndarray, np.ndarray]:
+    """Corners (3,) of the map, ENU."""
+    return cache.index.box_min[0], cache.index.box_max[0]
+
+
+def _surface_m(cache: TileCache, east: float, north: float) -> float:
+    """Height (ENU) of the highest surface at a place; ScenarioError where the map has none."""
+    top = float(_bounds(cache)[1][2]) + 1.0
+    down = np.array([[0.0, 0.0, -1.0]])
+    distance = float(MapSurface(cache).cast(np.array([east, north, top]), down).distances[0])
+    if not np.isfinite(distance):
+        place = cache.frame.position([east, north, 0.0])
+        raise ScenarioError(
+            f"home at {place.latitude_deg:.6f}, {place.longitude_deg:.6f} is not on the map "
+            f"{cache.path}: plan the mission over it"
+        )
+    return top - distance
+
+
+def _world(cache: TileCache, home: Geodetic) -> WorldInfo:
+    """The map as far as a flight needs a world: a flat place about home, without known roads."""
+    low, high = _bounds(cache)
+    size = float(2 * np.abs([low[:2], high[:2]]).max())
+    none = River(np.zeros((0, 2)), np.zeros(0), np.zeros(0))
+    return WorldInfo(
+        seed=0,
+        variant="map",
+        size_m=size,
+        origin=home,
+        geoid_separation_m=cache.manifest.geoid_separation_m,
+        targets=(),
+        roads=(),
+        buildings=0,
+        terrain=Terrain(np.zeros((2, 2), np.float32), size, none),
+    )
+
+
+def _triangle(cache: TileCache) -> dict[str, object]:
+    low, high = _bounds(cache)
+    side = round(_SIDE * float((high - low)[:2].min()) / 2)
+    corners = ((0, side), (side, side), (0, 0))
+    legs = tuple(
+        Leg(east_m=e, north_m=n, height_m=_HEIGHT_M, gimbal_pitch_deg=-80.0) for e, n in corners
+    )
+    return {"legs": legs, "takeoff_height_m": _HEIGHT_M, "deny_after_s": 5.0, "speed_m_s": 8.0}
+
+
+def _as_planned(planned: PlannedMission, home: LocalFrame, scenario: Scenario) -> Scenario:
+    legs = []
+    for waypoint in planned.waypoints:
+        east, north, _ = home.enu_from_geodetic(
+            waypoint.latitude_deg, waypoint.longitude_deg, home.origin.height_m
+        )
+        pitch = _PITCH_DEG if waypoint.pitch_deg is None else waypoint.pitch_deg
+        legs.append(
+            {
+                "east_m": float(east),
+                "north_m": float(north),
+                "height_m": waypoint.height_m,
+                "gimbal_pitch_deg": min(max(pitch, -90.0), 0.0),
+            }
+        )
+    if planned.returns:
+        legs.append({**legs[-1], "east_m": 0.0, "north_m": 0.0})
+    changed: dict[str, object] = {"legs": legs}
+    changed["takeoff_height_m"] = planned.takeoff_height_m or planned.waypoints[0].height_m
+    if planned.speed_m_s is not None and planned.speed_m_s > 0:
+        changed["speed_m_s"] = planned.speed_m_s
+    return Scenario.model_validate(scenario.model_dump() | changed)
