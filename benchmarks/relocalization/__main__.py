@@ -2,13 +2,16 @@
 
     python -m benchmarks.relocalization --set generated --views 80 --heading known --out out.json
     python -m benchmarks.relocalization --set quito --views 48 --heading unknown
+    python -m benchmarks.relocalization --set quito --on FOLDER/generated/2000001/survey.cache
     python -m benchmarks.relocalization --report out.json more.json
 
 Sets are those of `python -m benchmarks.basin`: generated worlds of seeds that no training uses, the
 query on another day under made weather; quito, a real mesh (map and query from the same mesh);
-caliterra, real photos. Autopilot and barometer are drawn about the truth: roll and pitch 0.7
-degrees, height 2 m; heading uniform within 15 degrees, or anything. Found and confirmed: accepted,
-and within 3 m and 3 degrees; false: accepted and not. Times are medians; the wall's are this
+caliterra, real photos. With --on the views are searched on a map on which they are not: every
+answer is false. A run with --out goes on where the last one ended. Autopilot and barometer are
+drawn about the truth: roll and pitch 0.7 degrees, height 2 m; heading uniform within 15 degrees, or
+anything. Found and confirmed: accepted, and within 3 m and 3 degrees; false: accepted and not.
+Times are medians; the wall's are this
 machine's, with whatever else runs on it.
 """
 
@@ -21,7 +24,7 @@ from pathlib import Path
 from benchmarks.basin.views import load_views
 from benchmarks.common.arguments import Parser, existing, output, whole
 from benchmarks.common.named_errors import named_errors
-from benchmarks.relocalization.run import Outcome, run, table, with_threads
+from benchmarks.relocalization.run import Outcome, Search, run, table, with_threads
 from localizer.config import LocalizerConfig
 
 
@@ -33,6 +36,8 @@ def parser() -> Parser:
     p.add_argument(
         "--heading", choices=("known", "unknown", "both"), default="both", help="to 15 degrees"
     )
+    p.add_argument("--on", type=existing, help="tile cache of another place, to be searched")
+    p.add_argument("--first", type=whole(0, 100_000), default=0, help="view to begin with")
     p.add_argument("--threads", type=whole(1, 64), default=2, help="of a search")
     p.add_argument("--seed", type=whole(0, 1_000_000), default=0, help="of the sensors' errors")
     p.add_argument("--cache", type=Path, default=Path(".cache/basin"), help="of views and maps")
@@ -50,9 +55,12 @@ def main() -> None:
         return
     config = with_threads(LocalizerConfig(), args.threads)
     views = load_views(args.set, args.cache, args.data, args.views)
-    outcomes: list[Outcome] = []
+    kept = json.loads(args.out.read_text()) if args.out and args.out.exists() else []
+    outcomes = [Outcome(**row) for row in kept]
     for known in {"known": (True,), "unknown": (False,), "both": (True, False)}[args.heading]:
-        for outcome in run(args.set, views, config, heading_known=known, seed=args.seed):
+        done = sum(o.heading_known is known for o in outcomes)
+        asked = Search(args.set, config, known, args.seed, args.on)
+        for outcome in run(asked, views, args.first + done):
             outcomes.append(outcome)
             if args.out:  # after each one: an interrupted run keeps what it has
                 args.out.write_text(json.dumps([asdict(o) for o in outcomes], indent=1))

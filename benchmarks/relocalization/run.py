@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -13,8 +13,10 @@ from benchmarks.basin.views import View
 from benchmarks.common.shares import exact_interval
 from localizer.config import LocalizerConfig
 from localizer.evaluation.places import KnownOfPlace
+from localizer.geometry.pose import Array, Pose
 from localizer.map.cache.cache import TileCache
 from localizer.relocalization.relocalizer import OpenRelocalizer, open_relocalizer
+from localizer.relocalization.types import PlaceCandidate
 from localizer.types import Frame
 
 NEAR_M = 15.0  # from which a registration finds the place
@@ -23,8 +25,8 @@ RIGHT_M, RIGHT_DEG = 3.0, 3.0
 
 @dataclass(frozen=True)
 class Outcome:
-    """One view. rank: of the first candidate within 15 m, -1 without; found: accepted and right;
-    false: accepted and not right; area_km2: of the map; cpu_s, wall_s: of the whole search.
+    """One view. rank: of the first candidate that shows the place, -1 without; found: accepted and
+    right; false: accepted and not right; area_km2: of the map; cpu_s, wall_s: of the whole search.
     """
 
     set: str
@@ -42,46 +44,79 @@ class Outcome:
     wall_s: float
 
 
-def run(
-    name: str, views: Sequence[View], config: LocalizerConfig, *, heading_known: bool, seed: int
-) -> Iterator[Outcome]:
-    """Every view on the map of its own place, the whole of it."""
-    known = KnownOfPlace(prior=False, heading=heading_known, seed=seed)
+@dataclass(frozen=True)
+class Search:
+    """What is asked. name: of the views' set; on: another place's map, where no view is."""
+
+    name: str
+    config: LocalizerConfig
+    heading_known: bool
+    seed: int
+    on: Path | None = None
+
+
+def run(asked: Search, views: Sequence[View], first: int) -> Iterator[Outcome]:
+    """Every view from number `first` on, on the whole map of its own place or of another."""
+    known = KnownOfPlace(prior=False, heading=asked.heading_known, seed=asked.seed)
     maps: dict[Path, OpenRelocalizer] = {}
     try:
-        for k, view in enumerate(views):
-            if view.map_cache not in maps:
-                opened = open_relocalizer(TileCache.open(view.map_cache), config)
+        for k, view in enumerate(views[first:], first):
+            cache = asked.on or view.map_cache
+            if cache not in maps:
+                opened = open_relocalizer(TileCache.open(cache), asked.config)
                 if opened is None:
                     raise RuntimeError("an overview that nobody stopped was not made")
-                maps[view.map_cache] = opened
-            yield _one(name, view, maps[view.map_cache], known, k)
+                maps[cache] = opened
+            yield _one(asked, view, maps[cache], known, k)
     finally:
         for opened in maps.values():
             opened.close()
 
 
-def _one(name: str, view: View, opened: OpenRelocalizer, known: KnownOfPlace, k: int) -> Outcome:
+def _one(
+    asked: Search, view: View, opened: OpenRelocalizer, known: KnownOfPlace, k: int
+) -> Outcome:
     relocalizer = opened.relocalizer
-    query = known.query(Frame(view.query, 1, view.camera, k), view.truth, k)
+    truth = view.truth
+    if asked.on is not None:  # as high above that map's ground as it was above its own
+        ground = float(np.nanmedian(relocalizer.overview.levels[0].ground))
+        truth = replace(truth, translation=np.array([0.0, 0.0, ground + view.height]))
+    query = known.query(Frame(view.query, 1, view.camera, k), truth, k)
     wall, cpu = time.perf_counter(), time.process_time()
     candidates = relocalizer.search(query)
     searched = time.process_time()
     found = relocalizer.confirm(query, candidates)
     verified, wall = time.process_time(), time.perf_counter() - wall
-    places = np.array([c.world_from_camera.translation[:2] for c in candidates]).reshape(-1, 2)
-    near = np.linalg.norm(places - view.truth.translation[:2], axis=1) <= NEAR_M
-    right, error = False, None
-    if found is not None:
-        metres, degrees = found.world_from_camera.distance_to(view.truth)
-        right, error = metres <= RIGHT_M and degrees <= RIGHT_DEG, metres
+    right, error, rank = False, None, -1
+    if asked.on is None:
+        rank = _rank(candidates, view)
+        if found is not None:
+            metres, degrees = found.world_from_camera.distance_to(view.truth)
+            right, error = metres <= RIGHT_M and degrees <= RIGHT_DEG, metres
+    name = asked.name if asked.on is None else f"{asked.name}, not on this map"
     return Outcome(
         name, known.heading, view.condition, view.height, relocalizer.overview.area_km2,
-        int(np.argmax(near)) if near.any() else -1,
-        right, found is not None and not right, error,
+        rank, right, found is not None and not right, error,
         None if found is None else found.quality,
         searched - cpu, verified - searched, wall,
     )  # fmt: skip
+
+
+def _rank(candidates: Sequence[PlaceCandidate], view: View) -> int:
+    """Of the first candidate that looks at the ground within `NEAR_M` of what the view shows; -1
+    without. What lies ahead is found, and the camera follows with its heading's error.
+    """
+    aim = _aim(view.truth, view.height)
+    aims = np.array([_aim(c.world_from_camera, view.height) for c in candidates]).reshape(-1, 2)
+    near = np.linalg.norm(aims - aim, axis=1) <= NEAR_M
+    return int(np.argmax(near)) if near.any() else -1
+
+
+def _aim(pose: Pose, height_m: float) -> Array:
+    """East and north (2,) of the ground in the image's middle."""
+    axis = pose.rotation[:, 2]
+    place: Array = pose.translation[:2] + axis[:2] * height_m / max(-axis[2], 0.2)
+    return place
 
 
 def table(outcomes: Sequence[Outcome]) -> str:

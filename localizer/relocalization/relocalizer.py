@@ -33,6 +33,7 @@ from localizer.types import FeaturePyramid, PosePrior
 
 _SEARCH_WIDTH = 480  # px of the frame that the ground is rectified from
 _BLUR_PX = 0.6  # the map is sampled more coarsely than the frame
+_LEAST_JUDGED = 3  # candidates
 _SAME_PLACE_M = 5.0  # answers that are closer are one
 
 
@@ -137,13 +138,15 @@ class Relocalizer:
                 return []
             prior = self._verifier.prior(candidate, query)
             judged.append(self._judge(features, camera, query, candidate, rank, prior))
-            if judged[-1].credible and judged[-1].result.quality > self._config.decisive_quality:
+            # The first few are looked at in any case: among equal roofs several places agree.
+            if rank + 1 >= _LEAST_JUDGED and any(map(self._is_decisive, judged)):
                 break
         order = sorted(judged, key=lambda j: -j.result.quality)
         final = []
         for k, first in enumerate(order):
             j = first
             hopeless = k > 0 and j.result.quality < 0.5 * order[0].result.quality
+            hopeless = hopeless or k >= self._config.finalists
             for _ in range(0 if hopeless else self._config.passes - 1):
                 if should_stop():
                     return []
@@ -153,6 +156,12 @@ class Relocalizer:
                 j = self._judge(features, camera, query, j.candidate, j.rank, prior)
             final.append(j)
         return sorted(final, key=lambda j: (-int(j.credible), -j.result.quality))
+
+    def _is_decisive(self, judged: Judged) -> bool:
+        """Whether no other candidate can be better: all but a few parts of the image agree."""
+        votes = judged.result.agreement
+        least = self._config.decisive_agreement
+        return judged.credible and votes is not None and votes.share >= least
 
     def _judge(
         self,
@@ -179,7 +188,7 @@ class Relocalizer:
         rivals = [
             j.result.quality
             for j in judged[1:]
-            if math.isfinite(j.result.score)
+            if j.credible
             and np.linalg.norm(j.result.world_from_camera.translation - place) > _SAME_PLACE_M
         ]
         rival = max(rivals, default=0.0)

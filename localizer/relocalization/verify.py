@@ -27,7 +27,7 @@ from localizer.types import FeaturePyramid, PosePrior, RegistrationStatus
 _PLACE_SIGMA_M = 5.0  # of a candidate: some cells, and houses that lean
 _HEADING_SIGMA_RAD = np.radians(5.0)  # half a step of the headings tried
 _LEAST_TILT_SIGMA_RAD = np.radians(0.3)
-_FARTHEST_M = 40.0  # of an answer from its candidate: a registration that ran so far ran away
+_FARTHEST_M = 60.0  # of an answer from its candidate: a registration that ran so far ran away
 _MIN_MAP_SHARE = 0.1  # of the view
 
 
@@ -83,6 +83,9 @@ class Verifier:
         if result.overlap < c.min_overlap or result.quality < c.min_quality:
             return False
         if result.covariance.diagonal()[:3].max() > c.max_sigma_m**2:
+            return False
+        votes = result.agreement  # None on a GPU: the other tests decide
+        if votes is not None and votes.share < c.min_agreement:
             return False
         return self.agrees(result.world_from_camera, candidate, query)
 

@@ -4,16 +4,18 @@ import numpy as np
 import pytest
 
 from localizer.geometry.camera import Camera
-from localizer.geometry.pose import so3_exp
+from localizer.geometry.pose import Pose, so3_exp
+from localizer.registration.agreement import Agreement
+from localizer.registration.result import Registration
 from localizer.relocalization.config import RelocalizationConfig
 from localizer.relocalization.correlate import STEP, LevelCorrelator, transform_patch
 from localizer.relocalization.overview import OverviewLevel, Projection
 from localizer.relocalization.patch import footprint, rectify, turned
 from localizer.relocalization.search import headings, scales, shared_extractions
 from localizer.relocalization.topview import DOWN
-from localizer.relocalization.types import PlaceQuery, SearchRegion
-from localizer.relocalization.verify import tilt_and_heading
-from localizer.types import Frame
+from localizer.relocalization.types import PlaceCandidate, PlaceQuery, SearchRegion
+from localizer.relocalization.verify import Verifier, tilt_and_heading
+from localizer.types import Frame, RegistrationStatus
 
 CAMERA = Camera.from_fov(160, 120, 60.0)
 CONFIG = RelocalizationConfig()
@@ -110,10 +112,11 @@ def test_the_footprint_holds_what_is_seen():
 
 def test_headings_cover_what_is_not_known():
     all_round = headings(query(), CONFIG)
-    np.testing.assert_allclose(np.diff(np.append(all_round, 2 * np.pi)), np.radians(10))
+    step = np.radians(CONFIG.heading_step_deg)
+    np.testing.assert_allclose(np.diff(np.append(all_round, 2 * np.pi)), step)
     few = headings(query(np.radians(7.5)), CONFIG)
-    assert np.abs(few).max() + np.radians(CONFIG.heading_step_deg) / 2 >= np.radians(15)
-    assert len(few) <= 4
+    assert np.abs(few).max() + step / 2 >= np.radians(15) - 1e-9
+    assert len(few) <= 6
 
 
 def test_heights_cover_the_ground_and_its_error():
@@ -137,3 +140,17 @@ def test_tilt_and_heading_of_a_turn():
     tilt, heading = tilt_and_heading(turn @ reference, reference)
     assert np.degrees(tilt) == pytest.approx(2.0, abs=0.01)
     assert np.degrees(heading) == pytest.approx(130.0, abs=0.05)
+
+
+@pytest.mark.parametrize(
+    ("votes", "credible"),
+    [(Agreement(60, 54, 6.0), True), (Agreement(60, 20, 4.0), False), (None, True)],
+)
+def test_an_answer_needs_the_parts_of_the_image(votes, credible):
+    """Without votes (a GPU) the other tests decide, as before."""
+    pose = Pose(DOWN, np.array([0.0, 0.0, 100.0]))
+    found = Registration(
+        pose, 0.01 * np.eye(6), 0.2, 0.9, 0.5, RegistrationStatus.OK, 1, agreement=votes
+    )
+    verifier = Verifier(None, None, None, CONFIG, 1000, 0)
+    assert verifier.is_credible(found, PlaceCandidate(pose, 0.4), query()) == credible

@@ -76,6 +76,19 @@ def test_found_with_no_idea_of_place_or_heading(opened, query, truth):
     assert off @ np.linalg.solve(found.covariance[:3, :3], off) < 30
 
 
+def test_a_twin_that_is_as_credible_forbids_an_answer(opened, query, truth, monkeypatch):
+    """Equal roofs: both places agree, so neither is given; a rival that disagrees is none."""
+    relocalizer = opened.relocalizer
+    candidates = relocalizer.search(query)
+    best, *_ = relocalizer.verify(query, candidates)
+    away = Pose(truth.rotation, truth.translation + np.array([60.0, 0.0, 0.0]))
+    result = replace(best.result, world_from_camera=away, quality=best.result.quality - 0.01)
+    for credible in (True, False):
+        twin = replace(best, rank=1, result=result, credible=credible)
+        monkeypatch.setattr(relocalizer, "verify", lambda *_, twin=twin: [best, twin])
+        assert (relocalizer.confirm(query, candidates) is None) is credible
+
+
 def test_the_region_is_kept(opened, query, truth):
     near = SearchRegion.circle(truth.translation + 20.0, 60.0)
     places = opened.relocalizer.search(replace(query, region=near))
