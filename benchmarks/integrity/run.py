@@ -207,3 +207,9 @@ def deadline(minutes: float) -> Callable[[], bool]:
     """Whether so many minutes from now have not passed."""
     end = time.monotonic() + 60.0 * minutes
     return lambda: time.monotonic() < end
+
+
+def turn(more_time: Callable[[], bool], count: int) -> Callable[[], bool]:
+    """As `more_time`, but for so many calls at the most."""
+    calls = iter(range(count))
+    return lambda: next(calls, None) is not None and more_time()

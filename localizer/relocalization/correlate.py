@@ -83,18 +83,30 @@ def transform_patch(features: Float32, mask: Float32) -> PatchSpectra:
 
 
 class LevelCorrelator:
-    """Correlates patches with one level; keeps spectra of `byte_budget`. Safe to share."""
+    """Correlates patches with one level; keeps spectra of `byte_budget`. Safe to share.
+
+    A search goes over all its blocks again and again. Where they do not fit, the block unused for
+    longest is the next one wanted: so only what other searches left is given up for a new one, and
+    the share that fits is found each time.
+    """
 
     def __init__(self, level: OverviewLevel, byte_budget: int) -> None:
         self.level = level
         self._budget = byte_budget
         self._kept: OrderedDict[Block, _Spectra] = OrderedDict()
+        self._used: dict[Block, int] = {}  # number of the search that last wanted it
+        self._search = 0
         self._bytes = 0
         self._lock = threading.Lock()
         # int8 squares summed as such would wrap.
         sample = level.features[:, ::4, ::4].astype(np.float32) * level.quantum
         energy = (sample**2).sum(axis=0)
         self._usual = float(energy[energy > 0].mean()) if (energy > 0).any() else 1.0
+
+    def begin(self) -> None:
+        """A search begins: what earlier ones wanted may be given up."""
+        with self._lock:
+            self._search += 1
 
     def blocks(self) -> list[Block]:
         """Every block: patches may begin half a block outside the map."""
@@ -129,16 +141,25 @@ class LevelCorrelator:
             kept = self._kept.get(block)
             if kept is not None:
                 self._kept.move_to_end(block)
+                self._used[block] = self._search
                 return kept
         made = self._transform(block)
         with self._lock:
-            if made.nbytes <= self._budget and block not in self._kept:
+            if block not in self._kept and self._has_room(made.nbytes):
                 self._kept[block] = made
+                self._used[block] = self._search
                 self._bytes += made.nbytes
-                while self._bytes > self._budget:
-                    _, oldest = self._kept.popitem(last=False)
-                    self._bytes -= oldest.nbytes
         return made
+
+    def _has_room(self, nbytes: int) -> bool:
+        """Whether there is, after giving up what only earlier searches wanted; under the lock."""
+        while self._bytes + nbytes > self._budget and self._kept:
+            oldest = next(iter(self._kept))
+            if self._used[oldest] == self._search:
+                return False
+            self._bytes -= self._kept.pop(oldest).nbytes
+            del self._used[oldest]
+        return self._bytes + nbytes <= self._budget
 
     def _transform(self, block: Block) -> _Spectra:
         level = self.level

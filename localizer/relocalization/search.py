@@ -124,6 +124,7 @@ def search(
     seen = footprint(view.camera, query.rotation, 1.0, largest / float(heights[-1]))
     level = level_for(tuple(c.level for c in correlators), seen.side_m * float(heights[0]))
     correlator = next(c for c in correlators if c.level is level)
+    correlator.begin()
     run = _Search(view, query, correlator, extractor, config, seen, heights)
     groups = shared_extractions(heights, config.extraction_ratio)
     jobs = [(float(a), g) for g in groups for a in headings(query, config)]

@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+import scipy.fft
 
 from localizer.geometry.camera import Camera
 from localizer.geometry.pose import Pose, so3_exp
@@ -82,6 +83,37 @@ def test_a_cut_from_the_map_scores_one_where_it_was_cut_and_nowhere_else():
     assert best[0][1:] == (r, c)
     assert best[0][0] == pytest.approx(1.0, abs=0.05)
     assert best[1][0] < 0.3
+
+
+def test_a_map_that_does_not_fit_is_kept_in_part_and_the_next_search_keeps_its_own(monkeypatch):
+    """The least recently used would be the next one wanted: going round, nothing was ever found."""
+    features = np.random.default_rng(0).integers(-99, 99, (3, 512, 512)).astype(np.int8)
+    one = LevelCorrelator(level(features), 1 << 40)
+    patch = transform_patch(np.ones((16, 16, 3), np.float32), np.ones((16, 16), np.float32))
+    blocks = one.blocks()
+    size = 3 * 256 * 129 * 8 + 32 * 17 * 8
+    made = []
+    correlator = LevelCorrelator(level(features), 5 * size)
+    transform = scipy.fft.rfft2
+    monkeypatch.setattr(
+        scipy.fft, "rfft2", lambda x, *a, **k: (made.append(x.ndim), transform(x, *a, **k))[1]
+    )
+
+    def transformed(wanted):
+        made.clear()
+        correlator.begin()
+        for block in wanted * 2:
+            np.testing.assert_allclose(
+                correlator.correlate(patch, block), one.correlate(patch, block), atol=1e-6
+            )
+        return made.count(3)
+
+    for block in blocks:
+        one.correlate(patch, block)
+    n = len(blocks)
+    assert n > 10
+    assert transformed(blocks) == n + (n - 5)  # the second round finds five
+    assert transformed(blocks[-5:]) == 5  # and another search its own
 
 
 def test_rectified_ground_lies_where_it_is():
