@@ -22,7 +22,7 @@ class IntegrityConfig(BaseModel):
     min_overlap: float = Field(0.35, ge=0, le=1, description="share of anchors in view")
     min_quality: float = Field(0.15, ge=0, le=1, description="registration quality")
     min_agreement: float = Field(
-        0.55, ge=0, le=1, description="share of the image's parts that match best where they lie"
+        0.4, ge=0, le=1, description="share of the image's parts that match best where they lie"
     )
     min_parts: int = Field(
         8, ge=0, le=1000, description="parts of the image that can say so, of 32 px"

@@ -44,7 +44,7 @@ class RelocalizationConfig(BaseModel):
         0.6, ge=0, le=1, description="share of the image's parts that agree on an answer"
     )
     min_overlap: float = Field(0.5, ge=0, le=1, description="share of the anchors in view")
-    max_sigma_m: float = Field(2.0, ge=0.01, le=100, description="position sigma of an answer")
+    max_sigma_m: float = Field(4.0, ge=0.01, le=100, description="position sigma of an answer")
     tilt_gate_deg: float = Field(
         2.0, ge=0.1, le=90, description="added to three sigmas of roll and pitch"
     )
