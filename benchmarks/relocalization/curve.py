@@ -93,8 +93,12 @@ def costs(
 def main() -> None:
     p = Parser(__doc__)
     p.add_argument("map", type=existing, help="tile cache")
-    p.add_argument("--areas", nargs="+", type=number(0.01, 1000), default=[1.0, 3.0, 10.0])
-    p.add_argument("--heading", choices=("known", "unknown"), default="known")
+    p.add_argument(
+        "--areas", nargs="+", type=number(0.01, 1000), default=[1.0, 3.0, 10.0], help="km2"
+    )
+    p.add_argument(
+        "--heading", choices=("known", "unknown"), default="known", help="to 15 degrees, or not"
+    )
     p.add_argument("--spectra-mib", type=whole(0, 1 << 20), help="budget of kept transforms")
     p.add_argument("--out", type=output, help="JSON")
     args = p.parse_args()
