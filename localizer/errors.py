@@ -35,6 +35,10 @@ class OutsideMapError(MapError):
     """A pose whose view does not meet the map."""
 
 
+class MapLoadingError(OutsideMapError):
+    """A view of which nothing is in memory yet; it is on its way."""
+
+
 class RenderError(LocalizerError):
     """A renderer backend that is not available, or that is used by the wrong thread."""
 

@@ -10,13 +10,16 @@ from typing import Any
 
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
+from mavlink_bridge.link.clock import monotonic_ns
 from mavlink_bridge.messages import HealthLevel, without_figures
+from mavlink_bridge.texts import Settling
 
 _log = logging.getLogger(__name__)
 
 _TEXTS = 64
 _TEXT_LENGTH = 50  # STATUSTEXT.text
 _MAX_CHUNKS = 4
+_AGAIN_NS = 10_000_000_000
 _SEVERITY = {
     HealthLevel.STARTING: mavlink.MAV_SEVERITY_INFO,
     HealthLevel.OK: mavlink.MAV_SEVERITY_INFO,
@@ -37,6 +40,9 @@ class OperatorStatus:
         self._health_lock = threading.Lock()
         self._text_lock = threading.Lock()
         self._health = (HealthLevel.STARTING, "")
+        self._settling = Settling()
+        self._told_ns: dict[tuple[HealthLevel, str], int] = {}
+        self._last_told = self._health
         self._texts: deque[tuple[int, str]] = deque(maxlen=_TEXTS)
         self._text_id = 0
 
@@ -45,11 +51,25 @@ class OperatorStatus:
         """The localizer's health, as the heartbeats tell it."""
         return self._health[0]
 
-    def set_health(self, level: HealthLevel, text: str, *, tell: bool) -> None:
-        """A change of level or text (but for its figures) is told once, if at all."""
+    def set_health(
+        self, level: HealthLevel, text: str, *, tell: bool, now_ns: int | None = None
+    ) -> None:
+        """A change of level or text (but for its figures) is told, if at all; to be called again
+        and again.
+
+        What comes and goes by turns is told once in 10 s, and its end once it has lasted: an
+        overloaded computer is well and ill every other second. now_ns: CLOCK_MONOTONIC.
+        """
+        now_ns = monotonic_ns() if now_ns is None else now_ns
+        key = (level, without_figures(text))
+        bad = level in (HealthLevel.DEGRADED, HealthLevel.FAILED)
         with self._health_lock:
-            news = (level, without_figures(text)) != self._health
-            self._health = (level, without_figures(text))
+            self._health = key
+            over = self._settling.is_over(now_ns, bad=bad)
+            lately = now_ns - self._told_ns.get(key, -_AGAIN_NS) < _AGAIN_NS
+            news = key != self._last_told and (not lately if bad else over)
+            if news:
+                self._last_told, self._told_ns[key] = key, now_ns
         if news and tell:
             self.say(_SEVERITY[level], f"PiLoT: {text or level.value}")
 

@@ -27,6 +27,8 @@ _log = logging.getLogger(__name__)
 _PERIOD_S = 1.0
 _WINDOW = 200
 _STALE_S = 2.0
+_RATE_S = 5.0
+_LEAST_HZ = 3.0  # below 4 an EKF does without; a frame or two more or less is no news
 _SHORT_BRIDGE_NS = 2_000_000_000
 _NOTICE = 5  # MAV_SEVERITY_NOTICE
 _NOT_USED = "vision not used: "
@@ -73,6 +75,7 @@ class HealthMonitor:
         self._ended = ""
         self._file = record_folder / "health.json" if record_folder else None
         self._estimates: deque[tuple[float, PoseEstimate]] = deque(maxlen=_WINDOW)
+        self._came: deque[tuple[float, int]] = deque(maxlen=_WINDOW)
         self._write_failed = False
         self._failures = 0
         self._stop = threading.Event()
@@ -108,7 +111,7 @@ class HealthMonitor:
                 return
 
     def _report(self) -> None:
-        level, text = self._assess()
+        level, text = self.assess()
         # The bridge logs and records what it tells; a silent vehicle it tells by itself, and what
         # keeps positions from the EKF; the guardian tells what it withholds.
         if self._ended:
@@ -120,7 +123,7 @@ class HealthMonitor:
         self._bridge.set_health(level, text, tell=not known)
         self._write(level.value, text)
 
-    def _assess(self) -> tuple[HealthLevel, str]:
+    def assess(self) -> tuple[HealthLevel, str]:
         """The worst thing that is true now, in one line."""
         feed = self._feed_state()
         if feed in _OF_FEED:
@@ -134,13 +137,17 @@ class HealthMonitor:
         if time.monotonic() - arrived > _STALE_S:
             if _is_lost(estimate):  # the error stands in health.json; this is what to act on
                 return HealthLevel.FAILED, "localization lost" + self._since(estimate)
-            return HealthLevel.DEGRADED, engine.last_error or "no frame is being localized"
+            nothing = self._overload(engine) or "no frame is being localized"
+            return HealthLevel.DEGRADED, engine.last_error or nothing
         level, text = _OF_STATE[estimate.state]
         if estimate.state is TrackingState.BRIDGING:
             level, text = _bridging(estimate)
         trouble = self._bridge.trouble
         if level is HealthLevel.OK and trouble:
             level, text = HealthLevel.DEGRADED, _NOT_USED + trouble
+        overload = self._overload(engine)
+        if overload and level is HealthLevel.OK:
+            level, text = HealthLevel.DEGRADED, overload
         withheld = self._guardian.reason if self._guardian is not None else ""
         if withheld and not _is_lost(estimate):
             level, text = HealthLevel.FAILED, withheld
@@ -150,6 +157,20 @@ class HealthMonitor:
         text += ", map unreadable" if self._unreadable_nodes() else ""
         text += ", video scaled" if feed is StreamState.SCALED else ""
         return level, text + ("" if self._is_recorded() else ", record incomplete")
+
+    def _overload(self, engine: EngineHealth) -> str:
+        """Too few frames are localized of those that come; empty where they are enough."""
+        now_s, came = time.monotonic(), engine.frames_in
+        self._came.append((now_s, came))
+        while now_s - self._came[0][0] > _RATE_S:
+            self._came.popleft()
+        begun_s, before = self._came[0]
+        if now_s - begun_s < 0.7 * _RATE_S:
+            return ""
+        offered, done = (came - before) / (now_s - begun_s), self._rate()
+        if done >= _LEAST_HZ or offered < 2.0 * _LEAST_HZ:
+            return ""
+        return f"overloaded, {done:.0f} of {offered:.0f} frames/s"
 
     def _since(self, estimate: PoseEstimate) -> str:
         """Since when there is no fix, and how far off the autopilot may be.
@@ -201,7 +222,7 @@ class HealthMonitor:
     def _rate(self) -> float:
         """Localized frames per second over the last few seconds."""
         now = time.monotonic()
-        return sum(1 for t, _ in list(self._estimates) if now - t < 5.0) / 5.0
+        return sum(1 for t, _ in list(self._estimates) if now - t < _RATE_S) / _RATE_S
 
     def _stages(self) -> dict[str, dict[str, float]]:
         """p50 and p95 of each stage over the window, ms."""

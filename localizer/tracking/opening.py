@@ -89,6 +89,7 @@ def build_localizer(
     return Localizer(
         stack.renderer, extractor, optimizer, camera, config, sensors,
         map_frame=stack.cache.frame, on_close=on_close,
+        is_loading=lambda: not stack.streamer.idle,
     )  # fmt: skip
 
 

@@ -16,7 +16,12 @@ import cv2
 import numpy as np
 
 from localizer.config import LocalizerConfig
-from localizer.errors import CameraError, GeoreferenceError, OutsideMapError
+from localizer.errors import (
+    CameraError,
+    GeoreferenceError,
+    MapLoadingError,
+    OutsideMapError,
+)
 from localizer.features.extractor import DeviceExtractor, FeatureExtractor
 from localizer.geometry.camera import Camera
 from localizer.geometry.geo import LocalFrame
@@ -108,7 +113,8 @@ class Localizer:
     sensors: other sensors' accounts (autopilot and gimbal). Their turns replace the constant
     angular rate of the motion model, their attitude enters the registration as a weak prior
     (`AttitudePrior`), and with the displacement it confirms or refutes a place that was searched.
-    map_frame: the map's. on_close: releases what was opened for this localizer alone.
+    map_frame: the map's. on_close: releases what was opened for this localizer alone. is_loading:
+    whether tiles that were asked for are still on their way.
     """
 
     def __init__(
@@ -122,7 +128,9 @@ class Localizer:
         *,
         map_frame: LocalFrame | None = None,
         on_close: Callable[[], None] = lambda: None,
+        is_loading: Callable[[], bool] = lambda: False,
     ) -> None:
+        self._is_loading = is_loading
         self._map_frame, self._on_close = map_frame, on_close
         self._renderer = renderer
         self._extractor = extractor
@@ -256,6 +264,8 @@ class Localizer:
         """Render the view at the prior's pose and select its geo-anchors (paper, Eq. 1 and 2)."""
         view = self._renderer.render(prior.world_from_camera, self.camera, wait=wait)
         if np.count_nonzero(view.depth) < _MIN_MAP_SHARE * view.depth.size:
+            if not wait and self._is_loading():
+                raise MapLoadingError("the map is being loaded")
             e, n, u = prior.world_from_camera.translation
             raise OutsideMapError(
                 f"the view from east {e:.1f} north {n:.1f} up {u:.1f} m (map frame) does not meet "

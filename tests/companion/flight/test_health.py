@@ -78,7 +78,8 @@ def test_the_worst_thing_is_told(tmp_path, state, connected, level, text):
     assert events == []  # the bridge logs and records it; once is enough
     written = json.loads((tmp_path / "health.json").read_text())
     assert set(written) == {
-        "level", "text", "time_ns", "engine", "rate_hz", "stages_ms", "bridge", "shadow", "guardian"
+        "level", "text", "time_ns", "pid", "engine", "rate_hz", "stages_ms", "bridge", "shadow",
+        "guardian",
     }  # fmt: skip
     assert written["bridge"]["fix_latency_ms"] is None  # NaN is no JSON
     assert written["level"] == level.value
@@ -202,3 +203,35 @@ def test_bridging_is_told_once_it_lasts(tmp_path, seconds, level, text):
     monitor.start()
     monitor.stop()
     assert bridge.told[0] == (level, text)
+
+
+def test_an_overloaded_computer_is_told_as_that(tmp_path, monkeypatch):
+    """Ten pictures a second come, one is localized; with five a second all is well."""
+    now, came = [100.0], [0]
+    monkeypatch.setattr("companion.flight.health.time.monotonic", lambda: now[0])
+    bridge = FakeBridge(True)
+    monitor = HealthMonitor(
+        lambda: EngineHealth(frames_in=came[0]), bridge, lambda: StreamState.LIVE,
+        lambda *_: None, tmp_path,
+    )  # fmt: skip
+
+    def fly(seconds, localized_hz):
+        for _ in range(seconds):
+            now[0] += 1.0
+            came[0] += 10
+            for _ in range(localized_hz):
+                monitor.add_estimate(
+                    SimpleNamespace(
+                        state=TrackingState.TRACKING, stage_ms={}, last_fix_ns=None, sequence=0
+                    )
+                )
+            told.append(monitor.assess())
+
+    told = []
+    fly(10, 5)
+    assert {text for _, text in told} == {"localization tracking"}
+    told.clear()
+    fly(8, 1)
+    assert told[-1] == (HealthLevel.DEGRADED, "overloaded, 1 of 10 frames/s")
+    fly(8, 5)
+    assert told[-1] == (HealthLevel.OK, "localization tracking")

@@ -16,6 +16,7 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 from mavlink_bridge import Bridge, BridgeConfig, HealthLevel, VehicleState
 from mavlink_bridge.link.link import Link, sleep_until
 from mavlink_bridge.link.transport import Endpoint, Transport, open_transport
+from mavlink_bridge.status import OperatorStatus
 from mavlink_bridge.vehicle.presence import VehicleWatch
 
 HEARTBEAT = mavlink.MAVLink_heartbeat_message(2, 3, 81, 4, 4, 3)
@@ -234,3 +235,40 @@ def test_what_the_operator_reads_is_logged_and_recorded_once(
         (mavlink.MAV_SEVERITY_WARNING, "PiLoT: localization degraded"),
         (mavlink.MAV_SEVERITY_WARNING, "PiLoT: no map at north -9590.3 m"),
     ]
+
+
+def test_an_overloaded_computer_is_told_once_and_not_every_second() -> None:
+    """Well and ill by turns for a minute: each bad text once in 10 s, the end once it lasts."""
+    told: list[str] = []
+    status = OperatorStatus(lambda _: None, lambda _, text: told.append(text))
+    second = 10**9
+
+    def report(at_s: int, level: HealthLevel, text: str) -> None:
+        status.set_health(level, text, tell=True, now_ns=at_s * second)
+        assert status.level is level  # the heartbeats say what is
+
+    report(0, HealthLevel.OK, "localization tracking")
+    for at_s in range(1, 61):
+        if at_s % 2:
+            report(at_s, HealthLevel.DEGRADED, f"overloaded, {at_s % 3} of 10 frames/s")
+        else:
+            report(at_s, HealthLevel.OK, "localization tracking")
+    assert told[:2] == [
+        "PiLoT: localization tracking",
+        "PiLoT: overloaded, 1 of 10 frames/s",
+    ]
+    assert len(told) == 2  # 60 before
+    for at_s in range(61, 66):
+        report(at_s, HealthLevel.OK, "localization tracking")
+    assert told[2:] == ["PiLoT: localization tracking"]
+
+
+def test_a_worse_state_is_told_at_once_and_an_older_one_again_after_a_while() -> None:
+    told: list[str] = []
+    status = OperatorStatus(lambda _: None, lambda _, text: told.append(text))
+    degraded, lost = (HealthLevel.DEGRADED, "bridging"), (HealthLevel.FAILED, "lost")
+    steps = [(0, degraded), (1, lost), (2, degraded), (3, lost), (12, degraded), (13, lost)]
+    for at_s, (level, text) in steps:
+        status.set_health(level, text, tell=True, now_ns=at_s * 10**9)
+    names = [text.removeprefix("PiLoT: ") for text in told]
+    assert names == ["bridging", "lost", "bridging", "lost"]  # at 0, 1, 12 and 13 s
