@@ -10,6 +10,7 @@ from pydantic import BaseModel, ConfigDict, Field, field_validator, model_valida
 
 from companion.errors import ConfigError
 from companion.guardian.config import GuardianConfig
+from companion.live.config import ConsoleConfig
 from companion.settings_file import SettingsError, read_settings, validated
 from companion.sources.base import SourceSettings
 from companion.targets.detections import parse_host_port
@@ -169,6 +170,9 @@ class CompanionConfig(_Model):
     prior: PriorConfig = PriorConfig()
     guardian: GuardianConfig = GuardianConfig()
     record: RecordConfig | None = None
+    console: ConsoleConfig | None = Field(
+        None, description="the operator's page (extra `console`); null: none"
+    )
 
 
 def load_config(path: Path) -> CompanionConfig:
@@ -213,6 +217,7 @@ def _resolve(config: CompanionConfig, folder: Path) -> CompanionConfig:
         "bridge": _resolve_bridge(config.bridge, folder),
         "prior": _resolve_prior(config.prior, folder),
         "record": record,
+        "console": _resolve_console(config.console, folder),
     }
     return config.model_copy(update=update)
 
@@ -222,6 +227,14 @@ def _resolve_prior(prior: PriorConfig, folder: Path) -> PriorConfig:
         return prior
     path = _path(folder, prior.state_file, "prior.state_file")
     return prior.model_copy(update={"state_file": path})
+
+
+def _resolve_console(console: ConsoleConfig | None, folder: Path) -> ConsoleConfig | None:
+    if console is None:
+        return None
+    given = {name: getattr(console, name) for name in ("token_file", "tls_certificate", "tls_key")}
+    update = {name: _path(folder, path, f"console.{name}") for name, path in given.items() if path}
+    return console.model_copy(update=update)
 
 
 def _resolve_bridge(bridge: BridgeConfig, folder: Path) -> BridgeConfig:

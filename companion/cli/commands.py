@@ -1,5 +1,5 @@
-"""The command line: ``companion run | eval | localize | convert | replay | report | map | world |
-doctor | key``.
+"""The command line: ``companion run | eval | localize | convert | replay | report | console | map |
+world | doctor | key``.
 
 Exit codes: 0 done; 1 `doctor` found advice, `replay` differs, `localize` localized nothing or `map
 verify` found damage; 2 wrong usage, a named error, or `doctor` found the vehicle not fit to fly;
@@ -16,6 +16,7 @@ import typer
 from rich.console import Console
 from rich.markup import escape
 
+from companion.cli.console import console_command
 from companion.cli.convert import convert_command
 from companion.cli.doctor import doctor_command
 from companion.cli.evaluate import evaluate_command
@@ -63,6 +64,7 @@ app.command("localize")(localize_command)
 app.command("convert")(convert_command)
 app.command("replay")(replay_command)
 app.command("report")(report_command)
+app.command("console")(console_command)
 app.command("doctor")(doctor_command)
 app.command("key")(key_command)
 app.add_typer(map_app, name="map", help="Build and inspect tile caches.")

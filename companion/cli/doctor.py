@@ -24,16 +24,21 @@ def doctor_command(
     ] = False,
     yes: Annotated[bool, typer.Option(help="do not ask")] = False,
     vehicle: Annotated[bool, typer.Option(help="examine the flight controller too")] = True,
+    beside_flight: Annotated[
+        bool,
+        typer.Option("--beside-flight", help="leave out vehicle and feed: a flight has them"),
+    ] = False,
 ) -> None:
     """Check a deployment; exit code 0 good, 1 advice, 2 not fit to fly."""
     settings = load_config(config)
+    vehicle, feed = vehicle and not beside_flight, not beside_flight
     console = Console()
     with shown_steps(console) as say:
         say(f"examining {config}")  # the imports take seconds, too
         from companion.preflight.doctor import examine_deployment
         from mavlink_bridge.preflight.doctor import repair
 
-        diagnosis = examine_deployment(settings, vehicle=vehicle, say=say)
+        diagnosis = examine_deployment(settings, vehicle=vehicle, feed=feed, say=say)
     print_diagnosis(console, diagnosis)
     if fix and diagnosis.fixable:
         names = ", ".join(f"{f.name} = {f.fix:.7g}" for f in diagnosis.fixable if f.fix is not None)
@@ -41,7 +46,7 @@ def doctor_command(
             reboot = repair(settings.bridge, diagnosis.fixable)
             console.print("written" + ("; reboot the flight controller" if reboot else ""))
             with shown_steps(console) as say:
-                diagnosis = examine_deployment(settings, vehicle=vehicle, say=say)
+                diagnosis = examine_deployment(settings, vehicle=vehicle, feed=feed, say=say)
             print_diagnosis(console, diagnosis)
     raise typer.Exit(diagnosis.exit_code)
 

@@ -13,6 +13,7 @@ import typer
 from companion.cli.interrupts import end_at_once
 from companion.config import CompanionConfig, load_config
 from companion.terminal.console_log import console_log
+from companion.terminal.console_process import running_console
 from localizer.registration.devices import DeviceChoice
 from localizer.render.select import RendererName
 
@@ -67,7 +68,7 @@ def run_command(
         signal.signal(number, interrupt)
     # The terminal may be a radio link that the aircraft flies away from.
     signal.signal(signal.SIGHUP, signal.SIG_IGN)
-    with console_log(verbose):
+    with console_log(verbose), running_console(config, settings.console):
         try:
             companion.run()
         finally:  # what is down needs no second order; the interpreter's own end would die of one

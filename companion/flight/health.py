@@ -73,6 +73,8 @@ class HealthMonitor:
         self._guardian = guardian
         self._unreadable_nodes = unreadable_nodes
         self._ended = ""
+        self.newest: dict[str, Any] = {"level": "starting", "text": "starting"}
+        """The newest report, as health.json has it."""
         self._file = record_folder / "health.json" if record_folder else None
         self._estimates: deque[tuple[float, PoseEstimate]] = deque(maxlen=_WINDOW)
         self._came: deque[tuple[float, int]] = deque(maxlen=_WINDOW)
@@ -185,9 +187,7 @@ class HealthMonitor:
         return text + (f", +-{2.0 * sigma_m:.0f} m" if sigma_m is not None else "")
 
     def _write(self, level: str, text: str) -> None:
-        if self._file is None:
-            return
-        report = {
+        report: dict[str, Any] = {
             "level": level,
             "text": text,
             "time_ns": time.monotonic_ns(),
@@ -199,6 +199,9 @@ class HealthMonitor:
             "shadow": self._bridge.shadow_score().line(),
             "guardian": self._guardian_report(),
         }
+        self.newest = report
+        if self._file is None:
+            return
         temporary = self._file.with_suffix(".tmp")
         try:
             temporary.write_text(json.dumps(_finite(report), indent=1, default=str))

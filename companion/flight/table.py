@@ -27,6 +27,10 @@ from companion.flight.sightings import Sightings
 from companion.flight.view_reporter import ViewReporter
 from companion.guardian.guardian import Guardian
 from companion.guardian.monitor import Limits
+from companion.live.orders import Helm, OrderError, Orders
+from companion.live.protocol import socket_path
+from companion.live.publisher import Publisher
+from companion.live.shown import Instruments, Shown
 from companion.preflight.coverage import check_origin
 from companion.preflight.map_pin import require_pinned
 from companion.sources import FrameSource, StreamState, open_source
@@ -40,7 +44,7 @@ from localizer.map.cache.surface import MapSurface
 from localizer.tracking.engine import DualThreadEngine
 from localizer.tracking.opening import MapStack, build_localizer
 from localizer.tracking.pipeline import Localizer
-from localizer.types import PoseEstimate, ReferenceBundle
+from localizer.types import Frame, PoseEstimate, ReferenceBundle
 from mavlink_bridge.bridge import Bridge
 from mavlink_bridge.config import BridgeConfig
 
@@ -239,6 +243,61 @@ def _feed(making: Making) -> Feed:
     return Feed(source, making.channels.frames.send)
 
 
+def _console(making: Making) -> Publisher:
+    """Everything it asks of the flight is a look at what is there; it subscribes last, and what it
+    keeps of a picture is a reference.
+    """
+    config, bridge, channels = making.config, making[Bridge], making.channels
+    assert config.console is not None  # or the part is not wanted
+    cache, search, health = making[MapStack].cache, making[PlaceSearch], making[HealthMonitor]
+    geoid_m = cache.manifest.geoid_separation_m
+    instruments = Instruments(
+        lambda: health.newest, bridge.state, bridge.shadow_score, bridge.loop_verdict,
+        lambda: bridge.injecting,
+    )  # fmt: skip
+    folder = making[RecordKeeper].folder
+    about = {
+        "map": str(config.map),
+        "record": None if folder is None else str(folder),
+        "control": config.console.control,
+        "mode": config.bridge.mode,
+        "delay_ms": config.bridge.injection.delay_ms,
+        "alert_limit_m": config.bridge.injection.alert_limit_m,
+    }
+    shown = Shown(cache.frame, geoid_m, instruments, about)
+
+    def hint(latitude_deg: float, longitude_deg: float, radius_m: float) -> None:
+        height_m = cache.frame.origin.height_m
+        place = cache.frame.enu_from_geodetic(latitude_deg, longitude_deg, height_m)
+        low, high = cache.index.box_min[0] - radius_m, cache.index.box_max[0] + radius_m
+        if not ((low <= place) & (place <= high))[:2].all():
+            raise OrderError("the hint lies off the map")
+        search.hint(float(place[0]), float(place[1]), radius_m)
+
+    helm = Helm(bridge.say, channels.clicks.send, hint)
+    orders = Orders(config.console.control, helm)
+    record = None if config.record is None else config.record.folder
+    path = socket_path(config.map, record, config.console.listen)
+    publisher = Publisher(path, shown, orders, config.console.frames_hz)
+
+    def see(frame: Frame) -> None:
+        if publisher.is_watched:
+            shown.add_frame(frame)
+
+    def estimated(estimate: PoseEstimate, bundle: ReferenceBundle) -> None:
+        shown.add_estimate(estimate, bundle)
+        if publisher.is_watched:
+            publisher.wake()
+
+    channels.frames.subscribe(see)
+    channels.estimates.subscribe(estimated)
+    channels.targets.subscribe(shown.add_target)
+    channels.gone.subscribe(shown.forget_target)
+    channels.events.subscribe(shown.add_event)
+    channels.texts.subscribe(lambda severity, text: shown.add_event(_level(severity), text))
+    return publisher
+
+
 def _search(making: Making) -> PlaceSearch:
     cache, event = making[MapStack].cache, making.channels.events.send
     search = PlaceSearch(cache, making.config.localizer, making[AutopilotPose], event)
@@ -314,6 +373,12 @@ PARTS: tuple[Part[Any], ...] = (
     Part(
         "search", PlaceSearch, _search, depends=(MapStack, AutopilotPose),
         start=PlaceSearch.start, stop=PlaceSearch.stop, close=PlaceSearch.close,
+    ),
+    Part(
+        "console", Publisher, _console,
+        depends=(MapStack, Bridge, HealthMonitor, RecordKeeper, PlaceSearch),
+        start=Publisher.start, stop=Publisher.stop, close=Publisher.close,
+        wanted=lambda config: config.console is not None,
     ),
     Part(
         "engine", DualThreadEngine, _engine, depends=(Localizer, PriorSources, PlaceSearch),

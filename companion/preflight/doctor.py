@@ -31,9 +31,13 @@ _GOVERNOR = Path("/sys/devices/system/cpu/cpu0/cpufreq/scaling_governor")
 
 
 def examine_deployment(
-    config: CompanionConfig, *, vehicle: bool = True, say: Callable[[str], None] = lambda _: None
+    config: CompanionConfig,
+    *,
+    vehicle: bool = True,
+    feed: bool = True,
+    say: Callable[[str], None] = lambda _: None,
 ) -> Diagnosis:
-    """Every check; `vehicle` false leaves out what needs the flight controller.
+    """Every check; `vehicle` false leaves out what needs the flight controller, `feed` the camera.
 
     The feed is read while the vehicle is listened to: both are waiting. The localizer comes before,
     alone: its compilers hold the interpreter, and the link's round trip would be theirs. say: takes
@@ -46,9 +50,9 @@ def examine_deployment(
     listening = f" and listening to the vehicle at {config.bridge.connection}" if vehicle else ""
     say(f"reading the feed {redacted(config.camera.source)}{listening}")
     with ThreadPoolExecutor(1) as aside:
-        camera = aside.submit(_check_camera, config)
+        camera = aside.submit(_check_camera, config) if feed else None
         diagnosis = examine(config.bridge, say) if vehicle else None
-        findings += [camera.result(), _check_power()]
+        findings += [*([] if camera is None else [camera.result()]), _check_power()]
     findings += check_places(config)
     if cache is not None and config.bridge.origin is not None:
         findings.append(check_origin(config.bridge.origin, cache))

@@ -1,0 +1,93 @@
+"""``companion console``: the operator's page, as a process of its own."""
+
+from __future__ import annotations
+
+import os
+import sys
+import threading
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+from rich.console import Console
+
+from companion.config import load_config
+from companion.errors import ConfigError
+from companion.live.config import ConsoleConfig
+from companion.terminal.console_log import console_log
+
+if TYPE_CHECKING:
+    from companion.console.server import Site
+
+_NICE = 15  # below everything that flies
+_MOST_CONNECTIONS = 64
+
+
+def console_command(
+    config: Annotated[Path, typer.Argument(help="deployment YAML")],
+    listen: Annotated[
+        str | None, typer.Option(help="address:port instead of console.listen")
+    ] = None,
+    lifeline: Annotated[
+        bool, typer.Option("--lifeline", hidden=True, help="end with standard input")
+    ] = False,
+) -> None:
+    """Serve the operator's page: what the flight sees, live, with or without a flight."""
+    settings = load_config(config)
+    given = settings.console or ConsoleConfig()
+    # The flight is met by the deployment's own address, whatever this page listens on.
+    meeting = given.listen
+    if listen is not None:
+        given = ConsoleConfig.model_validate(given.model_dump() | {"listen": listen})
+    os.nice(_NICE)
+    if lifeline:
+        threading.Thread(target=_end_with_input, name="lifeline", daemon=True).start()
+    require_extra()
+    from companion.console.flight_source import FlightSource
+    from companion.console.records import Records
+    from companion.console.security import read_token
+    from companion.console.server import Site
+    from companion.live.protocol import socket_path
+
+    record = None if settings.record is None else settings.record.folder
+    source = FlightSource(socket_path(settings.map, record, meeting))
+    records = Records(None if record is None else record.parent)
+    token = read_token(given.token_file)
+    serve(Site(given, source, settings.map, records, config.absolute(), token))
+
+
+def require_extra() -> None:
+    """`ConfigError` where the packages of the extra `console` are not installed."""
+    try:
+        import starlette  # noqa: F401
+        import uvicorn  # noqa: F401
+        import websockets  # noqa: F401
+    except ImportError as error:
+        raise ConfigError(f"install pilot-companion[console] for the console: {error}") from error
+
+
+def serve(site: Site) -> None:
+    """Serve until interrupted."""
+    import uvicorn
+
+    from companion.console.server import make_application
+
+    config = site.config
+    Console().print(f"console: [green]{config.url}[/]", soft_wrap=True, highlight=False)
+    server = uvicorn.Server(
+        uvicorn.Config(
+            make_application(site), host=config.host, port=config.port, log_level="warning",
+            ws="websockets-sansio", ws_max_size=4096, limit_concurrency=_MOST_CONNECTIONS,
+            timeout_keep_alive=5, timeout_graceful_shutdown=1, server_header=False,
+            ssl_certfile=config.tls_certificate, ssl_keyfile=config.tls_key, lifespan="on",
+        )
+    )  # fmt: skip
+    with console_log(verbose=False):
+        server.run()
+
+
+def _end_with_input() -> None:
+    """The flight that started this process holds the other end: when it is gone, so is this."""
+    while sys.stdin.buffer.read(1):
+        pass
+    os._exit(0)

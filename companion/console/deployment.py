@@ -1,0 +1,105 @@
+"""The deployment file: shown with its keys' help, checked before it is written, kept before."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import tempfile
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any, get_args
+
+from pydantic import BaseModel
+
+from companion.config import CompanionConfig, load_config
+from companion.errors import ConfigError
+from companion.redaction import redacted
+
+_MOST_BYTES = 64 << 10
+
+
+def shown(path: Path, editable: bool) -> dict[str, Any]:
+    """The file's text, and the help; credentials only for somebody who may change the file."""
+    try:
+        text = path.read_text(encoding="utf-8")
+    except (OSError, ValueError) as error:
+        raise ConfigError(f"{path}: cannot be read: {error}") from error
+    return {
+        "path": str(path),
+        "text": text if editable else redacted(text),
+        "editable": editable,
+        "help": [{"key": k, "default": d, "text": t} for k, d, t in help_lines(CompanionConfig)],
+    }
+
+
+def check(path: Path, text: str) -> CompanionConfig:
+    """What the text would be as the deployment; `ConfigError` names what is wrong.
+
+    Read from a file beside the real one, since relative paths begin there.
+    """
+    if len(text.encode()) > _MOST_BYTES:
+        raise ConfigError(f"over {_MOST_BYTES >> 10} KiB; that is no deployment")
+    with _beside(path, text) as trial:
+        try:
+            return load_config(trial)
+        except ConfigError as error:
+            raise ConfigError(str(error).replace(str(trial), path.name)) from error
+
+
+def replace(path: Path, text: str) -> Path:
+    """Write a text that holds; returns where the old one is kept."""
+    check(path, text)
+    stamp = time.strftime("%Y%m%dT%H%M%S", time.gmtime())
+    kept = path.with_name(f"{path.name}.{stamp}.old")
+    number = 2
+    while kept.exists():
+        kept = path.with_name(f"{path.name}.{stamp}-{number}.old")
+        number += 1
+    try:
+        mode = path.stat().st_mode & 0o777
+        kept.write_bytes(path.read_bytes())
+        kept.chmod(mode)
+        with _beside(path, text) as fresh:
+            fresh.chmod(mode)
+            os.replace(fresh, path)
+    except OSError as error:
+        raise ConfigError(f"{path}: cannot be written: {error}") from error
+    return kept
+
+
+def help_lines(model: type[BaseModel], where: str = "") -> list[tuple[str, str, str]]:
+    """(key, default, description) of every setting."""
+    lines = []
+    for name, field in model.model_fields.items():
+        nested = _models(field.annotation)
+        key = f"{where}{name}"
+        if nested:
+            lines += [line for m in nested for line in help_lines(m, f"{key}.")]
+            continue
+        default = "needed" if field.is_required() else str(field.default)
+        lines.append((key, default, field.description or ""))
+    return lines
+
+
+def _models(annotation: object) -> list[type[BaseModel]]:
+    if isinstance(annotation, type) and issubclass(annotation, BaseModel):
+        return [annotation]
+    return [m for part in get_args(annotation) for m in _models(part)]
+
+
+@contextlib.contextmanager
+def _beside(path: Path, text: str) -> Iterator[Path]:
+    """A file of that text in the same folder; gone afterwards, if it is still there."""
+    try:
+        number, name = tempfile.mkstemp(prefix=f".{path.name}.", suffix=".yaml", dir=path.parent)
+    except OSError as error:
+        raise ConfigError(f"{path.parent}: cannot be written: {error}") from error
+    try:
+        with os.fdopen(number, "w", encoding="utf-8") as file:
+            file.write(text)
+            file.flush()
+            os.fsync(file.fileno())
+        yield Path(name)
+    finally:
+        Path(name).unlink(missing_ok=True)

@@ -1,0 +1,178 @@
+"""A picture for the page: the video as JPEG, the map's edges in it, and the map as seen from there.
+
+Nothing is rendered: what the localizer compared the frame with comes along with its depth, and is
+carried to the estimated pose.
+"""
+
+from __future__ import annotations
+
+import json
+import struct
+import time
+from dataclasses import dataclass
+from typing import Any
+
+import cv2
+import numpy as np
+
+from companion.live.protocol import Message
+from localizer.geometry.camera import Camera
+from localizer.geometry.pose import Pose, matrix_from_quaternion
+
+_QUALITY = 75
+_MOST_EDGES = 6000
+_BLUR_PX = 1.2
+_CANNY = (70, 150)
+_STEPS = 2  # of the fixed point that finds where a ray meets the reference's surface
+
+
+@dataclass(frozen=True)
+class View:
+    """The reference view: rgb (h, w, 3), depth (h, w) m along the axis, 0 where nothing is."""
+
+    rgb: np.ndarray
+    depth: np.ndarray
+    camera: Camera
+    pose: Pose
+
+
+@dataclass(frozen=True)
+class Picture:
+    """A frame with its pose and reference; both None while nothing is localized. camera: of the
+    image as it was sent.
+    """
+
+    image: np.ndarray
+    camera: Camera
+    pose: Pose | None
+    view: View | None
+
+
+def unpack(message: Message) -> Picture:
+    """The arrays of a frame's message."""
+    head, body = message.head, message.body
+    width, height = head["image"]
+    camera = Camera.from_dict(head["camera"]).resized(width, height)
+    size = 3 * width * height
+    image = np.frombuffer(body, np.uint8, size).reshape(height, width, 3)
+    estimate, shown = head.get("estimate"), head.get("view")
+    pose = None if estimate is None else _pose(estimate["pose"])
+    view = None
+    if shown is not None:
+        seen = Camera.from_dict(shown["camera"])
+        n = seen.width * seen.height
+        rgb = np.frombuffer(body, np.uint8, 3 * n, size).reshape(seen.height, seen.width, 3)
+        depth = np.frombuffer(body, np.float32, n, size + 3 * n)
+        view = View(rgb, depth.reshape(seen.height, seen.width), seen, _pose(shown["pose"]))
+    return Picture(image, camera, pose, view)
+
+
+def page_message(message: Message, with_map: bool) -> bytes:
+    """What the page gets: uint32 length of the head, the head, then its parts one after the other.
+
+    The head's `parts` are the lengths of JPEG, edges (uint16 pairs, pixels) and the map's JPEG.
+    """
+    picture = unpack(message)
+    parts = [_jpeg(picture.image), edges(picture).tobytes(), b""]
+    if with_map and (warped := map_at_pose(picture)) is not None:
+        parts[2] = _jpeg(warped)
+    head: dict[str, Any] = {
+        "kind": "frame",
+        "image": message.head["image"],
+        "width_px": message.head["camera"]["width"],
+        "estimate": message.head.get("estimate"),
+        "exposure_ns": message.head["exposure_ns"],
+        "age_ms": (time.monotonic_ns() - message.head["exposure_ns"]) * 1e-6,
+        "exposure_utc_ms": exposure_utc_ms(message.head["exposure_ns"]),
+        "footprint_enu_m": footprint(picture),
+        "parts": [len(part) for part in parts],
+    }
+    text = json.dumps(head, separators=(",", ":")).encode()
+    # Aligned, so that the page can look at the edges in place.
+    text += b" " * (-(4 + len(text) + len(parts[0])) % 2)
+    return struct.pack("<I", len(text)) + text + b"".join(parts)
+
+
+def exposure_utc_ms(exposure_ns: int) -> float:
+    """The exposure on this machine's clock."""
+    return time.time() * 1e3 - (time.monotonic_ns() - exposure_ns) * 1e-6
+
+
+def edges(picture: Picture) -> np.ndarray:
+    """Where the map's edges lie in the picture at the estimated pose: (n, 2) uint16 pixels."""
+    nothing = np.empty((0, 2), np.uint16)
+    view = picture.view
+    if view is None or picture.pose is None:
+        return nothing
+    # Blurred: the edges of roofs and roads, not of every blade of grass.
+    gray = cv2.GaussianBlur(cv2.cvtColor(view.rgb, cv2.COLOR_RGB2GRAY), (0, 0), _BLUR_PX)
+    rows, columns = np.nonzero((cv2.Canny(gray, *_CANNY) > 0) & (view.depth > 0))
+    if not len(rows):
+        return nothing
+    chosen = np.linspace(0, len(rows) - 1, min(len(rows), _MOST_EDGES)).astype(int)
+    rows, columns = rows[chosen], columns[chosen]
+    points = _world(view, columns + 0.5, rows + 0.5, view.depth[rows, columns])
+    pixels, inside = picture.camera.project(picture.pose.inverse.apply(points))
+    return np.asarray(pixels[inside], np.uint16)
+
+
+def map_at_pose(picture: Picture) -> np.ndarray | None:
+    """The map as the camera saw it from the estimated pose, distortion included, half size.
+
+    For each pixel the ray is followed to the depth that the reference has where it passes; the
+    reference was rendered at the predicted pose, so two steps are enough.
+    """
+    view, pose = picture.view, picture.pose
+    if view is None or pose is None:
+        return None
+    half = picture.camera.resized(picture.camera.width // 2, picture.camera.height // 2)
+    columns, rows = np.meshgrid(np.arange(half.width) + 0.5, np.arange(half.height) + 0.5)
+    rays = half.rays(np.stack([columns, rows], axis=-1))
+    view_from_camera = view.pose.inverse @ pose
+    known = view.depth[view.depth > 0]
+    if not len(known):
+        return None
+    depth = np.full(columns.shape, float(np.median(known)))
+    pixels = np.zeros((*columns.shape, 2))
+    for _ in range(_STEPS + 1):
+        points = view_from_camera.apply((rays * depth[..., None]).reshape(-1, 3))
+        pixels = view.camera.project(points)[0].reshape(pixels.shape)
+        at = np.nan_to_num(pixels, nan=-1.0).astype(np.float32)
+        found = cv2.remap(
+            view.depth, at[..., 0] - 0.5, at[..., 1] - 0.5, cv2.INTER_NEAREST,
+            borderMode=cv2.BORDER_REPLICATE,
+        )  # fmt: skip
+        depth = np.where(found > 0, found, depth)
+    at = np.nan_to_num(pixels, nan=-9.0).astype(np.float32)
+    return np.asarray(cv2.remap(view.rgb, at[..., 0] - 0.5, at[..., 1] - 0.5, cv2.INTER_LINEAR))
+
+
+def footprint(picture: Picture) -> list[list[float]]:
+    """The corners of what the reference sees, (east, north) m; those in the sky are left out."""
+    view = picture.view
+    if view is None:
+        return []
+    height, width = view.depth.shape
+    corners = [(0, 0), (width - 1, 0), (width - 1, height - 1), (0, height - 1)]
+    known = [(c, r) for c, r in corners if view.depth[r, c] > 0]
+    if not known:
+        return []
+    columns, rows = np.array(known).T
+    points = _world(view, columns + 0.5, rows + 0.5, view.depth[rows, columns])
+    return [[float(e), float(n)] for e, n, _ in points]
+
+
+def _world(view: View, u: np.ndarray, v: np.ndarray, depth: np.ndarray) -> np.ndarray:
+    rays = view.camera.rays(np.stack([u, v], axis=-1))
+    return np.asarray(view.pose.apply(rays * depth[:, None].astype(np.float64)))
+
+
+def _pose(data: dict[str, Any]) -> Pose:
+    return Pose(matrix_from_quaternion(np.array(data["q"])), np.array(data["t"]))
+
+
+def _jpeg(rgb: np.ndarray) -> bytes:
+    _, data = cv2.imencode(
+        ".jpg", cv2.cvtColor(rgb, cv2.COLOR_RGB2BGR), [cv2.IMWRITE_JPEG_QUALITY, _QUALITY]
+    )
+    return data.tobytes()

@@ -1,0 +1,357 @@
+"""The page's server: Starlette behind `security.Guarded`, fed by a `Source`."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import json
+import logging
+from collections.abc import AsyncIterator, Awaitable, Callable
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+from starlette.applications import Starlette
+from starlette.concurrency import run_in_threadpool
+from starlette.requests import ClientDisconnect, Request
+from starlette.responses import HTMLResponse, JSONResponse, Response, StreamingResponse
+from starlette.routing import Mount, Route, WebSocketRoute
+from starlette.staticfiles import StaticFiles
+from starlette.websockets import WebSocket, WebSocketDisconnect
+
+from companion.console import deployment, exports
+from companion.console.examination import Examination
+from companion.console.pictures import page_message
+from companion.console.records import Records, archive
+from companion.console.security import REPORT_POLICY, Guarded
+from companion.console.source import Source, sample_of
+from companion.console.tiles import TileName, TopTiles
+from companion.errors import CompanionError
+from companion.live.config import ConsoleConfig
+from localizer.errors import LocalizerError
+
+_log = logging.getLogger(__name__)
+_STATIC = Path(__file__).parent / "static"
+_MOST_PAGES = 8
+_SLOWEST_S = 10.0  # a page that does not take a message for so long is left
+Answer = Callable[[Request], Awaitable[Response]]
+
+
+@dataclass(frozen=True)
+class Site:
+    """What the server serves. deployment: the file, None in a replay; token: needed of everybody,
+    None on loopback without one.
+    """
+
+    config: ConsoleConfig
+    source: Source
+    map_path: Path
+    records: Records
+    deployment: Path | None = None
+    token: str | None = None
+    replay: bool = False
+
+
+class RefusedError(CompanionError):
+    """A request that is understood and not done."""
+
+
+class Pages:
+    """The pages that are open, and the pictures that they share."""
+
+    def __init__(self, source: Source) -> None:
+        self._source = source
+        self._open: dict[int, dict[str, Any]] = {}
+        self._made: tuple[tuple[int, bool], bytes] | None = None
+        self._making = asyncio.Lock()
+
+    async def serve(self, socket: WebSocket) -> None:
+        """One page, until it goes. It gets what is newest; what it was too slow for is gone."""
+        await socket.accept()
+        if len(self._open) >= _MOST_PAGES:
+            await socket.close(1013, "too many pages are open")
+            return
+        wishes = {"frames": False, "map": False}
+        self._open[id(socket)] = wishes
+        listener = asyncio.create_task(self._listen(socket, wishes))
+        try:
+            await self._tell(socket, wishes, listener)
+        except (WebSocketDisconnect, RuntimeError, asyncio.TimeoutError, OSError):
+            pass
+        finally:
+            listener.cancel()
+            del self._open[id(socket)]
+            self._watch()
+            with contextlib.suppress(RuntimeError, OSError):
+                await socket.close()
+
+    async def _tell(
+        self, socket: WebSocket, wishes: dict[str, Any], listener: asyncio.Task[None]
+    ) -> None:
+        newest, states, frames, connected = self._source.newest, -1, -1, None
+        while not listener.done():
+            waiting = asyncio.create_task(self._source.changed())
+            if newest.states != states or connected != self._source.is_connected:
+                states, connected = newest.states, self._source.is_connected
+                await _sent(socket.send_text(json.dumps(self._state_message(connected))))
+            if wishes["frames"] and newest.frame is not None and newest.frames != frames:
+                frames = newest.frames
+                await _sent(socket.send_bytes(await self._picture(bool(wishes["map"]))))
+            await asyncio.wait({waiting, listener}, return_when=asyncio.FIRST_COMPLETED)
+            waiting.cancel()
+
+    def _state_message(self, connected: bool) -> dict[str, Any]:
+        newest = self._source.newest
+        state = newest.state
+        return {
+            "kind": "state",
+            "connected": connected,
+            "about": newest.hello,
+            "state": state,
+            "sample": None if state is None else sample_of(state),
+        }
+
+    async def _picture(self, with_map: bool) -> bytes:
+        newest = self._source.newest
+        async with self._making:
+            key = (newest.frames, with_map)
+            if self._made is None or self._made[0] != key:
+                assert newest.frame is not None
+                data = await run_in_threadpool(page_message, newest.frame, with_map)
+                self._made = (key, data)
+            return self._made[1]
+
+    async def _listen(self, socket: WebSocket, wishes: dict[str, Any]) -> None:
+        """What the page wants to see; anything else ends it."""
+        while True:
+            message = await socket.receive()
+            if message["type"] != "websocket.receive":
+                return
+            try:
+                value = json.loads(message.get("text") or "")
+                for name in wishes:
+                    wishes[name] = value.get(name) is True
+            except (ValueError, AttributeError, RecursionError):
+                return
+            self._watch()
+
+    def _watch(self) -> None:
+        self._source.watch(any(w["frames"] for w in self._open.values()))
+
+
+class Views:
+    """One method an address. Errors that have a name become one line."""
+
+    def __init__(self, site: Site) -> None:
+        self._site = site
+        self._tiles: TopTiles | None = None
+        self._examination = None if site.deployment is None else Examination(site.deployment)
+
+    async def page(self, _: Request) -> Response:
+        """The page itself."""
+        return HTMLResponse((_STATIC / "index.html").read_text(encoding="utf-8"))
+
+    async def about(self, _: Request) -> Response:
+        """What the page may do, and the map."""
+        tiles = await run_in_threadpool(self._opened_tiles)
+        return JSONResponse(
+            {
+                "control": self._site.config.control and not self._site.replay,
+                "replay": self._site.replay,
+                "deployment": self._site.deployment is not None,
+                "map": tiles.about(),
+            }
+        )
+
+    async def history(self, _: Request) -> Response:
+        """The last ten minutes, and the events."""
+        newest = self._site.source.newest
+        return JSONResponse({"samples": list(newest.samples), "events": list(newest.events)})
+
+    async def tile(self, request: Request) -> Response:
+        """The map from above."""
+        name = TileName(*(request.path_params[k] for k in ("z", "x", "y")))
+        tiles = await run_in_threadpool(self._opened_tiles)
+        data = await run_in_threadpool(tiles.tile, name)
+        if data is None:
+            return Response(status_code=404)
+        headers = {"cache-control": "private, max-age=3600"}
+        return Response(data, media_type="image/jpeg", headers=headers)
+
+    async def targets(self, request: Request) -> Response:
+        """The targets for other programs."""
+        found = ((self._site.source.newest.state or {}).get("targets")) or []
+        if request.path_params["kind"] == "geojson":
+            text, kind = json.dumps(exports.geojson(found)), "application/geo+json"
+        else:
+            text, kind = exports.cursor_on_target(found), "application/xml"
+        name = f"targets.{'geojson' if kind.endswith('json') else 'cot'}"
+        return Response(text, media_type=kind, headers=_attachment(name))
+
+    async def order(self, request: Request) -> Response:
+        """Targets and hints: what may be done in the air, too."""
+        self._require_control()
+        order = await _object(request)
+        if order.get("do") not in ("target", "box", "stop", "hint"):
+            raise RefusedError("no such order")
+        ok, text = await self._site.source.order(order)
+        _log.info("order %s: %s", order.get("do"), text)
+        return JSONResponse({"ok": ok, "text": text}, status_code=200 if ok else 409)
+
+    async def examine(self, request: Request) -> Response:
+        """The doctor: POST begins it, GET tells how far it is."""
+        if self._examination is None:
+            raise RefusedError("there is no deployment to examine")
+        if request.method == "POST":
+            self._require_control()
+            self._require_disarmed()
+            if not self._examination.begin(self._site.source.is_connected):
+                raise RefusedError("the doctor is at work already")
+            _log.info("the doctor was called")
+        return JSONResponse(self._examination.report())
+
+    async def settings(self, request: Request) -> Response:
+        """The deployment file: GET shows it, POST checks or writes it."""
+        path = self._site.deployment
+        if path is None:
+            raise RefusedError("there is no deployment to show")
+        if request.method == "GET":
+            shown = await run_in_threadpool(deployment.shown, path, self._site.config.control)
+            return JSONResponse(shown)
+        self._require_control()
+        self._require_disarmed()
+        body = await _object(request)
+        text = body.get("text")
+        if not isinstance(text, str):
+            raise RefusedError("text is the file's text")
+        if body.get("write") is not True:
+            await run_in_threadpool(deployment.check, path, text)
+            return JSONResponse({"ok": True, "text": "it holds"})
+        kept = await run_in_threadpool(deployment.replace, path, text)
+        _log.info("%s was written, the old one is %s", path, kept)
+        told = f"written, in force with the next start; the old one is {kept.name}"
+        return JSONResponse({"ok": True, "text": told})
+
+    async def records(self, _: Request) -> Response:
+        """What there is to download."""
+        listed = await run_in_threadpool(self._site.records.listed)
+        keys = ("name", "started_utc_ns", "ended")
+        return JSONResponse([{k: asdict(r)[k] for k in keys} for r in listed])
+
+    async def record(self, request: Request) -> Response:
+        """One record as .tar, or its report."""
+        record = await run_in_threadpool(self._site.records.find, request.path_params["name"])
+        if record is None:
+            raise RefusedError("there is no record of that name")
+        if request.path_params["kind"] == "tar":
+            headers = _attachment(f"{record.name}.tar")
+            return StreamingResponse(archive(record), media_type="application/x-tar",
+                                     headers=headers)  # fmt: skip
+        if self._site.source.newest.is_armed():
+            raise RefusedError("reports are made on the ground: they need the processor")
+        from companion.reporting.layout import render
+        from companion.reporting.report import report_of
+
+        text = await run_in_threadpool(lambda: render(report_of(record.path)))
+        return HTMLResponse(text, headers={"content-security-policy": REPORT_POLICY})
+
+    async def seek(self, request: Request) -> Response:
+        """Of a replay: the time bar."""
+        if not self._site.replay:
+            raise RefusedError("a flight that runs has no time bar")
+        ok, text = await self._site.source.order(await _object(request))
+        return JSONResponse({"ok": ok, "text": text}, status_code=200 if ok else 409)
+
+    def close(self) -> None:
+        """Release what is open."""
+        if self._tiles is not None:
+            self._tiles.close()
+
+    def _opened_tiles(self) -> TopTiles:
+        if self._tiles is None:
+            self._tiles = TopTiles(self._site.map_path)
+        return self._tiles
+
+    def _require_control(self) -> None:
+        if not self._site.config.control or self._site.replay:
+            raise RefusedError("this page only reads: console.control is false")
+
+    def _require_disarmed(self) -> None:
+        armed = self._site.source.newest.is_armed() if self._site.source.is_connected else False
+        if armed is None:
+            raise RefusedError("nobody knows whether the vehicle is armed: it is not heard")
+        if armed:
+            raise RefusedError("not while the vehicle is armed")
+
+
+def make_application(site: Site) -> Guarded:
+    """The whole site."""
+    views, pages = Views(site), Pages(site.source)
+
+    @contextlib.asynccontextmanager
+    async def lifespan(_: Starlette) -> AsyncIterator[None]:
+        task = asyncio.create_task(site.source.run())
+        try:
+            yield
+        finally:
+            task.cancel()
+            with contextlib.suppress(asyncio.CancelledError):
+                await task
+            views.close()
+
+    routes = [
+        Route("/", views.page),
+        Route("/api/about", _named(views.about)),
+        Route("/api/history", _named(views.history)),
+        Route("/api/targets.{kind:str}", _named(views.targets)),
+        Route("/api/order", _named(views.order), methods=["POST"]),
+        Route("/api/seek", _named(views.seek), methods=["POST"]),
+        Route("/api/doctor", _named(views.examine), methods=["GET", "POST"]),
+        Route("/api/deployment", _named(views.settings), methods=["GET", "POST"]),
+        Route("/api/records", _named(views.records)),
+        Route("/api/records/{name:str}/{kind:str}", _named(views.record)),
+        Route("/tiles/{z:int}/{x:int}/{y:int}.jpg", _named(views.tile)),
+        WebSocketRoute("/ws", pages.serve),
+        Mount("/static", StaticFiles(directory=_STATIC)),
+    ]
+    return Guarded(Starlette(routes=routes, lifespan=lifespan), site.config, site.token)
+
+
+def _named(answer: Answer) -> Answer:
+    """Errors with a name become their text; others are logged, and the page learns nothing."""
+
+    async def answered(request: Request) -> Response:
+        try:
+            return await answer(request)
+        except RefusedError as error:
+            return JSONResponse({"ok": False, "text": str(error)}, status_code=409)
+        except (CompanionError, LocalizerError) as error:
+            return JSONResponse({"ok": False, "text": str(error)}, status_code=400)
+        except Exception:
+            _log.exception("%s failed", request.url.path)
+            return JSONResponse({"ok": False, "text": "it failed, see the log"}, status_code=500)
+
+    return answered
+
+
+async def _object(request: Request) -> dict[str, Any]:
+    if request.headers.get("content-type", "").split(";")[0] != "application/json":
+        raise RefusedError("the body is JSON")
+    try:
+        value = json.loads(await request.body())
+    except ClientDisconnect as error:  # `Guarded` ended it, too
+        raise RefusedError("the body is too long") from error
+    except (ValueError, RecursionError) as error:
+        raise RefusedError(f"not JSON: {error}") from error
+    if not isinstance(value, dict):
+        raise RefusedError("the body is a JSON object")
+    return value
+
+
+async def _sent(sending: Awaitable[None]) -> None:
+    await asyncio.wait_for(sending, _SLOWEST_S)
+
+
+def _attachment(name: str) -> dict[str, str]:
+    safe = "".join(c for c in name if c.isascii() and (c.isalnum() or c in "-_."))
+    return {"content-disposition": f'attachment; filename="{safe}"'}

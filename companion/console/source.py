@@ -1,0 +1,114 @@
+"""Where the page's states and pictures come from: a flight that runs, or a record of one."""
+
+from __future__ import annotations
+
+from collections import deque
+from dataclasses import dataclass, field
+from typing import Any, Protocol
+
+from companion.live.protocol import Message
+
+_TEN_MINUTES = 600
+_EVENTS = 1000
+
+
+@dataclass
+class Newest:
+    """What came last, and what is kept of what came before. counts: how many states and pictures
+    there were, by which a page sees that there is a new one.
+    """
+
+    hello: dict[str, Any] | None = None
+    state: dict[str, Any] | None = None
+    frame: Message | None = None
+    states: int = 0
+    frames: int = 0
+    samples: deque[dict[str, Any]] = field(default_factory=lambda: deque(maxlen=_TEN_MINUTES))
+    events: deque[dict[str, Any]] = field(default_factory=lambda: deque(maxlen=_EVENTS))
+
+    def take(self, message: Message) -> None:
+        """Note a message of the flight."""
+        kind = message.head.get("kind")
+        if kind == "hello":
+            self.hello = message.head
+            self.samples.clear()
+            self.events.clear()
+        elif kind == "frame":
+            self.frame = message
+            self.frames += 1
+        elif kind == "state":
+            self.state = message.head
+            self.states += 1
+            self.events.extend(message.head.get("events") or ())
+            sample = sample_of(message.head)
+            if not self.samples or sample["t"] - self.samples[-1]["t"] >= 0.95:
+                self.samples.append(sample)
+
+    def is_armed(self) -> bool | None:
+        """Whether the vehicle is; None where that is not known although a flight runs."""
+        if self.hello is None:
+            return False
+        vehicle = (self.state or {}).get("vehicle") or {}
+        return bool(vehicle.get("armed")) if vehicle.get("connected") else None
+
+
+class Source(Protocol):
+    """A flight, or a record."""
+
+    @property
+    def newest(self) -> Newest:
+        """What is to be shown."""
+        ...
+
+    @property
+    def is_connected(self) -> bool:
+        """Whether it gives anything now."""
+        ...
+
+    def watch(self, wanted: bool) -> None:
+        """Whether pictures are wanted."""
+        ...
+
+    async def changed(self) -> None:
+        """Returns when there is something new."""
+        ...
+
+    async def order(self, order: dict[str, Any]) -> tuple[bool, str]:
+        """Ask for something to be done; whether it was, and what or why not."""
+        ...
+
+    async def run(self) -> None:
+        """Serve until cancelled."""
+        ...
+
+
+def sample_of(state: dict[str, Any]) -> dict[str, Any]:
+    """One second of the plots: t in seconds of UTC; what is not known is None."""
+    estimate = state.get("estimate") or {}
+    health = state.get("health") or {}
+    guardian = health.get("guardian") or {}
+    machine = state.get("machine") or {}
+    vehicle = state.get("vehicle") or {}
+    stages = estimate.get("stages_ms") or {}
+    accepted = bool(estimate.get("accepted"))
+    return {
+        "t": (state.get("utc_ns") or 0) * 1e-9,
+        "sigma_m": estimate.get("sigma_m") if accepted else None,
+        "hpl_m": guardian.get("hpl_m"),
+        "residual_m": state.get("gnss_residual_m"),
+        "quality": estimate.get("quality"),
+        "rate_hz": health.get("rate_hz"),
+        **{name: stages.get(name) for name in ("reference", "extract", "register", "latency")},
+        "cpu_percent": machine.get("cpu_percent"),
+        "temperature_c": machine.get("temperature_c"),
+        "vision": [estimate.get("latitude_deg"), estimate.get("longitude_deg")]
+        if accepted else None,
+        "autopilot": _place(vehicle, "latitude_deg", "longitude_deg"),
+        "gnss": _place(vehicle, "gps_latitude_deg", "gps_longitude_deg")
+        if (vehicle.get("gps_fix_type") or 0) >= 3 else None,
+    }  # fmt: skip
+
+
+def _place(vehicle: dict[str, Any], *keys: str) -> list[float] | None:
+    values = [vehicle.get(key) for key in keys]
+    return None if None in values else values  # type: ignore[return-value]  # no None in it

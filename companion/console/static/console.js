@@ -1,0 +1,286 @@
+import * as maplibre from "./vendor/maplibre-gl.mjs";
+import { toMgrs } from "./mgrs.js";
+import { Plots } from "./plots.js";
+import { MapView } from "./map.js";
+import { VideoView } from "./video.js";
+
+const $ = (id) => document.getElementById(id);
+const page = { about: null, state: null, connected: false };
+
+export async function ask(path, body) {
+  const options = body === undefined ? {} : {
+    method: "POST", body: JSON.stringify(body),
+    headers: { "Content-Type": "application/json", "X-Console": "1" },
+  };
+  try {
+    const answer = await fetch(path, options);
+    return await answer.json();
+  } catch (error) {
+    return { ok: false, text: String(error) };
+  }
+}
+
+// --- views ---------------------------------------------------------------------------------------
+
+const opened = {
+  records: showRecords, settings: showSettings, doctor: showDoctor,
+  plots: () => plots.resize(), map: () => map?.resize(),
+};
+
+function open(view) {
+  document.body.dataset.view = view;
+  document.querySelectorAll("nav button").forEach((button) => {
+    button.setAttribute("aria-current", String(button.dataset.view === view));
+  });
+  wish();
+  opened[view]?.();
+}
+document.querySelectorAll("nav button").forEach((button) => {
+  button.addEventListener("click", () => open(button.dataset.view));
+});
+
+// --- state ---------------------------------------------------------------------------------------
+
+const text = (value, digits, unit = "") =>
+  value === null || value === undefined ? "-" : `${value.toFixed(digits)}${unit}`;
+
+function showState() {
+  const { state, connected } = page;
+  const about = page.hello ?? {};
+  const health = state?.health ?? {};
+  const header = $("state");
+  if (!connected || !state) {
+    header.dataset.level = "off";
+    $("word").textContent = page.about?.replay ? "record" : "no flight";
+    $("reason").textContent = "the companion is not running; records, doctor and settings are at hand";
+    if (!state) return;
+  } else {
+    header.dataset.level = health.level ?? "off";
+    const word = state.estimate?.state ?? health.level ?? "-";
+    $("word").textContent = health.level === "failed" && word === "tracking" ? "withheld" : word;
+    $("reason").textContent = health.text ?? "";
+  }
+  const estimate = state.estimate;
+  const fixNs = estimate?.last_fix_ns;
+  const age = fixNs ? (state.time_ns - fixNs) * 1e-9 : null;
+  const latency = health.stages_ms?.latency?.p95;
+  const vehicle = state.vehicle ?? {};
+  const limit = about.delay_ms;
+  figures([
+    ["fix age", text(age, 1, " s"), age !== null && age > 2],
+    ["rate", text(health.rate_hz, 1, " Hz")],
+    ["sigma", text(estimate?.accepted ? estimate.sigma_m : null, 2, " m")],
+    ["HPL", text(health.guardian?.hpl_m, 1, " m"), health.guardian?.hpl_m > about.alert_limit_m],
+    ["latency p95", `${text(latency, 0)}/${text(limit, 0, " ms")}`, latency > limit],
+    ["mode", `${about.mode ?? "-"}${state.injecting ? ", injecting" : ""}`, false, true],
+    ["EKF", ekf(vehicle, state.follows), state.follows?.used === false, true],
+    ["vehicle", vehicle.connected ? `${vehicle.mode || "?"}${vehicle.armed ? ", armed" : ", disarmed"}` : "not heard",
+      !vehicle.connected, true],
+    ["shadow", state.shadow ? (state.shadow.go ? "go" : "no-go") : "-", false, true],
+  ]);
+  $("figures").title = state.shadow?.line ?? "";
+}
+
+function ekf(vehicle, follows) {
+  if (follows) return follows.used ? "follows" : `not: ${follows.reason}`;
+  const ratio = vehicle.ekf_horizontal_variance;
+  return ratio === null || ratio === undefined ? "-" : `ratio ${ratio.toFixed(2)}`;
+}
+
+function figures(rows) {
+  const list = $("figures");
+  while (list.children.length < rows.length) {
+    const row = document.createElement("div");
+    row.append(document.createElement("dt"), document.createElement("dd"));
+    list.append(row);
+  }
+  rows.forEach(([name, value, bad, word], i) => {
+    const [dt, dd] = list.children[i].children;
+    dt.textContent = name;
+    dd.textContent = value;
+    dd.className = `${bad ? "bad" : ""} ${word ? "word" : ""}`;
+  });
+}
+
+// --- targets, events -----------------------------------------------------------------------------
+
+function showTargets(targets) {
+  const body = $("targets").tBodies[0];
+  $("no-targets").hidden = targets.length > 0;
+  while (body.rows.length > targets.length) body.deleteRow(-1);
+  targets.forEach((target, i) => {
+    const row = body.rows[i] ?? newTargetRow(body);
+    const place = `${target.latitude_deg.toFixed(7)}, ${target.longitude_deg.toFixed(7)}`;
+    const cells = [target.name, place, toMgrs(target.latitude_deg, target.longitude_deg),
+      text(target.amsl_m, 1), text(target.height_m, 1), text(target.sigma_m, 2)];
+    cells.forEach((value, k) => { row.cells[k].textContent = value; });
+    row.dataset.place = `${target.name} ${place} ${cells[2]} AMSL ${cells[3]} m`;
+  });
+}
+
+function newTargetRow(body) {
+  const row = body.insertRow();
+  for (let k = 0; k < 7; k += 1) row.insertCell();
+  const button = document.createElement("button");
+  button.textContent = "Copy";
+  button.addEventListener("click", async () => {
+    try { await navigator.clipboard.writeText(row.dataset.place); button.textContent = "Copied"; }
+    catch { button.textContent = "cannot copy"; }
+    setTimeout(() => { button.textContent = "Copy"; }, 1500);
+  });
+  row.cells[6].append(button);
+  return row;
+}
+
+const eventsSeen = new Set();
+function addEvents(events, state) {
+  const list = $("events");
+  for (const event of events ?? []) {
+    if (eventsSeen.has(event.number)) continue;
+    eventsSeen.add(event.number);
+    const item = document.createElement("li");
+    item.className = event.level === "warning" ? "warning" : "info";
+    const time = document.createElement("time");
+    const utc = new Date((state.utc_ns - (state.time_ns - event.time_ns)) / 1e6);
+    time.textContent = utc.toISOString().slice(11, 19);
+    item.append(time, document.createTextNode(event.text));
+    list.prepend(item);
+    while (list.children.length > 300) list.lastChild.remove();
+  }
+}
+
+// --- doctor, records, settings -------------------------------------------------------------------
+
+let doctorTimer = null;
+async function showDoctor() {
+  const report = await ask("/api/doctor");
+  if (report.lines) {
+    $("doctor").textContent = report.lines.join("\n");
+    const words = { 0: "good", 1: "advice", 2: "not fit to fly" };
+    $("doctor-told").textContent = report.running ? "at work" : words[report.code] ?? "";
+  } else $("doctor-told").textContent = report.text;
+  clearTimeout(doctorTimer);
+  if (report.running) doctorTimer = setTimeout(showDoctor, 500);
+}
+$("examine").addEventListener("click", async () => {
+  const report = await ask("/api/doctor", {});
+  if (report.ok === false) $("doctor-told").textContent = report.text;
+  else showDoctor();
+});
+
+async function showRecords() {
+  const records = await ask("/api/records");
+  const body = $("records").tBodies[0];
+  body.replaceChildren();
+  for (const record of Array.isArray(records) ? records : []) {
+    const row = body.insertRow();
+    const began = record.started_utc_ns ? new Date(record.started_utc_ns / 1e6).toISOString().slice(0, 19) : "-";
+    for (const value of [record.name, began, record.ended]) row.insertCell().textContent = value;
+    const cell = row.insertCell();
+    for (const [kind, label] of [["report", "report"], ["tar", "download"]]) {
+      const link = document.createElement("a");
+      link.href = `/api/records/${encodeURIComponent(record.name)}/${kind}`;
+      link.textContent = label;
+      if (kind === "report") { link.target = "_blank"; link.rel = "noopener"; }
+      cell.append(link, " ");
+    }
+  }
+}
+
+let help = [];
+async function showSettings() {
+  if ($("settings-text").value) return;
+  const shown = await ask("/api/deployment");
+  if (!shown.path) { $("settings-told").textContent = shown.text; return; }
+  $("settings-path").textContent = shown.path;
+  $("settings-text").value = shown.text;
+  $("settings-text").readOnly = !shown.editable;
+  help = shown.help;
+  showHelp();
+}
+function showHelp() {
+  const wanted = $("find").value.toLowerCase();
+  const body = $("help").tBodies[0];
+  body.replaceChildren();
+  for (const line of help.filter((h) => `${h.key} ${h.text}`.toLowerCase().includes(wanted))) {
+    const row = body.insertRow();
+    for (const value of [line.key, line.default, line.text]) row.insertCell().textContent = value;
+  }
+}
+$("find").addEventListener("input", showHelp);
+for (const [id, write] of [["check", false], ["write", true]]) {
+  $(id).addEventListener("click", async () => {
+    const answer = await ask("/api/deployment", { text: $("settings-text").value, write });
+    $("settings-told").textContent = answer.text;
+  });
+}
+
+// --- the line to the server ----------------------------------------------------------------------
+
+let socket = null;
+function wish() {
+  if (socket?.readyState !== WebSocket.OPEN) return;
+  const narrow = matchMedia("(max-width: 800px)").matches;
+  const frames = !document.hidden && (!narrow || ["map", "video"].includes(document.body.dataset.view));
+  socket.send(JSON.stringify({ frames, map: video.needsMap }));
+}
+
+function connect() {
+  socket = new WebSocket(`${location.protocol === "https:" ? "wss" : "ws"}://${location.host}/ws`);
+  socket.binaryType = "arraybuffer";
+  socket.onopen = wish;
+  socket.onclose = () => { page.connected = false; showState(); setTimeout(connect, 1000); };
+  socket.onmessage = ({ data }) => {
+    if (typeof data !== "string") { video.show(data); return; }
+    const message = JSON.parse(data);
+    Object.assign(page, { state: message.state, hello: message.about, connected: message.connected });
+    showState();
+    if (!message.state) return;
+    showTargets(message.state.targets ?? []);
+    addEvents(message.state.events, message.state);
+    map?.update(message.state);
+    if (message.sample) { plots.add(message.sample); map?.addSample(message.sample); }
+    if (page.about?.replay) showTime(message.state.replay);
+  };
+}
+document.addEventListener("visibilitychange", wish);
+addEventListener("resize", wish);
+
+// --- replay --------------------------------------------------------------------------------------
+
+let held = false;
+function showTime(replay) {
+  if (!replay) return;
+  if (!held) $("seek").value = Math.round((1000 * replay.at_s) / Math.max(replay.length_s, 1e-6));
+  $("clock").textContent = `${replay.at_s.toFixed(1)} of ${replay.length_s.toFixed(1)} s`;
+  $("play").textContent = replay.playing ? "Pause" : "Play";
+}
+$("seek").addEventListener("input", () => {
+  held = true;
+  plots.clear(); map?.clear();
+  ask("/api/seek", { share: $("seek").value / 1000 }).then(() => { held = false; });
+});
+$("play").addEventListener("click", () => ask("/api/seek", { play: $("play").textContent === "Play" }));
+
+// --- begin ---------------------------------------------------------------------------------------
+
+const plots = new Plots($("plots"));
+const video = new VideoView($, ask, () => page, wish);
+let map = null;
+
+async function begin() {
+  open("map");
+  page.about = await ask("/api/about");
+  document.body.classList.toggle("reads", !page.about.control);
+  $("time").hidden = !page.about.replay;
+  if (page.about.map) {
+    try { map = new MapView(maplibre, $, ask, page.about.map); }
+    catch (error) { $("map-note").textContent = `no map: ${error.message}`; }
+  } else $("map-note").textContent = page.about.text ?? "no map";
+  window.consoleMap = map;
+  const history = await ask("/api/history");
+  (history.samples ?? []).forEach((sample) => { plots.add(sample, false); map?.addSample(sample, false); });
+  plots.draw(); map?.draw();
+  connect();
+}
+begin();

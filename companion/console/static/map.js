@@ -1,0 +1,180 @@
+// The map from above, with everything that has a place.
+const EMPTY = { type: "FeatureCollection", features: [] };
+const TRACKS = [["gnss", "#ffffff", 6], ["autopilot", "#1fd1ff", 4], ["vision", "#ff8c1a", 2.5]];
+const CHI95 = 2.4477; // of two dimensions
+const KEPT = 600;
+
+export class MapView {
+  constructor(maplibre, $, ask, about) {
+    this.$ = $;
+    this.ask = ask;
+    this.about = about;
+    this.samples = [];
+    this.following = true;
+    this.hinting = false;
+    this.pins = new Map();
+    maplibre.setWorkerUrl("/static/vendor/maplibre-gl-worker.mjs");
+    this.maplibre = maplibre;
+    this.map = new maplibre.Map({
+      container: "map", style: style(about), bounds: about.bounds, fitBoundsOptions: { padding: 20 },
+      attributionControl: false, dragRotate: false, pitchWithRotate: false, maxZoom: 21, fadeDuration: 0,
+    });
+    this.map.addControl(new maplibre.ScaleControl());
+    this.map.addControl(new maplibre.AttributionControl({ compact: true, customAttribution: about.attribution }));
+    this.map.on("load", () => { this.loaded = true; this.draw(); });
+    this.map.on("dragstart", () => this.follow(false));
+    this.map.on("click", (event) => this.clicked(event.lngLat));
+    this.craft = this.marker(craftSvg(), "craft");
+    $("follow").addEventListener("click", () => this.follow(!this.following));
+    $("hint").addEventListener("click", () => {
+      this.hinting = true;
+      $("map-note").textContent = "click where you are";
+    });
+  }
+
+  marker(content, name) {
+    const element = document.createElement("div");
+    element.className = name;
+    if (typeof content === "string") element.textContent = content; else element.append(content);
+    return new this.maplibre.Marker({ element, anchor: name === "craft" ? "center" : "bottom-left", rotationAlignment: "map" });
+  }
+
+  follow(on) {
+    this.following = on;
+    this.$("follow").setAttribute("aria-pressed", String(on));
+  }
+
+  async clicked({ lat, lng }) {
+    if (!this.hinting) return;
+    this.hinting = false;
+    const radius = Number(this.$("radius").value);
+    this.source("hint", polygon([lng, lat], circle(lat, radius)));
+    const answer = await this.ask("/api/order", { do: "hint", latitude_deg: lat, longitude_deg: lng, radius_m: radius });
+    this.$("map-note").textContent = answer.text;
+  }
+
+  addSample(sample, draw = true) {
+    this.samples.push(sample);
+    while (this.samples.length > KEPT) this.samples.shift();
+    if (draw) this.draw();
+  }
+
+  clear() { this.samples = []; }
+
+  update(state) {
+    this.state = state;
+    if (!this.loaded) return;
+    const at = state.estimate;
+    if (at) {
+      const place = [at.longitude_deg, at.latitude_deg];
+      this.craft.setLngLat(place).setRotation(at.heading_deg).addTo(this.map);
+      this.source("ellipse", polygon(place, ellipse(at.covariance_m2, at.latitude_deg)));
+      if (this.following) {
+        const zoomed = this.zoomed || this.map.getZoom() >= 16;
+        this.zoomed = true;
+        this.map.jumpTo(zoomed ? { center: place } : { center: place, zoom: 17 });
+      }
+    }
+    const targets = state.targets ?? [];
+    this.source("targets", {
+      type: "FeatureCollection",
+      features: targets.map((t) => polygon([t.longitude_deg, t.latitude_deg], ellipse(t.covariance_m2, t.latitude_deg, 1)).features[0]),
+    });
+    this.pin(targets);
+    this.draw();
+  }
+
+  pin(targets) {
+    const names = new Set(targets.map((t) => t.name));
+    for (const [name, pin] of this.pins) if (!names.has(name)) { pin.remove(); this.pins.delete(name); }
+    for (const t of targets) {
+      if (!this.pins.has(t.name)) this.pins.set(t.name, this.marker(t.name, "pin").setLngLat([t.longitude_deg, t.latitude_deg]).addTo(this.map));
+      this.pins.get(t.name).setLngLat([t.longitude_deg, t.latitude_deg]);
+    }
+  }
+
+  footprint(points) {
+    if (!this.loaded) return;
+    const ring = points.map(([e, n]) => this.fromEnu(e, n));
+    this.source("footprint", ring.length < 3 ? EMPTY : feature({ type: "Polygon", coordinates: [[...ring, ring[0]]] }));
+  }
+
+  fromEnu(east, north) {
+    const [lat, lon] = this.about.origin;
+    const [perLat, perLon] = metresPerDegree(lat);
+    return [lon + east / perLon, lat + north / perLat];
+  }
+
+  draw() {
+    if (!this.loaded) return;
+    for (const [name] of TRACKS) {
+      const points = this.samples.map((s) => s[name]).filter(Boolean).map(([lat, lon]) => [lon, lat]);
+      this.source(name, points.length < 2 ? EMPTY : feature({ type: "LineString", coordinates: points }));
+    }
+  }
+
+  source(name, data) { this.map.getSource(name)?.setData(data); }
+
+  resize() { this.map.resize(); }
+}
+
+function style(about) {
+  const source = { type: "geojson", data: EMPTY };
+  const sources = { top: { type: "raster", tiles: [`${location.origin}/tiles/{z}/{x}/{y}.jpg`], tileSize: 256, minzoom: 8, maxzoom: 21, bounds: about.bounds.flat() } };
+  const layers = [
+    { id: "ground", type: "background", paint: { "background-color": "#9aa3ad" } },
+    { id: "top", type: "raster", source: "top", paint: { "raster-fade-duration": 0 } },
+  ];
+  const outline = about.outline.length > 2 ? feature({ type: "Polygon", coordinates: [[...about.outline, about.outline[0]]] }) : EMPTY;
+  sources.coverage = { type: "geojson", data: outline };
+  layers.push({ id: "coverage", type: "line", source: "coverage", paint: { "line-color": "#101418", "line-width": 2, "line-dasharray": [3, 2] } });
+  for (const [name, colour, width] of TRACKS) {
+    sources[name] = source;
+    layers.push({ id: `${name}-rim`, type: "line", source: name, paint: { "line-color": "#101418", "line-width": width + 2 } });
+    layers.push({ id: name, type: "line", source: name, paint: { "line-color": colour, "line-width": width } });
+  }
+  for (const [name, colour] of [["footprint", "#ffe14d"], ["ellipse", "#ff8c1a"], ["targets", "#ff2fd0"], ["hint", "#0b4f9e"]]) {
+    sources[name] = source;
+    layers.push({ id: `${name}-fill`, type: "fill", source: name, paint: { "fill-color": colour, "fill-opacity": 0.18 } });
+    layers.push({ id: name, type: "line", source: name, paint: { "line-color": colour, "line-width": 2 } });
+  }
+  return { version: 8, sources, layers };
+}
+
+const feature = (geometry) => ({ type: "FeatureCollection", features: [{ type: "Feature", properties: {}, geometry }] });
+
+export function metresPerDegree(latitude) {
+  const phi = (latitude * Math.PI) / 180;
+  return [111132.95 - 559.85 * Math.cos(2 * phi) + 1.18 * Math.cos(4 * phi), 111412.88 * Math.cos(phi) - 93.5 * Math.cos(3 * phi)];
+}
+
+function polygon([lon, lat], offsets) {
+  const [perLat, perLon] = metresPerDegree(lat);
+  return feature({ type: "Polygon", coordinates: [offsets.map(([e, n]) => [lon + e / perLon, lat + n / perLat])] });
+}
+
+function circle(_, radius) {
+  return Array.from({ length: 49 }, (__, i) => [radius * Math.cos((i * Math.PI) / 24), radius * Math.sin((i * Math.PI) / 24)]);
+}
+
+// The 95 % ellipse of a covariance [[ee, en], [en, nn]], never smaller than can be seen.
+function ellipse([[a, b], [, c]], _, least = 0.3) {
+  const mean = (a + c) / 2, spread = Math.hypot((a - c) / 2, b);
+  const major = Math.max(CHI95 * Math.sqrt(Math.max(mean + spread, 0)), least);
+  const minor = Math.max(CHI95 * Math.sqrt(Math.max(mean - spread, 0)), least);
+  const angle = 0.5 * Math.atan2(2 * b, a - c);
+  return circle(0, 1).map(([x, y]) => [
+    major * x * Math.cos(angle) - minor * y * Math.sin(angle), major * x * Math.sin(angle) + minor * y * Math.cos(angle)]);
+}
+
+function craftSvg() {
+  const svg = document.createElementNS("http://www.w3.org/2000/svg", "svg");
+  svg.setAttribute("viewBox", "-15 -15 30 30");
+  const path = document.createElementNS("http://www.w3.org/2000/svg", "path");
+  path.setAttribute("d", "M0 -14 L9 11 L0 5 L-9 11 Z");
+  path.setAttribute("fill", "#ff8c1a");
+  path.setAttribute("stroke", "#101418");
+  path.setAttribute("stroke-width", "2");
+  svg.append(path);
+  return svg;
+}

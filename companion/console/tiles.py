@@ -1,0 +1,118 @@
+"""The map itself from above, as the tiles that a browser's map asks for (z, x, y, web mercator)."""
+
+from __future__ import annotations
+
+import math
+import threading
+from collections import OrderedDict
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import cv2
+
+from localizer.map.cache.cache import TileCache
+from localizer.map.cache.stream import TileStreamer
+from localizer.relocalization.topview import render_top_view
+from localizer.render.numba_raster import NumbaRenderer
+
+_SIDE_PX = 256
+_KEPT = 500
+_MEMORY = 192 << 20  # of decoded map tiles
+_LEAST_ZOOM, _MOST_ZOOM = 8, 22
+_EQUATOR_M = 40_075_016.686
+_QUALITY = 80
+
+
+@dataclass(frozen=True)
+class TileName:
+    """Of one tile."""
+
+    zoom: int
+    x: int
+    y: int
+
+    @property
+    def is_valid(self) -> bool:
+        """Whether there is such a tile on Earth, at a zoom that is drawn."""
+        side = 1 << max(self.zoom, 0)
+        return _LEAST_ZOOM <= self.zoom <= _MOST_ZOOM and 0 <= self.x < side and 0 <= self.y < side
+
+    @property
+    def centre(self) -> tuple[float, float]:
+        """Latitude and longitude, degrees."""
+        side = 1 << self.zoom
+        longitude = (self.x + 0.5) / side * 360.0 - 180.0
+        latitude = math.degrees(math.atan(math.sinh(math.pi * (1 - 2 * (self.y + 0.5) / side))))
+        return latitude, longitude
+
+    @property
+    def side_m(self) -> float:
+        """Its side on the ground."""
+        return _EQUATOR_M * math.cos(math.radians(self.centre[0])) / (1 << self.zoom)
+
+
+class TopTiles:
+    """Draws on demand, one at a time, and keeps the last ones."""
+
+    def __init__(self, map_path: Path) -> None:
+        self._cache = TileCache.open(map_path)
+        self._lock = threading.Lock()
+        self._kept: OrderedDict[TileName, bytes] = OrderedDict()
+        self._streamer: TileStreamer | None = None
+        self._renderer: NumbaRenderer | None = None
+
+    def about(self) -> dict[str, Any]:
+        """What the page needs to place the map."""
+        manifest, frame = self._cache.manifest, self._cache.frame
+        low, high = self._cache.index.box_min[0], self._cache.index.box_max[0]
+        ground = frame.origin.height_m
+        corners = [frame.position([e, n, 0.0]) for e, n in ((low[0], low[1]), (high[0], high[1]))]
+        return {
+            "bounds": [
+                [corners[0].longitude_deg, corners[0].latitude_deg],
+                [corners[1].longitude_deg, corners[1].latitude_deg],
+            ],
+            "origin": [frame.origin.latitude_deg, frame.origin.longitude_deg, ground],
+            "outline": [[lon, lat] for lat, lon in manifest.extent],
+            "gsd_m": manifest.gsd_m,
+            "attribution": manifest.attribution,
+            "geoid_separation_m": manifest.geoid_separation_m,
+        }
+
+    def tile(self, name: TileName) -> bytes | None:
+        """The tile as JPEG; None beside the map."""
+        if not name.is_valid:
+            return None
+        frame = self._cache.frame
+        centre = frame.enu_from_geodetic(*name.centre, frame.origin.height_m)[:2]
+        low, high = self._cache.index.box_min[0][:2], self._cache.index.box_max[0][:2]
+        reach = name.side_m / 2
+        if (centre + reach < low).any() or (centre - reach > high).any():
+            return None
+        with self._lock:
+            kept = self._kept.get(name)
+            if kept is not None:
+                self._kept.move_to_end(name)
+                return kept
+            view = render_top_view(
+                self._drawing(), centre, _SIDE_PX, name.side_m / _SIDE_PX,
+                float(self._cache.index.box_min[0, 2]),
+            )  # fmt: skip
+            bgr = cv2.cvtColor(view.rgb, cv2.COLOR_RGB2BGR)
+            _, data = cv2.imencode(".jpg", bgr, [cv2.IMWRITE_JPEG_QUALITY, _QUALITY])
+            self._kept[name] = data.tobytes()
+            while len(self._kept) > _KEPT:
+                self._kept.popitem(last=False)
+            return self._kept[name]
+
+    def close(self) -> None:
+        """End the loader."""
+        if self._streamer is not None:
+            self._streamer.close()
+
+    def _drawing(self) -> NumbaRenderer:
+        if self._renderer is None:
+            self._streamer = TileStreamer(self._cache, _MEMORY)
+            self._renderer = NumbaRenderer(self._streamer, threads=1)
+        return self._renderer

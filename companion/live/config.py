@@ -1,0 +1,65 @@
+"""The console's settings."""
+
+from __future__ import annotations
+
+import ipaddress
+from pathlib import Path
+
+from pydantic import BaseModel, ConfigDict, Field, model_validator
+
+
+class ConsoleConfig(BaseModel):
+    """Where the operator's page is served, and what it may do."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
+
+    listen: str = Field(
+        "127.0.0.1:8080",
+        pattern=r"^(\[[0-9a-fA-F:]+\]|[0-9.]+|localhost):\d{1,5}$",
+        description="address:port; another than loopback needs token_file",
+    )
+    control: bool = Field(
+        False, description="the page may set targets and hints, and change settings on the ground"
+    )
+    token_file: Path | None = Field(None, description="file of mode 0600; needed off loopback")
+    hosts: tuple[str, ...] = Field((), description="names by which browsers reach it, as host")
+    tls_certificate: Path | None = Field(None, description="PEM; with tls_key: https")
+    tls_key: Path | None = None
+    frames_hz: float = Field(6.0, ge=0.2, le=15.0, description="pictures per second on the page")
+
+    @model_validator(mode="after")
+    def _is_guarded(self) -> ConsoleConfig:
+        if not self.is_loopback and self.token_file is None:
+            raise ValueError("token_file is needed where listen is not a loopback address")
+        if (self.tls_certificate is None) != (self.tls_key is None):
+            raise ValueError("tls_certificate and tls_key go together")
+        if not 0 < self.port < 65536:
+            raise ValueError("listen: the port is 1 to 65535")
+        return self
+
+    @property
+    def host(self) -> str:
+        """The address that is listened on, without brackets."""
+        return self.listen.rpartition(":")[0].strip("[]")
+
+    @property
+    def port(self) -> int:
+        """The TCP port."""
+        return int(self.listen.rpartition(":")[2])
+
+    @property
+    def is_loopback(self) -> bool:
+        """Whether only this machine reaches it."""
+        if self.host == "localhost":
+            return True
+        try:
+            return ipaddress.ip_address(self.host).is_loopback
+        except ValueError:
+            return False
+
+    @property
+    def url(self) -> str:
+        """What to type into a browser on this machine."""
+        scheme = "http" if self.tls_certificate is None else "https"
+        host = "127.0.0.1" if self.host in ("0.0.0.0", "::") else self.host
+        return f"{scheme}://{f'[{host}]' if ':' in host else host}:{self.port}/"

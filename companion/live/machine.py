@@ -1,0 +1,51 @@
+"""How busy and how warm this computer is."""
+
+from __future__ import annotations
+
+import os
+import time
+from pathlib import Path
+
+_ZONES = Path("/sys/class/thermal")
+_HOT_READS_S = 5.0
+
+
+class MachineLoad:
+    """Of this process, and of the machine."""
+
+    def __init__(self) -> None:
+        self._before = (time.monotonic(), self._used_s())
+        self._temperature: tuple[float, float | None] = (-_HOT_READS_S, None)
+
+    def read(self) -> dict[str, float | None]:
+        """cpu_percent: of one core, since the last reading; load: one minute's average; warmest
+        zone in degrees Celsius, where the machine tells it.
+        """
+        now, used = time.monotonic(), self._used_s()
+        elapsed = max(now - self._before[0], 1e-3)
+        share = 100.0 * (used - self._before[1]) / elapsed
+        self._before = (now, used)
+        if now - self._temperature[0] >= _HOT_READS_S:
+            self._temperature = (now, warmest_c())
+        return {
+            "cpu_percent": share,
+            "cores": float(os.cpu_count() or 1),
+            "load": os.getloadavg()[0],
+            "temperature_c": self._temperature[1],
+        }
+
+    @staticmethod
+    def _used_s() -> float:
+        times = os.times()
+        return times.user + times.system
+
+
+def warmest_c(zones: Path = _ZONES) -> float | None:
+    """The warmest thermal zone; None where none can be read."""
+    found = []
+    for path in zones.glob("thermal_zone*/temp"):
+        try:
+            found.append(int(path.read_text()) / 1000.0)
+        except (OSError, ValueError):
+            continue
+    return max(found, default=None)

@@ -1,0 +1,95 @@
+"""What the console asks the flight to do: checked again here, since a page may be anybody's."""
+
+from __future__ import annotations
+
+import math
+import time
+from collections import deque
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+from companion.errors import CompanionError
+from mavlink_bridge.messages import TrackRequest
+
+_NOTICE = 5  # MAV_SEVERITY_NOTICE
+_MOST = 10  # orders in as many seconds
+_SPAN_S = 5.0
+_LARGEST_RADIUS_M = 10_000.0
+
+
+class OrderError(CompanionError):
+    """An order that is not carried out, and why."""
+
+
+@dataclass(frozen=True)
+class Helm:
+    """What orders act on. say: tells the operator and the log; track: a ground station's click;
+    hint: (latitude_deg, longitude_deg, radius_m), raises `OrderError` for a place off the map.
+    """
+
+    say: Callable[[int, str], None]
+    track: Callable[[TrackRequest], None]
+    hint: Callable[[float, float, float], None]
+
+
+class Orders:
+    """Carries out the console's orders, if `control` is on; each is told."""
+
+    def __init__(
+        self, control: bool, helm: Helm, clock: Callable[[], float] = time.monotonic
+    ) -> None:
+        self._control, self._helm, self._clock = control, helm, clock
+        self._taken: deque[float] = deque(maxlen=_MOST)
+
+    def take(self, order: dict[str, Any]) -> str:
+        """Do it; returns what was done. `OrderError` says why not."""
+        if not self._control:
+            raise OrderError("the console only reads: console.control is false")
+        now = self._clock()
+        if len(self._taken) == _MOST and now - self._taken[0] < _SPAN_S:
+            raise OrderError(f"more than {_MOST} orders in {_SPAN_S:.0f} s")
+        self._taken.append(now)
+        do = order.get("do")
+        if do == "stop":
+            return self._track("stop", order, (), "targets ended")
+        if do == "target":
+            x, y = (_share(order, key) for key in ("x", "y"))
+            return self._track("point", order, (x, y), f"target at {x:.2f} {y:.2f}")
+        if do == "box":
+            box = tuple(_share(order, key) for key in ("left", "top", "right", "bottom"))
+            if box[0] >= box[2] or box[1] >= box[3]:
+                raise OrderError("a box has its left top before its right bottom")
+            return self._track("rectangle", order, box, f"target box at {box[0]:.2f} {box[1]:.2f}")
+        if do == "hint":
+            latitude = _number(order, "latitude_deg", -90.0, 90.0)
+            longitude = _number(order, "longitude_deg", -180.0, 180.0)
+            radius = _number(order, "radius_m", 5.0, _LARGEST_RADIUS_M)
+            self._helm.hint(latitude, longitude, radius)
+            return self._told(f"hint {latitude:.5f} {longitude:.5f} +-{radius:.0f} m")
+        raise OrderError("no such order")
+
+    def _track(self, kind: str, order: dict[str, Any], at: tuple[float, ...], text: str) -> str:
+        now_ns = time.monotonic_ns()
+        time_ns = order.get("exposure_ns", now_ns)
+        if not isinstance(time_ns, int) or not 0 <= now_ns - time_ns < 10_000_000_000:
+            time_ns = now_ns
+        self._helm.track(TrackRequest(kind, time_ns, at))
+        return self._told(text)
+
+    def _told(self, text: str) -> str:
+        self._helm.say(_NOTICE, f"PiLoT: console: {text}")
+        return text
+
+
+def _share(order: dict[str, Any], key: str) -> float:
+    return _number(order, key, 0.0, 1.0)
+
+
+def _number(order: dict[str, Any], key: str, low: float, high: float) -> float:
+    value = order.get(key)
+    if isinstance(value, bool) or not isinstance(value, int | float):
+        raise OrderError(f"{key} is a number")
+    if not (math.isfinite(value) and low <= value <= high):
+        raise OrderError(f"{key} is {low:g} to {high:g}")
+    return float(value)

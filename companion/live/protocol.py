@@ -1,0 +1,98 @@
+"""Messages between flight and console over a local stream socket.
+
+One message: two big-endian uint32 (bytes of the head, bytes of the body), the head as JSON, the
+body as it is (pictures). Both sides bound what they take.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+import stat
+import struct
+import tempfile
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from companion.errors import CompanionError
+
+MOST_HEAD = 1 << 20
+MOST_BODY = 64 << 20
+MOST_ORDER = 4096  # bytes of what the console may say at once
+_SIZES = struct.Struct(">II")
+
+
+class LinkError(CompanionError):
+    """Bytes that are no message of the other side, or a socket that cannot be had."""
+
+
+@dataclass(frozen=True)
+class Message:
+    """head: JSON object with its "kind"; body: bytes."""
+
+    head: dict[str, Any]
+    body: bytes = b""
+
+
+def encode(head: dict[str, Any], *parts: bytes | memoryview) -> bytes:
+    """A message as bytes. NaN is refused: browsers do not read it."""
+    text = json.dumps(head, allow_nan=False, separators=(",", ":")).encode()
+    size = sum(len(part) for part in parts)
+    return b"".join((_SIZES.pack(len(text), size), text, *parts))
+
+
+class Decoder:
+    """Bytes in, messages out."""
+
+    def __init__(self, most_head: int = MOST_HEAD, most_body: int = MOST_BODY) -> None:
+        self._most_head, self._most_body = most_head, most_body
+        self._buffer = bytearray()
+
+    def feed(self, data: bytes) -> Iterator[Message]:
+        """Every message that is whole now; `LinkError` for what cannot be one."""
+        self._buffer += data
+        while len(self._buffer) >= _SIZES.size:
+            head, body = _SIZES.unpack_from(self._buffer)
+            if head > self._most_head or body > self._most_body:
+                raise LinkError(f"a message of {head} + {body} bytes is too long")
+            end = _SIZES.size + head + body
+            if len(self._buffer) < end:
+                return
+            raw = bytes(self._buffer[_SIZES.size : end])
+            del self._buffer[:end]
+            try:
+                value = json.loads(raw[:head])
+            except (ValueError, RecursionError) as error:
+                raise LinkError(f"not a message: {error}") from error
+            if not isinstance(value, dict):
+                raise LinkError("not a message: its head is no object")
+            yield Message(value, raw[head:])
+
+
+def socket_path(map_path: Path, record: Path | None, listen: str) -> Path:
+    """Where a deployment's two processes meet: the same for both, in a folder of this user's.
+
+    A path of its own for each deployment; short, because such addresses end at 107 bytes.
+    """
+    key = f"{Path(map_path).absolute()}\0{record and Path(record).absolute()}\0{listen}"
+    name = hashlib.sha256(key.encode()).hexdigest()[:16]
+    return runtime_folder() / f"{name}.sock"
+
+
+def runtime_folder() -> Path:
+    """A folder that only this user can enter; `LinkError` where somebody else made it."""
+    base = os.environ.get("XDG_RUNTIME_DIR")
+    folder = Path(base) if base else Path(tempfile.gettempdir()) / f"companion-{os.getuid()}"
+    if base:
+        folder = folder / "companion"
+    try:
+        folder.mkdir(mode=0o700, exist_ok=True)
+        found = folder.lstat()
+    except OSError as error:
+        raise LinkError(f"{folder}: no place for the console's socket: {error}") from error
+    if not stat.S_ISDIR(found.st_mode) or found.st_uid != os.getuid() or found.st_mode & 0o077:
+        raise LinkError(f"{folder}: is not a folder of this user alone (0700); remove it")
+    return folder

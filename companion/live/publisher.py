@@ -1,0 +1,235 @@
+"""The flight's side of the console: a local socket, served by one thread of low priority.
+
+It keeps at most one unfinished message per console: what does not fit is dropped, never queued.
+While nobody is connected it sleeps.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import logging
+import os
+import selectors
+import socket
+import threading
+import time
+from collections import deque
+from pathlib import Path
+from typing import Any
+
+from companion.live.orders import OrderError, Orders
+from companion.live.protocol import MOST_ORDER, Decoder, LinkError, encode
+from companion.live.shown import Shown
+
+_log = logging.getLogger(__name__)
+_NICE = 10
+_MOST_CONSOLES = 3
+_STATE_S = 0.5
+_ANSWERS = 8
+
+
+class _Console:
+    """One connection. watching: it wants pictures."""
+
+    def __init__(self, connection: socket.socket) -> None:
+        self.connection = connection
+        self.decoder = Decoder(MOST_ORDER, 0)
+        self.sending = memoryview(b"")
+        self.answers: deque[bytes] = deque(maxlen=_ANSWERS)
+        self.told = 0
+        self.watching = False
+
+    @property
+    def is_idle(self) -> bool:
+        return not self.sending
+
+
+class Publisher:
+    """Serves the console's process at `path`.
+
+    shown: makes the messages; orders: carries out what the console asks. Nothing here is called by
+    the flight but `start`, `stop` and `wake`, which only sets a flag.
+    """
+
+    def __init__(self, path: Path, shown: Shown, orders: Orders, frames_hz: float) -> None:
+        self.path, self._shown, self._orders = path, shown, orders
+        self._frame_s = 1.0 / frames_hz
+        self._consoles: dict[socket.socket, _Console] = {}
+        self._selector = selectors.DefaultSelector()
+        self._woken, self._waker = socket.socketpair()
+        for end in (self._woken, self._waker):
+            end.setblocking(False)
+        self._listening = _listen(path)
+        self._stopping = False
+        self._next_state_s = self._next_frame_s = 0.0
+        self._thread = threading.Thread(target=self._run, name="console link", daemon=True)
+
+    @property
+    def is_watched(self) -> bool:
+        """Whether anybody wants pictures; without, nothing is kept for them."""
+        return any(c.watching for c in tuple(self._consoles.values()))
+
+    def start(self) -> None:
+        """Serve."""
+        self._selector.register(self._listening, selectors.EVENT_READ, self._accept)
+        self._selector.register(self._woken, selectors.EVENT_READ, self._drain)
+        self._thread.start()
+
+    def stop(self) -> None:
+        """Close every connection."""
+        self._stopping = True
+        self.wake()
+        if self._thread.ident is not None:
+            self._thread.join(2.0)
+
+    def close(self) -> None:
+        """Undo the making."""
+        for end in (self._listening, self._woken, self._waker):
+            end.close()
+        with contextlib.suppress(OSError):
+            self.path.unlink()
+
+    def waiting(self) -> list[int]:
+        """Bytes that wait for each console."""
+        return [len(c.sending) for c in tuple(self._consoles.values())]
+
+    def wake(self) -> None:
+        """There is a new picture. Never blocks."""
+        with contextlib.suppress(OSError):
+            self._waker.send(b"1")
+
+    def _run(self) -> None:
+        with contextlib.suppress(OSError, AttributeError):  # on Linux a thread has its own
+            os.setpriority(os.PRIO_PROCESS, threading.get_native_id(), _NICE)
+        while not self._stopping:
+            try:
+                self._turn()
+            except Exception:  # whatever the console does, the flight goes on without it
+                _log.exception("the console's link failed and starts over")
+                self._drop_all()
+        self._drop_all()
+        self._selector.close()
+
+    def _turn(self) -> None:
+        timeout = None
+        if self._consoles:
+            timeout = max(self._next_state_s - time.monotonic(), 0.0)
+        for key, events in self._selector.select(timeout):
+            key.data(key.fileobj, events)
+        now = time.monotonic()
+        if self._consoles and now >= self._next_state_s:
+            self._next_state_s = now + _STATE_S
+            for console in self._idle():
+                head, told = self._shown.state(console.told)
+                if self._offer(console, encode(head)):
+                    console.told = told
+        if self.is_watched and now >= self._next_frame_s:
+            message = self._shown.take_frame()
+            if message is not None:
+                self._next_frame_s = now + self._frame_s
+                for console in self._idle():
+                    if console.watching:
+                        self._offer(console, message)
+
+    def _idle(self) -> list[_Console]:
+        return [c for c in self._consoles.values() if c.is_idle]
+
+    def _accept(self, listening: Any, _: int) -> None:
+        with contextlib.suppress(OSError):
+            connection, _address = listening.accept()
+            if len(self._consoles) >= _MOST_CONSOLES:
+                connection.close()
+                return
+            connection.setblocking(False)
+            console = _Console(connection)
+            self._consoles[connection] = console
+            self._selector.register(connection, selectors.EVENT_READ, self._serve)
+            self._next_state_s = 0.0
+            self._offer(console, encode(self._shown.hello()))
+
+    def _drain(self, woken: Any, _: int) -> None:
+        with contextlib.suppress(OSError):
+            woken.recv(4096)
+
+    def _serve(self, connection: Any, events: int) -> None:
+        console = self._consoles[connection]
+        try:
+            if events & selectors.EVENT_WRITE:
+                self._send(console)
+            if events & selectors.EVENT_READ:
+                data = connection.recv(MOST_ORDER)
+                if not data:
+                    raise LinkError("closed")
+                for message in console.decoder.feed(data):
+                    self._obey(console, message.head)
+        except BlockingIOError:
+            pass
+        except (OSError, LinkError):
+            self._drop(console)
+
+    def _obey(self, console: _Console, head: dict[str, Any]) -> None:
+        if head.get("kind") == "watch":
+            console.watching = head.get("frames") is True
+            return
+        try:
+            ok, text = True, self._orders.take(head)
+        except OrderError as error:
+            ok, text = False, str(error)
+        number = head.get("number")
+        if isinstance(number, int):
+            answer = {"kind": "answer", "number": number, "ok": ok, "text": text}
+            console.answers.append(encode(answer))
+        if console.is_idle:
+            self._next_answer(console)
+
+    def _offer(self, console: _Console, message: bytes) -> bool:
+        """Begin to send, if nothing else is under way."""
+        if not console.is_idle:
+            return False
+        console.sending = memoryview(message)
+        try:
+            self._send(console)
+        except BlockingIOError:
+            pass
+        except OSError:
+            self._drop(console)
+            return False
+        return True
+
+    def _send(self, console: _Console) -> None:
+        try:
+            while console.sending:
+                console.sending = console.sending[console.connection.send(console.sending) :]
+        finally:
+            if console.connection in self._consoles:
+                wanted = selectors.EVENT_READ | (selectors.EVENT_WRITE if console.sending else 0)
+                self._selector.modify(console.connection, wanted, self._serve)
+        self._next_answer(console)
+
+    def _next_answer(self, console: _Console) -> None:
+        if console.answers and console.is_idle:
+            self._offer(console, console.answers.popleft())
+
+    def _drop(self, console: _Console) -> None:
+        if self._consoles.pop(console.connection, None) is not None:
+            self._selector.unregister(console.connection)
+            console.connection.close()
+
+    def _drop_all(self) -> None:
+        for console in tuple(self._consoles.values()):
+            self._drop(console)
+
+
+def _listen(path: Path) -> socket.socket:
+    """A socket at that path, for this user alone."""
+    listening = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
+    try:
+        path.unlink(missing_ok=True)  # of a process that was killed
+        listening.bind(str(path))
+        path.chmod(0o600)
+        listening.listen(_MOST_CONSOLES)
+        listening.setblocking(False)
+    except OSError as error:
+        listening.close()
+        raise LinkError(f"{path}: the console's socket cannot be made: {error}") from error
+    return listening

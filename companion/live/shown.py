@@ -1,0 +1,254 @@
+"""What the console is shown: one state document, and pictures with the poses that belong to them.
+
+The flight's threads only leave references here; all formatting is the console link's thread's.
+"""
+
+from __future__ import annotations
+
+import math
+import threading
+import time
+from collections import OrderedDict, deque
+from collections.abc import Callable
+from dataclasses import asdict, dataclass
+from typing import Any
+
+import cv2
+import numpy as np
+
+from companion.live.machine import MachineLoad
+from companion.live.protocol import encode
+from companion.targets.reporter import Target
+from localizer.geometry.geo import LocalFrame
+from localizer.geometry.pose import Pose, quaternion_from_matrix
+from localizer.types import Frame, PoseEstimate, ReferenceBundle, RenderedView
+from mavlink_bridge.injection.closed_loop import LoopVerdict
+from mavlink_bridge.injection.shadow import ShadowScore
+from mavlink_bridge.messages import VehicleState
+
+_FRAMES = 12  # pictures that wait for their estimate: a second or so
+_WIDEST = 960  # pixels that are sent
+_EVENTS = 300
+_TARGETS = 64
+
+
+@dataclass(frozen=True)
+class Instruments:
+    """What is asked for each state document. injecting: whether fixes go out now."""
+
+    health: Callable[[], dict[str, Any]]
+    vehicle: Callable[[], VehicleState]
+    shadow: Callable[[], ShadowScore]
+    verdict: Callable[[], LoopVerdict | None]
+    injecting: Callable[[], bool]
+
+
+class Shown:
+    """Keeps the newest of everything. about: what never changes in a flight (mode, limits, map)."""
+
+    def __init__(
+        self, frame: LocalFrame, geoid_m: float, instruments: Instruments, about: dict[str, Any]
+    ) -> None:
+        self._frame, self._geoid_m = frame, geoid_m
+        self._instruments, self._about = instruments, about
+        self._load = MachineLoad()
+        self._lock = threading.Lock()
+        self._pictures: OrderedDict[int, Frame] = OrderedDict()
+        self._paired: tuple[Frame, PoseEstimate | None, RenderedView | None] | None = None
+        self._estimate: PoseEstimate | None = None
+        self._targets: OrderedDict[str, Target] = OrderedDict()
+        self._events: deque[tuple[int, int, str, str]] = deque(maxlen=_EVENTS)
+        self._count = 0
+
+    # --- from the flight's threads; none of them waits ----------------------------------------
+
+    def add_frame(self, frame: Frame) -> None:
+        """Keep a reference to a picture until its estimate comes."""
+        with self._lock:
+            self._pictures[frame.exposure_time_ns] = frame
+            while len(self._pictures) > _FRAMES:
+                self._pictures.popitem(last=False)
+
+    def add_estimate(self, estimate: PoseEstimate, bundle: ReferenceBundle | None) -> None:
+        """Pair an estimate with its picture, if that was kept."""
+        self._estimate = estimate
+        with self._lock:
+            frame = self._pictures.pop(estimate.exposure_time_ns, None)
+            if frame is not None:
+                self._paired = (frame, estimate, None if bundle is None else bundle.view)
+
+    def add_target(self, target: Target) -> None:
+        """Keep the newest fix of each target."""
+        with self._lock:
+            self._targets[target.fix.target_id] = target
+            self._targets.move_to_end(target.fix.target_id)
+            while len(self._targets) > _TARGETS:
+                self._targets.popitem(last=False)
+
+    def forget_target(self, name: str) -> None:
+        """It was ended by order."""
+        with self._lock:
+            self._targets.pop(name, None)
+
+    def add_event(self, level: str, text: str) -> None:
+        """Something happened."""
+        with self._lock:
+            self._count += 1
+            self._events.append((self._count, time.monotonic_ns(), level, text))
+
+    # --- for the link's thread ----------------------------------------------------------------
+
+    def hello(self) -> dict[str, Any]:
+        """The first message."""
+        return {"kind": "hello", **self._about, "monotonic_ns": time.monotonic_ns()}
+
+    def state(self, told: int) -> tuple[dict[str, Any], int]:
+        """The state document, and up to which event it tells; events up to `told` are left out."""
+        with self._lock:
+            events = [e for e in self._events if e[0] > told]
+            targets = list(self._targets.values())
+            count = self._count
+        vehicle, shadow = self._instruments.vehicle(), self._instruments.shadow()
+        verdict = self._instruments.verdict()
+        document = {
+            "kind": "state",
+            "time_ns": time.monotonic_ns(),
+            "utc_ns": time.time_ns(),
+            "health": self._instruments.health(),
+            "vehicle": asdict(vehicle),
+            "shadow": asdict(shadow) | {"line": shadow.line()},
+            "follows": None if verdict is None else asdict(verdict),
+            "injecting": self._instruments.injecting(),
+            "estimate": self._estimate and self._position(self._estimate),
+            "gnss_residual_m": self._residual(vehicle),
+            "targets": [self._target(t) for t in targets],
+            "machine": self._load.read(),
+            "events": [
+                {"number": n, "time_ns": t, "level": level, "text": text}
+                for n, t, level, text in events
+            ],
+        }
+        plain: dict[str, Any] = _plain(document)
+        return plain, count
+
+    def take_frame(self) -> bytes | None:
+        """The newest picture with its pose and the map's view of it; None if none is new."""
+        with self._lock:
+            paired, self._paired = self._paired, None
+            if paired is None and self._pictures and self._is_unlocalized():
+                _, frame = self._pictures.popitem(last=True)
+                paired = (frame, None, None)
+        if paired is None:
+            return None
+        frame, estimate, view = paired
+        image = _narrowed(frame.image)
+        head: dict[str, Any] = {
+            "kind": "frame",
+            "exposure_ns": frame.exposure_time_ns,
+            "image": [image.shape[1], image.shape[0]],
+            "camera": frame.camera.to_dict(),
+            "estimate": None,
+            "view": None,
+        }
+        parts = [image.tobytes()]
+        if estimate is not None:
+            head["estimate"] = self._position(estimate) | {
+                "pose": _pose(estimate.world_from_camera)
+            }
+            if view is not None and estimate.accepted:
+                head["view"] = {
+                    "camera": view.camera.to_dict(), "pose": _pose(view.world_from_camera)
+                }  # fmt: skip
+                parts += [view.rgb.tobytes(), view.depth.tobytes()]
+        return encode(_plain(head), *parts)
+
+    def _is_unlocalized(self) -> bool:
+        newest = self._estimate
+        return newest is None or time.monotonic_ns() - newest.exposure_time_ns > 1_000_000_000
+
+    def _position(self, estimate: PoseEstimate) -> dict[str, Any]:
+        pose = estimate.world_from_camera
+        at = self._frame.position(pose.translation)
+        forward = pose.rotation[:, 2]
+        up = -pose.rotation[:, 1]
+        ahead = forward if abs(forward[2]) < 0.98 else up  # looking down, the picture's top
+        return {
+            "time_ns": estimate.exposure_time_ns,
+            "latitude_deg": at.latitude_deg,
+            "longitude_deg": at.longitude_deg,
+            "height_m": at.height_m,
+            "amsl_m": at.height_m - self._geoid_m,
+            "enu_m": [float(x) for x in pose.translation],
+            "heading_deg": math.degrees(math.atan2(ahead[0], ahead[1])) % 360.0,
+            "covariance_m2": estimate.covariance[:2, :2].tolist(),
+            "sigma_m": float(np.sqrt(max(np.linalg.eigvalsh(estimate.covariance[:2, :2])[-1], 0))),
+            "sigma_up_m": float(np.sqrt(max(estimate.covariance[2, 2], 0.0))),
+            "state": estimate.state.value,
+            "status": estimate.status.name,
+            "accepted": estimate.accepted,
+            "quality": estimate.quality,
+            "last_fix_ns": estimate.last_fix_ns,
+            "stages_ms": dict(estimate.stage_ms),
+        }
+
+    def _residual(self, vehicle: VehicleState) -> float | None:
+        """Horizontal, of the newest fix to the receiver's own position, m. The receiver's delay
+        times the speed is in it.
+        """
+        estimate = self._estimate
+        if estimate is None or not estimate.accepted or vehicle.gps_fix_type < 3:
+            return None
+        if vehicle.gps_latitude_deg is None or vehicle.gps_longitude_deg is None:
+            return None
+        height = self._frame.origin.height_m
+        place = (vehicle.gps_latitude_deg, vehicle.gps_longitude_deg, height)
+        gnss = self._frame.enu_from_geodetic(*place)
+        return float(np.hypot(*(estimate.world_from_camera.translation - gnss)[:2]))
+
+    def _target(self, target: Target) -> dict[str, Any]:
+        fix = target.fix
+        at = self._frame.position(fix.position_world)
+        return {
+            "name": fix.target_id,
+            "time_ns": fix.exposure_time_ns,
+            "latitude_deg": at.latitude_deg,
+            "longitude_deg": at.longitude_deg,
+            "height_m": at.height_m,
+            "amsl_m": at.height_m - self._geoid_m,
+            "covariance_m2": fix.covariance[:2, :2].tolist(),
+            "sigma_m": float(np.sqrt(max(fix.covariance[0, 0] + fix.covariance[1, 1], 0.0))),
+            "sigma_up_m": float(np.sqrt(max(fix.covariance[2, 2], 0.0))),
+            "elsewhere": fix.elsewhere,
+            "pixel": [float(x) for x in fix.pixel],
+            "velocity_m_s": None if target.velocity is None else [*map(float, target.velocity)],
+        }
+
+
+def _pose(pose: Pose) -> dict[str, list[float]]:
+    return {
+        "q": [float(x) for x in quaternion_from_matrix(pose.rotation)],
+        "t": [float(x) for x in pose.translation],
+    }
+
+
+def _narrowed(image: np.ndarray) -> np.ndarray:
+    height, width = image.shape[:2]
+    if width <= _WIDEST:
+        return np.ascontiguousarray(image)
+    size = (_WIDEST, round(height * _WIDEST / width))
+    return np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA))
+
+
+def _plain(value: Any) -> Any:
+    """JSON's own types; what is not a number is None."""
+    if isinstance(value, dict):
+        return {str(k): _plain(v) for k, v in value.items()}
+    if isinstance(value, list | tuple):
+        return [_plain(v) for v in value]
+    if isinstance(value, np.generic):
+        value = value.item()
+    if isinstance(value, float):
+        return value if math.isfinite(value) else None
+    if value is None or isinstance(value, bool | int | str):
+        return value
+    return str(value)

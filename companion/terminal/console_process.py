@@ -1,0 +1,73 @@
+"""The console's process beside a flight: begun with it, ended with it, and nothing more.
+
+When it crashes it is told once and stays down: `companion console` begins it again by hand. Its
+lifeline is a pipe: whatever ends the flight's process closes it.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import importlib.util
+import logging
+import subprocess
+import sys
+import threading
+from collections.abc import Iterator
+from pathlib import Path
+
+from companion.live.config import ConsoleConfig
+
+_log = logging.getLogger("companion.console")
+_STOP_S = 3.0
+_NEEDED = ("starlette", "uvicorn", "websockets")
+
+
+@contextlib.contextmanager
+def running_console(deployment: Path, config: ConsoleConfig | None) -> Iterator[None]:
+    """Serve the page while this lasts; a flight goes on without it."""
+    process = None if config is None else _begun(deployment, config)
+    try:
+        yield
+    finally:
+        if process is not None:
+            _end(process)
+
+
+def _begun(deployment: Path, config: ConsoleConfig) -> subprocess.Popen[bytes] | None:
+    missing = [name for name in _NEEDED if importlib.util.find_spec(name) is None]
+    if missing:
+        _log.warning("no console: install pilot-companion[console] (%s missing)", missing[0])
+        return None
+    command = [sys.executable, "-m", "companion", "console", str(deployment), "--lifeline"]
+    try:
+        process = subprocess.Popen(
+            command, stdin=subprocess.PIPE, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE,
+            start_new_session=True,  # an interrupt at the terminal is the flight's
+        )  # fmt: skip
+    except OSError as error:
+        _log.warning("no console: %s", error)
+        return None
+    _log.info("console: %s", config.url)
+    threading.Thread(target=_tell_end, args=(process,), name="console end", daemon=True).start()
+    return process
+
+
+def _tell_end(process: subprocess.Popen[bytes]) -> None:
+    assert process.stderr is not None
+    last = b""
+    for line in process.stderr:
+        last = line.strip() or last
+    code = process.wait()
+    if code > 0:  # below zero: ended by order
+        _log.warning("the console ended (%d): %s", code, last.decode("utf-8", "replace")[:300])
+
+
+def _end(process: subprocess.Popen[bytes]) -> None:
+    if process.stdin is not None:
+        with contextlib.suppress(OSError):
+            process.stdin.close()
+    try:
+        process.wait(_STOP_S)
+    except subprocess.TimeoutExpired:
+        process.kill()
+        process.wait()

@@ -1,0 +1,135 @@
+"""A flight for the console's tests: the map's own pictures along a line, the truth as estimate.
+
+Everything else is the product's: what is shown, the publisher, orders, clicks, targets.
+"""
+
+from __future__ import annotations
+
+import threading
+import time
+from contextlib import contextmanager
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from companion.config import TargetConfig
+from companion.live.orders import Helm, Orders
+from companion.live.publisher import Publisher
+from companion.live.shown import Instruments, Shown
+from companion.targets.clicks import ClickPolicy
+from companion.targets.reporter import TargetReporter
+from localizer.geometry.camera import Camera
+from localizer.geometry.pose import Pose
+from localizer.map.cache.cache import TileCache
+from localizer.map.cache.stream import TileStreamer
+from localizer.map.cache.surface import MapSurface
+from localizer.relocalization.topview import DOWN
+from localizer.render.numba_raster import NumbaRenderer
+from localizer.types import (
+    Frame,
+    PoseEstimate,
+    ReferenceBundle,
+    RegistrationStatus,
+    TrackingState,
+)
+from mavlink_bridge.injection.shadow import ShadowScore
+from mavlink_bridge.messages import VehicleState
+
+CAMERA = Camera.from_fov(480, 360, 65.0)
+HEIGHT_M = 80.0
+
+
+@dataclass
+class Flight:
+    """The flight's side. said: what the operator was told; hints: what the search was given."""
+
+    path: object
+    cache: TileCache
+    control: bool = True
+    armed: bool = False
+    hz: float = 5.0
+    said: list[str] = field(default_factory=list)
+    hints: list[tuple[float, float, float]] = field(default_factory=list)
+    targets: dict[str, np.ndarray] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        self.vehicle = VehicleState(connected=True, mode="GUIDED", system_id=1, armed=self.armed)
+        origin = self.cache.frame.origin
+        self.health = {
+            "level": "ok", "text": "localization tracking", "rate_hz": self.hz,
+            "guardian": {"hpl_m": 2.5, "vpl_m": 2.0, "findings": {}},
+            "stages_ms": {"latency": {"p50": 90.0, "p95": 120.0}},
+        }  # fmt: skip
+        instruments = Instruments(
+            lambda: self.health, lambda: self.vehicle,
+            lambda: ShadowScore(False, 3, ("only 3 fixes of 50",)), lambda: None, lambda: False,
+        )  # fmt: skip
+        about = {"mode": "shadow", "delay_ms": 220.0, "alert_limit_m": 10.0, "record": None}
+        self.shown = Shown(self.cache.frame, 48.0, instruments, about)
+        self.origin = origin
+        self.reporter = TargetReporter(
+            TargetConfig(), MapSurface(self.cache).cast, self._located, self.shown.forget_target
+        )
+        self.clicks = ClickPolicy(self.reporter, self._say)
+        helm = Helm(self._say, self.clicks.on_request, lambda *hint: self.hints.append(hint))
+        self.publisher = Publisher(self.path, self.shown, Orders(self.control, helm), 10.0)
+        self._stop = threading.Event()
+        self._streamer = TileStreamer(self.cache)
+        self._renderer = NumbaRenderer(self._streamer)
+        self._views = self._way()
+
+    def _located(self, target) -> None:
+        self.targets[target.fix.target_id] = target.fix.position_world
+        self.shown.add_target(target)
+
+    def _say(self, severity: int, text: str) -> None:
+        self.said.append(text)
+        self.shown.add_event("info", text)
+
+    def _way(self):
+        base = float(self.cache.index.box_min[0, 2])
+        poses = [Pose(DOWN, np.array([x, 0.0, base + HEIGHT_M])) for x in range(-20, 21, 4)]
+        return [self._renderer.render(pose, CAMERA, wait=True) for pose in poses]
+
+    def send(self, number: int) -> PoseEstimate:
+        """One frame with its estimate."""
+        view = self._views[number % len(self._views)]
+        now = time.monotonic_ns()
+        frame = Frame(view.rgb, now - 50_000_000, CAMERA, number)
+        estimate = PoseEstimate(
+            view.world_from_camera, np.eye(6) * 0.01, 0.8, TrackingState.TRACKING,
+            RegistrationStatus.OK, True, frame.exposure_time_ns, number, CAMERA,
+            {"reference": 40.0, "extract": 25.0, "register": 9.0, "latency": 50.0},
+            frame.exposure_time_ns,
+        )  # fmt: skip
+        if self.publisher.is_watched:
+            self.shown.add_frame(frame)
+        self.clicks.add_estimate(estimate)
+        self.reporter.add_estimate(estimate)
+        bundle = ReferenceBundle(replace(view), None, now)
+        self.shown.add_estimate(estimate, bundle)
+        self.publisher.wake()
+        return estimate
+
+    def _fly(self) -> None:
+        number = 0
+        while not self._stop.wait(1.0 / self.hz):
+            self.send(number)
+            number += 1
+
+    @contextmanager
+    def flying(self):
+        """Serve, and fly up and down."""
+        self.reporter.start()
+        self.publisher.start()
+        thread = threading.Thread(target=self._fly)
+        thread.start()
+        try:
+            yield self
+        finally:
+            self._stop.set()
+            thread.join()
+            self.publisher.stop()
+            self.publisher.close()
+            self.reporter.stop()
+            self._streamer.close()

@@ -1,0 +1,336 @@
+"""Attacks on the page: another site's page, a made-up name, the network, floods, odd paths."""
+
+import asyncio
+import io
+import json
+import os
+import tarfile
+
+import pytest
+import yaml
+from pydantic import ValidationError
+
+pytest.importorskip("starlette")
+pytest.importorskip("httpx2")
+from starlette.testclient import TestClient
+from starlette.websockets import WebSocketDisconnect
+
+from companion.console.records import Records
+from companion.console.security import MOST_BODY, Guarded, read_token
+from companion.console.server import Site, make_application
+from companion.console.source import Newest
+from companion.errors import ConfigError
+from companion.live.config import ConsoleConfig
+
+HOST = "127.0.0.1:8080"
+SAME = {"host": HOST, "origin": f"http://{HOST}", "x-console": "1"}
+TOKEN = "0123456789abcdef0123"
+MODEL = {"width": 64, "height": 48, "fx": 60, "fy": 60, "cx": 32, "cy": 24}
+
+
+class Still:
+    """A flight that shows one state and notes what it was asked."""
+
+    def __init__(self, armed=False, connected=True):
+        self.newest = Newest()
+        self.newest.hello = {"kind": "hello"}
+        vehicle = {"connected": connected, "armed": armed}
+        self.newest.state = {"kind": "state", "vehicle": vehicle, "targets": [], "events": []}
+        self.newest.states = 1
+        self.is_connected = True
+        self.orders = []
+        self.watched = []
+
+    def watch(self, wanted):
+        self.watched.append(wanted)
+
+    async def changed(self):
+        await asyncio.Event().wait()
+
+    async def order(self, order):
+        self.orders.append(order)
+        return True, "done"
+
+    async def run(self):
+        pass
+
+
+@pytest.fixture
+def deployment(tmp_path):
+    path = tmp_path / "deployment.yaml"
+    camera = {"source": "rtsp://user:secret@10.0.0.1/a", "model": MODEL}
+    path.write_text(yaml.safe_dump({"map": "map", "camera": camera}))
+    path.chmod(0o640)
+    return path
+
+
+@pytest.fixture
+def site(tmp_path, deployment, small_assets):
+    def make(source=None, *, token=None, **config):
+        config = {"control": True} | config
+        flights = tmp_path / "flights"
+        record = flights / "flight"
+        (record / "snapshots").mkdir(parents=True, exist_ok=True)
+        (record / "record.json").write_text(json.dumps({"utc_ns": 5}))
+        (record / "events.csv").write_text("time_ns,level,text\n")
+        return Site(
+            ConsoleConfig(**config), source or Still(), small_assets.map_cache,
+            Records(flights), deployment, token,
+        )  # fmt: skip
+
+    return make
+
+
+def _client(site):
+    return TestClient(make_application(site), base_url=f"http://{HOST}")
+
+
+@pytest.mark.parametrize(
+    "host",
+    ["evil.example", "127.0.0.1.evil.example:8080", "10.1.2.3:8080", "", "[::1", "localhost."],
+)
+def test_a_name_that_was_made_to_point_here_gets_nothing(site, host):
+    """DNS rebinding: the browser sends the attacker's name."""
+    with _client(site()) as client:
+        assert client.get("/api/records", headers={"host": host}).status_code == 421
+        assert client.get("/api/records", headers={"host": "localhost:8080"}).status_code == 200
+
+
+@pytest.mark.parametrize(
+    "headers",
+    [
+        {"origin": "http://evil.example"},
+        {"origin": "null"},
+        {"origin": "http://127.0.0.1:9999"},
+        {"origin": f"https://{HOST}"},
+        {"sec-fetch-site": "cross-site"},
+        {"x-console": "0"},
+    ],
+)
+def test_another_sites_page_cannot_act(site, headers):
+    source = Still()
+    with _client(site(source)) as client:
+        answer = client.post("/api/order", json={"do": "stop"}, headers=SAME | headers)
+        assert answer.status_code == 403
+        plain = {"host": HOST, "content-type": "text/plain"}  # what a form can send
+        assert client.post("/api/order", content="{}", headers=plain).status_code == 403
+        assert not source.orders
+        assert client.post("/api/order", json={"do": "stop"}, headers=SAME).status_code == 200
+        assert source.orders == [{"do": "stop"}]
+
+
+@pytest.mark.parametrize("origin", [None, "http://evil.example"])
+def test_another_sites_page_cannot_listen(site, origin):
+    headers = {"host": HOST} | ({"origin": origin} if origin else {})
+    with (
+        _client(site()) as client,
+        pytest.raises(WebSocketDisconnect),
+        client.websocket_connect("/ws", headers=headers),
+    ):
+        pass
+
+
+def test_a_page_of_our_own_listens_and_garbage_ends_only_itself(site):
+    source = Still()
+    with _client(site(source)) as client:
+        for garbage in ("{", "[1]", '{"frames": ' + "[" * 2000):
+            with client.websocket_connect("/ws", headers=SAME) as page:
+                assert page.receive_json()["kind"] == "state"
+                page.send_text(garbage)
+                with pytest.raises(WebSocketDisconnect):
+                    page.receive_text()
+        with client.websocket_connect("/ws", headers=SAME) as page:
+            assert page.receive_json()["connected"] is True
+
+
+def test_without_the_token_nothing_is_seen(site):
+    with _client(site(token=TOKEN)) as client:
+        for path in ("/", "/api/records", "/static/console.js", "/tiles/17/1/1.jpg"):
+            assert client.get(path).status_code == 401
+        for wrong in ("x", TOKEN[:-1], TOKEN + "0"):
+            bearer = {"authorization": f"Bearer {wrong}"}
+            assert client.get("/api/records", headers=bearer).status_code == 401
+        with pytest.raises(WebSocketDisconnect), client.websocket_connect("/ws", headers=SAME):
+            pass
+        right = {"authorization": f"Bearer {TOKEN}"}
+        assert client.get("/api/records", headers=right).status_code == 200
+
+
+def test_the_token_leaves_the_address_for_a_cookie_that_scripts_cannot_read(site):
+    with _client(site(token=TOKEN)) as client:
+        answer = client.get(f"/?token={TOKEN}", follow_redirects=False)
+        assert (answer.status_code, answer.headers["location"]) == (303, "/")
+        cookie = answer.headers["set-cookie"]
+        assert "HttpOnly" in cookie
+        assert "SameSite=Strict" in cookie
+        assert client.get("/api/records").status_code == 200  # by the cookie
+
+
+def test_off_loopback_a_token_is_needed_and_nobody_else_may_read_it(tmp_path):
+    with pytest.raises(ValidationError, match="token_file is needed"):
+        ConsoleConfig(listen="0.0.0.0:8080")
+    path = tmp_path / "token"
+    ConsoleConfig(listen="0.0.0.0:8080", token_file=path)
+    path.write_text(TOKEN)
+    path.chmod(0o644)
+    with pytest.raises(ConfigError, match="chmod 600"):
+        read_token(path)
+    path.chmod(0o600)
+    assert read_token(path) == TOKEN
+    path.write_text("short")
+    with pytest.raises(ConfigError, match="16 characters"):
+        read_token(path)
+
+
+@pytest.mark.parametrize(
+    "path",
+    [
+        "/static/../server.py", "/static/%2e%2e/server.py", "/static/..%2fserver.py",
+        "/static/%2e%2e%2f%2e%2e%2f%2e%2e%2fpyproject.toml", "/static//etc/passwd",
+        "/api/records/../tar", "/api/records/..%2f..%2fetc/tar", "/api/records/%2e%2e/tar",
+        "/api/records/latest/tar", "/api/records/elsewhere/tar", "/api/records/%00/tar",
+    ],
+)  # fmt: skip
+def test_no_path_leads_out(site, tmp_path, path):
+    made = site()
+    outside = tmp_path / "elsewhere"
+    outside.mkdir()
+    (outside / "record.json").write_text("{}")
+    for name in ("latest", "elsewhere"):
+        (tmp_path / "flights" / name).symlink_to(outside)
+    with _client(made) as client:
+        answer = client.get(path)
+        assert answer.status_code in (404, 405, 409), answer.text[:100]
+        assert "root:" not in answer.text
+
+
+def test_a_record_is_given_without_what_its_links_point_to(site, tmp_path):
+    made = site()
+    record = tmp_path / "flights" / "flight"
+    secret = tmp_path / "secret"
+    secret.mkdir()
+    (secret / "key").write_text("secret")
+    (record / "key").symlink_to(secret / "key")
+    (record / "folder").symlink_to(secret)
+    with _client(made) as client:
+        assert [r["name"] for r in client.get("/api/records").json()] == ["flight"]
+        data = client.get("/api/records/flight/tar").content
+    with tarfile.open(fileobj=io.BytesIO(data)) as tar:
+        names = tar.getnames()
+    assert names == ["flight/events.csv", "flight/record.json"]
+
+
+def test_sizes_are_bounded(site):
+    with _client(site()) as client:
+        headers = SAME | {"content-type": "application/json"}
+        huge = b"[" * (MOST_BODY + 1)
+        assert client.post("/api/order", content=huge, headers=headers).status_code == 413
+
+        def endless():  # without a length: the connection ends
+            for _ in range(2 * MOST_BODY // 4096):
+                yield b"[" * 4096
+
+        answer = client.post("/api/order", content=endless(), headers=headers)
+        assert (answer.status_code, answer.json()["text"]) == (409, "the body is too long")
+
+
+def test_floods_are_refused_until_they_are_over():
+    now = [0.0]
+    answered = []
+
+    async def app(scope, receive, send):
+        answered.append(scope["path"])
+
+    async def nothing(*_):
+        return {}
+
+    guarded = Guarded(app, ConsoleConfig(), None, lambda: now[0])
+    scope = {
+        "type": "http", "method": "GET", "path": "/", "headers": [(b"host", HOST.encode())],
+        "query_string": b"",
+    }  # fmt: skip
+
+    async def ask(times):
+        for _ in range(times):
+            await guarded(dict(scope), nothing, nothing)
+
+    asyncio.run(ask(1000))
+    assert len(answered) == 400
+    now[0] = 1.0
+    asyncio.run(ask(1000))
+    assert len(answered) == 500
+
+
+def test_every_answer_forbids_foreign_script_and_a_report_runs_on_its_own(site, tmp_path):
+    with _client(site()) as client:
+        for path in ("/", "/static/console.js", "/api/records", "/nothing"):
+            headers = client.get(path).headers
+            assert "script-src 'self'" in headers["content-security-policy"]
+            assert "unsafe" not in headers["content-security-policy"]
+            assert headers["x-frame-options"] == "DENY"
+            assert headers["x-content-type-options"] == "nosniff"
+        for name in ("estimates", "targets"):
+            (tmp_path / "flights" / "flight" / f"{name}.csv").write_text("a\n")
+        report = client.get("/api/records/flight/report")
+        assert report.status_code == 200
+        assert report.headers["content-security-policy"].startswith("sandbox allow-scripts;")
+
+
+def test_a_page_that_only_reads_can_do_nothing(site, deployment):
+    source = Still()
+    before = deployment.read_text()
+    with _client(site(source, control=False)) as client:
+        for path, body in (
+            ("/api/order", {"do": "hint", "latitude_deg": 1, "longitude_deg": 1, "radius_m": 9}),
+            ("/api/doctor", {}),
+            ("/api/deployment", {"text": before + "\n", "write": True}),
+        ):
+            assert client.post(path, json=body, headers=SAME).status_code == 409
+        shown = client.get("/api/deployment").json()
+        assert "secret" not in shown["text"]
+        assert not shown["editable"]
+    assert not source.orders
+    assert deployment.read_text() == before
+
+
+@pytest.mark.parametrize(("armed", "connected"), [(True, True), (False, False)])
+def test_while_armed_or_not_heard_only_targets_and_hints(site, deployment, armed, connected):
+    source = Still(armed, connected)
+    before = deployment.read_text()
+    with _client(site(source)) as client:
+        for path, body in (
+            ("/api/doctor", {}), ("/api/deployment", {"text": before + "\n", "write": True}),
+        ):  # fmt: skip
+            assert client.post(path, json=body, headers=SAME).status_code == 409
+        for do in ("target", "hint"):
+            assert client.post("/api/order", json={"do": do}, headers=SAME).status_code == 200
+        for do in ("arm", "", None, 5):
+            assert client.post("/api/order", json={"do": do}, headers=SAME).status_code == 409
+    assert [o["do"] for o in source.orders] == ["target", "hint"]
+    assert deployment.read_text() == before
+
+
+def test_settings_are_checked_before_they_are_written_and_the_old_ones_kept(site, deployment):
+    before = deployment.read_text()
+    with _client(site()) as client:
+
+        def post(text, write):
+            body = {"text": text, "write": write}
+            return client.post("/api/deployment", json=body, headers=SAME)
+
+        bad = post(before.replace("map: map", "map: map\nno_such: 1"), True)
+        assert (bad.status_code, "no such setting" in bad.json()["text"]) == (400, True)
+        assert deployment.read_text() == before
+        assert post(before + "# new\n", False).json()["ok"]
+        assert deployment.read_text() == before
+        assert post(before + "# new\n", True).json()["ok"]
+        assert any(
+            line["key"] == "console.listen" for line in client.get("/api/deployment").json()["help"]
+        )
+    assert deployment.read_text() == before + "# new\n"
+    assert os.stat(deployment).st_mode & 0o777 == 0o640
+    (kept,) = deployment.parent.glob("deployment.yaml.*.old")
+    assert kept.read_text() == before
+    assert {p.name for p in deployment.parent.iterdir()} == {
+        deployment.name, kept.name, "flights"
+    }  # fmt: skip

@@ -1,0 +1,188 @@
+"""The flight's side of the console: it never waits, whatever the other side does."""
+
+import socket
+import stat
+
+import numpy as np
+import pytest
+
+from companion.errors import CompanionError
+from companion.live.orders import Helm, OrderError, Orders
+from companion.live.protocol import Decoder, LinkError, encode, runtime_folder, socket_path
+from companion.live.publisher import Publisher
+from companion.live.shown import Instruments, Shown
+from localizer.geometry.camera import Camera
+from localizer.geometry.geo import Geodetic, LocalFrame
+from localizer.geometry.pose import Pose
+from localizer.types import Frame, PoseEstimate, RegistrationStatus, TrackingState
+from mavlink_bridge.injection.shadow import ShadowScore
+from mavlink_bridge.messages import VehicleState
+
+CAMERA = Camera.from_fov(640, 480, 60.0)
+FRAME = LocalFrame(Geodetic(47.0, 8.0, 400.0))
+
+
+def _shown():
+    instruments = Instruments(
+        lambda: {"level": "ok", "text": "", "rate_hz": float("nan")}, VehicleState,
+        lambda: ShadowScore(False, 0, ("none",)), lambda: None, lambda: False,
+    )  # fmt: skip
+    return Shown(FRAME, 48.0, instruments, {"mode": "shadow"})
+
+
+class Ship:
+    """What orders reach."""
+
+    def __init__(self):
+        self.said, self.tracked, self.hints = [], [], []
+        self.helm = Helm(lambda _, text: self.said.append(text), self.tracked.append,
+                         lambda *hint: self.hints.append(hint))  # fmt: skip
+
+
+@pytest.fixture
+def serving(tmp_path):
+    ship, shown = Ship(), _shown()
+    publisher = Publisher(tmp_path / "s", shown, Orders(True, ship.helm), 15.0)
+    publisher.start()
+    yield publisher, shown, ship
+    publisher.stop()
+    publisher.close()
+
+
+class Console:
+    def __init__(self, path):
+        self.socket = socket.socket(socket.AF_UNIX)
+        self.socket.settimeout(30.0)
+        self.socket.connect(str(path))
+        self._decoder = Decoder()
+        self._messages = []
+
+    def send(self, head):
+        self.socket.sendall(encode(head))
+
+    def next(self, kind):
+        while True:
+            for i, message in enumerate(self._messages):
+                if message.head["kind"] == kind:
+                    return self._messages.pop(i)
+            data = self.socket.recv(1 << 20)
+            if not data:
+                raise EOFError
+            self._messages += self._decoder.feed(data)
+
+
+def _estimate(number):
+    return PoseEstimate(
+        Pose(np.eye(3), np.array([1.0, 2.0, 3.0])), np.eye(6), 0.5, TrackingState.TRACKING,
+        RegistrationStatus.OK, True, number, number, CAMERA, {}, number,
+    )  # fmt: skip
+
+
+def _give(publisher, shown, number):
+    image = np.full((480, 640, 3), number % 256, np.uint8)
+    shown.add_frame(Frame(image, number, CAMERA, number))
+    shown.add_estimate(_estimate(number), None)
+    publisher.wake()
+
+
+def test_a_console_that_does_not_read_costs_one_message_and_the_next_gets_the_newest(serving):
+    publisher, shown, _ = serving
+    idle, reader = Console(publisher.path), Console(publisher.path)
+    for console in (idle, reader):
+        console.next("hello")
+        console.send({"kind": "watch", "frames": True})
+    seen = []
+    number = 0
+    while len(seen) < 3:
+        number += 1
+        _give(publisher, shown, number)  # returns at once, however many there are
+        if number % 20 == 0:
+            reader.socket.settimeout(1.0)
+            seen.append(reader.next("frame").head["exposure_ns"])
+    assert seen == sorted(seen)
+    assert max(publisher.waiting()) <= 640 * 480 * 3 + 65536
+
+
+GARBAGE = (b"\xff" * 64, b"\0\0\x10\0\0\0\0\0x", b"\0\0\0\2\0\0\0\0[]")
+
+
+@pytest.mark.parametrize("garbage", GARBAGE)
+def test_garbage_ends_that_console_alone(serving, garbage):
+    publisher, _, ship = serving
+    bad = Console(publisher.path)
+    bad.next("hello")
+    bad.socket.sendall(garbage + b"\0" * 8000)
+    with pytest.raises((EOFError, ConnectionError)):
+        bad.next("never")
+    good = Console(publisher.path)
+    assert good.next("state").head["health"]["rate_hz"] is None  # NaN is no JSON
+    hint = {"do": "hint", "latitude_deg": 47.0, "longitude_deg": 8.0, "radius_m": 50}
+    good.send(hint | {"number": 7})
+    answer = good.next("answer").head
+    assert (answer["number"], answer["ok"]) == (7, True)
+    assert ship.hints == [(47.0, 8.0, 50.0)]
+    assert ship.said == ["PiLoT: console: hint 47.00000 8.00000 +-50 m"]
+
+
+def test_more_consoles_than_a_few_are_sent_away(serving):
+    publisher, *_ = serving
+    consoles = [Console(publisher.path) for _ in range(3)]
+    for console in consoles:
+        console.next("hello")
+    with pytest.raises((EOFError, ConnectionError)):
+        Console(publisher.path).next("hello")
+
+
+def test_the_socket_is_this_users_alone(serving, tmp_path, monkeypatch):
+    publisher, *_ = serving
+    assert stat.S_IMODE(publisher.path.stat().st_mode) == 0o600
+    monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
+    assert stat.S_IMODE(runtime_folder().stat().st_mode) == 0o700
+    assert len(str(socket_path(tmp_path / ("m" * 200), None, "127.0.0.1:1").name)) < 30
+    (tmp_path / "companion").chmod(0o777)  # somebody else may have laid a socket there
+    with pytest.raises(LinkError, match="0700"):
+        runtime_folder()
+
+
+def test_events_are_told_once():
+    shown = _shown()
+    shown.add_event("info", "one")
+    first, told = shown.state(0)
+    shown.add_event("warning", "two")
+    second, _ = shown.state(told)
+    assert [e["text"] for e in first["events"]] == ["one"]
+    assert [e["text"] for e in second["events"]] == ["two"]
+
+
+@pytest.mark.parametrize(
+    "order",
+    [
+        {"do": "arm"}, {}, {"do": ["target"]},
+        {"do": "target", "x": 1.5, "y": 0.5}, {"do": "target", "x": True, "y": 0},
+        {"do": "target", "x": float("nan"), "y": 0.5}, {"do": "target", "x": "0.5", "y": 0.5},
+        {"do": "box", "left": 0.5, "top": 0.1, "right": 0.4, "bottom": 0.2},
+        {"do": "hint", "latitude_deg": 91, "longitude_deg": 8, "radius_m": 50},
+        {"do": "hint", "latitude_deg": 47, "longitude_deg": 8, "radius_m": 1e9},
+    ],
+)  # fmt: skip
+def test_an_order_that_makes_no_sense_is_refused(order):
+    ship = Ship()
+    with pytest.raises(OrderError):
+        Orders(True, ship.helm).take(order)
+    assert (ship.said, ship.tracked, ship.hints) == ([], [], [])
+
+
+def test_without_control_and_beyond_the_rate_nothing_is_done():
+    ship = Ship()
+    with pytest.raises(OrderError, match="only reads"):
+        Orders(False, ship.helm).take({"do": "stop"})
+    now = [0.0]
+    orders = Orders(True, ship.helm, lambda: now[0])
+    for _ in range(10):
+        orders.take({"do": "stop"})
+    with pytest.raises(OrderError, match="more than 10"):
+        orders.take({"do": "stop"})
+    now[0] = 6.0
+    orders.take({"do": "stop"})
+    assert len(ship.tracked) == 11
+    assert issubclass(OrderError, CompanionError)
