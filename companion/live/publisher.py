@@ -123,13 +123,11 @@ class Publisher:
                 head, told = self._shown.state(console.told)
                 if self._offer(console, encode(head)):
                     console.told = told
-        if self.is_watched and now >= self._next_frame_s:
-            message = self._shown.take_frame()
-            if message is not None:
-                self._next_frame_s = now + self._frame_s
-                for console in self._idle():
-                    if console.watching:
-                        self._offer(console, message)
+        ready = [c for c in self._idle() if c.watching]
+        if ready and now >= self._next_frame_s and (message := self._shown.take_frame()):
+            self._next_frame_s = now + self._frame_s
+            for console in ready:
+                self._offer(console, message)
 
     def _idle(self) -> list[_Console]:
         return [c for c in self._consoles.values() if c.is_idle]
