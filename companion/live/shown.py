@@ -18,7 +18,7 @@ import numpy as np
 
 from companion.live.machine import MachineLoad
 from companion.live.protocol import encode
-from companion.targets.reporter import Target
+from companion.targets.population import Target
 from localizer.geometry.geo import LocalFrame
 from localizer.geometry.pose import Pose, quaternion_from_matrix
 from localizer.types import Frame, PoseEstimate, ReferenceBundle, RenderedView
@@ -219,7 +219,7 @@ class Shown:
             "sigma_m": float(np.sqrt(max(fix.covariance[0, 0] + fix.covariance[1, 1], 0.0))),
             "sigma_up_m": float(np.sqrt(max(fix.covariance[2, 2], 0.0))),
             "elsewhere": fix.elsewhere,
-            "pixel": [float(x) for x in fix.pixel],
+            "pixel": None if fix.pixel is None else [float(x) for x in fix.pixel],
             "velocity_m_s": None if target.velocity is None else [*map(float, target.velocity)],
         }
 

@@ -108,7 +108,7 @@ export class VideoView {
   // Where a target is in this picture is known for the frame that it was located in.
   paintTarget(target) {
     const camera = this.page().state?.vehicle ? this.head?.image : null;
-    if (!camera || Math.abs(target.time_ns - this.head.exposure_ns) > 5e8) return;
+    if (!camera || !target.pixel || Math.abs(target.time_ns - this.head.exposure_ns) > 5e8) return;
     const scale = this.canvas.width / (this.head.width_px ?? this.canvas.width);
     const [u, v] = [target.pixel[0] * scale, target.pixel[1] * scale];
     this.context.strokeStyle = "#ff2fd0";
