@@ -78,14 +78,16 @@ def main() -> None:
     loader = LoaderConfig(o.batch, o.anchors, o.crop, data.appearance)
     make_place(data.first_seed, scenes, photos, 1)  # compiles
     began = time.perf_counter()
-    places = [make_place(data.first_seed + k, scenes, photos, data.visits) for k in (1, 2)]
+    places = [make_place(data.first_seed + k, scenes, photos, data.flight_days) for k in (1, 2)]
     each = (time.perf_counter() - began) / len(places)
-    print(f"place of {data.cells} cells with {data.visits} visits: {each:.2f} s on one core")
+    print(
+        f"place of {data.cells} cells with {data.flight_days} flight days: {each:.2f} s on one core"
+    )
     numpy_pairs(places[0], scenes, loader, 1)
     made, seconds = numpy_pairs(places[0], scenes, loader, args.pairs)
     print(f"NumPy, one core: {made / seconds:.2f} pairs/s")
     device = torch.device("cuda" if torch.cuda.is_available() else "cpu")
-    plan = LivePlan(data.first_seed, data.scenes, 2, 1, data.visits)
+    plan = LivePlan(data.first_seed, data.scenes, 2, 1, data.flight_days)
     stream = LiveStream(plan, scenes, photos, loader, run.seed, device)
     try:
         stream.take(0, places[0])

@@ -55,8 +55,8 @@ _NEXT_STATION_S = 10.0  # a second ground station takes over where the first one
 class Bridge:
     """Speaks MAVLink for the localizer. Every public method may be called from any thread.
 
-    It has more than 15 public methods and 200 lines because it is the package's whole surface: each
-    method hands one thing to, or asks one thing of, the part that does the work.
+    Above 200 lines and 15 public methods: it is the package's whole surface, and each method hands
+    one thing to, or asks one thing of, the part that does the work.
 
     on_track: called (in a link's thread; must return at once) when the operator asks for tracking.
     on_hint: called likewise when the operator says where the vehicle is.

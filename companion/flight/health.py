@@ -18,7 +18,7 @@ import numpy as np
 
 from companion.guardian.guardian import Guardian
 from companion.sources import StreamState
-from localizer.tracking.engine import EngineHealth
+from localizer.tracking.engine_health import EngineHealth
 from localizer.types import PoseEstimate, TrackingState
 from mavlink_bridge.bridge import Bridge
 from mavlink_bridge.messages import HealthLevel

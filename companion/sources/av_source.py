@@ -55,7 +55,7 @@ class _Input:
     """What is read instead of `url`, where the receiving is ours."""
 
 
-class _Decoder:
+class Decoder:
     """One open container: packets in, pictures out. Single-threaded, because FFmpeg's frame threads
     add a frame of delay each.
     """
@@ -98,6 +98,7 @@ class _Decoder:
                 yield None, arrival_ns
 
     def close(self) -> None:
+        """Close the container."""
         self._container.close()
 
 
@@ -135,7 +136,7 @@ class VideoFileSource:
     def frames(self) -> Iterator[Frame]:
         """Every picture; raises `StreamDecodeError` when the file holds none."""
         try:
-            decoder = _Decoder(_Input(str(self._path), {}), None)
+            decoder = Decoder(_Input(str(self._path), {}), None)
         except av.error.FFmpegError as error:
             raise StreamOpenError(
                 f"{self._path}: not a video, or damaged from the start: {error}"
@@ -154,7 +155,7 @@ class VideoFileSource:
         self._closed.set()
         self._report(StreamState.CLOSED, f"{self._path}: closed")
 
-    def _play(self, decoder: _Decoder) -> Iterator[Frame]:
+    def _play(self, decoder: Decoder) -> Iterator[Frame]:
         start = time.monotonic_ns()
         first: int | None = None
         for picture in self._readable(decoder):
@@ -183,7 +184,7 @@ class VideoFileSource:
             text = scaling_text(camera.width, camera.height, self._camera, str(self._path))
             self._report(StreamState.SCALED, text)
 
-    def _readable(self, decoder: _Decoder) -> Iterator[av.VideoFrame]:
+    def _readable(self, decoder: Decoder) -> Iterator[av.VideoFrame]:
         try:
             for picture, _ in decoder.pictures():
                 if picture is None:
@@ -203,7 +204,7 @@ class VideoFileSource:
         n = self._counters.undecodable + 1
         self._counters = replace(self._counters, undecodable=n)
 
-    def _pts_ns(self, picture: av.VideoFrame, decoder: _Decoder) -> int:
+    def _pts_ns(self, picture: av.VideoFrame, decoder: Decoder) -> int:
         stamp = _pts_ns(picture)
         if stamp is not None:
             return stamp
@@ -333,7 +334,7 @@ class LiveVideoSource:
 
     def _receive_once(self, *, reconnect: bool) -> str:
         """Receives until the connection ends; returns why it did."""
-        decoder = _Decoder(self._input, self._settings.stall_timeout_s)
+        decoder = Decoder(self._input, self._settings.stall_timeout_s)
         if reconnect:
             self._count(reconnects=1)
         clock = ExposureClock(

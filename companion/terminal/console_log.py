@@ -20,7 +20,7 @@ from rich.console import Console
 from rich.logging import RichHandler
 
 OURS = ("companion", "localizer", "mavlink_bridge")
-_WAITING = 1000
+WAITING = 1000
 _LAST_WORDS_S = 2.0
 
 
@@ -65,7 +65,7 @@ def console_log(verbose: bool, descriptor: int = 1) -> Iterator[None]:
 
     verbose: of our own packages, because numba's own log is endless.
     """
-    waiting: queue.Queue[logging.LogRecord | None] = queue.Queue(_WAITING)
+    waiting: queue.Queue[logging.LogRecord | None] = queue.Queue(WAITING)
     console = Console(file=Descriptor(descriptor))  # type: ignore[arg-type]
     writer = RichHandler(show_path=False, console=console)
     over = threading.Event()  # the descriptor's number may soon be another file's

@@ -16,16 +16,16 @@ import threading
 import time
 from collections.abc import Callable
 from contextlib import suppress
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 from localizer.errors import LocalizerError
+from localizer.tracking.engine_health import EngineHealth, HealthBook
 from localizer.tracking.mailbox import Mailbox
 from localizer.tracking.pipeline import Localizer, stopwatch
 from localizer.types import Frame, PoseEstimate, PosePrior, ReferenceBundle
 
 _log = logging.getLogger(__name__)
 _IDLE_S = 0.2
-_REPORT_EVERY_S = 5.0
 _DEFAULT_INTERVAL_NS = 100_000_000
 
 Subscriber = Callable[[PoseEstimate, ReferenceBundle], None]
@@ -36,28 +36,6 @@ Searcher = Callable[[Frame, Callable[[], bool]], PosePrior | None]
 
 _TRIED_FRAMES = 5  # with what is known outside, before a search begins
 _SEARCH_NICE = 15  # of the search thread: its seconds must not cost the tracker frames
-
-
-@dataclass(frozen=True)
-class EngineHealth:
-    """Counters since the start, the text of the error that stands ("" when none does), and which
-    renderer, feature network and optimizer serve. searches, found: of places without a prior;
-    searching: whether one is under way.
-    """
-
-    frames_in: int = 0
-    frames_dropped: int = 0
-    localized: int = 0
-    accepted: int = 0
-    references: int = 0
-    errors: int = 0
-    searches: int = 0
-    found: int = 0
-    searching: bool = False
-    last_error: str = ""
-    renderer: str = ""
-    features: str = ""
-    optimizer: str = ""
 
 
 class DualThreadEngine:
@@ -82,18 +60,13 @@ class DualThreadEngine:
         self._sought: Mailbox[Frame] = Mailbox()
         self._found: PosePrior | None = None
         self._unknown_frames = 0
-        self._errors: dict[str, str] = {}
         self._frames: Mailbox[Frame] = Mailbox()
         self._render_times: Mailbox[int] = Mailbox()
         self._bundle: ReferenceBundle | None = None
-        self._reported_s = -_REPORT_EVERY_S
         self._interval_ns = _DEFAULT_INTERVAL_NS
         self._last_exposure_ns: int | None = None
         self._reference_ms: dict[str, float] = {}
-        self._health = EngineHealth(
-            renderer=localizer.renderer_name, features=localizer.features_name
-        )
-        self._health_lock = threading.Lock()
+        self._book = HealthBook(localizer.renderer_name, localizer.features_name)
         self._stop = threading.Event()
         self._threads = [
             threading.Thread(target=self._run, args=(self._render_once,), name="render"),
@@ -120,28 +93,22 @@ class DualThreadEngine:
     def submit(self, frame: Frame) -> None:
         """Offer a frame; an older one that was not yet taken is dropped. Never blocks."""
         self._frames.put(frame)
-        self._count(frames_in=1)
+        self._book.count(frames_in=1)
 
     @property
     def health(self) -> EngineHealth:
         """A snapshot of the counters."""
-        with self._health_lock:
-            return replace(
-                self._health,
-                frames_dropped=self._frames.dropped,
-                optimizer=self._localizer.optimizer_name,
-                last_error=next(iter(self._errors.values()), ""),
-            )
+        return self._book.read(self._frames.dropped, self._localizer.optimizer_name)
 
     def _run(self, once: Callable[[], None]) -> None:
         while not self._stop.is_set():
             try:
                 once()
             except LocalizerError as error:
-                self._report(str(error))
+                self._book.report(str(error))
             except Exception as error:  # the flight goes on: degrade, report, try the next frame
                 _log.exception("unexpected error on the %s thread", threading.current_thread().name)
-                self._report(f"unexpected {type(error).__name__}: {error}")
+                self._book.report(f"unexpected {type(error).__name__}: {error}")
 
     def _search(self) -> None:
         with suppress(OSError):  # on Linux a thread has a priority of its own
@@ -153,22 +120,18 @@ class DualThreadEngine:
         frame = self._sought.take(_IDLE_S)
         if frame is None or self._searcher is None or self._knows_place():
             return
-        self._set_searching(True)
+        self._book.set_searching(True)
         try:
             found = self._searcher(frame, self._knows_place)
         finally:
-            self._set_searching(False)
-        self._count(searches=1, found=int(found is not None))
-        self._clear_error()
+            self._book.set_searching(False)
+        self._book.count(searches=1, found=int(found is not None))
+        self._book.clear_error()
         self._found = found
 
     def _knows_place(self) -> bool:
         """Whether a search has become idle: the place is known or on probation, or we end."""
         return self._stop.is_set() or not self._localizer.tracker.standing.wants_prior
-
-    def _set_searching(self, searching: bool) -> None:
-        with self._health_lock:
-            self._health = replace(self._health, searching=searching)
 
     def _render_once(self) -> None:
         time_ns = self._render_times.take(_IDLE_S)
@@ -178,8 +141,8 @@ class DualThreadEngine:
         with stopwatch(stage_ms, "reference"):
             bundle = self._localizer.make_reference(prior)
         self._bundle, self._reference_ms = bundle, stage_ms
-        self._clear_error()
-        self._count(references=1)
+        self._book.clear_error()
+        self._book.count(references=1)
         self._localizer.prefetch(time_ns)  # last: nothing waits for it
 
     def _localize_once(self) -> None:
@@ -251,26 +214,7 @@ class DualThreadEngine:
         return frame.exposure_time_ns + self._interval_ns
 
     def _publish(self, estimate: PoseEstimate, bundle: ReferenceBundle) -> None:
-        self._clear_error()
-        self._count(localized=1, accepted=int(estimate.accepted))
+        self._book.clear_error()
+        self._book.count(localized=1, accepted=int(estimate.accepted))
         for subscriber in self._subscribers:
             subscriber(estimate, bundle)
-
-    def _report(self, text: str) -> None:
-        with self._health_lock:
-            self._errors[threading.current_thread().name] = text
-        self._count(errors=1)
-        now = time.monotonic()
-        if now - self._reported_s > _REPORT_EVERY_S:
-            self._reported_s = now
-            _log.warning("%s", text)
-
-    def _clear_error(self) -> None:
-        """This thread has done its work: an error of its own is over, another thread's is not."""
-        with self._health_lock:
-            self._errors.pop(threading.current_thread().name, None)
-
-    def _count(self, **increments: int) -> None:
-        with self._health_lock:
-            h = self._health
-            self._health = replace(h, **{k: getattr(h, k) + n for k, n in increments.items()})

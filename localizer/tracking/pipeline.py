@@ -110,6 +110,9 @@ class Localizer:
 
     Each half (`make_reference`, `localize`) may also run on its own thread, as in the engine.
 
+    Above 200 lines and 15 public methods: it is the library's whole surface for one camera, and
+    the halves share what it holds; motion, judgement and bridging are `Tracker`'s.
+
     sensors: other sensors' accounts (autopilot and gimbal). Their turns replace the constant
     angular rate of the motion model, their attitude enters the registration as a weak prior
     (`AttitudePrior`), and with the displacement it confirms or refutes a place that was searched.

@@ -104,8 +104,8 @@ def quantize(
     typer.echo(f"{out}: mean cosine to the float features {write(model, out, shards):.4f}")
 
 
-@app.command()
-def unfuse(
+@app.command("make-trainable")
+def make_trainable(
     model: Annotated[Path, typer.Argument(help="Published ONNX model of this network.")],
     out: Annotated[Path, typer.Argument(help="Checkpoint to write, for a run's warm_start.")],
     shards: Annotated[list[Path], typer.Argument(help="Shards (.npz) to take statistics on.")],
@@ -127,8 +127,8 @@ def curves(log: Annotated[Path, typer.Argument(help="CSV that a run wrote.")]) -
     typer.echo(plot(log))
 
 
-@app.command()
-def sheet(
+@app.command("contact-sheet")
+def contact_sheet_of(
     shards: Annotated[list[Path], typer.Argument(help="Shards (.npz) to show pairs of.")],
     out: Annotated[Path, typer.Option(help="PNG to write.")] = Path("pairs.png"),
     pairs: Annotated[int, typer.Option(help="Pairs from each shard.")] = 2,

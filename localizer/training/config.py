@@ -59,7 +59,7 @@ class DataSection(_PlacesSection):
 class LiveSection(_PlacesSection):
     """Pairs rendered while training (`training.data.live`). image: width, height of a view;
     cells: side of a place; active: places that a step draws from, of which one is replaced every
-    `steps_per_scene` steps; visits: days of flight at each place.
+    `steps_per_scene` steps; flight_days: that each place is seen on.
     """
 
     live: Literal[True]
@@ -67,7 +67,7 @@ class LiveSection(_PlacesSection):
     cells: int = Field(gt=0, le=16384, multiple_of=BLOCK)
     active: int = Field(gt=0)
     steps_per_scene: int = Field(gt=0, le=_MOST_STEPS)
-    visits: int = Field(gt=0, le=1000)
+    flight_days: int = Field(gt=0, le=1000)
 
     @model_validator(mode="after")
     def _places_suffice(self) -> LiveSection:

@@ -38,6 +38,28 @@ _INTERVALS, _INTERVALS_KNOWN = 10, 3
 _STALE_NS = 3_000_000_000
 
 
+class _Pace:
+    """How often fixes come of age, and whether the next one should have."""
+
+    def __init__(self, overdue_intervals: float) -> None:
+        self._overdue_intervals = overdue_intervals
+        self._intervals_ns: deque[int] = deque(maxlen=_INTERVALS)
+        self._taken_ns = 0
+
+    def note(self, time_ns: int, last_ns: int | None, now_ns: int) -> None:
+        """A fix of time_ns was taken now, after one of last_ns."""
+        self._taken_ns = now_ns
+        if last_ns is not None and time_ns - last_ns < _STALE_NS:
+            self._intervals_ns.append(time_ns - last_ns)
+
+    def overdue(self, now_ns: int) -> bool:
+        """Whether the next fix should have come by now, judged by the usual interval."""
+        if len(self._intervals_ns) < _INTERVALS_KNOWN:
+            return False
+        usual = statistics.median(self._intervals_ns)
+        return now_ns - self._taken_ns > self._overdue_intervals * usual
+
+
 class Injector:
     """Turns fixes into a steady stream of injections. One thread calls `submit` and `step`."""
 
@@ -57,8 +79,8 @@ class Injector:
         self._last_slot_ns = 0
         self._last_stamp_ns = 0
         self._last_was_fill = False
-        self._intervals_ns: deque[int] = deque(maxlen=_INTERVALS)
-        self._taken_ns = self._sent_fix_ns = 0
+        self._pace = _Pace(config.overdue_intervals)
+        self._sent_fix_ns = 0
         self.yaw_difference_rad: float | None = None
         """The last fix's yaw minus the autopilot's; None while none could be compared."""
         self.reason = NO_FIX_YET
@@ -163,23 +185,12 @@ class Injector:
             if not verdict.accept:
                 self.counters["fixes_yaw_refused"] += 1
                 continue
-            self._note_interval(fix, now_ns)
+            last = self._propagator.fix
+            self._pace.note(fix.time_ns, None if last is None else last.time_ns, now_ns)
             self._propagator.update(fix)
             if self._fresh is not None:
                 self.counters["fixes_superseded"] += 1
             self._fresh = fix
-
-    def _note_interval(self, fix: VisionFix, now_ns: int) -> None:
-        last, self._taken_ns = self._propagator.fix, now_ns
-        if last is not None and fix.time_ns - last.time_ns < _STALE_NS:
-            self._intervals_ns.append(fix.time_ns - last.time_ns)
-
-    def _overdue(self, now_ns: int) -> bool:
-        """Whether the next fix should have come by now, judged by the usual interval."""
-        if len(self._intervals_ns) < _INTERVALS_KNOWN:
-            return False
-        usual = statistics.median(self._intervals_ns)
-        return now_ns - self._taken_ns > self._config.overdue_intervals * usual
 
     # --- what to send ----------------------------------------------------------------------------
 
@@ -219,7 +230,7 @@ class Injector:
         if fix is None or position is None or time_ns <= self._last_stamp_ns:
             return None
         too_far = (time_ns - fix.time_ns) * 1e-9 > self._config.max_extrapolation_s
-        if too_far or (not fresh and self._overdue(now_ns)):
+        if too_far or (not fresh and self._pace.overdue(now_ns)):
             return Withheld(NO_FRESH_FIX, "withheld_stale")
         sigma = position.horizontal_sigma_m
         if sigma > self._config.max_sigma_m:

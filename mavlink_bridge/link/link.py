@@ -12,7 +12,7 @@ import select
 import threading
 import time
 from collections import deque
-from collections.abc import Callable, Collection, Mapping
+from collections.abc import Callable, Collection
 from dataclasses import asdict, dataclass
 from typing import Any, Protocol
 
@@ -63,7 +63,6 @@ class LinkCounters:
     rx_bytes: int = 0
     tx_bytes: int = 0
     tx_messages: int = 0
-    tx_rate_limited: int = 0
     tx_dropped: int = 0
     handler_errors: int = 0
     failures: int = 0
@@ -73,15 +72,14 @@ class LinkCounters:
 class Link:
     """A MAVLink 2 link that stays up.
 
-    min_interval_ns: shortest time between two messages of one id and component; faster ones are
-    dropped and counted. timeout_s: silence after which a stream (TCP, serial) is reopened.
+    timeout_s: silence after which a stream (TCP, serial) is reopened.
 
     stop: what ends the owner thread when it is set. sender, follow_hosts_after_s: UDP, who alone is
     heard, and after which silence another host may be. window: what outlives a restart of the time
     stamps that signed messages had.
 
-    Over 200 lines, because one thread owns transport, parser, packers and what is unsent, and the
-    order in which its loop serves them keeps positions first on a slow port.
+    Above 200 lines: one thread owns transport, parser, packers and what is unsent, and the order in
+    which its loop serves them keeps positions first on a slow port.
     """
 
     def __init__(
@@ -91,7 +89,6 @@ class Link:
         *,
         name: str = "link",
         wanted: Collection[int] | None = None,
-        min_interval_ns: Mapping[int, int] | None = None,
         signing_key: bytes | None = None,
         signing_link_id: int = 1,
         recorder: TlogRecorder | None = None,
@@ -108,7 +105,6 @@ class Link:
         self.system_id = 0
         self._handler = handler
         self._reader = FrameReader(wanted, signing_key, window)
-        self._min_interval_ns = dict(min_interval_ns or {})
         self._window = window
         self._only, self._follow_hosts_after_s = sender, follow_hosts_after_s
         self._key, self._key_link = signing_key, signing_link_id
@@ -116,7 +112,6 @@ class Link:
         self._timeout_ns = int(timeout_s * 1e9)
         self._open = opener
         self._packers: dict[int, Any] = {}
-        self._last_sent_ns: dict[tuple[int, int], int] = {}
         self._outbox: deque[tuple[Any, int]] = deque(maxlen=_OUTBOX)
         self._unsent = bytearray()
         self._broken: OSError | None = None
@@ -346,12 +341,6 @@ class Link:
         if self._transport is None or self.system_id == 0:
             self.counters.tx_dropped += 1
             return False
-        now_ns = monotonic_ns()
-        identity = (message.get_msgId(), component)
-        interval = self._min_interval_ns.get(identity[0])
-        if interval is not None and now_ns - self._last_sent_ns.get(identity, 0) < interval:
-            self.counters.tx_rate_limited += 1
-            return False
         if len(self._unsent) > _MAX_UNSENT:
             self.counters.tx_dropped += 1
             return False
@@ -365,7 +354,6 @@ class Link:
             )
         frame = message.pack(packer)
         packer.seq = (packer.seq + 1) % 256
-        self._last_sent_ns[identity] = now_ns
         return self._write(frame)
 
     def _write(self, frame: bytes) -> bool:

@@ -317,13 +317,13 @@ def print_report(report: FlightReport, folder: Path) -> None:
     table.add_column("")
     for column in ("median", "p95", "max", ""):
         table.add_column(column, justify="right")
-    _add(table, "localizer 3-D, m", report.localizer_m,
+    add_spread(table, "localizer 3-D, m", report.localizer_m,
          f"R@1/3/5 {m.recall_1:.1f}/{m.recall_3:.1f}/{m.recall_5:.1f} %")  # fmt: skip
-    _add(table, "localizer horizontal, m", report.localizer_horizontal_m, "")
-    _add(table, "localizer rotation, °", report.localizer_deg,
+    add_spread(table, "localizer horizontal, m", report.localizer_horizontal_m, "")
+    add_spread(table, "localizer rotation, °", report.localizer_deg,
          f"completeness {m.completeness:.1f} % ({report.completeness_sent:.1f} % of sent)",
          )  # fmt: skip
-    _add(
+    add_spread(
         table,
         "EKF horizontal, m",
         report.ekf_in_map_m,
@@ -331,13 +331,13 @@ def print_report(report: FlightReport, folder: Path) -> None:
     )
     shift_m = float(np.hypot(*report.map_shift_m[:2]))
     if shift_m > 0:
-        _add(table, "EKF against GNSS, m", report.ekf_horizontal_m,
-             f"the map lies {shift_m:.1f} m beside GNSS")  # fmt: skip
-    _add(table, "EKF vertical, m", report.ekf_vertical_m, "")
-    _add(table, "fixed targets, m", report.fixed_targets_m, "3-D")
-    _add(table, "moving targets, m", report.moving_targets_m, "3-D, every car seen")
+        add_spread(table, "EKF against GNSS, m", report.ekf_horizontal_m,
+                   f"the map lies {shift_m:.1f} m beside GNSS")  # fmt: skip
+    add_spread(table, "EKF vertical, m", report.ekf_vertical_m, "")
+    add_spread(table, "fixed targets, m", report.fixed_targets_m, "3-D")
+    add_spread(table, "moving targets, m", report.moving_targets_m, "3-D, every car seen")
     for name, spread in report.targets_m.items():
-        _add(table, f"  {name}, m", spread, f"{report.target_fixes[name]} fixes")
+        add_spread(table, f"  {name}, m", spread, f"{report.target_fixes[name]} fixes")
     console.print(table)
     stages = Table(title=f"{m.fps:.1f} localized frames/s, {report.frames_dropped} of "
                          f"{report.frames_sent} frames dropped")  # fmt: skip
@@ -372,7 +372,8 @@ def _verdict(report: FlightReport) -> Table:
     return table
 
 
-def _add(table: Table, name: str, spread: Spread, note: str) -> None:
+def add_spread(table: Table, name: str, spread: Spread, note: str) -> None:
+    """A row of a table of errors."""
     figures = (spread.median, spread.p95, spread.maximum)
     table.add_row(name, *(_figure(x, 2) for x in figures), note)
 

@@ -11,7 +11,7 @@ from companion.flight.recorder import ESTIMATE_COLUMNS, EVENT_COLUMNS, TARGET_CO
 from companion.targets.detections import Detection, parse_detection
 from localizer.evaluation.metrics import LocalizationMetrics
 from localizer.evaluation.sequences import CSV_COLUMNS
-from localizer.tracking.engine import EngineHealth
+from localizer.tracking.engine_health import EngineHealth
 from localizer.types import TrackingState
 from mavlink_bridge.messages import HealthLevel
 

@@ -127,7 +127,7 @@ def build_tree(
         "vertical_datum": datum,
         "geoid_separation_m": separation,
         "options": tree.options,
-        "source_fingerprint": _fingerprint(tree.files),
+        "source_fingerprint": fingerprint(tree.files),
     }
     with staging(Path(out), parameters, overwrite=overwrite) as staged:
         job = ImportJob(staged, frame, lift, rules)
@@ -189,7 +189,8 @@ def _origin(tree: SourceTree, lift: float) -> Geodetic:
     return Geodetic(round(float(lat), 9), round(float(lon), 9), round(float(h) + lift, 4))
 
 
-def _fingerprint(files: Iterable[Path]) -> str:
+def fingerprint(files: Iterable[Path]) -> str:
+    """What changes when one of the files does: of their names, sizes and times."""
     digest = hashlib.sha256()
     for path in files:
         try:

@@ -16,6 +16,8 @@ from localizer.map.cache.cache import REPLACE, TileIndex
 _HORIZON_MARGIN_M = 30.0  # what a sphere misses of the ellipsoid over some tens of kilometres
 _SEMI_MAJOR_M, _ECCENTRICITY_SQUARED = 6378137.0, 6.69437999014e-3  # WGS84
 
+_RELAX = 1.4  # step by which detail is reduced when a view does not fit into the budget
+
 _UNSEEN, _CULLED, _WANTED, _REFINED = 0, 1, 2, 3
 
 
@@ -90,6 +92,26 @@ class TileSelector:
         )
         order = np.argsort(priority[:requests], kind="stable")
         return Selection(nodes[0, :wanted], nodes[1, :shown], nodes[2, :requests][order], hole)
+
+    def fitting_limits(
+        self,
+        world_from_camera: Pose,
+        camera: Camera,
+        finest: DetailLimits,
+        sizes: NDArray[np.int64],
+        budget: int,
+    ) -> DetailLimits:
+        """The finest limits at which the view's wanted nodes, of `sizes` bytes (N,), fit into the
+        budget.
+        """
+        limits = finest
+        everything = np.ones(len(sizes), np.bool_)
+        for _ in range(16):
+            choice = self.select(world_from_camera, camera, everything, limits)
+            if sizes[choice.wanted].sum() <= budget:
+                break
+            limits = limits.relaxed(_RELAX)
+        return limits
 
 
 def frustum_planes(world_from_camera: Pose, camera: Camera) -> Array:

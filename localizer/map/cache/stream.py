@@ -10,7 +10,6 @@ from __future__ import annotations
 import logging
 import threading
 import time
-from collections import OrderedDict
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
@@ -21,22 +20,12 @@ from localizer.errors import MapCacheError
 from localizer.geometry.camera import Camera
 from localizer.geometry.pose import Pose
 from localizer.map.cache.cache import TileCache
+from localizer.map.cache.failed_nodes import FailedNodes
+from localizer.map.cache.resident_nodes import ResidentNodes
 from localizer.map.cache.select import DetailLimits, Selection, TileSelector
 from localizer.map.cache.tile import TileMesh
 
 _log = logging.getLogger(__name__)
-
-_RETRY_S, _RETRY_MOST_S = 0.5, 30.0  # between attempts at a node that could not be read
-_RELAX = 1.4  # step by which detail is reduced when a view does not fit into the budget
-
-
-@dataclass(frozen=True)
-class _Failure:
-    """Why a node could not be read, how often in a row, and when it is tried again."""
-
-    error: MapCacheError
-    count: int
-    again_s: float
 
 
 @dataclass(frozen=True)
@@ -80,24 +69,17 @@ class TileStreamer:
         which nodes that could not be read are tried again.
         """
         self.cache = cache
-        self._index = cache.index
         self._selector = TileSelector(cache.index, cache.frame)
         self._limits = DetailLimits(max_error_px, max_texel_px)
-        self._budget = byte_budget
-        self._node_bytes = _node_bytes(cache)
-        self._meshes: OrderedDict[int, list[TileMesh]] = OrderedDict()  # least recent first
+        self._nodes = ResidentNodes(_node_bytes(cache), byte_budget)
+        self._failed = FailedNodes(clock)
         self._current: list[TileMesh] = []
-        self._resident = np.zeros(len(self._node_bytes), np.bool_)
-        self._failed: dict[int, _Failure] = {}
-        self._clock = clock
-        self._bytes = 0
         self._counts = dict.fromkeys(StreamCounters.__dataclass_fields__, 0)
         self._lock = threading.Condition()
         self._queue: list[int] = []  # nodes to load, most urgent first
         self._ahead: list[int] = []  # after those
         self._arrived: list[tuple[int, list[TileMesh]]] = []  # loaded, not yet in use
         self._arrived_bytes = 0
-        self._evicted: list[list[TileMesh]] = []  # for the loader to free
         self._bytes_per_select = bytes_per_select
         self._protected: set[int] = set()  # in the current view
         self._closed = self._waiting = False
@@ -116,18 +98,18 @@ class TileStreamer:
         with self._lock:
             self._take_in(None if wait else self._bytes_per_select)
             choice = self._choose(world_from_camera, camera, limits)
-            while wait and not self._resident[choice.wanted].all():
-                missing = choice.wanted[~self._resident[choice.wanted]].tolist()
+            while wait and not self._nodes.resident[choice.wanted].all():
+                missing = choice.wanted[~self._nodes.resident[choice.wanted]].tolist()
                 for node in missing:
-                    if self._is_waiting(node):
-                        raise self._failed[node].error
+                    self._failed.check(node)
                 self._queue = missing
                 self._lock.notify_all()
                 self._lock.wait()
                 self._take_in(None)
                 choice = self._choose(world_from_camera, camera, limits)
             self._count(choice)
-            self._current = [mesh for node in choice.shown for mesh in self._touched(int(node))]
+            shown = (self._nodes.touched(node) for node in choice.shown.tolist())
+            self._current = [mesh for meshes in shown for mesh in meshes]
             return list(self._current)
 
     def current(self) -> list[TileMesh]:
@@ -141,35 +123,40 @@ class TileStreamer:
         """
         limits = [self._fitting_limits(view, camera) for view in views]
         with self._lock:
-            room = self._budget - int(self._node_bytes[list(self._protected)].sum())
+            room = self._nodes.budget - int(self._nodes.sizes[list(self._protected)].sum())
             seen = set(self._protected)
             self._ahead = []
             for view, limit in zip(views, limits, strict=True):
-                choice = self._selector.select(view, camera, self._resident, limit)
+                choice = self._selector.select(view, camera, self._nodes.resident, limit)
                 for node in choice.wanted.tolist():
                     if node in seen:
                         continue
                     seen.add(node)
-                    room -= int(self._node_bytes[node])
+                    room -= int(self._nodes.sizes[node])
                     if room < 0:
                         break
-                    if self._resident[node]:
-                        self._meshes.move_to_end(node)
-                    elif not self._is_waiting(node):
+                    if self._nodes.resident[node]:
+                        self._nodes.touched(node)
+                    elif not self._failed.is_waiting(node):
                         self._ahead.append(node)
             self._lock.notify_all()
 
     def counters(self) -> StreamCounters:
         """What has happened so far."""
         with self._lock:
-            resident = self._bytes + self._arrived_bytes
-            return StreamCounters(**self._counts | {"resident_bytes": resident})
+            now = {
+                "resident_bytes": self._nodes.bytes + self._arrived_bytes,
+                "evicted": self._nodes.evictions,
+                "failures": self._failed.attempts,
+                "unreadable": len(self._failed),
+            }
+            return StreamCounters(**self._counts | now)
 
     @property
     def idle(self) -> bool:
         """Whether the loader waits and has nothing to load or to free."""
         with self._lock:
-            return self._waiting and not (self._evicted or self._to_load())
+            return self._waiting and not (self._nodes.evicted or self._to_load())
 
     def close(self) -> None:
         """Stop the loader thread and drop all tiles."""
@@ -178,11 +165,8 @@ class TileStreamer:
             self._lock.notify_all()
         self._thread.join()
         with self._lock:
-            self._meshes.clear()
             self._arrived.clear()
-            self._evicted.clear()
-            self._resident[:] = False
-            self._bytes = 0
+            self._nodes.clear()
 
     def __enter__(self) -> TileStreamer:
         return self
@@ -191,32 +175,23 @@ class TileStreamer:
         self.close()
 
     def _fitting_limits(self, world_from_camera: Pose, camera: Camera) -> DetailLimits:
-        """The finest limits at which the view's wanted nodes fit into the budget."""
-        limits = self._limits
-        everything = np.ones(len(self._resident), np.bool_)
-        for _ in range(16):
-            choice = self._selector.select(world_from_camera, camera, everything, limits)
-            if self._node_bytes[choice.wanted].sum() <= self._budget:
-                break
-            limits = limits.relaxed(_RELAX)
-        return limits
+        nodes = self._nodes
+        return self._selector.fitting_limits(
+            world_from_camera, camera, self._limits, nodes.sizes, nodes.budget
+        )
 
     def _choose(self, world_from_camera: Pose, camera: Camera, limits: DetailLimits) -> Selection:
         """Select, and hand the loader its list. The lock is held."""
         if self._closed:
             raise RuntimeError("the tile streamer is closed")
-        choice = self._selector.select(world_from_camera, camera, self._resident, limits)
+        choice = self._selector.select(world_from_camera, camera, self._nodes.resident, limits)
         self._protected = {0, *choice.wanted.tolist(), *choice.shown.tolist()}
-        self._queue = [n for n in choice.requests.tolist() if not self._is_waiting(n)]
+        self._queue = [n for n in choice.requests.tolist() if not self._failed.is_waiting(n)]
         self._lock.notify_all()
         return choice
 
-    def _touched(self, node: int) -> Sequence[TileMesh]:
-        self._meshes.move_to_end(node)
-        return self._meshes[node]
-
     def _count(self, choice: Selection) -> None:
-        hits = int(self._resident[choice.wanted].sum())
+        hits = int(self._nodes.resident[choice.wanted].sum())
         self._counts["selections"] += 1
         self._counts["hits"] += hits
         self._counts["misses"] += len(choice.wanted) - hits
@@ -226,13 +201,13 @@ class TileStreamer:
     def _run(self) -> None:
         while True:
             with self._lock:
-                while not (self._closed or self._evicted or self._to_load()):
+                while not (self._closed or self._nodes.evicted or self._to_load()):
                     self._waiting = True
                     self._lock.wait()
                     self._waiting = False
                 if self._closed:
                     return
-                evicted, self._evicted = self._evicted, []
+                evicted = self._nodes.take_evicted()
             # Giving megabytes back to the system takes its time: not the render thread's.
             del evicted
             with self._lock:
@@ -241,47 +216,20 @@ class TileStreamer:
                     continue
                 node = nodes.pop(0)
                 # A node may have been asked for again while it was being loaded.
-                if self._is_waiting(node) or self._resident[node] or self._has_arrived(node):
+                if self._failed.is_waiting(node) or self._nodes.resident[node]:
                     continue
-            meshes: list[TileMesh] | None = None
-            failure: MapCacheError | None = None
-            start = int(self._index.tile_start[node])
-            try:
-                tiles = range(start, start + int(self._index.tile_count[node]))
-                meshes = [_ready(self.cache.load_tile(t)) for t in tiles]
-            except MapCacheError as error:
-                failure = error
-            except Exception as error:  # or nothing would be loaded ever again
-                failure = MapCacheError(f"node {node} of the map: {type(error).__name__}: {error}")
-                _log.debug("unexpected, while loading the map", exc_info=True)
+                if any(node == arrived for arrived, _ in self._arrived):
+                    continue
+            loaded = _load(self.cache, node)
             with self._lock:
-                if meshes is not None:
-                    self._arrived.append((node, meshes))
-                    self._arrived_bytes += int(self._node_bytes[node])
+                if isinstance(loaded, MapCacheError):
+                    self._failed.note(node, loaded)
+                else:
+                    self._arrived.append((node, loaded))
+                    self._arrived_bytes += int(self._nodes.sizes[node])
                     self._counts["loaded"] += 1
-                    self._failed.pop(node, None)
-                elif failure is not None:
-                    self._note_failure(node, failure)
-                self._counts["unreadable"] = len(self._failed)
+                    self._failed.forget(node)
                 self._lock.notify_all()
-
-    def _note_failure(self, node: int, error: MapCacheError) -> None:
-        """Try it again later, and later still: a disk may come back. The lock is held."""
-        before = self._failed.get(node)
-        if before is None:
-            _log.error("%s", error)
-        count = 1 if before is None else before.count + 1
-        wait_s = min(_RETRY_S * 2.0 ** min(count - 1, 10), _RETRY_MOST_S)
-        self._failed[node] = _Failure(error, count, self._clock() + wait_s)
-        self._counts["failures"] += 1
-
-    def _is_waiting(self, node: int) -> bool:
-        """Whether a node could not be read and it is not time to try again."""
-        failure = self._failed.get(node)
-        return failure is not None and self._clock() < failure.again_s
-
-    def _has_arrived(self, node: int) -> bool:
-        return any(node == arrived for arrived, _ in self._arrived)
 
     def _to_load(self) -> list[int]:
         """The nodes to load, in order; empty while there is no room to put them down."""
@@ -294,25 +242,22 @@ class TileStreamer:
         taken = 0
         while self._arrived and (limit is None or taken < limit):
             node, meshes = self._arrived.pop(0)
-            size = int(self._node_bytes[node])
+            size = int(self._nodes.sizes[node])
             self._arrived_bytes -= size
             taken += size
-            self._make_room(size)
-            self._meshes[node] = meshes
-            self._resident[node] = True
-            self._bytes += size
+            self._nodes.add(node, meshes, keep=self._protected, beside=self._arrived_bytes)
 
-    def _make_room(self, needed: int) -> None:
-        """Drop least recently used nodes; the current view's stay, so that it can complete."""
-        for node in list(self._meshes):
-            if self._bytes + self._arrived_bytes + needed <= self._budget:
-                return
-            if node in self._protected:
-                continue
-            self._evicted.append(self._meshes.pop(node))
-            self._resident[node] = False
-            self._bytes -= int(self._node_bytes[node])
-            self._counts["evicted"] += 1
+
+def _load(cache: TileCache, node: int) -> list[TileMesh] | MapCacheError:
+    start = int(cache.index.tile_start[node])
+    try:
+        tiles = range(start, start + int(cache.index.tile_count[node]))
+        return [_ready(cache.load_tile(t)) for t in tiles]
+    except MapCacheError as error:
+        return error
+    except Exception as error:  # or nothing would be loaded ever again
+        _log.debug("unexpected, while loading the map", exc_info=True)
+        return MapCacheError(f"node {node} of the map: {type(error).__name__}: {error}")
 
 
 def _ready(mesh: TileMesh) -> TileMesh:

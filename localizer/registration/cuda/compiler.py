@@ -65,7 +65,7 @@ def compile_sources(
     try:
         return Image(path.read_bytes(), "")
     except OSError:
-        image = _compile(nvrtc, sources, main, options)
+        image = compile_image(nvrtc, sources, main, options)
     _store(path, image.code)
     return image
 
@@ -86,7 +86,10 @@ def _store(path: Path, code: bytes) -> None:
         return
 
 
-def _compile(nvrtc: ModuleType, sources: Mapping[str, str], main: str, options: list[str]) -> Image:
+def compile_image(
+    nvrtc: ModuleType, sources: Mapping[str, str], main: str, options: list[str]
+) -> Image:
+    """Compile `main` with the others as its headers, past the cache."""
     headers = {name: text for name, text in sources.items() if name != main}
     program = _checked(
         nvrtc,

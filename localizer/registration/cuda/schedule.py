@@ -203,17 +203,13 @@ class CudaSchedule:
         points = np.ascontiguousarray((anchors.points_world - origin).T, dtype=np.float32)
         address = put("points", points)
         for k, level in enumerate(query.levels):
-            packed = self._level(k, level, camera, anchors)
+            packed = _packed_level(self._backend, k, level, camera, anchors)
             packed["points"], packed["total"] = address, points.shape[1]
             memory.write(frame, memory.level(k), packed)
         if motion is not None and config.motion_weight > 0:
             memory.write(frame, memory.motion, _packed_motion(motion, origin, config))
         if constraint is not None:
-            packed = np.zeros((), dtype=layout.PRIOR)
-            packed["rotation"] = constraint.camera_from_local.rotation
-            packed["translation"] = constraint.camera_from_local.translation
-            packed["information"] = constraint.information
-            memory.write(frame, memory.prior, packed)
+            memory.write(frame, memory.prior, _packed_prior(constraint))
         state = np.zeros((), dtype=layout.STATE)
         state["count"] = len(swarm[0])
         memory.write(frame, memory.state, state)
@@ -221,27 +217,6 @@ class CudaSchedule:
         memory.write(frame, int(first["rotations"]), np.ascontiguousarray(swarm[0]))
         memory.write(frame, int(first["translations"]), np.ascontiguousarray(swarm[1]))
         self._device.upload(memory.base, frame)
-
-    def _level(
-        self, k: int, level: FeatureLevel, camera: Camera, anchors: Anchors
-    ) -> NDArray[np.void]:
-        put, half = self._backend.arena.put, self._backend.half
-        packed = np.zeros((), dtype=layout.LEVEL)
-        packed["features"] = self._query_address(f"features {k}", level.features, half)
-        packed["confidence"] = self._query_address(f"confidence {k}", level.confidence, False)
-        packed["anchor_features"] = put(f"anchor features {k}", stored(anchors.features[k], half))
-        packed["anchor_confidence"] = put(
-            f"anchor confidence {k}", stored(anchors.confidence[k], False)
-        )
-        packed["height"], packed["width"] = level.confidence.shape
-        packed["focal"], packed["centre"] = level_intrinsics(camera, level)
-        return packed
-
-    def _query_address(self, name: str, values: object, half: bool) -> int:
-        """Where the device finds them: in place if they are there already, else a copy."""
-        if isinstance(values, DeviceArray):
-            return values.checked_address(np.float16 if half else np.float32)
-        return self._backend.arena.put(name, stored(np.asarray(values), half))
 
     def _collect(
         self, memory: FrameMemory, config: JNGOConfig, anchors: int, channels: int
@@ -296,6 +271,38 @@ def _taking_part(total: int, wanted: int) -> int:
     """Anchors that `thinned` leaves."""
     step = max(1, total // wanted)
     return -(-total // step)
+
+
+def _packed_level(
+    backend: CudaBackend, k: int, level: FeatureLevel, camera: Camera, anchors: Anchors
+) -> NDArray[np.void]:
+    """A level's description but for its points; its features are copied to the device."""
+    put, half = backend.arena.put, backend.half
+    packed = np.zeros((), dtype=layout.LEVEL)
+    packed["features"] = _query_address(backend, f"features {k}", level.features, half)
+    packed["confidence"] = _query_address(backend, f"confidence {k}", level.confidence, False)
+    packed["anchor_features"] = put(f"anchor features {k}", stored(anchors.features[k], half))
+    packed["anchor_confidence"] = put(
+        f"anchor confidence {k}", stored(anchors.confidence[k], False)
+    )
+    packed["height"], packed["width"] = level.confidence.shape
+    packed["focal"], packed["centre"] = level_intrinsics(camera, level)
+    return packed
+
+
+def _query_address(backend: CudaBackend, name: str, values: object, half: bool) -> int:
+    """Where the device finds them: in place if they are there already, else a copy."""
+    if isinstance(values, DeviceArray):
+        return values.checked_address(np.float16 if half else np.float32)
+    return backend.arena.put(name, stored(np.asarray(values), half))
+
+
+def _packed_prior(constraint: QuadraticPrior) -> NDArray[np.void]:
+    packed = np.zeros((), dtype=layout.PRIOR)
+    packed["rotation"] = constraint.camera_from_local.rotation
+    packed["translation"] = constraint.camera_from_local.translation
+    packed["information"] = constraint.information
+    return packed
 
 
 def _packed_motion(motion: PosePrior, origin: Array, config: JNGOConfig) -> NDArray[np.void]:

@@ -18,7 +18,7 @@ from localizer.geometry.pose import Pose
 from localizer.synth.heightfield.scene import BLOCK, LitScene
 
 _FACADES = 4096  # rows that are kept for a scene's prisms
-_CHUNK = {"cuda": 16_000_000, "cpu": 400_000}  # rays that are walked together
+CHUNK = {"cuda": 16_000_000, "cpu": 400_000}  # rays that are walked together
 _SWEEP = 8  # steps between two looks for rays that are finished
 
 
@@ -70,7 +70,7 @@ def render(
     The cameras (world_from_camera poses) may differ in focal length, not in size.
     """
     rays = cameras[0].width * cameras[0].height * supersample**2
-    some = max(_CHUNK.get(pool.device.type, 400_000) // rays, 1)
+    some = max(CHUNK.get(pool.device.type, 400_000) // rays, 1)
     parts = [
         _render(pool, slots[k : k + some], poses[k : k + some], cameras[k : k + some], supersample)
         for k in range(0, len(slots), some)

@@ -108,7 +108,8 @@ class ShardStream:
                 return collate(samples)
         raise SequenceError(
             f"step {step}: hardly a pair of the run's shards has {self._config.anchors} anchors "
-            f"in a crop of {self._config.crop}: enlarge `crop`, or look at them with `sheet`"
+            f"in a crop of {self._config.crop}: enlarge `crop`, or look at them "
+            "with `contact-sheet`"
         )
 
     def _shard(self, path: Path) -> list[Pair]:

@@ -30,14 +30,14 @@ class PlaceVisits:
 
 
 def make_place(
-    seed: int, scenes: SceneConfig, photos: PhotoSource | None, visits: int
+    seed: int, scenes: SceneConfig, photos: PhotoSource | None, flight_days: int
 ) -> PlaceVisits:
     """The place of a seed, lit and ready to render."""
     rng = np.random.default_rng(seed)
     place, source = draw_place(rng, scenes, None if photos is None else photos.library())
     survey = survey_scene(rng, place, scenes)
     days = []
-    for _ in range(visits):
+    for _ in range(flight_days):
         visit = draw_visit(rng)
         fixed = None if scenes.light_variety else survey.light
         days.append((visit, *lived_scene(rng, place, visit, fixed, scenes.shared_detail)))

@@ -41,15 +41,15 @@ _SPARE = 1.25  # candidates for each sample: some see too little in common
 @dataclass(frozen=True)
 class LivePlan:
     """Which places a step draws from: `active` of them, of which the oldest is replaced by a new
-    one every `steps_per_place` steps. places: how many there are before they repeat; visits:
-    flights of each.
+    one every `steps_per_place` steps. places: how many there are before they repeat; flight_days:
+    on which each is seen.
     """
 
     first_seed: int
     places: int
     active: int
     steps_per_place: int
-    visits: int
+    flight_days: int
 
     def window(self, step: int) -> range:
         """Running numbers of the places of a step; number k lies in slot ``k % active``."""
@@ -82,7 +82,7 @@ class LiveStream:
         self._ahead = workers
         # Forked processes would inherit a GPU's context, which does not work in them.
         self._makers = ProcessPoolExecutor(workers, get_context("spawn"), initializer=be_modest)
-        self._views = plan.visits + 1  # slots of a place: its survey and its days
+        self._views = plan.flight_days + 1  # slots of a place: its survey and its days
         self._pool = ScenePool(plan.active * self._views, scenes.cells, device)
         self._coming: dict[int, Future[PlaceVisits]] = {}
         self._places: dict[int, PlaceVisits] = {}
@@ -130,7 +130,7 @@ class LiveStream:
             if number not in self._places and number not in self._coming:
                 seed = self._plan.seed(number, self._rank, self._count)
                 self._coming[number] = self._makers.submit(
-                    make_place, seed, self._scenes, self._photos, self._plan.visits
+                    make_place, seed, self._scenes, self._photos, self._plan.flight_days
                 )
         self._places = {k: v for k, v in self._places.items() if k in window}
         for number in window:
@@ -156,7 +156,7 @@ class LiveStream:
         drawn: list[tuple[int, int, Pose, Pose, Camera]] = []
         for _ in range(count):
             number = int(rng.choice(numbers))
-            place, day = self._places[number], int(rng.integers(self._plan.visits))
+            place, day = self._places[number], int(rng.integers(self._plan.flight_days))
             views = draw_views(rng, place.survey, place.days[day][0], self._scenes)
             if views is not None:
                 drawn.append((number, day, *views))

@@ -22,7 +22,9 @@ def open_stream(
     loader = LoaderConfig(o.batch, o.anchors, o.crop, data.appearance)
     if isinstance(data, DataSection):
         return ShardStream(schedule(data), loader, config.seed, workers.rank, generating)
-    plan = LivePlan(data.first_seed, data.scenes, data.active, data.steps_per_scene, data.visits)
+    plan = LivePlan(
+        data.first_seed, data.scenes, data.active, data.steps_per_scene, data.flight_days
+    )
     return LiveStream(
         plan, scene_config(data), photo_source(data), loader, config.seed, workers.device,
         rank=workers.rank, count=workers.count, workers=data.workers,

@@ -28,7 +28,7 @@ from localizer.training.data.seeds import FIRST_WORLD_SEED
 
 
 def world_pairs(
-    seed: int, scenes: SceneConfig, *, count: int, size_m: float = 800.0, visits: int = 2
+    seed: int, scenes: SceneConfig, *, count: int, size_m: float = 800.0, flight_days: int = 2
 ) -> Iterator[Pair]:
     """`count` pairs of the world of `seed`: surveyed once, seen again on other days."""
     if seed < FIRST_WORLD_SEED:
@@ -37,7 +37,7 @@ def world_pairs(
     with tempfile.TemporaryDirectory() as temporary, ExitStack() as stack:
         root = Path(temporary)
         looks = {root / "survey": Visit("survey", SURVEY)}
-        looks |= {root / f"day{k}": Visit("live", draw_look(rng)) for k in range(visits)}
+        looks |= {root / f"day{k}": Visit("live", draw_look(rng)) for k in range(flight_days)}
         info = build_visits(WorldConfig(seed, size_m), looks, processes=1)[0]
         renderers = []
         for folder in looks:
@@ -48,7 +48,7 @@ def world_pairs(
         survey, days = renderers[0], renderers[1:]
         made = 0
         while made < count:
-            pair = _pair(rng, scenes, info, survey, days[made * visits // count])
+            pair = _pair(rng, scenes, info, survey, days[made * flight_days // count])
             if pair is not None:
                 made += 1
                 yield pair

@@ -10,7 +10,7 @@ import pytest
 
 from companion.flight.health import HealthMonitor
 from companion.sources import StreamState
-from localizer.tracking.engine import EngineHealth
+from localizer.tracking.engine_health import EngineHealth
 from localizer.types import TrackingState
 from mavlink_bridge.link.link import sleep_until
 from mavlink_bridge.messages import HealthLevel, without_figures

@@ -214,7 +214,7 @@ def _interrupted_at(step, start):
 
 
 def test_a_start_that_is_interrupted_anywhere_leaves_nothing(tmp_path, monkeypatch):
-    monkeypatch.setattr(Recorder, "_run", lambda _: None)  # its thread would outlive the test
+    monkeypatch.setattr(threading.Thread, "start", lambda _: None)  # it would outlive the test
     folder = tmp_path / "flight"
     for step in itertools.count():
         if not _interrupted_at(step, lambda: Recorder(RecordConfig(folder=folder), FRAME)):
@@ -241,7 +241,16 @@ def test_a_disk_that_stands_still_is_left_behind(tmp_path, monkeypatch):
     monkeypatch.setattr("companion.flight.recorder._CLOSE_S", 0.2)
     recorder = Recorder(RecordConfig(folder=tmp_path), FRAME)
     still = threading.Event()
-    monkeypatch.setattr(recorder, "_write", lambda *_: still.wait(60.0))
+
+    class Standing:
+        """A target whose row takes as long as a disk that stands still."""
+
+        @property
+        def position_world(self):
+            still.wait(60.0)
+            return np.zeros(3)
+
+    recorder.target(Standing(), None)
     for _ in range(5000):  # more than the queue holds
         recorder.event("info", "x")
     began = time.monotonic()

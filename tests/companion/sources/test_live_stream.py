@@ -317,7 +317,7 @@ def test_closing_waits_for_a_reader_that_is_just_being_started(
     def decoder(*_: Any) -> None:
         raise ValueError("nothing comes")
 
-    monkeypatch.setattr("companion.sources.av_source._Decoder", decoder)
+    monkeypatch.setattr("companion.sources.av_source.Decoder", decoder)
     source = open_source(url, CAMERA)
     begun, go_on = threading.Event(), threading.Event()
     start = threading.Thread.start
@@ -389,7 +389,7 @@ def test_an_unexpected_error_in_the_reader_is_a_stall_and_tried_again(
     def decoder(*_: Any) -> None:
         raise ValueError("no such enumeration value")
 
-    monkeypatch.setattr("companion.sources.av_source._Decoder", decoder)
+    monkeypatch.setattr("companion.sources.av_source.Decoder", decoder)
     with Watch(url, retry_max_s=0.3) as watch:
         watch.wait_until(lambda: StreamState.STALLED in watch.states)
         assert "unexpected ValueError" in watch.text(StreamState.STALLED)

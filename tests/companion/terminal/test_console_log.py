@@ -8,7 +8,7 @@ from contextlib import contextmanager
 
 import pytest
 
-from companion.terminal.console_log import _WAITING, OURS, console_log
+from companion.terminal.console_log import OURS, WAITING, console_log
 
 _log = logging.getLogger("companion.test")
 
@@ -79,7 +79,7 @@ def test_a_reader_that_ends_ends_nobody():
 def test_a_stopped_terminal_stops_nobody_and_the_end_is_not_waited_for():
     with _pipe() as (_, write):
         with console_log(False, write.fileno()):
-            assert _logs(2 * _WAITING)  # far more than a pipe and the queue hold
+            assert _logs(2 * WAITING)  # far more than a pipe and the queue hold
             began = time.monotonic()
         assert time.monotonic() - began < 30.0  # the terminal never reads on
 

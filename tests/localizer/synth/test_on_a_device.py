@@ -77,7 +77,7 @@ def test_the_chunks_of_a_batch_do_not_show(monkeypatch: pytest.MonkeyPatch) -> N
     pool.put(0, scene(0))
     poses, cameras = [looking(*view) for view in VIEWS], [Camera.from_fov(48, 32, 50.0)] * 3
     whole = heightfield_torch.render(pool, [0, 0, 0], poses, cameras)
-    monkeypatch.setitem(heightfield_torch._CHUNK, "cpu", 48 * 32)
+    monkeypatch.setitem(heightfield_torch.CHUNK, "cpu", 48 * 32)
     for a, b in zip(whole, heightfield_torch.render(pool, [0, 0, 0], poses, cameras), strict=True):
         torch.testing.assert_close(a, b, rtol=0, atol=0)
 

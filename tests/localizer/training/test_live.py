@@ -21,7 +21,7 @@ from localizer.training.models.s0 import S0Config  # noqa: E402
 SHIPPED = Path(__file__).parents[3] / "configs" / "train_s0.yaml"
 SCENES = SceneConfig(cells=256, width=128, height=96)
 LOADER = LoaderConfig(batch=3, anchors=64, crop=(96, 64), appearance=True)
-PLAN = LivePlan(first_seed=3000, places=50, active=2, steps_per_place=2, visits=2)
+PLAN = LivePlan(first_seed=3000, places=50, active=2, steps_per_place=2, flight_days=2)
 
 
 def opened(loader: LoaderConfig = LOADER, **changes: int) -> LiveStream:
@@ -90,7 +90,7 @@ def test_the_shipped_run_trains_a_small_s0(tmp_path: Path) -> None:
     run = load_config(SHIPPED)
     assert isinstance(run.data, LiveSection)
     data = run.data.model_copy(update={
-        "image": (128, 96), "cells": 256, "active": 2, "steps_per_scene": 2, "visits": 1,
+        "image": (128, 96), "cells": 256, "active": 2, "steps_per_scene": 2, "flight_days": 1,
         "photos": None, "workers": 1,
     })  # fmt: skip
     optimizer = run.optimizer.model_copy(update={

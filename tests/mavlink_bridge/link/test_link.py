@@ -371,28 +371,6 @@ def test_serial_port_both_ways_and_unplugged(
     assert sleep_until(lambda: link.counters.open_failures > 0, 30.0)
 
 
-def test_rate_limit_is_per_message_and_component(
-    start: Callable[..., tuple[Link, Recorder]], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    now_ns = 10**15  # stands still, so that how fast this machine is does not count
-    monkeypatch.setattr("mavlink_bridge.link.link.monotonic_ns", lambda: now_ns)
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as peer:
-        peer.bind(("127.0.0.1", 0))
-        link, _ = start(
-            f"udpout:127.0.0.1:{peer.getsockname()[1]}",
-            min_interval_ns={mavlink.MAVLINK_MSG_ID_HEARTBEAT: SECOND // 5},
-        )
-        assert sleep_until(lambda: link.connected, 30.0)
-        for rounds in (1, 2, 3):
-            for _ in range(50):
-                link.send(HEARTBEAT, 191)
-                link.send(HEARTBEAT, 197)
-                link.send(mavlink.MAVLink_timesync_message(0, 1), 191)
-            assert sleep_until(lambda n=rounds: link.counters.tx_rate_limited == 98 * n, 30.0)
-            assert link.counters.tx_messages == (50 + 2) * rounds
-            now_ns += SECOND // 5
-
-
 def test_failing_handler_is_counted_and_the_link_lives(
     start: Callable[..., tuple[Link, Recorder]],
 ) -> None:

@@ -14,7 +14,7 @@ from rasterio.enums import Resampling
 from rasterio.transform import from_origin
 
 from localizer.geometry.geo import Geodetic
-from localizer.map.building.build import _fingerprint, build_cache
+from localizer.map.building.build import build_cache, fingerprint
 from localizer.map.building.staging import Staging
 from localizer.map.importers.georeference import Georeference
 from localizer.map.importers.raster import read_rasters
@@ -123,9 +123,9 @@ def test_what_a_tiles_content_refers_to(tmp_path):
     root = {"boundingVolume": {"sphere": [4.3e6, 6e5, 4.6e6, 100]}, "geometricError": 0,
             "content": {"uri": "tile.gltf"}}  # fmt: skip
     (tmp_path / "tileset.json").write_text(json.dumps({"asset": {"version": "1.0"}, "root": root}))
-    before = _fingerprint(read_tileset(tmp_path).files)
+    before = fingerprint(read_tileset(tmp_path).files)
     os.utime(tmp_path / "roof.jpg", ns=(1, 1))
-    assert _fingerprint(read_tileset(tmp_path).files) != before
+    assert fingerprint(read_tileset(tmp_path).files) != before
 
 
 @pytest.mark.parametrize("change", ["overview", "statistics", "mask"])
@@ -151,4 +151,4 @@ def test_what_lies_beside_a_raster(tmp_path, change):
             data.write_mask(np.full((64, 64), 255, np.uint8))
     after = read_rasters(paths).files
     assert len(after) == 3
-    assert _fingerprint(after) != _fingerprint(before)
+    assert fingerprint(after) != fingerprint(before)

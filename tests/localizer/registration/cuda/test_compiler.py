@@ -74,7 +74,7 @@ def test_the_cache_is_used_and_told_apart(tmp_path, monkeypatch):
     def refuse(*_):
         raise AssertionError("compiled again")
 
-    monkeypatch.setattr(compiler, "_compile", refuse)
+    monkeypatch.setattr(compiler, "compile_image", refuse)
     assert compile_kernels(4, False, (8, 7), tmp_path).code == first.code
     for other in ((8, False, (8, 7)), (4, True, (8, 7)), (4, False, (8, 9))):
         with pytest.raises(AssertionError, match="compiled again"):

@@ -1,0 +1,64 @@
+"""The tiles in memory, least recently used first out."""
+
+from __future__ import annotations
+
+from collections import OrderedDict
+from collections.abc import Collection, Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from localizer.map.cache.tile import TileMesh
+
+
+class ResidentNodes:
+    """Who asks holds the streamer's lock.
+
+    sizes: bytes of each node (N,), in memory or not; resident: which are (N,); bytes: of those.
+    evicted: what left and is not yet freed; evictions: how many nodes ever did.
+    """
+
+    def __init__(self, sizes: NDArray[np.int64], budget: int) -> None:
+        self.sizes, self.budget = sizes, budget
+        self.resident = np.zeros(len(sizes), np.bool_)
+        self.bytes = self.evictions = 0
+        self.evicted: list[list[TileMesh]] = []
+        self._meshes: OrderedDict[int, list[TileMesh]] = OrderedDict()  # least recent first
+
+    def touched(self, node: int) -> Sequence[TileMesh]:
+        """A resident node's meshes; it counts as used."""
+        self._meshes.move_to_end(node)
+        return self._meshes[node]
+
+    def add(self, node: int, meshes: list[TileMesh], *, keep: Collection[int], beside: int) -> None:
+        """Bring a node in, for which others leave if need be, but not those to `keep`: a view must
+        be able to complete. beside: bytes that are in memory elsewhere.
+        """
+        size = int(self.sizes[node])
+        self._make_room(beside + size, keep)
+        self._meshes[node] = meshes
+        self.resident[node] = True
+        self.bytes += size
+
+    def take_evicted(self) -> list[list[TileMesh]]:
+        """What left, to be freed where it costs nobody time."""
+        taken, self.evicted = self.evicted, []
+        return taken
+
+    def clear(self) -> None:
+        """Drop all tiles."""
+        self._meshes.clear()
+        self.evicted.clear()
+        self.resident[:] = False
+        self.bytes = 0
+
+    def _make_room(self, needed: int, keep: Collection[int]) -> None:
+        for node in list(self._meshes):
+            if self.bytes + needed <= self.budget:
+                return
+            if node in keep:
+                continue
+            self.evicted.append(self._meshes.pop(node))
+            self.resident[node] = False
+            self.bytes -= int(self.sizes[node])
+            self.evictions += 1

@@ -1,0 +1,79 @@
+"""What an engine's threads have done, and which error stands."""
+
+from __future__ import annotations
+
+import logging
+import threading
+import time
+from dataclasses import dataclass, replace
+
+_log = logging.getLogger(__name__)
+_REPORT_EVERY_S = 5.0
+
+
+@dataclass(frozen=True)
+class EngineHealth:
+    """Counters since the start, the text of the error that stands ("" when none does), and which
+    renderer, feature network and optimizer serve. searches, found: of places without a prior;
+    searching: whether one is under way.
+    """
+
+    frames_in: int = 0
+    frames_dropped: int = 0
+    localized: int = 0
+    accepted: int = 0
+    references: int = 0
+    errors: int = 0
+    searches: int = 0
+    found: int = 0
+    searching: bool = False
+    last_error: str = ""
+    renderer: str = ""
+    features: str = ""
+    optimizer: str = ""
+
+
+class HealthBook:
+    """Where an engine's threads enter what they did; every method may be called by any of them."""
+
+    def __init__(self, renderer: str, features: str) -> None:
+        self._health = EngineHealth(renderer=renderer, features=features)
+        self._errors: dict[str, str] = {}  # by thread
+        self._reported_s = -_REPORT_EVERY_S
+        self._lock = threading.Lock()
+
+    def read(self, frames_dropped: int, optimizer: str) -> EngineHealth:
+        """A snapshot, with what only the engine knows."""
+        with self._lock:
+            return replace(
+                self._health,
+                frames_dropped=frames_dropped,
+                optimizer=optimizer,
+                last_error=next(iter(self._errors.values()), ""),
+            )
+
+    def count(self, **increments: int) -> None:
+        """Add to counters of `EngineHealth`, by name."""
+        with self._lock:
+            h = self._health
+            self._health = replace(h, **{k: getattr(h, k) + n for k, n in increments.items()})
+
+    def set_searching(self, searching: bool) -> None:
+        """Whether a search for a place is under way."""
+        with self._lock:
+            self._health = replace(self._health, searching=searching)
+
+    def report(self, text: str) -> None:
+        """An error of this thread: it stands until the thread has done its work again."""
+        with self._lock:
+            self._errors[threading.current_thread().name] = text
+        self.count(errors=1)
+        now = time.monotonic()
+        if now - self._reported_s > _REPORT_EVERY_S:
+            self._reported_s = now
+            _log.warning("%s", text)
+
+    def clear_error(self) -> None:
+        """This thread has done its work: an error of its own is over, another thread's is not."""
+        with self._lock:
+            self._errors.pop(threading.current_thread().name, None)

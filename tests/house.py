@@ -1,0 +1,175 @@
+"""The rules of the house, read from source text: sizes, one-way imports, nothing private reached.
+
+Python files are given as a mapping of paths (POSIX, from the repository's root) to their text.
+Only what a search of the text makes suspect is parsed, so that the whole tree takes a second.
+"""
+
+from __future__ import annotations
+
+import ast
+import re
+from collections import Counter, defaultdict
+from collections.abc import Iterator, Mapping
+from pathlib import Path, PurePosixPath
+
+PACKAGES = ("localizer", "mavlink_bridge", "companion", "sitl", "benchmarks")
+MOST_MODULES, MOST_LINES, MOST_METHODS = 15, 200, 15
+
+# Which packages each may import.
+_MAY_IMPORT = {
+    "localizer": set[str](),
+    "mavlink_bridge": set[str](),
+    "companion": {"localizer", "mavlink_bridge"},
+    "sitl": {"localizer", "mavlink_bridge", "companion"},
+    "benchmarks": {"localizer", "mavlink_bridge", "companion", "sitl"},
+}
+# Other people's names that begin with an underscore and have no public way to what they do.
+_OUTSIDE = {"os._exit", "self._offscreen._renderer"}
+_OUTSIDE_MODULES = {"numba.core.runtime"}
+
+_IMPORT = re.compile(r"^[ \t]*(?:from ([\w.]+) import (\([^)]*\)|[^\n]*)|import ([\w.]+))", re.M)
+_REACHES = re.compile(r"([\w\])]+)\._(?!_)\w|import[^\n]* _(?!_)\w|setattr\(.*\b_(?!_)[A-Za-z]")
+_CLASS = re.compile(r"^class .*\n(?:(?:[ \t)].*)?\n)*", re.M)  # up to the next line at column 0
+
+
+def sources(root: Path) -> dict[str, str]:
+    """The Python files of packages and tests."""
+    folders = (*PACKAGES, "tests", "examples")
+    return {
+        path.relative_to(root).as_posix(): path.read_text(encoding="utf-8")
+        for folder in folders
+        for path in (root / folder).rglob("*.py")
+    }
+
+
+def crowded_folders(files: Mapping[str, str]) -> list[str]:
+    """Folders of packages with too many modules."""
+    paths = [PurePosixPath(path) for path in files]
+    count = Counter(p.parent for p in paths if p.name != "__init__.py" and p.parts[0] in PACKAGES)
+    return [f"{folder}: {n} modules" for folder, n in count.items() if n > MOST_MODULES]
+
+
+def large_classes(files: Mapping[str, str]) -> list[str]:
+    """Classes of packages that are too large and whose docstring says no reason, as ``Above 200
+    lines: ...`` or ``Above 15 public methods: ...``.
+    """
+    return [
+        f"{path}: {problem}"
+        for path, text in files.items()
+        if path.split("/")[0] in PACKAGES
+        for match in _CLASS.finditer(text)
+        if _may_be_large(match.group())
+        for node in ast.walk(ast.parse(match.group()))
+        if isinstance(node, ast.ClassDef) and (problem := _too_large(node))
+    ]
+
+
+def _may_be_large(text: str) -> bool:
+    return text.count("\n") > MOST_LINES or text.count(" def ") > MOST_METHODS
+
+
+def _too_large(node: ast.ClassDef) -> str:
+    lines = (node.end_lineno or node.lineno) - node.lineno + 1
+    kinds = (ast.FunctionDef, ast.AsyncFunctionDef)
+    methods = sum(isinstance(m, kinds) and not m.name.startswith("_") for m in node.body)
+    told = re.search(r"Above [^:]*:", " ".join((ast.get_docstring(node) or "").split()))
+    reason = "" if told is None else told.group()
+    if lines > MOST_LINES and f"{MOST_LINES} lines" not in reason:
+        return f"{node.name} has {lines} lines, and its docstring says no reason"
+    if methods > MOST_METHODS and f"{MOST_METHODS} public methods" not in reason:
+        return f"{node.name} has {methods} public methods, and its docstring says no reason"
+    return ""
+
+
+def wrong_imports(files: Mapping[str, str]) -> list[str]:
+    """Imports against the one direction: sitl -> companion -> localizer, mavlink_bridge."""
+    return [
+        f"{path} imports {module}"
+        for path, text in files.items()
+        if path.split("/")[0] in PACKAGES
+        for module in _imported(path, text, files)
+        if (top := module.split(".")[0]) in PACKAGES
+        and top != path.split("/")[0]
+        and top not in _MAY_IMPORT[path.split("/")[0]]
+    ]
+
+
+def folder_circles(files: Mapping[str, str]) -> list[str]:
+    """Folders of packages that import each other, over any number of others. A folder and those in
+    it count as one place.
+    """
+    graph: dict[str, set[str]] = defaultdict(set)
+    for path, text in files.items():
+        here = path.rpartition("/")[0]
+        if path.split("/")[0] not in PACKAGES:
+            continue
+        for module in _imported(path, text, files):
+            there = module.replace(".", "/")
+            there = there if f"{there}/__init__.py" in files else there.rpartition("/")[0]
+            nested = f"{there}/".startswith(f"{here}/") or f"{here}/".startswith(f"{there}/")
+            if there.count("/") and here.count("/") and not nested:
+                graph[here].add(there)
+    while leaves := {f for f in graph if not graph[f] & graph.keys()}:
+        for folder in leaves:
+            del graph[folder]
+    return [f"{here} -> {', '.join(sorted(graph[here] & graph.keys()))}" for here in sorted(graph)]
+
+
+def _imported(path: str, text: str, files: Mapping[str, str]) -> Iterator[str]:
+    """The modules and packages of ours that a file imports."""
+    for match in _IMPORT.finditer(text):
+        module, names, plain = match.groups()
+        if plain is not None:
+            yield plain
+            continue
+        for name in re.findall(r"(\w+)(?: as \w+)?\s*(?:,|\)|$|#)", names.strip("( \n") + ","):
+            inner = f"{module}.{name}"
+            is_module = f"{inner.replace('.', '/')}.py" in files
+            yield inner if is_module else module
+
+
+def private_reaches(files: Mapping[str, str]) -> list[str]:
+    """Where a file uses an underscored name that it does not define itself. A test may set a
+    module's constant (``_CLOSE_S``), so that a limit of time is reached sooner.
+    """
+    return [
+        f"{path}:{line}: {what}"
+        for path, text in files.items()
+        if any(m.group(1) not in ("self", "cls") for m in _REACHES.finditer(text))
+        for line, what in _reaches(ast.parse(text))
+    ]
+
+
+def _reaches(tree: ast.Module) -> Iterator[tuple[int, str]]:
+    own = _defined(tree)
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Attribute) and _is_private(node.attr) and node.attr not in own:
+            if (what := ast.unparse(node)) not in _OUTSIDE:
+                yield node.lineno, what
+        elif isinstance(node, ast.ImportFrom) and node.module not in _OUTSIDE_MODULES:
+            for name in node.names:
+                if _is_private(name.name):
+                    yield node.lineno, f"from {node.module} import {name.name}"
+        elif isinstance(node, ast.Call) and ast.unparse(node.func).endswith(("setattr", "setitem")):
+            for argument in node.args[:2]:
+                if isinstance(argument, ast.Constant) and isinstance(argument.value, str):
+                    name_set = argument.value.rpartition(".")[2]
+                    if _is_private(name_set) and not name_set.isupper():
+                        yield node.lineno, ast.unparse(node)
+
+
+def _defined(tree: ast.Module) -> set[str]:
+    names = set()
+    for node in ast.walk(tree):
+        if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef | ast.ClassDef):
+            names.add(node.name)
+        elif isinstance(node, ast.Attribute) and isinstance(node.value, ast.Name):
+            if node.value.id in ("self", "cls"):
+                names.add(node.attr)
+        elif isinstance(node, ast.Name) and isinstance(node.ctx, ast.Store):
+            names.add(node.id)
+    return names
+
+
+def _is_private(name: str) -> bool:
+    return name.startswith("_") and not name.startswith("__")
