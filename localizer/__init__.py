@@ -40,6 +40,7 @@ if TYPE_CHECKING:
         write_tum,
     )
     from localizer.map.building.build import build_cache
+    from localizer.map.building.options import BuildOptions
     from localizer.tracking.engine import DualThreadEngine
     from localizer.tracking.opening import open_localizer
     from localizer.tracking.pipeline import Localizer
@@ -53,6 +54,7 @@ _HOMES = {
     "LocalizerConfig": "localizer.config",
     "DualThreadEngine": "localizer.tracking.engine",
     "build_cache": "localizer.map.building.build",
+    "BuildOptions": "localizer.map.building.options",
     "Camera": "localizer.geometry.camera",
     "Pose": "localizer.geometry.pose",
     "Geodetic": "localizer.geometry.geo",
@@ -90,6 +92,7 @@ __all__ = [  # noqa: RUF022
     "LocalizerConfig",
     "DualThreadEngine",
     "build_cache",
+    "BuildOptions",
     "Camera",
     "Pose",
     "Geodetic",

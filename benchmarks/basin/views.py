@@ -21,6 +21,7 @@ from localizer.geometry.camera import Camera
 from localizer.geometry.geo import Geodetic
 from localizer.geometry.pose import Pose
 from localizer.map.building.build import build_cache
+from localizer.map.building.options import BuildOptions
 from localizer.map.cache.cache import TileCache
 from localizer.map.cache.stream import TileStreamer
 from localizer.map.importers.rules import ImportRules
@@ -80,11 +81,12 @@ def _make_world(home: Path) -> None:
     info = build_visits(WorldConfig(seed, WORLD_M), visits, processes=1)[0]
     for folder in visits:
         build_cache(
-            folder, home / f"{folder.name}.cache", origin=info.origin, workers=1,
-            overwrite=True,
-        )  # fmt: skip
-    half = 0.36 * WORLD_M
-    store_renders(home, home / "survey.cache", home / "day.cache", (half, half), rng,
+            folder,
+            home / f"{folder.name}.cache",
+            BuildOptions(origin=info.origin, workers=1, overwrite=True),
+        )
+    half = 0.36 * _WORLD_M
+    _store_renders(home, home / "survey.cache", home / "day.cache", (half, half), rng,
                    VIEWS_PER_WORLD)  # fmt: skip
 
 
@@ -145,11 +147,13 @@ def _make_real(source: Path, home: Path, count: int) -> None:
     build_cache(
         rasters if rasters[0].exists() else source,
         cache,
-        geoid_separation_m=0.0,
-        vertical_datum="ellipsoidal",
-        rules=ImportRules(trusted=frozenset({"geoid"})),
-        origin=Geodetic(origin["lat"], origin["lon"], origin["height"]) if origin else None,
-        overwrite=True,
+        BuildOptions(
+            geoid_separation_m=0.0,
+            vertical_datum="ellipsoidal",
+            rules=ImportRules(trusted=frozenset({"geoid"})),
+            origin=Geodetic(origin["lat"], origin["lon"], origin["height"]) if origin else None,
+            overwrite=True,
+        ),
     )
     if (source / "queries").exists():
         _store(home, photo_views(cache, source / "queries"))

@@ -23,6 +23,7 @@ from localizer.geometry.camera import Camera
 from localizer.geometry.geo import Geodetic
 from localizer.geometry.pose import Pose
 from localizer.map.building.build import build_cache
+from localizer.map.building.options import BuildOptions
 from localizer.map.cache.cache import TileCache
 from localizer.map.cache.stream import TileStreamer
 from localizer.map.importers.rules import ImportRules
@@ -63,10 +64,12 @@ def _map(folder: Path, cache: Path, origin: Geodetic | None) -> Path:
         build_cache(
             layers if layers[0].exists() else folder,
             built,
-            geoid_separation_m=0.0,
-            vertical_datum="ellipsoidal",
-            rules=ImportRules(trusted=frozenset({"geoid"})),
-            origin=origin,
+            BuildOptions(
+                geoid_separation_m=0.0,
+                vertical_datum="ellipsoidal",
+                rules=ImportRules(trusted=frozenset({"geoid"})),
+                origin=origin,
+            ),
         )
     return built
 

@@ -85,6 +85,7 @@ def build(
 ) -> None:
     """Import a source into a tile cache; goes on where an interrupted build stopped."""
     from localizer.map.building.build import build_cache
+    from localizer.map.building.options import BuildOptions
     from localizer.map.importers.rules import ImportRules
 
     rules = ImportRules.of(limit or (), trust or ())
@@ -93,20 +94,22 @@ def build(
             manifest = build_cache(
                 source,
                 out,
-                geoid_separation_m=geoid_separation,
-                vertical_datum=vertical_datum,
-                georeference=georeference,
-                up_axis=up_axis,
-                height_unit=height_unit,
-                nodata=nodata,
-                attribution=attribution,
-                skip_bad_tiles=skip_bad_tiles,
-                overwrite=overwrite,
-                workers=workers,
-                apart=True,
-                scheduler=scheduler,
+                BuildOptions(
+                    geoid_separation_m=geoid_separation,
+                    vertical_datum=vertical_datum,
+                    georeference=georeference,
+                    up_axis=up_axis,
+                    height_unit=height_unit,
+                    nodata=nodata,
+                    attribution=attribution,
+                    skip_bad_tiles=skip_bad_tiles,
+                    overwrite=overwrite,
+                    workers=workers,
+                    apart=True,
+                    scheduler=scheduler,
+                    rules=rules,
+                ),
                 progress=bar,
-                rules=rules,
             )
     except KeyboardInterrupt:
         Console(stderr=True).print("interrupted: the same command goes on with what is done")

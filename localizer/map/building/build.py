@@ -14,13 +14,13 @@ from localizer.geometry.geo import Geodetic, LocalFrame, geodetic_from_ecef
 from localizer.map.building.assembly import assemble
 from localizer.map.building.heights import extent_warnings, heights_of
 from localizer.map.building.isolation import call_apart
+from localizer.map.building.options import BuildOptions
 from localizer.map.building.sources import SourceOptions, find_source, read_source
 from localizer.map.building.staging import Record, publish, staging
 from localizer.map.building.workers import ImportJob, Progress, Workers, import_all, tiles_of
 from localizer.map.cache.cache import Manifest
-from localizer.map.importers.georeference import Georeference, UpAxis
-from localizer.map.importers.rules import ImportRules
-from localizer.map.source import FlatTree, SourceNode, SourceTree, VerticalDatum
+from localizer.map.importers.georeference import Georeference
+from localizer.map.source import FlatTree, SourceNode, SourceTree
 
 _NAMED_FAILURES = 20  # how many bad tiles an error message lists
 
@@ -28,69 +28,32 @@ _NAMED_FAILURES = 20  # how many bad tiles an error message lists
 def build_cache(
     source: Path | Sequence[Path],
     out: Path,
+    options: BuildOptions | None = None,
     *,
-    geoid_separation_m: float | None = None,
-    vertical_datum: VerticalDatum | None = None,
-    georeference: Georeference | Path | None = None,
-    up_axis: UpAxis | None = None,
-    height_unit: str | None = None,
-    nodata: float | None = None,
-    origin: Geodetic | None = None,
-    attribution: str | None = None,
-    skip_bad_tiles: bool = False,
-    overwrite: bool = False,
-    workers: int | None = None,
-    apart: bool | None = None,
     progress: Progress | None = None,
-    scheduler: str | None = None,
-    rules: ImportRules | None = None,
 ) -> Manifest:
     """Import a map source into a tile cache at `out`.
 
+    An interrupted build goes on where it stopped.
+
     source: a `tileset.json`, a mesh (glTF, GLB, OBJ), a DSM and an orthophoto, or a folder that
-    holds one of these.
-    geoid_separation_m: height of the geoid above the ellipsoid at the map (MAVLink altitudes are
-    above the geoid), else the source's own, else EGM96's. vertical_datum: what the source's heights
-    are; "amsl" ones are lifted by the separation; needed unless the source's format or CRS says it.
-    georeference, up_axis: of a mesh, see `read_georeference` and `mesh_tree`. height_unit, nodata:
-    of a DSM, see `read_rasters`. origin: of the world
-    frame, else the source's centre. skip_bad_tiles: leave out tiles that cannot be imported (their
-    parents are shown there) instead of failing. workers: processes, else one per core; more than
-    one needs the usual ``if __name__ == "__main__"`` guard in a script. apart: read the source in
-    processes with limits of memory and time, else unless workers is 1. scheduler: address of a
-    Dask scheduler whose workers share the file system, instead of local processes. progress: told
-    the number of imported tiles and of all, at the start and after each. rules: what a source may
-    ask for, and which doubts about it are meant. An interrupted build goes on where it stopped.
+    holds one of these. progress: told the number of imported tiles and of all, at the start and
+    after each.
     """
-    rules = rules or ImportRules()
-    apart = workers != 1 if apart is None else apart
+    options = options or BuildOptions()
     given = [Path(source)] if isinstance(source, str | Path) else [Path(s) for s in source]
-    sources, georeference = find_source(given, georeference)
-    options = SourceOptions(up_axis, height_unit, nodata, rules)
+    sources, georeference = find_source(given, options.georeference)
+    reading = SourceOptions(options.up_axis, options.height_unit, options.nodata, options.rules)
     named = " ".join(map(str, sources))
-    if apart:
+    if options.is_apart:
+        what = f"{named}: its reading"
         flat = call_apart(
-            _read_flat, sources, georeference, options, rules=rules, what=f"{named}: its reading"
+            _read_flat, sources, georeference, reading, rules=options.rules, what=what
         )
         tree = flat.tree()
     else:
-        tree = read_source(sources, georeference, options)
-    return build_tree(
-        tree,
-        out,
-        name=named,
-        geoid_separation_m=geoid_separation_m,
-        vertical_datum=vertical_datum,
-        origin=origin,
-        attribution=attribution,
-        skip_bad_tiles=skip_bad_tiles,
-        overwrite=overwrite,
-        workers=workers,
-        apart=apart,
-        progress=progress,
-        scheduler=scheduler,
-        rules=rules,
-    )
+        tree = read_source(sources, georeference, reading)
+    return build_tree(tree, out, named, options, progress=progress)
 
 
 def _read_flat(
@@ -102,26 +65,20 @@ def _read_flat(
 def build_tree(
     tree: SourceTree,
     out: Path,
-    *,
     name: str,
-    geoid_separation_m: float | None = None,
-    vertical_datum: VerticalDatum | None = None,
-    origin: Geodetic | None = None,
-    attribution: str | None = None,
-    skip_bad_tiles: bool = False,
-    overwrite: bool = False,
-    workers: int | None = None,
-    apart: bool | None = None,
+    options: BuildOptions | None = None,
+    *,
     progress: Progress | None = None,
-    scheduler: str | None = None,
-    rules: ImportRules | None = None,
 ) -> Manifest:
     """Build a cache from any importer's tree; see `build_cache`. name: of the source."""
-    rules = rules or ImportRules()
+    options = options or BuildOptions()
+    rules = options.rules
     _require_on_earth(tree)
-    separation, datum, doubts = heights_of(tree, geoid_separation_m, vertical_datum, name, rules)
+    separation, datum, doubts = heights_of(
+        tree, options.geoid_separation_m, options.vertical_datum, name, rules
+    )
     lift = separation if datum == "amsl" else 0.0
-    frame = LocalFrame(origin or _origin(tree, lift))
+    frame = LocalFrame(options.origin or _origin(tree, lift))
     parameters = {
         "origin": [frame.origin.latitude_deg, frame.origin.longitude_deg, frame.origin.height_m],
         "vertical_datum": datum,
@@ -129,16 +86,16 @@ def build_tree(
         "options": tree.options,
         "source_fingerprint": fingerprint(tree.files),
     }
-    with staging(Path(out), parameters, overwrite=overwrite) as staged:
+    with staging(Path(out), parameters, overwrite=options.overwrite) as staged:
         job = ImportJob(staged, frame, lift, rules)
         how = Workers(
-            workers or os.cpu_count() or 1,
-            apart=workers != 1 if apart is None else apart,
-            scheduler=scheduler,
+            options.workers or os.cpu_count() or 1,
+            apart=options.is_apart,
+            scheduler=options.scheduler,
         )
         records = import_all(tree.root, job, how, progress or (lambda _done, _total: None))
         skipped = _failures(tree.root, records)
-        if skipped and not skip_bad_tiles:
+        if skipped and not options.skip_bad_tiles:
             raise MapSourceError(_failure_text(name, skipped))
         index, manifest = assemble(tree, records, staged, frame)
         doubts += extent_warnings(
@@ -149,7 +106,9 @@ def build_tree(
                 "vertical_datum": datum,
                 "geoid_separation_m": separation,
                 "source": name,
-                "attribution": tree.attribution if attribution is None else attribution,
+                "attribution": (
+                    tree.attribution if options.attribution is None else options.attribution
+                ),
                 "build": parameters,
                 "skipped": skipped,
                 "warnings": (*tree.warnings, *doubts),

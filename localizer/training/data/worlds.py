@@ -16,6 +16,7 @@ import numpy as np
 from localizer.errors import MapSourceError
 from localizer.geometry.camera import Camera
 from localizer.map.building.build import build_cache
+from localizer.map.building.options import BuildOptions
 from localizer.map.cache.cache import TileCache
 from localizer.map.cache.stream import TileStreamer
 from localizer.render.numba_raster import NumbaRenderer
@@ -42,7 +43,7 @@ def world_pairs(
         renderers = []
         for folder in looks:
             cache = root / f"{folder.name}.cache"
-            build_cache(folder, cache, origin=info.origin, workers=1)
+            build_cache(folder, cache, BuildOptions(origin=info.origin, workers=1))
             streamer = stack.enter_context(TileStreamer(TileCache.open(cache)))
             renderers.append(NumbaRenderer(streamer, threads=1))
         survey, days = renderers[0], renderers[1:]

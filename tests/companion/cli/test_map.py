@@ -14,6 +14,7 @@ from typer.testing import CliRunner
 from companion.cli.commands import app
 from companion.errors import ReportError
 from localizer.map.building import build
+from localizer.map.building.options import BuildOptions
 from localizer.map.cache.cache import TileCache
 from tests.localizer.map.conftest import write_tileset
 
@@ -27,7 +28,7 @@ def source(tmp_path_factory):
 @pytest.fixture(scope="module")
 def cache(source, tmp_path_factory):
     out = tmp_path_factory.mktemp("built") / "cache"
-    build.build_cache(source, out, workers=1)
+    build.build_cache(source, out, BuildOptions(workers=1))
     return TileCache.open(out)
 
 
@@ -95,7 +96,10 @@ def test_a_place_that_cannot_be_written_is_one_line(cache, tmp_path, monkeypatch
 def test_progress_is_told_from_the_start_to_all_tiles(source, tmp_path):
     told = []
     build.build_cache(
-        source, tmp_path / "c", workers=1, progress=lambda done, total: told.append((done, total))
+        source,
+        tmp_path / "c",
+        BuildOptions(workers=1),
+        progress=lambda done, total: told.append((done, total)),
     )
     assert told == [(done, 21) for done in range(22)]
 

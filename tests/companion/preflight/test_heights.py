@@ -9,6 +9,7 @@ import pytest
 from companion.preflight.heights import check_heights
 from localizer.geometry.geo import Geodetic, LocalFrame
 from localizer.map.building.build import build_cache
+from localizer.map.building.options import BuildOptions
 from localizer.map.cache.cache import TileCache
 from mavlink_bridge.messages import VehicleState
 from tests.localizer.map.conftest import ORIGIN, SEPARATION_M, height, write_tileset
@@ -17,7 +18,7 @@ from tests.localizer.map.conftest import ORIGIN, SEPARATION_M, height, write_til
 @pytest.fixture(scope="module")
 def cache(tmp_path_factory):
     folder = tmp_path_factory.mktemp("map")
-    build_cache(write_tileset(folder / "source"), folder / "cache", workers=1)
+    build_cache(write_tileset(folder / "source"), folder / "cache", BuildOptions(workers=1))
     return TileCache.open(folder / "cache")
 
 

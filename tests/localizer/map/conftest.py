@@ -14,6 +14,7 @@ import pytest
 
 from localizer.geometry.geo import Geodetic, LocalFrame
 from localizer.map.building.build import build_cache
+from localizer.map.building.options import BuildOptions
 from localizer.map.cache.cache import TileCache
 
 ORIGIN = Geodetic(47.2, 8.2, 430.0)
@@ -168,7 +169,7 @@ def source(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def cache_path(source: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The cache of `source`; read only."""
     out = tmp_path_factory.mktemp("built") / "cache"
-    build_cache(source, out, workers=1)
+    build_cache(source, out, BuildOptions(workers=1))
     return out
 
 
@@ -183,7 +184,7 @@ def build(tmp_path: Path) -> Callable[..., TileCache]:
 
     def run(source: Path, **options) -> TileCache:
         out = tmp_path / "cache"
-        build_cache(source, out, workers=1, **options)
+        build_cache(source, out, BuildOptions(workers=1, **options))
         return TileCache.open(out)
 
     return run

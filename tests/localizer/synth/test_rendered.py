@@ -6,6 +6,7 @@ import pytest
 from localizer.geometry.camera import Camera
 from localizer.geometry.pose import Pose
 from localizer.map.building.build import build_cache
+from localizer.map.building.options import BuildOptions
 from localizer.map.cache.cache import TileCache
 from localizer.map.cache.stream import TileStreamer
 from localizer.render.numba_raster import NumbaRenderer
@@ -19,7 +20,9 @@ CAMERA = Camera.from_fov(320, 240, 60.0)
 def renderer(small_world, tmp_path_factory):
     folder, info = small_world["survey"]
     out = tmp_path_factory.mktemp("cache") / "map"
-    manifest = build_cache(folder / "tileset.json", out, origin=info.origin, workers=1)
+    manifest = build_cache(
+        folder / "tileset.json", out, BuildOptions(origin=info.origin, workers=1)
+    )
     assert manifest.geoid_separation_m == info.geoid_separation_m
     streamer = TileStreamer(TileCache.open(out))
     yield NumbaRenderer(streamer, threads=1)

@@ -23,6 +23,7 @@ from localizer.geometry.camera import Camera
 from localizer.geometry.geo import Geodetic, LocalFrame
 from localizer.geometry.pose import matrix_from_euler, quaternion_from_matrix
 from localizer.map.building.build import build_cache
+from localizer.map.building.options import BuildOptions
 from localizer.map.cache.cache import TileCache
 from localizer.map.cache.stream import TileStreamer
 from localizer.render.numba_raster import NumbaRenderer
@@ -65,9 +66,7 @@ def cache(tmp_path_factory: pytest.TempPathFactory) -> Path:
     build_cache(
         folder / "tileset.json",
         folder / "cache",
-        geoid_separation_m=47.0,
-        origin=ORIGIN,
-        workers=1,
+        BuildOptions(geoid_separation_m=47.0, origin=ORIGIN, workers=1),
     )
     return folder / "cache"
 

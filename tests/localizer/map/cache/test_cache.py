@@ -17,6 +17,7 @@ import pytest
 from localizer.errors import LocalizerError, MapCacheError, MapSourceError
 from localizer.geometry.pose import Pose
 from localizer.map.building.build import build_cache
+from localizer.map.building.options import BuildOptions
 from localizer.map.cache.cache import TileCache, decode_tile, encode_tile
 from localizer.map.cache.tile import TileMesh, build_mips, texel_coverage
 
@@ -169,7 +170,7 @@ def test_unused_texels_do_not_bleed_into_mips():
 
 def test_same_input_gives_the_same_bytes(source, tmp_path):
     manifests = [
-        build_cache(source, tmp_path / name, workers=workers)
+        build_cache(source, tmp_path / name, BuildOptions(workers=workers))
         for name, workers in (("a", 1), ("b", 2))
     ]
     assert manifests[0] == manifests[1]
@@ -181,6 +182,7 @@ KILLED = """
 import os, sys
 from pathlib import Path
 from localizer.map.building.build import build_cache
+from localizer.map.building.options import BuildOptions
 import localizer.map.building.staging as staging
 store, count = staging.Staging.store, 0
 def store_some(self, key, meshes):
@@ -190,7 +192,7 @@ def store_some(self, key, meshes):
         os.kill(os.getpid(), 9)
     return store(self, key, meshes)
 staging.Staging.store = store_some
-build_cache(Path(sys.argv[1]), Path(sys.argv[2]), workers=1)
+build_cache(Path(sys.argv[1]), Path(sys.argv[2]), BuildOptions(workers=1))
 """
 
 
@@ -208,7 +210,7 @@ def test_build_goes_on_after_kill(source, cache, tmp_path, monkeypatch):
         "store",
         lambda self, key, meshes: (stored.append(key), store(self, key, meshes))[1],
     )
-    manifest = build_cache(source, out, workers=1)
+    manifest = build_cache(source, out, BuildOptions(workers=1))
     assert sorted(stored) == list(range(9, 21))
     assert manifest == cache.manifest
     assert not out.with_name("cache.building").exists()
@@ -219,10 +221,11 @@ import resource, signal, sys
 from pathlib import Path
 from localizer.errors import MapCacheError
 from localizer.map.building.build import build_cache
+from localizer.map.building.options import BuildOptions
 signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
 resource.setrlimit(resource.RLIMIT_FSIZE, (5000, 5000))
 try:
-    build_cache(Path(sys.argv[1]), Path(sys.argv[2]), workers=1)
+    build_cache(Path(sys.argv[1]), Path(sys.argv[2]), BuildOptions(workers=1))
 except MapCacheError as error:
     sys.exit(f"named: {error}")
 """
@@ -235,7 +238,7 @@ def test_a_full_disk_is_named_and_the_build_goes_on_after_it(source, cache, tmp_
     assert run.stderr.startswith("named: ")
     assert "cannot be written: File too large" in run.stderr
     assert not out.exists()
-    assert build_cache(source, out, workers=1) == cache.manifest
+    assert build_cache(source, out, BuildOptions(workers=1)) == cache.manifest
 
 
 ORPHANS = """
@@ -278,7 +281,7 @@ def test_a_changed_source_is_not_mixed_with_an_old_build(make, tmp_path):
     subprocess.run([sys.executable, "-c", KILLED, str(source), str(out)], check=False)
     first = next((tmp_path / "s").glob("0_*.glb"))
     os.utime(first, ns=(time.time_ns(), time.time_ns() + 10**9))
-    fresh = build_cache(source, out, workers=1)
+    fresh = build_cache(source, out, BuildOptions(workers=1))
     assert fresh.tiles == 21
 
 
@@ -289,14 +292,14 @@ def test_two_builds_do_not_share_a_folder(source, tmp_path):
         staging(tmp_path / "c", {}, overwrite=False),
         pytest.raises(MapCacheError, match="another"),
     ):
-        build_cache(source, tmp_path / "c", workers=1)
+        build_cache(source, tmp_path / "c", BuildOptions(workers=1))
 
 
 def test_overwrite_replaces_the_cache(source, tmp_path):
     out = tmp_path / "c"
-    build_cache(source, out, workers=1)
+    build_cache(source, out, BuildOptions(workers=1))
     (out / "mark").write_text("old")
-    build_cache(source, out, workers=1, overwrite=True)
+    build_cache(source, out, BuildOptions(workers=1, overwrite=True))
     assert not (out / "mark").exists()
     assert TileCache.open(out).manifest.tiles == 21
     assert [p.name for p in tmp_path.iterdir() if p.name.startswith("c")] == ["c"]
@@ -309,9 +312,9 @@ def test_overwrite_spares_what_is_no_cache(source, tmp_path):
     (tmp_path / "c.old").mkdir()
     (tmp_path / "c.old" / "draft.tex").touch()
     with pytest.raises(MapCacheError, match="no tile cache"):
-        build_cache(source, out, workers=1, overwrite=True)
+        build_cache(source, out, BuildOptions(workers=1, overwrite=True))
     (out / "thesis.tex").unlink()
-    build_cache(source, out, workers=1, overwrite=True)
+    build_cache(source, out, BuildOptions(workers=1, overwrite=True))
     assert (tmp_path / "c.old" / "draft.tex").exists()
 
 

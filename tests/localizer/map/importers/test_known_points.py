@@ -15,6 +15,7 @@ from scipy.spatial import cKDTree
 from localizer.geometry.camera import Camera
 from localizer.geometry.pose import Pose
 from localizer.map.building.build import build_cache
+from localizer.map.building.options import BuildOptions
 from localizer.map.cache.cache import TileCache
 from localizer.map.cache.pick import cast_rays, pick
 from localizer.map.cache.stream import TileStreamer
@@ -74,7 +75,7 @@ def imported(real_data, tmp_path_factory):
     def build(name: str, tileset: str, **options) -> tuple[Path, TileCache]:
         source = real_data(name) / tileset
         out = tmp_path_factory.mktemp(name) / "cache"
-        build_cache(source, out, workers=2, **options)
+        build_cache(source, out, BuildOptions(workers=2, **options))
         return source, TileCache.open(out)
 
     return build

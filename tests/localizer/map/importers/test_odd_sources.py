@@ -23,6 +23,7 @@ from localizer.geometry.geo import Geodetic, LocalFrame
 from localizer.geometry.geoid import geoid_separation
 from localizer.map.building.build import build_cache
 from localizer.map.building.isolation import call_apart
+from localizer.map.building.options import BuildOptions
 from localizer.map.cache.cache import TileCache
 from localizer.map.importers.georeference import Georeference, ecef_from_crs
 from localizer.map.importers.raster_file import offline, open_raster
@@ -435,12 +436,12 @@ def test_an_odd_source_is_refused_by_name_or_trusted(case, tmp_path, make):
     source = case.make(tmp_path) if case in RASTERS else case.make(tmp_path, make)
     options = {"workers": 1} | case.options
     with pytest.raises(LocalizerError, match=case.says) as refusal:
-        build_cache(source, tmp_path / "c", **options)
+        build_cache(source, tmp_path / "c", BuildOptions(**options))
     assert not (tmp_path / "c").exists()
     if case.trust is not None:
         assert f"--trust {case.trust}" in str(refusal.value)
         trusting = ImportRules(trusted=frozenset({case.trust}))
-        build_cache(source, tmp_path / "c", rules=trusting, **options)
+        build_cache(source, tmp_path / "c", BuildOptions(rules=trusting, **options))
 
 
 # --- odd, and handled right -----------------------------------------------------------------------
@@ -450,7 +451,7 @@ def test_an_odd_source_is_refused_by_name_or_trusted(case, tmp_path, make):
 def built(tmp_path):
     def run(source, **options):
         options = {"workers": 1} | options
-        build_cache(source, tmp_path / "c", **options)
+        build_cache(source, tmp_path / "c", BuildOptions(**options))
         return TileCache.open(tmp_path / "c")
 
     return run
@@ -591,7 +592,7 @@ def test_only_control_points_are_no_place(tmp_path):
         data.transform = Affine.identity()
         data.gcps = points, CRS(UTM).to_wkt()
     with pytest.raises(LocalizerError, match=r"no CRS|only control points"):
-        build_cache(paths, tmp_path / "c", workers=1, **ELLIPSOIDAL)
+        build_cache(paths, tmp_path / "c", BuildOptions(workers=1, **ELLIPSOIDAL))
 
 
 def test_no_name_makes_gdal_fetch_anything(tmp_path):
@@ -626,7 +627,7 @@ def test_no_name_makes_gdal_fetch_anything(tmp_path):
             paths = rasters(tmp_path)
             (tmp_path / name).write_text(vrt)
             with pytest.raises(MapSourceError, match="no GeoTIFF"):
-                build_cache(paths, tmp_path / "c", workers=1, **ELLIPSOIDAL)
+                build_cache(paths, tmp_path / "c", BuildOptions(workers=1, **ELLIPSOIDAL))
             (tmp_path / name).unlink()
         with offline(), pytest.raises(rasterio.errors.RasterioError):
             rasterio.open(f"/vsicurl/{address}")
@@ -680,7 +681,7 @@ def test_limits_and_doubts_are_named():
 
 
 def test_a_honest_source_is_read_apart_without_a_warning(source, cache, tmp_path):
-    manifest = build_cache(source, tmp_path / "c", workers=1, apart=True)
+    manifest = build_cache(source, tmp_path / "c", BuildOptions(workers=1, apart=True))
     assert manifest == cache.manifest
     assert manifest.warnings == ()
 
@@ -690,9 +691,10 @@ def test_a_mesh_in_feet_is_refused(tmp_path):
     path.write_text(json.dumps({"epsg": 2263, "offset": [985000, 210000, 0]}))
     with pytest.raises(GeoreferenceError, match="in feet"):
         build_cache(
-            obj(tmp_path), tmp_path / "c", georeference=path, workers=1,
-            **ELLIPSOIDAL,
-        )  # fmt: skip
+            obj(tmp_path),
+            tmp_path / "c",
+            BuildOptions(georeference=path, workers=1, **ELLIPSOIDAL),
+        )
 
 
 def test_a_raster_on_this_disk_is_still_opened(tmp_path):

@@ -15,6 +15,7 @@ from rasterio.transform import from_origin
 
 from localizer.geometry.geo import Geodetic
 from localizer.map.building.build import build_cache, fingerprint
+from localizer.map.building.options import BuildOptions
 from localizer.map.building.staging import Staging
 from localizer.map.importers.georeference import Georeference
 from localizer.map.importers.raster import read_rasters
@@ -106,13 +107,13 @@ def test_a_texture_that_changes_while_a_build_rests_begins_it_anew(tmp_path, mon
     monkeypatch.setattr(Staging, "store", interrupted)
     monkeypatch.setattr("localizer.map.building.quadtree.LEAF_TRIANGLES", 400)
     with pytest.raises(KeyboardInterrupt):
-        build_cache(obj, tmp_path / "out", **options)
+        build_cache(obj, tmp_path / "out", BuildOptions(**options))
     cv2.imwrite(str(tmp_path / "t.png"), np.full((64, 64, 3), 200, np.uint8))
     stored = []
     monkeypatch.setattr(
         Staging, "store", lambda self, key, m: (stored.append(key), store(self, key, m))[1]
     )
-    manifest = build_cache(obj, tmp_path / "out", **options)
+    manifest = build_cache(obj, tmp_path / "out", BuildOptions(**options))
     assert 0 in stored
     assert len(stored) == manifest.tiles
 

@@ -13,6 +13,7 @@ import pytest
 from localizer.errors import GeoreferenceError, MapCacheError, MapSourceError
 from localizer.geometry.pose import Pose
 from localizer.map.building.build import build_cache
+from localizer.map.building.options import BuildOptions
 from localizer.map.importers.gltf import read_gltf
 from localizer.map.importers.rules import ImportRules
 from localizer.map.importers.tiles3d import read_tileset
@@ -230,12 +231,12 @@ def test_the_geoid_separation_is_computed_and_compared(tmp_path, make):
     document = json.loads(source.read_text())
     del document["asset"]["extras"]
     source.write_text(json.dumps(document))
-    manifest = build_cache(source, tmp_path / "none given", workers=1)
+    manifest = build_cache(source, tmp_path / "none given", BuildOptions(workers=1))
     assert manifest.geoid_separation_m == pytest.approx(47.75, abs=0.01)
     with pytest.raises(GeoreferenceError, match=r"given .* is 20.00 m, EGM96's .* is 47.75 m"):
-        build_cache(source, tmp_path / "c", geoid_separation_m=20, workers=1)
+        build_cache(source, tmp_path / "c", BuildOptions(geoid_separation_m=20, workers=1))
     with pytest.raises(GeoreferenceError, match="does not occur"):
-        build_cache(source, tmp_path / "c", geoid_separation_m=900, workers=1)
+        build_cache(source, tmp_path / "c", BuildOptions(geoid_separation_m=900, workers=1))
 
 
 def test_a_tileset_that_is_not_on_earth_is_an_error(tmp_path, make, build):
@@ -249,7 +250,7 @@ def test_a_tileset_that_is_not_on_earth_is_an_error(tmp_path, make, build):
 
 def test_existing_cache_is_kept_unless_told(source, cache_path):
     with pytest.raises(MapCacheError, match=r"exists already.*--overwrite"):
-        build_cache(source, cache_path, workers=1)
+        build_cache(source, cache_path, BuildOptions(workers=1))
 
 
 HOSTILE_TILESETS = {

@@ -101,11 +101,14 @@ def test_a_level_or_a_place_that_the_map_does_not_have_is_named(cache, tmp_path)
 def test_dask_builds_the_same_cache(source, cache, tmp_path):
     distributed = pytest.importorskip("distributed")
     from localizer.map.building.build import build_cache
+    from localizer.map.building.options import BuildOptions
 
     with distributed.LocalCluster(
         n_workers=2, threads_per_worker=1, processes=True, dashboard_address=None
     ) as cluster:
-        manifest = build_cache(source, tmp_path / "c", scheduler=cluster.scheduler_address)
+        manifest = build_cache(
+            source, tmp_path / "c", BuildOptions(scheduler=cluster.scheduler_address)
+        )
     assert manifest == cache.manifest
 
 
