@@ -18,7 +18,7 @@ from mavlink_bridge.injection.closed_loop import LoopVerdict
 from mavlink_bridge.injection.rc_gate import InjectionGate
 from mavlink_bridge.injection.shadow import ShadowScore, gnss_healthy
 from mavlink_bridge.link.clock import SteadyUtc, monotonic_ns
-from mavlink_bridge.link.link import Link, LinkHandler
+from mavlink_bridge.link.link import Link, LinkHandler, LinkOptions
 from mavlink_bridge.link.replay import ReplayWindow
 from mavlink_bridge.link.signing import load_key
 from mavlink_bridge.link.tlog import TlogRecorder
@@ -298,9 +298,7 @@ def _make_link(
 ) -> Link:
     key = None if signing is None else load_key(signing.key_file)
     is_fc = name == "fc"
-    return Link(
-        Endpoint.parse(connection),
-        handler,
+    options = LinkOptions(
         name=name,
         wanted=wanted,
         signing_key=key,
@@ -313,6 +311,7 @@ def _make_link(
         timeout_s=config.link_timeout_s,
         opener=opener,
     )
+    return Link(Endpoint.parse(connection), handler, options)
 
 
 def _mount(config: BridgeConfig) -> quat.Quaternion:

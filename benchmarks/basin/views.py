@@ -85,8 +85,8 @@ def _make_world(home: Path) -> None:
             home / f"{folder.name}.cache",
             BuildOptions(origin=info.origin, workers=1, overwrite=True),
         )
-    half = 0.36 * _WORLD_M
-    _store_renders(home, home / "survey.cache", home / "day.cache", (half, half), rng,
+    half = 0.36 * WORLD_M
+    store_renders(home, home / "survey.cache", home / "day.cache", (half, half), rng,
                    VIEWS_PER_WORLD)  # fmt: skip
 
 

@@ -69,53 +69,59 @@ class LinkCounters:
     timeouts: int = 0
 
 
+@dataclass(frozen=True)
+class LinkOptions:
+    """What a link is told beyond its endpoint. name: of its thread and its counters. wanted: ids of
+    messages, None for all. opener: of its transport. recorder: of what passes.
+
+    signing_key: 32 bytes, None without signing; window: what outlives a restart of the time stamps
+    that signed messages had. timeout_s: silence after which a stream (TCP, serial) is reopened.
+
+    sender, follow_hosts_after_s: UDP, who alone is heard, and after which silence another host may
+    be. stop: what ends the owner thread when it is set.
+    """
+
+    name: str = "link"
+    wanted: Collection[int] | None = None
+    signing_key: bytes | None = None
+    signing_link_id: int = 1
+    recorder: TlogRecorder | None = None
+    timeout_s: float = 5.0
+    opener: Callable[[Endpoint], Transport] = open_transport
+    stop: threading.Event | None = None
+    sender: tuple[str, int | None] | None = None
+    follow_hosts_after_s: float | None = None
+    window: ReplayWindow | None = None
+
+
 class Link:
     """A MAVLink 2 link that stays up.
-
-    timeout_s: silence after which a stream (TCP, serial) is reopened.
-
-    stop: what ends the owner thread when it is set. sender, follow_hosts_after_s: UDP, who alone is
-    heard, and after which silence another host may be. window: what outlives a restart of the time
-    stamps that signed messages had.
 
     Above 200 lines: one thread owns transport, parser, packers and what is unsent, and the order in
     which its loop serves them keeps positions first on a slow port.
     """
 
     def __init__(
-        self,
-        endpoint: Endpoint,
-        handler: LinkHandler,
-        *,
-        name: str = "link",
-        wanted: Collection[int] | None = None,
-        signing_key: bytes | None = None,
-        signing_link_id: int = 1,
-        recorder: TlogRecorder | None = None,
-        timeout_s: float = 5.0,
-        opener: Callable[[Endpoint], Transport] = open_transport,
-        stop: threading.Event | None = None,
-        sender: tuple[str, int | None] | None = None,
-        follow_hosts_after_s: float | None = None,
-        window: ReplayWindow | None = None,
+        self, endpoint: Endpoint, handler: LinkHandler, options: LinkOptions | None = None
     ) -> None:
+        o = options or LinkOptions()
         self.endpoint = endpoint
-        self.name = name
+        self.name = o.name
         self.counters = LinkCounters()
         self.system_id = 0
         self._handler = handler
-        self._reader = FrameReader(wanted, signing_key, window)
-        self._window = window
-        self._only, self._follow_hosts_after_s = sender, follow_hosts_after_s
-        self._key, self._key_link = signing_key, signing_link_id
-        self._recorder = recorder
-        self._timeout_ns = int(timeout_s * 1e9)
-        self._open = opener
+        self._reader = FrameReader(o.wanted, o.signing_key, o.window)
+        self._window = o.window
+        self._only, self._follow_hosts_after_s = o.sender, o.follow_hosts_after_s
+        self._key, self._key_link = o.signing_key, o.signing_link_id
+        self._recorder = o.recorder
+        self._timeout_ns = int(o.timeout_s * 1e9)
+        self._open = o.opener
         self._packers: dict[int, Any] = {}
         self._outbox: deque[tuple[Any, int]] = deque(maxlen=_OUTBOX)
         self._unsent = bytearray()
         self._broken: OSError | None = None
-        self._stop = threading.Event() if stop is None else stop
+        self._stop = threading.Event() if o.stop is None else o.stop
         self._thread: threading.Thread | None = None
         self._transport: Transport | None = None
         self._waker = WakePipe()

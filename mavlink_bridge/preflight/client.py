@@ -11,7 +11,7 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from mavlink_bridge.config import BridgeConfig
 from mavlink_bridge.errors import ConnectionSilentError
-from mavlink_bridge.link.link import Link
+from mavlink_bridge.link.link import Link, LinkOptions
 from mavlink_bridge.link.signing import load_key
 from mavlink_bridge.link.transport import Endpoint
 from mavlink_bridge.vehicle.readings import is_autopilot
@@ -35,10 +35,12 @@ class VehicleClient:
         self._link = Link(
             Endpoint.parse(config.connection),
             self,
-            name=name,
-            wanted={mavlink.MAVLINK_MSG_ID_HEARTBEAT, *wanted},
-            signing_key=key,
-            signing_link_id=1 if config.signing is None else config.signing.link_id,
+            LinkOptions(
+                name=name,
+                wanted={mavlink.MAVLINK_MSG_ID_HEARTBEAT, *wanted},
+                signing_key=key,
+                signing_link_id=1 if config.signing is None else config.signing.link_id,
+            ),
         )
         self._changed = threading.Condition()
         self.system = 0

@@ -85,13 +85,19 @@ def _parallel(line: Array, offset_m: float) -> Array:
     return moved
 
 
+@dataclass(frozen=True)
+class Crowd:
+    """Movers of one kind: their names begin with `prefix`, their speeds are between two."""
+
+    prefix: str
+    meshes: Sequence[TileMesh]
+    speeds_mps: tuple[float, float]
+
+
 def spread(
+    crowd: Crowd,
     paths: Sequence[Array],
-    meshes: Sequence[TileMesh],
     count: int,
-    *,
-    prefix: str,
-    speeds_mps: tuple[float, float],
     rng: np.random.Generator,
     epoch_ns: int = 0,
 ) -> tuple[Mover, ...]:
@@ -102,11 +108,11 @@ def spread(
     chosen = rng.choice(len(paths), count, p=lengths / lengths.sum())
     return tuple(
         Mover(
-            name=f"{prefix}{i}",
+            name=f"{crowd.prefix}{i}",
             path=paths[k],
-            speed_mps=float(rng.uniform(*speeds_mps)),
+            speed_mps=float(rng.uniform(*crowd.speeds_mps)),
             phase_m=float(rng.uniform(0, lengths[k])),
-            mesh=meshes[int(rng.integers(len(meshes)))],
+            mesh=crowd.meshes[int(rng.integers(len(crowd.meshes)))],
             epoch_ns=epoch_ns,
         )
         for i, k in enumerate(chosen)

@@ -9,7 +9,7 @@ from localizer.geometry.geo import LocalFrame
 from localizer.geometry.pose import Array
 from localizer.synth.tiles.props import CAR_COLOURS, car_mesh, person_mesh
 from localizer.synth.world import WorldInfo
-from sitl.camera.movers import Mover, spread, there_and_back
+from sitl.camera.movers import Crowd, Mover, spread, there_and_back
 
 # From the right-hand lane that a world gives: the lane of the other direction is 4.4 m to its left.
 _OTHER_LANE_M = 4.4
@@ -42,16 +42,12 @@ def traffic(
     ]
     car_meshes = [car_mesh(colour, seed=i) for i, colour in enumerate(CAR_COLOURS)]
     person_meshes = [person_mesh(clothes) for clothes in _CLOTHES]
+    all_cars = Crowd("car", car_meshes, _CAR_MPS)
+    all_people = Crowd("person", person_meshes, _WALK_MPS)
     return (
-        *spread(
-            driving, car_meshes, cars, prefix="car", speeds_mps=_CAR_MPS, rng=rng,
-            epoch_ns=epoch_ns,
-        ),
-        *spread(
-            walking, person_meshes, people, prefix="person", speeds_mps=_WALK_MPS, rng=rng,
-            epoch_ns=epoch_ns,
-        ),
-    )  # fmt: skip
+        *spread(all_cars, driving, cars, rng, epoch_ns),
+        *spread(all_people, walking, people, rng, epoch_ns),
+    )
 
 
 def _path(

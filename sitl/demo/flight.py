@@ -35,6 +35,7 @@ from sitl.ground.pilot import Pilot
 from sitl.vehicles.launch import (
     GIMBAL,
     SPEEDS,
+    VehicleSetup,
     gps_input_parameters,
     open_vehicle,
     vision_parameters,
@@ -73,11 +74,10 @@ def fly(
     ports = Ports(free_udp_port(), free_udp_port())
     with ExitStack() as stack:
         progress("starting the vehicle", 0.0)
-        vehicle = stack.enter_context(
-            open_vehicle(
-                kind, home, 0.0, vehicle_parameters(scenario), seed=seed, log=folder / "vehicle.log"
-            )
+        setup = VehicleSetup(
+            parameters=vehicle_parameters(scenario), seed=seed, log=folder / "vehicle.log"
         )
+        vehicle = stack.enter_context(open_vehicle(kind, home, setup))
         pilot = stack.enter_context(Pilot(vehicle.gcs_endpoint, alive=vehicle.check))
         progress("waiting for GNSS and the EKF", 0.0)
         with pilot.fast_forward():

@@ -93,13 +93,34 @@ class FlightReport:
     warning: str | None
 
 
+@dataclass(frozen=True)
+class _Tables:
+    """A flight's records as they are read from its folder."""
+
+    truth: Columns
+    estimates: Columns
+    targets: Columns
+    vehicle: Columns
+
+    @classmethod
+    def read(cls, folder: Path) -> _Tables:
+        """What the camera, the companion and the vehicle left."""
+        record = folder / "companion"
+        return cls(
+            read_columns(folder / "frames.csv"),
+            read_columns(record / "estimates.csv", text=("state", "status")),
+            read_columns(record / "targets.csv", text=("target_id", "visibility")),
+            read_columns(folder / "vehicle.csv"),
+        )
+
+
 def make_report(record: FlightRecord, scenario: Scenario, seed: int) -> FlightReport:
     """Measure the records and write report.json, frames, plots and overlays into their folder."""
     folder, span = record.folder, record.denied_ns
-    truth = read_columns(folder / "frames.csv")
-    estimates = read_columns(folder / "companion" / "estimates.csv", text=("state", "status"))
-    targets = read_columns(folder / "companion" / "targets.csv", text=("target_id", "visibility"))
-    vehicle = read_columns(folder / "vehicle.csv")
+    tables = _Tables.read(folder)
+    truth, estimates, targets, vehicle = (
+        tables.truth, tables.estimates, tables.targets, tables.vehicle
+    )  # fmt: skip
     errors = frame_errors(truth, estimates, span)
     shift_m = record.errors.map_shift_m
     _, absolute, _ = ekf_errors(vehicle, span)
@@ -146,7 +167,7 @@ def make_report(record: FlightRecord, scenario: Scenario, seed: int) -> FlightRe
     )
     _write_json(folder, report, record, scenario, seed, config)
     _write_frames(folder / "frames_report.csv", errors)
-    _plot(folder, record, truth, (estimates, targets), vehicle, (ekf_times, horizontal), config)
+    _plot(record, tables, (ekf_times, horizontal), config)
     return report
 
 
@@ -202,18 +223,12 @@ def _cell(value: float) -> str:
 
 
 def _plot(
-    folder: Path,
-    record: FlightRecord,
-    truth: Columns,
-    recorded: tuple[Columns, Columns],
-    vehicle: Columns,
-    ekf: tuple[Array, Array],
-    config: CompanionConfig,
+    record: FlightRecord, tables: _Tables, ekf: tuple[Array, Array], config: CompanionConfig
 ) -> None:
-    """recorded: the companion's estimates and targets."""
-    estimates, targets = recorded
-    start = record.denied_ns[0]
-    all_errors = frame_errors(truth, estimates, (0, 2**62))
+    """ekf: times in ns and horizontal errors."""
+    folder, start = record.folder, record.denied_ns[0]
+    estimates, vehicle = tables.estimates, tables.vehicle
+    all_errors = frame_errors(tables.truth, estimates, (0, 2**62))
     exposed_s = _seconds(all_errors.time_ns, start)
     series = [
         ErrorSeries("localizer", exposed_s, all_errors.translation_m, "3-D position error, m"),
@@ -240,7 +255,7 @@ def _plot(
         denied = min(int(np.searchsorted(vehicle["time_ns"], start)), len(tracks["truth"]) - 1)
         marks["GNSS off"] = tracks["truth"][denied]
         picture = _map_picture(renderer, tracks.values())
-        plot_tracks(folder / "tracks.png", tracks, picture, marks, _located(targets))
+        plot_tracks(folder / "tracks.png", tracks, picture, marks, _located(tables.targets))
         _overlays(folder, (estimates, all_errors), renderer, config, start)
     finally:
         streamer.close()

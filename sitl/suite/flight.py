@@ -21,7 +21,7 @@ from sitl.suite.case import Case, Event
 from sitl.suite.doctor import consult
 from sitl.suite.record import Record, Sample, Text
 from sitl.suite.simulated_localizer import BridgeFeed, FixModel, FixSink, TruthFeed
-from sitl.vehicles.launch import open_vehicle
+from sitl.vehicles.launch import VehicleSetup, open_vehicle
 from sitl.vehicles.process import VehicleKind, VehicleProcess, VehicleProcessError
 
 HOME = Location(47.397742, 8.545594, 488.0)
@@ -42,7 +42,8 @@ def fly(case: Case, kind: VehicleKind, seed: int = 0) -> Record:
     with ExitStack() as stack:
         speedup = 1.0 if case.raw is None else _RAW_SPEEDUP
         parameters = case.vehicle.all_parameters()
-        vehicle = open_vehicle(kind, HOME, 0.0, parameters, speedup=speedup, seed=seed)
+        setup = VehicleSetup(parameters=parameters, speedup=speedup, seed=seed)
+        vehicle = open_vehicle(kind, HOME, setup)
         return _CaseFlight(case, stack.enter_context(vehicle), stack, seed).run()
 
 

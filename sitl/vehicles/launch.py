@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
@@ -134,21 +135,29 @@ class EmbeddedSitl(VehicleProcess):
         ]
 
 
+@dataclass(frozen=True)
+class VehicleSetup:
+    """How a vehicle stands and runs. parameters: beside the vehicle's own; seed: of the embedded
+    vehicle, ArduPilot draws its own noise; log: where what it prints is kept.
+    """
+
+    heading_deg: float = 0.0
+    parameters: dict[str, float] | None = None
+    speedup: float = 1.0
+    seed: int = 0
+    log: Path | None = None
+
+
 def open_vehicle(
     kind: Literal["auto", "ardupilot", "embedded"],
     home: Location,
-    heading_deg: float = 0.0,
-    parameters: dict[str, float] | None = None,
-    *,
-    speedup: float = 1.0,
-    seed: int = 0,
-    log: Path | None = None,
+    setup: VehicleSetup | None = None,
 ) -> VehicleProcess:
     """A vehicle that is not started yet; "auto" is ArduPilot where its binary is found.
 
-    home: altitude AMSL. The seed is for the embedded vehicle; ArduPilot draws its own noise. log:
-    where what it prints is kept.
+    home: altitude AMSL.
     """
+    s = setup or VehicleSetup()
     if kind == "ardupilot" or (kind == "auto" and find_arducopter() is not None):
-        return ArduPilotSitl(home, heading_deg, parameters, speedup, log)
-    return EmbeddedSitl(home, heading_deg, parameters, speedup, seed, log)
+        return ArduPilotSitl(home, s.heading_deg, s.parameters, s.speedup, s.log)
+    return EmbeddedSitl(home, s.heading_deg, s.parameters, s.speedup, s.seed, s.log)

@@ -30,7 +30,7 @@ from sitl.suite.loop.case import LoopCase, LoopEvent, PlaceHint, Wrong
 from sitl.suite.loop.companion import LoopCompanion
 from sitl.suite.loop.disturbances import GnssDrag, OtherWork
 from sitl.suite.loop.judge import LoopRecord, LoopSample, LoopText
-from sitl.vehicles.launch import VISION_SOURCE, open_vehicle
+from sitl.vehicles.launch import VISION_SOURCE, VehicleSetup, open_vehicle
 from sitl.vehicles.process import VehicleKind, VehicleProcess
 
 _STEP_S = 0.25
@@ -152,7 +152,8 @@ class _LoopFlight:
     def _open_vehicle(self) -> VehicleProcess:
         log = self._out / "vehicle.log"
         parameters = vehicle_parameters(self._case.scenario) | self._case.vehicle
-        vehicle = open_vehicle(self._kind, self._home, 0.0, parameters, seed=self._seed, log=log)
+        setup = VehicleSetup(parameters=parameters, seed=self._seed, log=log)
+        vehicle = open_vehicle(self._kind, self._home, setup)
         return self._stack.enter_context(vehicle)
 
     def _write_deployment(self, vehicle: VehicleProcess) -> Path:

@@ -22,7 +22,7 @@ from mavlink_bridge import Bridge, BridgeConfig
 from mavlink_bridge.config import InjectionConfig, SigningConfig, TargetsConfig
 from mavlink_bridge.errors import BridgeStateError, EndpointError
 from mavlink_bridge.link.framing import FrameReader
-from mavlink_bridge.link.link import Link, sleep_until
+from mavlink_bridge.link.link import Link, LinkOptions, sleep_until
 from mavlink_bridge.link.signing import create_key
 from mavlink_bridge.link.transport import Endpoint, UdpTransport, open_transport
 from mavlink_bridge.link.waking import WakePipe
@@ -64,7 +64,7 @@ def start() -> Iterator[Callable[..., tuple[Link, Recorder]]]:
 
     def make(endpoint: str, **options: Any) -> tuple[Link, Recorder]:
         handler = Recorder()
-        link = Link(Endpoint.parse(endpoint), handler, **options)
+        link = Link(Endpoint.parse(endpoint), handler, LinkOptions(**options))
         link.system_id = 1
         links.append(link)
         link.start()

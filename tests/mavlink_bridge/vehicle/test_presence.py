@@ -14,7 +14,7 @@ import pytest
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from mavlink_bridge import Bridge, BridgeConfig, HealthLevel, VehicleState
-from mavlink_bridge.link.link import Link, sleep_until
+from mavlink_bridge.link.link import Link, LinkOptions, sleep_until
 from mavlink_bridge.link.transport import Endpoint, Transport, open_transport
 from mavlink_bridge.status import OperatorStatus
 from mavlink_bridge.vehicle.presence import VehicleWatch
@@ -62,7 +62,7 @@ def test_the_handlers_clock_goes_on_while_the_transport_is_closed(
             return self.is_set()
 
     ticks = Ticks()
-    link = Link(Endpoint.parse("tcp:127.0.0.1:9"), ticks, opener=refuse, stop=Stop())
+    link = Link(Endpoint.parse("tcp:127.0.0.1:9"), ticks, LinkOptions(opener=refuse, stop=Stop()))
     link.system_id = 1
     for _ in range(700):
         link.send(HEARTBEAT, 191)
@@ -97,7 +97,7 @@ def test_an_unforeseen_error_costs_the_connection_and_not_the_link() -> None:
             self.socket.close()
             self.other.close()
 
-    link = Link(Endpoint.parse("tcp:127.0.0.1:9"), Ticks(), opener=lambda _: Broken())
+    link = Link(Endpoint.parse("tcp:127.0.0.1:9"), Ticks(), LinkOptions(opener=lambda _: Broken()))
     link.start()
     assert sleep_until(lambda: link.counters.failures >= 3, 30.0)
     link.stop()
@@ -125,7 +125,7 @@ def test_a_write_that_fails_reconnects_at_once_and_is_no_error_of_the_handler() 
             self.socket.close()
             self.other.close()
 
-    link = Link(Endpoint.parse("tcp:127.0.0.1:9"), Ticks(), opener=lambda _: Deaf())
+    link = Link(Endpoint.parse("tcp:127.0.0.1:9"), Ticks(), LinkOptions(opener=lambda _: Deaf()))
     link.system_id = 1
     link.start()
     assert sleep_until(lambda: link.counters.opened >= 3, 30.0)

@@ -9,7 +9,7 @@ from companion.geometry import GimbalAngles, Mount
 from localizer.geometry.geo import Geodetic, LocalFrame
 from localizer.geometry.pose import Pose, matrix_from_euler, quaternion_from_matrix, so3_exp
 from localizer.map.cache.tile import TileMesh
-from sitl.camera.movers import Mover, spread, there_and_back
+from sitl.camera.movers import Crowd, Mover, spread, there_and_back
 from sitl.camera.true_motion import PoseTrack, TruthSample, camera_pose
 
 MESH = TileMesh(
@@ -87,8 +87,8 @@ def test_there_and_back_keeps_to_the_right() -> None:
 
 def test_the_same_seed_spreads_the_same_movers() -> None:
     def make(seed: int) -> list[tuple[float, ...]]:
-        movers = spread([SQUARE, SQUARE * 3], [MESH], 12, prefix="car", speeds_mps=(6, 14),
-                        rng=np.random.default_rng(seed))  # fmt: skip
+        crowd = Crowd("car", [MESH], (6, 14))
+        movers = spread(crowd, [SQUARE, SQUARE * 3], 12, np.random.default_rng(seed))
         return [tuple(m.position_at(10**10)) for m in movers]
 
     assert make(1) == make(1)

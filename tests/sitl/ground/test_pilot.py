@@ -31,7 +31,14 @@ from sitl.ground.tracks import LeastLatencyClock, Track
 from sitl.suite.simulated_localizer import FixModel, TruthFeed
 from sitl.vehicles import ardupilot, process
 from sitl.vehicles.ardupilot import ArduPilotNotFoundError, ArduPilotSitl, find_arducopter
-from sitl.vehicles.launch import GIMBAL, SPEEDS, EmbeddedSitl, open_vehicle, vision_parameters
+from sitl.vehicles.launch import (
+    GIMBAL,
+    SPEEDS,
+    EmbeddedSitl,
+    VehicleSetup,
+    open_vehicle,
+    vision_parameters,
+)
 from sitl.vehicles.process import VehicleProcess, VehicleProcessError
 
 HOME = Location(47.397742, 8.545594, 488.0)
@@ -219,7 +226,7 @@ def test_flies_a_mission_on_gps_and_then_on_vision(real_time, kind):
     parameters = {**vision_parameters(), **GIMBAL, **SPEEDS}
     with (
         real_time(),
-        open_vehicle(kind, HOME, 30.0, parameters, speedup=SPEEDUP) as vehicle,
+        open_vehicle(kind, HOME, VehicleSetup(30.0, parameters, SPEEDUP)) as vehicle,
     ):
         pilot = Pilot(vehicle.gcs_endpoint, SPEEDUP, vehicle.check)
         with pilot:
@@ -267,7 +274,7 @@ def _check_gimbal(pilot):
 
 
 def test_a_vehicle_comes_back_on_its_ports(kind):
-    with open_vehicle(kind, HOME, 0.0, {}, speedup=SPEEDUP) as vehicle:
+    with open_vehicle(kind, HOME, VehicleSetup(0.0, {}, SPEEDUP)) as vehicle:
         endpoint = vehicle.gcs_endpoint
         with Pilot(endpoint, SPEEDUP, vehicle.check) as pilot:
             pilot.link.sleep(5)
@@ -279,7 +286,7 @@ def test_a_vehicle_comes_back_on_its_ports(kind):
 
 
 def test_a_reboot_by_command_keeps_the_parameters(kind):
-    with open_vehicle(kind, HOME, 0.0, {}, speedup=SPEEDUP) as vehicle:
+    with open_vehicle(kind, HOME, VehicleSetup(0.0, {}, SPEEDUP)) as vehicle:
         with Pilot(vehicle.gcs_endpoint, SPEEDUP, vehicle.check) as pilot:
             pilot.link.set_parameter("VISO_TYPE", 1)
             pilot.link.sleep(5)
@@ -292,7 +299,7 @@ def test_a_reboot_by_command_keeps_the_parameters(kind):
 
 
 def test_waiting_for_a_vehicle_that_died_ends_at_once():
-    with open_vehicle("embedded", HOME, 0.0, {}, speedup=SPEEDUP) as vehicle:
+    with open_vehicle("embedded", HOME, VehicleSetup(0.0, {}, SPEEDUP)) as vehicle:
         pilot = Pilot(vehicle.gcs_endpoint, SPEEDUP, vehicle.check)
         with pilot:
             vehicle.stop()
@@ -303,7 +310,7 @@ def test_waiting_for_a_vehicle_that_died_ends_at_once():
 
 
 def test_refusals_reach_the_pilot(kind):
-    with open_vehicle(kind, HOME, 0.0, {"SIM_GPS1_ENABLE": 0}, speedup=SPEEDUP) as vehicle:
+    with open_vehicle(kind, HOME, VehicleSetup(0.0, {"SIM_GPS1_ENABLE": 0}, SPEEDUP)) as vehicle:
         pilot = Pilot(vehicle.gcs_endpoint, SPEEDUP, vehicle.check)
         with pilot:
             pilot.link.sleep(26)
