@@ -24,6 +24,7 @@ from benchmarks.basin.views import (
     store_renders,
 )
 from localizer.map.building.build import build_cache
+from localizer.map.building.options import BuildOptions
 from localizer.map.importers.rules import ImportRules
 from localizer.types import Float32, Image
 
@@ -128,11 +129,13 @@ def _build(sources: list[Path], cache: Path) -> None:
     build_cache(
         sources,
         cache,
-        geoid_separation_m=0.0,
-        vertical_datum="ellipsoidal",
-        rules=ImportRules(trusted=frozenset({"geoid"})),
-        overwrite=True,
-        workers=1,
+        BuildOptions(
+            geoid_separation_m=0.0,
+            vertical_datum="ellipsoidal",
+            rules=ImportRules(trusted=frozenset({"geoid"})),
+            overwrite=True,
+            workers=1,
+        ),
     )
 
 

@@ -14,7 +14,7 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from mavlink_bridge.config import BridgeConfig, SigningConfig
 from mavlink_bridge.link.clock import monotonic_ns
-from mavlink_bridge.link.link import Link
+from mavlink_bridge.link.link import Link, LinkOptions
 from mavlink_bridge.link.signing import load_key
 from mavlink_bridge.link.transport import Endpoint
 
@@ -91,8 +91,10 @@ def _link(connection: str, signing: SigningConfig | None, speaker: _Speaker) -> 
     return Link(
         Endpoint.parse(connection),
         speaker,
-        name="last words",
-        wanted=_HEARD,
-        signing_key=None if signing is None else load_key(signing.key_file),
-        signing_link_id=1 if signing is None else signing.link_id,
+        LinkOptions(
+            name="last words",
+            wanted=_HEARD,
+            signing_key=None if signing is None else load_key(signing.key_file),
+            signing_link_id=1 if signing is None else signing.link_id,
+        ),
     )
