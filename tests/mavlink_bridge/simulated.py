@@ -106,6 +106,7 @@ class Flight:
         self.latency_ms = 50
         self.sees = True
         self.yaw_is_seen = True
+        self.yaw_error_rad = 0.0
         self.mangle: Callable[[bytes], bytes] = lambda frame: frame
         self._answered = 0
 
@@ -146,7 +147,7 @@ class Flight:
             988.0 + GEOID,
             0.0,
             0.0,
-            self.yaw(exposure_ns) if self.yaw_is_seen else None,
+            self.yaw(exposure_ns) + self.yaw_error_rad if self.yaw_is_seen else None,
             np.eye(3) * 0.04,
             reset=self.reset_next,
         )

@@ -483,6 +483,24 @@ def test_a_target_from_the_future_is_not_reported_for_ever(flight: Flight) -> No
     assert not [m for _, m, _ in flight.link.sent if m.get_type() == "CAMERA_TRACKING_GEO_STATUS"]
 
 
+def test_what_keeps_vision_from_the_ekf_stands_as_its_trouble(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """A gimbal 10 degrees off, whose fixes the yaw guard refuses; an EKF that is elsewhere."""
+    flight = Flight(monkeypatch)
+    flight.run(6.0)
+    assert flight.end.trouble == ""
+    flight.yaw_error_rad = 0.17
+    flight.run(6.0)
+    assert "not sent: vision yaw differs" in flight.end.trouble
+    flight.yaw_error_rad = 0.0
+    flight.run(12.0)
+    assert flight.end.trouble == ""
+    flight.ekf_north_m = 20.0
+    flight.run(6.0)
+    assert "20.0 m from what is sent" in flight.end.trouble
+
+
 def test_a_blind_yaw_guard_is_told_once(monkeypatch: pytest.MonkeyPatch) -> None:
     flight = Flight(monkeypatch)
     monkeypatch.setattr(flight, "yaw", lambda _: 0.0)
