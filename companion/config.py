@@ -94,6 +94,15 @@ class FeedConfig(_Model):
     )
     settings: SourceSettings = SourceSettings()
 
+    @model_validator(mode="after")
+    def _sender_is_of_udp(self) -> FeedConfig:
+        if self.settings.sender is not None and not self.source.startswith("udp://"):
+            raise ValueError(
+                "settings.sender chooses among the senders of a udp:// feed; this source has none: "
+                "remove it"
+            )
+        return self
+
 
 class TargetConfig(_Model):
     """Target geo-localization."""

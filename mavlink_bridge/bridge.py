@@ -86,7 +86,10 @@ class Bridge:
                 config.tlog, lambda why: teller.warn(f"tlog is incomplete: {why}")
             )
         self._tracker = VehicleTracker(
-            config.system_id, _mount(config), config.camera.mount == "fixed"
+            config.system_id,
+            _mount(config),
+            config.camera.mount == "fixed",
+            (config.camera.gimbal_component, config.camera.gimbal_device),
         )
         self._shared = shared = Shared(
             config,

@@ -155,6 +155,12 @@ class CameraConfig(_Model):
     horizontal_fov_deg: float = Field(default=60.0, ge=0.1, lt=180.0)
     stream_uri: str = Field(default="", max_length=159)
     mount: Literal["gimbal", "fixed"] = "gimbal"
+    gimbal_component: int = Field(
+        default=0, ge=0, le=255, description="whose angles count where there are several; 0: any"
+    )
+    gimbal_device: int = Field(
+        default=0, ge=0, le=255, description="its gimbal_device_id; 0: the first that is heard"
+    )
     mount_roll_deg: float = Field(default=0.0, ge=-180.0, le=180.0)
     mount_pitch_deg: float = Field(default=0.0, ge=-180.0, le=180.0)
     mount_yaw_deg: float = Field(default=0.0, ge=-180.0, le=180.0)
@@ -280,6 +286,15 @@ class BridgeConfig(_Model):
         components = (self.localizer_component, self.companion_component, self.camera_component)
         if len(set(components)) < 3:
             raise ValueError("localizer, companion and camera need a component id each")
+        return self
+
+    @model_validator(mode="after")
+    def _sender_is_of_udpin(self) -> BridgeConfig:
+        if self.sender is not None and not self.connection.startswith("udpin:"):
+            raise ValueError(
+                f"sender chooses among the senders of a udpin connection; {self.connection} has "
+                "one peer: remove it"
+            )
         return self
 
     @model_validator(mode="after")

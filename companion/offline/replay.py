@@ -172,7 +172,12 @@ class _Autopilot:
             )
         )
         self._now_ns = record.start_ns
-        self._tracker = VehicleTracker(bridge.system_id, mount, bridge.camera.mount == "fixed")
+        self._tracker = VehicleTracker(
+            bridge.system_id,
+            mount,
+            bridge.camera.mount == "fixed",
+            (bridge.camera.gimbal_component, bridge.camera.gimbal_device),
+        )
         dated = ((utc - record.utc_minus_monotonic_ns, m) for utc, m in read_tlog(tlog))
         # A .tlog is appended to: earlier flights may stand before this one.
         self._messages = (item for item in dated if item[0] >= record.start_ns)

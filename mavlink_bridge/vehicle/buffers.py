@@ -16,6 +16,7 @@ _LENGTH = 512
 MAX_GAP_NS = 500_000_000
 _MAX_EXTRAPOLATION_NS = 100_000_000
 _GIMBAL_FALLBACK_NS = 1_000_000_000
+_GIMBAL_GONE_NS = 3_000_000_000
 
 # Best first: a poorer source is only used while no better one speaks.
 GIMBAL_SOURCES = ("GIMBAL_DEVICE_ATTITUDE_STATUS", "MOUNT_ORIENTATION", "MOUNT_STATUS")
@@ -44,13 +45,15 @@ class VectorSample:
 class GimbalSample:
     """One gimbal message: gimbal to the horizon frame that points to north or to the nose.
 
-    earth_frame: yaw is from true north, else from the vehicle's heading.
+    earth_frame: yaw is from true north, else from the vehicle's heading. device: component and
+    gimbal_device_id that it is of.
     """
 
     time_ns: int
     quaternion: quat.Quaternion
     earth_frame: bool
     source: str
+    device: tuple[int, int] = (0, 0)
 
 
 def attitude(
@@ -172,19 +175,41 @@ class InertialBuffer:
 
 
 class GimbalBuffer:
-    """The last gimbal attitudes of the best source that speaks."""
+    """The last gimbal attitudes of the best source that speaks, and of one gimbal only.
 
-    def __init__(self) -> None:
+    The first gimbal that is heard is followed as long as it speaks: the angles of two, mixed, are
+    those of none. device: the (component, gimbal_device_id) to follow instead, 0 for any. others:
+    which were heard besides.
+    """
+
+    def __init__(self, device: tuple[int, int] = (0, 0)) -> None:
         self._samples: deque[GimbalSample] = deque(maxlen=_LENGTH)
+        self._wanted = device
+        self.others: set[tuple[int, int]] = set()
+
+    @property
+    def device(self) -> tuple[int, int] | None:
+        """Whose angles are used; None before the first."""
+        return self._samples[-1].device if self._samples else None
 
     def clear(self) -> None:
         """Forget all."""
         self._samples.clear()
 
     def add(self, sample: GimbalSample) -> None:
-        """Append, unless a better source spoke within the last second."""
+        """Append, unless a better source, or the gimbal that is followed, spoke of late."""
+        if not self._is_wanted(sample.device):
+            self.others.add(sample.device)
+            return
         if self._samples:
             newest = self._samples[-1]
+            if sample.source == newest.source and sample.device != newest.device:
+                self.others.add(sample.device)
+                if sample.time_ns - newest.time_ns < _GIMBAL_GONE_NS:
+                    return
+                self._samples.clear()
+                self._samples.append(sample)
+                return
             rank = GIMBAL_SOURCES.index(sample.source)
             worse = rank > GIMBAL_SOURCES.index(newest.source)
             age = sample.time_ns - newest.time_ns
@@ -194,6 +219,10 @@ class GimbalBuffer:
                 # Angles of two frames cannot be interpolated.
                 self._samples.clear()
         self._samples.append(sample)
+
+    def _is_wanted(self, device: tuple[int, int]) -> bool:
+        pairs = zip(self._wanted, device, strict=True)
+        return all(wanted in (0, given) for wanted, given in pairs)
 
     def at(self, time_ns: int) -> GimbalSample | None:
         """Interpolated sample; the newest is held for 0.5 s (a gimbal moves slowly)."""

@@ -32,6 +32,8 @@ _RATE_RADPS = 100.0
 _FORCE_MPS2 = 1_000.0
 _DISTANCE_M = 1e6
 _SPEED_MPS = 1_000.0
+_FIX_3D = 3  # GPS_FIX_TYPE
+_HEIGHTS_MM = (-1_000_000, 50_000_000)  # AMSL: the Dead Sea's shore, and above any aircraft
 
 
 def is_autopilot(message: Any) -> bool:
@@ -56,14 +58,15 @@ def gimbal_in_earth_frame(flags: int) -> bool:
 class VehicleReadings:
     """The newest of everything and buffers of what is interpolated; the tracker's lock guards it.
 
-    globals: the EKF's latitude, longitude, altitude AMSL. locals: its NED from the origin.
+    globals: the EKF's latitude, longitude, altitude AMSL. locals: its NED from the origin. gimbal:
+    component and device whose angles count, 0 for any.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, gimbal: tuple[int, int] = (0, 0)) -> None:
         self.state = VehicleState()
         self.heartbeat_ns: int | None = None
         self.attitudes = AttitudeBuffer()
-        self.gimbals = GimbalBuffer()
+        self.gimbals = GimbalBuffer(gimbal)
         self.globals = VectorBuffer()
         self.locals = VectorBuffer()
         self.inertial = InertialBuffer()
@@ -125,7 +128,9 @@ class VehicleReadings:
 
     def _gimbal_device(self, m: Any, time_ns: int) -> None:
         earth = gimbal_in_earth_frame(m.flags)
-        self.gimbals.add(GimbalSample(time_ns, quat.normalise(m.q), earth, GIMBAL_SOURCES[0]))
+        q = quat.normalise(m.q)
+        device = (m.get_srcComponent(), getattr(m, "gimbal_device_id", 0))
+        self.gimbals.add(GimbalSample(time_ns, q, earth, GIMBAL_SOURCES[0], device))
 
     def _mount_orientation(self, m: Any, time_ns: int) -> None:
         roll, pitch, yaw = (math.radians(a) for a in (m.roll, m.pitch, m.yaw))
@@ -155,8 +160,7 @@ class VehicleReadings:
     def _global_position(self, m: Any, time_ns: int) -> None:
         if m.lat == 0 and m.lon == 0:
             return  # what firmwares send before they have a position
-        if abs(m.lat) > 900_000_000 or abs(m.lon) > 1_800_000_000:
-            raise ValueError(f"no place on Earth: {m.lat}, {m.lon}")
+        _check_place(m.lat, m.lon)
         self.globals.add(time_ns, (m.lat * 1e-7, m.lon * 1e-7, m.alt * 1e-3))
         self.state = replace(
             self.state,
@@ -189,6 +193,14 @@ class VehicleReadings:
         )
 
     def _gps(self, m: Any, time_ns: int) -> None:
+        if m.fix_type >= _FIX_3D:
+            # A receiver that claims a fix where there is no place is none: its report is not heard
+            # at all, and GNSS counts as gone once no better one comes.
+            _check_place(m.lat, m.lon)
+            if m.lat == 0 and m.lon == 0:
+                raise ValueError("a 3D fix at 0, 0")
+            if not _HEIGHTS_MM[0] <= m.alt <= _HEIGHTS_MM[1]:
+                raise ValueError(f"{m.alt} mm is no height of an aircraft")
         accuracy = getattr(m, "h_acc", 0)
         height = getattr(m, "alt_ellipsoid", 0)  # an extension: 0 where it is not sent
         self.state = replace(
@@ -241,6 +253,11 @@ def boot_time_ns(message: Any) -> int | None:
 def _known(value: float) -> float | None:
     """A field's value, None where it is NaN: the estimator does not say."""
     return None if math.isnan(value) else value
+
+
+def _check_place(latitude_e7: int, longitude_e7: int) -> None:
+    if abs(latitude_e7) > 900_000_000 or abs(longitude_e7) > 1_800_000_000:
+        raise ValueError(f"no place on Earth: {latitude_e7}, {longitude_e7}")
 
 
 def _check_within(limit: float, *values: float) -> None:

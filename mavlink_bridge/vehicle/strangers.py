@@ -52,6 +52,10 @@ class StrangerWatch:
         """Other hosts on the port; two vehicles of the same ids: their boot times alternate."""
         if link.stranger:
             self._teller.tell("foreign", f"MAVLink of {link.stranger} ignored")
+        others = self._tracker.other_gimbals
+        if others and not self._config.camera.gimbal_component:
+            component, device = others[0]
+            self._teller.tell("gimbals", f"another gimbal ignored: {component}, device {device}")
         clock = self._tracker.clock
         if self._twins.two(now_ns, clock.strays + clock.reboots):
             system = link.system_id

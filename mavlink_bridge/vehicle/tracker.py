@@ -28,12 +28,21 @@ _OLD_NS = 2_000_000_000
 
 
 class VehicleTracker:
-    """Follows one vehicle's messages. `handle` runs in the link's thread, the rest anywhere."""
+    """Follows one vehicle's messages. `handle` runs in the link's thread, the rest anywhere.
 
-    def __init__(self, system_id: int | None, mount: quat.Quaternion, fixed_camera: bool) -> None:
+    gimbal: component and gimbal_device_id whose angles count, 0 for any.
+    """
+
+    def __init__(
+        self,
+        system_id: int | None,
+        mount: quat.Quaternion,
+        fixed_camera: bool,
+        gimbal: tuple[int, int] = (0, 0),
+    ) -> None:
         self.clock = BootClock()
         self._lock = threading.Lock()
-        self._readings = VehicleReadings()
+        self._readings = VehicleReadings(gimbal)
         self._wanted_id = system_id
         self._mount = mount
         self._fixed = fixed_camera
@@ -52,6 +61,12 @@ class VehicleTracker:
                 clock_offset_ns=self.clock.offset_ns,
                 clock_source=self.clock.source,
             )
+
+    @property
+    def other_gimbals(self) -> tuple[tuple[int, int], ...]:
+        """Gimbals that are heard besides the one whose angles are used: (component, device)."""
+        with self._lock:
+            return () if self._fixed else tuple(sorted(self._readings.gimbals.others))
 
     def attitude_at(self, time_ns: int) -> Attitude | None:
         """The vehicle's attitude at a time."""

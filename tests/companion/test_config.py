@@ -38,6 +38,7 @@ def test_minimal_config_and_paths_relative_to_the_file(tmp_path):
     [
         ({"mapp": "x"}, r"mapp: no such setting \(got 'x'\)"),
         ({"localizer": {"width": "wide"}}, "localizer.width"),
+        ({"camera": {**CAMERA, "source": "frames", "settings": {"sender": "127.0.0.1"}}}, "udp://"),
         ({"targets": {"rate_hz": True}}, "targets.rate_hz: Input should not be a boolean"),
         ({"camera": CAMERA | {"lever_arm_m": [0, True, 0]}}, r"camera.lever_arm_m.1.*\(got True"),
         ({"localizer": {"motion": {"acceleration_sigma": -1}}}, "acceleration_sigma"),

@@ -526,3 +526,10 @@ def test_a_key_file_that_changes_while_the_link_runs_changes_nothing(
             assert heard(server, reader)
             assert bridge.counters()["fc_opened"] >= 2
     assert reader.counters.bad_signatures == 0
+
+
+@pytest.mark.parametrize("connection", ["tcp:127.0.0.1:5760", "udpout:127.0.0.1:14550"])
+def test_a_sender_where_there_is_one_peer_is_refused(connection: str) -> None:
+    """It was ignored without a word, and looked like a guard."""
+    with pytest.raises(ValidationError, match="udpin"):
+        BridgeConfig(connection=connection, sender="127.0.0.1")

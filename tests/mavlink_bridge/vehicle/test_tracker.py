@@ -3,18 +3,22 @@
 from __future__ import annotations
 
 import math
+from collections import Counter
 from collections.abc import Callable
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from mavlink_bridge import quaternion as quat
-from mavlink_bridge.config import OriginConfig
+from mavlink_bridge.config import BridgeConfig, OriginConfig
 from mavlink_bridge.messages import Origin
+from mavlink_bridge.texts import Teller
 from mavlink_bridge.vehicle.origin import OriginKeeper, ned_from_origin, north_east, offset
 from mavlink_bridge.vehicle.profile import ARDUPILOT, ARDUPILOT_SQRT, GENERIC, PX4, select_profile
 from mavlink_bridge.vehicle.readings import gimbal_in_earth_frame
+from mavlink_bridge.vehicle.strangers import StrangerWatch
 from mavlink_bridge.vehicle.tracker import VehicleTracker
 
 MS = 1_000_000
@@ -395,3 +399,94 @@ def test_zero_origin_is_none() -> None:
 )
 def test_profile_of_a_firmware(autopilot: str, version: Any, profile: Any) -> None:
     assert select_profile(autopilot, version) is profile
+
+
+def gimbal_status(it: VehicleTracker, at_ms: int, yaw_deg: float, who: tuple[int, int]) -> None:
+    """GIMBAL_DEVICE_ATTITUDE_STATUS of (component, device), yaw from the vehicle's heading."""
+    component, device = who
+    q = quat.from_euler(0.0, -0.5, math.radians(yaw_deg))
+    m = mavlink.MAVLink_gimbal_device_attitude_status_message(
+        0, 0, at_ms, mavlink.GIMBAL_DEVICE_FLAGS_YAW_IN_VEHICLE_FRAME, list(q), 0, 0, 0, 0,
+        gimbal_device_id=device,
+    )  # fmt: skip
+    message = sent(m, component=component)
+    assert it.accepts(message)
+    it.handle(message, 10 * SECOND + at_ms * MS)
+
+
+def fly_level(
+    it: VehicleTracker, seconds: float, speaks: Callable[[int], dict[tuple[int, int], float]]
+) -> None:
+    """Attitudes at 20 Hz, and the angles of whoever speaks at a time in ms, by gimbal."""
+    for at_ms in range(0, round(seconds * 1000), 50):
+        m = mavlink.MAVLink_attitude_message(at_ms, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
+        it.handle(sent(m), 10 * SECOND + at_ms * MS)
+        for who, yaw_deg in speaks(at_ms).items():
+            gimbal_status(it, at_ms, yaw_deg, who)
+
+
+CAMERA_GIMBAL, OTHER_GIMBAL = (1, 1), (1, 2)
+
+
+def looks(it: VehicleTracker, at_ms: int) -> float:
+    gimbal = it.gimbal_at(10 * SECOND + at_ms * MS)
+    assert gimbal is not None
+    return math.degrees(gimbal.yaw_vehicle_rad)
+
+
+@pytest.mark.parametrize("other", [OTHER_GIMBAL, (154, 0)])
+def test_the_angles_of_two_gimbals_are_not_mixed(other: tuple[int, int]) -> None:
+    """Each report of the second one turned the camera by 90 degrees."""
+    it = tracker()
+    fly_level(it, 4.0, lambda at_ms: {other: 100.0} if at_ms % 100 else {CAMERA_GIMBAL: 10.0})
+    assert looks(it, 2025) == pytest.approx(10.0, abs=0.01)
+    assert looks(it, 2075) == pytest.approx(10.0, abs=0.01)
+    assert it.other_gimbals == (other,)
+    told: list[str] = []
+    teller = Teller(lambda _, text: told.append(text))
+    watch = StrangerWatch(BridgeConfig(), it, teller, Counter())
+    link: Any = SimpleNamespace(stranger="", system_id=1)
+    for _ in range(3):
+        watch.check(link, 20 * SECOND)
+    assert told == [f"PiLoT: another gimbal ignored: {other[0]}, device {other[1]}"]
+
+
+def test_the_configured_gimbal_counts_whoever_spoke_first() -> None:
+    it = VehicleTracker(None, quat.IDENTITY, False, (0, 2))
+    it.handle(sent(mavlink.MAVLink_heartbeat_message(2, 3, 81, 4, 4, 3)), SECOND)
+    fly_level(it, 2.0, lambda _: {CAMERA_GIMBAL: 10.0, OTHER_GIMBAL: 100.0})
+    assert looks(it, 1025) == pytest.approx(100.0, abs=0.01)
+
+
+def test_a_gimbal_that_falls_silent_makes_room() -> None:
+    it = tracker()
+    fly_level(
+        it, 6.0, lambda at_ms: {CAMERA_GIMBAL: 10.0} if at_ms < 1000 else {OTHER_GIMBAL: 100.0}
+    )
+    assert looks(it, 5500) == pytest.approx(100.0, abs=0.01)
+
+
+@pytest.mark.parametrize(
+    ("latitude", "longitude", "altitude_m"),
+    [(0, 0, 500), (950_000_000, 0, 500), (1, 1_900_000_000, 500), (470_000_000, 80_000_000, 9e4)],
+)
+def test_a_receiver_where_there_is_no_place_is_not_heard(
+    latitude: int, longitude: int, altitude_m: float
+) -> None:
+    """A 3D fix in the Gulf of Guinea, beyond a pole, in space: GNSS would count as healthy."""
+    it = tracker()
+
+    def says(at_s: float, *place: int) -> None:
+        m = mavlink.MAVLink_gps_raw_int_message(0, 3, *place, 80, 100, 0, 0, 12, 0, 0, 1000)
+        it.handle(sent(m), round(at_s * SECOND))
+
+    says(10.0, 470_000_000, 80_000_000, 500_000)
+    says(11.0, latitude, longitude, round(altitude_m * 1e3))
+    state = it.snapshot(11 * SECOND)
+    assert state.gps_latitude_deg == pytest.approx(47.0)
+    assert state.gps_time_ns == 10 * SECOND
+    assert it.ignored == 1
+    # Without a fix the place means nothing, and the report that there is none does.
+    lost = mavlink.MAVLink_gps_raw_int_message(0, 0, 0, 0, 0, 0, 0, 0, 0, 0)
+    it.handle(sent(lost), 12 * SECOND)
+    assert it.snapshot(12 * SECOND).gps_fix_type == 0

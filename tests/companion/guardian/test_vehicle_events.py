@@ -1,0 +1,142 @@
+"""The EKF's answer, clocks, and a guardian that fails: each told, and none of them by accident."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from companion.guardian.config import GuardianConfig
+from companion.guardian.guardian import Guardian
+from companion.guardian.monitor import Limits, Monitor
+from mavlink_bridge.messages import VehicleState, VisionFix
+from tests.companion.guardian.simulated import Flight, hover, leg, second
+
+PICTURE = np.random.default_rng(3).integers(0, 255, (120, 160, 3)).astype(np.uint8)
+
+
+def monitor() -> Monitor:
+    return Monitor(GuardianConfig(), Limits())
+
+
+class Answering(Flight):
+    """The EKF's innovation ratio and a leap of its position, by the time."""
+
+    ratio: Any = staticmethod(lambda at_s: 0.2)
+    leap_m: Any = staticmethod(lambda at_s: 0.0)
+
+    def state(self) -> VehicleState:
+        state = super().state()
+        north, east, down = state.local_position_ned or (0.0, 0.0, 0.0)
+        return replace(
+            state,
+            ekf_horizontal_variance=self.ratio(self.at_s),
+            local_position_ned=(north + self.leap_m(self.at_s), east, down),
+        )
+
+
+def flown(path: Any, seconds: float, **answers: Any) -> Answering:
+    flight = Answering(monitor(), path, noise_m=0.05)
+    for name, answer in answers.items():
+        setattr(flight, name, answer)
+    flight.fly(seconds)
+    return flight
+
+
+def test_an_ekf_that_refuses_is_told_again_as_long_as_it_does() -> None:
+    flight = flown(hover, 30.0, ratio=lambda at_s: 1.4 if 5.0 <= at_s < 20.0 else 0.3)
+    told = [at_s for at_s, text in flight.lines if "EKF refuses vision (1.4)" in text]
+    assert told[0] == pytest.approx(7.0, abs=0.3)
+    assert np.diff(told) == pytest.approx([10.0], abs=0.3)
+    assert 23.0 <= flight.told("over: ekf refuses") < 23.5
+    assert flight.withheld == []  # what it refuses does no harm; silence would
+
+
+@pytest.mark.parametrize("ratio", [float("nan"), float("inf"), None])
+def test_a_ratio_that_says_nothing_is_no_refusal(ratio: float | None) -> None:
+    known = None if ratio is None or np.isnan(ratio) else ratio
+    assert flown(hover, 6.0, ratio=lambda _: known).lines == []
+
+
+def test_a_refusal_of_a_second_is_none() -> None:
+    """A gust, a turn: the ratio passes 1 now and then."""
+    assert flown(hover, 12.0, ratio=lambda at_s: 1.5 if 5.0 <= at_s < 6.5 else 0.3).lines == []
+
+
+def test_a_reset_of_the_ekf_is_unconfirmed_until_the_imu_has_agreed_for_a_while() -> None:
+    flight = flown(leg, 30.0, leap_m=lambda at_s: 15.0 if at_s >= 12.0 else 0.0)
+    assert flight.lines[0][1] == "PiLoT: EKF jumped 15 m: unconfirmed"
+    assert flight.lines[0][0] == pytest.approx(12.0, abs=0.15)
+    assert 21.5 <= flight.told("over: ekf jumped") <= 24.0
+
+
+def test_while_it_is_unconfirmed_nobody_says_that_the_ekf_follows() -> None:
+    flight = flown(leg, 14.0, leap_m=lambda at_s: 15.0 if at_s >= 12.0 else 0.0)
+    assert flight.monitor.doubt == "EKF jumped 15 m: unconfirmed"
+
+
+def test_hard_flight_is_no_jump() -> None:
+    """Out of a hover with 2.5 m/s^2, and a metre of an EKF's own correction."""
+    assert flown(leg, 12.0, leap_m=lambda at_s: 1.0 if at_s >= 8.0 else 0.0).lines == []
+
+
+@pytest.mark.parametrize("stamp", [lambda _: 5.0, lambda at_s: 20.0 - at_s])
+def test_pictures_whose_clock_stands_or_runs_back_are_withheld(stamp: Any) -> None:
+    """From 5 s on; the fixes go on under stamps of their own."""
+    watched = monitor()
+    flight = Flight(watched, noise_m=0.05)
+    told_s = np.inf
+    for tenth in range(1, 100):
+        flight.fly(0.1 * tenth)
+        at_s = 0.1 * tenth
+        moved = np.roll(PICTURE, 7 * tenth, axis=1)
+        watched.see(second(at_s if at_s < 5.0 else stamp(at_s)), moved)
+        told_s = min(told_s, flight.told("withheld: video clock ran back or stands"))
+    assert 5.5 <= told_s < 6.5
+    assert max(flight.withheld) > 9.7
+    assert not [at_s for at_s in flight.withheld if at_s < 5.5]
+
+
+def test_pictures_that_come_twice_now_and_then_are_no_broken_clock() -> None:
+    watched = monitor()
+    flight = Flight(watched, noise_m=0.05)
+    for tenth in range(1, 60):
+        flight.fly(0.1 * tenth)
+        watched.see(second(0.1 * tenth), PICTURE)
+        watched.see(second(0.1 * tenth), PICTURE)  # as a feed repeats a frame
+    assert not [text for _, text in flight.lines if "clock" in text]
+
+
+class Broken:
+    """A bridge that fails where the guardian asks it."""
+
+    def __init__(self) -> None:
+        self.said: list[tuple[int, str]] = []
+
+    def state(self) -> VehicleState:
+        raise RuntimeError("boom")
+
+    def say(self, severity: int, text: str) -> None:
+        self.said.append((severity, text))
+
+
+def test_a_guardian_that_fails_is_told_once_and_positions_flow(
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    """Withholding for a fault of our own would land the aircraft."""
+    bridge: Any = Broken()
+    guardian = Guardian(GuardianConfig(), Limits(), bridge)
+    fix = VisionFix(second(1.0), 47.0, 8.0, 500.0)
+    assert guardian.judge(fix) is fix
+    assert guardian.judge(fix) is fix
+    assert bridge.said == [(3, "PiLoT: guardian failed: fixes are not watched")]
+    assert "boom" in caplog.text
+
+
+def test_a_gnss_that_jumps_is_told_and_nothing_is_withheld() -> None:
+    """100 km off, as a spoofer or a cold start may say; it is a receiver's word against ours."""
+    flight = Flight(monitor(), gnss_north_m=lambda at_s: 1e5 if at_s >= 5.0 else 0.0).fly(9.0)
+    assert 7.0 <= flight.told("GNSS 100000 m from vision") < 8.0
+    assert flight.withheld == []
