@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from dataclasses import replace
 from functools import partial
 from typing import Any
 
@@ -172,6 +173,13 @@ class Bridge:
     def forget(self, target_id: int) -> None:
         """Tell the ground of that target no more; never blocks."""
         self._to_ground(TargetEnd(target_id))
+
+    def track(self, request: TrackRequest) -> None:
+        """Take a wish as if a ground station had said it; a target gets a number among theirs."""
+        if request.kind != "stop":
+            request = replace(request, number=next(self._shared.target_numbers))
+        if self._shared.on_track is not None:
+            self._shared.on_track(request)
 
     def doubt(self, why: str) -> None:
         """Until it is called with an empty text, "the EKF follows" is not said."""

@@ -19,6 +19,7 @@ from companion.reporting.report import write_page
 from localizer.errors import LocalizerError
 from localizer.synth.appearance.model import CONDITIONS
 from sitl.demo.assets import FlightAssets, prepare
+from sitl.demo.companion_process import free_console_port
 from sitl.demo.flight import fly
 from sitl.demo.kinematic import record_scenario
 from sitl.demo.progress import shown_progress
@@ -116,8 +117,11 @@ def demo(
         assets = _world_of(script, seed, worlds, ideal, console)
         check_inside(script, assets.world.size_m)
     _clear(out)
+    port = free_console_port()
+    if port is not None:
+        console.print(f"watch it: [green]http://127.0.0.1:{port}/[/] (once the companion is up)")
     with shown_progress(console) as progress:
-        record = fly(assets, script, kinds[fc], seed, out, progress)
+        record = fly(assets, script, kinds[fc], seed, out, progress, port)
     print_report(make_report(record, script, seed), out)
     console.print(f"open: [green]{write_page(out).resolve()}", soft_wrap=True)
 

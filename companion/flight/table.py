@@ -7,6 +7,7 @@ above it and subscribes to the channels that it reads.
 from __future__ import annotations
 
 import logging
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -47,6 +48,7 @@ from localizer.tracking.pipeline import Localizer
 from localizer.types import Frame, PoseEstimate, ReferenceBundle
 from mavlink_bridge.bridge import Bridge
 from mavlink_bridge.config import BridgeConfig
+from mavlink_bridge.messages import TrackRequest
 
 _log = logging.getLogger(__name__)
 _WARNING = 4  # MAV_SEVERITY_WARNING; lower is worse
@@ -274,7 +276,13 @@ def _console(making: Making) -> Publisher:
             raise OrderError("the hint lies off the map")
         search.hint(float(place[0]), float(place[1]), radius_m)
 
-    helm = Helm(bridge.say, channels.clicks.send, hint)
+    # A click of the page names its frame; a ground station's is taken to be late.
+    late_ns = round(config.targets.operator_delay_ms * 1e6)
+
+    def track(request: TrackRequest) -> None:
+        bridge.track(replace(request, time_ns=request.time_ns + late_ns))
+
+    helm = Helm(bridge.say, track, hint)
     orders = Orders(config.console.control, helm)
     record = None if config.record is None else config.record.folder
     path = socket_path(config.map, record, config.console.listen)

@@ -24,8 +24,9 @@ class OrderError(CompanionError):
 
 @dataclass(frozen=True)
 class Helm:
-    """What orders act on. say: tells the operator and the log; track: a ground station's click;
-    hint: (latitude_deg, longitude_deg, radius_m), raises `OrderError` for a place off the map.
+    """What orders act on. say: tells the operator and the log; track: a click, its time that of
+    the frame that it points into; hint: (latitude_deg, longitude_deg, radius_m), raises
+    `OrderError` for a place off the map.
     """
 
     say: Callable[[int, str], None]

@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
+import importlib.util
 import os
 import signal
 import socket
 import subprocess
 import sys
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import yaml
 
@@ -27,6 +29,8 @@ class Ports:
 
     video: int
     detections: int
+    console: int | None = None
+    """TCP port of the operator's page; None: no page."""
 
 
 def free_udp_port() -> int:
@@ -34,6 +38,17 @@ def free_udp_port() -> int:
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
         probe.bind(("127.0.0.1", 0))
         return int(probe.getsockname()[1])
+
+
+def free_console_port() -> int | None:
+    """8080, or another that nobody listens on; None where the extra `console` is not installed."""
+    if any(importlib.util.find_spec(name) is None for name in ("starlette", "uvicorn")):
+        return None
+    for port in (8080, 0):
+        with socket.socket(socket.AF_INET, socket.SOCK_STREAM) as probe, suppress(OSError):
+            probe.bind(("127.0.0.1", port))
+            return int(probe.getsockname()[1])
+    return None
 
 
 def write_deployment(
@@ -45,7 +60,7 @@ def write_deployment(
 ) -> Path:
     """The deployment file of this flight: what an operator would write by hand."""
     camera = scenario.camera.camera()
-    config = {
+    config: dict[str, Any] = {
         "map": str(assets.map_cache.resolve()),
         "camera": {
             "source": f"udp://127.0.0.1:{ports.video}",
@@ -67,6 +82,8 @@ def write_deployment(
         "targets": {"detections": f"127.0.0.1:{ports.detections}"},
         "record": {"folder": str((folder / "companion").resolve())},
     }
+    if ports.console is not None:
+        config["console"] = {"listen": f"127.0.0.1:{ports.console}", "control": True}
     path = folder / "companion.yaml"
     path.write_text(yaml.safe_dump(config, sort_keys=False))
     return path

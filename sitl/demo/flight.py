@@ -66,12 +66,15 @@ def fly(
     seed: int,
     folder: Path,
     progress: Progress = lambda *_: None,
+    console: int | None = None,
 ) -> FlightRecord:
-    """Fly the scenario; `folder` receives every record. Progress is (phase, share done)."""
+    """Fly the scenario; `folder` receives every record. Progress is (phase, share done). console:
+    port of the operator's page, if there is to be one.
+    """
     folder.mkdir(parents=True, exist_ok=True)
     cache = TileCache.open(assets.map_cache)
     home = home_of(assets)
-    ports = Ports(free_udp_port(), free_udp_port())
+    ports = Ports(free_udp_port(), free_udp_port(), console)
     with ExitStack() as stack:
         progress("starting the vehicle", 0.0)
         setup = VehicleSetup(

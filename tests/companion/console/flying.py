@@ -5,6 +5,7 @@ Everything else is the product's: what is shown, the publisher, orders, clicks, 
 
 from __future__ import annotations
 
+import itertools
 import threading
 import time
 from contextlib import contextmanager
@@ -70,8 +71,17 @@ class Flight:
         self.reporter = TargetReporter(
             TargetConfig(), MapSurface(self.cache).cast, self._located, self.shown.forget_target
         )
-        self.clicks = ClickPolicy(self.reporter, self._say)
-        helm = Helm(self._say, self.clicks.on_request, lambda *hint: self.hints.append(hint))
+        config = TargetConfig()
+        self.clicks = ClickPolicy(self.reporter, self._say, config)
+        numbers = itertools.count(1)
+
+        def track(request):
+            late_ns = round(config.operator_delay_ms * 1e6)
+            self.clicks.on_request(
+                replace(request, time_ns=request.time_ns + late_ns, number=next(numbers))
+            )
+
+        helm = Helm(self._say, track, lambda *hint: self.hints.append(hint))
         self.publisher = Publisher(self.path, self.shown, Orders(self.control, helm), 10.0)
         self._stop = threading.Event()
         self._streamer = TileStreamer(self.cache)
