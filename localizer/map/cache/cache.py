@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import hashlib
 import json
+import os
+import stat
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -139,7 +141,7 @@ class TileCache:
         path = Path(path)
         manifest = _read_manifest(path)
         try:
-            data = (path / INDEX_NAME).read_bytes()
+            data = _file_bytes(path / INDEX_NAME)
         except OSError as error:
             raise MapCacheError(f"{path / INDEX_NAME}: cannot be read: {error}") from error
         if hashlib.sha256(data).hexdigest() != manifest.index_sha256:
@@ -186,7 +188,7 @@ class TileCache:
             raise MapCacheError(f"{self.path}: no tile {tile_id}; the index has {self.tile_ids}")
         path = self.tile_path(tile_id)
         try:
-            data = path.read_bytes()
+            data = _file_bytes(path)
         except OSError as error:
             raise MapCacheError(f"tile {tile_id}, {path}: cannot be read: {error}") from error
         if hashlib.sha256(data).digest() != self.index.digest[tile_id].tobytes():
@@ -262,6 +264,15 @@ def _decode_image(data: NDArray[np.uint8]) -> Image:
         raise MapCacheError("a texture level cannot be decoded")
     decoded: Image = image.astype(np.uint8, copy=False)
     return decoded
+
+
+def _file_bytes(path: Path) -> bytes:
+    """A regular file's content; OSError for a pipe or a device, on which a read waits for ever."""
+    descriptor = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC)
+    with open(descriptor, "rb") as file:
+        if not stat.S_ISREG(os.fstat(descriptor).st_mode):
+            raise OSError(f"{path} is no regular file")
+        return file.read()
 
 
 def _read_manifest(path: Path) -> Manifest:

@@ -54,6 +54,17 @@ def test_missing_tile_is_named(copy):
         cache.load_tile(999)
 
 
+@pytest.mark.parametrize("what", ["tile", "index"])
+def test_a_pipe_in_a_cache_does_not_hang_the_loader(copy, what):
+    """A read of it would never return: neither at the start nor in flight."""
+    cache = TileCache.open(copy)
+    path = cache.tile_path(0) if what == "tile" else copy / "index.safetensors"
+    path.unlink()
+    os.mkfifo(path)
+    with pytest.raises(MapCacheError, match="no regular file"):
+        cache.load_tile(0) if what == "tile" else TileCache.open(copy)
+
+
 def test_damaged_index_is_found(copy):
     path = copy / "index.safetensors"
     data = bytearray(path.read_bytes())
