@@ -12,7 +12,9 @@ from rich.console import Console
 from rich.progress import Progress
 from rich.table import Table
 
-from companion.errors import RecordError
+from companion.cli.console import require_extra, serve
+from companion.errors import ConfigError, RecordError
+from companion.live.config import ConsoleConfig
 from localizer.geometry.pose import Array
 
 
@@ -25,8 +27,15 @@ def replay_command(
     tolerance_m: Annotated[
         float, typer.Option(min=0, help="95 % of the positions must lie so near")
     ] = 1.0,
+    page: Annotated[
+        str | None,
+        typer.Option("--console", help="address:port: show the record in a browser instead"),
+    ] = None,
 ) -> None:
     """Localize a recorded flight again; exit code 0 if it agrees with the record, else 1."""
+    if page is not None:
+        show_record(record, map_cache, page)
+        return
     from companion.offline.replay import load_record, replay, summarize
 
     loaded = load_record(record)
@@ -59,3 +68,23 @@ def _spread(values: Array, digits: int) -> tuple[str, ...]:
     if not len(values):
         return ("-", "-", "-")
     return tuple(f"{x:.{digits}f}" for x in (*np.percentile(values, [50, 95]), values.max()))
+
+
+def show_record(record: Path, map_cache: Path | None, listen: str) -> None:
+    """Serve the page on this machine with the record, and its neighbours to download."""
+    require_extra()
+    from companion.console.records import Records
+    from companion.console.replay_source import ReplaySource
+    from companion.console.server import Site
+    from companion.reporting.record import read_record
+
+    tables = read_record(record)
+    map_path = map_cache or tables.map_path
+    if map_path is None:
+        raise RecordError(f"{record}: does not say which map was flown on; give it as --map")
+    try:
+        config = ConsoleConfig(listen=listen)
+    except ValueError as error:
+        raise ConfigError(f"--console {listen}: {error}") from error
+    source = ReplaySource(tables)
+    serve(Site(config, source, map_path, Records(record.absolute().parent), replay=True))

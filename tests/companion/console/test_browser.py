@@ -1,0 +1,119 @@
+"""The page in a real browser, on a flight's socket: it shows, clicks are targets, hints arrive."""
+
+import shutil
+import socket
+import subprocess
+import sys
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+import yaml
+
+from companion.live.protocol import socket_path
+from localizer.map.cache.cache import TileCache
+from tests.companion.console.companion_flying import CAMERA, HEIGHT_M, Flight
+
+playwright = pytest.importorskip("playwright.sync_api")
+CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser")
+pytestmark = [
+    pytest.mark.browser,
+    pytest.mark.skipif(CHROMIUM is None, reason="no Chromium on this machine"),
+]
+SOFTWARE_GL = ("--no-sandbox", "--use-gl=angle", "--use-angle=swiftshader",
+               "--enable-unsafe-swiftshader", "--ignore-gpu-blocklist")  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def flight(small_assets, tmp_path_factory):
+    """The flight, and the page's process with its address."""
+    home = tmp_path_factory.mktemp("deployment")
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        listen = f"127.0.0.1:{probe.getsockname()[1]}"
+    record = home / "flights" / "flight"
+    record.mkdir(parents=True)
+    (record / "record.json").write_text("{}")
+    model = CAMERA.to_dict()
+    config = {
+        "map": str(small_assets.map_cache),
+        "camera": {"source": "udp://127.0.0.1:5600", "model": model},
+        "record": {"folder": str(record)},
+        "console": {"listen": listen, "control": True},
+    }
+    path = home / "deployment.yaml"
+    path.write_text(yaml.safe_dump(config))
+    meeting = socket_path(small_assets.map_cache, record, listen)
+    flight = Flight(meeting, TileCache.open(small_assets.map_cache))
+    command = [sys.executable, "-m", "companion", "console", str(path), "--lifeline"]
+    with flight.flying():
+        console = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE)
+        console.stdout.readline()
+        yield SimpleNamespace(flight=flight, url=f"http://{listen}/", listen=listen)
+        console.stdin.close()
+        console.wait(20)
+
+
+@pytest.fixture
+def page(flight):
+    """The page, at a laptop's size; what it complained of and whom it asked stands in `seen`."""
+    with playwright.sync_playwright() as driver:
+        browser = driver.chromium.launch(executable_path=CHROMIUM, args=list(SOFTWARE_GL))
+        page = browser.new_page(viewport={"width": 1280, "height": 800})
+        seen = SimpleNamespace(errors=[], hosts=set())
+        page.on("console", lambda m: m.type == "error" and seen.errors.append(m.text))
+        page.on("pageerror", lambda e: seen.errors.append(str(e)))
+        page.on("request", lambda r: "://" in r.url and seen.hosts.add(r.url.split("/")[2]))
+        page.set_default_timeout(60_000)
+        page.goto(flight.url)
+        _until(page, lambda: (page.evaluate("window.consoleFrames") or 0) > 2)
+        yield page, seen
+        browser.close()
+
+
+def _until(page, holds, seconds=60):
+    """The page polls; `wait_for_function` would need eval, which its policy forbids."""
+    for _ in range(4 * seconds):
+        if holds():
+            return
+        page.wait_for_timeout(250)
+    raise AssertionError("it did not come true")
+
+
+def test_it_shows_the_flight_and_asks_nobody_else(page, flight):
+    page, seen = page
+    assert page.inner_text("#word").lower() == "tracking"
+    for size in ((1280, 800), (390, 844)):
+        page.set_viewport_size({"width": size[0], "height": size[1]})
+        wide = page.evaluate("document.documentElement.scrollWidth")
+        assert wide <= size[0], "it must not have to be dragged sideways"
+    assert seen.hosts == {flight.listen}
+    assert seen.errors == []
+
+
+def test_a_click_is_a_target_at_the_place_that_was_clicked(page, flight):
+    """The camera looks straight down: the middle of the picture is the ground below it."""
+    page, _ = page
+    box = page.locator("#video").bounding_box()
+    page.mouse.click(box["x"] + box["width"] / 2, box["y"] + box["height"] / 2)
+    _until(page, lambda: flight.flight.targets)
+    (place,) = list(flight.flight.targets.values())[:1]
+    assert abs(place[1]) < 3.0  # the line that is flown
+    assert -24.0 < place[0] < 24.0
+    assert place[2] < flight.flight.cache.index.box_min[0, 2] + HEIGHT_M / 2
+    _until(page, lambda: page.locator("#targets tbody tr").count() == 1)
+    assert any(text.startswith("PiLoT: console: target") for text in flight.flight.said)
+
+
+def test_a_hint_arrives_where_the_map_was_clicked(page, flight):
+    page, _ = page
+    _until(page, lambda: page.evaluate("window.consoleMap?.loaded === true"))
+    page.click("#follow")
+    page.click("#hint")
+    page.click("#map", position={"x": 150, "y": 150})
+    _until(page, lambda: flight.flight.hints)
+    latitude, longitude, radius = flight.flight.hints[0]
+    frame = flight.flight.cache.frame
+    at = frame.enu_from_geodetic(latitude, longitude, frame.origin.height_m)
+    assert np.hypot(*at[:2]) < 400.0
+    assert radius == 150.0

@@ -1,0 +1,74 @@
+"""A record in the page: rows at their times, and the time bar."""
+
+import asyncio
+import csv
+import json
+
+import cv2
+import numpy as np
+import pytest
+
+from companion.console.replay_source import ReplaySource
+from companion.flight.recorder import ESTIMATE_COLUMNS, EVENT_COLUMNS, TARGET_COLUMNS
+from companion.reporting.record import read_record
+
+MODEL = {"width": 64, "height": 48, "fx": 60, "fy": 60, "cx": 32, "cy": 24}
+S = 1_000_000_000
+
+
+def _rows(path, columns, rows):
+    with path.open("w", newline="") as file:
+        writer = csv.DictWriter(file, columns, restval="0")
+        writer.writeheader()
+        writer.writerows(rows)
+
+
+@pytest.fixture
+def source(tmp_path):
+    (tmp_path / "snapshots").mkdir()
+    states = ["tracking"] * 11 + ["lost"] * 10
+    _rows(
+        tmp_path / "estimates.csv", ESTIMATE_COLUMNS,
+        [
+            {"exposure_time_ns": (10 + i) * S, "qx": 1.0, "state": s, "status": "OK",
+             "latitude_deg": 47 + i * 1e-5, "accepted": int(s == "tracking")}
+            for i, s in enumerate(states)
+        ],
+    )  # fmt: skip
+    target = {"exposure_time_ns": 12 * S, "target_id": "car"}
+    _rows(tmp_path / "targets.csv", TARGET_COLUMNS, [target])
+    event = {"time_ns": 15 * S, "level": "warning", "text": "GNSS lost"}
+    _rows(tmp_path / "events.csv", EVENT_COLUMNS, [event])
+    image = np.full((48, 64, 3), 90, np.uint8)
+    cv2.imwrite(str(tmp_path / "snapshots" / f"{14 * S}.jpg"), image)
+    manifest = {"monotonic_ns": 10 * S, "utc_ns": 1000 * S, "config": {"camera": {"model": MODEL}}}
+    (tmp_path / "record.json").write_text(json.dumps(manifest))
+    return ReplaySource(read_record(tmp_path))
+
+
+def _at(source, share):
+    assert asyncio.run(source.order({"share": share})) == (True, "done")
+    return source.newest.state
+
+
+def test_the_time_bar_leads_to_what_was_known_then(source):
+    state = _at(source, 0.1)
+    assert state["estimate"]["latitude_deg"] == pytest.approx(47 + 2e-5)
+    assert [t["name"] for t in state["targets"]] == ["car"]
+    assert (state["health"]["level"], state["events"], source.newest.frame) == ("ok", [], None)
+    assert state["utc_ns"] == 1002 * S
+    state = _at(source, 0.75)
+    assert (state["estimate"]["state"], state["health"]["level"]) == ("lost", "failed")
+    assert [e["text"] for e in state["events"]] == ["GNSS lost"]
+    assert state["targets"] == []  # seen 13 s ago
+    assert source.newest.frame.head["image"] == [64, 48]
+
+
+@pytest.mark.parametrize("order", [{}, {"share": 2}, {"share": "x"}, {"play": 1}, {"share": None}])
+def test_an_order_that_makes_no_sense_is_refused(source, order):
+    assert asyncio.run(source.order(order))[0] is False
+
+
+def test_the_heading_is_where_the_top_of_the_picture_points(source):
+    """qx = 1: the camera looks straight down, its picture's top to the north."""
+    assert _at(source, 0.0)["estimate"]["heading_deg"] == pytest.approx(0.0)
