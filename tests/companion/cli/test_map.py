@@ -120,5 +120,5 @@ def test_info_says_where_the_map_is_and_writes_its_outline(cache, tmp_path):
     assert (east, north) == pytest.approx((400, 400), rel=0.01)
     root = ElementTree.parse(kml).getroot()
     text = root.findtext(".//{http://www.opengis.net/kml/2.2}coordinates")
-    corners = np.array([place.split(",") for place in text.split()], float)
+    corners = np.array([place.split(",") for place in text.split()], np.float64)
     assert corners == pytest.approx(ring, abs=1e-7)

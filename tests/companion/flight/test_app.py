@@ -8,6 +8,7 @@ import os
 import threading
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -85,6 +86,8 @@ class _InterruptedWait:
 
 
 class _StubFeed(Feed):
+    ended: Any
+
     def __init__(self):
         self.ended, self.error = _InterruptedWait(), None
 

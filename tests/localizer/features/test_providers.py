@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 from collections.abc import Callable
 from pathlib import Path
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import numpy as np
 import onnxruntime as ort
@@ -18,7 +18,7 @@ from localizer.features.extractor import SHIPPED_MODEL
 NAMES = {"TensorRT": "Tensorrt", "CUDA": "CUDA", "CPU": "CPU", "Azure": "Azure"}
 START = ort.InferenceSession
 
-Asked = list[list[object]]
+Asked = list[list[Any]]
 
 
 class Stand:

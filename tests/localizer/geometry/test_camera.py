@@ -110,7 +110,8 @@ def test_undistortion_maps_put_every_ray_where_the_pinhole_sees_it(distorted):
     target = distorted.without_distortion().resized(320, 240)
     v, u = np.mgrid[0:480, 0:640] + 0.5
     seen = distorted.rays(np.stack([u, v], axis=-1))[..., :2].astype(np.float32)
-    remapped = cv2.remap(seen, *distorted.undistortion_maps(target), cv2.INTER_LINEAR)
+    map_x, map_y = distorted.undistortion_maps(target)
+    remapped = cv2.remap(seen, map_x, map_y, cv2.INTER_LINEAR)
     v, u = np.mgrid[0:240, 0:320] + 0.5
     expected = target.rays(np.stack([u, v], axis=-1))[..., :2]
     inner = np.s_[12:-12, 12:-12]

@@ -9,6 +9,7 @@ from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -33,7 +34,8 @@ class Content:
 
     @property
     def image(self) -> np.ndarray:
-        return cv2.imdecode(np.frombuffer(self.jpeg, np.uint8), cv2.IMREAD_COLOR)[..., ::-1]
+        image: Any = cv2.imdecode(np.frombuffer(self.jpeg, np.uint8), cv2.IMREAD_COLOR)
+        return image[..., ::-1]
 
 
 @dataclass
@@ -156,8 +158,8 @@ def test_a_world_that_is_interrupted_paints_no_more_blocks(tmp_path, monkeypatch
             self.ending, self.painted = threading.Event(), []
             pools.append(self)
 
-        def submit(self, _task, place):
-            return super().submit(self._paint, place)
+        def submit(self, fn, /, *args, **kwargs):
+            return super().submit(self._paint, *args)
 
         def _paint(self, place):
             self.painted.append(place)

@@ -38,6 +38,7 @@ def test_what_was_seen_once_has_no_velocity():
     target.update(_sighting(0, (1.0, GROUND, 0.3)))
     assert target.velocity is None
     target.update(_sighting(1, (1.0, GROUND, 0.3)))
+    assert target.velocity is not None
     assert np.linalg.norm(target.velocity) < 0.1
     for k in range(2, 5):  # elsewhere: the third time it begins anew
         target.update(_sighting(k, (1.0, ROOF + 200.0, 0.3)))

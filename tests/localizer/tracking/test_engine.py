@@ -160,11 +160,15 @@ def test_reaches_tracking_from_a_prior_and_stops_cleanly(flight):
     assert not threads()
 
 
-def test_the_map_is_loaded_along_the_way_ahead(flight):
+def test_the_map_is_loaded_along_the_way_ahead(flight, monkeypatch):
     renderer = FakeRenderer()
     localizer = _localizer(renderer)
     way = np.array([20.0, 0.0, 0.0])  # m/s
-    localizer.predict = lambda t: PosePrior(Pose(NADIR.rotation, way * t * 1e-9), np.eye(6), t)
+
+    def predict(time_ns):
+        return PosePrior(Pose(NADIR.rotation, way * time_ns * 1e-9), np.eye(6), time_ns)
+
+    monkeypatch.setattr(localizer, "predict", predict)
     localizer.prefetch(500_000_000)
     _, views = renderer.ahead.pop()
     assert [v.translation[0] for v in views] == pytest.approx([30.0, 70.0])
@@ -300,8 +304,8 @@ def test_a_stream_that_changes_its_size_is_undistorted_with_its_own_camera():
 
 def test_features_of_a_reference_do_not_see_the_maps_holes():
     class Holed(FakeRenderer):
-        def render(self, world_from_camera, camera, *, wait=False):
-            view = super().render(world_from_camera, camera, wait=wait)
+        def render(self, world_from_camera, camera, extra=(), *, wait=False):
+            view = super().render(world_from_camera, camera, extra, wait=wait)
             depth = view.depth.copy()
             depth[50:90, 100:140] = 0
             rgb = np.where(depth[..., None] > 0, 70, SKY).astype(np.uint8)

@@ -108,7 +108,7 @@ def test_a_disk_that_stalls_does_not_stall_the_sender(
     class Stalled:
         """A disk that takes nothing until the sender is through."""
 
-        def write(self, data: bytes) -> int:
+        def write(self, data: bytes | bytearray, /) -> int:
             writing.set()
             if not written.wait(30.0):
                 waited_in_vain.append(len(data))

@@ -178,8 +178,8 @@ def test_loss_is_told_on_the_ground_link_within_seconds(reconnecting: bool) -> N
             assert time.monotonic() - spoke_at > 3.0
             over.set()
             time.sleep(0.5)
-            told = [text for text in bridge.texts() if "lost" in text]
-            assert told == ["PiLoT: flight controller lost: no heartbeat for 3 s"]
+            lines = [text for text in bridge.texts() if "lost" in text]
+            assert lines == ["PiLoT: flight controller lost: no heartbeat for 3 s"]
 
 
 def test_each_change_is_told_once() -> None:

@@ -10,6 +10,7 @@ import threading
 import time
 from multiprocessing.connection import Connection
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -207,7 +208,7 @@ def test_nobody_else_is_on_the_pipe_while_the_camera_stops(cache: Path, tmp_path
 
     ours, its = multiprocessing.Pipe()
     sender = threading.Thread(target=send, name="sender")
-    pipe = _Watched(ours, sender)
+    pipe: Any = _Watched(ours, sender)
     process = WorldCameraProcess(
         _config(cache, tmp_path / "frames.csv", _free_url()), lambda: (pipe, its)
     )

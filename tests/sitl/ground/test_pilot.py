@@ -65,10 +65,11 @@ def test_track_brackets_a_time_and_forgets_the_oldest():
     assert track.newest.time_ns == 990
 
 
-def test_a_vehicle_that_dies_at_once_is_reported_with_its_log(folders, tmp_path):
+def test_a_vehicle_that_dies_at_once_is_reported_with_its_log(folders, tmp_path, monkeypatch):
     for log in (None, tmp_path / "vehicle.log"):
         vehicle = EmbeddedSitl(HOME, parameters={}, log=log)
-        vehicle.command = lambda _instance: ["/bin/sh", "-c", "echo out of propellers; exit 3"]
+        dying = ["/bin/sh", "-c", "echo out of propellers; exit 3"]
+        monkeypatch.setattr(vehicle, "command", lambda _instance, it=dying: it)
         with pytest.raises(VehicleProcessError, match=r"(?s)ended with status.*out of propellers"):
             vehicle.start()
     assert log.read_text() == "out of propellers\n"

@@ -10,6 +10,7 @@ import threading
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -564,7 +565,7 @@ def test_rasters_that_run_the_other_way_lie_the_same(tmp_path, built, flip):
     seen = honest.load_tile(0).mips[0]
     if flip == "rows":
         options = {"transform": Affine(STEP, 0, LEFT, 0, STEP, TOP - CELLS * STEP)}
-        turn = (..., slice(None, None, -1), slice(None))
+        turn: tuple[Any, ...] = (..., slice(None, None, -1), slice(None))
     else:
         options = {"transform": Affine(-STEP, 0, LEFT + CELLS * STEP, 0, -STEP, TOP)}
         turn = (..., slice(None, None, -1))

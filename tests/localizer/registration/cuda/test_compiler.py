@@ -34,7 +34,7 @@ def resources(log: str) -> dict[str, Resources]:
         stack, stores, loads = map(int, re.search(
             r"(\d+) bytes stack frame, (\d+) bytes spill stores, (\d+) bytes spill loads", part
         ).groups())  # fmt: skip
-        registers = int(re.search(r"Used (\d+) registers", part)[1])
+        (registers,) = map(int, re.findall(r"Used (\d+) registers", part)[:1])
         shared = re.search(r"(\d+) bytes smem", part)
         found[name] = Resources(registers, stack, stores + loads, int(shared[1]) if shared else 0)
     return found
