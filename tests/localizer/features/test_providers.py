@@ -56,7 +56,7 @@ def install(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Callable[..., As
         asked: Asked = []
 
         def session(
-            path: str, options: object, providers: list[object], **rest: object
+            path: str, options: object, providers: list[Any], **rest: object
         ) -> ort.InferenceSession | Stand:
             asked.append(providers)
             assert rest == {"enable_fallback": False}
@@ -80,7 +80,7 @@ def install(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Callable[..., As
     return installed
 
 
-def names(providers: list[object]) -> list[str]:
+def names(providers: list[Any]) -> list[str]:
     first = [p if isinstance(p, str) else p[0] for p in providers]
     return [name.removesuffix("ExecutionProvider") for name in first]
 
