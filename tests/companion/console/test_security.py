@@ -304,8 +304,8 @@ def test_while_armed_or_not_heard_only_targets_and_hints(site, deployment, armed
             assert client.post(path, json=body, headers=SAME).status_code == 409
         for do in ("target", "hint"):
             assert client.post("/api/order", json={"do": do}, headers=SAME).status_code == 200
-        for do in ("arm", "", None, 5):
-            assert client.post("/api/order", json={"do": do}, headers=SAME).status_code == 409
+        for wrong in ("arm", "", None, 5):
+            assert client.post("/api/order", json={"do": wrong}, headers=SAME).status_code == 409
     assert [o["do"] for o in source.orders] == ["target", "hint"]
     assert deployment.read_text() == before
 

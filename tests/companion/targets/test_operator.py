@@ -200,6 +200,7 @@ def test_a_target_is_held_by_geometry_hidden_by_a_roof_and_ends_when_it_is_long_
     place = np.array([-12.0, 0.0, 0.0])  # on the ground, beside the roof (-10 to 10 m)
     operator.fly(10)
     pixel = projected(estimate(pose_at(0.9), 0), place)
+    assert pixel is not None
     operator.clicks_at(pixel[0] / 640, pixel[1] / 480, after_ms=0)
     operator.fly(200)
     seen = [t.fix.visibility for t in operator.told]
