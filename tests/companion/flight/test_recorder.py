@@ -246,13 +246,13 @@ def test_a_disk_that_stands_still_is_left_behind(tmp_path, monkeypatch):
         """A target whose row takes as long as a disk that stands still."""
 
         @property
-        def position_world(self):
+        def fix(self):
             still.wait(60.0)
-            return np.zeros(3)
 
-    recorder.target(Standing(), None)
+    recorder.target(Standing())
     for _ in range(5000):  # more than the queue holds
         recorder.event("info", "x")
+    assert recorder.dropped > 0  # it stands
     began = time.monotonic()
     recorder.close()
     assert time.monotonic() - began < 30.0
