@@ -174,7 +174,10 @@ def run_set(
     """
     chosen = np.random.default_rng(37).permutation(len(everywhere))[:_PLACES]
     places = [everywhere[int(k)] for k in chosen]
-    done = {o.view for o in read(path)} if path.exists() else set()
+    kept = read(path) if path.exists() else []
+    if path.exists() and len(kept) != len(path.read_text().splitlines()):
+        path.write_text("".join(json.dumps(asdict(o)) + "\n" for o in kept))
+    done = {o.view for o in kept}
     left = [k for k in range(len(views)) if k not in done]
     with Registrar(LocalizerConfig()) as registrar, path.open("a") as file:
         while left and more_time():

@@ -1,0 +1,81 @@
+"""What the integrity benchmark counts: false accepts, losses, and files that were cut short."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import asdict, replace
+
+import numpy as np
+import pytest
+
+from benchmarks.common.shares import exact_interval
+from benchmarks.integrity.report import OURS, WITHOUT, rows
+from benchmarks.integrity.run import Outcome, read, turn
+from localizer.integrity.acceptance import IntegrityConfig
+
+RIGHT = Outcome(
+    "quito", 0, "day", "near", 3.0, 3.0, True, metres=0.2, degrees=0.1, off_map_m=0.2,
+    overlap=0.9, quality=0.6, sigma_m=0.2, gate=3.0, parts=60, votes=57, peak=7.0, lead=1.0,
+)  # fmt: skip
+WRONG = replace(RIGHT, kind="far", metres=40.0, off_map_m=40.0, votes=9)
+
+
+def of(outcomes: list[Outcome], acceptance: str, name: str = "all"):
+    made = rows(outcomes, IntegrityConfig())
+    return next(r for r in made if (r.set, r.acceptance) == (name, acceptance))
+
+
+def test_what_the_votes_let_through_and_what_they_cost():
+    torn = replace(RIGHT, votes=10)
+    outcomes = [
+        RIGHT,
+        torn,
+        WRONG,
+        replace(WRONG, metres=5.0, off_map_m=5.0),
+        replace(WRONG, ok=False),
+    ]
+    before, ours = of(outcomes, WITHOUT), of(outcomes, OURS)
+    assert (before.false.hits, before.false_far.hits, before.false.count) == (2, 1, 3)
+    assert (before.lost.hits, before.lost.count) == (0, 2)
+    assert (ours.false.hits, ours.lost.hits, ours.lost.count) == (0, 1, 2)
+
+
+def test_a_right_place_from_a_wrong_beginning_is_no_false_accept():
+    found = replace(RIGHT, kind="lost")
+    assert of([found], OURS).false.hits == 0
+    assert of([found], OURS).false.count == 1
+
+
+def test_the_picture_of_a_shifted_map_is_where_it_shows():
+    shifted = replace(RIGHT, set="shifted", kind="far", metres=5.1, off_map_m=0.1)
+    assert of([shifted], OURS, "shifted").false.hits == 0
+
+
+def test_a_wrong_focal_length_and_equal_roofs_are_counted_apart_and_in_all():
+    focal = replace(WRONG, kind="focal", votes=58, metres=6.0, off_map_m=6.0)
+    roofs = replace(WRONG, set="roofs", votes=58)
+    assert of([focal, roofs], OURS).false.hits == 2
+    assert of([focal, roofs], OURS, "all, focal length right").false.hits == 1
+    assert (
+        of([focal, roofs, RIGHT], OURS, "all, focal length right, no equal roofs").false.hits == 0
+    )
+
+
+def test_a_line_that_was_cut_short_costs_its_view_alone(tmp_path):
+    path = tmp_path / "quito.jsonl"
+    lines = [json.dumps(asdict(replace(RIGHT, view=k))) for k in (0, 1, 1)]
+    path.write_text("\n".join(lines)[:-20])
+    assert [o.view for o in read(path)] == [0]
+
+
+def test_a_set_has_its_turn_and_no_more():
+    mine = turn(lambda: True, 3)
+    assert [mine() for _ in range(5)] == [True, True, True, False, False]
+    assert not turn(lambda: False, 3)()
+
+
+@pytest.mark.parametrize(("hits", "count", "high"), [(0, 10_000, 0.0369), (4, 10_000, 0.1024)])
+def test_intervals_are_exact(hits, count, high):
+    """Upper bounds of 0 and 4 of 10,000: 1 - 0.025^(1/n), and by tables of Clopper and Pearson."""
+    assert exact_interval(hits, count)[1] == pytest.approx(high, abs=2e-4)
+    assert np.isclose(exact_interval(count, count)[1], 100.0)
