@@ -34,6 +34,7 @@ from localizer.types import FeaturePyramid, PosePrior
 _SEARCH_WIDTH = 480  # px of the frame that the ground is rectified from
 _BLUR_PX = 0.6  # the map is sampled more coarsely than the frame
 _LEAST_JUDGED = 3  # candidates
+_NEARLY = 0.8  # of the winner's correlation: a place that has to be looked at, too
 _SAME_PLACE_M = 5.0  # answers that are closer are one
 
 
@@ -138,8 +139,7 @@ class Relocalizer:
                 return []
             prior = self._verifier.prior(candidate, query)
             judged.append(self._judge(features, camera, query, candidate, rank, prior))
-            # The first few are looked at in any case: among equal roofs several places agree.
-            if rank + 1 >= _LEAST_JUDGED and any(map(self._is_decisive, judged)):
+            if self._is_settled(judged, candidates[rank + 1 :]):
                 break
         order = sorted(judged, key=lambda j: -j.result.quality)
         final = []
@@ -156,6 +156,15 @@ class Relocalizer:
                 j = self._judge(features, camera, query, j.candidate, j.rank, prior)
             final.append(j)
         return sorted(final, key=lambda j: (-int(j.credible), -j.result.quality))
+
+    def _is_settled(self, judged: list[Judged], left: list[PlaceCandidate]) -> bool:
+        """Whether the rest need not be looked at: one of the first few is decisive, and nowhere
+        else does the ground look nearly as much like the frame, as among equal roofs it does.
+        """
+        decisive = [j.candidate.score for j in judged if self._is_decisive(j)]
+        if len(judged) < _LEAST_JUDGED or not decisive:
+            return False
+        return all(c.score < _NEARLY * max(decisive) for c in left)
 
     def _is_decisive(self, judged: Judged) -> bool:
         """Whether no other candidate can be better: all but a few parts of the image agree."""
@@ -196,6 +205,10 @@ class Relocalizer:
             return None
         own = best.candidate.score
         runner_up = max((c.score for k, c in enumerate(candidates) if k != best.rank), default=0.0)
+        # Where other ground looks nearly as much like the frame, the right place may be none of the
+        # candidates: half-agreeing parts are what the next of many equal roofs gives.
+        if runner_up >= _NEARLY * own and not self._is_decisive(best):
+            return None
         return Relocalization(
             best.result.world_from_camera,
             best.result.covariance,
