@@ -99,6 +99,10 @@ class InjectionConfig(_Model):
         default=False,
         description="inject and switch without a go of the shadow score; told as a warning",
     )
+    map_shift: Literal["tell", "apply"] = Field(
+        default="tell",
+        description="what is done about a map that lies beside GNSS; apply: fixes are shifted",
+    )
     send_attitude: bool = True
     covariance: Literal["profile", "cbrt", "sqrt", "variance"] = "profile"
     gps_id: int = Field(default=0, ge=0, le=3, description="0-based GPS instance of GPS_INPUT")

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from functools import partial
 
 import cv2
 import numpy as np
@@ -29,6 +30,9 @@ from localizer.types import FeaturePyramid, Image
 _BEGIN_M, _BEGIN_RAD = 0.1, float(np.radians(0.05))  # sigmas: the tracker's last good fix
 _STARTED_NS = 1_000_000_000
 _SURFACE = 4000  # points: anchors of a reference view, as configured for flight
+
+
+Surface = Callable[[], Array | None] | None
 
 
 @dataclass(frozen=True)
@@ -87,8 +91,8 @@ class Flyer:
         for k, frame in enumerate(self._frames(stretch, rng)):
             for run in runs:
                 if k:
-                    surface = self._surface(run.ahead) if run.depth == "map" else None
-                    run.step(frame, surface, stretch, k)
+                    look = partial(self._surface, run.ahead) if run.depth == "map" else None
+                    run.step(frame, look, stretch, k)
                 else:
                     run.odometry.begin(
                         frame, begun, covariance, velocity=stretch.velocity,
@@ -140,7 +144,7 @@ class _Run:
         self.steps: list[Step] = []
         self._begun = self._last = begun
 
-    def step(self, frame: OdometryFrame, surface: Array | None, stretch: Stretch, k: int) -> None:
+    def step(self, frame: OdometryFrame, surface: Surface, stretch: Stretch, k: int) -> None:
         """Carry on by one frame, and measure it."""
         started = time.perf_counter()
         estimate = self.odometry.step(frame, surface=surface, constraint=stretch.sensed[k])

@@ -63,6 +63,7 @@ class HealthMonitor:
         position_sigma_m: Callable[[], float | None] = lambda: None,
         guardian: Guardian | None = None,
         unreadable_nodes: Callable[[], int] = lambda: 0,
+        map_shift: Callable[[], dict[str, float | bool] | None] = lambda: None,
     ) -> None:
         self._engine_health = engine_health
         self._bridge = bridge
@@ -72,6 +73,7 @@ class HealthMonitor:
         self._position_sigma_m = position_sigma_m
         self._guardian = guardian
         self._unreadable_nodes = unreadable_nodes
+        self._map_shift = map_shift
         self._ended = ""
         self.newest: dict[str, Any] = {"level": "starting", "text": "starting"}
         """The newest report, as health.json has it."""
@@ -198,6 +200,7 @@ class HealthMonitor:
             "bridge": self._bridge.counters(),
             "shadow": self._bridge.shadow_score().line(),
             "guardian": self._guardian_report(),
+            "map_shift": self._map_shift(),
         }
         self.newest = report
         if self._file is None:

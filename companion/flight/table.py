@@ -13,6 +13,7 @@ from typing import Any
 
 import numpy as np
 
+from companion.calibration.map_shift import MapShift
 from companion.config import CompanionConfig
 from companion.errors import ConfigError
 from companion.flight.conversions import Installation, target_report
@@ -139,6 +140,7 @@ def _health(making: Making) -> HealthMonitor:
         lambda: autopilot().sigma_m,
         making.get(Guardian),
         lambda: streamer.counters().unreadable,
+        making[MapShift].report,
     )
     making.channels.estimates.subscribe(lambda estimate, _: health.add_estimate(estimate))
     return health
@@ -221,6 +223,18 @@ def _injection(making: Making) -> FixInjection:
     injection = FixInjection(making[Bridge], making[Installation])
     making.channels.estimates.subscribe(injection.add_estimate)
     return injection
+
+
+def _map_shift(making: Making) -> MapShift:
+    injection = making.config.bridge.injection
+    shift = MapShift(
+        making[Bridge],
+        injection.map_shift,
+        making.channels.events.send,
+        gnss_is_ours=injection.message == "gps_input",
+    )
+    making[FixInjection].add_judge(shift.judge)
+    return shift
 
 
 def _guardian(making: Making) -> Guardian:
@@ -337,6 +351,7 @@ PARTS: tuple[Part[Any], ...] = (
         start=Bridge.start, stop=Bridge.stop, close=Bridge.stop,  # one not started has files open
     ),
     Part("injection", FixInjection, _injection, depends=(Bridge, Installation)),
+    Part("map shift", MapShift, _map_shift, depends=(Bridge, FixInjection)),
     Part(
         "guardian", Guardian, _guardian, depends=(Bridge, Installation, FixInjection),
         start=Guardian.start, stop=Guardian.stop, wanted=lambda config: config.guardian.enabled,
@@ -349,7 +364,7 @@ PARTS: tuple[Part[Any], ...] = (
     Part("source", FrameSource, _source, depends=(Bridge,)),
     Part(
         "health", HealthMonitor, _health,
-        depends=(MapStack, Bridge, RecordKeeper, FrameSource, Guardian),
+        depends=(MapStack, Bridge, MapShift, RecordKeeper, FrameSource, Guardian),
         later=(DualThreadEngine, AutopilotPose), start=HealthMonitor.start, stop=HealthMonitor.stop,
     ),
     Part(

@@ -67,9 +67,12 @@ class OdometryConfig(BaseModel):
     rise_sigma_m: float = Field(
         0.3, ge=0.01, le=100, description="of the barometer's rise since the keyframe"
     )
+    parallax_noise: float | None = Field(
+        0.02, ge=1e-4, le=10, description="sigma of a parallax's cost, as a share; null: not used"
+    )
     with_map: GrowthModel = Field(
         GrowthModel(
-            registration=16.0, scale=0.001, horizontal=0.02, vertical=0.02, tilt=2e-4, heading=4e-4
+            registration=1.0, scale=0.001, horizontal=0.02, vertical=0.02, tilt=5e-4, heading=4e-4
         ),
         description="growth with depth from the map's geometry",
     )

@@ -34,7 +34,7 @@ class Keyframe:
 
     anchors: its features at world points, as the map registration's. covariance: (6, 6) of its
     pose, as `PosePrior`'s. source: of its depth. way_m: flown up to it. constraint: what other
-    sensors said of its pose.
+    sensors said of its pose. features, surface: what it was made of.
     """
 
     anchors: Anchors
@@ -43,6 +43,8 @@ class Keyframe:
     time_ns: int
     source: DepthSource
     way_m: float
+    features: FeaturePyramid
+    surface: Array | None = None
     constraint: PoseConstraint | None = None
 
 
@@ -66,7 +68,7 @@ def keyframe_anchors(
     rng = np.random.default_rng(seed)
     points, pixels = np.zeros((0, 3)), np.zeros((0, 2))
     if surface is not None:
-        points, pixels = _in_view(surface, world_from_camera, camera)
+        points, pixels = in_view(surface, world_from_camera, camera)
         if len(points) > count:
             chosen = np.sort(rng.choice(len(points), count, replace=False))
             points, pixels = points[chosen], pixels[chosen]
@@ -88,7 +90,7 @@ def _require_host(features: FeaturePyramid) -> None:
         )
 
 
-def _in_view(points: Array, pose: Pose, camera: Camera) -> tuple[Array, Array]:
+def in_view(points: Array, pose: Pose, camera: Camera) -> tuple[Array, Array]:
     """Those of the points (N, 3) that the camera sees off its border, with their pixels."""
     pixels, inside = camera.project(pose.inverse.apply(points))
     pixels, points = pixels[inside], points[inside]

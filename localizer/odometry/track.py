@@ -1,0 +1,139 @@
+"""The thread of poses that the odometry follows: predicted, judged, carried on by one frame."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from localizer.geometry.pose import Array, Pose
+from localizer.odometry.config import GrowthModel, OdometryConfig
+from localizer.odometry.estimate import OdometryFrame
+from localizer.odometry.growth import (
+    carried,
+    distance_squared,
+    fused,
+    since,
+    walked,
+    weighed,
+    without_constant_error,
+)
+from localizer.odometry.keyframe import DepthSource, Keyframe
+from localizer.registration.priors import PoseConstraint
+from localizer.registration.result import Registration
+from localizer.types import PosePrior, RegistrationStatus
+
+_SEARCH_M, _SEARCH_RAD = 1.0, float(np.radians(2.0))  # sigmas of a search without a prediction
+
+
+@dataclass(frozen=True)
+class Beginning:
+    """Where and when the pose was last known otherwise, and what a first keyframe is made of."""
+
+    frame: OdometryFrame
+    pose: Pose
+    covariance: Array
+    surface: Array | None
+    constraint: PoseConstraint | None
+
+    def corrected(self, constraint: PoseConstraint | None) -> PoseConstraint | None:
+        """The constraint without the constant error that it had at the beginning."""
+        if constraint is None or self.constraint is None:
+            return constraint
+        return without_constant_error(constraint, self.constraint, self.pose)
+
+
+@dataclass(frozen=True)
+class Track:
+    """The last usable estimate. covariance: without the error of scale. constraint: what other
+    sensors said, less their constant error. relative: (6, 6) what the covariance holds beside the
+    keyframe's own. best: quality of the keyframe's first registration.
+    """
+
+    pose: Pose
+    covariance: Array
+    velocity: Array
+    time_ns: int
+    way_m: float
+    aided_rotation: Array | None
+    constraint: PoseConstraint | None
+    relative: Array
+    best: float = 0.0
+
+    def ahead(
+        self, config: OdometryConfig, time_ns: int, constraint: PoseConstraint | None
+    ) -> PosePrior:
+        """Constant velocity, turned by what the sensors say."""
+        dt = seconds(self.time_ns, time_ns)
+        rotation, aided = self.pose.rotation, aided_rotation(constraint)
+        if aided is not None and self.aided_rotation is not None:
+            rotation = aided @ self.aided_rotation.T @ rotation
+        pose = Pose(rotation, self.pose.translation + self.velocity * dt)
+        reach = _SEARCH_M + 0.5 * config.acceleration_sigma * dt**2
+        sigma = np.repeat([reach, _SEARCH_RAD * (1.0 + dt)], 3)
+        return PosePrior(pose, np.diag(sigma**2), time_ns, self.velocity)
+
+
+def growth_of(config: OdometryConfig, keyframe: Keyframe) -> GrowthModel:
+    """The model of growth for the keyframe's source of depth."""
+    return config.with_map if keyframe.source is DepthSource.MAP else config.with_ground
+
+
+def fault(config: OdometryConfig, result: Registration, prior: PosePrior) -> str:
+    """Why a registration is not used; "" if it is."""
+    if result.status is not RegistrationStatus.OK:
+        return str(result.status.value)
+    if result.quality < config.min_quality:
+        return f"quality {result.quality:.2f} is below {config.min_quality:g}"
+    if result.overlap < config.min_overlap:
+        return f"overlap {result.overlap:.2f} is below {config.min_overlap:g}"
+    sigma = float(np.sqrt(result.covariance.diagonal()[:3].max()))
+    if sigma > config.max_sigma_m:
+        return f"position sigma {sigma:.1f} m is beyond {config.max_sigma_m:g}"
+    if distance_squared(prior, result.world_from_camera, result.covariance) > config.gate:
+        return "the pose contradicts the prediction"
+    return ""
+
+
+def followed(
+    config: OdometryConfig,
+    track: Track,
+    keyframe: Keyframe,
+    result: Registration,
+    time_ns: int,
+    sensed: tuple[PoseConstraint | None, PoseConstraint | None],
+) -> Track:
+    """The track after a registration against the keyframe.
+
+    sensed: what other sensors say of this frame, as they say it and less their constant error.
+    """
+    constraint, corrected = sensed
+    model, begun = growth_of(config, keyframe), keyframe.world_from_camera
+    hop = float(np.linalg.norm(result.world_from_camera.translation - begun.translation))
+    relative = model.registration * result.covariance + walked(model, hop)
+    pose = result.world_from_camera
+    if keyframe.constraint is not None and corrected is not None:
+        turn = np.radians(
+            [config.turn_sigma_deg, config.turn_sigma_deg, config.heading_turn_sigma_deg]
+        )
+        if known := since(keyframe.constraint, corrected, begun, turn, config.rise_sigma_m):
+            pose, relative = weighed(pose, relative, known)
+    lever = pose.translation - begun.translation
+    pose, covariance = fused(pose, carried(keyframe.covariance, lever) + relative, corrected)
+    dt = seconds(track.time_ns, time_ns)
+    velocity = (pose.translation - track.pose.translation) / dt if dt > 0 else track.velocity
+    return Track(
+        pose, covariance, velocity, time_ns, keyframe.way_m + hop, aided_rotation(constraint),
+        corrected, relative, track.best or result.quality,
+    )  # fmt: skip
+
+
+def aided_rotation(constraint: PoseConstraint | None) -> Array | None:
+    """The rotation that a constraint knows."""
+    known = constraint is not None and bool(np.diag(constraint.information)[3:].all())
+    return constraint.world_from_camera.rotation if known and constraint is not None else None
+
+
+def seconds(begin_ns: int, end_ns: int) -> float:
+    """From nanoseconds."""
+    return (end_ns - begin_ns) * 1e-9
