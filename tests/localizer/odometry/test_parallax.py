@@ -55,7 +55,7 @@ def test_a_keyframe_that_is_off_is_brought_to_the_maps_shape(mountains: Flight) 
         assert found is not None
         error = off(found.first, mountains.pose(FIRST))
         before.append(np.degrees(step[3:5]))
-        after.append(error[3:5])
+        after.append(error[3:5].copy())
         error[3:] = np.radians(error[3:])
         distances.append(error @ np.linalg.solve(found.covariance, error) / 6)
         assert np.linalg.det(found.covariance) < 0.1 * np.linalg.det(covariance)
