@@ -10,7 +10,7 @@ from tests.localizer.odometry.conftest import CAMERA, Flight
 from tests.localizer.registration.conftest import SyntheticPlace
 
 FIRST, SECOND = 0, 6  # 24 m apart
-NOISE = 0.01
+NOISE = 0.02
 
 
 @pytest.fixture(scope="module")
