@@ -39,7 +39,7 @@ def console_command(
     meeting = given.listen
     if listen is not None:
         given = ConsoleConfig.model_validate(given.model_dump() | {"listen": listen})
-    os.nice(_NICE)
+    os.setpriority(os.PRIO_PROCESS, 0, _NICE)  # whatever priority the flight has
     if lifeline:
         threading.Thread(target=_end_with_input, name="lifeline", daemon=True).start()
     require_extra()
