@@ -161,6 +161,7 @@ def _targets(making: Making) -> TargetReporter:
         camera, number = target.estimate.camera, numbers.of(target.fix.target_id)
         bridge.report(target_report(target.fix, camera, cache.frame, number))
 
+    channels.frames.subscribe(reporter.add_frame)
     channels.estimates.subscribe(lambda estimate, _: reporter.add_estimate(estimate))
     channels.targets.subscribe(report)
     channels.gone.subscribe(lambda name: bridge.forget(numbers.of(name)))

@@ -6,8 +6,9 @@ No thread and no clock: what time it is, the frames' exposures say.
 from __future__ import annotations
 
 import logging
+from collections import deque
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -15,6 +16,7 @@ from companion.config import TargetConfig
 from companion.targets.detections import CLICKED, Detection
 from localizer.geometry.pose import Array
 from localizer.targets.bias import SharedBias
+from localizer.targets.follow import Gray, ImageFollower
 from localizer.targets.locate import RayCaster, ray_in_world
 from localizer.targets.track import TargetSettings, TargetTrack, projected
 from localizer.types import PoseEstimate, TargetFix, Visibility
@@ -24,6 +26,17 @@ _MAX_DETECTED = 32  # at a time: what a telemetry link bears
 # A detected target unseen for so long makes room for another.
 _GONE_NS = 10_000_000_000
 _WARNING, _INFO = 4, 6  # MAV_SEVERITY
+_PICTURES = 24  # kept, of accepted frames: longer than an operator's delay
+_PICTURE_NS = 60_000_000  # between a click's frame and the picture that stands for it
+_PASSED_NS = 450_000_000  # a picture so much earlier or later shows the ground that a car covers
+_FOLLOWED_PX = 1.5
+_STILL_M = 1.0  # around where a standing target is expected
+_NEAR_M = 1.5  # around where a moving one is, and three sigmas of its motion, at most so many:
+_FAR_M = 15.0
+_DEPARTS_S = 1.0  # after a click: so long it may be one that moves
+_FASTEST_MPS = 25.0
+_COURSE_MPS = 3.0  # from which on its velocity says how it is turned
+_LOST_S = 4.0
 _PIXELS = 0.05  # of the picture's width: a delay's error beyond it is told as that much
 
 
@@ -66,7 +79,10 @@ class _Life:
     is_clicked: bool
     seen_ns: int
     """When it was last in the picture."""
-    extent: tuple[float, float] | None = None
+    extent_m: tuple[float, float] | None = None
+    follower: ImageFollower | None = None
+    found_ns: int = 0
+    """When it was last found in the image."""
     refusals: int = 0
 
 
@@ -96,6 +112,7 @@ class Population:
             config.max_sigma_m,
         )
         self._lives: dict[str, _Life] = {}
+        self._pictures: deque[tuple[PoseEstimate, Gray]] = deque(maxlen=_PICTURES)
         self.missed = 0
         self.doubted = 0
         self.refused = 0
@@ -110,11 +127,16 @@ class Population:
             self._say(_WARNING, f"PiLoT: target {click.number} refused: {track.refusal}")
             self._gone(name)
             return
-        life = _Life(track, time_ns, True, time_ns, click.extent)
+        life = _Life(track, time_ns, True, time_ns, found_ns=time_ns)
+        away = fix.position_world - click.estimate.world_from_camera.translation
+        if click.extent is not None:
+            cell = float(np.linalg.norm(away)) / click.estimate.camera.fx
+            life.extent_m = (click.extent[0] * cell, click.extent[1] * cell)
         self._lives[name] = life
         sigma = float(np.sqrt(fix.covariance[0, 0] + fix.covariance[1, 1]))
         self._say(_INFO, f"PiLoT: target {click.number}: +-{sigma:.1f} m")
         self._report(life, fix, click.estimate)
+        self._follow(name, life, click, fix)
 
     def see(self, detection: Detection, estimate: PoseEstimate) -> None:
         """A detection in its frame, at most `rate_hz` times a second."""
@@ -138,6 +160,12 @@ class Population:
         self._lives[name] = life
         life.told_ns = life.seen_ns = time_ns
         self._report(life, fix, estimate)
+
+    def look(self, estimate: PoseEstimate, gray: Gray) -> None:
+        """Every clicked target is looked for in the picture of an accepted frame, (H, W) grey."""
+        self._pictures.append((estimate, gray))
+        for name, life in [(n, x) for n, x in self._lives.items() if x.follower is not None]:
+            self._look_for(name, life, estimate, gray)
 
     def hold(self, estimate: PoseEstimate) -> None:
         """Every clicked target as a newer frame shows it; those out of sight too long end."""
@@ -163,7 +191,74 @@ class Population:
             if self._lives.pop(name, None) is not None:
                 self._gone(name)
 
+    def _follow(self, name: str, life: _Life, click: Click, fix: TargetFix) -> None:
+        """Begin to follow it in the image from the click's own picture, where that is kept, and
+        through those that came since: the operator's delay is made up for.
+        """
+        time_ns = click.estimate.exposure_time_ns
+        kept = [p for p in self._pictures if abs(p[0].exposure_time_ns - time_ns) <= _PICTURE_NS]
+        if not kept:
+            return
+        estimate, gray = min(kept, key=lambda p: abs(p[0].exposure_time_ns - time_ns))
+        half_m = None if life.extent_m is None else 0.5 * max(life.extent_m)
+        follower = ImageFollower(gray, estimate, fix.position_world, half_m)
+        if not follower.ready:
+            return
+        others = [
+            p for p in self._pictures
+            if abs(p[0].exposure_time_ns - estimate.exposure_time_ns) > _PASSED_NS
+        ]  # fmt: skip
+        follower.isolate(others, fix.position_world)
+        life.follower = follower
+        for newer, picture in [
+            p for p in self._pictures if p[0].exposure_time_ns > estimate.exposure_time_ns
+        ]:
+            if name in self._lives:
+                self._look_for(name, life, newer, picture)
+
+    def _look_for(self, name: str, life: _Life, estimate: PoseEstimate, gray: Gray) -> None:
+        """Measure its pixel where it is found; a moving one that is not coasts, then is lost."""
+        time_ns, track, follower = estimate.exposure_time_ns, life.track, life.follower
+        expected = track.expected(time_ns)
+        if follower is None or expected is None:
+            return
+        position, P = expected
+        since_s = (time_ns - life.found_ns) * 1e-9
+        if track.moves:
+            sigma = float(np.sqrt(max(np.linalg.eigvalsh(P)[-1], 0.0)))
+            found = follower.find(gray, estimate, position, _NEAR_M + min(3.0 * sigma, _FAR_M))
+        else:
+            found = follower.find(gray, estimate, position, _STILL_M)
+            if found is None and since_s <= _DEPARTS_S:
+                # It moves, though nobody has measured how: the ground that it left tells its shape.
+                if not follower.is_isolated:
+                    follower.isolate(((estimate, gray),), position)
+                if follower.is_isolated:
+                    reach_m = _NEAR_M + _FASTEST_MPS * since_s
+                    found = follower.find(gray, estimate, position, reach_m)
+        fix = None
+        if found is not None:
+            fix = track.see(estimate, found.pixel, pixel_sigma=_FOLLOWED_PX)
+            life.found_ns = life.seen_ns = time_ns
+            velocity = None if fix is None else fix.velocity
+            if track.moves and velocity is not None and np.hypot(*velocity[:2]) > _COURSE_MPS:
+                follower.turn_to(velocity)
+        elif track.moves and since_s > _LOST_S:
+            self._say(_INFO, f"PiLoT: target {name[len(CLICKED) :]} lost")
+            self.end((name,))
+            return
+        elif track.moves:
+            fix = track.coast(estimate)
+        if fix is not None and self._is_due(life, time_ns):
+            life.told_ns = time_ns
+            self._report(life, fix, estimate)
+
     def _report(self, life: _Life, fix: TargetFix, estimate: PoseEstimate) -> None:
+        if life.extent_m is not None:
+            away = fix.position_world - estimate.world_from_camera.translation
+            scale = estimate.camera.fx / float(np.linalg.norm(away))
+            extent = (life.extent_m[0] * scale, life.extent_m[1] * scale)
+            fix = replace(fix, extent=extent)
         self._tell(Target(fix, estimate))
 
     def _is_due(self, life: _Life, time_ns: int) -> bool:

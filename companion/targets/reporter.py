@@ -8,14 +8,17 @@ from collections import deque
 from collections.abc import Callable
 from typing import Any
 
+import cv2
+
 from companion.config import TargetConfig
 from companion.targets.detections import Detection
 from companion.targets.population import Click, Population, Target
 from localizer.targets.locate import RayCaster
-from localizer.types import PoseEstimate
+from localizer.types import Frame, PoseEstimate
 
 _log = logging.getLogger(__name__)
 _KEPT = 64
+_PICTURES = 16
 _MATCH_NS = 5_000_000  # detection and estimate must be of the same frame
 
 
@@ -45,6 +48,7 @@ class TargetReporter:
         self._estimates: deque[PoseEstimate] = deque(maxlen=_KEPT)
         self._detections: deque[Detection] = deque(maxlen=_KEPT)
         self._held: PoseEstimate | None = None
+        self._pictures: deque[Frame] = deque(maxlen=_PICTURES)
         self._condition = threading.Condition()
         self._stopping = False
         self.failed = 0
@@ -95,6 +99,11 @@ class TargetReporter:
             self._clicks.append(click)
             self._condition.notify()
 
+    def add_frame(self, frame: Frame) -> None:
+        """Offer a picture; it is looked at once its frame has an estimate. Never blocks."""
+        with self._condition:
+            self._pictures.append(frame)
+
     def forget(self, names: tuple[str, ...]) -> None:
         """End these targets: what was seen of them is dropped. Never blocks."""
         with self._condition:
@@ -114,6 +123,9 @@ class TargetReporter:
                 clicks, self._clicks = self._clicks, []
                 forgotten, self._forgotten = self._forgotten, ()
                 newest = self._estimates[-1] if self._estimates else None
+                pictures = self._take_pictures()
+            for estimate, frame in pictures:
+                self._guarded(self._population.look, estimate, _gray(frame))
             for click in clicks:
                 self._guarded(self._population.begin, click)
             for name in forgotten:
@@ -152,8 +164,24 @@ class TargetReporter:
         self._detections = deque(waiting, maxlen=_KEPT)
         return pairs
 
+    def _take_pictures(self) -> list[tuple[PoseEstimate, Frame]]:
+        """Pictures whose frame has an estimate; older ones never get one."""
+        found = {e.exposure_time_ns: e for e in self._estimates}
+        pairs = [
+            (found[f.exposure_time_ns], f) for f in self._pictures if f.exposure_time_ns in found
+        ]
+        newest = self._estimates[-1].exposure_time_ns if self._estimates else 0
+        self._pictures = deque(
+            (f for f in self._pictures if f.exposure_time_ns > newest), maxlen=_PICTURES
+        )
+        return pairs
+
     def _match(self, detection: Detection) -> PoseEstimate | None:
         for estimate in reversed(self._estimates):
             if abs(estimate.exposure_time_ns - detection.time_ns) <= _MATCH_NS:
                 return estimate
         return None
+
+
+def _gray(frame: Frame) -> Any:
+    return cv2.cvtColor(frame.image, cv2.COLOR_RGB2GRAY)

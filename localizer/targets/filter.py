@@ -68,6 +68,14 @@ class TargetFilter:
         covariance: Array = self._tracks[0].covariance[3:, 3:].copy()
         return covariance
 
+    def expected(self, time_ns: int) -> tuple[Array, Array] | None:
+        """Where it would be by its motion: position (3,), covariance (3, 3); None before a first
+        sighting."""
+        if not self._tracks:
+            return None
+        track = _predicted(self._tracks[0], time_ns - self._time_ns)
+        return track.mean[:3], track.covariance[:3, :3]
+
     def update(self, sighting: TargetSighting) -> TargetFix | None:
         """Fuse a sighting of at least one surface. Three that fit no track restart the filter.
 

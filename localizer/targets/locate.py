@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import cache
 
 import numpy as np
 
@@ -142,6 +143,7 @@ def locate(
     return tuple(sorted(found, key=lambda s: -s.probability))
 
 
+@cache
 def _nodes() -> tuple[Array, Array]:
     """Gauss-Hermite quadrature of the plane's standard normal: nodes (N, 2), weights (N,)."""
     x, w = np.polynomial.hermite_e.hermegauss(_ORDER)

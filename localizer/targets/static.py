@@ -140,6 +140,12 @@ class StaticTarget:
         return True
 
     @property
+    def strain(self) -> float:
+        """How much more the newest sightings disagree than their errors say, squared; 1: not."""
+        n = len(self._recent)
+        return max(1.0, sum(self._recent) / (2 * n)) if n else 1.0
+
+    @property
     def moves(self) -> bool:
         """Whether the newest sightings say that it does not stand still."""
         n = len(self._recent)

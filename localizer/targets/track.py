@@ -107,6 +107,30 @@ class TargetTrack:
         self._last, self._seen_ns = fix, time_ns
         return fix
 
+    def expected(self, time_ns: int) -> tuple[Array, Array] | None:
+        """Position (3,) and covariance (3, 3) where it should be at a time; None before a fix."""
+        if self._last is None:
+            return None
+        if self._moves:
+            return self._moving.expected(time_ns)
+        best = self._static.places()[0]
+        return best.position, best.covariance
+
+    def coast(self, estimate: PoseEstimate) -> TargetFix | None:
+        """A moving target that is not seen, where its motion carries it; None of another."""
+        expected = self.expected(estimate.exposure_time_ns) if self._moves else None
+        if expected is None:
+            return None
+        position, P = expected
+        if float(np.sqrt(np.trace(P))) > self._settings.max_sigma_m:
+            return None
+        bias = self._settings.bias.covariance(position - estimate.world_from_camera.translation)
+        return TargetFix(
+            self._id, position, P + bias, projected(estimate, position),
+            estimate.exposure_time_ns, 0.0, self._moving.velocity,
+            self._moving.velocity_covariance, Visibility.HIDDEN,
+        )  # fmt: skip
+
     def hold(self, estimate: PoseEstimate) -> TargetFix | None:
         """A standing target where the pose projects it; None of one that moves, or before one."""
         if self._moves or self._last is None:
@@ -137,7 +161,8 @@ class TargetTrack:
         covariance, elsewhere = bias.copy(), 0.0
         for place in places:
             offset = place.position - best.position
-            covariance += place.weight * (place.covariance + np.outer(offset, offset))
+            spread = self._static.strain * place.covariance
+            covariance += place.weight * (spread + np.outer(offset, offset))
             if offset @ np.linalg.solve(best.covariance + bias, offset) > _ELSEWHERE:
                 elsewhere += place.weight
         return TargetFix(

@@ -39,7 +39,7 @@ def pose_at(time_s, speed=10.0, turn=0.0):
     return Pose(sway @ DOWN, np.array([speed * time_s - 40.0, 5.0 * np.sin(0.3 * time_s), 100.0]))
 
 
-def estimate(pose, time_ns, state=TrackingState.TRACKING, sigma=0.01, accepted=True):
+def estimate(pose, time_ns, state=TrackingState.TRACKING, sigma=0.01, accepted=True, camera=CAMERA):
     """What a localizer would say of it."""
     P = np.diag(np.repeat([sigma, sigma * 1e-2], 3) ** 2)
-    return PoseEstimate(pose, P, 1.0, state, RegistrationStatus.OK, accepted, time_ns, 0, CAMERA)
+    return PoseEstimate(pose, P, 1.0, state, RegistrationStatus.OK, accepted, time_ns, 0, camera)

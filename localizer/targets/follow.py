@@ -1,0 +1,204 @@
+"""A target followed in the image: its appearance, looked for on ground that the pose holds still.
+
+Each frame is resampled to a chart: a square of the horizontal plane through the target, of fixed
+metres per cell. In charts the camera's motion is gone: what stands still stays in its cell, a car
+moves by its own way at its own size, and turned to its course it keeps its look through a bend.
+Normalised cross-correlation with two templates (the first one and one of late) finds it there.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from localizer.geometry.pose import Array
+from localizer.targets.track import projected
+from localizer.types import PoseEstimate
+
+Gray = NDArray[np.uint8]
+
+_SMALLEST_M, _LARGEST_M = 1.5, 15.0  # half the side of what is followed
+_POINT_M = 3.0  # half the side around a point of which no extent is known
+_CELLS = (9, 41)  # of a template's half side: what tells it from others, and what costs little
+_LARGEST_REACH = 80  # cells that are searched to each side
+_SEEN = 0.65  # correlation from which on it is the target
+_SURE = 0.8  # from which on its present look is learned
+_CLEAR = 1.15  # by how much the best place leads the second
+_RENEWED_NS = 500_000_000
+_OTHER, _NOISES = 10.0, 3.0  # grey levels, and medians of the chart: what differs by more has moved
+_SHARES = (0.03, 0.7)  # of a chart that may be the target
+_BEND_RAD = 0.1
+_FLAT = 4.0  # grey levels: a template of less contrast tells nothing
+
+
+@dataclass(frozen=True)
+class Found:
+    """Where the target is in a frame. position: (3,) world metres on the chart's plane."""
+
+    position: Array
+    pixel: tuple[float, float]
+    score: float
+
+
+class ImageFollower:
+    """Follows one target from a frame in which its place is known. Not thread-safe.
+
+    half_m: half the side of what is followed; None around a point. Use `ready` first: plain ground
+    has no look that could be followed.
+    """
+
+    def __init__(
+        self, gray: Gray, estimate: PoseEstimate, position: Array, half_m: float | None
+    ) -> None:
+        self._half_m = float(np.clip(half_m or _POINT_M, _SMALLEST_M, _LARGEST_M))
+        camera = estimate.camera
+        distance = float(np.linalg.norm(position - estimate.world_from_camera.translation))
+        cell = distance / camera.fx
+        half = int(np.clip(round(self._half_m / cell), *_CELLS))
+        self._cell, self._half = self._half_m / half, half
+        self._course = 0.0
+        first = self._chart(gray, estimate, position, half)
+        self._first, self._late = first, first
+        self._mask: NDArray[np.float32] | None = None
+        self._is_laid = False
+        self._renewed_ns = estimate.exposure_time_ns
+        self.ready = first is not None and float(first.std()) >= _FLAT
+
+    def find(
+        self, gray: Gray, estimate: PoseEstimate, expected: Array, reach_m: float
+    ) -> Found | None:
+        """The target within `reach_m` of where it is expected (3,); None where it is not seen."""
+        reach = min(int(np.ceil(reach_m / self._cell)) + 1, _LARGEST_REACH)
+        chart = self._chart(gray, estimate, expected, self._half + reach)
+        if chart is None:
+            return None
+        best: tuple[float, Array] | None = None
+        for template in (self._late, self._first):
+            if template is None:
+                continue
+            score, offset = _match(chart, template, self._mask, reach)
+            if best is None or score > best[0] + 0.05:
+                best = score, offset
+        if best is None or best[0] < _SEEN:
+            return None
+        position = expected + self._on_ground(best[1] * self._cell)
+        pixel = projected(estimate, position)
+        if pixel is None:
+            return None
+        if best[0] >= _SURE and estimate.exposure_time_ns - self._renewed_ns >= _RENEWED_NS:
+            self._renew(gray, estimate, position)
+        return Found(position, pixel, best[0])
+
+    def isolate(self, pictures: Sequence[tuple[PoseEstimate, Gray]], position: Array) -> bool:
+        """Tell it from the ground by pictures of the same ground (3,) without it; False if it
+        cannot be told: it does not move, or the pictures do not show that.
+
+        In charts the ground stands still, so what differs from their median is what has moved.
+        """
+        charts = [self._chart(gray, estimate, position, self._half) for estimate, gray in pictures]
+        known = [chart for chart in charts if chart is not None]
+        if not known or self._first is None:
+            return False
+        off = np.abs(self._first - np.median(known, axis=0))
+        off = cv2.GaussianBlur(off, (0, 0), 1.0)
+        least = max(_OTHER, _NOISES * float(np.median(off)))
+        close = cv2.morphologyEx((off > least).astype(np.uint8), cv2.MORPH_CLOSE, np.ones((3, 3)))
+        _, labels, stats, _ = cv2.connectedComponentsWithStats(close)
+        middle = labels[self._half - 1 : self._half + 2, self._half - 1 : self._half + 2]
+        here = [label for label in np.unique(middle) if label != 0]
+        if not here:
+            return False
+        label = max(here, key=lambda k: int(stats[k, cv2.CC_STAT_AREA]))
+        share = float(stats[label, cv2.CC_STAT_AREA]) / labels.size
+        if not _SHARES[0] <= share <= _SHARES[1]:
+            return False
+        mask = cv2.dilate((labels == label).astype(np.uint8), np.ones((3, 3)))
+        self._mask = mask.astype(np.float32)
+        return True
+
+    @property
+    def is_isolated(self) -> bool:
+        """Whether it is known which cells are the target's and which the ground's."""
+        return self._mask is not None
+
+    def turn_to(self, velocity: Array) -> None:
+        """Lay charts along its course (m/s, world axes): in them a bend does not turn it."""
+        course = float(np.arctan2(velocity[1], velocity[0]))
+        if not self._is_laid:
+            self._is_laid = True
+            self._first, self._late = (
+                self._turned(self._first, course),
+                self._turned(self._late, course),
+            )
+            self._mask = self._turned(self._mask, course)
+            self._course = course
+        elif abs(np.remainder(course - self._course + np.pi, 2 * np.pi) - np.pi) > _BEND_RAD:
+            self._course = course
+
+    def _turned(
+        self, chart: NDArray[np.float32] | None, course: float
+    ) -> NDArray[np.float32] | None:
+        """A chart to the north as it looks along a course."""
+        if chart is None:
+            return None
+        c, s, h = np.cos(course), np.sin(course), float(self._half)
+        back = np.array([[c, -s, h - c * h + s * h], [s, c, h - s * h - c * h]])
+        turned: NDArray[np.float32] = cv2.warpAffine(
+            chart, back, chart.shape[::-1], flags=cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP,
+            borderMode=cv2.BORDER_REPLICATE,
+        )  # fmt: skip
+        return turned
+
+    def _renew(self, gray: Gray, estimate: PoseEstimate, position: Array) -> None:
+        fresh = self._chart(gray, estimate, position, self._half)
+        if fresh is not None and float(fresh.std()) >= _FLAT:
+            self._late, self._renewed_ns = fresh, estimate.exposure_time_ns
+
+    def _on_ground(self, along: Array) -> Array:
+        """Metres along the chart's rows and columns (2,) as a world vector (3,)."""
+        c, s = np.cos(self._course), np.sin(self._course)
+        return np.array([c * along[0] - s * along[1], s * along[0] + c * along[1], 0.0])
+
+    def _chart(
+        self, gray: Gray, estimate: PoseEstimate, middle: Array, half: int
+    ) -> NDArray[np.float32] | None:
+        """(2 half + 1, 2 half + 1) grey levels about `middle`; None where some are not in view."""
+        steps = np.arange(-half, half + 1) * self._cell
+        c, s = np.cos(self._course), np.sin(self._course)
+        x, y = np.meshgrid(steps, steps)
+        points = np.stack([middle[0] + c * x - s * y, middle[1] + s * x + c * y,
+                           np.full_like(x, middle[2])], axis=-1)  # fmt: skip
+        pose = estimate.world_from_camera
+        pixels, inside = estimate.camera.project((points - pose.translation) @ pose.rotation)
+        if not inside[half, half] or float(np.mean(inside)) < 0.6:
+            return None
+        at = np.nan_to_num(pixels - 0.5, nan=-1e3).astype(np.float32)
+        chart = cv2.remap(gray, at, None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+        return np.asarray(chart, dtype=np.float32)
+
+
+def _match(
+    chart: NDArray[np.float32],
+    template: NDArray[np.float32],
+    mask: NDArray[np.float32] | None,
+    reach: int,
+) -> tuple[float, Array]:
+    """(correlation, offset in cells (2,), x then y) of the best place; 0 where a second rivals."""
+    scores = cv2.matchTemplate(chart, template, cv2.TM_CCOEFF_NORMED, mask=mask)
+    scores = np.nan_to_num(scores, nan=-1.0, posinf=-1.0, neginf=-1.0)
+    _, best, _, (x, y) = cv2.minMaxLoc(scores)
+    offset = np.array([x - reach, y - reach], dtype=np.float64)
+    for axis, line, k in ((0, scores[y], x), (1, scores[:, x], y)):
+        if 0 < k < len(line) - 1:
+            a, b, c = (float(v) for v in line[k - 1 : k + 2])
+            bend = a - 2 * b + c
+            offset[axis] += 0.5 * (a - c) / bend if bend < 0 else 0.0
+    near = max(3, (len(template) - 1) // 3)
+    rivals = scores.copy()
+    rivals[max(y - near, 0) : y + near + 1, max(x - near, 0) : x + near + 1] = -1.0
+    second = float(rivals.max())
+    return (float(best) if best >= _CLEAR * second else 0.0), offset

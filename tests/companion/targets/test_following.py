@@ -1,0 +1,153 @@
+"""A clicked target followed in made pictures: a car behind a roof, a place that stands."""
+
+import cv2
+import numpy as np
+import pytest
+
+from localizer.geometry.camera import Camera
+from localizer.geometry.pose import Pose, so3_exp
+from localizer.targets.track import projected
+from localizer.types import Visibility
+from tests.companion.targets import scene
+from tests.companion.targets.scene import MS
+from tests.companion.targets.test_operator import Operator
+
+CELL = 0.25  # metres of the ground's texture
+SIZE = 1200
+CAMERA = Camera(240, 180, 200.0, 200.0, 120.0, 90.0)
+ROOF = (10.0, 8.0)  # half side and height, about the origin
+
+
+def texture(seed, size):
+    rng = np.random.default_rng(seed)
+    fine = cv2.GaussianBlur(rng.uniform(0, 255, (size, size)).astype(np.float32), (0, 0), 1.2)
+    return cv2.normalize(fine, None, 40, 215, cv2.NORM_MINMAX)
+
+
+NOISE = np.random.default_rng(4).normal(0, 3, (180, 240))
+GROUND, CAR, TILES = texture(1, SIZE), texture(2, 24), texture(3, 80)
+
+
+class Pictures:
+    """Renders ground, a car and a roof for the scene's camera, by one ray a pixel."""
+
+    def __init__(self, car_at):
+        self._car_at = car_at
+        v, u = np.mgrid[0:180, 0:240] + 0.5
+        self._rays = CAMERA.rays(np.stack([u, v], axis=-1))
+
+    def of(self, pose, time_s):
+        d = self._rays @ pose.rotation.T
+        eye = pose.translation
+        ground = eye + d * (-eye[2] / d[..., 2])[..., None]
+        image = self._sample(GROUND, ground[..., :2], CELL)
+        (x, y), course = self._car_at(time_s)
+        c, s = np.cos(course), np.sin(course)
+        off = ground[..., :2] - (x, y)
+        along = np.stack([c * off[..., 0] + s * off[..., 1], c * off[..., 1] - s * off[..., 0]], -1)
+        inside = (np.abs(along) < (2.5, 1.2)).all(axis=-1)
+        image[inside] = self._sample(CAR, along, CELL)[inside]
+        roof = eye + d * ((ROOF[1] - eye[2]) / d[..., 2])[..., None]
+        covered = (np.abs(roof[..., :2]) < ROOF[0]).all(axis=-1)
+        image[covered] = self._sample(TILES, roof[..., :2], CELL)[covered]
+        noise = np.roll(NOISE, round(time_s * 10) * 7, axis=1)
+        return np.clip(image + noise, 0, 255).astype(np.uint8)
+
+    @staticmethod
+    def _sample(picture, points, cell):
+        at = (points / cell + np.array(picture.shape[::-1]) / 2).astype(np.float32)
+        return cv2.remap(picture, at, None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REFLECT)
+
+
+def watching(time_s):
+    """Circles at 90 m, and keeps the middle in view."""
+    angle = 0.05 * time_s
+    eye = np.array([25.0 * np.cos(angle), 25.0 * np.sin(angle) - 10.0, 90.0])
+    z = np.array([0.0, -5.0, 0.0]) - eye
+    z /= np.linalg.norm(z)
+    x = np.cross(z, [0.0, 1.0, 0.0])
+    x /= np.linalg.norm(x)
+    return Pose(np.column_stack([x, np.cross(z, x), z]), eye)
+
+
+def driving(time_s):
+    """A bend beside the roof, then under its edge: 5 m/s."""
+    way = 5.0 * time_s - 30.0
+    return (way, -11.0 + 6.0 * np.tanh(way / 10.0)), float(
+        np.arctan2(0.6 / np.cosh(way / 10) ** 2, 1)
+    )
+
+
+class Watcher(Operator):
+    """An operator with pictures; poses err by a little, as a registration's do."""
+
+    def __init__(self, pictures, until_s):
+        super().__init__(flown=watching, rate_hz=10.0)
+        self._pictures, self._until_s = pictures, until_s
+        self._rng = np.random.default_rng(0)
+
+    def fly(self, frames=1):
+        for _ in range(frames):
+            time_s = self.time_ms / 1e3
+            true = watching(time_s)
+            off = self._rng.normal(0, [0.05] * 3 + [3e-4] * 3)
+            told = Pose(so3_exp(off[3:]) @ true.rotation, true.translation + off[:3])
+            seen = scene.estimate(told, self.time_ms * MS, sigma=0.05, camera=CAMERA)
+            self.clicks.add_estimate(seen)
+            self.population.look(seen, self._pictures.of(true, time_s))
+            self.population.hold(seen)
+            self.time_ms += 100
+        self.now_ms = self.time_ms - 100
+
+
+def _click(watcher, point, delay_s=0.25):
+    """Where the operator saw it: the frame is `delay_s` old when the command comes."""
+    seen_s = (watcher.now_ms + 40) / 1e3 - delay_s
+    seen = scene.estimate(watching(seen_s), 0, camera=CAMERA)
+    u, v = projected(seen, np.array(point(seen_s)))
+    watcher.clicks_at(u / CAMERA.width, v / CAMERA.height)
+
+
+def test_a_car_is_followed_through_a_bend_and_found_again_behind_a_roof():
+    watcher = Watcher(Pictures(driving), 14.0)
+    watcher.fly(8)
+    _click(watcher, lambda t: (*driving(t)[0], 0.0))
+    watcher.fly(110)
+    assert watcher.gone == []
+    told = [(t.fix, t.estimate.exposure_time_ns * 1e-9) for t in watcher.of(1)]
+    error = {s: np.linalg.norm(f.position_world[:2] - driving(s)[0]) for f, s in told}
+    seen = [s for f, s in told if f.visibility is Visibility.SEEN]
+    assert np.median([error[s] for s in seen]) < 0.5
+    for fix, s in told:  # while its motion is not measured yet, too
+        assert error[s] < 3.0 * np.sqrt(fix.covariance.trace()), s
+    settled = [f for f, s in told if f.visibility is Visibility.SEEN and s > 3.0]
+    assert all(f.velocity is not None for f in settled)
+    assert np.median([np.hypot(*f.velocity[:2]) for f in settled]) == pytest.approx(5.3, abs=0.7)
+    gaps = np.diff(seen)
+    assert gaps.max() > 1.9  # behind the roof
+    assert seen[-1] > 11.0
+
+
+def test_a_place_that_stands_is_never_told_to_move_though_a_car_passes_it():
+    watcher = Watcher(Pictures(driving), 14.0)
+    watcher.fly(8)
+    place = np.array([-8.0, -16.0, 0.0])
+    _click(watcher, lambda _: place)
+    watcher.fly(60)
+    fixes = [t.fix for t in watcher.of(1)]
+    assert len(fixes) > 40
+    assert all(f.velocity is None for f in fixes)
+    for fix in fixes:
+        np.testing.assert_allclose(fix.position_world, place, atol=1.0)
+
+
+def test_a_car_that_does_not_come_back_is_lost_with_a_word():
+    def vanishing(time_s):
+        return driving(time_s) if time_s < 4.0 else ((500.0, 500.0), 0.0)
+
+    watcher = Watcher(Pictures(vanishing), 14.0)
+    watcher.fly(8)
+    _click(watcher, lambda t: (*driving(t)[0], 0.0))
+    watcher.fly(80)
+    assert watcher.texts[-1] == "PiLoT: target 1 lost"
+    assert watcher.gone == ["ground station 1"]
