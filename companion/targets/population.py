@@ -34,8 +34,8 @@ _STILL_M = 1.0  # around where a standing target is expected
 _NEAR_M = 1.5  # around where a moving one is, and three sigmas of its motion, at most so many:
 _FAR_M = 15.0
 _DEPARTS_S = 1.0  # after a click: so long it may be one that moves
+_DEPARTED = 0.85  # correlation: what has just left looks as it did
 _FASTEST_MPS = 25.0
-_COURSE_MPS = 3.0  # from which on its velocity says how it is turned
 _LOST_S = 4.0
 _PIXELS = 0.05  # of the picture's width: a delay's error beyond it is told as that much
 
@@ -224,25 +224,28 @@ class Population:
             return
         position, P = expected
         since_s = (time_ns - life.found_ns) * 1e-9
-        if track.moves:
+        found = None
+        if track.moves and track.is_hiding(estimate, position):
+            pass  # what is seen there is what hides it
+        elif track.moves:
             sigma = float(np.sqrt(max(np.linalg.eigvalsh(P)[-1], 0.0)))
             found = follower.find(gray, estimate, position, _NEAR_M + min(3.0 * sigma, _FAR_M))
         else:
             found = follower.find(gray, estimate, position, _STILL_M)
             if found is None and since_s <= _DEPARTS_S:
                 # It moves, though nobody has measured how: the ground that it left tells its shape.
+                least = 0.0 if follower.is_isolated else _DEPARTED
                 if not follower.is_isolated:
                     follower.isolate(((estimate, gray),), position)
                 if follower.is_isolated:
                     reach_m = _NEAR_M + _FASTEST_MPS * since_s
                     found = follower.find(gray, estimate, position, reach_m)
+                if found is not None and found.score < least:
+                    found = None  # a car that passes over a place takes nothing of it along
         fix = None
         if found is not None:
             fix = track.see(estimate, found.pixel, pixel_sigma=_FOLLOWED_PX)
             life.found_ns = life.seen_ns = time_ns
-            velocity = None if fix is None else fix.velocity
-            if track.moves and velocity is not None and np.hypot(*velocity[:2]) > _COURSE_MPS:
-                follower.turn_to(velocity)
         elif track.moves and since_s > _LOST_S:
             self._say(_INFO, f"PiLoT: target {name[len(CLICKED) :]} lost")
             self.end((name,))

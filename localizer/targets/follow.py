@@ -2,8 +2,8 @@
 
 Each frame is resampled to a chart: a square of the horizontal plane through the target, of fixed
 metres per cell. In charts the camera's motion is gone: what stands still stays in its cell, a car
-moves by its own way at its own size, and turned to its course it keeps its look through a bend.
-Normalised cross-correlation with two templates (the first one and one of late) finds it there.
+moves by its own way at its own size, and the chart turns with it through a bend. Normalised
+cross-correlation with two templates (the first one and one of late) finds it there.
 """
 
 from __future__ import annotations
@@ -20,18 +20,24 @@ from localizer.targets.track import projected
 from localizer.types import PoseEstimate
 
 Gray = NDArray[np.uint8]
+Grey = NDArray[np.float32]  # of a chart
 
 _SMALLEST_M, _LARGEST_M = 1.5, 15.0  # half the side of what is followed
 _POINT_M = 3.0  # half the side around a point of which no extent is known
 _CELLS = (9, 41)  # of a template's half side: what tells it from others, and what costs little
 _LARGEST_REACH = 80  # cells that are searched to each side
-_SEEN = 0.65  # correlation from which on it is the target
+_SEEN = 0.65  # correlation from which on it is the target where it is expected,
+_FOUND = 0.72  # and where much ground is searched: somewhere some of it looks a little like it
+_EXPECTED_M = 5.0
+# rad, by which it may have turned since it was last found: a moment ago, or some seconds.
+_TURNS, _FAR_TURNS = (0.0, 0.2, -0.2), (0.0, 0.25, -0.25, 0.5, -0.5, 0.75, -0.75)
+_LONG_AGO_M = 3.0  # of reach
+_PREFERRED = 0.05  # by how much another look must be better
 _SURE = 0.8  # from which on its present look is learned
 _CLEAR = 1.15  # by how much the best place leads the second
-_RENEWED_NS = 500_000_000
+_RENEWED_NS = 2_000_000_000
 _OTHER, _NOISES = 10.0, 3.0  # grey levels, and medians of the chart: what differs by more has moved
 _SHARES = (0.03, 0.7)  # of a chart that may be the target
-_BEND_RAD = 0.1
 _FLAT = 4.0  # grey levels: a template of less contrast tells nothing
 
 
@@ -63,8 +69,7 @@ class ImageFollower:
         self._course = 0.0
         first = self._chart(gray, estimate, position, half)
         self._first, self._late = first, first
-        self._mask: NDArray[np.float32] | None = None
-        self._is_laid = False
+        self._mask: Grey | None = None
         self._renewed_ns = estimate.exposure_time_ns
         self.ready = first is not None and float(first.std()) >= _FLAT
 
@@ -76,20 +81,24 @@ class ImageFollower:
         chart = self._chart(gray, estimate, expected, self._half + reach)
         if chart is None:
             return None
-        best: tuple[float, Array] | None = None
-        for template in (self._late, self._first):
-            if template is None:
-                continue
-            score, offset = _match(chart, template, self._mask, reach)
-            if best is None or score > best[0] + 0.05:
-                best = score, offset
-        if best is None or best[0] < _SEEN:
+        best, turn = (-1.0, np.zeros(2)), 0.0
+        for angle in _TURNS if reach_m <= _LONG_AGO_M else _FAR_TURNS:
+            for template in (self._first, self._late):
+                turned, mask = self._turned(template, -angle), self._turned(self._mask, -angle)
+                if best[0] >= _SURE or turned is None:
+                    break
+                one = _match(chart, turned, mask, reach)
+                if one[0] > best[0] + _PREFERRED:
+                    best, turn = one, angle
+        if best[0] < (_SEEN if reach_m <= _EXPECTED_M else _FOUND):
             return None
         position = expected + self._on_ground(best[1] * self._cell)
         pixel = projected(estimate, position)
         if pixel is None:
             return None
-        if best[0] >= _SURE and estimate.exposure_time_ns - self._renewed_ns >= _RENEWED_NS:
+        self._course += turn
+        is_due = estimate.exposure_time_ns - self._renewed_ns >= _RENEWED_NS
+        if is_due and best[0] >= _SURE:
             self._renew(gray, estimate, position)
         return Found(position, pixel, best[0])
 
@@ -125,27 +134,11 @@ class ImageFollower:
         """Whether it is known which cells are the target's and which the ground's."""
         return self._mask is not None
 
-    def turn_to(self, velocity: Array) -> None:
-        """Lay charts along its course (m/s, world axes): in them a bend does not turn it."""
-        course = float(np.arctan2(velocity[1], velocity[0]))
-        if not self._is_laid:
-            self._is_laid = True
-            self._first, self._late = (
-                self._turned(self._first, course),
-                self._turned(self._late, course),
-            )
-            self._mask = self._turned(self._mask, course)
-            self._course = course
-        elif abs(np.remainder(course - self._course + np.pi, 2 * np.pi) - np.pi) > _BEND_RAD:
-            self._course = course
-
-    def _turned(
-        self, chart: NDArray[np.float32] | None, course: float
-    ) -> NDArray[np.float32] | None:
-        """A chart to the north as it looks along a course."""
-        if chart is None:
-            return None
-        c, s, h = np.cos(course), np.sin(course), float(self._half)
+    def _turned(self, chart: Grey | None, angle: float) -> Grey | None:
+        """A chart as it looks from a chart that is turned by `angle`."""
+        if chart is None or angle == 0.0:
+            return chart
+        c, s, h = np.cos(angle), np.sin(angle), float(self._half)
         back = np.array([[c, -s, h - c * h + s * h], [s, c, h - s * h - c * h]])
         turned: NDArray[np.float32] = cv2.warpAffine(
             chart, back, chart.shape[::-1], flags=cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP,
@@ -155,7 +148,10 @@ class ImageFollower:
 
     def _renew(self, gray: Gray, estimate: PoseEstimate, position: Array) -> None:
         fresh = self._chart(gray, estimate, position, self._half)
-        if fresh is not None and float(fresh.std()) >= _FLAT:
+        if fresh is None or self._first is None:
+            return
+        # What has come before it, or what it passes, must not become its look.
+        if _match(fresh, self._first, self._mask, 0)[0] >= _SEEN:
             self._late, self._renewed_ns = fresh, estimate.exposure_time_ns
 
     def _on_ground(self, along: Array) -> Array:
@@ -163,9 +159,7 @@ class ImageFollower:
         c, s = np.cos(self._course), np.sin(self._course)
         return np.array([c * along[0] - s * along[1], s * along[0] + c * along[1], 0.0])
 
-    def _chart(
-        self, gray: Gray, estimate: PoseEstimate, middle: Array, half: int
-    ) -> NDArray[np.float32] | None:
+    def _chart(self, gray: Gray, estimate: PoseEstimate, middle: Array, half: int) -> Grey | None:
         """(2 half + 1, 2 half + 1) grey levels about `middle`; None where some are not in view."""
         steps = np.arange(-half, half + 1) * self._cell
         c, s = np.cos(self._course), np.sin(self._course)
@@ -184,7 +178,7 @@ class ImageFollower:
 def _match(
     chart: NDArray[np.float32],
     template: NDArray[np.float32],
-    mask: NDArray[np.float32] | None,
+    mask: Grey | None,
     reach: int,
 ) -> tuple[float, Array]:
     """(correlation, offset in cells (2,), x then y) of the best place; 0 where a second rivals."""

