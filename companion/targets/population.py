@@ -16,7 +16,7 @@ from companion.config import TargetConfig
 from companion.targets.detections import CLICKED, Detection
 from localizer.geometry.pose import Array
 from localizer.targets.bias import SharedBias
-from localizer.targets.follow import Gray, ImageFollower
+from localizer.targets.follow import Found, Gray, ImageFollower
 from localizer.targets.locate import RayCaster, ray_in_world
 from localizer.targets.track import TargetSettings, TargetTrack, projected
 from localizer.types import PoseEstimate, TargetFix, Visibility
@@ -81,6 +81,8 @@ class _Life:
     """When it was last in the picture."""
     extent_m: tuple[float, float] | None = None
     follower: ImageFollower | None = None
+    moved_at_once: bool = False
+    """The pictures about the click's own show that it moves."""
     found_ns: int = 0
     """When it was last found in the image."""
     refusals: int = 0
@@ -208,7 +210,7 @@ class Population:
             p for p in self._pictures
             if abs(p[0].exposure_time_ns - estimate.exposure_time_ns) > _PASSED_NS
         ]  # fmt: skip
-        follower.isolate(others, fix.position_world)
+        life.moved_at_once = follower.isolate(others, fix.position_world)
         life.follower = follower
         for newer, picture in [
             p for p in self._pictures if p[0].exposure_time_ns > estimate.exposure_time_ns
@@ -233,15 +235,7 @@ class Population:
         else:
             found = follower.find(gray, estimate, position, _STILL_M)
             if found is None and since_s <= _DEPARTS_S:
-                # It moves, though nobody has measured how: the ground that it left tells its shape.
-                least = 0.0 if follower.is_isolated else _DEPARTED
-                if not follower.is_isolated:
-                    follower.isolate(((estimate, gray),), position)
-                if follower.is_isolated:
-                    reach_m = _NEAR_M + _FASTEST_MPS * since_s
-                    found = follower.find(gray, estimate, position, reach_m)
-                if found is not None and found.score < least:
-                    found = None  # a car that passes over a place takes nothing of it along
+                found = self._departed(life, follower, estimate, gray, position)
         fix = None
         if found is not None:
             fix = track.see(estimate, found.pixel, pixel_sigma=_FOLLOWED_PX)
@@ -255,6 +249,23 @@ class Population:
         if fix is not None and self._is_due(life, time_ns):
             life.told_ns = time_ns
             self._report(life, fix, estimate)
+
+    @staticmethod
+    def _departed(
+        life: _Life, follower: ImageFollower, estimate: PoseEstimate, gray: Gray, position: Array
+    ) -> Found | None:
+        """A target that moves, though nobody has measured how: the ground that it left tells its
+        shape. A car that passes over a place takes nothing of it along.
+        """
+        if not follower.is_isolated and not follower.isolate(((estimate, gray),), position):
+            return None
+        since_s = (estimate.exposure_time_ns - life.found_ns) * 1e-9
+        found = follower.find(gray, estimate, position, _NEAR_M + _FASTEST_MPS * since_s)
+        if found is not None and (life.moved_at_once or found.score >= _DEPARTED):
+            return found
+        if not life.moved_at_once:
+            follower.forget_shape()
+        return None
 
     def _report(self, life: _Life, fix: TargetFix, estimate: PoseEstimate) -> None:
         if life.extent_m is not None:

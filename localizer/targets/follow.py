@@ -129,6 +129,10 @@ class ImageFollower:
         self._mask = mask.astype(np.float32)
         return True
 
+    def forget_shape(self) -> None:
+        """Undo `isolate`."""
+        self._mask = None
+
     @property
     def is_isolated(self) -> bool:
         """Whether it is known which cells are the target's and which the ground's."""
