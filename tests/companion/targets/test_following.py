@@ -86,7 +86,7 @@ class Watcher(Operator):
         self._pictures, self._until_s = pictures, until_s
         self._rng = np.random.default_rng(0)
 
-    def fly(self, frames=1):
+    def fly(self, frames=1, state=None):
         for _ in range(frames):
             time_s = self.time_ms / 1e3
             true = watching(time_s)
