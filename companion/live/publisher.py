@@ -1,4 +1,4 @@
-"""The flight's side of the console: a local socket, served by one thread of low priority.
+"""The flight's side of the console: a local socket, served by one thread.
 
 It keeps at most one unfinished message per console: what does not fit is dropped, never queued.
 While nobody is connected it sleeps.
@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import contextlib
 import logging
-import os
 import selectors
 import socket
 import threading
@@ -22,7 +21,6 @@ from companion.live.protocol import MOST_ORDER, Decoder, LinkError, encode
 from companion.live.shown import Shown
 
 _log = logging.getLogger(__name__)
-_NICE = 10
 _MOST_CONSOLES = 3
 _STATE_S = 0.5
 _ANSWERS = 8
@@ -99,8 +97,8 @@ class Publisher:
             self._waker.send(b"1")
 
     def _run(self) -> None:
-        with contextlib.suppress(OSError, AttributeError):  # on Linux a thread has its own
-            os.setpriority(os.PRIO_PROCESS, threading.get_native_id(), _NICE)
+        # Of the process's own priority: a thread of a lower one that is put aside while it holds
+        # the interpreter would hold up every thread that flies.
         while not self._stopping:
             try:
                 self._turn()
