@@ -94,6 +94,8 @@ class Population:
     tell: takes each fix. gone: takes the name of each target that ended. say: tells the operator
     (MAV_SEVERITY, text). missed counts detections that show no map: beside the picture, or in the
     sky; doubted those whose place may not be told; refused those of targets beyond the 32nd.
+
+    Above 200 lines: what is done to one target touches the others, so all live under one owner.
     """
 
     def __init__(
