@@ -44,6 +44,8 @@ class VisualOdometry:
     camera: the working pinhole of the features. optimizer: see `odometry_optimizer`. ground: a
     terrain model for where the map has no geometry; None: a plane at the height of the ground where
     the map was last seen.
+
+    Above 200 lines: one frame's way, from keyframe to estimate, over one state.
     """
 
     def __init__(
