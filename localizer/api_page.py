@@ -21,7 +21,21 @@ _HEAD = """# API of `localizer`
 Made from the docstrings by `python -m localizer.api_page docs/api.md`; do not edit. Everything here
 is imported as `from localizer import NAME` and stays; what is not here may change. Frames, heights
 and time are those of [architecture.md](architecture.md), angles those of [angles.md](angles.md);
-[examples/](../examples) shows it at work.
+[examples/](../examples) shows it at work. One photo
+([localize_photo.py](../examples/localize_photo.py)):
+
+```python
+camera = Camera.from_json("camera.json")
+image = cv2.cvtColor(cv2.imread(photo), cv2.COLOR_BGR2RGB)
+with open_localizer(cache, camera) as localizer:
+    about = PoseRow(photo, Geodetic(latitude, longitude, height), roll, pitch, yaw)
+    localizer.set_prior(PosePrior.around(pose_of_row(about, localizer.frame)))
+    found = localizer.track(Frame(image, 0, camera, 0), passes=3)
+    print(localizer.frame.position(found.world_from_camera.translation))
+    print("accepted" if found.accepted else f"not localized: {found.status.value}")
+```
+
+`accepted` says whether a pose may be used; `status` only why there is none.
 """
 
 

@@ -69,10 +69,10 @@ class Camera:
             raise CameraError(f"{where}: {error}") from error
 
     @classmethod
-    def from_json(cls, path: Path) -> Camera:
+    def from_json(cls, path: Path | str) -> Camera:
         """From a ``camera.json`` file."""
         try:
-            data = json.loads(path.read_text())
+            data = json.loads(Path(path).read_text())
         except (OSError, ValueError) as error:
             raise CameraError(f"{path}: cannot be read as JSON: {error}") from error
         if not isinstance(data, dict):

@@ -31,10 +31,13 @@ class PoseRow:
     yaw_deg: float
 
 
-def read_poses(path: Path) -> tuple[PoseRow, ...]:
-    """Every pose of a file, in its order; blank lines and lines that begin with # are skipped."""
+def read_poses(path: Path | str) -> tuple[PoseRow, ...]:
+    """Every pose of a file, in its order; blank lines and lines that begin with # are skipped.
+
+    A line is ``name lon lat alt roll pitch yaw``: degrees, metres above the ellipsoid.
+    """
     try:
-        lines = path.read_text(encoding="utf-8").splitlines()
+        lines = Path(path).read_text(encoding="utf-8").splitlines()
     except (OSError, UnicodeDecodeError) as error:
         raise PoseFileError(f"{path}: cannot be read: {error}") from error
     rows = [
@@ -63,9 +66,9 @@ def _parse(line: str, where: str) -> PoseRow:
     return row
 
 
-def write_poses(path: Path, rows: Iterable[PoseRow]) -> None:
+def write_poses(path: Path | str, rows: Iterable[PoseRow]) -> None:
     """Write a pose file: 1e-9 degrees of position (0.1 mm), 1e-4 m, 1e-6 degrees of angle."""
-    path.write_text("".join(f"{pose_line(row)}\n" for row in rows), encoding="utf-8")
+    Path(path).write_text("".join(f"{pose_line(row)}\n" for row in rows), encoding="utf-8")
 
 
 def pose_line(row: PoseRow) -> str:
