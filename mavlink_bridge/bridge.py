@@ -60,7 +60,7 @@ class Bridge:
     one thing to, or asks one thing of, the part that does the work.
 
     on_track: called (in a link's thread; must return at once) when the operator asks for tracking.
-    on_hint: called likewise when the operator says where the vehicle is.
+    on_hint: called likewise when the operator says where the vehicle is; whether it can be used.
     on_text: called likewise with every line for the operator (severity, text), for a record.
     opener: opens the links' transports; raises OSError or EndpointError while it cannot.
     Raises errors of `mavlink_bridge.errors` for keys, files and endpoints that cannot be used.
@@ -72,7 +72,7 @@ class Bridge:
         geoid_separation_m: float,
         *,
         on_track: Callable[[TrackRequest], None] | None = None,
-        on_hint: Callable[[PlaceHint], None] | None = None,
+        on_hint: Callable[[PlaceHint], bool] | None = None,
         on_text: Callable[[int, str], None] = lambda _severity, _text: None,
         opener: Callable[[Endpoint], Transport] = open_transport,
     ) -> None:

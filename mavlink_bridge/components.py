@@ -168,11 +168,14 @@ class Components:
         )
         link.send(ack, self._config.localizer_component)
 
-    def _hint(self, message: Any, on_hint: Callable[[PlaceHint], None]) -> int:
+    def _hint(self, message: Any, on_hint: Callable[[PlaceHint], bool]) -> int:
         hint = place_hint(message)
         if hint is None:
             return int(mavlink.MAV_RESULT_DENIED)
-        on_hint(hint)
+        if not on_hint(hint):
+            text = "PiLoT: hint refused: not on the map"
+            self._shared.say(mavlink.MAV_SEVERITY_WARNING, text)
+            return int(mavlink.MAV_RESULT_DENIED)
         text = f"PiLoT: search {hint.radius_m:.0f} m about the place given"
         self._shared.say(mavlink.MAV_SEVERITY_NOTICE, text)
         return int(mavlink.MAV_RESULT_ACCEPTED)

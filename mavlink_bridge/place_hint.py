@@ -16,6 +16,12 @@ from mavlink_bridge.messages import PlaceHint
 PLACE_HINT = int(mavlink.MAV_CMD_EXTERNAL_POSITION_ESTIMATE)
 _DEFAULT_RADIUS_M = 100.0  # where the command gives no accuracy
 _LEAST_RADIUS_M, _LARGEST_RADIUS_M = 10.0, 20_000.0
+_GLOBAL = (
+    mavlink.MAV_FRAME_GLOBAL,
+    mavlink.MAV_FRAME_GLOBAL_INT,
+    mavlink.MAV_FRAME_GLOBAL_RELATIVE_ALT,
+    mavlink.MAV_FRAME_GLOBAL_RELATIVE_ALT_INT,
+)
 
 
 def place_hint(message: Any) -> PlaceHint | None:
@@ -25,6 +31,8 @@ def place_hint(message: Any) -> PlaceHint | None:
     1e-7 degrees in COMMAND_INT, as degrees (to about a metre) in COMMAND_LONG.
     """
     if message.get_type() == "COMMAND_INT":
+        if message.frame not in _GLOBAL:  # x and y of a local frame are metres
+            return None
         latitude, longitude = message.x * 1e-7, message.y * 1e-7
     else:
         latitude, longitude = message.param5, message.param6

@@ -29,7 +29,7 @@ class Shared:
     health: Callable[[], HealthLevel]
     say: Callable[[int, str], None]
     on_track: Callable[[TrackRequest], None] | None
-    on_hint: Callable[[PlaceHint], None] | None
+    on_hint: Callable[[PlaceHint], bool] | None
     watch: VehicleWatch
     gate: InjectionGate | None
     target_numbers: Iterator[int] = field(default_factory=lambda: count(1))

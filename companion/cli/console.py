@@ -14,6 +14,7 @@ from rich.console import Console
 from companion.config import load_config
 from companion.errors import ConfigError
 from companion.live.config import ConsoleConfig
+from companion.settings_file import SettingsError, validated
 from companion.terminal.console_log import console_log
 
 if TYPE_CHECKING:
@@ -38,7 +39,10 @@ def console_command(
     # The flight is met by the deployment's own address, whatever this page listens on.
     meeting = given.listen
     if listen is not None:
-        given = ConsoleConfig.model_validate(given.model_dump() | {"listen": listen})
+        try:
+            given = validated(ConsoleConfig, given.model_dump() | {"listen": listen})
+        except SettingsError as error:
+            raise ConfigError(f"--listen {listen}: {str(error).strip()}") from error
     os.setpriority(os.PRIO_PROCESS, 0, _NICE)  # whatever priority the flight has
     if lifeline:
         threading.Thread(target=_end_with_input, name="lifeline", daemon=True).start()

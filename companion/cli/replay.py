@@ -15,6 +15,7 @@ from rich.table import Table
 from companion.cli.console import require_extra, serve
 from companion.errors import ConfigError, RecordError
 from companion.live.config import ConsoleConfig
+from companion.settings_file import SettingsError, validated
 from localizer.geometry.pose import Array
 
 
@@ -83,8 +84,8 @@ def show_record(record: Path, map_cache: Path | None, listen: str) -> None:
     if map_path is None:
         raise RecordError(f"{record}: does not say which map was flown on; give it as --map")
     try:
-        config = ConsoleConfig(listen=listen)
-    except ValueError as error:
-        raise ConfigError(f"--console {listen}: {error}") from error
+        config = validated(ConsoleConfig, {"listen": listen})
+    except SettingsError as error:
+        raise ConfigError(f"--console {listen}: {str(error).strip()}") from error
     source = ReplaySource(tables)
     serve(Site(config, source, map_path, Records(record.absolute().parent), replay=True))

@@ -6,15 +6,21 @@ import asyncio
 import time
 from typing import Any
 
-import cv2
 import numpy as np
 
 from companion.console.source import Newest
+from companion.errors import StreamDecodeError
 from companion.live.protocol import Message
 from companion.offline.tables import Columns
-from companion.reporting.record import RecordTables
+from companion.reporting.record import RecordTables, is_time_ns
+from companion.sources.folder_source import read_image
 
 _STEP_S = 0.5
+_ABSURD = 1e12  # no measurement
+_TARGET_NUMBERS = (
+    "latitude_deg", "longitude_deg", "height_m", "cov_ee", "cov_en", "cov_nn",
+    "sigma_horizontal_m", "sigma_up_m", "elsewhere",
+)  # fmt: skip
 
 
 class ReplaySource:
@@ -31,7 +37,7 @@ class ReplaySource:
         self._told = 0
         self._event = asyncio.Event()
         paths = (tables.folder / "snapshots").glob("*.jpg")
-        self._pictures = sorted((int(p.stem), p) for p in paths if p.stem.isdigit())
+        self._pictures = sorted((int(p.stem), p) for p in paths if is_time_ns(p.stem))
         self._shown: int | None = None
 
     @property
@@ -82,7 +88,7 @@ class ReplaySource:
     def _state(self, now_ns: int) -> dict[str, Any]:
         tables = self._tables
         row = _last(tables.estimates, "exposure_time_ns", now_ns)
-        utc_ns = int(tables.manifest.get("utc_ns", 0)) - tables.start_ns + now_ns
+        utc_ns = tables.utc_ns - tables.start_ns + now_ns
         estimate = None if row is None else _estimate(tables.estimates, row)
         state = "-" if estimate is None else str(estimate["state"])
         level = {"tracking": "ok", "lost": "failed"}.get(state, "degraded")
@@ -108,7 +114,7 @@ class ReplaySource:
         times = columns["exposure_time_ns"]
         rows = np.flatnonzero((times <= now_ns) & (times > now_ns - 10_000_000_000))
         newest = {str(columns["target_id"][i]): int(i) for i in rows}
-        return [_target(columns, name, i) for name, i in newest.items()]
+        return [t for name, i in newest.items() if (t := _target(columns, name, i)) is not None]
 
     def _events(self, now_ns: int) -> list[dict[str, Any]]:
         columns = self._tables.events
@@ -131,10 +137,12 @@ class ReplaySource:
         if not known or camera is None or known[-1][0] == self._shown:
             return
         self._shown, path = known[-1]
-        bgr = cv2.imread(str(path))
-        if bgr is None or bgr.shape[:2] != (camera.height, camera.width):
+        try:
+            rgb = read_image(path)
+        except (StreamDecodeError, OSError):  # power may have gone while it was written
             return
-        rgb = cv2.cvtColor(bgr, cv2.COLOR_BGR2RGB)
+        if rgb.shape[:2] != (camera.height, camera.width):
+            return
         head = {
             "kind": "frame", "exposure_ns": time.monotonic_ns(), "camera": camera.to_dict(),
             "image": [camera.width, camera.height], "estimate": None, "view": None,
@@ -153,7 +161,7 @@ def _last(columns: Columns, name: str, now_ns: int) -> int | None:
 def _estimate(columns: Columns, row: int) -> dict[str, Any]:
     def number(name: str) -> float | None:
         value = float(columns[name][row]) if name in columns else float("nan")
-        return value if np.isfinite(value) else None
+        return value if abs(value) < _ABSURD else None  # false for NaN, too
 
     east, north = (number(f"sigma_{axis}_m") or 0.0 for axis in ("east", "north"))
     return {
@@ -174,30 +182,28 @@ def _estimate(columns: Columns, row: int) -> dict[str, Any]:
     }
 
 
-def _heading_deg(columns: Columns, row: int) -> float:
+def _heading_deg(columns: Columns, row: int) -> float | None:
     """Where the picture's top or the camera's axis points, whichever lies flatter."""
     w, x, y, z = (float(columns[k][row]) for k in ("qw", "qx", "qy", "qz"))
     forward = (2 * (x * z + w * y), 2 * (y * z - w * x), 1 - 2 * (x * x + y * y))
     up = (-2 * (x * y - w * z), -(1 - 2 * (x * x + z * z)))
     ahead = forward[:2] if abs(forward[2]) < 0.98 else up
-    return float(np.degrees(np.arctan2(ahead[0], ahead[1])) % 360.0)
+    heading = float(np.degrees(np.arctan2(ahead[0], ahead[1])) % 360.0)
+    return heading if np.isfinite(heading) else None
 
 
-def _target(columns: Columns, name: str, row: int) -> dict[str, Any]:
-    def number(key: str) -> float:
-        return float(columns[key][row])
-
+def _target(columns: Columns, name: str, row: int) -> dict[str, Any] | None:
+    """A target's row; None where a number lacks: browsers read no NaN."""
+    numbers = {key: float(columns[key][row]) for key in _TARGET_NUMBERS if key in columns}
+    if len(numbers) < len(_TARGET_NUMBERS) or not all(map(np.isfinite, numbers.values())):
+        return None
+    ee, en, nn = (numbers.pop(key) for key in ("cov_ee", "cov_en", "cov_nn"))
     return {
         "name": name,
         "time_ns": int(columns["exposure_time_ns"][row]),
-        "latitude_deg": number("latitude_deg"),
-        "longitude_deg": number("longitude_deg"),
-        "height_m": number("height_m"),
+        "sigma_m": numbers.pop("sigma_horizontal_m"),
+        **numbers,
         "amsl_m": None,
-        "covariance_m2": [[number("cov_ee"), number("cov_en")], [number("cov_en"),
-                          number("cov_nn")]],
-        "sigma_m": number("sigma_horizontal_m"),
-        "sigma_up_m": number("sigma_up_m"),
-        "elsewhere": number("elsewhere"),
+        "covariance_m2": [[ee, en], [en, nn]],
         "pixel": None,
-    }  # fmt: skip
+    }

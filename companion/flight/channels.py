@@ -11,7 +11,7 @@ from typing import Generic, ParamSpec
 
 from companion.targets.population import Target
 from localizer.types import Frame, PoseEstimate, ReferenceBundle
-from mavlink_bridge.messages import PlaceHint, TrackRequest
+from mavlink_bridge.messages import TrackRequest
 
 P = ParamSpec("P")
 
@@ -54,8 +54,6 @@ class Channels:
     """The name of every target that ended, on the targets' thread."""
     clicks: Channel[[TrackRequest]] = field(default_factory=Channel)
     """What the ground station asks the camera to track, on a MAVLink link's thread."""
-    hints: Channel[[PlaceHint]] = field(default_factory=Channel)
-    """Where the operator says that the vehicle is, on a MAVLink link's thread."""
     texts: Channel[[int, str]] = field(default_factory=Channel)
     """Every line (MAV_SEVERITY, text) that the bridge told the operator, on any thread."""
     events: Channel[[str, str]] = field(default_factory=Channel)

@@ -12,6 +12,7 @@ import json
 import logging
 import math
 import os
+import stat
 import threading
 from collections.abc import Callable
 from dataclasses import asdict, dataclass
@@ -30,6 +31,7 @@ _log = logging.getLogger(__name__)
 _WRITE_S = 0.5
 _FASTEST_MPS = 40.0  # a way beyond it is a jump of the EKF
 _LEAST_SIGMA_M = 0.5
+_FARTHEST_M = 1e6
 _BOOT = Path("/proc/sys/kernel/random/boot_id")
 LocalAt = Callable[[int], tuple[float, ...] | None]
 
@@ -61,6 +63,9 @@ def read_last_fix(path: Path, boot: str) -> LastFix | None:
     """What a process of this boot left; None where nothing may be trusted."""
     try:
         status = os.lstat(path)
+        if not stat.S_ISREG(status.st_mode):  # a pipe would be waited for
+            _log.warning("%s is no plain file: ignored", path)
+            return None
         if status.st_uid != os.geteuid() or status.st_mode & 0o022:
             _log.warning("%s may be written by others: ignored", path)
             return None
@@ -76,9 +81,22 @@ def read_last_fix(path: Path, boot: str) -> LastFix | None:
     except (OSError, ValueError, KeyError, TypeError, OverflowError, RecursionError) as error:
         _log.warning("%s cannot be used: %s", path, error)
         return None
-    numbers = (found.latitude_deg, found.longitude_deg, found.height_m, found.sigma_m)
-    sane = all(math.isfinite(v) for v in (*numbers, *found.local_ned)) and found.sigma_m > 0.0
-    return found if sane and boot and found.boot == boot else None
+    if not _is_place(found):
+        _log.warning("%s cannot be used: it names no place", path)
+        return None
+    return found if boot and found.boot == boot else None
+
+
+def _is_place(fix: LastFix) -> bool:
+    """Whether the numbers can be what a flight was; comparisons are false for NaN."""
+    metres = (fix.height_m, *fix.local_ned)
+    return (
+        0 <= fix.time_ns < 1 << 63
+        and abs(fix.latitude_deg) <= 90.0
+        and abs(fix.longitude_deg) <= 180.0
+        and all(abs(v) < _FARTHEST_M for v in metres)
+        and 0.0 < fix.sigma_m < _FARTHEST_M
+    )
 
 
 class FixMemory:
@@ -116,7 +134,10 @@ class FixMemory:
         self._stop.set()
         self._thread.join()
         if self._path is not None:
-            self._path.unlink(missing_ok=True)
+            try:
+                self._path.unlink(missing_ok=True)
+            except OSError as error:  # its age and the boot still tell the next process
+                _log.warning("the last fix is not removed: %s", error)
 
     def add_estimate(self, estimate: PoseEstimate, _: ReferenceBundle) -> None:
         """Note a place that the map confirmed. Never blocks."""
@@ -158,7 +179,7 @@ class FixMemory:
             try:
                 self._write(newest, self._path)
                 self._failed = False
-            except OSError as error:
+            except (OSError, ValueError) as error:  # ValueError: a covariance that is none
                 if not self._failed:
                     _log.warning("the last fix is not kept: %s: %s", self._path, error)
                 self._failed = True

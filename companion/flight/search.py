@@ -28,6 +28,7 @@ from mavlink_bridge.messages import PlaceHint
 _log = logging.getLogger(__name__)
 _NICE = 15  # of the preparing thread: the overview's seconds must not cost the tracker frames
 _HINT_SIGMAS = 2.0
+_HORIZON_M = 10_000.0  # below the origin: over 350 km away
 _HINT_S = 120.0  # after which an operator's word is of another place
 _STOP_S = 10.0
 
@@ -48,6 +49,19 @@ class Hint:
     centre: tuple[float, float]
     radius_m: float
     time_s: float
+
+
+def place_on_map(
+    cache: TileCache, latitude_deg: float, longitude_deg: float, radius_m: float
+) -> tuple[float, float] | None:
+    """East and north, metres; None where no part of the map's box lies within the radius."""
+    place = cache.frame.enu_from_geodetic(
+        latitude_deg, longitude_deg, cache.manifest.origin.height_m
+    )
+    low, high = cache.index.box_min[0] - radius_m, cache.index.box_max[0] + radius_m
+    inside = bool(((low <= place) & (place <= high))[:2].all())
+    # East and north come back to zero on the far side of the Earth.
+    return (float(place[0]), float(place[1])) if inside and place[2] > -_HORIZON_M else None
 
 
 class PlaceSearch:
@@ -88,12 +102,15 @@ class PlaceSearch:
         """The operator says where we are, map frame: the next searches look there. Never a fix."""
         self._hint = Hint((east_m, north_m), radius_m, time.monotonic())
 
-    def hint_at(self, hint: PlaceHint) -> None:
-        """The same in WGS84, with twice the operator's sigma."""
-        height_m = self._cache.manifest.origin.height_m
-        at = self._cache.frame.enu_from_geodetic(hint.latitude_deg, hint.longitude_deg, height_m)
-        self.hint(float(at[0]), float(at[1]), _HINT_SIGMAS * hint.radius_m)
+    def hint_at(self, hint: PlaceHint) -> bool:
+        """The same in WGS84, with twice the operator's sigma; False where that is off the map."""
+        radius_m = _HINT_SIGMAS * hint.radius_m
+        at = place_on_map(self._cache, hint.latitude_deg, hint.longitude_deg, radius_m)
+        if at is None:
+            return False
+        self.hint(*at, radius_m)
         self._event("info", f"search about {at[0]:.0f} m east, {at[1]:.0f} m north: operator")
+        return True
 
     def search(self, frame: Frame, should_stop: Callable[[], bool]) -> PosePrior | None:
         """The camera's pose at the frame's exposure, to be tried; None where nothing convinces."""

@@ -24,7 +24,7 @@ from companion.flight.last_fix import FixMemory
 from companion.flight.parts import Making, Part
 from companion.flight.priors import AutopilotPose, PriorSources
 from companion.flight.recorder import RecordKeeper, remove_empty
-from companion.flight.search import PlaceSearch
+from companion.flight.search import PlaceSearch, place_on_map
 from companion.flight.sightings import Sightings
 from companion.flight.view_reporter import ViewReporter
 from companion.guardian.guardian import Guardian
@@ -75,11 +75,12 @@ def _installation(making: Making) -> Installation:
 
 
 def _bridge(making: Making) -> Bridge:
+    search = making.later(PlaceSearch)
     return Bridge(
         _bridge_config(making.config),
         making[MapStack].cache.manifest.geoid_separation_m,
         on_track=making.channels.clicks.send,
-        on_hint=making.channels.hints.send,
+        on_hint=lambda hint: search().hint_at(hint),
         on_text=making.channels.texts.send,
     )
 
@@ -284,12 +285,10 @@ def _console(making: Making) -> Publisher:
     shown = Shown(cache.frame, geoid_m, instruments, about)
 
     def hint(latitude_deg: float, longitude_deg: float, radius_m: float) -> None:
-        height_m = cache.frame.origin.height_m
-        place = cache.frame.enu_from_geodetic(latitude_deg, longitude_deg, height_m)
-        low, high = cache.index.box_min[0] - radius_m, cache.index.box_max[0] + radius_m
-        if not ((low <= place) & (place <= high))[:2].all():
+        place = place_on_map(cache, latitude_deg, longitude_deg, radius_m)
+        if place is None:
             raise OrderError("the hint lies off the map")
-        search.hint(float(place[0]), float(place[1]), radius_m)
+        search.hint(*place, radius_m)
 
     # A click of the page names its frame; a ground station's is taken to be late.
     late_ns = round(config.targets.operator_delay_ms * 1e6)
@@ -323,9 +322,7 @@ def _console(making: Making) -> Publisher:
 
 def _search(making: Making) -> PlaceSearch:
     cache, event = making[MapStack].cache, making.channels.events.send
-    search = PlaceSearch(cache, making.config.localizer, making[AutopilotPose], event)
-    making.channels.hints.subscribe(search.hint_at)
-    return search
+    return PlaceSearch(cache, making.config.localizer, making[AutopilotPose], event)
 
 
 def _engine(making: Making) -> DualThreadEngine:
@@ -348,7 +345,7 @@ PARTS: tuple[Part[Any], ...] = (
     Part("map", MapStack, _map, close=MapStack.close),
     Part("installation", Installation, _installation, depends=(MapStack,)),
     Part(
-        "bridge", Bridge, _bridge, depends=(MapStack,),
+        "bridge", Bridge, _bridge, depends=(MapStack,), later=(PlaceSearch,),
         start=Bridge.start, stop=Bridge.stop, close=Bridge.stop,  # one not started has files open
     ),
     Part("injection", FixInjection, _injection, depends=(Bridge, Installation)),

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import time
 from collections import deque
 from collections.abc import Callable
@@ -91,6 +90,6 @@ def _number(order: dict[str, Any], key: str, low: float, high: float) -> float:
     value = order.get(key)
     if isinstance(value, bool) or not isinstance(value, int | float):
         raise OrderError(f"{key} is a number")
-    if not (math.isfinite(value) and low <= value <= high):
+    if not low <= value <= high:  # false for NaN, too
         raise OrderError(f"{key} is {low:g} to {high:g}")
     return float(value)

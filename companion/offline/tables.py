@@ -24,7 +24,10 @@ def read_columns(path: Path, text: Sequence[str] = ()) -> dict[str, np.ndarray]:
         lines = file.readlines()
     if lines and not lines[-1].endswith("\n"):
         lines.pop()
-    rows = list(csv.DictReader(lines))
+    try:
+        rows = list(csv.DictReader(lines))
+    except csv.Error as error:
+        raise RecordError(f"{path}: not a table of a record: {error}") from error
     names = rows[0].keys() if rows else []
     columns: dict[str, np.ndarray] = {}
     try:

@@ -55,9 +55,9 @@ class AutopilotTracks:
 def read_autopilot(tables: RecordTables, pictures: MapPictures) -> AutopilotTracks:
     """From the record's `bridge.tlog`; a flight without one has none."""
     path = tables.tlog
-    if path is None or pictures.cache is None or "utc_ns" not in tables.manifest:
+    if path is None or pictures.cache is None or not tables.utc_ns:
         return AutopilotTracks()
-    offset_ns = int(tables.manifest["utc_ns"]) - tables.start_ns
+    offset_ns = tables.utc_ns - tables.start_ns
     try:
         return _tracks(path, offset_ns, tables.start_ns, pictures.cache.frame)
     except (BridgeError, OSError) as error:

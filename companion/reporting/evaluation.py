@@ -5,15 +5,15 @@ from __future__ import annotations
 import json
 from pathlib import Path
 
-import cv2
 import numpy as np
 
-from companion.errors import RecordError
+from companion.errors import RecordError, StreamDecodeError
 from companion.offline.tables import read_columns
 from companion.reporting.content import Curve, MapSheet, Overlay, Plot, Report, Span, Track, Verdict
 from companion.reporting.pictures import map_pictures
 from companion.reporting.record import VISION
 from companion.reporting.verdicts import advice
+from companion.sources.folder_source import read_image
 
 _TEXT = ("name", "state", "status", "problem")
 _SHEETS = 3  # pictures side by side on an overlay sheet: video, render, checkerboard
@@ -51,7 +51,7 @@ def evaluation_report(folder: Path) -> Report:
         overlays=_overlays(folder),
         abscissa="frame",
         settings=settings,
-        versions=document.get("versions", {}),
+        versions=dict(document.get("versions", {})),
         notes=notes,
     )
 
@@ -117,10 +117,10 @@ def _overlays(folder: Path) -> tuple[Overlay, ...]:
     """The sheets that `companion eval` wrote of the worst frames, taken apart again."""
     sheets = []
     for path in sorted(folder.glob("overlay-*.png")):
-        image = cv2.imread(str(path))
-        if image is None:
+        try:
+            rgb = read_image(path)
+        except (StreamDecodeError, OSError):
             continue
-        rgb = cv2.cvtColor(image, cv2.COLOR_BGR2RGB).astype(np.uint8)
         width = rgb.shape[1] // _SHEETS
         body = rgb[22:]  # under the caption
         number = path.stem.removeprefix("overlay-")

@@ -114,8 +114,10 @@ def target_marks(targets: Columns) -> tuple[Mark, ...]:
     marks = []
     for name, rows in by_name(targets).items():
         i = rows[-1]
-        place = float(targets["east_m"][i]), float(targets["north_m"][i])
-        marks.append(Mark(name, *place, "target", float(targets["sigma_horizontal_m"][i])))
+        columns = ("east_m", "north_m", "sigma_horizontal_m")
+        east, north, sigma = (float(targets[key][i]) for key in columns)
+        if np.isfinite([east, north, sigma]).all():
+            marks.append(Mark(name, east, north, "target", sigma))
     return tuple(marks)
 
 

@@ -41,7 +41,7 @@ def render(report: Report) -> str:
     page = resources.files("companion.reporting") / "page"
     body = "\n".join(part for part in _sections(report) if part)
     data = {"plots": [_plot_data(p) for p in report.plots], "abscissa": report.abscissa}
-    return (
+    text = (
         (page / "report.html").read_text(encoding="utf-8")
         .replace("{{title}}", escape(report.title))
         .replace("{{css}}", vendored("uPlot.min.css") + (page / "report.css").read_text("utf-8"))
@@ -50,6 +50,8 @@ def render(report: Report) -> str:
         .replace("{{data}}", _embedded(data))
         .replace("{{js}}", vendored("uPlot.iife.min.js") + (page / "report.js").read_text("utf-8"))
     )  # fmt: skip
+    # Names of files and texts of JSON may hold half a character (a lone surrogate).
+    return text.encode("utf-8", "replace").decode("utf-8")
 
 
 def _embedded(data: Any) -> str:

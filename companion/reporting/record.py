@@ -23,6 +23,21 @@ from localizer.errors import CameraError
 from localizer.geometry.camera import Camera
 
 _OVERLAYS = 8
+_LARGEST = 1e9
+_DIGITS = 18
+_LATEST_NS = 1 << 62  # the year 2116: sums of two still fit 64 bits
+_NEEDED = {
+    "estimates.csv": (
+        "exposure_time_ns", "east_m", "north_m", "up_m", "qw", "qx", "qy", "qz", "sigma_east_m",
+        "sigma_north_m", "quality", "state", "status", "accepted",
+        *(f"{name}_ms" for name in figures.STAGES),
+    ),
+    "targets.csv": (
+        "exposure_time_ns", "target_id", "latitude_deg", "longitude_deg", "height_m", "east_m",
+        "north_m", "sigma_horizontal_m", "elsewhere",
+    ),
+    "events.csv": ("time_ns", "level", "text"),
+}  # fmt: skip
 _LATEST_MS = 250.0  # the oldest measurement that ArduPilot fuses
 VISION = "#ff8c1a"
 AUTOPILOT = "#1fd1ff"
@@ -48,9 +63,24 @@ class RecordTables:
     @property
     def start_ns(self) -> int:
         """Of the record, CLOCK_MONOTONIC."""
-        return int(self.manifest.get("monotonic_ns", 0)) or int(
+        return self._time_ns("monotonic_ns") or int(
             next(iter(self.estimates.get("exposure_time_ns", ())), 0)
         )
+
+    @property
+    def utc_ns(self) -> int:
+        """Of the start; 0 where the record does not say."""
+        return self._time_ns("utc_ns")
+
+    @property
+    def settings(self) -> dict[str, Any]:
+        """The deployment that was flown; {} where the record does not say."""
+        return _mapping(self.manifest.get("config"))
+
+    @property
+    def versions(self) -> dict[str, Any]:
+        """Of the software; {} where the record does not say."""
+        return _mapping(self.manifest.get("versions"))
 
     @property
     def map_path(self) -> Path | None:
@@ -84,7 +114,12 @@ class RecordTables:
 
     def _number(self, *keys: str) -> float | None:
         value = self._setting(*keys)
-        return float(value) if isinstance(value, int | float) else None
+        known = isinstance(value, int | float) and abs(value) < _LARGEST  # false for NaN, too
+        return float(value) if known else None
+
+    def _time_ns(self, key: str) -> int:
+        value = self.manifest.get(key)
+        return value if isinstance(value, int) and 0 <= value < _LATEST_NS else 0
 
     def _setting(self, *keys: str) -> Any:
         value: Any = self.manifest.get("config")
@@ -96,9 +131,9 @@ class RecordTables:
 def read_record(folder: Path) -> RecordTables:
     """Read what `companion run` left; `RecordError` for a folder that is no record."""
     try:
-        estimates = read_columns(folder / "estimates.csv", ("state", "status"))
-        targets = read_columns(folder / "targets.csv", ("target_id", "visibility"))
-        events = read_columns(folder / "events.csv", ("level", "text"))
+        estimates = _table(folder / "estimates.csv", ("state", "status"))
+        targets = _table(folder / "targets.csv", ("target_id", "visibility"))
+        events = _table(folder / "events.csv", ("level", "text"))
     except (OSError, UnicodeDecodeError) as error:
         raise RecordError(f"{folder}: not a flight's record: {error}") from error
     notes = []
@@ -120,8 +155,8 @@ def record_report(folder: Path) -> Report:
         return Report(
             f"Flight {folder.name}", _how_it_ended(tables), "never localized",
             verdicts=_verdicts(tables), events=happened, notes=tables.notes,
-            settings=dict(tables.manifest.get("config", {})),
-            versions=dict(tables.manifest.get("versions", {})),
+            settings=tables.settings,
+            versions=tables.versions,
         )  # fmt: skip
     time_s = figures.seconds(estimates["exposure_time_ns"], start_ns)
     with map_pictures(tables.map_path) as pictures:
@@ -146,8 +181,8 @@ def record_report(folder: Path) -> Report:
             figures.target_table(tables.targets),
             figures.stage_table(estimates),
             "time since the start, s",
-            dict(tables.manifest.get("config", {})),
-            dict(tables.manifest.get("versions", {})),
+            tables.settings,
+            tables.versions,
             (*tables.notes, *pictures.notes),
         )
 
@@ -161,11 +196,14 @@ def worst_frames(
     """
     estimates = tables.estimates
     paths = sorted((tables.folder / "snapshots").glob("*.jpg"))
-    paths = [p for p in paths if p.stem.isdigit()]
+    paths = [p for p in paths if is_time_ns(p.stem)]
     stamps = np.asarray(estimates["exposure_time_ns"])
     order = np.argsort(stamps)
     found = figures.nearest(stamps[order], np.array([int(p.stem) for p in paths], dtype=np.int64))
     pairs = [(p, int(order[k])) for p, k in zip(paths, found, strict=True) if k >= 0]
+    numbers = [estimates[k] for k in ("east_m", "north_m", "up_m", "qw", "qx", "qy", "qz")]
+    placed_at = np.isfinite(np.column_stack(numbers)).all(axis=1)
+    pairs = [p for p in pairs if placed_at[p[1]]]
     key = np.where(np.isfinite(goodness), goodness, -np.inf)
     pairs.sort(key=lambda pair: float(key[pair[1]]))
     accepted = np.asarray(estimates["accepted"]) > 0
@@ -250,7 +288,8 @@ def _verdicts(tables: RecordTables) -> tuple[Verdict, ...]:
             )
         )  # fmt: skip
         latency = np.asarray(estimates["latency_ms"])
-        p95 = float(np.percentile(latency[np.isfinite(latency)], 95))
+        known = latency[np.isfinite(latency)]
+        p95 = float(np.percentile(known, 95)) if len(known) else float("nan")
         limit = tables.delay_ms or _LATEST_MS
         verdicts.append(
             Verdict(
@@ -283,3 +322,21 @@ def _document(path: Path) -> dict[str, Any]:
     except (OSError, ValueError, RecursionError):
         return {}
     return value if isinstance(value, dict) else {}
+
+
+def _table(path: Path, text: tuple[str, ...]) -> Columns:
+    """A table that holds what a report needs, or nothing."""
+    columns = read_columns(path, text)
+    missing = [name for name in _NEEDED[path.name] if name not in columns]
+    if columns and missing:
+        raise RecordError(f"{path}: not a table of a record: no column {missing[0]}")
+    return columns
+
+
+def _mapping(value: Any) -> dict[str, Any]:
+    return value if isinstance(value, dict) else {}
+
+
+def is_time_ns(text: str) -> bool:
+    """Whether a snapshot's name is the time of its exposure."""
+    return text.isascii() and text.isdigit() and len(text) <= _DIGITS

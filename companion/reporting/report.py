@@ -20,7 +20,17 @@ def write_page(folder: Path, out: Path | None = None) -> Path:
 
 
 def report_of(folder: Path) -> Report:
-    """The folder's report; `RecordError` for a folder that is none of the three."""
+    """The folder's report; `RecordError` for a folder that is none of the three, or damaged."""
+    try:
+        return _report_of(folder)
+    # What a damaged or a foreign file raises where a report takes it apart.
+    except (ValueError, KeyError, TypeError, IndexError, AttributeError, ArithmeticError) as error:
+        why = f"{type(error).__name__}: {error}"
+        told = f"{folder}: its files are damaged or of another version: {why}"
+        raise RecordError(told) from error
+
+
+def _report_of(folder: Path) -> Report:
     if (folder / "frames_report.csv").exists() and (folder / "companion").is_dir():
         return demo_report(folder)
     if (folder / "estimates.csv").exists():

@@ -20,6 +20,7 @@ from typing import Protocol
 
 _log = logging.getLogger(__name__)
 _WATCH_S = 0.5  # between looks at what else is due; a death wakes at once
+_AGAIN_S = 1.0
 _USAGE = 2  # exit code of a named error
 
 
@@ -58,7 +59,7 @@ class Supervisor:
     """`run` until the flight is over.
 
     spawn: makes a process, flying at once or as a standby. tell: a line (severity, text) to the
-    operator; mark: what ``health.json`` is to say. clock: monotonic seconds.
+    operator; mark: what ``health.json`` is to say. clock: monotonic seconds; pause: sleeps so many.
     """
 
     def __init__(
@@ -68,14 +69,15 @@ class Supervisor:
         mark: Callable[[str], None],
         policy: RestartPolicy | None = None,
         clock: Callable[[], float] = time.monotonic,
+        pause: Callable[[float], None] = time.sleep,
     ) -> None:
         self._spawn, self._tell, self._mark = spawn, tell, mark
         self._policy = policy or RestartPolicy()
-        self._clock = clock
+        self._clock, self._pause = clock, pause
         self._flying: Process | None = None
         self._standby: Process | None = None
         self._deaths: deque[float] = deque(maxlen=self._policy.deaths)
-        self._since_s = 0.0
+        self._since_s = self._no_standby_until_s = 0.0
         self._stopping = False
 
     def run(self) -> int:
@@ -111,8 +113,18 @@ class Supervisor:
         flown_s = self._clock() - self._since_s
         wanted = code is None and self._standby is None and not self._stopping
         if wanted and flown_s >= self._policy.standby_after_s:
-            self._standby = self._spawn(True)
+            self._prepare_standby()
         return code
+
+    def _prepare_standby(self) -> None:
+        """Without one a restart takes longer, and nothing else: the flight goes on."""
+        if self._clock() < self._no_standby_until_s:
+            return
+        try:
+            self._standby = self._spawn(True)
+        except OSError as error:
+            self._no_standby_until_s = self._clock() + self._policy.standby_after_s
+            _log.warning("no standby can be started: %s", error)
 
     def _is_hopeless(self, code: int) -> bool:
         """A wrong configuration is as wrong the next time; it was told where it was found."""
@@ -133,11 +145,24 @@ class Supervisor:
             return False
         process, self._standby = self._standby, None
         if process is None:
-            self._fly(self._spawn(False))
-        else:
-            process.release()
-            self._fly(process)
+            return self._begin_anew(code)
+        process.release()
+        self._fly(process)
         return True
+
+    def _begin_anew(self, code: int) -> bool:
+        """A cold start, a few times where the computer has no process to give; False: none had."""
+        for _ in range(self._policy.deaths):
+            try:
+                self._fly(self._spawn(False))
+                return True
+            except OSError as error:
+                _log.error("no flight process can be started: %s", error)
+                self._pause(_AGAIN_S)
+        text = f"companion died ({described(code)}), not restarted"
+        self._guarded(lambda: self._mark(text))
+        self._guarded(lambda: self._tell(2, f"PiLoT: {text}"))
+        return False
 
     @staticmethod
     def _guarded(do: Callable[[], None]) -> None:

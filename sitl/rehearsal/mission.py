@@ -76,7 +76,9 @@ def read_mission(path: Path) -> PlannedMission:
     except OSError as error:
         raise ScenarioError(f"{path}: cannot be read: {error.strerror}") from error
     # What a damaged or a foreign file raises while it is taken apart.
-    except (ValueError, KeyError, TypeError, IndexError, RecursionError) as error:
+    except (
+        ValueError, KeyError, TypeError, IndexError, AttributeError, OverflowError, RecursionError
+    ) as error:  # fmt: skip
         raise ScenarioError(
             f"{path}: no .plan of QGroundControl and no QGC WPL 110 file ({error})"
         ) from error
@@ -150,6 +152,8 @@ def _mission(path: Path, home: tuple[float, float] | None, items: list[_Item]) -
             pitch = item.parameters[0]
         else:
             ignored.append(item.command)
+    if home is not None and not all(math.isfinite(x) for x in home):
+        raise ValueError(f"home is no place: {home}")
     if not waypoints:
         raise ScenarioError(f"{path}: holds no waypoint")
     return PlannedMission(home, tuple(waypoints), takeoff, speed, returns, tuple(ignored))

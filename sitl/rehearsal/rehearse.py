@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from companion.preflight.coverage import covered
+from companion.settings_file import SettingsError, validated
 from localizer.geometry.geo import Geodetic, LocalFrame
 from localizer.map.cache.cache import TileCache
 from localizer.map.cache.surface import MapSurface
@@ -144,4 +145,7 @@ def _as_planned(planned: PlannedMission, home: LocalFrame, scenario: Scenario) -
     changed["takeoff_height_m"] = planned.takeoff_height_m or planned.waypoints[0].height_m
     if planned.speed_m_s is not None and planned.speed_m_s > 0:
         changed["speed_m_s"] = planned.speed_m_s
-    return Scenario.model_validate(scenario.model_dump() | changed)
+    try:
+        return validated(Scenario, scenario.model_dump() | changed)
+    except SettingsError as error:
+        raise ScenarioError(f"the mission cannot be flown:\n{error}") from error

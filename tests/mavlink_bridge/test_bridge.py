@@ -20,6 +20,7 @@ from mavlink_bridge.config import InjectionConfig, OriginConfig, SigningConfig, 
 from mavlink_bridge.errors import BridgeStateError, FixError
 from mavlink_bridge.link.link import sleep_until
 from mavlink_bridge.link.signing import create_key
+from mavlink_bridge.messages import PlaceHint
 from mavlink_bridge.status import status_texts
 
 HOME = (47.397742, 8.545594)
@@ -61,8 +62,9 @@ class GroundStation:
     def of(self, name: str) -> list[Any]:
         return [m for m in list(self.received) if m.get_type() == name]
 
-    def send(self, message: Any) -> None:
-        self.socket.sendto(message.pack(self.codec), self.peer)
+    def send(self, message: Any, system: int = 255) -> None:
+        codec = self.codec if system == 255 else mavlink.MAVLink(None, system, 190)
+        self.socket.sendto(message.pack(codec), self.peer)
 
     def stop(self) -> None:
         self._stop.set()
@@ -571,3 +573,53 @@ def test_unphysical_fixes_are_refused(wrong: dict[str, Any]) -> None:
     good = {"time_ns": 1, "latitude_deg": 47.0, "longitude_deg": 8.0, "height_m": 500.0}
     with pytest.raises(FixError, match="vision fix"):
         VisionFix(**{**good, **wrong})
+
+
+def test_the_operators_hint_comes_from_authorised_systems_only_and_is_no_position(
+    autopilot: Any, ground: GroundStation, run: Callable[..., Bridge]
+) -> None:
+    heard: list[PlaceHint] = []
+
+    def take(hint: PlaceHint) -> bool:
+        heard.append(hint)
+        return hint.latitude_deg > 0
+
+    settings = config(
+        autopilot.port, ground_connection=f"udpout:127.0.0.1:{ground.port}", mode="inject"
+    )
+    run(settings, autopilot, on_hint=take)
+    assert sleep_until(lambda: ground.peer is not None, 30.0)
+    number, nan = mavlink.MAV_CMD_EXTERNAL_POSITION_ESTIMATE, math.nan
+    whole, frame = mavlink.MAVLink_command_int_message, mavlink.MAV_FRAME_GLOBAL
+
+    def answer(message: Any, system: int = 255) -> int:
+        before = len(ground.of("COMMAND_ACK"))
+        ground.send(message, system=system)
+        assert sleep_until(lambda: len(ground.of("COMMAND_ACK")) > before, 30.0)
+        ack = ground.of("COMMAND_ACK")[-1]
+        assert (ack.command, ack.get_srcComponent()) == (number, 197)
+        return int(ack.result)
+
+    def place(x: int, y: int, sigma_m: float = 40.0) -> Any:
+        return whole(1, 197, frame, number, 0, 0, 0.0, 0.0, sigma_m, nan, x, y, nan)
+
+    accepted, denied = mavlink.MAV_RESULT_ACCEPTED, mavlink.MAV_RESULT_DENIED
+    assert answer(place(473980000, 85460000)) == accepted
+    assert (heard[0].latitude_deg, heard[0].longitude_deg) == pytest.approx((47.398, 8.546))
+    assert heard[0].radius_m == 40.0
+    assert answer(place(473980000, 85460000), system=66) == denied  # a stranger's
+    assert answer(place(0, 0)) == denied  # not filled in
+    local = whole(1, 197, mavlink.MAV_FRAME_LOCAL_NED, number, 0, 0, 0.0, 0.0, 40.0, nan,
+                  473980000, 85460000, nan)  # fmt: skip
+    assert answer(local) == denied  # metres
+    assert answer(place(2147483647, 2147483647)) == denied  # "not set"
+    assert len(heard) == 1
+    assert answer(place(-473980000, 85460000)) == denied  # not on the map, says who knows it
+    long = mavlink.MAVLink_command_long_message(
+        1, 197, number, 0, 0.0, 0.0, nan, nan, 47.398, 8.546, nan
+    )
+    assert answer(long) == accepted
+    assert heard[-1].latitude_deg == pytest.approx(47.398, abs=2e-5)
+    assert heard[-1].radius_m > 50.0  # an unknown one is large
+    for kind in ("VISION_POSITION_ESTIMATE", "GPS_INPUT", "ODOMETRY", "COMMAND_INT"):
+        assert not autopilot.of(kind)  # nothing was injected, nothing passed on

@@ -99,7 +99,7 @@ def read_rows(path: Path) -> tuple[LoopRow, ...]:
     try:
         flights = json.loads(path.read_text(encoding="utf-8"))["flights"]
         return tuple(_row(flight) for flight in flights)
-    except (OSError, ValueError, KeyError, TypeError) as error:
+    except (OSError, ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
         raise ScenarioError(f"{path}: not a loop.json of this version: {error}") from error
 
 

@@ -19,6 +19,8 @@ from sitl.suite.loop.judge import false_alarms, figures, judge
 from sitl.suite.loop.report import LoopRow, as_data, markdown
 from sitl.vehicles.process import VehicleKind
 
+_MOST_SEEDS = 1000
+_DIGITS = 9
 _OTHER_SEED = 100  # of the place whose map is wrong here, beyond the flown world's seed
 
 
@@ -70,8 +72,12 @@ def parse_seeds(text: str) -> tuple[int, ...]:
     """``5``, or ``1..10`` for both and all between; ScenarioError for anything else."""
     first, dots, last = text.partition("..")
     if not (first.isdecimal() and (last.isdecimal() or not dots)):
-        raise ScenarioError(f"--seeds is a number or FIRST..LAST, not {text!r}")
+        raise ScenarioError(f"--seeds is a number or FIRST..LAST, not {text[:40]!r}")
+    if max(len(first), len(last)) > _DIGITS:
+        raise ScenarioError(f"--seeds: a seed has at most {_DIGITS} digits")
     seeds = range(int(first), int(last or first) + 1)
+    if int(last or first) - int(first) >= _MOST_SEEDS:
+        raise ScenarioError(f"--seeds {text}: at most {_MOST_SEEDS} at a time")
     if not seeds:
         raise ScenarioError(f"--seeds {text}: the last seed is before the first")
     return tuple(seeds)

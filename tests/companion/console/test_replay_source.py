@@ -8,7 +8,9 @@ import cv2
 import numpy as np
 import pytest
 
+from companion.cli.replay import show_record
 from companion.console.replay_source import ReplaySource
+from companion.errors import ConfigError
 from companion.flight.recorder import ESTIMATE_COLUMNS, EVENT_COLUMNS, TARGET_COLUMNS
 from companion.reporting.record import read_record
 
@@ -72,3 +74,29 @@ def test_an_order_that_makes_no_sense_is_refused(source, order):
 def test_the_heading_is_where_the_top_of_the_picture_points(source):
     """qx = 1: the camera looks straight down, its picture's top to the north."""
     assert _at(source, 0.0)["estimate"]["heading_deg"] == pytest.approx(0.0)
+
+
+@pytest.mark.parametrize("value", ["nan", "", "inf", "-1e308"])
+def test_what_no_browser_reads_is_not_sent(tmp_path, value):
+    numbers = ("qw", "qx", "sigma_east_m", "latitude_deg", "quality", "hpl_m", "latency_ms")
+    row = {"exposure_time_ns": S, "state": "tracking"} | dict.fromkeys(numbers, value)
+    _rows(tmp_path / "estimates.csv", ESTIMATE_COLUMNS, [row])
+    spoilt = ("latitude_deg", "sigma_up_m", "cov_en") if value != "-1e308" else ()
+    target = {"exposure_time_ns": S, "target_id": "car"} | dict.fromkeys(spoilt, value)
+    _rows(tmp_path / "targets.csv", TARGET_COLUMNS, [target])
+    _rows(tmp_path / "events.csv", EVENT_COLUMNS, [])
+    (tmp_path / "record.json").write_text(json.dumps({"utc_ns": "x", "monotonic_ns": None}))
+    source = ReplaySource(read_record(tmp_path))
+    asyncio.run(source.order({"share": 0.0}))
+    assert source.newest.states == 1
+    json.dumps([source.newest.state, *source.newest.samples], allow_nan=False)
+
+
+def test_an_address_that_is_none_is_one_line(tmp_path):
+    _rows(tmp_path / "estimates.csv", ESTIMATE_COLUMNS, [])
+    for name, columns in (("targets.csv", TARGET_COLUMNS), ("events.csv", EVENT_COLUMNS)):
+        _rows(tmp_path / name, columns, [])
+    for listen in ("nonsense", "127.0.0.1:99999"):
+        with pytest.raises(ConfigError, match="--console") as told:
+            show_record(tmp_path, tmp_path, listen)
+        assert "\n" not in str(told.value)

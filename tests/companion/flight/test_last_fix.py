@@ -79,6 +79,9 @@ def test_what_may_not_be_trusted_is_not_used(
         json.dumps({**asdict(BEGUN), "height_m": "NaN"}),
         json.dumps({**asdict(BEGUN), "sigma_m": 0.0}),
         json.dumps({**asdict(BEGUN), "local_ned": [1.0]}),
+        json.dumps({**asdict(BEGUN), "time_ns": -(10**400)}),
+        json.dumps({**asdict(BEGUN), "latitude_deg": 1e300}),
+        json.dumps({**asdict(BEGUN), "sigma_m": 1e300}),
     ],
 )  # fmt: skip
 def test_a_file_of_another_boot_or_without_sense_is_none(tmp_path: Path, content: str) -> None:
@@ -112,3 +115,23 @@ def test_once_found_the_memory_is_its_own(tmp_path: Path) -> None:
     ) == pytest.approx([5.0, 6.0, 80.0], abs=1e-3)
     kept_on.stop()
     assert not path.exists()
+
+
+def test_a_pipe_in_its_place_is_not_waited_for(tmp_path: Path) -> None:
+    path = tmp_path / "last-fix.json"
+    os.mkfifo(path, 0o600)
+    assert read_last_fix(path, boot_id()) is None
+
+
+def test_what_cannot_be_kept_or_removed_ends_no_flight(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    path = tmp_path / "last-fix.json"
+    path.mkdir()  # neither replaced by a file, nor removed as one
+    kept_on = memory(path)
+    kept_on.start()
+    kept_on.add_estimate(tracked(104 * SECOND), None)  # type: ignore[arg-type]
+    while "is not kept" not in caplog.text:
+        pass
+    kept_on.stop()
+    assert "is not removed" in caplog.text

@@ -171,6 +171,7 @@ def test_events_are_told_once():
         {"do": "arm"}, {}, {"do": ["target"]},
         {"do": "target", "x": 1.5, "y": 0.5}, {"do": "target", "x": True, "y": 0},
         {"do": "target", "x": float("nan"), "y": 0.5}, {"do": "target", "x": "0.5", "y": 0.5},
+        {"do": "target", "x": 10**400, "y": 0.5},
         {"do": "box", "left": 0.5, "top": 0.1, "right": 0.4, "bottom": 0.2},
         {"do": "hint", "latitude_deg": 91, "longitude_deg": 8, "radius_m": 50},
         {"do": "hint", "latitude_deg": 47, "longitude_deg": 8, "radius_m": 1e9},

@@ -154,3 +154,74 @@ def test_the_stanford_diagram_counts_what_misleads():
     text = render(Report("t", "s", "f", stanford=Stanford(errors, levels, 10.0)))
     assert "4 fixes: 3 within the alert limit of 10 m; 2 of them are further off" in text
     assert "(misleading), 1 beyond the limit (hazardous)" in text
+
+
+HOSTILE = "<img src=x onerror=alert(1)>\"'&</script><!--"
+
+
+def _changed(path, change):
+    document = json.loads(path.read_text())
+    change(document)
+    path.write_text(json.dumps(document))
+
+
+@pytest.mark.parametrize(
+    ("file", "content"),
+    [
+        ("estimates.csv", "a,b\n1,2\n"), ("targets.csv", "a,b\n1,2\n"),
+        ("events.csv", "a,b\n1,2\n"), ("estimates.csv", "a,b\n" + "x" * 200_000 + ",1\n"),
+        ("estimates.csv", "\0\0\0\n\0\n"),
+    ],
+)  # fmt: skip
+def test_a_foreign_table_is_one_named_line(record, file, content):
+    (record / file).write_text(content)
+    with pytest.raises(RecordError, match="not a table of a record") as told:
+        report_of(record)
+    assert "\n" not in str(told.value)
+
+
+@pytest.mark.parametrize("value", [None, 5, "x", [1], [[1, 2]], float("nan"), 10**400, "\ud800"])
+@pytest.mark.parametrize("key", ["config", "versions", "monotonic_ns", "utc_ns"])
+def test_a_manifest_of_nonsense_costs_what_it_would_have_told(record, key, value):
+    def change(document):
+        document["config"]["map"] = "missing"
+        document[key] = value
+
+    _changed(record / "record.json", change)
+    assert "Verdict" in render(report_of(record))
+
+
+@pytest.mark.parametrize("value", ["", "nan", "inf"])
+def test_numbers_that_are_none_cost_their_own_figure(record, value):
+    _changed(record / "record.json", lambda d: d["config"]["bridge"].update(
+        injection={"delay_ms": float("nan"), "alert_limit_m": 10**400}))  # fmt: skip
+    rows = [
+        _estimate(i, latency_ms=value, quality=value, qw=value, sigma_east_m=value)
+        for i in range(9)
+    ]
+    _rows(record / "estimates.csv", ESTIMATE_COLUMNS, rows)
+    target = {"exposure_time_ns": START_NS, "target_id": "A", "east_m": value}
+    _rows(record / "targets.csv", TARGET_COLUMNS, [target])
+    (record / "snapshots" / "\N{SUPERSCRIPT TWO}.jpg").write_bytes(b"")
+    (record / "snapshots" / f"{'9' * 40}.jpg").write_bytes(b"")
+    assert "nan ms" in render(report_of(record))
+
+
+def test_nothing_of_a_record_becomes_markup(record):
+    def change(document):
+        document["versions"] = {HOSTILE: HOSTILE}
+        document["config"] |= {HOSTILE: HOSTILE, "map": HOSTILE}
+
+    _changed(record / "record.json", change)
+    (record / "health.json").write_text(
+        json.dumps({"level": "ended", "text": HOSTILE + "\ud800", "shadow": HOSTILE})
+    )
+    target = {"exposure_time_ns": START_NS, "target_id": HOSTILE}
+    _rows(record / "targets.csv", TARGET_COLUMNS, [target])
+    event = {"time_ns": START_NS, "level": HOSTILE, "text": HOSTILE}
+    _rows(record / "events.csv", EVENT_COLUMNS, [event])
+    _rows(record / "estimates.csv", ESTIMATE_COLUMNS, [_estimate(0, HOSTILE, 1, status=HOSTILE)])
+    record = record.rename(record.with_name("<img src=x onerror=alert(1)>"))
+    page = write_page(record).read_text(encoding="utf-8")
+    assert "<img src=x" not in page
+    assert "&lt;img src=x" in page

@@ -53,15 +53,20 @@ class Stage:
         self.told: list[tuple[int, str]] = []
         self.marked: list[str] = []
         self._now_s = 0.0
+        self.refusals = 0
         self.supervisor = Supervisor(
             self._spawn,
             lambda severity, text: self.told.append((severity, text)),
             self.marked.append,
             RestartPolicy(**policy),  # type: ignore[arg-type]
             self._clock,
+            lambda _: None,
         )
 
     def _spawn(self, standby: bool) -> Scripted:
+        if self.refusals > 0 and self.spawned:
+            self.refusals -= 1
+            raise BlockingIOError(11, "Resource temporarily unavailable")
         process = self.waiting.pop(0)
         process.standby = standby
         self.spawned.append(process)
@@ -98,6 +103,22 @@ def test_after_too_many_deaths_it_gives_up_and_says_so() -> None:
         "restarting", "restarting", "not restarted",
     ]  # fmt: skip
     assert all(len(text) <= 50 for _, text in stage.told)
+
+
+def test_a_standby_that_cannot_be_started_ends_nothing() -> None:
+    stage = Stage([Scripted(60, 0), Scripted(9, 0)], standby_after_s=5.0)
+    stage.refusals = 1
+    assert stage.supervisor.run() == 0
+    assert [p.standby for p in stage.spawned] == [False, True]  # tried again later
+
+
+@pytest.mark.parametrize(("refusals", "code"), [(2, 0), (9, 137)])
+def test_a_computer_without_a_process_to_give_is_asked_again(refusals: int, code: int) -> None:
+    stage = Stage([Scripted(3, -9), Scripted(3, 0)], standby_after_s=60.0)
+    stage.refusals = refusals
+    assert stage.supervisor.run() == code
+    told = ["restarting", "not restarted"][: 1 + (code > 0)]
+    assert [text.split("), ")[1] for _, text in stage.told] == told
 
 
 def test_deaths_that_are_far_apart_are_each_mended() -> None:

@@ -138,3 +138,23 @@ def test_a_real_mesh_is_rehearsed_over(real_data, tmp_path):
     for point in points:
         assert np.all(low - 0.1 <= point.position_at(0))
         assert np.all(point.position_at(0) <= high + 0.1)
+
+
+def test_what_no_flight_can_be_is_a_named_error(tmp_path, small_assets, home):
+    lat, lon = home
+    absurd = {"high": 1e9, "under": -500.0}
+    for name, height in absurd.items():
+        plan = _plan(tmp_path / f"{name}.plan", home, _item(16, 0, 0, 0, None, lat, lon, height))
+        with pytest.raises(ScenarioError, match="cannot be flown"):
+            rehearse(small_assets.map_cache, None, plan, Scenario())
+    endless = tmp_path / "endless.plan"
+    endless.write_text(
+        '{"mission": {"plannedHomePosition": [47, 8, 0], "items": '
+        '[{"type": "SimpleItem", "command": 1e999, "frame": 3, "params": [0,0,0,0,0,0,0]}]}}'
+    )
+    with pytest.raises(ScenarioError, match=r"no \.plan"):
+        read_mission(endless)
+    nowhere = (float("nan"), lon)
+    plan = _plan(tmp_path / "a.plan", nowhere, _item(16, 0, 0, 0, None, lat, lon, 60))
+    with pytest.raises(ScenarioError, match="home is no place"):
+        read_mission(plan)

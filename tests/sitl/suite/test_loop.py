@@ -124,9 +124,10 @@ def test_the_flights_of_several_runs_make_one_table(tmp_path: Path) -> None:
     path = tmp_path / "loop.json"
     path.write_text(json.dumps(as_data(rows), allow_nan=False), encoding="utf-8")
     assert markdown(read_rows(path)) == markdown(rows)
-    path.write_text("[]", encoding="utf-8")
-    with pytest.raises(ScenarioError, match=r"not a loop\.json"):
-        read_rows(path)
+    for damaged in ("[]", '{"flights": [5]}', "[" * 100_000):
+        path.write_text(damaged, encoding="utf-8")
+        with pytest.raises(ScenarioError, match=r"not a loop\.json"):
+            read_rows(path)
 
 
 @pytest.mark.parametrize(("text", "seeds"), [("5", (5,)), ("1..3", (1, 2, 3))])
@@ -134,7 +135,7 @@ def test_seeds_are_one_or_a_range(text: str, seeds: tuple[int, ...]) -> None:
     assert parse_seeds(text) == seeds
 
 
-@pytest.mark.parametrize("text", ["", "1..", "3..1", "-1", "1...3", "a"])
+@pytest.mark.parametrize("text", ["", "1..", "3..1", "-1", "1...3", "a", "1..999999", "9" * 5000])
 def test_other_seeds_are_refused(text: str) -> None:
     with pytest.raises(ScenarioError, match="seeds"):
         parse_seeds(text)
