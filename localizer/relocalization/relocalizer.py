@@ -203,8 +203,14 @@ class Relocalizer:
         rival = max(rivals, default=0.0)
         if not best.credible or best.result.quality < rival + self._config.margin:
             return None
-        own = best.candidate.score
-        runner_up = max((c.score for k, c in enumerate(candidates) if k != best.rank), default=0.0)
+        # Candidates that registration brings to one place are one: its score is the best of theirs.
+        same = {
+            j.rank
+            for j in judged
+            if np.linalg.norm(j.result.world_from_camera.translation - place) <= _SAME_PLACE_M
+        }
+        own = max(candidates[rank].score for rank in same)
+        runner_up = max((c.score for k, c in enumerate(candidates) if k not in same), default=0.0)
         # Where other ground looks nearly as much like the frame, the right place may be none of the
         # candidates: half-agreeing parts are what the next of many equal roofs gives.
         if runner_up >= _NEARLY * own and not self._is_decisive(best):
