@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import sys
 import threading
+from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -63,9 +64,8 @@ def console_command(
 def require_extra() -> None:
     """`ConfigError` where the packages of the extra `console` are not installed."""
     try:
-        import starlette  # noqa: F401
-        import uvicorn  # noqa: F401
-        import websockets  # noqa: F401
+        for name in ("starlette", "uvicorn", "websockets"):
+            import_module(name)
     except ImportError as error:
         raise ConfigError(f"install pilot-companion[console] for the console: {error}") from error
 
