@@ -161,6 +161,9 @@ class RecordConfig(_Model):
     snapshot_interval_s: float | None = Field(
         10.0, ge=0.001, le=86400, description="a video frame is kept this often; none: never"
     )
+    mcap: bool = Field(
+        False, description="write record.mcap in flight, too (extra `mcap`), for Foxglove and Rerun"
+    )
 
 
 class CompanionConfig(_Model):

@@ -1,5 +1,5 @@
-"""The command line: ``companion run | eval | localize | convert | replay | report | console | map |
-world | doctor | key``.
+"""The command line: ``companion run | eval | localize | convert | replay | report | export |
+console | map | world | doctor | key``.
 
 Exit codes: 0 done; 1 `doctor` found advice, `replay` differs, `localize` localized nothing or `map
 verify` found damage; 2 wrong usage, a named error, or `doctor` found the vehicle not fit to fly;
@@ -20,6 +20,7 @@ from companion.cli.console import console_command
 from companion.cli.convert import convert_command
 from companion.cli.doctor import doctor_command
 from companion.cli.evaluate import evaluate_command
+from companion.cli.export import export_command
 from companion.cli.interrupts import INTERRUPTED
 from companion.cli.key import key_command
 from companion.cli.localize import localize_command
@@ -64,6 +65,7 @@ app.command("localize")(localize_command)
 app.command("convert")(convert_command)
 app.command("replay")(replay_command)
 app.command("report")(report_command)
+app.command("export")(export_command)
 app.command("console")(console_command)
 app.command("doctor")(doctor_command)
 app.command("key")(key_command)

@@ -9,9 +9,9 @@ import logging
 import queue
 import threading
 import time
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
-from typing import Any, TextIO
+from typing import Any, Protocol, TextIO
 
 import cv2
 import numpy as np
@@ -33,6 +33,7 @@ _FLUSH_S = 1.0
 _CLOSE_S = 5.0
 MANIFEST_NAME = "record.json"
 LATEST_NAME = "latest"
+MCAP_NAME = "record.mcap"
 
 ESTIMATE_COLUMNS = (
     "exposure_time_ns", "sequence", "east_m", "north_m", "up_m", "qw", "qx", "qy", "qz",
@@ -47,6 +48,7 @@ TARGET_COLUMNS = (
     "cov_ee", "cov_en", "cov_eu", "cov_nn", "cov_nu", "cov_uu", "elsewhere", "visibility",
 )  # fmt: skip
 EVENT_COLUMNS = ("time_ns", "level", "text")
+_COLUMNS = {"estimates": ESTIMATE_COLUMNS, "targets": TARGET_COLUMNS, "events": EVENT_COLUMNS}
 
 
 def fresh_folder(folder: Path) -> Path:
@@ -70,7 +72,7 @@ def remove_empty(folder: Path) -> None:
     with contextlib.suppress(OSError):
         if any(len(t.read_text().splitlines()) > 1 for t in tables if t.exists()):
             return
-        for path in (*tables, folder / MANIFEST_NAME):
+        for path in (*tables, folder / MANIFEST_NAME, folder / MCAP_NAME):
             path.unlink(missing_ok=True)
         if snapshots.exists():
             snapshots.rmdir()
@@ -143,13 +145,33 @@ def _target_row(fix: TargetFix, frame: LocalFrame) -> tuple[Any, ...]:
     )  # fmt: skip
 
 
+class RecordStream(Protocol):
+    """A second form of the record, written along with the tables (`companion.export`)."""
+
+    def row(self, table: str, row: Mapping[str, Any]) -> None:
+        """A row of that table, by its columns."""
+        ...
+
+    def image(self, jpeg: bytes, exposure_time_ns: int) -> None:
+        """A snapshot."""
+        ...
+
+    def flush(self) -> None:
+        """Hand what is written to the operating system."""
+        ...
+
+    def close(self) -> None:
+        """Finish it."""
+        ...
+
+
 class Recorder:
     """Writes ``estimates.csv``, ``targets.csv`` and ``events.csv`` in a folder, and the accepted
     estimates as a trajectory (`TrajectoryFiles`, made at the first of them).
 
     Nothing here blocks its callers: rows beyond a bounded queue are dropped and counted. So is what
     the disk does not take (full, gone): the flight goes on without its record, and on_failure is
-    called once, in the recorder's thread, with the reason.
+    called once, in the recorder's thread, with the reason. stream: takes the same, if given.
     """
 
     def __init__(
@@ -157,8 +179,10 @@ class Recorder:
         config: RecordConfig,
         frame: LocalFrame,
         on_failure: Callable[[str], None] = lambda _: None,
+        stream: RecordStream | None = None,
     ) -> None:
         folder = config.folder
+        self._stream = stream
         self._snapshots = folder / "snapshots"
         self._interval_ns = (config.snapshot_interval_s or 0.0) * 1e9
         self._next_snapshot_ns = 0.0
@@ -169,7 +193,7 @@ class Recorder:
         self._on_failure = on_failure
         self._failed = False
         self._folder = folder
-        self._files: list[TextIO | TrajectoryFiles] = []
+        self._files: list[TextIO | TrajectoryFiles | RecordStream] = []
         self._trajectory: TrajectoryFiles | None = None
         try:
             self._snapshots.mkdir(parents=True, exist_ok=True)
@@ -180,6 +204,8 @@ class Recorder:
             }
         except OSError as error:
             raise _unwritable(folder, error) from error
+        if stream is not None:
+            self._files.append(stream)
         # A daemon: a disk that stands still must not keep the process from ending.
         self._thread = threading.Thread(target=self._run, name="recorder", daemon=True)
         self._thread.start()
@@ -237,12 +263,18 @@ class Recorder:
             (frame,) = row()
             # Not imwrite, which does not tell why it could not.
             _, jpeg = cv2.imencode(".jpg", cv2.cvtColor(frame.image, cv2.COLOR_RGB2BGR))
-            (self._snapshots / snapshot_name(frame.exposure_time_ns)).write_bytes(jpeg.tobytes())
+            data = jpeg.tobytes()
+            (self._snapshots / snapshot_name(frame.exposure_time_ns)).write_bytes(data)
+            if self._stream is not None:
+                self._stream.image(data, frame.exposure_time_ns)
         elif name == "trajectory":
             (estimate,) = row()
             self._append(estimate)
         elif name:
-            self._writers[name].writerow(row())
+            values = tuple(row())
+            self._writers[name].writerow(values)
+            if self._stream is not None:
+                self._stream.row(name, dict(zip(_COLUMNS[name], values, strict=True)))
 
     def _append(self, estimate: PoseEstimate) -> None:
         if self._trajectory is None:
@@ -276,6 +308,21 @@ class Recorder:
                 self._on_failure(getattr(error, "strerror", None) or str(error))
 
 
+def _live_mcap(config: CompanionConfig, record: RecordConfig) -> RecordStream | None:
+    """``record.mcap``; None, and told, where it cannot be had: the tables suffice."""
+    try:
+        from companion.export.mcap_file import McapFile
+
+        record.folder.mkdir(parents=True, exist_ok=True)
+        camera = config.camera.model.camera()
+        return McapFile(record.folder / MCAP_NAME, system_minus_monotonic(), camera)
+    except ImportError as error:
+        _log.warning("no record.mcap: install pilot-companion[mcap] (%s)", error)
+    except OSError as error:
+        _log.warning("no record.mcap: %s", error)
+    return None
+
+
 class RecordKeeper:
     """The record of one process, where the disk takes one: this may be a restart in the air.
 
@@ -297,7 +344,8 @@ class RecordKeeper:
         try:
             record = record.model_copy(update={"folder": fresh_folder(record.folder)})
             claim(record.folder)
-            self.recorder = Recorder(record, self._frame, self.failed)
+            stream = _live_mcap(config, record) if record.mcap else None
+            self.recorder = Recorder(record, self._frame, self.failed, stream)
             self.folder = record.folder
             write_manifest(record.folder, config)
         except DiskFaultError as error:

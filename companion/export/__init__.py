@@ -1,0 +1,1 @@
+"""Records for other programs: MCAP with Foxglove's schemas."""
