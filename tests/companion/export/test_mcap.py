@@ -122,7 +122,7 @@ def test_a_record_is_what_foxglove_expects(flight, small_assets):
     assert schema == "foxglove.CameraCalibration"
     assert image.frame_id == calibration.frame_id == "camera"
     np.testing.assert_allclose(np.reshape(calibration.K, (3, 3))[:2, 2], [31.5, 23.5])
-    np.testing.assert_allclose(calibration.D, MODEL["distortion"])
+    assert list(calibration.D) == MODEL["distortion"]
 
     ((schema, _, scene),) = messages["/targets"]
     (entity,) = scene.entities
@@ -188,7 +188,7 @@ def test_in_flight_the_same_is_written_and_a_loss_of_power_leaves_what_was_writt
         assert schema == again
         assert abs(logged - later) < 1_000_000  # the two clocks are read once more
         if topic == "/vision/pose":
-            assert said.pose == read.pose
+            assert str(said.pose) == str(read.pose)  # each file brings its own classes
     whole = (keeper.folder / "record.mcap").read_bytes()
     cut = tmp_path / "cut.mcap"
     cut.write_bytes(whole[: len(whole) - 900])  # within the index at its end
