@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 from functools import partial
 from typing import Any
@@ -44,12 +44,14 @@ from mavlink_bridge.messages import (
     VisionFix,
 )
 from mavlink_bridge.shared import Shared
-from mavlink_bridge.status import OperatorStatus
+from mavlink_bridge.status import OperatorStatus, named_values
 from mavlink_bridge.texts import Teller
 from mavlink_bridge.vehicle.presence import VehicleWatch
 from mavlink_bridge.vehicle.tracker import VehicleTracker
 
 _GROUND_WANTED = frozenset(message_id(name) for name in ("HEARTBEAT", *COMMANDS_IN))
+_WARNING = 4  # MAV_SEVERITY; lower is worse
+_AUTOPILOT = 1  # MAV_COMP_ID_AUTOPILOT1
 _NEXT_STATION_S = 10.0  # a second ground station takes over where the first one fell silent
 
 
@@ -79,7 +81,7 @@ class Bridge:
         self._config = config
         self._started = self._stopped = False
         self._utc = SteadyUtc()
-        self._status = OperatorStatus(self._tell, on_text)
+        self._status = OperatorStatus(self._tell_text, on_text)
         teller = Teller(self.say)
         self._recorder = None
         if config.tlog is not None:
@@ -120,7 +122,7 @@ class Bridge:
         self._links = tuple(dict.fromkeys((self._fc_link, self._ground_link)))
         self._cot = None
         if config.targets.cot_endpoint:
-            self._cot = CursorOnTarget(config.targets, self._utc)
+            self._cot = CursorOnTarget(config.targets, config.camera, self._utc)
 
     # --- life -----------------------------------------------------------------------------------
 
@@ -191,7 +193,10 @@ class Bridge:
 
     def look(self, view: CameraView) -> None:
         """Tell the ground where the camera looks (CAMERA_FOV_STATUS); never blocks."""
-        self._to_ground(view)
+        if self._config.camera.announce:
+            self._to_ground(view)
+        if self._cot is not None:
+            self._cot.look(view)
 
     def _to_ground(self, item: TargetReport | TargetEnd | CameraView) -> None:
         self._ground.show(item)
@@ -208,8 +213,20 @@ class Bridge:
         """A line for the operator: STATUSTEXT on the ground side, and the log."""
         self._status.say(severity, text)
 
-    def _tell(self, message: Any) -> None:
-        self._ground_link.send(message, self._config.companion_component)
+    def tell_figures(self, figures: Mapping[str, float]) -> None:
+        """NAMED_VALUE_FLOAT for each figure, names of at most 10 characters, where
+        `named_values` has them; never blocks.
+        """
+        if self._config.named_values:
+            uptime_ms = self._shared.uptime_ms(monotonic_ns())
+            for message in named_values(figures, uptime_ms):
+                self._ground_link.send(message, self._config.companion_component)
+
+    def _tell_text(self, severity: int, message: Any) -> None:
+        component = self._config.companion_component
+        if self._config.texts_as_autopilot and severity <= _WARNING:
+            component = self.state().component_id or _AUTOPILOT
+        self._ground_link.send(message, component)
 
     # --- out ------------------------------------------------------------------------------------
 

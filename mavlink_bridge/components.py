@@ -60,6 +60,7 @@ class Components:
             shared.on_track,
             shared.target_numbers,
             ground_link=ground,
+            utc=shared.utc,
         )
         self._next_heartbeat_ns = 0
         # Where one link is signed, an order over another that is not would go round the signature.

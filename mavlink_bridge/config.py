@@ -157,7 +157,11 @@ class CameraConfig(_Model):
     width_px: int = Field(default=1280, ge=1, le=65535)
     height_px: int = Field(default=720, ge=1, le=65535)
     horizontal_fov_deg: float = Field(default=60.0, ge=0.1, lt=180.0)
-    stream_uri: str = Field(default="", max_length=159)
+    stream_uri: str = Field(
+        default="",
+        max_length=159,
+        description="rtsp://..., tcp://..., or udp://...:PORT and PORT of MPEG-TS; empty: none",
+    )
     mount: Literal["gimbal", "fixed"] = "gimbal"
     gimbal_component: int = Field(
         default=0, ge=0, le=255, description="whose angles count where there are several; 0: any"
@@ -181,8 +185,29 @@ class TargetsConfig(_Model):
 
     rate_hz: float = Field(default=5.0, ge=0.01, le=30.0)
     adsb: bool = Field(default=False, description="ADSB_VEHICLE, on the ground link only")
+    captured: bool = Field(
+        default=False,
+        description="CAMERA_IMAGE_CAPTURED once for each confirmed target: a mark on QGC's map",
+    )
+    confirmed_sigma_m: float = Field(
+        default=3.0,
+        ge=0.01,
+        le=1000.0,
+        description="horizontal; of a confirmed target",
+    )
     cot_endpoint: str = Field(default="", description="host:port of a Cursor-on-Target listener")
     cot_stale_s: float = Field(default=30.0, ge=0.1, le=86400.0)
+    cot_aircraft: bool = Field(
+        default=False,
+        description="Cursor-on-Target of the aircraft too, with the camera's wedge and its video",
+    )
+    cot_callsign: str = Field(
+        default="PiLoT",
+        min_length=1,
+        max_length=32,
+        pattern=r"^[\w .-]+$",
+        description="of the aircraft; one for each that is on the same map",
+    )
 
     @field_validator("cot_endpoint")
     @classmethod
@@ -235,6 +260,14 @@ class BridgeConfig(_Model):
     localizer_component: int = Field(default=197, ge=2, le=255)  # 1 is the autopilot
     companion_component: int = Field(default=191, ge=2, le=255)
     camera_component: int = Field(default=100, ge=2, le=255)
+    named_values: bool = Field(
+        default=False,
+        description="NAMED_VALUE_FLOAT VPS_* at 1 Hz, to plot and to watch",
+    )
+    texts_as_autopilot: bool = Field(
+        default=False,
+        description="warnings and errors come from the autopilot's component, for MAVProxy",
+    )
     attitude_rate_hz: float = Field(default=50.0, ge=5.0, le=200.0)
     injection: InjectionConfig = InjectionConfig()
     origin: OriginConfig | None = None
@@ -299,6 +332,21 @@ class BridgeConfig(_Model):
                 f"sender chooses among the senders of a udpin connection; {self.connection} has "
                 "one peer: remove it"
             )
+        return self
+
+    @model_validator(mode="after")
+    def _autopilots_texts_need_a_ground_link(self) -> BridgeConfig:
+        if self.texts_as_autopilot and self.ground_connection is None:
+            raise ValueError(
+                "texts_as_autopilot needs ground_connection: ArduPilot drops what comes back to it "
+                "under its own ids"
+            )
+        return self
+
+    @model_validator(mode="after")
+    def _aircraft_needs_a_listener(self) -> BridgeConfig:
+        if self.targets.cot_aircraft and not self.targets.cot_endpoint:
+            raise ValueError("targets.cot_aircraft needs targets.cot_endpoint, host:port")
         return self
 
     @model_validator(mode="after")

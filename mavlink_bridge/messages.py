@@ -200,6 +200,10 @@ class CameraView:
     """The point on the ground in the picture's centre; None where the ray meets nothing."""
     image_longitude_deg: float | None = None
     image_height_m: float | None = None
+    h_accuracy_m: float | None = None
+    """1 sigma of the camera's position, horizontal (over both directions)."""
+    v_accuracy_m: float | None = None
+    """1 sigma of its height."""
 
     def __post_init__(self) -> None:
         _check_position("camera view", self.latitude_deg, self.longitude_deg, self.height_m)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 import threading
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import Any
 
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
@@ -18,6 +18,7 @@ _log = logging.getLogger(__name__)
 
 _TEXTS = 64
 _TEXT_LENGTH = 50  # STATUSTEXT.text
+_NAME_LENGTH = 10  # NAMED_VALUE_FLOAT.name
 _MAX_CHUNKS = 4
 _AGAIN_NS = 10_000_000_000
 _SEVERITY = {
@@ -31,10 +32,13 @@ _SEVERITY = {
 class OperatorStatus:
     """Tells the operator. Every method may be called from any thread.
 
-    send: a message to the ground; on_text: every line (severity, text), for a record.
+    send: a line's severity and message to the ground; on_text: every line (severity, text), for a
+    record.
     """
 
-    def __init__(self, send: Callable[[Any], None], on_text: Callable[[int, str], None]) -> None:
+    def __init__(
+        self, send: Callable[[int, Any], None], on_text: Callable[[int, str], None]
+    ) -> None:
         self._send = send
         self._on_text = on_text
         self._health_lock = threading.Lock()
@@ -82,7 +86,7 @@ class OperatorStatus:
         with self._text_lock:  # two threads' texts under one id would be mixed at the receiver
             self._text_id = text_id = self._text_id % 0xFFFF + 1
         for message in status_texts(severity, text, text_id):
-            self._send(message)
+            self._send(severity, message)
 
     def texts(self) -> list[str]:
         """The last lines, oldest first."""
@@ -101,4 +105,15 @@ def status_texts(severity: int, text: str, text_id: int) -> list[Any]:
     return [
         mavlink.MAVLink_statustext_message(severity, chunk, text_id, i)
         for i, chunk in enumerate(chunks)
+    ]
+
+
+def named_values(figures: Mapping[str, float], uptime_ms: int) -> list[Any]:
+    """NAMED_VALUE_FLOAT (251) of each figure; a name holds 10 characters."""
+    too_long = [name for name in figures if not 0 < len(name) <= _NAME_LENGTH]
+    if too_long:
+        raise ValueError(f"NAMED_VALUE_FLOAT.name holds {_NAME_LENGTH} characters: {too_long}")
+    return [
+        mavlink.MAVLink_named_value_float_message(uptime_ms, name.encode("ascii"), value)
+        for name, value in figures.items()
     ]

@@ -204,4 +204,6 @@ def camera_view(estimate: PoseEstimate, frame: LocalFrame, cast: RayCaster) -> C
         None if seen is None else seen.latitude_deg,
         None if seen is None else seen.longitude_deg,
         None if seen is None else seen.height_m,
+        float(np.sqrt(estimate.covariance[0, 0] + estimate.covariance[1, 1])),
+        float(np.sqrt(estimate.covariance[2, 2])),
     )

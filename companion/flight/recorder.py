@@ -18,6 +18,7 @@ import numpy as np
 
 from companion.config import CompanionConfig, RecordConfig
 from companion.errors import DiskFaultError, ReportError
+from companion.ground.target_files import write_target_files
 from companion.redaction import redacted
 from companion.sources.timing import system_minus_monotonic
 from companion.trajectory import TrajectoryFiles, snapshot_name, stamped
@@ -370,9 +371,14 @@ class RecordKeeper:
             _log.info("no link to the newest record: %s", error)
 
     def close(self) -> None:
-        """Write what is queued and close the files."""
+        """Write what is queued, close the files, and put the targets on maps."""
         if self.recorder is not None:
             self.recorder.close()
+        if self.folder is not None:
+            try:
+                write_target_files(self.folder)
+            except OSError as error:
+                _log.warning("no maps of the targets: %s", error)
 
     def failed(self, why: str) -> None:
         """Something is missing in the record from now on."""

@@ -27,6 +27,7 @@ from companion.flight.recorder import RecordKeeper, remove_empty
 from companion.flight.search import PlaceSearch, place_on_map
 from companion.flight.sightings import Sightings
 from companion.flight.view_reporter import ViewReporter
+from companion.ground.vital_signs import VitalSigns
 from companion.guardian.guardian import Guardian
 from companion.guardian.monitor import Limits
 from companion.live.orders import Helm, OrderError, Orders
@@ -189,6 +190,12 @@ def _view(making: Making) -> ViewReporter:
     view = ViewReporter(rate_hz, cache.frame, MapSurface(cache).cast, bridge.look)
     making.channels.estimates.subscribe(lambda estimate, _: view.add_estimate(estimate))
     return view
+
+
+def _vital_signs(making: Making) -> VitalSigns:
+    signs = VitalSigns(making[Bridge].tell_figures)
+    making.channels.estimates.subscribe(lambda estimate, _: signs.add_estimate(estimate))
+    return signs
 
 
 def _autopilot(making: Making) -> AutopilotPose:
@@ -389,7 +396,12 @@ PARTS: tuple[Part[Any], ...] = (
     Part(
         "view", ViewReporter, _view, depends=(MapStack, Bridge),
         start=ViewReporter.start, stop=ViewReporter.stop,
-        wanted=lambda config: config.bridge.camera.announce,
+        wanted=lambda config: config.bridge.camera.announce or config.bridge.targets.cot_aircraft,
+    ),
+    Part(
+        "vital signs", VitalSigns, _vital_signs, depends=(Bridge,),
+        start=VitalSigns.start, stop=VitalSigns.stop,
+        wanted=lambda config: config.bridge.named_values,
     ),
     Part(
         "search", PlaceSearch, _search, depends=(MapStack, AutopilotPose),

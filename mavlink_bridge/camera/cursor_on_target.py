@@ -1,73 +1,80 @@
-"""Cursor-on-Target: a target as ATAK and WinTAK show it."""
+"""Cursor-on-Target: targets, the aircraft, its camera's wedge and video, for ATAK and WinTAK.
+
+MITRE's "Cursor-on-Target Event Data Model" 2.0; `<sensor>` and `<__video>` as ATAK-CIV reads them.
+"""
 
 from __future__ import annotations
 
 import logging
 import math
+import threading
 from datetime import datetime, timedelta, timezone
 from xml.etree import ElementTree
 
-from mavlink_bridge.config import TargetsConfig
+from mavlink_bridge import quaternion as quat
+from mavlink_bridge.config import CameraConfig, TargetsConfig
 from mavlink_bridge.link.clock import SteadyUtc
 from mavlink_bridge.link.transport import Endpoint, UdpTransport
-from mavlink_bridge.messages import TargetReport
+from mavlink_bridge.messages import CameraView, TargetReport
+from mavlink_bridge.vehicle.origin import north_east
 
 _log = logging.getLogger(__name__)
 
-_COT_TYPE = "a-u-G"  # atom, unknown affiliation, ground
+_TARGET_TYPE = "a-u-G"  # atom, unknown affiliation, ground
+_AIRCRAFT_TYPE = "a-f-A-M-H-Q"  # friendly, air, military, rotary wing, unmanned: ATAK's UAS
+_MEASURED = "m-r"  # how: machine, relayed
 _TOLD_ELSEWHERE = 0.05  # from here on a target's other surface is worth a remark
+_AIRCRAFT_PERIOD_NS = 900_000_000  # about 1 Hz: views do not come on the second
+_AIRCRAFT_STALE_S = 10.0
+_STEEP_RAD = math.radians(-60.0)  # below it the picture's upper edge tells the azimuth
 
 
 class CursorOnTarget:
-    """Sends targets to `cot_endpoint` over a socket of its own. Any thread may call it."""
+    """Sends targets, and the aircraft, to `cot_endpoint` over a socket of its own.
 
-    def __init__(self, config: TargetsConfig, utc: SteadyUtc) -> None:
+    Any thread may call it.
+    """
+
+    def __init__(self, config: TargetsConfig, camera: CameraConfig, utc: SteadyUtc) -> None:
         self._config = config
+        self._camera = camera
         self._utc = utc
         where = Endpoint.parse(f"udpout:{config.cot_endpoint}")
         self._socket = UdpTransport(None, (where.address, where.number))
+        self._lock = threading.Lock()
+        self._next_ns = 0
 
     def send(self, target: TargetReport) -> None:
         """One event; what the network refuses is lost."""
-        try:
-            self._socket.write(cursor_on_target(target, self._config, self._utc))
-        except OSError as error:
-            _log.debug("Cursor-on-Target not sent: %s", error)
+        self._write(cursor_on_target(target, self._config, self._utc))
+
+    def look(self, view: CameraView) -> None:
+        """The aircraft and its camera, once a second where `cot_aircraft` has them."""
+        if not self._config.cot_aircraft:
+            return
+        with self._lock:
+            if view.time_ns < self._next_ns:
+                return
+            self._next_ns = view.time_ns + _AIRCRAFT_PERIOD_NS
+        self._write(aircraft_on_map(view, self._config, self._camera, self._utc))
 
     def close(self) -> None:
         """Close the socket."""
         self._socket.close()
 
+    def _write(self, event: bytes) -> None:
+        try:
+            self._socket.write(event)
+        except OSError as error:
+            _log.debug("Cursor-on-Target not sent: %s", error)
+
 
 def cursor_on_target(report: TargetReport, config: TargetsConfig, utc: SteadyUtc) -> bytes:
-    """A Cursor-on-Target event (XML) for ATAK and WinTAK; hae is the ellipsoidal height."""
-    seen = datetime.fromtimestamp(utc.utc_ns(report.time_ns) * 1e-9, tz=timezone.utc)
-
-    def stamp(moment: datetime) -> str:
-        return moment.strftime("%Y-%m-%dT%H:%M:%S.%f")[:-3] + "Z"
-
-    def accuracy(value: float | None) -> str:
-        return "9999999.0" if value is None else f"{value:.1f}"  # CoT's "unknown"
-
-    event = ElementTree.Element(
-        "event",
-        version="2.0",
-        uid=f"pilot-target-{report.target_id}",
-        type=_COT_TYPE,
-        how="m-r",
-        time=stamp(seen),
-        start=stamp(seen),
-        stale=stamp(seen + timedelta(seconds=config.cot_stale_s)),
-    )
-    ElementTree.SubElement(
-        event,
-        "point",
-        lat=f"{report.latitude_deg:.7f}",
-        lon=f"{report.longitude_deg:.7f}",
-        hae=f"{report.height_m:.2f}",
-        ce=accuracy(report.h_accuracy_m),
-        le=accuracy(report.v_accuracy_m),
-    )
+    """A target's event (XML); hae is the ellipsoidal height."""
+    seen = _moment(report.time_ns, utc)
+    stale = seen + timedelta(seconds=config.cot_stale_s)
+    event = _event(f"pilot-target-{report.target_id}", _TARGET_TYPE, seen, stale)
+    _point(event, report)
     detail = ElementTree.SubElement(event, "detail")
     ElementTree.SubElement(detail, "contact", callsign=f"TGT{report.target_id:04d}")
     if report.elsewhere >= _TOLD_ELSEWHERE:
@@ -79,5 +86,97 @@ def cursor_on_target(report: TargetReport, config: TargetsConfig, utc: SteadyUtc
         ElementTree.SubElement(
             detail, "track", course=f"{course:.1f}", speed=f"{math.hypot(north, east):.2f}"
         )
+    return _document(event)
+
+
+def aircraft_on_map(
+    view: CameraView, config: TargetsConfig, camera: CameraConfig, utc: SteadyUtc
+) -> bytes:
+    """The aircraft's event: where it is, the wedge that its camera sees, and where the video is.
+
+    The wedge's range is the way over the ground to the picture's centre, so that it ends there on
+    the map; a camera that looks into the sky has none.
+    """
+    seen = _moment(view.time_ns, utc)
+    stale = seen + timedelta(seconds=_AIRCRAFT_STALE_S)
+    event = _event(f"pilot-aircraft-{config.cot_callsign}", _AIRCRAFT_TYPE, seen, stale)
+    _point(event, view)
+    detail = ElementTree.SubElement(event, "detail")
+    ElementTree.SubElement(detail, "contact", callsign=config.cot_callsign)
+    azimuth_deg, elevation_deg, roll_deg = sensor_angles(view.quaternion_ned)
+    sensor = ElementTree.SubElement(
+        detail,
+        "sensor",
+        version="0.6",
+        type="r-e",
+        model=camera.model,
+        azimuth=f"{azimuth_deg:.1f}",
+        elevation=f"{elevation_deg:.1f}",
+        roll=f"{roll_deg:.1f}",
+        fov=f"{camera.horizontal_fov_deg:.1f}",
+        vfov=f"{camera.vertical_fov_deg:.1f}",
+        north="0",
+    )
+    if view.image_latitude_deg is not None and view.image_longitude_deg is not None:
+        place = (view.latitude_deg, view.longitude_deg)
+        centre = (view.image_latitude_deg, view.image_longitude_deg)
+        sensor.set("range", f"{max(1.0, math.hypot(*north_east(*place, *centre))):.0f}")
+    if "://" in camera.stream_uri:
+        ElementTree.SubElement(detail, "__video", url=camera.stream_uri)
+    return _document(event)
+
+
+def sensor_angles(quaternion_ned: quat.Quaternion) -> tuple[float, float, float]:
+    """Azimuth from true north, elevation and roll of a camera (x along the boresight), degrees."""
+    forward = quat.rotate(quaternion_ned, (1.0, 0.0, 0.0))
+    right = quat.rotate(quaternion_ned, (0.0, 1.0, 0.0))
+    up = quat.rotate(quaternion_ned, (0.0, 0.0, -1.0))
+    elevation = math.asin(max(-1.0, min(1.0, -forward[2])))
+    along = up if elevation < _STEEP_RAD else forward
+    azimuth = math.atan2(along[1], along[0]) % (2.0 * math.pi)
+    roll = math.atan2(right[2], -up[2])
+    if elevation < _STEEP_RAD:
+        roll = 0.0  # it is in the azimuth
+    return math.degrees(azimuth), math.degrees(elevation), math.degrees(roll)
+
+
+def _event(uid: str, kind: str, seen: datetime, stale: datetime) -> ElementTree.Element:
+    return ElementTree.Element(
+        "event",
+        version="2.0",
+        uid=uid,
+        type=kind,
+        how=_MEASURED,
+        time=_stamp(seen),
+        start=_stamp(seen),
+        stale=_stamp(stale),
+    )
+
+
+def _point(event: ElementTree.Element, place: TargetReport | CameraView) -> None:
+    ElementTree.SubElement(
+        event,
+        "point",
+        lat=f"{place.latitude_deg:.7f}",
+        lon=f"{place.longitude_deg:.7f}",
+        hae=f"{place.height_m:.2f}",
+        ce=_accuracy(place.h_accuracy_m),
+        le=_accuracy(place.v_accuracy_m),
+    )
+
+
+def _moment(time_ns: int, utc: SteadyUtc) -> datetime:
+    return datetime.fromtimestamp(utc.utc_ns(time_ns) * 1e-9, tz=timezone.utc)
+
+
+def _stamp(moment: datetime) -> str:
+    return moment.strftime("%Y-%m-%dT%H:%M:%S.%f")[:-3] + "Z"
+
+
+def _accuracy(value: float | None) -> str:
+    return "9999999.0" if value is None else f"{value:.1f}"  # CoT's "unknown"
+
+
+def _document(event: ElementTree.Element) -> bytes:
     document: bytes = ElementTree.tostring(event, encoding="utf-8", xml_declaration=True)
     return document

@@ -16,8 +16,7 @@ from mavlink_bridge.messages import CameraView, TrackRequest
 NAN = math.nan
 _INVALID_LATLON = 0x7FFFFFFF  # INT32_MAX: unknown coordinate, by the message's definition
 _CAMERA_FLAGS = (
-    mavlink.CAMERA_CAP_FLAGS_HAS_VIDEO_STREAM
-    | mavlink.CAMERA_CAP_FLAGS_HAS_TRACKING_POINT
+    mavlink.CAMERA_CAP_FLAGS_HAS_TRACKING_POINT
     | mavlink.CAMERA_CAP_FLAGS_HAS_TRACKING_RECTANGLE
     | mavlink.CAMERA_CAP_FLAGS_HAS_TRACKING_GEO_STATUS
 )
@@ -31,7 +30,14 @@ def _text(value: str, length: int) -> list[int]:
 
 
 def camera_information(config: CameraConfig, uptime_ms: int) -> Any:
-    """CAMERA_INFORMATION (259) with the tracking flags; focal length and sensor size unknown."""
+    """CAMERA_INFORMATION (259) with the tracking flags; focal length and sensor size unknown.
+
+    A video stream is announced only where there is one: QGroundControl would leave the video that
+    was set by hand for a stream without an address.
+    """
+    flags = _CAMERA_FLAGS
+    if config.stream_uri:
+        flags |= mavlink.CAMERA_CAP_FLAGS_HAS_VIDEO_STREAM
     return mavlink.MAVLink_camera_information_message(
         uptime_ms,
         _text(config.vendor, 32),
@@ -43,7 +49,7 @@ def camera_information(config: CameraConfig, uptime_ms: int) -> Any:
         config.width_px,
         config.height_px,
         0,
-        _CAMERA_FLAGS,
+        flags,
         0,
         b"",
     )
@@ -51,9 +57,7 @@ def camera_information(config: CameraConfig, uptime_ms: int) -> Any:
 
 def video_stream_information(config: CameraConfig) -> Any:
     """VIDEO_STREAM_INFORMATION (269) of the one stream."""
-    kind = mavlink.VIDEO_STREAM_TYPE_MPEG_TS
-    if config.stream_uri.startswith("rtsp:"):
-        kind = mavlink.VIDEO_STREAM_TYPE_RTSP
+    kind, address = stream_address(config.stream_uri)
     return mavlink.MAVLink_video_stream_information_message(
         1,
         1,
@@ -66,8 +70,23 @@ def video_stream_information(config: CameraConfig) -> Any:
         0,
         round(config.horizontal_fov_deg),
         b"map camera",
-        config.stream_uri.encode("ascii", "replace"),
+        address.encode("ascii", "replace"),
     )
+
+
+def stream_address(uri: str) -> tuple[int, str]:
+    """VIDEO_STREAM_TYPE and the uri field: an address to connect to, of UDP the port to listen at.
+
+    QGroundControl and Mission Planner put the field of an MPEG-TS stream behind "0.0.0.0:", so the
+    port must stand there alone.
+    """
+    scheme, _, rest = uri.rpartition("://")
+    if scheme in ("rtsp", "rtsps"):
+        return int(mavlink.VIDEO_STREAM_TYPE_RTSP), uri
+    if scheme == "tcp":
+        return int(mavlink.VIDEO_STREAM_TYPE_TCP_MPEG), rest
+    port = rest.partition("?")[0].rpartition(":")[2].strip("/")
+    return int(mavlink.VIDEO_STREAM_TYPE_MPEG_TS), port
 
 
 def camera_fov_status(

@@ -21,6 +21,7 @@ _ADSB_FLAGS = (
     | mavlink.ADSB_FLAGS_VALID_ALTITUDE
     | mavlink.ADSB_FLAGS_VALID_CALLSIGN
 )
+_ELSEWHERE = 0.05  # a target more likely on another surface than this is not confirmed
 _ICAO_BASE = 0xF00000  # unassigned block; the low bits carry the target's number
 
 
@@ -81,6 +82,36 @@ def tracking_geo_status(
         heading,
         NAN,
     )
+
+
+def image_captured(
+    report: TargetReport, geoid_separation_m: float, index: int, uptime_ms: int, utc_us: int
+) -> Any:
+    """CAMERA_IMAGE_CAPTURED (263) at the target's place: QGroundControl marks it on its map.
+
+    index: counts these messages. There is no picture: the file's address is empty.
+    """
+    altitude_mm = round((report.height_m - geoid_separation_m) * 1e3)
+    return mavlink.MAVLink_camera_image_captured_message(
+        uptime_ms,
+        utc_us,
+        0,
+        round(report.latitude_deg * 1e7),
+        round(report.longitude_deg * 1e7),
+        altitude_mm,
+        0,
+        (NAN,) * 4,
+        index,
+        1,
+        b"",
+    )
+
+
+def is_confirmed(report: TargetReport, sigma_m: float) -> bool:
+    """Whether it is seen, known to `sigma_m`, and hardly on another surface."""
+    accuracy = report.h_accuracy_m
+    is_known = accuracy is not None and accuracy <= sigma_m
+    return is_known and not report.coasting and report.elsewhere < _ELSEWHERE
 
 
 def _status(report: TargetReport) -> int:

@@ -20,11 +20,18 @@ from pymavlink import mavutil
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from mavlink_bridge import Bridge, BridgeConfig, CameraView, TargetReport, TrackRequest
+from mavlink_bridge.config import CameraConfig, TargetsConfig
 from mavlink_bridge.link.link import sleep_until
 from sitl.geodesy import Location
 from sitl.vehicles.ardupilot import ArduPilotSitl, find_arducopter
 from sitl.vehicles.launch import GIMBAL, EmbeddedSitl
 
+PROMISED = (
+    "CAMERA_TRACKING_GEO_STATUS",
+    "CAMERA_FOV_STATUS",
+    "CAMERA_IMAGE_CAPTURED",
+    "NAMED_VALUE_FLOAT",
+)
 HOME = Location(47.397742, 8.545594, 488.0)
 GEOID = 47.3
 REAL = [
@@ -75,7 +82,13 @@ def test_an_independent_client_through_the_autopilots_routing(vehicle: Any, tmp_
     asked: list[TrackRequest] = []
     path = tmp_path / "flight.tlog"
     config = BridgeConfig(
-        connection=vehicle.companion_endpoint, mode="rc", tlog=path, ground_systems=(245,)
+        connection=vehicle.companion_endpoint,
+        mode="rc",
+        tlog=path,
+        ground_systems=(245,),
+        named_values=True,
+        targets=TargetsConfig(captured=True),
+        camera=CameraConfig(stream_uri="rtsp://10.0.0.2:8554/main"),
     )
     sdk = Mavsdk(Configuration.create_with_component_type(ComponentType.GROUND_STATION))
     with Bridge(config, GEOID, on_track=asked.append) as bridge:
@@ -99,15 +112,15 @@ def converse(vehicle: Any, bridge: Bridge, sdk: Any, asked: list[TrackRequest]) 
     sdk.add_any_connection(vehicle.spare_endpoint.replace("tcp:", "tcpout://"))
     station = Station(sdk)
     camera = Camera(station.system)
-    for name in ("CAMERA_TRACKING_GEO_STATUS", "CAMERA_FOV_STATUS", "COMMAND_ACK", "STATUSTEXT"):
+    for name in (*PROMISED, "COMMAND_ACK", "STATUSTEXT", "VIDEO_STREAM_INFORMATION"):
         station.listen(name)
 
     def report() -> bool:
         now = time.monotonic_ns()
         bridge.report(TargetReport(now, 47.398, 8.546, 535.3, h_accuracy_m=2.0))
         bridge.look(CameraView(now, 47.3975, 8.5455, 635.3, (0.8, 0.0, -0.6, 0.0), 47.399, 8.547))
-        wanted = ("CAMERA_TRACKING_GEO_STATUS", "CAMERA_FOV_STATUS")
-        return bool(all(station.heard[k] for k in wanted) and camera.camera_list().cameras)
+        bridge.tell_figures({"VPS_SIGNAL": 2.0})
+        return bool(all(station.heard[k] for k in PROMISED) and camera.camera_list().cameras)
 
     assert sleep_until(report, 30.0, step_s=0.2), station.heard
     geo = station.heard["CAMERA_TRACKING_GEO_STATUS"][-1]
@@ -118,6 +131,14 @@ def converse(vehicle: Any, bridge: Bridge, sdk: Any, asked: list[TrackRequest]) 
     assert view["alt_camera"] == pytest.approx(588_000, abs=2)
     assert (view["lat_image"], view["lon_image"]) == (473990000, 85470000)
     assert view["q"] == pytest.approx([0.8, 0.0, -0.6, 0.0])
+    mark = station.heard["CAMERA_IMAGE_CAPTURED"]
+    assert {(m["lat"], m["lon"], m["alt"]) for m in mark} == {(473980000, 85460000, 488_000)}
+    figure = station.heard["NAMED_VALUE_FLOAT"][-1]
+    assert (figure["name"].rstrip("\0"), figure["value"]) == ("VPS_SIGNAL", 2.0)
+    station.command(mavlink.MAV_CMD_REQUEST_MESSAGE, 100, 269.0)
+    assert sleep_until(lambda: bool(station.heard["VIDEO_STREAM_INFORMATION"]), 30.0)
+    stream = station.heard["VIDEO_STREAM_INFORMATION"][-1]
+    assert stream["uri"].rstrip("\0") == "rtsp://10.0.0.2:8554/main"
     (information,) = camera.camera_list().cameras
     assert (information.component_id, information.model_name) == (100, "map camera")
     camera.track_point(100, 0.25, 0.75, 0.1)

@@ -1,0 +1,78 @@
+"""How vision does, in a few numbers once a second that any ground station can plot and watch."""
+
+from __future__ import annotations
+
+import logging
+import threading
+import time
+from collections import deque
+from collections.abc import Callable, Mapping
+
+import numpy as np
+
+from localizer.types import PoseEstimate, TrackingState
+
+_log = logging.getLogger(__name__)
+_PERIOD_S = 1.0
+_WINDOW_NS = 5_000_000_000  # that the rate is taken over
+_STALE_NS = 2_000_000_000  # without an accepted position: there is no signal
+_KEPT = 512  # estimates: five seconds of a fast camera
+_NONE, _WEAK, _FULL = 0.0, 1.0, 2.0
+
+
+class VitalSigns:
+    """Counts estimates and tells every second, on a thread of its own.
+
+    VPS_SIGNAL 0 no position, 1 one that is not to be relied on (initializing, degraded, bridging),
+    2 tracking; VPS_RATE accepted positions a second; VPS_AGE seconds since the newest one's
+    exposure; VPS_SIGMA its horizontal sigma, metres; VPS_QUAL its registration's quality, 0 to 1.
+    tell: takes them; must not block.
+    """
+
+    def __init__(self, tell: Callable[[Mapping[str, float]], None]) -> None:
+        self._tell = tell
+        self._accepted: deque[PoseEstimate] = deque(maxlen=_KEPT)
+        self._state: TrackingState | None = None
+        self._stop = threading.Event()
+        self._failures = 0
+        self._thread = threading.Thread(target=self._run, name="vital signs")
+
+    def start(self) -> None:
+        """Start the thread."""
+        self._thread.start()
+
+    def stop(self) -> None:
+        """Stop the thread."""
+        self._stop.set()
+        self._thread.join()
+
+    def add_estimate(self, estimate: PoseEstimate) -> None:
+        """Note an estimate. Never blocks."""
+        self._state = estimate.state
+        if estimate.accepted:
+            self._accepted.append(estimate)
+
+    def figures(self, now_ns: int) -> dict[str, float]:
+        """The numbers at a CLOCK_MONOTONIC time; what is not known is left out."""
+        accepted = list(self._accepted)
+        recent = sum(1 for e in accepted if 0 <= now_ns - e.exposure_time_ns < _WINDOW_NS)
+        figures = {"VPS_SIGNAL": _NONE, "VPS_RATE": recent / (_WINDOW_NS * 1e-9)}
+        if not accepted:
+            return figures
+        newest = accepted[-1]
+        age_ns = now_ns - newest.exposure_time_ns
+        figures["VPS_AGE"] = age_ns * 1e-9
+        figures["VPS_SIGMA"] = float(np.sqrt(newest.covariance[0, 0] + newest.covariance[1, 1]))
+        figures["VPS_QUAL"] = float(newest.quality)
+        if age_ns <= _STALE_NS and self._state is not TrackingState.LOST:
+            figures["VPS_SIGNAL"] = _FULL if self._state is TrackingState.TRACKING else _WEAK
+        return figures
+
+    def _run(self) -> None:
+        while not self._stop.wait(_PERIOD_S):
+            try:
+                self._tell(self.figures(time.monotonic_ns()))
+            except Exception:  # telemetry must not end the flight
+                self._failures += 1
+                if self._failures == 1:
+                    _log.exception("the vital signs could not be told")
