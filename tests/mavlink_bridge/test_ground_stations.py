@@ -208,6 +208,7 @@ def test_warnings_reach_a_station_that_hears_the_autopilot_only(autopilot, as_au
         assert sleep_until(lambda: bridge.port is not None, 30.0)
         autopilot.peer = ("127.0.0.1", bridge.port)
         assert sleep_until(lambda: bridge.state().connected, 30.0)
+        assert sleep_until(lambda: bool(station.listen()), 30.0)  # its link knows whose it is
         bridge.say(4, "PiLoT: the warning")
         bridge.say(6, "PiLoT: news")
         bridge.tell_figures({"VPS_SIGNAL": 2.0, "VPS_AGE": 0.25})
