@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import math
 from collections import deque
 from dataclasses import dataclass
@@ -28,6 +29,7 @@ _HISTORY = 64
 _STALE_NS = 1_500_000_000
 _FROM_GNSS_M = 3.0  # an EKF farther from the receiver follows something else
 _LOW_M = 10.0  # above ground; the first metres show neither focal length nor place
+_KEEPS_NS, _KEPT = 1_000_000_000, 20  # what was known at earlier times
 
 
 class Moved(Protocol):
@@ -89,6 +91,15 @@ class CalibrationFigures:
     axis: str
 
 
+@dataclass(frozen=True)
+class _Known:
+    """What was known at a time, to go back to."""
+
+    time_ns: int
+    position: PositionFilter
+    attitude: AttitudeFilter
+
+
 class CalibrationWatch:
     """One thread. `add` sightings, then `step`."""
 
@@ -103,11 +114,26 @@ class CalibrationWatch:
         self._gnss_heights = _History()
         self._pressures = _History()
         self._depth_m = 0.0
-        self._fixed = False
+        self._fixed = self._on_gnss = False
+        self._kept: deque[_Known] = deque(maxlen=_KEPT)
 
     def add(self, sighting: Sighting) -> None:
         """A registered picture that was accepted against the map."""
         self._waiting.append(sighting)
+
+    def distrust(self, since_ns: int) -> None:
+        """Pictures from a time on are not of their time (frozen, repeated): they are left out, and
+        what they have taught already is forgotten. For as long as they last.
+        """
+        self._waiting = deque((s for s in self._waiting if s.time_ns <= since_ns), _QUEUE)
+        if self._last_ns <= since_ns:
+            return
+        while self._kept and self._kept[-1].time_ns > since_ns:
+            self._kept.pop()
+        known = _Known(0, PositionFilter(), AttitudeFilter())
+        known = copy.deepcopy(self._kept[-1]) if self._kept else known
+        self._position, self._attitude = known.position, known.attitude
+        self._last, self._last_ns = None, since_ns
 
     def step(self, now_ns: int, vehicle: Vehicle, track: Track) -> None:
         """Take in what has come; a few times a second."""
@@ -127,13 +153,12 @@ class CalibrationWatch:
         """What is known by now."""
         angles = self._attitude.boresight_rad
         worst = max(range(3), key=lambda i: abs(angles[i].value) / max(angles[i].sigma, 1e-6))
-        angle = angles[worst]
-        return CalibrationFigures(
-            self._position.focal,
-            self._lateness(),
-            Figure(math.degrees(angle.value), math.degrees(angle.sigma)),
-            AXES[worst],
-        )
+        angle, late = angles[worst], self._lateness()
+        # An EKF that follows late positions turns its own heading away (5 degrees in 8 s at 10 m/s,
+        # ArduPilot): then nobody can tell whether the camera is off, or the EKF.
+        sigma = math.inf if not self._on_gnss and _tells(late) else math.degrees(angle.sigma)
+        boresight = Figure(math.degrees(angle.value), sigma)
+        return CalibrationFigures(self._position.focal, late, boresight, AXES[worst])
 
     def known_m(self, speed_mps: float, *, focal: bool, time: bool) -> float:
         """By how much a position is wrong for what was found, metres."""
@@ -148,8 +173,7 @@ class CalibrationWatch:
         """
         way, turns = self._position.late_s, self._attitude.late_s
         if not self._fixed:
-            tells = abs(way.value) > 2.0 * way.sigma
-            return _fused(way, turns) if tells and _agree(way, turns) else way
+            return _fused(way, turns) if _tells(way) and _agree(way, turns) else way
         surer, other = (way, turns) if way.sigma <= turns.sigma else (turns, way)
         limit = self._limits.time_s
         contradicted = surer.exceeds(limit) and other.is_within(limit)
@@ -159,7 +183,11 @@ class CalibrationWatch:
         gap_s = (seen.time_ns - self._last_ns) * 1e-9
         self._last_ns = seen.time_ns
         self._depth_m = seen.depth_m
+        if not self._kept or seen.time_ns - self._kept[-1].time_ns >= _KEEPS_NS:
+            known_now = _Known(seen.time_ns - 1, self._position, self._attitude)
+            self._kept.append(copy.deepcopy(known_now))
         known = self._evidence(seen, state, vehicle)
+        self._on_gnss = known.north_east_m is not None
         self._attitude.take(seen, known, gap_s)
         moved = track.at(seen.time_ns)
         if moved is None:
@@ -212,6 +240,11 @@ class _History:
             return None
         times, values = zip(*self._rows, strict=True)
         return float(np.interp(time_ns, times, values))
+
+
+def _tells(figure: Figure) -> bool:
+    """Whether it says anything but zero."""
+    return abs(figure.value) > 2.0 * figure.sigma
 
 
 def _agree(a: Figure, b: Figure) -> bool:

@@ -33,6 +33,7 @@ _IDENTICAL_S = 1.5
 _STILL_PER_M = 90.0  # s/m: how much longer where the limit is more metres on the ground
 _STILL_FIRST_S = 2.0
 _MOVED_M, _MOVED_SPEED_MPS, _MOVED_LEAST_S = 2.0, 1.5, 0.35
+_REPEATS_BEFORE_S = 1.5  # by which a loop may be older than its finding, beyond `repeat_s`
 _SHOWS_GRAY = 2.0  # contrast below which a picture shows nothing, gray levels of 255
 _WAITS_NS = 500_000_000  # for the IMU's record to reach a fix
 _FRESH_NS = 1_000_000_000
@@ -201,6 +202,7 @@ class Monitor:
         for sample in vehicle.inertial_since(self._track.newest_ns):
             self._track.add(sample, vehicle.attitude_at)
         self._follow(now_ns, state)
+        self._leave_out_old_pictures()
         self._calibration.step(now_ns, vehicle, self._track)
         lines = []
         readings = self._readings(now_ns, state)
@@ -210,6 +212,19 @@ class Monitor:
                 withholds = latch.rule.action is not Action.NONE
                 lines.append(Line(text, latch.raised, withholds))
         return lines
+
+    def _leave_out_old_pictures(self) -> None:
+        """A picture that stands still or comes again shows no camera: its sightings agree with no
+        motion, which looks like late stamps (a frozen hover was blamed on them, ArduPilot).
+        """
+        if self._picture is None:
+            return
+        time_ns, verdict = self._picture
+        if verdict.repeat_lag_s > 0.0 or self._latches[f.VIDEO_REPEATS.name].raised:
+            found_s = self._config.picture.repeat_s + _REPEATS_BEFORE_S
+            self._calibration.distrust(time_ns - int(found_s * 1e9))
+        elif verdict.still_s >= _IDENTICAL_S or self._latches[f.VIDEO_FROZEN.name].raised:
+            self._calibration.distrust(time_ns - int(verdict.still_s * 1e9))
 
     def _follow(self, now_ns: int, state: VehicleState) -> None:
         """Fixes whose time the IMU's record has reached, in order."""

@@ -2,11 +2,16 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from companion.calibration.config import CalibrationLimits
+from companion.calibration.sighting import Sighting
 from companion.calibration.watch import CalibrationFigures
+from mavlink_bridge import quaternion as quat
+from mavlink_bridge.messages import GimbalAttitude
 from tests.companion.calibration.simulated import Flown, Wrong, square
 
 LIMITS = CalibrationLimits()
@@ -109,6 +114,43 @@ def test_what_contradicts_itself_is_not_told() -> None:
             return super().gimbal_at(time_ns - 200_000_000)
 
     assert "time" not in ever(Lagging(Wrong(), square(60.0, leg_s=10.0)).fly())
+
+
+def test_an_ekf_that_late_positions_turned_away_is_no_camera_that_is_off() -> None:
+    """`late-300ms` at 10 m/s on ArduPilot: on vision alone the EKF's heading went 5 degrees off in
+    8 s, and the camera's yaw was blamed beside the stamps.
+    """
+
+    class Dragged(Flown):
+        def gimbal_at(self, time_ns: int) -> GimbalAttitude:
+            q = super().gimbal_at(time_ns).quaternion
+            away = float(np.radians(np.clip(time_ns * 1e-9 - 40.0, 0.0, 8.0) * 0.7))
+            turned = quat.multiply(quat.from_euler(0.0, 0.0, away), q)
+            return GimbalAttitude(time_ns, 0.0, 0.0, 0.0, 0.0, turned, "test")
+
+    route = square(60.0, leg_s=10.0, climb_s=0.0)
+    flown = Dragged(Wrong(late_s=0.3, late_from_s=8.0), route, lambda at_s: at_s < 5.0).fly()
+    assert ever(flown) == {"time"}
+
+
+def test_pictures_that_come_again_are_forgotten() -> None:
+    """A loop of 5 s from 40 s on, found 3.5 s later: until then other places were taken in."""
+
+    class Looped(Flown):
+        def _sighting(self, at_s: float) -> Sighting:
+            if at_s < 40.0:
+                return super()._sighting(at_s)
+            if at_s >= 43.5:
+                self.watch.distrust(40_000_000_000)
+            shown = super()._sighting(35.0 + at_s % 5.0)
+            return replace(shown, time_ns=round(at_s * 1e9))
+
+    flown = Looped(Wrong(), square(60.0, leg_s=10.0), lambda at_s: at_s < 30.0).fly()
+    last = flown.found[-1][1]
+    before = next(figures for at_s, figures in flown.found if at_s >= 40.0)
+    assert not set().union(*(findings(f) for at_s, f in flown.found if not 40.0 < at_s < 44.0))
+    assert last.late_s.value == pytest.approx(before.late_s.value, abs=0.02)
+    assert last.focal.value == pytest.approx(before.focal.value, abs=0.002)
 
 
 def test_switched_off_it_says_nothing() -> None:
