@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import fcntl
 import os
 import shutil
 import signal
@@ -21,6 +22,7 @@ from sitl.demo.assets import FlightAssets, prepare
 from sitl.demo.kinematic import record_scenario
 from sitl.demo.scenario import CameraSpec, Leg, Scenario
 from sitl.errors import SimulationError
+from tests.parts import COMPUTING, REAL_TIME, SHARED_FOLDER, part_of
 
 # The suite tries the same examples every time, so that a failure belongs to the change it is seen
 # on; `pytest --hypothesis-profile=explore` draws new ones. No deadlines: a busy machine takes its
@@ -56,20 +58,40 @@ def real_data() -> Callable[[str], Path]:
 
 
 @pytest.fixture(scope="session")
-def small_assets(tmp_path_factory: pytest.TempPathFactory) -> FlightAssets:
-    """A 400 m world with both caches: 12 s of processor, so all tests share it."""
-    return prepare(5, tmp_path_factory.mktemp("worlds"), size_m=400.0, ideal=True)
+def shared_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """What tests of every process and part share: who writes in it holds `_alone_in`."""
+    given = os.environ.get(SHARED_FOLDER)
+    return Path(given) if given else tmp_path_factory.mktemp("shared")
+
+
+@contextmanager
+def _alone_in(folder: Path) -> Iterator[None]:
+    """Other processes that ask for the folder wait."""
+    with (folder / "lock").open("w") as lock:
+        fcntl.flock(lock, fcntl.LOCK_EX)
+        yield
 
 
 @pytest.fixture(scope="session")
-def small_sequence(small_assets: FlightAssets, tmp_path_factory: pytest.TempPathFactory) -> Path:
+def small_assets(shared_folder: Path) -> FlightAssets:
+    """A 400 m world with both caches: 12 s of processor, so all tests share it."""
+    with _alone_in(shared_folder):
+        return prepare(5, shared_folder / "worlds", size_m=400.0, ideal=True)
+
+
+@pytest.fixture(scope="session")
+def small_sequence(small_assets: FlightAssets, shared_folder: Path) -> Path:
     """A video of the small world at 5 Hz with its true poses, as `companion eval` reads it."""
     leg = Leg(east_m=0, north_m=26, height_m=80, gimbal_pitch_deg=-85)
     scenario = Scenario(
         takeoff_height_m=80, legs=(leg,), cars=2, people=2, camera=CameraSpec(rate_hz=5)
     ).ideal()
-    out = tmp_path_factory.mktemp("sequence")
-    assert record_scenario(small_assets, scenario, 5, out) >= 25
+    out, done = shared_folder / "sequence", shared_folder / "sequence-complete"
+    with _alone_in(shared_folder):
+        if not done.exists():
+            shutil.rmtree(out, ignore_errors=True)
+            assert record_scenario(small_assets, scenario, 5, out) >= 25
+            done.touch()
     return out
 
 
@@ -202,8 +224,27 @@ def _processor_share(workers: int, seconds: float = 1.5) -> float:
     return sum(float(p.communicate()[0]) for p in started) / (workers * seconds)
 
 
-def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Skip what needs a missing part, with the reason."""
+def pytest_addoption(parser: pytest.Parser) -> None:
+    """`--part`: one of the suite's two parts (tests/parts.py); both without it."""
+    parser.addoption("--part", choices=[COMPUTING, REAL_TIME], help="one part of the suite")
+
+
+def pytest_ignore_collect(collection_path: Path, config: pytest.Config) -> bool | None:
+    """A file of the other part is not even imported, unless it is named on the command line."""
+    named = [Path(argument.split("::")[0]).resolve() for argument in config.args]
+    other = collection_path.suffix == ".py" and not _wanted(collection_path, config)
+    return True if other and collection_path not in named else None
+
+
+def _wanted(path: Path, config: pytest.Config) -> bool:
+    return config.getoption("--part") in (None, part_of(path.relative_to(ROOT).as_posix()))
+
+
+def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
+    """Keep the part asked for; skip what needs a missing part, with the reason."""
+    others = [item for item in items if not _wanted(item.path, config)]
+    config.hook.pytest_deselected(items=others)
+    items[:] = [item for item in items if item not in set(others)]
     home = os.environ.get("ARDUPILOT_HOME")
     path = os.pathsep.join(p for p in (home, os.environ.get("PATH")) if p)
     if shutil.which("arducopter", path=path) is None:
