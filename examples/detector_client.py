@@ -62,7 +62,9 @@ def main(deployment: Path) -> int:
 
 
 if __name__ == "__main__":
+    if len(sys.argv) != 2 or sys.argv[1] == "--help":
+        sys.exit(__doc__)
     try:
         print(f"{main(Path(sys.argv[1]))} detections sent")
-    except (IndexError, CompanionError) as error:
-        sys.exit(f"{error if isinstance(error, CompanionError) else __doc__}")
+    except CompanionError as error:
+        sys.exit(str(error))

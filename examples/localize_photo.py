@@ -13,6 +13,8 @@ import cv2
 
 from localizer import Camera, Frame, Geodetic, PosePrior, PoseRow, open_localizer, pose_of_row
 
+if len(sys.argv) != 10:
+    sys.exit(__doc__)
 photo, cache, camera_file, *numbers = sys.argv[1:]
 latitude, longitude, height, roll, pitch, yaw = map(float, numbers)
 camera = Camera.from_json(Path(camera_file))

@@ -97,4 +97,6 @@ def main() -> None:
 
 
 if __name__ == "__main__":
+    if len(sys.argv) != 11:
+        sys.exit(__doc__)
     main()

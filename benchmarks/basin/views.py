@@ -25,6 +25,7 @@ from localizer.map.building.options import BuildOptions
 from localizer.map.cache.cache import TileCache
 from localizer.map.cache.stream import TileStreamer
 from localizer.map.importers.rules import ImportRules
+from localizer.pictures import read_rgb
 from localizer.render.numba_raster import NumbaRenderer
 from localizer.synth.appearance.model import CONDITIONS, apply_appearance, sample_appearance
 from localizer.synth.config import SURVEY, WorldConfig
@@ -168,7 +169,7 @@ def photo_views(cache: Path, photos: Path, size: tuple[int, int] = SIZE) -> list
     poses = json.loads((photos / "poses.json").read_text())
     views = []
     for path in sorted((photos / "images").iterdir()):
-        photo = cv2.cvtColor(cv2.imread(str(path)), cv2.COLOR_BGR2RGB)
+        photo = read_rgb(path)
         query = cv2.resize(photo, size, interpolation=cv2.INTER_AREA).astype(np.uint8)
         truth = Pose.from_matrix(np.array(poses[path.name]["T_enu_from_cam"]))
         views.append(View(cache, query, truth, camera, "photo", 40.0))

@@ -26,6 +26,7 @@ from benchmarks.basin.views import (
 from localizer.map.building.build import build_cache
 from localizer.map.building.options import BuildOptions
 from localizer.map.importers.rules import ImportRules
+from localizer.pictures import read_rgb
 from localizer.types import Float32, Image
 
 TUNING = "tuning"  # thresholds may be chosen on it, figures are those of the others
@@ -167,8 +168,7 @@ def _forest(data: Path, seed: int) -> tuple[Image, Float32]:
     plots = sorted((data / "textures" / "neon_forest").glob("HARV_*.jpg"))[:12]
     side, part = round(_SIDE_M / _GSD_M), round(40.0 / _GSD_M)
     rgb = np.zeros((side, side, 3), np.uint8)
-    pictures = [cv2.cvtColor(cv2.imread(str(p)), cv2.COLOR_BGR2RGB) for p in plots]
-    pictures = [cv2.resize(p, (part, part), interpolation=cv2.INTER_AREA) for p in pictures]
+    pictures = [cv2.resize(read_rgb(p), (part, part), interpolation=cv2.INTER_AREA) for p in plots]
     for i in range(0, side, part):
         for j in range(0, side, part):
             tile = np.rot90(pictures[int(rng.integers(len(pictures)))], int(rng.integers(4)))

@@ -57,12 +57,15 @@ def read_token(path: Path | None) -> str | None:
     if path is None:
         return None
     try:
+        mode = path.stat().st_mode
+        if not stat.S_ISREG(mode):  # opening a pipe would wait for who writes into it
+            raise ConfigError(f"console.token_file {path}: is no regular file")
         with path.open("rb") as file:
             mode = os.fstat(file.fileno()).st_mode
             raw = file.read(1025)
     except OSError as error:
         raise ConfigError(f"console.token_file {path}: cannot be read: {error}") from error
-    if not stat.S_ISREG(mode) or mode & 0o077:
+    if mode & 0o077:
         raise ConfigError(f"console.token_file {path}: chmod 600 it: others can read the token")
     token = raw.decode("ascii", "replace").strip()
     if not _LEAST_TOKEN <= len(token) <= 1024 or not token.isprintable() or " " in token:

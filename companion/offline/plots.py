@@ -12,6 +12,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from localizer.geometry.pose import Array
+from localizer.pictures import write_rgb
 from localizer.types import Image
 
 mpl.use("Agg")
@@ -42,8 +43,7 @@ def overlay_sheet(video: Image, render: Image, caption: str) -> Image:
 
 def save_image(path: Path, rgb: Image) -> None:
     """Write an RGB image as PNG or JPEG, by suffix."""
-    if not cv2.imwrite(str(path), cv2.cvtColor(rgb, cv2.COLOR_RGB2BGR)):
-        raise OSError(f"{path} was not written")
+    write_rgb(path, rgb)
 
 
 @dataclass(frozen=True)
@@ -86,7 +86,8 @@ def plot_tracks(
     low, high = points.min(axis=0) - 80, points.max(axis=0) + 80
     axes.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]), xlabel="east, m", ylabel="north, m")
     axes.set_aspect("equal")
-    axes.legend(loc="upper right", facecolor="0.7", framealpha=1.0)  # a white line is seen on grey
+    # Below the map, which it would hide; a white line is seen on grey.
+    figure.legend(loc="outside lower center", ncols=4, facecolor="0.7", framealpha=1.0)
     figure.savefig(path, dpi=110)
 
 
@@ -132,7 +133,7 @@ def plot_errors(
         beyond = max(float(s.error[np.isfinite(s.error)].max(initial=0.0)) for s in shown)
         if limit is not None and beyond > limit:  # cut off, and not in silence
             text = f"outside the shaded span up to {beyond:.3g}"
-            axes.text(0.01, 0.93, text, transform=axes.transAxes, fontsize="small", va="top")
+            axes.set_title(text, loc="left", fontsize="small")
         axes.grid(alpha=0.3)
         axes.legend(loc="upper right", fontsize="small")
     figure.savefig(path, dpi=110)

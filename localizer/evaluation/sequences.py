@@ -14,7 +14,6 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal
 
-import cv2
 import numpy as np
 
 from localizer.errors import LocalizerError, OutsideMapError, SequenceError
@@ -23,8 +22,9 @@ from localizer.geometry.camera import Camera
 from localizer.geometry.geo import LocalFrame
 from localizer.geometry.pose import Array, Pose, so3_exp
 from localizer.geometry.posefile import read_poses, world_from_camera
+from localizer.pictures import read_rgb
 from localizer.tracking.pipeline import Localizer
-from localizer.types import Frame, Image, PoseEstimate, PosePrior, RegistrationStatus
+from localizer.types import Frame, PoseEstimate, PosePrior, RegistrationStatus
 
 PriorMode = Literal["first", "each"]
 # (frame, its truth, its index) -> the prior to begin from, None where no place is found.
@@ -50,15 +50,12 @@ class Sequence:
 
     def frame(self, index: int) -> Frame:
         """Decode one frame."""
-        data = cv2.imread(str(self.images[index]), cv2.IMREAD_COLOR)
-        if data is None:
-            raise SequenceError(f"{self.images[index]}: missing or not an image")
-        if data.shape[:2] != (self.camera.height, self.camera.width):
+        rgb = read_rgb(self.images[index])
+        if rgb.shape[:2] != (self.camera.height, self.camera.width):
             raise SequenceError(
-                f"{self.images[index]}: is {data.shape[1]}x{data.shape[0]}, the camera model says "
+                f"{self.images[index]}: is {rgb.shape[1]}x{rgb.shape[0]}, the camera model says "
                 f"{self.camera.width}x{self.camera.height}: give this sequence's calibration"
             )
-        rgb: Image = cv2.cvtColor(data, cv2.COLOR_BGR2RGB).astype(np.uint8, copy=False)
         return Frame(rgb, self.times_ns[index], self.camera, index)
 
     def first(self, count: int) -> Sequence:

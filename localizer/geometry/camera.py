@@ -72,7 +72,9 @@ class Camera:
     def from_json(cls, path: Path | str) -> Camera:
         """From a ``camera.json`` file."""
         try:
-            data = json.loads(Path(path).read_text())
+            data = json.loads(Path(path).read_text(encoding="utf-8"))
+        except FileNotFoundError as error:
+            raise CameraError(f"{path}: does not exist") from error
         except (OSError, ValueError) as error:
             raise CameraError(f"{path}: cannot be read as JSON: {error}") from error
         if not isinstance(data, dict):

@@ -8,7 +8,6 @@ from collections.abc import Iterable, Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
-import cv2
 import numpy as np
 from rich.console import Console
 from rich.table import Table
@@ -31,6 +30,7 @@ from localizer.geometry.camera import Camera
 from localizer.geometry.pose import Array, Pose
 from localizer.map.cache.cache import TileCache
 from localizer.map.cache.stream import TileStreamer
+from localizer.pictures import read_rgb
 from localizer.render.numba_raster import NumbaRenderer
 from localizer.tracking.pipeline import Undistorter
 from localizer.types import Frame
@@ -315,7 +315,7 @@ def _overlays(
             usable.append((path, k, error_m if np.isfinite(error_m) else 0.0))
     usable.sort(key=lambda item: -item[2])
     for number, (path, k, error_m) in enumerate(usable[:_OVERLAYS]):
-        image = cv2.cvtColor(cv2.imread(str(path)), cv2.COLOR_BGR2RGB).astype(np.uint8)
+        image = read_rgb(path)
         video = undistort(Frame(image, int(path.stem), camera, 0))
         view = renderer.render(estimated[k], target, wait=True)
         caption = f"t = {(int(path.stem) - start) * 1e-9:.1f} s, {error_m:.2f} m off"

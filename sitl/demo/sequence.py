@@ -6,11 +6,10 @@ import json
 from collections.abc import Iterable
 from pathlib import Path
 
-import cv2
-
 from localizer.geometry.camera import Camera
 from localizer.geometry.geo import LocalFrame
 from localizer.geometry.posefile import PoseRow, pose_row, write_poses
+from localizer.pictures import write_rgb
 from sitl.camera.true_motion import PoseTrack
 from sitl.camera.world_camera import WorldCamera
 
@@ -39,8 +38,7 @@ def record_sequence(
         if exposure is None:
             continue
         name = f"{len(rows):06d}.jpg"
-        options = [cv2.IMWRITE_JPEG_QUALITY, _JPEG_QUALITY]
-        cv2.imwrite(str(images / name), exposure.image[..., ::-1], options)
+        write_rgb(images / name, exposure.image, _JPEG_QUALITY)
         rows.append(pose_row(name, exposure.world_from_camera, frame))
         stamps.append(f"{name} {time_ns}\n")
     write_poses(out / "poses.txt", rows)

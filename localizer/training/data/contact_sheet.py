@@ -5,9 +5,9 @@ from __future__ import annotations
 from collections.abc import Sequence
 from pathlib import Path
 
-import cv2
 import numpy as np
 
+from localizer.pictures import write_rgb
 from localizer.synth.appearance.model import apply_appearance, sample_appearance
 from localizer.training.data.batches import tamed
 from localizer.training.data.pairs import Pair, warp_check
@@ -19,7 +19,7 @@ _CHECKER_PX = 24
 def contact_sheet(pairs: Sequence[Pair], path: Path) -> Path:
     """One row a pair: reference, clean query, query as trained on, warped checkerboard, depth."""
     rows = [_row(pair, np.random.default_rng(k)) for k, pair in enumerate(pairs)]
-    cv2.imwrite(str(path), cv2.cvtColor(np.vstack(rows), cv2.COLOR_RGB2BGR))
+    write_rgb(path, np.vstack(rows))
     return path
 
 

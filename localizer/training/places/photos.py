@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from localizer.errors import SequenceError
+from localizer.pictures import read_rgb
 
 _SEASONS = "neon_sjer_pairs"  # group whose plots were photographed at two dates
 
@@ -62,11 +63,7 @@ class PhotoLibrary:
 
 def read_photo(path: Path) -> NDArray[np.uint8]:
     """(H, W, 3) RGB of a photo's file; SequenceError where it is none."""
-    image = cv2.imread(str(path), cv2.IMREAD_COLOR)
-    if image is None:
-        raise SequenceError(f"{path}: cannot be decoded as an image")
-    colours: NDArray[np.uint8] = cv2.cvtColor(image, cv2.COLOR_BGR2RGB)
-    return colours
+    return read_rgb(path)
 
 
 def _grid(images: list[NDArray[np.uint8]], n: int, per_side: int) -> NDArray[np.uint8]:

@@ -180,6 +180,10 @@ def test_off_loopback_a_token_is_needed_and_nobody_else_may_read_it(tmp_path):
     path.write_text("short")
     with pytest.raises(ConfigError, match="16 characters"):
         read_token(path)
+    path.unlink()
+    os.mkfifo(path, 0o600)  # nobody writes into it
+    with pytest.raises(ConfigError, match="no regular file"):
+        read_token(path)
 
 
 @pytest.mark.parametrize(

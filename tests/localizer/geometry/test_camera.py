@@ -150,7 +150,7 @@ def test_impossible_cameras(camera, change, message):
 
 def test_bad_files_are_named(tmp_path):
     path = tmp_path / "camera.json"
-    with pytest.raises(CameraError, match=r"camera\.json"):
+    with pytest.raises(CameraError, match=r"camera\.json: does not exist"):
         Camera.from_json(path)
     path.write_text("[1, 2]")
     with pytest.raises(CameraError, match="width, height"):
