@@ -35,6 +35,7 @@ _NOT_USED = "vision not used: "
 _TOLD = (_NOT_USED, "withheld: ")
 _SILENT_VEHICLE = "no heartbeat from the flight controller"
 
+_NO_FRAME = "no frame is being localized"
 _OF_FEED = {
     StreamState.FAILED: (HealthLevel.FAILED, "video feed failed"),
     StreamState.MISFIT: (HealthLevel.FAILED, "video size does not fit the calibration"),
@@ -121,11 +122,19 @@ class HealthMonitor:
         if self._ended:
             if self._stop.is_set():
                 self._bridge.say(_NOTICE, "PiLoT: ending, nothing is injected any more")
-                self._write("ended", f"{self._ended}; {text} until then")
+                self._write("ended", f"{self._ended}; {self._last_state(text)}")
             return
         known = text == _SILENT_VEHICLE or text.startswith(_TOLD)
         self._bridge.set_health(level, text, tell=not known)
         self._write(level.value, text)
+
+    def _last_state(self, text: str) -> str:
+        """What was true until the end. A camera that ended before says nothing of the flight."""
+        if text.startswith(_NO_FRAME):
+            arrived, estimate = self._estimates[-1]
+            age_s = time.monotonic() - arrived
+            return f"{_OF_STATE[estimate.state][1]} until {age_s:.0f} s before, then {text}"
+        return f"{text} until then"
 
     def assess(self) -> tuple[HealthLevel, str]:
         """The worst thing that is true now, in one line."""
@@ -141,7 +150,7 @@ class HealthMonitor:
         if time.monotonic() - arrived > _STALE_S:
             if _is_lost(estimate):  # the error stands in health.json; this is what to act on
                 return HealthLevel.FAILED, "localization lost" + self._since(estimate)
-            nothing = self._overload(engine) or "no frame is being localized"
+            nothing = self._overload(engine) or _NO_FRAME
             return HealthLevel.DEGRADED, engine.last_error or nothing
         level, text = _OF_STATE[estimate.state]
         if estimate.state is TrackingState.BRIDGING:

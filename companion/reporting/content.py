@@ -130,7 +130,8 @@ class Table:
 class Report:
     """All of it. first: what went wrong first, in words; abscissa: of the plots and the timeline.
 
-    spans: named lanes of stretches (states, GNSS denied); notes: what the report could not show.
+    spans: named lanes of stretches (states, GNSS denied); notes: what the report could not show;
+    overlays_of: the frames of which the overlays show the worst.
     """
 
     title: str
@@ -149,3 +150,4 @@ class Report:
     settings: dict[str, Any] = field(default_factory=dict)
     versions: dict[str, Any] = field(default_factory=dict)
     notes: Sequence[str] = ()
+    overlays_of: str = "all frames"

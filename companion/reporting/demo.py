@@ -15,7 +15,13 @@ from companion.offline.tables import Columns, poses, read_columns
 from companion.reporting import figures
 from companion.reporting.content import Curve, Overlay, Plot, Report, Span, Stanford, Track, Verdict
 from companion.reporting.pictures import map_pictures
-from companion.reporting.record import VISION, RecordTables, read_record, worst_frames
+from companion.reporting.record import (
+    KEPT_FRAMES,
+    VISION,
+    RecordTables,
+    read_record,
+    worst_frames,
+)
 from companion.reporting.record import uncertainty_plots as uncertainty
 from companion.reporting.verdicts import advice
 
@@ -83,6 +89,7 @@ def demo_report(folder: Path) -> Report:
         {"config": document.get("config", {}), "scenario": document.get("scenario", {})},
         dict(document.get("versions", {})),
         notes,
+        KEPT_FRAMES,
     )
 
 

@@ -89,8 +89,8 @@ def _verdicts(report: Report) -> str:
         why = "" if v.ok else f"<br><small>{escape(v.meaning)}. Look at: {escape(v.look)}.</small>"
         mark = "ok" if v.ok else "missed"
         rows.append(
-            f"<tr class={mark}><td>{escape(v.name)}{why}</td><td>{escape(v.value)}</td>"
-            f"<td>{escape(v.needed)}</td><td class=mark>{mark}</td></tr>"
+            f"<tr class={mark}><td>{escape(v.name)}{why}</td>{_cell(v.value)}"
+            f"{_cell(v.needed)}<td class=mark>{mark}</td></tr>"
         )
     missed = sum(not v.ok for v in report.verdicts)
     head = "targets reached" if not missed else f"{missed} of {len(rows)} targets missed"
@@ -236,9 +236,20 @@ def _stanford(data: Stanford) -> str:
         f'<rect class=bad x=0 y="{side - limit:.1f}" width="{side}" height="{limit:.1f}"/>'
         f'<path class=good d="M0 {side}L{limit:.1f} {side - limit:.1f}H0Z"/>'
         f'<path class=axis d="M0 0V{side}H{side}M0 {side}L{side} 0M0 {side - limit:.1f}H{side}"/>'
-        f"{dots}<text x={side / 2:.0f} y={side + 35:.0f}>error, m (to {top:g})</text>"
-        f'<text transform="rotate(-90)" x={-side / 2:.0f} y=-25>protection level, m</text></svg>'
+        f"{dots}{_ticks(side, top)}"
+        f"<text x={side / 2:.0f} y={side + 35:.0f}>error, m (to {top:g})</text>"
+        f'<text transform="rotate(-90)" x={-side / 2:.0f} y=-32>protection level, m</text></svg>'
     )
+
+
+def _ticks(side: float, top: float) -> str:
+    """Numbers along both axes of the diagram, at every quarter."""
+    texts = []
+    for k in range(5):
+        value, at = f"{top * k / 4:g}", side * k / 4
+        texts.append(f'<text x="{at:.0f}" y="{side + 16:.0f}">{value}</text>')
+        texts.append(f'<text x=-14 y="{side - at + 5:.0f}">{value}</text>')
+    return "".join(texts)
 
 
 def _overlays(report: Report) -> str:
@@ -251,17 +262,23 @@ def _overlays(report: Report) -> str:
             f"<figcaption>{escape(o.caption)}</figcaption></figure>"
         )
     return (
+        f"<p class=sub>Of {escape(report.overlays_of)}.</p>"
         "<div class=controls><label>frame <input type=range id=which min=0 "
         f"max={len(sheets) - 1} value=0></label> <label>video | map <input type=range id=share "
         "min=0 max=100 value=50></label></div>" + "".join(sheets)
     )
 
 
+def _cell(text: str) -> str:
+    """A number and its unit stay on one line."""
+    number = len(text) < 24 and any(character.isdigit() for character in text)
+    return f"<td{' class=n' if number else ''}>{escape(text)}</td>"
+
+
 def _table(table: Table) -> str:
     head = "".join(f"<th>{escape(h)}" for h in table.headings)
     rows = "".join(
-        f"<tr{' class=missed' if i in table.bad else ''}>"
-        + "".join(f"<td>{escape(cell)}" for cell in row)
+        f"<tr{' class=missed' if i in table.bad else ''}>" + "".join(_cell(cell) for cell in row)
         for i, row in enumerate(table.rows)
     )
     return f"<div class=scroll><table><tr>{head}{rows}</table></div>"

@@ -23,6 +23,7 @@ from localizer.errors import CameraError
 from localizer.geometry.camera import Camera
 
 _OVERLAYS = 8
+KEPT_FRAMES = "the frames that the record kept (record.snapshot_interval_s), not of all"
 _LARGEST = 1e9
 _DIGITS = 18
 _LATEST_NS = 1 << 62  # the year 2116: sums of two still fit 64 bits
@@ -184,6 +185,7 @@ def record_report(folder: Path) -> Report:
             tables.settings,
             tables.versions,
             (*tables.notes, *pictures.notes),
+            KEPT_FRAMES,
         )
 
 
@@ -284,7 +286,7 @@ def _verdicts(tables: RecordTables) -> tuple[Verdict, ...]:
             Verdict(
                 "frames accepted once tracking", f"{share:.1f} %", ">= 95 %", share >= 95.0,
                 "frames were refused, so there was no position for them",
-                "quality over time and the worst frames",
+                "quality over time and the worst of the kept frames",
             )
         )  # fmt: skip
         latency = np.asarray(estimates["latency_ms"])

@@ -18,6 +18,13 @@ from sitl.errors import PilotError
 SYSTEM, COMPONENT = 255, 190  # of the ground station
 
 
+def silence(link: Any) -> None:
+    """A vehicle that closes its end is not printed, nor connected to again: who uses the link
+    notices, and says it in words of its own.
+    """
+    link.handle_eof = link.handle_disconnect = lambda: None
+
+
 class Connection:
     """A MAVLink connection over TCP; any thread sends, one receives."""
 
@@ -45,6 +52,7 @@ class Connection:
                         f"no vehicle listens at {self.endpoint}: {error}; is it started?"
                     ) from error
                 time.sleep(0.1)
+        silence(self._link)
 
     def shut_down(self) -> None:
         """End what the receiving thread waits for."""

@@ -22,6 +22,7 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 from mavlink_bridge import VisionFix
 from sitl.embedded.physics.rotation import matrix, quaternion
 from sitl.geodesy import Location
+from sitl.ground.connection import silence
 from sitl.ground.pilot import Pilot
 from sitl.ground.tracks import Truth
 
@@ -222,6 +223,7 @@ class TruthFeed:
             dialect="ardupilotmega",
             robust_parsing=True,
         )
+        silence(self._link)
         pilot.record.subscribe(self._on_truth)
 
     def change(self, model: FixModel, *, reset: bool = False) -> None:

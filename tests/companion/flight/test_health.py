@@ -179,6 +179,24 @@ def test_after_the_end_the_file_says_that_it_ended_and_how(tmp_path):
     assert bridge.said == ["PiLoT: ending, nothing is injected any more"]
 
 
+def test_a_camera_that_ended_before_does_not_speak_for_the_flight(tmp_path, monkeypatch):
+    now = [100.0]
+    monkeypatch.setattr("companion.flight.health._STALE_S", 2.0)
+    monkeypatch.setattr("companion.flight.health.time.monotonic", lambda: now[0])
+    monitor = HealthMonitor(
+        EngineHealth, FakeBridge(True), lambda: StreamState.LIVE, lambda *_: None, tmp_path
+    )
+    tracking = SimpleNamespace(state=TrackingState.TRACKING, stage_ms={}, last_fix_ns=None)
+    monitor.add_estimate(tracking)
+    now[0] += 5.0
+    monitor.end("stopped")
+    monitor.start()
+    monitor.stop()
+    assert json.loads((tmp_path / "health.json").read_text())["text"] == (
+        "stopped; localization tracking until 5 s before, then no frame is being localized"
+    )
+
+
 @pytest.mark.parametrize(
     ("seconds", "level", "text"),
     [
