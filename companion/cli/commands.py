@@ -1,5 +1,5 @@
 """The command line: ``companion run | eval | localize | convert | replay | report | export |
-console | map | world | doctor | key``.
+console | map | world | doctor | key | self-test``.
 
 Exit codes: 0 done; 1 `doctor` found advice, `replay` differs, `localize` localized nothing or `map
 verify` found damage; 2 wrong usage, a named error, or `doctor` found the vehicle not fit to fly;
@@ -28,6 +28,7 @@ from companion.cli.map import app as map_app
 from companion.cli.replay import replay_command
 from companion.cli.report import report_command
 from companion.cli.run import run_command
+from companion.cli.self_test import self_test_command
 from companion.cli.world import app as world_app
 from companion.errors import CompanionError
 from companion.versions import versions
@@ -69,6 +70,7 @@ app.command("export")(export_command)
 app.command("console")(console_command)
 app.command("doctor")(doctor_command)
 app.command("key")(key_command)
+app.command("self-test")(self_test_command)
 app.add_typer(map_app, name="map", help="Build and inspect tile caches.")
 app.add_typer(world_app, name="world", help="Generated worlds for tests and demos.")
 
