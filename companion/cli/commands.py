@@ -18,7 +18,7 @@ from rich.markup import escape
 
 from companion.cli.console import console_command
 from companion.cli.convert import convert_command
-from companion.cli.doctor import doctor_command
+from companion.cli.doctor import doctor_command, self_test_command
 from companion.cli.evaluate import evaluate_command
 from companion.cli.export import export_command
 from companion.cli.interrupts import INTERRUPTED
@@ -28,7 +28,6 @@ from companion.cli.map import app as map_app
 from companion.cli.replay import replay_command
 from companion.cli.report import report_command
 from companion.cli.run import run_command
-from companion.cli.self_test import self_test_command
 from companion.cli.world import app as world_app
 from companion.errors import CompanionError
 from companion.versions import versions

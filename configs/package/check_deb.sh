@@ -1,0 +1,64 @@
+#!/bin/sh
+# Install, start, upgrade, remove and purge the package in a clean Debian root: check_deb.sh DEB [SUITE]
+# Needs root and mmdebstrap, and qemu-user with binfmt for another architecture than this one's.
+# What it cannot show in a root without a running systemd: the unit's own restrictions.
+set -eu
+deb=$(realpath "$1") suite=${2:-bookworm}
+arch=$(dpkg-deb --field "$deb" Architecture)
+root=${ROOT:-$(mktemp -d)/root}
+say() { echo "== $*"; }
+in_root() { chroot "$root" env -i PATH=/usr/sbin:/usr/bin:/sbin:/bin HOME=/root LC_ALL=C.UTF-8 \
+    DEBIAN_FRONTEND=noninteractive "$@"; }
+as_service() { in_root setpriv --reuid companion --regid companion --init-groups \
+    --no-new-privs --bounding-set=-all --inh-caps=-all env HOME=/var/lib/companion \
+    NUMBA_CACHE_DIR=/var/cache/companion/kernels PILOT_CACHE=/var/cache/companion "$@"; }
+fail() { echo "check_deb.sh: $*" >&2; exit 1; }
+
+if [ ! -x "$root/usr/bin/dpkg" ]; then
+    say "a clean $suite root for $arch in $root"
+    mmdebstrap --quiet --arch="$arch" --variant=apt "$suite" "$root"
+fi
+mountpoint -q "$root/proc" || mount -t proc proc "$root/proc"
+mountpoint -q "$root/dev" || mount --rbind /dev "$root/dev"
+trap 'umount -l "$root/proc" "$root/dev"' EXIT
+
+say install
+cp /etc/resolv.conf "$root/etc/resolv.conf"
+in_root apt-get -q update
+cp "$deb" "$root/tmp/new.deb"
+in_root apt-get -q -y install --no-install-recommends /tmp/new.deb
+in_root companion --version
+[ "$(in_root stat -c %U:%G:%a /etc/companion/deployment.yaml)" = root:companion:640 ] \
+    || fail "the deployment file can be read by others"
+as_service sh -c 'echo > /opt/companion/x' 2> /dev/null && fail "the service may write its program"
+
+say "start: as the unit does, over a map, with no vehicle and no camera"
+as_service sh -c 'cd /var/lib/companion && companion self-test'
+# A failure by name where there is no map yet, as on a fresh computer.
+code=0; as_service companion run /etc/companion/deployment.yaml || code=$?
+[ "$code" = 2 ] || fail "without a map the exit code is $code, not 2"
+
+say upgrade
+dpkg-deb -R "$root/tmp/new.deb" "$root/tmp/next"
+sed -i 's/^Version: .*/&+next/' "$root/tmp/next/DEBIAN/control"
+dpkg-deb --root-owner-group -Znone --build "$root/tmp/next" "$root/tmp/next.deb" > /dev/null
+rm -rf "$root/tmp/next"
+echo "# mine" >> "$root/etc/companion/deployment.yaml"
+echo keep > "$root/var/lib/companion/flights/mine"
+in_root dpkg --force-confold -i /tmp/next.deb
+in_root companion --version
+grep -q "^# mine" "$root/etc/companion/deployment.yaml" || fail "the upgrade replaced the deployment"
+[ -f "$root/var/lib/companion/flights/mine" ] || fail "the upgrade took a record"
+
+say remove
+in_root dpkg --remove pilot-companion
+[ ! -e "$root/opt/companion/venv" ] || fail "the program is still there"
+[ -f "$root/var/lib/companion/flights/mine" ] || fail "removing took a record"
+say purge
+in_root dpkg --purge pilot-companion
+for left in /opt/companion /var/lib/companion /var/cache/companion /etc/companion; do
+    [ ! -e "$root$left" ] || fail "$left is still there"
+done
+in_root getent passwd companion > /dev/null && fail "the user is still there"
+rm "$root/tmp/new.deb" "$root/tmp/next.deb"
+say "passed: $(basename "$deb")"

@@ -1,0 +1,103 @@
+"""What operators install: the wheel in an environment of its own, and the service's unit."""
+
+import configparser
+import shutil
+import subprocess
+import sys
+import zipfile
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[1]
+UNIT = ROOT / "configs" / "companion.service"
+# Packages come from here; what is installed editable does not, so only the wheel has ours.
+SITE = next(p for p in map(Path, sys.path) if p.name == "site-packages")
+
+
+def _run(*command, **options):
+    done = subprocess.run(command, capture_output=True, text=True, check=False, **options)
+    assert done.returncode == 0, done.stdout + done.stderr
+    return done.stdout
+
+
+@pytest.fixture(scope="module")
+def built(tmp_path_factory):
+    """Source distribution and wheel, built from a copy: setuptools writes into its source."""
+    folder = tmp_path_factory.mktemp("package")
+    source = folder / "source"
+    names = subprocess.run(
+        ["git", "ls-files", "-z"], cwd=ROOT, capture_output=True, check=True
+    ).stdout.split(b"\0")
+    for name in filter(None, map(bytes.decode, names)):
+        if (ROOT / name).is_file() and not name.startswith(("tests/", "docs/")):
+            (source / name).parent.mkdir(parents=True, exist_ok=True)
+            shutil.copy2(ROOT / name, source / name)
+    backend = "import setuptools.build_meta as b; b.build_sdist({0!r}); b.build_wheel({0!r})"
+    _run(sys.executable, "-c", backend.format(str(folder)), cwd=source)
+    return folder
+
+
+@pytest.fixture(scope="module")
+def environment(built):
+    """An environment with nothing of ours but the wheel; what we depend on is borrowed."""
+    folder = built / "venv"
+    _run(sys.executable, "-m", "venv", "--without-pip", folder)
+    site = next(folder.glob("lib/python*/site-packages"))
+    (wheel,) = built.glob("*.whl")
+    _run(
+        sys.executable, "-m", "pip", "install", "--quiet", "--no-deps", "--target", site, wheel,
+    )  # fmt: skip
+    (site / "borrowed.pth").write_text(f"{SITE}\n")
+    return folder / "bin" / "python"
+
+
+def test_the_wheel_has_what_the_program_reads(built):
+    (wheel,) = built.glob("*.whl")
+    names = set(zipfile.ZipFile(wheel).namelist())
+    for package in ("localizer", "companion", "mavlink_bridge", "sitl"):
+        of_source = {
+            str(path.relative_to(ROOT))
+            for path in (ROOT / package).rglob("*")
+            if path.is_file() and "__pycache__" not in path.parts
+        }
+        assert of_source <= names, f"not in the wheel: {sorted(of_source - names)[:5]}"
+    assert list(built.glob("*.tar.gz"))
+
+
+def test_the_command_runs_outside_the_checkout(environment, tmp_path):
+    where = _run(environment, "-c", "import companion; print(companion.__file__)", cwd=tmp_path)
+    assert str(environment.parents[1]) in where
+    assert _run(environment, "-m", "companion", "--version", cwd=tmp_path).startswith("companion 0")
+
+
+@pytest.mark.long  # compiles every kernel anew: minutes
+def test_it_computes_outside_the_checkout(environment, tmp_path):
+    deployment = str(ROOT / "configs" / "deployment.yaml")
+    done = subprocess.run(
+        [environment, "-m", "companion", "doctor", "--no-vehicle", deployment],
+        cwd=tmp_path, capture_output=True, text=True, check=False,
+    )  # fmt: skip
+    assert done.returncode == 2, done.stdout + done.stderr  # it says that there is no map
+    assert "area" in done.stdout + done.stderr
+    assert "Traceback" not in done.stderr
+    said = _run(environment, "-m", "companion", "self-test", cwd=tmp_path)
+    assert "self-test passed" in said
+
+
+def test_the_units_restrictions_leave_what_the_program_needs():
+    unit = configparser.ConfigParser(strict=False, interpolation=None)
+    unit.optionxform = str  # type: ignore[assignment,method-assign]
+    unit.read(UNIT)
+    service = unit["Service"]
+    assert service["ProtectSystem"] == "strict"
+    assert service["NoNewPrivileges"] == "yes"
+    assert "MemoryDenyWriteExecute" not in service  # numba compiles
+    assert service["RestrictRealtime"] == "yes"
+    assert {"AF_INET", "AF_INET6", "AF_UNIX"} <= set(service["RestrictAddressFamilies"].split())
+
+
+@pytest.mark.skipif(shutil.which("systemd-analyze") is None, reason="no systemd-analyze")
+def test_the_unit_is_hardened():
+    said = _run("systemd-analyze", "security", "--offline=true", "--threshold=30", str(UNIT))
+    assert "Overall exposure level" in said
