@@ -16,7 +16,7 @@ from companion.sources.base import SourceSettings
 from companion.targets.detections import parse_host_port
 from localizer.config import LocalizerConfig
 from localizer.errors import CameraError
-from localizer.geometry.camera import Camera
+from localizer.geometry.camera import MAX_READOUT_MS, Camera
 from mavlink_bridge.config import BridgeConfig
 
 _FIELDS_OF_VIEW_DEG = (1.0, 170.0)
@@ -39,6 +39,9 @@ class CameraModel(_Model):
     cy: float
     distortion: tuple[float, float, float, float, float] = Field(
         (0.0, 0.0, 0.0, 0.0, 0.0), description="Brown: k1 k2 p1 p2 k3"
+    )
+    readout_ms: float = Field(
+        0.0, ge=0, le=MAX_READOUT_MS, description="rolling shutter: first row to last; 0: global"
     )
 
     @model_validator(mode="after")
@@ -78,7 +81,10 @@ class CameraModel(_Model):
 
     def camera(self) -> Camera:
         """As the geometry type."""
-        return Camera(self.width, self.height, self.fx, self.fy, self.cx, self.cy, self.distortion)
+        return Camera(
+            self.width, self.height, self.fx, self.fy, self.cx, self.cy, self.distortion,
+            self.readout_ms,
+        )  # fmt: skip
 
 
 Arm = Annotated[float, Field(ge=-20.0, le=20.0)]  # metres; larger ones were given in cm or mm

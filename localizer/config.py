@@ -8,6 +8,7 @@ from pydantic import BaseModel, ConfigDict, Field
 
 from localizer.integrity.acceptance import IntegrityConfig
 from localizer.odometry.config import OdometryConfig
+from localizer.registration.calibration import CalibrationSigmas
 from localizer.registration.config import JNGOConfig
 from localizer.registration.devices import DeviceChoice
 from localizer.relocalization.config import RelocalizationConfig
@@ -46,6 +47,7 @@ class LocalizerConfig(BaseModel):
     cache_mib: int = Field(384, ge=16, le=1 << 20, description="resident tiles, MiB")
     seed: int = Field(0, ge=0, lt=2**31, description="seed of anchors and hypotheses")
     registration: JNGOConfig = JNGOConfig()
+    calibration: CalibrationSigmas = CalibrationSigmas()
     # Off: a gimbal that is half a degree off pulls the position by a metre at 120 m, while vision
     # alone knows the tilt to 0.2 degrees. For poor light, give it the gimbal's honest error.
     attitude: AttitudePrior | None = None

@@ -18,12 +18,15 @@ from numpy.typing import ArrayLike, NDArray
 from localizer.errors import CameraError
 from localizer.geometry.pose import Array
 
+MAX_READOUT_MS = 200.0
 _KEYS = ("width", "height", "fx", "fy", "cx", "cy")
 
 
 @dataclass(frozen=True)
 class Camera:
-    """Intrinsics in pixels. `distortion` is Brown's (k1, k2, p1, p2, k3), all 0 for a pinhole."""
+    """Intrinsics in pixels. `distortion` is Brown's (k1, k2, p1, p2, k3), all 0 for a pinhole.
+    readout_ms: from the first row's exposure to the last one's, 0 of a global shutter.
+    """
 
     width: int
     height: int
@@ -32,11 +35,17 @@ class Camera:
     cx: float
     cy: float
     distortion: tuple[float, float, float, float, float] = (0.0, 0.0, 0.0, 0.0, 0.0)
+    readout_ms: float = 0.0
 
     def __post_init__(self) -> None:
         numbers = (self.fx, self.fy, self.cx, self.cy, *self.distortion)
         if not all(np.isfinite(numbers)):
             raise CameraError(f"camera intrinsics must be finite numbers, got {self}")
+        if not 0.0 <= self.readout_ms <= MAX_READOUT_MS:
+            raise CameraError(
+                f"a readout of {self.readout_ms:g} ms: give milliseconds from the first row's "
+                f"exposure to the last one's, 0 to {MAX_READOUT_MS:g}"
+            )
         if self.width < 8 or self.height < 8:
             raise CameraError(f"camera size {self.width}x{self.height} is below 8x8 pixels")
         if self.fx <= 0 or self.fy <= 0:
@@ -52,7 +61,8 @@ class Camera:
 
     @classmethod
     def from_dict(cls, data: dict[str, Any], where: str = "camera") -> Camera:
-        """From width, height, fx, fy, cx, cy and optional ``distortion`` (k1 k2 p1 p2 k3).
+        """From width, height, fx, fy, cx, cy and optional ``distortion`` (k1 k2 p1 p2 k3) and
+        ``readout_ms``.
 
         The distortion may also stand as the single keys k1, k2, p1, p2, k3.
         """
@@ -64,7 +74,9 @@ class Camera:
             k = (*(float(x) for x in d), 0.0, 0.0, 0.0, 0.0, 0.0)[:5]
             fx, fy, cx, cy = (float(data[key]) for key in _KEYS[2:])
             width, height = int(data["width"]), int(data["height"])
-            return cls(width, height, fx, fy, cx, cy, (k[0], k[1], k[2], k[3], k[4]))
+            bent = (k[0], k[1], k[2], k[3], k[4])
+            readout_ms = float(data.get("readout_ms", 0.0))
+            return cls(width, height, fx, fy, cx, cy, bent, readout_ms)
         except (TypeError, ValueError, OverflowError, CameraError) as error:
             raise CameraError(f"{where}: {error}") from error
 
@@ -83,7 +95,9 @@ class Camera:
 
     def to_dict(self) -> dict[str, Any]:
         """Inverse of `from_dict`."""
-        return {k: getattr(self, k) for k in _KEYS} | {"distortion": list(self.distortion)}
+        return {k: getattr(self, k) for k in _KEYS} | {
+            "distortion": list(self.distortion), "readout_ms": self.readout_ms
+        }  # fmt: skip
 
     @property
     def K(self) -> Array:

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from enum import Enum
 
 from localizer.geometry.pose import Array, Pose
+from localizer.geometry.shutter import Sweep
 from localizer.odometry.keyframe import DepthSource
 from localizer.odometry.usability import Usability
 from localizer.types import FeaturePyramid
@@ -26,11 +27,13 @@ class OdometryFrame:
 
     features: of the undistorted picture, in host memory, as for the map registration. time_ns: the
     exposure's. usability: `usability.examine`'s verdict on the picture, None if nobody looked.
+    sweep: the camera's motion while its rows were read out; None: they were all at once.
     """
 
     features: FeaturePyramid
     time_ns: int
     usability: Usability | None = None
+    sweep: Sweep | None = None
 
 
 @dataclass(frozen=True)

@@ -11,6 +11,7 @@ from localizer.device_array import DeviceArray
 from localizer.errors import DeviceArrayError
 from localizer.geometry.camera import Camera
 from localizer.geometry.pose import Array, Pose
+from localizer.geometry.shutter import Sweep
 from localizer.odometry.ground import Ground, ground_points
 from localizer.registration.anchors import anchors_at
 from localizer.registration.priors import PoseConstraint
@@ -56,19 +57,20 @@ def keyframe_anchors(
     ground: Ground | None,
     count: int,
     seed: int = 0,
+    sweep: Sweep | None = None,
 ) -> tuple[Anchors, DepthSource]:
     """Anchors of a flown picture, at most about `count`.
 
     surface: points (N, 3) on the map's surfaces, off their edges, as seen from about here: the
     anchors of the map view that was rendered for this frame. Nothing is rendered anew, and their
     picture plays no part. ground: gives points where the map has none. Without either there are
-    no anchors.
+    no anchors. sweep: of the picture, see `OdometryFrame`.
     """
     _require_host(features)
     rng = np.random.default_rng(seed)
     points, pixels = np.zeros((0, 3)), np.zeros((0, 2))
     if surface is not None:
-        points, pixels = in_view(surface, world_from_camera, camera)
+        points, pixels = in_view(surface, world_from_camera, camera, sweep)
         if len(points) > count:
             chosen = np.sort(rng.choice(len(points), count, replace=False))
             points, pixels = points[chosen], pixels[chosen]
@@ -90,9 +92,15 @@ def _require_host(features: FeaturePyramid) -> None:
         )
 
 
-def in_view(points: Array, pose: Pose, camera: Camera) -> tuple[Array, Array]:
-    """Those of the points (N, 3) that the camera sees off its border, with their pixels."""
-    pixels, inside = camera.project(pose.inverse.apply(points))
+def in_view(
+    points: Array, pose: Pose, camera: Camera, sweep: Sweep | None = None
+) -> tuple[Array, Array]:
+    """Those of the points (N, 3) that the camera sees off its border, with their pixels.
+
+    sweep: the camera's motion while its rows are read out.
+    """
+    seen = points if sweep is None else sweep.seen(points, pose, camera)
+    pixels, inside = camera.project(pose.inverse.apply(seen))
     pixels, points = pixels[inside], points[inside]
     border = max(2.0, _BORDER_SHARE * min(camera.width, camera.height))
     size = np.array([camera.width, camera.height])

@@ -25,6 +25,7 @@ from localizer.odometry.track import (
     growth_of,
     seconds,
 )
+from localizer.registration.anchors import swept
 from localizer.registration.jngo import JNGO
 from localizer.registration.priors import PoseConstraint
 from localizer.registration.result import Registration
@@ -140,7 +141,7 @@ class VisualOdometry:
         result = self._optimizer.register(
             frame.features,
             self._camera,
-            keyframe.anchors,
+            swept(keyframe.anchors, frame.sweep, prior.world_from_camera, self._camera),
             prior,
             motion=prior,
             seed=self._seed + frame.time_ns % 1_000_003,
@@ -180,7 +181,7 @@ class VisualOdometry:
     ) -> Keyframe | None:  # fmt: skip
         anchors, source = keyframe_anchors(
             frame.features, self._camera, pose, surface, self._ground or self._plane,
-            self.config.anchors, self._seed,
+            self.config.anchors, self._seed, frame.sweep,
         )  # fmt: skip
         if len(anchors.points_world) < 2 * self._optimizer.config.min_anchors:
             return None

@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from localizer.geometry.pose import Array
+from localizer.geometry.camera import Camera
+from localizer.geometry.pose import Array, Pose
+from localizer.geometry.shutter import Sweep
 from localizer.registration.sampling import sample_features
 from localizer.types import Anchors, FeatureLevel, FeaturePyramid, Float32, RenderedView
 
@@ -114,3 +118,17 @@ def _sample(level: FeatureLevel, values: Float32, pixels: Array) -> Float32:
     """Values (h, w, C) of a level at pixels (N, 2), as (N, C)."""
     uv = pixels / level.stride - 0.5
     return sample_features(values, uv[:, 0], uv[:, 1])
+
+
+def swept(anchors: Anchors, sweep: Sweep | None, pose: Pose, camera: Camera) -> Anchors:
+    """The anchors, moved to where a picture whose rows were read out one after the other has them.
+
+    pose: where the camera is thought to be (in the middle of the readout); some degrees beside it
+    change the rows, and so the places, by centimetres. None: all rows at once, nothing moves.
+    """
+    if sweep is None or len(anchors.points_world) == 0:
+        return anchors
+    depth_m = float(np.linalg.norm(anchors.points_world.mean(axis=0) - pose.translation))
+    if not sweep.matters(camera, depth_m):
+        return anchors
+    return replace(anchors, points_world=sweep.seen(anchors.points_world, pose, camera))

@@ -14,6 +14,7 @@ import numpy as np
 
 from localizer.geometry.camera import Camera
 from localizer.geometry.pose import Array, Pose
+from localizer.geometry.shutter import Sweep
 from localizer.odometry import (
     OdometryConfig,
     OdometryFrame,
@@ -81,10 +82,11 @@ class Bridging:
         return self._odometry.ready
 
     def begin(
-        self, estimate: PoseEstimate, query: FeaturePyramid, anchors: Anchors, velocity: Array
-    ) -> None:
+        self, estimate: PoseEstimate, query: FeaturePyramid, anchors: Anchors, velocity: Array,
+        sweep: Sweep | None = None,
+    ) -> None:  # fmt: skip
         """The map has just said where this frame was: whatever was bridged before is over."""
-        frame = OdometryFrame(query, estimate.exposure_time_ns)
+        frame = OdometryFrame(query, estimate.exposure_time_ns, sweep=sweep)
         self._odometry.begin(
             frame,
             estimate.world_from_camera,
@@ -95,12 +97,13 @@ class Bridging:
         )
 
     def carry(
-        self, frame: Frame, query: FeaturePyramid, prediction: PosePrior, anchors: Anchors | None
-    ) -> Carried:
+        self, frame: Frame, query: FeaturePyramid, prediction: PosePrior, anchors: Anchors | None,
+        sweep: Sweep | None = None,
+    ) -> Carried:  # fmt: skip
         """Carry the pose on to a frame. anchors: of the reference at the prediction, if any."""
         if not self._odometry.ready:
             return _NOTHING
-        seen = OdometryFrame(query, frame.exposure_time_ns, examine(frame.image))
+        seen = OdometryFrame(query, frame.exposure_time_ns, examine(frame.image), sweep)
         surface = anchors.points_world if anchors is not None else None
         constraint = self._constraint(frame.exposure_time_ns)
         estimate = self._odometry.step(seen, prediction, surface=surface, constraint=constraint)

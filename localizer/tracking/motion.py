@@ -18,6 +18,7 @@ from filterpy.kalman import update as kalman_update
 from pydantic import BaseModel, ConfigDict, Field
 
 from localizer.geometry.pose import Array, Pose, so3_exp, so3_log
+from localizer.geometry.shutter import Sweep
 from localizer.integrity.confirmation import DisplacementBetween
 from localizer.types import PosePrior
 
@@ -27,6 +28,7 @@ RotationAt = Callable[[int], "Array | None"]
 _MAX_SIGMA_M = 10.0  # beyond it nothing is gained: the swarm's own limits are reached
 _MAX_SIGMA_RAD = float(np.radians(8.0))
 _LONGEST_S = 10.0  # a camera's clock that jumped, or a gap that no velocity bridges
+_LEAST_RATE_NS = 15_000_000  # to both sides of an exposure: sensors report every 20 ms
 _H = np.hstack([np.eye(6), np.zeros((6, 6))])
 
 
@@ -63,6 +65,11 @@ class MotionState:
     def velocity(self) -> Array:
         """Velocity (3,) in world axes, m/s."""
         return self.mean[6:9]
+
+    @property
+    def rate(self) -> Array:
+        """Angular rate (3,) in world axes, rad/s."""
+        return self.mean[9:]
 
     @property
     def prior(self) -> PosePrior:
@@ -192,6 +199,19 @@ class MeasuredMotion:
         # The camera's clock jumped: by its velocity the state would be moved the wrong way.
         turn = self._turn(state.time_ns, time_ns)
         return kept(state, time_ns, self._config, turn)
+
+    def sweep(self, ahead: MotionState, readout_ms: float) -> Sweep | None:
+        """The camera's motion while a frame at the state's time is read out; None: all at once.
+
+        Its turn by the other sensor, whose report reaches to both sides of the exposure; without
+        one, by the motion model.
+        """
+        if readout_ms <= 0:
+            return None
+        half_ns = max(round(0.5e6 * readout_ms), _LEAST_RATE_NS)
+        turn = self._turn(ahead.time_ns - half_ns, ahead.time_ns + half_ns)
+        rate = ahead.rate if turn is None else so3_log(turn) / (2e-9 * half_ns)
+        return Sweep.of(rate, ahead.velocity, readout_ms)
 
     def _turn(self, begin_ns: int, end_ns: int) -> Array | None:
         begin, end = self._rotation_at(begin_ns), self._rotation_at(end_ns)

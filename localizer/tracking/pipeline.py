@@ -25,7 +25,8 @@ from localizer.errors import (
 from localizer.features.extractor import DeviceExtractor, FeatureExtractor
 from localizer.geometry.camera import Camera
 from localizer.geometry.geo import LocalFrame
-from localizer.registration.anchors import select_anchors
+from localizer.registration.anchors import select_anchors, swept
+from localizer.registration.calibration import calibration_covariance
 from localizer.registration.jngo import JNGO
 from localizer.registration.priors import PoseConstraint, attitude_constraint
 from localizer.render.base import MapRenderer
@@ -308,19 +309,28 @@ class Localizer:
         if ahead is None:
             raise OutsideMapError(_NO_PRIOR)
         stage_ms: dict[str, float] = {}
-        result = None
+        result, sweep = None, self._tracker.sweep(frame, ahead)
         if anchors is not None:
             with stopwatch(stage_ms, "register"):
+                about = ahead.prior.world_from_camera
                 result = self._optimizer.register(
                     query,
                     self.camera,
-                    anchors,
+                    swept(anchors, sweep, about, frame.camera),
                     ahead.prior,
                     motion=ahead.prior if seen.standing.trusts_prediction else None,
                     constraint=self._attitude(frame.exposure_time_ns),
                     seed=self._config.seed + frame.sequence,
                 )
         estimate = self._tracker.judge(seen, ahead, frame, query, anchors, result)
+        if anchors is not None and estimate.status is RegistrationStatus.OK:
+            # Added to what is told and not to what is filtered: the next frame errs alike.
+            moving = (ahead.velocity, ahead.rate)
+            unknown = calibration_covariance(
+                self._config.calibration, anchors.points_world, estimate.world_from_camera,
+                self.camera, sweep, moving,
+            )  # fmt: skip
+            estimate = replace(estimate, covariance=estimate.covariance + unknown)
         return replace(estimate, stage_ms=stage_ms)
 
 

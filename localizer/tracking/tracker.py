@@ -7,12 +7,14 @@ from dataclasses import dataclass, field
 
 from localizer.config import LocalizerConfig
 from localizer.geometry.pose import Array, Pose
+from localizer.geometry.shutter import Sweep
 from localizer.integrity.acceptance import is_acceptable
 from localizer.integrity.confirmation import Witness
 from localizer.registration.result import Registration
 from localizer.tracking import motion
 from localizer.tracking.bridging import Bridging, Carried, Carry
 from localizer.tracking.motion import MeasuredMotion, MotionState, OtherSensors
+from localizer.tracking.rejoining import Rejoining
 from localizer.tracking.states import Outcome, Standing, judge
 from localizer.types import (
     Anchors,
@@ -60,6 +62,7 @@ class Tracker:
         self._motion = MeasuredMotion(config.motion, sensors.rotation_at)
         self._sensors = sensors
         self._bridging = bridging
+        self._rejoining = Rejoining()
         self._lock = threading.Lock()
         self._state = TrackerState()
 
@@ -96,6 +99,10 @@ class Tracker:
         """The motion of `seen` at a frame's exposure; None before the first prior."""
         return self._motion.at_frame(seen.motion, time_ns) if seen.motion is not None else None
 
+    def sweep(self, frame: Frame, ahead: MotionState) -> Sweep | None:
+        """The camera's motion while the frame is read out. ahead: the motion at its exposure."""
+        return self._motion.sweep(ahead, frame.camera.readout_ms)
+
     def judge(
         self,
         seen: TrackerState,
@@ -112,6 +119,8 @@ class Tracker:
         """
         acceptable = result is not None and self._is_acceptable(result, ahead.prior)
         carried = self._carry(seen, ahead, frame, query, anchors, acceptable)
+        rejoins = not acceptable and self._rejoins(seen.standing, result, carried, frame)
+        acceptable = acceptable or rejoins
         if result is not None:
             measured, covariance = result.world_from_camera, result.covariance
         else:
@@ -122,11 +131,14 @@ class Tracker:
         bridges = standing.state is TrackingState.BRIDGING
         lost = standing.state is TrackingState.LOST
         moved = self._next_motion(ahead, result, acceptable and not bridges, carried, lost)
+        if rejoins and not bridges and result is not None:  # the prediction was of the wrong place
+            moved = motion.start(_restart(result, ahead), self._config.motion)
         self._store(seen, moved, standing)
         given, usable = _given(outcome, result, carried, standing)
         estimate = _estimate(frame, given, standing, usable)
         if estimate.accepted and not bridges and self._bridging is not None and anchors is not None:
-            self._bridging.begin(estimate, query, anchors, moved.velocity)
+            swept = self.sweep(frame, ahead)
+            self._bridging.begin(estimate, query, anchors, moved.velocity, swept)
         return estimate
 
     def _is_acceptable(self, result: Registration, prior: PosePrior) -> bool:
@@ -143,7 +155,26 @@ class Tracker:
         wanted = not acceptable or standing.state is TrackingState.BRIDGING
         if self._bridging is None or not standing.trusts_prediction or not wanted:
             return Carried(Carry.NONE)
-        return self._bridging.carry(frame, query, ahead.prior, anchors)
+        swept = self.sweep(frame, ahead)
+        return self._bridging.carry(frame, query, ahead.prior, anchors, swept)
+
+    def _rejoins(
+        self, standing: Standing, result: Registration | None, carried: Carried, frame: Frame
+    ) -> bool:
+        """Whether the map's answers, refused by the gate alone, refute the pose that is carried."""
+        pose = carried.world_from_camera
+        good = result is not None and is_acceptable(self._config.integrity, result, 0.0)
+        if standing.state is not TrackingState.BRIDGING or result is None or not good:
+            self._rejoining = Rejoining()
+            return False
+        if pose is None:  # a gap of the odometry says nothing of the map's answers
+            return False
+        rotation = self._sensors.rotation_at(frame.exposure_time_ns)
+        self._rejoining = self._rejoining.with_answer(
+            result.world_from_camera, result.covariance, frame.exposure_time_ns, pose, rotation,
+            self._config.integrity,
+        )  # fmt: skip
+        return self._rejoining.confirmed
 
     def _witness(self, standing: Standing, outcome: Outcome) -> Witness:
         """What other sensors say of a place on trial."""
@@ -175,6 +206,13 @@ class Tracker:
         with self._lock:
             if self._state is seen:
                 self._state = TrackerState(state, standing)
+
+
+def _restart(result: Registration, ahead: MotionState) -> PosePrior:
+    """A beginning at the map's answer, with the velocity that the odometry measured."""
+    return PosePrior(
+        result.world_from_camera, result.covariance, ahead.time_ns, ahead.velocity.copy()
+    )
 
 
 def _given(

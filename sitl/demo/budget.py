@@ -36,6 +36,9 @@ def draw_errors(scenario: Scenario, seed: int) -> FlightErrors:
     def normal(key: int, count: int) -> np.ndarray:
         return np.random.default_rng([seed, 41, key]).normal(size=count)
 
+    c = scenario.camera
+    rolls = c.readout_ms > 0
+    readout_ms = max(c.readout_ms + spec.readout_ms * float(normal(6, 1)[0]), 0.0) if rolls else 0.0
     scale = 1.0 + 0.01 * spec.focal_percent * float(normal(0, 1)[0])
     principal = spec.principal_px * normal(1, 2)
     bend = spec.distortion * normal(2, 5) * (1.0, 1.0, 0.1, 0.1, 0.0)
@@ -43,14 +46,14 @@ def draw_errors(scenario: Scenario, seed: int) -> FlightErrors:
     camera = Camera(
         nominal.width, nominal.height, nominal.fx * scale, nominal.fy * scale,
         nominal.cx + float(principal[0]), nominal.cy + float(principal[1]), (k1, k2, p1, p2, k3),
+        readout_ms,
     )  # fmt: skip
     rng = np.random.default_rng([seed, 41, 4])
     away, bearing = rng.uniform(*spec.map_shift_m), rng.uniform(0, 2 * np.pi)
     up = spec.map_shift_up_m * float(rng.normal())
     arm = spec.lever_arm_m * normal(3, 3)
-    c = scenario.camera
     realism = CameraRealism(
-        c.readout_ms, c.vibration_deg, c.auto_exposure, c.supersample, c.packet_loss,
+        readout_ms, c.vibration_deg, c.auto_exposure, c.supersample, c.packet_loss,
         spec.stamp_offset_ms * float(normal(5, 1)[0]), spec.stamp_jitter_ms,
     )  # fmt: skip
     detector = DetectorErrors(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib.util
+import math
 import os
 import signal
 import socket
@@ -66,7 +67,7 @@ def write_deployment(
             "source": f"udp://127.0.0.1:{ports.video}",
             "model": camera.to_dict(),
         },
-        "localizer": {"width": scenario.localizer_width},
+        "localizer": {"width": scenario.localizer_width, "calibration": _known_to(scenario)},
         "bridge": {
             "connection": vehicle.companion_endpoint,
             "mode": "inject",
@@ -87,6 +88,20 @@ def write_deployment(
     path = folder / "companion.yaml"
     path.write_text(yaml.safe_dump(config, sort_keys=False))
     return path
+
+
+def _known_to(scenario: Scenario) -> dict[str, float]:
+    """How well the deployment knows its camera: the sigmas from which the flight's errors are
+    drawn, as the calibration's report states them; not the draw.
+    """
+    drawn = scenario.errors
+    return {
+        "focal_percent": drawn.focal_percent,
+        "principal_percent": 100.0 * drawn.principal_px / scenario.camera.width,
+        "distortion": drawn.distortion,
+        "readout_ms": drawn.readout_ms,
+        "stamp_ms": math.hypot(drawn.stamp_offset_ms, drawn.stamp_jitter_ms),
+    }
 
 
 @contextmanager

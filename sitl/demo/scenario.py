@@ -51,6 +51,7 @@ class ErrorSpec(_Model):
     lever_arm_m: float = Field(0.05, ge=0, le=2, description="camera to autopilot, per axis")
     stamp_offset_ms: float = Field(3.0, ge=0, le=200, description="of the camera's clock")
     stamp_jitter_ms: float = Field(2.0, ge=0, le=100, description="from picture to picture")
+    readout_ms: float = Field(1.0, ge=0, le=20, description="of the shutter's readout time")
     map_shift_m: tuple[Shift, Shift] = Field(
         (0.3, 1.5), description="least and most that the map lies beside GNSS, horizontally"
     )
@@ -66,8 +67,8 @@ class ErrorSpec(_Model):
         """A deployment that knows the aircraft exactly, and an eye that errs by a pixel."""
         return cls(
             focal_percent=0, principal_px=0, distortion=0, lever_arm_m=0, stamp_offset_ms=0,
-            stamp_jitter_ms=0, map_shift_m=(0.0, 0.0), map_shift_up_m=0, detector_missed=0,
-            detector_false=0, detector_swapped=0, detector_box_centre=False,
+            stamp_jitter_ms=0, readout_ms=0, map_shift_m=(0.0, 0.0), map_shift_up_m=0,
+            detector_missed=0, detector_false=0, detector_swapped=0, detector_box_centre=False,
         )  # fmt: skip
 
     @model_validator(mode="after")
@@ -105,8 +106,9 @@ class CameraSpec(_Model):
         """The calibrated model."""
         ideal = Camera.from_fov(self.width, self.height, self.horizontal_fov_deg)
         return Camera(
-            ideal.width, ideal.height, ideal.fx, ideal.fy, ideal.cx, ideal.cy, self.distortion
-        )
+            ideal.width, ideal.height, ideal.fx, ideal.fy, ideal.cx, ideal.cy, self.distortion,
+            self.readout_ms,
+        )  # fmt: skip
 
 
 _LEGS = (

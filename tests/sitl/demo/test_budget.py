@@ -10,8 +10,10 @@ from sitl.demo.scenario import Scenario
 
 
 def test_the_ideal_flight_has_no_errors_at_all():
-    drawn = draw_errors(Scenario().ideal(), seed=3)
-    assert drawn.camera == Scenario().camera.camera()
+    ideal = Scenario().ideal()
+    drawn = draw_errors(ideal, seed=3)
+    assert drawn.camera == ideal.camera.camera()
+    assert ideal.camera.camera().readout_ms == 0
     assert drawn.lever_arm_m == (0.0, 0.0, 0.0)
     assert drawn.map_shift_m == (0.0, 0.0, 0.0)
     assert drawn.realism == CameraRealism()
@@ -28,6 +30,7 @@ def test_every_error_is_drawn_and_spreads_as_the_scenario_says():
         "k1": ([d.camera.distortion[0] - nominal.distortion[0] for d in drawn], 0.003),
         "lever": ([d.lever_arm_m[1] for d in drawn], 0.05),
         "stamp": ([d.realism.stamp_offset_ms for d in drawn], 3.0),
+        "readout": ([d.realism.readout_ms - nominal.readout_ms for d in drawn], 1.0),
         "up": ([d.map_shift_m[2] for d in drawn], 0.3),
     }
     for name, (values, sigma) in spreads.items():

@@ -1,0 +1,112 @@
+"""What a camera's model leaves unknown, as an uncertainty of the poses that it leads to.
+
+No picture shows it: the residuals are as small with a principal point that is a pixel off, and the
+position is a quarter of a metre beside at 120 m, in every frame alike.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from pydantic import BaseModel, ConfigDict, Field
+
+from localizer.geometry.camera import Camera
+from localizer.geometry.pose import Array, Pose
+from localizer.geometry.shutter import Sweep
+
+_POINTS = 400  # enough for a mean
+_LEAST_EIGENVALUE = 1e-9  # of the scaled normal equations, below which no pose is determined
+
+
+class CalibrationSigmas(BaseModel):
+    """One sigma of each number of the camera's model, as its calibration leaves them."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
+
+    focal_percent: float = Field(0.1, ge=0, le=20, description="of the focal length")
+    principal_percent: float = Field(
+        0.11, ge=0, le=20, description="of the principal point, per axis, of the picture's width"
+    )
+    distortion: float = Field(0.003, ge=0, le=1, description="of k1; k2 as much, p1, p2 a tenth")
+    readout_ms: float = Field(1.0, ge=0, le=100, description="of a rolling shutter's readout")
+    stamp_ms: float = Field(4.0, ge=0, le=1000, description="of the frames' time stamps")
+
+    @classmethod
+    def none(cls) -> CalibrationSigmas:
+        """Of a camera that is known exactly."""
+        return cls(
+            focal_percent=0, principal_percent=0, distortion=0, readout_ms=0, stamp_ms=0
+        )  # fmt: skip
+
+
+def calibration_covariance(
+    sigmas: CalibrationSigmas, points_world: Array, pose: Pose, camera: Camera,
+    sweep: Sweep | None, moving: tuple[Array, Array],
+) -> Array:  # fmt: skip
+    """Covariance (6, 6), as `PosePrior`'s, of a registered pose by the model's errors.
+
+    Each number that is off by a sigma moves every point's pixel; the pose gives way by least
+    squares over the points in view, ``(sum J'J)^-1 sum J'c``, and the numbers fail independently.
+    A late stamp moves the pose along its motion.
+
+    points_world: (N, 3), what was registered against. camera: the pinhole of the registration;
+    sweep: see `Sweep`, with the readout of `camera`; moving: velocity (3,), m/s, and angular rate
+    (3,), rad/s, world axes.
+    """
+    stamped = 1e-3 * sigmas.stamp_ms * np.concatenate(moving)
+    late = np.outer(stamped, stamped)
+    step = max(1, len(points_world) // _POINTS)
+    points = points_world[::step]
+    pixels, inside = camera.project(pose.inverse.apply(points))
+    points, pixels = points[inside], pixels[inside]
+    if len(points) < 6:
+        return late
+    J = _pixel_motion(points, pose, camera)
+    shifts = _pixel_shifts(sigmas, points, pixels, pose, camera, sweep)
+    normal = np.einsum("nai,naj->ij", J, J)
+    scale = 1.0 / np.sqrt(np.maximum(np.diag(normal), 1e-300))
+    scaled = normal * np.outer(scale, scale)
+    if np.linalg.eigvalsh(scaled)[0] < _LEAST_EIGENVALUE:
+        return late
+    gained = np.einsum("nai,nak->ik", J, shifts)
+    effects = scale[:, None] * np.linalg.solve(scaled, scale[:, None] * gained)
+    covariance: Array = effects @ effects.T + late
+    return covariance
+
+
+def _pixel_motion(points: Array, pose: Pose, camera: Camera) -> Array:
+    """(N, 2, 6): pixels by the camera's position and left rotation vector, world axes."""
+    R, away = pose.rotation, points - pose.translation
+    x, y, z = (away @ R).T
+    by_point = np.zeros((len(points), 2, 3))
+    by_point[:, 0, 0], by_point[:, 0, 2] = camera.fx / z, -camera.fx * x / z**2
+    by_point[:, 1, 1], by_point[:, 1, 2] = camera.fy / z, -camera.fy * y / z**2
+    in_world = by_point @ R.T
+    turned = np.cross(in_world, away[:, None, :])  # row' (away x turn) = (row x away)' turn
+    return np.concatenate([-in_world, turned], axis=2)
+
+
+def _pixel_shifts(
+    sigmas: CalibrationSigmas, points: Array, pixels: Array, pose: Pose, camera: Camera,
+    sweep: Sweep | None,
+) -> Array:  # fmt: skip
+    """(N, 2, K): by how much each of K numbers, off by its sigma, moves the points' pixels."""
+    f = np.array([camera.fx, camera.fy])
+    x, y = ((pixels - (camera.cx, camera.cy)) / f).T
+    r2, none = x * x + y * y, np.zeros(len(points))
+    centre = 0.01 * sigmas.principal_percent * camera.width
+    focal, radial = 0.01 * sigmas.focal_percent, sigmas.distortion
+    tangential = 0.1 * radial
+    columns = [
+        np.stack([none + centre, none], axis=1),
+        np.stack([none, none + centre], axis=1),
+        focal * f * np.stack([x, y], axis=1),
+        radial * f * np.stack([x * r2, y * r2], axis=1),
+        radial * f * np.stack([x * r2 * r2, y * r2 * r2], axis=1),
+        tangential * f * np.stack([2 * x * y, r2 + 2 * y * y], axis=1),
+        tangential * f * np.stack([r2 + 2 * x * x, 2 * x * y], axis=1),
+    ]
+    if sweep is not None and camera.readout_ms > 0:
+        swept, _ = camera.project(pose.inverse.apply(sweep.seen(points, pose, camera)))
+        columns.append((swept - pixels) * (sigmas.readout_ms / camera.readout_ms))
+    shifts: Array = np.nan_to_num(np.stack(columns, axis=2))
+    return shifts

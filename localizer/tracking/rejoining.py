@@ -1,0 +1,59 @@
+"""When the map is right and the carried pose is not: the way back that the gate would refuse.
+
+The odometry carries a pose on as exactly as it began. Begun a few metres wrong, it holds that error
+for good, sure of itself, and every right answer of the map fails the gate. So the map's answers
+are followed beside it: those that move as the odometry does, whose motion owes the map nothing,
+over a way on which a wrong match would have changed, count against the place that is carried.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from localizer.geometry.pose import Array, Pose
+from localizer.integrity.acceptance import IntegrityConfig
+from localizer.integrity.confirmation import Probation, Verdict, Witness, weigh
+
+_LEAST_RUN = 8  # answers in a row
+_DRIFT_SIGMA_M = 0.2  # of the odometry over such a way
+
+
+@dataclass(frozen=True)
+class Rejoining:
+    """A run of the map's answers beside a carried pose: immutable, `with_answer` gives the next.
+
+    begun: the run's first answer; carried: the odometry's position (3,) then.
+    """
+
+    begun: Probation | None = None
+    carried: Array | None = None
+    answers: int = 0
+    confirmed: bool = False
+
+    def with_answer(
+        self, pose: Pose, covariance: Array, time_ns: int, carried: Pose, rotation: Array | None,
+        config: IntegrityConfig,
+    ) -> Rejoining:  # fmt: skip
+        """After one more answer that is good in itself. rotation: the autopilot's account of the
+        camera's, or None.
+        """
+        first = Rejoining(Probation(pose, covariance, time_ns), carried.translation, 1)
+        if self.begun is None or self.carried is None:
+            return first
+        way = (carried.translation - self.carried, _DRIFT_SIGMA_M)
+        verdict = weigh(self.begun, pose, covariance, time_ns, Witness(rotation, way), config)
+        if verdict is Verdict.CONTRADICTED or self._jumps(pose, way[0], covariance):
+            return first
+        answers = self.answers + 1
+        confirmed = verdict is Verdict.CONFIRMED and answers >= _LEAST_RUN
+        return replace(self, answers=answers, confirmed=self.confirmed or confirmed)
+
+    def _jumps(self, pose: Pose, way: Array, covariance: Array) -> bool:
+        """Whether this answer lies elsewhere than the run's others, but for their own noise."""
+        if self.begun is None:
+            return False
+        moved = pose.translation - self.begun.world_from_camera.translation
+        own = float(np.sqrt((self.begun.covariance + covariance).diagonal()[:3].max()))
+        return float(np.linalg.norm(moved - way)) > 3.0 * (own + _DRIFT_SIGMA_M)
