@@ -41,3 +41,7 @@ class RecordError(CompanionError):
 
 class DetectionError(CompanionError):
     """A datagram that is not a pixel detection."""
+
+
+class MissionFileError(CompanionError):
+    """A mission that cannot be read, or that does not lie where the map is."""

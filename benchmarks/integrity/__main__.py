@@ -21,12 +21,13 @@ from dataclasses import asdict
 from pathlib import Path
 
 from benchmarks.common.arguments import Parser, number, output
+from benchmarks.common.deadline import deadline
 from benchmarks.common.named_errors import named_errors, needs_torch
 
 with needs_torch():
     from benchmarks.integrity.maps import SETS, SHIFT_M, TUNING, load_set
     from benchmarks.integrity.report import by_condition, plot, rows, table
-    from benchmarks.integrity.run import Outcome, deadline, read, run_set, turn
+    from benchmarks.integrity.run import Outcome, read, run_set, turn
 from localizer.integrity.acceptance import IntegrityConfig
 
 _TURN = 8  # views of a set before it is the next one's turn

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack
 from dataclasses import asdict, dataclass, fields, replace
@@ -204,12 +203,6 @@ def read(path: Path) -> list[Outcome]:
     if any(set(row) != names for row in rows):
         raise SequenceError(f"{path}: not a file of this benchmark: begin anew without it")
     return [Outcome(**row) for row in rows if row["view"] not in cut]
-
-
-def deadline(minutes: float) -> Callable[[], bool]:
-    """Whether so many minutes from now have not passed."""
-    end = time.monotonic() + 60.0 * minutes
-    return lambda: time.monotonic() < end
 
 
 def turn(more_time: Callable[[], bool], count: int) -> Callable[[], bool]:

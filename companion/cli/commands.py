@@ -1,9 +1,9 @@
-"""The command line: ``companion run | eval | localize | convert | replay | report | export |
+"""The command line: ``companion run | plan | eval | localize | convert | replay | report | export |
 console | map | world | doctor | key | self-test``.
 
-Exit codes: 0 done; 1 `doctor` found advice, `replay` differs, `localize` localized nothing or `map
-verify` found damage; 2 wrong usage, a named error, or `doctor` found the vehicle not fit to fly;
-130 interrupted (`run` that was flying ends with 0).
+Exit codes: 0 done; 1 `doctor` found advice, `plan` a leg on which vision will not do, `replay`
+differs, `localize` localized nothing or `map verify` found damage; 2 wrong usage, a named error, or
+`doctor` found the vehicle not fit to fly; 130 interrupted (`run` that was flying ends with 0).
 """
 
 from __future__ import annotations
@@ -16,6 +16,7 @@ import typer
 from rich.console import Console
 from rich.markup import escape
 
+from companion.cli.before.plan import plan_command
 from companion.cli.console import console_command
 from companion.cli.convert import convert_command
 from companion.cli.doctor import doctor_command, self_test_command
@@ -60,6 +61,7 @@ def _options(
 
 
 app.command("run")(run_command)
+app.command("plan")(plan_command)
 app.command("eval")(evaluate_command)
 app.command("localize")(localize_command)
 app.command("convert")(convert_command)

@@ -1,167 +1,25 @@
-"""Missions as ground stations save them: QGroundControl's ``.plan`` (JSON) and ``.waypoints``
-(``QGC WPL 110``, also Mission Planner's), as the waypoints that a rehearsal flies.
-"""
+"""The missions of `companion.planning.mission`, as far as a rehearsal flies them."""
 
 from __future__ import annotations
 
-import json
-import math
-from collections.abc import Iterator
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
-from pymavlink.dialects.v20 import ardupilotmega as mavlink
-
+from companion.errors import MissionFileError
+from companion.planning import mission as saved
+from companion.planning.mission import HeightAbove, PlannedMission
 from sitl.demo.scenario import ScenarioError
-
-_PLACES = (
-    mavlink.MAV_CMD_NAV_WAYPOINT,
-    mavlink.MAV_CMD_NAV_SPLINE_WAYPOINT,
-    mavlink.MAV_CMD_NAV_LOITER_UNLIM,
-    mavlink.MAV_CMD_NAV_LOITER_TIME,
-    mavlink.MAV_CMD_NAV_LOITER_TURNS,
-)
-_ENDS = (mavlink.MAV_CMD_NAV_RETURN_TO_LAUNCH, mavlink.MAV_CMD_NAV_LAND)
-_RELATIVE = (
-    mavlink.MAV_FRAME_GLOBAL_RELATIVE_ALT,
-    mavlink.MAV_FRAME_GLOBAL_RELATIVE_ALT_INT,
-)
-
-
-@dataclass(frozen=True)
-class Waypoint:
-    """A place to fly to; height_m above home; pitch_deg of the gimbal on the way there, if said."""
-
-    latitude_deg: float
-    longitude_deg: float
-    height_m: float
-    pitch_deg: float | None
-
-
-@dataclass(frozen=True)
-class PlannedMission:
-    """home: (latitude, longitude) degrees, if the file has it. returns: it ends with a return or a
-    landing. ignored: command numbers that a rehearsal does not fly.
-    """
-
-    home: tuple[float, float] | None
-    waypoints: tuple[Waypoint, ...]
-    takeoff_height_m: float | None
-    speed_m_s: float | None
-    returns: bool
-    ignored: tuple[int, ...]
-
-
-@dataclass(frozen=True)
-class _Item:
-    command: int
-    frame: int
-    parameters: tuple[float, float, float, float]
-    latitude_deg: float
-    longitude_deg: float
-    altitude_m: float
 
 
 def read_mission(path: Path) -> PlannedMission:
-    """Read either format; ScenarioError says what is wrong with a file."""
+    """Read a saved mission; ScenarioError says what is wrong with it, or cannot be rehearsed."""
     try:
-        text = path.read_text(encoding="utf-8")
-        home: tuple[float, float] | None
-        if path.suffix == ".plan":
-            home, items = _plan(json.loads(text))
-        else:
-            home, items = _waypoints(text)
-        return _mission(path, home, items)
-    except OSError as error:
-        raise ScenarioError(f"{path}: cannot be read: {error.strerror}") from error
-    # What a damaged or a foreign file raises while it is taken apart.
-    except (
-        ValueError, KeyError, TypeError, IndexError, AttributeError, OverflowError, RecursionError
-    ) as error:  # fmt: skip
+        planned = saved.read_mission(path)
+    except MissionFileError as error:
+        raise ScenarioError(str(error)) from error
+    strange = {w.above.value for w in planned.waypoints} - {HeightAbove.HOME.value}
+    if strange:
         raise ScenarioError(
-            f"{path}: no .plan of QGroundControl and no QGC WPL 110 file ({error})"
-        ) from error
-
-
-def _plan(document: dict[str, Any]) -> tuple[tuple[float, float], list[_Item]]:
-    mission = document["mission"]
-    home = mission["plannedHomePosition"]
-    items = [_plan_item(item) for entry in mission["items"] for item in _simple(entry)]
-    return (float(home[0]), float(home[1])), items
-
-
-def _simple(entry: dict[str, Any]) -> Iterator[dict[str, Any]]:
-    """A simple item, or those that a complex one (a survey) was turned into when it was saved."""
-    if entry["type"] == "SimpleItem":
-        yield entry
-    else:
-        yield from entry["TransectStyleComplexItem"]["Items"]
-
-
-def _plan_item(entry: dict[str, Any]) -> _Item:
-    numbers = [0.0 if p is None else float(p) for p in entry["params"]]
-    p1, p2, p3, p4, latitude, longitude, altitude = numbers
-    return _Item(
-        int(entry["command"]), int(entry["frame"]), (p1, p2, p3, p4), latitude, longitude, altitude
-    )
-
-
-def _waypoints(text: str) -> tuple[tuple[float, float] | None, list[_Item]]:
-    """Rows of index, current, frame, command, four parameters, latitude, longitude, altitude,
-    autocontinue; row 0 is home.
-    """
-    first, *lines = text.splitlines()
-    if first.split() != ["QGC", "WPL", "110"]:
-        raise ValueError(f"it begins with {first[:20]!r}")
-    items = []
-    for line in lines:
-        if not line.strip():
-            continue
-        cells = line.split()
-        p1, p2, p3, p4, latitude, longitude, altitude = (float(c) for c in cells[4:11])
-        items.append(
-            _Item(int(cells[3]), int(cells[2]), (p1, p2, p3, p4), latitude, longitude, altitude)
+            f"{path}: waypoints above {', '.join(sorted(strange))}; a rehearsal flies heights "
+            "above home (frame 3): save the mission with relative altitudes"
         )
-    home = (items[0].latitude_deg, items[0].longitude_deg) if items else None
-    return (None if home == (0.0, 0.0) else home), items[1:]
-
-
-def _mission(path: Path, home: tuple[float, float] | None, items: list[_Item]) -> PlannedMission:
-    waypoints: list[Waypoint] = []
-    takeoff = speed = pitch = None
-    returns, ignored = False, []
-    for item in items:
-        if item.command in _PLACES or item.command == mavlink.MAV_CMD_NAV_TAKEOFF:
-            _require_relative(path, item)
-        if item.command == mavlink.MAV_CMD_NAV_TAKEOFF:
-            takeoff = item.altitude_m
-        elif item.command in _PLACES:
-            place = (item.latitude_deg, item.longitude_deg, item.altitude_m)
-            if not all(math.isfinite(x) for x in place):
-                raise ValueError(f"waypoint {len(waypoints) + 1} is no place: {place}")
-            waypoints.append(Waypoint(*place, pitch))
-        elif item.command in _ENDS:
-            returns = True
-        elif item.command == mavlink.MAV_CMD_DO_CHANGE_SPEED:
-            speed = item.parameters[1]
-        elif item.command in (
-            mavlink.MAV_CMD_DO_GIMBAL_MANAGER_PITCHYAW,
-            mavlink.MAV_CMD_DO_MOUNT_CONTROL,
-        ):
-            pitch = item.parameters[0]
-        else:
-            ignored.append(item.command)
-    if home is not None and not all(math.isfinite(x) for x in home):
-        raise ValueError(f"home is no place: {home}")
-    if not waypoints:
-        raise ScenarioError(f"{path}: holds no waypoint")
-    return PlannedMission(home, tuple(waypoints), takeoff, speed, returns, tuple(ignored))
-
-
-def _require_relative(path: Path, item: _Item) -> None:
-    if item.frame not in _RELATIVE:
-        raise ScenarioError(
-            f"{path}: an item in frame {item.frame}; a rehearsal flies heights above home "
-            "(frame 3): save the mission with relative altitudes"
-        )
+    return planned

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
+from companion.planning.mission import PlannedMission
 from companion.preflight.coverage import covered
 from companion.settings_file import SettingsError, validated
 from localizer.geometry.geo import Geodetic, LocalFrame
@@ -16,7 +17,7 @@ from localizer.synth.plan.terrain import River, Terrain
 from localizer.synth.world import WorldInfo
 from sitl.demo.assets import FlightAssets
 from sitl.demo.scenario import Leg, Scenario, ScenarioError
-from sitl.rehearsal.mission import PlannedMission, read_mission
+from sitl.rehearsal.mission import read_mission
 
 _PITCH_DEG = -75.0  # where the mission does not say
 _SIDE = 0.5  # of the map's shorter half extent: how far the flight without a mission goes

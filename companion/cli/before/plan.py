@@ -1,0 +1,109 @@
+"""``companion plan``: where along a mission vision will do, before it is flown."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterable, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Annotated
+
+import typer
+from rich.box import SIMPLE_HEAD
+from rich.console import Console
+from rich.markup import escape
+from rich.table import Table
+
+from companion.config import load_config
+from companion.errors import ReportError
+from companion.terminal.steps import shown_count
+
+
+def plan_command(
+    mission: Annotated[
+        Path, typer.Argument(help="QGroundControl's .plan, or .waypoints (QGC WPL 110)")
+    ],
+    config: Annotated[Path, typer.Option(help="deployment YAML: camera, mount, localizer")],
+    map_cache: Annotated[
+        Path | None, typer.Option("--map", help="tile cache; else the deployment's")
+    ] = None,
+    out: Annotated[Path, typer.Option(help="folder of the report")] = Path("plan"),
+    condition: Annotated[
+        list[str] | None,
+        typer.Option(help="day, season, dusk, night, fog, rain or snow; may be repeated (day)"),
+    ] = None,
+    sigma: Annotated[
+        float, typer.Option(min=0.05, max=100, help="position sigma that will do, m")
+    ] = 1.0,
+    spacing: Annotated[
+        float, typer.Option(min=2, max=1000, help="between the places looked at, m")
+    ] = 25.0,
+    speed: Annotated[
+        float, typer.Option(min=0.1, max=100, help="where the mission does not say, m/s")
+    ] = 10.0,
+    pitch: Annotated[
+        float, typer.Option(min=-90, max=0, help="of the gimbal where the mission does not say")
+    ] = -75.0,
+    alternatives: Annotated[
+        bool, typer.Option(help="look for what would do instead on legs that will not do")
+    ] = True,
+) -> None:
+    """Forecast a mission over its map: exit code 1 if vision will not do on some leg."""
+    from companion.planning import page, pictures
+    from companion.planning.judge import Limits
+    from companion.planning.mission import read_mission
+    from companion.planning.plan import Question, aim_of, make_plan
+    from localizer.forecast.visit import FORECAST_CONDITIONS
+    from localizer.map.cache.cache import TileCache
+    from localizer.map.inspection.inspect import write_picture
+
+    conditions = tuple(dict.fromkeys(condition or ["day"]))
+    unknown = [c for c in conditions if c not in FORECAST_CONDITIONS]
+    if unknown:
+        raise typer.BadParameter(
+            f"--condition {unknown[0]}: one of {', '.join(FORECAST_CONDITIONS)}"
+        )
+    deployment = load_config(config)
+    planned = read_mission(mission)
+    cache = TileCache.open(map_cache or deployment.map)
+    try:
+        out.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise ReportError(f"--out {out}: cannot be written: {error}") from error
+    question = replace(
+        Question(mission, conditions, Limits(sigma)),
+        spacing_m=spacing, speed_m_s=speed, pitch_deg=pitch, seek=alternatives,
+    )  # fmt: skip
+    with shown_count(Console(stderr=True), "places") as count:
+        plan = make_plan(planned, cache, deployment, question, count)
+    sheet = pictures.sheet_of(plan, cache)
+    camera = deployment.camera.model.camera().without_distortion()
+    shown = (
+        ("Track", pictures.track_picture(sheet, plan)),
+        ("Ground that is seen", pictures.heat_picture(sheet, plan, cache, camera,
+                                                      aim_of(deployment, pitch))),
+    )  # fmt: skip
+    for name, (_, rgb) in zip(("track.png", "heat.png"), shown, strict=True):
+        write_picture(out / name, rgb)
+    page.write_page(plan, shown, out / "plan.html")
+    (out / "plan.json").write_text(json.dumps(page.as_data(plan), indent=1), encoding="utf-8")
+    _print("legs", page.LEG_HEADINGS, [page.leg_row(v) for v in plan.verdicts])
+    _print("to be bridged", page.STRETCH_HEADINGS, map(page.stretch_row, plan.stretches))
+    _print("what would do instead", page.INSTEAD_HEADINGS, page.instead_rows(plan))
+    for note in plan.notes:
+        Console().print(escape(note), style="dim", soft_wrap=True, highlight=False)
+    Console().print(f"{escape(page.verdict_words(plan))} {escape(str(out / 'plan.html'))}",
+                    style="green" if plan.holds else "red", soft_wrap=True)  # fmt: skip
+    raise typer.Exit(0 if plan.holds else 1)
+
+
+def _print(title: str, headings: Sequence[str], rows: Iterable[Sequence[str]]) -> None:
+    made = list(rows)
+    if not made:
+        return
+    table = Table(title=title, box=SIMPLE_HEAD)
+    for heading in headings:
+        table.add_column(heading, overflow="fold")
+    for row in made:
+        table.add_row(*map(escape, row))
+    Console().print(table)

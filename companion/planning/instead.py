@@ -1,0 +1,110 @@
+"""What would do instead, where a leg will not: other heights, gimbal angles and headings, by the
+same forecast.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from companion.planning.judge import Judged, LegVerdict
+from companion.planning.survey import Progress, Surveyor, moved
+from companion.planning.way import Sample
+
+_HEIGHT_FACTORS = (0.6, 1.5, 2.2)
+_PITCHES_DEG = (-90.0, -60.0, -45.0)
+_LEAST_CHANGE_DEG = 10.0
+_TURNS_DEG = (90.0, 180.0)
+_LOWEST_M, _HIGHEST_M = 25.0, 300.0  # above the ground that is seen
+_SAMPLES = 2  # of a leg, the worst
+_LEGS = 12  # the longest of those that will not do
+
+
+@dataclass(frozen=True)
+class Change:
+    """Fly so much higher, with the gimbal at this pitch, the camera turned from the way by so much
+    (all as in `Sample`). words: for the pilot.
+    """
+
+    rise_m: float
+    pitch_deg: float
+    turn_deg: float
+    words: str
+
+
+@dataclass(frozen=True)
+class Instead:
+    """The best change for a leg. risk: the largest of its samples with it, 0 to 1; holds: whether
+    they all hold then.
+    """
+
+    leg: str
+    change: Change
+    risk: float
+    sigma_m: float
+    holds: bool
+
+
+def instead(
+    surveyor: Surveyor, verdicts: Sequence[LegVerdict], fixed: bool, progress: Progress | None
+) -> tuple[Instead, ...]:
+    """For each of the longest legs that will not do, the change with the least risk, if any lowers
+    it. fixed: whether the camera cannot be turned but with the vehicle.
+    """
+    bad = sorted(
+        (v for v in verdicts if not v.holds), key=lambda v: -(1 - v.share) * v.leg.length_m
+    )[:_LEGS]
+    tried: list[tuple[LegVerdict, Change, list[Sample]]] = []
+    for verdict in bad:
+        worst = sorted((j for j in verdict.judged if not j.holds), key=lambda j: -j.forecast.risk)[
+            :_SAMPLES
+        ]
+        for change in changes(worst[0], fixed):
+            samples = [
+                moved(j.sample, change.rise_m, change.pitch_deg, change.turn_deg) for j in worst
+            ]
+            tried.append((verdict, change, samples))
+    judged = iter(surveyor.judged([s for _, _, part in tried for s in part], progress))
+    found: dict[str, Instead] = {}
+    for verdict, change, samples in tried:
+        results = [next(judged) for _ in samples]
+        option = _option(verdict.leg.name, change, results)
+        best = found.get(option.leg)
+        if option.risk < verdict.worst.forecast.risk and (
+            best is None or (not option.holds, option.risk) < (not best.holds, best.risk)
+        ):
+            found[option.leg] = option
+    return tuple(found[v.leg.name] for v in bad if v.leg.name in found)
+
+
+def changes(worst: Judged, fixed: bool) -> list[Change]:
+    """What may be tried at a sample; only heights and headings of a fixed camera."""
+    sample, ground = worst.sample, worst.forecast.ground_m
+    options = []
+    above = ground * abs(float(np.sin(np.radians(sample.pitch_deg)))) if ground else 0.0
+    for factor in _HEIGHT_FACTORS if above else ():
+        height = above * factor
+        if _LOWEST_M <= height <= _HIGHEST_M:
+            rise = height - above
+            words = f"{abs(rise):.0f} m {'higher' if rise > 0 else 'lower'}"
+            options.append(Change(rise, sample.pitch_deg, 0.0, words))
+    if not fixed:
+        options += [
+            Change(0.0, pitch, 0.0, f"gimbal at {pitch:.0f}°")
+            for pitch in _PITCHES_DEG
+            if abs(pitch - sample.pitch_deg) >= _LEAST_CHANGE_DEG
+        ]
+    options += [
+        Change(0.0, sample.pitch_deg, turn, f"camera {turn:.0f}° from the way")
+        for turn in _TURNS_DEG
+    ]
+    return options
+
+
+def _option(leg: str, change: Change, results: Sequence[Judged]) -> Instead:
+    worst = max(results, key=lambda j: (not j.holds, j.forecast.risk))
+    return Instead(
+        leg, change, worst.forecast.risk, worst.forecast.sigma_m, all(j.holds for j in results)
+    )

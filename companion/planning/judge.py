@@ -1,0 +1,144 @@
+"""What a forecast means for a flight: verdicts of samples and legs, and what must be bridged."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from enum import Enum
+
+import numpy as np
+
+from companion.planning.way import Leg, Sample
+from localizer.forecast.forecast import ViewForecast
+from localizer.forecast.risk import RISK_LIMIT
+from localizer.odometry.config import GrowthModel
+
+_LEAST_MAP_SHARE = 0.5  # of the picture: with less it is the map that ends
+_LIKENESS = 0.7  # of another place's match, beyond which it may be taken for this one
+
+
+class Reason(Enum):
+    """Why a place will not do."""
+
+    NONE = "holds"
+    NO_MAP = "no map in view"
+    EDGE = "the map ends in view"
+    ALIKE = "another place looks like it"
+    SIGMA = "sigma beyond the limit"
+    WEAK = "too little to match"
+
+
+@dataclass(frozen=True)
+class Limits:
+    """sigma_m: of the position, one axis, that the mission can live with; risk: share of pictures
+    that may be lost or wrong.
+    """
+
+    sigma_m: float = 1.0
+    risk: float = RISK_LIMIT
+
+
+@dataclass(frozen=True)
+class Judged:
+    """A sample with the worst of its forecasts, over the conditions."""
+
+    sample: Sample
+    forecast: ViewForecast
+    reason: Reason
+
+    @property
+    def holds(self) -> bool:
+        """Whether vision will do there."""
+        return self.reason is Reason.NONE
+
+
+@dataclass(frozen=True)
+class LegVerdict:
+    """A leg's samples, judged. holds: of all of them; share: of the samples that hold."""
+
+    leg: Leg
+    judged: tuple[Judged, ...]
+
+    @property
+    def holds(self) -> bool:
+        """Whether every sample holds."""
+        return all(j.holds for j in self.judged)
+
+    @property
+    def share(self) -> float:
+        """Of the samples that hold."""
+        return float(np.mean([j.holds for j in self.judged]))
+
+    @property
+    def worst(self) -> Judged:
+        """The sample with the largest risk."""
+        return max(self.judged, key=lambda j: (not j.holds, j.forecast.risk))
+
+    @property
+    def sigma_m(self) -> float:
+        """Median over the samples that hold; NaN where none does."""
+        held = [j.forecast.sigma_m for j in self.judged if j.holds]
+        return float(np.median(held)) if held else math.nan
+
+
+@dataclass(frozen=True)
+class Stretch:
+    """A way on which vision is not to be had. begin_m, end_m: of the mission's way; drift_m: sigma
+    of the position (horizontal, one axis) after it if odometry carries it; can_bridge: whether
+    that stays below the odometry's end.
+    """
+
+    begin_m: float
+    end_m: float
+    seconds: float
+    drift_m: float
+    can_bridge: bool
+
+    @property
+    def length_m(self) -> float:
+        """Of the way."""
+        return self.end_m - self.begin_m
+
+
+def judge(sample: Sample, forecasts: Sequence[ViewForecast], limits: Limits) -> Judged:
+    """The sample under the condition that it fares worst in."""
+    worst = max(forecasts, key=lambda f: (_reason(f, limits) is not Reason.NONE, f.risk, f.sigma_m))
+    return Judged(sample, worst, _reason(worst, limits))
+
+
+def _reason(forecast: ViewForecast, limits: Limits) -> Reason:
+    if forecast.ground_m == 0.0:
+        return Reason.NO_MAP
+    risky = forecast.risk > limits.risk
+    if risky and forecast.figures.map_share < _LEAST_MAP_SHARE:
+        return Reason.EDGE
+    if forecast.rival.share > _LIKENESS:
+        return Reason.ALIKE
+    if risky:
+        return Reason.WEAK
+    return Reason.SIGMA if forecast.sigma_m > limits.sigma_m else Reason.NONE
+
+
+def stretches(
+    verdicts: Sequence[LegVerdict], speed_m_s: float, growth: GrowthModel, longest_sigma_m: float
+) -> tuple[Stretch, ...]:
+    """What must be bridged, in the order of the way; neighbouring samples are one stretch."""
+    found: list[tuple[float, float]] = []
+    for verdict in verdicts:
+        half = verdict.leg.step_m / 2
+        for judged in (j for j in verdict.judged if not j.holds):
+            begin, end = judged.sample.way_m - half, judged.sample.way_m + half
+            if found and begin - found[-1][1] < 1e-6 + 0.01 * half:
+                found[-1] = (found[-1][0], end)
+            else:
+                found.append((begin, end))
+    return tuple(_stretch(b, e, speed_m_s, growth, longest_sigma_m) for b, e in found)
+
+
+def _stretch(
+    begin_m: float, end_m: float, speed_m_s: float, growth: GrowthModel, longest_sigma_m: float
+) -> Stretch:
+    length = end_m - begin_m
+    drift = math.hypot(growth.horizontal * math.sqrt(length), growth.scale * length)
+    return Stretch(begin_m, end_m, length / speed_m_s, drift, drift <= longest_sigma_m)

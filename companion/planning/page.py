@@ -1,0 +1,181 @@
+"""A plan as one HTML page that needs no other file, and as plain data."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Sequence
+from html import escape
+from pathlib import Path
+from typing import Any
+
+from companion.errors import ReportError
+from companion.planning.judge import LegVerdict, Stretch
+from companion.planning.plan import Plan
+from companion.reporting.layout import data_uri
+from localizer.types import Image
+
+_CSS = """
+body{font:15px/1.45 system-ui,sans-serif;max-width:1080px;margin:2em auto;
+padding:0 1em;color:#1c2430}
+h1{font-size:1.5em;margin-bottom:.2em}table{border-collapse:collapse;margin:.6em 0}
+td,th{border:1px solid #c9d0d8;padding:.25em .6em;text-align:left}th{background:#eef1f4}
+tr.bad td{background:#fbe4e4}.verdict{font-size:1.15em;padding:.5em .8em;border-left:6px solid}
+.ok{border-color:#2a9d4a;background:#e8f5ec}.no{border-color:#c62828;background:#fbe4e4}
+img{width:100%;max-width:1000px;border:1px solid #c9d0d8}small{color:#5b6470}
+"""
+LEG_HEADINGS = (
+    "leg", "m", "holds", "sigma m", "lost or wrong", "map", "like it", "in", "why not"
+)  # fmt: skip
+STRETCH_HEADINGS = ("from m", "to m", "length m", "seconds", "drift m", "odometry")
+INSTEAD_HEADINGS = ("leg", "fly", "lost or wrong", "sigma m", "holds then")
+
+
+def verdict_words(plan: Plan) -> str:
+    """The answer in a sentence."""
+    bad = [v for v in plan.verdicts if not v.holds]
+    limits = plan.question.limits
+    if not bad:
+        return (
+            f"Vision should hold on all {len(plan.verdicts)} legs "
+            f"({plan.length_m / 1000:.1f} km), sigma below {limits.sigma_m:g} m."
+        )
+    lost = sum(s.length_m for s in plan.stretches)
+    return (
+        f"Vision will not do on {len(bad)} of {len(plan.verdicts)} legs: {lost:.0f} of "
+        f"{plan.length_m:.0f} m have to be bridged or flown otherwise."
+    )
+
+
+def leg_row(verdict: LegVerdict) -> tuple[str, ...]:
+    """A leg as cells; its worst place says why."""
+    worst = verdict.worst
+    forecast = worst.forecast
+    return (
+        verdict.leg.name,
+        f"{verdict.leg.length_m:.0f}",
+        f"{100 * verdict.share:.0f} %",
+        "none" if math.isnan(verdict.sigma_m) else f"{verdict.sigma_m:.2f}",
+        f"{100 * forecast.risk:.0f} %",
+        f"{100 * forecast.figures.map_share:.0f} %",
+        f"{100 * forecast.rival.share:.0f} %",
+        forecast.condition,
+        "" if worst.holds else worst.reason.value,
+    )
+
+
+def stretch_row(stretch: Stretch) -> tuple[str, ...]:
+    """A stretch as cells."""
+    return (
+        f"{stretch.begin_m:.0f}",
+        f"{stretch.end_m:.0f}",
+        f"{stretch.length_m:.0f}",
+        f"{stretch.seconds:.0f}",
+        f"{stretch.drift_m:.1f}",
+        "carries it" if stretch.can_bridge else "ends before",
+    )
+
+
+def instead_rows(plan: Plan) -> list[tuple[str, ...]]:
+    """What would do instead, as cells."""
+    return [
+        (
+            i.leg,
+            i.change.words,
+            f"{100 * i.risk:.0f} %",
+            f"{i.sigma_m:.2f}",
+            "yes" if i.holds else "better, but no",
+        )
+        for i in plan.instead
+    ]
+
+
+def as_data(plan: Plan) -> dict[str, Any]:
+    """For other programs: what was asked, and every leg, sample and stretch."""
+    q = plan.question
+    return {
+        "mission": str(q.mission_file),
+        "conditions": list(q.conditions),
+        "sigma_limit_m": q.limits.sigma_m,
+        "risk_limit": q.limits.risk,
+        "holds": plan.holds,
+        "length_m": plan.length_m,
+        "speed_m_s": plan.speed_m_s,
+        "legs": [
+            {
+                "name": v.leg.name,
+                "length_m": v.leg.length_m,
+                "holds": v.holds,
+                "samples": [
+                    {
+                        "way_m": j.sample.way_m,
+                        "position_enu_m": [float(x) for x in j.sample.position],
+                        "condition": j.forecast.condition,
+                        "risk": j.forecast.risk,
+                        "sigma_m": j.forecast.sigma_m,
+                        "map_share": j.forecast.figures.map_share,
+                        "texture": j.forecast.texture,
+                        "likest_place": j.forecast.rival.share,
+                        "reason": j.reason.value,
+                    }
+                    for j in v.judged
+                ],
+            }
+            for v in plan.verdicts
+        ],
+        "stretches": [
+            {"begin_m": s.begin_m, "end_m": s.end_m, "seconds": s.seconds, "drift_m": s.drift_m}
+            for s in plan.stretches
+        ],
+        "instead": [
+            {"leg": i.leg, "fly": i.change.words, "risk": i.risk, "holds": i.holds}
+            for i in plan.instead
+        ],
+        "notes": list(plan.notes),
+    }
+
+
+def write_page(plan: Plan, pictures: Sequence[tuple[str, Image]], path: Path) -> None:
+    """Write the page. ReportError where it cannot be written."""
+    q = plan.question
+    shown = "".join(
+        f'<h2>{escape(title)}</h2><img alt="{escape(title)}" src="{data_uri(rgb)}">'
+        for title, rgb in pictures
+    )
+    bad = {k for k, v in enumerate(plan.verdicts) if not v.holds}
+    body = (
+        f"<h1>Forecast of {escape(q.mission_file.name)}</h1>"
+        f"<p class='verdict {'no' if bad else 'ok'}'>{escape(verdict_words(plan))}</p>"
+        f"<p>Under {escape(', '.join(q.conditions))}; sigma to {q.limits.sigma_m:g} m, at most "
+        f"{100 * q.limits.risk:.0f} % of the pictures lost or more than 1 m wrong.</p>"
+        + "<h2>Legs</h2>"
+        + _table(LEG_HEADINGS, map(leg_row, plan.verdicts), bad)
+        + _part("To be bridged", STRETCH_HEADINGS, map(stretch_row, plan.stretches))
+        + _part("What would do instead", INSTEAD_HEADINGS, instead_rows(plan))
+        + shown
+        + "<ul>"
+        + "".join(f"<li><small>{escape(note)}</small>" for note in plan.notes)
+        + "</ul>"
+    )
+    text = (
+        '<!doctype html><html lang="en"><meta charset="utf-8"><title>Forecast</title>'
+        f"<style>{_CSS}</style><body>{body}</body></html>"
+    )
+    try:
+        # A file's name may hold half a character (a lone surrogate).
+        path.write_bytes(text.encode("utf-8", "replace"))
+    except OSError as error:
+        raise ReportError(f"{path}: cannot be written: {error}") from error
+
+
+def _part(title: str, headings: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
+    made = list(rows)
+    return f"<h2>{escape(title)}</h2>{_table(headings, made, set())}" if made else ""
+
+
+def _table(headings: Sequence[str], rows: Iterable[Sequence[str]], bad: set[int]) -> str:
+    head = "".join(f"<th>{escape(h)}" for h in headings)
+    body = "".join(
+        f"<tr{' class=bad' if k in bad else ''}>" + "".join(f"<td>{escape(c)}" for c in row)
+        for k, row in enumerate(rows)
+    )
+    return f"<table><tr>{head}{body}</table>"

@@ -1,0 +1,100 @@
+"""The forecasts along a mission, on as many threads as there are to be used."""
+
+from __future__ import annotations
+
+import itertools
+import os
+import queue
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import ExitStack, contextmanager
+from dataclasses import replace
+
+from companion.config import CompanionConfig
+from companion.planning.judge import Judged, Limits, judge
+from companion.planning.way import Aim, Sample, camera_pose
+from localizer.features.detail import DetailExtractor
+from localizer.features.extractor import load_extractor
+from localizer.forecast.forecast import Forecaster
+from localizer.map.cache.cache import TileCache
+from localizer.map.cache.stream import TileStreamer
+from localizer.registration.jngo import JNGO
+from localizer.render.numba_raster import NumbaRenderer
+
+Progress = Callable[[int, int], None]
+_MOST_THREADS = 8
+
+
+class Surveyor:
+    """Judges samples; `surveyor` makes one.
+
+    Each thread takes a forecaster for itself: renderers, networks and optimizers are used by one
+    thread at a time.
+    """
+
+    def __init__(
+        self,
+        cache: TileCache,
+        aim: Aim,
+        conditions: tuple[str, ...],
+        limits: Limits,
+        forecasters: Sequence[Forecaster],
+    ) -> None:
+        self._cache, self._aim = cache, aim
+        self._conditions, self._limits = conditions, limits
+        self._idle: queue.SimpleQueue[Forecaster] = queue.SimpleQueue()
+        for forecaster in forecasters:
+            self._idle.put(forecaster)
+        self._threads = len(forecasters)
+
+    def judged(self, samples: Sequence[Sample], progress: Progress | None = None) -> list[Judged]:
+        """The samples in their order; the same samples give the same."""
+        made = []
+        with ThreadPoolExecutor(self._threads, "forecast") as pool:
+            for done, judged in enumerate(pool.map(self._one, itertools.count(), samples), 1):
+                made.append(judged)
+                if progress is not None:
+                    progress(done, len(samples))
+        return made
+
+    def _one(self, number: int, sample: Sample) -> Judged:
+        pose = camera_pose(sample, self._cache, self._aim)
+        forecaster = self._idle.get()
+        try:
+            return judge(sample, forecaster.at(pose, self._conditions, number), self._limits)
+        finally:
+            self._idle.put(forecaster)
+
+
+@contextmanager
+def surveyor(
+    cache: TileCache,
+    deployment: CompanionConfig,
+    aim: Aim,
+    conditions: tuple[str, ...],
+    limits: Limits,
+) -> Iterator[Surveyor]:
+    """A surveyor over an open map, with a thread for each processor that this process may use.
+
+    It computes on the CPU, so that every machine forecasts alike.
+    """
+    threads = min(len(os.sched_getaffinity(0)), _MOST_THREADS)
+    config, camera = deployment.localizer, deployment.camera.model.camera()
+    forecasters = []
+    with ExitStack() as stack:
+        for _ in range(threads):
+            budget = config.cache_mib * 2**20 // threads
+            streamer = stack.enter_context(TileStreamer(cache, byte_budget=budget))
+            renderer = NumbaRenderer(streamer, 1)
+            stack.callback(renderer.close)
+            extractor = DetailExtractor(load_extractor(config.model, threads=1))
+            optimizer = JNGO(config.registration, threads=1)
+            forecasters.append(Forecaster(renderer, extractor, optimizer, camera, config))
+        yield Surveyor(cache, aim, conditions, limits, forecasters)
+
+
+def moved(sample: Sample, rise_m: float, pitch_deg: float, turn_deg: float) -> Sample:
+    """The sample flown higher or lower, looking elsewhere."""
+    position = sample.position.copy()
+    position[2] += rise_m
+    return replace(sample, position=position, pitch_deg=pitch_deg, turn_deg=turn_deg)

@@ -1,0 +1,52 @@
+"""From what a simulated registration says to what a flight would: fitted on worlds, not derived.
+
+`SIGMA_FACTOR` and `WEIGHTS` come from ``python -m benchmarks.planning FOLDER --fit`` on its worlds
+for tuning; its held-out worlds had no part in them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from localizer.geometry.pose import Array
+
+RIGHT_M = 1.0  # beyond it a position is not "right"
+WORST_M = 10.0  # sigmas and errors beyond it count as this
+RISK_LIMIT = 0.2  # share of pictures lost or wrong beyond which a place will not do
+
+SIGMA_FACTOR = 0.704
+"""Position error in flight over the simulated registration's sigma, root mean square."""
+
+WEIGHTS = (0.493, 0.513, -0.109, 0.0, -1.816, 1.197, 0.218)
+"""Of the logistic model: constant, then those of `predictors`."""
+
+
+@dataclass(frozen=True)
+class Figures:
+    """Of some draws at one view. sigma_m: median position sigma (one axis, rms), not yet scaled;
+    agreement, quality: means; map_share: of the picture; failed: share of the draws that were
+    refused or more than `RIGHT_M` off; error_m: their mean error, at most `WORST_M`.
+    """
+
+    sigma_m: float
+    agreement: float
+    quality: float
+    map_share: float
+    failed: float
+    error_m: float
+
+
+def predictors(figures: Figures) -> Array:
+    """(6,) what the logistic model weighs."""
+    f = figures
+    sigma, error = (np.log(np.clip(x, 0.01, WORST_M)) for x in (f.sigma_m, f.error_m))
+    return np.array([sigma, f.agreement, f.quality, f.map_share, f.failed, error])
+
+
+def failure_risk(figures: Figures, weights: Sequence[float] = WEIGHTS) -> float:
+    """Probability, 0 to 1, that a picture taken there is refused or more than `RIGHT_M` off."""
+    constant, *slopes = weights
+    return float(1.0 / (1.0 + np.exp(-(constant + np.dot(slopes, predictors(figures))))))

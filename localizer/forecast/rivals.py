@@ -1,0 +1,68 @@
+"""Whether another place looks like this one: the best match at displaced poses."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from localizer.geometry.pose import Array, Pose
+from localizer.registration.backend import LevelProblem, camera_from_local, world_from_camera
+from localizer.registration.covariance import apart_px, mean_motion, pose_differences
+from localizer.registration.cpu.reference import in_view, project, projection_jacobian
+from localizer.registration.jngo import JNGO
+from localizer.registration.selection import quality, thinned
+
+_RINGS = (0.08, 0.16, 0.3, 0.45)  # of the ground's width in view
+_BEARINGS = 12
+_ITERATIONS = (3, 3)  # Levenberg-Marquardt steps on the coarsest and on the finest network level
+_ANCHORS = 250
+
+
+@dataclass(frozen=True)
+class Rival:
+    """The likest other place. share: its match over the true one's, 0 (chance) to 1 (the same);
+    distance_m: how far off it is, 0 without one.
+    """
+
+    share: float
+    distance_m: float
+
+
+def likest_rival(
+    optimizer: JNGO, levels: tuple[LevelProblem, ...], origin: Array, truth: Pose, width_m: float
+) -> Rival:
+    """The best mode that displaced poses run into, away from the true one.
+
+    levels: of the query, coarse to fine, the network's; origin: (3,) of their local frame;
+    width_m: of the ground in view.
+    """
+    angles = np.arange(_BEARINGS) * 2 * np.pi / _BEARINGS
+    ring = np.stack([np.cos(angles), np.sin(angles), np.zeros(_BEARINGS)], axis=1)
+    steps = np.concatenate([factor * width_m * ring for factor in _RINGS])
+    R, t = camera_from_local(
+        np.repeat(truth.rotation[None], len(steps), axis=0), truth.translation + steps, origin
+    )
+    settings = optimizer.config.settings
+    for level, iterations in zip((levels[0], levels[-1]), _ITERATIONS, strict=True):
+        found = optimizer.backend.refine(thinned(level, _ANCHORS), R, t, iterations, settings)
+        R, t = found.rotations, found.translations
+    rotation, translation = camera_from_local(truth.rotation[None], truth.translation[None], origin)
+    here, there = rotation[0], translation[0]
+    fine = levels[-1]
+    differences = pose_differences(*world_from_camera(R, t, origin), truth)
+    apart = apart_px(differences, here, there, _motion(thinned(fine, _ANCHORS), here, there))
+    scores = np.where(apart > optimizer.config.mode_px, found.scores, np.inf)
+    best = int(np.argmin(scores))
+    own = quality(fine, here, there, settings)
+    if not np.isfinite(scores[best]) or own <= 0:
+        return Rival(0.0, 0.0)
+    other = quality(fine, R[best], t[best], settings)
+    return Rival(min(other / own, 1.0), float(np.linalg.norm(differences[best, :3])))
+
+
+def _motion(problem: LevelProblem, rotation: Array, translation: Array) -> Array:
+    """(6, 6) of `CovarianceSums.motion` at a pose."""
+    x, uv = project(problem, rotation, translation)
+    seen = in_view(problem, x, uv)
+    return mean_motion(projection_jacobian(problem, x[seen], translation))

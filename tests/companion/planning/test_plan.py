@@ -1,0 +1,200 @@
+"""A mission from a ground station's file to legs, verdicts, pictures and an exit code."""
+
+import json
+import math
+
+import cv2
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+from companion.cli.commands import app
+from companion.errors import MissionFileError
+from companion.geometry import Mount
+from companion.planning.instead import changes
+from companion.planning.judge import Judged, LegVerdict, Limits, Reason, judge, stretches
+from companion.planning.mission import HeightAbove, read_mission
+from companion.planning.way import Aim, Ground, camera_pose, legs_of
+from localizer.forecast.forecast import ViewForecast
+from localizer.forecast.risk import Figures
+from localizer.forecast.rivals import Rival
+from localizer.map.building import build
+from localizer.map.building.options import BuildOptions
+from localizer.map.cache.cache import TileCache
+from localizer.odometry.config import OdometryConfig
+from tests.localizer.map.conftest import height, write_tileset
+
+DEPLOYMENT = """
+map: {map}
+camera:
+  source: udp://0.0.0.0:5600
+  model: {{width: 640, height: 480, fx: 500.0, fy: 500.0, cx: 320.0, cy: 240.0}}
+"""
+GIMBAL = Aim(Mount.from_degrees(), -75.0, False)
+
+
+@pytest.fixture(scope="module")
+def cache(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("map")
+    build.build_cache(write_tileset(folder), folder / "cache", BuildOptions(workers=1))
+    return TileCache.open(folder / "cache")
+
+
+def place(cache, east, north):
+    latitude, longitude, _ = cache.frame.geodetic_from_enu([east, north, 0.0])
+    return float(latitude), float(longitude)
+
+
+def item(command, *numbers, frame=3):
+    return {"type": "SimpleItem", "command": command, "frame": frame, "params": list(numbers)}
+
+
+def plan_file(path, cache, *items, home=(0, 0)):
+    mission = {"plannedHomePosition": [*place(cache, *home), 440.0], "items": list(items)}
+    path.write_text(json.dumps({"fileType": "Plan", "mission": mission}))
+    return path
+
+
+def waypoint(cache, east, north, up, frame=3):
+    return item(16, 0, 0, 0, None, *place(cache, east, north), up, frame=frame)
+
+
+def test_each_altitude_is_above_what_its_frame_says(tmp_path, cache):
+    path = plan_file(
+        tmp_path / "a.plan", cache,
+        waypoint(cache, 60, 0, 70), waypoint(cache, 60, 60, 500, frame=0),
+        waypoint(cache, 0, 60, 70, frame=10),
+    )  # fmt: skip
+    mission = read_mission(path)
+    assert [w.above for w in mission.waypoints] == [
+        HeightAbove.HOME, HeightAbove.SEA, HeightAbove.TERRAIN,
+    ]  # fmt: skip
+    legs = legs_of(mission, cache, Ground(cache), GIMBAL, 1000.0)
+    ends = [leg.samples[0].position[2] for leg in legs]  # of each leg the middle
+    home, sea = float(height(0, 0)) + 70, 500 + 47.5 - 430
+    terrain = float(height(0, 60)) + 70
+    assert ends == pytest.approx([home, (home + sea) / 2, (sea + terrain) / 2], abs=0.5)
+    assert [leg.name for leg in legs] == ["home to 1", "1 to 2", "2 to 3"]
+    assert [leg.samples[0].heading_deg for leg in legs] == pytest.approx([90, 0, 270], abs=0.1)
+
+
+def test_samples_stand_for_equal_parts_of_the_whole_way(tmp_path, cache):
+    path = plan_file(
+        tmp_path / "a.plan", cache, item(22, 0, 0, 0, None, 0, 0, 40),
+        waypoint(cache, 0, 0, 40), waypoint(cache, 100, 0, 40), item(20, 0, 0, 0, 0, 0, 0, 0),
+    )  # fmt: skip
+    legs = legs_of(read_mission(path), cache, Ground(cache), GIMBAL, 20.0)
+    assert [leg.name for leg in legs] == ["1 to 2", "2 to home"]  # the climb is no leg
+    ways = [s.way_m for leg in legs for s in leg.samples]
+    assert ways == pytest.approx(np.arange(10, 200, 20), abs=0.2)
+
+
+def test_gimbal_and_fixed_cameras_look_where_they_are_aimed(tmp_path, cache):
+    path = plan_file(tmp_path / "a.plan", cache, item(205, -40, 0, 0, 0, 0, 0, 0),
+                     waypoint(cache, 100, 0, 40))  # fmt: skip
+    sample = legs_of(read_mission(path), cache, Ground(cache), GIMBAL, 500.0)[0].samples[0]
+    forward = camera_pose(sample, cache, GIMBAL).rotation[:, 2]
+    down = math.radians(40)
+    assert forward == pytest.approx([math.cos(down), 0, -math.sin(down)], abs=1e-3)
+    screwed = Aim(Mount.from_degrees(pitch_deg=-90.0), -75.0, True)
+    pose = camera_pose(sample, cache, screwed)
+    assert pose.rotation[:, 2] == pytest.approx([0, 0, -1], abs=1e-3)
+    assert -pose.rotation[:, 1] == pytest.approx([1, 0, 0], abs=1e-3)  # image up is ahead
+
+
+def test_missions_that_cannot_be_placed_are_named(tmp_path, cache):
+    ground = Ground(cache)
+    far = plan_file(tmp_path / "far.plan", cache, waypoint(cache, 0, 0, 50), home=(0, 9e5))
+    with pytest.raises(MissionFileError, match="km from the map's origin"):
+        legs_of(read_mission(far), cache, ground, GIMBAL, 25.0)
+    beside = plan_file(tmp_path / "b.plan", cache, waypoint(cache, 0, 0, 50), home=(900, 0))
+    with pytest.raises(MissionFileError, match=r"home at .* is not over the map"):
+        legs_of(read_mission(beside), cache, ground, GIMBAL, 25.0)
+    spot = plan_file(tmp_path / "s.plan", cache, waypoint(cache, 0, 0, 50))
+    with pytest.raises(MissionFileError, match="goes nowhere"):
+        legs_of(read_mission(spot), cache, ground, GIMBAL, 25.0)
+    local = plan_file(tmp_path / "l.plan", cache, waypoint(cache, 0, 0, 50, frame=1))
+    with pytest.raises(MissionFileError, match="frame 1"):
+        read_mission(local)
+
+
+def forecast(risk=0.01, sigma=0.2, share=1.0, rival=0.1, ground=80.0, condition="day"):
+    figures = Figures(sigma, 0.9, 0.6, share, 0.0, 0.2)
+    return ViewForecast(condition, figures, sigma, risk, ground, 20.0, Rival(rival, 12.0))
+
+
+@pytest.fixture
+def leg(tmp_path, cache):
+    path = plan_file(tmp_path / "a.plan", cache, waypoint(cache, 100, 0, 40))
+    return legs_of(read_mission(path), cache, Ground(cache), GIMBAL, 20.0)[0]
+
+
+@pytest.mark.parametrize(
+    ("given", "reason"),
+    [
+        (forecast(), Reason.NONE),
+        (forecast(risk=1.0, share=0.0, ground=0.0), Reason.NO_MAP),
+        (forecast(risk=0.6, share=0.3), Reason.EDGE),
+        (forecast(risk=0.6), Reason.WEAK),
+        (forecast(rival=0.9), Reason.ALIKE),
+        (forecast(sigma=1.4), Reason.SIGMA),
+    ],
+)
+def test_each_verdict_has_its_reason(leg, given, reason):
+    assert judge(leg.samples[0], [given], Limits()).reason is reason
+
+
+def test_the_worst_condition_counts(leg):
+    both = [forecast(condition="day"), forecast(risk=0.5, condition="night")]
+    judged = judge(leg.samples[0], both, Limits())
+    assert (judged.forecast.condition, judged.holds) == ("night", False)
+
+
+def test_neighbours_are_bridged_together_and_no_stretch_is_invented(leg):
+    def verdict(bad):
+        judged = [judge(s, [forecast(risk=0.9 if k in bad else 0.0)], Limits())
+                  for k, s in enumerate(leg.samples)]  # fmt: skip
+        return [LegVerdict(leg, tuple(judged))]
+
+    odometry = OdometryConfig()
+    assert stretches(verdict(()), 5.0, odometry.with_map, 15.0) == ()
+    first, second = stretches(verdict((0, 1, 3)), 5.0, odometry.with_map, 15.0)
+    assert (first.begin_m, first.length_m) == pytest.approx((0, 40), abs=0.1)
+    assert first.seconds == pytest.approx(8, abs=0.1)
+    assert second.length_m == pytest.approx(20, abs=0.1)
+    assert 0 < second.drift_m < first.drift_m
+    assert not stretches(verdict((0, 1)), 5.0, odometry.with_map, 0.01)[0].can_bridge
+
+
+def test_a_fixed_camera_is_offered_no_gimbal_angle(leg):
+    worst = Judged(leg.samples[0], forecast(risk=0.9), Reason.WEAK)
+    assert any("gimbal" in c.words for c in changes(worst, fixed=False))
+    assert not any("gimbal" in c.words for c in changes(worst, fixed=True))
+    assert any("higher" in c.words for c in changes(worst, fixed=True))
+
+
+def run(*arguments):
+    return CliRunner().invoke(app, ["plan", *map(str, arguments)])
+
+
+def test_a_mission_over_the_edge_is_told_with_pictures_and_exit_code_1(tmp_path, cache):
+    config = tmp_path / "deployment.yaml"
+    config.write_text(DEPLOYMENT.format(map=cache.path))
+    out = tmp_path / "report"
+    over = plan_file(tmp_path / "over.plan", cache,
+                     waypoint(cache, 100, 0, 60), waypoint(cache, 420, 0, 60))  # fmt: skip
+    done = run(over, "--config", config, "--out", out, "--spacing", 80)
+    assert done.exit_code == 1, done.output
+    made = json.loads((out / "plan.json").read_text())
+    assert made["legs"][1]["samples"][-1]["reason"] == "no map in view"
+    assert made["stretches"][-1]["end_m"] == pytest.approx(420, abs=1)
+    page = (out / "plan.html").read_text()
+    assert "no map in view" in page
+    assert "http" not in page  # nothing is fetched
+    track = cv2.imread(str(out / "track.png"))
+    assert track is not None
+    red = (abs(track.astype(int) - (40, 40, 198)).max(axis=2) < 12).sum()
+    assert red > 500
+    assert cv2.imread(str(out / "heat.png")).shape == track.shape
+    wrong = run(over, "--config", config, "--out", out, "--condition", "hail")
+    assert wrong.exit_code == 2
