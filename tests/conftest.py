@@ -22,7 +22,7 @@ from sitl.demo.assets import FlightAssets, prepare
 from sitl.demo.kinematic import record_scenario
 from sitl.demo.scenario import CameraSpec, Leg, Scenario
 from sitl.errors import SimulationError
-from tests.parts import COMPUTING, REAL_TIME, SHARED_FOLDER, part_of
+from tests.parts import ALONE, SHARED_FOLDER, SIDE_BY_SIDE, part_of
 
 # The suite tries the same examples every time, so that a failure belongs to the change it is seen
 # on; `pytest --hypothesis-profile=explore` draws new ones. No deadlines: a busy machine takes its
@@ -226,7 +226,7 @@ def _processor_share(workers: int, seconds: float = 1.5) -> float:
 
 def pytest_addoption(parser: pytest.Parser) -> None:
     """`--part`: one of the suite's two parts (tests/parts.py); both without it."""
-    parser.addoption("--part", choices=[COMPUTING, REAL_TIME], help="one part of the suite")
+    parser.addoption("--part", choices=[SIDE_BY_SIDE, ALONE], help="one part of the suite")
 
 
 def pytest_ignore_collect(collection_path: Path, config: pytest.Config) -> bool | None:

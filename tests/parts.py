@@ -1,8 +1,8 @@
 """The suite in two parts: `python -m tests.parts [pytest's arguments]`, as `make test` calls it.
 
-What only computes runs first, on two cores. What meets real time, a vehicle, a port of its own or a
-browser runs after it in one process, with the machine to itself. Each part prints its own summary;
-a failure of the first does not keep the second from running. `pytest` alone runs both as one.
+Most tests run first, two at a time. What flies, streams pictures in real time or drives a browser
+runs after them, one at a time, with the machine to itself. Each part prints its own summary; a
+failure of the first does not keep the second from running. `pytest` alone runs both as one.
 """
 
 from __future__ import annotations
@@ -14,39 +14,21 @@ import tempfile
 from collections.abc import Mapping, Sequence
 from pathlib import Path, PurePosixPath
 
-COMPUTING, REAL_TIME = "computing", "real-time"
+SIDE_BY_SIDE, ALONE = "side-by-side", "alone"
 
-# Files and folders whose tests run alone; every other test only computes.
+# Files and folders whose tests need the machine for themselves: simulated vehicles, pictures in
+# real time, a browser, measured processors. Every other test is content with a core, and patient.
 RUNS_ALONE = (
     "tests/companion/console/test_browser.py",
     "tests/companion/flight/test_app.py",
-    "tests/companion/live",
-    "tests/companion/offline/test_replay.py",
     "tests/companion/preflight/test_coverage.py",
-    "tests/companion/sources/test_datagrams.py",
     "tests/companion/sources/test_live_stream.py",
-    "tests/companion/sources/test_recorded.py",
     "tests/companion/sources/test_rtsp.py",
-    "tests/companion/supervision",
-    "tests/companion/targets/test_detections.py",
-    "tests/companion/targets/test_reporter.py",
-    "tests/companion/terminal",
     "tests/examples/test_bridge_examples.py",
-    "tests/examples/test_detector_client.py",
-    "tests/mavlink_bridge/link/test_link.py",
     "tests/mavlink_bridge/link/test_routing.py",
-    "tests/mavlink_bridge/link/test_tlog.py",
-    "tests/mavlink_bridge/preflight",
-    "tests/mavlink_bridge/test_attacks.py",
-    "tests/mavlink_bridge/test_bridge.py",
-    "tests/mavlink_bridge/test_faults.py",
-    "tests/mavlink_bridge/vehicle/test_last_words.py",
-    "tests/mavlink_bridge/vehicle/test_presence.py",
-    "tests/sitl/camera/test_detector.py",
+    "tests/mavlink_bridge/preflight/test_mission.py",
     "tests/sitl/camera/test_process.py",
-    "tests/sitl/camera/test_realism.py",
     "tests/sitl/demo/test_flight.py",
-    "tests/sitl/embedded/test_protocols.py",
     "tests/sitl/ground/test_pilot.py",
     "tests/sitl/suite/test_flights.py",
     "tests/sitl/suite/test_loop_flights.py",
@@ -68,7 +50,7 @@ def part_of(path: str) -> str:
     """The part to which a test file belongs; its path as POSIX from the repository's root."""
     file = PurePosixPath(path)
     alone = any(file.is_relative_to(entry) for entry in RUNS_ALONE)
-    return REAL_TIME if alone else COMPUTING
+    return ALONE if alone else SIDE_BY_SIDE
 
 
 def together(codes: Sequence[int]) -> int:
@@ -85,8 +67,8 @@ def main(arguments: Sequence[str]) -> int:
     with tempfile.TemporaryDirectory(prefix="tests-") as shared:
         common = {**os.environ, SHARED_FOLDER: str(Path(shared).resolve())}
         codes = {
-            COMPUTING: _run(COMPUTING, [*_WORKERS, *arguments], common | _ONE_CORE),
-            REAL_TIME: _run(REAL_TIME, arguments, common),
+            SIDE_BY_SIDE: _run(SIDE_BY_SIDE, [*_WORKERS, *arguments], common | _ONE_CORE),
+            ALONE: _run(ALONE, arguments, common),
         }
     outcome = ", ".join(f"{part} part: {_word(code)}" for part, code in codes.items())
     print(outcome, flush=True)

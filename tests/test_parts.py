@@ -8,29 +8,29 @@ from types import SimpleNamespace
 
 import pytest
 
-from tests.parts import COMPUTING, REAL_TIME, RUNS_ALONE, main, part_of, together
+from tests.parts import ALONE, RUNS_ALONE, SIDE_BY_SIDE, main, part_of, together
 
 ROOT = Path(__file__).resolve().parents[1]
-# What gives real time away: a vehicle in real time, the conversation with one, a machine with room.
-MEETS_REAL_TIME = re.compile(
-    r"EmbeddedSitl\(|FakeAutopilot|def test_\w+\([^)]*\b(?:real_time|watched_processors)\b"
+# What gives it away: a vehicle in real time, a browser, a fixture that measures the processors.
+NEEDS_THE_MACHINE = re.compile(
+    r"EmbeddedSitl\(|sync_playwright|def test_\w+\([^)]*\b(?:real_time|watched_processors)\b"
 )
 
 
-def test_what_meets_real_time_runs_alone():
+def test_what_needs_the_machine_runs_alone():
     found = [
         path.relative_to(ROOT).as_posix()
         for path in (ROOT / "tests").rglob("test_*.py")
-        if path != Path(__file__).resolve() and MEETS_REAL_TIME.search(path.read_text())
+        if path != Path(__file__).resolve() and NEEDS_THE_MACHINE.search(path.read_text())
     ]
-    assert len(found) >= 10
-    assert [path for path in found if part_of(path) == COMPUTING] == []
+    assert len(found) >= 8
+    assert [path for path in found if part_of(path) == SIDE_BY_SIDE] == []
 
 
 @pytest.mark.parametrize("entry", RUNS_ALONE)
 def test_what_runs_alone_exists(entry):
     assert (ROOT / entry).exists()
-    assert part_of(entry) == REAL_TIME
+    assert part_of(entry) == ALONE
 
 
 @pytest.mark.parametrize(
@@ -52,9 +52,9 @@ def test_the_second_part_runs_after_a_failure_of_the_first(monkeypatch, capsys):
     monkeypatch.setattr("subprocess.run", run)
     assert main(["-k", "pose"]) == 1
     first, second = commands
-    assert f"--part={COMPUTING}" in first
-    assert f"--part={REAL_TIME}" in second
+    assert f"--part={SIDE_BY_SIDE}" in first
+    assert f"--part={ALONE}" in second
     assert "--numprocesses=2" in first
     assert "--numprocesses=2" not in second
     assert all(command[-2:] == ["-k", "pose"] for command in commands)
-    assert "computing part: FAILED (1), real-time part: passed" in capsys.readouterr().out
+    assert "side-by-side part: FAILED (1), alone part: passed" in capsys.readouterr().out
