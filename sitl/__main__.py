@@ -7,6 +7,7 @@ import logging
 import shutil
 import signal
 import sys
+from functools import partial
 from pathlib import Path
 from typing import Annotated, get_args
 
@@ -20,9 +21,9 @@ from localizer.errors import LocalizerError
 from localizer.synth.appearance.model import CONDITIONS
 from sitl.demo.assets import FlightAssets, prepare
 from sitl.demo.companion_process import free_console_port
-from sitl.demo.flight import fly
+from sitl.demo.flight import Onlookers, fly
 from sitl.demo.kinematic import record_scenario
-from sitl.demo.progress import shown_progress
+from sitl.demo.progress import LogProgress, shown_progress
 from sitl.demo.report import make_report, print_report
 from sitl.demo.scenario import (
     Injection,
@@ -121,7 +122,8 @@ def demo(
     if port is not None:
         console.print(f"watch it: [green]http://127.0.0.1:{port}/[/] (once the companion is up)")
     with shown_progress(console) as progress:
-        record = fly(assets, script, kinds[fc], seed, out, progress, port)
+        onlookers = Onlookers(progress, partial(_tell_endpoint, console), port)
+        record = fly(assets, script, kinds[fc], seed, out, onlookers)
     print_report(make_report(record, script, seed), out)
     console.print(f"open: [green]{write_page(out).resolve()}", soft_wrap=True)
 
@@ -208,6 +210,7 @@ def loop(
         parse_seeds(seeds),
         worlds,
         lambda line: console.print(f"[dim]{escape(line)}[/]"),
+        LogProgress(console),
         lambda row: print_loop_row(console, row),
     )
     rows = fly_loop(cases, options)
@@ -227,13 +230,17 @@ def loop_table(
     print(markdown(rows))
 
 
+def _tell_endpoint(console: Console, endpoint: str) -> None:
+    """An own line, which stays above the bar."""
+    _, host, port = endpoint.split(":")
+    console.print(f"ground station: [green]TCP {host} port {port}[/] (QGroundControl: Comm Links)")
+
+
 def _world_of(
     script: Scenario, seed: int, worlds: Path | None, ideal: bool, console: Console
 ) -> FlightAssets:
-    def say(text: str) -> None:
-        console.print(f"[dim]{text}[/]")
-
-    return prepare(seed, worlds, say, script.world_m, ideal, script.world)
+    with shown_progress(console) as progress:
+        return prepare(seed, worlds, progress, script.world_m, ideal, script.world)
 
 
 def _clear(out: Path) -> None:

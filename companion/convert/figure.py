@@ -35,6 +35,15 @@ class _Ray:
     colour: str = "black"
 
 
+@dataclass(frozen=True)
+class _Arc:
+    """An angle: its text stands outside of the arc, or ends at `beside` where that is crowded."""
+
+    text: str
+    radius: float = 0.55
+    beside: tuple[float, float] | None = None
+
+
 _NORTH, _HORIZON, _NADIR = 90.0, 0.0, -90.0
 _NOSE, _HEADING, _SIGHT = 90.0 - _BODY.yaw_deg, 90.0 - _CAMERA.yaw_deg, _CAMERA.pitch_deg
 
@@ -53,10 +62,15 @@ def draw(path: Path) -> None:
     figure.savefig(path, dpi=80, metadata={"Software": None})
 
 
+def _camera(degrees: float) -> _Ray:
+    return _Ray(degrees, "camera", "tab:red")
+
+
 def _pose_line(above: Any, side: Any, pose: Pose) -> str:
     row = pose_row("", pose, LocalFrame(_PLACE))
-    _angle(above, _Ray(_NORTH, "north: 0"), _HEADING, f"yaw {row.yaw_deg:+.0f}")
-    _angle(side, _Ray(_NADIR, "nadir: 0"), _SIGHT, f"pitch {row.pitch_deg:+.0f}")
+    _angle(above, _Ray(_NORTH, "north: 0"), _camera(_HEADING), _Arc(f"yaw {row.yaw_deg:+.0f}"))
+    pitch = _Arc(f"pitch {row.pitch_deg:+.0f}", beside=(-0.08, -0.5))
+    _angle(side, _Ray(_NADIR, "nadir: 0"), _camera(_SIGHT), pitch)
     angles = f"roll {row.roll_deg:.0f}, pitch {row.pitch_deg:.0f}, yaw {row.yaw_deg:.0f}"
     return f"PiLoT pose line\n{angles}"
 
@@ -65,41 +79,48 @@ def _autopilot(above: Any, side: Any, pose: Pose) -> str:
     body = matrix_from_euler(*_BODY.radians)
     # The body is level: its own axes are those of its heading.
     gimbal = angles_of_matrix(body.T @ NED_FROM_ENU @ pose.rotation @ GIMBAL_FROM_CAMERA.T)
-    yaw = f"body yaw {_BODY.yaw_deg:+.0f}"
-    _angle(above, _Ray(_NORTH, "north: 0"), _NOSE, yaw, 0.4, "tab:blue", "nose", "center")
-    _angle(above, _Ray(_NOSE, ""), _HEADING, f"gimbal yaw {gimbal.yaw_deg:+.0f}", 0.6)
-    _angle(side, _Ray(_HORIZON, "horizon: 0"), _SIGHT, f"gimbal pitch {gimbal.pitch_deg:+.0f}")
+    nose, yaw = (
+        _Ray(_NOSE, "nose", "tab:blue"),
+        _Arc(f"body\nyaw {_BODY.yaw_deg:+.0f}", 0.4, (-0.08, 0.4)),
+    )
+    _angle(above, _Ray(_NORTH, "north: 0"), nose, yaw)
+    _angle(
+        above, _Ray(_NOSE, ""), _camera(_HEADING), _Arc(f"gimbal yaw {gimbal.yaw_deg:+.0f}", 0.6)
+    )
+    pitch = _Arc(f"gimbal pitch {gimbal.pitch_deg:+.0f}")
+    _angle(side, _Ray(_HORIZON, "horizon: 0"), _camera(_SIGHT), pitch)
     angles = f"gimbal {abs(gimbal.roll_deg):.0f} {gimbal.pitch_deg:.0f} {gimbal.yaw_deg:.0f}"
     return f"Autopilot: body FRD in NED, gimbal\nbody 0 0 {_BODY.yaw_deg:.0f}, {angles}"
 
 
 def _photo(above: Any, side: Any, pose: Pose) -> str:
     gimbal = gimbal_of_pose(pose, LocalFrame(_PLACE))
-    _angle(above, _Ray(_NORTH, "north: 0"), _HEADING, f"yaw {gimbal.yaw_deg:+.0f}")
-    _angle(side, _Ray(_HORIZON, "horizon: 0"), _SIGHT, f"pitch {gimbal.pitch_deg:+.0f}")
+    yaw, pitch = _Arc(f"yaw {gimbal.yaw_deg:+.0f}"), _Arc(f"pitch {gimbal.pitch_deg:+.0f}")
+    _angle(above, _Ray(_NORTH, "north: 0"), _camera(_HEADING), yaw)
+    _angle(side, _Ray(_HORIZON, "horizon: 0"), _camera(_SIGHT), pitch)
     angles = f"Roll {gimbal.roll_deg:.0f}, Pitch {gimbal.pitch_deg:.0f}, Yaw {gimbal.yaw_deg:.0f}"
     return f"XMP of a photo (DJI)\nGimbal {angles}"
 
 
-def _angle(
-    axes: Any, zero: _Ray, end: float, text: str, radius: float = 0.55,
-    colour: str = "tab:red", name: str = "camera", align: str = "left",
-) -> None:  # fmt: skip
+def _angle(axes: Any, zero: _Ray, turned: _Ray, arc: _Arc) -> None:
     """An arc from the direction that counts as zero to another one, with an arrow at its end."""
     if zero.text:
         _ray(axes, _Ray(zero.degrees, zero.text, "gray"), "--")
-    _ray(axes, _Ray(end, name, colour))
-    low, high = sorted((zero.degrees, end))
-    axes.add_patch(Arc((0, 0), 2 * radius, 2 * radius, theta1=low, theta2=high, color=colour))
-    last = np.sign(end - zero.degrees) * 6.0
+    _ray(axes, turned)
+    low, high = sorted((zero.degrees, turned.degrees))
+    size, colour = 2 * arc.radius, turned.colour
+    axes.add_patch(Arc((0, 0), size, size, theta1=low, theta2=high, color=colour))
+    last = np.sign(turned.degrees - zero.degrees) * 6.0
     axes.annotate(
         "",
-        _at(end, radius),
-        _at(end - last, radius),
+        _at(turned.degrees, arc.radius),
+        _at(turned.degrees - last, arc.radius),
         arrowprops={"arrowstyle": "->", "color": colour},
     )
-    place = _at(zero.degrees + 0.4 * (end - zero.degrees), radius + 0.2)
-    axes.text(*place, text, color=colour, fontsize=9, ha=align, va="center")
+    middle = zero.degrees + 0.4 * (turned.degrees - zero.degrees)
+    place = arc.beside or _at(middle, arc.radius + 0.2)
+    align = "right" if arc.beside else "left"
+    axes.text(*place, arc.text, color=colour, fontsize=9, ha=align, va="center")
 
 
 def _ray(axes: Any, ray: _Ray, style: str = "-") -> None:

@@ -7,7 +7,7 @@ import multiprocessing
 import pickle
 import tempfile
 from collections import defaultdict
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -143,14 +143,21 @@ def build_world(
 
 
 def build_visits(
-    config: WorldConfig, visits: dict[Path, Visit], processes: int = 2
+    config: WorldConfig,
+    visits: dict[Path, Visit],
+    processes: int = 2,
+    progress: Callable[[float], None] = lambda _: None,
 ) -> list[WorldInfo]:
-    """Several visits to one world: the plan is made once, each visit is painted to its folder."""
+    """Several visits to one world: the plan is made once, each visit is painted to its folder.
+
+    progress: told the share of all that is done, 0 to 1.
+    """
     plan = plan_world(config)
     infos = []
-    for folder, visit in visits.items():
+    for number, (folder, visit) in enumerate(visits.items()):
         info = _info(plan, visit.name)
-        _write_visit(plan, visit, folder, info, processes)
+        for share in _write_visit(plan, visit, folder, info, processes):
+            progress((number + share) / len(visits))
         infos.append(info)
     return infos
 
@@ -172,7 +179,8 @@ def _info(plan: WorldPlan, variant: str) -> WorldInfo:
 
 def _write_visit(
     plan: WorldPlan, visit: Visit, folder: Path, info: WorldInfo, processes: int
-) -> None:
+) -> Iterator[float]:
+    """Writes a visit; yields the share of it that is painted."""
     folder.mkdir(parents=True, exist_ok=True)
     for stale in (*folder.glob("*.glb"), folder / "tileset.json", folder / _INFO):
         stale.unlink(missing_ok=True)
@@ -184,7 +192,8 @@ def _write_visit(
     tops: dict[tuple[int, int], Part] = {}
     per_top = round(TOP_M / BLOCK_M)
     with painted_blocks(scene, folder, places, processes) as done:
-        for (column, row), part in done:
+        for number, ((column, row), part) in enumerate(done, start=1):
+            yield number / len(places)
             key = (column // per_top, row // per_top)
             waiting[key].append(part)
             if len(waiting[key]) == per_top**2:

@@ -133,7 +133,7 @@ class Detector:
         if self._rng.random() < self._errors.false:
             u, v = self._rng.uniform((0, 0), (self._camera.width, self._camera.height))
             self._false += 1
-            found.append(Detection(f"false{self._false}", stamp_ns, float(u), float(v)))
+            found.append(Detection(f"no-target-{self._false}", stamp_ns, float(u), float(v)))
         return found
 
     def _visible(self, place: Array, view: DetectorView) -> Array | None:

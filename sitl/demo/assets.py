@@ -10,6 +10,7 @@ import os
 import shutil
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 from localizer.map.building.build import build_cache
@@ -20,6 +21,7 @@ from localizer.synth.world import WorldInfo, build_visits
 
 # Raised when generated worlds change, so that old ones are not flown by mistake.
 _GENERATION, _IDEAL_GENERATION = 2, 1
+_PAINTED = 0.8  # of the time that a world takes, its two imports being the rest
 
 
 @dataclass(frozen=True)
@@ -29,6 +31,17 @@ class FlightAssets:
     world: WorldInfo
     map_cache: Path
     live_cache: Path
+
+
+def _import(folder: Path, progress: Callable[[float], None], number: int) -> None:
+    """A visit's tileset into the cache beside it; the first or second of two imports."""
+    each = (1.0 - _PAINTED) / 2
+    begun = _PAINTED + each * number
+    build_cache(
+        folder / "tileset.json",
+        folder.with_name(f"{folder.name}-cache"),
+        progress=lambda done, total: progress(begun + each * done / max(total, 1)),
+    )
 
 
 def default_folder() -> Path:
@@ -42,14 +55,15 @@ def default_folder() -> Path:
 def prepare(
     seed: int,
     folder: Path | None = None,
-    say: Callable[[str], None] = lambda _: None,
+    progress: Callable[[str, float], None] = lambda _phase, _share: None,
     size_m: float = 1600.0,
     ideal: bool = False,
     character: Character = "mixed",
 ) -> FlightAssets:
     """Build what is missing of a world, by the importer that users use; the rest is reused.
 
-    ideal: the map shares geometry and fine texture with what is flown over.
+    ideal: the map shares geometry and fine texture with what is flown over. progress: told what is
+    being done and the share of it all that is done, 0 to 1; never where nothing is missing.
     """
     generation = _IDEAL_GENERATION if ideal else _GENERATION
     name = f"world-{generation}-{seed}-{size_m:.0f}"
@@ -59,17 +73,17 @@ def prepare(
     if not done.exists():
         shutil.rmtree(home, ignore_errors=True)
         home.mkdir(parents=True)
-        say(f"generating world {seed} (a few minutes, once)")
         config = WorldConfig(seed, size_m, character=character)
         if ideal:
             then, now = Visit("survey", look_of("survey")), Visit("live", look_of("live"))
         else:
             then, now = surveyed_and_lived(config)
         visits = {survey: then, live: now}
-        build_visits(config, visits)
-        for visit in visits:
-            say(f"importing the {visit.name} tileset")
-            build_cache(visit / "tileset.json", home / f"{visit.name}-cache")
+        generating = f"generating world {seed} (a few minutes, once)"
+        progress(generating, 0.0)
+        build_visits(config, visits, progress=lambda share: progress(generating, _PAINTED * share))
+        for number, visit in enumerate(visits):
+            _import(visit, partial(progress, f"importing the {visit.name} tileset"), number)
         done.touch()
     caches = (home / "survey-cache", home / "live-cache")
     for cache in caches:

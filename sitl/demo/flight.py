@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import csv
 import time
+from collections.abc import Callable
 from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
@@ -59,28 +60,40 @@ class FlightRecord:
     gimbal_alignment_deg: tuple[float, float, float]
 
 
+@dataclass(frozen=True)
+class Onlookers:
+    """Who watches a flight. progress: told its phase and the share of it that is done; connectable:
+    told where a ground station may connect to the vehicle ("tcp:HOST:PORT"); console: port of the
+    operator's page, if there is to be one.
+    """
+
+    progress: Progress = lambda _phase, _share: None
+    connectable: Callable[[str], None] = lambda _endpoint: None
+    console: int | None = None
+
+
 def fly(
     assets: FlightAssets,
     scenario: Scenario,
     kind: VehicleChoice,
     seed: int,
     folder: Path,
-    progress: Progress = lambda *_: None,
-    console: int | None = None,
+    onlookers: Onlookers | None = None,
 ) -> FlightRecord:
-    """Fly the scenario; `folder` receives every record. Progress is (phase, share done). console:
-    port of the operator's page, if there is to be one.
-    """
+    """Fly the scenario; `folder` receives every record."""
+    onlookers = onlookers or Onlookers()
+    progress = onlookers.progress
     folder.mkdir(parents=True, exist_ok=True)
     cache = TileCache.open(assets.map_cache)
     home = home_of(assets)
-    ports = Ports(free_udp_port(), free_udp_port(), console)
+    ports = Ports(free_udp_port(), free_udp_port(), onlookers.console)
     with ExitStack() as stack:
         progress("starting the vehicle", 0.0)
         setup = VehicleSetup(
             parameters=vehicle_parameters(scenario), seed=seed, log=folder / "vehicle.log"
         )
         vehicle = stack.enter_context(open_vehicle(kind, home, setup))
+        onlookers.connectable(vehicle.spare_endpoint)
         pilot = stack.enter_context(Pilot(vehicle.gcs_endpoint, alive=vehicle.check))
         progress("waiting for GNSS and the EKF", 0.0)
         with pilot.fast_forward():

@@ -1,4 +1,4 @@
-"""How far a flight is: a bar on a terminal, a line now and then in a log."""
+"""How far a flight or the making of its world is: a bar on a terminal, lines in a log."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ class LogProgress:
         self._phase: str | None = None
 
     def __call__(self, phase: str, share: float) -> None:
-        """The flight is in a phase; share of it all that is done, 0 to 1."""
+        """It is in a phase; share of it all that is done, 0 to 1."""
         now_s = self._clock() - self._begun
         if phase == self._phase and now_s - self._printed_s < LINE_EVERY_S:
             return
@@ -38,5 +38,9 @@ def shown_progress(console: Console) -> Iterator[Callable[[str, float], None]]:
         return
     columns = (TextColumn("{task.description}"), BarColumn(), TimeElapsedColumn())
     with Progress(*columns, console=console) as bar:
-        task = bar.add_task("", total=1.0)
-        yield lambda phase, share: bar.update(task, description=phase, completed=share)
+        task = bar.add_task("", total=1.0, visible=False)  # until there is something to tell
+
+        def show(phase: str, share: float) -> None:
+            bar.update(task, description=phase, completed=share, visible=True)
+
+        yield show

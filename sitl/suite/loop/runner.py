@@ -27,7 +27,8 @@ _OTHER_SEED = 100  # of the place whose map is wrong here, beyond the flown worl
 @dataclass(frozen=True)
 class LoopOptions:
     """On which vehicles, over which worlds (one for each seed), and where records and worlds are
-    kept. say: progress, one line at a time; landed: every flight's outcome as it comes.
+    kept. say: progress, one line at a time; building: how far a world is that is being made (what,
+    share done); landed: every flight's outcome as it comes.
     """
 
     vehicles: tuple[VehicleKind, ...]
@@ -35,6 +36,7 @@ class LoopOptions:
     seeds: tuple[int, ...] = (5,)
     worlds: Path | None = None
     say: Callable[[str], None] = lambda _: None
+    building: Callable[[str, float], None] = lambda _phase, _share: None
     landed: Callable[[LoopRow], None] = lambda _: None
 
 
@@ -56,12 +58,12 @@ def fly_loop(cases: Sequence[LoopCase], options: LoopOptions) -> tuple[LoopRow, 
 
 
 def loop_assets(
-    case: LoopCase, seed: int, worlds: Path | None, say: Callable[[str], None]
+    case: LoopCase, seed: int, worlds: Path | None, progress: Callable[[str, float], None]
 ) -> LoopAssets:
     """What a case flies over, and the map that it gives the companion; made where missing."""
-    world = prepare(seed, worlds, say, case.size_m, ideal=True)
+    world = prepare(seed, worlds, progress, case.size_m, ideal=True)
     if case.wrong.other_map:
-        other = prepare(seed + _OTHER_SEED, worlds, say, case.size_m, ideal=True)
+        other = prepare(seed + _OTHER_SEED, worlds, progress, case.size_m, ideal=True)
         return LoopAssets(world, other.map_cache)
     if case.wrong.map_reach_m is not None:
         return LoopAssets(world, inner_map(world.map_cache, case.wrong.map_reach_m))
@@ -84,7 +86,7 @@ def parse_seeds(text: str) -> tuple[int, ...]:
 
 
 def _flown(case: LoopCase, kind: VehicleKind, seed: int, options: LoopOptions) -> LoopRow:
-    assets = loop_assets(case, seed, options.worlds, options.say)
+    assets = loop_assets(case, seed, options.worlds, options.building)
     folder = options.out / f"{kind}-{case.name}-{seed}"
     shutil.rmtree(folder, ignore_errors=True)
     try:

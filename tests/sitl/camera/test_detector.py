@@ -99,7 +99,7 @@ def test_misses_false_ones_and_exchanged_names_come_as_often_as_said(listener):
     count: Counter[str] = Counter()
     for _ in range(2000):
         for d in eye.observe(_view()):
-            if d.target_id.startswith("false"):
+            if d.target_id.startswith("no-target"):
                 count["false"] += 1
                 continue
             near = [n for n, p in true.items() if np.hypot(d.u - p[0], d.v - p[1]) < 0.01]

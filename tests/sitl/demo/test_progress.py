@@ -4,8 +4,12 @@ from __future__ import annotations
 
 import io
 
+import pytest
 from rich.console import Console
 
+from localizer.map.cache.cache import TileCache
+from localizer.synth.world import WorldInfo
+from sitl.demo import assets
 from sitl.demo.progress import LogProgress, shown_progress
 
 
@@ -29,3 +33,27 @@ def test_what_is_no_terminal_gets_lines() -> None:
     with shown_progress(Console(file=io.StringIO(), force_terminal=True, width=80)) as progress:
         progress("starting the vehicle", 0.0)
     assert not isinstance(progress, LogProgress)
+
+
+def test_a_world_that_is_being_made_tells_how_far_it_is(tmp_path, monkeypatch) -> None:
+    def build_visits(config, visits, progress) -> None:
+        progress(0.5)
+        progress(1.0)
+
+    def build_cache(source, out, progress) -> None:
+        progress(1, 2)
+        progress(2, 2)
+
+    monkeypatch.setattr(assets, "build_visits", build_visits)
+    monkeypatch.setattr(assets, "build_cache", build_cache)
+    monkeypatch.setattr(TileCache, "open", lambda _: None)
+    monkeypatch.setattr(WorldInfo, "load", lambda _: None)
+    told: list[tuple[str, float]] = []
+    for _ in range(2):  # the second time it is there
+        assets.prepare(3, tmp_path, lambda *what: told.append(what), ideal=True)
+    phases = ["generating world 3 (a few minutes, once)"] * 3
+    phases += ["importing the survey tileset"] * 2 + ["importing the live tileset"] * 2
+    assert [phase for phase, _ in told] == phases
+    shares = [share for _, share in told]
+    assert shares == sorted(shares)
+    assert (shares[0], shares[-1]) == (0.0, pytest.approx(1.0))
