@@ -100,6 +100,11 @@ class FeedConfig(_Model):
     )
     settings: SourceSettings = SourceSettings()
 
+    @property
+    def is_video(self) -> bool:
+        """Whether its pictures come in packets: not out of a folder of images."""
+        return "://" in self.source or not Path(self.source).is_dir()
+
     @model_validator(mode="after")
     def _sender_is_of_udp(self) -> FeedConfig:
         if self.settings.sender is not None and not self.source.startswith("udp://"):
@@ -172,6 +177,18 @@ class RecordConfig(_Model):
     )
 
 
+class KlvConfig(_Model):
+    """The video sent on, with where each picture was taken in it (MISB ST 0601)."""
+
+    output: str = Field(
+        pattern=r"^udp://[^\s/@?]+:[0-9]{1,5}(\?.*)?$", description="udp://HOST:PORT, MPEG-TS"
+    )
+    mission: str = Field("", max_length=127, description="told in each packet; empty: none")
+    hold_ms: float = Field(
+        200.0, ge=0, le=2000, description="a picture waits so long for its pose, at the most"
+    )
+
+
 class CompanionConfig(_Model):
     """One deployment."""
 
@@ -188,6 +205,9 @@ class CompanionConfig(_Model):
     prior: PriorConfig = PriorConfig()
     guardian: GuardianConfig = GuardianConfig()
     record: RecordConfig | None = None
+    klv: KlvConfig | None = Field(
+        None, description="the camera's video on to a ground station, with metadata; null: not sent"
+    )
     console: ConsoleConfig | None = Field(
         None, description="the operator's page (extra `console`); null: none"
     )

@@ -1,5 +1,5 @@
 """The command line: ``companion run | plan | eval | localize | convert | replay | report | export |
-console | map | world | doctor | key | self-test``.
+klv | console | map | world | doctor | key | self-test``.
 
 Exit codes: 0 done; 1 `doctor` found advice, `plan` a leg on which vision will not do, `replay`
 differs, `localize` localized nothing or `map verify` found damage; 2 wrong usage, a named error, or
@@ -21,7 +21,7 @@ from companion.cli.console import console_command
 from companion.cli.convert import convert_command
 from companion.cli.doctor import doctor_command, self_test_command
 from companion.cli.evaluate import evaluate_command
-from companion.cli.export import export_command
+from companion.cli.export import export_command, klv_command
 from companion.cli.interrupts import INTERRUPTED
 from companion.cli.key import key_command
 from companion.cli.localize import localize_command
@@ -69,6 +69,7 @@ app.command("replay")(replay_command)
 app.command("report")(report_command)
 app.command("export")(export_command)
 app.command("console")(console_command)
+app.command("klv")(klv_command)
 app.command("doctor")(doctor_command)
 app.command("key")(key_command)
 app.command("self-test")(self_test_command)

@@ -1,4 +1,4 @@
-"""``companion export``: a record for other programs."""
+"""``companion export`` and ``companion klv``: a record for other programs."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ from typing import Annotated
 import typer
 from rich.console import Console
 from rich.markup import escape
+from rich.progress import Progress
 
 from companion.errors import ConfigError
 from companion.terminal.steps import shown_steps
@@ -38,3 +39,38 @@ def export_command(
         console.print(f"note: {escape(note)}", soft_wrap=True, highlight=False)
     path = escape(str(written.path))
     console.print(f"{written.messages} messages: [green]{path}[/]", soft_wrap=True, highlight=False)
+
+
+def klv_command(
+    video: Annotated[Path, typer.Argument(help="recording of the camera's stream")],
+    record: Annotated[Path, typer.Option(help="folder that `companion run` recorded")],
+    out: Annotated[
+        Path | None, typer.Option(help="file to write; none: beside the video, .klv.ts")
+    ] = None,
+    map_cache: Annotated[
+        Path | None, typer.Option("--map", help="instead of the record's map")
+    ] = None,
+    begin: Annotated[
+        float | None,
+        typer.Option(
+            help="seconds from the record's start to the video's first picture; none: the pictures "
+            "carry MISP time stamps"
+        ),
+    ] = None,
+    mission: Annotated[str, typer.Option(help="told in each packet")] = "",
+) -> None:
+    """Write the video again as MPEG-TS with MISB ST 0601 metadata; nothing is encoded again."""
+    from companion.reporting.klv_recording import describe_recording
+
+    path = out or video.with_suffix(".klv.ts")
+    with Progress(transient=True) as bar:
+        task = bar.add_task("describing", total=None)
+        written = describe_recording(
+            video, record, path, map_cache=map_cache, begin_s=begin, mission=mission,
+            progress=lambda: bar.advance(task),
+        )  # fmt: skip
+    Console().print(
+        f"{written.described} of {written.pictures} pictures described: "
+        f"[green]{escape(str(path))}[/]",
+        soft_wrap=True, highlight=False,
+    )  # fmt: skip

@@ -30,6 +30,8 @@ from companion.flight.view_reporter import ViewReporter
 from companion.ground.vital_signs import VitalSigns
 from companion.guardian.guardian import Guardian
 from companion.guardian.monitor import Limits
+from companion.klv.metadata import Scene
+from companion.klv.relay import KlvRelay
 from companion.live.orders import Helm, OrderError, Orders
 from companion.live.protocol import socket_path
 from companion.live.publisher import Publisher
@@ -37,11 +39,13 @@ from companion.live.shown import Instruments, Shown
 from companion.preflight.coverage import check_origin
 from companion.preflight.map_pin import require_pinned
 from companion.sources import FrameSource, StreamState, open_source
+from companion.sources.timing import system_minus_monotonic
 from companion.targets.clicks import ClickPolicy
 from companion.targets.detections import DetectionListener
 from companion.targets.numbers import TargetNumbers
 from companion.targets.population import Target
 from companion.targets.reporter import TargetReporter
+from localizer.geometry.pose import matrix_from_quaternion
 from localizer.map.cache.cache import TileCache
 from localizer.map.cache.surface import MapSurface
 from localizer.tracking.engine import DualThreadEngine
@@ -124,7 +128,26 @@ def _source(making: Making) -> FrameSource:
     def on_stranger(text: str) -> None:
         bridge.say(_WARNING, f"PiLoT: {text}")
 
-    return open_source(camera.source, camera.model.camera(), camera.settings, on_state, on_stranger)
+    model, tap = camera.model.camera(), making.get(KlvRelay)
+    return open_source(camera.source, model, camera.settings, on_state, on_stranger, tap)
+
+
+def _klv(making: Making) -> KlvRelay:
+    config, bridge, cache = making.config, making[Bridge], making[MapStack].cache
+    assert config.klv is not None  # or the part is not wanted
+    if not config.camera.is_video:
+        raise ConfigError(f"klv: {config.camera.source} is no video that could be sent on")
+    geoid_m = cache.manifest.geoid_separation_m
+    scene = Scene(cache.frame, MapSurface(cache).cast, geoid_m, config.klv.mission)
+
+    def attitude(time_ns: int) -> np.ndarray | None:
+        known = bridge.attitude_at(time_ns)
+        return None if known is None else matrix_from_quaternion(known.quaternion)
+
+    relay = KlvRelay(config.klv, scene, attitude, system_minus_monotonic())
+    making.channels.estimates.subscribe(lambda estimate, _: relay.add_estimate(estimate))
+    making.channels.targets.subscribe(relay.add_target)
+    return relay
 
 
 def _health(making: Making) -> HealthMonitor:
@@ -366,7 +389,11 @@ PARTS: tuple[Part[Any], ...] = (
         start=RecordKeeper.link,
         close=RecordKeeper.close,
     ),
-    Part("source", FrameSource, _source, depends=(Bridge,)),
+    Part(
+        "klv", KlvRelay, _klv, depends=(MapStack, Bridge), start=KlvRelay.start, stop=KlvRelay.stop,
+        wanted=lambda config: config.klv is not None,
+    ),
+    Part("source", FrameSource, _source, depends=(Bridge, KlvRelay)),
     Part(
         "health", HealthMonitor, _health,
         depends=(MapStack, Bridge, MapShift, RecordKeeper, FrameSource, Guardian),

@@ -9,6 +9,7 @@ from companion.errors import StreamOpenError
 from companion.sources.av_source import LiveVideoSource, VideoFileSource
 from companion.sources.base import (
     FrameSource,
+    PacketTap,
     SourceCounters,
     SourceSettings,
     StateCallback,
@@ -21,6 +22,7 @@ __all__ = [
     "FolderSource",
     "FrameSource",
     "LiveVideoSource",
+    "PacketTap",
     "SourceCounters",
     "SourceSettings",
     "StateCallback",
@@ -38,16 +40,18 @@ def open_source(
     settings: SourceSettings | None = None,
     on_state: StateCallback | None = None,
     on_stranger: Callable[[str], None] | None = None,
+    tap: PacketTap | None = None,
 ) -> FrameSource:
     """The feed at `location`: ``udp://host:port``, ``rtsp://...``, ``/dev/videoN`` (or
     ``v4l2:///dev/videoN``), a video file, or a folder of images.
 
     on_stranger: told, once for each address, that somebody else sends video to a UDP feed.
+    tap: takes the packets of a video beside the decoding; a folder of images has none.
     Raises `StreamOpenError` for what is not there. A live stream may come later.
     """
     text = str(location)
     if text.startswith(_LIVE):
-        return LiveVideoSource(text, camera, settings, on_state, on_stranger)
+        return LiveVideoSource(text, camera, settings, on_state, on_stranger, tap)
     if "://" in text:
         raise StreamOpenError(
             f"{text}: unknown kind of source; use udp://, rtsp://, /dev/videoN, a file or a folder"
@@ -56,5 +60,5 @@ def open_source(
     if path.is_dir():
         return FolderSource(path, camera, settings, on_state)
     if path.is_file():
-        return VideoFileSource(path, camera, settings, on_state)
+        return VideoFileSource(path, camera, settings, on_state, tap)
     raise StreamOpenError(f"{path}: no such file or folder")

@@ -8,6 +8,7 @@ import time
 import traceback
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
+from fractions import Fraction
 from pathlib import Path
 
 import av
@@ -17,6 +18,7 @@ from av.sidedata.sidedata import Type as SideDataType
 from companion.errors import StreamDecodeError, StreamError, StreamOpenError, StreamSizeError
 from companion.redaction import redacted
 from companion.sources.base import (
+    PacketTap,
     SourceCounters,
     SourceSettings,
     StateCallback,
@@ -60,7 +62,10 @@ class Decoder:
     add a frame of delay each.
     """
 
-    def __init__(self, source: _Input, read_timeout_s: float | None) -> None:
+    def __init__(
+        self, source: _Input, read_timeout_s: float | None, tap: PacketTap | None = None
+    ) -> None:
+        self._tap = tap
         timeout = None if read_timeout_s is None else (_OPEN_TIMEOUT_S, read_timeout_s)
         if source.datagrams is not None:
             source.datagrams.begin(_OPEN_TIMEOUT_S)
@@ -81,6 +86,8 @@ class Decoder:
         context.thread_count = 1
         if read_timeout_s is not None:
             context.flags |= _LOW_DELAY
+        if tap is not None:
+            tap.begin(self.stream)
 
     def pictures(self) -> Iterator[tuple[av.VideoFrame | None, int]]:
         """(picture, arrival time in ns) per picture, (None, time) per packet that gave none."""
@@ -90,6 +97,8 @@ class Decoder:
                 pictures = packet.decode()
             except av.error.InvalidDataError:
                 pictures = []
+            if self._tap is not None and packet.size:
+                self._tap.packet(packet)
             whole = [p for p in pictures if not p.is_corrupt]
             self.late += max(0, len(whole) - (1 if packet.size else 0))
             for picture in whole:
@@ -111,6 +120,7 @@ class VideoFileSource:
         camera: Camera,
         settings: SourceSettings | None = None,
         on_state: StateCallback | None = None,
+        tap: PacketTap | None = None,
     ) -> None:
         if not path.is_file():
             raise StreamOpenError(f"{path}: no such video file")
@@ -118,6 +128,7 @@ class VideoFileSource:
         self._camera = camera
         self._settings = settings or SourceSettings()
         self._on_state = on_state
+        self._tap = tap
         self._closed = threading.Event()
         self._counters = SourceCounters()
         self._state = StreamState.IDLE
@@ -136,7 +147,7 @@ class VideoFileSource:
     def frames(self) -> Iterator[Frame]:
         """Every picture; raises `StreamDecodeError` when the file holds none."""
         try:
-            decoder = Decoder(_Input(str(self._path), {}), None)
+            decoder = Decoder(_Input(str(self._path), {}), None, self._tap)
         except av.error.FFmpegError as error:
             raise StreamOpenError(
                 f"{self._path}: not a video, or damaged from the start: {error}"
@@ -171,6 +182,7 @@ class VideoFileSource:
             n = self._counters.delivered
             frame = Frame(_rgb(picture, self._to_rgb), start + offset, camera, n)
             self._counters = replace(self._counters, received=n + 1, delivered=n + 1)
+            _tell(self._tap, picture, frame.exposure_time_ns)
             yield frame
         if not self._counters.delivered:
             raise StreamDecodeError(f"{self._path}: no picture in it can be decoded; replace it")
@@ -229,7 +241,9 @@ class LiveVideoSource:
         settings: SourceSettings | None = None,
         on_state: StateCallback | None = None,
         on_stranger: Callable[[str], None] | None = None,
+        tap: PacketTap | None = None,
     ) -> None:
+        self._tap = tap
         self._location = redacted(location)
         self._camera = camera
         self._settings = settings or SourceSettings()
@@ -334,7 +348,7 @@ class LiveVideoSource:
 
     def _receive_once(self, *, reconnect: bool) -> str:
         """Receives until the connection ends; returns why it did."""
-        decoder = Decoder(self._input, self._settings.stall_timeout_s)
+        decoder = Decoder(self._input, self._settings.stall_timeout_s, self._tap)
         if reconnect:
             self._count(reconnects=1)
         clock = ExposureClock(
@@ -373,6 +387,7 @@ class LiveVideoSource:
             return
         stamps = Stamps(_pts_ns(picture), _misp_time(picture))
         exposure_ns = clock.exposure_time(stamps, arrival_ns)
+        _tell(self._tap, picture, exposure_ns)
         if not self._newest.put((picture, camera, exposure_ns, self._counters.received)):
             return  # closed meanwhile
         self._count(received=1)
@@ -454,6 +469,11 @@ def _pts_ns(picture: av.VideoFrame) -> int | None:
         return None
     time_ns: int = round(picture.pts * picture.time_base * 1_000_000_000)
     return time_ns
+
+
+def _tell(tap: PacketTap | None, picture: av.VideoFrame, exposure_ns: int) -> None:
+    if tap is not None and picture.pts is not None and picture.time_base is not None:
+        tap.picture(Fraction(picture.pts * picture.time_base), exposure_ns)
 
 
 def _misp_time(picture: av.VideoFrame) -> MispTime | None:

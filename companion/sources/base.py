@@ -5,8 +5,10 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from enum import Enum
+from fractions import Fraction
 from typing import Protocol
 
+import av
 from pydantic import BaseModel, ConfigDict, Field, field_validator
 
 from companion.errors import StreamSizeError
@@ -104,6 +106,24 @@ class SourceSettings(BaseModel):
         if value is not None:
             parse_sender(value)
         return value
+
+
+class PacketTap(Protocol):
+    """Takes a video's packets as they came, beside the decoding. Called on the reader's thread;
+    must not block.
+    """
+
+    def begin(self, stream: av.VideoStream) -> None:
+        """A connection was made: the packets that follow are of this stream."""
+        ...
+
+    def packet(self, packet: av.Packet) -> None:
+        """The next packet, in the order of decoding; it is the tap's to keep."""
+        ...
+
+    def picture(self, pts: Fraction, exposure_time_ns: int) -> None:
+        """When the picture of that presentation time (seconds) was taken, once it is known."""
+        ...
 
 
 class FrameSource(Protocol):

@@ -1,0 +1,127 @@
+"""MISB ST 0601 UAS Datalink Local Set: numbers by tag to bytes (SMPTE ST 336 KLV).
+
+Tags and ranges as of edition 8, which all later ones keep. What lies outside its tag's range is
+left out: a receiver must not be told a limit for a value.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+UNIVERSAL_LABEL = bytes.fromhex("060e2b34020b01010e01030101000000")
+VERSION = 8
+
+CHECKSUM, TIME, MISSION = 1, 2, 3
+PLATFORM_HEADING, PLATFORM_PITCH, PLATFORM_ROLL = 5, 6, 7
+IMAGE_SOURCE, COORDINATES = 11, 12
+SENSOR_LATITUDE, SENSOR_LONGITUDE, SENSOR_ALTITUDE = 13, 14, 15
+HORIZONTAL_FOV, VERTICAL_FOV = 16, 17
+RELATIVE_AZIMUTH, RELATIVE_ELEVATION, RELATIVE_ROLL = 18, 19, 20
+SLANT_RANGE = 21
+CENTRE_LATITUDE, CENTRE_LONGITUDE, CENTRE_ELEVATION = 23, 24, 25
+FIRST_CORNER_OFFSET = 26
+TARGET_LATITUDE, TARGET_LONGITUDE, TARGET_ELEVATION = 40, 41, 42
+TARGET_CE90, TARGET_LE90 = 45, 46
+LOCAL_SET_VERSION = 65
+SENSOR_HEIGHT, CENTRE_HEIGHT = 75, 78
+FIRST_CORNER = 82
+PLATFORM_PITCH_FULL, PLATFORM_ROLL_FULL = 90, 91
+
+
+@dataclass(frozen=True)
+class _Mapped:
+    """A number of `size` bytes that spans low to high; signed ones leave out the smallest."""
+
+    size: int
+    low: float
+    high: float
+
+    def encode(self, value: float) -> bytes | None:
+        if not (math.isfinite(value) and self.low <= value <= self.high):
+            return None
+        if self.low < 0 and self.low == -self.high:
+            top = (1 << (8 * self.size - 1)) - 1
+            return round(value / self.high * top).to_bytes(self.size, "big", signed=True)
+        top = (1 << 8 * self.size) - 1
+        return round((value - self.low) / (self.high - self.low) * top).to_bytes(self.size, "big")
+
+
+_ALTITUDE, _ANGLE, _ERROR = _Mapped(2, -900, 19000), _Mapped(4, 0, 360), _Mapped(2, 0, 4095)
+_LATITUDE, _LONGITUDE = _Mapped(4, -90, 90), _Mapped(4, -180, 180)
+_MAPPED = {
+    PLATFORM_HEADING: _Mapped(2, 0, 360),
+    PLATFORM_PITCH: _Mapped(2, -20, 20),
+    PLATFORM_ROLL: _Mapped(2, -50, 50),
+    SENSOR_LATITUDE: _LATITUDE,
+    SENSOR_LONGITUDE: _LONGITUDE,
+    SENSOR_ALTITUDE: _ALTITUDE,
+    HORIZONTAL_FOV: _Mapped(2, 0, 180),
+    VERTICAL_FOV: _Mapped(2, 0, 180),
+    RELATIVE_AZIMUTH: _ANGLE,
+    RELATIVE_ELEVATION: _Mapped(4, -180, 180),
+    RELATIVE_ROLL: _ANGLE,
+    SLANT_RANGE: _Mapped(4, 0, 5e6),
+    CENTRE_LATITUDE: _LATITUDE,
+    CENTRE_LONGITUDE: _LONGITUDE,
+    CENTRE_ELEVATION: _ALTITUDE,
+    **dict.fromkeys(range(FIRST_CORNER_OFFSET, FIRST_CORNER_OFFSET + 8), _Mapped(2, -0.075, 0.075)),
+    TARGET_LATITUDE: _LATITUDE,
+    TARGET_LONGITUDE: _LONGITUDE,
+    TARGET_ELEVATION: _ALTITUDE,
+    TARGET_CE90: _ERROR,
+    TARGET_LE90: _ERROR,
+    SENSOR_HEIGHT: _ALTITUDE,
+    CENTRE_HEIGHT: _ALTITUDE,
+    **{FIRST_CORNER + k: (_LATITUDE, _LONGITUDE)[k % 2] for k in range(8)},
+    PLATFORM_PITCH_FULL: _Mapped(4, -90, 90),
+    PLATFORM_ROLL_FULL: _Mapped(4, -90, 90),
+}
+_TEXTS = frozenset((MISSION, IMAGE_SOURCE, COORDINATES))
+_LONGEST_TEXT = 127
+
+
+def encode(time_us: int, fields: Mapping[int, float | str]) -> bytes:
+    """One packet: universal label, length, time first, the fields by tag, checksum last.
+
+    time_us: microseconds since 1970-01-01. ValueError for a tag that is not known here.
+    """
+    body = _item(TIME, time_us.to_bytes(8, "big"))
+    for tag, value in sorted({**fields, LOCAL_SET_VERSION: VERSION}.items()):
+        encoded = _encoded(tag, value)
+        if encoded is not None:
+            body += _item(tag, encoded)
+    length = len(body) + 4  # the checksum's own item
+    packet = UNIVERSAL_LABEL + _length(length) + body + bytes((CHECKSUM, 2))
+    return packet + checksum(packet).to_bytes(2, "big")
+
+
+def checksum(data: bytes) -> int:
+    """The 16-bit running sum, from the label to the checksum's length (ST 0601, tag 1)."""
+    return (sum(data[0::2]) * 256 + sum(data[1::2])) & 0xFFFF
+
+
+def _encoded(tag: int, value: float | str) -> bytes | None:
+    if isinstance(value, str):
+        if tag not in _TEXTS:
+            raise ValueError(f"ST 0601 tag {tag} is no text here")
+        return value.encode("utf-8")[:_LONGEST_TEXT] or None
+    if tag == LOCAL_SET_VERSION:
+        return bytes((int(value),))
+    if tag not in _MAPPED:
+        raise ValueError(f"ST 0601 tag {tag} is not known here")
+    return _MAPPED[tag].encode(value)
+
+
+def _item(tag: int, value: bytes) -> bytes:
+    """Tag, length and value; tags up to 127 are one byte (BER-OID)."""
+    return bytes((tag,)) + _length(len(value)) + value
+
+
+def _length(n: int) -> bytes:
+    """BER: short form up to 127, else the number of bytes and then these."""
+    if n < 128:
+        return bytes((n,))
+    size = (n.bit_length() + 7) // 8
+    return bytes((0x80 | size,)) + n.to_bytes(size, "big")

@@ -1,0 +1,188 @@
+"""The camera's video sent on as it came, with ST 0601 metadata in step with its pictures.
+
+A packet is held until its picture's pose is known, at most `hold_ms` after it came: a picture that
+was not localized, or too late, goes on without metadata.
+"""
+
+from __future__ import annotations
+
+import logging
+import threading
+import time
+from collections import deque
+from collections.abc import Callable
+from dataclasses import dataclass
+from fractions import Fraction
+
+import av
+
+from companion.config import KlvConfig
+from companion.errors import StreamError
+from companion.klv.local_set import encode
+from companion.klv.metadata import Scene, picture_fields
+from companion.klv.transport import TransportWriter
+from companion.targets.population import Target
+from localizer.geometry.pose import Array
+from localizer.types import PoseEstimate
+
+_log = logging.getLogger(__name__)
+_QUEUE = 512  # packets: seconds of video
+_KEPT = 64  # exposures and estimates
+_TARGET_NS = 1_000_000_000  # a target that was told so lately is the picture's
+
+
+@dataclass(frozen=True)
+class _Item:
+    """A packet, or a new connection's writer; arrival_ns: CLOCK_MONOTONIC."""
+
+    arrival_ns: int
+    packet: av.Packet | None = None
+    writer: TransportWriter | None = None
+
+
+class KlvRelay:
+    """A `PacketTap` that writes to `config.output` on a thread of its own.
+
+    attitude: the aircraft's, NED from body (3, 3), at a time; None where it is not known.
+    utc_minus_monotonic_ns: of this computer. Whatever fails here is counted, and told once.
+    """
+
+    def __init__(
+        self,
+        config: KlvConfig,
+        scene: Scene,
+        attitude: Callable[[int], Array | None],
+        utc_minus_monotonic_ns: int,
+    ) -> None:
+        self._config = config
+        self._scene = scene
+        self._attitude = attitude
+        self._utc_ns = utc_minus_monotonic_ns
+        self._items: deque[_Item] = deque()
+        self._exposures: dict[Fraction, int] = {}
+        self._estimates: dict[int, PoseEstimate] = {}
+        self._newest_ns = 0
+        self._target: Target | None = None
+        self._writer: TransportWriter | None = None
+        self._condition = threading.Condition()
+        self._stopping = False
+        self.sent = self.described = self.dropped = self.failed = 0
+        self._thread = threading.Thread(target=self._run, name="klv")
+
+    def start(self) -> None:
+        """Start the thread."""
+        self._thread.start()
+
+    def stop(self) -> None:
+        """Stop the thread and end the stream."""
+        with self._condition:
+            self._stopping = True
+            self._condition.notify()
+        self._thread.join()
+
+    def begin(self, stream: av.VideoStream) -> None:
+        """A new connection: its packets go into a stream of their own."""
+        try:
+            writer = TransportWriter(self._config.output, stream)
+        except StreamError as error:
+            self._fail(error)
+            return
+        self._put(_Item(time.monotonic_ns(), writer=writer))
+
+    def packet(self, packet: av.Packet) -> None:
+        """Take a packet. Never blocks."""
+        self._put(_Item(time.monotonic_ns(), packet=packet))
+
+    def picture(self, pts: Fraction, exposure_time_ns: int) -> None:
+        """Note when a packet's picture was taken. Never blocks."""
+        with self._condition:
+            self._exposures[pts] = exposure_time_ns
+            while len(self._exposures) > _KEPT:
+                self._exposures.pop(next(iter(self._exposures)))
+
+    def add_estimate(self, estimate: PoseEstimate) -> None:
+        """Note an estimate, used or not. Never blocks."""
+        with self._condition:
+            self._newest_ns = max(self._newest_ns, estimate.exposure_time_ns)
+            if estimate.accepted:
+                self._estimates[estimate.exposure_time_ns] = estimate
+                while len(self._estimates) > _KEPT:
+                    self._estimates.pop(next(iter(self._estimates)))
+            self._condition.notify()
+
+    def add_target(self, target: Target) -> None:
+        """Note a located target. Never blocks."""
+        self._target = target
+
+    def _put(self, item: _Item) -> None:
+        with self._condition:
+            if len(self._items) >= _QUEUE and item.packet is not None:
+                self.dropped += 1
+                return
+            self._items.append(item)
+            self._condition.notify()
+
+    def _run(self) -> None:
+        while True:
+            with self._condition:
+                while not self._items and not self._stopping:
+                    self._condition.wait()
+                if self._stopping:
+                    break
+                item = self._items.popleft()
+                estimate = self._wait_for(item)
+            try:
+                self._send(item, estimate)
+            except Exception as error:  # a lost stream must not end the flight
+                self._fail(error)
+        self._close()
+
+    def _wait_for(self, item: _Item) -> PoseEstimate | None:
+        """The estimate of a packet's picture; None if there is none in time. Holds the lock."""
+        if item.packet is None or item.packet.pts is None:
+            return None
+        pts = Fraction(item.packet.pts * item.packet.time_base)
+        until_ns = item.arrival_ns + round(self._config.hold_ms * 1e6)
+        while not self._stopping:
+            exposure_ns = self._exposures.get(pts)
+            if exposure_ns is not None and self._newest_ns >= exposure_ns:
+                return self._estimates.get(exposure_ns)  # newer ones come no more for it
+            left_ns = until_ns - time.monotonic_ns()
+            if left_ns <= 0:
+                return None
+            self._condition.wait(left_ns * 1e-9)
+        return None
+
+    def _send(self, item: _Item, estimate: PoseEstimate | None) -> None:
+        if item.writer is not None:
+            self._close()
+            self._writer = item.writer
+        if item.packet is None or self._writer is None:
+            return
+        if estimate is not None:
+            pts = Fraction(item.packet.pts * item.packet.time_base)
+            self._writer.describe(pts, self._metadata(estimate))
+            self.described += 1
+        self._writer.write(item.packet)
+        self.sent += 1
+
+    def _metadata(self, estimate: PoseEstimate) -> bytes:
+        time_ns, target = estimate.exposure_time_ns, self._target
+        fix = None if target is None else target.fix
+        if fix is not None and abs(time_ns - fix.exposure_time_ns) > _TARGET_NS:
+            fix = None
+        fields = picture_fields(estimate, self._scene, self._attitude(time_ns), fix)
+        return encode((time_ns + self._utc_ns) // 1000, fields)
+
+    def _close(self) -> None:
+        if self._writer is not None:
+            try:
+                self._writer.close()
+            except OSError as error:
+                self._fail(error)
+            self._writer = None
+
+    def _fail(self, error: Exception) -> None:
+        self.failed += 1
+        if self.failed == 1:
+            _log.warning("klv.output %s: %s", self._config.output, error)

@@ -1,0 +1,221 @@
+"""``companion klv``: the metadata of a flight's record put into a recording of its video."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack
+from dataclasses import dataclass
+from fractions import Fraction
+from pathlib import Path
+
+import av
+import numpy as np
+from av.sidedata.sidedata import Type as SideDataType
+
+from companion.errors import RecordError, StreamOpenError
+from companion.klv.local_set import encode
+from companion.klv.metadata import Scene, picture_fields
+from companion.klv.transport import TransportWriter
+from companion.offline.tables import Columns, poses
+from companion.reporting.record import RecordTables, read_record
+from companion.sources.base import fitted_camera
+from companion.sources.misp import parse_message
+from localizer.geometry.camera import Camera
+from localizer.geometry.pose import Array, matrix_from_euler
+from localizer.map.cache.cache import TileCache
+from localizer.map.cache.surface import MapSurface
+from localizer.types import PoseEstimate, RegistrationStatus, TargetFix, TrackingState
+from mavlink_bridge.link.tlog import read_tlog
+
+_SAME_NS = 5_000_000  # a picture and its estimate
+_ATTITUDE_NS = 100_000_000
+_TARGET_NS = 1_000_000_000
+
+
+@dataclass(frozen=True)
+class Written:
+    """What came of it: pictures of the video, and how many of them got metadata."""
+
+    path: Path
+    pictures: int
+    described: int
+
+
+def describe_recording(
+    video: Path,
+    record: Path,
+    out: Path,
+    *,
+    map_cache: Path | None = None,
+    begin_s: float | None = None,
+    mission: str = "",
+    progress: Callable[[], None] = lambda: None,
+) -> Written:
+    """Write `video` again as MPEG-TS with ST 0601 metadata beside each picture that was localized.
+
+    begin_s: when its first picture was taken, seconds since the record's start; None: the pictures
+    carry MISP time stamps. Raises `RecordError`, `StreamOpenError`.
+    """
+    tables = read_record(record)
+    map_path = map_cache or tables.map_path
+    if map_path is None:
+        raise RecordError(f"{record}: does not say which map was flown on; give it as --map")
+    if tables.camera is None or not tables.estimates:
+        raise RecordError(f"{record}: holds no estimate, or does not say which camera")
+    if not tables.utc_ns:
+        raise RecordError(f"{record}: does not say what time it was (record.json)")
+    if out.resolve() == video.resolve():
+        raise RecordError(f"{out}: is the video itself; give another file as --out")
+    cache = TileCache.open(map_path)
+    with ExitStack() as stack:
+        scene = Scene(
+            cache.frame, MapSurface(cache).cast, cache.manifest.geoid_separation_m, mission
+        )
+        track = _Track(tables, scene)
+        try:
+            source = stack.enter_context(av.open(str(video)))
+            stream = source.streams.video[0]
+        except (OSError, ValueError, IndexError) as error:
+            raise StreamOpenError(f"{video}: not a video: {error}") from error
+        camera = fitted_camera(stream.width, stream.height, tables.camera, str(video))
+        begin_ns = None if begin_s is None else tables.start_ns + round(begin_s * 1e9)
+        clock = _Clock(begin_ns, tables.utc_ns - tables.start_ns)
+        writer = TransportWriter(str(out), stream)
+        pictures = described = 0
+        try:
+            for packet, taken in _packets(source, stream, clock):
+                for pts, time_ns in taken:
+                    pictures += 1
+                    progress()
+                    metadata = track.at(time_ns, camera)
+                    if metadata is not None:
+                        writer.describe(pts, metadata)
+                        described += 1
+                if packet.dts is not None:
+                    writer.write(packet)
+        finally:
+            writer.close()
+    if not described:
+        out.unlink(missing_ok=True)
+        raise RecordError(
+            f"{video}: no picture of it was localized in {record}; are they of one flight? Say "
+            "when its first picture was taken with --begin"
+        )
+    return Written(out, pictures, described)
+
+
+@dataclass
+class _Clock:
+    """From a picture to its exposure on the record's CLOCK_MONOTONIC."""
+
+    begin_ns: int | None
+    utc_minus_monotonic_ns: int
+    first: Fraction | None = None
+
+    def exposure_ns(self, picture: av.VideoFrame) -> int | None:
+        """None of a picture that does not say."""
+        pts = Fraction(picture.pts * picture.time_base)
+        self.first = pts if self.first is None else self.first
+        if self.begin_ns is not None:
+            return self.begin_ns + round((pts - self.first) * 10**9)
+        for data in picture.side_data:
+            if data.type == SideDataType.SEI_UNREGISTERED:
+                stamp = parse_message(bytes(data))
+                if stamp is not None:
+                    return stamp.time_us * 1000 - self.utc_minus_monotonic_ns
+        return None
+
+
+def _packets(
+    source: av.container.InputContainer, stream: av.VideoStream, clock: _Clock
+) -> Iterator[tuple[av.Packet, list[tuple[Fraction, int]]]]:
+    """Every packet of the video, and the pictures (presentation time, exposure) that it gave."""
+    for packet in source.demux(stream):
+        taken = []
+        try:
+            pictures = packet.decode()
+        except av.error.InvalidDataError:
+            pictures = []
+        for picture in pictures:
+            if picture.pts is not None:
+                time_ns = clock.exposure_ns(picture)
+                if time_ns is not None:
+                    taken.append((Fraction(picture.pts * picture.time_base), time_ns))
+        yield packet, taken
+
+
+class _Track:
+    """What the record knows at a time: pose, the aircraft's attitude, the newest target."""
+
+    def __init__(self, tables: RecordTables, scene: Scene) -> None:
+        self._scene = scene
+        self._utc_ns = tables.utc_ns - tables.start_ns
+        estimates = tables.estimates
+        used = np.asarray(estimates["accepted"]) > 0
+        kept: Columns = {name: values[used] for name, values in estimates.items()}
+        order = np.argsort(kept["exposure_time_ns"], kind="stable")
+        kept = {name: values[order] for name, values in kept.items()}
+        self._times = np.asarray(kept["exposure_time_ns"], dtype=np.int64)
+        self._poses = poses(kept)
+        self._targets = _targets(tables.targets)
+        self._attitudes = _attitudes(tables.tlog, self._utc_ns)
+
+    def at(self, time_ns: int, camera: Camera) -> bytes | None:
+        """The packet of a picture; None of one that was not localized."""
+        k = _nearest(self._times, time_ns, _SAME_NS)
+        if k is None:
+            return None
+        estimate = PoseEstimate(
+            self._poses[k], np.zeros((6, 6)), 1.0, TrackingState.TRACKING, RegistrationStatus.OK,
+            True, int(self._times[k]), 0, camera,
+        )  # fmt: skip
+        body = None
+        times, angles = self._attitudes
+        j = _nearest(times, time_ns, _ATTITUDE_NS)
+        if j is not None:
+            body = matrix_from_euler(*angles[j])
+        fields = picture_fields(estimate, self._scene, body, self._target(time_ns))
+        return encode((time_ns + self._utc_ns) // 1000, fields)
+
+    def _target(self, time_ns: int) -> TargetFix | None:
+        times, fixes = self._targets
+        k = int(np.searchsorted(times, time_ns, side="right")) - 1
+        if k < 0 or time_ns - times[k] > _TARGET_NS:
+            return None
+        return fixes[k]
+
+
+def _nearest(times: np.ndarray, time_ns: int, within_ns: int) -> int | None:
+    k = int(np.searchsorted(times, time_ns))
+    near = [j for j in (k - 1, k) if 0 <= j < len(times)]
+    best = min(near, key=lambda j: abs(int(times[j]) - time_ns), default=None)
+    if best is None or abs(int(times[best]) - time_ns) > within_ns:
+        return None
+    return best
+
+
+def _targets(table: Columns) -> tuple[np.ndarray, list[TargetFix]]:
+    """Every report of a target, in the order of time."""
+    rows = []
+    for k in range(len(table.get("exposure_time_ns", ()))):
+        place = np.array([table[name][k] for name in ("east_m", "north_m", "up_m")], dtype=float)
+        horizontal, up = float(table["sigma_horizontal_m"][k]), float(table["sigma_up_m"][k])
+        if np.isfinite([*place, horizontal, up]).all():
+            P = np.diag([horizontal**2 / 2.0, horizontal**2 / 2.0, up**2])
+            time_ns = int(table["exposure_time_ns"][k])
+            rows.append(TargetFix(str(table["target_id"][k]), place, P, None, time_ns, 0.0))
+    rows.sort(key=lambda fix: fix.exposure_time_ns)
+    return np.array([r.exposure_time_ns for r in rows], dtype=np.int64), rows
+
+
+def _attitudes(tlog: Path | None, utc_minus_monotonic_ns: int) -> tuple[np.ndarray, Array]:
+    """When ATTITUDE came, and (N, 3) roll, pitch, yaw; none without a log."""
+    rows: list[tuple[int, float, float, float]] = []
+    if tlog is not None and tlog.is_file():
+        for utc_ns, message in read_tlog(tlog):
+            if message.get_type() == "ATTITUDE" and message.get_srcComponent() == 1:
+                time_ns = utc_ns - utc_minus_monotonic_ns
+                rows.append((time_ns, message.roll, message.pitch, message.yaw))
+    rows.sort()
+    times = np.array([row[0] for row in rows], dtype=np.int64)
+    return times, np.array([row[1:] for row in rows], dtype=float).reshape(-1, 3)
