@@ -230,8 +230,8 @@ class VideoFileSource:
 
 
 class LiveVideoSource:
-    """A live stream. A reader thread decodes; the newest picture wins; a stream that stops is
-    reported and connected to again, waiting longer after each failure.
+    """A live stream, decoded by a reader thread; the newest picture wins. One that stops is told and
+    connected to again, waiting longer after each failure.
     """
 
     def __init__(
@@ -243,11 +243,10 @@ class LiveVideoSource:
         on_stranger: Callable[[str], None] | None = None,
         tap: PacketTap | None = None,
     ) -> None:
-        self._tap = tap
+        self._tap, self._on_stranger = tap, on_stranger
         self._location = redacted(location)
         self._camera = camera
         self._settings = settings or SourceSettings()
-        self._on_stranger = on_stranger
         self._input = live_input(location, camera, self._settings, self._stranger)
         self._on_state = on_state
         self._newest: Mailbox[tuple[av.VideoFrame, Camera, int, int]] = Mailbox()
