@@ -230,8 +230,8 @@ class VideoFileSource:
 
 
 class LiveVideoSource:
-    """A live stream, decoded by a reader thread; the newest picture wins. One that stops is told and
-    connected to again, waiting longer after each failure.
+    """A live stream, decoded by a reader thread; the newest picture wins. One that stops is told,
+    and connected to again, waiting longer after each failure.
     """
 
     def __init__(
