@@ -262,6 +262,10 @@ class Bridge:
         """The last lines told to the operator, oldest first."""
         return self._status.texts()
 
+    def turns(self) -> dict[str, int]:
+        """When each link's thread began its newest turn, CLOCK_MONOTONIC ns, by the link's name."""
+        return {f"link {link.name}": link.turn_ns for link in self._links}
+
     @property
     def port(self) -> int | None:
         """The local UDP port of the flight controller's link; None while it has none.

@@ -35,6 +35,7 @@ def run_command(
         bool, typer.Option(help="restart it when it dies, and tell the operator")
     ] = False,
     standby: Annotated[bool, typer.Option(hidden=True)] = False,
+    pulse: Annotated[int | None, typer.Option(hidden=True, min=3)] = None,
     verbose: Annotated[bool, typer.Option("--verbose", "-v", help="log more")] = False,
 ) -> None:
     """Localize the camera feed and inject positions until interrupted."""
@@ -55,7 +56,7 @@ def run_command(
     settings = settings.model_copy(update={"localizer": localizer})
     from companion.flight.standby import ready
 
-    companion = ready(settings, standby=standby)
+    companion = ready(settings, standby=standby, pulse=pulse)
     if companion is None:
         return
 
@@ -91,7 +92,7 @@ def _supervise(settings: CompanionConfig, arguments: list[str]) -> int:
     supervisor = Supervisor(
         lambda standby: FlightProcess(command, standby=standby),
         tell,
-        lambda text: mark_dead(record.folder, text) if record is not None else None,
+        lambda pid, text: mark_dead(record.folder, pid, text) if record is not None else None,
     )
     for number in ENDING:
         signal.signal(number, lambda received, _: supervisor.stop(received))

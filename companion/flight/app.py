@@ -19,8 +19,12 @@ from companion.flight.health import HealthMonitor
 from companion.flight.parts import Assembly, Part
 from companion.flight.recorder import RecordKeeper
 from companion.flight.table import PARTS
+from companion.guardian.guardian import Guardian
 from companion.redaction import redacted
+from companion.supervision.pulse import Pulse
+from localizer.tracking.engine import DualThreadEngine
 from localizer.tracking.opening import MapStack
+from mavlink_bridge.bridge import Bridge
 
 _log = logging.getLogger(__name__)
 # How long a thread may keep the interpreter from another that woke up. Python's 5 ms, several times
@@ -29,13 +33,36 @@ _SWITCH_S = 0.0002
 
 
 class Companion:
-    """One deployment. `run` blocks until `stop` is called or the feed ends."""
+    """One deployment. `run` blocks until `stop` is called or the feed ends.
 
-    def __init__(self, config: CompanionConfig, parts: Sequence[Part[Any]] = PARTS) -> None:
+    pulse: descriptor of the supervisor's pipe, see `Pulse`; None without a supervisor.
+    """
+
+    def __init__(
+        self,
+        config: CompanionConfig,
+        parts: Sequence[Part[Any]] = PARTS,
+        pulse: int | None = None,
+    ) -> None:
         self._config = config
         self._parts = Assembly(config, parts)
+        self._pulse = pulse
+        self._up = ExitStack()
         self._is_stopping = False
         self._is_up = False
+
+    def prepare(self) -> None:
+        """Make what takes long and needs neither link nor feed: for a standby."""
+        try:
+            self._parts.make(self._up, ahead=True)
+        except BaseException:
+            self.put_away()
+            raise
+
+    def put_away(self) -> None:
+        """Close what was prepared and does not fly."""
+        self._up.close()
+        self._parts.forget()
 
     def run(self) -> None:
         """Fly until stopped. Raises what ended the feed, after everything is shut down.
@@ -45,7 +72,7 @@ class Companion:
         """
         sys.setswitchinterval(_SWITCH_S)
         self._parts.channels.events.subscribe(_log_event)
-        with ExitStack() as up:
+        with self._up as up:
             try:
                 self._parts.make(up)
                 # What the imports and compilers left is never garbage: searching it for garbage
@@ -58,6 +85,10 @@ class Companion:
                 self.discard_record()
                 raise
             self._parts.start(up)
+            if self._pulse is not None:
+                pulse = Pulse(self._turns, self._pulse)
+                pulse.start()
+                up.callback(pulse.stop)  # first of all: what comes down takes no turns
             self._tell_what_runs()
             feed = self._parts[Feed]
             # In slices: signals are handled between them.
@@ -82,6 +113,14 @@ class Companion:
         """Remove the record of a start that comes to nothing. It may be at any of its steps."""
         for undo in self._parts.abandonments:
             undo()
+
+    def _turns(self) -> dict[str, int]:
+        """When each thread without which no position comes began its newest turn, ns, by name."""
+        parts, turns = self._parts, self._parts[DualThreadEngine].turns()
+        turns |= {"feed": parts[Feed].turn_ns, **parts[Bridge].turns()}
+        health, guardian = parts.get(HealthMonitor), parts.get(Guardian)
+        turns |= {} if health is None else {"health": health.turn_ns}
+        return turns | ({} if guardian is None else {"guardian": guardian.turn_ns})
 
     def _tell_what_runs(self) -> None:
         events = self._parts.channels.events

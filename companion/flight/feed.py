@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import threading
+import time
 from collections.abc import Callable
 
 from companion.sources import FrameSource
@@ -19,6 +20,7 @@ class Feed:
         self._take = take
         self.ended = threading.Event()
         self.error: Exception | None = None
+        self._taken_ns: int | None = None
         self._thread = threading.Thread(target=self._run, name="feed")
 
     def start(self) -> None:
@@ -30,10 +32,18 @@ class Feed:
         self._source.close()
         self._thread.join()
 
+    @property
+    def turn_ns(self) -> int:
+        """Since when a frame is being handed on, CLOCK_MONOTONIC; now while the next is awaited."""
+        taken_ns = self._taken_ns
+        return time.monotonic_ns() if taken_ns is None else taken_ns
+
     def _run(self) -> None:
         try:
             for frame in self._source.frames():
+                self._taken_ns = time.monotonic_ns()
                 self._take(frame)
+                self._taken_ns = None
         except Exception as error:
             self.error = error
         self.ended.set()

@@ -83,6 +83,8 @@ class HealthMonitor:
         self._came: deque[tuple[float, int]] = deque(maxlen=_WINDOW)
         self._write_failed = False
         self._failures = 0
+        self.turn_ns = time.monotonic_ns()
+        """When its thread began its newest turn, CLOCK_MONOTONIC."""
         self._stop = threading.Event()
         self._thread = threading.Thread(target=self._run, name="health")
 
@@ -106,6 +108,7 @@ class HealthMonitor:
     def _run(self) -> None:
         while True:
             stopping = self._stop.wait(_PERIOD_S)
+            self.turn_ns = time.monotonic_ns()
             try:
                 self._report()
             except Exception:  # or the heartbeats would go on with the last level for ever

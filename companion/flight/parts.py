@@ -32,7 +32,7 @@ class Part(Generic[T]):
     depends: tuple[type, ...] = ()
     """Parts above this one in the table that `make` uses."""
     later: tuple[type, ...] = ()
-    """Parts below this one that it asks only once all are made, see `Making.later`."""
+    """Other parts that it asks only once all are made, see `Making.later`."""
     start: Callable[[T], None] | None = None
     stop: Callable[[T], None] | None = None
     """Undoes `start`; waits for the part's threads."""
@@ -40,6 +40,8 @@ class Part(Generic[T]):
     """Undoes `make`, where that opened something."""
     wanted: Callable[[CompanionConfig], bool] = _always
     """Whether this deployment has the part at all."""
+    ahead: bool = False
+    """Whether a standby makes it before it may fly; it needs only parts that are made so, too."""
 
 
 class Making:
@@ -101,13 +103,22 @@ class Assembly:
         found: T | None = self._made.get(kind)
         return found
 
-    def make(self, up: ExitStack) -> None:
-        """Make every part; `up` closes them in the reverse order."""
+    def make(self, up: ExitStack, *, ahead: bool = False) -> None:
+        """Make every part that is not made yet; `up` closes them in the reverse order.
+
+        ahead: only what a standby makes.
+        """
         for part in self._parts:
+            if part.kind in self._made or (ahead and not part.ahead):
+                continue
             made = part.make(Making(part, self))
             self._made[part.kind] = made
             if part.close is not None:
                 up.callback(part.close, made)
+
+    def forget(self) -> None:
+        """What was made is closed: it is made anew."""
+        self._made.clear()
 
     def start(self, up: ExitStack) -> None:
         """Start every part; `up` stops them in the reverse order."""
@@ -123,7 +134,7 @@ def _check_order(parts: Sequence[Part[Any]]) -> None:
     known: set[type] = set()
     every = {part.kind for part in parts}
     for part in parts:
-        missing = (set(part.depends) - known) | (set(part.later) - (every - known))
+        missing = (set(part.depends) - known) | (set(part.later) - every)
         if missing or part.kind in known:
             names = ", ".join(sorted(kind.__name__ for kind in missing)) or part.kind.__name__
             raise LookupError(

@@ -49,6 +49,7 @@ from localizer.geometry.pose import matrix_from_quaternion
 from localizer.map.cache.cache import TileCache
 from localizer.map.cache.surface import MapSurface
 from localizer.tracking.engine import DualThreadEngine
+from localizer.tracking.motion import OtherSensors
 from localizer.tracking.opening import MapStack, build_localizer
 from localizer.tracking.pipeline import Localizer
 from localizer.types import Frame, PoseEstimate, ReferenceBundle
@@ -246,9 +247,14 @@ def _last_fix(making: Making) -> FixMemory:
 
 def _localizer(making: Making) -> Localizer:
     _log.info("making the localizer ready; the first start on a machine compiles its kernels")
-    config, autopilot = making.config, making[AutopilotPose]
+    config, autopilot = making.config, making.later(AutopilotPose)
     camera = config.camera.model.camera()
-    return build_localizer(making[MapStack], camera, config.localizer, autopilot.sensors)
+    sensors = OtherSensors(
+        lambda time_ns: autopilot().rotation(time_ns),
+        lambda begin_ns, end_ns: autopilot().displacement(begin_ns, end_ns),
+        lambda _time_ns: autopilot().height_m,
+    )
+    return build_localizer(making[MapStack], camera, config.localizer, sensors)
 
 
 def _injection(making: Making) -> FixInjection:
@@ -372,7 +378,7 @@ def _engine(making: Making) -> DualThreadEngine:
 # source and a port in use are found before the localizer, whose compilation takes its time; the
 # record is closed after all that could tell it something.
 PARTS: tuple[Part[Any], ...] = (
-    Part("map", MapStack, _map, close=MapStack.close),
+    Part("map", MapStack, _map, close=MapStack.close, ahead=True),
     Part("installation", Installation, _installation, depends=(MapStack,)),
     Part(
         "bridge", Bridge, _bridge, depends=(MapStack,), later=(PlaceSearch,),
@@ -419,7 +425,9 @@ PARTS: tuple[Part[Any], ...] = (
         lambda making: PriorSources(making[FixMemory].prior, making[AutopilotPose].prior),
         depends=(FixMemory, AutopilotPose),
     ),
-    Part("localizer", Localizer, _localizer, depends=(MapStack, AutopilotPose)),
+    Part(
+        "localizer", Localizer, _localizer, depends=(MapStack,), later=(AutopilotPose,), ahead=True
+    ),
     Part(
         "view", ViewReporter, _view, depends=(MapStack, Bridge),
         start=ViewReporter.start, stop=ViewReporter.stop,

@@ -32,6 +32,8 @@ class Guardian:
         self._lock = threading.Lock()
         self._picture: tuple[int, Image] | None = None
         self._failures = 0
+        self.turn_ns = monotonic_ns()
+        """When its thread began its newest turn, CLOCK_MONOTONIC."""
         self._stop = threading.Event()
         self._thread = threading.Thread(target=self._run, name="guardian")
 
@@ -88,6 +90,7 @@ class Guardian:
 
     def _run(self) -> None:
         while not self._stop.wait(_PERIOD_S):
+            self.turn_ns = monotonic_ns()
             try:
                 self._step()
             except Exception:

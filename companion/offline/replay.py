@@ -48,6 +48,7 @@ class RecordedEstimate:
     known_ns: int
     world_from_camera: Pose
     accepted: bool
+    is_tracking: bool = True
 
 
 @dataclass(frozen=True)
@@ -150,6 +151,7 @@ def _estimate(row: dict[str, str]) -> RecordedEstimate:
         exposure_ns + round(1e6 * float(row["latency_ms"])),
         Pose(matrix_from_quaternion(q), t),
         row["accepted"] == "1",
+        row.get("state", "tracking") == "tracking",
     )
 
 

@@ -3,10 +3,22 @@
 from __future__ import annotations
 
 import contextlib
+import os
 import subprocess
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 _DISMISS_S = 5.0
+_KILL_S = 1.0
+_READ = 4096
+
+
+@dataclass(frozen=True)
+class Beat:
+    """A sign of life: which part's last turn is longest ago, and how long."""
+
+    part: str
+    age_s: float
 
 
 class FlightProcess:
@@ -16,11 +28,21 @@ class FlightProcess:
     """
 
     def __init__(self, command: Sequence[str], *, standby: bool) -> None:
-        self._process = subprocess.Popen(
-            [*command, "--standby"] if standby else command,
-            stdin=subprocess.PIPE if standby else subprocess.DEVNULL,
-            start_new_session=True,
-        )
+        self._beats, end = os.pipe()
+        os.set_blocking(self._beats, False)
+        self._unread = b""
+        try:
+            self._process = subprocess.Popen(
+                [*command, f"--pulse={end}", *(["--standby"] if standby else [])],
+                stdin=subprocess.PIPE if standby else subprocess.DEVNULL,
+                start_new_session=True,
+                pass_fds=(end,),
+            )
+        except BaseException:
+            os.close(self._beats)
+            raise
+        finally:
+            os.close(end)
 
     @property
     def pid(self) -> int:
@@ -41,6 +63,28 @@ class FlightProcess:
         except subprocess.TimeoutExpired:
             return None
 
+    def close(self) -> None:
+        """Nothing is read of it any more."""
+        if self._beats >= 0:
+            os.close(self._beats)
+            self._beats = -1
+
+    def beats(self) -> tuple[Beat, ...]:
+        """What it said since the last look."""
+        try:
+            while data := os.read(self._beats, _READ):
+                self._unread += data
+        except OSError:  # nothing more for now
+            pass
+        *lines, self._unread = self._unread.split(b"\n")
+        self._unread = self._unread[:_READ]
+        return tuple(beat for line in lines if (beat := _beat(line)) is not None)
+
+    def kill(self) -> None:
+        """End one that hangs; it may be stopped, or wait for a disk."""
+        self._process.kill()
+        self.wait(_KILL_S)
+
     def interrupt(self, number: int) -> None:
         """Pass a signal on; harmless when it has ended."""
         with contextlib.suppress(ProcessLookupError):
@@ -54,3 +98,10 @@ class FlightProcess:
         if self.wait(_DISMISS_S) is None:
             self._process.kill()
             self._process.wait()
+        self.close()
+
+
+def _beat(line: bytes) -> Beat | None:
+    """A line of `companion.supervision.pulse`; None for anything else."""
+    part, _, age_ms = line.decode(errors="replace").partition(" ")
+    return Beat(part, int(age_ms) * 1e-3) if age_ms.isdecimal() and len(age_ms) < 12 else None

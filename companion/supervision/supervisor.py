@@ -1,9 +1,9 @@
 """Keeps the flight process alive: a process of its own that does nothing else.
 
-It waits for the flight process to end. A death is told to the operator and marked in
-``health.json`` within a second, and a standby process, whose imports and compiled kernels are in
-memory already, takes over. Deaths that come too fast end it: something is wrong that no restart
-mends.
+It waits for the flight process to end, and for the signs of life of its parts: one that hangs is
+ended. A death is told to the operator and marked in ``health.json`` within a second, and a standby
+process, with map and network in memory, takes over. Deaths that come too fast end it: something is
+wrong that no restart mends.
 """
 
 from __future__ import annotations
@@ -13,13 +13,16 @@ import logging
 import signal
 import time
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Protocol
+from typing import Any, Protocol
+
+from companion.supervision.processes import Beat
 
 _log = logging.getLogger(__name__)
-_WATCH_S = 0.5  # between looks at what else is due; a death wakes at once
+_WATCH_S = 0.25  # between looks at what else is due; a death wakes at once
+_LOOKED_AWAY_S = 1.5  # after which it was the supervisor that stood still, or the computer
 _AGAIN_S = 1.0
 _USAGE = 2  # exit code of a named error
 
@@ -37,6 +40,15 @@ class Process(Protocol):
     def wait(self, timeout_s: float) -> int | None:
         """Its exit code, negative of a signal; None while it runs."""
 
+    def beats(self) -> Sequence[Beat]:
+        """Its signs of life since the last look."""
+
+    def kill(self) -> None:
+        """End one that hangs."""
+
+    def close(self) -> None:
+        """Nothing is asked of it any more."""
+
     def interrupt(self, number: int) -> None:
         """Pass a signal on; harmless when it has ended."""
 
@@ -48,25 +60,34 @@ class Process(Protocol):
 class RestartPolicy:
     """At most `deaths` within `window_s`; a standby is made once one flies for `standby_after_s`:
     its imports take a core for seconds.
+
+    A part without a turn for `part_s` hangs, and a process without a sign of life for `silent_s`:
+    beyond what an overloaded computer does, and below the autopilot's patience. Before its first
+    sign a standby that was released has `released_s`, another `cold_s`: it may compile.
     """
 
     deaths: int = 5
     window_s: float = 300.0
     standby_after_s: float = 20.0
+    part_s: float = 4.0
+    silent_s: float = 3.0
+    released_s: float = 30.0
+    cold_s: float = 300.0
 
 
 class Supervisor:
     """`run` until the flight is over.
 
     spawn: makes a process, flying at once or as a standby. tell: a line (severity, text) to the
-    operator; mark: what ``health.json`` is to say. clock: monotonic seconds; pause: sleeps so many.
+    operator; mark: what the ``health.json`` of the process (id) is to say. clock: monotonic
+    seconds; pause: sleeps so many.
     """
 
     def __init__(
         self,
         spawn: Callable[[bool], Process],
         tell: Callable[[int, str], None],
-        mark: Callable[[str], None],
+        mark: Callable[[int, str], None],
         policy: RestartPolicy | None = None,
         clock: Callable[[], float] = time.monotonic,
         pause: Callable[[float], None] = time.sleep,
@@ -78,21 +99,27 @@ class Supervisor:
         self._standby: Process | None = None
         self._deaths: deque[float] = deque(maxlen=self._policy.deaths)
         self._since_s = self._no_standby_until_s = 0.0
+        self._heard_s = self._looked_s = self._patience_s = 0.0
         self._stopping = False
 
     def run(self) -> int:
         """The exit code of the flight process that ended in order, or of the last one."""
-        self._fly(self._spawn(False))
+        self._fly(self._spawn(False), self._policy.cold_s)
         try:
             while True:
                 code = self._watch()
+                hangs = self._hanging() if code is None and not self._stopping else ""
+                if hangs:
+                    code = self._end_what_hangs()
                 if code is None:
                     continue
-                if self._stopping or code == 0 or self._is_hopeless(code):
+                if not hangs and (self._stopping or code == 0 or self._is_hopeless(code)):
                     return code
-                if not self._recover(code):
+                if not self._recover(f"hangs ({hangs})" if hangs else f"died ({described(code)})"):
                     return code if code > 0 else 128 - code
         finally:
+            if self._flying is not None:
+                self._flying.close()
             if self._standby is not None:
                 self._standby.dismiss()
 
@@ -102,8 +129,12 @@ class Supervisor:
         if self._flying is not None:
             self._flying.interrupt(number)
 
-    def _fly(self, process: Process) -> None:
+    def _fly(self, process: Process, patience_s: float) -> None:
+        if self._flying is not None:
+            self._flying.close()
         self._flying, self._since_s = process, self._clock()
+        self._heard_s = self._looked_s = self._since_s
+        self._patience_s = patience_s
         if self._stopping:
             process.interrupt(signal.SIGINT)
 
@@ -115,6 +146,25 @@ class Supervisor:
         if wanted and flown_s >= self._policy.standby_after_s:
             self._prepare_standby()
         return code
+
+    def _hanging(self) -> str:
+        """What of the flight process hangs; empty while nothing does."""
+        assert self._flying is not None
+        now_s, beats = self._clock(), self._flying.beats()
+        looked_away = now_s - self._looked_s > _LOOKED_AWAY_S
+        self._looked_s = now_s
+        if beats:
+            self._heard_s, self._patience_s = now_s, self._policy.silent_s
+            last = beats[-1]
+            return last.part[:12] if last.age_s > self._policy.part_s else ""
+        if looked_away:
+            self._heard_s = now_s
+        return "process" if now_s - self._heard_s > self._patience_s else ""
+
+    def _end_what_hangs(self) -> int:
+        assert self._flying is not None
+        self._flying.kill()
+        return -signal.SIGKILL
 
     def _prepare_standby(self) -> None:
         """Without one a restart takes longer, and nothing else: the flight goes on."""
@@ -130,37 +180,35 @@ class Supervisor:
         """A wrong configuration is as wrong the next time; it was told where it was found."""
         return code == _USAGE and not self._deaths and self._standby is None
 
-    def _recover(self, code: int) -> bool:
-        """Tell, mark, and fly again; False where that has become pointless."""
-        now_s = self._clock()
+    def _recover(self, how: str) -> bool:
+        """Fly again, tell and mark; False where that has become pointless. how: it ended."""
+        assert self._flying is not None
+        now_s, dead = self._clock(), self._flying.pid
         recent = [at for at in self._deaths if now_s - at < self._policy.window_s]
         self._deaths.append(now_s)
-        why = described(code)
         again = len(recent) + 1 < self._policy.deaths
         what = "restarting" if again else "not restarted"
-        _log.error("the flight process died (%s), %s", why, what)
-        self._guarded(lambda: self._mark(f"companion died ({why}), {what}"))
-        self._guarded(lambda: self._tell(2, f"PiLoT: companion died ({why}), {what}"))
-        if not again:
-            return False
-        process, self._standby = self._standby, None
-        if process is None:
-            return self._begin_anew(code)
-        process.release()
-        self._fly(process)
-        return True
+        _log.error("the flight process %s, %s", how, what)
+        process, self._standby = (self._standby, None) if again else (None, self._standby)
+        if process is not None:
+            # First of all. It opens the links later than this process, which then tells at once.
+            process.release()
+            self._fly(process, self._policy.released_s)
+        self._guarded(lambda: self._tell(2, f"PiLoT: companion {how}, {what}"))
+        self._guarded(lambda: self._mark(dead, f"companion {how}, {what}"))
+        return again and (process is not None or self._begin_anew(how, dead))
 
-    def _begin_anew(self, code: int) -> bool:
+    def _begin_anew(self, how: str, dead: int) -> bool:
         """A cold start, a few times where the computer has no process to give; False: none had."""
         for _ in range(self._policy.deaths):
             try:
-                self._fly(self._spawn(False))
+                self._fly(self._spawn(False), self._policy.cold_s)
                 return True
             except OSError as error:
                 _log.error("no flight process can be started: %s", error)
                 self._pause(_AGAIN_S)
-        text = f"companion died ({described(code)}), not restarted"
-        self._guarded(lambda: self._mark(text))
+        text = f"companion {how}, not restarted"
+        self._guarded(lambda: self._mark(dead, text))
         self._guarded(lambda: self._tell(2, f"PiLoT: {text}"))
         return False
 
@@ -183,18 +231,26 @@ def described(code: int) -> str:
         return f"signal {-code}"
 
 
-def mark_dead(folder: Path, text: str, latest: str = "latest") -> None:
-    """Let the newest record's ``health.json`` say so; a record that is not there says nothing."""
-    path = folder.parent / latest / "health.json"
-    if not path.parent.is_dir():
-        path = folder / "health.json"
-    if not path.parent.is_dir():
-        return
-    temporary = path.with_suffix(".dead")
+def mark_dead(folder: Path, pid: int, text: str) -> None:
+    """Let the ``health.json`` of the process say so, in the record at `folder` or beside it.
+
+    Where no record has one of this process, there is nothing to say it in.
+    """
+    for path in folder.parent.glob(f"{folder.name}*/health.json"):
+        report = _report(path)
+        if report.get("pid") == pid:
+            _mark(path, report, text)
+
+
+def _report(path: Path) -> dict[str, Any]:
     try:
-        report = dict(json.loads(path.read_text(encoding="utf-8")))
-    except (OSError, ValueError, TypeError):
-        report = {}
+        return dict(json.loads(path.read_text(encoding="utf-8")))
+    except (OSError, ValueError, TypeError, RecursionError):
+        return {}
+
+
+def _mark(path: Path, report: dict[str, Any], text: str) -> None:
+    temporary = path.with_suffix(".dead")
     report.update(level="failed", text=text, time_ns=time.monotonic_ns())
     temporary.write_text(json.dumps(report, indent=1), encoding="utf-8")
     temporary.replace(path)

@@ -68,6 +68,7 @@ class DualThreadEngine:
         self._reference_ms: dict[str, float] = {}
         self._book = HealthBook(localizer.renderer_name, localizer.features_name)
         self._stop = threading.Event()
+        self._turns: dict[str, int] = {}
         self._threads = [
             threading.Thread(target=self._run, args=(self._render_once,), name="render"),
             threading.Thread(target=self._run, args=(self._localize_once,), name="localize"),
@@ -100,8 +101,14 @@ class DualThreadEngine:
         """A snapshot of the counters."""
         return self._book.read(self._frames.dropped, self._localizer.optimizer_name)
 
+    def turns(self) -> dict[str, int]:
+        """When each thread that makes fixes began its newest turn, CLOCK_MONOTONIC ns, by name."""
+        return {n: self._turns[n] for n in ("render", "localize") if n in self._turns}
+
     def _run(self, once: Callable[[], None]) -> None:
+        name = threading.current_thread().name
         while not self._stop.is_set():
+            self._turns[name] = time.monotonic_ns()
             try:
                 once()
             except LocalizerError as error:

@@ -124,6 +124,7 @@ class Link:
         self._stop = threading.Event() if o.stop is None else o.stop
         self._thread: threading.Thread | None = None
         self._transport: Transport | None = None
+        self._turn_ns: int | None = None
         self._waker = WakePipe()
         self._wake_read = self._waker.read_end
 
@@ -137,6 +138,12 @@ class Link:
         """The local UDP port; None while the transport is closed, and for streams."""
         transport = self._transport
         return transport.port if isinstance(transport, UdpTransport) else None
+
+    @property
+    def turn_ns(self) -> int:
+        """When the owner thread began its newest turn, CLOCK_MONOTONIC; now while it opens."""
+        turn_ns = self._turn_ns
+        return monotonic_ns() if turn_ns is None else turn_ns
 
     @property
     def congested(self) -> bool:
@@ -210,6 +217,7 @@ class Link:
         backoff_s = _BACKOFF_S[0]
         while not self._stop.is_set():
             opened_ns = monotonic_ns()
+            self._turn_ns = None  # a name server or a modem may take long
             self._transport = self._try_open()
             if self._transport is not None:
                 self._serve_until_lost(self._transport)
@@ -257,8 +265,9 @@ class Link:
         while (left_ns := end_ns - monotonic_ns()) > 0:
             if self._stop.wait(min(left_ns * 1e-9, _IDLE_TICK_S)):
                 return
+            self._turn_ns = monotonic_ns()
             self._empty_outbox()
-            self._guard(self._handler.on_tick, self, monotonic_ns())
+            self._guard(self._handler.on_tick, self, self._turn_ns)
 
     def _serve(self, transport: Transport) -> None:
         self._reader.reset()
@@ -275,6 +284,7 @@ class Link:
             wait_s = min(max(deadline_ns - monotonic_ns(), 0) * 1e-9, _LONGEST_WAIT_S)
             poller.modify(transport, select.POLLIN | (select.POLLOUT if self._unsent else 0))
             ready = dict(poller.poll(wait_s * 1e3))
+            self._turn_ns = monotonic_ns()
             events = ready.get(transport.fileno(), 0)
             if events & ~select.POLLOUT and self._receive(transport):
                 last_rx_ns = monotonic_ns()

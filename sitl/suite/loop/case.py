@@ -65,8 +65,8 @@ class LoopEvent(_Model):
     """Something that happens at_s seconds after the recorded part began (and GNSS was denied).
 
     picture: a fault of the video. kill: SIGKILL to the companion, which is started again
-    restart_after_s later, or by its supervisor. start: of a companion that did not run until now
-    (`cold`). vehicle: parameters that the ground station sets.
+    restart_after_s later, or by its supervisor. hang: SIGSTOP to the flight process. start: of a
+    companion that did not run until now (`cold`). vehicle: parameters that the ground station sets.
     """
 
     at_s: float = Field(ge=0)
@@ -76,6 +76,7 @@ class LoopEvent(_Model):
     hint: PlaceHint | None = None
     start: bool = False
     kill: bool = False
+    hang: bool = False
     restart_after_s: float = Field(1.0, ge=0, le=60)
     vehicle: dict[str, float] = {}
 
@@ -102,7 +103,7 @@ class Expectation(_Model):
     told_within_s: an EKF error beyond `beyond_m` is told (health worse than ok, or a finding of the
     guardian that stands) at latest so long after it began. never_modes: flight modes that must not
     be entered. max_error_m: of the EKF. false_fixes: injected positions further off than 5 m;
-    injects: and some are injected.
+    injects: and some are injected. back_within_s: of a kill or a hang, injected again.
     ends_tracking: the last health is ok. says: parts of texts that must come from the companion.
     silent: no warning text, no finding of the guardian, and a health that is ok throughout.
     """
@@ -113,6 +114,7 @@ class Expectation(_Model):
     max_error_m: float | None = Field(None, gt=0)
     false_fixes: int | None = Field(0, ge=0)
     injects: bool = True
+    back_within_s: float | None = Field(None, gt=0)
     ends_tracking: bool = False
     says: tuple[str, ...] = ()
     silent: bool = False

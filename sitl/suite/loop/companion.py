@@ -80,6 +80,10 @@ class LoopCompanion:
             self._process.send_signal(signal.SIGKILL)
             self._process.wait()
 
+    def hang(self) -> None:
+        """SIGSTOP to the process that flies: it is not dead, and does nothing."""
+        os.kill(self.health().pid, signal.SIGSTOP)
+
     def require(self) -> None:
         """FlightError when it has ended by itself."""
         code = None if self._process is None else self._process.poll()

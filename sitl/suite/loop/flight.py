@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from contextlib import ExitStack
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -13,6 +13,7 @@ import numpy as np
 import yaml
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
+from companion.offline.replay import read_estimates
 from localizer.map.cache.cache import TileCache
 from mavlink_bridge.link.tlog import read_tlog
 from sitl.camera.gimbal_error import GimbalError
@@ -29,7 +30,7 @@ from sitl.suite.flight import longest_stall, slowest_pace
 from sitl.suite.loop.case import LoopCase, LoopEvent, PlaceHint, Wrong
 from sitl.suite.loop.companion import LoopCompanion
 from sitl.suite.loop.disturbances import GnssDrag, OtherWork
-from sitl.suite.loop.judge import LoopRecord, LoopSample, LoopText
+from sitl.suite.loop.judge import Back, LoopRecord, LoopSample, LoopText
 from sitl.vehicles.launch import VISION_SOURCE, VehicleSetup, open_vehicle
 from sitl.vehicles.process import VehicleKind, VehicleProcess
 
@@ -78,6 +79,7 @@ class _LoopFlight:
         self._ticks: list[tuple[float, float]] = []
         self._tlog = out.resolve() / "flight.tlog"
         self._start_ns = 0
+        self._ended_ns: int | None = None
 
     def prepare(self) -> None:
         """From power on to a companion that tracks at the flight's height."""
@@ -137,7 +139,7 @@ class _LoopFlight:
         texts = tuple(
             LoopText((t.time_ns - self._start_ns) * 1e-9, t.component, t.severity, t.text)
             for t in self._pilot.record.texts
-            if t.time_ns >= self._start_ns
+            if self._start_ns <= t.time_ns <= self._end_ns
         )
         return LoopRecord(
             self._with_errors(),
@@ -145,6 +147,7 @@ class _LoopFlight:
             tuple(self._fix_errors()),
             slowest_pace(self._ticks),
             longest_stall(self._ticks),
+            self._back(),
         )
 
     # --- before ----------------------------------------------------------------------------------
@@ -210,6 +213,10 @@ class _LoopFlight:
             self._tell_place(event.hint)
         if event.start:
             self._companion.start()
+        if event.kill or event.hang:
+            self._ended_ns = time.monotonic_ns()
+        if event.hang:
+            self._companion.hang()
         if event.kill:
             self._companion.kill()
         if event.kill and not self._case.supervised:
@@ -267,6 +274,29 @@ class _LoopFlight:
             samples.append(replace(sample, error_m=error_m))
         return tuple(samples)
 
+    def _back(self) -> Back | None:
+        """What came after the companion's end, by its own record and by what was sent."""
+        if self._ended_ns is None:
+            return None
+        ended_ns = self._ended_ns
+        utc_ns = time.time_ns() - time.monotonic_ns() + ended_ns
+        sent = [
+            stamp_ns
+            for stamp_ns, message in (read_tlog(self._tlog) if self._tlog.exists() else ())
+            if message.get_type() == "VISION_POSITION_ESTIMATE" and stamp_ns > utc_ns
+        ]
+        known = [
+            (e.known_ns, e.accepted, e.is_tracking)
+            for path in sorted(self._out.glob("companion*/estimates.csv"))
+            for e in read_estimates(path)
+            if e.exposure_time_ns > ended_ns
+        ]
+        return Back(
+            _first_s((t for t, accepted, _ in known if accepted), ended_ns),
+            _first_s((t for t, accepted, tracks in known if accepted and tracks), ended_ns),
+            _first_s(sent, utc_ns),
+        )
+
     def _fix_errors(self) -> list[float]:
         """Horizontal errors of every position that was injected in the recorded part, metres."""
         origin = self._pilot.record.origin
@@ -283,6 +313,10 @@ class _LoopFlight:
             true = origin.ned_of(truth.location)
             errors.append(math.hypot(message.x - true[0], message.y - true[1]))
         return errors
+
+
+def _first_s(times_ns: Iterable[int], since_ns: int) -> float:
+    return (min(times_ns, default=math.inf) - since_ns) * 1e-9
 
 
 def _merged(base: dict[str, object], over: dict[str, object]) -> dict[str, object]:

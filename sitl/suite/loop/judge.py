@@ -60,10 +60,24 @@ class LoopText:
 
 
 @dataclass(frozen=True)
+class Back:
+    """Seconds from the end of a companion to what came of the next; infinite: never.
+
+    estimates_s, tracks_s: until its first accepted estimate was known, and the first one of a
+    tracker that tracks; injects_s: until its first position was sent to the autopilot.
+    """
+
+    estimates_s: float
+    tracks_s: float
+    injects_s: float
+
+
+@dataclass(frozen=True)
 class LoopRecord:
     """What a flight left. fix_errors_m: horizontal, of every position that was injected.
 
     pace, stall_s: how far the simulated vehicle was from real time, see `sitl.suite.record`.
+    back: where the companion was killed or hung; None elsewhere.
     """
 
     samples: tuple[LoopSample, ...]
@@ -71,6 +85,7 @@ class LoopRecord:
     fix_errors_m: tuple[float, ...]
     pace: float = 1.0
     stall_s: float = 0.0
+    back: Back | None = None
 
 
 @dataclass(frozen=True)
@@ -170,6 +185,12 @@ def judge(record: LoopRecord, expect: Expectation, *, denied: bool = False) -> t
     if expect.false_fixes is not None:
         ok = flown.false <= expect.false_fixes and (flown.sent > 0 or not expect.injects)
         held.append(Held("false fixes injected", ok, f"{flown.false} of {flown.sent}"))
+    if expect.back_within_s is not None:
+        back = record.back or Back(math.inf, math.inf, math.inf)
+        ok = back.injects_s <= expect.back_within_s
+        found = f"estimate after {back.estimates_s:.1f} s, tracks {back.tracks_s:.1f}"
+        found += f", injects {back.injects_s:.1f}"
+        held.append(Held(f"back within {expect.back_within_s:g} s", ok, found))
     if expect.ends_tracking:
         last = samples[-1] if samples else None
         ok = last is not None and last.level == "ok" and not last.age_s > _STALE_S

@@ -3,17 +3,16 @@
 from __future__ import annotations
 
 import json
-import os
 import signal
 import sys
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
 import pytest
 
-from companion.supervision.processes import FlightProcess
+from companion.supervision.processes import Beat, FlightProcess
 from companion.supervision.supervisor import RestartPolicy, Supervisor, described, mark_dead
 
 
@@ -28,6 +27,18 @@ class Scripted:
     released: bool = False
     dismissed: bool = False
     signals: list[int] = field(default_factory=list)
+    says: Callable[[int], Beat | None] = lambda _: Beat("all", 0.1)
+    killed: bool = False
+
+    def beats(self) -> tuple[Beat, ...]:
+        beat = self.says(self.looks)
+        return () if beat is None else (beat,)
+
+    def kill(self) -> None:
+        self.killed = True
+
+    def close(self) -> None:
+        pass
 
     def release(self) -> None:
         self.released = True
@@ -45,7 +56,7 @@ class Scripted:
 
 
 class Stage:
-    """Hands out processes in order; each look takes half a second."""
+    """Hands out processes in order; each look takes half a second, a quarter without beats."""
 
     def __init__(self, flights: Sequence[Scripted], **policy: float) -> None:
         self.waiting = list(flights)
@@ -57,7 +68,7 @@ class Stage:
         self.supervisor = Supervisor(
             self._spawn,
             lambda severity, text: self.told.append((severity, text)),
-            self.marked.append,
+            lambda _, text: self.marked.append(text),
             RestartPolicy(**policy),  # type: ignore[arg-type]
             self._clock,
             lambda _: None,
@@ -72,8 +83,12 @@ class Stage:
         self.spawned.append(process)
         return process
 
+    def sleep(self, seconds: float) -> None:
+        """Time goes by."""
+        self._now_s += seconds
+
     def _clock(self) -> float:
-        self._now_s += 0.5
+        self._now_s += 0.25
         return self._now_s
 
 
@@ -180,11 +195,87 @@ def test_real_processes_killed_and_released(tmp_path: Path) -> None:
     supervisor = Supervisor(
         lambda standby: FlightProcess(command, standby=standby),
         lambda _, text: told.append(text),
-        lambda _: None,
+        lambda *_: None,
         RestartPolicy(standby_after_s=0.0),
     )
     assert supervisor.run() == 0
     assert told == ["PiLoT: companion died (SIGKILL), restarting"]
+
+
+@pytest.mark.parametrize(
+    ("says", "hangs"),
+    [
+        (lambda looks: Beat("localize", 20.0 - looks), "localize"),  # a part that blocks for ever
+        (lambda looks: Beat("all", 0.0) if looks > 15 else None, "process"),  # SIGSTOP, a lock
+        (lambda looks: Beat("link fc", 3.9 if looks % 2 else 0.0), ""),  # slow, and goes on
+    ],
+)
+def test_what_hangs_is_told_ended_and_taken_over(
+    says: Callable[[int], Beat | None], hangs: str
+) -> None:
+    flights = [Scripted(20, 0, says=says), Scripted(20, 0), Scripted(9, 0)]
+    stage = Stage(flights, standby_after_s=1.0)
+    assert stage.supervisor.run() == 0
+    told = [f"companion hangs ({hangs}), restarting"] if hangs else []
+    assert stage.spawned[0].killed == bool(hangs)
+    assert stage.spawned[1].released == bool(hangs)
+    assert stage.marked == told
+    assert stage.told == [(2, f"PiLoT: {text}") for text in told]
+
+
+def test_a_process_that_never_shows_life_is_ended_after_its_patience() -> None:
+    """Compiling takes minutes on a new machine; a standby that was released has compiled."""
+    mute: Callable[[int], Beat | None] = lambda _: None  # noqa: E731
+    stage = Stage([Scripted(200, 0, says=mute), Scripted(9, 0)], cold_s=120.0)
+    assert stage.supervisor.run() == 0
+    assert stage.told == []
+    stage = Stage([Scripted(1000, 0, says=mute), Scripted(9, 0)], cold_s=120.0)
+    assert stage.supervisor.run() == 0
+    assert stage.told == [(2, "PiLoT: companion hangs (process), restarting")]
+
+
+def test_a_computer_that_slept_hangs_nothing() -> None:
+    """Both processes stood still: the supervisor sees no signs of life at first."""
+
+    class Slept(Scripted):
+        def wait(self, timeout_s: float) -> int | None:
+            if self.looks == 10:
+                stage.sleep(60.0)
+            return super().wait(timeout_s)
+
+    quiet = {8, 9}  # looks after it, until the next sign comes
+    process = Slept(20, 0, says=lambda at: None if at in quiet else Beat("all", 0.0))
+    stage = Stage([process], standby_after_s=1e3)
+    assert stage.supervisor.run() == 0
+    assert stage.told == []
+
+
+_HANGING = """
+import os, signal, sys
+pulse = next(int(one.partition("=")[2]) for one in sys.argv if one.startswith("--pulse="))
+if "--standby" in sys.argv:
+    sys.exit(0 if sys.stdin.readline() == "fly\\n" else 7)
+os.write(pulse, b"all 0\\n")
+if "stops" in sys.argv:
+    os.kill(os.getpid(), signal.SIGSTOP)
+while True:
+    os.write(pulse, b"localize 9000\\n")
+    signal.sigtimedwait([], 0.05)
+"""
+
+
+@pytest.mark.parametrize(("how", "what"), [("stops", "process"), ("blocks", "localize")])
+def test_real_processes_that_stop_or_block_are_ended(how: str, what: str) -> None:
+    told: list[str] = []
+    command = [sys.executable, "-S", "-c", _HANGING, how]
+    supervisor = Supervisor(
+        lambda standby: FlightProcess(command, standby=standby),
+        lambda _, text: told.append(text),
+        lambda *_: None,
+        RestartPolicy(standby_after_s=0.0, silent_s=0.6),
+    )
+    assert supervisor.run() == 0
+    assert told == [f"PiLoT: companion hangs ({what}), restarting"]
 
 
 def test_a_standby_whose_supervisor_is_gone_ends(tmp_path: Path) -> None:
@@ -201,17 +292,19 @@ def test_codes_in_words(code: int, said: str) -> None:
     assert described(code) == said
 
 
-def test_the_newest_health_says_dead(tmp_path: Path) -> None:
-    """Of a restarted flight the record that `latest` points to; without a record nothing."""
-    for name in ("flight", "flight-2"):
+def test_the_health_of_the_process_says_dead(tmp_path: Path) -> None:
+    """Of several flights the record of the process that died; without a record nothing."""
+    for name, pid in (("flight", 11), ("flight-2", 12)):
         (tmp_path / name).mkdir()
-        (tmp_path / name / "health.json").write_text('{"level": "ok"}')
-    os.symlink("flight-2", tmp_path / "latest")
+        (tmp_path / name / "health.json").write_text(f'{{"level": "ok", "pid": {pid}}}')
+    (tmp_path / "flight-3").mkdir()  # of the standby, which does not report yet
+    (tmp_path / "flight-4").mkdir()
+    (tmp_path / "flight-4" / "health.json").write_text("{")
     before_ns = time.monotonic_ns()
-    mark_dead(tmp_path / "flight", "companion died (SIGKILL), restarting")
+    mark_dead(tmp_path / "flight", 12, "companion died (SIGKILL), restarting")
     report = json.loads((tmp_path / "flight-2" / "health.json").read_text())
     assert (report["level"], report["text"]) == ("failed", "companion died (SIGKILL), restarting")
     assert report["time_ns"] >= before_ns
     assert json.loads((tmp_path / "flight" / "health.json").read_text())["level"] == "ok"
-    mark_dead(tmp_path / "nowhere" / "flight", "dead")
+    mark_dead(tmp_path / "nowhere" / "flight", 12, "dead")
     assert not (tmp_path / "nowhere").exists()

@@ -12,6 +12,7 @@ import pytest
 from sitl.demo.scenario import ScenarioError
 from sitl.suite.loop.case import Expectation, load_loop_cases
 from sitl.suite.loop.judge import (
+    Back,
     Held,
     LoopRecord,
     LoopSample,
@@ -63,6 +64,14 @@ def test_every_expectation_can_fail() -> None:
     bad = judge(record(landed, errors=(0.2, 7.0)), replace_says(expect))
     assert [h.ok for h in bad] == [True, False, False, False, False, False, False]
     assert not judge(record((), errors=()), Expectation())[0].ok
+
+
+@pytest.mark.parametrize(("injects_s", "ok"), [(4.9, True), (5.1, False), (float("inf"), False)])
+def test_who_is_back_too_late_or_never_is_missed(injects_s: float, ok: bool) -> None:
+    expect = Expectation(back_within_s=5.0)
+    flown = replace(record(flight([0.5] * 4)), back=Back(1.0, 2.0, injects_s))
+    assert judge(flown, expect)[-1].ok is ok
+    assert not judge(record(flight([0.5] * 4)), expect)[-1].ok
 
 
 def replace_says(expect: Expectation) -> Expectation:

@@ -1,0 +1,60 @@
+"""A sign of life of every part, four times a second, for the supervisor that restarts what hangs.
+
+A process whose threads wait for ever is not dead, and its heartbeat may go on. So each thread that
+a position needs notes the time of its every turn, and this part tells the oldest of them.
+"""
+
+from __future__ import annotations
+
+import os
+import threading
+from collections.abc import Callable, Mapping
+
+from mavlink_bridge.link.clock import monotonic_ns
+
+_PERIOD_S = 0.25
+
+
+class Pulse:
+    """Writes ``NAME MILLISECONDS`` lines: the part whose last turn is longest ago, and how long.
+
+    beats: the CLOCK_MONOTONIC times of the parts' last turns, ns. descriptor: of a pipe's end,
+    which is closed at the end. A supervisor that does not read is not waited for.
+    """
+
+    def __init__(self, beats: Callable[[], Mapping[str, int]], descriptor: int) -> None:
+        self._beats, self._descriptor = beats, descriptor
+        os.set_inheritable(descriptor, False)
+        os.set_blocking(descriptor, False)
+        self._stop = threading.Event()
+        self._thread = threading.Thread(target=self._run, name="pulse")
+
+    def start(self) -> None:
+        """Start telling."""
+        self._thread.start()
+
+    def stop(self) -> None:
+        """Say that the end begins, which may take its time, and end."""
+        self._stop.set()
+        self._thread.join()
+        self._say(b"ending 0\n")
+        os.close(self._descriptor)
+
+    def _run(self) -> None:
+        while not self._stop.wait(_PERIOD_S):
+            self._say(line(self._beats(), monotonic_ns()))
+
+    def _say(self, text: bytes) -> None:
+        try:
+            os.write(self._descriptor, text)
+        except OSError:  # full, or the supervisor is gone: the flight goes on alone
+            return
+
+
+def line(beats: Mapping[str, int], now_ns: int) -> bytes:
+    """The line of a moment; ``all 0`` without any part."""
+    if not beats:
+        return b"all 0\n"
+    name = min(beats, key=lambda one: beats[one])
+    age_ms = max(now_ns - beats[name], 0) // 1_000_000
+    return f"{name.replace(' ', '-')} {age_ms}\n".encode()
