@@ -208,7 +208,7 @@ class HealthMonitor:
             "pid": os.getpid(),
             "engine": asdict(self._engine_health()),
             "rate_hz": self._rate(),
-            "stages_ms": self._stages(),
+            "stages_ms": _stages([e for _, e in list(self._estimates)]),
             "bridge": self._bridge.counters(),
             "shadow": self._bridge.shadow_score().line(),
             "guardian": self._guardian_report(),
@@ -242,17 +242,18 @@ class HealthMonitor:
         now = time.monotonic()
         return sum(1 for t, _ in list(self._estimates) if now - t < _RATE_S) / _RATE_S
 
-    def _stages(self) -> dict[str, dict[str, float]]:
-        """p50 and p95 of each stage over the window, ms."""
-        recent = [e.stage_ms for _, e in list(self._estimates)]
-        stages = {name for stage_ms in recent for name in stage_ms}
-        return {
-            name: {
-                "p50": float(np.percentile([s[name] for s in recent if name in s], 50)),
-                "p95": float(np.percentile([s[name] for s in recent if name in s], 95)),
-            }
-            for name in sorted(stages)
+
+def _stages(estimates: list[PoseEstimate]) -> dict[str, dict[str, float]]:
+    """p50 and p95 of each stage, ms."""
+    recent = [e.stage_ms for e in estimates]
+    stages = {name for stage_ms in recent for name in stage_ms}
+    return {
+        name: {
+            "p50": float(np.percentile([s[name] for s in recent if name in s], 50)),
+            "p95": float(np.percentile([s[name] for s in recent if name in s], 95)),
         }
+        for name in sorted(stages)
+    }
 
 
 def _waiting_for(engine: EngineHealth) -> str:
