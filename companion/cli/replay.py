@@ -16,6 +16,7 @@ from companion.cli.console import require_extra, serve
 from companion.errors import ConfigError, RecordError
 from companion.live.config import ConsoleConfig
 from companion.settings_file import SettingsError, validated
+from companion.terminal.steps import shown_steps
 from localizer.geometry.pose import Array
 
 
@@ -77,6 +78,7 @@ def show_record(record: Path, map_cache: Path | None, listen: str) -> None:
     from companion.console.records import Records
     from companion.console.replay_source import ReplaySource
     from companion.console.server import Site
+    from companion.reporting.pictures import map_pictures
     from companion.reporting.record import read_record
 
     tables = read_record(record)
@@ -87,5 +89,11 @@ def show_record(record: Path, map_cache: Path | None, listen: str) -> None:
         config = validated(ConsoleConfig, {"listen": listen})
     except SettingsError as error:
         raise ConfigError(f"--console {listen}: {str(error).strip()}") from error
-    source = ReplaySource(tables)
-    serve(Site(config, source, map_path, Records(record.absolute().parent), replay=True))
+    with shown_steps(Console()) as say, map_pictures(map_path) as pictures:
+        say(f"reading {record} and its map")
+        source = ReplaySource(tables, pictures)
+        for note in pictures.notes:
+            say(note)
+        records = Records(record.absolute().parent)
+        say(f"serving {config.url} until Ctrl-C")
+        serve(Site(config, source, map_path, records, replay=True))

@@ -82,8 +82,9 @@ def page_message(message: Message, with_map: bool) -> bytes:
         "width_px": message.head["camera"]["width"],
         "estimate": message.head.get("estimate"),
         "exposure_ns": message.head["exposure_ns"],
-        "age_ms": (time.monotonic_ns() - message.head["exposure_ns"]) * 1e-6,
-        "exposure_utc_ms": exposure_utc_ms(message.head["exposure_ns"]),
+        "exposure_utc_ms": None
+        if message.head.get("recorded")
+        else exposure_utc_ms(message.head["exposure_ns"]),
         "footprint_enu_m": footprint(picture),
         "parts": [len(part) for part in parts],
     }

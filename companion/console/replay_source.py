@@ -1,33 +1,40 @@
-"""A finished flight as a source of the page: its record, played, with a time bar."""
+"""A finished flight as a source of the page: its record, played, with a time bar.
+
+The map's view of a kept picture is rendered again at the recorded pose; where autopilot and
+receiver were comes from the .tlog.
+"""
 
 from __future__ import annotations
 
 import asyncio
-import time
 from typing import Any
 
 import numpy as np
 
-from companion.console.source import Newest
-from companion.errors import StreamDecodeError
+from companion.console.kept_pictures import KeptPictures
+from companion.console.record_rows import ABSURD, estimate_of, last, target_of
+from companion.console.source import Newest, sample_of
 from companion.live.protocol import Message
-from companion.offline.tables import Columns
-from companion.reporting.record import RecordTables, is_time_ns
-from companion.sources.folder_source import read_image
+from companion.reporting.autopilot import AutopilotTracks, TimedTrack, read_autopilot
+from companion.reporting.pictures import MapPictures
+from companion.reporting.record import RecordTables
 
 _STEP_S = 0.5
-_ABSURD = 1e12  # no measurement
-_TARGET_NUMBERS = (
-    "latitude_deg", "longitude_deg", "height_m", "cov_ee", "cov_en", "cov_nn",
-    "sigma_horizontal_m", "sigma_up_m", "elsewhere",
-)  # fmt: skip
+_PLOTTED = 600  # seconds before a place of the time bar that plots and tracks begin with
+_RATE_S, _LATENCY_S = 3.0, 10.0  # over which rate and latency are told
+_HEARD_NS = 2_000_000_000  # a place of autopilot or receiver holds so long
 
 
 class ReplaySource:
-    """Plays the record's rows at the pace at which they were flown."""
+    """Plays the record's rows at the pace at which they were flown. pictures: of its map; without,
+    there is neither the map's view nor the autopilot's track.
+    """
 
-    def __init__(self, tables: RecordTables) -> None:
+    def __init__(self, tables: RecordTables, pictures: MapPictures | None = None) -> None:
         self._tables = tables
+        self._map = pictures
+        self._tracks = AutopilotTracks() if pictures is None else read_autopilot(tables, pictures)
+        self._residuals = self._gnss_residuals()
         self.newest = Newest()
         times = tables.estimates.get("exposure_time_ns", np.empty(0, np.int64))
         self._start_ns = int(times[0]) if len(times) else 0
@@ -36,9 +43,7 @@ class ReplaySource:
         self._playing = True
         self._told = 0
         self._event = asyncio.Event()
-        paths = (tables.folder / "snapshots").glob("*.jpg")
-        self._pictures = sorted((int(p.stem), p) for p in paths if is_time_ns(p.stem))
-        self._shown: int | None = None
+        self._pictures = KeptPictures(tables, pictures)
 
     @property
     def is_connected(self) -> bool:
@@ -58,19 +63,19 @@ class ReplaySource:
         if isinstance(share, int | float) and 0 <= share <= 1:
             self._at_s = float(share) * self._length_s
             self._told = 0
-            self.newest.samples.clear()
+            self._fill_samples()
         elif isinstance(play, bool):
             self._playing = play
         else:
             return False, "share is 0 to 1, play true or false"
-        self._show()
+        await self._show()
         return True, "done"
 
     async def run(self) -> None:
         """Play until cancelled; at the end it stands."""
         self.newest.take(Message({"kind": "hello", "mode": "record", **self._limits()}))
         while True:
-            self._show()
+            await self._show()
             await asyncio.sleep(_STEP_S)
             if self._playing:
                 self._at_s = min(self._at_s + _STEP_S, self._length_s)
@@ -78,33 +83,91 @@ class ReplaySource:
     def _limits(self) -> dict[str, Any]:
         return {"delay_ms": self._tables.delay_ms, "alert_limit_m": self._tables.alert_limit_m}
 
-    def _show(self) -> None:
+    async def _show(self) -> None:
         now_ns = self._start_ns + round(self._at_s * 1e9)
         self.newest.take(Message(self._state(now_ns)))
-        self._take_picture(now_ns)
+        await self._take_picture(now_ns)
         event, self._event = self._event, asyncio.Event()
         event.set()
 
+    def _fill_samples(self) -> None:
+        """The plots and tracks up to where the time bar stands."""
+        self.newest.samples.clear()
+        told, self._told = self._told, len(self._tables.events.get("time_ns", ()))
+        first_s = max(self._at_s - _PLOTTED, 0.0)
+        for at_s in np.arange(first_s, self._at_s, 1.0):
+            state = self._state(self._start_ns + round(at_s * 1e9))
+            self.newest.samples.append(sample_of(state))
+        self._told = told
+
+    def _gnss_residuals(self) -> np.ndarray | None:
+        gnss = self._tracks.gnss
+        return None if gnss is None else gnss.distance_to(self._tables.estimates)
+
     def _state(self, now_ns: int) -> dict[str, Any]:
         tables = self._tables
-        row = _last(tables.estimates, "exposure_time_ns", now_ns)
+        row = last(tables.estimates, "exposure_time_ns", now_ns)
         utc_ns = tables.utc_ns - tables.start_ns + now_ns
-        estimate = None if row is None else _estimate(tables.estimates, row)
+        estimate = None if row is None else estimate_of(tables.estimates, row)
         state = "-" if estimate is None else str(estimate["state"])
         level = {"tracking": "ok", "lost": "failed"}.get(state, "degraded")
         return {
             "kind": "state", "time_ns": now_ns, "utc_ns": utc_ns,
             "health": {
-                "level": level, "text": f"record of {tables.folder.name}", "rate_hz": None,
+                "level": level, "text": f"record of {tables.folder.name}",
+                "rate_hz": self._rate_hz(now_ns),
                 "guardian": {"hpl_m": None if estimate is None else estimate.pop("hpl_m")},
+                "stages_ms": {"latency": {"p95": self._latency_ms(now_ns)}},
             },
-            "vehicle": {}, "shadow": None, "follows": None, "injecting": False,
-            "estimate": estimate, "gnss_residual_m": None, "machine": {},
+            "vehicle": self._vehicle(now_ns), "shadow": None, "follows": None, "injecting": False,
+            "estimate": estimate, "gnss_residual_m": self._residual(row), "machine": {},
             "targets": self._targets(now_ns), "events": self._events(now_ns),
             "replay": {
                 "at_s": self._at_s, "length_s": self._length_s, "playing": self._playing
             },
         }  # fmt: skip
+
+    def _rows(self, now_ns: int, seconds: float) -> slice:
+        """The estimates of the last seconds."""
+        times = self._tables.estimates.get("exposure_time_ns", np.empty(0, np.int64))
+        ends = np.searchsorted(times, [now_ns - round(seconds * 1e9), now_ns], side="right")
+        return slice(int(ends[0]), int(ends[1]))
+
+    def _rate_hz(self, now_ns: int) -> float | None:
+        rows = self._rows(now_ns, _RATE_S)
+        elapsed_s = min(_RATE_S, (now_ns - self._start_ns) * 1e-9)
+        return (rows.stop - rows.start) / elapsed_s if elapsed_s >= 1.0 else None
+
+    def _latency_ms(self, now_ns: int) -> float | None:
+        column = self._tables.estimates.get("latency_ms")
+        values = () if column is None else column[self._rows(now_ns, _LATENCY_S)]
+        known = [float(v) for v in values if abs(v) < ABSURD]  # false for NaN, too
+        return float(np.percentile(known, 95)) if known else None
+
+    def _residual(self, row: int | None) -> float | None:
+        if row is None or self._residuals is None:
+            return None
+        value = float(self._residuals[row])
+        return value if np.isfinite(value) else None
+
+    def _vehicle(self, now_ns: int) -> dict[str, Any]:
+        ekf, gnss = (self._place(track, now_ns) for track in (self._tracks.ekf, self._tracks.gnss))
+        told: dict[str, Any] = {}
+        if ekf is not None:
+            told |= {"latitude_deg": ekf[0], "longitude_deg": ekf[1]}
+        if gnss is not None:
+            told |= {"gps_latitude_deg": gnss[0], "gps_longitude_deg": gnss[1], "gps_fix_type": 3}
+        return told
+
+    def _place(self, track: TimedTrack | None, now_ns: int) -> tuple[float, float] | None:
+        """Latitude and longitude, degrees, if told not long before."""
+        if track is None or self._map is None or self._map.cache is None:
+            return None
+        i = int(np.searchsorted(track.time_ns, now_ns, side="right")) - 1
+        if i < 0 or now_ns - int(track.time_ns[i]) > _HEARD_NS:
+            return None
+        at = self._map.cache.frame.position([*track.points[i], 0.0])
+        return at.latitude_deg, at.longitude_deg
 
     def _targets(self, now_ns: int) -> list[dict[str, Any]]:
         """Each target's last fix of the last ten seconds."""
@@ -114,7 +177,7 @@ class ReplaySource:
         times = columns["exposure_time_ns"]
         rows = np.flatnonzero((times <= now_ns) & (times > now_ns - 10_000_000_000))
         newest = {str(columns["target_id"][i]): int(i) for i in rows}
-        return [t for name, i in newest.items() if (t := _target(columns, name, i)) is not None]
+        return [t for name, i in newest.items() if (t := target_of(columns, name, i)) is not None]
 
     def _events(self, now_ns: int) -> list[dict[str, Any]]:
         columns = self._tables.events
@@ -130,80 +193,8 @@ class ReplaySource:
             for i in rows
         ]  # fmt: skip
 
-    def _take_picture(self, now_ns: int) -> None:
-        """The newest kept picture, with its pose; without the map's view, which is not recorded."""
-        camera = self._tables.camera
-        known = [p for p in self._pictures if p[0] <= now_ns]
-        if not known or camera is None or known[-1][0] == self._shown:
-            return
-        self._shown, path = known[-1]
-        try:
-            rgb = read_image(path)
-        except (StreamDecodeError, OSError):  # power may have gone while it was written
-            return
-        if rgb.shape[:2] != (camera.height, camera.width):
-            return
-        head = {
-            "kind": "frame", "exposure_ns": time.monotonic_ns(), "camera": camera.to_dict(),
-            "image": [camera.width, camera.height], "estimate": None, "view": None,
-        }  # fmt: skip
-        self.newest.take(Message(head, rgb.tobytes()))
-
-
-def _last(columns: Columns, name: str, now_ns: int) -> int | None:
-    """The number of the last row up to a time."""
-    if not columns:
-        return None
-    row = int(np.searchsorted(columns[name], now_ns, side="right")) - 1
-    return row if row >= 0 else None
-
-
-def _estimate(columns: Columns, row: int) -> dict[str, Any]:
-    def number(name: str) -> float | None:
-        value = float(columns[name][row]) if name in columns else float("nan")
-        return value if abs(value) < _ABSURD else None  # false for NaN, too
-
-    east, north = (number(f"sigma_{axis}_m") or 0.0 for axis in ("east", "north"))
-    return {
-        "time_ns": int(columns["exposure_time_ns"][row]),
-        "latitude_deg": number("latitude_deg"),
-        "longitude_deg": number("longitude_deg"),
-        "height_m": number("height_m"),
-        "heading_deg": _heading_deg(columns, row),
-        "covariance_m2": [[east**2, 0.0], [0.0, north**2]],
-        "sigma_m": max(east, north),
-        "state": str(columns["state"][row]),
-        "accepted": bool(columns["accepted"][row] > 0),
-        "quality": number("quality"),
-        "hpl_m": number("hpl_m"),
-        "stages_ms": {
-            name: number(f"{name}_ms") for name in ("reference", "extract", "register", "latency")
-        },
-    }
-
-
-def _heading_deg(columns: Columns, row: int) -> float | None:
-    """Where the picture's top or the camera's axis points, whichever lies flatter."""
-    w, x, y, z = (float(columns[k][row]) for k in ("qw", "qx", "qy", "qz"))
-    forward = (2 * (x * z + w * y), 2 * (y * z - w * x), 1 - 2 * (x * x + y * y))
-    up = (-2 * (x * y - w * z), -(1 - 2 * (x * x + z * z)))
-    ahead = forward[:2] if abs(forward[2]) < 0.98 else up
-    heading = float(np.degrees(np.arctan2(ahead[0], ahead[1])) % 360.0)
-    return heading if np.isfinite(heading) else None
-
-
-def _target(columns: Columns, name: str, row: int) -> dict[str, Any] | None:
-    """A target's row; None where a number lacks: browsers read no NaN."""
-    numbers = {key: float(columns[key][row]) for key in _TARGET_NUMBERS if key in columns}
-    if len(numbers) < len(_TARGET_NUMBERS) or not all(map(np.isfinite, numbers.values())):
-        return None
-    ee, en, nn = (numbers.pop(key) for key in ("cov_ee", "cov_en", "cov_nn"))
-    return {
-        "name": name,
-        "time_ns": int(columns["exposure_time_ns"][row]),
-        "sigma_m": numbers.pop("sigma_horizontal_m"),
-        **numbers,
-        "amsl_m": None,
-        "covariance_m2": [[ee, en], [en, nn]],
-        "pixel": None,
-    }
+    async def _take_picture(self, now_ns: int) -> None:
+        """The newest kept picture, if it is another than the last."""
+        message = await asyncio.to_thread(self._pictures.newest, now_ns)
+        if message is not None:
+            self.newest.take(message)

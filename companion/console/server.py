@@ -82,8 +82,8 @@ class Pages:
             listener.cancel()
             del self._open[id(socket)]
             self._watch()
-            with contextlib.suppress(RuntimeError, OSError):
-                await socket.close()
+            with contextlib.suppress(WebSocketDisconnect, RuntimeError, OSError):
+                await socket.close()  # it may have gone first
 
     async def _tell(
         self, socket: WebSocket, wishes: dict[str, Any], listener: asyncio.Task[None]

@@ -17,6 +17,7 @@ from pathlib import Path
 from typing import Any
 
 from companion.live.orders import OrderError, Orders
+from companion.live.pace import Pace
 from companion.live.protocol import MOST_ORDER, Decoder, LinkError, encode
 from companion.live.shown import Shown
 
@@ -51,7 +52,7 @@ class Publisher:
 
     def __init__(self, path: Path, shown: Shown, orders: Orders, frames_hz: float) -> None:
         self.path, self._shown, self._orders = path, shown, orders
-        self._frame_s = 1.0 / frames_hz
+        self._pictures = Pace(1.0 / frames_hz)
         self._consoles: dict[socket.socket, _Console] = {}
         self._selector = selectors.DefaultSelector()
         self._woken, self._waker = socket.socketpair()
@@ -59,7 +60,7 @@ class Publisher:
             end.setblocking(False)
         self._listening = _listen(path)
         self._stopping = False
-        self._next_state_s = self._next_frame_s = 0.0
+        self._next_state_s = 0.0
         self._thread = threading.Thread(target=self._run, name="console link", daemon=True)
 
     @property
@@ -122,8 +123,8 @@ class Publisher:
                 if self._offer(console, encode(head)):
                     console.told = told
         ready = [c for c in self._idle() if c.watching]
-        if ready and now >= self._next_frame_s and (message := self._shown.take_frame()):
-            self._next_frame_s = now + self._frame_s
+        if ready and self._pictures.is_due(now) and (message := self._shown.take_frame()):
+            self._pictures.went(now)
             for console in ready:
                 self._offer(console, message)
 

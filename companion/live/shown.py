@@ -122,7 +122,8 @@ class Shown:
             "estimate": self._estimate and self._position(self._estimate),
             "gnss_residual_m": self._residual(vehicle),
             "targets": [self._target(t) for t in targets],
-            "machine": self._load.read(),
+            # Asked on the link's own thread, which it times: what the console costs the flight.
+            "machine": self._load.read() | {"console_link_s": time.thread_time()},
             "events": [
                 {"number": n, "time_ns": t, "level": level, "text": text}
                 for n, t, level, text in events

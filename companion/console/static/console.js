@@ -30,7 +30,9 @@ const opened = {
 function open(view) {
   document.body.dataset.view = view;
   document.querySelectorAll("nav button").forEach((button) => {
-    button.setAttribute("aria-current", String(button.dataset.view === view));
+    const chosen = button.dataset.view === view;
+    button.setAttribute("aria-current", String(chosen));
+    if (chosen) button.scrollIntoView({ block: "nearest", inline: "nearest" });
   });
   wish();
   opened[view]?.();
@@ -74,11 +76,15 @@ function showState() {
     ["latency p95", `${text(latency, 0)}/${text(limit, 0, " ms")}`, latency > limit],
     ["mode", `${about.mode ?? "-"}${state.injecting ? ", injecting" : ""}`, false, true],
     ["EKF", ekf(vehicle, state.follows), state.follows?.used === false, true],
-    ["vehicle", vehicle.connected ? `${vehicle.mode || "?"}${vehicle.armed ? ", armed" : ", disarmed"}` : "not heard",
-      !vehicle.connected, true],
+    ["vehicle", aboutVehicle(vehicle), !vehicle.connected && !page.about?.replay, true],
     ["shadow", state.shadow ? (state.shadow.go ? "go" : "no-go") : "-", false, true],
   ]);
   $("figures").title = state.shadow?.line ?? "";
+}
+
+function aboutVehicle(vehicle) {
+  if (vehicle.connected) return `${vehicle.mode || "?"}${vehicle.armed ? ", armed" : ", disarmed"}`;
+  return page.about?.replay ? "-" : "not heard";
 }
 
 function ekf(vehicle, follows) {
@@ -111,8 +117,10 @@ function showTargets(targets) {
   targets.forEach((target, i) => {
     const row = body.rows[i] ?? newTargetRow(body);
     const place = `${target.latitude_deg.toFixed(7)}, ${target.longitude_deg.toFixed(7)}`;
+    const geoid = page.about?.map?.geoid_separation_m;
+    const amsl = target.amsl_m ?? (geoid === undefined ? null : target.height_m - geoid);
     const cells = [target.name, place, toMgrs(target.latitude_deg, target.longitude_deg),
-      text(target.amsl_m, 1), text(target.height_m, 1), text(target.sigma_m, 2)];
+      text(amsl, 1), text(target.height_m, 1), text(target.sigma_m, 2)];
     cells.forEach((value, k) => { row.cells[k].textContent = value; });
     row.dataset.place = `${target.name} ${place} ${cells[2]} AMSL ${cells[3]} m`;
   });
@@ -255,10 +263,14 @@ function showTime(replay) {
   $("clock").textContent = `${replay.at_s.toFixed(1)} of ${replay.length_s.toFixed(1)} s`;
   $("play").textContent = replay.playing ? "Pause" : "Play";
 }
-$("seek").addEventListener("input", () => {
+let asked = 0;
+$("seek").addEventListener("input", async () => {
   held = true;
-  plots.clear(); map?.clear();
-  ask("/api/seek", { share: $("seek").value / 1000 }).then(() => { held = false; });
+  const number = (asked += 1);
+  await ask("/api/seek", { share: $("seek").value / 1000 });
+  if (number !== asked) return; // the bar went on
+  await showHistory();
+  held = false;
 });
 $("play").addEventListener("click", () => ask("/api/seek", { play: $("play").textContent === "Play" }));
 
@@ -268,19 +280,25 @@ const plots = new Plots($("plots"));
 const video = new VideoView($, ask, () => page, wish);
 let map = null;
 
+async function showHistory() {
+  const history = await ask("/api/history");
+  plots.clear(); map?.clear();
+  (history.samples ?? []).forEach((sample) => { plots.add(sample, false); map?.addSample(sample, false); });
+  plots.draw(); map?.draw();
+}
+
 async function begin() {
   open("map");
   page.about = await ask("/api/about");
   document.body.classList.toggle("reads", !page.about.control);
+  document.body.classList.toggle("record", Boolean(page.about.replay));
   $("time").hidden = !page.about.replay;
   if (page.about.map) {
     try { map = new MapView(maplibre, $, ask, page.about.map); }
     catch (error) { $("map-note").textContent = `no map: ${error.message}`; }
   } else $("map-note").textContent = page.about.text ?? "no map";
   window.consoleMap = map;
-  const history = await ask("/api/history");
-  (history.samples ?? []).forEach((sample) => { plots.add(sample, false); map?.addSample(sample, false); });
-  plots.draw(); map?.draw();
+  await showHistory();
   connect();
 }
 begin();

@@ -6,7 +6,7 @@ const KINDS = [
   ["latency, ms", ["reference", "extract", "register", "latency"]],
   ["quality", ["quality"]],
   ["rate, Hz", ["rate_hz"]],
-  ["CPU, % of a core", ["cpu_percent"]],
+  ["processor, % of a core", ["cpu_percent"]],
   ["temperature, °C", ["temperature_c"]],
 ];
 const COLOURS = ["#0b4f9e", "#b03a00", "#0b6b2e", "#6d2382"];
@@ -40,6 +40,8 @@ export class Plots {
     const x = this.samples.map((s) => s.t);
     const width = Math.max(280, Math.floor(this.box.clientWidth / Math.max(1, Math.floor(this.box.clientWidth / 310))) - 8);
     KINDS.forEach(([, names], i) => {
+      // What nobody told (no GNSS, a record without temperature) takes no room.
+      this.charts[i].root.hidden = !this.samples.some((s) => names.some((n) => s[n] !== null && s[n] !== undefined));
       this.charts[i].setData([x, ...names.map((n) => this.samples.map((s) => s[n] ?? null))]);
       if (this.charts[i].width !== width) this.charts[i].setSize({ width, height: 150 });
     });
@@ -50,8 +52,8 @@ export class Plots {
     this.charts = KINDS.map(([title, names]) => new Chart({
       title, width: 300, height: 150, legend: { show: names.length > 1, live: false },
       cursor: { show: false },
-      series: [{}, ...names.map((label, i) => ({ label: label.replace("_m", ""), stroke: COLOURS[i], width: 1.5 }))],
-      axes: [{ size: 30 }, { size: 44 }],
+      series: [{}, ...names.map((label, i) => ({ label: label.replace("_m", "").replace("hpl", "HPL"), stroke: COLOURS[i], width: 1.5 }))],
+      axes: [{ size: 30 }, { size: 54 }],
     }, [[], ...names.map(() => [])], this.box));
   }
 }

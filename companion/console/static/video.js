@@ -61,17 +61,26 @@ export class VideoView {
       if (this.canvas.width !== head.image[0] || this.canvas.height !== head.image[1]) [this.canvas.width, this.canvas.height] = head.image;
       this.$("video-note").hidden = true;
       this.paint();
-      const age = Date.now() - head.exposure_utc_ms;
-      this.ages.push(age);
-      if (this.ages.length > 50) this.ages.shift();
-      this.$("video-age").textContent = `shown ${Math.round(age)} ms after its exposure`;
+      this.tellAge(head);
       window.consoleMap?.footprint(head.footprint_enu_m);
       window.consoleFrames = (window.consoleFrames ?? 0) + 1;
       window.consoleAges = this.ages;
     } finally { this.busy = false; }
   }
 
+  tellAge(head) {
+    if (head.exposure_utc_ms === null) {
+      this.$("video-age").textContent = "a kept picture, the newest before this moment";
+      return;
+    }
+    const age = Date.now() - head.exposure_utc_ms;
+    this.ages.push(age);
+    if (this.ages.length > 50) this.ages.shift();
+    this.$("video-age").textContent = `shown ${Math.round(age)} ms after its exposure`;
+  }
+
   paint() {
+    this.$("share-label").hidden = this.mode !== "slider";
     if (!this.image) return;
     const { context, canvas } = this, { width, height } = canvas;
     context.drawImage(this.image, 0, 0, width, height);
@@ -114,7 +123,9 @@ export class VideoView {
     this.context.strokeStyle = "#ff2fd0";
     this.context.strokeRect(u - 9, v - 9, 18, 18);
     this.context.fillStyle = "#ff2fd0";
-    this.context.font = "14px sans-serif";
+    // Of the size that the picture has on the screen, not in itself.
+    const px = Math.round((14 * this.canvas.width) / Math.max(this.canvas.getBoundingClientRect().width, 1));
+    this.context.font = `bold ${px}px sans-serif`;
     this.context.fillText(target.name, u + 12, v - 8);
   }
 }

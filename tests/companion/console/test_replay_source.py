@@ -3,16 +3,22 @@
 import asyncio
 import csv
 import json
+import struct
 
 import cv2
 import numpy as np
 import pytest
+from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from companion.cli.replay import show_record
+from companion.console.pictures import page_message
 from companion.console.replay_source import ReplaySource
 from companion.errors import ConfigError
 from companion.flight.recorder import ESTIMATE_COLUMNS, EVENT_COLUMNS, TARGET_COLUMNS
+from companion.reporting.pictures import map_pictures
 from companion.reporting.record import read_record
+from localizer.map.cache.cache import TileCache
+from mavlink_bridge.link.tlog import TlogRecorder
 
 MODEL = {"width": 64, "height": 48, "fx": 60, "fy": 60, "cx": 32, "cy": 24}
 S = 1_000_000_000
@@ -64,6 +70,54 @@ def test_the_time_bar_leads_to_what_was_known_then(source):
     assert [e["text"] for e in state["events"]] == ["GNSS lost"]
     assert state["targets"] == []  # seen 13 s ago
     assert source.newest.frame.head["image"] == [64, 48]
+
+
+def test_figures_of_the_head_are_those_of_that_moment(source):
+    state = _at(source, 0.75)
+    assert state["health"]["rate_hz"] == pytest.approx(1.0)  # a row a second
+    assert state["estimate"]["last_fix_ns"] == 20 * S  # the last that was accepted
+    assert [round(s["t"]) for s in source.newest.samples] == list(range(1000, 1016))
+    assert len({e["number"] for e in source.newest.events}) == 1
+
+
+def test_a_kept_picture_is_no_live_one_and_says_where_its_targets_were(source):
+    state = _at(source, 0.2)
+    assert state["targets"][0]["pixel"] == [0.0, 0.0]
+    _at(source, 0.5)
+    message = page_message(source.newest.frame, False)
+    (size,) = struct.unpack_from("<I", message)
+    head = json.loads(message[4 : 4 + size])
+    assert (head["exposure_ns"], head["exposure_utc_ms"]) == (14 * S, None)
+
+
+def test_with_the_map_the_picture_has_its_edges_and_the_autopilot_its_track(
+    source, small_assets, tmp_path
+):
+    """The camera stands 60 m above the map's origin and looks down."""
+    manifest = json.loads((tmp_path / "record.json").read_text())
+    manifest["config"]["bridge"] = {"tlog": str(tmp_path / "flight.tlog")}
+    (tmp_path / "record.json").write_text(json.dumps(manifest))
+    with (tmp_path / "estimates.csv").open(newline="") as file:
+        rows = list(csv.DictReader(file))
+    cache = TileCache.open(small_assets.map_cache)
+    up = float(cache.index.box_min[0, 2]) + 60.0
+    _rows(tmp_path / "estimates.csv", ESTIMATE_COLUMNS, [r | {"up_m": up} for r in rows])
+    at, codec = cache.frame.origin, mavlink.MAVLink(None, 1, 1)
+    place = (round(at.latitude_deg * 1e7), round(at.longitude_deg * 1e7), 0)
+    log = TlogRecorder(tmp_path / "flight.tlog")
+    log.start()
+    position = mavlink.MAVLink_global_position_int_message(1, *place, 0, 0, 0, 0, 0)
+    log.write(position.pack(codec), 1004_000_000)
+    log.close()
+    with map_pictures(small_assets.map_cache) as pictures:
+        source = ReplaySource(read_record(tmp_path), pictures)
+        state = _at(source, 0.25)
+        assert state["vehicle"]["latitude_deg"] == pytest.approx(at.latitude_deg, abs=1e-6)
+        message = page_message(source.newest.frame, True)
+    (size,) = struct.unpack_from("<I", message)
+    head = json.loads(message[4 : 4 + size])
+    assert len(head["footprint_enu_m"]) == 4
+    assert head["parts"][2] > 0  # the map as it was seen from there
 
 
 @pytest.mark.parametrize("order", [{}, {"share": 2}, {"share": "x"}, {"play": 1}, {"share": None}])

@@ -1,10 +1,18 @@
 """Attacks on the page: another site's page, a made-up name, the network, floods, odd paths."""
 
 import asyncio
+import http.client
 import io
 import json
 import os
+import shutil
+import socket
+import ssl
+import subprocess
+import sys
 import tarfile
+import time
+from xml.etree import ElementTree
 
 import pytest
 import yaml
@@ -312,6 +320,85 @@ def test_while_armed_or_not_heard_only_targets_and_hints(site, deployment, armed
             assert client.post("/api/order", json={"do": wrong}, headers=SAME).status_code == 409
     assert [o["do"] for o in source.orders] == ["target", "hint"]
     assert deployment.read_text() == before
+
+
+def test_targets_go_out_as_geojson_and_as_cursor_on_target_and_a_name_is_no_markup(site):
+    source = Still()
+    source.newest.state = dict(source.newest.state or {}) | {"targets": [
+        {"name": "<car>&", "latitude_deg": 47.5, "longitude_deg": 8.25, "height_m": 450.0,
+         "amsl_m": 402.0, "sigma_m": 0.5, "sigma_up_m": 0.7, "elsewhere": 0.0}
+    ]}  # fmt: skip
+    with _client(site(source)) as client:
+        (feature,) = client.get("/api/targets.geojson").json()["features"]
+        assert feature["geometry"]["coordinates"] == [8.25, 47.5, 450.0]
+        root = ElementTree.fromstring(client.get("/api/targets.cot").text)
+        assert root.find("event/point").attrib["lat"] == "47.50000000"
+        assert root.find("event/detail/contact").attrib["callsign"] == "<car>&"
+
+
+def test_with_a_certificate_only_tls_is_spoken_and_only_with_the_token(deployment, tmp_path):
+    """The whole process, as an operator begins it."""
+    if (openssl := shutil.which("openssl")) is None:
+        pytest.skip("no openssl to make a certificate with")
+    key, certificate, token = (tmp_path / name for name in ("key.pem", "cert.pem", "token"))
+    subprocess.run(
+        [openssl, "req", "-x509", "-newkey", "rsa:2048", "-nodes", "-days", "2", "-subj",
+         "/CN=localhost", "-addext", "subjectAltName=IP:127.0.0.1", "-keyout", key, "-out",
+         certificate], check=True, capture_output=True,
+    )  # fmt: skip
+    token.write_text(TOKEN)
+    token.chmod(0o600)
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        listen = f"127.0.0.1:{probe.getsockname()[1]}"
+    settings = yaml.safe_load(deployment.read_text())
+    settings["console"] = {
+        "listen": listen, "token_file": str(token), "tls_certificate": str(certificate),
+        "tls_key": str(key),
+    }  # fmt: skip
+    deployment.write_text(yaml.safe_dump(settings))
+    command = [sys.executable, "-m", "companion", "console", str(deployment), "--lifeline"]
+    trusted = ssl.create_default_context(cafile=certificate)
+
+    def ask(path, **headers):
+        line = http.client.HTTPSConnection(listen, context=trusted, timeout=30)
+        line.request("GET", path, headers=headers)
+        answer = line.getresponse()
+        answer.read()
+        line.close()
+        return answer
+
+    with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.DEVNULL) as process:
+        try:
+            _until_it_listens(listen, process)
+            assert ask("/api/records").status == 401
+            answer = ask(f"/?token={TOKEN}")
+            cookie = answer.headers["set-cookie"]
+            assert (answer.status, "; Secure" in cookie) == (303, True)
+            assert ask("/api/records", cookie=cookie.split(";")[0]).status == 200
+            plain = http.client.HTTPConnection(listen, timeout=10)
+            with pytest.raises((http.client.HTTPException, OSError)):
+                _answer(plain)
+        finally:
+            process.stdin.close()
+            process.wait(20)
+
+
+def _answer(line):
+    line.request("GET", "/")
+    return line.getresponse()
+
+
+def _until_it_listens(listen, process):
+    host, _, port = listen.rpartition(":")
+    while process.poll() is None:
+        try:
+            socket.create_connection((host, int(port)), 1.0).close()
+        except OSError:
+            time.sleep(0.1)
+        else:
+            return
+    raise AssertionError("the console ended")
 
 
 def test_settings_are_checked_before_they_are_written_and_the_old_ones_kept(site, deployment):

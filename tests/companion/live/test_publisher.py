@@ -184,6 +184,23 @@ def test_an_order_that_makes_no_sense_is_refused(order):
     assert (ship.said, ship.tracked, ship.hints) == ([], [], [])
 
 
+@pytest.mark.parametrize(
+    ("order", "told"),
+    [
+        ({"do": "stop"}, "PiLoT: console: targets ended"),
+        ({"do": "target", "x": 0.5, "y": 0.25}, "PiLoT: console: target at 0.50 0.25"),
+        ({"do": "hint", "latitude_deg": 47.5, "longitude_deg": 8.25, "radius_m": 50},
+         "PiLoT: console: hint 47.50000 8.25000 +-50 m"),
+    ],
+)  # fmt: skip
+def test_every_order_is_told_to_the_operator(order, told):
+    """Helm.say is STATUSTEXT and the record's event; 50 characters fit one message."""
+    ship = Ship()
+    Orders(True, ship.helm).take(order)
+    assert ship.said == [told]
+    assert len(told) <= 50
+
+
 def test_without_control_and_beyond_the_rate_nothing_is_done():
     ship = Ship()
     with pytest.raises(OrderError, match="only reads"):

@@ -1,0 +1,1 @@
+"""What the operator's page costs a flight, and how late it shows a picture."""
