@@ -69,7 +69,9 @@ def deployment(folder: Path, sequence: Path, assets: FlightAssets, endpoint: str
 
 def measure(kind: Kind, sequence: Path, rounds: int) -> list[dict[str, Any]]:
     """Examine a vehicle that is ready to fly, so often."""
-    assets = prepare(0, say=lambda text: print(text, file=sys.stderr, flush=True))
+    assets = prepare(
+        0, progress=lambda phase, share: print(f"{phase} {share:.0%}", file=sys.stderr)
+    )
     with tempfile.TemporaryDirectory(prefix="doctor-") as name, contextlib.ExitStack() as stack:
         setup = VehicleSetup(parameters=vehicle_parameters(Scenario()))
         vehicle = stack.enter_context(open_vehicle(kind, home_of(assets), setup))
