@@ -73,4 +73,7 @@ def test_a_summary_compares_the_same_views():
     assert s["r1"] == 50.0
     assert s["r3"] == 75.0
     assert s["change"] == -50.0
-    assert s["change_low"] <= -50.0 <= s["change_high"]
+    low, high = s["change_low"], s["change_high"]
+    assert low is not None
+    assert high is not None
+    assert low <= -50.0 <= high

@@ -4,6 +4,7 @@ import socket
 import subprocess
 import sys
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -52,7 +53,7 @@ def test_every_red_box_arrives_with_its_frames_time_and_nothing_else(tmp_path):
         probe.bind(("127.0.0.1", 0))
         port = probe.getsockname()[1]
     boxes = [(20, 30, 10), None, (100, 60, 6), (50, 50, 2)]  # the last one is too small
-    got = []
+    got: list[Any] = []
     listener = DetectionListener(f"127.0.0.1:{port}", got.append)
     try:
         done = _run(_deployment(tmp_path, port, boxes))

@@ -523,7 +523,7 @@ def test_signing_vehicle_that_does_not_know_the_time(
     vehicle.codec.signing.timestamp -= 365 * 86_400 * 100_000
     settings = BridgeConfig(connection=LISTENING, signing=SigningConfig(key_file=tmp_path / "key"))
     bridge = run(settings, vehicle)
-    assert bridge.counters()["fc_bad_signatures"] > 0
+    assert int(bridge.counters()["fc_bad_signatures"] or 0) > 0
     assert bridge.state().system_id == 1
     assert sleep_until(lambda: bridge.attitude_at(time.monotonic_ns()) is not None, 30.0)
 

@@ -1,6 +1,7 @@
 """What the camera component tells of targets, and that an ended one is told no more."""
 
 from itertools import count
+from typing import Any
 
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
@@ -13,7 +14,7 @@ SECOND = 10**9
 
 def test_a_target_that_is_forgotten_is_told_no_more_and_the_others_are():
     component = CameraComponent(BridgeConfig(), 47.5, None, count(1), ground_link=True)
-    sent = []
+    sent: list[Any] = []
 
     def told(now_ns):
         sent.clear()
@@ -35,7 +36,8 @@ class Station:
     """A ground station's commands to the camera, and what it hears."""
 
     def __init__(self):
-        self.asked, self.heard = [], []
+        self.asked: list[Any] = []
+        self.heard: list[Any] = []
         self.camera = CameraComponent(
             BridgeConfig(), 47.5, self.asked.append, count(1), ground_link=True
         )

@@ -3,6 +3,7 @@
 import json
 import time
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -36,7 +37,7 @@ MODEL = {
 def _read(path):
     with path.open("rb") as file:
         reader = make_reader(file, decoder_factories=[DecoderFactory()])
-        messages = {}
+        messages: dict[Any, Any] = {}
         topics = {c.topic for c in reader.get_summary().channels.values()} - {"/diagnostics"}
         for schema, channel, message, value in reader.iter_decoded_messages(topics):
             messages.setdefault(channel.topic, []).append((schema.name, message.log_time, value))

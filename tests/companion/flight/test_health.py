@@ -4,6 +4,7 @@ import json
 import time
 from functools import partial
 from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -245,7 +246,7 @@ def test_an_overloaded_computer_is_told_as_that(tmp_path, monkeypatch):
                 )
             told.append(monitor.assess())
 
-    told = []
+    told: list[Any] = []
     fly(10, 5)
     assert {text for _, text in told} == {"localization tracking"}
     told.clear()

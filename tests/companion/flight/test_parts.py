@@ -1,6 +1,7 @@
 """The table of parts: made and started in order, undone in the reverse, whatever fails."""
 
 from contextlib import ExitStack
+from typing import Any
 
 import pytest
 
@@ -38,7 +39,7 @@ def _part(log, kind, make=None, **columns):
 
 
 def test_all_are_made_before_the_first_starts_and_undone_in_the_reverse():
-    log = []
+    log: list[Any] = []
     assembly = Assembly(_config(), [_part(log, Lower), _part(log, Upper)])
     with ExitStack() as up:
         assembly.make(up)
@@ -53,7 +54,7 @@ def test_a_part_that_cannot_be_made_closes_those_before_it():
     def fail(_):
         raise OSError("no")
 
-    log = []
+    log: list[Any] = []
     assembly = Assembly(_config(), [_part(log, Lower), _part(log, Upper, fail)])
     with pytest.raises(OSError, match="no"), ExitStack() as up:
         assembly.make(up)
@@ -64,7 +65,7 @@ def test_a_part_sees_what_its_line_names_and_nothing_else():
     def use(making):
         return making[Lower]
 
-    log = []
+    log: list[Any] = []
     for depends in ((), (Lower,)):
         parts = [_part(log, Lower), _part(log, Upper, use, depends=depends)]
         with ExitStack() as up:
@@ -83,7 +84,7 @@ def test_a_part_that_is_asked_later_stands_below():
         found.append(upper)
         return Lower()
 
-    log = []
+    log: list[Any] = []
     parts = [_part(log, Lower, use, later=(Upper,)), _part(log, Upper)]
     assembly = Assembly(_config(), parts)
     with ExitStack() as up:
@@ -94,7 +95,7 @@ def test_a_part_that_is_asked_later_stands_below():
 
 
 def test_what_is_not_wanted_is_not_made():
-    log = []
+    log: list[Any] = []
     parts = [
         _part(log, Lower, wanted=lambda config: config.bridge.camera.announce),
         _part(log, Upper, lambda making: making.get(Lower) or Upper(), depends=(Lower,)),
@@ -119,7 +120,8 @@ def test_the_process_starts_and_stops_in_this_order():
 
 
 def test_every_subscriber_is_served_though_one_fails():
-    channel, taken = Channel(), []
+    channel: Channel[Any] = Channel()
+    taken: list[Any] = []
 
     def fail(_):
         raise ValueError("boom")

@@ -8,6 +8,7 @@ import threading
 import time
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -117,7 +118,7 @@ def test_a_flight_without_an_accepted_estimate_leaves_no_trajectory(tmp_path):
 
 def test_a_trajectory_that_cannot_be_written_costs_itself_only(tmp_path):
     (tmp_path / "poses.txt").mkdir()
-    told = []
+    told: list[Any] = []
     recorder = Recorder(RecordConfig(folder=tmp_path), FRAME, told.append)
     for estimate in _estimates(4):
         recorder.estimate(estimate)
@@ -152,7 +153,7 @@ def test_a_file_in_the_folders_place_is_a_named_error(tmp_path):
 @pytest.mark.skipif(not os.path.exists("/dev/full"), reason="no /dev/full here")
 def test_a_full_disk_costs_rows_and_not_the_recorder(tmp_path, caplog):
     (tmp_path / "events.csv").symlink_to("/dev/full")
-    told = []
+    told: list[Any] = []
     recorder = Recorder(RecordConfig(folder=tmp_path), FRAME, told.append)
     with caplog.at_level(logging.WARNING):
         for _ in range(2000):  # more than a file's buffer holds
@@ -226,7 +227,7 @@ def test_a_start_that_is_interrupted_anywhere_leaves_nothing(tmp_path, monkeypat
 
 def test_what_cannot_be_written_costs_itself_only(tmp_path):
     """No UTF-8 for half a surrogate pair, no picture of nothing: neither is the disk's fault."""
-    told = []
+    told: list[Any] = []
     recorder = Recorder(RecordConfig(folder=tmp_path, snapshot_interval_s=1.0), FRAME, told.append)
     recorder.event("info", "\ud800")
     recorder.snapshot(Frame(np.zeros((0, 0, 3), np.uint8), 10**9, CAMERA, 0))

@@ -39,6 +39,7 @@ def test_the_picture_s_centre_falls_on_the_ground():
     assert (view.latitude_deg, view.longitude_deg) == pytest.approx((47.0, 8.0))
     assert view.height_m == pytest.approx(600.0, abs=0.01)
     # 45 deg down from 100 m meets the ground 100 m to the north: 1 deg of latitude is 111.17 km.
+    assert view.image_latitude_deg is not None
     assert (view.image_latitude_deg - 47.0) * 111_170 == pytest.approx(100.0, abs=0.5)
     assert view.image_longitude_deg == pytest.approx(8.0, abs=1e-9)
     assert view.image_height_m == pytest.approx(500.0, abs=0.01)

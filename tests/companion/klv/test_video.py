@@ -115,8 +115,12 @@ def test_the_fields_of_a_picture_are_where_it_was_taken_and_what_it_shows():
     half_w, half_h = 100.0 * 80 / 140, 100.0 * 60 / 140
     for k, (east, north) in enumerate(((-1, 1), (1, 1), (1, -1), (-1, -1))):
         corner = frame.position(np.array([50.0 + east * half_w, north * half_h, 0.0]))
-        assert fields[26 + 2 * k] == pytest.approx(corner.latitude_deg - fields[23], abs=1e-7)
-        assert fields[27 + 2 * k] == pytest.approx(corner.longitude_deg - fields[24], abs=1e-7)
+        assert fields[26 + 2 * k] == pytest.approx(
+            corner.latitude_deg - float(fields[23]), abs=1e-7
+        )
+        assert fields[27 + 2 * k] == pytest.approx(
+            corner.longitude_deg - float(fields[24]), abs=1e-7
+        )
     assert (fields[5], fields[6], fields[7]) == pytest.approx((30.0, np.degrees(0.1), 0.0))
     # Platform and camera angles together give the camera's own direction: down, top to the north.
     on_body = matrix_from_euler(*np.radians([fields[20], fields[19], fields[18]]))

@@ -2,6 +2,7 @@
 
 import socket
 import stat
+from typing import Any
 
 import numpy as np
 import pytest
@@ -34,7 +35,9 @@ class Ship:
     """What orders reach."""
 
     def __init__(self):
-        self.said, self.tracked, self.hints = [], [], []
+        self.said: list[Any] = []
+        self.tracked: list[Any] = []
+        self.hints: list[Any] = []
         self.helm = Helm(lambda _, text: self.said.append(text), self.tracked.append,
                          lambda *hint: self.hints.append(hint))  # fmt: skip
 
@@ -103,7 +106,7 @@ def test_a_console_that_does_not_read_costs_one_message_and_the_next_gets_the_ne
     for console in (idle, reader):
         console.next("hello")
         console.send({"kind": "watch", "frames": True})
-    seen = []
+    seen: list[Any] = []
     number = 0
     while len(seen) < 3:
         number += 1

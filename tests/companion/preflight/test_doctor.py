@@ -1,6 +1,7 @@
 """The companion's own checks of a deployment; the flight controller's are the bridge's."""
 
 import sys
+from typing import Any
 
 import cv2
 import numpy as np
@@ -106,7 +107,7 @@ def test_a_feed_that_delivers_is_left_after_three_seconds_of_pictures(map_cache,
 
 
 def test_what_is_being_done_is_told_before_it_takes_time(map_cache, feed):
-    said = []
+    said: list[Any] = []
     camera = {"source": str(feed), "model": MODEL, "settings": {"rate_hz": 20.0}}
     config = parse_config({"map": str(map_cache), "camera": camera}, "test")
     examine_deployment(config, vehicle=False, say=said.append)

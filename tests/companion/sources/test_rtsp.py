@@ -57,7 +57,7 @@ class _RtspCamera:
     def _answer(self, client: socket.socket) -> None:
         requests = client.makefile("rb")
         while not self._closed.is_set():
-            lines = []
+            lines: list[Any] = []
             while (line := requests.readline().strip()) or not lines:
                 if not line:
                     return

@@ -1,6 +1,7 @@
 """Clicks through the targets' thread; what they mean is in test_operator.py."""
 
 import itertools
+from typing import Any
 
 import numpy as np
 import pytest
@@ -20,7 +21,9 @@ class Ground:
     """A ground station that clicks into frames of a camera 100 m above flat ground."""
 
     def __init__(self):
-        self.targets, self.texts, self.gone = [], [], []
+        self.targets: list[Any] = []
+        self.texts: list[Any] = []
+        self.gone: list[Any] = []
         config = TargetConfig(operator_delay_ms=0.0)
         self.numbers = itertools.count(1)
         self.reporter = TargetReporter(config, flat, self.targets.append, on_gone=self.gone.append)

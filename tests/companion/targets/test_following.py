@@ -104,7 +104,9 @@ def _click(watcher, point, delay_s=0.25):
     """Where the operator saw it: the frame is `delay_s` old when the command comes."""
     seen_s = (watcher.now_ms + 40) / 1e3 - delay_s
     seen = scene.estimate(watching(seen_s), 0, camera=CAMERA)
-    u, v = projected(seen, np.array(point(seen_s)))
+    pixel = projected(seen, np.array(point(seen_s)))
+    assert pixel is not None
+    u, v = pixel
     watcher.clicks_at(u / CAMERA.width, v / CAMERA.height)
 
 

@@ -1,5 +1,7 @@
 """What an operator gets for his clicks: one target, one number, one life, under his own pixel."""
 
+from typing import Any
+
 import numpy as np
 import pytest
 
@@ -22,7 +24,9 @@ class Operator:
         self.config = TargetConfig(
             operator_delay_ms=delay_ms, operator_delay_sigma_ms=sigma_ms, **settings
         )
-        self.told, self.gone, self.texts = [], [], []
+        self.told: list[Any] = []
+        self.gone: list[Any] = []
+        self.texts: list[Any] = []
         self.population = Population(
             self.config, cast, self.told.append, self._end, lambda _, text: self.texts.append(text)
         )

@@ -71,7 +71,7 @@ def test_arrays_of_other_libraries():
             } | changes  # fmt: skip
 
     array = DeviceArray.of(Theirs())
-    assert (array.address, array.shape, array.dtype) == (4096, (2, 3), np.float32)
+    assert (array.address, array.shape, array.dtype) == (4096, (2, 3), np.dtype(np.float32))
     assert array.reshaped(3, 2).shape == (3, 2)
     with pytest.raises(DeviceArrayError, match="cannot be"):
         array.reshaped(4, 2)

@@ -31,7 +31,7 @@ def test_unprojection_and_projection_are_inverse(reference):
 
 
 def test_count_and_shapes(reference):
-    anchors = select_anchors(*reference, count=200)
+    anchors = select_anchors(reference[0], reference[1], count=200)
     assert anchors.points_world.shape == (200, 3)
     assert [f.shape for f in anchors.features] == [(200, 16)] * 3
     assert all(f.dtype == np.float32 and f.flags.c_contiguous for f in anchors.features)
@@ -39,7 +39,7 @@ def test_count_and_shapes(reference):
 
 def test_spread_over_the_whole_view(reference, camera):
     """Every cell of a 4 x 4 split gets its share, within a third."""
-    anchors = select_anchors(*reference, count=480)
+    anchors = select_anchors(reference[0], reference[1], count=480)
     columns = (anchors.pixels[:, 0] * 4 // camera.width).astype(int)
     rows = (anchors.pixels[:, 1] * 4 // camera.height).astype(int)
     counts = np.bincount(rows * 4 + columns, minlength=16)
@@ -74,7 +74,8 @@ def test_a_steep_plane_is_no_depth_edge(camera, scene, reference):
 
 
 def test_deterministic_by_seed(reference):
-    a, b, c = (select_anchors(*reference, count=100, seed=s) for s in (4, 4, 5))
+    view, pyramid = reference
+    a, b, c = (select_anchors(view, pyramid, count=100, seed=s) for s in (4, 4, 5))
     np.testing.assert_array_equal(a.pixels, b.pixels)
     assert not np.array_equal(a.pixels, c.pixels)
 

@@ -67,7 +67,7 @@ def test_swarm_reaches_what_one_hypothesis_does_not(scene_factory, prior):
 
 
 def test_more_anchors_sharpen_the_winner(jngo, place, camera, scene_factory, prior):
-    errors_by_count = {150: [], 1500: []}
+    errors_by_count: dict[int, list[Any]] = {150: [], 1500: []}
     for seed in range(10):
         scene = scene_factory(300 + seed, 1.0, 1.0)
         view = place.view(scene.reference, camera)
@@ -333,7 +333,7 @@ def test_level_count_mismatch_is_named(jngo, scene, prior):
 
 def test_the_detail_level_sharpens_the_winner(jngo, place, camera, scene_factory, prior):
     """A level more than `iterations`, of stride 1: the search ignores it, the winner ends on it."""
-    found = {"without": [], "with": []}
+    found: dict[str, list[Any]] = {"without": [], "with": []}
     for seed in range(5):
         scene = scene_factory(500 + seed, 1.0, 1.0)
         detailed, coarse = (

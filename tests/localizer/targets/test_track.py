@@ -25,7 +25,9 @@ def test_a_car_that_turned_about_unseen_was_told_hundreds_of_metres_off():
         seen = _car(20.0 + k * 0.05, turned_s=99.0)
         surface = TargetSurface(1.0, seen, np.eye(3) * 0.09)
         old.update(TargetSighting("car", (surface,), (0.0, 0.0), round((20 + k * 0.05) * 1e9)))
-    carried, _ = old.expected(round(41.7e9))
+    expected = old.expected(round(41.7e9))
+    assert expected is not None
+    carried, _ = expected
     back = _car(41.7, turned_s=21.0)
     assert np.linalg.norm(carried - back) > 400.0  # what used to be reported
     surface = TargetSurface(1.0, back, np.eye(3) * 0.09)

@@ -4,6 +4,7 @@ import threading
 import time
 from dataclasses import replace
 from types import SimpleNamespace
+from typing import Any
 
 import cv2
 import numpy as np
@@ -111,7 +112,7 @@ class Flight:
     """An engine, its estimates, and frames on demand."""
 
     def __init__(self, localizer: Localizer, provider=_prior, searcher=None) -> None:
-        self.estimates = []
+        self.estimates: list[Any] = []
         self.localizer, self.provider = localizer, provider
         self.engine = DualThreadEngine(
             localizer,
@@ -287,7 +288,7 @@ def test_a_frame_of_another_size_is_named():
 def test_a_stream_that_changes_its_size_is_undistorted_with_its_own_camera():
     """The same lens at half the size gives the same working image, but for sampling."""
     camera = Camera(640, 480, 500.0, 500.0, 320.0, 240.0, (-0.12, 0.03, 0.001, -0.0005, 0.0))
-    seen = []
+    seen: list[Any] = []
     extractor = SimpleNamespace(extract=seen.append)
     localizer = Localizer(
         FakeRenderer(), extractor, FakeOptimizer(), camera, LocalizerConfig(odometry=None)
@@ -422,8 +423,9 @@ def test_while_lost_a_search_finds_the_place_and_the_way_flown_confirms_it(fligh
     f.feed_until(lambda: f.estimates[-1].state is TrackingState.LOST)
     f.feed_until(lambda: f.engine.health.found > 0)
     f.feed_until(lambda: f.localizer.tracker.standing.probation is not None)
-    assert f.estimates[-1].state is TrackingState.LOST
-    assert not f.estimates[-1].accepted
+    last = f.estimates[-1]
+    assert last.state is TrackingState.LOST
+    assert not last.accepted
     for step in range(12):  # it flies on, and the map goes on matching
         optimizer.offset = elsewhere + np.array([0.6 * step, 0.0, 0.0])
         count = len(f.estimates)

@@ -56,4 +56,4 @@ def test_a_world_that_is_being_made_tells_how_far_it_is(tmp_path, monkeypatch) -
     assert [phase for phase, _ in told] == phases
     shares = [share for _, share in told]
     assert shares == sorted(shares)
-    assert (shares[0], shares[-1]) == (0.0, pytest.approx(1.0))
+    assert [shares[0], shares[-1]] == pytest.approx([0.0, 1.0])

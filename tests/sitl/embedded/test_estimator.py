@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import numpy as np
 import pytest
@@ -135,7 +136,7 @@ class Still:
     """A filter whose vehicle stands still."""
 
     def __init__(self, parameters=None):
-        self.texts = []
+        self.texts: list[Any] = []
         self.filter = Estimator(
             Parameters({**VISION, **(parameters or {})}), lambda _s, t: self.texts.append(t)
         )

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import numpy as np
 import pytest
@@ -217,7 +218,7 @@ def test_flies_a_mission_with_speed_gimbal_and_return(bench, home):
         item(mis.WAYPOINT, 100, 80, 60.0, home=home),
         MissionItem(command=mis.RTL, parameters=(0.0, 0.0, 0.0, 0.0), **bare),
     ]
-    reached = []
+    reached: list[Any] = []
     b.vehicle.modes.on_reached = reached.append
     b.take_off(20.0)
     assert b.vehicle.modes.set_mode(Mode.AUTO)

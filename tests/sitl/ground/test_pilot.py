@@ -12,6 +12,7 @@ import tempfile
 import time
 from pathlib import Path
 from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -53,10 +54,12 @@ def test_boot_clock_takes_the_least_latency():
 
 
 def test_track_brackets_a_time_and_forgets_the_oldest():
-    track = Track(limit=10)
+    track: Track[Any] = Track(limit=10)
     for t in range(100):
         track.add(SimpleNamespace(time_ns=10 * t))
-    before, after = track.around(985)
+    both = track.around(985)
+    assert both is not None
+    before, after = both
     assert (before.time_ns, after.time_ns) == (980, 990)
     assert track.around(991) is None
     assert track.around(0) is None

@@ -673,7 +673,7 @@ def test_what_a_process_does_is_a_named_error_here(what, limits, says):
 
 def test_limits_and_doubts_are_named():
     rules = ImportRules.of(["pixels=1e6", "nodes=7"], ["geoid"])
-    assert (rules.pixels, rules.nodes, rules.trusted) == (1_000_000, 7, {"geoid"})
+    assert (rules.pixels, rules.nodes, rules.trusted) == (1_000_000, 7, frozenset({"geoid"}))
     for text in ("pixels", "pixels=many", "stars=3", "nodes=0", "depth=1e6"):
         with pytest.raises(MapSourceError, match="--limit"):
             ImportRules.of([text])
