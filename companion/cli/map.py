@@ -13,6 +13,7 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
+from companion.cli.before.map_check import check_command
 from companion.errors import ReportError
 from companion.terminal.import_bar import ImportBar
 
@@ -24,6 +25,9 @@ CachePath = Annotated[Path, typer.Argument(help="folder of a tile cache")]
 @app.callback()
 def _group() -> None:
     """Tile caches: import a map source, check it, look at it."""
+
+
+app.command("check")(check_command)
 
 
 @app.command("build")
@@ -59,6 +63,9 @@ def build(
         float | None, typer.Option(help="of a DSM that does not say it: what missing heights are")
     ] = None,
     attribution: Annotated[str | None, typer.Option(help="who made the source")] = None,
+    imagery_date: Annotated[
+        str | None, typer.Option(help="of the source's pictures: 2024, 2024-06 or 2024-06-30")
+    ] = None,
     skip_bad_tiles: Annotated[
         bool, typer.Option(help="leave out tiles that cannot be imported instead of failing")
     ] = False,
@@ -102,6 +109,7 @@ def build(
                     height_unit=height_unit,
                     nodata=nodata,
                     attribution=attribution,
+                    imagery_date=imagery_date,
                     skip_bad_tiles=skip_bad_tiles,
                     overwrite=overwrite,
                     workers=workers,
@@ -154,6 +162,7 @@ def info(
     facts = {
         "source": m.source,
         "attribution": m.attribution or "not given",
+        "imagery of": str(m.build.get("imagery_date", "not known")),
         "origin": f"{m.origin.latitude_deg:.7f}, {m.origin.longitude_deg:.7f}, "
         f"{m.origin.height_m:.2f} m (ellipsoidal)",
         "latitude": f"{min(south_north):.6f} to {max(south_north):.6f}",

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import os
+import re
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 
@@ -73,6 +74,7 @@ def build_tree(
     """Build a cache from any importer's tree; see `build_cache`. name: of the source."""
     options = options or BuildOptions()
     rules = options.rules
+    dated = _dated(options.imagery_date)
     _require_on_earth(tree)
     separation, datum, doubts = heights_of(
         tree, options.geoid_separation_m, options.vertical_datum, name, rules
@@ -109,12 +111,22 @@ def build_tree(
                 "attribution": (
                     tree.attribution if options.attribution is None else options.attribution
                 ),
-                "build": parameters,
+                "build": parameters | dated,
                 "skipped": skipped,
                 "warnings": (*tree.warnings, *doubts),
             }
         )
         return publish(staged, Path(out), index, manifest)
+
+
+def _dated(imagery_date: str | None) -> dict[str, str]:
+    if imagery_date is None:
+        return {}
+    if not re.fullmatch(r"\d{4}(-(0[1-9]|1[0-2])(-(0[1-9]|[12]\d|3[01]))?)?", imagery_date):
+        raise MapSourceError(
+            f"imagery date {imagery_date!r}: give a year, a month or a day, as 2024-06-30"
+        )
+    return {"imagery_date": imagery_date}
 
 
 def _failures(root: SourceNode, records: dict[int, Record]) -> dict[str, str]:

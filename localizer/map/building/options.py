@@ -21,7 +21,7 @@ class BuildOptions:
 
     georeference, up_axis: of a mesh, see `read_georeference` and `mesh_tree`. height_unit, nodata:
     of a DSM, see `read_rasters`. origin: of the world frame, else the source's centre. attribution:
-    whose data it is.
+    whose data it is; imagery_date: of its pictures, as 2024, 2024-06 or 2024-06-30.
 
     skip_bad_tiles: leave out tiles that cannot be imported (their parents are shown there) instead
     of failing. overwrite: replace a cache of another source or of other options. rules: what a
@@ -41,6 +41,7 @@ class BuildOptions:
     nodata: float | None = None
     origin: Geodetic | None = None
     attribution: str | None = None
+    imagery_date: str | None = None
     skip_bad_tiles: bool = False
     overwrite: bool = False
     workers: int | None = None

@@ -1,0 +1,66 @@
+"""``companion map check``: whether a map will do, in words and pictures."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+from typing import Annotated
+
+import typer
+from rich.box import SIMPLE_HEAD
+from rich.console import Console
+from rich.markup import escape
+from rich.table import Table
+
+from companion.errors import ReportError
+
+_COLOURS = {"good": "green", "advice": "yellow", "bad": "red"}
+
+
+def check_command(
+    cache: Annotated[Path, typer.Argument(help="folder of a tile cache")],
+    out: Annotated[Path, typer.Option(help="folder of the pictures")] = Path("map-check"),
+    height: Annotated[
+        float, typer.Option(min=5, max=5000, help="of the mission above the ground, m")
+    ] = 120.0,
+    config: Annotated[
+        Path | None, typer.Option(help="deployment YAML: its camera and working width")
+    ] = None,
+    fov: Annotated[
+        float, typer.Option(min=1, max=170, help="horizontal, degrees, without a deployment")
+    ] = 65.0,
+    width: Annotated[
+        int, typer.Option(min=64, max=2048, help="working width, without a deployment")
+    ] = 320,
+) -> None:
+    """Coverage, holes, texel size, date, seams, picture on surface: exit code 1 if one is bad."""
+    from companion.config import load_config
+    from localizer.map.cache.cache import TileCache
+    from localizer.map.inspection.check import Use, check_map
+    from localizer.map.inspection.inspect import write_picture
+    from localizer.tracking.pipeline import working_camera
+
+    pixel_rad = 2 * math.tan(math.radians(fov) / 2) / width
+    if config is not None:
+        deployment = load_config(config)
+        camera = working_camera(deployment.camera.model.camera(), deployment.localizer.width)
+        pixel_rad = 1 / camera.fx
+    opened = TileCache.open(cache)
+    try:
+        out.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise ReportError(f"--out {out}: cannot be written: {error}") from error
+    made = check_map(opened, Use(height, pixel_rad))
+    for name, rgb in made.pictures.items():
+        write_picture(out / f"{name}.png", rgb)
+    table = Table(box=SIMPLE_HEAD)
+    for column in ("", "what", "found", "meaning"):
+        table.add_column(column, overflow="fold")
+    for f in made.findings:
+        mark = f"[{_COLOURS[f.grade.value]}]{f.grade.value}[/]"
+        table.add_row(mark, f.name, escape(f.found), escape(f.words))
+    Console().print(table)
+    bad = [f.name for f in made.findings if f.grade.value == "bad"]
+    verdict = f"This map will not do: {', '.join(bad)}." if bad else "This map will do."
+    Console().print(f"{verdict} Pictures: {escape(str(out))}", soft_wrap=True)
+    raise typer.Exit(0 if made.ok else 1)

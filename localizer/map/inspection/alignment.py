@@ -1,0 +1,105 @@
+"""Whether a map's picture lies where its surface lies: by the edges that both have."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+
+from localizer.map.inspection.mosaic import Mosaic
+from localizer.types import Float32
+
+_CELL_M = 0.5  # at which edges are compared
+_REACH_M = 10.0  # of the shifts that are tried
+_STEP_M = 1.5  # of the surface, within a cell or two: walls, crowns
+_SMOOTH_M = 1.0
+_DARK = 10.0  # grey value below which colour is noise
+_LEAST_COLOUR = 1e-3  # of the strongest edges of colour
+_LEAST_EDGES = 400  # cells with a step; with fewer nothing can be said
+_LEAST_PEAK = 4.0  # of the best shift's correlation over the others', in their deviations
+
+
+@dataclass(frozen=True)
+class Alignment:
+    """east_m, north_m: by how much the picture lies beside the surface; peak: how clear that is, in
+    standard deviations; edges: cells of the surface with a step. known: whether it can be said.
+    """
+
+    east_m: float
+    north_m: float
+    peak: float
+    edges: int
+
+    @property
+    def known(self) -> bool:
+        """Whether there are edges enough, and one shift at which they meet."""
+        return self.edges >= _LEAST_EDGES and self.peak >= _LEAST_PEAK
+
+    @property
+    def distance_m(self) -> float:
+        """Of the shift."""
+        return float(np.hypot(self.east_m, self.north_m))
+
+
+def alignment_of(mosaic: Mosaic) -> Alignment:
+    """The shift of the picture at which its edges lie best on the surface's steps.
+
+    Good to about a metre: walls that lean in the picture draw it to one side. Without colours
+    nothing can be said.
+    """
+    scale = mosaic.gsd_m / _CELL_M
+    size = (round(mosaic.rgb.shape[1] * scale), round(mosaic.rgb.shape[0] * scale))
+    rgb = cv2.resize(mosaic.rgb, size, interpolation=cv2.INTER_AREA).astype(np.float32)
+    gaps = cv2.resize(np.isnan(mosaic.height).astype(np.uint8), size, interpolation=cv2.INTER_AREA)
+    low = float(np.nanmin(mosaic.height)) if np.isfinite(mosaic.height).any() else 0.0
+    heights = cv2.resize(np.nan_to_num(mosaic.height, nan=low), size, interpolation=cv2.INTER_AREA)
+    reach = round(_REACH_M / _CELL_M)
+    inner = cv2.erode(1 - (gaps > 0).astype(np.uint8), np.ones((2 * reach + 1,) * 2, np.uint8))
+    steps = _gradient(heights) > _STEP_M
+    steps &= inner > 0
+    edges = int(steps.sum())
+    if edges < _LEAST_EDGES or min(size) <= 4 * reach:
+        return Alignment(0.0, 0.0, 0.0, edges)
+    picture = _colour_edges(rgb)
+    if float(np.percentile(picture, 97)) < _LEAST_COLOUR:
+        return Alignment(0.0, 0.0, 0.0, edges)
+    picture = np.minimum(picture, np.percentile(picture, 97)) - cv2.blur(picture, (41, 41))
+    surface = steps.astype(np.float32) - cv2.blur(steps.astype(np.float32), (41, 41))
+    core = surface[reach:-reach, reach:-reach]
+    match = cv2.matchTemplate(
+        np.ascontiguousarray(picture, np.float32), np.ascontiguousarray(core), cv2.TM_CCORR
+    )
+    row, column = np.unravel_index(int(match.argmax()), match.shape)
+    far = np.hypot(*(np.indices(match.shape) - np.reshape((row, column), (2, 1, 1)))) > 6
+    peak = float((match[row, column] - match[far].mean()) / max(float(match[far].std()), 1e-9))
+    dx, dy = _between(match, int(row), int(column))
+    return Alignment((dx - reach) * _CELL_M, -(dy - reach) * _CELL_M, peak, edges)
+
+
+def _colour_edges(rgb: Float32) -> Float32:
+    """Gradient (h, w) of the colour without its brightness: the edge of a shadow is none, and every
+    shadow lies to the same side.
+    """
+    smooth = cv2.GaussianBlur(rgb, (0, 0), _SMOOTH_M / _CELL_M)
+    chroma = (smooth + _DARK) / (smooth.sum(axis=2, keepdims=True) + 3 * _DARK)
+    parts = [_gradient(np.ascontiguousarray(chroma[..., k])) for k in range(3)]
+    return np.asarray(np.sum(parts, axis=0), np.float32)
+
+
+def _gradient(image: Float32) -> Float32:
+    dx, dy = (cv2.Sobel(image, cv2.CV_32F, *axis, scale=0.125) for axis in ((1, 0), (0, 1)))
+    return np.asarray(np.hypot(dx, dy), np.float32)
+
+
+def _between(match: Float32, row: int, column: int) -> tuple[float, float]:
+    """Column and row of the peak by a parabola through its neighbours."""
+    found = []
+    for at, line in ((column, match[row]), (row, match[:, column])):
+        offset = 0.0
+        if 0 < at < len(line) - 1:
+            a, b, c = (float(v) for v in line[at - 1 : at + 2])
+            bend = a - 2 * b + c
+            offset = 0.5 * (a - c) / bend if bend < 0 else 0.0
+        found.append(at + offset)
+    return found[0], found[1]

@@ -1,0 +1,294 @@
+"""Whether a map will do for a flight: coverage, holes, texel size, seams, picture on surface."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from enum import Enum
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from localizer.map.cache.cache import TileCache
+from localizer.map.inspection.alignment import Alignment, alignment_of
+from localizer.map.inspection.mosaic import Mosaic, mosaic_of
+from localizer.types import Image
+
+_LEAST_HOLE_M2 = 25.0
+_LEAST_BLANK_M2 = 100.0  # of one flat white or black: no picture was taken there
+_WHITE, _BLACK, _FLAT = 250, 5, 2  # grey values
+_MOST_HOLES, _MOST_BLANK = 0.02, 0.02  # of the area covered
+_COARSE, _TOO_COARSE = 2.0, 4.0  # texels over the working pixel on the ground
+_LEAST_COVERED = 0.5  # of the rectangle about the map
+_SEAM_M = 0.5  # median step of heights along a border of tiles
+_SEAM_GREY = 12.0  # likewise of grey values
+_LEAST_SEAM_PX = 20
+_SHIFT_M = 1.5
+
+
+class Grade(Enum):
+    """How good a finding is."""
+
+    GOOD = "good"
+    ADVICE = "advice"
+    BAD = "bad"
+
+
+@dataclass(frozen=True)
+class Finding:
+    """One question about a map. name: what; found: with units; grade; words: what it means."""
+
+    name: str
+    found: str
+    grade: Grade
+    words: str
+
+
+@dataclass(frozen=True)
+class Use:
+    """What the map is for. height_m: above the ground; pixel_rad: angle of a working pixel."""
+
+    height_m: float
+    pixel_rad: float
+
+    @property
+    def pixel_m(self) -> float:
+        """Ground size of a working pixel, straight down."""
+        return self.height_m * self.pixel_rad
+
+
+@dataclass(frozen=True)
+class MapCheck:
+    """findings: each question's; pictures: name to RGB."""
+
+    findings: tuple[Finding, ...]
+    pictures: dict[str, Image]
+
+    @property
+    def ok(self) -> bool:
+        """Whether nothing is bad."""
+        return all(f.grade is not Grade.BAD for f in self.findings)
+
+
+@dataclass(frozen=True)
+class Seam:
+    """A border between tiles. ends: rows and columns of its ends; height_m, grey: median steps
+    across it beyond those beside it.
+    """
+
+    ends: tuple[tuple[int, int], tuple[int, int]]
+    height_m: float
+    grey: float
+
+    @property
+    def seen(self) -> bool:
+        """Whether it shows."""
+        return self.height_m > _SEAM_M or self.grey > _SEAM_GREY
+
+
+def check_map(cache: TileCache, use: Use) -> MapCheck:
+    """All questions, with a picture of each."""
+    mosaic = mosaic_of(cache)
+    gaps, holes = _holes(mosaic)
+    blank = _blank(mosaic)
+    seams = seams_of(cache, mosaic)
+    shift = alignment_of(mosaic)
+    findings = (
+        _coverage(mosaic, gaps),
+        _holes_finding(mosaic, holes),
+        _blank_finding(mosaic, blank),
+        _texels(cache, use),
+        _date(cache),
+        _seam_finding(seams),
+        _shift(shift),
+    )
+    pictures = {
+        "coverage": _painted(mosaic, {(220, 0, 200): holes, (255, 140, 0): blank}, gaps & ~holes),
+        "texels": _texel_picture(cache, mosaic, use),
+        "seams": _seam_picture(mosaic, seams),
+        "alignment": _alignment_picture(mosaic),
+    }
+    return MapCheck(findings, pictures)
+
+
+def seams_of(cache: TileCache, mosaic: Mosaic) -> list[Seam]:
+    """The borders of the finest nodes, inside the map."""
+    index, rows, columns = cache.index, *mosaic.height.shape
+    grey = mosaic.rgb.astype(np.float32).mean(axis=2)
+    found = []
+    leaves = np.flatnonzero((index.child_count == 0) & (index.tile_count > 0))
+    for node in leaves:
+        top, left = mosaic.pixel(float(index.box_min[node, 0]), float(index.box_max[node, 1]))
+        bottom, right = mosaic.pixel(float(index.box_max[node, 0]), float(index.box_min[node, 1]))
+        a, b = (round(np.clip(x, 0, rows)) for x in (top, bottom))
+        c, d = (round(np.clip(x, 0, columns)) for x in (left, right))
+        for across, at, (begin, end) in ((1, d, (a, b)), (0, b, (c, d))):
+            limit = (rows, columns)[across]
+            if not 4 <= at < limit - 4 or end - begin < _LEAST_SEAM_PX:
+                continue
+            ends = ((begin, at), (end, at)) if across else ((at, begin), (at, end))
+            steps = [_step(layer, at, (begin, end), across) for layer in (mosaic.height, grey)]
+            found.append(Seam(ends, steps[0], steps[1]))
+    return found
+
+
+def _step(layer: NDArray[np.float32], at: int, ends: tuple[int, int], across: int) -> float:
+    """Median step over a line of a layer (rows, columns), less that beside it; 0 where unknown."""
+    lines = layer if across else layer.T
+    near = lines[ends[0] : ends[1], at - 4 : at + 4]
+    over = np.abs(near[:, 4] - near[:, 3])
+    beside = 0.5 * (np.abs(near[:, 1] - near[:, 0]) + np.abs(near[:, 7] - near[:, 6]))
+    known = np.isfinite(over) & np.isfinite(beside)
+    if known.sum() < _LEAST_SEAM_PX:
+        return 0.0
+    return float(np.median(over[known]) - np.median(beside[known]))
+
+
+def _holes(mosaic: Mosaic) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
+    """Where there is no map, and of that what map surrounds, (h, w)."""
+    gaps = np.isnan(mosaic.height)
+    framed = np.pad(gaps.astype(np.uint8), 1, constant_values=1)
+    count, labels, stats, _ = cv2.connectedComponentsWithStats(framed, connectivity=4)
+    large = stats[:, cv2.CC_STAT_AREA] * mosaic.gsd_m**2 >= _LEAST_HOLE_M2
+    inside = np.array([k not in (0, labels[0, 0]) for k in range(count)]) & large
+    return gaps, inside[labels[1:-1, 1:-1]] & gaps
+
+
+def _blank(mosaic: Mosaic) -> NDArray[np.bool_]:
+    """Surface under one flat white or black, (h, w)."""
+    low, high = mosaic.rgb.min(axis=2), mosaic.rgb.max(axis=2)
+    flat = (high - low <= _FLAT) & ((low >= _WHITE) | (high <= _BLACK))
+    flat &= ~np.isnan(mosaic.height)
+    _, labels, stats, _ = cv2.connectedComponentsWithStats(flat.astype(np.uint8), connectivity=4)
+    large = stats[:, cv2.CC_STAT_AREA] * mosaic.gsd_m**2 >= _LEAST_BLANK_M2
+    large[0] = False
+    return np.asarray(large[labels])
+
+
+def _coverage(mosaic: Mosaic, gaps: NDArray[np.bool_]) -> Finding:
+    share = float(1 - gaps.mean())
+    rows, columns = gaps.shape
+    found = (
+        f"{share * gaps.size * mosaic.gsd_m**2 / 1e6:.3f} km², {100 * share:.0f} % of "
+        f"{columns * mosaic.gsd_m:.0f} x {rows * mosaic.gsd_m:.0f} m"
+    )
+    if share >= _LEAST_COVERED:
+        return Finding("coverage", found, Grade.GOOD, "fly where the map is, with its margin")
+    words = "less than half of its rectangle is covered: look whether the mission's part is"
+    return Finding("coverage", found, Grade.ADVICE, words)
+
+
+def _holes_finding(mosaic: Mosaic, holes: NDArray[np.bool_]) -> Finding:
+    share = float(holes.sum() / max((~np.isnan(mosaic.height)).sum(), 1))
+    count = cv2.connectedComponents(holes.astype(np.uint8), connectivity=4)[0] - 1
+    found = f"{count} of {_LEAST_HOLE_M2:.0f} m² or more, {100 * share:.2f} % of the area"
+    if share > _MOST_HOLES:
+        return Finding("holes", found, Grade.BAD, "views over them have little to match")
+    words = "small ones do no harm" if count else "none"
+    return Finding("holes", found, Grade.GOOD, words)
+
+
+def _blank_finding(mosaic: Mosaic, blank: NDArray[np.bool_]) -> Finding:
+    share = float(blank.sum() / max((~np.isnan(mosaic.height)).sum(), 1))
+    found = f"{100 * share:.2f} % of the area"
+    if share > _MOST_BLANK:
+        words = "surface without a picture (plain white or black): the source lacks imagery there"
+        return Finding("without picture", found, Grade.BAD, words)
+    return Finding("without picture", found, Grade.GOOD, "as it should be")
+
+
+def _texels(cache: TileCache, use: Use) -> Finding:
+    gsd = _leaf_gsd(cache)
+    typical = float(np.median(gsd)) if len(gsd) else cache.manifest.gsd_m
+    ratio = typical / use.pixel_m
+    found = f"{typical:.2f} m (median), a working pixel {use.pixel_m:.2f} m at {use.height_m:.0f} m"
+    if ratio <= _COARSE:
+        return Finding("texel size", found, Grade.GOOD, f"{ratio:.1f} working pixels")
+    words = f"{ratio:.1f} working pixels: the map is blurred beside the video; fly higher"
+    return Finding("texel size", found, Grade.ADVICE if ratio <= _TOO_COARSE else Grade.BAD, words)
+
+
+def _date(cache: TileCache) -> Finding:
+    date = cache.manifest.build.get("imagery_date")
+    if date:
+        words = "what was built or felled since costs accuracy"
+        return Finding("imagery of", str(date), Grade.GOOD, words)
+    words = "the source does not say; what was built or felled since costs accuracy"
+    return Finding("imagery of", "not known", Grade.ADVICE, words)
+
+
+def _seam_finding(seams: list[Seam]) -> Finding:
+    seen = [s for s in seams if s.seen]
+    found = f"{len(seen)} of {len(seams)} borders of tiles"
+    if not seen:
+        return Finding("seams", found, Grade.GOOD, "none show")
+    worst = max(seen, key=lambda s: s.height_m / _SEAM_M + s.grey / _SEAM_GREY)
+    words = f"the worst steps by {worst.height_m:.2f} m and {worst.grey:.0f} grey values"
+    return Finding("seams", found, Grade.ADVICE, words)
+
+
+def _shift(shift: Alignment) -> Finding:
+    name = "picture on surface"
+    if not shift.known:
+        words = f"{shift.edges} cells with a step: too few, or they do not meet; flat land"
+        return Finding(name, "cannot be told", Grade.GOOD, words)
+    found = f"{shift.east_m:+.1f} m east, {shift.north_m:+.1f} m north (peak {shift.peak:.0f})"
+    if shift.distance_m <= _SHIFT_M:
+        return Finding(name, found, Grade.GOOD, "together, to about a metre")
+    words = (
+        f"the picture lies {shift.distance_m:.1f} m beside its surface: roofs are painted on the "
+        "ground. Check the CRS of orthophoto and surface, or take a true orthophoto"
+    )
+    return Finding(name, found, Grade.BAD, words)
+
+
+def _leaf_gsd(cache: TileCache) -> NDArray[np.float64]:
+    index = cache.index
+    leaves = (index.child_count == 0) & (index.tile_count > 0) & (index.gsd > 0)
+    gsd: NDArray[np.float64] = index.gsd[leaves]
+    return gsd
+
+
+def _painted(
+    mosaic: Mosaic, parts: dict[tuple[int, int, int], NDArray[np.bool_]], away: NDArray[np.bool_]
+) -> Image:
+    picture: Image = mosaic.rgb.copy()
+    picture[away] = 210
+    for colour, where in parts.items():
+        picture[where] = colour
+    return picture
+
+
+def _texel_picture(cache: TileCache, mosaic: Mosaic, use: Use) -> Image:
+    """Texels over working pixels, from green (fine) to red (four and more)."""
+    index = cache.index
+    ratio = np.zeros(mosaic.height.shape, np.float32)
+    for node in np.flatnonzero((index.child_count == 0) & (index.gsd > 0)):
+        top, left = mosaic.pixel(float(index.box_min[node, 0]), float(index.box_max[node, 1]))
+        bottom, right = mosaic.pixel(float(index.box_max[node, 0]), float(index.box_min[node, 1]))
+        part = tuple(slice(max(int(a), 0), max(int(np.ceil(b)), 0)) for a, b in
+                     ((top, bottom), (left, right)))  # fmt: skip
+        ratio[part] = index.gsd[node] / use.pixel_m
+    level = np.clip(1 - ratio / _TOO_COARSE, 0, 1)
+    colours = np.stack([255 * (1 - level), 200 * level, np.full_like(level, 40)], axis=2)
+    mixed = 0.5 * mosaic.rgb + 0.5 * colours
+    mixed[np.isnan(mosaic.height)] = 210
+    return np.asarray(mixed, np.uint8)
+
+
+def _seam_picture(mosaic: Mosaic, seams: list[Seam]) -> Image:
+    picture: Image = mosaic.rgb.copy()
+    for seam in seams:
+        (a, b), (c, d) = seam.ends
+        colour = (220, 0, 0) if seam.seen else (0, 170, 0)
+        cv2.line(picture, (b, a), (d, c), colour, 3 if seam.seen else 1)
+    return picture
+
+
+def _alignment_picture(mosaic: Mosaic) -> Image:
+    """The surface's steps in red over the picture."""
+    height = np.nan_to_num(mosaic.height, nan=float(np.nanmin(mosaic.height)))
+    dx, dy = (cv2.Sobel(height, cv2.CV_32F, *axis, scale=0.125) for axis in ((1, 0), (0, 1)))
+    picture: Image = mosaic.rgb.copy()
+    picture[np.hypot(dx, dy) > 1.0] = (230, 20, 20)
+    return picture

@@ -1,0 +1,109 @@
+"""A map is examined before it is flown over: each fault is found, and a sound map has none."""
+
+import cv2
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+from companion.cli.commands import app
+from localizer.errors import MapSourceError
+from localizer.map.building import build
+from localizer.map.building.options import BuildOptions
+from localizer.map.cache.cache import TileCache
+from localizer.map.inspection.alignment import alignment_of
+from localizer.map.inspection.check import Grade, Use, check_map, seams_of
+from localizer.map.inspection.mosaic import Mosaic, mosaic_of
+from tests.localizer.map.conftest import write_tileset
+
+FINE = Use(120.0, 0.004)
+COLOURS = ((170, 60, 40), (120, 120, 130), (60, 110, 50), (190, 170, 120))
+
+
+@pytest.fixture(scope="module")
+def cache(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("map")
+    options = BuildOptions(workers=1, imagery_date="2024-06")
+    build.build_cache(write_tileset(folder), folder / "cache", options)
+    return TileCache.open(folder / "cache")
+
+
+def village(east_m=0.0, north_m=0.0, shadow_m=(4.0, 5.0), grey=False) -> Mosaic:
+    """160 houses on a meadow, their picture moved, with shadows to one side; 0.5 m a pixel."""
+    rng = np.random.default_rng(7)
+    rgb = np.full((500, 500, 3), (70, 110, 55), np.float32)
+    rgb += rng.normal(0, 6, rgb.shape).astype(np.float32)
+    height = np.zeros((500, 500), np.float32)
+    houses = [(*rng.integers(30, 460, 2), *rng.integers(12, 26, 2)) for _ in range(160)]
+    dx, dy = round(east_m / 0.5), round(-north_m / 0.5)
+    for x, y, w, h in houses:
+        height[y : y + h, x : x + w] = 7.0
+        sx, sy = (round(v / 0.5) for v in shadow_m)
+        rgb[y + dy + sy : y + dy + sy + h, x + dx + sx : x + dx + sx + w] *= 0.35
+    for k, (x, y, w, h) in enumerate(houses):
+        rgb[y + dy : y + dy + h, x + dx : x + dx + w] = COLOURS[k % 4]
+    if grey:
+        rgb = np.repeat(rgb.mean(axis=2, keepdims=True), 3, axis=2)
+    return Mosaic(np.clip(rgb, 0, 255).astype(np.uint8), height, 0.0, 0.0, 0.5)
+
+
+@pytest.mark.parametrize(("east", "north"), [(0.0, 0.0), (4.0, -3.0), (-6.0, 2.0)])
+def test_a_moved_picture_is_measured_and_shadows_are_no_shift(east, north):
+    found = alignment_of(village(east, north))
+    assert found.known
+    assert (found.east_m, found.north_m) == pytest.approx((east, north), abs=0.5)
+
+
+def test_without_houses_or_without_colour_nothing_is_said():
+    flat = village()
+    flat.height[:] = 0.0
+    assert not alignment_of(flat).known
+    assert not alignment_of(village(4.0, 0.0, grey=True)).known
+
+
+def test_a_sound_map_is_good(cache):
+    made = {f.name: f for f in check_map(cache, FINE).findings}
+    assert [n for n, f in made.items() if f.grade is Grade.BAD] == []
+    assert made["coverage"].found.startswith("0.159 km², 99 %")
+    assert (made["imagery of"].found, made["imagery of"].grade) == ("2024-06", Grade.GOOD)
+
+
+def test_a_date_that_is_none_is_refused_before_the_build(tmp_path):
+    options = BuildOptions(workers=1, imagery_date="June 2024")
+    with pytest.raises(MapSourceError, match="'June 2024': give a year"):
+        build.build_cache(write_tileset(tmp_path), tmp_path / "cache", options)
+
+
+def test_texels_are_judged_by_the_height_that_is_flown(cache):
+    def grade(height_m):
+        found = check_map(cache, Use(height_m, 0.004)).findings
+        return next(f.grade for f in found if f.name == "texel size")
+
+    gsd = float(np.median(cache.index.gsd[cache.index.child_count == 0]))
+    assert grade(gsd / 0.004) is Grade.GOOD
+    assert grade(gsd / 0.004 / 3) is Grade.ADVICE
+    assert grade(gsd / 0.004 / 8) is Grade.BAD
+
+
+def test_seams_show_where_tiles_do_not_meet(cache):
+    mosaic = mosaic_of(cache, 200_000)
+    assert max(s.height_m for s in seams_of(cache, mosaic)) < 0.2
+    column = round(mosaic.pixel(0.0, 0.0)[1])
+    mosaic.height[:, column:] += 2.0
+    seen = [s for s in seams_of(cache, mosaic) if s.height_m > 0.5]
+    assert all(s.seen for s in seen)
+    assert seen
+    assert {s.ends[0][1] for s in seen} == {column}
+    assert max(s.height_m for s in seen) == pytest.approx(2.0, abs=0.2)
+
+
+def test_the_command_says_it_in_words_pictures_and_its_exit_code(cache, tmp_path):
+    good = CliRunner().invoke(app, ["map", "check", str(cache.path), "--out", str(tmp_path / "a")])
+    assert good.exit_code == 0, good.output
+    assert "This map will do." in good.output
+    names = {p.name for p in (tmp_path / "a").iterdir()}
+    assert names == {"coverage.png", "texels.png", "seams.png", "alignment.png"}
+    assert cv2.imread(str(tmp_path / "a" / "coverage.png")) is not None
+    low = ["map", "check", str(cache.path), "--out", str(tmp_path / "b"), "--height", "5"]
+    bad = CliRunner().invoke(app, low)
+    assert bad.exit_code == 1
+    assert "will not do: texel size" in bad.output
