@@ -65,6 +65,7 @@ class HealthMonitor:
         guardian: Guardian | None = None,
         unreadable_nodes: Callable[[], int] = lambda: 0,
         map_shift: Callable[[], dict[str, float | bool] | None] = lambda: None,
+        targets: Callable[[], dict[str, int]] = dict,
     ) -> None:
         self._engine_health = engine_health
         self._bridge = bridge
@@ -74,7 +75,7 @@ class HealthMonitor:
         self._position_sigma_m = position_sigma_m
         self._guardian = guardian
         self._unreadable_nodes = unreadable_nodes
-        self._map_shift = map_shift
+        self._map_shift, self._targets = map_shift, targets
         self._ended = ""
         self.newest: dict[str, Any] = {"level": "starting", "text": "starting"}
         """The newest report, as health.json has it."""
@@ -213,6 +214,7 @@ class HealthMonitor:
             "shadow": self._bridge.shadow_score().line(),
             "guardian": self._guardian_report(),
             "map_shift": self._map_shift(),
+            "targets": self._targets(),
         }
         self.newest = report
         if self._file is None:

@@ -7,6 +7,7 @@ above it and subscribes to the channels that it reads.
 from __future__ import annotations
 
 import logging
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -38,10 +39,11 @@ from companion.live.publisher import Publisher
 from companion.live.shown import Instruments, Shown
 from companion.preflight.coverage import check_origin
 from companion.preflight.map_pin import require_pinned
-from companion.sources import FrameSource, StreamState, open_source
+from companion.sources import FrameSource, PacketTap, PacketTaps, StreamState, open_source
 from companion.sources.timing import system_minus_monotonic
 from companion.targets.clicks import ClickPolicy
 from companion.targets.detections import DetectionListener
+from companion.targets.frame_times import FrameTimes
 from companion.targets.numbers import TargetNumbers
 from companion.targets.population import Target
 from companion.targets.reporter import TargetReporter
@@ -129,8 +131,18 @@ def _source(making: Making) -> FrameSource:
     def on_stranger(text: str) -> None:
         bridge.say(_WARNING, f"PiLoT: {text}")
 
-    model, tap = camera.model.camera(), making.get(KlvRelay)
+    model = camera.model.camera()
+    wanted: tuple[PacketTap | None, ...] = (making.get(KlvRelay), making.get(FrameTimes))
+    taps = [tap for tap in wanted if tap is not None]
+    tap = PacketTaps(taps) if taps else None
     return open_source(camera.source, model, camera.settings, on_state, on_stranger, tap)
+
+
+def _frame_times(making: Making) -> FrameTimes:
+    targets = making.later(TargetReporter)
+    times = FrameTimes(lambda detection: targets().add_detection(detection))
+    making.channels.frames.subscribe(times.add_frame)
+    return times
 
 
 def _klv(making: Making) -> KlvRelay:
@@ -167,6 +179,7 @@ def _health(making: Making) -> HealthMonitor:
         making.get(Guardian),
         lambda: streamer.counters().unreadable,
         making[MapShift].report,
+        _target_counts(making),
     )
     making.channels.estimates.subscribe(lambda estimate, _: health.add_estimate(estimate))
     return health
@@ -205,7 +218,24 @@ def _clicks(making: Making) -> ClickPolicy:
 def _detections(making: Making) -> DetectionListener:
     address = making.config.targets.detections
     assert address is not None  # or the part is not wanted
-    return DetectionListener(address, making[TargetReporter].add_detection)
+    return DetectionListener(address, making[FrameTimes].add_detection)
+
+
+def _target_counts(making: Making) -> Callable[[], dict[str, int]]:
+    """What was asked of the targets and could not be told, for the health and the report."""
+    targets, times = making.later(TargetReporter), making.get(FrameTimes)
+
+    def counts() -> dict[str, int]:
+        reporter = targets()
+        return {
+            "missed": reporter.missed,
+            "doubted": reporter.doubted,
+            "refused": reporter.refused,
+            "failed": reporter.failed,
+            "unmatched": 0 if times is None else times.unmatched,
+        }
+
+    return counts
 
 
 def _view(making: Making) -> ViewReporter:
@@ -399,11 +429,16 @@ PARTS: tuple[Part[Any], ...] = (
         "klv", KlvRelay, _klv, depends=(MapStack, Bridge), start=KlvRelay.start, stop=KlvRelay.stop,
         wanted=lambda config: config.klv is not None,
     ),
-    Part("source", FrameSource, _source, depends=(Bridge, KlvRelay)),
+    Part(
+        "frame times", FrameTimes, _frame_times, later=(TargetReporter,),
+        wanted=lambda config: config.targets.detections is not None,
+    ),
+    Part("source", FrameSource, _source, depends=(Bridge, KlvRelay, FrameTimes)),
     Part(
         "health", HealthMonitor, _health,
-        depends=(MapStack, Bridge, MapShift, RecordKeeper, FrameSource, Guardian),
-        later=(DualThreadEngine, AutopilotPose), start=HealthMonitor.start, stop=HealthMonitor.stop,
+        depends=(MapStack, Bridge, MapShift, RecordKeeper, FrameSource, Guardian, FrameTimes),
+        later=(DualThreadEngine, AutopilotPose, TargetReporter),
+        start=HealthMonitor.start, stop=HealthMonitor.stop,
     ),
     Part(
         "targets", TargetReporter, _targets, depends=(MapStack, Bridge),
@@ -411,7 +446,7 @@ PARTS: tuple[Part[Any], ...] = (
     ),
     Part("clicks", ClickPolicy, _clicks, depends=(TargetReporter, Bridge)),
     Part(
-        "detections", DetectionListener, _detections, depends=(TargetReporter,),
+        "detections", DetectionListener, _detections, depends=(FrameTimes,),
         close=DetectionListener.close, wanted=lambda config: config.targets.detections is not None,
     ),
     Part("autopilot", AutopilotPose, _autopilot, depends=(Bridge, Installation)),

@@ -300,6 +300,7 @@ def _verdicts(tables: RecordTables) -> tuple[Verdict, ...]:
                 "latency by stage; more processor, lower localizer.width, higher delay_ms",
             )
         )  # fmt: skip
+    verdicts += _untold_targets(health.get("targets"))
     shadow = str(health.get("shadow", ""))
     if shadow:
         verdicts.append(
@@ -310,6 +311,22 @@ def _verdicts(tables: RecordTables) -> tuple[Verdict, ...]:
             )
         )  # fmt: skip
     return tuple(verdicts)
+
+
+def _untold_targets(counts: Any) -> list[Verdict]:
+    """Clicks and detections that were not told; nothing where all were, or nobody counted."""
+    named = {k: v for k, v in _mapping(counts).items() if isinstance(v, int) and v > 0}
+    if not named:
+        return []
+    text = ", ".join(f"{number} {name}" for name, number in named.items())
+    return [
+        Verdict(
+            "clicks and detections not told", text, "none", False,
+            "missed: no map under the pixel; doubted: its place may not be told; refused: more "
+            "than 32 at a time; unmatched: names a frame that never came; failed: an error",
+            "events at that time; what the detector sends (docs/formats.md)",
+        )
+    ]  # fmt: skip
 
 
 def _how_it_ended(tables: RecordTables) -> str:

@@ -10,6 +10,7 @@ from companion.sources.av_source import LiveVideoSource, VideoFileSource
 from companion.sources.base import (
     FrameSource,
     PacketTap,
+    PacketTaps,
     SourceCounters,
     SourceSettings,
     StateCallback,
@@ -23,6 +24,7 @@ __all__ = [
     "FrameSource",
     "LiveVideoSource",
     "PacketTap",
+    "PacketTaps",
     "SourceCounters",
     "SourceSettings",
     "StateCallback",

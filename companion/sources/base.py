@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from enum import Enum
 from fractions import Fraction
@@ -124,6 +124,28 @@ class PacketTap(Protocol):
     def picture(self, pts: Fraction, exposure_time_ns: int) -> None:
         """When the picture of that presentation time (seconds) was taken, once it is known."""
         ...
+
+
+class PacketTaps:
+    """Several taps as one."""
+
+    def __init__(self, taps: Sequence[PacketTap]) -> None:
+        self._taps = tuple(taps)
+
+    def begin(self, stream: av.VideoStream) -> None:
+        """As of `PacketTap`."""
+        for tap in self._taps:
+            tap.begin(stream)
+
+    def packet(self, packet: av.Packet) -> None:
+        """As of `PacketTap`."""
+        for tap in self._taps:
+            tap.packet(packet)
+
+    def picture(self, pts: Fraction, exposure_time_ns: int) -> None:
+        """As of `PacketTap`."""
+        for tap in self._taps:
+            tap.picture(pts, exposure_time_ns)
 
 
 class FrameSource(Protocol):

@@ -2,6 +2,8 @@
 
 One datagram is one detection: ``{"target_id": "car", "time_ns": 123, "u": 320.5, "v": 240.5}``;
 time_ns is the frame's exposure on CLOCK_MONOTONIC, (u, v) the pixel in the video as streamed.
+A detector that does not know it names its frame: ``"sequence"`` is the frame's number, ``"pts_s"``
+the presentation time in the stream, seconds.
 """
 
 from __future__ import annotations
@@ -34,30 +36,51 @@ class Detection:
     v: float
 
 
-def parse_detection(data: bytes) -> Detection:
-    """Decode one datagram; `DetectionError` says what is wrong with it."""
+@dataclass(frozen=True)
+class FrameName:
+    """How a detector names a frame whose exposure it does not know; one of the two is set."""
+
+    sequence: int | None = None
+    pts_s: float | None = None
+
+
+def parse_detection(data: bytes) -> tuple[Detection, FrameName | None]:
+    """Decode one datagram; `DetectionError` says what is wrong with it.
+
+    The name of its frame is None where it tells the exposure; else the detection's time is 0.
+    """
     try:
         message = json.loads(data)
+        given = [key for key in ("time_ns", "sequence", "pts_s") if key in message]
+        if len(given) != 1:
+            raise ValueError("one of time_ns, sequence and pts_s says which frame")
         detection = Detection(
             str(message["target_id"]),
-            int(message["time_ns"]),
+            int(message["time_ns"]) if given == ["time_ns"] else 0,
             float(message["u"]),
             float(message["v"]),
         )
+        name = None
+        if given == ["sequence"]:
+            name = FrameName(sequence=int(message["sequence"]))
+        elif given == ["pts_s"]:
+            name = FrameName(pts_s=float(message["pts_s"]))
     except (ValueError, KeyError, TypeError, OverflowError, RecursionError) as error:
         raise DetectionError(f"not a detection: {type(error).__name__} {error}") from error
     if not (isfinite(detection.u) and isfinite(detection.v)):
         raise DetectionError("pixel must be finite")
-    name = detection.target_id
-    if not 0 < len(name) <= _MAX_NAME or not name.isprintable():
+    if name is not None and name.pts_s is not None and not isfinite(name.pts_s):
+        raise DetectionError("pts_s must be finite")
+    target = detection.target_id
+    if not 0 < len(target) <= _MAX_NAME or not target.isprintable():
         raise DetectionError(f"target_id must have 1 to {_MAX_NAME} printable characters")
-    if name.startswith(CLICKED):
-        raise DetectionError(f"target_id {name!r}: names that begin so are the operator's clicks")
-    return detection
+    if target.startswith(CLICKED):
+        raise DetectionError(f"target_id {target!r}: names that begin so are the operator's clicks")
+    return detection, name
 
 
 def encode_detection(detection: Detection) -> bytes:
-    """Inverse of `parse_detection`."""
+    """A datagram of a detection whose exposure is known."""
     return json.dumps(detection.__dict__).encode()
 
 
@@ -72,7 +95,9 @@ def parse_host_port(text: str) -> tuple[str, int]:
 class DetectionListener:
     """Receives detections on a thread; bad datagrams are counted and ignored."""
 
-    def __init__(self, address: str, on_detection: Callable[[Detection], None]) -> None:
+    def __init__(
+        self, address: str, on_detection: Callable[[Detection, FrameName | None], None]
+    ) -> None:
         self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
         try:
             self._socket.bind(parse_host_port(address))
@@ -101,11 +126,11 @@ class DetectionListener:
                 continue
             self._stop.wait(_PAUSE_S)
             try:
-                detection = parse_detection(data)
+                detection, name = parse_detection(data)
             except DetectionError as error:
                 self.rejected += 1
                 if self.rejected == 1:
                     _log.warning("targets.detections: %s", error)
                 continue
             self.received += 1
-            self._on_detection(detection)
+            self._on_detection(detection, name)

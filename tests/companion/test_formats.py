@@ -52,5 +52,5 @@ def test_what_json_files_hold():
 def test_the_example_of_a_detection_is_one():
     example = re.search(r"```json\n(.*?)\n```", TEXT, re.DOTALL)
     assert example is not None
-    detection = parse_detection(example.group(1).encode())
+    detection, _ = parse_detection(example.group(1).encode())
     assert detection == Detection(**json.loads(example.group(1)))

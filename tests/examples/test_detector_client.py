@@ -54,7 +54,7 @@ def test_every_red_box_arrives_with_its_frames_time_and_nothing_else(tmp_path):
         port = probe.getsockname()[1]
     boxes = [(20, 30, 10), None, (100, 60, 6), (50, 50, 2)]  # the last one is too small
     got: list[Any] = []
-    listener = DetectionListener(f"127.0.0.1:{port}", got.append)
+    listener = DetectionListener(f"127.0.0.1:{port}", lambda detection, _: got.append(detection))
     try:
         done = _run(_deployment(tmp_path, port, boxes))
         assert done.stdout == "2 detections sent\n", done.stderr

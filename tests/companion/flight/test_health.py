@@ -80,7 +80,7 @@ def test_the_worst_thing_is_told(tmp_path, state, connected, level, text):
     written = json.loads((tmp_path / "health.json").read_text())
     assert set(written) == {
         "level", "text", "time_ns", "pid", "engine", "rate_hz", "stages_ms", "bridge", "shadow",
-        "guardian", "map_shift",
+        "guardian", "map_shift", "targets",
     }  # fmt: skip
     assert written["bridge"]["fix_latency_ms"] is None  # NaN is no JSON
     assert written["level"] == level.value

@@ -15,7 +15,7 @@ from companion.targets.detections import (
 
 def test_round_trip():
     detection = Detection("car", 123456789, 320.5, 200.25)
-    assert parse_detection(encode_detection(detection)) == detection
+    assert parse_detection(encode_detection(detection)) == (detection, None)
 
 
 @pytest.mark.parametrize(
@@ -52,7 +52,7 @@ def test_listener_survives_garbage():
         probe.bind(("127.0.0.1", 0))
         port = probe.getsockname()[1]
     got: list[Detection] = []
-    listener = DetectionListener(f"127.0.0.1:{port}", got.append)
+    listener = DetectionListener(f"127.0.0.1:{port}", lambda detection, _: got.append(detection))
     try:
         with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sender:
             sender.sendto(b"garbage", ("127.0.0.1", port))

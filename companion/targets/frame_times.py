@@ -1,0 +1,90 @@
+"""Which frame a detector means: by its number or its presentation time instead of its exposure."""
+
+from __future__ import annotations
+
+import threading
+from collections import OrderedDict, deque
+from collections.abc import Callable
+from dataclasses import replace
+from fractions import Fraction
+
+import av
+
+from companion.targets.detections import Detection, FrameName
+from localizer.types import Frame
+
+_KEPT = 256  # frames: as many as a slow detector may be behind
+_WAITING = 64
+_SAME_S = 0.001  # presentation times that differ by less are of one picture
+
+
+class FrameTimes:
+    """Gives each detection its frame's exposure time, at once or when the frame comes.
+
+    A `PacketTap` that looks at presentation times alone. on_detection: takes what is timed; must
+    not block. unmatched counts what named a frame that never came. Safe to use from any thread.
+    """
+
+    def __init__(self, on_detection: Callable[[Detection], None]) -> None:
+        self._on_detection = on_detection
+        self._by_sequence: OrderedDict[int, int] = OrderedDict()
+        self._by_pts: OrderedDict[Fraction, int] = OrderedDict()
+        self._waiting: deque[tuple[Detection, FrameName]] = deque()
+        self._lock = threading.Lock()
+        self.unmatched = 0
+
+    def add_detection(self, detection: Detection, name: FrameName | None = None) -> None:
+        """Hand a detection on, or keep it until the frame it names comes."""
+        if name is None:
+            self._on_detection(detection)
+            return
+        with self._lock:
+            time_ns = self._time_of(name)
+            if time_ns is None:
+                self._waiting.append((detection, name))
+                if len(self._waiting) > _WAITING:
+                    self._waiting.popleft()
+                    self.unmatched += 1
+                return
+        self._on_detection(replace(detection, time_ns=time_ns))
+
+    def add_frame(self, frame: Frame) -> None:
+        """Note a frame's number. Never blocks."""
+        with self._lock:
+            self._by_sequence[frame.sequence] = frame.exposure_time_ns
+            if len(self._by_sequence) > _KEPT:
+                self._by_sequence.popitem(last=False)
+        self._release()
+
+    def begin(self, stream: av.VideoStream) -> None:
+        """A new connection counts its presentation times anew."""
+        with self._lock:
+            self._by_pts.clear()
+
+    def packet(self, packet: av.Packet) -> None:
+        """Packets say nothing here."""
+
+    def picture(self, pts: Fraction, exposure_time_ns: int) -> None:
+        """Note a picture's presentation time. Never blocks."""
+        with self._lock:
+            self._by_pts[pts] = exposure_time_ns
+            if len(self._by_pts) > _KEPT:
+                self._by_pts.popitem(last=False)
+        self._release()
+
+    def _release(self) -> None:
+        """Hand on what waited for the newest frame."""
+        with self._lock:
+            timed = [(d, n, self._time_of(n)) for d, n in self._waiting]
+            self._waiting = deque((d, n) for d, n, t in timed if t is None)
+        for detection, _, time_ns in timed:
+            if time_ns is not None:
+                self._on_detection(replace(detection, time_ns=time_ns))
+
+    def _time_of(self, name: FrameName) -> int | None:
+        if name.sequence is not None:
+            return self._by_sequence.get(name.sequence)
+        for pts in reversed(self._by_pts):
+            if name.pts_s is not None and abs(float(pts) - name.pts_s) < _SAME_S:
+                return self._by_pts[pts]
+        return None
