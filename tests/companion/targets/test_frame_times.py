@@ -20,7 +20,7 @@ def _asked(text):
 
 
 def test_each_of_the_three_ways_to_name_a_frame():
-    told = []
+    told: list[Detection] = []
     times = FrameTimes(told.append)
     times.add_frame(Frame(IMAGE, 1000, CAMERA, 7))
     times.picture(Fraction(3003, 90_000), 2000)
@@ -31,7 +31,7 @@ def test_each_of_the_three_ways_to_name_a_frame():
 
 
 def test_a_detection_may_come_before_its_frame_and_none_is_given_anothers_time():
-    told = []
+    told: list[Detection] = []
     times = FrameTimes(told.append)
     car = Detection("car", 0, 1.0, 2.0)
     times.add_detection(car, FrameName(pts_s=0.1))
@@ -45,7 +45,7 @@ def test_a_detection_may_come_before_its_frame_and_none_is_given_anothers_time()
 
 
 def test_after_a_reconnection_old_presentation_times_mean_nothing():
-    told = []
+    told: list[Detection] = []
     times = FrameTimes(told.append)
     times.picture(Fraction(1), 10)
     times.begin(None)
