@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping
-from dataclasses import replace
-from functools import partial
+from dataclasses import dataclass, replace
 from typing import Any
 
 from mavlink_bridge import quaternion as quat
@@ -108,7 +107,7 @@ class Bridge:
             InjectionGate(config.rc, teller.notice) if config.mode == "rc" else None,
         )
         self._fc = FlightControllerEnd(shared)
-        make = partial(_make_link, config=config, recorder=self._recorder, opener=opener)
+        make = _LinkMaker(config, self._recorder, opener)
         self._fc_link = make(config.connection, self._fc, "fc", FC_WANTED, config.signing)
         # Without a ground link of its own, what is for the ground is routed by the autopilot.
         self._ground: Components = self._fc.components
@@ -317,33 +316,39 @@ class Bridge:
         return result
 
 
-def _make_link(
-    connection: str,
-    handler: LinkHandler,
-    name: str,
-    wanted: frozenset[int],
-    signing: SigningConfig | None,
-    *,
-    config: BridgeConfig,
-    recorder: TlogRecorder | None,
-    opener: Callable[[Endpoint], Transport],
-) -> Link:
-    key = None if signing is None else load_key(signing.key_file)
-    is_fc = name == "fc"
-    options = LinkOptions(
-        name=name,
-        wanted=wanted,
-        signing_key=key,
-        sender=parse_sender(config.sender) if is_fc and config.sender else None,
-        # A signature says more of who speaks than an address does.
-        follow_hosts_after_s=None if is_fc and key is None else _NEXT_STATION_S,
-        window=None if signing is None else ReplayWindow(signing.state_path(name)),
-        signing_link_id=1 if signing is None else signing.link_id,
-        recorder=recorder,
-        timeout_s=config.link_timeout_s,
-        opener=opener,
-    )
-    return Link(Endpoint.parse(connection), handler, options)
+@dataclass(frozen=True)
+class _LinkMaker:
+    """Makes both links of a bridge: to the autopilot ("fc") and to the ground."""
+
+    config: BridgeConfig
+    recorder: TlogRecorder | None
+    opener: Callable[[Endpoint], Transport]
+
+    def __call__(
+        self,
+        connection: str,
+        handler: LinkHandler,
+        name: str,
+        wanted: frozenset[int],
+        signing: SigningConfig | None,
+    ) -> Link:
+        config = self.config
+        key = None if signing is None else load_key(signing.key_file)
+        is_fc = name == "fc"
+        options = LinkOptions(
+            name=name,
+            wanted=wanted,
+            signing_key=key,
+            sender=parse_sender(config.sender) if is_fc and config.sender else None,
+            # A signature says more of who speaks than an address does.
+            follow_hosts_after_s=None if is_fc and key is None else _NEXT_STATION_S,
+            window=None if signing is None else ReplayWindow(signing.state_path(name)),
+            signing_link_id=1 if signing is None else signing.link_id,
+            recorder=self.recorder,
+            timeout_s=config.link_timeout_s,
+            opener=self.opener,
+        )
+        return Link(Endpoint.parse(connection), handler, options)
 
 
 def _mount(config: BridgeConfig) -> quat.Quaternion:

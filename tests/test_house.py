@@ -10,12 +10,20 @@ from tests.house import (
     crowded_folders,
     folder_circles,
     large_classes,
+    long_signatures,
     private_reaches,
     sources,
     wrong_imports,
 )
 
-RULES = (crowded_folders, large_classes, wrong_imports, folder_circles, private_reaches)
+RULES = (
+    crowded_folders,
+    large_classes,
+    long_signatures,
+    wrong_imports,
+    folder_circles,
+    private_reaches,
+)
 
 
 @pytest.fixture(scope="module")
@@ -43,6 +51,13 @@ WIDE = "class A:\n    '''{}'''\n" + "".join(f"    def f{n}(self): ...\n" for n i
         (large_classes, {"localizer/a.py": WIDE.format("Above 200 lines: one thread.")}, 1),
         (large_classes, {"localizer/a.py": WIDE.format("Above 15 public methods: a face.")}, 0),
         (large_classes, {"tests/a.py": WIDE.format("")}, 0),
+        (long_signatures, {"localizer/a.py": "def f(a, b, c, d, e, f, g, h): ...\n"}, 1),
+        (
+            long_signatures,
+            {"sitl/a.py": "class A:\n    def f(self, a, b, c, d, e, f, g): ...\n"},
+            0,
+        ),
+        (long_signatures, {"localizer/a.py": "@njit\ndef f(a, b, c, d, e, f, g, h): ...\n"}, 0),
         (wrong_imports, {"localizer/a.py": "from mavlink_bridge import bridge\n"}, 1),
         (wrong_imports, {"mavlink_bridge/a.py": "def f():\n    import companion.flight\n"}, 1),
         (wrong_imports, {"companion/a.py": "from mavlink_bridge import bridge\n"}, 0),

@@ -10,7 +10,7 @@ import threading
 import time
 from collections import deque
 from collections.abc import Callable
-from dataclasses import asdict
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
@@ -50,6 +50,21 @@ _OF_STATE = {
 }
 
 
+@dataclass(frozen=True)
+class Besides:
+    """What else may say how well it goes: is the record complete, the autopilot's own idea of its
+    position's sigma in metres, the guardian, nodes of the map that cannot be read, the map's shift,
+    counts of targets.
+    """
+
+    is_recorded: Callable[[], bool] = lambda: True
+    position_sigma_m: Callable[[], float | None] = lambda: None
+    guardian: Guardian | None = None
+    unreadable_nodes: Callable[[], int] = lambda: 0
+    map_shift: Callable[[], dict[str, float | bool] | None] = lambda: None
+    targets: Callable[[], dict[str, int]] = dict
+
+
 class HealthMonitor:
     """Watches the parts and reports transitions. Its thread owns ``health.json``."""
 
@@ -60,22 +75,18 @@ class HealthMonitor:
         feed_state: Callable[[], StreamState],
         event: Callable[[str, str], None],
         record_folder: Path | None,
-        is_recorded: Callable[[], bool] = lambda: True,
-        position_sigma_m: Callable[[], float | None] = lambda: None,
-        guardian: Guardian | None = None,
-        unreadable_nodes: Callable[[], int] = lambda: 0,
-        map_shift: Callable[[], dict[str, float | bool] | None] = lambda: None,
-        targets: Callable[[], dict[str, int]] = dict,
+        besides: Besides | None = None,
     ) -> None:
+        besides = besides or Besides()
         self._engine_health = engine_health
         self._bridge = bridge
         self._feed_state = feed_state
         self._event = event
-        self._is_recorded = is_recorded
-        self._position_sigma_m = position_sigma_m
-        self._guardian = guardian
-        self._unreadable_nodes = unreadable_nodes
-        self._map_shift, self._targets = map_shift, targets
+        self._is_recorded = besides.is_recorded
+        self._position_sigma_m = besides.position_sigma_m
+        self._guardian = besides.guardian
+        self._unreadable_nodes = besides.unreadable_nodes
+        self._map_shift, self._targets = besides.map_shift, besides.targets
         self._ended = ""
         self.newest: dict[str, Any] = {"level": "starting", "text": "starting"}
         """The newest report, as health.json has it."""

@@ -19,7 +19,7 @@ from companion.config import CompanionConfig
 from companion.errors import ConfigError
 from companion.flight.conversions import Installation, target_report
 from companion.flight.feed import Feed
-from companion.flight.health import HealthMonitor
+from companion.flight.health import Besides, HealthMonitor
 from companion.flight.injection import FixInjection, is_for_injection
 from companion.flight.last_fix import FixMemory
 from companion.flight.parts import Making, Part
@@ -168,18 +168,21 @@ def _health(making: Making) -> HealthMonitor:
     streamer = making[MapStack].streamer
     autopilot = making.later(AutopilotPose)
     source = making[FrameSource]  # type: ignore[type-abstract]  # whichever of its kinds
-    health = HealthMonitor(
-        lambda: engine().health,
-        making[Bridge],
-        lambda: source.state,
-        making.channels.events.send,
-        keeper.folder,
+    besides = Besides(
         lambda: keeper.is_complete,
         lambda: autopilot().sigma_m,
         making.get(Guardian),
         lambda: streamer.counters().unreadable,
         making[MapShift].report,
         _target_counts(making),
+    )
+    health = HealthMonitor(
+        lambda: engine().health,
+        making[Bridge],
+        lambda: source.state,
+        making.channels.events.send,
+        keeper.folder,
+        besides,
     )
     making.channels.estimates.subscribe(lambda estimate, _: health.add_estimate(estimate))
     return health

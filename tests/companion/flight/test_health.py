@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from companion.flight.health import HealthMonitor
+from companion.flight.health import Besides, HealthMonitor
 from companion.sources import StreamState
 from localizer.tracking.engine_health import EngineHealth
 from localizer.types import TrackingState
@@ -47,7 +47,7 @@ def _one_report(folder, state, connected, tracking=None, frames_in=0, trouble=""
     bridge, events = FakeBridge(connected, trouble), []
     monitor = HealthMonitor(
         lambda: EngineHealth(frames_in=frames_in), bridge, lambda: state,
-        lambda *e: events.append(e), folder, **options,
+        lambda *e: events.append(e), folder, Besides(**options),
     )  # fmt: skip
     if tracking is not None:
         monitor.add_estimate(SimpleNamespace(state=tracking, stage_ms={}, last_fix_ns=None))
@@ -151,7 +151,8 @@ def test_a_loss_says_how_long_and_how_far_and_is_no_news_when_a_search_ends(tmp_
         bridge = FakeBridge(True)
         monitor = HealthMonitor(
             partial(EngineHealth, frames_in=9, searching=searching), bridge,
-            lambda: StreamState.LIVE, lambda *_: None, tmp_path, position_sigma_m=lambda: 20.0,
+            lambda: StreamState.LIVE, lambda *_: None, tmp_path,
+            Besides(position_sigma_m=lambda: 20.0),
         )  # fmt: skip
         monitor.add_estimate(lost)
         monitor.start()
@@ -167,7 +168,7 @@ def test_after_the_end_the_file_says_that_it_ended_and_how(tmp_path):
     bridge = FakeBridge(True)
     monitor = HealthMonitor(
         lambda: EngineHealth(frames_in=9), bridge, lambda: StreamState.LIVE, lambda *_: None,
-        tmp_path, unreadable_nodes=lambda: 3,
+        tmp_path, Besides(unreadable_nodes=lambda: 3),
     )  # fmt: skip
     tracking = SimpleNamespace(state=TrackingState.TRACKING, stage_ms={}, last_fix_ns=None)
     monitor.add_estimate(tracking)
