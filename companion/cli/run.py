@@ -42,6 +42,8 @@ def run_command(
     # Whatever is imported or read until there is something to put away.
     for number in ENDING:
         signal.signal(number, end_at_once)
+    if pulse is not None:
+        os.setpgrp()  # see `FlightProcess`
     settings = load_config(config)
     os.umask(_UMASK)
     if supervised:

@@ -31,6 +31,7 @@ _HORIZONTAL = 8 | 16  # EKF_POS_HORIZ_REL | EKF_POS_HORIZ_ABS
 _DRIFT_SPEED_M_S = 0.15
 _DRIFT_ACCELERATION_M_S2 = 0.05
 _LARGEST_SIGMA_M = 5000.0
+_AHEAD_S = 0.3  # by which a velocity carries a position on
 _UNTOLD_SIGMA_M = 25.0  # of a position of which nobody says where it comes from
 
 
@@ -58,6 +59,21 @@ def drift_sigma_m(seconds: float) -> float:
     """Sigma of an EKF's position, horizontal, so long after its last absolute measurement."""
     t = max(seconds, 0.0)
     return min(_DRIFT_SPEED_M_S * t + _DRIFT_ACCELERATION_M_S2 * t * t, _LARGEST_SIGMA_M)
+
+
+def local_about(autopilot: Autopilot, time_ns: int) -> tuple[float, ...] | None:
+    """The EKF's position (north, east, down), m, at a time; a little ahead of its newest report by
+    its velocity: a picture is often newer than that (10 Hz).
+    """
+    known = autopilot.local_at(time_ns)
+    if known is not None:
+        return known
+    state = autopilot.state()
+    position, velocity = state.local_position_ned, state.local_velocity_ned
+    ahead_s = (time_ns - state.local_time_ns) * 1e-9
+    if position is None or velocity is None or not 0.0 <= ahead_s <= _AHEAD_S:
+        return None
+    return tuple(p + v * ahead_s for p, v in zip(position, velocity, strict=True))
 
 
 @dataclass(frozen=True)

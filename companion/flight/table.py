@@ -23,7 +23,7 @@ from companion.flight.health import Besides, HealthMonitor
 from companion.flight.injection import FixInjection, is_for_injection
 from companion.flight.last_fix import FixMemory
 from companion.flight.parts import Making, Part
-from companion.flight.priors import AutopilotPose, PriorSources
+from companion.flight.priors import AutopilotPose, PriorSources, local_about
 from companion.flight.recorder import RecordKeeper, remove_empty
 from companion.flight.search import PlaceSearch, place_on_map
 from companion.flight.sightings import Sightings
@@ -262,7 +262,7 @@ def _autopilot(making: Making) -> AutopilotPose:
 
 
 def _last_fix(making: Making) -> FixMemory:
-    config, guardian = making.config, making.get(Guardian)
+    config, guardian, bridge = making.config, making.get(Guardian), making[Bridge]
     path = config.prior.state_file
     if path is None and config.record is not None:
         path = config.record.folder.parent / "last-fix.json"
@@ -271,7 +271,7 @@ def _last_fix(making: Making) -> FixMemory:
         config.prior,
         making[AutopilotPose],
         making[Installation],
-        making[Bridge].local_at,
+        lambda time_ns: local_about(bridge, time_ns),
         lambda: guardian is None or not guardian.reason,
     )
     making.channels.estimates.subscribe(memory.add_estimate)

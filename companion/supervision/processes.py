@@ -24,7 +24,8 @@ class Beat:
 class FlightProcess:
     """A command that flies. standby: with ``--standby`` it prepares, and waits for a line.
 
-    It has a session of its own: the terminal's interrupt comes through the supervisor alone.
+    It takes a process group of its own: the terminal's interrupt comes through the supervisor
+    alone. Not a session: Linux schedules each as one, whatever priority the supervisor was given.
     """
 
     def __init__(self, command: Sequence[str], *, standby: bool) -> None:
@@ -35,7 +36,6 @@ class FlightProcess:
             self._process = subprocess.Popen(
                 [*command, f"--pulse={end}", *(["--standby"] if standby else [])],
                 stdin=subprocess.PIPE if standby else subprocess.DEVNULL,
-                start_new_session=True,
                 pass_fds=(end,),
             )
         except BaseException:

@@ -15,10 +15,12 @@ import pytest
 from companion.config import PriorConfig
 from companion.flight.conversions import Installation
 from companion.flight.last_fix import FixMemory, LastFix, boot_id, read_last_fix
+from companion.flight.priors import local_about
 from localizer.geometry.camera import Camera
 from localizer.geometry.geo import Geodetic, LocalFrame
 from localizer.geometry.pose import Pose
 from localizer.types import PoseEstimate, RegistrationStatus, TrackingState
+from mavlink_bridge.messages import VehicleState
 
 FRAME = LocalFrame(Geodetic(47.0, 8.0, 500.0))
 INSTALLATION = Installation(FRAME, 47.0, np.zeros(3))
@@ -54,6 +56,30 @@ def test_the_way_that_the_ekf_flew_since_is_added(tmp_path: Path) -> None:
     assert prior.independent  # it begins tracking without a search
     sigma = float(np.sqrt(prior.covariance[0, 0]))
     assert 0.5 < sigma < 2.0
+
+
+@pytest.mark.parametrize(("ahead_s", "usable"), [(0.0, True), (0.2, True), (0.4, False)])
+def test_a_picture_that_is_newer_than_the_ekf_report_can_be_placed(
+    tmp_path: Path, ahead_s: float, usable: bool
+) -> None:
+    """Killed on the embedded vehicle: positions came at 10 Hz, pictures were 70 ms old, and the
+    last place was never used: 3 s on trial instead.
+    """
+    state = VehicleState(
+        local_position_ned=(13.0, 24.0, -85.0),
+        local_velocity_ned=(5.0, 0.0, 0.0),
+        local_time_ns=103 * SECOND,
+    )
+    autopilot: Any = SimpleNamespace(state=lambda: state, local_at=lambda _: None)
+    path = kept(tmp_path)
+    about = FixMemory(
+        path, PriorConfig(), AUTOPILOT, INSTALLATION, lambda t: local_about(autopilot, t)
+    )
+    prior = about.prior(103 * SECOND + round(ahead_s * SECOND))
+    assert (prior is not None) is usable
+    if prior is not None:
+        north = prior.world_from_camera.translation[1]
+        assert north == pytest.approx(3.0 + 5.0 * ahead_s, abs=0.01)
 
 
 @pytest.mark.parametrize(
