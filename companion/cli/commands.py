@@ -1,5 +1,5 @@
-"""The command line: ``companion run | plan | eval | localize | convert | replay | report | export |
-klv | console | map | world | doctor | key | self-test``.
+"""The command line: ``companion init | run | plan | eval | localize | convert | replay | report |
+export | klv | console | map | world | doctor | key | self-test``.
 
 Exit codes: 0 done; 1 `doctor` found advice, `plan` a leg on which vision will not do, `replay`
 differs, `localize` localized nothing or `map verify` found damage; 2 wrong usage, a named error, or
@@ -16,6 +16,7 @@ import typer
 from rich.console import Console
 from rich.markup import escape
 
+from companion.cli.before.init import init_command
 from companion.cli.before.plan import plan_command
 from companion.cli.console import console_command
 from companion.cli.convert import convert_command
@@ -61,6 +62,7 @@ def _options(
 
 
 app.command("run")(run_command)
+app.command("init")(init_command)
 app.command("plan")(plan_command)
 app.command("eval")(evaluate_command)
 app.command("localize")(localize_command)

@@ -1,0 +1,142 @@
+"""``companion init``: a deployment file from what vehicle, stream and map say."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import typer
+from rich.console import Console
+from rich.markup import escape
+
+from companion.config import CompanionConfig, parse_config
+from companion.errors import CompanionError, ConfigError
+from localizer.errors import LocalizerError
+from mavlink_bridge.errors import BridgeError
+
+_DEFAULT_FOV_DEG = 65.0
+
+
+def init_command(
+    out: Annotated[Path, typer.Argument(help="deployment file to write")] = Path("deployment.yaml"),
+    map_cache: Annotated[Path | None, typer.Option("--map", help="tile cache")] = None,
+    source: Annotated[
+        str | None, typer.Option(help="video: udp://, rtsp://, /dev/videoN, a file or a folder")
+    ] = None,
+    connection: Annotated[
+        str | None, typer.Option(help="autopilot: serial:/dev/ttyTHS1:921600, udpin:HOST:PORT, ...")
+    ] = None,
+    camera: Annotated[
+        Path | None, typer.Option(help="camera.json of the calibration; else --fov")
+    ] = None,
+    fov: Annotated[
+        float | None, typer.Option(min=1, max=170, help="horizontal, degrees: not calibrated")
+    ] = None,
+    mount: Annotated[
+        Literal["gimbal", "fixed"] | None, typer.Option(help="fixed: screwed to the airframe")
+    ] = None,
+    mount_pitch: Annotated[
+        float, typer.Option(min=-180, max=180, help="of a fixed camera, nose up: -90 looks down")
+    ] = -90.0,
+    record: Annotated[Path, typer.Option(help="folder of the flights' records")] = Path("flights"),
+    listen: Annotated[
+        bool, typer.Option(help="ask vehicle and stream; else only what is given is written")
+    ] = True,
+    overwrite: Annotated[bool, typer.Option(help="replace a file that is there")] = False,
+    reference: Annotated[
+        bool, typer.Option("--reference", help="print every setting with its default, no more")
+    ] = False,
+) -> None:
+    """Ask for map, stream and vehicle, ask these themselves, and write a short deployment file."""
+    from companion.setup.reference import reference as all_settings
+    from companion.setup.write import deployment_text, write_deployment
+
+    if reference:
+        typer.echo(all_settings(), nl=False)
+        return
+    if out.exists() and not overwrite:
+        raise ConfigError(f"{out}: is there already; --overwrite replaces it")
+    notes: list[str] = []
+    asked = map_cache or Path(typer.prompt("map: folder of the tile cache"))
+    settings: dict[str, Any] = {"map": str(asked.resolve()), "map_sha256": _pinned(asked)}
+    feed = source or typer.prompt("video source", default="udp://0.0.0.0:5600")
+    wire = connection or typer.prompt("autopilot", default="serial:/dev/ttyTHS1:921600")
+    mounted = mount or typer.prompt("camera mount (gimbal, fixed)", default="gimbal")
+    if camera is None and fov is None:
+        fov = typer.prompt(
+            "horizontal field of view, degrees", default=_DEFAULT_FOV_DEG, type=float
+        )
+    size = _stream_size(feed, notes) if listen else None
+    placed = feed if "://" in feed else str(Path(feed).resolve())
+    settings["camera"] = {"source": placed, "model": _model(camera, fov, size, notes)}
+    bridge: dict[str, Any] = {"connection": wire, "camera": {"mount": mounted}}
+    if mounted == "fixed":
+        bridge["camera"]["mount_pitch_deg"] = mount_pitch
+    settings["bridge"] = bridge
+    settings["record"] = {"folder": str((record / "flight").resolve())}
+    config = parse_config(settings, str(out))
+    if listen:
+        config = _with_vehicle(config, notes)
+    write_deployment(deployment_text(config, notes), out, overwrite)
+    for note in notes:
+        Console().print(escape(note), style="yellow", soft_wrap=True, highlight=False)
+    Console().print(f"{escape(str(out))} is written; next: companion doctor {escape(str(out))}",
+                    soft_wrap=True)  # fmt: skip
+
+
+def _pinned(map_cache: Path) -> str:
+    """The map's hash; MapCacheError where there is none."""
+    from companion.preflight.map_pin import map_hash
+    from localizer.map.cache.cache import TileCache
+
+    manifest = TileCache.open(map_cache).manifest
+    place = f"{manifest.origin.latitude_deg:.5f}, {manifest.origin.longitude_deg:.5f}"
+    typer.echo(f"map: {manifest.tiles} tiles of {manifest.gsd_m:.2f} m texels about {place}")
+    return map_hash(map_cache)
+
+
+def _stream_size(feed: str, notes: list[str]) -> tuple[int, int] | None:
+    from companion.redaction import redacted
+    from companion.setup.asking import first_picture
+
+    try:
+        seen = first_picture(feed)
+    except (CompanionError, LocalizerError) as error:
+        notes.append(f"the stream {redacted(feed)} gave no picture ({error}): check width, height")
+        return None
+    typer.echo(f"stream: {seen.width}x{seen.height}")
+    return seen.width, seen.height
+
+
+def _model(
+    camera: Path | None, fov: float | None, size: tuple[int, int] | None, notes: list[str]
+) -> dict[str, Any]:
+    from localizer.geometry.camera import Camera
+
+    if camera is not None:
+        lens = Camera.from_json(camera)
+        if size is not None and size != (lens.width, lens.height):
+            notes.append(
+                f"the stream is {size[0]}x{size[1]}, the calibration of {lens.width}x{lens.height} "
+                "is scaled: wrong if the camera crops or zooms"
+            )
+        return lens.to_dict()
+    width, height = size or (1280, 720)
+    notes.append("camera.model is a field of view, not a calibration: docs/install.md, calibration")
+    return Camera.from_fov(width, height, fov or _DEFAULT_FOV_DEG).to_dict()
+
+
+def _with_vehicle(config: CompanionConfig, notes: list[str]) -> CompanionConfig:
+    """With the system id of the autopilot that answers."""
+    from mavlink_bridge.preflight.meeting import meet
+
+    try:
+        met = meet(config.bridge)
+    except BridgeError as error:
+        notes.append(f"no vehicle was heard ({error})")
+        return config
+    typer.echo(f"vehicle: {met.firmware}, system id {met.system_id}")
+    if met.firmware != "ArduPilot":
+        notes.append(f"{met.firmware}: choose bridge.injection.message by docs/bridge.md")
+    bridge = config.bridge.model_copy(update={"system_id": met.system_id})
+    return config.model_copy(update={"bridge": bridge})

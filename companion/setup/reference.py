@@ -1,0 +1,114 @@
+"""Every setting with its true default and what it means, generated from the schema."""
+
+from __future__ import annotations
+
+import json
+import textwrap
+from collections.abc import Iterator
+from typing import Any, get_args
+
+import yaml
+from pydantic import BaseModel
+from pydantic.fields import FieldInfo
+from pydantic_core import PydanticUndefined
+
+from companion.config import CompanionConfig
+
+# What must be given: no default can be right.
+_EXAMPLES: dict[str, Any] = {
+    "map": "maps/area",
+    "source": "udp://192.168.144.20:5600",
+    "width": 1280,
+    "height": 720,
+    "fx": 1005.0,
+    "fy": 1005.0,
+    "cx": 640.0,
+    "cy": 360.0,
+    "folder": "flights/flight",
+    "latitude_deg": 47.4,
+    "longitude_deg": 8.5,
+    "altitude_amsl_m": 488.0,
+    "key_file": "mavlink.key",
+}
+_OTHER = "..."  # of a part that is off: its own page says more
+_WIDTH = 100
+_REQUIRED = "required, this is an example"
+
+
+def reference() -> str:
+    """The text of a deployment file that lists every setting."""
+    head = (
+        "# Every setting of a deployment with its default, from `companion init --reference`.\n"
+        "# A deployment file needs only what differs: `companion init` writes one.\n"
+    )
+    return head + "\n".join(_lines(CompanionConfig, None, 0)) + "\n"
+
+
+def _lines(model: type[BaseModel], default: BaseModel | None, depth: int) -> Iterator[str]:
+    """The settings of a model; default: what it is where it is left out, None: its own."""
+    for name, field in model.model_fields.items():
+        indent = "  " * depth
+        value = _default(field) if default is None else getattr(default, name)
+        part = _part(field)
+        yield from _words(field, value, indent)
+        if part is None or (value is None and not field.is_required()):
+            given = _EXAMPLES.get(name, _OTHER) if value is PydanticUndefined else value
+            yield f"{indent}{name}: {_text(given)}"
+            if part is not None:
+                yield from (f"{indent}  # {line}" for line in _lines(part, None, 0))
+            continue
+        yield f"{indent}{name}:"
+        inner = value if isinstance(value, BaseModel) else None
+        yield from _lines(part, inner, depth + 1)
+
+
+def _default(field: FieldInfo) -> Any:
+    return (
+        PydanticUndefined if field.is_required() else field.get_default(call_default_factory=True)
+    )
+
+
+def _part(field: FieldInfo) -> type[BaseModel] | None:
+    """The model that a setting consists of, None of a plain one."""
+    for annotation in (field.annotation, *get_args(field.annotation)):
+        if isinstance(annotation, type) and issubclass(annotation, BaseModel):
+            return annotation
+    return None
+
+
+def _words(field: FieldInfo, value: Any, indent: str) -> Iterator[str]:
+    """The setting's meaning and bounds as comments."""
+    names = {"ge": ">=", "gt": ">", "le": "<=", "lt": "<"}
+    bounds = [
+        f"{names[key]} {getattr(part, key):g}"
+        for part in field.metadata
+        for key in names
+        if getattr(part, key, None) is not None
+    ]
+    choices = [str(c) for c in get_args(field.annotation) if isinstance(c, str)]
+    parts = [field.description or "", " ".join(bounds), "one of " + ", ".join(choices)]
+    said = [p for p in parts[:2] if p] + ([parts[2]] if choices else [])
+    if value is PydanticUndefined and _part(field) is None:
+        said.append(_REQUIRED)
+    for line in textwrap.wrap("; ".join(said), _WIDTH - len(indent) - 2):
+        yield f"{indent}# {line}"
+
+
+def _text(value: Any) -> str:
+    """A value on one line, as YAML and as people write it."""
+    if isinstance(value, tuple | list):
+        return json.dumps([_number(v) for v in value])
+    if isinstance(value, float):
+        return _float(value)
+    plain = value if isinstance(value, bool | int | str) or value is None else str(value)
+    return yaml.safe_dump(plain, width=1000).removesuffix("\n...\n").strip()
+
+
+def _number(value: Any) -> Any:
+    return value if isinstance(value, bool | int | float | str) else str(value)
+
+
+def _float(value: float) -> str:
+    """YAML reads a number without a point before its exponent as text."""
+    text = repr(value)
+    return text if "e" not in text or "." in text else text.replace("e", ".0e")

@@ -1,0 +1,121 @@
+"""A deployment file from questions: short, valid, and true to the schema's defaults."""
+
+import json
+
+import cv2
+import numpy as np
+import pytest
+import yaml
+from pydantic import BaseModel
+from typer.testing import CliRunner
+
+from companion.cli.commands import app
+from companion.config import CompanionConfig, load_config, parse_config
+from companion.preflight.map_pin import map_hash
+from companion.setup.difference import differing
+from companion.setup.reference import reference
+from localizer.map.building import build
+from localizer.map.building.options import BuildOptions
+from tests.companion.test_config import DEPLOYMENT, MINIMAL, MODEL
+from tests.localizer.map.conftest import write_tileset
+
+EXAMPLES = {"map", "camera.source", "bridge.connection", "record.folder"}
+
+
+@pytest.fixture(scope="module")
+def cache(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("map")
+    build.build_cache(write_tileset(folder), folder / "cache", BuildOptions(workers=1))
+    return folder / "cache"
+
+
+@pytest.fixture
+def video(tmp_path):
+    """A folder of two pictures of 640 x 480."""
+    folder = tmp_path / "video"
+    folder.mkdir()
+    for k in range(2):
+        cv2.imwrite(str(folder / f"{k}.png"), np.full((480, 640, 3), 90 * k, np.uint8))
+    return folder
+
+
+def paths(data, where=""):
+    for key, value in data.items():
+        here = f"{where}{key}"
+        if isinstance(value, dict):
+            yield from paths(value, here + ".")
+        else:
+            yield here
+
+
+def test_only_what_differs_is_kept_and_nothing_is_lost():
+    given = MINIMAL | {
+        "bridge": {"injection": {"rate_hz": 10.0, "yaw_guard": {"enabled": False}}},
+        "localizer": {"odometry": None, "attitude": {"tilt_sigma_deg": 0.5}},
+        "console": {"listen": "127.0.0.1:8081"},
+    }
+    config = parse_config(given, "test")
+    kept = differing(config)
+    assert set(paths(kept)) == {
+        "map", "camera.source", *(f"camera.model.{k}" for k in MODEL),
+        "bridge.injection.rate_hz", "bridge.injection.yaw_guard.enabled", "localizer.odometry",
+        "localizer.attitude.tilt_sigma_deg", "console.listen",
+    }  # fmt: skip
+    assert parse_config(kept, "again") == config
+
+
+def test_the_reference_is_a_valid_deployment_of_true_defaults():
+    config = parse_config(yaml.safe_load(reference()), "reference")
+    own = set(paths(differing(config)))
+    assert own == {"map", "camera.source", *(f"camera.model.{k}" for k in (
+        "width", "height", "fx", "fy", "cx", "cy"))}  # fmt: skip
+    text = reference()
+
+    def names(model: type[BaseModel]) -> set[str]:
+        return set(model.model_fields)
+
+    assert all(f"{name}:" in text for name in names(CompanionConfig))
+    assert "delay_ms: 100.0" in text
+    assert "# age at which a fix is sent" in text
+
+
+def test_the_shipped_deployment_file_differs_from_the_defaults_in_its_examples_only():
+    shipped = set(paths(differing(load_config(DEPLOYMENT))))
+    assert {p for p in shipped if not p.startswith("camera.model.")} == EXAMPLES
+
+
+def test_map_and_stream_are_asked_and_a_silent_vehicle_is_noted(
+    cache, video, tmp_path, monkeypatch
+):
+    monkeypatch.setattr("mavlink_bridge.preflight.client._CONNECT_S", 0.2)
+    out = tmp_path / "deployment.yaml"
+    answers = f"{cache}\n{video}\nudpin:127.0.0.1:0\ngimbal\n60\n"
+    done = CliRunner().invoke(app, ["init", str(out)], input=answers)
+    assert done.exit_code == 0, done.output
+    config, text = load_config(out), out.read_text()
+    assert (config.camera.model.width, config.camera.model.height) == (640, 480)
+    assert config.camera.model.fx == pytest.approx(320 / np.tan(np.radians(30)))
+    assert config.map == cache
+    assert config.map_sha256 == map_hash(cache)
+    assert config.bridge.mode == "shadow"
+    assert "no vehicle was heard" in text
+    assert "not a calibration" in text
+    assert len(text.splitlines()) < 25
+    again = CliRunner().invoke(app, ["init", str(out)], input=answers)
+    assert again.exit_code != 0
+    assert out.read_text() == text
+
+
+def test_a_calibration_of_another_size_is_told(cache, video, tmp_path):
+    lens = tmp_path / "camera.json"
+    lens.write_text(json.dumps(MODEL | {"width": 1280, "cx": 640}))
+    out = tmp_path / "d.yaml"
+    done = CliRunner().invoke(
+        app,
+        ["init", str(out), "--map", str(cache), "--source", str(video), "--camera", str(lens),
+         "--connection", "udpin:127.0.0.1:14551", "--mount", "fixed", "--no-listen"],
+    )  # fmt: skip
+    assert done.exit_code == 0, done.output
+    config = load_config(out)
+    assert config.camera.model.fx == 550
+    assert (config.bridge.camera.mount, config.bridge.camera.mount_pitch_deg) == ("fixed", -90.0)
