@@ -14,14 +14,14 @@ import numpy as np
 from localizer.geometry.pose import Array
 from localizer.targets.bias import SharedBias
 from localizer.targets.filter import TargetFilter
+from localizer.targets.limits import LastPlace, is_at_seen_depth, is_on_map
 from localizer.targets.locate import RayCaster, locate, ray_in_world, ray_spread
 from localizer.targets.static import Place, SightedRay, StaticTarget
-from localizer.types import PoseEstimate, TargetFix, TargetSighting, Visibility
+from localizer.types import PoseEstimate, TargetFix, TargetSighting, TargetSurface, Visibility
 
 _STANDS_S = 2.0  # for so long it must agree with standing before it stands again
 _STANDS_MPS = 1.0
 _GAP_S = 5.0  # a moving target unseen for so long may be anywhere: it begins anew
-_FASTEST_MPS = 60.0
 _ELSEWHERE = 9.0
 _OUTLIERS = 3
 _REPROJECTED = 5.0  # sigmas of pixel and pose between a fix and the pixel that it was seen at
@@ -54,7 +54,7 @@ class TargetTrack:
         self._moves = False
         self._stands_since_ns = 0
         self._outliers = 0
-        self._last: TargetFix | None = None
+        self._last = LastPlace()
         self._seen_ns = 0
         self.refusal = ""
 
@@ -102,15 +102,15 @@ class TargetTrack:
         if self._moves:
             bias = settings.bias.covariance(fix.position_world - eye)
             fix = replace(fix, covariance=fix.covariance + bias)
-        why = self._objection(fix, estimate, ray)
+        why = self._objection(fix, ray, surfaces)
         if why:
             return self._refuse(why)
-        self._last, self._seen_ns = fix, time_ns
+        self._seen_ns = time_ns
         return fix
 
     def expected(self, time_ns: int) -> tuple[Array, Array] | None:
         """Position (3,) and covariance (3, 3) where it should be at a time; None before a fix."""
-        if self._last is None:
+        if self._last.fix is None:
             return None
         if self._moves:
             return self._moving.expected(time_ns)
@@ -118,7 +118,9 @@ class TargetTrack:
         return best.position, best.covariance
 
     def coast(self, estimate: PoseEstimate) -> TargetFix | None:
-        """A moving target that is not seen, where its motion carries it; None of another."""
+        """A moving target that is not seen, where its motion carries it; None of another, and where
+        that leads out of the picture or off the map.
+        """
         expected = self.expected(estimate.exposure_time_ns) if self._moves else None
         if expected is None:
             return None
@@ -126,15 +128,17 @@ class TargetTrack:
         if float(np.sqrt(np.trace(P))) > self._settings.max_sigma_m:
             return None
         bias = self._settings.bias.covariance(position - estimate.world_from_camera.translation)
-        return TargetFix(
-            self._id, position, P + bias, projected(estimate, position),
+        pixel = projected(estimate, position)
+        fix = TargetFix(
+            self._id, position, P + bias, pixel,
             estimate.exposure_time_ns, 0.0, self._moving.velocity,
             self._moving.velocity_covariance, Visibility.HIDDEN,
         )  # fmt: skip
+        return fix if pixel is not None and is_on_map(fix, self._cast) else None
 
     def hold(self, estimate: PoseEstimate) -> TargetFix | None:
         """A standing target where the pose projects it; None of one that moves, or before one."""
-        if self._moves or self._last is None:
+        if self._moves or self._last.fix is None:
             return None
         fix = self._standing(estimate, None)
         away = fix.position_world - estimate.world_from_camera.translation
@@ -164,7 +168,7 @@ class TargetTrack:
 
     def places(self) -> tuple[Place, ...]:
         """Where it may stand, the reported place first; none of one that moves."""
-        return self._static.places() if self._last is not None and not self._moves else ()
+        return self._static.places() if self._last.fix is not None and not self._moves else ()
 
     def _standing(self, estimate: PoseEstimate, pixel: tuple[float, float] | None) -> TargetFix:
         """The place of the smallest expected error; the others widen its covariance."""
@@ -183,11 +187,14 @@ class TargetTrack:
             self._id, best.position, covariance, pixel, estimate.exposure_time_ns, elsewhere
         )
 
-    def _objection(self, fix: TargetFix, estimate: PoseEstimate, ray: SightedRay) -> str:
+    def _objection(
+        self, fix: TargetFix, ray: SightedRay, surfaces: tuple[TargetSurface, ...]
+    ) -> str:
         """Why this may not be told; empty if it may.
 
-        A fix lies under the pixel that it was seen at, is known to some metres, and is no farther
-        from the last one than both errors and a vehicle's speed allow.
+        A fix lies under the pixel that it was seen at, at a depth that its frame shows, on the map,
+        is known to some metres, and is no farther from the last one than both errors and a
+        vehicle's speed allow.
         """
         P, sigma = fix.covariance, float(np.sqrt(np.trace(fix.covariance)))
         if not np.isfinite(sigma) or sigma > self._settings.max_sigma_m:
@@ -199,15 +206,11 @@ class TargetTrack:
         C = ray.spread.covariance + S @ P @ S.T / distance**2
         if float(r @ np.linalg.solve(C, r)) > _REPROJECTED**2:
             return "its place is not under its pixel"
-        if self._last is not None:
-            moved = float(np.linalg.norm(fix.position_world - self._last.position_world))
-            both = sigma + float(np.sqrt(np.trace(self._last.covariance)))
-            speed = _FASTEST_MPS if fix.velocity is not None or self._moves else 0.0
-            elapsed_s = abs(estimate.exposure_time_ns - self._last.exposure_time_ns) * 1e-9
-            if moved > 3.0 * both + speed * elapsed_s:
-                self._last = None  # the next one is judged by itself
-                return f"{moved:.0f} m from where it was, which its error does not cover"
-        return ""
+        if not is_on_map(fix, self._cast):
+            return "no map at its place"
+        if not is_at_seen_depth(fix, ray.eye, ray.direction, surfaces):
+            return "not at the depth that is seen"
+        return self._last.objection(fix, moves=self._moves)
 
     def _refuse(self, why: str) -> TargetFix | None:
         self.refusal = why

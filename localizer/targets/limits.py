@@ -1,0 +1,108 @@
+"""What may be told of a target at all: on the map, at the depth that is seen, and not by a leap.
+
+A map with a hole under a car lets the car's rays meet what lies behind, hundreds of metres on. Each
+such place lies under its pixel and has a small covariance of its own; that it is wrong shows in
+where the target was before, and in what the same rays met then.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from localizer.geometry.pose import Array
+from localizer.targets.locate import RayCaster
+from localizer.types import TargetFix, TargetSurface
+
+_SIGMAS = 3.0
+_FASTEST_MPS = 60.0
+_LEAP_NS = 3_000_000_000  # a leap is believed once sightings have agreed on it for so long
+_LEAP_GAP_NS = 1_000_000_000  # and none was missing for so long
+_OFF_SURFACE_M = 25.0  # between a place and the map: a bridge, a tree, a roof's edge
+_DEPTH_M = 3.0
+_ASIDE = np.array([[0, 0, 0], [1, 0, 0], [-1, 0, 0], [0, 1, 0], [0, -1, 0]], dtype=np.float64)
+
+
+@dataclass
+class _Leap:
+    """Another place that was seen again and again since `since_ns`."""
+
+    since_ns: int
+    newest: TargetFix
+
+
+class LastPlace:
+    """Where a target was last told. Not thread-safe."""
+
+    def __init__(self) -> None:
+        self.fix: TargetFix | None = None
+        self._leap: _Leap | None = None
+        self._begun_ns = 0
+
+    def objection(self, fix: TargetFix, *, moves: bool) -> str:
+        """Why a place is not believed; empty for one that is, which is the last one from then on.
+
+        A detector may give its name to another object: then the new place is told once it has been
+        seen for as long as the old one was, 3 s at the most.
+        """
+        last, time_ns = self.fix, fix.exposure_time_ns
+        if last is None or _reachable(last, fix, moves=moves):
+            self._begun_ns = time_ns if last is None else self._begun_ns
+            self.fix, self._leap = fix, None
+            return ""
+        leap = self._leap
+        follows = (
+            leap is not None
+            and time_ns - leap.newest.exposure_time_ns <= _LEAP_GAP_NS
+            and _reachable(leap.newest, fix, moves=True)
+        )
+        if leap is None or not follows:
+            leap = _Leap(time_ns, fix)
+        self._leap = _Leap(leap.since_ns, fix)
+        if time_ns - leap.since_ns >= min(_LEAP_NS, last.exposure_time_ns - self._begun_ns):
+            self.fix, self._leap, self._begun_ns = fix, None, leap.since_ns
+            return ""
+        moved = float(np.linalg.norm(fix.position_world - last.position_world))
+        return f"{moved:.0f} m from where it was, which its error does not cover"
+
+
+def is_on_map(fix: TargetFix, cast: RayCaster) -> bool:
+    """Whether the map has a surface about the height of the place, there or as far beside it as its
+    error reaches.
+    """
+    P = fix.covariance
+    aside = max(1.0, 2.0 * float(np.sqrt(P[0, 0] + P[1, 1])))
+    reach = _OFF_SURFACE_M + _SIGMAS * float(np.sqrt(P[2, 2]))
+    down = np.array([[0.0, 0.0, -1.0]])
+    for offset in _ASIDE:
+        above = fix.position_world + aside * offset + np.array([0.0, 0.0, reach])
+        distance = float(cast(above, down).distances[0])
+        if np.isfinite(distance) and distance <= 2.0 * reach:
+            return True
+    return False
+
+
+def is_at_seen_depth(
+    fix: TargetFix, eye: Array, direction: Array, surfaces: tuple[TargetSurface, ...]
+) -> bool:
+    """Whether a place is as far along the pixel's ray as one of the surfaces that the frame's rays
+    met; eye, direction: (3,) of that ray. Errors of both count.
+    """
+    along = float((fix.position_world - eye) @ direction)
+    own = float(np.sqrt(direction @ fix.covariance @ direction))
+    for surface in surfaces:
+        off = abs(along - float((surface.position - eye) @ direction))
+        sigma = float(np.sqrt(direction @ surface.covariance @ direction))
+        if off <= _DEPTH_M + _SIGMAS * (own + sigma):
+            return True
+    return False
+
+
+def _reachable(a: TargetFix, b: TargetFix, *, moves: bool) -> bool:
+    """Whether both may be one target: within their errors, and a vehicle's way between them."""
+    moved = float(np.linalg.norm(b.position_world - a.position_world))
+    both = sum(float(np.sqrt(np.trace(fix.covariance))) for fix in (a, b))
+    speed = _FASTEST_MPS if moves or b.velocity is not None else 0.0
+    elapsed_s = abs(b.exposure_time_ns - a.exposure_time_ns) * 1e-9
+    return moved <= _SIGMAS * both + speed * elapsed_s

@@ -1,0 +1,146 @@
+"""A place that is hundreds of metres off is not told: the fault of the car that was 414 m off.
+
+The fault: for a moment the map lacks the ground under the target, and its rays meet what lies
+250 m below. The place is then under its pixel, and known to 3 m.
+"""
+
+import numpy as np
+import pytest
+
+from companion.config import TargetConfig
+from companion.targets.detections import Detection
+from companion.targets.population import Population, Target
+from localizer.geometry.camera import Camera
+from localizer.geometry.pose import Pose, so3_exp
+from localizer.map.cache.pick import BundleHits
+from localizer.targets.limits import LastPlace, is_at_seen_depth, is_on_map
+from localizer.targets.track import TargetSettings, TargetTrack, projected
+from localizer.types import (
+    PoseEstimate,
+    RegistrationStatus,
+    TargetFix,
+    TargetSurface,
+    TrackingState,
+)
+
+CAMERA = Camera.from_fov(640, 480, 60)
+SIGMA = np.diag([0.1, 0.1, 0.1, 1e-3, 1e-3, 1e-3]) ** 2
+SECOND = 10**9
+FRAMES = 60  # at 10 Hz
+HOLE_M = 250.0
+
+
+def estimate_at(k):
+    """Flies east at 10 m/s and 100 m, looks north and down by 38 degrees."""
+    pose = Pose(so3_exp([0.9, 0.0, 0.0]) @ np.diag([1.0, -1.0, -1.0]), np.array([k, -100.0, 100.0]))
+    return PoseEstimate(
+        pose, SIGMA, 1.0, TrackingState.TRACKING, RegistrationStatus.OK, True,
+        SECOND + k * SECOND // 10, 0, CAMERA,
+    )  # fmt: skip
+
+
+class Ground:
+    """Flat ground that ends in the north, with a hole while `is_holed`."""
+
+    def __init__(self, ends_m=1e9):
+        self.is_holed, self.ends_m = False, ends_m
+
+    def cast(self, origin, directions):
+        height = -HOLE_M if self.is_holed else 0.0
+        with np.errstate(divide="ignore"):
+            distances = (height - origin[2]) / directions[:, 2]
+        points = origin + distances[:, None] * directions
+        missed = (distances <= 0) | (points[:, 1] > self.ends_m)
+        distances = np.where(missed, np.nan, distances)
+        return BundleHits(distances, np.tile([0.0, 0.0, 1.0], (len(directions), 1)))
+
+
+def errors(holed, velocity):
+    """(frame, error, own sigma, m) of every report of a target that a detector sees."""
+    ground, told, found = Ground(), list[Target](), []
+    population = Population(
+        TargetConfig(rate_hz=10), ground.cast, told.append, lambda _: None, lambda *_: None
+    )
+    noise = np.random.default_rng(0)
+    for k in range(FRAMES):
+        estimate, ground.is_holed = estimate_at(k), k in holed
+        true = np.array([20.0, 60.0, 0.0]) + 0.1 * k * np.array([*velocity, 0.0])
+        at = projected(estimate, true)
+        assert at is not None
+        u, v = at + noise.normal(scale=0.7, size=2)
+        before = len(told)
+        population.see(Detection("car", estimate.exposure_time_ns, u, v), estimate)
+        for target in told[before:]:
+            off = float(np.linalg.norm((target.fix.position_world - true)[:2]))
+            found.append((k, off, float(np.sqrt(np.trace(target.fix.covariance[:2, :2])))))
+    return found
+
+
+@pytest.mark.parametrize("velocity", [(0.0, 0.0), (8.0, 3.0)])
+@pytest.mark.parametrize("holed", [range(40, 41), range(40, 43), range(40, 55)])
+def test_a_hole_under_a_target_never_moves_it_hundreds_of_metres(holed, velocity):
+    told = errors(set(holed), velocity)
+    assert max(off - 3.0 * sigma for _, off, sigma in told) < 0.5
+    assert len(told) >= FRAMES - len(holed) - 5  # and it comes back at once
+
+
+@pytest.mark.parametrize("velocity", [(0.0, 0.0), (8.0, 3.0)])
+def test_without_a_fault_every_report_is_told_within_its_bound(velocity):
+    told = errors(set(), velocity)
+    assert len(told) >= FRAMES - 2
+    assert max(off - 3.0 * sigma for _, off, sigma in told) < 0.5
+
+
+def test_a_hole_in_the_very_first_frame_does_not_keep_the_right_place_out():
+    """One view alone cannot tell: it is told for what it claims, and then no more."""
+    told = errors({0}, (8.0, 3.0))
+    assert [k for k, off, _ in told if off > 100.0] == [0]
+    assert len(told) > FRAMES // 2
+
+
+def _fix(place, time_ns, sigma=1.0):
+    return TargetFix("car", np.array(place, dtype=float), np.eye(3) * sigma**2, (1.0, 1.0), time_ns)
+
+
+def test_another_object_under_the_same_name_is_told_once_it_was_seen_for_as_long():
+    last = LastPlace()
+    for k in range(100):
+        assert last.objection(_fix([0, 0, 0], k * SECOND // 10), moves=False) == ""
+    refused = [
+        k
+        for k in range(100, 150)
+        if last.objection(_fix([300, 0, 0], k * SECOND // 10), moves=False)
+    ]
+    assert refused == list(range(100, 130))
+    assert "300 m from where it was" in last.objection(_fix([0, 0, 0], 16 * SECOND), moves=False)
+
+
+def test_what_is_in_the_air_or_beyond_the_map_is_on_no_map():
+    ground = Ground(ends_m=500.0)
+    assert is_on_map(_fix([0, 100, 3.0], 0), ground.cast)
+    assert is_on_map(_fix([0, 501.0, 0.0], 0), ground.cast)  # as near to the edge as its error
+    assert not is_on_map(_fix([0, 520.0, 0.0], 0), ground.cast)
+    assert not is_on_map(_fix([0, 100, 60.0], 0), ground.cast)
+    assert not is_on_map(_fix([0, 100, -60.0], 0), ground.cast)
+
+
+def test_a_place_along_the_ray_but_deeper_than_what_is_seen_is_refused():
+    eye, ray = np.zeros(3), np.array([0.0, 1.0, 0.0])
+    near = TargetSurface(1.0, np.array([0.0, 200.0, 0.0]), np.eye(3) * 0.3**2)
+    assert is_at_seen_depth(_fix([0, 203, 0], 0), eye, ray, (near,))
+    assert not is_at_seen_depth(_fix([0, 614, 0], 0), eye, ray, (near,))
+
+
+def test_a_car_that_coasts_off_the_map_or_out_of_the_picture_is_told_no_more():
+    ground = Ground(ends_m=80.0)
+    track = TargetTrack("car", TargetSettings(), ground.cast)
+    for k in range(12):
+        estimate = estimate_at(k)
+        at = projected(estimate, np.array([20.0, 60.0 + 1.5 * k, 0.0]))  # 15 m/s to the north
+        track.see(estimate, at)
+    assert track.moves
+    far = [track.coast(estimate_at(k)) for k in range(12, 40)]
+    told = [fix.position_world[1] for fix in far if fix is not None]
+    assert told
+    assert max(told) < 90.0
+    assert far[-1] is None
