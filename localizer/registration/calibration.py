@@ -1,4 +1,4 @@
-"""What a camera's model leaves unknown, as an uncertainty of the poses that it leads to.
+"""What camera model and survey leave unknown, as an uncertainty of the poses that they lead to.
 
 No picture shows it: the residuals are as small with a principal point that is a pixel off, and the
 position is a quarter of a metre beside at 120 m, in every frame alike.
@@ -18,7 +18,9 @@ _LEAST_EIGENVALUE = 1e-9  # of the scaled normal equations, below which no pose 
 
 
 class CalibrationSigmas(BaseModel):
-    """One sigma of each number of the camera's model, as its calibration leaves them."""
+    """One sigma of each number of the camera's model, as its calibration leaves them, and of the
+    map's surface, as its survey does.
+    """
 
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
 
@@ -29,12 +31,16 @@ class CalibrationSigmas(BaseModel):
     distortion: float = Field(0.003, ge=0, le=1, description="of k1; k2 as much, p1, p2 a tenth")
     readout_ms: float = Field(1.0, ge=0, le=100, description="of a rolling shutter's readout")
     stamp_ms: float = Field(4.0, ge=0, le=1000, description="of the frames' time stamps")
+    map_m: float = Field(0.07, ge=0, le=20, description="of the map's surface, per axis")
+    map_length_m: float = Field(
+        5.0, ge=0.01, le=1000, description="over which it is displaced alike"
+    )
 
     @classmethod
     def none(cls) -> CalibrationSigmas:
-        """Of a camera that is known exactly."""
+        """Of a camera and a map that are known exactly."""
         return cls(
-            focal_percent=0, principal_percent=0, distortion=0, readout_ms=0, stamp_ms=0
+            focal_percent=0, principal_percent=0, distortion=0, readout_ms=0, stamp_ms=0, map_m=0
         )  # fmt: skip
 
 
@@ -46,7 +52,7 @@ def calibration_covariance(
 
     Each number that is off by a sigma moves every point's pixel; the pose gives way by least
     squares over the points in view, ``(sum J'J)^-1 sum J'c``, and the numbers fail independently.
-    A late stamp moves the pose along its motion.
+    A late stamp moves the pose along its motion. Patches of the map are displaced independently.
 
     points_world: (N, 3), what was registered against. camera: the pinhole of the registration;
     sweep: see `Sweep`, with the readout of `camera`; moving: velocity (3,), m/s, and angular rate
@@ -67,10 +73,25 @@ def calibration_covariance(
     scaled = normal * np.outer(scale, scale)
     if np.linalg.eigvalsh(scaled)[0] < _LEAST_EIGENVALUE:
         return late
-    gained = np.einsum("nai,nak->ik", J, shifts)
-    effects = scale[:, None] * np.linalg.solve(scaled, scale[:, None] * gained)
-    covariance: Array = effects @ effects.T + late
+    inverse = np.linalg.inv(scaled) * np.outer(scale, scale)
+    effects = inverse @ np.einsum("nai,nak->ik", J, shifts)
+    displaced = inverse @ _displacement(sigmas, J, camera) @ inverse
+    covariance: Array = effects @ effects.T + displaced + late
     return covariance
+
+
+def _displacement(sigmas: CalibrationSigmas, J: Array, camera: Camera) -> Array:
+    """(6, 6): variance of ``sum J'c`` where the surface is displaced patch by patch.
+
+    J: (N, 2, 6) of `_pixel_motion`, spread evenly over the picture; a patch is a square of
+    `map_length_m` on the ground and its points are displaced alike.
+    """
+    by_place = J[:, :, :3]
+    px_per_m2 = 0.5 * np.einsum("nai,nai->n", by_place, by_place)
+    ground_m2 = camera.width * camera.height / len(J) * float((1.0 / px_per_m2).sum())
+    in_patch = len(J) * min(sigmas.map_length_m**2 / max(ground_m2, 1e-9), 1.0)
+    spread: Array = np.einsum("nai,nak,nbk,nbj->ij", J, by_place, by_place, J)
+    return sigmas.map_m**2 * in_patch * spread
 
 
 def _pixel_motion(points: Array, pose: Pose, camera: Camera) -> Array:

@@ -42,7 +42,15 @@ class MotionConfig(BaseModel):
 
     acceleration_sigma: float = Field(3.0, ge=0.01, le=100, description="m/s²")
     angular_acceleration_sigma: float = Field(1.0, ge=0.001, le=100, description="rad/s²")
-    turn_sigma: float = Field(0.006, ge=1e-4, le=1, description="error of a measured turn, rad")
+    turn_sigma: float = Field(
+        0.001, ge=1e-4, le=1, description="error of a turn measured between two frames, rad"
+    )
+    turn_walk: float = Field(
+        0.004, ge=0, le=1, description="what it grows by with time, rad per root second"
+    )
+    turn_delay_s: float = Field(
+        0.01, ge=0, le=1, description="how late it may be: at a turn rate so much of an angle"
+    )
     initial_velocity_sigma: float = Field(
         8.0, ge=0.01, le=100, description="m/s, of an unknown velocity"
     )
@@ -113,7 +121,7 @@ def predict(
     if turn is not None:
         F[3:6, 9:] = 0.0
         Q[3:6, :] = Q[:, 3:6] = 0.0
-        Q[3:6, 3:6] = np.eye(3) * config.turn_sigma**2
+        Q[3:6, 3:6] = np.eye(3) * _turn_variance(turn, abs(dt), config)
     mean, P = kalman_predict(state.mean, state.covariance, F, Q)
     if turn is None:
         return _fold_rotation(mean, P, state.rotation, time_ns)
@@ -233,6 +241,12 @@ def _fold_rotation(mean: Array, P: Array, rotation: Array, time_ns: int) -> Moti
     mean[3:6] = 0.0
     P = np.asarray(P, dtype=np.float64)
     return MotionState(mean, 0.5 * (P + P.T), folded, time_ns)
+
+
+def _turn_variance(turn: Array, dt: float, config: MotionConfig) -> float:
+    """Of a measured turn, rad² per axis: its noise, the sensor's wander, and its lateness."""
+    late = config.turn_delay_s * float(np.linalg.norm(so3_log(turn))) / dt
+    return config.turn_sigma**2 + config.turn_walk**2 * dt + late**2
 
 
 def _process_noise(dt: float, config: MotionConfig) -> Array:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import threading
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 from localizer.config import LocalizerConfig
 from localizer.geometry.pose import Array, Pose
@@ -135,6 +135,11 @@ class Tracker:
             moved = motion.start(_restart(result, ahead), self._config.motion)
         self._store(seen, moved, standing)
         given, usable = _given(outcome, result, carried, standing)
+        if usable and not bridges:
+            # Position and tilt err together, from frame to frame anew; the turn between two frames
+            # is known several times better. The sigmas told stay the registration's: the map errs
+            # alike for seconds, which a filter takes for knowledge.
+            given = replace(given, world_from_camera=moved.prior.world_from_camera)
         estimate = _estimate(frame, given, standing, usable)
         if estimate.accepted and not bridges and self._bridging is not None and anchors is not None:
             swept = self.sweep(frame, ahead)

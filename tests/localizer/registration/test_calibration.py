@@ -103,3 +103,20 @@ def test_points_that_hold_no_pose_add_nothing_but_time():
     far = np.repeat(_scene()[:1], 50, axis=0)
     for points in (np.zeros((0, 3)), far):
         assert not calibration_covariance(known, points, POSE, CAMERA, None, STILL).any()
+
+
+def test_a_displaced_surface_moves_the_pose_as_its_patches_do():
+    """Against draws: every 6 m square of the ground displaced by itself, the pose fitted."""
+    points, rng = _scene(), np.random.default_rng(8)
+    known = NOTHING.model_copy(update={"map_m": 0.1, "map_length_m": 6.0})
+    wanted = np.sqrt(calibration_covariance(known, points, POSE, CAMERA, None, STILL).diagonal())
+    square = np.floor(points[:, :2] / 6.0).astype(int)
+    _, patch = np.unique(square, axis=0, return_inverse=True)
+    patch, errors = patch.ravel(), []
+    for _ in range(40):
+        moved = points + rng.normal(0, 0.1, (patch.max() + 1, 3))[patch]
+        pixels, _ = CAMERA.project(POSE.inverse.apply(moved))
+        errors.append(_fitted(pixels, points))
+    found = np.sqrt(np.mean(np.square(errors), axis=0))
+    assert np.all(found < 1.6 * wanted)
+    assert np.all(found > 0.5 * wanted)

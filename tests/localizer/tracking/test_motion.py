@@ -92,6 +92,53 @@ def test_a_measured_turn_replaces_the_constant_rate():
     np.testing.assert_allclose(later.rotation, so3_exp([0.0, 0.0, 1.0]), atol=1e-9)
 
 
+def _registrations(rng: np.random.Generator, count: int) -> tuple[np.ndarray, np.ndarray]:
+    """Errors (count, 6) of registrations from 120 m and their covariance: who errs in tilt by a
+    tenth of a degree is 0.2 m beside.
+    """
+    P = np.diag([0.03**2] * 6) * 1e-4
+    P[:3, :3] += np.eye(3) * 0.03**2
+    for position, tilt, sign in ((0, 4, -1.0), (1, 3, 1.0)):
+        lever = np.zeros(6)
+        lever[position], lever[tilt] = sign * 120.0, 1.0
+        P += np.outer(lever, lever) * 0.0015**2
+    return rng.multivariate_normal(np.zeros(6), P, count), P
+
+
+@pytest.mark.parametrize(("rate_deg_s", "share"), [(0.0, 0.75), (40.0, 0.85)])
+def test_a_turn_that_is_known_better_mends_the_position(rate_deg_s, share):
+    """What the gimbal says of the turn between two frames, and none of its constant error."""
+    rng = np.random.default_rng(4)
+    noise, P = _registrations(rng, 60)
+    mounted = so3_exp([0.02, -0.01, 0.03])
+    raw, fused, state, before = [], [], None, mounted
+    for k in range(60):
+        truth = Pose(so3_exp([0.0, 0.0, np.radians(rate_deg_s) * 0.1 * k]), [1.0 * k, 0, 120.0])
+        told = mounted @ so3_exp(rng.normal(0, 7e-4, 3)) @ truth.rotation
+        seen = Pose(so3_exp(noise[k, 3:]) @ truth.rotation, truth.translation + noise[k, :3])
+        time_ns = round(0.1 * k * SECOND)
+        if state is None:
+            state = motion.start(PosePrior(seen, P, time_ns, np.array([10.0, 0, 0])), CONFIG)
+        else:
+            turn = told @ before.T
+            ahead = motion.predict(state, time_ns, CONFIG, turn)
+            state = motion.update(ahead, seen, P)
+        before = told
+        raw.append(np.linalg.norm(noise[k, :3]))
+        fused.append(truth.distance_to(state.prior.world_from_camera)[0])
+    assert np.median(raw[10:]) > 0.15
+    assert np.median(fused[10:]) < share * np.median(raw[10:])
+
+
+def test_a_turns_error_grows_with_its_rate_and_with_time():
+    still, state = np.eye(3), motion.start(_prior(1e-3), CONFIG)
+    short = motion.predict(state, SECOND // 10, CONFIG, still).covariance[3, 3]
+    long = motion.predict(state, 4 * SECOND, CONFIG, still).covariance[3, 3]
+    fast = motion.predict(state, SECOND // 10, CONFIG, so3_exp([0.1, 0.0, 0.0])).covariance[3, 3]
+    assert np.sqrt(long - short) > 0.007
+    assert np.sqrt(fast - short) == pytest.approx(0.01, rel=0.01)
+
+
 def test_the_priors_velocity_starts_the_filter():
     """A prior that knows its velocity is moved by it, with less doubt than one that does not."""
     moving = replace(_prior(), velocity=np.array([12.0, 0.0, 0.0]))
