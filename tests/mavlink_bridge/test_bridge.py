@@ -238,7 +238,7 @@ def test_command_gates_injection(
     assert not bridge.injecting
     assert ask(mavlink.MAV_CMD_USER_1, 1.0) == mavlink.MAV_RESULT_ACCEPTED
     assert ask(mavlink.MAV_CMD_USER_1, 1.0) == mavlink.MAV_RESULT_ACCEPTED  # sent again
-    assert bridge.injecting
+    assert sleep_until(lambda: bridge.injecting, 30.0)  # from the other link's next turn on
     feed(bridge, more(autopilot, 4))
     assert ask(mavlink.MAV_CMD_USER_1, 0.0) == mavlink.MAV_RESULT_ACCEPTED
     assert not bridge.injecting
