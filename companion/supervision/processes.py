@@ -9,7 +9,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 _DISMISS_S = 5.0
-_KILL_S = 1.0
+_KILL_S = 10.0  # its ports are free once it is gone, and not before
 _READ = 4096
 
 

@@ -110,6 +110,7 @@ class ShadowInterlock:
         if score.go:
             self._go_ns, self._against = self._compared_ns(), ""
         elif score.samples >= MINIMUM_SAMPLES:
-            # It stays when its samples have aged: what was wrong with GNSS is wrong without.
-            self._against = score.reasons[0]
+            # It stays when its samples have aged: what was wrong with GNSS is wrong without. A rate
+            # that was too low says nothing of the map: the injection looks at it itself.
+            self._against = score.against[0] if score.against else ""
         self._reason = self._against or (score.reasons[0] if score.reasons else "")

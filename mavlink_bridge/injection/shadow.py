@@ -37,7 +37,8 @@ class ShadowScore:
 
     Without samples nothing of that is known: None. bias_ne_m: mean north and east difference.
     height_m: median difference of the heights. consistency: median squared Mahalanobis distance
-    (1.4 is ideal). reasons: why it is a no-go; empty if it is a go.
+    (1.4 is ideal). reasons: why it is a no-go; empty if it is a go. against: those of them
+    that speak against the positions themselves, not against how many came.
     """
 
     go: bool
@@ -49,6 +50,7 @@ class ShadowScore:
     height_m: float | None = None
     consistency: float | None = None
     rate_hz: float | None = None
+    against: tuple[str, ...] = ()
 
     def line(self) -> str:
         """One line for the operator."""
@@ -95,23 +97,25 @@ class ShadowScorer:
         consistency = float(np.median(samples[:, 3]))
         span_s = float(samples[-1, 0] - samples[0, 0]) * 1e-9
         rate = (len(samples) - 1) / span_s if span_s > 0 else 0.0
-        reasons = []
+        reasons, against = [], []
         if len(samples) < MINIMUM_SAMPLES:
             reasons.append(f"only {len(samples)} fixes of {MINIMUM_SAMPLES}")
         elif rate < _RATE_LIMIT_HZ:
             reasons.append(f"{rate:.1f} Hz, needs {_RATE_LIMIT_HZ:.0f}")
         if median > _MEDIAN_LIMIT_M:
-            reasons.append(f"median error {median:.1f} m")
+            against.append(f"median error {median:.1f} m")
         if p95 > _P95_LIMIT_M:
-            reasons.append(f"p95 error {p95:.1f} m")
+            against.append(f"p95 error {p95:.1f} m")
         if consistency > _CONSISTENCY_LIMIT:
-            reasons.append("errors exceed the claimed covariance")
+            against.append("errors exceed the claimed covariance")
         height = float(np.median(samples[:, 4]))
         if abs(height) > _HEIGHT_LIMIT_M:
-            reasons.append(f"height differs by {height:+.0f} m; check geoid, datum, barometer")
+            against.append(f"height differs by {height:+.0f} m; check geoid, datum, barometer")
         if refused_yaw_rad is not None:
-            reasons.append(f"yaw differs by {math.degrees(refused_yaw_rad):+.1f} deg")
+            against.append(f"yaw differs by {math.degrees(refused_yaw_rad):+.1f} deg")
+        reasons += against
         bias = (float(samples[:, 1].mean()), float(samples[:, 2].mean()))
         return ShadowScore(
-            not reasons, len(samples), tuple(reasons), median, p95, bias, height, consistency, rate
-        )
+            not reasons, len(samples), tuple(reasons), median, p95, bias, height, consistency, rate,
+            tuple(against),
+        )  # fmt: skip

@@ -162,6 +162,13 @@ class LoopCase(_Model):
         return self
 
     @property
+    def earns(self) -> bool:
+        """Whether injection is earned by the shadow score before GNSS is gone; else, where what is
+        wrong would not be flown at all, it is forced. A cold companion has nothing to compare.
+        """
+        return self.wrong == Wrong() and not self.cold
+
+    @property
     def is_normal(self) -> bool:
         """Whether nothing is wrong: whatever is told then is a false alarm."""
         return self.wrong == Wrong() and not self.timeline and not self.cold

@@ -22,7 +22,8 @@ _FRESH_S = 2.0  # a health report that is written every second
 @dataclass(frozen=True)
 class Health:
     """The newest ``health.json``: level and text, its age in seconds (infinite without one), names
-    of the guardian's findings that stand, localized frames per second, and whose report it is.
+    of the guardian's findings that stand, localized frames per second, whose report it is, and its
+    shadow score.
     """
 
     level: str = "starting"
@@ -31,6 +32,12 @@ class Health:
     findings: tuple[str, ...] = ()
     rate_hz: float = 0.0
     pid: int = 0
+    shadow: str = ""
+
+    @property
+    def has_go(self) -> bool:
+        """Whether the shadow score is a go."""
+        return self.shadow.startswith("go")
 
     @property
     def is_tracking(self) -> bool:
@@ -111,5 +118,5 @@ class LoopCompanion:
         findings = tuple(guardian.get("findings", {}))
         return Health(
             str(report["level"]), str(report["text"]), age_s, findings, float(report["rate_hz"]),
-            int(report["pid"]),
+            int(report["pid"]), str(report["shadow"]),
         )  # fmt: skip

@@ -35,7 +35,7 @@ from sitl.vehicles.launch import VISION_SOURCE, VehicleSetup, open_vehicle
 from sitl.vehicles.process import VehicleKind, VehicleProcess
 
 _STEP_S = 0.25
-_TRACKING_S, _WRONG_S = 90.0, 15.0
+_TRACKING_S, _WRONG_S, _GO_S = 90.0, 15.0, 40.0
 _LOCALIZER = 197  # component
 _DRAG_STEP_S = 0.5
 _POSITION_FRESH_S = 1.0  # LOCAL_POSITION_NED comes 25 times a second, while there is a position
@@ -80,6 +80,7 @@ class _LoopFlight:
         self._tlog = out.resolve() / "flight.tlog"
         self._start_ns = 0
         self._ended_ns: int | None = None
+        self._shadow: str | None = None
 
     def prepare(self) -> None:
         """From power on to a companion that tracks at the flight's height."""
@@ -107,6 +108,9 @@ class _LoopFlight:
             pilot.link.set_parameter("SIM_WIND_DIR", 270.0)
             pilot.link.set_parameter("SIM_WIND_SPD", case.wind_m_s)
             pilot.link.sleep(8.0)
+        if case.earns:
+            pilot.link.wait_wall(self._has_go, _GO_S)
+            self._shadow = self._companion.health().shadow
 
     def _wait_tracking(self) -> None:
         """Wait for a health that is ok; where something is wrong it may never be, or say why."""
@@ -148,6 +152,7 @@ class _LoopFlight:
             slowest_pace(self._ticks),
             longest_stall(self._ticks),
             self._back(),
+            self._shadow,
         )
 
     # --- before ----------------------------------------------------------------------------------
@@ -169,6 +174,7 @@ class _LoopFlight:
         settings = yaml.safe_load(path.read_text(encoding="utf-8"))
         for axis in ("fx", "fy"):
             settings["camera"]["model"][axis] *= case.wrong.focal
+        settings["bridge"]["injection"]["force"] = not case.earns and not case.cold
         settings["record"]["snapshot_interval_s"] = 5.0
         settings["bridge"]["tlog"] = str(self._tlog)
         path.write_text(yaml.safe_dump(_merged(settings, case.deployment), sort_keys=False))
@@ -252,6 +258,10 @@ class _LoopFlight:
                 health.text, health.age_s, health.findings, health.rate_hz,
             )
         )  # fmt: skip
+
+    def _has_go(self) -> bool:
+        self._companion.require()
+        return self._companion.health().has_go
 
     def _is_tracking(self) -> bool:
         self._companion.require()

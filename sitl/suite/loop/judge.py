@@ -77,7 +77,8 @@ class LoopRecord:
     """What a flight left. fix_errors_m: horizontal, of every position that was injected.
 
     pace, stall_s: how far the simulated vehicle was from real time, see `sitl.suite.record`.
-    back: where the companion was killed or hung; None elsewhere.
+    back: where the companion was killed or hung; None elsewhere. shadow: its score when the
+    recorded part began; None where injection was forced.
     """
 
     samples: tuple[LoopSample, ...]
@@ -86,6 +87,7 @@ class LoopRecord:
     pace: float = 1.0
     stall_s: float = 0.0
     back: Back | None = None
+    shadow: str | None = None
 
 
 @dataclass(frozen=True)
@@ -185,6 +187,8 @@ def judge(record: LoopRecord, expect: Expectation, *, denied: bool = False) -> t
     if expect.false_fixes is not None:
         ok = flown.false <= expect.false_fixes and (flown.sent > 0 or not expect.injects)
         held.append(Held("false fixes injected", ok, f"{flown.false} of {flown.sent}"))
+    if record.shadow is not None:
+        held.append(Held("go earned", record.shadow.startswith("go"), record.shadow))
     if expect.back_within_s is not None:
         back = record.back or Back(math.inf, math.inf, math.inf)
         ok = back.injects_s <= expect.back_within_s

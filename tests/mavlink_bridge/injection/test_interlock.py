@@ -93,6 +93,22 @@ def test_without_gnss_it_begins_and_says_that_nothing_was_compared(
     assert told(flight, "shadow") == ["injecting without shadow check"]
 
 
+def test_a_rate_that_was_low_on_gnss_does_not_forbid_for_ever(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """It says nothing against the map: a vehicle without GNSS would have landed for it."""
+    flight = on_gnss(monkeypatch)
+    for _ in range(80):
+        for flight.sees, seconds in ((True, 0.1), (False, 0.3)):
+            flight.run(seconds)
+    assert flight.vision() == []
+    assert told(flight, "not sent: no go")
+    flight.sees, flight.gnss_north_m = True, None
+    flight.run(6.0)
+    assert len(flight.vision()) > 20
+    assert told(flight, "shadow") == ["injecting without shadow check"]
+
+
 def test_force_overrules_and_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
     injection = InjectionConfig(rate_hz=10, delay_ms=100, force=True)
     flight = on_gnss(monkeypatch, injection=injection)
