@@ -1,4 +1,4 @@
-"""Where are we, while nobody knows: the map is searched in one frame, on a thread of low priority.
+"""Where are we, while nobody knows: the map is searched in one frame, on a thread of its own.
 
 The answer is no fix: it is a place that the tracker puts on trial (`PosePrior.independent`).
 """
@@ -7,11 +7,9 @@ from __future__ import annotations
 
 import logging
 import math
-import os
 import threading
 import time
 from collections.abc import Callable
-from contextlib import suppress
 from dataclasses import dataclass
 
 import numpy as np
@@ -26,7 +24,6 @@ from localizer.types import Frame, PosePrior
 from mavlink_bridge.messages import PlaceHint
 
 _log = logging.getLogger(__name__)
-_NICE = 15  # of the preparing thread: the overview's seconds must not cost the tracker frames
 _HINT_SIGMAS = 2.0
 _HORIZON_M = 10_000.0  # below the origin: over 350 km away
 _HINT_S = 120.0  # after which an operator's word is of another place
@@ -162,8 +159,7 @@ class PlaceSearch:
         return SearchRegion.circle(prior.world_from_camera.translation, _SIGMAS * sigma_m)
 
     def _prepare(self) -> None:
-        with suppress(OSError):  # on Linux a thread has a priority of its own
-            os.setpriority(os.PRIO_PROCESS, threading.get_native_id(), _NICE)
+        # Of the process's own priority, see `DualThreadEngine`.
         try:
             self._open = open_relocalizer(self._cache, self._config, should_stop=self._stop.is_set)
         except (LocalizerError, OSError) as error:

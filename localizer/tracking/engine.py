@@ -4,18 +4,16 @@ The localization thread takes the newest frame, registers it against the newest 
 publishes the estimate. Each estimate wakes the render thread, which predicts the pose at the next
 exposure, renders the reference for it and has the map loaded along the way ahead. Neither waits for
 a subscriber, and neither dies of an error: errors are counted, logged and reported as the engine's
-health. While no place is known a third thread, below both in priority, searches for one; what it
-finds is tried by the localization thread, which goes on trying meanwhile.
+health. While no place is known a third thread searches for one; what it finds is tried by the
+localization thread, which goes on trying meanwhile.
 """
 
 from __future__ import annotations
 
 import logging
-import os
 import threading
 import time
 from collections.abc import Callable
-from contextlib import suppress
 from dataclasses import replace
 
 from localizer.errors import LocalizerError
@@ -35,7 +33,6 @@ PriorProvider = Callable[[int], PosePrior | None]
 Searcher = Callable[[Frame, Callable[[], bool]], PosePrior | None]
 
 _TRIED_FRAMES = 5  # with what is known outside, before a search begins
-_SEARCH_NICE = 15  # of the search thread: its seconds must not cost the tracker frames
 
 
 class DualThreadEngine:
@@ -118,8 +115,9 @@ class DualThreadEngine:
                 self._book.report(f"unexpected {type(error).__name__}: {error}")
 
     def _search(self) -> None:
-        with suppress(OSError):  # on Linux a thread has a priority of its own
-            os.setpriority(os.PRIO_PROCESS, threading.get_native_id(), _SEARCH_NICE)
+        # Of the process's own priority: a thread of a lower one that is put aside while it holds
+        # the interpreter holds up all that fly (2 s at nice 15, 0.2 s without, on a busy
+        # processor); and the ports of a killed process are free once its last thread had its turn.
         self._run(self._search_once)
 
     def _search_once(self) -> None:
