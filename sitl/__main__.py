@@ -17,6 +17,7 @@ from rich.markup import escape
 
 from companion.errors import CompanionError
 from companion.reporting.report import write_page
+from companion.terminal.links import file_link
 from localizer.errors import LocalizerError
 from localizer.synth.appearance.model import CONDITIONS
 from sitl.demo.assets import FlightAssets, prepare
@@ -46,7 +47,7 @@ from sitl.vehicles.process import VehicleKind
 
 # What a flight and its report leave in their folder.
 _REPORT_FILES = (
-    "companion", "companion.log", "companion.yaml", "errors.png", "frames.csv",
+    "companion", "companion.log", "companion.yaml", "errors.png", "flight.tlog", "frames.csv",
     "frames_report.csv", "latest", "overlay-*", "report.html", "report.json", "tracks.png",
     "truth.tum", "vehicle.csv", "vehicle.log",
 )  # fmt: skip
@@ -125,7 +126,7 @@ def demo(
         onlookers = Onlookers(progress, partial(_tell_endpoint, console), port)
         record = fly(assets, script, kinds[fc], seed, out, onlookers)
     print_report(make_report(record, script, seed), out)
-    console.print(f"open: [green]{write_page(out).resolve()}", soft_wrap=True)
+    console.print("open:", file_link(write_page(out).resolve()), soft_wrap=True)
 
 
 @app.command()

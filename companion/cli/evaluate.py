@@ -20,6 +20,7 @@ from rich.table import Table
 from companion.errors import ConfigError, ReportError
 from companion.offline.plots import ErrorSeries, overlay_sheet, plot_errors, save_image
 from companion.reporting.report import write_page
+from companion.terminal.links import file_link
 from companion.trajectory import stamped, write_trajectory
 from companion.versions import versions
 from localizer.config import LocalizerConfig
@@ -129,7 +130,7 @@ def evaluate_command(
     finally:
         stack.close()
     page = write_page(report)
-    Console().print(f"report: [green]{escape(str(page))}[/]", soft_wrap=True, highlight=False)
+    Console().print("report:", file_link(page), soft_wrap=True, highlight=False)
 
 
 @contextmanager

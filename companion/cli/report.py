@@ -7,8 +7,8 @@ from typing import Annotated
 
 import typer
 from rich.console import Console
-from rich.markup import escape
 
+from companion.terminal.links import file_link
 from companion.terminal.steps import shown_steps
 
 
@@ -27,4 +27,4 @@ def report_command(
         from companion.reporting.report import write_page
 
         path = write_page(folder, out)
-    console.print(f"report: [green]{escape(str(path))}[/]", soft_wrap=True, highlight=False)
+    console.print("report:", file_link(path), soft_wrap=True, highlight=False)

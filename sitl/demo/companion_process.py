@@ -71,6 +71,7 @@ def write_deployment(
         "localizer": {"width": scenario.localizer_width, "calibration": _known_to(scenario)},
         "bridge": {
             "connection": vehicle.companion_endpoint,
+            "tlog": str((folder / "flight.tlog").resolve()),
             "mode": "inject",
             "injection": {
                 "message": scenario.injection,
