@@ -76,9 +76,14 @@ class Page(threading.Thread):
         origin: Any = f"http://{self._listen}"
         with connect(f"ws://{self._listen}/ws", origin=origin, max_size=None) as line:
             line.send(json.dumps({"frames": self._pictures, "map": False}))
+            shown = 0
             while not self._over.is_set():
                 try:
-                    self._take(line.recv(timeout=0.5))
+                    message = line.recv(timeout=0.5)
+                    self._take(message)
+                    if isinstance(message, bytes):
+                        shown += 1
+                        line.send(json.dumps({"frames": True, "map": False, "shown": shown}))
                 except TimeoutError:
                     continue
                 except ConnectionClosed:
@@ -330,8 +335,9 @@ def main() -> None:
         options.map, cache.manifest.geoid_separation_m, options.console_nice,
     )  # fmt: skip
     runs = []
-    for _ in range(options.rounds):
-        for condition in CONDITIONS:
+    for number in range(options.rounds):
+        # There and back: what warms up, or other work that begins, is nobody's in particular.
+        for condition in CONDITIONS if number % 2 == 0 else CONDITIONS[::-1]:
             home = Path(tempfile.mkdtemp(prefix="console-"))
             try:
                 runs.append(fly(work, condition, home))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import socket
 import sys
 import threading
 from importlib import import_module
@@ -71,14 +72,22 @@ def require_extra() -> None:
 
 
 def serve(site: Site) -> None:
-    """Serve until interrupted."""
+    """Serve until interrupted. The address is printed once it can be opened."""
     import uvicorn
 
     from companion.console.server import make_application
 
     config = site.config
-    Console().print(f"console: [green]{config.url}[/]", soft_wrap=True, highlight=False)
-    server = uvicorn.Server(
+
+    class Announced(uvicorn.Server):
+        """Says where it is when it is there."""
+
+        async def startup(self, sockets: list[socket.socket] | None = None) -> None:
+            await super().startup(sockets=sockets)
+            if self.started:
+                Console().print(f"console: [green]{config.url}[/]", soft_wrap=True, highlight=False)
+
+    server = Announced(
         uvicorn.Config(
             make_application(site), host=config.host, port=config.port, log_level="warning",
             ws="websockets-sansio", ws_max_size=4096, limit_concurrency=_MOST_CONNECTIONS,

@@ -34,6 +34,9 @@ _log = logging.getLogger(__name__)
 _STATIC = Path(__file__).parent / "static"
 _MOST_PAGES = 8
 _SLOWEST_S = 10.0  # a page that does not take a message for so long is left
+_UNDER_WAY = (
+    2  # pictures that a page has not yet said it showed: sockets would hold seconds of them
+)
 Answer = Callable[[Request], Awaitable[Response]]
 
 
@@ -71,7 +74,7 @@ class Pages:
         if len(self._open) >= _MOST_PAGES:
             await socket.close(1013, "too many pages are open")
             return
-        wishes = {"frames": False, "map": False}
+        wishes = {"frames": False, "map": False, "shown": 0}
         self._open[id(socket)] = wishes
         listener = asyncio.create_task(self._listen(socket, wishes))
         try:
@@ -89,13 +92,15 @@ class Pages:
         self, socket: WebSocket, wishes: dict[str, Any], listener: asyncio.Task[None]
     ) -> None:
         newest, states, frames, connected = self._source.newest, -1, -1, None
+        sent = 0
         while not listener.done():
             waiting = asyncio.create_task(self._source.changed())
             if newest.states != states or connected != self._source.is_connected:
                 states, connected = newest.states, self._source.is_connected
                 await _sent(socket.send_text(json.dumps(self._state_message(connected))))
-            if wishes["frames"] and newest.frame is not None and newest.frames != frames:
-                frames = newest.frames
+            fresh = newest.frame is not None and newest.frames != frames
+            if wishes["frames"] and fresh and sent - wishes["shown"] < _UNDER_WAY:
+                frames, sent = newest.frames, sent + 1
                 await _sent(socket.send_bytes(await self._picture(bool(wishes["map"]))))
             await asyncio.wait({waiting, listener}, return_when=asyncio.FIRST_COMPLETED)
             waiting.cancel()
@@ -122,16 +127,18 @@ class Pages:
             return self._made[1]
 
     async def _listen(self, socket: WebSocket, wishes: dict[str, Any]) -> None:
-        """What the page wants to see; anything else ends it."""
+        """What the page wants to see, and how many pictures it showed; anything else ends it."""
         while True:
             message = await socket.receive()
             if message["type"] != "websocket.receive":
                 return
             try:
                 value = json.loads(message.get("text") or "")
-                for name in wishes:
+                for name in ("frames", "map"):
                     wishes[name] = value.get(name) is True
-            except (ValueError, AttributeError, RecursionError):
+                shown = value.get("shown", 0)
+                wishes["shown"] = max(wishes["shown"], int(shown))
+            except (ValueError, TypeError, OverflowError, AttributeError, RecursionError):
                 return
             self._watch()
 

@@ -226,20 +226,21 @@ for (const [id, write] of [["check", false], ["write", true]]) {
 // --- the line to the server ----------------------------------------------------------------------
 
 let socket = null;
+let shown = 0; // pictures; the server holds back what would come too late
 function wish() {
   if (socket?.readyState !== WebSocket.OPEN) return;
   const narrow = matchMedia("(max-width: 800px)").matches;
   const frames = !document.hidden && (!narrow || ["map", "video"].includes(document.body.dataset.view));
-  socket.send(JSON.stringify({ frames, map: video.needsMap }));
+  socket.send(JSON.stringify({ frames, map: video.needsMap, shown }));
 }
 
 function connect() {
   socket = new WebSocket(`${location.protocol === "https:" ? "wss" : "ws"}://${location.host}/ws`);
   socket.binaryType = "arraybuffer";
-  socket.onopen = wish;
+  socket.onopen = () => { shown = 0; wish(); };
   socket.onclose = () => { page.connected = false; showState(); setTimeout(connect, 1000); };
   socket.onmessage = ({ data }) => {
-    if (typeof data !== "string") { video.show(data); return; }
+    if (typeof data !== "string") { video.show(data).finally(() => { shown += 1; wish(); }); return; }
     const message = JSON.parse(data);
     Object.assign(page, { state: message.state, hello: message.about, connected: message.connected });
     showState();

@@ -117,7 +117,7 @@ def test_images_that_cannot_be_used_are_named_and_counted_and_the_rest_is_locali
     cv2.imwrite(str(images / "000003.jpg"), np.zeros((240, 320, 3), np.uint8))
     arguments = (broken, "--map", assets.map_cache, "--report", tmp_path / "r")
     result = _run(*arguments, "--limit", 6)
-    assert "000000.jpg: missing or not an image" in result.output
+    assert "000000.jpg: not an image, or damaged" in result.output
     assert "000003.jpg: is 320x240" in result.output
     report = json.loads((tmp_path / "r" / "report.json").read_text())
     assert report["frames"] == 6

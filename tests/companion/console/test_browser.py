@@ -13,6 +13,7 @@ import yaml
 from companion.live.protocol import socket_path
 from localizer.map.cache.cache import TileCache
 from tests.companion.console.companion_flying import CAMERA, HEIGHT_M, Flight
+from tests.companion.console.record_of import write_record
 
 playwright = pytest.importorskip("playwright.sync_api")
 CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser")
@@ -28,9 +29,7 @@ SOFTWARE_GL = ("--no-sandbox", "--use-gl=angle", "--use-angle=swiftshader",
 def flight(small_assets, tmp_path_factory):
     """The flight, and the page's process with its address."""
     home = tmp_path_factory.mktemp("deployment")
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        listen = f"127.0.0.1:{probe.getsockname()[1]}"
+    listen = _free_address()
     record = home / "flights" / "flight"
     record.mkdir(parents=True)
     (record / "record.json").write_text("{}")
@@ -54,21 +53,53 @@ def flight(small_assets, tmp_path_factory):
         console.wait(20)
 
 
-@pytest.fixture
-def page(flight):
-    """The page, at a laptop's size; what it complained of and whom it asked stands in `seen`."""
+@pytest.fixture(scope="module")
+def chromium():
     with playwright.sync_playwright() as driver:
         browser = driver.chromium.launch(executable_path=CHROMIUM, args=list(SOFTWARE_GL))
-        page = browser.new_page(viewport={"width": 1280, "height": 800})
-        seen = SimpleNamespace(errors=[], hosts=set())
-        page.on("console", lambda m: m.type == "error" and seen.errors.append(m.text))
-        page.on("pageerror", lambda e: seen.errors.append(str(e)))
-        page.on("request", lambda r: "://" in r.url and seen.hosts.add(r.url.split("/")[2]))
-        page.set_default_timeout(60_000)
-        page.goto(flight.url)
-        _until(page, lambda: (page.evaluate("window.consoleFrames") or 0) > 2)
-        yield page, seen
+        yield browser
         browser.close()
+
+
+def _opened(chromium, url):
+    """A page at a laptop's size; what it complained of and whom it asked stands in `seen`."""
+    page = chromium.new_page(viewport={"width": 1280, "height": 800})
+    seen = SimpleNamespace(errors=[], hosts=set())
+    page.on("console", lambda m: m.type == "error" and seen.errors.append(m.text))
+    page.on("pageerror", lambda e: seen.errors.append(str(e)))
+    page.on("request", lambda r: "://" in r.url and seen.hosts.add(r.url.split("/")[2]))
+    page.set_default_timeout(60_000)
+    page.goto(url)
+    return page, seen
+
+
+@pytest.fixture
+def page(chromium, flight):
+    page, seen = _opened(chromium, flight.url)
+    _until(page, lambda: (page.evaluate("window.consoleFrames") or 0) > 2)
+    yield page, seen
+    page.close()
+
+
+@pytest.fixture
+def replay(chromium, small_assets, tmp_path):
+    """A record of 20 s over the map's origin, played by `companion replay --console`."""
+    record, listen = tmp_path / "flight", _free_address()
+    write_record(record, small_assets.map_cache)
+    command = [sys.executable, "-m", "companion", "replay", str(record), "--console", listen]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as process:
+        while "console:" not in process.stdout.readline():
+            pass
+        page, seen = _opened(chromium, f"http://{listen}/")
+        yield page, seen
+        page.close()
+        process.terminate()
+
+
+def _free_address():
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        return f"127.0.0.1:{probe.getsockname()[1]}"
 
 
 def _until(page, holds, seconds=60):
@@ -89,6 +120,59 @@ def test_it_shows_the_flight_and_asks_nobody_else(page, flight):
         assert wide <= size[0], "it must not have to be dragged sideways"
     assert seen.hosts == {flight.listen}
     assert seen.errors == []
+
+
+@pytest.mark.parametrize("size", [(1280, 800), (390, 844)], ids=["laptop", "phone"])
+def test_every_view_passes_axe_and_is_never_wider_than_the_screen(page, size):
+    """axe-core: contrast, names, keyboard, landmarks."""
+    axe = pytest.importorskip("axe_playwright_python.sync_playwright")
+    page, _ = page
+    page.set_viewport_size({"width": size[0], "height": size[1]})
+    for view in _views(page):
+        page.click(f"nav button[data-view={view}]")
+        found = axe.Axe().run(page)
+        assert found.violations_count == 0, f"{view}: {found.generate_report()}"
+        wide = page.evaluate("document.documentElement.scrollWidth")
+        assert wide <= size[0], f"{view} must be dragged sideways"
+
+
+def test_axe_would_have_seen_pale_text(page):
+    axe = pytest.importorskip("axe_playwright_python.sync_playwright")
+    page, _ = page
+    page.evaluate("document.getElementById('reason').style.color = '#3a8f5a'")
+    ids = [v["id"] for v in axe.Axe().run(page).response["violations"]]
+    assert "color-contrast" in ids
+
+
+def test_the_views_are_reached_by_keyboard(page):
+    page, _ = page
+    page.focus("nav button[data-view=video]")
+    page.keyboard.press("Tab")
+    page.keyboard.press("Enter")
+    assert page.evaluate("document.body.dataset.view") == "targets"
+
+
+def test_a_record_is_shown_with_the_maps_view_and_a_time_bar(replay):
+    page, seen = replay
+    _until(page, lambda: (page.evaluate("window.consoleFrames") or 0) > 0)
+    assert "kept picture" in page.inner_text("#video-age")
+    assert "doctor" not in _views(page)  # nothing to examine
+    page.click("#play")
+    page.evaluate(
+        "() => { const s = document.getElementById('seek'); s.value = 900;"
+        " s.dispatchEvent(new Event('input')); }"
+    )
+    _until(page, lambda: page.inner_text("#clock").startswith("18.0"))
+    assert page.inner_text("#word").lower() == "lost"  # as the record has it from 15 s on
+    page.click("nav button[data-view=video]")
+    page.select_option("#overlay", "checker")
+    assert page.is_hidden("#share-label")
+    assert seen.errors == []
+
+
+def _views(page):
+    shown = "buttons => buttons.filter(b => b.offsetParent).map(b => b.dataset.view)"
+    return page.eval_on_selector_all("nav button", shown)
 
 
 def test_a_click_is_a_target_at_the_place_that_was_clicked(page, flight):

@@ -11,7 +11,6 @@ import ssl
 import subprocess
 import sys
 import tarfile
-import time
 from xml.etree import ElementTree
 
 import pytest
@@ -368,9 +367,9 @@ def test_with_a_certificate_only_tls_is_spoken_and_only_with_the_token(deploymen
         line.close()
         return answer
 
-    with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.DEVNULL) as process:
+    with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE) as process:
         try:
-            _until_it_listens(listen, process)
+            assert b"console: https://" in process.stdout.readline()  # told once it is there
             assert ask("/api/records").status == 401
             answer = ask(f"/?token={TOKEN}")
             cookie = answer.headers["set-cookie"]
@@ -387,18 +386,6 @@ def test_with_a_certificate_only_tls_is_spoken_and_only_with_the_token(deploymen
 def _answer(line):
     line.request("GET", "/")
     return line.getresponse()
-
-
-def _until_it_listens(listen, process):
-    host, _, port = listen.rpartition(":")
-    while process.poll() is None:
-        try:
-            socket.create_connection((host, int(port)), 1.0).close()
-        except OSError:
-            time.sleep(0.1)
-        else:
-            return
-    raise AssertionError("the console ended")
 
 
 def test_settings_are_checked_before_they_are_written_and_the_old_ones_kept(site, deployment):
