@@ -59,7 +59,7 @@ def test_what_a_flight_writes_is_not_for_everybody(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     class Flying:
-        def __init__(self, _: object) -> None:
+        def __init__(self, *_: object, **__: object) -> None:
             (tmp_path / "record").mkdir()
 
         def run(self) -> None:
