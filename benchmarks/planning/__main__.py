@@ -36,7 +36,6 @@ SETS: dict[str, tuple[tuple[int, float, Character], ...]] = {
         (2_500_002, 400.0, "forest"),
         (2_500_003, 400.0, "mixed"),
         (2_500_004, 400.0, "dense"),
-        (2_500_000, 800.0, "mixed"),
     ),
 }
 

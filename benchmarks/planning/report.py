@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -17,7 +18,7 @@ from localizer.forecast.risk import RIGHT_M, RISK_LIMIT, WEIGHTS, Figures, failu
 from localizer.geometry.pose import Array
 
 FAILED_SHARE = 0.2  # of a leg's pictures, refused or more than 1 m off: beyond it the leg failed
-_BOOTSTRAPS = 2000
+_BOOTSTRAPS = 400
 _RIDGE = 0.005
 # A figure that is better must not tell of more risk: signs of the weights of `predictors`.
 _SIGNS = ((0, None), (None, 0), (None, 0), (None, 0), (0, None), (0, None))
@@ -34,11 +35,6 @@ def is_bad(leg: Flown) -> bool:
     return float(np.mean([failed(p) for p in leg.pictures])) > FAILED_SHARE
 
 
-def leg_risk(leg: Flown) -> float:
-    """As forecast, mean along the leg."""
-    return float(np.mean([failure_risk(f) for f in leg.figures]))
-
-
 def auc(score: Array, bad: NDArray[np.bool_]) -> float:
     """Area under the ROC curve: probability that a bad leg scores above a good one."""
     positives, negatives = int(bad.sum()), int((~bad).sum())
@@ -48,15 +44,55 @@ def auc(score: Array, bad: NDArray[np.bool_]) -> float:
     return float((ranks[bad].sum() - positives * (positives + 1) / 2) / (positives * negatives))
 
 
-def interval(legs: Sequence[Flown], figure: Callable[[Sequence[Flown]], float]) -> list[float]:
+@dataclass(frozen=True)
+class Scored:
+    """A leg as its figures count it. risk: forecast; bad: whether it failed; squares: of errors
+    over forecast variances of accepted pictures where vision is said to do; sigma_m, error_m: mean
+    of the leg's forecast sigmas and rms of its errors there, NaN where none is.
+    """
+
+    risk: float
+    bad: bool
+    squares: Array
+    sigma_m: float
+    error_m: float
+
+    @classmethod
+    def of(cls, leg: Flown, factor: float, weights: Sequence[float] = WEIGHTS) -> Scored:
+        """Under a factor of sigma and weights of the risk."""
+        told = [failure_risk(f, weights) for f in leg.figures]
+        each = PICTURES // FORECASTS
+        kept = [
+            (factor * leg.figures[k // each].sigma_m, p.error_m)
+            for k, p in enumerate(leg.pictures)
+            if p.accepted and told[k // each] <= RISK_LIMIT
+        ]
+        sigma, error = np.array(kept).reshape(-1, 2).T
+        some = len(kept) > 0
+        return cls(
+            float(np.mean(told)),
+            is_bad(leg),
+            error**2 / 3 / sigma**2,
+            float(sigma.mean()) if some else np.nan,
+            float(np.sqrt((error**2).mean())) if some else np.nan,
+        )
+
+
+def interval(legs: Sequence[Scored], figure: Callable[[Sequence[Scored]], float]) -> list[float]:
     """The figure with its 95 % bootstrap interval over legs: [value, low, high]."""
     rng = np.random.default_rng(0)
     drawn = [
         figure([legs[int(i)] for i in rng.integers(0, len(legs), len(legs))])
         for _ in range(_BOOTSTRAPS)
     ]
-    low, high = np.nanpercentile(drawn, (2.5, 97.5))
+    known = [x for x in drawn if np.isfinite(x)]
+    low, high = np.percentile(known, (2.5, 97.5)) if known else (np.nan, np.nan)
     return [float(figure(legs)), float(low), float(high)]
+
+
+def area(legs: Sequence[Scored]) -> float:
+    """AUC of the forecast risk."""
+    return auc(np.array([x.risk for x in legs]), np.array([x.bad for x in legs]))
 
 
 def paired(leg: Flown) -> list[tuple[Figures, Picture]]:
@@ -65,61 +101,42 @@ def paired(leg: Flown) -> list[tuple[Figures, Picture]]:
     return [(leg.figures[k // each], p) for k, p in enumerate(leg.pictures)]
 
 
-def sigma_ratio(legs: Sequence[Flown], factor: float, weights: Sequence[float] = WEIGHTS) -> float:
+def sigma_ratio(legs: Sequence[Scored]) -> float:
     """Measured error over forecast sigma, by the median of its square; 1 is calibrated."""
-    squares = _squared_ratios(legs, factor, weights)
+    squares = np.concatenate([x.squares for x in legs])
     return float(np.sqrt(np.median(squares) / _CHI2_MEDIAN)) if len(squares) else float("nan")
 
 
-def sigma_ratio_rms(legs: Sequence[Flown], factor: float) -> float:
+def sigma_ratio_rms(legs: Sequence[Scored]) -> float:
     """The same by the mean of its square: a few large errors count for much."""
-    squares = _squared_ratios(legs, factor, WEIGHTS)
+    squares = np.concatenate([x.squares for x in legs])
     return float(np.sqrt(squares.mean())) if len(squares) else float("nan")
 
 
-def _squared_ratios(legs: Sequence[Flown], factor: float, weights: Sequence[float]) -> Array:
-    """Of accepted pictures where the forecast says that vision will do, as a user is told sigma."""
-    return np.array(
-        [
-            p.error_m**2 / 3 / (factor * f.sigma_m) ** 2
-            for leg in legs
-            for f, p in paired(leg)
-            if p.accepted and failure_risk(f, weights) <= RISK_LIMIT
-        ]
-    )
-
-
-def rank_correlation(legs: Sequence[Flown]) -> float:
-    """Spearman, of a leg's forecast sigma and its rms error, on legs that would be flown."""
-    sigma, error = [], []
-    for leg in legs:
-        kept = [(f.sigma_m, p.error_m) for f, p in paired(leg) if p.accepted]
-        if kept and leg_risk(leg) <= RISK_LIMIT:
-            sigma.append(np.mean([s for s, _ in kept]))
-            error.append(np.sqrt(np.mean([e**2 for _, e in kept])))
-    return float(spearmanr(sigma, error).statistic) if len(sigma) > 2 else float("nan")
+def rank_correlation(legs: Sequence[Scored]) -> float:
+    """Spearman, of a leg's forecast sigma and its rms error, where vision is said to do."""
+    pairs = np.array([(x.sigma_m, x.error_m) for x in legs if np.isfinite(x.sigma_m)])
+    if len(pairs) < 3 or np.ptp(pairs, axis=0).min() == 0:
+        return float("nan")
+    return float(spearmanr(*pairs.T).statistic)
 
 
 def summary(legs: Sequence[Flown], factor: float, threshold: float) -> dict[str, Any]:
     """All figures of some legs."""
-    bad = np.array([is_bad(leg) for leg in legs])
-    risk = np.array([leg_risk(leg) for leg in legs])
+    scored = [Scored.of(leg, factor) for leg in legs]
+    bad, risk = np.array([x.bad for x in scored]), np.array([x.risk for x in scored])
     told = risk > threshold
-
-    def area(some: Sequence[Flown]) -> float:
-        return auc(np.array([leg_risk(x) for x in some]), np.array([is_bad(x) for x in some]))
-
     return {
         "legs": len(legs),
         "failed": int(bad.sum()),
-        "auc": interval(legs, area),
+        "auc": interval(scored, area),
         "told_of_failed": f"{int((told & bad).sum())} of {int(bad.sum())}",
         "false_alarms": f"{int((told & ~bad).sum())} of {int((~bad).sum())}",
         "brier": float(np.mean((risk - [np.mean([failed(p) for p in x.pictures]) for x in legs])
                                ** 2)),
-        "sigma_ratio_median": interval(legs, lambda s: sigma_ratio(s, factor)),
-        "sigma_ratio_rms": interval(legs, lambda s: sigma_ratio_rms(s, factor)),
-        "rank_correlation": interval(legs, rank_correlation),
+        "sigma_ratio_median": interval(scored, sigma_ratio),
+        "sigma_ratio_rms": interval(scored, sigma_ratio_rms),
+        "rank_correlation": interval(scored, rank_correlation),
         "risk_table": _reliability(risk, legs),
     }  # fmt: skip
 
@@ -161,4 +178,7 @@ def fitted(legs: Sequence[Flown]) -> dict[str, Any]:
     slopes = found[1:] / spread
     constant = float(found[0] - slopes @ mean)
     weights = [round(float(w), 3) for w in (constant, *slopes)]
-    return {"SIGMA_FACTOR": sigma_ratio(legs, 1.0, weights), "WEIGHTS": weights}
+    return {
+        "SIGMA_FACTOR": sigma_ratio([Scored.of(x, 1.0, weights) for x in legs]),
+        "WEIGHTS": weights,
+    }
