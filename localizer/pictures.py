@@ -18,7 +18,7 @@ def read_rgb(path: Path) -> Image:
     except (OSError, cv2.error) as error:
         raise SequenceError(f"{path}: cannot be read: {error}") from error
     if bgr is None:
-        raise SequenceError(f"{path}: missing or not an image")
+        raise SequenceError(f"{path}: not an image, or damaged")
     return np.asarray(cv2.cvtColor(bgr, cv2.COLOR_BGR2RGB), np.uint8)
 
 

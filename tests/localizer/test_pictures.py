@@ -25,5 +25,5 @@ def test_what_is_no_image_is_named(tmp_path):
     with pytest.raises(SequenceError, match=r"a\.jpg"):
         read_rgb(path)
     path.write_bytes(b"no image")
-    with pytest.raises(SequenceError, match=r"a\.jpg: missing or not an image"):
+    with pytest.raises(SequenceError, match=r"a\.jpg: not an image"):
         read_rgb(path)
