@@ -1,9 +1,10 @@
 """Pictures of the console for the docs, one a size of screen.
 
-    python -m benchmarks.screens URL [--out docs/img] [--wait 15]
+    python -m benchmarks.screens URL [--report report/report.html] [--out docs/img] [--wait 15]
 
-Needs a console that shows a flight (`make demo` prints its address), Chromium and playwright
-(the extra `dev`). --wait: seconds for the map's tiles.
+Needs a console that shows a flight or a record (`make demo` and `companion replay --console` print
+its address), Chromium and playwright (the extra `dev`). --wait: seconds for the map's tiles;
+--report: a report, too.
 """
 
 from __future__ import annotations
@@ -11,7 +12,7 @@ from __future__ import annotations
 import shutil
 from pathlib import Path
 
-from benchmarks.common.arguments import Parser, number
+from benchmarks.common.arguments import Parser, existing, number
 from benchmarks.common.named_errors import named_errors
 from companion.errors import ReportError
 
@@ -20,8 +21,8 @@ _GL = ["--no-sandbox", "--use-gl=angle", "--use-angle=swiftshader", "--enable-un
 _PATIENCE_MS = 120_000
 
 
-def take(url: str, out: Path, wait_s: float) -> None:
-    """JPEGs of the page at `url`. ReportError where it or the browser cannot be had."""
+def take(url: str, out: Path, wait_s: float, report: Path | None = None) -> None:
+    """JPEGs of the page and of the report. ReportError where they or the browser cannot be had."""
     try:
         from playwright.sync_api import Error, sync_playwright
     except ModuleNotFoundError as error:
@@ -39,6 +40,11 @@ def take(url: str, out: Path, wait_s: float) -> None:
                 picture = out / f"{name}.jpg"
                 page.screenshot(path=picture, type="jpeg", quality=70, timeout=_PATIENCE_MS)
                 page.close()
+            if report is not None:
+                width, height = _SIZES["console"]
+                page = browser.new_page(viewport={"width": width, "height": 2 * height})
+                page.goto(report.resolve().as_uri())
+                page.screenshot(path=out / "report.jpg", type="jpeg", quality=60)
             browser.close()
     except Error as error:
         raise ReportError(f"{url}: no pictures of it: {error.message.splitlines()[0]}") from error
@@ -50,8 +56,9 @@ def main() -> None:
     parser.add_argument("url", help="of the console")
     parser.add_argument("--out", type=Path, default=Path("docs/img"), help="folder")
     parser.add_argument("--wait", type=number(0.0, 600.0), default=15.0, help="seconds")
+    parser.add_argument("--report", type=existing, help="report.html of a flight")
     options = parser.parse_args()
-    take(options.url, options.out, options.wait)
+    take(options.url, options.out, options.wait, options.report)
 
 
 if __name__ == "__main__":

@@ -5,7 +5,7 @@ import { MapView } from "./map.js";
 import { VideoView } from "./video.js";
 
 const $ = (id) => document.getElementById(id);
-const page = { about: null, state: null, connected: false };
+const page = { about: null, state: null, connected: false, earlier: [] };
 
 export async function ask(path, body) {
   const options = body === undefined ? {} : {
@@ -246,7 +246,7 @@ function connect() {
     showState();
     if (!message.state) return;
     showTargets(message.state.targets ?? []);
-    addEvents(message.state.events, message.state);
+    addEvents([...page.earlier.splice(0), ...(message.state.events ?? [])], message.state);
     map?.update(message.state);
     if (message.sample) { plots.add(message.sample); map?.addSample(message.sample); }
     if (page.about?.replay) showTime(message.state.replay);
@@ -283,6 +283,7 @@ let map = null;
 
 async function showHistory() {
   const history = await ask("/api/history");
+  page.earlier = history.events ?? [];
   plots.clear(); map?.clear();
   (history.samples ?? []).forEach((sample) => { plots.add(sample, false); map?.addSample(sample, false); });
   plots.draw(); map?.draw();
