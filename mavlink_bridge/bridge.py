@@ -9,6 +9,7 @@ from typing import Any
 
 from mavlink_bridge import quaternion as quat
 from mavlink_bridge.camera.cursor_on_target import CursorOnTarget
+from mavlink_bridge.camera.look_at import LookAt
 from mavlink_bridge.components import COMMANDS_IN, Components
 from mavlink_bridge.config import BridgeConfig, SigningConfig
 from mavlink_bridge.errors import BridgeStateError
@@ -105,6 +106,7 @@ class Bridge:
             on_hint,
             VehicleWatch(self.say),
             InjectionGate(config.rc, teller.notice) if config.mode == "rc" else None,
+            LookAt(config, geoid_separation_m, self.say),
         )
         self._fc = FlightControllerEnd(shared)
         make = _LinkMaker(config, self._recorder, opener)
@@ -168,12 +170,14 @@ class Bridge:
     def report(self, target: TargetReport) -> None:
         """Report a target to the ground; never blocks."""
         self._to_ground(target)
+        self._shared.look.report(target)
         if self._cot is not None:
             self._cot.send(target)
 
     def forget(self, target_id: int) -> None:
         """Tell the ground of that target no more; never blocks."""
         self._to_ground(TargetEnd(target_id))
+        self._shared.look.forget(target_id)
 
     def track(self, request: TrackRequest) -> None:
         """Take a wish as if a ground station had said it; a target gets a number among theirs."""

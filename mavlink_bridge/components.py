@@ -9,6 +9,7 @@ from typing import Any
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from mavlink_bridge.camera.component import TRACKING, CameraComponent
+from mavlink_bridge.camera.look_at import LOOKS
 from mavlink_bridge.injection.rc_gate import COMMANDS
 from mavlink_bridge.link.link import Link
 from mavlink_bridge.messages import (
@@ -36,7 +37,7 @@ SYSTEM_STATUS = {
 
 
 # What changes what the companion does; a question (camera information) anybody may ask.
-_ORDERS = frozenset((*COMMANDS.values(), *TRACKING, PLACE_HINT))
+_ORDERS = frozenset((*COMMANDS.values(), *TRACKING, *LOOKS, PLACE_HINT))
 
 
 def _is_order(command: int) -> bool:
@@ -61,6 +62,7 @@ class Components:
             shared.target_numbers,
             ground_link=ground,
             utc=shared.utc,
+            look=shared.look,
         )
         self._next_heartbeat_ns = 0
         # Where one link is signed, an order over another that is not would go round the signature.

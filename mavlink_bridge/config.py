@@ -260,6 +260,10 @@ class BridgeConfig(_Model):
     localizer_component: int = Field(default=197, ge=2, le=255)  # 1 is the autopilot
     companion_component: int = Field(default=191, ge=2, le=255)
     camera_component: int = Field(default=100, ge=2, le=255)
+    look_at: bool = Field(
+        default=False,
+        description="a ground station may turn the gimbal to a place or target by the camera",
+    )
     named_values: bool = Field(
         default=False,
         description="NAMED_VALUE_FLOAT VPS_* at 1 Hz, to plot and to watch",

@@ -8,6 +8,7 @@ from typing import Any
 
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
+from mavlink_bridge.camera.look_at import LOOKS
 from mavlink_bridge.components import COMMANDS_IN, Components
 from mavlink_bridge.config import Mode
 from mavlink_bridge.injection.fix_sender import FixSender
@@ -154,6 +155,8 @@ class FlightControllerEnd:
             self.counters["commands_refused"] += 1
         if message.command == mavlink.MAV_CMD_SET_EKF_SOURCE_SET:
             self.sources.acknowledged(accepted(message))
+        elif message.command in LOOKS:
+            self._shared.look.answered(message.result)
 
     def _rebooted(self) -> None:
         self.counters["reboots"] += 1
@@ -188,6 +191,9 @@ class FlightControllerEnd:
             self.requests.tick(link, state, now_ns)
             self.time_sync.tick(link, now_ns)
             self.origin.tick(link, now_ns, may_set=self.injecting)
+            look = self._shared.look.due(now_ns)
+            if look is not None:
+                self._commander.send_int(link, look[0], look[1], look[2:])
             if config.ground_connection is None and config.camera.announce:
                 self.components.serve_camera(link, state, now_ns)
         return due_ns

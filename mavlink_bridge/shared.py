@@ -6,6 +6,7 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from itertools import count
 
+from mavlink_bridge.camera.look_at import LookAt
 from mavlink_bridge.config import BridgeConfig, Mode
 from mavlink_bridge.injection.rc_gate import InjectionGate
 from mavlink_bridge.link.clock import SteadyUtc
@@ -32,6 +33,7 @@ class Shared:
     on_hint: Callable[[PlaceHint], bool] | None
     watch: VehicleWatch
     gate: InjectionGate | None
+    look: LookAt
     target_numbers: Iterator[int] = field(default_factory=lambda: count(1))
     """Of clicked targets, over all links; none is given twice."""
 

@@ -13,6 +13,7 @@ from typing import Any
 
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
+from mavlink_bridge.camera.look_at import LOOKS, LookAt
 from mavlink_bridge.camera.messages import (
     camera_fov_status,
     camera_information,
@@ -76,9 +77,10 @@ class CameraComponent:
         *,
         ground_link: bool,
         utc: SteadyUtc | None = None,
+        look: LookAt | None = None,
     ) -> None:
         self._camera = config.camera
-        self._utc = utc or SteadyUtc()
+        self._utc, self._look = utc or SteadyUtc(), look
         self._confirmed_m = config.targets.confirmed_sigma_m if config.targets.captured else None
         self._captured: dict[int, _Mark] = {}
         self._component = config.camera_component
@@ -191,6 +193,8 @@ class CameraComponent:
         command = message.command
         if command in TRACKING:
             return self._track(message, time_ns)
+        if command in LOOKS and self._look is not None:
+            return self._look.command(message)
         if command == mavlink.MAV_CMD_REQUEST_MESSAGE:
             return self._request(message.param1, uptime_ms, send)
         if command in _OLD_REQUESTS:

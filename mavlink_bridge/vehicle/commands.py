@@ -25,6 +25,13 @@ class Commander:
         )
         link.send(message, self._component)
 
+    def send_int(self, link: Link, command: int, frame: int, place: tuple[int, int, float]) -> None:
+        """One command with a place: COMMAND_INT (75), latitude and longitude in 1e-7 degrees."""
+        message = mavlink.MAVLink_command_int_message(
+            link.system_id, mavlink.MAV_COMP_ID_AUTOPILOT1, frame, command, 0, 0, 0, 0, 0, 0, *place
+        )
+        link.send(message, self._component)
+
     def is_ours(self, link: Link, ack: Any) -> bool:
         """Whether a COMMAND_ACK (77) answers us, and not somebody else's command.
 

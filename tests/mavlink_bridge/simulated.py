@@ -13,6 +13,7 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from mavlink_bridge import BridgeConfig, HealthLevel, VisionFix
 from mavlink_bridge import quaternion as quat
+from mavlink_bridge.camera.look_at import LookAt
 from mavlink_bridge.config import InjectionConfig, OriginConfig
 from mavlink_bridge.flight_controller import FC_WANTED, FlightControllerEnd
 from mavlink_bridge.injection.rc_gate import InjectionGate
@@ -89,6 +90,7 @@ class Flight:
             None,
             VehicleWatch(say),
             gate,
+            LookAt(config, GEOID, say),
         )
         self.shared = shared
         self.end = FlightControllerEnd(shared)

@@ -21,6 +21,7 @@ from mavlink_bridge.camera.cursor_on_target import (
     cursor_on_target,
     sensor_angles,
 )
+from mavlink_bridge.camera.look_at import LOOKS
 from mavlink_bridge.camera.messages import camera_information, video_stream_information
 from mavlink_bridge.config import CameraConfig, TargetsConfig
 from mavlink_bridge.link.clock import SteadyUtc
@@ -236,7 +237,7 @@ def test_the_buttons_for_qgroundcontrol_are_commands_that_our_components_take():
     config = BridgeConfig()
     ours = {
         config.localizer_component: {mavlink.MAV_CMD_USER_1},
-        config.camera_component: {mavlink.MAV_CMD_CAMERA_STOP_TRACKING},
+        config.camera_component: {mavlink.MAV_CMD_CAMERA_STOP_TRACKING, *LOOKS},
     }
     for action in document["actions"]:
         assert action["mavCmd"] in ours[action["compId"]]

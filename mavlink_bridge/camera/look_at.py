@@ -1,0 +1,176 @@
+"""Look-at: the gimbal turned to a place or a target by the autopilot, which holds it there.
+
+MAV_CMD_DO_SET_ROI_LOCATION (195) of the gimbal protocol v2, sent on to the autopilot as its gimbal
+manager; https://mavlink.io/en/services/gimbal_v2.html. ArduCopter turns the whole aircraft where
+the mount has no yaw of its own. Off unless `look_at` allows it.
+"""
+
+from __future__ import annotations
+
+import math
+import threading
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+from pymavlink.dialects.v20 import ardupilotmega as mavlink
+
+from mavlink_bridge.config import BridgeConfig
+from mavlink_bridge.messages import TargetReport
+from mavlink_bridge.vehicle.origin import north_east
+
+LOOK_AT_PLACE = mavlink.MAV_CMD_DO_SET_ROI_LOCATION
+LOOK_AHEAD = mavlink.MAV_CMD_DO_SET_ROI_NONE
+LOOK_AT_TARGET = mavlink.MAV_CMD_USER_4  # ours: param1 is the target's number, 0 ends it
+LOOKS = frozenset((LOOK_AT_PLACE, LOOK_AHEAD, LOOK_AT_TARGET))
+_FRAMES = (
+    mavlink.MAV_FRAME_GLOBAL,
+    mavlink.MAV_FRAME_GLOBAL_INT,
+    mavlink.MAV_FRAME_GLOBAL_RELATIVE_ALT,
+    mavlink.MAV_FRAME_GLOBAL_RELATIVE_ALT_INT,
+)
+_AGAIN_NS = 1_000_000_000  # a target that moves is followed so often
+_MOVED_M = 1.0
+_PATIENCE_NS = 3_000_000_000  # for the autopilot's answer
+_WARNING, _INFO = 4, 6  # MAV_SEVERITY
+
+
+@dataclass(frozen=True)
+class _Place:
+    """degrees, metres above what the frame says."""
+
+    latitude_deg: float
+    longitude_deg: float
+    altitude_m: float
+    frame: int = int(mavlink.MAV_FRAME_GLOBAL)
+
+
+class LookAt:
+    """What the gimbal is to look at. Safe to use from any thread; `due` and `answered` are called
+    in the flight controller's.
+
+    say: tells the operator (MAV_SEVERITY, text).
+    """
+
+    def __init__(
+        self, config: BridgeConfig, geoid_separation_m: float, say: Callable[[int, str], None]
+    ) -> None:
+        self._allowed = config.look_at
+        self._has_gimbal = config.camera.mount == "gimbal"
+        self._geoid_m = geoid_separation_m
+        self._say = say
+        self._targets: dict[int, TargetReport] = {}
+        self._number = 0
+        self._wanted: _Place | None = None
+        self._ahead = False
+        self._sent: _Place | None = None
+        self._sent_ns = 0
+        self._asked_ns: int | None = None
+        self._lock = threading.Lock()
+
+    def report(self, target: TargetReport) -> None:
+        """Where a target is now."""
+        with self._lock:
+            self._targets[target.target_id] = target
+            if self._number and target.target_id == self._number:
+                self._wanted = self._place_of(target)
+
+    def forget(self, number: int) -> None:
+        """A target ended; the gimbal stays where it was last seen, and the operator is told."""
+        with self._lock:
+            self._targets.pop(number, None)
+            if self._number != number:
+                return
+            self._number, self._wanted = 0, None
+        self._say(_INFO, f"PiLoT: target {number} ended, the gimbal stays")
+
+    def command(self, message: Any) -> int:
+        """A COMMAND_LONG or COMMAND_INT of `LOOKS`: its MAV_RESULT. A refusal is told, too."""
+        why = self._obey(message)
+        if not why:
+            return int(mavlink.MAV_RESULT_ACCEPTED)
+        self._say(_WARNING, f"PiLoT: look-at refused: {why}")
+        return int(mavlink.MAV_RESULT_DENIED)
+
+    def due(self, now_ns: int) -> tuple[int, int, int, int, float] | None:
+        """The COMMAND_INT that the autopilot is to get now: command, frame, x, y, z."""
+        with self._lock:
+            if self._asked_ns is not None and now_ns - self._asked_ns > _PATIENCE_NS:
+                self._asked_ns = None
+                self._say(_WARNING, "PiLoT: the autopilot does not answer look-at")
+            if self._ahead:
+                self._ahead, self._sent = False, None
+                self._asked_ns = now_ns
+                return (LOOK_AHEAD, int(mavlink.MAV_FRAME_GLOBAL), 0, 0, 0.0)
+            wanted = self._wanted
+            if wanted is None or not self._is_news(wanted, now_ns):
+                return None
+            self._sent, self._sent_ns = wanted, now_ns
+            self._asked_ns = now_ns if self._asked_ns is None else self._asked_ns
+            x, y = round(wanted.latitude_deg * 1e7), round(wanted.longitude_deg * 1e7)
+            return (LOOK_AT_PLACE, wanted.frame, x, y, wanted.altitude_m)
+
+    def answered(self, result: int) -> None:
+        """The autopilot's answer to a look-at: what it refuses is told and not tried again."""
+        with self._lock:
+            self._asked_ns = None
+            if result in (mavlink.MAV_RESULT_ACCEPTED, mavlink.MAV_RESULT_IN_PROGRESS):
+                return
+            self._wanted, self._number = None, 0
+        name = mavlink.enums["MAV_RESULT"].get(result)
+        reason = "unknown" if name is None else name.name.removeprefix("MAV_RESULT_").lower()
+        self._say(_WARNING, f"PiLoT: the autopilot refused look-at: {reason}")
+
+    def _obey(self, message: Any) -> str:
+        """Why not; empty if it is done."""
+        if not self._allowed:
+            return "bridge.look_at is off"
+        if not self._has_gimbal:
+            return "the camera is fixed"
+        with self._lock:
+            if message.command == LOOK_AT_PLACE:
+                return self._look(0, _place(message), "no place on Earth")
+            number = 0
+            if message.command == LOOK_AT_TARGET:
+                number = int(message.param1) if math.isfinite(message.param1) else -1
+            if number == 0:
+                self._number, self._wanted, self._ahead = 0, None, True
+                return ""
+            target = self._targets.get(number)
+            place = None if target is None else self._place_of(target)
+            return self._look(number, place, f"no target {number}")
+
+    def _look(self, number: int, place: _Place | None, why_not: str) -> str:
+        if place is None:
+            return why_not
+        self._number, self._wanted, self._sent = number, place, None
+        return ""
+
+    def _place_of(self, target: TargetReport) -> _Place:
+        altitude_m = target.height_m - self._geoid_m
+        return _Place(target.latitude_deg, target.longitude_deg, altitude_m)
+
+    def _is_news(self, wanted: _Place, now_ns: int) -> bool:
+        sent = self._sent
+        if sent is None:
+            return True
+        if wanted == sent or now_ns - self._sent_ns < _AGAIN_NS:
+            return False
+        north, east = north_east(
+            sent.latitude_deg, sent.longitude_deg, wanted.latitude_deg, wanted.longitude_deg
+        )
+        return math.hypot(north, east, wanted.altitude_m - sent.altitude_m) > _MOVED_M
+
+
+def _place(message: Any) -> _Place | None:
+    """Of a MAV_CMD_DO_SET_ROI_LOCATION; None where it names none."""
+    if message.get_type() == "COMMAND_INT":
+        latitude, longitude, altitude = message.x * 1e-7, message.y * 1e-7, message.z
+        frame = int(message.frame)
+    else:
+        latitude, longitude, altitude = message.param5, message.param6, message.param7
+        frame = int(mavlink.MAV_FRAME_GLOBAL)
+    is_place = abs(latitude) <= 90.0 and abs(longitude) <= 180.0 and abs(altitude) < 2e4
+    if frame not in _FRAMES or not is_place or (latitude == 0.0 and longitude == 0.0):
+        return None
+    return _Place(latitude, longitude, altitude, frame)
