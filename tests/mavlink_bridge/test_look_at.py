@@ -111,6 +111,32 @@ def test_an_autopilot_that_refuses_or_does_not_answer_is_told():
     ]
 
 
+def test_a_stations_command_reaches_the_autopilot_through_the_bridge(autopilot):
+    config = BridgeConfig(connection="udpin:127.0.0.1:0", look_at=True)
+    with Bridge(config, 47.0) as bridge:
+        assert sleep_until(lambda: bridge.port is not None, 30.0)
+        autopilot.peer = ("127.0.0.1", bridge.port)
+        assert sleep_until(lambda: bridge.state().connected, 30.0)
+        bridge.report(_target(7, time_ns=time.monotonic_ns()))
+        for system, number in ((254, 7.0), (255, 9.0), (255, 7.0)):
+            command = mavlink.MAVLink_command_long_message(
+                1, 100, LOOK_AT_TARGET, 0, number, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
+            )
+            autopilot.send(command, 190, system)
+        (told,) = autopilot.wait_for("COMMAND_INT")
+        assert (told.command, told.target_component, told.frame) == (LOOK_AT_PLACE, 1, 0)
+        assert (told.x, told.y, told.z) == (474000000, 85500000, 500.0)
+        answers = [m.result for m in autopilot.of("COMMAND_ACK") if m.command == LOOK_AT_TARGET]
+        assert answers == [DENIED, DENIED, OK]  # not in ground_systems; nobody knows it
+        refused = mavlink.MAVLink_command_ack_message(
+            LOOK_AT_PLACE, mavlink.MAV_RESULT_FAILED, 0, 0, 1, 191
+        )
+        autopilot.send(refused)
+        text = "PiLoT: the autopilot refused look-at: failed"
+        assert sleep_until(lambda: text in bridge.texts(), 30.0)
+
+
+@pytest.mark.long
 def test_the_gimbal_turns_to_a_target_through_the_autopilot_and_stays_there():
     """The whole way on the embedded vehicle: station, routing, camera component, autopilot, mount.
 
@@ -119,14 +145,13 @@ def test_the_gimbal_turns_to_a_target_through_the_autopilot_and_stays_there():
     with EmbeddedSitl(HOME, parameters=GIMBAL) as vehicle:
         config = BridgeConfig(connection=vehicle.companion_endpoint, look_at=True)
         station = mavutil.mavlink_connection(vehicle.spare_endpoint, source_system=255)
+        west = 8.545594 - 100.0 / (111_320 * math.cos(math.radians(HOME.latitude_deg)))
         with Bridge(config, 47.0) as bridge:
-            west = 8.545594 - 100.0 / (111_320 * math.cos(math.radians(HOME.latitude_deg)))
 
             def asked():
                 station.mav.heartbeat_send(6, 8, 0, 0, 0)
-                bridge.report(
-                    TargetReport(time.monotonic_ns(), 47.397742, west, 488.0 + 47.0, target_id=7)
-                )
+                now_ns = time.monotonic_ns()
+                bridge.report(TargetReport(now_ns, 47.397742, west, 535.0, target_id=7))
                 station.mav.command_long_send(1, 100, LOOK_AT_TARGET, 0, 7, 0, 0, 0, 0, 0, 0)
                 ack = station.recv_match(type="COMMAND_ACK", blocking=True, timeout=1.0)
                 return ack is not None and ack.command == LOOK_AT_TARGET and ack.result == OK
@@ -141,5 +166,5 @@ def test_the_gimbal_turns_to_a_target_through_the_autopilot_and_stays_there():
             assert sleep_until(lambda: bridge.state().connected, 30.0)
             assert not looks_west()
             # It refuses until it knows where it is; the operator asks again.
-            assert sleep_until(lambda: asked() and looks_west(), 60.0, step_s=0.5), bridge.texts()
+            assert sleep_until(lambda: asked() and looks_west(), 120.0, step_s=0.5), bridge.texts()
         station.close()
