@@ -8,7 +8,7 @@ import math
 import time
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import cv2
 import numpy as np
@@ -21,11 +21,13 @@ from localizer.map.cache.cache import TileCache
 from localizer.map.cache.stream import TileStreamer
 from localizer.registration.jngo import JNGO
 from localizer.registration.result import Registration
+from localizer.relocalization.align import FrameShift
 from localizer.relocalization.correlate import LevelCorrelator
 from localizer.relocalization.overview import MapOverview, Progress, open_overview
 from localizer.relocalization.search import View, search
 from localizer.relocalization.types import PlaceCandidate, PlaceQuery, Relocalization
-from localizer.relocalization.verify import Verifier
+from localizer.relocalization.verdict import NEARLY, Judged, answer, is_decisive
+from localizer.relocalization.verify import Aligned, Verifier
 from localizer.render.base import MapRenderer
 from localizer.render.numba_raster import NumbaRenderer
 from localizer.tracking.pipeline import Undistorter, working_camera
@@ -33,20 +35,10 @@ from localizer.types import FeaturePyramid, PosePrior
 
 _SEARCH_WIDTH = 480  # px of the frame that the ground is rectified from
 _BLUR_PX = 0.6  # the map is sampled more coarsely than the frame
+# Grey levels (sigma) without fine noise. A covered lens has 0.5 and kept a busy computer searching
+# until long after the cover was gone; the dullest of 190 views at night, dusk and fog has 1.8.
+_COARSE_PX, _LEAST_CONTRAST = 2.0, 1.0
 _LEAST_JUDGED = 3  # candidates
-_NEARLY = 0.8  # of the winner's correlation: a place that has to be looked at, too
-_SAME_PLACE_M = 5.0  # answers that are closer are one
-
-
-@dataclass(frozen=True)
-class Judged:
-    """A candidate after registration. prior: what the next pass begins from."""
-
-    candidate: PlaceCandidate
-    rank: int
-    result: Registration
-    prior: PosePrior
-    credible: bool
 
 
 class Relocalizer:
@@ -103,14 +95,21 @@ class Relocalizer:
         began = time.perf_counter()
         judged = self.verify(query, candidates, should_stop) if candidates else []
         stages = {"confirm": time.perf_counter() - began}
-        return self._answer(query, candidates, judged, stages) if judged else None
+        return answer(query, candidates, judged, self._config, stages) if judged else None
 
     def search(
         self, query: PlaceQuery, should_stop: Callable[[], bool] = lambda: False
     ) -> list[PlaceCandidate]:
-        """The places that look most like the frame from above, best first; none if stopped."""
+        """The places that look most like the frame from above, best first; none if stopped, or
+        where the frame shows nothing.
+        """
         camera = working_camera(query.frame.camera, min(_SEARCH_WIDTH, query.frame.camera.width))
         image = cv2.GaussianBlur(self._undistorted(query, camera), (0, 0), _BLUR_PX)
+        if (
+            float(cv2.GaussianBlur(image, (0, 0), _COARSE_PX).std(axis=(0, 1)).max())
+            < _LEAST_CONTRAST
+        ):
+            return []
         view = View(image.astype(np.uint8, copy=False), camera)
         threads = self._config.threads
         pool = ThreadPoolExecutor(threads, "place-search") if threads > 1 else None
@@ -133,18 +132,11 @@ class Relocalizer:
         """The candidates registered: all once, those that can win to the end; best first."""
         camera = working_camera(query.frame.camera, self._width)
         features = self._detail.extract(self._undistorted(query, camera))
-        judged: list[Judged] = []
-        for rank, candidate in enumerate(candidates[: self._config.candidates]):
-            if should_stop():
-                return []
-            prior = self._verifier.prior(candidate, query)
-            judged.append(self._judge(features, camera, query, candidate, rank, prior))
-            if self._is_settled(judged, candidates[rank + 1 :]):
-                break
-        order = sorted(judged, key=lambda j: -j.result.quality)
+        first = self._first_pass(features, camera, query, candidates, should_stop)
+        order = sorted(first, key=lambda j: -j.result.quality)
         final = []
-        for k, first in enumerate(order):
-            j = first
+        for k, begun in enumerate(order):
+            j = begun
             hopeless = k > 0 and j.result.quality < 0.5 * order[0].result.quality
             hopeless = hopeless or k >= self._config.finalists
             for _ in range(0 if hopeless else self._config.passes - 1):
@@ -153,80 +145,65 @@ class Relocalizer:
                 if not math.isfinite(j.result.score):
                     break
                 prior = self._verifier.again(j.prior, j.result)
-                j = self._judge(features, camera, query, j.candidate, j.rank, prior)
+                result = self._verifier.register(features, camera, prior, query)
+                j = self._judged(result, query, j.candidate, j.rank, prior)
             final.append(j)
         return sorted(final, key=lambda j: (-int(j.credible), -j.result.quality))
+
+    def _first_pass(
+        self,
+        features: FeaturePyramid,
+        camera: Camera,
+        query: PlaceQuery,
+        candidates: list[PlaceCandidate],
+        should_stop: Callable[[], bool],
+    ) -> list[Judged]:
+        """Each aligned and registered; where none convinces, the best aligned from all sides. None
+        if stopped.
+        """
+        frame = FrameShift(features.levels)
+        judged: list[Judged] = []
+        places: list[Aligned] = []
+        for rank, candidate in enumerate(candidates[: self._config.candidates]):
+            if should_stop():
+                return []
+            place = self._verifier.aligned(frame, camera, self._verifier.prior(candidate, query))
+            result = self._verifier.register(features, camera, place.prior, query, place.reference)
+            judged.append(self._judged(result, query, candidate, rank, place.prior))
+            places.append(replace(place, reference=None))  # of so many, they are large
+            if self._is_settled(judged, candidates[rank + 1 :]):
+                break
+        if any(j.credible for j in judged):
+            return judged
+        best = sorted(range(len(judged)), key=lambda k: -places[k].score)
+        for k in best[: self._config.finalists]:
+            if should_stop():
+                return []
+            result = self._verifier.around(features, camera, places[k], query)
+            if result.quality > judged[k].result.quality:
+                candidate = judged[k].candidate
+                judged[k] = self._judged(result, query, candidate, k, places[k].prior)
+        return judged
 
     def _is_settled(self, judged: list[Judged], left: list[PlaceCandidate]) -> bool:
         """Whether the rest need not be looked at: one of the first few is decisive, and nowhere
         else does the ground look nearly as much like the frame, as among equal roofs it does.
         """
-        decisive = [j.candidate.score for j in judged if self._is_decisive(j)]
+        decisive = [j.candidate.score for j in judged if is_decisive(j, self._config)]
         if len(judged) < _LEAST_JUDGED or not decisive:
             return False
-        return all(c.score < _NEARLY * max(decisive) for c in left)
+        return all(c.score < NEARLY * max(decisive) for c in left)
 
-    def _is_decisive(self, judged: Judged) -> bool:
-        """Whether no other candidate can be better: all but a few parts of the image agree."""
-        votes = judged.result.agreement
-        least = self._config.decisive_agreement
-        return judged.credible and votes is not None and votes.share >= least
-
-    def _judge(
+    def _judged(
         self,
-        features: FeaturePyramid,
-        camera: Camera,
+        result: Registration,
         query: PlaceQuery,
         candidate: PlaceCandidate,
         rank: int,
         prior: PosePrior,
     ) -> Judged:
-        result = self._verifier.register(features, camera, prior, query)
         credible = self._verifier.is_credible(result, candidate, query)
         return Judged(candidate, rank, result, prior, credible)
-
-    def _answer(
-        self,
-        query: PlaceQuery,
-        candidates: list[PlaceCandidate],
-        judged: list[Judged],
-        stages: dict[str, float],
-    ) -> Relocalization | None:
-        best = judged[0]
-        place = best.result.world_from_camera.translation
-        rivals = [
-            j.result.quality
-            for j in judged[1:]
-            if j.credible
-            and np.linalg.norm(j.result.world_from_camera.translation - place) > _SAME_PLACE_M
-        ]
-        rival = max(rivals, default=0.0)
-        if not best.credible or best.result.quality < rival + self._config.margin:
-            return None
-        # Candidates that registration brings to one place are one: its score is the best of theirs.
-        same = {
-            j.rank
-            for j in judged
-            if np.linalg.norm(j.result.world_from_camera.translation - place) <= _SAME_PLACE_M
-        }
-        own = max(candidates[rank].score for rank in same)
-        runner_up = max((c.score for k, c in enumerate(candidates) if k not in same), default=0.0)
-        # Where other ground looks nearly as much like the frame, the right place may be none of the
-        # candidates: half-agreeing parts are what the next of many equal roofs gives.
-        if runner_up >= _NEARLY * own and not self._is_decisive(best):
-            return None
-        return Relocalization(
-            best.result.world_from_camera,
-            best.result.covariance,
-            query.frame.exposure_time_ns,
-            best.result.quality,
-            best.result.overlap,
-            own,
-            runner_up,
-            best.rank,
-            rival,
-            stages,
-        )
 
     def _undistorted(self, query: PlaceQuery, camera: Camera) -> np.ndarray:
         key = (query.frame.camera, camera.width)

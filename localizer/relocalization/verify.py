@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -18,17 +18,49 @@ from localizer.registration.priors import (
     height_constraint,
 )
 from localizer.registration.result import Registration, failure
+from localizer.relocalization.align import FrameShift, moved
 from localizer.relocalization.config import RelocalizationConfig
 from localizer.relocalization.types import PlaceCandidate, PlaceQuery
 from localizer.render.base import MapRenderer
 from localizer.render.holes import fill_holes
-from localizer.types import FeaturePyramid, PosePrior, RegistrationStatus
+from localizer.types import FeaturePyramid, PosePrior, RegistrationStatus, RenderedView
 
 _PLACE_SIGMA_M = 5.0  # of a candidate: some cells, and houses that lean
 _HEADING_SIGMA_RAD = np.radians(5.0)  # half a step of the headings tried
 _LEAST_TILT_SIGMA_RAD = np.radians(0.3)
 _FARTHEST_M = 60.0  # of an answer from its candidate: a registration that ran so far ran away
 _MIN_MAP_SHARE = 0.1  # of the view
+_ALIGNMENTS = 2  # the second sees the houses from nearly the right side
+_MOVED_M = 1.0  # less than a registration minds
+_ALIGNED_M = 25.0  # from a candidate: farther is another one's
+_AROUND, _AROUND_HEIGHTS_M = 0.1, (30.0, 100.0)  # of the height above ground, which is cut
+_SIDES = ((1.0, 0.0), (0.0, 1.0), (-1.0, 0.0), (0.0, -1.0))
+
+
+@dataclass(frozen=True)
+class Reference:
+    """The map rendered at a pose, with its features."""
+
+    view: RenderedView
+    features: FeaturePyramid
+
+    @property
+    def ground_m(self) -> float:
+        """World z of what is seen, the median over the image."""
+        v, u = np.nonzero(self.view.depth)
+        some = slice(None, None, max(1, len(u) // 500))
+        pixels = np.stack([u[some], v[some]], axis=-1) + 0.5
+        points = self.view.camera.rays(pixels) * self.view.depth[v[some], u[some], None]
+        return float(np.median(self.view.world_from_camera.apply(points)[:, 2]))
+
+
+@dataclass(frozen=True)
+class Aligned:
+    """A candidate's prior after alignment. reference: rendered there; score: of `Shift`."""
+
+    prior: PosePrior
+    reference: Reference | None
+    score: float
 
 
 @dataclass(frozen=True)
@@ -55,15 +87,57 @@ class Verifier:
         time_ns = query.frame.exposure_time_ns
         return PosePrior(candidate.world_from_camera, np.diag(sigma**2), time_ns)
 
-    def register(
-        self, features: FeaturePyramid, camera: Camera, prior: PosePrior, query: PlaceQuery
-    ) -> Registration:
-        """One pass: the view at the prior's pose, and the frame registered to it."""
+    def reference(self, prior: PosePrior, camera: Camera) -> Reference | None:
+        """The map as the prior's pose sees it; None where that is hardly any."""
         view = self.renderer.render(prior.world_from_camera, camera, wait=True)
         if np.count_nonzero(view.depth) < _MIN_MAP_SHARE * view.depth.size:
+            return None
+        return Reference(view, self.extractor.extract(fill_holes(view)))
+
+    def aligned(self, frame: FrameShift, camera: Camera, prior: PosePrior) -> Aligned:
+        """The prior moved to where the frame lies over its rendering, and the rendering there."""
+        start = prior.world_from_camera.translation
+        reference, score = self.reference(prior, camera), 0.0
+        for _ in range(_ALIGNMENTS):
+            if reference is None:
+                break
+            shift = frame.over(reference.features.levels)
+            score = max(score, shift.score)
+            away = moved(prior.world_from_camera, camera, shift, reference.ground_m)
+            there = shifted(prior, away)
+            far = float(np.linalg.norm(there.world_from_camera.translation - start))
+            if np.linalg.norm(away) < _MOVED_M or far > _ALIGNED_M:
+                break
+            prior = there
+            reference = self.reference(prior, camera)
+        return Aligned(prior, reference, score)
+
+    def around(
+        self, features: FeaturePyramid, camera: Camera, aligned: Aligned, query: PlaceQuery
+    ) -> Registration:
+        """The best of registrations that begin to all sides of an aligned place."""
+        reference = aligned.reference or self.reference(aligned.prior, camera)
+        if reference is None:
+            return failure(aligned.prior, RegistrationStatus.NO_OVERLAP)
+        above = aligned.prior.world_from_camera.translation[2] - reference.ground_m
+        reach = _AROUND * float(np.clip(above, *_AROUND_HEIGHTS_M))
+        starts = [shifted(aligned.prior, reach * np.array(side)) for side in _SIDES]
+        found = [self.register(features, camera, start, query, reference) for start in starts]
+        return max(found, key=lambda result: result.quality)
+
+    def register(
+        self,
+        features: FeaturePyramid,
+        camera: Camera,
+        prior: PosePrior,
+        query: PlaceQuery,
+        reference: Reference | None = None,
+    ) -> Registration:
+        """One pass: the frame registered to the view at the prior's pose, rendered if not given."""
+        reference = reference or self.reference(prior, camera)
+        if reference is None:
             return failure(prior, RegistrationStatus.NO_OVERLAP)
-        reference = self.extractor.extract(fill_holes(view))
-        anchors = select_anchors(view, reference, self.anchors, self.seed)
+        anchors = select_anchors(reference.view, reference.features, self.anchors, self.seed)
         constraint = self._constraint(prior.world_from_camera, query)
         return self.optimizer.register(
             features, camera, anchors, prior, constraint=constraint, seed=self.seed
@@ -116,6 +190,13 @@ class Verifier:
             attitude_constraint(turn @ query.rotation, tilt, np.pi),
             height_constraint(query.height_m, max(query.height_sigma_m, 0.3)),
         )
+
+
+def shifted(prior: PosePrior, away: Array) -> PosePrior:
+    """A prior so far (2,) m to the east and north."""
+    pose = prior.world_from_camera
+    place = pose.translation + np.array([*away, 0.0])
+    return replace(prior, world_from_camera=Pose(pose.rotation, place))
 
 
 def tilt_and_heading(rotation: Array, reference: Array) -> tuple[float, float]:

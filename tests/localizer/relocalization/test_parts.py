@@ -1,5 +1,6 @@
 """The search's parts, each against what it should be by definition."""
 
+import cv2
 import numpy as np
 import pytest
 import scipy.fft
@@ -8,6 +9,7 @@ from localizer.geometry.camera import Camera
 from localizer.geometry.pose import Pose, so3_exp
 from localizer.registration.agreement import Agreement
 from localizer.registration.result import Registration
+from localizer.relocalization.align import FrameShift, moved
 from localizer.relocalization.config import RelocalizationConfig
 from localizer.relocalization.correlate import STEP, LevelCorrelator, transform_patch
 from localizer.relocalization.overview import OverviewLevel, Projection
@@ -16,7 +18,7 @@ from localizer.relocalization.search import headings, scales, shared_extractions
 from localizer.relocalization.topview import DOWN
 from localizer.relocalization.types import PlaceCandidate, PlaceQuery, SearchRegion
 from localizer.relocalization.verify import Verifier, tilt_and_heading
-from localizer.types import Frame, RegistrationStatus
+from localizer.types import FeatureLevel, Frame, RegistrationStatus
 
 CAMERA = Camera.from_fov(160, 120, 60.0)
 CONFIG = RelocalizationConfig()
@@ -172,6 +174,27 @@ def test_tilt_and_heading_of_a_turn():
     tilt, heading = tilt_and_heading(turn @ reference, reference)
     assert np.degrees(tilt) == pytest.approx(2.0, abs=0.01)
     assert np.degrees(heading) == pytest.approx(130.0, abs=0.05)
+
+
+def test_the_shift_of_an_image_is_found_and_moves_the_camera():
+    """A frame that shows what the rendering has 12 px to the right of and 20 px below."""
+    rng = np.random.default_rng(2)
+    ground = cv2.GaussianBlur(rng.normal(size=(60, 70, 6)).astype(np.float32), (0, 0), 1.0)
+    sure = np.full((40, 50), 0.7, np.float32)
+
+    def pyramid(row, column):
+        features = np.ascontiguousarray(ground[row : row + 40, column : column + 50])
+        return (FeatureLevel(features, sure, 8), FeatureLevel(features, sure, 4))
+
+    shift = FrameShift(pyramid(10, 8)).over(pyramid(5, 5))
+    assert (shift.u, shift.v) == (12.0, 20.0)
+    assert shift.score == pytest.approx(0.9, abs=0.1)
+    pose = Pose(DOWN, np.array([7.0, 8.0, 100.0]))
+    # From 80 m above the ground, north up: right is east, below is south.
+    expected = np.array([12.0, -20.0]) * 80.0 / CAMERA.fx
+    np.testing.assert_allclose(moved(pose, CAMERA, shift, 20.0), expected)
+    level_view = Pose(so3_exp((np.pi / 2, 0, 0)) @ DOWN, pose.translation)
+    assert not moved(level_view, CAMERA, shift, 20.0).any()  # sees no ground
 
 
 @pytest.mark.parametrize(

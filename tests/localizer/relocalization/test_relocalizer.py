@@ -16,7 +16,7 @@ from localizer.relocalization.overview import open_overview, overview_key
 from localizer.relocalization.patch import turned
 from localizer.relocalization.relocalizer import open_relocalizer
 from localizer.relocalization.topview import DOWN
-from localizer.relocalization.types import PlaceQuery, SearchRegion
+from localizer.relocalization.types import PlaceCandidate, PlaceQuery, SearchRegion
 from localizer.render.numba_raster import NumbaRenderer
 from localizer.types import Frame
 
@@ -47,15 +47,20 @@ def truth(small_assets):
     return Pose(rotation, np.array([*PLACE, ground + 110.0]))
 
 
-@pytest.fixture(scope="module")
-def query(small_assets, truth):
-    """The frame of another day; the heading that is given is 100 degrees off, the height 2 m."""
-    with TileStreamer(TileCache.open(small_assets.live_cache)) as streamer:
+def seen_from(truth, assets):
+    """The image (H, W, 3) of another day."""
+    with TileStreamer(TileCache.open(assets.live_cache)) as streamer:
         renderer = NumbaRenderer(streamer, 1)
         rgb = renderer.render(truth, CAMERA, wait=True).rgb
         renderer.close()
+    return rgb
+
+
+@pytest.fixture(scope="module")
+def query(small_assets, truth):
+    """The frame of another day; the heading that is given is 100 degrees off, the height 2 m."""
     return PlaceQuery(
-        Frame(rgb, 123, CAMERA, 7),
+        Frame(seen_from(truth, small_assets), 123, CAMERA, 7),
         turned(so3_exp((0.005, -0.004, 0)) @ truth.rotation, np.radians(100)),
         tilt_sigma_rad=np.radians(0.7),
         heading_sigma_rad=None,
@@ -89,6 +94,55 @@ def test_a_twin_that_is_as_credible_forbids_an_answer(opened, query, truth, monk
         assert (relocalizer.confirm(query, candidates) is None) is credible
 
 
+def test_a_place_that_stands_out_needs_no_decisive_votes(opened, query, truth, monkeypatch):
+    """Other ground looks alike from above. It is no rival where its own registration says so; where
+    it fits nearly as badly as the answer, or was never looked at, there is none.
+    """
+    relocalizer = opened.relocalizer
+    best, *_ = relocalizer.verify(query, relocalizer.search(query)[:1])
+    votes = replace(best.result.agreement, votes=round(0.7 * best.result.agreement.parts))
+    best = replace(best, result=replace(best.result, agreement=votes))
+    away = Pose(truth.rotation, truth.translation + np.array([60.0, 0.0, 0.0]))
+    candidates = [best.candidate, PlaceCandidate(away, best.candidate.score)]
+
+    def answer(share, looked_at=True):
+        result = replace(best.result, world_from_camera=away, quality=share * best.result.quality)
+        other = replace(best, rank=1, result=result, credible=False)
+        judged = [best, other] if looked_at else [best]
+        monkeypatch.setattr(relocalizer, "verify", lambda *_: judged)
+        return relocalizer.confirm(query, candidates)
+
+    assert answer(0.5) is not None
+    assert answer(0.9) is None
+    assert answer(0.5, looked_at=False) is None
+
+
+def test_a_low_camera_among_high_houses_is_found_from_candidates_aside(opened, small_assets):
+    """Their roofs lean outwards: flat ground fits best up to 12 m beside the place, from where
+    a registration alone found two of eight back (the flight covered-10s was not found again).
+    """
+    place, up_m = np.array([36.5, 63.7]), 62.0
+    rotation = turned(so3_exp((np.radians(10), 0, 0)) @ DOWN, np.radians(-90))
+    truth = Pose(rotation, np.array([*place, up_m]))
+    query = PlaceQuery(
+        Frame(seen_from(truth, small_assets), 123, CAMERA, 7),
+        turned(truth.rotation, np.radians(4)),
+        tilt_sigma_rad=np.radians(1),
+        heading_sigma_rad=np.radians(10),
+        height_m=up_m + 1.0,
+        height_sigma_m=3.0,
+        region=SearchRegion.circle(place + 3.0, 30.0),
+    )
+    errors = []
+    for angle in np.arange(8) * np.pi / 4:
+        aside = np.array([*(place + 10 * np.array([np.cos(angle), np.sin(angle)])), query.height_m])
+        candidate = PlaceCandidate(Pose(query.rotation, aside), 0.4)
+        best = opened.relocalizer.verify(query, [candidate])[0]
+        errors.append(best.result.world_from_camera.distance_to(truth)[0] if best.credible else 99)
+    assert max(errors) < 0.5, errors
+    assert opened.relocalizer.find(query) is not None
+
+
 def test_the_region_is_kept(opened, query, truth):
     near = SearchRegion.circle(truth.translation + 20.0, 60.0)
     places = opened.relocalizer.search(replace(query, region=near))
@@ -110,6 +164,23 @@ def test_a_frame_of_nowhere_is_not_found(opened, query):
     frame = replace(query.frame, image=blocks)
     near = SearchRegion.circle(PLACE, 80.0)
     assert opened.relocalizer.find(replace(query, frame=frame, region=near)) is None
+
+
+def test_a_covered_lens_is_not_searched_for(opened, query):
+    """Its search would go on for seconds, over the first frames that show something again."""
+    noise = np.random.default_rng(1).normal(8.0, 2.0, query.frame.image.shape)
+    dark = replace(query.frame, image=noise.clip(0, 255).astype(np.uint8))
+    asked = []
+    assert opened.relocalizer.search(replace(query, frame=dark), lambda: asked.append(1)) == []
+    assert not asked
+    dull = (0.1 * query.frame.image.astype(np.float32)).astype(np.uint8)  # a dark night is
+
+    def stop():
+        asked.append(1)
+        return True
+
+    opened.relocalizer.search(replace(query, frame=replace(dark, image=dull)), stop)
+    assert asked
 
 
 def test_stops_when_told(opened, query):

@@ -1,0 +1,97 @@
+"""Where a candidate really is: the frame's features over those of the map rendered at it.
+
+A search takes the ground as flat. Roofs that stand high under a low camera lean outwards in its
+frame, so that the best place of the flat ground is metres off: farther than a registration finds
+back. In a rendering they lean likewise, and what is left is a shift of the image.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import scipy.fft
+from numpy.typing import NDArray
+
+from localizer.geometry.camera import Camera
+from localizer.geometry.pose import Array, Pose
+from localizer.types import FeatureLevel, Float32
+
+_LEVEL = 1  # of the pyramid: stride 4. At 8 a shift of some metres is lost between cells
+_LEAST_SHARED = 0.35  # of the image, under a shift
+_LEAST_DOWN = 0.1  # of a ray, to meet the ground
+
+Complex64 = NDArray[np.complex64]
+
+
+@dataclass(frozen=True)
+class Shift:
+    """u, v: px of the image that the frame lies to the right of and below in the rendering;
+    score: correlation there times the root of the share that both see, 0 to 1.
+    """
+
+    u: float
+    v: float
+    score: float
+
+
+class FrameShift:
+    """Finds the shift of one frame's features over renderings' features of the same size."""
+
+    def __init__(self, levels: tuple[FeatureLevel, ...]) -> None:
+        level = levels[_LEVEL]
+        self._shape = level.features.shape[:2]
+        self._stride = level.stride
+        h, w = self._shape
+        self._size = (scipy.fft.next_fast_len(2 * h, True), scipy.fft.next_fast_len(2 * w, True))
+        features = _weighted(level)
+        self._spectrum = self._transformed(features).conj()
+        self._energy = self._transformed((features**2).sum(axis=2)).conj()
+        self._ones = self._transformed(np.ones(self._shape, np.float32))
+        seen = self._back(self._ones * self._ones.conj()) / (h * w)
+        self._share = np.clip(seen, 0.0, 1.0)
+        self._under = self._back(self._ones * self._energy)
+
+    def over(self, levels: tuple[FeatureLevel, ...]) -> Shift:
+        """The best shift over a rendering's pyramid."""
+        features = _weighted(levels[_LEVEL])
+        raw = self._back((self._transformed(features) * self._spectrum).sum(axis=2))
+        energy = self._transformed((features**2).sum(axis=2))
+        beside = self._back(energy * self._ones.conj())
+        norm = np.sqrt(np.maximum(self._under, 1e-6) * np.maximum(beside, 1e-6))
+        scores = np.where(self._share >= _LEAST_SHARED, raw / norm * np.sqrt(self._share), -1.0)
+        i, j = (int(k) for k in np.unravel_index(int(scores.argmax()), scores.shape))
+        v = i if i < self._shape[0] else i - self._size[0]
+        u = j if j < self._shape[1] else j - self._size[1]
+        return Shift(float(u * self._stride), float(v * self._stride), float(scores[i, j]))
+
+    def _transformed(self, values: Float32) -> Complex64:
+        spectrum: Complex64 = scipy.fft.rfft2(values, self._size, axes=(0, 1), workers=1)
+        return spectrum
+
+    def _back(self, spectrum: Complex64) -> Float32:
+        values: Float32 = scipy.fft.irfft2(spectrum, self._size, axes=(0, 1), workers=1)
+        return values
+
+
+def moved(pose: Pose, camera: Camera, shift: Shift, ground_m: float) -> Array:
+    """How far (2,) m a camera lies from a rendering's pose whose image its own is shifted over, at
+    one heading and height; ground_m: the height of the ground. Zero where no ground is seen.
+    """
+    middle = np.array([camera.cx, camera.cy])
+    rays = camera.rays(np.stack([middle, middle + np.array([shift.u, shift.v])])) @ pose.rotation.T
+    if (rays[:, 2] > -_LEAST_DOWN * np.linalg.norm(rays, axis=1)).any():
+        return np.zeros(2)
+    places = rays[:, :2] * ((ground_m - pose.translation[2]) / rays[:, 2])[:, None]
+    away: Array = places[1] - places[0]
+    return away
+
+
+def _weighted(level: FeatureLevel) -> Float32:
+    """Features (H, W, C) less their mean, by confidence: what an image has everywhere tells no
+    shift.
+    """
+    weights = level.confidence.astype(np.float32)[..., None]
+    features = level.features.astype(np.float32)
+    mean = (features * weights).sum(axis=(0, 1)) / max(float(weights.sum()), 1e-9)
+    return np.asarray((features - mean) * weights, np.float32)
