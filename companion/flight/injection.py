@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-from companion.flight.conversions import Installation, vision_fix
+from companion.conversions import Installation, vision_fix
 from localizer.types import PoseEstimate, ReferenceBundle, TrackingState
 from mavlink_bridge.bridge import Bridge
 from mavlink_bridge.injection.fix_queue import PendingJump

@@ -21,7 +21,7 @@ from pathlib import Path
 import numpy as np
 
 from companion.config import PriorConfig
-from companion.flight.conversions import Installation
+from companion.conversions import Installation
 from companion.flight.priors import AutopilotPose, drift_sigma_m
 from localizer.geometry.geo import NED_FROM_ENU
 from localizer.geometry.pose import Pose

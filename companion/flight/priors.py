@@ -11,7 +11,7 @@ from typing import Protocol
 import numpy as np
 
 from companion.config import PriorConfig
-from companion.flight.conversions import Installation, camera_rotation, vehicle_prior
+from companion.conversions import Installation, camera_rotation, vehicle_prior
 from localizer.geometry.geo import NED_FROM_ENU
 from localizer.geometry.pose import Array
 from localizer.tracking.engine import PriorProvider

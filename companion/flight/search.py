@@ -28,6 +28,7 @@ _HINT_SIGMAS = 2.0
 _HORIZON_M = 10_000.0  # below the origin: over 350 km away
 _HINT_S = 120.0  # after which an operator's word is of another place
 _STOP_S = 10.0
+_WHOLE_MAP_EVERY = 5  # searches
 
 # What the autopilot knows of the camera while it does not know where it is.
 _TILT_SIGMA_RAD = math.radians(2.0)  # with the gimbal's own error
@@ -65,14 +66,21 @@ class PlaceSearch:
     """Finds a place in a frame with what the autopilot knows besides.
 
     The map's overview is opened (or, the first time, computed) on a thread of its own, so that
-    neither the start nor a search waits for it.
+    neither the start nor a search waits for it. reach: where the camera can be at a time since the
+    map last said where it was, asked where the autopilot knows no position.
     """
 
     def __init__(
-        self, cache: TileCache, config: LocalizerConfig, autopilot: AutopilotPose, event: Event
+        self,
+        cache: TileCache,
+        config: LocalizerConfig,
+        autopilot: AutopilotPose,
+        event: Event,
+        reach: Callable[[int], SearchRegion | None] = lambda _time_ns: None,
     ) -> None:
         self._cache, self._config = cache, config
-        self._autopilot, self._event = autopilot, event
+        self._autopilot, self._event, self._reach = autopilot, event, reach
+        self._in_reach = 0  # searches since the whole map was searched
         self._hint: Hint | None = None
         self._open: OpenRelocalizer | None = None
         self._stop = threading.Event()
@@ -144,17 +152,20 @@ class PlaceSearch:
             _HEADING_SIGMA_RAD if self._autopilot.knows_heading else None,
             height_m,
             _HEIGHT_SIGMA_M,
-            self._region(frame.exposure_time_ns),
+            self.region(frame.exposure_time_ns),
         )
 
-    def _region(self, time_ns: int) -> SearchRegion | None:
-        """The operator's word, else where the autopilot can be; None: the whole map."""
+    def region(self, time_ns: int) -> SearchRegion | None:
+        """The operator's word, else where the autopilot is, else where the aircraft can have got
+        to; None: the whole map, now and then in any case: the last place seen may be wrong.
+        """
         hint = self._hint
         if hint is not None and time.monotonic() - hint.time_s < _HINT_S:
             return SearchRegion.circle(np.array(hint.centre), hint.radius_m)
         prior = self._autopilot.prior(time_ns)
         if prior is None:
-            return None
+            self._in_reach = (self._in_reach + 1) % _WHOLE_MAP_EVERY
+            return self._reach(time_ns) if self._in_reach else None
         sigma_m = float(np.sqrt(prior.covariance[0, 0]))
         return SearchRegion.circle(prior.world_from_camera.translation, _SIGMAS * sigma_m)
 

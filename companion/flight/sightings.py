@@ -7,7 +7,7 @@ from collections.abc import Callable
 import numpy as np
 
 from companion.calibration.sighting import Sighting
-from companion.flight.conversions import Installation, vision_fix
+from companion.conversions import Installation, vision_fix
 from companion.geometry import ned_from_world
 from localizer.types import Float32, PoseEstimate, ReferenceBundle, TrackingState
 from mavlink_bridge.bridge import Bridge

@@ -16,14 +16,15 @@ import numpy as np
 
 from companion.calibration.map_shift import MapShift
 from companion.config import CompanionConfig
+from companion.conversions import Installation, target_report
 from companion.errors import ConfigError
-from companion.flight.conversions import Installation, target_report
 from companion.flight.feed import Feed
 from companion.flight.health import Besides, HealthMonitor
 from companion.flight.injection import FixInjection, is_for_injection
 from companion.flight.last_fix import FixMemory
 from companion.flight.parts import Making, Part
 from companion.flight.priors import AutopilotPose, PriorSources, local_about
+from companion.flight.reach import Reach
 from companion.flight.recorder import RecordKeeper, remove_empty
 from companion.flight.search import PlaceSearch, place_on_map
 from companion.flight.sightings import Sightings
@@ -390,8 +391,12 @@ def _console(making: Making) -> Publisher:
 
 
 def _search(making: Making) -> PlaceSearch:
-    cache, event = making[MapStack].cache, making.channels.events.send
-    return PlaceSearch(cache, making.config.localizer, making[AutopilotPose], event)
+    cache, channels, reach = making[MapStack].cache, making.channels, Reach(making[Bridge])
+    channels.estimates.subscribe(reach.add_estimate)
+    channels.frames.subscribe(lambda _frame: reach.follow())
+    return PlaceSearch(
+        cache, making.config.localizer, making[AutopilotPose], channels.events.send, reach.region
+    )
 
 
 def _engine(making: Making) -> DualThreadEngine:

@@ -6,7 +6,7 @@ import logging
 import threading
 from collections.abc import Callable
 
-from companion.flight.conversions import camera_view
+from companion.conversions import camera_view
 from localizer.geometry.geo import LocalFrame
 from localizer.targets.locate import RayCaster
 from localizer.types import PoseEstimate

@@ -17,8 +17,8 @@ from typing import TextIO
 import numpy as np
 
 from companion.config import CompanionConfig, parse_config
+from companion.conversions import Installation
 from companion.errors import RecordError, StreamDecodeError
-from companion.flight.conversions import Installation
 from companion.flight.priors import AutopilotPose
 from companion.flight.recorder import MANIFEST_NAME
 from companion.sources.base import fitted_camera

@@ -16,7 +16,7 @@ import numpy as np
 import pytest
 
 from companion.config import TargetConfig
-from companion.flight.conversions import target_report
+from companion.conversions import target_report
 from companion.targets.clicks import ClickPolicy
 from companion.targets.population import Target
 from companion.targets.reporter import TargetReporter

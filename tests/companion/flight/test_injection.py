@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from companion.flight.conversions import Installation
+from companion.conversions import Installation
 from companion.flight.injection import FixInjection
 from localizer.geometry.camera import Camera
 from localizer.geometry.geo import Geodetic, LocalFrame

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from companion.config import PriorConfig
-from companion.flight.conversions import Installation
+from companion.conversions import Installation
 from companion.flight.last_fix import FixMemory, LastFix, boot_id, read_last_fix
 from companion.flight.priors import local_about
 from localizer.geometry.camera import Camera

@@ -6,6 +6,7 @@ import pytest
 from companion.flight.search import PlaceSearch, place_on_map
 from localizer.config import LocalizerConfig
 from localizer.map.cache.cache import TileCache
+from localizer.relocalization.types import SearchRegion
 from mavlink_bridge.messages import PlaceHint
 
 
@@ -43,3 +44,23 @@ def test_another_country_and_the_far_side_of_the_earth_are_refused(cache):
         assert not search.hint_at(PlaceHint(*place, 100.0))
     assert not search.hint_at(PlaceHint(-latitude, longitude - 180.0, 20_000.0))
     assert told == []
+
+
+class Lost:
+    """An autopilot that knows no position."""
+
+    def prior(self, _time_ns):
+        return None
+
+
+def test_the_whole_map_is_searched_now_and_then_whatever_was_seen(cache):
+    about = SearchRegion.circle(np.array([10.0, 20.0]), 40.0)
+    search = PlaceSearch(cache, LocalizerConfig(), Lost(), lambda *_: None, lambda _t: about)
+    assert [search.region(k) for k in range(10)] == 2 * ([about] * 4 + [None])
+
+
+def test_the_operators_word_comes_before_what_was_seen(cache):
+    about = SearchRegion.circle(np.array([10.0, 20.0]), 40.0)
+    search = PlaceSearch(cache, LocalizerConfig(), Lost(), lambda *_: None, lambda _t: about)
+    search.hint(300.0, 400.0, 50.0)
+    assert search.region(0).centre == pytest.approx([300.0, 400.0])

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from companion.calibration.sighting import Sighting
-from companion.flight.conversions import Installation
+from companion.conversions import Installation
 from companion.flight.sightings import Sightings, middle_depth_m
 from localizer.geometry.camera import Camera
 from localizer.geometry.geo import Geodetic, LocalFrame

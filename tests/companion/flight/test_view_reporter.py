@@ -6,7 +6,7 @@ import threading
 import numpy as np
 import pytest
 
-from companion.flight.conversions import camera_view
+from companion.conversions import camera_view
 from companion.flight.view_reporter import ViewReporter
 from localizer.geometry.camera import Camera
 from localizer.geometry.geo import Geodetic, LocalFrame

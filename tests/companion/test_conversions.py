@@ -3,7 +3,7 @@ import math
 import numpy as np
 import pytest
 
-from companion.flight.conversions import Installation, vehicle_prior, vision_fix
+from companion.conversions import Installation, vehicle_prior, vision_fix
 from companion.geometry import GIMBAL_FROM_CAMERA, ned_from_world
 from localizer.geometry.camera import Camera
 from localizer.geometry.geo import Geodetic, LocalFrame
