@@ -13,9 +13,7 @@ import cv2
 
 from localizer import Camera, Frame, Geodetic, PosePrior, PoseRow, open_localizer, pose_of_row
 
-if len(sys.argv) != 10:
-    sys.exit(__doc__)
-photo, cache, camera_file, *numbers = sys.argv[1:]
+photo, cache, camera_file, *numbers = sys.argv[1:] if len(sys.argv) == 10 else sys.exit(__doc__)
 latitude, longitude, height, roll, pitch, yaw = map(float, numbers)
 camera = Camera.from_json(Path(camera_file))
 image = cv2.cvtColor(cv2.imread(photo), cv2.COLOR_BGR2RGB)
