@@ -27,6 +27,7 @@ RUNS_ALONE = (
     "tests/examples/test_bridge_examples.py",
     "tests/mavlink_bridge/link/test_routing.py",
     "tests/mavlink_bridge/preflight/test_mission.py",
+    "tests/mavlink_bridge/test_look_at.py",
     "tests/sitl/camera/test_process.py",
     "tests/sitl/demo/test_flight.py",
     "tests/sitl/ground/test_pilot.py",
