@@ -22,7 +22,7 @@ from sitl.demo.assets import FlightAssets, prepare
 from sitl.demo.kinematic import record_scenario
 from sitl.demo.scenario import CameraSpec, Leg, Scenario
 from sitl.errors import SimulationError
-from tests.parts import ALONE, SHARED_FOLDER, SIDE_BY_SIDE, part_of
+from tests.parts import PARTS, SHARED_FOLDER, part_of
 
 # The suite tries the same examples every time, so that a failure belongs to the change it is seen
 # on; `pytest --hypothesis-profile=explore` draws new ones. No deadlines: a busy machine takes its
@@ -225,12 +225,12 @@ def _processor_share(workers: int, seconds: float = 1.5) -> float:
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:
-    """`--part`: one of the suite's two parts (tests/parts.py); both without it."""
-    parser.addoption("--part", choices=[SIDE_BY_SIDE, ALONE], help="one part of the suite")
+    """`--part`: one of the suite's parts (tests/parts.py); all without it."""
+    parser.addoption("--part", choices=PARTS, help="one part of the suite")
 
 
 def pytest_ignore_collect(collection_path: Path, config: pytest.Config) -> bool | None:
-    """A file of the other part is not even imported, unless it is named on the command line."""
+    """A file of another part is not even imported, unless it is named on the command line."""
     named = [Path(argument.split("::")[0]).resolve() for argument in config.args]
     other = collection_path.suffix == ".py" and not _wanted(collection_path, config)
     return True if other and collection_path not in named else None

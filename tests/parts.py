@@ -1,8 +1,9 @@
-"""The suite in two parts: `python -m tests.parts [pytest's arguments]`, as `make test` calls it.
+"""The suite in three parts: `python -m tests.parts [pytest's arguments]`, as `make test` calls it.
 
-Most tests run first, two at a time. What flies, streams pictures in real time or drives a browser
-runs after them, one at a time, with the machine to itself. Each part prints its own summary; a
-failure of the first does not keep the second from running. `pytest` alone runs both as one.
+Most tests run first, two at a time; then, likewise, those that fly a simulated vehicle without
+pictures: each is content with a core that nobody else uses. What streams pictures in real time or
+drives a browser runs after them, one at a time, with the machine to itself. Each part prints its
+own summary; a failure of one does not keep the next from running. `pytest` alone runs all as one.
 """
 
 from __future__ import annotations
@@ -14,30 +15,35 @@ import tempfile
 from collections.abc import Mapping, Sequence
 from pathlib import Path, PurePosixPath
 
-SIDE_BY_SIDE, ALONE = "side-by-side", "alone"
+SIDE_BY_SIDE, VEHICLES, ALONE = "side-by-side", "vehicles", "alone"
+PARTS = (SIDE_BY_SIDE, VEHICLES, ALONE)
 
-# Files and folders whose tests need the machine for themselves: simulated vehicles, pictures in
-# real time, a browser, measured processors. Every other test is content with a core, and patient.
-RUNS_ALONE = (
-    "tests/companion/console/test_browser.py",
-    "tests/companion/flight/test_app.py",
+# Files and folders whose tests fly a simulated vehicle, without pictures.
+FLIES = (
     "tests/companion/preflight/test_coverage.py",
-    "tests/companion/sources/test_live_stream.py",
-    "tests/companion/sources/test_rtsp.py",
     "tests/examples/test_bridge_examples.py",
     "tests/mavlink_bridge/link/test_routing.py",
     "tests/mavlink_bridge/preflight/test_mission.py",
     "tests/mavlink_bridge/test_look_at.py",
-    "tests/sitl/camera/test_process.py",
-    "tests/sitl/demo/test_flight.py",
     "tests/sitl/ground/test_pilot.py",
     "tests/sitl/suite/test_flights.py",
-    "tests/sitl/suite/test_loop_flights.py",
     "tests/sitl/vehicles",
+)
+
+# Those whose tests need the machine for themselves: pictures in real time, a browser, measured
+# processors. Every other test is content with a core, and patient.
+RUNS_ALONE = (
+    "tests/companion/console/test_browser.py",
+    "tests/companion/flight/test_app.py",
+    "tests/companion/sources/test_live_stream.py",
+    "tests/companion/sources/test_rtsp.py",
+    "tests/sitl/camera/test_process.py",
+    "tests/sitl/demo/test_flight.py",
+    "tests/sitl/suite/test_loop_flights.py",
     "tests/test_real_time.py",
 )
 
-# Where both parts find what is dear to build (tests/conftest.py); a folder that lives as long.
+# Where the parts find what is dear to build (tests/conftest.py); a folder that lives as long.
 SHARED_FOLDER = "PILOT_TEST_SHARED"
 
 # A file's tests share its fixtures, so one worker runs them; a core for each of two workers.
@@ -50,25 +56,28 @@ _PASSED, _NOTHING_RAN = 0, 5  # pytest's exit codes
 def part_of(path: str) -> str:
     """The part to which a test file belongs; its path as POSIX from the repository's root."""
     file = PurePosixPath(path)
-    alone = any(file.is_relative_to(entry) for entry in RUNS_ALONE)
-    return ALONE if alone else SIDE_BY_SIDE
+    for part, entries in ((VEHICLES, FLIES), (ALONE, RUNS_ALONE)):
+        if any(file.is_relative_to(entry) for entry in entries):
+            return part
+    return SIDE_BY_SIDE
 
 
 def together(codes: Sequence[int]) -> int:
-    """One exit code of both parts: the first that tells of a problem.
+    """One exit code of all parts: the first that tells of a problem.
 
-    A part that has none of the tests asked for passes, unless no part has any.
+    A part that has none of the tests asked for passes, unless none has any.
     """
     problems = [code for code in codes if code not in (_PASSED, _NOTHING_RAN)]
     return problems[0] if problems else min(codes)
 
 
 def main(arguments: Sequence[str]) -> int:
-    """Run both parts with pytest's arguments; pytest's exit code."""
+    """Run all parts with pytest's arguments; pytest's exit code."""
     with tempfile.TemporaryDirectory(prefix="tests-") as shared:
         common = {**os.environ, SHARED_FOLDER: str(Path(shared).resolve())}
         codes = {
             SIDE_BY_SIDE: _run(SIDE_BY_SIDE, [*_WORKERS, *arguments], common | _ONE_CORE),
+            VEHICLES: _run(VEHICLES, [*_WORKERS, *arguments], common | _ONE_CORE),
             ALONE: _run(ALONE, arguments, common),
         }
     outcome = ", ".join(f"{part} part: {_word(code)}" for part, code in codes.items())

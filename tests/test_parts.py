@@ -1,4 +1,4 @@
-"""The suite's two parts: who belongs where, and that neither hides the other."""
+"""The suite's parts: who belongs where, and that none hides another."""
 
 from __future__ import annotations
 
@@ -8,7 +8,17 @@ from types import SimpleNamespace
 
 import pytest
 
-from tests.parts import ALONE, RUNS_ALONE, SIDE_BY_SIDE, main, part_of, together
+from tests.parts import (
+    ALONE,
+    FLIES,
+    PARTS,
+    RUNS_ALONE,
+    SIDE_BY_SIDE,
+    VEHICLES,
+    main,
+    part_of,
+    together,
+)
 
 ROOT = Path(__file__).resolve().parents[1]
 # What gives it away: a vehicle in real time, a browser, a fixture that measures the processors.
@@ -27,10 +37,12 @@ def test_what_needs_the_machine_runs_alone():
     assert [path for path in found if part_of(path) == SIDE_BY_SIDE] == []
 
 
-@pytest.mark.parametrize("entry", RUNS_ALONE)
-def test_what_runs_alone_exists(entry):
+@pytest.mark.parametrize(
+    ("entry", "part"), [(e, VEHICLES) for e in FLIES] + [(e, ALONE) for e in RUNS_ALONE]
+)
+def test_what_is_listed_exists(entry, part):
     assert (ROOT / entry).exists()
-    assert part_of(entry) == ALONE
+    assert part_of(entry) == part
 
 
 @pytest.mark.parametrize(
@@ -42,8 +54,8 @@ def test_one_exit_code(codes, code):
     assert together(codes) == code
 
 
-def test_the_second_part_runs_after_a_failure_of_the_first(monkeypatch, capsys):
-    codes, commands = iter([1, 0]), []
+def test_the_parts_run_after_a_failure_of_the_first(monkeypatch, capsys):
+    codes, commands = iter([1, 0, 0]), []
 
     def run(command, **_):
         commands.append(command)
@@ -51,10 +63,11 @@ def test_the_second_part_runs_after_a_failure_of_the_first(monkeypatch, capsys):
 
     monkeypatch.setattr("subprocess.run", run)
     assert main(["-k", "pose"]) == 1
-    first, second = commands
-    assert f"--part={SIDE_BY_SIDE}" in first
-    assert f"--part={ALONE}" in second
+    first, second, third = commands
+    assert [f"--part={p}" in c for p, c in zip(PARTS, commands, strict=True)] == [True] * 3
     assert "--numprocesses=2" in first
-    assert "--numprocesses=2" not in second
+    assert "--numprocesses=2" in second
+    assert "--numprocesses=2" not in third
     assert all(command[-2:] == ["-k", "pose"] for command in commands)
-    assert "side-by-side part: FAILED (1), alone part: passed" in capsys.readouterr().out
+    said = capsys.readouterr().out
+    assert "side-by-side part: FAILED (1), vehicles part: passed, alone part: passed" in said

@@ -482,7 +482,7 @@ PARTS: tuple[Part[Any], ...] = (
         wanted=lambda config: config.bridge.named_values,
     ),
     Part(
-        "search", PlaceSearch, _search, depends=(MapStack, AutopilotPose),
+        "search", PlaceSearch, _search, depends=(MapStack, AutopilotPose, Bridge),
         start=PlaceSearch.start, stop=PlaceSearch.stop, close=PlaceSearch.close,
     ),
     Part(
