@@ -19,7 +19,7 @@ if [ ! -x "$root/usr/bin/dpkg" ]; then
     mmdebstrap --quiet --arch="$arch" --variant=apt "$suite" "$root"
 fi
 mountpoint -q "$root/proc" || mount -t proc proc "$root/proc"
-mountpoint -q "$root/dev" || mount --rbind /dev "$root/dev"
+mountpoint -q "$root/dev" || mount --rbind --make-rslave /dev "$root/dev"
 trap 'umount -l "$root/proc" "$root/dev"' EXIT
 
 say install

@@ -12,7 +12,7 @@ from localizer.relocalization.types import PlaceCandidate, PlaceQuery, Relocaliz
 from localizer.types import PosePrior
 
 NEARLY = 0.8  # of the winner's correlation: a place that has to be looked at, too
-_STANDS_OUT = 1.5  # times the quality of any other place. Equal houses: 1.0 to 1.1
+_STANDS_OUT = 1.5  # times the quality of any other place. Equal houses: 1.0 to 1.19
 _SAME_PLACE_M = 5.0  # answers that are closer are one
 
 
