@@ -6,6 +6,8 @@ import heapq
 import os
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
+from functools import partial
+from importlib import import_module
 from operator import itemgetter
 from pathlib import Path
 from typing import Any
@@ -37,7 +39,7 @@ class Exported:
 def require_extra() -> None:
     """`ConfigError` where the packages of the extra `mcap` are not installed."""
     try:
-        import companion.export.mcap_file  # noqa: F401  # only whether it can be imported
+        import_module("companion.export.mcap_file")
     except ImportError as error:
         raise ConfigError(f"install pilot-companion[mcap] to write MCAP: {error}") from error
 
@@ -123,17 +125,19 @@ def _rows(
     names = list(columns)
     for i in np.argsort(columns[time], kind="stable"):
         row = {name: columns[name][i] for name in names}
-        yield int(row[time]) + offset_ns, lambda row=row: take(row)  # type: ignore[misc]
+        yield int(row[time]) + offset_ns, partial(take, row)
 
 
 def _pictures(folder: Path, offset_ns: int, take: Callable[[bytes, int], None]) -> Iterator[Step]:
     paths = (p for p in (folder / "snapshots").glob("*.jpg") if is_time_ns(p.stem))
     for path in sorted(paths, key=lambda p: int(p.stem)):
         time_ns = int(path.stem)
-        yield (
-            time_ns + offset_ns,
-            lambda path=path, time_ns=time_ns: take(path.read_bytes(), time_ns),  # type: ignore[misc]
-        )
+        yield time_ns + offset_ns, partial(_take_picture, take, path, time_ns)
+
+
+def _take_picture(take: Callable[[bytes, int], None], path: Path, time_ns: int) -> None:
+    """Read when its turn comes: a flight's pictures do not fit in memory together."""
+    take(path.read_bytes(), time_ns)
 
 
 def _mavlink(file: Any, path: Path, tables: RecordTables) -> Iterator[Step]:
@@ -163,7 +167,7 @@ def _mavlink(file: Any, path: Path, tables: RecordTables) -> Iterator[Step]:
                 continue
             made = messages.reported_location(frame, place, sigma_m, time_ns)
         if made is not None:
-            yield time_ns, lambda t=topic, m=made, at=time_ns: file.put(t, m, at)  # type: ignore[misc]
+            yield time_ns, partial(file.put, topic, made, time_ns)
 
 
 def _geoid_separation_m(tables: RecordTables) -> float:
