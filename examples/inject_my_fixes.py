@@ -2,7 +2,7 @@
 
     my_localizer | python examples/inject_my_fixes.py CONNECTION LAT LON ALTITUDE GEOID
 
-CONNECTION is that of docs/bridge.md (serial:/dev/ttyTHS1:921600, udpin:0.0.0.0:14551, ...). LAT,
+CONNECTION is that of messages.md (serial:/dev/ttyTHS1:921600, udpin:0.0.0.0:14551, ...). LAT,
 LON and ALTITUDE (metres above mean sea level) become the EKF's origin if it has none; GEOID is how
 far the mean sea level lies above the ellipsoid there, metres. Your localizer, in any language,
 writes a line per picture:
@@ -13,7 +13,7 @@ writes a line per picture:
 (without the line break). The fields are those of `mavlink_bridge.VisionFix`; time_ns is the
 exposure on this computer's CLOCK_MONOTONIC, the place is the vehicle's and its height is above the
 ellipsoid. Leave out what you do not know. Parameters of the autopilot: `companion doctor`, and the
-table in docs/bridge.md. Fly it in mode "shadow" first: that compares and sends nothing.
+table in docs/reference/messages.md. Fly it in mode "shadow" first: that compares and sends nothing.
 """
 
 import json

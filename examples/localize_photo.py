@@ -3,7 +3,7 @@
 python examples/localize_photo.py PHOTO CACHE CAMERA.json LAT LON HEIGHT ROLL PITCH YAW
 
 Degrees, metres above the ellipsoid; pitch 0 looks straight down, 90 at the horizon; yaw counts
-counter-clockwise from north (docs/angles.md).
+counter-clockwise from north (docs/reference/angles.md).
 """
 
 import sys

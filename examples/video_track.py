@@ -2,7 +2,7 @@
 
 python examples/video_track.py VIDEO CACHE CAMERA.json LAT LON HEIGHT ROLL PITCH YAW PLOT.png
 
-The pose is about where the first frame was taken (docs/angles.md). Beside the plot stands
+The pose is about where the first frame was taken (docs/reference/angles.md). Beside the plot stands
 PLOT.tum, a trajectory for evo. A frame that is not localized is left out; the motion model goes on
 to the next one.
 """

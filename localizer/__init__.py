@@ -2,7 +2,7 @@
 
 A camera's pose from its image and a geo-referenced 3D map: `open_localizer` opens a map that
 `build_cache` made, `Localizer.set_prior` tells about where the camera is, `Localizer.track`
-localizes one frame after the other. examples/ shows it at work; docs/api.md holds every name.
+localizes one frame after the other. examples/ shows it at work; api.md holds every name.
 """
 
 import os

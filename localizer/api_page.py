@@ -1,4 +1,4 @@
-"""The API page, made from the docstrings: ``python -m localizer.api_page docs/api.md``.
+"""The API page, made from the docstrings: ``python -m localizer.api_page docs/reference/api.md``.
 
 A test holds the page equal to what this prints.
 """
@@ -18,11 +18,11 @@ import localizer
 
 _HEAD = """# API of `localizer`
 
-Made from the docstrings by `python -m localizer.api_page docs/api.md`; do not edit. Everything here
-is imported as `from localizer import NAME` and stays; what is not here may change. Frames, heights
-and time are those of [architecture.md](architecture.md), angles those of [angles.md](angles.md);
-[examples/](../examples) shows it at work. One photo
-([localize_photo.py](../examples/localize_photo.py)):
+Made from the docstrings by `python -m localizer.api_page docs/reference/api.md`; do not edit.
+Everything here is imported as `from localizer import NAME` and stays; what is not here may change.
+Frames, heights and time are those of [architecture.md](../explanation/architecture.md), angles
+those of [angles.md](angles.md); [examples/](../../examples) shows it at work. One photo
+([localize_photo.py](../../examples/localize_photo.py)):
 
 ```python
 camera = Camera.from_json("camera.json")
@@ -65,7 +65,7 @@ def _section(name: str, value: Any) -> str:
         lines += [f"- `{member.name}`: {member.value}" for member in value]
     elif issubclass(value, BaseModel):
         lines += [
-            "Every key with its default: [configs/deployment.yaml](../configs/deployment.yaml)."
+            "Every key with its default: [configs/deployment.yaml](../../configs/deployment.yaml)."
         ]
     else:
         lines.insert(1, _code(f"{name}{_signature(value.__init__)}"))

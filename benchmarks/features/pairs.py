@@ -1,7 +1,7 @@
 """Generated test pairs for the feature benchmark: unseen places and a mesh world.
 
 What differs between map and query is drawn by the training's own generator, with other seeds and
-with real textures that no training run has seen; docs/model-card.md says what each difference
+with real textures that no training run has seen; model-card.md says what each difference
 stands for. `shared_detail` is the easier condition of earlier reports.
 """
 

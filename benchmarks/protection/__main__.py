@@ -82,7 +82,7 @@ def report(outcomes: list[Outcome]) -> dict[str, Any]:
 
 
 def table(found: dict[str, Any]) -> str:
-    """For docs/safety.md."""
+    """For docs/explanation/integrity.md."""
     rows = [
         "| frames, constants, risk | within HPL | within VPL | HPL, VPL median m | worst / HPL |",
         "|---|---|---|---|---|",

@@ -46,4 +46,6 @@ def key_command(
                 soft_wrap=True,
             )
     console.print(f"deployment: bridge.signing: {{key_file: {file}}}", soft_wrap=True)
-    console.print("ground stations need the same key before they connect: docs/bridge.md, Signing")
+    console.print(
+        "ground stations need the same key before they connect: docs/reference/messages.md, Signing"
+    )

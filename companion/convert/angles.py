@@ -1,4 +1,4 @@
-"""The angle conventions around a camera's pose (docs/angles.md), turned into each other.
+"""The angle conventions around a camera's pose (docs/reference/angles.md), turned into each other.
 
 Everything meets in one place: NED from camera, (3, 3), axes OpenCV, at the camera's position.
 """

@@ -1,4 +1,4 @@
-"""The figure of docs/angles.md: ``python -m companion.convert.figure docs/angles.png``.
+"""The figure of angles.md: ``python -m companion.convert.figure docs/img/angles.png``.
 
 One camera, seen from above and from the side, with the angles that each convention gives it. Every
 number in it is computed by the conversions themselves.

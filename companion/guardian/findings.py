@@ -23,7 +23,7 @@ class Action(enum.IntEnum):
 
 @dataclass(frozen=True)
 class Rule:
-    """One line of the table in docs/safety.md.
+    """One line of the table in docs/explanation/integrity.md.
 
     text: for the operator, with one figure {0:.0f} and a word {1}. alert_s: how long the evidence
     must last; release_s: how long it must be over. repeat_s: told again as long as it lasts; 0:

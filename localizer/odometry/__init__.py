@@ -1,4 +1,4 @@
-"""Visual odometry: frame to keyframe, where the map does not match (docs/odometry.md)."""
+"""Visual odometry: frame to keyframe, where the map does not match (odometry.md)."""
 
 from localizer.odometry.config import GrowthModel, OdometryConfig
 from localizer.odometry.estimate import OdometryEstimate, OdometryFrame, OdometryStatus

@@ -8,7 +8,7 @@ from pydantic import BaseModel, ConfigDict, Field
 class GrowthModel(BaseModel):
     """How the error grows along the way, beside each registration's own covariance.
 
-    Fitted by ``python -m benchmarks.odometry`` (docs/odometry.md). A walk is a sigma per square
+    Fitted by ``python -m benchmarks.odometry`` (odometry.md). A walk is a sigma per square
     root of a metre flown, from keyframe to keyframe; scale is an error that stays.
     """
 

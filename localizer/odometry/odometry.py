@@ -1,4 +1,4 @@
-"""Visual odometry: carries the pose on where the map does not match (docs/odometry.md)."""
+"""Visual odometry: carries the pose on where the map does not match (odometry.md)."""
 
 from __future__ import annotations
 

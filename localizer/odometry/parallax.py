@@ -3,7 +3,7 @@
 A keyframe whose pose is a little off drapes its picture over the wrong parts of the map's geometry.
 A later picture then moves over it as the true shape does, not as the map's: roofs slide against
 streets, and a picture that is tilted shears. The pose with which both agree best is a measurement
-of the keyframe that needs nothing of the map's own picture, and does not drift (docs/odometry.md).
+of the keyframe that needs nothing of the map's own picture, and does not drift (odometry.md).
 
 The cost is no sum of squares that linearises: what tells, tells at roofs' edges. So it is sampled
 about the pose as far as that is uncertain, and a quadratic is fitted to it.

@@ -1,4 +1,4 @@
-"""Registration: geo-anchors, pose hypotheses and the JNGO optimizer (docs/registration.md)."""
+"""Registration: geo-anchors, pose hypotheses and the JNGO optimizer (registration.md)."""
 
 from localizer.registration.anchors import anchors_at, select_anchors
 from localizer.registration.config import JNGOConfig

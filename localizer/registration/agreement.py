@@ -1,4 +1,4 @@
-"""Whether the parts of an image agree on a pose, each by itself (docs/registration.md, section 8a).
+"""Whether the parts of an image agree on a pose, each by itself (registration.md, section 8a).
 
 At the right pose nearly every part of the image matches best where it lies. A wrong pose is the
 best compromise of parts that each would rather lie elsewhere: its cost may be low, because land of

@@ -1,4 +1,4 @@
-"""Selection of the geo-anchors of a reference view (paper, Eq. 1; docs/registration.md)."""
+"""Selection of the geo-anchors of a reference view (paper, Eq. 1; registration.md)."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What every registration backend is given and gives back (docs/registration.md, section 3).
+"""What every registration backend is given and gives back (registration.md, section 3).
 
 A pose inside the optimizer is `camera_from_local`: a rotation and a translation that map local
 points to the camera. The local frame has world axes and its origin at the anchors' weighted
@@ -20,7 +20,7 @@ from localizer.types import Anchors, FeatureLevel, FeaturePyramid, Float32
 
 @dataclass(frozen=True)
 class LMSettings:
-    """Levenberg-Marquardt and robust-loss settings (docs/registration.md, sections 3 and 5).
+    """Levenberg-Marquardt and robust-loss settings (registration.md, sections 3 and 5).
 
     scale: of the residual norm of one anchor, where the loss leaves the square: Huber's threshold,
     or Geman and McClure's scale if `redescending`. Unit features differ by at most 2.
@@ -113,7 +113,7 @@ def local_origin(anchors: Anchors, world_from_camera: Pose) -> Array:
     """Origin (3,) of the local frame: the anchors' centroid, each weighted by 1 / depth².
 
     That is the weight of an anchor's translation information, so that about this point translation
-    and rotation are nearly uncorrelated (docs/registration.md, section 4).
+    and rotation are nearly uncorrelated (docs/explanation/registration.md, section 4).
     """
     depth = world_from_camera.inverse.apply(anchors.points_world)[:, 2]
     weight = 1.0 / np.maximum(np.abs(depth), 1.0) ** 2

@@ -1,4 +1,4 @@
-"""Uncertainty of a registered pose (docs/registration.md, section 8)."""
+"""Uncertainty of a registered pose (docs/explanation/registration.md, section 8)."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Rotation-aware pose hypotheses (paper, Eq. 4 and 5; docs/registration.md, section 6)."""
+"""Rotation-aware pose hypotheses (paper, Eq. 4 and 5; registration.md, section 6)."""
 
 from __future__ import annotations
 

@@ -2,7 +2,7 @@
 
 Hypotheses about the prior are refined coarse to fine by Levenberg-Marquardt, pruned between levels
 by successive halving, scored after the last step, and selected with the motion term of Eq. 10.
-docs/registration.md is the specification.
+docs/explanation/registration.md is the specification.
 """
 
 from __future__ import annotations

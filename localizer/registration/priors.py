@@ -1,7 +1,7 @@
 """Knowledge about the camera pose from other sensors, as residuals of the registration.
 
 Each function gives a `PoseConstraint`; `combine` adds several; `JNGO.register` takes the result
-(docs/registration.md, section 9). All are optional and none is used unless it is given.
+(docs/explanation/registration.md, section 9). All are optional and none is used unless it is given.
 """
 
 from __future__ import annotations

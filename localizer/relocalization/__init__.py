@@ -1,1 +1,1 @@
-"""Where am I, without a prior: one frame against the whole map (docs/relocalization.md)."""
+"""Where am I, without a prior: one frame against the whole map (relocalization.md)."""

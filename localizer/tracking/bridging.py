@@ -2,7 +2,7 @@
 
 Snow, a building site, the map's edge: the picture is good and the map says nothing. The odometry
 keeps every accepted frame as a possible beginning, which costs nothing, and steps on from it when
-frames are rejected (docs/odometry.md).
+frames are rejected (docs/explanation/odometry.md).
 """
 
 from __future__ import annotations

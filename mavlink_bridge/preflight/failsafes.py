@@ -1,7 +1,7 @@
 """What ArduPilot does once vision ends: told before the flight, and never written.
 
 The vehicle's failsafes are its pilot's decision. Values are those of ArduCopter's own parameter
-descriptions; the times were measured in SITL (docs/safety.md).
+descriptions; the times were measured in SITL (docs/explanation/integrity.md).
 """
 
 from __future__ import annotations
@@ -72,7 +72,7 @@ def failsafes(config: BridgeConfig, read: Read) -> list[Failsafe]:
     action = read("FS_EKF_ACTION")
     if action is not None:
         found = _COPTER_LANDS.get(action, f"FS_EKF_ACTION {action:g}")
-        why = "also when the companion dies; a supervised one is back sooner (docs/safety.md)"
+        why = "also when the companion dies; a supervised one is back sooner (integrity.md)"
         ok = action in (1.0, 2.0)
         lines.append(Failsafe("when vision ends", found, "as the pilot expects", why, ok))
     return lines

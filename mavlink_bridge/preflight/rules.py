@@ -1,6 +1,6 @@
 """What the flight controller's parameters must be for the chosen injection.
 
-Every rule for ArduPilot is a refusal or an error that was measured (docs/bridge.md); those for PX4
+Every rule for ArduPilot is a refusal or an error that was measured (messages.md); those for PX4
 are from its documentation.
 """
 

@@ -1,6 +1,6 @@
 """Firmware profiles: what each autopilot makes of the messages it is sent.
 
-Measured or read from source; see docs/bridge.md for the table and where each entry comes from.
+Measured or read from source; see messages.md for the table and where each entry comes from.
 """
 
 from __future__ import annotations

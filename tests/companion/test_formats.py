@@ -1,4 +1,4 @@
-"""docs/formats.md says what the code writes and reads."""
+"""docs/reference/formats.md says what the code writes and reads."""
 
 import dataclasses
 import json
@@ -15,7 +15,9 @@ from localizer.tracking.engine_health import EngineHealth
 from localizer.types import TrackingState
 from mavlink_bridge.messages import HealthLevel
 
-TEXT = (Path(__file__).resolve().parents[2] / "docs" / "formats.md").read_text(encoding="utf-8")
+TEXT = (Path(__file__).resolve().parents[2] / "docs" / "reference" / "formats.md").read_text(
+    encoding="utf-8"
+)
 
 
 def _section(begin, end):

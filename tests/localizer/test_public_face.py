@@ -32,8 +32,10 @@ def test_importing_the_package_imports_no_kernel_and_no_network():
 
 
 def test_the_api_page_is_made_from_todays_docstrings():
-    docs = ROOT / "docs" / "api.md"
-    assert docs.read_text(encoding="utf-8") == page(), "python -m localizer.api_page docs/api.md"
+    docs = ROOT / "docs" / "reference" / "api.md"
+    assert docs.read_text(encoding="utf-8") == page(), (
+        "python -m localizer.api_page docs/reference/api.md"
+    )
 
 
 def test_the_page_begins_with_what_the_example_does():

@@ -122,7 +122,9 @@ def _model(
             )
         return lens.to_dict()
     width, height = size or (1280, 720)
-    notes.append("camera.model is a field of view, not a calibration: docs/install.md, calibration")
+    notes.append(
+        "camera.model is a field of view, not a calibration: docs/how-to/install.md, calibration"
+    )
     return Camera.from_fov(width, height, fov or _DEFAULT_FOV_DEG).to_dict()
 
 
@@ -137,6 +139,8 @@ def _with_vehicle(config: CompanionConfig, notes: list[str]) -> CompanionConfig:
         return config
     typer.echo(f"vehicle: {met.firmware}, system id {met.system_id}")
     if met.firmware != "ArduPilot":
-        notes.append(f"{met.firmware}: choose bridge.injection.message by docs/bridge.md")
+        notes.append(
+            f"{met.firmware}: choose bridge.injection.message by docs/reference/messages.md"
+        )
     bridge = config.bridge.model_copy(update={"system_id": met.system_id})
     return config.model_copy(update={"bridge": bridge})

@@ -1,4 +1,4 @@
-"""The tile cache on disk: manifest, index and one file per tile (see docs/cache-format.md)."""
+"""The tile cache on disk: manifest, index and one file per tile (see cache-format.md)."""
 
 from __future__ import annotations
 

@@ -1,7 +1,7 @@
 """The small dense algebra of the numba kernel: the 6x6 system, the retraction, the quadratic prior.
 
 float64 throughout, in place on scratch that the caller owns. Equation numbers are of
-docs/registration.md.
+docs/explanation/registration.md.
 """
 
 # ruff: noqa: PLR0912 (loops over a packed triangle, unrolled by hand)

@@ -5,7 +5,7 @@ image; (2) sample: per anchor reduce the C channels to the 2x2 structure tensor,
 gradient·residual and the squared residual norm (SIMD over channels), so that no C x 6 Jacobian is
 ever formed; (3) accumulate the 6x6 normal equations (SIMD over anchors). Poses, the 6x6 solution
 and the retraction are float64; points, features and sums are float32. Threads split the hypotheses
-and hold no GIL. Equations are numbered in docs/registration.md.
+and hold no GIL. Equations are numbered in docs/explanation/registration.md.
 """
 
 # ruff: noqa: PLR0915 (kernels pass arrays and unroll sums, for speed)

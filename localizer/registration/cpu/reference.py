@@ -1,6 +1,6 @@
 """The reference backend: the specification in plain float64 NumPy, slow and obviously right.
 
-Every equation number is of docs/registration.md. The other backends are tested against this one.
+Every equation number is of registration.md. The other backends are tested against this one.
 """
 
 from __future__ import annotations

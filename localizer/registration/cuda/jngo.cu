@@ -1,4 +1,4 @@
-// The CUDA kernels of the registration (docs/registration.md, docs/gpu.md), compiled at run time.
+// The CUDA kernels of the registration (docs/explanation/registration.md, docs/how-to/gpu.md), compiled at run time.
 #ifndef CUDA_EMULATION
 // Two IEEE halves to float, without the toolkit's headers, which are not there at run time.
 __device__ __forceinline__ void half_pair(unsigned bits, float& low, float& high) {

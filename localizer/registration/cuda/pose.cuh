@@ -1,4 +1,4 @@
-// Float64 mathematics of one pose: equations 5, 8, 13 and 15 of docs/registration.md.
+// Float64 mathematics of one pose: equations 5, 8, 13 and 15 of docs/explanation/registration.md.
 #pragma once
 #include "layout.cuh"
 

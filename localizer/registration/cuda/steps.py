@@ -1,4 +1,4 @@
-"""The launches of a registration's graph, in order (docs/registration.md, section 7)."""
+"""The launches of a registration's graph, in order (registration.md, section 7)."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ class Step:
 
 
 def launches(shape: Shape, memory: FrameMemory, multiprocessors: int) -> Iterator[Step]:
-    """The launches, in order (docs/registration.md, section 7)."""
+    """The launches, in order (docs/explanation/registration.md, section 7)."""
     c, searched = shape.config, len(shape.config.iterations)
     levels = len(shape.channels)
     for k in range(levels):

@@ -2,7 +2,7 @@
 
 A map's texture was taken once, at the survey's resolution. Until the flight, grass, crops, leaf
 litter, bare soil and water have taken another fine texture: what lasts is their layout, and hard
-surfaces. Each function stands for one of these (docs/model-card.md); training places and the
+surfaces. Each function stands for one of these (model-card.md); training places and the
 worlds that are flown use the same ones.
 """
 

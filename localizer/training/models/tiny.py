@@ -5,7 +5,7 @@ uncertainty (Sec. 3.3.1, A.1). Eight channels are fixed orientation energy (`ori
 is learned; what share each has in the squared distance is learned too, pixel by pixel, because
 orientation does not last on grass, leaves and water. The confidence is the
 orientation's clarity: one that was learned with the features gathered the anchors in a few places
-and cost accuracy each time it was tried (docs/model-card.md). The finest level is at stride 2: half
+and cost accuracy each time it was tried (model-card.md). The finest level is at stride 2: half
 the paper's, a quarter of the work. The coarsest stage is dilated, because at stride 8 a wide field
 of view costs next to nothing.
 """

@@ -41,7 +41,7 @@ def test_report_has_the_papers_columns(recorded, tmp_path, prior):
             "recall_5", "completeness", "fps"}  # fmt: skip
     assert keys <= set(report)
     assert report["frames"] == FRAMES
-    # 0.04 to 0.05 m; before the detail level it was 0.35 m (docs/results.md).
+    # 0.04 to 0.05 m; before the detail level it was 0.35 m (docs/results/index.md).
     assert report["recall_1"] == 100.0
     assert report["median_translation_m"] < 0.12
     assert (tmp_path / "frames.csv").stat().st_size > 0

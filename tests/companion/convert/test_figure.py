@@ -1,4 +1,4 @@
-"""The figure of docs/angles.md can be drawn, and its page says what the conversions say."""
+"""The figure of angles.md can be drawn, and its page says what the conversions say."""
 
 from pathlib import Path
 
@@ -14,7 +14,7 @@ from localizer.geometry.posefile import pose_row
 def test_the_figure(tmp_path):
     draw(tmp_path / "angles.png")
     drawn = cv2.imread(str(tmp_path / "angles.png"))
-    kept = cv2.imread(str(Path(__file__).resolve().parents[3] / "docs" / "angles.png"))
+    kept = cv2.imread(str(Path(__file__).resolve().parents[3] / "docs" / "img" / "angles.png"))
     assert drawn.shape == kept.shape
 
 

@@ -66,7 +66,7 @@ def test_fused_is_the_same_function(trained, fused):
 
 
 def test_size(trained, fused):
-    """The figures of docs/gpu.md; the paper's Table 5 gives shapes only."""
+    """The figures of docs/how-to/gpu.md; the paper's Table 5 gives shapes only."""
     assert parameter_count(trained) == 957_123
     assert parameter_count(fused) == 525_923
     assert multiply_adds(fused, 512, 512) == pytest.approx(19.74e9, rel=1e-3)
