@@ -33,6 +33,7 @@ from companion.sources.datagrams import (
     VideoDatagrams,
 )
 from companion.sources.misp import MispTime, parse_message
+from companion.sources.references import References
 from companion.sources.timing import ExposureClock, Stamps
 from localizer.geometry.camera import Camera
 from localizer.tracking.mailbox import Mailbox
@@ -83,6 +84,8 @@ class Decoder:
         self.stream = self._container.streams.video[0]
         self.late = 0  # pictures that packets before theirs held back (B-frames)
         context = self.stream.codec_context
+        h264 = context.name == "h264" and read_timeout_s is not None
+        self._references = References(bytes(context.extradata or b"")) if h264 else None
         context.thread_count = 1
         if read_timeout_s is not None:
             context.flags |= _LOW_DELAY
@@ -99,12 +102,17 @@ class Decoder:
                 pictures = []
             if self._tap is not None and packet.size:
                 self._tap.packet(packet)
-            whole = [p for p in pictures if not p.is_corrupt]
+            late = self._leans_on_lost(packet, arrival_ns)  # each packet: it counts them
+            whole = [p for p in pictures if not p.is_corrupt and not late]
             self.late += max(0, len(whole) - (1 if packet.size else 0))
             for picture in whole:
                 yield picture, arrival_ns
             if not whole and packet.size:
                 yield None, arrival_ns
+
+    def _leans_on_lost(self, packet: av.Packet, arrival_ns: int) -> bool:
+        follows = self._references
+        return follows is not None and follows.is_broken(bytes(packet), arrival_ns)
 
     def close(self) -> None:
         """Close the container."""

@@ -47,7 +47,8 @@ StateCallback = Callable[[StreamState, str], None]
 @dataclass(frozen=True)
 class SourceCounters:
     """received: pictures decoded; delivered: handed out by `frames`; dropped: overwritten by a
-    newer one before they were fetched; undecodable: packets that gave no whole picture; misfits:
+    newer one before they were fetched; undecodable: packets that gave no whole picture, or one
+    that was predicted from a picture that never came (`companion.sources.references`); misfits:
     pictures whose shape is not the calibration's; reconnects: connections after the first; foreign:
     datagrams of others than the feed's sender, which are not taken.
     """

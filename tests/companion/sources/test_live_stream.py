@@ -5,6 +5,7 @@ from __future__ import annotations
 import socket
 import threading
 import time
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -15,7 +16,7 @@ from companion.sources import FrameSource, SourceSettings, StreamState, open_sou
 from companion.sources.base import fitted_camera
 from localizer.geometry.camera import Camera
 from localizer.types import Frame, Image
-from sitl.camera.stream import VideoSender
+from sitl.camera.stream import LossyLink, VideoSender
 
 CAMERA = Camera.from_fov(320, 240, 70.0)
 _CELL = 16
@@ -403,3 +404,41 @@ def test_an_unexpected_error_in_the_reader_is_a_stall_and_tried_again(
 def test_pictures_too_small_for_a_camera_are_misfits(size: tuple[int, int]) -> None:
     with pytest.raises(StreamSizeError, match=f"delivers {size[0]}x{size[1]}"):
         fitted_camera(*size, CAMERA, "udp://x:1")
+
+
+class _HoledLink:
+    """A link that loses whole pictures while `lost` is set."""
+
+    def __init__(self, url: str) -> None:
+        self.lost = False
+        self._link = LossyLink(url, 0.0)
+
+    def write(self, data: bytes) -> int:
+        return len(data) if self.lost else self._link.write(data)
+
+
+def test_pictures_after_a_lost_one_are_not_given(url: str) -> None:
+    link, rate_hz = _HoledLink(url), 8.0
+    with Watch(url, stall_timeout_s=5.0) as watch:
+        sender = VideoSender(url, CAMERA.width, CAMERA.height, rate_hz, link=link)
+        number = 0
+        while not watch.frames:  # it joins at a key frame
+            sender.send(counter_image(number), time.monotonic_ns())
+            number += 1
+            time.sleep(0.02)
+        joined = number + (-number) % int(rate_hz)  # the next key frame
+        lost = joined + 3
+        for n in range(number, joined + 2 * int(rate_hz)):
+            link.lost = n == lost
+            sender.send(counter_image(n), time.monotonic_ns())
+            if not lost <= n < joined + rate_hz:
+                watch.wait_until(partial(_shows, watch, n))
+        sender.close()
+    numbers = [read_counter(frame.image) for frame, _ in watch.frames]
+    between = [n for n in numbers if joined <= n < joined + rate_hz]
+    assert between == [joined, joined + 1, joined + 2]
+    assert watch.source.counters.undecodable >= rate_hz - 4
+
+
+def _shows(watch: Watch, number: int) -> bool:
+    return read_counter(watch.frames[-1][0].image) == number
