@@ -26,6 +26,7 @@ Thumbnail = NDArray[np.float32]
 WIDTH, HEIGHT = 64, 48  # of a thumbnail
 _CRC_ROWS = 8  # every eighth row is enough to tell two pictures of a sensor apart
 _UNLIKE_GRAY = 2.0  # root mean square difference beyond which a fit need not be tried
+_MOST_GAIN = 3.0  # ratio of contrasts that another exposure makes; of a covered lens it is 10
 _SURE = 2e-4  # a fit with a larger sigma says nothing: the picture has no content
 _MEDIAN_OF = 5
 _CANDIDATES = 3  # for a loop, of a minute's pictures
@@ -159,7 +160,8 @@ def resemblance(a: _Seen, b: _Seen) -> float:
     """How far the picture moved from a to b, as a share of its width; 1 where nobody can say."""
     if a.crc == b.crc:
         return 0.0
-    if unlikeness(a, b) > _UNLIKE_GRAY:
+    low, high = sorted((a.contrast, b.contrast))
+    if unlikeness(a, b) > _UNLIKE_GRAY or high > _MOST_GAIN * low:
         return 1.0
     moved = picture_motion(a.thumbnail, b.thumbnail)
     return moved.share if moved.sigma < _SURE else 1.0

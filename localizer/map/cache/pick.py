@@ -14,6 +14,9 @@ from localizer.map.cache.tile import TileMesh
 from localizer.types import RenderedView
 
 _JUMP = 0.02  # relative change of depth between neighbouring pixels that may be an edge
+# Between tiles, whose corners are rounded each to its own float32, nothing is open: metres, and the
+# same as a share of a triangle's side.
+_SEAM_M, _SEAM = 1e-3, 1e-4
 _CORNERS = np.array(list(np.ndindex(2, 2, 2)), np.bool_)
 
 
@@ -47,6 +50,7 @@ class Pyramid:
     def beyond(self, points: Array) -> NDArray[np.uint8]:
         """Which planes each point (..., 3), from the eye, lies beyond: (...) four bits."""
         x, y, z = np.moveaxis(points @ self.axes.T, -1, 0)
+        z = z + _SEAM_M
         return np.asarray((x > z) + 2 * (-x > z) + 4 * (y > z) + 8 * (-y > z), np.uint8)
 
     def meets_boxes(self, low: Array, high: Array) -> NDArray[np.bool_]:
@@ -161,11 +165,12 @@ def _cast(positions, faces, low, high, origin, directions, nearest):  # type: ig
         d = directions[r]
         enter, leave = 0.0, nearest[r]
         for a in range(3):
+            below, above = low[a] - _SEAM_M - origin[a], high[a] + _SEAM_M - origin[a]
             if d[a] == 0.0:
-                if origin[a] < low[a] or origin[a] > high[a]:
+                if below > 0.0 or above < 0.0:
                     leave = -1.0
                 continue
-            t0, t1 = (low[a] - origin[a]) / d[a], (high[a] - origin[a]) / d[a]
+            t0, t1 = below / d[a], above / d[a]
             enter, leave = max(enter, min(t0, t1)), min(leave, max(t0, t1))
         if enter > leave + 1e-6 * abs(leave):
             continue
@@ -204,10 +209,10 @@ def _meet(positions, face, origin, d):  # type: ignore[no-untyped-def]
     inv = 1.0 / det
     ox, oy, oz = origin[0] - ax, origin[1] - ay, origin[2] - az
     b = (ox * hx + oy * hy + oz * hz) * inv
-    if b < 0.0 or b > 1.0:
+    if b < -_SEAM or b > 1.0 + _SEAM:
         return -1.0
     gx, gy, gz = oy * uz - oz * uy, oz * ux - ox * uz, ox * uy - oy * ux
     c = (d[0] * gx + d[1] * gy + d[2] * gz) * inv
-    if c < 0.0 or b + c > 1.0:
+    if c < -_SEAM or b + c > 1.0 + _SEAM:
         return -1.0
     return (vx * gx + vy * gy + vz * gz) * inv

@@ -104,3 +104,15 @@ def test_what_shows_nothing_is_no_evidence() -> None:
     fog = np.full((800, 1000, 3), 128, np.uint8)
     camera = Camera(fog, noise=2.0)
     assert max(v.still_s for v in watch([camera.look(*sway(k)) for k in range(50)])) < 1.0
+
+
+def test_what_comes_after_a_covered_lens_is_new() -> None:
+    """Any picture is a covered one's times a gain: it passed for frozen, then for a loop, and right
+    fixes were withheld for 13 s (the flight covered-10s, seed 1).
+    """
+    camera, lens = Camera(scene()), Camera(np.full((800, 1000, 3), 9, np.uint8), noise=4.0)
+    places = [(1.5 * k, 0.5 * k) for k in range(80)]
+    flown = [lens.look(*at) if 10 <= k < 40 else camera.look(*at) for k, at in enumerate(places)]
+    verdicts = watch(flown)
+    assert max(v.still_s for v in verdicts[45:]) < 0.5
+    assert max(v.repeat_lag_s for v in verdicts[40:]) == 0.0

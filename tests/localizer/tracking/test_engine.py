@@ -124,12 +124,25 @@ class Flight:
         self.engine.start()
 
     def feed_until(self, condition, timeout_s=60.0):
+        """Frames until something holds, at the engine's pace: the exposures' clock stands still
+        until both threads have done with a frame, or a starved machine would run through seconds
+        of flight (and begin searches) between two frames that are looked at.
+        """
         deadline = time.monotonic() + timeout_s
         while not condition():
             assert time.monotonic() < deadline, self.engine.health
+            submitted_ns = time.monotonic_ns()
             self.engine.submit(_frame(self.sequence))
             self.sequence += 1
-            time.sleep(INTERVAL_NS * 1e-9)
+            localized_ns = self._turn_after("localize", submitted_ns, deadline)
+            self._turn_after("render", localized_ns, deadline)
+
+    def _turn_after(self, thread: str, time_ns: int, deadline: float) -> int:
+        """Wait until a thread begins a new turn, and so has ended what it took; when it began."""
+        while (begun_ns := self.engine.turns().get(thread, 0)) <= time_ns:
+            assert time.monotonic() < deadline, f"{thread} stands: {self.engine.health}"
+            time.sleep(1e-3)
+        return begun_ns
 
 
 @pytest.fixture

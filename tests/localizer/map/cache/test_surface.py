@@ -54,6 +54,26 @@ def test_heights_are_those_of_the_source_not_of_a_coarse_level(cache, make):
     assert fine < 0.5 * rough
 
 
+def test_a_vertical_ray_on_the_border_of_tiles_meets_one_of_them(cache):
+    """Each tile's corners are rounded to its own float32: a ray between two of them met neither."""
+    index, down = cache.index, np.array([[0.0, 0.0, -1.0]])
+    leaves = np.flatnonzero(index.child_count == 0)
+    low, high = index.box_min[leaves].min(axis=0), index.box_max[leaves].max(axis=0)
+    inner = [np.unique(index.box_min[leaves][:, a].round(3)) for a in (0, 1)]
+    rng, surface, missed = np.random.default_rng(4), MapSurface(cache), []
+    tiles = _finest(cache)
+    for axis in (0, 1):
+        for border in (b for b in inner[axis] if low[axis] + 1 < b < high[axis] - 1):
+            along = rng.uniform(low[1 - axis] + 1, high[1 - axis] - 1, 6)
+            for place in ((border, a) if axis == 0 else (a, border) for a in along):
+                eye = np.array([*place, 150.0])
+                hits = surface.cast(eye, down).distances
+                single = cast_rays(tiles, eye, down)
+                if not (np.isfinite(hits).all() and np.isfinite(single).all()):
+                    missed.append(place)
+    assert missed == []
+
+
 def test_rays_beside_the_map_and_into_the_sky_meet_nothing(cache):
     surface = MapSurface(cache)
     for eye, axis in ((EYE, (0, 0, 1)), (EYE + np.array([5000.0, 0, 0]), (0, 0, -1))):
