@@ -7,7 +7,8 @@ deb=$(realpath "$1") suite=${2:-bookworm}
 arch=$(dpkg-deb --field "$deb" Architecture)
 root=${ROOT:-$(mktemp -d)/root}
 say() { echo "== $*"; }
-in_root() { chroot "$root" env -i PATH=/usr/sbin:/usr/bin:/sbin:/bin HOME=/root LC_ALL=C.UTF-8 \
+# QEMU_CPU: float32 products are NaN under qemu's default processor; cortex-a72 computes rightly.
+in_root() { chroot "$root" env -i ${QEMU_CPU:+QEMU_CPU=$QEMU_CPU} PATH=/usr/sbin:/usr/bin:/sbin:/bin HOME=/root LC_ALL=C.UTF-8 \
     DEBIAN_FRONTEND=noninteractive "$@"; }
 as_service() { in_root setpriv --reuid companion --regid companion --init-groups \
     --no-new-privs --bounding-set=-all --inh-caps=-all env HOME=/var/lib/companion \
