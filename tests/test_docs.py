@@ -1,0 +1,78 @@
+"""The documentation: its site builds strictly, its links lead somewhere, its lines can be read."""
+
+import importlib.util
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from benchmarks.site.__main__ import outdated
+
+ROOT = Path(__file__).parents[1]
+PAGES = sorted(
+    [
+        *ROOT.glob("docs/**/*.md"),
+        *(ROOT / n for n in ("README.md", "CONTRIBUTING.md", "SECURITY.md")),
+    ]
+)
+_LINK = re.compile(r"\]\(([^)\s#]+)(#[^)\s]*)?\)")
+
+
+def _prose(page):
+    """Number and text of each line outside of code blocks and tables."""
+    code = False
+    for number, line in enumerate(page.read_text(encoding="utf-8").splitlines(), start=1):
+        code ^= line.lstrip().startswith("```")
+        if not code and not line.startswith("|"):
+            yield number, line
+
+
+def test_links_lead_somewhere():
+    broken = [
+        f"{page.relative_to(ROOT)}: {link}"
+        for page in PAGES
+        for link, _ in _LINK.findall(page.read_text(encoding="utf-8"))
+        if "://" not in link and not (page.parent / link).exists()
+    ]
+    assert not broken
+
+
+def test_prose_fits_a_screen():
+    long = [
+        f"{page.relative_to(ROOT)}:{number}: {len(line)} characters"
+        for page in PAGES
+        for number, line in _prose(page)
+        if len(line) > 120
+    ]
+    assert not long
+
+
+def test_the_readme_is_read_as_text_too():
+    lines = (ROOT / "README.md").read_text(encoding="utf-8").splitlines()
+    assert max(map(len, lines)) <= 120
+
+
+def test_generated_pages_are_of_today():
+    assert not outdated(ROOT), "python -m benchmarks.site"
+
+
+@pytest.mark.skipif(
+    importlib.util.find_spec("material") is None, reason="no mkdocs-material (extra docs)"
+)
+def test_the_site_builds_strictly_and_asks_no_network(tmp_path):
+    command = [sys.executable, "-m", "mkdocs", "build", "--strict", "--site-dir", str(tmp_path)]
+    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    asked = {
+        f"{page.relative_to(tmp_path)}: {address}"
+        for page in tmp_path.rglob("*.html")
+        for address in re.findall(
+            r"<(?:script|img|iframe)[^>]* src=\"?(https?:[^\"\s>]+)"
+            r"|<link[^>]* rel=\"?(?:stylesheet|preconnect|icon)\"?[^>]* href=\"?(https?:[^\"\s>]+)",
+            page.read_text(encoding="utf-8"),
+        )
+    }
+    assert not asked
+    assert (tmp_path / "reference" / "cli.html").is_file()
