@@ -11,7 +11,8 @@ from typing import Annotated
 import typer
 
 from companion.cli.geographic import numbers
-from companion.errors import ConfigError, ReportError
+from companion.errors import ConfigError
+from companion.writing import writing
 from localizer.geometry.geo import Geodetic, LocalFrame
 from localizer.geometry.trajectory import StampedPose
 
@@ -81,10 +82,8 @@ def convert_command(
         above = Heights(heights.value, separation or 0.0)
     place = Place(frame, above)
     poses = _dated(READERS[of.value](source, place), times, needed=to is Target.TUM)
-    try:
+    with writing(out):
         WRITERS[to.value](out, poses, place)
-    except OSError as error:
-        raise ReportError(f"{out}: cannot be written: {error.strerror or error}") from error
     typer.echo(f"{out}: {len(poses)} poses")
 
 

@@ -17,12 +17,13 @@ from rich.markup import escape
 from rich.progress import Progress
 from rich.table import Table
 
-from companion.errors import ConfigError, ReportError
+from companion.errors import ConfigError
 from companion.offline.plots import ErrorSeries, overlay_sheet, plot_errors, save_image
 from companion.reporting.report import write_page
 from companion.terminal.links import file_link
 from companion.trajectory import stamped, write_trajectory
 from companion.versions import versions
+from companion.writing import made_folder, writing
 from localizer.config import LocalizerConfig
 from localizer.evaluation.metrics import LocalizationMetrics
 from localizer.evaluation.places import KnownOfPlace, PlaceFinder
@@ -121,12 +122,10 @@ def evaluate_command(
         unusable = sum(f.unusable for f in frames)
         # Before the files: they are told even if the disk is full.
         print_metrics(metrics, unusable, str(sequence))
-        try:
+        with writing(report, "--report"):
             _write_report(report, frames, metrics, settings, stack.cache.frame)
             _write_trajectories(report, frames, data, stack.cache.frame)
             _write_overlays(report, frames, data, stack.renderer, localizer.camera)
-        except OSError as error:
-            raise ReportError(f"--report {report}: cannot be written: {error}") from error
     finally:
         stack.close()
     page = write_page(report)
@@ -183,12 +182,8 @@ def _text(value: float | None, digits: int) -> str:
 
 def _prepare(folder: Path) -> None:
     """Make the report's folder and try it, before minutes are spent on what goes into it."""
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-        with TemporaryFile(dir=folder):
-            pass
-    except OSError as error:
-        raise ReportError(f"--report {folder}: cannot be written: {error}") from error
+    with writing(made_folder(folder, "--report"), "--report"), TemporaryFile(dir=folder):
+        pass
 
 
 def _write_report(

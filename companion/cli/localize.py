@@ -14,10 +14,11 @@ from rich.markup import escape
 from rich.progress import Progress
 
 from companion.cli.geographic import numbers
-from companion.errors import ConfigError, ReportError
+from companion.errors import ConfigError
 from companion.offline.localize import LocalizedImage, Sigmas, image_times, localize_images
 from companion.sources.folder_source import list_images
 from companion.trajectory import stamped, write_trajectory
+from companion.writing import made_folder, writing
 from localizer.config import LocalizerConfig
 from localizer.geometry.camera import Camera
 from localizer.geometry.geo import Geodetic, LocalFrame
@@ -76,7 +77,7 @@ def localize_command(
     rows = read_poses(priors) if priors is not None else [_row(paths[0].name, str(prior))]
     if paths[0].name not in {row.name for row in rows}:
         raise ConfigError(f"--priors {priors}: has no line for the first image, {paths[0].name}")
-    _prepare(out)
+    made_folder(out, "--out")
     config = LocalizerConfig(
         width=width, model=model, renderer=renderer, device=device, feature_threads=2
     )
@@ -93,10 +94,8 @@ def localize_command(
             )
         )
     accepted = _print(found, frame)
-    try:
+    with writing(out, "--out"):
         _write(out, found, frame)
-    except OSError as error:
-        raise ReportError(f"--out {out}: cannot be written: {error}") from error
     raise typer.Exit(0 if accepted else 1)
 
 
@@ -105,13 +104,6 @@ def _row(name: str, prior: str) -> PoseRow:
         prior, "--prior", ("LAT", "LON", "HEIGHT", "ROLL", "PITCH", "YAW")
     )
     return PoseRow(name, Geodetic(lat, lon, height), roll, pitch, yaw)
-
-
-def _prepare(folder: Path) -> None:
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise ReportError(f"--out {folder}: cannot be written: {error}") from error
 
 
 def _print(found: Sequence[LocalizedImage], frame: LocalFrame) -> int:

@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterable, Iterator
-from contextlib import contextmanager
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -14,8 +13,8 @@ from rich.markup import escape
 from rich.table import Table
 
 from companion.cli.before.map_check import check_command
-from companion.errors import ReportError
 from companion.terminal.import_bar import ImportBar
+from companion.writing import writing
 
 app = typer.Typer(no_args_is_help=True)
 
@@ -190,7 +189,7 @@ def info(
     _print_warnings(m.warnings)
     for file, written in ((geojson, as_geojson), (kml, as_kml)):
         if file is not None:
-            with _written(file):
+            with writing(file, "--out"):
                 file.write_text(written(m, opened.path.name), encoding="utf-8")
 
 
@@ -250,7 +249,7 @@ def render(
     opened = TileCache.open(cache)
     pose = inspect.camera_pose(opened, latitude, longitude, height, heading, pitch)
     view = inspect.render_view(opened, pose, Camera.from_fov(width, image_height, fov))
-    with _written(out):
+    with writing(out, "--out"):
         inspect.write_picture(out, view.rgb)
         inspect.write_picture(depth, inspect.depth_picture(view.depth))
     shown = view.depth[view.depth > 0]
@@ -271,7 +270,7 @@ def export(
     from localizer.map.inspection.inspect import export_glb
 
     opened = TileCache.open(cache)
-    with _written(out):
+    with writing(out, "--out"):
         triangles = export_glb(opened, out, level)
     Console().print(f"{out}: {triangles} triangles, {out.stat().st_size / 1e6:.1f} MB")
 
@@ -306,12 +305,3 @@ def _require_place(*files: Path) -> None:
             raise typer.BadParameter(f"--out {file}: no such folder")
         if not os.access(file if file.exists() else file.parent, os.W_OK):
             raise typer.BadParameter(f"--out {file}: may not be written; choose another place")
-
-
-@contextmanager
-def _written(out: Path) -> Iterator[None]:
-    """Around the writing of a file: what the disk says is a named error."""
-    try:
-        yield
-    except OSError as error:
-        raise ReportError(f"--out {out}: cannot be written: {error.strerror or error}") from error

@@ -8,10 +8,10 @@ from html import escape
 from pathlib import Path
 from typing import Any
 
-from companion.errors import ReportError
 from companion.planning.judge import LegVerdict, Stretch
 from companion.planning.plan import Plan
 from companion.reporting.layout import data_uri
+from companion.writing import writing
 from localizer.types import Image
 
 _CSS = """
@@ -160,11 +160,9 @@ def write_page(plan: Plan, pictures: Sequence[tuple[str, Image]], path: Path) ->
         '<!doctype html><html lang="en"><meta charset="utf-8"><title>Forecast</title>'
         f"<style>{_CSS}</style><body>{body}</body></html>"
     )
-    try:
+    with writing(path):
         # A file's name may hold half a character (a lone surrogate).
         path.write_bytes(text.encode("utf-8", "replace"))
-    except OSError as error:
-        raise ReportError(f"{path}: cannot be written: {error}") from error
 
 
 def _part(title: str, headings: Sequence[str], rows: Iterable[Sequence[str]]) -> str:

@@ -16,6 +16,7 @@ import numpy as np
 from companion.errors import ReportError
 from companion.reporting.content import MapSheet, Plot, Report, Stanford, Table, Track
 from companion.vendored import licence_of, vendored
+from companion.writing import writing
 from localizer.types import Image
 
 _JPEG_QUALITY = 82
@@ -29,10 +30,8 @@ _COLOURS = {
 
 def write_report(report: Report, path: Path) -> Path:
     """Write the page. `ReportError` where the disk does not take it."""
-    try:
+    with writing(path):
         path.write_text(render(report), encoding="utf-8")
-    except OSError as error:
-        raise ReportError(f"{path}: cannot be written: {error}") from error
     return path
 
 

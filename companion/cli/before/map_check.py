@@ -12,7 +12,7 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
-from companion.errors import ReportError
+from companion.writing import made_folder
 
 _COLOURS = {"good": "green", "advice": "yellow", "bad": "red"}
 
@@ -46,10 +46,7 @@ def check_command(
         camera = working_camera(deployment.camera.model.camera(), deployment.localizer.width)
         pixel_rad = 1 / camera.fx
     opened = TileCache.open(cache)
-    try:
-        out.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise ReportError(f"--out {out}: cannot be written: {error}") from error
+    made_folder(out, "--out")
     made = check_map(opened, Use(height, pixel_rad))
     for name, rgb in made.pictures.items():
         write_picture(out / f"{name}.png", rgb)

@@ -15,8 +15,8 @@ from rich.markup import escape
 from rich.table import Table
 
 from companion.config import load_config
-from companion.errors import ReportError
 from companion.terminal.steps import shown_count
+from companion.writing import made_folder
 
 
 def plan_command(
@@ -66,10 +66,7 @@ def plan_command(
     deployment = load_config(config)
     planned = read_mission(mission)
     cache = TileCache.open(map_cache or deployment.map)
-    try:
-        out.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise ReportError(f"--out {out}: cannot be written: {error}") from error
+    made_folder(out, "--out")
     question = replace(
         Question(mission, conditions, Limits(sigma)),
         spacing_m=spacing, speed_m_s=speed, pitch_deg=pitch, seek=alternatives,
