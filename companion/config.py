@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, field_validator, model_validator
 
@@ -13,7 +13,7 @@ from companion.guardian.config import GuardianConfig
 from companion.live.config import ConsoleConfig
 from companion.settings_file import SettingsError, read_settings, validated
 from companion.sources.base import SourceSettings
-from companion.targets.detections import parse_host_port
+from companion.targets.detections import CLICKED, parse_host_port
 from localizer.config import LocalizerConfig
 from localizer.errors import CameraError
 from localizer.geometry.camera import MAX_READOUT_MS, Camera
@@ -115,10 +115,38 @@ class FeedConfig(_Model):
         return self
 
 
+class DetectorConfig(_Model):
+    """An object detector in the companion's own process."""
+
+    model: Path = Field(description="ONNX file of a YOLO network")
+    labels: tuple[str, ...] = Field((), description="its classes' names; none: those in the file")
+    classes: tuple[str, ...] = Field((), description="names of what is reported; none: all")
+    threshold: float = Field(0.4, gt=0, lt=1, description="least score of a report")
+    layout: Literal["v5", "v8", "end2end"] | None = Field(
+        None, description="of its output; null: by the output's shape"
+    )
+    rate_hz: float = Field(2.0, ge=0.05, le=30, description="pictures a second, at most")
+    duty: float = Field(0.3, gt=0, le=1, description="share of one processor, at most")
+
+    @field_validator("labels")
+    @classmethod
+    def _are_names(cls, value: tuple[str, ...]) -> tuple[str, ...]:
+        for label in value:
+            if not 0 < len(label) <= 48 or not label.isprintable() or label.startswith(CLICKED):
+                raise ValueError(
+                    f"{label!r}: a name has 1 to 48 printable characters, and those that begin "
+                    f"with {CLICKED!r} are the operator's clicks"
+                )
+        return value
+
+
 class TargetConfig(_Model):
     """Target geo-localization."""
 
     detections: str | None = Field(None, description="host:port where pixel detections arrive")
+    detector: DetectorConfig | None = Field(
+        None, description="a network that looks for things in flight; null: none"
+    )
     rate_hz: float = Field(5.0, ge=0.01, le=30, description="reports per second and target")
     pixel_sigma: float = Field(1.5, ge=0.01, le=1000, description="error of a detection, pixels")
     map_sigma_m: float = Field(

@@ -43,5 +43,9 @@ class DetectionError(CompanionError):
     """A datagram that is not a pixel detection."""
 
 
+class DetectorError(CompanionError):
+    """A detection network that cannot be loaded, or whose output is of no known layout."""
+
+
 class MissionFileError(CompanionError):
     """A mission that cannot be read, or that does not lie where the map is."""

@@ -44,6 +44,7 @@ from companion.sources import FrameSource, PacketTap, PacketTaps, StreamState, o
 from companion.sources.timing import system_minus_monotonic
 from companion.targets.clicks import ClickPolicy
 from companion.targets.detections import DetectionListener
+from companion.targets.detector.worker import BoxDetector
 from companion.targets.frame_times import FrameTimes
 from companion.targets.numbers import TargetNumbers
 from companion.targets.population import Target
@@ -225,9 +226,22 @@ def _detections(making: Making) -> DetectionListener:
     return DetectionListener(address, making[FrameTimes].add_detection)
 
 
+def _detector(making: Making) -> BoxDetector:
+    channels, reporter = making.channels, making[TargetReporter]
+    config = making.config.targets.detector
+    assert config is not None  # or the part is not wanted
+    cast = MapSurface(making[MapStack].cache).cast
+    detector = BoxDetector(config, cast, reporter.add_detection, making[Bridge].say)
+    channels.frames.subscribe(detector.add_frame)
+    channels.estimates.subscribe(lambda estimate, _: detector.add_estimate(estimate))
+    return detector
+
+
 def _target_counts(making: Making) -> Callable[[], dict[str, int]]:
     """What was asked of the targets and could not be told, for the health and the report."""
     targets, times = making.later(TargetReporter), making.get(FrameTimes)
+    has_detector = making.config.targets.detector is not None
+    detector = making.later(BoxDetector) if has_detector else None
 
     def counts() -> dict[str, int]:
         reporter = targets()
@@ -235,7 +249,7 @@ def _target_counts(making: Making) -> Callable[[], dict[str, int]]:
             "missed": reporter.missed,
             "doubted": reporter.doubted,
             "refused": reporter.refused,
-            "failed": reporter.failed,
+            "failed": reporter.failed + (0 if detector is None else detector().failed),
             "unmatched": 0 if times is None else times.unmatched,
         }
 
@@ -445,7 +459,7 @@ PARTS: tuple[Part[Any], ...] = (
     Part(
         "health", HealthMonitor, _health,
         depends=(MapStack, Bridge, MapShift, RecordKeeper, FrameSource, Guardian, FrameTimes),
-        later=(DualThreadEngine, AutopilotPose, TargetReporter),
+        later=(DualThreadEngine, AutopilotPose, TargetReporter, BoxDetector),
         start=HealthMonitor.start, stop=HealthMonitor.stop,
     ),
     Part(
@@ -456,6 +470,11 @@ PARTS: tuple[Part[Any], ...] = (
     Part(
         "detections", DetectionListener, _detections, depends=(FrameTimes,),
         close=DetectionListener.close, wanted=lambda config: config.targets.detections is not None,
+    ),
+    Part(
+        "detector", BoxDetector, _detector, depends=(MapStack, TargetReporter, Bridge),
+        start=BoxDetector.start, stop=BoxDetector.stop,
+        wanted=lambda config: config.targets.detector is not None,
     ),
     Part("autopilot", AutopilotPose, _autopilot, depends=(Bridge, Installation)),
     Part(
