@@ -19,6 +19,7 @@ from mavlink_bridge.errors import FixError
 Array = NDArray[np.float64]
 _FASTEST_MPS = 1000.0
 _LEAST_KNOWN_M = 1e5  # of a sigma or an accuracy: beyond it nothing is known, and floats overflow
+_LARGEST_ANGLE_RAD = 10.0
 _LARGEST_SIGMA = 1e3  # of an angle or a speed
 
 
@@ -58,6 +59,14 @@ def _check_velocity(what: str, velocity_ned: tuple[float, float, float] | None) 
         raise FixError(
             f"{what}: velocity {velocity_ned} is not finite or above {_FASTEST_MPS:.0f} m/s; give "
             "m/s, or None where it is unknown"
+        )
+
+
+def _check_accuracies(what: str, accuracies: tuple[float | None, ...]) -> None:
+    if not all(a is None or 0.0 <= a <= _LEAST_KNOWN_M for a in accuracies):
+        raise FixError(
+            f"{what}: accuracies must be 0 to {_LEAST_KNOWN_M:g} m, None where unknown; got "
+            f"{accuracies}"
         )
 
 
@@ -116,8 +125,11 @@ class VisionFix:
             raise FixError(f"vision fix: quality must be 0..100, got {self.quality}")
         _check_velocity("vision fix", self.velocity_ned)
         angles = (self.roll_rad, self.pitch_rad, self.yaw_rad)
-        if not all(angle is None or math.isfinite(angle) for angle in angles):
-            raise FixError(f"vision fix: attitude {angles} is not finite; give None where unknown")
+        if not all(angle is None or abs(angle) <= _LARGEST_ANGLE_RAD for angle in angles):
+            raise FixError(
+                f"vision fix: attitude {angles} is not finite, or beyond {_LARGEST_ANGLE_RAD:g} "
+                "rad; give radians, None where unknown"
+            )
         if self.protection_m is not None and not all(p >= 0.0 for p in self.protection_m):
             raise FixError(
                 f"vision fix: protection levels must not be negative, got {self.protection_m}"
@@ -164,11 +176,9 @@ class TargetReport:
         _check_position("target report", self.latitude_deg, self.longitude_deg, self.height_m)
         _check_velocity("target report", self.velocity_ned)
         accuracies = (self.h_accuracy_m, self.v_accuracy_m, self.velocity_accuracy_mps)
-        if not all(a is None or 0.0 <= a <= _LEAST_KNOWN_M for a in accuracies):
-            raise FixError(
-                f"target report: accuracies must be 0 to {_LEAST_KNOWN_M:g} m, None where unknown; "
-                f"got {accuracies}"
-            )
+        _check_accuracies("target report", accuracies)
+        if not 0.0 <= self.elsewhere <= 1.0:
+            raise FixError(f"target report: elsewhere is a probability, got {self.elsewhere}")
         for place in (self.pixel, self.rectangle):
             if place is not None and not all(0.0 <= c <= 1.0 for c in place):
                 raise FixError(
@@ -209,6 +219,7 @@ class CameraView:
         _check_position("camera view", self.latitude_deg, self.longitude_deg, self.height_m)
         image = (self.image_latitude_deg, self.image_longitude_deg, self.image_height_m)
         _check_position("camera view's picture", *(value or 0.0 for value in image))
+        _check_accuracies("camera view", (self.h_accuracy_m, self.v_accuracy_m))
         if not all(abs(q) <= 1.001 for q in self.quaternion_ned):
             raise FixError(f"camera view: {self.quaternion_ned} is no rotation")
 

@@ -122,7 +122,7 @@ def track_request(message: Any, time_ns: int) -> TrackRequest | None:
         coordinates = (message.param1, message.param2)
         if not all(0.0 <= c <= 1.0 for c in coordinates):
             return None
-        radius = message.param3 if math.isfinite(message.param3) else 0.0
+        radius = message.param3 if 0.0 <= message.param3 <= 1.0 else 0.0
         return TrackRequest("point", time_ns, coordinates, radius)
     if message.command == mavlink.MAV_CMD_CAMERA_TRACK_RECTANGLE:
         rectangle = (message.param1, message.param2, message.param3, message.param4)

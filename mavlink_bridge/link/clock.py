@@ -14,7 +14,7 @@ from dataclasses import dataclass
 _WINDOW_NS = 30_000_000_000
 _MAX_SAMPLES = 128
 _RUN_BACK_NS = 1_000_000_000
-_RUN_BACK_CONFIRMATIONS = 3
+_CONFIRMATIONS = 3  # stamps in a row, of a clock that ran back or ahead
 _SILENCE_NS = 3_000_000_000
 _MAX_ROUND_TRIP_NS = 500_000_000
 _STAMP_GRAIN_NS = 1_000_000  # boot times are whole milliseconds in most messages
@@ -89,7 +89,8 @@ class BootClock:
     ``monotonic = middle + (boot - boot of that middle) / rate``, from the fastest round trip of
     30 s. Two answers whose round trips cannot both be true show that the clock stepped, or that it
     runs at another rate: a third answer tells which (a simulation at N times real speed runs at
-    rate N). A boot time that runs back, or a clock that is behind after a silence, is a reboot.
+    rate N). A boot time that runs back, or a clock that is behind after a silence, is a reboot. One
+    stamp far ahead is a damaged one, not the beginning of a time that all others then run back from.
     """
 
     def __init__(self) -> None:
@@ -103,8 +104,9 @@ class BootClock:
         self._sync: deque[_Sync] = deque(maxlen=_MAX_SAMPLES)
         self._doubted: _Sync | None = None
         self._anchor: tuple[int, int] | None = None
-        self._newest_boot_ns = 0
+        self._newest_boot_ns = self._newest_at_ns = 0
         self._behind: list[int] = []
+        self._ahead: list[int] = []
 
     @property
     def offset_ns(self) -> int | None:
@@ -118,7 +120,10 @@ class BootClock:
             return False  # an old frame that came late, or the first ones after a reboot
         if rebooted:
             self._restart()
-        self._newest_boot_ns = max(self._newest_boot_ns, boot_ns)
+        elif self._runs_ahead(boot_ns, received_ns):
+            return False
+        if boot_ns > self._newest_boot_ns:
+            self._newest_boot_ns, self._newest_at_ns = boot_ns, received_ns
         # The smallest difference is the message that was under way the shortest.
         self._lag.append((received_ns, received_ns - boot_ns))
         while self._lag and received_ns - self._lag[0][0] > _WINDOW_NS:
@@ -162,10 +167,25 @@ class BootClock:
         if self._behind and boot_ns < self._behind[-1]:
             self._behind.clear()
         self._behind.append(boot_ns)
-        if len(self._behind) < _RUN_BACK_CONFIRMATIONS:
+        if len(self._behind) < _CONFIRMATIONS:
             return False
         self._behind.clear()
         return True
+
+    def _runs_ahead(self, boot_ns: int, received_ns: int) -> bool:
+        """Whether a stamp is ahead of the time that has passed, and is not yet confirmed."""
+        passed = max(self.rate, 1.0) * (received_ns - self._newest_at_ns)
+        if not self._newest_boot_ns or boot_ns - self._newest_boot_ns <= passed + _RUN_BACK_NS:
+            self.strays += bool(self._ahead)
+            self._ahead.clear()
+            return False
+        if self._ahead and boot_ns < self._ahead[-1]:
+            self._ahead.clear()
+        self._ahead.append(boot_ns)
+        if len(self._ahead) < _CONFIRMATIONS:
+            return True
+        self._ahead.clear()
+        return False
 
     def _reconsider(self, sample: _Sync) -> bool:
         """An answer that contradicts the last: another rate, or a step; True for a reboot."""
@@ -187,7 +207,7 @@ class BootClock:
         )
         if rebooted:
             self._restart()
-            self._newest_boot_ns = sample.boot_ns
+            self._newest_boot_ns, self._newest_at_ns = sample.boot_ns, sample.middle_ns
         self._sync.append(sample)
         return rebooted
 
@@ -211,7 +231,8 @@ class BootClock:
         self._sync.clear()
         self._doubted = None
         self._behind.clear()
+        self._ahead.clear()
         self._anchor = None
         self.rate = 1.0
-        self._newest_boot_ns = 0
+        self._newest_boot_ns = self._newest_at_ns = 0
         self.source = "none"

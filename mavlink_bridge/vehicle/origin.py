@@ -23,6 +23,7 @@ Projection = Literal["ardupilot", "px4"]
 # ArduPilot, AP_Common/Location.h: metres per 1e-7 degree of latitude.
 METRES_PER_DEGREE = 0.011131884502145034 * 1e7
 _PX4_RADIUS_M = 6371000.0  # PX4 lib/geo: CONSTANTS_RADIUS_OF_EARTH
+_HIGHEST_M = 20_000.0  # of an origin, or as deep below the sea
 _ASK_EVERY_NS = 1_000_000_000
 _CHECK_EVERY_NS = 10_000_000_000
 _ASKS_BEFORE_SETTING = 3
@@ -91,6 +92,8 @@ def ned_from_origin(
 def _is_place(read: Origin) -> bool:
     """Not 0, 0, which firmwares send before they have an origin, and somewhere on Earth."""
     if read.latitude_deg == 0.0 and read.longitude_deg == 0.0:
+        return False
+    if not abs(read.altitude_amsl_m) <= _HIGHEST_M:
         return False
     return abs(read.latitude_deg) <= 90.0 and abs(read.longitude_deg) <= 180.0
 

@@ -34,6 +34,8 @@ _DISTANCE_M = 1e6
 _SPEED_MPS = 1_000.0
 _FIX_3D = 3  # GPS_FIX_TYPE
 _HEIGHTS_MM = (-1_000_000, 50_000_000)  # AMSL: the Dead Sea's shore, and above any aircraft
+_ACCURACY_MM = 100_000_000  # beyond it, as of UINT32_MAX, a receiver says that it does not know
+_SATURATED = 32_767  # of an int16: what the sensor could not say
 
 
 def is_autopilot(message: Any) -> bool:
@@ -143,6 +145,7 @@ class VehicleReadings:
         pitch, roll, yaw = (
             math.radians(0.01 * a) for a in (m.pointing_a, m.pointing_b, m.pointing_c)
         )
+        _check_within(_ANGLE_RAD, roll, pitch, yaw)
         q = quat.from_euler(roll, pitch, yaw)
         self.gimbals.add(GimbalSample(time_ns, q, False, GIMBAL_SOURCES[2]))
 
@@ -161,6 +164,7 @@ class VehicleReadings:
         if m.lat == 0 and m.lon == 0:
             return  # what firmwares send before they have a position
         _check_place(m.lat, m.lon)
+        _check_heights(m.alt, m.relative_alt)
         self.globals.add(time_ns, (m.lat * 1e-7, m.lon * 1e-7, m.alt * 1e-3))
         self.state = replace(
             self.state,
@@ -193,25 +197,25 @@ class VehicleReadings:
         )
 
     def _gps(self, m: Any, time_ns: int) -> None:
-        if m.fix_type >= _FIX_3D:
+        fixed = m.fix_type >= _FIX_3D
+        if fixed:
             # A receiver that claims a fix where there is no place is none: its report is not heard
             # at all, and GNSS counts as gone once no better one comes.
             _check_place(m.lat, m.lon)
             if m.lat == 0 and m.lon == 0:
                 raise ValueError("a 3D fix at 0, 0")
-            if not _HEIGHTS_MM[0] <= m.alt <= _HEIGHTS_MM[1]:
-                raise ValueError(f"{m.alt} mm is no height of an aircraft")
+            _check_heights(m.alt)
         accuracy = getattr(m, "h_acc", 0)
         height = getattr(m, "alt_ellipsoid", 0)  # an extension: 0 where it is not sent
         self.state = replace(
             self.state,
             gps_fix_type=m.fix_type,
             gps_satellites=0 if m.satellites_visible == 255 else m.satellites_visible,
-            gps_latitude_deg=m.lat * 1e-7,
-            gps_longitude_deg=m.lon * 1e-7,
-            gps_altitude_amsl_m=m.alt * 1e-3,
-            gps_height_m=height * 1e-3 if height else None,
-            gps_h_accuracy_m=accuracy * 1e-3 if accuracy else None,
+            gps_latitude_deg=m.lat * 1e-7 if fixed else None,
+            gps_longitude_deg=m.lon * 1e-7 if fixed else None,
+            gps_altitude_amsl_m=m.alt * 1e-3 if fixed else None,
+            gps_height_m=height * 1e-3 if fixed and height and _is_height(height) else None,
+            gps_h_accuracy_m=accuracy * 1e-3 if 0 < accuracy <= _ACCURACY_MM else None,
             gps_time_ns=time_ns,
         )
 
@@ -220,6 +224,9 @@ class VehicleReadings:
         self.state = replace(self.state, rc_channels_us=channels, rc_time_ns=time_ns)
 
     def _raw_imu(self, m: Any, time_ns: int) -> None:
+        raw = (m.xacc, m.yacc, m.zacc, m.xgyro, m.ygyro, m.zgyro)
+        if any(abs(value) >= _SATURATED for value in raw):
+            raise ValueError(f"{raw}: saturated")
         force = (_MILLI_G * m.xacc, _MILLI_G * m.yacc, _MILLI_G * m.zacc)
         rates = (1e-3 * m.xgyro, 1e-3 * m.ygyro, 1e-3 * m.zgyro)
         self.inertial.add(InertialSample(time_ns, force, rates))
@@ -251,13 +258,22 @@ def boot_time_ns(message: Any) -> int | None:
 
 
 def _known(value: float) -> float | None:
-    """A field's value, None where it is NaN: the estimator does not say."""
-    return None if math.isnan(value) else value
+    """A field's value, None where it is not finite: the estimator does not say."""
+    return value if math.isfinite(value) else None
 
 
 def _check_place(latitude_e7: int, longitude_e7: int) -> None:
     if abs(latitude_e7) > 900_000_000 or abs(longitude_e7) > 1_800_000_000:
         raise ValueError(f"no place on Earth: {latitude_e7}, {longitude_e7}")
+
+
+def _is_height(height_mm: int) -> bool:
+    return _HEIGHTS_MM[0] <= height_mm <= _HEIGHTS_MM[1]
+
+
+def _check_heights(*heights_mm: int) -> None:
+    if not all(_is_height(height) for height in heights_mm):
+        raise ValueError(f"{heights_mm} mm: no height of an aircraft")
 
 
 def _check_within(limit: float, *values: float) -> None:

@@ -20,6 +20,7 @@ from mavlink_bridge.injection.rc_gate import InjectionGate
 from mavlink_bridge.link.clock import SteadyUtc
 from mavlink_bridge.link.framing import FrameReader
 from mavlink_bridge.link.transport import Endpoint
+from mavlink_bridge.messages import PlaceHint, TrackRequest
 from mavlink_bridge.shared import Shared
 from mavlink_bridge.vehicle.presence import VehicleWatch
 from mavlink_bridge.vehicle.tracker import VehicleTracker
@@ -74,6 +75,8 @@ class Flight:
         for module in ("vehicle.timesync", "vehicle.presence", "link.clock"):
             monkeypatch.setattr(f"mavlink_bridge.{module}.monotonic_ns", lambda: self.now_ns)
         self.texts: list[str] = []
+        self.tracked: list[TrackRequest] = []
+        self.hinted: list[PlaceHint] = []
 
         def say(_: int, text: str) -> None:
             self.texts.append(text)
@@ -86,8 +89,8 @@ class Flight:
             self.now_ns,
             lambda: HealthLevel.OK,
             say,
-            None,
-            None,
+            self.track,
+            self.hint,
             VehicleWatch(say),
             gate,
             LookAt(config, GEOID, say),
@@ -111,6 +114,15 @@ class Flight:
         self.yaw_error_rad = 0.0
         self.mangle: Callable[[bytes], bytes] = lambda frame: frame
         self._answered = 0
+
+    def track(self, request: TrackRequest) -> None:
+        """A wish to track came."""
+        self.tracked.append(request)
+
+    def hint(self, hint: PlaceHint) -> bool:
+        """A hint at the place came."""
+        self.hinted.append(hint)
+        return True
 
     def boot_ns(self, now_ns: int) -> int:
         """The vehicle's clock."""

@@ -174,7 +174,9 @@ def test_what_is_read_is_in_the_units_of_the_definition() -> None:
     state = read("GLOBAL_POSITION_INT", place).snapshot(10**9)
     assert (state.latitude_deg, state.longitude_deg) == pytest.approx((LAT, LON), abs=1e-7)
     assert (state.altitude_amsl_m, state.altitude_relative_m) == pytest.approx((AMSL, 40.0))
-    gps = read("GPS_RAW_INT", {"lat": LAT, "lon": LON, "h_acc": 1.5}).snapshot(10**9)
+    seen = {"lat": LAT, "lon": LON, "h_acc": 1.5}
+    assert read("GPS_RAW_INT", seen).snapshot(10**9).gps_latitude_deg is None  # without a fix
+    gps = read("GPS_RAW_INT", seen, fix_type=3).snapshot(10**9)
     assert (gps.gps_latitude_deg, gps.gps_longitude_deg) == pytest.approx((LAT, LON), abs=1e-7)
     assert gps.gps_h_accuracy_m == pytest.approx(1.5)
     local = read("LOCAL_POSITION_NED", {"x": 1, "y": 2, "z": 3, "vx": 4, "vy": 5, "vz": 6})
