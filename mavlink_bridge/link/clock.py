@@ -90,7 +90,7 @@ class BootClock:
     30 s. Two answers whose round trips cannot both be true show that the clock stepped, or that it
     runs at another rate: a third answer tells which (a simulation at N times real speed runs at
     rate N). A boot time that runs back, or a clock that is behind after a silence, is a reboot. One
-    stamp far ahead is a damaged one, not the beginning of a time that all others then run back from.
+    stamp far ahead is a damaged one, no new time from which all others then run back.
     """
 
     def __init__(self) -> None:
