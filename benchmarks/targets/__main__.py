@@ -31,7 +31,7 @@ from localizer.types import PoseEstimate, TargetFix, TargetSighting
 from sitl.camera.traffic import traffic
 from sitl.demo.assets import prepare
 from sitl.demo.kinematic import camera_path
-from sitl.demo.scenario import load_scenario
+from sitl.demo.scenario import Scenario, load_scenario
 
 _SETTINGS = TargetSettings()
 _LOOKED_S = 20.0  # at most: a target is looked at, then left
@@ -101,13 +101,15 @@ def _sample(thing: Thing, k: int, looked_s: float, fix: TargetFix) -> Sample:
         thing.name, thing.kind, looked_s, float(np.linalg.norm(error)),
         float(error @ np.linalg.solve(fix.covariance, error)),
         float(np.sqrt(np.trace(fix.covariance))), fix.elsewhere,
-        fix.velocity is not None, velocity_error, velocity_nees,
+        fix.velocity is not None, velocity_error, velocity_nees, float(np.linalg.norm(error[:2])),
     )  # fmt: skip
 
 
 def fly(args: argparse.Namespace) -> list[dict[str, object]]:
     """All targets of one seed; the file is written as they come."""
     assets, scenario = prepare(args.seed, size_m=args.size), load_scenario(args.scenario)
+    if args.height is not None:
+        scenario = at_height(scenario, args.height)
     live, survey = TileCache.open(assets.live_cache), TileCache.open(assets.map_cache)
     camera = scenario.camera.camera()
     path = list(camera_path(scenario, float(assets.world.ground_height(0.0, 0.0))))
@@ -137,6 +139,12 @@ def fly(args: argparse.Namespace) -> list[dict[str, object]]:
     return found
 
 
+def at_height(scenario: Scenario, height_m: float) -> Scenario:
+    """The same legs, all of them at one height above home."""
+    legs = tuple(leg.model_copy(update={"height_m": height_m}) for leg in scenario.legs)
+    return scenario.model_copy(update={"takeoff_height_m": height_m, "legs": legs})
+
+
 def _plain(args: argparse.Namespace) -> dict[str, object]:
     return {key: str(v) if isinstance(v, Path) else v for key, v in vars(args).items()}
 
@@ -146,6 +154,7 @@ def main() -> None:
     parser.add_argument("seed", type=whole(0, 10**6), help="of the world, its cars and its points")
     parser.add_argument("--scenario", type=existing, default=Path("configs/demo_short.yaml"),
                         help="flight that is flown over it")  # fmt: skip
+    parser.add_argument("--height", type=number(21, 1000), help="of all legs, m; none: its own")
     parser.add_argument("--size", type=number(100, 10_000), default=1600.0, help="of the world, m")
     parser.add_argument("--method", choices=("track", "filter"), default="track", help="see above")
     parser.add_argument("--points", type=whole(0, 1000), default=20, help="plain, and at edges")

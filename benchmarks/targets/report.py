@@ -12,7 +12,9 @@ _CHI2_95 = {2: 5.991, 3: 7.815}
 
 @dataclass(frozen=True)
 class Sample:
-    """One reported fix. looked_s: since the target was first seen; elsewhere: as it was told."""
+    """One reported fix. horizontal_m: of error_m; looked_s: since the target was first seen;
+    elsewhere: as it was told.
+    """
 
     thing: str
     kind: str
@@ -24,6 +26,7 @@ class Sample:
     velocity_told: bool
     velocity_error_mps: float
     velocity_nees: float
+    horizontal_m: float
 
 
 def rows(samples: Iterable[Sample], refused: int, seen: int) -> list[dict[str, object]]:
@@ -58,6 +61,7 @@ def _row(chosen: list[Sample]) -> dict[str, object]:
         "worst_point": worst,
         "worst_point_p95_m": p95[worst],
         "points_above_1_m_p95": sum(e > 1.0 for e in p95.values()),
+        "ce90_m": float(np.quantile([s.horizontal_m for s in chosen], 0.9)),
         "within_1_3_5_m_percent": [round(100 * float(np.mean(errors <= m)), 2) for m in (1, 3, 5)],
         "inside_95_percent": float(100 * np.mean(nees <= _CHI2_95[3])),
         "nees_mean": float(np.minimum(nees, 1e6).mean()),

@@ -1,0 +1,130 @@
+"""Runs cells of the table: one JSON for each sequence and method, so that a killed run goes on."""
+
+from __future__ import annotations
+
+import json
+import os
+import time
+from collections.abc import Iterator, Sequence
+from concurrent.futures import ProcessPoolExecutor, as_completed
+from dataclasses import dataclass
+from pathlib import Path
+
+import cv2
+
+from benchmarks.places.flights import Cell, cells, sequence_of
+from benchmarks.places.rivals import PASSES, RIVALS, Setting, stack_of
+from benchmarks.places.worlds import open_place
+from localizer.config import LocalizerConfig
+from localizer.evaluation.sequences import Perturbation
+from localizer.evaluation.sequences import Sequence as Recorded
+
+PRIOR = Perturbation(10.0, 10.0)  # of the first frame, in metres and degrees, as the paper's
+
+
+@dataclass(frozen=True)
+class Plan:
+    """What is run. folder: of worlds, sequences and results; frames: of each sequence."""
+
+    folder: Path
+    frames: int
+    width: int
+    methods: tuple[str, ...]
+    cells: tuple[Cell, ...]
+
+    def result(self, cell: Cell, method: str) -> Path:
+        """The file of one method on one sequence."""
+        return self.folder / "results" / f"{cell.name}-{method}-{self.frames}-{self.width}.json"
+
+    def has_any(self, method: str) -> bool:
+        """Whether a method has run on any sequence."""
+        return any(self.result(cell, method).exists() for cell in self.cells)
+
+    def missing(self, cell: Cell) -> tuple[str, ...]:
+        """The methods that have not run on a sequence."""
+        return tuple(m for m in self.methods if not self.result(cell, m).exists())
+
+
+def chosen_cells(
+    places: Sequence[str], conditions: Sequence[str], heights: Sequence[str]
+) -> list[Cell]:
+    """The cells of the table that are asked for; nothing named stands for all."""
+    return [
+        c
+        for c in cells()
+        if (not places or c.place.name in places)
+        and (not conditions or c.condition in conditions)
+        and (not heights or c.height in heights)
+    ]
+
+
+def run(plan: Plan, processes: int, minutes: float) -> Iterator[str]:
+    """Runs what is missing, a sequence with all its methods at a time; yields what was done.
+
+    minutes: after which no new sequence is begun.
+    """
+    until_s = time.time() + 60 * minutes
+    waiting = [c for c in plan.cells if plan.missing(c)]
+    if processes == 1:
+        for cell in waiting:
+            if _in_time(plan, cell, until_s):
+                yield cell.name
+        return
+    with ProcessPoolExecutor(processes) as pool:
+        futures = {pool.submit(_in_time, plan, cell, until_s): cell for cell in waiting}
+        for future in as_completed(futures):
+            if future.result():
+                yield futures[future].name
+
+
+def _in_time(plan: Plan, cell: Cell, until_s: float) -> bool:
+    if time.time() > until_s:
+        return False
+    run_cell(plan, cell)
+    return True
+
+
+def run_cell(plan: Plan, cell: Cell) -> None:
+    """Every method that is missing on one sequence, all on the same pictures."""
+    cv2.setNumThreads(1)
+    home = open_place(cell.place, plan.folder, cell.seen)
+    sequence = sequence_of(cell, home, plan.folder, plan.frames)
+    for method in plan.missing(cell):
+        config = LocalizerConfig(width=plan.width, threads=1, renderer="numba", device="cpu")
+        document = {
+            "place": cell.place.name, "condition": cell.condition, "height": cell.height,
+            "weather": cell.weather, "method": method, "width": plan.width, "seed": cell.seed,
+            **localized(method, home.map_cache, sequence, config, cell.seed),
+        }  # fmt: skip
+        path = plan.result(cell, method)
+        path.parent.mkdir(parents=True, exist_ok=True)
+        partial = path.with_suffix(f".{os.getpid()}.partial")
+        partial.write_text(json.dumps(document) + "\n")
+        os.replace(partial, path)
+
+
+def localized(
+    method: str, map_cache: Path, sequence: Recorded, config: LocalizerConfig, seed: int
+) -> dict[str, object]:
+    """One method over one sequence: errors per frame (None: no answer) and processor time."""
+    stack = stack_of(map_cache, config)
+    metres: list[float | None] = []
+    degrees: list[float | None] = []
+    cpu_ms: list[float] = []
+    try:
+        tracking = RIVALS[method].open(stack, Setting(sequence.camera, config))
+        for index in range(len(sequence.images)):
+            frame = sequence.frame(index)
+            truth = sequence.truth[index]
+            if index == 0:
+                drawn = Perturbation(PRIOR.translation_m, PRIOR.rotation_deg, seed)
+                tracking.begin(drawn.prior(truth, index, frame.exposure_time_ns))
+            began = time.process_time()
+            pose = tracking.track(frame, PASSES if index == 0 else 1)
+            cpu_ms.append(round(1e3 * (time.process_time() - began), 2))
+            found = (None, None) if pose is None else truth.distance_to(pose)
+            metres.append(found[0])
+            degrees.append(found[1])
+    finally:
+        stack.close()
+    return {"metres": metres, "degrees": degrees, "cpu_ms": cpu_ms}

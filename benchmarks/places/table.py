@@ -1,0 +1,210 @@
+"""The table of the six places from its JSON: Markdown and a plot, nothing measured anew.
+
+Frames of a sequence err alike, so intervals are bootstraps over the sequences.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from benchmarks.places.flights import CONDITIONS, HEIGHT_M, HEIGHTS
+from benchmarks.places.rivals import MISSING, RIVALS
+from benchmarks.places.run import PRIOR, Plan
+from benchmarks.places.worlds import PLACES
+from localizer.errors import SequenceError
+from localizer.evaluation.metrics import LocalizationMetrics, localization_metrics
+from localizer.geometry.pose import Array
+
+_DRAWS = 1000
+_WARM = 3  # frames at the beginning that no rate is measured on: three passes, tiles to load
+# Table 2 of the paper, SynthCity-6: its own pictures, maps and machine (512 px, a GPU).
+PAPER = (
+    ("Render2ORB", "4.37", "0.21", "18.0 / 30.2 / 55.3", "38.4", "20"),
+    ("Render2RAFT", "5.21", "0.62", "8.4 / 32.5 / 48.9", "96.2", "10"),
+    ("PixLoc", "0.55", "0.06", "65.4 / 92.3 / 98.2", "96.5", "5"),
+    ("Render2Loc (RoMaV2)", "0.47", "0.04", "77.2 / 98.8 / 99.6", "100.0", "0.8"),
+    ("PiLoT", "0.46", "0.03", "80.4 / 99.9 / 99.9", "100.0", "28"),
+)
+
+
+@dataclass(frozen=True)
+class Result:
+    """One method on one sequence. metres, degrees (F,): NaN without an answer; cpu_ms (F,)."""
+
+    place: str
+    condition: str
+    height: str
+    method: str
+    metres: Array
+    degrees: Array
+    cpu_ms: Array
+
+
+def read_results(plan: Plan) -> list[Result]:
+    """Of the sequences that all of the plan's methods have done."""
+    return [
+        _read(plan.result(cell, method))
+        for cell in plan.cells
+        if not plan.missing(cell)
+        for method in plan.methods
+    ]
+
+
+def _read(path: Path) -> Result:
+    try:
+        d = json.loads(path.read_text())
+        metres, degrees, cpu = (np.array(d[k], float) for k in ("metres", "degrees", "cpu_ms"))
+        return Result(d["place"], d["condition"], d["height"], d["method"], metres, degrees, cpu)
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        raise SequenceError(f"{path}: not a result of this benchmark: {error}") from error
+
+
+def measures(results: Sequence[Result]) -> LocalizationMetrics:
+    """The paper's measures over all frames; frames a second of one core, by processor time."""
+    cpu = np.concatenate([r.cpu_ms[_WARM:] for r in results])
+    metres = np.concatenate([r.metres for r in results])
+    degrees = np.concatenate([r.degrees for r in results])
+    seconds = len(metres) * float(np.median(cpu)) * 1e-3
+    return localization_metrics(metres, degrees, seconds)
+
+
+def interval(
+    results: Sequence[Result], value: Callable[[LocalizationMetrics], float | None]
+) -> tuple[float, float] | None:
+    """95 % interval of a measure, bootstrap over the sequences; None where it has none."""
+    rng = np.random.default_rng(0)
+    drawn: list[float] = []
+    for _ in range(_DRAWS):
+        picked = [results[k] for k in rng.integers(0, len(results), len(results))]
+        found = value(measures(picked))
+        if found is not None:
+            drawn.append(found)
+    if not drawn:
+        return None
+    low, high = np.percentile(drawn, [2.5, 97.5])
+    return float(low), float(high)
+
+
+def rows(plan: Plan, results: Sequence[Result]) -> list[dict[str, object]]:
+    """Every group's figures with their intervals, as JSON."""
+    found: list[dict[str, object]] = []
+    for group, members in groups(results).items():
+        for method in plan.methods:
+            mine = [r for r in members if r.method == method]
+            if mine:
+                found.append({
+                    "group": group, "method": RIVALS[method].name, "sequences": len(mine),
+                    **measures(mine).to_dict(),
+                    "median_interval_m": interval(mine, lambda m: m.median_translation_m),
+                    "recall_3_interval": interval(mine, lambda m: m.recall_3),
+                })  # fmt: skip
+    return found
+
+
+def groups(results: Sequence[Result]) -> dict[str, list[Result]]:
+    """All sequences; those of each condition, place and height."""
+    found = {"all": list(results)}
+    found |= {c: [r for r in results if r.condition == c] for c in CONDITIONS}
+    found |= {p.name: [r for r in results if r.place == p.name] for p in PLACES}
+    found |= {h: [r for r in results if r.height == h] for h in HEIGHTS}
+    return {name: members for name, members in found.items() if members}
+
+
+def markdown(plan: Plan, results: Sequence[Result]) -> str:
+    """What was run, the whole table, then median and R@3 by condition, place and height."""
+    if not results:
+        return "No sequence has been done by all methods yet.\n"
+    count = len(results) // len(plan.methods)
+    frames = sum(len(r.metres) for r in results) // len(plan.methods)
+    lines = [
+        f"{count} of {len(plan.cells)} sequences (six places, {len(CONDITIONS)} conditions, low: "
+        f"{HEIGHT_M['low']:.0f} m, high: {HEIGHT_M['high']:.0f} m), {plan.frames} consecutive"
+        f" frames each at 10 a second ({frames} in all), working width {plan.width}; the first "
+        f"frame's prior up to {PRIOR.translation_m:.0f} m and {PRIOR.rotation_deg:.0f} degrees off,"
+        " no other is given. 95 % intervals over sequences.",
+        "",
+        "| method | median, m | median, deg | R@1 / 3 / 5 | completeness | frames/s of one core |",
+        "|---|---|---|---|---|---|",
+    ]
+    for method in plan.methods:
+        lines.append(_line(method, [r for r in results if r.method == method]))
+    lines += [f"| *paper: {n}* | {m} | {d} | {r} | {c} | ({f}) |" for n, m, d, r, c, f in PAPER]
+    names = [RIVALS[m].name for m in plan.methods]
+    lines += ["", "Median in metres (R@3 in per cent) by group:", ""]
+    lines += ["| | sequences | " + " | ".join(names) + " |", "|---" * (len(names) + 2) + "|"]
+    for group, members in groups(results).items():
+        cells = [_short([r for r in members if r.method == m]) for m in plan.methods]
+        lines.append(f"| {group} | {len(members) // len(plan.methods)} | {' | '.join(cells)} |")
+    lines += ["", "| method | settings |", "|---|---|"]
+    lines += [f"| {RIVALS[m].name} | {RIVALS[m].settings} |" for m in plan.methods]
+    return "\n".join([*lines, "", f"Not run: {MISSING}.", ""])
+
+
+def _line(method: str, mine: Sequence[Result]) -> str:
+    m = measures(mine)
+    median = _with_interval(m.median_translation_m, interval(mine, _median), 2)
+    recall = f"{m.recall_1:.1f} / {m.recall_3:.1f} / {m.recall_5:.1f}"
+    between = interval(mine, lambda x: x.recall_3)
+    if between:
+        recall += f" (R@3 {between[0]:.0f} to {between[1]:.0f})"
+    return (
+        f"| {RIVALS[method].name} | {median} | {_number(m.median_rotation_deg, 2)} | {recall} | "
+        f"{m.completeness:.1f} | {m.fps:.1f} |"
+    )
+
+
+def _median(m: LocalizationMetrics) -> float | None:
+    return m.median_translation_m
+
+
+def _short(mine: Sequence[Result]) -> str:
+    m = measures(mine)
+    return f"{_number(m.median_translation_m, 2)} ({m.recall_3:.0f})"
+
+
+def _number(value: float | None, digits: int) -> str:
+    return "-" if value is None else f"{value:.{digits}f}"
+
+
+def _with_interval(value: float | None, between: tuple[float, float] | None, digits: int) -> str:
+    if value is None or between is None:
+        return _number(value, digits)
+    return f"{value:.{digits}f} [{between[0]:.{digits}f}, {between[1]:.{digits}f}]"
+
+
+def draw(plan: Plan, results: Sequence[Result], path: Path) -> None:
+    """Share of all frames within an error, a curve for each method, a panel for each condition."""
+    import matplotlib
+
+    matplotlib.use("Agg")
+    from matplotlib import pyplot as plt
+
+    shown = [c for c in CONDITIONS if any(r.condition == c for r in results)]
+    figure, axes = plt.subplots(2, 3, figsize=(11, 6.5), sharex=True, sharey=True)
+    for axis, condition in zip(axes.ravel(), shown, strict=False):
+        for method in plan.methods:
+            mine = [r for r in results if (r.condition, r.method) == (condition, method)]
+            x, y = _curve(np.concatenate([r.metres for r in mine]))
+            width = 2.5 if method == plan.methods[-1] else 1.2
+            axis.step(x, y, where="post", label=RIVALS[method].name, linewidth=width)
+        axis.set(title=condition, xscale="log", xlim=(0.03, 30), ylim=(0, 100))
+        axis.grid(alpha=0.3)
+    axes[1, 1].set_xlabel("position error, m")
+    axes[0, 0].set_ylabel("% of all frames")
+    axes[1, 0].set_ylabel("% of all frames")
+    handles, labels = axes[0, 0].get_legend_handles_labels()
+    figure.legend(handles, labels, loc="lower center", ncols=4, fontsize=8)
+    figure.tight_layout(rect=(0, 0.07, 1, 1))
+    figure.savefig(path, dpi=90)
+    plt.close(figure)
+
+
+def _curve(metres: Array) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    found = np.sort(metres[np.isfinite(metres)])
+    return found, 100.0 * np.arange(1, len(found) + 1) / max(len(metres), 1)

@@ -1,0 +1,175 @@
+"""The table of the six places: a fair order, what counts, and figures that follow from the JSON."""
+
+from __future__ import annotations
+
+import json
+
+import numpy as np
+import pytest
+
+pytest.importorskip("torch")
+
+from benchmarks.places.flights import CONDITIONS, FULL, HEIGHTS, cells, first_frame
+from benchmarks.places.rivals import RIVALS, Answer, Rendered, Setting, unavailable
+from benchmarks.places.run import Plan, chosen_cells
+from benchmarks.places.table import interval, markdown, measures, read_results, rows
+from benchmarks.places.worlds import PLACES, visits
+from localizer.config import LocalizerConfig
+from localizer.errors import SequenceError
+from localizer.geometry.camera import Camera
+from localizer.geometry.pose import Pose
+from localizer.types import Frame, PosePrior, RenderedView
+
+METHODS = ("orb", "ours")
+NADIR = Pose(np.diag([1.0, -1.0, -1.0]), np.array([0.0, 0.0, 50.0]))
+
+
+def test_any_six_in_a_row_are_all_places_and_all_conditions_and_heights_take_turns():
+    order = cells()
+    assert len({c.name for c in order}) == len(order) == 6 * 6 * 2
+    for k in range(0, len(order), 6):
+        some = order[k : k + 6]
+        assert {c.place.name for c in some} == {p.name for p in PLACES}
+        assert {c.condition for c in some} == set(CONDITIONS)
+    half = order[:36]
+    for condition in CONDITIONS:
+        heights = [c.height for c in half if c.condition == condition]
+        assert heights.count("low") == heights.count("high") == 3
+
+
+def test_a_short_run_takes_frames_from_anywhere_and_a_full_one_all():
+    order = cells()
+    begins = [first_frame(c, 30) for c in order]
+    assert min(begins) >= 0
+    assert max(begins) <= FULL - 30
+    assert len(set(begins)) > 30
+    assert {first_frame(c, FULL) for c in order} == {0}
+
+
+def test_the_outdated_map_is_of_another_season_and_of_years_before():
+    survey, live, outdated = visits(PLACES[0]).values()
+    assert survey.survey is not None
+    assert live.changes is not None
+    assert outdated.changes is not None
+    assert outdated.changes.gone > live.changes.gone
+    assert outdated.changes.seed != live.changes.seed
+    assert outdated.look != live.look
+
+
+def _plan(tmp_path, count=4):
+    (tmp_path / "results").mkdir()
+    return Plan(tmp_path, 3, 320, METHODS, tuple(cells()[:count]))
+
+
+def _done(plan, cell, method, metres):
+    document = {
+        "place": cell.place.name, "condition": cell.condition, "height": cell.height,
+        "method": method, "metres": metres, "degrees": [None if m is None else 0.5 for m in metres],
+        "cpu_ms": [100.0] * len(metres),
+    }  # fmt: skip
+    plan.result(cell, method).write_text(json.dumps(document))
+
+
+def test_only_sequences_that_every_method_has_done_are_counted(tmp_path):
+    plan = _plan(tmp_path)
+    assert "No sequence" in markdown(plan, read_results(plan))
+    first, second, *_ = plan.cells
+    _done(plan, first, "orb", [0.5, None, 4.0, 2.0])
+    _done(plan, first, "ours", [0.1, 0.2, 0.3, 0.4])
+    _done(plan, second, "ours", [9.0] * 4)
+    assert plan.missing(first) == ()
+    assert plan.missing(second) == ("orb",)
+    results = read_results(plan)
+    assert len(results) == 2
+    text = markdown(plan, results)
+    assert "1 of 4 sequences" in text
+    assert "(4 in all)" in text
+    orb = measures([r for r in results if r.method == "orb"])
+    assert orb.median_translation_m == 2.0
+    assert (orb.recall_1, orb.recall_3, orb.recall_5) == (25.0, 50.0, 75.0)
+    assert orb.completeness == 75.0
+    assert orb.fps == pytest.approx(10.0)
+    ours = next(r for r in rows(plan, results) if (r["group"], r["method"]) == ("all", "ours"))
+    assert ours["recall_1"] == 100.0
+    assert f"| {first.condition} | 1 |" in text
+
+
+def test_an_interval_is_over_sequences_and_not_over_their_frames(tmp_path):
+    plan = _plan(tmp_path, 6)
+    for k, cell in enumerate(plan.cells):
+        for method in METHODS:
+            _done(plan, cell, method, [0.1 if k % 2 else 4.0] * 50)
+    mine = [r for r in read_results(plan) if r.method == "ours"]
+    between = interval(mine, lambda m: m.recall_1)
+    assert between is not None
+    low, high = between
+    assert high - low > 40  # 300 frames by themselves would have 11
+
+
+def test_a_damaged_result_is_named(tmp_path):
+    plan = _plan(tmp_path, 1)
+    for method in METHODS:
+        plan.result(plan.cells[0], method).write_text("{}")
+    with pytest.raises(SequenceError, match="not a result of this benchmark"):
+        read_results(plan)
+
+
+def test_cells_can_be_chosen():
+    chosen = chosen_cells(("forest",), ("fog", "night"), ("low",))
+    assert {(c.place.name, c.height) for c in chosen} == {("forest", "low")}
+    assert sorted(c.condition for c in chosen) == ["fog", "night"]
+    assert len(chosen_cells((), (), HEIGHTS)) == 72
+
+
+def test_a_method_that_lacks_its_weights_says_which():
+    assert unavailable("ours") == ""
+    assert set(RIVALS) >= {"orb", "sift", "xfeat", "flow", "pixloc", "paper", "gradient", "ours"}
+
+
+class _Flat:
+    """Ground 50 m below, wherever the camera is."""
+
+    def __init__(self):
+        self.asked = []
+
+    def render(self, world_from_camera, camera, extra=(), *, wait=False):
+        self.asked.append(world_from_camera)
+        shape = (camera.height, camera.width)
+        rgb = np.zeros((*shape, 3), np.uint8)
+        return RenderedView(rgb, np.full(shape, 50.0, np.float32), world_from_camera, camera)
+
+
+class _Stack:
+    def __init__(self):
+        self.renderer = _Flat()
+
+
+def test_a_rival_is_rendered_for_where_it_predicts_itself_and_not_where_it_is():
+    """It flies 1 m a frame; from the third frame on its own velocity carries it."""
+    camera = Camera.from_fov(320, 240, 60.0)
+    stack, true_m = _Stack(), [0.0]
+
+    def step(view, image, prior, seed):
+        pose = Pose(NADIR.rotation, NADIR.translation + np.array([true_m[0], 0.0, 0.0]))
+        return Answer(pose, np.eye(6) * 1e-4)
+
+    rival = Rendered(stack, Setting(camera, LocalizerConfig()), step)
+    rival.begin(PosePrior(NADIR, np.eye(6), 10**9))
+    image = np.zeros((240, 320, 3), np.uint8)
+    for k in range(8):
+        true_m[0] = float(k)
+        found = rival.track(Frame(image, 10**9 + k * 10**8, camera, k), 3 if k == 0 else 1)
+        assert found is not None
+        assert found.translation[0] == k
+    assert stack.renderer.asked[-1].translation[0] == pytest.approx(7.0, abs=0.3)
+    assert len(stack.renderer.asked) == 3 + 7
+
+
+def test_a_rival_that_found_nothing_has_no_pose_and_stays_where_it_was():
+    camera, stack = Camera.from_fov(320, 240, 60.0), _Stack()
+    rival = Rendered(stack, Setting(camera, LocalizerConfig()), lambda *_: None)
+    rival.begin(PosePrior(NADIR, np.eye(6), 10**9))
+    image = np.zeros((240, 320, 3), np.uint8)
+    poses = [rival.track(Frame(image, 10**9 + k * 10**8, camera, k), 1) for k in range(10)]
+    assert poses == [None] * 10
+    assert stack.renderer.asked[-1].translation == pytest.approx(NADIR.translation)
