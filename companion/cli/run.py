@@ -82,6 +82,7 @@ def run_command(
 def _supervise(settings: CompanionConfig, arguments: list[str]) -> int:
     """The exit code of the flight process, or of the last one."""
     from companion.supervision.processes import FlightProcess
+    from companion.supervision.service_manager import ServiceManager
     from companion.supervision.supervisor import Supervisor, mark_dead
     from mavlink_bridge.vehicle.last_words import say_without_bridge
 
@@ -95,6 +96,7 @@ def _supervise(settings: CompanionConfig, arguments: list[str]) -> int:
         lambda standby: FlightProcess(command, standby=standby),
         tell,
         lambda pid, text: mark_dead(record.folder, pid, text) if record is not None else None,
+        manager=ServiceManager.of(os.environ),
     )
     for number in ENDING:
         signal.signal(number, lambda received, _: supervisor.stop(received))

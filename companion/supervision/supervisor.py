@@ -2,14 +2,15 @@
 
 It waits for the flight process to end, and for the signs of life of its parts: one that hangs is
 ended. A death is told to the operator and marked in ``health.json`` within a second, and a standby
-process, with map and network in memory, takes over. Deaths that come too fast end it: something is
-wrong that no restart mends.
+process, with map and network in memory, takes over. Deaths that come fast never end it, since the
+aircraft may fly without GNSS: cold starts wait longer and longer, and each is told.
 """
 
 from __future__ import annotations
 
 import json
 import logging
+import math
 import signal
 import time
 from collections import deque
@@ -23,7 +24,9 @@ from companion.supervision.processes import Beat
 _log = logging.getLogger(__name__)
 _WATCH_S = 0.25  # between looks at what else is due; a death wakes at once
 _LOOKED_AWAY_S = 1.5  # after which it was the supervisor that stood still, or the computer
-_AGAIN_S = 1.0
+_PAUSE_S = 0.25  # between looks whether to go on waiting
+_MOST_DEATHS = 64  # that are remembered: more within the window wait no longer
+_PART = 10  # characters of a part's name, so that the line is one STATUSTEXT
 _USAGE = 2  # exit code of a named error
 
 
@@ -58,8 +61,9 @@ class Process(Protocol):
 
 @dataclass(frozen=True)
 class RestartPolicy:
-    """At most `deaths` within `window_s`; a standby is made once one flies for `standby_after_s`:
-    its imports take a core for seconds.
+    """From `deaths` within `window_s` on, a cold start waits for 2 s, and twice as long each time,
+    at most `wait_s`: it takes all cores for seconds. A standby takes over at once, however often;
+    it is made once one flies for `standby_after_s`: its imports take a core for seconds.
 
     A part without a turn for `part_s` hangs, and a process without a sign of life for `silent_s`:
     beyond what an overloaded computer does, and below the autopilot's patience. Before its first
@@ -68,6 +72,7 @@ class RestartPolicy:
 
     deaths: int = 5
     window_s: float = 300.0
+    wait_s: float = 30.0
     standby_after_s: float = 20.0
     part_s: float = 4.0
     silent_s: float = 3.0
@@ -75,12 +80,25 @@ class RestartPolicy:
     cold_s: float = 300.0
 
 
+class Manager(Protocol):
+    """Who started the supervisor, and restarts it where it says nothing for long."""
+
+    def ready(self) -> None:
+        """A process flies: its every part took a turn. Said of each process."""
+
+    def alive(self) -> None:
+        """It is watched, and nothing in it hangs."""
+
+    def status(self, text: str) -> None:
+        """How it goes."""
+
+
 class Supervisor:
     """`run` until the flight is over.
 
     spawn: makes a process, flying at once or as a standby. tell: a line (severity, text) to the
-    operator; mark: what the ``health.json`` of the process (id) is to say. clock: monotonic
-    seconds; pause: sleeps so many.
+    operator; mark: what the ``health.json`` of the process (id) is to say. manager: told on the
+    way. clock: monotonic seconds; pause: sleeps so many.
     """
 
     def __init__(
@@ -89,21 +107,27 @@ class Supervisor:
         tell: Callable[[int, str], None],
         mark: Callable[[int, str], None],
         policy: RestartPolicy | None = None,
+        manager: Manager | None = None,
         clock: Callable[[], float] = time.monotonic,
         pause: Callable[[float], None] = time.sleep,
     ) -> None:
         self._spawn, self._tell, self._mark = spawn, tell, mark
         self._policy = policy or RestartPolicy()
+        self._manager = manager
         self._clock, self._pause = clock, pause
         self._flying: Process | None = None
         self._standby: Process | None = None
-        self._deaths: deque[float] = deque(maxlen=self._policy.deaths)
+        self._deaths: deque[float] = deque(maxlen=_MOST_DEATHS)
         self._since_s = self._no_standby_until_s = 0.0
         self._heard_s = self._looked_s = self._patience_s = 0.0
+        self._shown_s: float | None = None
+        self._is_new = True
         self._stopping = False
 
     def run(self) -> int:
-        """The exit code of the flight process that ended in order, or of the last one."""
+        """The exit code of the flight process that ended in order, or of the last before an order
+        to end.
+        """
         self._fly(self._spawn(False), self._policy.cold_s)
         try:
             while True:
@@ -115,7 +139,8 @@ class Supervisor:
                     continue
                 if not hangs and (self._stopping or code == 0 or self._is_hopeless(code)):
                     return code
-                if not self._recover(f"hangs ({hangs})" if hangs else f"died ({described(code)})"):
+                self._recover(f"hangs ({hangs})" if hangs else f"died ({described(code)})")
+                if self._flying is None:  # an order to end came while it waited
                     return code if code > 0 else 128 - code
         finally:
             if self._flying is not None:
@@ -134,6 +159,7 @@ class Supervisor:
             self._flying.close()
         self._flying, self._since_s = process, self._clock()
         self._heard_s = self._looked_s = self._since_s
+        self._shown_s, self._is_new = None, True
         self._patience_s = patience_s
         if self._stopping:
             process.interrupt(signal.SIGINT)
@@ -153,13 +179,29 @@ class Supervisor:
         now_s, beats = self._clock(), self._flying.beats()
         looked_away = now_s - self._looked_s > _LOOKED_AWAY_S
         self._looked_s = now_s
+        hangs = ""
         if beats:
             self._heard_s, self._patience_s = now_s, self._policy.silent_s
             last = beats[-1]
-            return last.part[:12] if last.age_s > self._policy.part_s else ""
-        if looked_away:
+            hangs = last.part[:_PART] if last.age_s > self._policy.part_s else ""
+            self._tell_ready(now_s, last)
+        elif looked_away:
             self._heard_s = now_s
-        return "process" if now_s - self._heard_s > self._patience_s else ""
+        elif now_s - self._heard_s > self._patience_s:
+            hangs = "process"
+        if self._manager is not None and not hangs:
+            self._manager.alive()  # a start, too, which may compile: it has its patience here
+        return hangs
+
+    def _tell_ready(self, now_s: float, last: Beat) -> None:
+        """Once every part took a turn since the first sign of life: a frame, or a wait for one."""
+        if self._shown_s is None:
+            self._shown_s = now_s
+        if self._manager is None or last.age_s >= now_s - self._shown_s or not self._is_new:
+            return
+        self._is_new = False
+        self._manager.ready()
+        self._manager.status("flying")
 
     def _end_what_hangs(self) -> int:
         assert self._flying is not None
@@ -180,37 +222,58 @@ class Supervisor:
         """A wrong configuration is as wrong the next time; it was told where it was found."""
         return code == _USAGE and not self._deaths and self._standby is None
 
-    def _recover(self, how: str) -> bool:
-        """Fly again, tell and mark; False where that has become pointless. how: it ended."""
+    def _recover(self, how: str) -> None:
+        """Fly again, tell and mark; nothing flies afterwards where an order to end came."""
         assert self._flying is not None
-        now_s, dead = self._clock(), self._flying.pid
-        recent = [at for at in self._deaths if now_s - at < self._policy.window_s]
-        self._deaths.append(now_s)
-        again = len(recent) + 1 < self._policy.deaths
-        what = "restarting" if again else "not restarted"
+        dead, wait_s = self._flying.pid, self._wait_s()
+        process, self._standby = self._standby, None
+        what = f"again in {wait_s:.0f} s" if process is None and wait_s else "restarting"
         _log.error("the flight process %s, %s", how, what)
-        process, self._standby = (self._standby, None) if again else (None, self._standby)
         if process is not None:
             # First of all. It opens the links later than this process, which then tells at once.
             process.release()
             self._fly(process, self._policy.released_s)
-        self._guarded(lambda: self._tell(2, f"PiLoT: companion {how}, {what}"))
-        self._guarded(lambda: self._mark(dead, f"companion {how}, {what}"))
-        return again and (process is not None or self._begin_anew(how, dead))
+        text = f"companion {how}, {what}"
+        self._guarded(lambda: self._tell(2, f"PiLoT: {text}"))
+        self._guarded(lambda: self._mark(dead, text))
+        if self._manager is not None:
+            self._manager.status(text)
+        if process is None:
+            self._begin_anew(wait_s)
 
-    def _begin_anew(self, how: str, dead: int) -> bool:
-        """A cold start, a few times where the computer has no process to give; False: none had."""
-        for _ in range(self._policy.deaths):
+    def _wait_s(self) -> float:
+        """Seconds before a cold start, now that one died: longer, the more died of late."""
+        now_s, policy = self._clock(), self._policy
+        self._deaths.append(now_s)
+        recent = sum(now_s - at < policy.window_s for at in self._deaths)
+        beyond = recent - policy.deaths
+        return 0.0 if beyond < 0 else min(2.0 ** min(1 + beyond, 16), policy.wait_s)
+
+    def _begin_anew(self, wait_s: float) -> None:
+        """A cold start, however long the computer has no process to give."""
+        if self._flying is not None:
+            self._flying.close()
+            self._flying = None
+        self._wait(wait_s)
+        again_s = 1.0
+        while not self._stopping:
             try:
                 self._fly(self._spawn(False), self._policy.cold_s)
-                return True
+                return
             except OSError as error:
                 _log.error("no flight process can be started: %s", error)
-                self._pause(_AGAIN_S)
-        text = f"companion {how}, not restarted"
-        self._guarded(lambda: self._mark(dead, text))
-        self._guarded(lambda: self._tell(2, f"PiLoT: {text}"))
-        return False
+                self._wait(again_s)
+                again_s = min(2.0 * again_s, self._policy.wait_s)
+
+    def _wait(self, seconds: float) -> None:
+        """Unless an order to end comes."""
+        slices = math.ceil(seconds / _PAUSE_S)
+        for _ in range(slices):
+            if self._stopping:
+                return
+            self._pause(_PAUSE_S)
+            if self._manager is not None:
+                self._manager.alive()
 
     @staticmethod
     def _guarded(do: Callable[[], None]) -> None:

@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import configparser
 import json
+import os
 import signal
+import socket
 import sys
 import time
 from collections.abc import Callable, Sequence
@@ -13,6 +16,7 @@ from pathlib import Path
 import pytest
 
 from companion.supervision.processes import Beat, FlightProcess
+from companion.supervision.service_manager import ServiceManager
 from companion.supervision.supervisor import RestartPolicy, Supervisor, described, mark_dead
 
 
@@ -55,6 +59,22 @@ class Scripted:
         self.dismissed = True
 
 
+class Noted:
+    """What the service manager is told, in order."""
+
+    def __init__(self) -> None:
+        self.said: list[str] = []
+
+    def ready(self) -> None:
+        self.said.append("ready")
+
+    def alive(self) -> None:
+        self.said.append("alive")
+
+    def status(self, text: str) -> None:
+        self.said.append(text)
+
+
 class Stage:
     """Hands out processes in order; each look takes half a second, a quarter without beats."""
 
@@ -65,13 +85,17 @@ class Stage:
         self.marked: list[str] = []
         self._now_s = 0.0
         self.refusals = 0
+        self.waited_s = 0.0
+        self.stops_after_s = float("inf")
+        self.manager = Noted()
         self.supervisor = Supervisor(
             self._spawn,
             lambda severity, text: self.told.append((severity, text)),
             lambda _, text: self.marked.append(text),
             RestartPolicy(**policy),  # type: ignore[arg-type]
+            self.manager,
             self._clock,
-            lambda _: None,
+            self._wait,
         )
 
     def _spawn(self, standby: bool) -> Scripted:
@@ -86,6 +110,12 @@ class Stage:
     def sleep(self, seconds: float) -> None:
         """Time goes by."""
         self._now_s += seconds
+
+    def _wait(self, seconds: float) -> None:
+        self.waited_s += seconds
+        self.sleep(seconds)
+        if self.waited_s >= self.stops_after_s:
+            self.supervisor.stop(signal.SIGTERM)
 
     def _clock(self) -> float:
         self._now_s += 0.25
@@ -110,14 +140,32 @@ def test_a_death_before_there_is_a_standby_starts_a_cold_one() -> None:
     assert [p.standby for p in stage.spawned] == [False, False]
 
 
-def test_after_too_many_deaths_it_gives_up_and_says_so() -> None:
-    stage = Stage([Scripted(2, 1) for _ in range(9)], deaths=3, standby_after_s=1e3)
-    assert stage.supervisor.run() == 1
-    assert len(stage.spawned) == 3
-    assert [text.split("), ")[1] for _, text in stage.told] == [
-        "restarting", "restarting", "not restarted",
-    ]  # fmt: skip
+def test_quick_deaths_never_end_it_and_cold_starts_wait_longer_and_longer() -> None:
+    """It gave up at the fifth: under denial nobody would have flown on."""
+    stage = Stage([*(Scripted(2, 1) for _ in range(9)), Scripted(2, 0)], standby_after_s=1e3)
+    assert stage.supervisor.run() == 0
+    assert len(stage.spawned) == 10
+    waits = ["restarting"] * 4 + [f"again in {s} s" for s in (2, 4, 8, 16, 30)]
+    assert [text.split("), ")[1] for _, text in stage.told] == waits
+    assert stage.waited_s == 2 + 4 + 8 + 16 + 30
     assert all(len(text) <= 50 for _, text in stage.told)
+    assert stage.marked == [text.removeprefix("PiLoT: ") for _, text in stage.told]
+
+
+def test_a_standby_takes_over_at_once_however_many_died() -> None:
+    """The wait is for the processors that a cold start takes."""
+    stage = Stage([*(Scripted(30, -9) for _ in range(8)), Scripted(0, 0)], standby_after_s=2.0)
+    stage.waiting += [Scripted(9, 0) for _ in range(3)]
+    assert stage.supervisor.run() == 0
+    assert all(text.endswith("restarting") for _, text in stage.told)
+    assert stage.waited_s == 0.0
+
+
+def test_an_order_to_end_is_obeyed_while_it_waits() -> None:
+    stage = Stage([Scripted(2, 1) for _ in range(9)], standby_after_s=1e3)
+    stage.stops_after_s = 5.0
+    assert stage.supervisor.run() == 1
+    assert 5.0 <= stage.waited_s < 6.0
 
 
 def test_a_standby_that_cannot_be_started_ends_nothing() -> None:
@@ -127,13 +175,13 @@ def test_a_standby_that_cannot_be_started_ends_nothing() -> None:
     assert [p.standby for p in stage.spawned] == [False, True]  # tried again later
 
 
-@pytest.mark.parametrize(("refusals", "code"), [(2, 0), (9, 137)])
-def test_a_computer_without_a_process_to_give_is_asked_again(refusals: int, code: int) -> None:
+@pytest.mark.parametrize("refusals", [2, 9])
+def test_a_computer_without_a_process_to_give_is_asked_again(refusals: int) -> None:
     stage = Stage([Scripted(3, -9), Scripted(3, 0)], standby_after_s=60.0)
     stage.refusals = refusals
-    assert stage.supervisor.run() == code
-    told = ["restarting", "not restarted"][: 1 + (code > 0)]
-    assert [text.split("), ")[1] for _, text in stage.told] == told
+    assert stage.supervisor.run() == 0
+    assert [text for _, text in stage.told] == ["PiLoT: companion died (SIGKILL), restarting"]
+    assert stage.waited_s == sum(min(2**i, 30) for i in range(refusals))
 
 
 def test_deaths_that_are_far_apart_are_each_mended() -> None:
@@ -308,3 +356,70 @@ def test_the_health_of_the_process_says_dead(tmp_path: Path) -> None:
     assert json.loads((tmp_path / "flight" / "health.json").read_text())["level"] == "ok"
     mark_dead(tmp_path / "nowhere" / "flight", 12, "dead")
     assert not (tmp_path / "nowhere").exists()
+
+
+# --- the service manager --------------------------------------------------------------------------
+
+
+def test_the_service_is_ready_once_every_part_took_a_turn() -> None:
+    """Not with the first sign of life: the thread that localizes compiles for its first frame."""
+    compiles: Callable[[int], Beat] = lambda left: Beat(  # noqa: E731
+        "localize", 0.5 * (40 - left) if left > 33 else 0.1
+    )
+    flights = [Scripted(40, 0, says=compiles)]
+    stage = Stage(flights, standby_after_s=1e3)
+    assert stage.supervisor.run() == 0
+    said = stage.manager.said
+    assert said.count("ready") == 1
+    assert said.index("ready") == said.index("flying") - 1 == 6  # after six looks that were alive
+
+
+def test_a_process_that_waits_for_its_first_sign_keeps_the_service_alive() -> None:
+    """A cold start compiles for minutes: its patience is the supervisor's, not systemd's."""
+    stage = Stage([Scripted(400, 0, says=lambda _: None)], cold_s=300.0, standby_after_s=1e3)
+    assert stage.supervisor.run() == 0
+    assert stage.manager.said == ["alive"] * 400
+
+
+def test_what_hangs_is_not_called_alive() -> None:
+    blocked = Scripted(20, 0, says=lambda left: Beat("localize", 20.0 - left))
+    stage = Stage([blocked, Scripted(20, 0), Scripted(9, 0)], standby_after_s=1.0)
+    assert stage.supervisor.run() == 0
+    text = "companion hangs (localize), restarting"
+    said = stage.manager.said
+    assert said[: said.index(text)] == ["alive"] * 4
+    assert said[said.index(text) :].count("ready") == 1
+
+
+@pytest.mark.parametrize("address", ["{}/notify", "@pilot-test-{}"])
+def test_systemd_is_told_over_its_socket(address: str, tmp_path: Path) -> None:
+    where = address.format(tmp_path if "/" in address else os.getpid())
+    with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as systemd:
+        systemd.bind(where.replace("@", "\0", 1))
+        systemd.setblocking(False)
+        environment = {"NOTIFY_SOCKET": where, "HOME": "/"}
+        manager = ServiceManager.of(environment)
+        assert environment == {"HOME": "/"}  # nobody below speaks for the service
+        manager.ready()
+        manager.alive()
+        manager.status("companion died (SIGKILL), restarting")
+        assert [systemd.recv(100) for _ in range(3)] == [
+            b"READY=1", b"WATCHDOG=1", b"STATUS=companion died (SIGKILL), restarting",
+        ]  # fmt: skip
+    manager.alive()  # a socket that is gone, or was never there, costs nothing
+    manager.close()
+    manager.alive()
+    ServiceManager.of({}).ready()
+
+
+def test_the_unit_lets_a_watched_service_start_and_hang_no_longer_than_it_may() -> None:
+    unit = configparser.ConfigParser(strict=False, interpolation=None)
+    unit.optionxform = str  # type: ignore[assignment,method-assign]
+    unit.read(Path(__file__).parents[3] / "configs" / "companion.service")
+    service = unit["Service"]
+    assert service["Type"] == "notify"
+    assert "--supervised" in service["ExecStart"]  # who tells systemd
+    policy = RestartPolicy()
+    # What ends a hung process may wait 10 s for its end, and tells within a second.
+    assert float(service["WatchdogSec"]) > max(policy.part_s, policy.silent_s) + 10.0 + 1.0
+    assert service["TimeoutStartSec"] == "infinity"
