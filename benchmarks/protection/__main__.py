@@ -4,6 +4,7 @@
     python -m benchmarks.protection --set caliterra --views 50 --draws 2 --out caliterra.json
     python -m benchmarks.protection --set generated --views 20 --focal 0.05 --out focal.json
     python -m benchmarks.protection --report generated.json caliterra.json --out fit.json
+    python -m benchmarks.protection --flights report-loop/* --out flights.json
 
 Sets are those of `python -m benchmarks.basin`: generated worlds of seeds that no training uses on
 another day under made weather, quito (a real mesh), caliterra (real photos). Each view is
@@ -11,6 +12,10 @@ registered with a camera whose focal length, principal point and distortion are 
 leaves them; map shift, lever arm and late stamps times speed are added (`draws.py`). The report
 fits the guardian's budget on the even views and says how many errors of the odd ones are within the
 levels, with the exact 95 % interval. A run goes on where its file ends.
+
+With --flights (folders of `python -m sitl loop` or `demo`) it counts how many positions lay inside
+the level that they had in flight: those that were injected, and those that were withheld or flown
+in shadow.
 """
 
 from __future__ import annotations
@@ -23,9 +28,11 @@ from typing import Any
 from benchmarks.basin.views import load_views
 from benchmarks.common.arguments import Parser, existing, number, output, whole
 from benchmarks.common.named_errors import named_errors
+from benchmarks.protection import flights
 from benchmarks.protection.fit import RISKS, along_axis, coverage, fitted, halves
 from benchmarks.protection.run import Outcome, run
 from companion.guardian.config import ProtectionConfig
+from mavlink_bridge.errors import RecordError
 
 
 def parser() -> Parser:
@@ -39,6 +46,7 @@ def parser() -> Parser:
     p.add_argument("--cache", type=Path, default=Path(".cache/basin"), help="of views and maps")
     p.add_argument("--data", type=Path, default=Path("../shared/data"), help="real sets")
     p.add_argument("--out", type=output, help="JSON of every outcome, or of the report")
+    p.add_argument("--flights", type=existing, nargs="+", help="flown folders, no run")
     p.add_argument("--report", type=existing, nargs="+", help="earlier files, no run")
     return p
 
@@ -98,8 +106,26 @@ def table(found: dict[str, Any]) -> str:
     return "\n".join(rows)
 
 
+def count_flights(folders: list[Path], out: Path | None) -> None:
+    """Print the shares of flown positions; what cannot be counted is named."""
+    flown, left_out = [], {}
+    for folder in folders:
+        try:
+            flown.append(flights.read_flight(folder))
+        except RecordError as error:
+            left_out[folder.name] = str(error)
+            print(f"left out: {error}")
+    found = flights.report(flown) | {"left_out": left_out}
+    print(flights.table(found))
+    if out is not None:
+        out.write_text(json.dumps(found, indent=1, allow_nan=False))
+
+
 def main() -> None:
     args = parser().parse_args()
+    if args.flights:
+        count_flights(args.flights, args.out)
+        return
     if args.report:
         found = report([o for path in args.report for o in read(path)])
         print(json.dumps(found["fitted"]))

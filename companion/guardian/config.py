@@ -50,10 +50,10 @@ class ProtectionConfig(_Model):
     risk: float = Field(
         default=1e-3, gt=0.0, le=0.1, description="probability of an error beyond the level"
     )
-    map_m: float = Field(default=0.3, ge=0.0, le=100.0, description="the map, north and east")
+    map_m: float = Field(default=0.28, ge=0.0, le=100.0, description="the map, north and east")
     map_height_m: float = Field(default=0.4, ge=0.0, le=100.0, description="the map's height")
     calibration_share: float = Field(
-        default=0.004, ge=0.0, le=0.5, description="the camera's, of the height above take-off"
+        default=0.003, ge=0.0, le=0.5, description="the camera's, of the height above take-off"
     )
     time_bias_s: float = Field(
         default=0.01, ge=0.0, le=1.0, description="the time stamps', times the speed"
