@@ -1,5 +1,5 @@
-"""The command line: ``companion init | run | plan | eval | localize | convert | replay | report |
-export | klv | console | map | world | doctor | key | self-test``.
+"""The command line: ``companion init | calibrate | run | plan | eval | localize | convert |
+replay | report | export | klv | console | map | world | doctor | key | self-test``.
 
 Exit codes: 0 done; 1 `doctor` found advice, `plan` a leg on which vision will not do, `replay`
 differs, `localize` localized nothing or `map verify` found damage; 2 wrong usage, a named error, or
@@ -16,6 +16,7 @@ import typer
 from rich.console import Console
 from rich.markup import escape
 
+from companion.cli.before.calibrate import app as calibrate_app
 from companion.cli.before.init import init_command
 from companion.cli.before.plan import plan_command
 from companion.cli.console import console_command
@@ -75,6 +76,9 @@ app.command("klv")(klv_command)
 app.command("doctor")(doctor_command)
 app.command("key")(key_command)
 app.command("self-test")(self_test_command)
+app.add_typer(
+    calibrate_app, name="calibrate", help="Camera, mounting and times, from a flight or a board."
+)
 app.add_typer(map_app, name="map", help="Build and inspect tile caches.")
 app.add_typer(world_app, name="world", help="Generated worlds for tests and demos.")
 

@@ -21,6 +21,7 @@ from companion.conversions import Installation
 from companion.errors import RecordError, StreamDecodeError
 from companion.flight.priors import AutopilotPose
 from companion.flight.recorder import MANIFEST_NAME
+from companion.offline.autopilot import RecordedAutopilot
 from companion.sources.base import fitted_camera
 from companion.sources.folder_source import read_image
 from companion.trajectory import snapshot_name
@@ -30,10 +31,6 @@ from localizer.geometry.pose import Array, Pose, matrix_from_quaternion
 from localizer.tracking.opening import MapStack, build_localizer
 from localizer.tracking.pipeline import Localizer
 from localizer.types import Frame, PoseEstimate
-from mavlink_bridge import quaternion as quat
-from mavlink_bridge.link.tlog import read_tlog
-from mavlink_bridge.messages import Attitude, GimbalAttitude, VehicleState
-from mavlink_bridge.vehicle.tracker import VehicleTracker
 
 _log = logging.getLogger(__name__)
 _MIN_IMAGES = 0.9  # share of the localized frames
@@ -94,8 +91,11 @@ class ReplaySummary:
         return bool(np.percentile(self.translation_m, 95) <= tolerance_m)
 
 
-def load_record(folder: Path) -> FlightRecord:
-    """Read a record that `companion run` left. `RecordError` says what it lacks."""
+def load_record(folder: Path, kept_share: float = _MIN_IMAGES) -> FlightRecord:
+    """Read a record that `companion run` left. `RecordError` says what it lacks.
+
+    kept_share: of the localized frames that must have their picture.
+    """
     try:
         manifest = json.loads((folder / MANIFEST_NAME).read_text(encoding="utf-8"))
         start_ns = int(manifest["monotonic_ns"])
@@ -109,8 +109,8 @@ def load_record(folder: Path) -> FlightRecord:
         raise RecordError(f"{folder}: not a flight's record: {error}") from error
     if not estimates:
         raise RecordError(f"{folder}: holds no estimate; nothing was localized in that flight")
-    missing = sum(not _image_path(folder, e).is_file() for e in estimates)
-    if missing > (1 - _MIN_IMAGES) * len(estimates):
+    missing = sum(not image_path(folder, e).is_file() for e in estimates)
+    if missing > (1 - kept_share) * len(estimates):
         raise RecordError(
             f"{folder}: {missing} of {len(estimates)} localized frames have no image in snapshots: "
             "fly with record.snapshot_interval_s 0.001 to keep every frame"
@@ -155,59 +155,9 @@ def _estimate(row: dict[str, str]) -> RecordedEstimate:
     )
 
 
-def _image_path(folder: Path, estimate: RecordedEstimate) -> Path:
+def image_path(folder: Path, estimate: RecordedEstimate) -> Path:
+    """Where a record keeps the estimate's picture, if it was kept."""
     return folder / "snapshots" / snapshot_name(estimate.exposure_time_ns)
-
-
-class _Autopilot:
-    """What the vehicle had said by a time, from the recorded messages."""
-
-    def __init__(self, record: FlightRecord, tlog: Path) -> None:
-        bridge = record.config.bridge
-        mount = quat.from_euler(
-            *np.radians(
-                [
-                    bridge.camera.mount_roll_deg,
-                    bridge.camera.mount_pitch_deg,
-                    bridge.camera.mount_yaw_deg,
-                ]
-            )
-        )
-        self._now_ns = record.start_ns
-        self._tracker = VehicleTracker(
-            bridge.system_id,
-            mount,
-            bridge.camera.mount == "fixed",
-            (bridge.camera.gimbal_component, bridge.camera.gimbal_device),
-        )
-        dated = ((utc - record.utc_minus_monotonic_ns, m) for utc, m in read_tlog(tlog))
-        # A .tlog is appended to: earlier flights may stand before this one.
-        self._messages = (item for item in dated if item[0] >= record.start_ns)
-        self._next = next(self._messages, None)
-
-    def advance(self, time_ns: int) -> None:
-        """Take in everything that had arrived by `time_ns`, CLOCK_MONOTONIC."""
-        self._now_ns = time_ns
-        while self._next is not None and self._next[0] <= time_ns:
-            received_ns, message = self._next
-            if self._tracker.accepts(message):
-                if message.get_type() != "TIMESYNC":
-                    self._tracker.handle(message, received_ns)
-                elif message.tc1 != 0:  # an answer; ts1 is our own time of the question
-                    self._tracker.timesync(message.tc1, message.ts1, received_ns)
-            self._next = next(self._messages, None)
-
-    def state(self) -> VehicleState:
-        return self._tracker.snapshot(self._now_ns)
-
-    def attitude_at(self, time_ns: int) -> Attitude | None:
-        return self._tracker.attitude_at(time_ns)
-
-    def gimbal_at(self, time_ns: int) -> GimbalAttitude | None:
-        return self._tracker.gimbal_at(time_ns)
-
-    def local_at(self, time_ns: int) -> tuple[float, ...] | None:
-        return self._tracker.local_at(time_ns)
 
 
 def replay(
@@ -215,7 +165,9 @@ def replay(
 ) -> list[ReplayedFrame]:
     """Localize the recorded frames again, over the map and with the settings of the record."""
     config = record.config
-    autopilot = _Autopilot(record, tlog)
+    autopilot = RecordedAutopilot(
+        config.bridge, tlog, record.start_ns, record.utc_minus_monotonic_ns
+    )
     stack = MapStack(config.map, config.localizer)
     try:
         camera = config.camera.model.camera()
@@ -227,7 +179,7 @@ def replay(
         frames = []
         for recorded in record.estimates:
             progress()
-            if not (path := _image_path(record.folder, recorded)).is_file():
+            if not (path := image_path(record.folder, recorded)).is_file():
                 continue
             autopilot.advance(recorded.known_ns)
             if localizer.tracker.standing.wants_prior:

@@ -73,6 +73,12 @@ class SourceSettings(BaseModel):
         le=1000,
         description="fixed glass-to-glass latency, taken off where the stream has no exact times",
     )
+    stamps_late_ms: float = Field(
+        default=0.0,
+        ge=-1000,
+        le=1000,
+        description="by which every picture's time is late, found by `calibrate flight`: taken off",
+    )
     timing: Timing = Field(
         default="auto",
         description="auto: MISP time stamps where the stream has them; pts: never use them",

@@ -1,0 +1,78 @@
+"""What ten draws say: errors against their targets and against their own sigmas."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from companion.calibrating import unknowns as u
+
+# What is asked: the largest error of each group, in its numbers' own units.
+TARGETS = {
+    "focal length": ((u.FOCAL,), 0.003, 100.0, "%"),
+    "boresight": ((8, 9, 10), float(np.radians(0.2)), float(np.degrees(1.0)), "deg"),
+    "time": ((u.LATE,), 0.010, 1000.0, "ms"),
+    "map, horizontally": ((15, 16), 0.3, 1.0, "m"),
+    "map against the flight's GNSS": ((15, 16), 0.3, 1.0, "m"),
+    "map, height": ((17,), 0.3, 1.0, "m"),
+}
+_INSIDE = 1.96
+
+
+def summary(rows: list[dict[str, Any]]) -> dict[str, Any]:
+    """Groups with their errors; all numbers' share inside 95 %; the flights after it."""
+    found, truth, sigma = (np.array([r[k] for r in rows]) for k in ("found", "truth", "sigma"))
+    lsq = np.array([r["lsq_sigma"] for r in rows])
+    off = np.array([r["ekf_off_m"] for r in rows])
+    groups = {}
+    for name, (which, target, scale, unit) in TARGETS.items():
+        columns = list(which)
+        error = found[:, columns] - truth[:, columns]
+        bound = sigma[:, columns]
+        if "GNSS" in name:  # what one flight can know: the receiver was off by so much itself
+            error, bound = error + off[:, :2], lsq[:, columns]
+        within = np.abs(error).max(axis=1) <= target
+        groups[name] = {
+            "target": target * scale, "unit": unit, "draws_within": int(within.sum()),
+            "draws": len(rows), "rms": float(np.sqrt((error**2).mean())) * scale,
+            "worst": float(np.abs(error).max()) * scale,
+            "inside_95": float((np.abs(error) <= _INSIDE * bound).mean()),
+            "sigma_median": float(np.median(bound)) * scale,
+        }  # fmt: skip
+    z = (found - truth) / sigma
+    flights = {
+        name: [r["again"][name]["median"] for r in rows] for name in ("old", "found", "true")
+    }
+    return {
+        "draws": len(rows), "groups": groups,
+        "inside_95_by_number": {
+            n.name: float((np.abs(z[:, k]) <= _INSIDE).mean())
+            for k, n in enumerate(u.UNKNOWNS[: u.CLIMB])
+        },
+        "inside_95_of_all": float((np.abs(z[:, : u.CLIMB]) <= _INSIDE).mean()),
+        "flights_after_median_m": flights,
+        "found_over_true": [f / t for f, t in zip(flights["found"], flights["true"], strict=True)],
+        "within_10_percent": int(
+            sum(f <= 1.1 * t for f, t in zip(flights["found"], flights["true"], strict=True))
+        ),
+    }  # fmt: skip
+
+
+def table(made: dict[str, Any]) -> str:
+    """The summary in lines."""
+    lines = [f"{made['draws']} draws"]
+    for name, g in made["groups"].items():
+        lines.append(
+            f"{name}: {g['draws_within']} of {g['draws']} within {g['target']:.3g} {g['unit']}; "
+            f"rms {g['rms']:.3g}, worst {g['worst']:.3g}, sigma {g['sigma_median']:.3g}; "
+            f"{100 * g['inside_95']:.0f} % inside 1.96 sigma"
+        )
+    lines.append(f"all numbers inside 1.96 sigma: {100 * made['inside_95_of_all']:.0f} %")
+    for name, values in made["flights_after_median_m"].items():
+        lines.append(f"flight after it, {name} deployment: median {np.median(values):.3f} m")
+    lines.append(
+        f"found against true: {np.median(made['found_over_true']):.3f} in the median, "
+        f"{made['within_10_percent']} of {made['draws']} within 10 %"
+    )
+    return "\n".join(lines)

@@ -1,0 +1,133 @@
+"""Each draw flown, calibrated and flown again; one line of JSON a draw."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from benchmarks.calibration.draws import Draw, Sortie, drawn, fly, true_camera, true_mount
+from companion.calibrating import unknowns as u
+from companion.calibrating.flight import Calibrated, calibrate
+from companion.calibrating.proposal import blind_spots, changed, changes
+from companion.config import CompanionConfig
+from companion.offline.replay import load_record
+from localizer.geometry.pose import Array, euler_from_matrix, so3_log
+from sitl.camera.gimbal_error import GimbalError
+from sitl.demo.assets import FlightAssets
+from sitl.demo.scenario import CameraSpec
+from sitl.desk.film import Localized
+
+_FRAMES = 100
+_AGAIN_S = 50.0
+_AGAIN = 7_000  # added to the seed of the flight after the calibration
+
+
+def run_draw(assets: FlightAssets, seed: int, folder: Path) -> dict[str, Any]:
+    """One draw: errors of what was found, its sigmas, and the flight after it."""
+    draw = drawn(seed)
+    sortie = fly(assets, draw, seed, folder, gimbal=GimbalError(seed))
+    seen = sortie.localized(sortie.deployment, seed, keep=True)
+    record = load_record(folder / "record", 0.0)
+    found = calibrate(record, folder / "flight.tlog", record.config.map, _FRAMES)
+    truth = true_numbers(draw, seed, sortie)
+    wanted = changes(sortie.deployment, found)
+    return {
+        "seed": seed, "draw": asdict(draw), "names": [n.name for n in u.UNKNOWNS],
+        "found": found.shared.tolist(), "truth": truth.tolist(), "sigma": found.sigmas.tolist(),
+        "lsq_sigma": np.sqrt(np.diag(found.solution.covariance)).tolist(),
+        "ekf_off_m": sortie.flown.ekf_off_m.tolist(), "frames": found.frames,
+        "before_px": found.before_px, "after_px": found.after_px,
+        "blind": list(blind_spots(found)), "in_flight_m": _errors(seen),
+        "again": _again(assets, draw, seed, folder, changed(sortie.deployment, wanted)),
+        "noise": _noise(found),
+    }  # fmt: skip
+
+
+def true_numbers(draw: Draw, seed: int, sortie: Sortie) -> Array:
+    """What `calibrate` should find, (COUNT,). The map's place is against the ground's true one."""
+    gimbal = GimbalError(seed)
+    truth = np.zeros(u.COUNT)
+    truth[u.FOCAL] = np.log1p(draw.focal)
+    truth[u.CENTRE], truth[u.BEND], truth[u.LATE] = draw.principal_px, draw.bend, draw.late_s
+    truth[u.MOUNT] = so3_log(true_mount(draw, gimbal))
+    truth[u.HEADING] = np.radians(gimbal.alignment_deg[2]) - sortie.flown.ekf_yaw_off_rad
+    truth[u.ARM], truth[u.SHIFT] = draw.arm_m, draw.shift_m
+    return truth
+
+
+def _noise(found: Calibrated) -> dict[str, list[float]]:
+    s = found.solution
+    return {
+        "attitude_deg": np.degrees(s.attitude.sigma).tolist(),
+        "attitude_memory_s": s.attitude.memory_s.tolist(),
+        "place_m": s.place.sigma.tolist(), "place_memory_s": s.place.memory_s.tolist(),
+    }  # fmt: skip
+
+
+def _errors(seen: list[Localized]) -> dict[str, float]:
+    """Of accepted poses against the truth, m; completeness as a share."""
+    off = [
+        x.estimate.world_from_camera.distance_to(x.truth)[0]
+        for x in seen
+        if x.estimate is not None and x.estimate.accepted
+    ]
+    values = np.array(off) if off else np.array([np.nan])
+    return {
+        "median": float(np.median(values)), "p95": float(np.percentile(values, 95)),
+        "accepted": len(off) / max(len(seen), 1),
+    }  # fmt: skip
+
+
+def _again(
+    assets: FlightAssets, draw: Draw, seed: int, folder: Path, found: CompanionConfig
+) -> dict[str, dict[str, float]]:
+    """Another way with the same aircraft, under the old, the found and the true deployment."""
+    camera, gimbal = true_camera(CameraSpec(), draw), GimbalError(seed)  # the same aircraft
+    sortie = fly(assets, draw, seed + _AGAIN, folder / "again", gimbal=gimbal, seconds=_AGAIN_S)
+    model = sortie.deployment.camera.model.model_copy(
+        update={
+            **{k: getattr(camera, k) for k in ("fx", "fy", "cx", "cy", "distortion")},
+            "readout_ms": camera.readout_ms,
+        }
+    )
+    settings = sortie.deployment.camera.settings
+    true = sortie.deployment.camera.model_copy(
+        update={
+            "model": model, "lever_arm_m": draw.arm_m,
+            "settings": settings.model_copy(update={"stamps_late_ms": 1e3 * draw.late_s}),
+        }
+    )  # fmt: skip
+    roll, pitch, yaw = (float(x) for x in np.degrees(euler_from_matrix(true_mount(draw, gimbal))))
+    bridge = sortie.deployment.bridge
+    mounted = bridge.camera.model_copy(
+        update={"mount_roll_deg": roll, "mount_pitch_deg": pitch, "mount_yaw_deg": yaw}
+    )
+    deployments = {
+        "old": sortie.deployment,
+        "found": found.model_copy(update={"map": sortie.deployment.map}),
+        "true": sortie.deployment.model_copy(
+            update={
+                "camera": true,
+                "bridge": bridge.model_copy(update={"camera": mounted}),
+            }
+        ),
+    }
+    return {
+        name: _errors(sortie.localized(config, seed + _AGAIN, keep=False))
+        for name, config in deployments.items()
+    }
+
+
+def read(path: Path) -> list[dict[str, Any]]:
+    """The draws of a file; a line that an interrupt cut short is left out."""
+    rows = []
+    for line in path.read_text().splitlines() if path.exists() else ():
+        try:
+            rows.append(json.loads(line))
+        except json.JSONDecodeError:
+            continue
+    return rows

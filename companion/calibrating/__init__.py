@@ -1,0 +1,1 @@
+"""``companion calibrate``: a deployment's camera, mounting and times from what was filmed."""

@@ -1,0 +1,137 @@
+"""The two accounts of a flight, and by how much a set of numbers contradicts them.
+
+Pictures: the pixels in which they show the map's points, whatever the pose. Autopilot: attitude
+(through the gimbal) and place, at the stamp less the lateness. Everything is vectorised over the
+frames, so that derivatives are differences: 25 evaluations of some milliseconds.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from companion.calibrating import unknowns as u
+from companion.calibrating.pictures import Parts
+from companion.calibrating.said import Said, at
+from companion.geometry import GIMBAL_FROM_CAMERA
+from localizer.geometry.camera import Camera
+from localizer.geometry.pose import Array, Pose, so3_exp
+
+
+@dataclass(frozen=True)
+class Sighted:
+    """One picture with what was said about it. time_ns: its stamp."""
+
+    time_ns: int
+    pose: Pose
+    parts: Parts
+    said: Said
+
+
+@dataclass(frozen=True)
+class Guess:
+    """All that is looked for. shared: (COUNT,), see `UNKNOWNS`; rotations (K, 3, 3), places (K, 3):
+    world from camera of every frame.
+    """
+
+    shared: Array
+    rotations: Array
+    places: Array
+
+    def moved(self, shared: Array, frames: Array) -> Guess:
+        """By steps (COUNT,) and (K, 6): metres, and left rotation vectors, world axes."""
+        turned = Rotation.from_rotvec(frames[:, 3:]).as_matrix() @ self.rotations
+        return Guess(self.shared + shared, turned, self.places + frames[:, :3])
+
+
+class Evidence:
+    """The observations of K frames with N parts in all, about a deployment's numbers.
+
+    camera, mount (3, 3), arm_m (3,): the deployment's.
+    """
+
+    def __init__(
+        self, frames: Sequence[Sighted], camera: Camera, mount: Array, arm_m: Array
+    ) -> None:
+        self.times_s = np.array([(f.time_ns - frames[0].time_ns) * 1e-9 for f in frames])
+        counts = [len(f.parts.points) for f in frames]
+        self.owner: NDArray[np.int64] = np.repeat(np.arange(len(frames)), counts)
+        self._points = np.concatenate([f.parts.points for f in frames])
+        self._pixels = np.concatenate([f.parts.pixels for f in frames])
+        information = np.concatenate([f.parts.information for f in frames])
+        self._root = np.linalg.cholesky(information).transpose(0, 2, 1)
+        self._camera, self._mount, self.arm_m = camera, mount, arm_m
+        self._housing = np.array([f.said.camera for f in frames])
+        self._body = np.array([f.said.body for f in frames])
+        self._place = np.array([f.said.place for f in frames])
+        self.placed: NDArray[np.bool_] = np.array([f.said.has_place for f in frames])
+        heights = self._place[:, self._place.shape[1] // 2, 2]
+        self._ground_m = float(np.nanmin(heights)) if self.placed.any() else 0.0
+        self._start = Guess(
+            np.zeros(u.COUNT),
+            np.array([f.pose.rotation for f in frames]),
+            np.array([f.pose.translation for f in frames]),
+        )
+
+    @property
+    def start(self) -> Guess:
+        """The deployment's numbers, and the poses that came with the frames."""
+        return self._start
+
+    def camera_of(self, shared: Array) -> Camera:
+        """The camera's model under these numbers."""
+        return changed_camera(self._camera, shared)
+
+    def pixels(self, guess: Guess) -> Array:
+        """(N, 2): predicted less seen, weighted by each part's own information, px."""
+        away = self._points - guess.places[self.owner]
+        x, y, z = np.einsum("nji,nj->in", guess.rotations[self.owner], away)
+        c = self.camera_of(guess.shared)
+        k1, k2, p1, p2, k3 = c.distortion
+        x, y = x / z, y / z
+        r2 = x * x + y * y
+        radial = 1.0 + r2 * (k1 + r2 * (k2 + r2 * k3))
+        xd = x * radial + 2 * p1 * x * y + p2 * (r2 + 2 * x * x)
+        yd = y * radial + p1 * (r2 + 2 * y * y) + 2 * p2 * x * y
+        off = np.stack([c.fx * xd + c.cx, c.fy * yd + c.cy], axis=1) - self._pixels
+        weighted: Array = np.einsum("nij,nj->ni", self._root, off)
+        return weighted
+
+    def attitudes(self, guess: Guess) -> Array:
+        """(K, 3): seen against said, rotation vectors in the camera's axes, rad."""
+        late_s = float(guess.shared[u.LATE])
+        heading = so3_exp([0.0, 0.0, -guess.shared[u.HEADING]])  # clockwise from north, in ENU
+        mount = self._mount @ so3_exp(guess.shared[u.MOUNT]) @ GIMBAL_FROM_CAMERA
+        said = heading @ at(self._housing, -late_s) @ mount
+        off = np.swapaxes(said, 1, 2) @ guess.rotations
+        turned: Array = Rotation.from_matrix(off).as_rotvec()
+        return turned
+
+    def places(self, guess: Guess) -> Array:
+        """(K, 3): seen less said, metres; NaN where nothing was said."""
+        late_s, s = float(guess.shared[u.LATE]), guess.shared
+        place = at(self._place, -late_s)
+        arm = at(self._body, -late_s) @ (self.arm_m + s[u.ARM])
+        climbed = (place[:, 2] - self._ground_m) * s[u.CLIMB]
+        said = place + arm + s[u.SHIFT]
+        said[:, 2] += climbed
+        off: Array = guess.places - said
+        return off
+
+
+def changed_camera(camera: Camera, shared: Array) -> Camera:
+    """A camera's model with the optics' numbers added to it."""
+    scale = float(np.exp(shared[u.FOCAL]))
+    right, down = shared[u.CENTRE]
+    b = shared[u.BEND]
+    k1, k2, p1, p2, k3 = camera.distortion
+    return Camera(
+        camera.width, camera.height, camera.fx * scale, camera.fy * scale,
+        camera.cx + float(right), camera.cy + float(down),
+        (k1 + float(b[0]), k2 + float(b[1]), p1 + float(b[2]), p2 + float(b[3]), k3),
+        camera.readout_ms,
+    )  # fmt: skip

@@ -1,0 +1,229 @@
+"""``companion calibrate flight``: from a record with pictures to the numbers of its deployment."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+
+from companion.calibrating import unknowns as u
+from companion.calibrating.evidence import Evidence, Guess, Sighted, changed_camera
+from companion.calibrating.pictures import PictureReader
+from companion.calibrating.said import REACH_S, Said, what_was_said
+from companion.calibrating.solve import Solution, solve
+from companion.config import CompanionConfig
+from companion.errors import RecordError, StreamDecodeError
+from companion.geometry import Mount
+from companion.offline.autopilot import RecordedAutopilot
+from companion.offline.replay import FlightRecord, RecordedEstimate, image_path
+from companion.sources.base import fitted_camera
+from companion.sources.folder_source import read_image
+from localizer.features.detail import DetailExtractor
+from localizer.features.extractor import load_extractor
+from localizer.geometry.camera import Camera
+from localizer.geometry.pose import Array, Pose
+from localizer.geometry.shutter import Sweep
+from localizer.tracking.opening import MapStack
+from localizer.tracking.pipeline import working_camera
+from localizer.types import Frame, Image
+from mavlink_bridge.injection.shadow import gnss_healthy
+from mavlink_bridge.messages import VehicleState
+
+_LEAST_FRAMES = 20
+_READ_TWICE = 2  # with the deployment's camera, and with the one that was found
+_LATER_NS = round(1e9 * (REACH_S + 0.3))
+_GNSS_BIAS_M = 0.5  # of a receiver, for minutes, however good it says it is
+_OURS = ("inject", "rc")
+
+
+@dataclass(frozen=True)
+class Calibrated:
+    """What a flight says. solution: see `solve`; before, after: mean distance of the pictures'
+    parts from where the map has them, px of the stream, poses free; frames, parts: how many were
+    used. gnss_bias_m: of the receiver, which no flight shows, in `covariance` already. notes:
+    sentences for the reader.
+    """
+
+    camera: Camera
+    mount: Array
+    arm_m: Array
+    solution: Solution
+    covariance: Array
+    before_px: float
+    after_px: float
+    frames: int
+    parts: int
+    gnss_bias_m: float
+    notes: tuple[str, ...]
+
+    @property
+    def shared(self) -> Array:
+        """The likeliest numbers, (COUNT,), as differences from the deployment's."""
+        return self.solution.guess.shared
+
+    @property
+    def sigmas(self) -> Array:
+        """(COUNT,), one standard deviation."""
+        return np.sqrt(np.diag(self.covariance))
+
+
+@dataclass(frozen=True)
+class _Picture:
+    """One that was chosen. said: by the autopilot; pose: where it was registered."""
+
+    recorded: RecordedEstimate
+    image: Image
+    said: Said
+    pose: Pose
+
+
+def calibrate(
+    record: FlightRecord,
+    tlog: Path,
+    map_cache: Path,
+    frames: int = 150,
+    progress: Callable[[int, int], None] = lambda _done, _total: None,
+) -> Calibrated:
+    """Numbers of the record's deployment by its own pictures, over a map.
+
+    frames: at most so many pictures are read, spread over the flight. progress: told how many are
+    read, and of how many (each twice). `RecordError` where the
+    record does not suffice, with what it lacks.
+    """
+    config = record.config
+    stack = MapStack(map_cache, config.localizer)
+    try:
+        mount = mount_of(config)
+        pictures, bias_m = _chosen(record, tlog, stack, mount, frames)
+        camera = config.camera.model.camera()
+        first = pictures[0].image
+        camera = fitted_camera(first.shape[1], first.shape[0], camera, str(record.folder))
+        arm_m = np.array(config.camera.lever_arm_m)
+        size = working_camera(camera, config.localizer.width)
+        extractor = DetailExtractor(
+            load_extractor(config.localizer.model, threads=1, size=(size.width, size.height))
+        )
+        guess: Guess | None = None
+        solution, before_px = None, np.nan
+        total = _READ_TWICE * len(pictures)
+        for turn in range(_READ_TWICE):
+            begun = total * turn // _READ_TWICE
+            shared = np.zeros(u.COUNT) if guess is None else guess.shared
+            believed = changed_camera(camera, shared)
+            reader = PictureReader(stack.renderer, extractor, believed, config.localizer.width)
+            late_s = float(shared[u.LATE])
+            pictures, sighted = _sighted(
+                pictures, reader, believed, late_s, lambda done, b=begun: progress(b + done, total)
+            )
+            evidence = Evidence(sighted, camera, mount, arm_m)
+            if guess is None:
+                still = np.arange(u.COUNT) < u.OPTICS.stop
+                before_px = solve(evidence, fixed=still).pixel_sigma
+            solution = solve(evidence)
+            guess = solution.guess
+            pictures = [
+                replace(p, pose=Pose(R, t))
+                for p, R, t in zip(pictures, guess.rotations, guess.places, strict=True)
+            ]
+    finally:
+        stack.close()
+    if solution is None:
+        raise RecordError(f"{record.folder}: nothing was solved")
+    covariance = solution.covariance.copy()
+    covariance[u.SHIFT, u.SHIFT] += np.eye(3) * bias_m**2
+    return Calibrated(
+        camera, mount, arm_m, solution, covariance, before_px, solution.pixel_sigma, len(sighted),
+        len(evidence.owner), bias_m, _notes(evidence, config),
+    )  # fmt: skip
+
+
+def mount_of(config: CompanionConfig) -> Array:
+    """(3, 3): the deployment's correction from the camera's housing to the gimbal."""
+    c = config.bridge.camera
+    return Mount.from_degrees(c.mount_roll_deg, c.mount_pitch_deg, c.mount_yaw_deg).rotation
+
+
+def _chosen(
+    record: FlightRecord, tlog: Path, stack: MapStack, mount: Array, most: int
+) -> tuple[list[_Picture], float]:
+    """At most so many accepted estimates with their pictures, and the receiver's own error, m."""
+    bridge = record.config.bridge
+    autopilot = RecordedAutopilot(bridge, tlog, record.start_ns, record.utc_minus_monotonic_ns)
+    good = [
+        e for e in record.estimates
+        if e.accepted and e.is_tracking and image_path(record.folder, e).is_file()
+    ]  # fmt: skip
+    if len(good) < _LEAST_FRAMES:
+        raise RecordError(
+            f"{record.folder}: {len(good)} localized frames with their pictures; calibration needs "
+            f"{_LEAST_FRAMES}, better 150: fly in shadow mode for three minutes with "
+            "record.snapshot_interval_s: 1"
+        )
+    picked = np.unique(np.linspace(0, len(good) - 1, min(most, len(good))).round().astype(int))
+    geoid_m, frame = stack.cache.manifest.geoid_separation_m, stack.cache.frame
+    trusted = bridge.mode not in _OURS
+    pictures, bias_m = [], _GNSS_BIAS_M
+    for index in picked:
+        estimate = good[index]
+        autopilot.advance(estimate.exposure_time_ns + _LATER_NS)
+        said = what_was_said(autopilot, estimate.exposure_time_ns, frame, geoid_m, mount)
+        if said is None:
+            continue
+        state = autopilot.state()
+        if not trusted or not _on_gnss(state, estimate.exposure_time_ns + _LATER_NS):
+            said = replace(said, place=np.full_like(said.place, np.nan))
+        else:
+            bias_m = max(_GNSS_BIAS_M, state.gps_h_accuracy_m or 0.0)
+        try:
+            image = read_image(image_path(record.folder, estimate))
+        except StreamDecodeError:
+            continue
+        pictures.append(_Picture(estimate, image, said, estimate.world_from_camera))
+    if len(pictures) < _LEAST_FRAMES:
+        raise RecordError(
+            f"{tlog}: attitude and gimbal are known at {len(pictures)} of {len(picked)} pictures; "
+            f"calibration needs {_LEAST_FRAMES}: is it this flight's log?"
+        )
+    return pictures, bias_m
+
+
+def _on_gnss(state: VehicleState, now_ns: int) -> bool:
+    return gnss_healthy(state, now_ns)
+
+
+def _sighted(
+    pictures: list[_Picture], reader: PictureReader, camera: Camera, late_s: float,
+    progress: Callable[[int], None],
+) -> tuple[list[_Picture], list[Sighted]]:  # fmt: skip
+    kept, sighted = [], []
+    for number, picture in enumerate(pictures):
+        progress(number + 1)
+        stamp_ns = picture.recorded.exposure_time_ns
+        rate, velocity = picture.said.motion(-late_s)
+        sweep = Sweep.of(rate, velocity, camera.readout_ms) if camera.readout_ms > 0 else None
+        frame = Frame(picture.image, stamp_ns, camera, 0)
+        parts = reader.read(frame, picture.pose, sweep)
+        if parts is not None:
+            kept.append(picture)
+            sighted.append(Sighted(stamp_ns, picture.pose, parts, picture.said))
+    if len(sighted) < _LEAST_FRAMES:
+        raise RecordError(
+            f"only {len(sighted)} of {len(pictures)} pictures can be laid on the map again: is it "
+            "the flight's own map?"
+        )
+    return kept, sighted
+
+
+def _notes(evidence: Evidence, config: CompanionConfig) -> tuple[str, ...]:
+    notes = []
+    share = float(evidence.placed.mean())
+    if config.bridge.mode in _OURS:
+        notes.append(
+            "the flight injected its fixes: the EKF's places are our own and were not used; fly in "
+            "shadow mode to learn lateness, lever arm and the map's place"
+        )
+    elif share < 0.5:
+        notes.append(f"places by GNSS are known at {100 * share:.0f} % of the pictures only")
+    return tuple(notes)

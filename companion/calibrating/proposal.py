@@ -1,0 +1,157 @@
+"""From what a flight says to a deployment: what changes, what it is worth, and the file."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import yaml
+
+from companion.calibrating import unknowns as u
+from companion.calibrating.evidence import changed_camera
+from companion.calibrating.flight import Calibrated
+from companion.config import CompanionConfig
+from companion.errors import ConfigError
+from companion.settings_file import read_settings, validated
+from localizer.geometry.pose import Array, euler_from_matrix, so3_exp
+
+_LEAST = {"focal_percent": 0.05, "principal_percent": 0.05, "distortion": 0.001, "stamp_ms": 2.0}
+_JITTER_MS = 2.0  # of stamps, from picture to picture, which the mean does not show
+_BLIND = 1.0  # information of a combination, in useful sigmas, below which it is not told
+_SHARE = 0.25  # of a combination's longest part: smaller ones are not named
+
+
+@dataclass(frozen=True)
+class Change:
+    """One setting: its key in the file, and its values."""
+
+    key: tuple[str, ...]
+    before: Any
+    after: Any
+
+
+def changes(config: CompanionConfig, found: Calibrated) -> tuple[Change, ...]:
+    """All settings that the flight's numbers replace, together: they were found together."""
+    s, told = found.shared, config.camera.model
+    camera = changed_camera(found.camera, s)
+    size = told.camera().resized(found.camera.width, found.camera.height)
+    camera = camera if size == told.camera() else camera.resized(told.width, told.height)
+    made = [
+        Change(("camera", "model", name), getattr(told, name), round(getattr(camera, name), 3))
+        for name in ("fx", "fy", "cx", "cy")
+    ]
+    made.append(
+        Change(
+            ("camera", "model", "distortion"),
+            list(told.distortion), [round(k, 5) for k in camera.distortion],
+        )
+    )  # fmt: skip
+    feed = config.camera.settings
+    late_ms = feed.stamps_late_ms + 1e3 * float(s[u.LATE])
+    made.append(
+        Change(("camera", "settings", "stamps_late_ms"), feed.stamps_late_ms, round(late_ms, 1))
+    )
+    made += _mounting(config, found)
+    arm = [round(float(x), 3) for x in found.arm_m + s[u.ARM]]
+    made.append(Change(("camera", "lever_arm_m"), list(config.camera.lever_arm_m), arm))
+    made += _sigmas(config, found)
+    return tuple(c for c in made if c.before != c.after)
+
+
+def _mounting(config: CompanionConfig, found: Calibrated) -> list[Change]:
+    mount = found.mount @ so3_exp(found.shared[u.MOUNT])
+    angles = np.degrees(euler_from_matrix(mount))
+    c = config.bridge.camera
+    names = ("mount_roll_deg", "mount_pitch_deg", "mount_yaw_deg")
+    return [
+        Change(("bridge", "camera", name), getattr(c, name), round(float(angle), 3))
+        for name, angle in zip(names, angles, strict=True)
+    ]
+
+
+def _sigmas(config: CompanionConfig, found: Calibrated) -> list[Change]:
+    """What the localizer may now believe of its camera."""
+    sigma = found.sigmas
+    told = config.localizer.calibration
+    values = {
+        "focal_percent": 100.0 * sigma[u.FOCAL],
+        "principal_percent": 100.0 * float(sigma[u.CENTRE].max()) / found.camera.width,
+        "distortion": float(sigma[u.BEND][0]),
+        "stamp_ms": float(np.hypot(1e3 * sigma[u.LATE], _JITTER_MS)),
+    }
+    return [
+        Change(
+            ("localizer", "calibration", name), getattr(told, name),
+            round(max(float(value), _LEAST[name]), 4),
+        )
+        for name, value in values.items()
+    ]  # fmt: skip
+
+
+def changed(config: CompanionConfig, wanted: tuple[Change, ...]) -> CompanionConfig:
+    """The deployment with its changes. `SettingsError` where the result is none."""
+    document = config.model_dump()
+    _apply(document, wanted)
+    return validated(CompanionConfig, document)
+
+
+def _apply(document: dict[str, Any], wanted: tuple[Change, ...]) -> None:
+    for change in wanted:
+        at = document
+        for name in change.key[:-1]:
+            if not isinstance(at.get(name), dict):
+                at[name] = {}
+            at = at[name]
+        at[change.key[-1]] = change.after
+
+
+def write_changed(path: Path, wanted: tuple[Change, ...], heading: str) -> Path:
+    """Replace the deployment file; the old one stays beside it under the name that is returned."""
+    document = read_settings(path, ConfigError)
+    _apply(document, wanted)
+    number, kept = 1, path.with_name(f"{path.name}.before-calibration")
+    while kept.exists():
+        number += 1
+        kept = path.with_name(f"{path.name}.before-calibration-{number}")
+    text = yaml.safe_dump(document, sort_keys=False, default_flow_style=None, width=100)
+    fresh = path.with_name(f".{path.name}.new")
+    try:
+        kept.write_bytes(path.read_bytes())
+        fresh.write_text(f"# {heading}\n# Before it: {kept.name}\n\n{text}", encoding="utf-8")
+        fresh.replace(path)
+    except OSError as error:
+        raise ConfigError(f"{path}: cannot be written: {error.strerror}") from error
+    return kept
+
+
+def blind_spots(found: Calibrated) -> tuple[str, ...]:
+    """What this flight cannot tell apart: weak eigenvectors of its information, in words."""
+    D = np.diag(u.USEFUL)
+    information = D @ found.solution.information @ D
+    values, vectors = np.linalg.eigh(0.5 * (information + information.T))
+    lines = []
+    for value, vector in zip(values, vectors.T, strict=True):
+        if value >= _BLIND:
+            break
+        lines.append(_combination(vector, float(value)))
+    return tuple(lines)
+
+
+def _combination(vector: Array, value: float) -> str:
+    longest = float(np.abs(vector).max())
+    named = [k for k in np.argsort(-np.abs(vector)) if abs(vector[k]) > _SHARE * longest]
+    sign = np.sign(vector[named[0]])
+    parts = []
+    for k in named:
+        unknown = u.UNKNOWNS[k]
+        amount = sign * vector[k] / longest * u.USEFUL[k] * unknown.scale
+        unit = f" {unknown.unit}" if unknown.unit else ""
+        parts.append(f"{unknown.name} {amount:+.3g}{unit}")
+    size = 1.0 / np.sqrt(max(value, 1e-6))
+    if len(parts) == 1:
+        only = u.UNKNOWNS[named[0]]
+        sigma = size * longest * only.useful * only.scale
+        return f"{only.name}: no better than {sigma:.3g} {only.unit}".rstrip()
+    return f"{', '.join(parts)} look alike, up to {size * longest:.2g} times as much"

@@ -1,0 +1,212 @@
+"""Least squares over all frames: the shared numbers and every frame's pose together.
+
+The pictures' noise is white between parts; attitude and place by the autopilot wander for seconds,
+so each is a Gauss-Markov process whose strength and memory are taken from what is left over.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.linalg import cho_factor, cho_solve
+
+from companion.calibrating import unknowns as u
+from companion.calibrating.evidence import Evidence, Guess
+from localizer.geometry.pose import Array
+
+_ROUNDS, _STEPS = 4, 5  # of noise, and of the poses and numbers under it
+_ALIKE = 6.0  # variance of the pictures' parts counts so often: neighbours err alike
+_CAUCHY = 2.5  # sigmas
+_MEMORIES_S = np.array([0.1, 0.3, 1.0, 2.0, 4.0, 8.0, 15.0, 30.0, 60.0])
+_WHITE = {"attitudes": np.radians(0.03), "places": 0.03}  # of what has no memory: rad, m
+_LEAST = {"attitudes": np.radians(0.05), "places": 0.08}
+_FIRST = {"attitudes": np.radians(0.5), "places": 0.4}
+_DIFFERENCE = 1e-5
+_CONVERGED = 1e-3  # of a sigma
+
+
+@dataclass(frozen=True)
+class Wander:
+    """A Gauss-Markov process per axis. sigma: (3,); memory_s: (3,)."""
+
+    sigma: Array
+    memory_s: Array
+
+    def whitening(self, times_s: Array, white: float) -> tuple[Array, Array]:
+        """(K, 3) factors of a value and of the one before it, by which what is left is white."""
+        gaps = np.diff(times_s)[:, None]
+        kept = np.concatenate([np.zeros((1, 3)), np.exp(-gaps / self.memory_s)])
+        variance = self.sigma**2 * (1.0 - kept**2) + white**2 * (1.0 + kept**2)
+        return 1.0 / np.sqrt(variance), kept / np.sqrt(variance)
+
+    @classmethod
+    def of(cls, left: Array, times_s: Array, least: float) -> Wander:
+        """The likeliest of what is left over, (K, 3)."""
+        sigmas, memories = np.zeros(3), np.zeros(3)
+        gaps = np.diff(times_s)
+        for axis in range(3):
+            e = left[:, axis]
+            best = np.inf
+            for memory_s in _MEMORIES_S:
+                kept = np.exp(-gaps / memory_s)
+                free = np.maximum(1.0 - kept**2, 1e-6)
+                squares = np.concatenate([e[:1] ** 2, (e[1:] - kept * e[:-1]) ** 2 / free])
+                variance = max(float(squares.mean()), least**2)
+                cost = float(squares.sum()) / variance + len(e) * np.log(variance)
+                cost += float(np.log(free).sum())
+                if cost < best:
+                    best, sigmas[axis], memories[axis] = cost, np.sqrt(variance), memory_s
+        return cls(sigmas, memories)
+
+
+@dataclass(frozen=True)
+class Solution:
+    """guess: the likeliest numbers and poses. covariance: (COUNT, COUNT) of the shared numbers, the
+    weak priors included; information: likewise, of the flight alone. pixel_sigma: of a part, px.
+    """
+
+    guess: Guess
+    covariance: Array
+    information: Array
+    pixel_sigma: float
+    attitude: Wander
+    place: Wander
+
+
+@dataclass(frozen=True)
+class _Noise:
+    """What is believed of the errors; weight: (N,) of the parts."""
+
+    pixel_sigma: float
+    weight: Array
+    attitude: Wander
+    place: Wander
+
+
+def solve(evidence: Evidence, fixed: NDArray[np.bool_] | None = None) -> Solution:
+    """The numbers that explain both accounts best. fixed: (COUNT,) bool, which keep their value."""
+    guess = evidence.start
+    still = np.zeros(u.COUNT, bool) if fixed is None else fixed
+    wander = {k: Wander(np.full(3, s), np.full(3, 5.0)) for k, s in _FIRST.items()}
+    noise = _Noise(1.0, np.ones(len(evidence.owner)), wander["attitudes"], wander["places"])
+    for _ in range(_ROUNDS):
+        for _ in range(_STEPS):
+            H, g = _normal(evidence, guess, noise, still)
+            factor = cho_factor(H, lower=True, check_finite=False)
+            step = -cho_solve(factor, g, check_finite=False)
+            frames = step[u.COUNT :].reshape(-1, 6)
+            guess = guess.moved(step[: u.COUNT], frames)
+            if np.abs(step[: u.COUNT] / u.USEFUL).max() < _CONVERGED:
+                break
+        noise = _noise(evidence, guess, noise)
+    H, _ = _normal(evidence, guess, noise, still)
+    shared = np.eye(len(H), u.COUNT)
+    P: Array = cho_solve(cho_factor(H, lower=True), shared)[: u.COUNT]
+    information: Array = np.linalg.inv(P).astype(np.float64) - np.diag(_prior(still))
+    return Solution(guess, P, information, noise.pixel_sigma, noise.attitude, noise.place)
+
+
+def _prior(still: NDArray[np.bool_]) -> Array:
+    """(COUNT,) information of the weak priors; of what is fixed, certainty."""
+    prior: Array = 1.0 / u.SIGMAS**2 * np.where(still, 1e12, 1.0)
+    return prior
+
+
+def _noise(evidence: Evidence, guess: Guess, before: _Noise) -> _Noise:
+    off = evidence.pixels(guess)
+    squares = (off**2).sum(axis=1)
+    sigma = float(np.sqrt(np.median(squares) / (2.0 * np.log(2.0))))
+    weight = 1.0 / (1.0 + squares / (_CAUCHY * sigma) ** 2)
+    attitude = Wander.of(evidence.attitudes(guess), evidence.times_s, _LEAST["attitudes"])
+    place, placed = before.place, evidence.placed
+    if placed.any():
+        left = evidence.places(guess)[placed]
+        place = Wander.of(left, evidence.times_s[placed], _LEAST["places"])
+    return replace(before, pixel_sigma=sigma, weight=weight, attitude=attitude, place=place)
+
+
+def _normal(
+    evidence: Evidence, guess: Guess, noise: _Noise, still: NDArray[np.bool_]
+) -> tuple[Array, Array]:
+    """Normal equations over (shared, frame 0, frame 1, ...): (M, M) and (M,)."""
+    K = len(evidence.times_s)
+    M = u.COUNT + 6 * K
+    H, g = np.zeros((M, M)), np.zeros(M)
+    _add_pictures(evidence, guess, noise, H, g)
+    _add_wander(evidence.attitudes, "attitudes", noise.attitude, evidence, guess, H, g)
+    if evidence.placed.any():
+        _add_wander(evidence.places, "places", noise.place, evidence, guess, H, g)
+    prior = _prior(still)
+    H[range(u.COUNT), range(u.COUNT)] += prior
+    g[: u.COUNT] += prior * guess.shared
+    H[range(u.COUNT, M), range(u.COUNT, M)] += 1e-9
+    return H, g
+
+
+def _derivatives(
+    function: Callable[[Guess], Array], guess: Guess, shared: range
+) -> tuple[Array, Array, Array]:
+    """Values (n, d), derivatives (n, d, 6) by each one's frame and (n, d, COUNT) by `shared`."""
+    K = len(guess.places)
+    value = function(guess)
+    by_frame = np.zeros((*value.shape, 6))
+    none = np.zeros(u.COUNT)
+    for j in range(6):
+        h = _DIFFERENCE * (1.0 if j < 3 else 0.01)
+        step = np.zeros((K, 6))
+        step[:, j] = h
+        by_frame[..., j] = (function(guess.moved(none, step)) - value) / h
+    by_shared = np.zeros((*value.shape, u.COUNT))
+    still = np.zeros((K, 6))
+    for j in shared:
+        step = none.copy()
+        step[j] = h = 1e-4 * u.USEFUL[j]
+        by_shared[..., j] = (function(guess.moved(step, still)) - value) / h
+    return value, by_frame, by_shared
+
+
+def _add_pictures(evidence: Evidence, guess: Guess, noise: _Noise, H: Array, g: Array) -> None:
+    value, by_frame, by_shared = _derivatives(evidence.pixels, guess, range(*u.OPTICS.indices(99)))
+    weight = noise.weight / (noise.pixel_sigma**2 * _ALIKE)
+    K, S = len(guess.places), u.COUNT
+    own = np.einsum("n,nai,naj->nij", weight, by_frame, by_frame)
+    both = np.einsum("n,nai,naj->nij", weight, by_frame, by_shared)
+    pull = np.einsum("n,nai,na->ni", weight, by_frame, value)
+    H[:S, :S] += np.einsum("n,nai,naj->ij", weight, by_shared, by_shared, optimize=True)
+    g[:S] += np.einsum("n,nai,na->i", weight, by_shared, value)
+    frames = np.zeros((K, 6, 6)), np.zeros((K, 6, S)), np.zeros((K, 6))
+    for total, each in zip(frames, (own, both, pull), strict=True):
+        np.add.at(total, evidence.owner, each)
+    for k in range(K):
+        at = slice(S + 6 * k, S + 6 * k + 6)
+        H[at, at] += frames[0][k]
+        H[at, :S] += frames[1][k]
+        H[:S, at] += frames[1][k].T
+        g[at] += frames[2][k]
+
+
+def _add_wander(
+    function: Callable[[Guess], Array], name: str, wander: Wander, evidence: Evidence,
+    guess: Guess, H: Array, g: Array,
+) -> None:  # fmt: skip
+    """One account of the autopilot's: each value less what is left of the one before it."""
+    used = evidence.placed if name == "places" else np.ones(len(guess.places), bool)
+    value, by_frame, by_shared = _derivatives(function, guess, range(u.LATE, u.COUNT))
+    which = np.flatnonzero(used)
+    now, before = wander.whitening(evidence.times_s[which], _WHITE[name])
+    rows, S = 3 * len(which), u.COUNT
+    J = np.zeros((len(which), 3, len(g)))
+    for i, k in enumerate(which):
+        J[i, :, S + 6 * k : S + 6 * k + 6] = now[i][:, None] * by_frame[k]
+        if i:
+            b = which[i - 1]
+            J[i, :, S + 6 * b : S + 6 * b + 6] = -before[i][:, None] * by_frame[b]
+    earlier = np.concatenate([which[:1], which[:-1]])
+    J[:, :, :S] = now[..., None] * by_shared[which] - before[..., None] * by_shared[earlier]
+    left = now * value[which] - before * value[earlier]
+    flat = J.reshape(rows, -1)
+    H += flat.T @ flat
+    g += flat.T @ left.reshape(rows)

@@ -1,0 +1,115 @@
+"""``companion calibrate``: what the deployment says of camera and mounting, measured."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+from rich.box import SIMPLE_HEAD
+from rich.console import Console
+from rich.markup import escape
+from rich.table import Table
+
+from companion.errors import ConfigError, RecordError
+from companion.terminal.steps import shown_count
+
+app = typer.Typer(no_args_is_help=True)
+
+
+@app.command("flight")
+def flight_command(
+    record: Annotated[Path, typer.Argument(help="folder that `companion run` recorded")],
+    tlog: Annotated[Path | None, typer.Option(help="instead of the record's bridge.tlog")] = None,
+    map_cache: Annotated[
+        Path | None, typer.Option("--map", help="instead of the record's map")
+    ] = None,
+    frames: Annotated[int, typer.Option(min=20, max=2000, help="pictures read at most")] = 150,
+    config: Annotated[
+        Path | None, typer.Option(help="deployment file that the record was flown with")
+    ] = None,
+    write: Annotated[
+        bool, typer.Option(help="change that file; the old one is kept beside it")
+    ] = False,
+    report: Annotated[Path | None, typer.Option("--json", help="all figures, to a file")] = None,
+) -> None:
+    """Camera, boresight, lever arm, times and map shift from a shadow flight with pictures."""
+    from companion.calibrating.flight import calibrate
+    from companion.calibrating.proposal import blind_spots, changes, write_changed
+    from companion.offline.replay import load_record
+
+    if write and config is None:
+        raise ConfigError("--write needs --config: which deployment file is to be changed?")
+    loaded = load_record(record, kept_share=0.0)
+    log = tlog or loaded.config.bridge.tlog
+    if log is None:
+        raise RecordError(f"{record}: flown without bridge.tlog; give the log as --tlog")
+    if map_cache is not None:
+        changed = loaded.config.model_copy(update={"map": map_cache})
+        loaded = replace(loaded, config=changed)
+    with shown_count(Console(stderr=True), "pictures") as count:
+        found = calibrate(loaded, log, loaded.config.map, frames, count)
+    wanted = changes(loaded.config, found)
+    console = Console()
+    console.print(_numbers(found))
+    blind = blind_spots(found)
+    console.print("What this flight cannot tell:" if blind else "This flight tells all of it.")
+    for line in blind:
+        console.print(f"  {escape(line)}", soft_wrap=True, highlight=False)
+    for note in found.notes:
+        console.print(escape(note), style="yellow", soft_wrap=True)
+    console.print(
+        f"{found.frames} pictures, {found.parts} of their parts: {found.before_px:.2f} px from the "
+        f"map with the deployment's camera, {found.after_px:.2f} px with the one found",
+        soft_wrap=True, highlight=False,
+    )  # fmt: skip
+    console.print(_changes(wanted))
+    if report is not None:
+        report.write_text(json.dumps(_figures(found, wanted, blind), indent=1), encoding="utf-8")
+    if write and config is not None:
+        kept = write_changed(config, wanted, f"calibrated by `companion calibrate flight {record}`")
+        console.print(f"{config} is changed; before it: {kept}", style="green", soft_wrap=True)
+
+
+def _numbers(found: Any) -> Table:
+    from companion.calibrating.unknowns import UNKNOWNS, USEFUL
+
+    table = Table(title="against the deployment", box=SIMPLE_HEAD)
+    for column in ("", "differs by", "1 sigma", "", "told"):
+        table.add_column(column, justify="left" if column in ("", "told") else "right")
+    for unknown, value, sigma, useful in zip(
+        UNKNOWNS, found.shared, found.sigmas, USEFUL, strict=True
+    ):
+        told = "yes" if sigma <= useful else "no"
+        table.add_row(
+            unknown.name, f"{value * unknown.scale:+.3g}", f"{sigma * unknown.scale:.2g}",
+            unknown.unit, told,
+        )  # fmt: skip
+    return table
+
+
+def _changes(wanted: tuple[Any, ...]) -> Table:
+    table = Table(title="deployment", box=SIMPLE_HEAD)
+    for column in ("key", "before", "after"):
+        table.add_column(column, overflow="fold")
+    for change in wanted:
+        table.add_row(".".join(change.key), str(change.before), str(change.after))
+    return table
+
+
+def _figures(found: Any, wanted: tuple[Any, ...], blind: tuple[str, ...]) -> dict[str, Any]:
+    from companion.calibrating.unknowns import UNKNOWNS
+
+    return {
+        "numbers": [
+            {"name": n.name, "unit": n.unit, "value": float(v * n.scale),
+             "sigma": float(s * n.scale)}
+            for n, v, s in zip(UNKNOWNS, found.shared, found.sigmas, strict=True)
+        ],
+        "covariance": found.covariance.tolist(), "cannot_tell": list(blind),
+        "changes": {".".join(c.key): [c.before, c.after] for c in wanted},
+        "pictures": found.frames, "parts": found.parts,
+        "before_px": found.before_px, "after_px": found.after_px, "notes": list(found.notes),
+    }  # fmt: skip

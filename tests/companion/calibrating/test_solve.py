@@ -1,0 +1,133 @@
+"""From made observations with known errors back to the errors, and to what cannot be known."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+import yaml
+
+from companion.calibrating import unknowns as u
+from companion.calibrating.evidence import Evidence, Sighted, changed_camera
+from companion.calibrating.flight import Calibrated
+from companion.calibrating.pictures import Parts
+from companion.calibrating.proposal import blind_spots, changed, changes, write_changed
+from companion.calibrating.said import OFFSETS_S, Said
+from companion.calibrating.solve import solve
+from companion.config import load_config
+from companion.geometry import GIMBAL_FROM_CAMERA
+from localizer.geometry.camera import Camera
+from localizer.geometry.geo import NED_FROM_ENU
+from localizer.geometry.pose import Pose, matrix_from_euler, so3_exp
+
+TOLD = Camera(640, 480, 500.0, 500.0, 320.0, 240.0, (-0.09, 0.02, 0.0, 0.0, 0.0))
+ERRORS = np.zeros(u.COUNT)
+ERRORS[u.FOCAL], ERRORS[u.LATE] = 0.025, 0.12
+ERRORS[u.MOUNT] = np.radians([2.0, -1.5, 1.0])
+ERRORS[u.SHIFT], ERRORS[u.BEND] = (1.5, -2.0, 0.4), (0.01, -0.005, 0.0, 0.0)
+
+
+def frames(rich: bool, count: int = 40, seed: int = 1) -> list[Sighted]:
+    """A flight with turns, heights and gimbal angles, or straight ahead looking down."""
+    rng = np.random.default_rng(seed)
+    camera = changed_camera(TOLD, ERRORS)
+    mount = so3_exp(ERRORS[u.MOUNT])
+    made = []
+    for k in range(count):
+        t0 = 2.0 * k
+        heading = 0.5 * np.sin(0.4 * k) if rich else 0.0
+        rate = 0.25 * np.cos(0.7 * k) if rich else 0.0
+        pitch = np.radians(-90.0 + (40.0 * ((k // 3) % 3) / 2 if rich else 0.0))
+        height = 60.0 + (50.0 * ((k // 5) % 3) / 2 if rich else 0.0)
+        speed = 8.0 * np.array([np.cos(heading), np.sin(heading), 0.0])
+        place0 = np.array([8.0 * k, 20 * np.sin(0.3 * k) if rich else 0.0, height])
+        camera_, body, place = [], [], []
+        for offset in OFFSETS_S:
+            yaw = heading + rate * offset
+            up = NED_FROM_ENU.T
+            body.append(up @ matrix_from_euler(0.05, 0.02, yaw))
+            camera_.append(up @ matrix_from_euler(0.0, pitch, yaw))
+            place.append(place0 + speed * offset)
+        said = Said(np.array(camera_), np.array(body), np.array(place))
+        i = np.argmin(np.abs(OFFSETS_S + ERRORS[u.LATE]))
+        R = said.camera[i] @ mount @ GIMBAL_FROM_CAMERA @ so3_exp(rng.normal(0, 1e-3, 3))
+        C = said.place[i] + ERRORS[u.SHIFT] + rng.normal(0, 0.05, 3)
+        pixels = rng.uniform(20, (620, 460), (60, 2))
+        rays = camera.rays(pixels) @ R.T
+        ground = rng.uniform(0.0, 6.0, 60)
+        points = C + rays * ((ground - C[2]) / rays[:, 2])[:, None]
+        keep = rays[:, 2] < -0.2
+        seen = pixels[keep] + rng.normal(0, 0.2, (int(keep.sum()), 2))
+        parts = Parts(points[keep], seen, np.broadcast_to(np.eye(2), (int(keep.sum()), 2, 2)))
+        pose = Pose(so3_exp(rng.normal(0, 0.01, 3)) @ R, C + rng.normal(0, 0.5, 3))
+        made.append(Sighted(round(t0 * 1e9), pose, parts, said))
+    return made
+
+
+def found_of(sighted: list[Sighted]) -> Calibrated:
+    solution = solve(Evidence(sighted, TOLD, np.eye(3), np.zeros(3)))
+    return Calibrated(
+        TOLD, np.eye(3), np.zeros(3), solution, solution.covariance, 1.0, solution.pixel_sigma,
+        len(sighted), 1, 0.5, (),
+    )  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def rich() -> Calibrated:
+    return found_of(frames(rich=True))
+
+
+def test_drawn_errors_come_back_within_their_sigmas(rich: Calibrated):
+    off = rich.shared - ERRORS
+    assert abs(off[u.FOCAL]) < 0.003
+    assert np.abs(off[u.MOUNT]).max() < np.radians(0.2)
+    assert abs(off[u.LATE]) < 0.010
+    assert np.abs(off[u.SHIFT]).max() < 0.3
+    assert np.abs(off / rich.sigmas).max() < 4.0
+
+
+def test_what_a_flight_straight_ahead_cannot_tell_is_said(rich: Calibrated):
+    flat = found_of(frames(rich=False))
+    assert blind_spots(rich) == () or not any("focal" in line for line in blind_spots(rich))
+    told = " ".join(blind_spots(flat))
+    assert "mounting" in told  # and heading are the same thing, seen straight from above
+    assert "heading" in told
+    assert flat.sigmas[u.MOUNT].max() > 5 * rich.sigmas[u.MOUNT].max()
+
+
+def test_a_flight_without_places_tells_optics_and_mounting_only():
+    blind = [
+        Sighted(f.time_ns, f.pose, f.parts, Said(f.said.camera, f.said.body, f.said.place * np.nan))
+        for f in frames(rich=True)
+    ]
+    found = found_of(blind)
+    assert abs(found.shared[u.FOCAL] - ERRORS[u.FOCAL]) < 0.004
+    assert found.sigmas[u.SHIFT].min() > 5.0
+    assert "map east of GNSS" in " ".join(blind_spots(found))
+
+
+def deployment(folder: Path) -> Path:
+    path = folder / "deployment.yaml"
+    document = {
+        "map": str(folder), "camera": {"source": "udp://0.0.0.0:5600", "model": TOLD.to_dict()},
+        "bridge": {"connection": "udpin:127.0.0.1:14550", "camera": {"mount_pitch_deg": 0.0}},
+    }  # fmt: skip
+    path.write_text(yaml.safe_dump(document))
+    return path
+
+
+def test_the_deployment_is_changed_and_the_old_one_kept(rich: Calibrated, tmp_path: Path):
+    path = deployment(tmp_path)
+    before = path.read_text()
+    wanted = changes(load_config(path), rich)
+    kept = write_changed(path, wanted, "calibrated")
+    assert kept.read_text() == before
+    after = load_config(path)
+    assert after.camera.model.fx == pytest.approx(500.0 * np.exp(0.025), rel=0.003)
+    assert after.camera.settings.stamps_late_ms == pytest.approx(120.0, abs=10.0)
+    assert after.bridge.camera.mount_pitch_deg == pytest.approx(-1.5, abs=0.2)
+    assert after == changed(load_config(kept), wanted)
+    assert write_changed(path, wanted, "again") != kept
+    json.dumps({".".join(c.key): [c.before, c.after] for c in wanted})
