@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -115,7 +116,7 @@ def calibrate(
             reader = PictureReader(stack.renderer, extractor, believed, config.localizer.width)
             late_s = float(shared[u.LATE])
             pictures, sighted = _sighted(
-                pictures, reader, believed, late_s, lambda done, b=begun: progress(b + done, total)
+                pictures, reader, believed, late_s, partial(_tell, progress, begun, total)
             )
             evidence = Evidence(sighted, camera, mount, arm_m)
             if guess is None:
@@ -137,6 +138,10 @@ def calibrate(
         camera, mount, arm_m, solution, covariance, before_px, solution.pixel_sigma, len(sighted),
         len(evidence.owner), bias_m, _notes(evidence, config),
     )  # fmt: skip
+
+
+def _tell(progress: Callable[[int, int], None], begun: int, total: int, done: int) -> None:
+    progress(begun + done, total)
 
 
 def mount_of(config: CompanionConfig) -> Array:

@@ -393,8 +393,7 @@ class LiveVideoSource:
         if camera is None:
             return
         stamps = Stamps(_pts_ns(picture), _misp_time(picture))
-        late_ns = round(self._settings.stamps_late_ms * 1e6)
-        exposure_ns = clock.exposure_time(stamps, arrival_ns) - late_ns
+        exposure_ns = clock.exposure_time(stamps, arrival_ns) - self._settings.late_ns
         _tell(self._tap, picture, exposure_ns)
         if not self._newest.put((picture, camera, exposure_ns, self._counters.received)):
             return  # closed meanwhile

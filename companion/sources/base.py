@@ -107,6 +107,11 @@ class SourceSettings(BaseModel):
         description="UDP: whose video is taken, ADDRESS or ADDRESS:PORT; null: the first one's",
     )
 
+    @property
+    def late_ns(self) -> int:
+        """`stamps_late_ms` in ns."""
+        return round(1e6 * self.stamps_late_ms)
+
     @field_validator("sender")
     @classmethod
     def _is_a_sender(cls, value: str | None) -> str | None:

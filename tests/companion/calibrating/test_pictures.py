@@ -19,13 +19,14 @@ CAMERA = Camera.from_fov(320, 240, 65.0)
 class Plane:
     """A renderer of one textured plane 100 m below, whatever it is asked."""
 
-    def __init__(self) -> None:
+    def __init__(self, depth_m: float = 100.0) -> None:
+        self.depth_m = depth_m
         noise = np.random.default_rng(3).normal(size=(240, 320, 3)).astype(np.float32)
         smooth = cv2.GaussianBlur(noise, (0, 0), 2.5)
         self.rgb = np.clip(128 + 400 * smooth, 0, 255).astype(np.uint8)
 
     def render(self, pose, camera, extra=(), *, wait=False):
-        return RenderedView(self.rgb, np.full((240, 320), 100.0, np.float32), pose, camera)
+        return RenderedView(self.rgb, np.full((240, 320), self.depth_m, np.float32), pose, camera)
 
 
 @pytest.mark.parametrize("longer", [1.0, 1.008])
@@ -47,9 +48,6 @@ def test_each_part_is_found_where_the_picture_has_it(longer):
 
 
 def test_a_view_beside_the_map_gives_nothing():
-    plane = Plane()
-    plane.render = lambda pose, camera, extra=(), *, wait=False: RenderedView(
-        plane.rgb, np.zeros((240, 320), np.float32), pose, camera
-    )
+    plane = Plane(depth_m=0.0)
     reader = PictureReader(plane, DetailExtractor(GradientExtractor()), CAMERA, 320)
     assert reader.read(Frame(plane.rgb, 0, CAMERA, 0), Pose.identity(), None) is None
