@@ -11,7 +11,12 @@ from mavlink_bridge.config import BridgeConfig
 from mavlink_bridge.link.clock import SteadyUtc, monotonic_ns
 from mavlink_bridge.link.link import sleep_until
 from mavlink_bridge.messages import Figures, GimbalAttitude, VehicleState
-from mavlink_bridge.preflight.failsafes import PARAMETERS, failsafes
+from mavlink_bridge.preflight.failsafes import (
+    PARAMETERS,
+    PX4_PARAMETERS,
+    failsafes,
+    px4_failsafes,
+)
 from mavlink_bridge.preflight.parameters import ParameterClient
 from mavlink_bridge.preflight.rules import (
     Read,
@@ -97,11 +102,12 @@ def check_parameters(rules: Iterable[Rule], read: Read) -> list[Finding]:
     return findings
 
 
-def check_failsafes(config: BridgeConfig, read: Read) -> list[Finding]:
+def check_failsafes(config: BridgeConfig, read: Read, *, px4: bool = False) -> list[Finding]:
     """What the autopilot does once vision ends: advice, which is never written."""
+    lines = px4_failsafes(config, read) if px4 else failsafes(config, read)
     return [
         Finding(line.name, line.found, line.needed, line.why, line.ok, required=False)
-        for line in failsafes(config, read)
+        for line in lines
     ]
 
 
@@ -277,8 +283,9 @@ def examine(config: BridgeConfig, say: Callable[[str], None] = lambda _: None) -
                 *arming_rules(config, source_set, client.read),
             ]
         findings += check_parameters(rules, client.read)
-        if state.autopilot != "px4":
-            findings += check_failsafes(config, client.read_known(PARAMETERS).get)
+        px4 = state.autopilot == "px4"
+        known = client.read_known(PX4_PARAMETERS if px4 else PARAMETERS)
+        findings += check_failsafes(config, known.get, px4=px4)
     return Diagnosis(tuple(findings), state)
 
 

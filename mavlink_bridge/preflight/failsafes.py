@@ -1,7 +1,8 @@
-"""What ArduPilot does once vision ends: told before the flight, and never written.
+"""What the autopilot does once vision ends: told before the flight, and never written.
 
-The vehicle's failsafes are its pilot's decision. Values are those of ArduCopter's own parameter
-descriptions; the times were measured in SITL (docs/explanation/integrity.md).
+The vehicle's failsafes are its pilot's decision. Values are those of the parameters' own
+descriptions; ArduCopter's times were measured in SITL (docs/explanation/integrity.md), PX4 was not
+flown.
 """
 
 from __future__ import annotations
@@ -53,6 +54,21 @@ _FENCE_LAND = (2.0, 4.0)
 _HEIGHT_FENCE = 1
 
 
+_PX4_ENDS = {0.0: "altitude mode: the pilot flies", 1.0: "LAND, without a height termination"}
+_PX4_LONGEST_US = 5e6  # EKF2_NOAID_TOUT as it comes
+_PX4_WANTED = (
+    _Wanted("COM_POS_LOW_ACT", (5.0, 2.0, 1.0), "3 flies home by the position that is doubted"),
+    _Wanted("GF_ACTION", (5.0, 2.0), "0 and 1 bound nothing, 3 flies home by the doubted position"),
+)
+PX4_PARAMETERS = (
+    *(wanted.name for wanted in _PX4_WANTED),
+    "EKF2_NOAID_TOUT",
+    "COM_POS_FS_EPH",
+    "GF_MAX_VER_DIST",
+    "COM_POSCTL_NAVL",
+)
+"""What `px4_failsafes` reads."""
+
 PARAMETERS = (*(wanted.name for wanted in _WANTED), "FENCE_TYPE", "FENCE_ACTION")
 """What `failsafes` reads."""
 
@@ -61,20 +77,49 @@ def failsafes(config: BridgeConfig, read: Read) -> list[Failsafe]:
     """What is set; a parameter that the vehicle does not have gives no line."""
     if config.mode == "off":
         return []
-    lines = []
-    for wanted in _WANTED:
-        value = read(wanted.name)
-        if value is not None:
-            needed = " or ".join(f"{v:g}" for v in wanted.allowed)
-            ok = any(abs(value - v) < 1e-6 for v in wanted.allowed)
-            lines.append(Failsafe(wanted.name, f"{value:g}", needed, wanted.why, ok))
-    lines += _fence(read)
+    lines = [*_listed(_WANTED, read), *_fence(read)]
     action = read("FS_EKF_ACTION")
     if action is not None:
         found = _COPTER_LANDS.get(action, f"FS_EKF_ACTION {action:g}")
         why = "also when the companion dies; a supervised one is back sooner (integrity.md)"
         ok = action in (1.0, 2.0)
         lines.append(Failsafe("when vision ends", found, "as the pilot expects", why, ok))
+    return lines
+
+
+def px4_failsafes(config: BridgeConfig, read: Read) -> list[Failsafe]:
+    """The same of PX4 (1.15 and later)."""
+    if config.mode == "off":
+        return []
+    lines = _listed(_PX4_WANTED, read)
+    alert_m = config.injection.alert_limit_m
+    bounds = (
+        ("EKF2_NOAID_TOUT", 1e6, _PX4_LONGEST_US, "us without vision before the EKF says so"),
+        ("COM_POS_FS_EPH", 0.1, alert_m, "m; beyond it the position is lost; never where negative"),
+        ("GF_MAX_VER_DIST", 1.0, 1e4, "m; a fence by height needs no position; 0 is none"),
+    )
+    for name, least, most, why in bounds:
+        value = read(name)
+        if value is not None:
+            needed, ok = f"{least:g} to {most:g}", least <= value <= most
+            lines.append(Failsafe(name, f"{value:g}", needed, why, ok))
+    action = read("COM_POSCTL_NAVL")
+    if action is not None:
+        found = _PX4_ENDS.get(action, f"COM_POSCTL_NAVL {action:g}")
+        why = "from PX4's documentation, not flown; also when the companion dies (integrity.md)"
+        ok = action in _PX4_ENDS
+        lines.append(Failsafe("when vision ends", found, "as the pilot expects", why, ok))
+    return lines
+
+
+def _listed(all_wanted: tuple[_Wanted, ...], read: Read) -> list[Failsafe]:
+    lines = []
+    for wanted in all_wanted:
+        value = read(wanted.name)
+        if value is not None:
+            needed = " or ".join(f"{v:g}" for v in wanted.allowed)
+            ok = any(abs(value - v) < 1e-6 for v in wanted.allowed)
+            lines.append(Failsafe(wanted.name, f"{value:g}", needed, wanted.why, ok))
     return lines
 
 

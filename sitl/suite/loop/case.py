@@ -104,7 +104,8 @@ class Expectation(_Model):
     guardian that stands) at latest so long after it began. never_modes: flight modes that must not
     be entered. max_error_m: of the EKF. false_fixes: injected positions further off than 5 m;
     injects: and some are injected. back_within_s: of a kill or a hang, injected again.
-    ends_tracking: the last health is ok. says: parts of texts that must come from the companion.
+    repeats: how often the companion may say the same, figures aside. ends_tracking: the last health
+    is ok. says: parts of texts that must come from the companion.
     silent: no warning text, no finding of the guardian, and a health that is ok throughout.
     """
 
@@ -118,6 +119,7 @@ class Expectation(_Model):
     ends_tracking: bool = False
     says: tuple[str, ...] = ()
     silent: bool = False
+    repeats: int | None = Field(None, ge=1)
 
 
 class LoopCase(_Model):

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import math
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 
 import numpy as np
 
+from mavlink_bridge.messages import without_figures
 from sitl.suite.loop.case import Expectation
 
 _STALE_S = 2.0  # a health report older than this is none: the process is gone, and its heartbeat
@@ -200,10 +202,19 @@ def judge(record: LoopRecord, expect: Expectation, *, denied: bool = False) -> t
         ok = last is not None and last.level == "ok" and not last.age_s > _STALE_S
         held.append(Held("tracks at the end", ok, last.health if last else "no samples"))
     held += [_said(record.texts, part) for part in expect.says]
+    if expect.repeats is not None:
+        held.append(_repeated(record.texts, expect.repeats))
     if expect.silent:
         told = false_alarms(record, denied=denied)
         held.append(Held("no warning", not told, "; ".join(told) or "none"))
     return tuple(held)
+
+
+def _repeated(texts: Sequence[LoopText], most: int) -> Held:
+    """Texts that cycle are read by nobody: an overloaded computer is well and ill by turns."""
+    said = Counter(without_figures(t.text) for t in texts if t.component != _AUTOPILOT)
+    text, times = said.most_common(1)[0] if said else ("nothing", 0)
+    return Held(f"says nothing more than {most} times", times <= most, f"{times} times {text!r}")
 
 
 def _said(texts: Sequence[LoopText], part: str) -> Held:

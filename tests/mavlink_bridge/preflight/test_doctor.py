@@ -13,7 +13,9 @@ from mavlink_bridge import Bridge, BridgeConfig
 from mavlink_bridge.config import InjectionConfig, OriginConfig
 from mavlink_bridge.errors import ParameterError
 from mavlink_bridge.link.link import sleep_until
+from mavlink_bridge.messages import VehicleState
 from mavlink_bridge.preflight.doctor import (
+    Finding,
     check_failsafes,
     check_parameters,
     examine,
@@ -316,6 +318,56 @@ def test_what_happens_when_vision_ends_is_told_and_never_written(
     ends = next(f for f in findings if f.name == "when vision ends")
     lands = {0.0: "drifts on", 2.0: "ALT_HOLD"} if name == "FS_EKF_ACTION" else {}
     assert lands.get(value, "LAND") in ends.found
+
+
+PX4_GOOD = {
+    "COM_POS_LOW_ACT": 5.0,
+    "GF_ACTION": 2.0,
+    "EKF2_NOAID_TOUT": 5e6,
+    "COM_POS_FS_EPH": 5.0,
+    "GF_MAX_VER_DIST": 120.0,
+    "COM_POSCTL_NAVL": 0.0,
+}
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "told"),
+    [
+        ("COM_POSCTL_NAVL", 1.0, set()),
+        ("COM_POSCTL_NAVL", 7.0, {"when vision ends"}),
+        ("COM_POS_LOW_ACT", 3.0, {"COM_POS_LOW_ACT"}),  # as it comes
+        ("GF_ACTION", 3.0, {"GF_ACTION"}),
+        ("GF_MAX_VER_DIST", 0.0, {"GF_MAX_VER_DIST"}),  # as it comes
+        ("EKF2_NOAID_TOUT", 1e7, {"EKF2_NOAID_TOUT"}),
+        ("COM_POS_FS_EPH", -1.0, {"COM_POS_FS_EPH"}),
+        ("COM_POS_FS_EPH", 50.0, {"COM_POS_FS_EPH"}),
+    ],
+)
+def test_what_px4_does_when_vision_ends_is_told_likewise(
+    name: str, value: float, told: set[str]
+) -> None:
+    findings = check_failsafes(config(), {**PX4_GOOD, name: value}.get, px4=True)
+    assert {f.name for f in findings} == {*PX4_GOOD, "when vision ends"} - {"COM_POSCTL_NAVL"}
+    assert {f.name for f in findings if not f.ok} == told
+    assert not any(f.required or f.fix is not None for f in findings)
+    ends = next(f for f in findings if f.name == "when vision ends")
+    assert {1.0: "LAND", 7.0: "7"}.get(value, "altitude mode") in ends.found
+
+
+def test_px4_is_asked_for_its_own_failsafes(
+    autopilot: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    link = Finding("connection", "px4", "a heartbeat", "", True, True)
+    known = ([link], VehicleState(autopilot="px4"))
+    monkeypatch.setattr("mavlink_bridge.preflight.doctor.check_link", lambda _: known)
+    autopilot.autopilot = mavlink.MAV_AUTOPILOT_PX4
+    autopilot.version = (1, 16, 0)
+    settings = config(autopilot.port)
+    rules = {rule.names[0]: 0.0 for rule in px4_rules(settings)}
+    autopilot.parameters = {**rules, **PX4_GOOD, "COM_POSCTL_NAVL": 1.0, "FS_EKF_ACTION": 0.0}
+    found = {f.name: f.found for f in examine(settings).findings}
+    assert found["when vision ends"].startswith("LAND")
+    assert "FS_EKF_ACTION" not in found
 
 
 def test_a_vehicle_without_these_parameters_gets_no_such_line(autopilot: Any) -> None:

@@ -78,6 +78,19 @@ def replace_says(expect: Expectation) -> Expectation:
     return expect.model_copy(update={"says": ("another text",)})
 
 
+def test_texts_that_cycle_are_counted_figures_aside() -> None:
+    """As on an overloaded machine: the same four texts, 42 times (an attack's flight)."""
+    texts = tuple(
+        LoopText(float(at_s), component, 4, f"PiLoT: overloaded, {at_s} of 8 frames/s")
+        for at_s, component in ((1, 191), (3, 191), (4, 1), (5, 191))
+    )
+    cycling = LoopRecord(flight([0.5] * 4), texts, (0.2,))
+    held = {h.what: h for h in judge(cycling, Expectation(repeats=2))}
+    assert not held["says nothing more than 2 times"].ok
+    assert held["says nothing more than 2 times"].seen.startswith("3 times 'PiLoT: overloaded")
+    assert all(h.ok for h in judge(cycling, Expectation(repeats=3)))
+
+
 def test_whatever_is_told_of_a_good_flight_is_a_false_alarm() -> None:
     quiet = LoopRecord(flight([0.5] * 4), (LoopText(1.0, 1, 3, "EKF3 IMU0 yaw"),), (0.2,))
     assert false_alarms(quiet) == ()
