@@ -17,8 +17,15 @@ from benchmarks.common.named_errors import named_errors
 from companion.errors import ReportError
 
 _SIZES = {"console": (1280, 800), "console-phone": (390, 844)}
-_GL = ["--no-sandbox", "--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader"]
+BROWSER_OPTIONS = (
+    "--no-sandbox", "--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader",
+)  # fmt: skip
 _PATIENCE_MS = 120_000
+
+
+def chromium() -> str | None:
+    """The system's; None: playwright's own."""
+    return shutil.which("chromium") or shutil.which("chromium-browser")
 
 
 def take(url: str, out: Path, wait_s: float, report: Path | None = None) -> None:
@@ -31,7 +38,7 @@ def take(url: str, out: Path, wait_s: float, report: Path | None = None) -> None
     out.mkdir(parents=True, exist_ok=True)
     try:
         with sync_playwright() as driver:
-            browser = driver.chromium.launch(executable_path=shutil.which("chromium"), args=_GL)
+            browser = driver.chromium.launch(executable_path=chromium(), args=list(BROWSER_OPTIONS))
             for name, (width, height) in _SIZES.items():
                 page = browser.new_page(viewport={"width": width, "height": height})
                 page.set_default_timeout(_PATIENCE_MS)

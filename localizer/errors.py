@@ -27,6 +27,10 @@ class MapSourceError(MapError):
     """A map source (tileset, mesh, raster) that cannot be imported."""
 
 
+class MapFetchError(MapError):
+    """A map service that refuses, a source that is not known, or a limit that was reached."""
+
+
 class MapCacheError(MapError):
     """A tile cache that is missing, incomplete, corrupt or of another format version."""
 

@@ -46,6 +46,7 @@ from mavlink_bridge.messages import (
 from mavlink_bridge.shared import Shared
 from mavlink_bridge.status import OperatorStatus, named_values
 from mavlink_bridge.texts import Teller
+from mavlink_bridge.vehicle.mission import Waypoint
 from mavlink_bridge.vehicle.presence import VehicleWatch
 from mavlink_bridge.vehicle.tracker import VehicleTracker
 
@@ -260,6 +261,14 @@ class Bridge:
     def inertial_since(self, time_ns: int) -> tuple[InertialSample, ...]:
         """What the vehicle's IMU read after a CLOCK_MONOTONIC time, oldest first."""
         return self._tracker.inertial_since(time_ns)
+
+    def mission(self) -> tuple[Waypoint, ...]:
+        """The places that the vehicle's mission flies to, as far as they are known. The first call
+        begins to read it, and it is followed from then on.
+        """
+        mission = self._fc.requests.mission
+        mission.wanted = True
+        return mission.waypoints
 
     def texts(self) -> list[str]:
         """The last lines told to the operator, oldest first."""

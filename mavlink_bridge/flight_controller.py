@@ -23,6 +23,7 @@ from mavlink_bridge.news import VehicleNews
 from mavlink_bridge.shared import Shared
 from mavlink_bridge.texts import Teller
 from mavlink_bridge.vehicle.commands import Commander, accepted
+from mavlink_bridge.vehicle.mission import MISSION_IN
 from mavlink_bridge.vehicle.origin_exchange import OriginExchange
 from mavlink_bridge.vehicle.profile import select_profile
 from mavlink_bridge.vehicle.readings import MESSAGES_IN
@@ -41,12 +42,22 @@ def message_id(name: str) -> int:
 
 FC_WANTED = frozenset(
     message_id(name)
-    for name in (*MESSAGES_IN, *COMMANDS_IN, "TIMESYNC", "GPS_GLOBAL_ORIGIN", "COMMAND_ACK")
+    for name in (
+        *MESSAGES_IN,
+        *COMMANDS_IN,
+        *MISSION_IN,
+        "TIMESYNC",
+        "GPS_GLOBAL_ORIGIN",
+        "COMMAND_ACK",
+    )
 )
 
 
 class FlightControllerEnd:
-    """Runs in the flight-controller link's thread; only `sender.fixes` is filled from outside."""
+    """Runs in the flight-controller link's thread; only `sender.fixes` is filled from outside.
+
+    Above 200 lines: it hands each message and each turn of the clock to one of a dozen parts.
+    """
 
     def __init__(self, shared: Shared) -> None:
         config = shared.config
@@ -141,6 +152,8 @@ class FlightControllerEnd:
                 self._rebooted()
         elif kind == "GPS_GLOBAL_ORIGIN":
             self.origin.on_message(message)
+        elif kind in MISSION_IN:
+            self.requests.mission.on_message(link, message, time_ns)
         elif kind == "COMMAND_ACK":
             self._acknowledged(link, message)
         elif self._tracker.handle(message, time_ns):
@@ -163,7 +176,7 @@ class FlightControllerEnd:
         self.origin.forget()
         self.sender.injector.guard.reset()
         self.sources.rebooted()
-        self.requests.streams.reset()
+        self.requests.reset()
         self._teller.warn("flight controller rebooted")
 
     # --- the clockwork --------------------------------------------------------------------------

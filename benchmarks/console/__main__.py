@@ -6,9 +6,10 @@ and with one that a page looks at, one after the other, each as often.
 SEQUENCE is of `python -m sitl sequence`. `companion run` plays it in real time, beside a vehicle
 that flies the truth. Processor time is the processes' own (not wall time); of the flight's process
 the console's thread is timed apart, since two flights differ by more than it takes. The page is a
-client of the same messages: a picture's age is taken when it has arrived, a browser decodes and
-paints it after that. --console-nice: priority of the console's process instead of its own 15, for
-machines on which other work runs; the product's is 15 below a flight at 0.
+client of the same messages: a picture's age is taken when it has arrived; with --browser it is the
+page in Chromium, and the age is that of what has been painted. --console-nice: priority of the
+console's process instead of its own 15, for machines on which other work runs; the product's is 15
+below a flight at 0.
 """
 
 from __future__ import annotations
@@ -34,6 +35,7 @@ import yaml
 
 from benchmarks.common.arguments import Parser, existing, output, whole
 from benchmarks.common.named_errors import named_errors
+from benchmarks.console.chromium import NOTE_AGES, opened_browser
 from benchmarks.console.vehicle import Sequence, Vehicle, begun_ns
 from companion.errors import ReportError
 from companion.offline.tables import read_columns
@@ -56,6 +58,8 @@ class Work:
     map_path: Path
     geoid_m: float
     console_nice: int | None
+    browser_nice: int | None = None
+    """The page in a browser, so much behind this process in priority; None: a client of it."""
 
 
 class Page(threading.Thread):
@@ -94,6 +98,10 @@ class Page(threading.Thread):
         self._over.set()
         self.join()
 
+    def forget(self) -> None:
+        """What came until now does not count."""
+        self.ages_ms.clear()
+
     def _take(self, message: str | bytes) -> None:
         if isinstance(message, bytes):
             (size,) = struct.unpack_from("<I", message)
@@ -103,6 +111,44 @@ class Page(threading.Thread):
         machine = (json.loads(message).get("state") or {}).get("machine") or {}
         if "console_link_s" in machine:
             self.link_s.append(machine["console_link_s"])
+
+
+class BrowserPage(Page):
+    """The page itself in Chromium; ages are taken when the frame that shows a picture was painted.
+    It stands `nice` behind this process, as on a machine of its own it would take nothing.
+    """
+
+    def __init__(self, listen: str, nice: int) -> None:
+        super().__init__(listen, pictures=True)
+        self._nice = nice
+        self._fresh = threading.Event()
+        self.complaints: list[str] = []
+
+    def forget(self) -> None:
+        """What was shown until now does not count."""
+        self._fresh.set()
+
+    def run(self) -> None:
+        """Show it until `end`."""
+        from playwright.sync_api import sync_playwright
+
+        with sync_playwright() as driver:
+            browser = opened_browser(driver, self._nice)
+            page = browser.new_page(viewport={"width": 1280, "height": 800})
+            page.on("pageerror", lambda e: self.complaints.append(str(e)))
+            page.goto(f"http://{self._listen}/", timeout=1e3 * _PATIENCE_S)
+            page.evaluate(NOTE_AGES)
+            while not self._over.is_set():
+                page.wait_for_timeout(500)
+                if self._fresh.is_set():
+                    self._fresh.clear()
+                    page.evaluate("window.measured.length = 0")
+                shown = page.evaluate("window.measured")
+                self.ages_ms = [at - exposed for at, exposed in shown]
+                used = page.evaluate("window.consoleLinkS ?? null")
+                if used is not None:
+                    self.link_s.append(used)
+            browser.close()
 
 
 def fly(work: Work, condition: Condition, folder: Path) -> dict[str, Any]:
@@ -128,11 +174,11 @@ def fly(work: Work, condition: Condition, folder: Path) -> dict[str, Any]:
             raise ReportError(f"the companion ended before it localized: {_last_line(folder)}")
         page = None
         if condition == "one page":
-            page = Page(listen, pictures=True)
+            page = _page(work, listen)
             page.start()
         time.sleep(_SETTLED_S)
         if page is not None:
-            page.ages_ms.clear()
+            page.forget()
         link = _link_s(listen) if condition == "no page" else None
         before = _used_s(process.pid), _used_s(console), time.monotonic()
         first_link = page.link_s[-1] if page is not None and page.link_s else link
@@ -159,6 +205,12 @@ def fly(work: Work, condition: Condition, folder: Path) -> dict[str, Any]:
         for name, q in (("p50", 50), ("p95", 95), ("max", 100)):
             cost[f"age_{name}_ms"] = float(np.percentile(page.ages_ms or [np.nan], q))
     return cost | quality(record, work.sequence)
+
+
+def _page(work: Work, listen: str) -> Page:
+    if work.browser_nice is None:
+        return Page(listen, pictures=True)
+    return BrowserPage(listen, work.browser_nice)
 
 
 def quality(record: Path, sequence: Sequence) -> dict[str, float]:
@@ -326,6 +378,8 @@ def main() -> None:
     parser.add_argument("--frames", type=whole(100, 100_000), default=300, help="of the sequence")
     parser.add_argument("--rounds", type=whole(1, 20), default=2, help="runs of each condition")
     parser.add_argument("--console-nice", type=whole(-20, 19), help="instead of 15")
+    parser.add_argument("--browser", action="store_true", help="the page in Chromium")
+    parser.add_argument("--browser-nice", type=whole(0, 19), default=5, help="behind the flight's")
     parser.add_argument("--out", type=output, help="JSON file of all runs")
     options = parser.parse_args()
     cache = TileCache.open(options.map)
@@ -333,6 +387,7 @@ def main() -> None:
         Sequence.read(options.sequence, cache.frame, options.frames),
         Camera.from_json(options.sequence / "camera.json").to_dict(),
         options.map, cache.manifest.geoid_separation_m, options.console_nice,
+        options.browser_nice if options.browser else None,
     )  # fmt: skip
     runs = []
     for number in range(options.rounds):
@@ -348,6 +403,7 @@ def main() -> None:
     if options.out is not None:
         facts = {"summary": told, "runs": runs, "limits": LIMITS, "frames": options.frames}
         facts["console_nice"] = options.console_nice
+        facts["browser_nice"] = options.browser_nice if options.browser else None
         options.out.write_text(json.dumps(facts, indent=1))
     print_table(told)
 

@@ -13,6 +13,7 @@ from rich.markup import escape
 from rich.table import Table
 
 from companion.cli.before.map_check import check_command
+from companion.cli.before.map_fetch import fetch_command, sources_command
 from companion.terminal.import_bar import ImportBar
 from companion.writing import writing
 
@@ -27,6 +28,8 @@ def _group() -> None:
 
 
 app.command("check")(check_command)
+app.command("fetch")(fetch_command)
+app.command("sources")(sources_command)
 
 
 @app.command("build")

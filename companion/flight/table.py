@@ -355,7 +355,7 @@ def _console(making: Making) -> Publisher:
     geoid_m = cache.manifest.geoid_separation_m
     instruments = Instruments(
         lambda: health.newest, bridge.state, bridge.shadow_score, bridge.loop_verdict,
-        lambda: bridge.injecting,
+        lambda: bridge.injecting, bridge.mission,
     )  # fmt: skip
     folder = making[RecordKeeper].folder
     about = {

@@ -25,6 +25,7 @@ from localizer.types import Frame, PoseEstimate, ReferenceBundle, RenderedView
 from mavlink_bridge.injection.closed_loop import LoopVerdict
 from mavlink_bridge.injection.shadow import ShadowScore
 from mavlink_bridge.messages import VehicleState
+from mavlink_bridge.vehicle.mission import Waypoint
 
 _FRAMES = 12  # pictures that wait for their estimate: a second or so
 _WIDEST = 960  # pixels that are sent
@@ -34,13 +35,16 @@ _TARGETS = 64
 
 @dataclass(frozen=True)
 class Instruments:
-    """What is asked for each state document. injecting: whether fixes go out now."""
+    """What is asked for each state document. injecting: whether fixes go out now;
+    mission: the places that the autopilot's flies to.
+    """
 
     health: Callable[[], dict[str, Any]]
     vehicle: Callable[[], VehicleState]
     shadow: Callable[[], ShadowScore]
     verdict: Callable[[], LoopVerdict | None]
     injecting: Callable[[], bool]
+    mission: Callable[[], tuple[Waypoint, ...]] = tuple
 
 
 class Shown:
@@ -121,6 +125,9 @@ class Shown:
             "injecting": self._instruments.injecting(),
             "estimate": self._estimate and self._position(self._estimate),
             "gnss_residual_m": self._residual(vehicle),
+            "mission": [
+                [w.number, w.latitude_deg, w.longitude_deg] for w in self._instruments.mission()
+            ],
             "targets": [self._target(t) for t in targets],
             # Asked on the link's own thread, which it times: what the console costs the flight.
             "machine": self._load.read() | {"console_link_s": time.thread_time()},

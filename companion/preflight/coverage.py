@@ -12,7 +12,7 @@ from localizer.geometry.pose import Array
 from localizer.map.cache.cache import TileCache
 from mavlink_bridge.config import OriginConfig
 from mavlink_bridge.preflight.doctor import Finding
-from mavlink_bridge.preflight.mission import Waypoint
+from mavlink_bridge.vehicle.mission import Waypoint
 
 _STEP_M = 25.0
 _NAME = "mission"

@@ -6,7 +6,6 @@ https://mavlink.io/en/services/mission.html
 from __future__ import annotations
 
 import time
-from dataclasses import dataclass
 from typing import Any
 
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
@@ -14,37 +13,16 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 from mavlink_bridge.config import BridgeConfig
 from mavlink_bridge.errors import MissionError
 from mavlink_bridge.preflight.client import VehicleClient
+from mavlink_bridge.vehicle.mission import Waypoint, place_of
 
 _RETRIES = 5
 _ANSWER_S = 1.0
 _LONGEST_S = 120.0  # for all items
-_POLE = 900_000_000  # 1e-7 degrees
-# INT32_MAX stands for "not set" in a whole number, as NaN does in a float (MAVLink, commands).
-_HERE = ((0, 0), (0x7FFFFFFF, 0x7FFFFFFF))
 _WANTED = (
     mavlink.MAVLINK_MSG_ID_MISSION_COUNT,
     mavlink.MAVLINK_MSG_ID_MISSION_ITEM_INT,
     mavlink.MAVLINK_MSG_ID_MISSION_ACK,
 )
-_GLOBAL_FRAMES = frozenset(
-    (
-        mavlink.MAV_FRAME_GLOBAL,
-        mavlink.MAV_FRAME_GLOBAL_RELATIVE_ALT,
-        mavlink.MAV_FRAME_GLOBAL_INT,
-        mavlink.MAV_FRAME_GLOBAL_RELATIVE_ALT_INT,
-        mavlink.MAV_FRAME_GLOBAL_TERRAIN_ALT,
-        mavlink.MAV_FRAME_GLOBAL_TERRAIN_ALT_INT,
-    )
-)
-
-
-@dataclass(frozen=True)
-class Waypoint:
-    """A place that the mission flies to. number: of the item; 0 is home in ArduPilot."""
-
-    number: int
-    latitude_deg: float
-    longitude_deg: float
 
 
 class MissionClient(VehicleClient):
@@ -80,9 +58,7 @@ class MissionClient(VehicleClient):
             )
         self.ask(mavlink.MAVLink_mission_ack_message(self.system, self.component, 0))
         items = [self._items[number] for number in range(count)]
-        return [
-            Waypoint(item.seq, item.x * 1e-7, item.y * 1e-7) for item in items if _is_place(item)
-        ]
+        return [place for item in items if (place := place_of(item)) is not None]
 
     def _repeat(self, question: Any, answered: Any, what: str) -> None:
         for _ in range(_RETRIES):
@@ -104,19 +80,6 @@ class MissionClient(VehicleClient):
             self._items[message.seq] = message
         elif message.type != mavlink.MAV_MISSION_ACCEPTED:
             self._refusal = message.type
-
-
-def _is_place(item: Any) -> bool:
-    """Whether the item is flown to; 0, 0 and the unset value mean where the vehicle is."""
-    flown = item.seq == 0 or item.command <= mavlink.MAV_CMD_NAV_LAST
-    if not flown or item.frame not in _GLOBAL_FRAMES or (item.x, item.y) in _HERE:
-        return False
-    if abs(item.x) > _POLE or abs(item.y) > 2 * _POLE:
-        raise MissionError(
-            f"item {item.seq} of the mission lies at {item.x * 1e-7:g}, {item.y * 1e-7:g} degrees, "
-            "which is no place on Earth; load the mission into the vehicle again"
-        )
-    return True
 
 
 def download_mission(config: BridgeConfig) -> list[Waypoint]:

@@ -8,6 +8,7 @@ from mavlink_bridge.config import BridgeConfig
 from mavlink_bridge.link.link import Link
 from mavlink_bridge.messages import VehicleState
 from mavlink_bridge.vehicle.commands import Commander
+from mavlink_bridge.vehicle.mission import MissionWatch
 from mavlink_bridge.vehicle.streams import StreamKeeper, wanted_streams
 
 _VERSION_EVERY_NS = 1_000_000_000
@@ -18,6 +19,7 @@ class VehicleRequests:
 
     def __init__(self, config: BridgeConfig, commander: Commander) -> None:
         self.streams = StreamKeeper()
+        self.mission = MissionWatch(config.companion_component)
         self._config = config
         self._commander = commander
         self._next_version_ns = 0
@@ -25,10 +27,12 @@ class VehicleRequests:
     def reset(self) -> None:
         """The link was opened or the vehicle came back: ask for everything again."""
         self.streams.reset()
+        self.mission.reset()
         self._next_version_ns = 0
 
     def tick(self, link: Link, state: VehicleState, now_ns: int) -> None:
         """Ask for what is missing."""
+        self.mission.tick(link, state, now_ns)
         for stream in self.streams.due(wanted_streams(self._config, state.autopilot), now_ns):
             interval_us = round(1e6 / stream.rate_hz)
             self._commander.send(

@@ -245,6 +245,7 @@ function connect() {
     Object.assign(page, { state: message.state, hello: message.about, connected: message.connected });
     showState();
     if (!message.state) return;
+    window.consoleLinkS = message.state.machine?.console_link_s;
     showTargets(message.state.targets ?? []);
     addEvents([...page.earlier.splice(0), ...(message.state.events ?? [])], message.state);
     map?.update(message.state);

@@ -36,7 +36,7 @@ export class MapView {
     const element = document.createElement("div");
     element.className = name;
     if (typeof content === "string") element.textContent = content; else element.append(content);
-    return new this.maplibre.Marker({ element, anchor: name === "craft" ? "center" : "bottom-left", rotationAlignment: "map" });
+    return new this.maplibre.Marker({ element, anchor: name === "pin" ? "bottom-left" : "center", rotationAlignment: "map" });
   }
 
   follow(on) {
@@ -81,6 +81,8 @@ export class MapView {
       features: targets.map((t) => polygon([t.longitude_deg, t.latitude_deg], ellipse(t.covariance_m2, t.latitude_deg, 1)).features[0]),
     });
     this.pin(targets);
+    this.plan(state.mission ?? []);
+    this.paintFootprint();
     this.draw();
   }
 
@@ -93,8 +95,25 @@ export class MapView {
     }
   }
 
-  footprint(points) {
-    if (!this.loaded) return;
+  // The mission's way: from place to place, each with the number of its item.
+  plan(places) {
+    const key = JSON.stringify(places);
+    if (key === this.planned) return;
+    this.planned = key;
+    this.missionLength = places.length;
+    const points = places.map(([, lat, lon]) => [lon, lat]);
+    this.source("mission", points.length < 2 ? EMPTY : feature({ type: "LineString", coordinates: points }));
+    this.stations?.forEach((station) => station.remove());
+    this.stations = places.map(([number, lat, lon]) => this.marker(String(number), "station").setLngLat([lon, lat]).addTo(this.map));
+  }
+
+  // With the next state: a map that is drawn anew with every picture takes a slow machine's time.
+  footprint(points) { this.seen = points; }
+
+  paintFootprint() {
+    if (!this.seen) return;
+    const points = this.seen;
+    this.seen = null;
     const ring = points.map(([e, n]) => this.fromEnu(e, n));
     this.source("footprint", ring.length < 3 ? EMPTY : feature({ type: "Polygon", coordinates: [[...ring, ring[0]]] }));
   }
@@ -128,6 +147,9 @@ function style(about) {
   const outline = about.outline.length > 2 ? feature({ type: "Polygon", coordinates: [[...about.outline, about.outline[0]]] }) : EMPTY;
   sources.coverage = { type: "geojson", data: outline };
   layers.push({ id: "coverage", type: "line", source: "coverage", paint: { "line-color": "#101418", "line-width": 2, "line-dasharray": [3, 2] } });
+  sources.mission = source;
+  layers.push({ id: "mission-rim", type: "line", source: "mission", paint: { "line-color": "#101418", "line-width": 4 } });
+  layers.push({ id: "mission", type: "line", source: "mission", paint: { "line-color": "#7dff5c", "line-width": 2, "line-dasharray": [4, 2] } });
   for (const [name, colour, width] of TRACKS) {
     sources[name] = source;
     layers.push({ id: `${name}-rim`, type: "line", source: name, paint: { "line-color": "#101418", "line-width": width + 2 } });

@@ -6,7 +6,6 @@ export class VideoView {
     Object.assign(this, { $, ask, page, wish });
     this.canvas = $("video");
     this.context = this.canvas.getContext("2d");
-    this.ages = [];
     this.busy = false;
     this.blink = false;
     $("overlay").addEventListener("change", () => { this.wish(); this.paint(); });
@@ -61,10 +60,10 @@ export class VideoView {
       if (this.canvas.width !== head.image[0] || this.canvas.height !== head.image[1]) [this.canvas.width, this.canvas.height] = head.image;
       this.$("video-note").hidden = true;
       this.paint();
-      this.tellAge(head);
+      // Once the screen's next frame, in which it is painted, is done.
+      requestAnimationFrame(() => setTimeout(() => this.tellAge(head)));
       window.consoleMap?.footprint(head.footprint_enu_m);
       window.consoleFrames = (window.consoleFrames ?? 0) + 1;
-      window.consoleAges = this.ages;
     } finally { this.busy = false; }
   }
 
@@ -73,10 +72,10 @@ export class VideoView {
       this.$("video-age").textContent = "a kept picture, the newest before this moment";
       return;
     }
-    const age = Date.now() - head.exposure_utc_ms;
-    this.ages.push(age);
-    if (this.ages.length > 50) this.ages.shift();
-    this.$("video-age").textContent = `shown ${Math.round(age)} ms after its exposure`;
+    const shown = Date.now();
+    this.$("video-age").textContent = `shown ${Math.round(shown - head.exposure_utc_ms)} ms after its exposure`;
+    const detail = { shown_utc_ms: shown, exposure_utc_ms: head.exposure_utc_ms };
+    dispatchEvent(new CustomEvent("console-picture", { detail }));
   }
 
   paint() {

@@ -35,6 +35,7 @@ from localizer.types import (
 )
 from mavlink_bridge.injection.shadow import ShadowScore
 from mavlink_bridge.messages import VehicleState
+from mavlink_bridge.vehicle.mission import Waypoint
 
 CAMERA = Camera.from_fov(480, 360, 65.0)
 HEIGHT_M = 80.0
@@ -56,6 +57,11 @@ class Flight:
     def __post_init__(self) -> None:
         self.vehicle = VehicleState(connected=True, mode="GUIDED", system_id=1, armed=self.armed)
         origin = self.cache.frame.origin
+        corners = [(0.0, 0.0), (0.0, 60.0), (60.0, 60.0)]
+        places = [self.cache.frame.position([e, n, 0.0]) for e, n in corners]
+        self.mission = tuple(
+            Waypoint(i, place.latitude_deg, place.longitude_deg) for i, place in enumerate(places)
+        )
         self.health = {
             "level": "ok", "text": "localization tracking", "rate_hz": self.hz,
             "guardian": {"hpl_m": 2.5, "vpl_m": 2.0, "findings": {}},
@@ -64,6 +70,7 @@ class Flight:
         instruments = Instruments(
             lambda: self.health, lambda: self.vehicle,
             lambda: ShadowScore(False, 3, ("only 3 fixes of 50",)), lambda: None, lambda: False,
+            lambda: self.mission,
         )  # fmt: skip
         about = {"mode": "shadow", "delay_ms": 220.0, "alert_limit_m": 10.0, "record": None}
         self.shown = Shown(self.cache.frame, 48.0, instruments, about)

@@ -201,3 +201,25 @@ def test_a_hint_arrives_where_the_map_was_clicked(page, flight):
     at = frame.enu_from_geodetic(latitude, longitude, frame.origin.height_m)
     assert np.hypot(*at[:2]) < 400.0
     assert radius == 150.0
+
+
+def test_the_mission_is_drawn_and_one_that_changed_is_drawn_anew(page, flight):
+    page, _ = page
+    _until(page, lambda: page.locator(".station").count() == 3)
+    texts = page.locator(".station").all_inner_texts()
+    assert texts == ["0", "1", "2"]
+    whole = flight.flight.mission
+    flight.flight.mission = whole[:2]
+    _until(page, lambda: page.locator(".station").count() == 2)
+    flight.flight.mission = whole
+
+
+def test_the_doctor_button_runs_the_doctor_and_tells_how_it_ended(page):
+    page, seen = page
+    page.click("nav button[data-view=doctor]")
+    page.click("#examine")
+    _until(page, lambda: page.inner_text("#doctor-told") in ("good", "advice", "not fit to fly"))
+    said = page.inner_text("#doctor")
+    assert "map" in said, said
+    assert len(said.splitlines()) > 5
+    assert seen.errors == []

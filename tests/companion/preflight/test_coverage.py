@@ -8,7 +8,7 @@ from companion.config import parse_config
 from companion.preflight.coverage import check_mission, covered
 from companion.preflight.doctor import examine_deployment
 from localizer.map.cache.cache import TileCache
-from mavlink_bridge.preflight.mission import Waypoint
+from mavlink_bridge.vehicle.mission import Waypoint
 from sitl.geodesy import Location
 from sitl.ground.mission_steps import takeoff_step, waypoint_step
 from sitl.ground.pilot import Pilot

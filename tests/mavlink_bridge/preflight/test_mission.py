@@ -10,7 +10,8 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from mavlink_bridge import BridgeConfig
 from mavlink_bridge.errors import ConnectionSilentError, MissionError
-from mavlink_bridge.preflight.mission import Waypoint, download_mission
+from mavlink_bridge.preflight.mission import download_mission
+from mavlink_bridge.vehicle.mission import Waypoint
 from sitl.geodesy import Location
 from sitl.ground.mission_steps import MissionStep, takeoff_step, waypoint_step
 from sitl.ground.pilot import Pilot

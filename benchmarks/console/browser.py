@@ -1,0 +1,296 @@
+"""A demo flight as a newcomer sees it: the page in a real browser from the moment its address is
+printed, and the same flight without a page.
+
+    python -m benchmarks.console.browser [--rounds 1] [--out FILE.json] [--screens FOLDER]
+
+Each round flies `python -m sitl demo` twice, once with the page open. From the page: seconds from
+the printed address to the page, its first picture and the first position; age of each picture when
+the frame that shows it has been painted, exposure and paint on this machine's clock; what a hint
+and the doctor, pressed in the page, were answered; what it complained of and whom it asked. From
+each flight's report: rate, latency and accuracy of the localizer. Needs Chromium and playwright
+(the extra `dev`). The browser runs already when the address comes. It shares the processors with
+the flight (--browser-nice lower in priority); its map is drawn by the processor, too, which no
+operator's machine does.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+import shutil
+import signal
+import subprocess
+import sys
+import tempfile
+import threading
+import time
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+
+from benchmarks.common.arguments import Parser, existing, output, whole
+from benchmarks.common.named_errors import named_errors
+from benchmarks.console.chromium import NOTE_AGES, opened_browser
+from companion.errors import ReportError
+
+Condition = Literal["no page", "one page"]
+SHORT = Path(__file__).with_name("short.yaml")
+_ADDRESS = re.compile(r"watch it: (http://\S+)")
+_PATIENCE_S = 420.0
+_OPEN_S = 180.0
+_WATCHED_S = 20.0  # pictures are measured so long, undisturbed, before buttons are pressed
+_DOCTOR_S = 60.0
+
+
+class Demo:
+    """The demo's process, and when it said what. Ended with its context."""
+
+    def __init__(self, folder: Path, scenario: Path, seed: int, vehicle: str) -> None:
+        self.report = folder / "report"
+        self.lines: list[tuple[float, str]] = []
+        self.address: tuple[float, str] | None = None
+        self._said = threading.Condition()
+        self._process = subprocess.Popen(
+            [
+                sys.executable, "-m", "sitl", "demo", "--scenario", str(scenario),
+                "--seed", str(seed), "--fc", vehicle, "--out", str(self.report),
+            ],
+            stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True,
+            env=os.environ | {"COLUMNS": "200", "PYTHONUNBUFFERED": "1"},
+        )  # fmt: skip
+        self._reader = threading.Thread(target=self._read, daemon=True)
+        self._reader.start()
+
+    def __enter__(self) -> Demo:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        if self._process.poll() is None:
+            self._process.send_signal(signal.SIGTERM)
+        try:
+            self._process.wait(30.0)
+        except subprocess.TimeoutExpired:
+            self._process.kill()
+            self._process.wait()
+
+    def wait_for_address(self) -> tuple[float, str]:
+        """When it was printed (monotonic seconds), and what."""
+        with self._said:
+            self._said.wait_for(lambda: self.address is not None or self.is_over, _PATIENCE_S)
+        if self.address is None:
+            raise ReportError(f"the demo printed no address: {self.tail()}")
+        return self.address
+
+    def wait(self) -> None:
+        """Until it has made its report."""
+        try:
+            self._process.wait(_PATIENCE_S)
+        except subprocess.TimeoutExpired as error:
+            raise ReportError(f"the demo has not ended in {_PATIENCE_S:.0f} s") from error
+        if not (self.report / "report.json").exists():
+            raise ReportError(f"the demo made no report: {self.tail()}")
+
+    @property
+    def is_over(self) -> bool:
+        """Whether it ended."""
+        return self._process.poll() is not None
+
+    def tail(self) -> str:
+        """What it said last."""
+        return " | ".join(text for _, text in self.lines[-4:])
+
+    def _read(self) -> None:
+        assert self._process.stdout is not None
+        for line in self._process.stdout:
+            now = time.monotonic()
+            found = _ADDRESS.search(line)
+            with self._said:
+                self.lines.append((now, line.rstrip()))
+                if found is not None:
+                    self.address = now, found.group(1)
+                self._said.notify_all()
+
+
+def watch(demo: Demo, browser: Any, screens: Path | None) -> dict[str, Any]:
+    """What the page showed, and when."""
+    page = browser.new_page(viewport={"width": 1280, "height": 800})
+    complaints: list[str] = []
+    hosts: set[str] = set()
+
+    def ask(request: Any) -> None:
+        if "://" in request.url:
+            hosts.add(request.url.split("/")[2])
+
+    def complain(message: Any) -> None:
+        if message.type == "error":
+            complaints.append(message.text)
+
+    page.on("pageerror", lambda e: complaints.append(str(e)))
+    page.on("request", ask)
+    begun, address = demo.wait_for_address()
+    refused = _opened(page, address, demo)
+    page.on("console", complain)
+    told: dict[str, Any] = {"page_s": time.monotonic() - begun, "refused": refused}
+    page.evaluate(NOTE_AGES)
+    _until(page, demo, lambda: bool(page.evaluate("window.measured.length")), "picture")
+    told["first_picture_s"] = time.monotonic() - begun
+    _until(page, demo, lambda: page.inner_text("#word").lower() == "tracking", "position")
+    told["first_position_s"] = time.monotonic() - begun
+    page.evaluate("window.measured.length = 0")
+    page.wait_for_timeout(1e3 * _WATCHED_S)
+    told |= _ages(page.evaluate("window.measured"))
+    told["mission_points"] = page.evaluate("window.consoleMap?.missionLength ?? 0")
+    if screens is not None:
+        _pictures(page, screens)
+    told["hint"] = _hint(page)
+    told["doctor"] = _refused_doctor(page)
+    told |= {"complaints": complaints, "hosts": sorted(hosts)}
+    told["only_itself"] = hosts == {address.split("/")[2]}
+    demo.wait()
+    page.close()
+    return told
+
+
+def _opened(page: Any, address: str, demo: Demo) -> int:
+    """Load it as somebody would who tries again; how often it was refused."""
+    from playwright.sync_api import Error
+
+    end, refused = time.monotonic() + _OPEN_S, 0
+    while time.monotonic() < end and not demo.is_over:
+        try:
+            page.goto(address, timeout=30_000)
+        except Error:
+            refused += 1
+            time.sleep(0.5)
+        else:
+            return refused
+    raise ReportError(f"{address}: cannot be opened: {demo.tail()}")
+
+
+def _until(page: Any, demo: Demo, holds: Any, what: str) -> None:
+    end = time.monotonic() + _OPEN_S
+    while not holds():
+        if time.monotonic() > end or demo.is_over:
+            raise ReportError(f"the page showed no {what}: {demo.tail()}")
+        page.wait_for_timeout(100)
+
+
+def _ages(shown: list[list[float]]) -> dict[str, float]:
+    """shown: when, and exposed when, of each picture; ms of UTC."""
+    times = np.array(shown, dtype=np.float64).reshape(-1, 2)
+    if len(times) < 2:
+        raise ReportError(f"the page showed {len(times)} pictures in {_WATCHED_S:.0f} s")
+    ages = times[:, 0] - times[:, 1]
+    return {
+        "pictures_per_s": 1e3 * (len(times) - 1) / float(times[-1, 0] - times[0, 0]),
+        **{f"age_p{q}_ms": float(np.percentile(ages, q)) for q in (50, 95, 100)},
+    }
+
+
+def _hint(page: Any) -> str:
+    """Press it and click into the map; what the flight answered."""
+    page.click("nav button[data-view=map]")
+    page.click("#hint")
+    page.click("#map", position={"x": 200, "y": 200})
+    return _answer(page, "#map-note", "click where you are")
+
+
+def _refused_doctor(page: Any) -> str:
+    """Press it; in the air it is refused, and the page says why."""
+    page.click("nav button[data-view=doctor]")
+    page.click("#examine")
+    return _answer(page, "#doctor-told", "")
+
+
+def _answer(page: Any, where: str, before: str) -> str:
+    text = ""
+    for _ in range(50):
+        text = str(page.inner_text(where))
+        if text not in (before, ""):
+            break
+        page.wait_for_timeout(100)
+    return text
+
+
+def _pictures(page: Any, folder: Path) -> None:
+    folder.mkdir(parents=True, exist_ok=True)
+    views = page.eval_on_selector_all("nav button", "all => all.map(b => b.dataset.view)")
+    for width, height in ((1280, 800), (390, 844)):
+        page.set_viewport_size({"width": width, "height": height})
+        for view in views:
+            page.click(f"nav button[data-view={view}]")
+            page.wait_for_timeout(1500)
+            page.screenshot(path=folder / f"{view}-{width}.png")
+    page.set_viewport_size({"width": 1280, "height": 800})
+
+
+def quality(folder: Path) -> dict[str, Any]:
+    """The localizer's figures of a flight's report."""
+    report = json.loads((folder / "report.json").read_text())["report"]
+    return {
+        "localizer": report["localizer"],
+        "localizer_m": report["localizer_m"],
+        "latency_ms": report["stages_ms"].get("latency"),
+        "completeness_sent": report["completeness_sent"],
+        "inside_bound": report["inside_bound"],
+        "ekf_in_map_m": report["ekf_in_map_m"],
+    }
+
+
+def fly(condition: Condition, options: Any) -> dict[str, Any]:
+    """One flight."""
+    folder = Path(tempfile.mkdtemp(prefix="console-"))
+    try:
+        with Demo(folder, options.scenario, options.seed, options.fc) as demo:
+            told: dict[str, Any] = {"condition": condition, "load": os.getloadavg()[0]}
+            if condition == "one page":
+                from playwright.sync_api import sync_playwright
+
+                with sync_playwright() as driver:
+                    browser = opened_browser(driver, options.browser_nice)
+                    told |= watch(demo, browser, options.screens)
+                    browser.close()
+            else:
+                demo.wait()
+            begun = demo.lines[0][0] if demo.lines else 0.0
+            told["said"] = [f"{at - begun:.1f} {text}" for at, text in demo.lines]
+            print(json.dumps(told), file=sys.stderr, flush=True)  # whatever the report lacks
+            return told | quality(demo.report)
+    finally:
+        if options.keep is not None:
+            kept = options.keep / condition.replace(" ", "-")
+            shutil.rmtree(kept, ignore_errors=True)
+            shutil.copytree(folder / "report", kept, symlinks=True)
+        shutil.rmtree(folder, ignore_errors=True)
+
+
+def main() -> None:
+    """Fly, print, write."""
+    parser = Parser(__doc__)
+    parser.add_argument("--rounds", type=whole(1, 20), default=1, help="flights of each condition")
+    parser.add_argument("--only", choices=("no page", "one page"), help="one condition")
+    parser.add_argument("--scenario", type=existing, default=SHORT, help="YAML")
+    parser.add_argument("--seed", type=whole(0, 10_000), default=0, help="of world and errors")
+    parser.add_argument("--fc", default="embedded", help="ardupilot or embedded")
+    parser.add_argument("--browser-nice", type=whole(0, 19), default=5, help="behind the flight's")
+    parser.add_argument("--screens", type=Path, help="folder for a PNG of each view and size")
+    parser.add_argument("--keep", type=Path, help="folder for the flights' reports")
+    parser.add_argument("--out", type=output, help="JSON file of all flights")
+    options = parser.parse_args()
+    order: tuple[Condition, ...] = ("no page", "one page")
+    runs = []
+    for number in range(options.rounds):
+        # There and back: what warms up, or other work that begins, is nobody's in particular.
+        for condition in order if number % 2 == 0 else order[::-1]:
+            if options.only in (None, condition):
+                runs.append(fly(condition, options))
+                print(json.dumps(runs[-1]), flush=True)
+                if options.out is not None:
+                    options.out.write_text(json.dumps({"runs": runs}, indent=1))
+
+
+if __name__ == "__main__":
+    with named_errors():
+        main()

@@ -1,0 +1,247 @@
+"""``companion map fetch``: a map of a place from the services that states offer."""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import numpy as np
+import typer
+from rich.box import SIMPLE_HEAD
+from rich.console import Console
+from rich.markup import escape
+from rich.table import Table
+
+from companion.errors import ConfigError
+from companion.terminal.steps import shown_count
+
+if TYPE_CHECKING:
+    from localizer.map.fetch.area import Area
+    from localizer.map.fetch.catalogue import Source
+    from localizer.map.fetch.polite import PoliteClient
+    from localizer.map.fetch.raster import Plan
+
+_FINEST_M = 0.2  # what a flight at 100 m and a working width of 320 can use, and some more
+_MB = 1e6
+
+Sources = Annotated[
+    list[Path] | None, typer.Option(help="YAML file of more sources; may be repeated")
+]
+
+
+@dataclass(frozen=True)
+class _Part:
+    """One of the two rasters."""
+
+    source: Source
+    plan: Plan
+    client: PoliteClient
+    folder: Path
+    out: Path
+
+
+def fetch_command(
+    out: Annotated[Path, typer.Option(help="folder of the cache to make")],
+    rectangle: Annotated[str | None, typer.Option(help="WEST,SOUTH,EAST,NORTH in degrees")] = None,
+    circle: Annotated[
+        str | None, typer.Option(help="LATITUDE,LONGITUDE,RADIUS: degrees and metres")
+    ] = None,
+    mission: Annotated[
+        Path | None, typer.Option(help=".plan or .waypoints; with --margin about its places")
+    ] = None,
+    margin: Annotated[
+        float, typer.Option(min=10, max=20_000, help="about a mission's places, m")
+    ] = 400.0,
+    imagery: Annotated[str | None, typer.Option(help="source; none: the finest there")] = None,
+    heights: Annotated[
+        str | None, typer.Option(help="source; none: the finest there, GLO-30 if no other")
+    ] = None,
+    sources: Sources = None,
+    resolution: Annotated[
+        float, typer.Option(min=0.02, max=100, help="of the imagery, m; not finer than its own")
+    ] = _FINEST_M,
+    most_mb: Annotated[
+        float, typer.Option(min=0.1, max=100_000, help="that may come, of both together")
+    ] = 2000.0,
+    only_estimate: Annotated[
+        bool, typer.Option("--estimate", help="say what it would take, and end")
+    ] = False,
+    keep: Annotated[
+        bool, typer.Option("--keep", help="keep the fetched GeoTIFFs beside the cache")
+    ] = False,
+    overwrite: Annotated[bool, typer.Option(help="replace a cache that is there")] = False,
+    workers: Annotated[int | None, typer.Option(min=1, help="processes of the import")] = None,
+) -> None:
+    """Fetch orthophoto and heights, and make a verified cache; goes on where it was cut off."""
+    from localizer.map.fetch.catalogue import choose, load_sources
+
+    area = _area(rectangle, circle, mission, margin)
+    known = load_sources(tuple(sources or ()))
+    console = Console()
+    console.print(f"area: {area}", highlight=False, soft_wrap=True)
+    work = out.with_name(f"{out.name}.fetch")
+    parts = [
+        _planned(choose(known, area, role, name), area, resolution, most_mb, work, role)
+        for role, name in (("imagery", imagery), ("heights", heights))
+    ]
+    total = _print_estimate(console, parts)
+    if total > most_mb:
+        raise ConfigError(
+            f"about {total:.0f} MB, more than --most-mb {most_mb:.0f}: a smaller area, a coarser "
+            "--resolution, or a higher --most-mb"
+        )
+    if only_estimate:
+        return
+    for part in parts:
+        _fetched(console, part, area)
+    _built(console, parts, out, overwrite, workers)
+    if not keep:
+        shutil.rmtree(work, ignore_errors=True)
+
+
+def sources_command(
+    sources: Sources = None,
+    keys: Annotated[bool, typer.Option("--keys", help="what a source's entry may say")] = False,
+) -> None:
+    """The map services that `map fetch` knows, their licences and whom to name."""
+    from localizer.map.fetch.catalogue import Source, load_sources
+
+    console = Console()
+    if keys:
+        table = Table("key", "meaning", box=SIMPLE_HEAD)
+        for name, info in Source.model_fields.items():
+            table.add_row(name, escape(info.description or ""))
+        console.print(table)
+        return
+    table = Table(box=SIMPLE_HEAD)
+    for column in ("name", "country", "what", "m", "licence", "attribution"):
+        table.add_column(column, overflow="fold")
+    for source in load_sources(tuple(sources or ())):
+        row = (source.name, source.country, source.title, f"{source.resolution_m:g}")
+        table.add_row(*map(escape, (*row, source.licence, source.attribution)))
+    console.print(table)
+
+
+def _area(rectangle: str | None, circle: str | None, mission: Path | None, margin: float) -> Area:
+    from companion.planning.mission import read_mission
+    from localizer.map.fetch.area import Area, around
+
+    if sum(given is not None for given in (rectangle, circle, mission)) != 1:
+        raise ConfigError("give one of --rectangle, --circle and --mission")
+    if rectangle is not None:
+        return Area(*_numbers("--rectangle", rectangle, 4))
+    if circle is not None:
+        latitude, longitude, radius = _numbers("--circle", circle, 3)
+        return around(np.array([[latitude, longitude]]), radius)
+    assert mission is not None
+    planned = read_mission(mission)
+    places = [(w.latitude_deg, w.longitude_deg) for w in planned.waypoints]
+    places += [] if planned.home is None else [planned.home]
+    if not places:
+        raise ConfigError(f"{mission}: flies to no place")
+    return around(np.array(places), margin)
+
+
+def _numbers(option: str, text: str, count: int) -> list[float]:
+    try:
+        numbers = [float(part) for part in text.split(",")]
+    except ValueError:
+        numbers = []
+    if len(numbers) != count:
+        raise ConfigError(f"{option} {text}: {count} numbers with commas between them")
+    return numbers
+
+
+def _planned(
+    source: Source, area: Area, resolution: float, most_mb: float, work: Path, role: str
+) -> _Part:
+    from localizer.map.fetch.fetch import make_plan
+    from localizer.map.fetch.polite import Manners, PoliteClient
+
+    client = PoliteClient(Manners(source.rate_per_s, round(most_mb * _MB)))
+    wanted = source.resolution_m if source.has_heights else max(source.resolution_m, resolution)
+    plan = make_plan(source, area, wanted, client)
+    return _Part(source, plan, client, work / f"{role}-pieces", work / f"{role}.tif")
+
+
+def _print_estimate(console: Console, parts: list[_Part]) -> float:
+    """A line a source; returns the megabytes of all."""
+    from localizer.map.fetch.fetch import estimate
+
+    total = 0.0
+    for part in parts:
+        expected = estimate(part.source, part.plan)
+        total += expected.bytes / _MB
+        width, height = expected.pixels
+        console.print(
+            f"{part.source.name}: {part.source.title}; {width} x {height} pixels, about "
+            f"{expected.requests} requests, {expected.bytes / _MB:.1f} MB, "
+            f"{expected.seconds:.0f} s at {part.source.rate_per_s:g} requests/s",
+            highlight=False, soft_wrap=True,
+        )  # fmt: skip
+        console.print(f"  licence: {part.source.licence}", highlight=False, soft_wrap=True)
+    return total
+
+
+def _fetched(console: Console, part: _Part, area: Area) -> None:
+    from localizer.map.fetch.fetch import fetch
+
+    what = f"fetching {part.source.name}"
+    with _told_count(console, what) as progress:
+        known = fetch(part.source, part.plan, part.folder, part.out, part.client, progress)
+    console.print(
+        f"{part.source.name}: {part.client.bytes / _MB:.1f} MB in {part.client.requests} requests, "
+        f"{100 * known:.1f} % of its raster known",
+        highlight=False, soft_wrap=True,
+    )  # fmt: skip
+
+
+@contextmanager
+def _told_count(console: Console, what: str) -> Iterator[Callable[[int, int], None]]:
+    try:
+        with shown_count(console, what) as progress:
+            yield progress
+    except KeyboardInterrupt:
+        Console(stderr=True).print("interrupted: the same command goes on with what has come")
+        raise
+
+
+def _built(
+    console: Console, parts: list[_Part], out: Path, overwrite: bool, workers: int | None
+) -> None:
+    from companion.terminal.import_bar import ImportBar
+    from localizer.map.building.build import build_cache
+    from localizer.map.building.options import BuildOptions
+    from localizer.map.cache.cache import TileCache
+    from localizer.map.inspection.inspect import verify
+
+    imagery, heights = (part.source for part in parts)
+    whose = dict.fromkeys((imagery.attribution, heights.attribution))
+    licences = dict.fromkeys((imagery.licence, heights.licence))
+    options = BuildOptions(
+        vertical_datum=heights.vertical_datum,
+        attribution=f"{'; '.join(whose)} (licences: {'; '.join(licences)})",
+        imagery_date=imagery.date,
+        overwrite=overwrite,
+        workers=workers,
+        apart=True,
+    )
+    with ImportBar() as bar:
+        manifest = build_cache([parts[1].out, parts[0].out], out, options, progress=bar)
+    for text in manifest.warnings:
+        console.print(f"[yellow]warning:[/] {escape(text)}", soft_wrap=True)
+    found = verify(TileCache.open(out))
+    for line in found.damaged:
+        console.print(f"[red]{escape(line)}")
+    if found.damaged:
+        raise typer.Exit(1)
+    console.print(
+        f"[green]{escape(str(out))}[/]: {manifest.tiles} tiles, all intact, "
+        f"{found.covered_m2 / 1e6:.2f} km² covered, {len(found.holes)} holes, "
+        f"{manifest.gsd_m:.2f} m texels; © {escape(str(options.attribution))}",
+        soft_wrap=True,
+    )

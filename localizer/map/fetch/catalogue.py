@@ -1,0 +1,150 @@
+"""The file of sources: which service has what, where, how fine, and under which licence."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+from typing import Any, Literal
+
+import yaml
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+from pyproj import CRS
+from pyproj.exceptions import CRSError
+
+from localizer.errors import MapFetchError
+from localizer.map.fetch.area import Area
+from localizer.map.fetch.terms import require_allowed
+from localizer.map.source import VerticalDatum
+
+Kind = Literal["wms", "wmts", "wcs", "xyz", "tms", "cog", "stac"]
+Role = Literal["imagery", "surface", "terrain"]
+SHIPPED = Path(__file__).with_name("sources.yaml")
+_MOST_BYTES = 1 << 20
+_IN_PROJECTION = ("wms", "wcs")
+
+
+class Source(BaseModel):
+    """One service. A key that is not known here is an error."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
+
+    name: str = Field(pattern=r"^[a-z0-9][a-z0-9-]{1,60}$", description="how it is asked for")
+    title: str = Field(description="what it is")
+    kind: Kind = Field(description="how it is spoken to")
+    role: Role = Field(description="imagery, surface (with roofs and trees) or terrain (without)")
+    url: str = Field(
+        description="address; xyz and tms with {z} {x} {y}; cog may have {lat} and {lon}, the "
+        "south-west corner of a degree as N47 and E008; stac a catalogue's file or an API"
+    )
+    licence: str = Field(min_length=3, description="its name, and where it can be read")
+    attribution: str = Field(min_length=2, description="who must be named; goes into the map")
+    country: str = Field(min_length=2, max_length=60, description="where it is")
+    bounds: tuple[float, float, float, float] = Field(description="west, south, east, north")
+    resolution_m: float = Field(gt=0.01, le=1000, description="metres a pixel, at its best")
+    layer: str = Field("", description="layer (wms, wmts), coverage (wcs), collection (stac)")
+    style: str = Field("", description="of wms and wmts; none: the service's own")
+    crs: str = Field("EPSG:3857", description="that wms or wcs is asked in")
+    format: str = Field("", description="MIME type asked for; none: JPEG, GeoTIFF for heights")
+    version: str = Field("", description="of the protocol; none: wms 1.3.0, wcs 2.0.1")
+    axes: tuple[str, str] | None = Field(
+        None, description="of wcs 2.0.1: names of easting and northing; none: as it says itself"
+    )
+    matrix_set: str = Field("", description="of wmts; none: the first in EPSG:3857")
+    asset: str = Field("", description="of stac: its key, * for any text; none: the first GeoTIFF")
+    most_zoom: int = Field(19, ge=0, le=24, description="of xyz and tms")
+    tile_px: int = Field(256, ge=64, le=4096, description="side of a tile, of xyz and tms")
+    piece_px: int = Field(1024, ge=64, le=8192, description="side of what is asked for at once")
+    vertical_datum: VerticalDatum | None = Field(None, description="of heights")
+    nodata: float | None = Field(None, description="what missing heights are, if it is not told")
+    date: str | None = Field(None, description="of the pictures: 2024, 2024-06 or 2024-06-30")
+    rate_per_s: float = Field(4.0, gt=0, le=50, description="requests a second, at most")
+    parallel: int = Field(4, ge=1, le=8, description="requests under way at once, at most")
+
+    @model_validator(mode="after")
+    def _holds(self) -> Source:
+        west, south, east, north = self.bounds
+        if not (-180 <= west < east <= 180 and -90 <= south < north <= 90):
+            raise ValueError("bounds: west, south, east, north in degrees")
+        if (self.role == "imagery") == (self.vertical_datum is not None):
+            raise ValueError("vertical_datum: needed for heights, and for nothing else")
+        if self.kind in ("wms", "wmts", "wcs") and not self.layer:
+            raise ValueError(f"layer: {self.kind} needs it")
+        if self.kind in ("xyz", "tms"):
+            if not all(part in self.url for part in ("{z}", "{x}", "{y}")):
+                raise ValueError("url: {z}, {x} and {y} stand in it")
+            if self.role != "imagery":
+                raise ValueError(f"role: {self.kind} gives pictures only")
+        try:
+            CRS(self.crs)
+        except CRSError as error:
+            raise ValueError(f"crs: {self.crs} is not known") from error
+        return self
+
+    @property
+    def has_heights(self) -> bool:
+        """Whether its numbers are heights."""
+        return self.role != "imagery"
+
+    @property
+    def area_deg2(self) -> float:
+        """By which a national service goes before one of the whole world."""
+        west, south, east, north = self.bounds
+        return (east - west) * (north - south)
+
+
+def load_sources(more: tuple[Path, ...] = (), shipped: Path = SHIPPED) -> tuple[Source, ...]:
+    """The shipped file's sources, and those of other files, which replace shipped ones of the same
+    name. `MapFetchError` names what does not hold, and what is refused.
+    """
+    found: dict[str, Source] = {}
+    for path in (shipped, *more):
+        for entry in _entries(path):
+            try:
+                source = Source.model_validate(entry)
+            except ValidationError as error:
+                first = error.errors()[0]
+                where = ".".join(str(part) for part in first["loc"])
+                name = entry.get("name", "?") if isinstance(entry, dict) else "?"
+                told = f"{where}: {first['msg']}" if where else first["msg"]
+                raise MapFetchError(f"{path}: source {name}: {told}") from error
+            require_allowed(source.url.replace("{", "").replace("}", ""))
+            found[source.name] = source
+    return tuple(found.values())
+
+
+def _entries(path: Path) -> list[Any]:
+    try:
+        text = path.read_bytes()
+        if len(text) > _MOST_BYTES:
+            raise MapFetchError(f"{path}: over {_MOST_BYTES >> 20} MiB; that is no file of sources")
+        document = yaml.safe_load(text.decode("utf-8"))
+    except (OSError, UnicodeDecodeError, yaml.YAMLError, RecursionError) as error:
+        raise MapFetchError(f"{path}: cannot be read: {error}") from error
+    entries = document.get("sources") if isinstance(document, dict) else None
+    if not isinstance(entries, list):
+        raise MapFetchError(f"{path}: a list `sources` is expected")
+    return entries
+
+
+def choose(sources: tuple[Source, ...], area: Area, role: str, name: str | None = None) -> Source:
+    """The source of that name, else the finest whose bounds hold the area. role: imagery, or
+    heights, which takes a surface before a terrain and a world's model only as the last resort.
+    """
+    fitting = [s for s in sources if s.has_heights == (role == "heights")]
+    if name is not None:
+        for source in fitting:
+            if source.name == name:
+                if not area.meets(source.bounds):
+                    raise MapFetchError(f"{name} has nothing at {area}")
+                return source
+        known = ", ".join(sorted(s.name for s in fitting))
+        raise MapFetchError(f"no source of {role} is called {name}; there are: {known}")
+    there = [s for s in fitting if area.within(s.bounds)]
+    if not there:
+        raise MapFetchError(
+            f"no source of {role} covers {area}: name one in a YAML file (--sources; keys in "
+            f"{SHIPPED.name} of the package), or bring your own GeoTIFF (`companion map build`)"
+        )
+    order = {"imagery": 0, "surface": 0, "terrain": 1}
+    return min(there, key=lambda s: (math.ceil(math.log10(s.resolution_m / 10)) > 0,
+                                     order[s.role], s.resolution_m, s.area_deg2))  # fmt: skip

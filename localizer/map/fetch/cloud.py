@@ -1,0 +1,267 @@
+"""Cloud-optimised GeoTIFFs: of large files only the blocks that are needed, by HTTP ranges; named
+by an address or found in a STAC catalogue.
+"""
+
+from __future__ import annotations
+
+import io
+import math
+from collections import OrderedDict
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import partial
+from typing import Any
+
+import numpy as np
+import rasterio
+from pyproj import CRS
+from rasterio.enums import Resampling
+from rasterio.errors import RasterioError
+from rasterio.io import MemoryFile
+from rasterio.vrt import WarpedVRT
+from rasterio.warp import transform_bounds
+
+from localizer.errors import MapFetchError
+from localizer.map.fetch.area import Area, utm_zone
+from localizer.map.fetch.catalogue import Source
+from localizer.map.fetch.polite import PoliteClient, shown
+from localizer.map.fetch.raster import Grid, Piece, Plan, cut, grid_over
+from localizer.map.importers.raster_file import offline
+
+NODATA = -32768.0
+_HEIGHT_BYTES, _PICTURE_BYTES = 3.0, 0.8
+_BLOCK = 1 << 18
+_KEPT_BLOCKS = 64  # 16 MiB a file that is open
+_MOST_FILES = 500
+
+
+class RangeFile(io.RawIOBase):
+    """A file on a server, read in blocks that are asked for once; one thread. failed: is given the
+    errors, of which GDAL's own would only say that something could not be read.
+    """
+
+    def __init__(self, url: str, client: PoliteClient, failed: list[MapFetchError]) -> None:
+        super().__init__()
+        self._url, self._client, self._failed = url, client, failed
+        self._at = 0
+        self._blocks: OrderedDict[int, bytes] = OrderedDict()
+        self._size = 0
+        self._block(0)
+
+    def readable(self) -> bool:
+        """It is."""
+        return True
+
+    def seekable(self) -> bool:
+        """It is."""
+        return True
+
+    def seek(self, offset: int, whence: int = io.SEEK_SET) -> int:
+        """Where the next read begins."""
+        base = {io.SEEK_SET: 0, io.SEEK_CUR: self._at, io.SEEK_END: self._size}[whence]
+        self._at = max(base + offset, 0)
+        return self._at
+
+    def tell(self) -> int:
+        """Where that is."""
+        return self._at
+
+    def readinto(self, buffer: Any) -> int:
+        """As much as is asked for, or is left."""
+        wanted = memoryview(buffer).cast("B")
+        end = min(self._at + len(wanted), self._size)
+        done = 0
+        while self._at < end:
+            number, offset = divmod(self._at, _BLOCK)
+            part = self._block(number)[offset : offset + end - self._at]
+            if not part:
+                break
+            wanted[done : done + len(part)] = part
+            done += len(part)
+            self._at += len(part)
+        return done
+
+    def _block(self, number: int) -> bytes:
+        if number in self._blocks:
+            self._blocks.move_to_end(number)
+            return self._blocks[number]
+        try:
+            data = self._asked(number)
+        except MapFetchError as error:
+            self._failed.append(error)
+            raise
+        self._blocks[number] = data
+        while len(self._blocks) > _KEPT_BLOCKS:
+            self._blocks.popitem(last=False)
+        return data
+
+    def _asked(self, number: int) -> bytes:
+        begin = number * _BLOCK
+        asked = {"Range": f"bytes={begin}-{begin + _BLOCK - 1}"}
+        answer = self._client.get(self._url, asked)
+        if answer.status != 206:
+            raise MapFetchError(
+                f"{shown(self._url)}: the server gives whole files only (no HTTP ranges): download "
+                "it once and use `companion map build`"
+            )
+        if not self._size:
+            total = answer.headers.get("content-range", "").rpartition("/")[2]
+            if not total.isdigit():
+                raise MapFetchError(f"{shown(self._url)}: does not say how long the file is")
+            self._size = int(total)
+        return answer.data
+
+
+@dataclass(frozen=True)
+class CloudFile:
+    """One file. bounds: west, south, east, north in degrees, of which it has something."""
+
+    url: str
+    bounds: tuple[float, float, float, float]
+
+
+def plan_files(
+    source: Source, area: Area, resolution_m: float, files: Sequence[CloudFile],
+    client: PoliteClient,
+) -> Plan:  # fmt: skip
+    """Windows of the files that meet an area. The grid is the files' own where they share it."""
+    there = [f for f in files if area.meets(f.bounds)]
+    if not there:
+        raise MapFetchError(f"{source.name}: has no file at {area}")
+    if len(there) > _MOST_FILES:
+        raise MapFetchError(f"{source.name}: {len(there)} files: a smaller area")
+    grid = _grid_of(there, area, resolution_m, client)
+    pieces = []
+    for column, row, width, height in cut(grid, source.piece_px):
+        window = grid.window(column, row, width, height)
+        meeting = [f for f in there if _meets(window, f)]
+        if meeting:
+            get = partial(_window, source, window, tuple(f.url for f in meeting))
+            pieces.append(Piece(f"{column}-{row}", column, row, width, height, get))
+    size = _HEIGHT_BYTES if source.has_heights else _PICTURE_BYTES
+    expected = size * grid.width * grid.height
+    return Plan(grid, tuple(pieces), size, len(there) + math.ceil(expected / _BLOCK))
+
+
+def degree_files(source: Source, area: Area) -> list[CloudFile]:
+    """Of a model that is cut by whole degrees (Copernicus GLO-30), else the one file."""
+    if "{lat}" not in source.url:
+        return [CloudFile(source.url, source.bounds)]
+    found = []
+    for south in range(math.floor(area.south), math.ceil(area.north)):
+        for west in range(math.floor(area.west), math.ceil(area.east)):
+            latitude = f"{'N' if south >= 0 else 'S'}{abs(south):02d}"
+            longitude = f"{'E' if west >= 0 else 'W'}{abs(west):03d}"
+            url = source.url.replace("{lat}", latitude).replace("{lon}", longitude)
+            found.append(CloudFile(url, (west, south, west + 1, south + 1)))
+    return found
+
+
+def _grid_of(
+    files: Sequence[CloudFile], area: Area, resolution_m: float, client: PoliteClient
+) -> Grid:
+    """In the first file's CRS where that is in metres, on its pixels where they are as wished."""
+    with _opened(files[0].url, client, []) as data:
+        if data.crs is None:
+            raise MapFetchError(f"{shown(files[0].url)}: has no CRS")
+        crs, transform = CRS(data.crs), data.transform
+    flat = crs.sub_crs_list[0] if crs.is_compound else crs
+    if flat.is_geographic:
+        utm = utm_zone(area)
+        return grid_over(area.bounds_in(utm), (resolution_m, resolution_m), utm)
+    unit = float(flat.axis_info[0].unit_conversion_factor)
+    own = abs(transform.a), abs(transform.e)
+    factor = max(round(resolution_m / unit / own[0]), 1)
+    pixel = factor * own[0], factor * own[1]
+    return grid_over(area.bounds_in(flat), pixel, flat, (transform.c, transform.f))
+
+
+def _meets(window: Grid, file: CloudFile) -> bool:
+    west, south, east, north = transform_bounds(
+        window.crs.to_wkt(), "EPSG:4326", *window.bounds, densify_pts=21
+    )
+    there = file.bounds
+    return bool(west <= there[2] and there[0] <= east and south <= there[3] and there[1] <= north)
+
+
+def _opened(url: str, client: PoliteClient, failed: list[MapFetchError]) -> Any:
+    """A dataset that reads through the client; GDAL itself stays off the network."""
+
+    def opener(path: str, mode: str = "rb", **_: object) -> RangeFile:
+        if mode not in ("r", "rb") or path != url:
+            raise FileNotFoundError(path)  # files beside it are not asked for
+        return RangeFile(url, client, failed)
+
+    try:
+        with offline():
+            return rasterio.open(url, driver="GTiff", opener=opener, sharing=False)
+    except RasterioError as error:
+        if failed:
+            raise failed[0] from error
+        raise MapFetchError(f"{shown(url)}: no GeoTIFF that can be read: {error}") from error
+
+
+def _window(
+    source: Source, window: Grid, urls: Sequence[str], client: PoliteClient
+) -> bytes | None:
+    """The first file that knows a pixel gives it."""
+    bands = 1 if source.has_heights else 3
+    dtype = np.float32 if source.has_heights else np.uint8
+    whole = np.zeros((bands, window.height, window.width), dtype)
+    known = np.zeros((window.height, window.width), bool)
+    how = Resampling.bilinear if source.has_heights else Resampling.average
+    for url in urls:
+        failed: list[MapFetchError] = []
+        try:
+            with (
+                offline(),
+                _opened(url, client, failed) as data,
+                _warped(data, window, how, source) as vrt,
+            ):
+                count = min(bands, data.count)
+                read = vrt.read(list(range(1, count + 1))).astype(dtype)
+                has = vrt.dataset_mask() > 0
+        except RasterioError as error:
+            raise MapFetchError(f"{shown(url)}: cannot be read: {error}") from error
+        finally:
+            if failed:
+                raise failed[0]
+        fresh = has & ~known
+        whole[:, fresh] = read[:, fresh] if count == bands else read[:1, fresh]
+        known |= has
+        if known.all():
+            break
+    return None if not known.any() else as_geotiff(whole, known, window)
+
+
+def _warped(data: Any, window: Grid, how: Resampling, source: Source) -> WarpedVRT:
+    own = CRS(data.crs)
+    flat = own.sub_crs_list[0] if own.is_compound else own
+    options: dict[str, Any] = {}
+    if source.nodata is not None:
+        options = {"src_nodata": source.nodata, "nodata": source.nodata}
+    elif data.nodata is None:
+        options = {"add_alpha": True}
+    return WarpedVRT(
+        data, src_crs=flat.to_wkt(), crs=window.crs.to_wkt(), transform=window.transform,
+        width=window.width, height=window.height, resampling=how, tolerance=0.01, **options,
+    )  # fmt: skip
+
+
+def as_geotiff(bands: np.ndarray, known: np.ndarray, window: Grid) -> bytes:
+    """A piece as a file. bands: (n, height, width); known: where they hold."""
+    heights = bands.dtype == np.float32
+    values = np.where(known, bands, NODATA if heights else 0).astype(bands.dtype)
+    profile: dict[str, Any] = {
+        "driver": "GTiff", "dtype": values.dtype.name, "count": len(values),
+        "width": window.width, "height": window.height, "crs": window.crs.to_wkt(),
+        "transform": window.transform, "compress": "deflate",
+    }  # fmt: skip
+    if heights:
+        profile["nodata"] = NODATA
+    with rasterio.Env(GDAL_TIFF_INTERNAL_MASK=True), MemoryFile() as memory:
+        with memory.open(**profile) as file:
+            file.write(values)
+            if not heights:
+                file.write_mask(known)
+        return bytes(memory.read())

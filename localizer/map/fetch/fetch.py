@@ -1,0 +1,128 @@
+"""One source over one area, into one GeoTIFF: planned, estimated, fetched piece by piece."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+from collections.abc import Callable
+from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
+from dataclasses import dataclass
+from pathlib import Path
+
+from localizer.errors import MapFetchError
+from localizer.map.fetch.area import Area
+from localizer.map.fetch.catalogue import Source
+from localizer.map.fetch.cloud import degree_files, plan_files
+from localizer.map.fetch.mosaic import assemble, check_piece
+from localizer.map.fetch.polite import PoliteClient
+from localizer.map.fetch.raster import Piece, Plan
+from localizer.map.fetch.stac import stac_files
+from localizer.map.fetch.tiles import plan_tiles
+from localizer.map.fetch.web_map import plan_blocks
+
+_LINE_BYTES_PER_S = 2e6  # that a line and a server are taken to give, for an estimate
+_LEAST_KNOWN = 0.5  # of a raster, below which it is no map of the place
+
+Progress = Callable[[int, int], None]
+
+
+@dataclass(frozen=True)
+class Estimate:
+    """What fetching would take."""
+
+    requests: int
+    bytes: float
+    seconds: float
+    pixels: tuple[int, int]
+
+
+def make_plan(source: Source, area: Area, resolution_m: float, client: PoliteClient) -> Plan:
+    """All pieces. It may ask the service what it has (capabilities, a catalogue, a file's head)."""
+    if source.kind in ("wms", "wcs"):
+        return plan_blocks(source, area, resolution_m, client)
+    if source.kind in ("xyz", "tms", "wmts"):
+        return plan_tiles(source, area, resolution_m, client)
+    if source.kind == "stac":
+        files = stac_files(source, area, client)
+    else:
+        files = degree_files(source, area)
+    return plan_files(source, area, resolution_m, files, client)
+
+
+def estimate(source: Source, plan: Plan) -> Estimate:
+    """Before anything large is asked for."""
+    seconds = max(plan.requests / source.rate_per_s, plan.bytes / _LINE_BYTES_PER_S)
+    size = plan.grid.width, plan.grid.height
+    return Estimate(plan.requests, plan.bytes, seconds, size)
+
+
+def fetch(
+    source: Source, plan: Plan, folder: Path, out: Path, client: PoliteClient,
+    progress: Progress = lambda _done, _total: None,
+) -> float:  # fmt: skip
+    """The raster `out`. Pieces that lie in the folder from a run that was cut off are not asked for
+    again; those of another plan are removed. Returns the share of the raster that is known.
+    """
+    _claim(source, plan, folder)
+    missing = [p for p in plan.pieces if not (folder / p.name).exists()]
+    done = len(plan.pieces) - len(missing)
+    progress(done, len(plan.pieces))
+    with ThreadPoolExecutor(source.parallel, thread_name_prefix="fetch") as pool:
+        # Few at a time, so that an end does not wait for thousands.
+        waiting: set[Future[None]] = set()
+        left = iter(missing)
+        try:
+            while True:
+                for piece in left:
+                    waiting.add(pool.submit(_keep, source, piece, folder, client))
+                    if len(waiting) >= 2 * source.parallel:
+                        break
+                if not waiting:
+                    break
+                finished, waiting = wait(waiting, return_when=FIRST_COMPLETED)
+                for future in finished:
+                    future.result()
+                    done += 1
+                    progress(done, len(plan.pieces))
+        except BaseException:
+            for future in waiting:
+                future.cancel()
+            raise
+    known = assemble(source, plan, folder, out)
+    if known < _LEAST_KNOWN:
+        out.unlink(missing_ok=True)
+        raise MapFetchError(
+            f"{source.name}: has only {100 * known:.0f} % of the area; name another source"
+        )
+    return known
+
+
+def _keep(source: Source, piece: Piece, folder: Path, client: PoliteClient) -> None:
+    """A piece becomes a file when it is whole; an empty one says that there is nothing."""
+    data = piece.get(client)
+    if data is not None:
+        check_piece(source, piece, data)
+    path = folder / piece.name
+    partial = folder / f".{piece.name}.part"
+    partial.write_bytes(data or b"")
+    os.replace(partial, path)
+
+
+def _claim(source: Source, plan: Plan, folder: Path) -> None:
+    """The folder belongs to this plan: another's pieces are not mixed in."""
+    told = {
+        "source": source.model_dump(mode="json"), "crs": plan.grid.crs.to_wkt(),
+        "left": plan.grid.left, "top": plan.grid.top, "pixel": plan.grid.pixel,
+        "size": [plan.grid.width, plan.grid.height], "pieces": [p.name for p in plan.pieces],
+    }  # fmt: skip
+    key = hashlib.sha256(json.dumps(told, sort_keys=True).encode()).hexdigest()
+    mark = folder / "plan.sha256"
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        if not mark.exists() or mark.read_text() != key:
+            for path in folder.iterdir():
+                path.unlink()
+            mark.write_text(key)
+    except OSError as error:
+        raise MapFetchError(f"{folder}: cannot be used: {error}") from error

@@ -1,0 +1,144 @@
+"""Pieces on disk become one GeoTIFF."""
+
+from __future__ import annotations
+
+import io
+import os
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import rasterio
+from PIL import Image
+from rasterio.enums import Resampling
+from rasterio.errors import RasterioError
+from rasterio.io import MemoryFile
+from rasterio.vrt import WarpedVRT
+from rasterio.windows import Window
+
+from localizer.errors import MapFetchError
+from localizer.map.fetch.catalogue import Source
+from localizer.map.fetch.cloud import NODATA
+from localizer.map.fetch.raster import Piece, Plan
+from localizer.map.importers.raster_file import offline
+
+_TIFF = (b"II*\0", b"MM\0*", b"II+\0", b"MM\0+")
+_LOWEST_M, _HIGHEST_M = -1000.0, 9500.0
+
+
+def assemble(source: Source, plan: Plan, folder: Path, out: Path) -> float:
+    """Write the raster; what no piece has is masked. Returns the share of it that is known."""
+    grid, heights = plan.grid, source.has_heights
+    profile: dict[str, Any] = {
+        "driver": "GTiff", "width": grid.width, "height": grid.height, "tiled": True,
+        "crs": grid.crs.to_wkt(), "transform": grid.transform, "compress": "deflate",
+        "BIGTIFF": "IF_SAFER", "dtype": "float32" if heights else "uint8",
+        "count": 1 if heights else 3,
+    }  # fmt: skip
+    if heights:
+        profile["nodata"] = NODATA
+    else:
+        profile["photometric"] = "RGB"
+    partial = out.with_name(f".{out.name}.part")
+    known_pixels = 0
+    try:
+        with (
+            offline(),
+            rasterio.Env(GDAL_TIFF_INTERNAL_MASK=True),
+            rasterio.open(partial, "w", **profile) as file,
+        ):
+            if not heights:
+                file.write_mask(np.zeros((grid.height, grid.width), bool))
+            for piece in plan.pieces:
+                path = folder / piece.name
+                if path.stat().st_size:
+                    known_pixels += _place(source, plan, piece, path.read_bytes(), file)
+        os.replace(partial, out)
+    except RasterioError as error:
+        raise MapFetchError(f"{source.name}: its answers make no raster: {error}") from error
+    finally:
+        partial.unlink(missing_ok=True)
+    return known_pixels / (grid.width * grid.height)
+
+
+def check_piece(source: Source, piece: Piece, data: bytes) -> None:
+    """`MapFetchError` for what is no image, or not of the size that was asked for."""
+    try:
+        if data[:4] in _TIFF:
+            with offline(), MemoryFile(data) as memory, memory.open(driver="GTiff") as image:
+                size, bands, dtype = (image.width, image.height), image.count, image.dtypes[0]
+        else:
+            with _picture(data) as picture:
+                size, bands, dtype = picture.size, len(picture.getbands()), "uint8"
+    except (RasterioError, OSError, ValueError, SyntaxError) as error:
+        raise MapFetchError(f"{source.name}: piece {piece.name} is no image: {error}") from error
+    if not piece.placed and size != (piece.width, piece.height):
+        raise MapFetchError(
+            f"{source.name}: piece {piece.name} is {size[0]} x {size[1]} pixels, asked for "
+            f"{piece.width} x {piece.height}"
+        )
+    if source.has_heights and (bands != 1 or dtype == "uint8"):
+        raise MapFetchError(
+            f"{source.name}: sends {bands} bands of {dtype}, no heights; set `format` to a GeoTIFF "
+            "of numbers"
+        )
+
+
+def _picture(data: bytes) -> Image.Image:
+    """A picture without a place. Nothing else is opened, whatever a server sends."""
+    return Image.open(io.BytesIO(data), formats=("JPEG", "PNG", "WEBP"))
+
+
+def _place(source: Source, plan: Plan, piece: Piece, data: bytes, file: Any) -> int:
+    """Write a piece where it belongs; returns how many pixels it knows."""
+    grid = plan.grid
+    if data[:4] in _TIFF:
+        with MemoryFile(data) as memory, memory.open(driver="GTiff") as image:
+            values, known = _values(source, plan, piece, image)
+    else:
+        with _picture(data) as picture:
+            pixels = np.asarray(picture.convert("RGBA"))
+        values, known = np.moveaxis(pixels[..., :3], -1, 0), pixels[..., 3] > 0
+    # A tile may reach beyond the raster.
+    left, top = max(-piece.column, 0), max(-piece.row, 0)
+    right = min(piece.width, grid.width - piece.column)
+    bottom = min(piece.height, grid.height - piece.row)
+    if right <= left or bottom <= top:
+        return 0
+    values, known = values[:, top:bottom, left:right], known[top:bottom, left:right]
+    window = Window(piece.column + left, piece.row + top, right - left, bottom - top)
+    if source.has_heights:
+        known = known & (values[0] > _LOWEST_M) & (values[0] < _HIGHEST_M)
+        file.write(np.where(known, values, NODATA).astype(np.float32), window=window)
+    else:
+        file.write(values.astype(np.uint8), window=window)
+        file.write_mask(known, window=window)
+    return int(known.sum())
+
+
+def _values(source: Source, plan: Plan, piece: Piece, image: Any) -> tuple[np.ndarray, np.ndarray]:
+    """(bands, height, width), and where they are known."""
+    wanted = 1 if source.has_heights else 3
+    if piece.placed and image.crs is not None and not image.transform.is_identity:
+        window = plan.grid.window(piece.column, piece.row, piece.width, piece.height)
+        how = Resampling.bilinear if source.has_heights else Resampling.average
+        nodata = source.nodata if source.nodata is not None else image.nodata
+        options: dict[str, Any] = {"add_alpha": True}
+        if nodata is not None:
+            options = {"src_nodata": nodata, "nodata": nodata}
+        with WarpedVRT(
+            image, crs=window.crs.to_wkt(), transform=window.transform, width=window.width,
+            height=window.height, resampling=how, tolerance=0.01, **options,
+        ) as warped:  # fmt: skip
+            bands = list(range(1, min(wanted, image.count) + 1))
+            values, known = warped.read(bands), warped.dataset_mask() > 0
+    else:
+        if (image.width, image.height) != (piece.width, piece.height):
+            raise MapFetchError(f"{source.name}: piece {piece.name} has another size")
+        values, known = image.read(), image.dataset_mask() > 0
+        if source.nodata is not None:
+            known &= values[0] != source.nodata
+        values = values[:wanted]
+    if len(values) < wanted:
+        values = np.repeat(values[:1], wanted, axis=0)
+    return values, known & np.isfinite(values.astype(np.float64)).all(axis=0)

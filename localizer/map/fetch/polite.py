@@ -1,0 +1,169 @@
+"""HTTP as a guest behaves: a rate, few connections, patience when told to wait, and limits."""
+
+from __future__ import annotations
+
+import email.utils
+import threading
+import time
+from collections.abc import Callable, Collection, Mapping
+from dataclasses import dataclass, field
+from urllib.parse import urljoin, urlsplit
+
+import urllib3
+
+from localizer.errors import MapFetchError
+from localizer.map.fetch.terms import require_allowed
+
+_AGENT = "pilot-companion (map fetch)"
+_TRIES = 5
+_FIRST_WAIT_S, _LONGEST_WAIT_S = 1.0, 60.0
+_MOST_REDIRECTS = 4
+_AGAIN = (408, 425, 429, 500, 502, 503, 504)
+_REDIRECTED = (301, 302, 303, 307, 308)
+_TIMEOUT = urllib3.Timeout(connect=15.0, read=60.0)
+_MOST_ANSWER = 256 << 20
+_BLOCK = 1 << 16
+
+
+@dataclass(frozen=True)
+class Manners:
+    """rate_per_s: requests a second to one host; bytes: that all answers together may have."""
+
+    rate_per_s: float = 4.0
+    most_bytes: int = 4 << 30
+
+
+@dataclass(frozen=True)
+class Answer:
+    """What came. status: 200 or 206."""
+
+    status: int
+    kind: str
+    data: bytes
+    headers: Mapping[str, str] = field(default_factory=dict)
+
+
+class PoliteClient:
+    """GET, from any number of threads. `MapFetchError` says what a server refused, or that a limit
+    was reached. sleep, clock: seconds.
+    """
+
+    def __init__(
+        self,
+        manners: Manners | None = None,
+        sleep: Callable[[float], None] = time.sleep,
+        clock: Callable[[], float] = time.monotonic,
+    ) -> None:
+        self._manners = manners or Manners()
+        self._sleep, self._clock = sleep, clock
+        self._pool = urllib3.PoolManager(num_pools=8, maxsize=8, headers={"User-Agent": _AGENT})
+        self._lock = threading.Lock()
+        self._due: dict[str, float] = {}
+        self._bytes = 0
+        self._requests = 0
+
+    @property
+    def bytes(self) -> int:
+        """Received until now."""
+        return self._bytes
+
+    @property
+    def requests(self) -> int:
+        """Sent until now, repeated ones too."""
+        return self._requests
+
+    def get(
+        self,
+        url: str,
+        headers: Mapping[str, str] | None = None,
+        missing: Collection[int] = (),
+    ) -> Answer:
+        """The answer to a GET, redirections followed, repeated while the server is busy. missing:
+        statuses that mean that there is nothing, and are an answer, too.
+        """
+        for _ in range(_MOST_REDIRECTS + 1):
+            require_allowed(url)
+            answer = self._patiently(url, headers or {}, missing)
+            if answer.status not in _REDIRECTED:
+                return answer
+            url = urljoin(url, answer.headers.get("location", ""))
+        raise MapFetchError(f"{url}: redirected more than {_MOST_REDIRECTS} times")
+
+    def _patiently(self, url: str, headers: Mapping[str, str], missing: Collection[int]) -> Answer:
+        wait_s, why = _FIRST_WAIT_S, ""
+        for attempt in range(_TRIES):
+            if attempt:
+                self._sleep(wait_s)
+                wait_s = min(2 * wait_s, _LONGEST_WAIT_S)
+            self._wait_turn(urlsplit(url).netloc)
+            try:
+                answer = self._once(url, headers)
+            except urllib3.exceptions.HTTPError as error:
+                why = str(error)
+                continue
+            if answer.status in (200, 206, *_REDIRECTED, *missing):
+                return answer
+            why = f"status {answer.status}"
+            if answer.status not in _AGAIN:
+                raise MapFetchError(f"{shown(url)}: {why}: {_first_words(answer.data)}")
+            wait_s = max(wait_s, _told_wait_s(answer.headers))
+        raise MapFetchError(f"{shown(url)}: given up after {_TRIES} tries: {why}")
+
+    def _wait_turn(self, host: str) -> None:
+        with self._lock:
+            now = self._clock()
+            due = max(self._due.get(host, now), now)
+            self._due[host] = due + 1.0 / self._manners.rate_per_s
+            self._requests += 1
+        if due > now:
+            self._sleep(due - now)
+
+    def _once(self, url: str, headers: Mapping[str, str]) -> Answer:
+        reply = self._pool.request(
+            "GET", url, headers={"User-Agent": _AGENT, **headers}, timeout=_TIMEOUT,
+            retries=False, redirect=False, preload_content=False,
+        )  # fmt: skip
+        try:
+            data = bytearray()
+            for block in reply.stream(_BLOCK):
+                data += block
+                self._count(len(block))
+                if len(data) > _MOST_ANSWER:
+                    raise MapFetchError(f"{shown(url)}: an answer of over {_MOST_ANSWER >> 20} MiB")
+        finally:
+            reply.release_conn()
+        kind = reply.headers.get("content-type", "").split(";")[0].strip().lower()
+        known = {name.lower(): value for name, value in reply.headers.items()}
+        return Answer(int(reply.status), kind, bytes(data), known)
+
+    def _count(self, size: int) -> None:
+        with self._lock:
+            self._bytes += size
+            if self._bytes > self._manners.most_bytes:
+                raise MapFetchError(
+                    f"more than {self._manners.most_bytes / 1e6:.0f} MB came: a smaller area, a "
+                    "coarser --resolution, or a higher --most-mb"
+                )
+
+
+def shown(url: str) -> str:
+    """An address without what may be a key."""
+    parts = urlsplit(url)
+    return f"{parts.scheme}://{parts.hostname}{f':{parts.port}' if parts.port else ''}{parts.path}"
+
+
+def _told_wait_s(headers: Mapping[str, str]) -> float:
+    """Retry-After: seconds, or a date; bounded."""
+    told = headers.get("retry-after", "")
+    try:
+        seconds = float(told)
+    except ValueError:
+        try:
+            seconds = email.utils.parsedate_to_datetime(told).timestamp() - time.time()
+        except (TypeError, ValueError):
+            return 0.0
+    return min(seconds, _LONGEST_WAIT_S) if seconds > 0 else 0.0  # false for NaN, too
+
+
+def _first_words(data: bytes) -> str:
+    return " ".join(data[:300].decode("utf-8", "replace").split())

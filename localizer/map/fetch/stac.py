@@ -1,0 +1,128 @@
+"""STAC: the files of a catalogue, static or with a search, that meet an area."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator
+from fnmatch import fnmatchcase
+from typing import Any
+from urllib.parse import urlencode, urljoin
+
+from localizer.errors import MapFetchError
+from localizer.map.fetch.area import Area
+from localizer.map.fetch.catalogue import Source
+from localizer.map.fetch.cloud import CloudFile
+from localizer.map.fetch.polite import PoliteClient, shown
+from localizer.map.fetch.terms import require_allowed
+
+_MOST_ITEMS, _MOST_PAGES = 2000, 50
+_TIFFS = ("image/tiff", "image/vnd.stac.geotiff")
+
+
+def stac_files(source: Source, area: Area, client: PoliteClient) -> list[CloudFile]:
+    """The asset of each item that meets the area; of items of one place the newest comes first."""
+    try:
+        import pystac
+    except ImportError as error:
+        raise MapFetchError("STAC needs pystac: pip install 'pilot-companion[fetch]'") from error
+
+    items = []
+    try:
+        walk = _searched if _is_api(source) else _walked
+        for item in walk(source, area, client):
+            items.append(item)
+            if len(items) > _MOST_ITEMS:
+                raise MapFetchError(f"{source.name}: over {_MOST_ITEMS} items: a smaller area")
+    except (pystac.STACError, KeyError, TypeError, ValueError, AttributeError) as error:
+        raise MapFetchError(f"{shown(source.url)}: no STAC that can be read: {error}") from error
+    items.sort(key=lambda item: str(item.datetime or item.properties.get("datetime") or ""),
+               reverse=True)  # fmt: skip
+    files = []
+    for item in items:
+        asset = _asset(source, item)
+        if asset is not None:
+            href = str(asset.get_absolute_href() or asset.href)
+            require_allowed(href)
+            files.append(CloudFile(href, _flat(item.bbox)))
+    if items and not files:
+        known = ", ".join(sorted(items[0].assets))
+        raise MapFetchError(f"{source.name}: no GeoTIFF among its assets ({known}); set `asset`")
+    return files
+
+
+def _is_api(source: Source) -> bool:
+    return not source.url.lower().split("?")[0].endswith(".json")
+
+
+def _asset(source: Source, item: Any) -> Any:
+    if source.asset:
+        return next((a for k, a in item.assets.items() if fnmatchcase(k, source.asset)), None)
+    for asset in item.assets.values():
+        if str(asset.media_type or "").split(";")[0].strip() in _TIFFS:
+            return asset
+    return None
+
+
+def _searched(source: Source, area: Area, client: PoliteClient) -> Iterator[Any]:
+    """GET /search of the STAC API, page by page."""
+    import pystac
+
+    box = (area.west, area.south, area.east, area.north)
+    parameters = {"bbox": ",".join(f"{v:.7f}" for v in box), "limit": "100"}
+    if source.layer:
+        parameters["collections"] = source.layer
+    url: str | None = f"{source.url.rstrip('/')}/search?{urlencode(parameters)}"
+    for _ in range(_MOST_PAGES):
+        if url is None:
+            return
+        page = json.loads(client.get(url).data)
+        for feature in page["features"]:
+            item = pystac.Item.from_dict(feature)
+            if item.bbox is not None and area.meets(_flat(item.bbox)):
+                yield item
+        links = [
+            li["href"] for li in page.get("links", ())
+            if li.get("rel") == "next" and li.get("method", "GET") == "GET"
+        ]  # fmt: skip
+        url = urljoin(url, links[0]) if links else None
+
+
+def _walked(source: Source, area: Area, client: PoliteClient) -> Iterator[Any]:
+    """A static catalogue, but not what lies elsewhere or in another collection."""
+    import pystac
+    from pystac.stac_io import DefaultStacIO
+
+    class Io(DefaultStacIO):
+        """Reads through the client, from the network only."""
+
+        def read_text(self, source: Any, *_: Any, **__: Any) -> str:
+            href = source if isinstance(source, str) else source.get_absolute_href()
+            return client.get(str(href)).data.decode("utf-8")
+
+    waiting = [pystac.read_file(source.url, stac_io=Io())]
+    for _ in range(_MOST_ITEMS):
+        if not waiting:
+            return
+        found = waiting.pop()
+        if isinstance(found, pystac.Collection):
+            if source.layer not in ("", found.id):
+                continue
+            boxes = found.extent.spatial.bboxes
+            if boxes and not any(area.meets(_flat(box)) for box in boxes):
+                continue
+        if isinstance(found, pystac.Item):
+            if found.bbox is not None and area.meets(_flat(found.bbox)):
+                yield found
+            continue
+        if isinstance(found, pystac.Catalog):
+            waiting += list(found.get_children())
+            for item in found.get_items():
+                if item.bbox is not None and area.meets(_flat(item.bbox)):
+                    yield item
+
+
+def _flat(box: Any) -> tuple[float, float, float, float]:
+    """A bounding box without heights."""
+    numbers = [float(v) for v in box]
+    west, south, east, north = numbers if len(numbers) == 4 else (*numbers[:2], *numbers[3:5])
+    return west, south, east, north

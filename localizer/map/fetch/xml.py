@@ -1,0 +1,27 @@
+"""XML of a server, without what XML can do besides."""
+
+from __future__ import annotations
+
+from xml.etree import ElementTree
+
+from localizer.errors import MapFetchError
+
+_MOST_BYTES = 32 << 20
+
+
+def parsed(data: bytes) -> ElementTree.Element:
+    """The root. Document types are refused: entities can make a small file large. ParseError for
+    what is no XML.
+    """
+    if len(data) > _MOST_BYTES or b"<!ENTITY" in data:
+        raise MapFetchError("a server's XML is too long, or brings entities of its own")
+    return ElementTree.fromstring(data)
+
+
+def texts(data: bytes) -> str:
+    """What a message says, for an error; of XML its texts alone."""
+    try:
+        words = " ".join(t.strip() for t in parsed(data[:65536]).itertext() if t.strip())
+    except (ElementTree.ParseError, MapFetchError):
+        words = data[:300].decode("utf-8", "replace")
+    return " ".join(words.split())[:300]

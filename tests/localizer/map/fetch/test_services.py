@@ -1,0 +1,220 @@
+"""Each kind of service gives the world that it serves, where it is and as high as it is."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import rasterio
+from pyproj import Transformer
+
+pytest.importorskip("owslib")
+pytest.importorskip("pystac")
+from localizer.errors import MapFetchError
+from localizer.map.fetch.area import Area
+from localizer.map.fetch.catalogue import Source
+from localizer.map.fetch.fetch import estimate, fetch, make_plan
+from localizer.map.fetch.polite import Manners, PoliteClient
+from tests.localizer.map.fetch.loopback import (
+    CRS,
+    MAPSERV,
+    colour,
+    geographic,
+    height_m,
+    rectangle,
+    serving,
+    wmts_capabilities,
+    write_map_file,
+    write_stac,
+    write_world,
+)
+
+AREA = Area(*rectangle())
+mapserver = pytest.mark.skipif(
+    not Path(MAPSERV).exists(), reason="no MapServer here: apt install cgi-mapserver"
+)
+
+
+@pytest.fixture(scope="module")
+def server(tmp_path_factory):
+    folder = write_world(tmp_path_factory.mktemp("world"))
+    with serving(folder) as served:
+        write_map_file(folder, served.url)
+        write_stac(folder, served.url)
+        (folder / "wmts.xml").write_text(wmts_capabilities(served.url))
+        yield served
+
+
+def source(kind: str, url: str, **more: object) -> Source:
+    role = more.pop("role", "imagery")
+    given = {
+        "name": "here", "title": "the world", "kind": kind, "role": role, "url": url,
+        "licence": "none: loopback", "attribution": "the tests", "country": "nowhere",
+        "bounds": rectangle(0.0), "resolution_m": 0.5 if role == "imagery" else 1.0,
+        "rate_per_s": 50.0, "vertical_datum": None if role == "imagery" else "amsl",
+    }  # fmt: skip
+    return Source.model_validate(given | more)
+
+
+def fetched(wanted: Source, tmp_path: Path, client: PoliteClient | None = None) -> Path:
+    client = client or PoliteClient(Manners(50.0))
+    plan = make_plan(wanted, AREA, wanted.resolution_m, client)
+    fetch(wanted, plan, tmp_path / "pieces", tmp_path / "out.tif", client)
+    return tmp_path / "out.tif"
+
+
+def compare(path: Path, expected, limit: float, share: float = 1.0) -> None:
+    """The raster's numbers against the world's at its own pixels' places, inside the area."""
+    with rasterio.open(path) as data:
+        rows, columns = np.mgrid[2 : data.height - 2 : 7, 2 : data.width - 2 : 7]
+        x, y = rasterio.transform.xy(data.transform, rows.ravel(), columns.ravel())
+        values = data.read().astype(np.float64)[:, rows.ravel(), columns.ravel()]
+        known = data.dataset_mask()[rows.ravel(), columns.ravel()] > 0
+        crs = data.crs
+    east, north = Transformer.from_crs(crs, CRS, always_xy=True).transform(x, y)
+    lat, lon = geographic(east, north)
+    inside = (AREA.south < lat) & (lat < AREA.north) & (AREA.west < lon) & (lon < AREA.east)
+    assert inside.sum() > 400
+    assert known[inside].all(), "the area has holes"
+    truth = np.asarray(expected(east, north), np.float64).reshape(len(east), -1).T
+    wrong = np.abs(values - truth).max(axis=0)[inside]
+    assert np.quantile(wrong, share) <= limit, f"{np.quantile(wrong, [0.5, 0.9, 0.99, 1.0])}"
+
+
+# A pixel on the border of two squares is neither's.
+PICTURE = {"expected": colour, "limit": 16.0, "share": 0.88}
+HEIGHTS = {"expected": height_m, "limit": 0.1}
+
+
+def test_a_cloud_optimised_file_gives_what_is_asked_and_not_the_whole(server, tmp_path):
+    small = source("cog", f"{server.url}/surface.tif", role="surface")
+    before = server.bytes
+    compare(fetched(small, tmp_path), **HEIGHTS)
+    assert all(r.startswith("bytes=") for r in server.ranges)
+    assert server.bytes - before < 2 * (server.folder / "surface.tif").stat().st_size
+
+
+def test_a_server_without_ranges_is_told_and_its_file_not_taken(server, tmp_path):
+    server.ranged = False
+    try:
+        with pytest.raises(MapFetchError, match="whole files only"):
+            fetched(source("cog", f"{server.url}/surface.tif", role="surface"), tmp_path)
+    finally:
+        server.ranged = True
+
+
+def test_a_catalogue_leads_to_the_newest_file_there_and_asks_nothing_elsewhere(server, tmp_path):
+    server.asked.clear()
+    compare(fetched(source("stac", f"{server.url}/stac/catalog.json"), tmp_path), **PICTURE)
+    assert not any("elsewhere-" in path for path in server.asked)
+    assert any("ortho.tif" in path for path in server.asked)
+
+
+def test_another_collection_has_nothing_there(server, tmp_path):
+    with pytest.raises(MapFetchError, match="no file at"):
+        fetched(source("stac", f"{server.url}/stac/catalog.json", layer="elsewhere"), tmp_path)
+
+
+@pytest.mark.parametrize("kind", ["xyz", "tms", "wmts"])
+def test_tiles(server, tmp_path, kind):
+    urls = {
+        "xyz": f"{server.url}/tiles/{{z}}/{{x}}/{{y}}.png",
+        "tms": f"{server.url}/tms/{{z}}/{{x}}/{{y}}.png",
+        "wmts": f"{server.url}/wmts.xml",
+    }
+    wanted = source(kind, urls[kind], layer="ortho")
+    compare(fetched(wanted, tmp_path), **PICTURE)
+
+
+@mapserver
+@pytest.mark.parametrize(
+    ("version", "crs"),
+    [("1.3.0", CRS), ("1.3.0", "EPSG:4326"), ("1.1.1", "EPSG:4326"), ("1.3.0", "EPSG:3857")],
+)
+def test_wms_of_mapserver_in_every_order_of_axes(server, tmp_path, version, crs):
+    wanted = source(
+        "wms", f"{server.url}/mapserv", layer="ortho", crs=crs, version=version, piece_px=300
+    )
+    compare(fetched(wanted, tmp_path), **PICTURE)
+
+
+@mapserver
+@pytest.mark.parametrize("version", ["1.0.0", "2.0.1"])
+def test_wcs_of_mapserver(server, tmp_path, version):
+    wanted = source(
+        "wcs", f"{server.url}/mapserv", role="surface", layer="surface", crs=CRS,
+        version=version, piece_px=120, format="GTIFF32" if version == "1.0.0" else "image/tiff",
+    )  # fmt: skip
+    compare(fetched(wanted, tmp_path), **HEIGHTS)
+
+
+@mapserver
+def test_what_a_service_refuses_is_told_in_its_own_words(server, tmp_path):
+    wanted = source("wms", f"{server.url}/mapserv", layer="nothing", crs=CRS)
+    with pytest.raises(MapFetchError, match=r"refused: .*Invalid layer"):
+        fetched(wanted, tmp_path)
+
+
+def test_what_came_is_not_asked_for_again_and_another_plan_begins_anew(server, tmp_path):
+    wanted = source("xyz", f"{server.url}/tiles/{{z}}/{{x}}/{{y}}.png")
+    fetched(wanted, tmp_path)
+    pieces = sorted((tmp_path / "pieces").glob("[0-9]*"))
+    pieces[0].unlink()
+    (tmp_path / "out.tif").unlink()
+    server.asked.clear()
+    compare(fetched(wanted, tmp_path), **PICTURE)
+    assert len(server.asked) == 1
+    other = wanted.model_copy(update={"most_zoom": 16})
+    server.asked.clear()
+    fetched(other, tmp_path)
+    assert len(server.asked) > 0
+
+
+def test_a_cut_off_run_leaves_whole_pieces_only(server, tmp_path):
+    wanted = source("xyz", f"{server.url}/tiles/{{z}}/{{x}}/{{y}}.png", parallel=1)
+    client = PoliteClient(Manners(50.0))
+    plan = make_plan(wanted, AREA, 0.5, client)
+
+    def interrupt(done: int, _: int) -> None:
+        if done == 3:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        fetch(wanted, plan, tmp_path / "pieces", tmp_path / "out.tif", client, interrupt)
+    assert not (tmp_path / "out.tif").exists()
+    server.asked.clear()
+    fetch(wanted, plan, tmp_path / "pieces", tmp_path / "out.tif", client)
+    assert len(server.asked) <= len(plan.pieces) - 3
+    compare(tmp_path / "out.tif", **PICTURE)
+
+
+def test_the_estimate_is_of_the_size_of_what_comes(server, tmp_path):
+    wanted = source("cog", f"{server.url}/ortho.tif")
+    client = PoliteClient(Manners(50.0))
+    plan = make_plan(wanted, AREA, 0.5, client)
+    expected = estimate(wanted, plan)
+    fetch(wanted, plan, tmp_path / "pieces", tmp_path / "out.tif", client)
+    assert expected.bytes / 5 < client.bytes < expected.bytes * 5
+    assert expected.requests / 5 < client.requests < expected.requests * 5
+
+
+def test_a_picture_where_heights_belong_is_refused(server, tmp_path):
+    wanted = source("cog", f"{server.url}/ortho.tif", role="surface")
+    wanted = wanted.model_copy(
+        update={"kind": "xyz", "url": f"{server.url}/tiles/{{z}}/{{x}}/{{y}}.png"}
+    )
+    with pytest.raises(MapFetchError, match="no heights"):
+        fetched(wanted, tmp_path)
+
+
+def test_a_server_that_fails_in_the_middle_of_a_file_is_told_and_not_taken_for_a_hole(
+    server, tmp_path
+):
+    wanted = source("cog", f"{server.url}/surface.tif", role="surface")
+    client = PoliteClient(Manners(50.0), sleep=lambda _: None)
+    plan = make_plan(wanted, AREA, 1.0, client)
+    server.broken = [(404, {})]
+    with pytest.raises(MapFetchError, match="status 404"):
+        fetch(wanted, plan, tmp_path / "pieces", tmp_path / "out.tif", client)
+    assert not (tmp_path / "out.tif").exists()
