@@ -12,6 +12,7 @@ import yaml
 from companion.calibrating import unknowns as u
 from companion.calibrating.evidence import changed_camera
 from companion.calibrating.flight import Calibrated
+from companion.calibrating.lens import Lens
 from companion.config import CompanionConfig
 from companion.errors import ConfigError
 from companion.settings_file import read_settings, validated
@@ -88,6 +89,35 @@ def _sigmas(config: CompanionConfig, found: Calibrated) -> list[Change]:
         )
         for name, value in values.items()
     ]  # fmt: skip
+
+
+def lens_changes(config: CompanionConfig | None, lens: Lens) -> tuple[Change, ...]:
+    """What a board changes; config: None where there is no deployment yet."""
+    model = None if config is None else config.camera.model
+    told = None if config is None else config.localizer.calibration
+    c = lens.camera
+    values: dict[str, Any] = {
+        "width": c.width, "height": c.height,
+        **{name: round(getattr(c, name), 2) for name in ("fx", "fy", "cx", "cy")},
+        "distortion": [round(k, 5) for k in c.distortion],
+    }  # fmt: skip
+    made = [
+        Change(("camera", "model", name), None if model is None else getattr(model, name), value)
+        for name, value in values.items()
+    ]
+    sigmas = {
+        "focal_percent": 100.0 * float(lens.sigmas[0]) / c.fx,
+        "principal_percent": 100.0 * float(lens.sigmas[2:4].max()) / c.width,
+        "distortion": float(lens.sigmas[4]),
+    }
+    made += [
+        Change(
+            ("localizer", "calibration", name), None if told is None else getattr(told, name),
+            round(max(value, _LEAST[name]), 4),
+        )
+        for name, value in sigmas.items()
+    ]  # fmt: skip
+    return tuple(made)
 
 
 def changed(config: CompanionConfig, wanted: tuple[Change, ...]) -> CompanionConfig:

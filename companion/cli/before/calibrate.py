@@ -113,3 +113,69 @@ def _figures(found: Any, wanted: tuple[Any, ...], blind: tuple[str, ...]) -> dic
         "pictures": found.frames, "parts": found.parts,
         "before_px": found.before_px, "after_px": found.after_px, "notes": list(found.notes),
     }  # fmt: skip
+
+
+@app.command("board")
+def board_command(
+    source: Annotated[
+        str | None, typer.Argument(help="the stream: udp://, rtsp://, /dev/video0, file or folder")
+    ] = None,
+    sheet: Annotated[
+        Path | None, typer.Option("--print", help="write the board to print: .pdf or .png")
+    ] = None,
+    paper: Annotated[str, typer.Option(help="a4, a3 or letter")] = "a4",
+    seconds: Annotated[
+        float, typer.Option(min=1, max=3600, help="of a stream, at the most")
+    ] = 180.0,
+    config: Annotated[Path | None, typer.Option(help="deployment file that is changed")] = None,
+    keep: Annotated[Path | None, typer.Option(help="folder for the views that were taken")] = None,
+) -> None:
+    """The camera's model from views of a printed board, with what is still missing told."""
+    from companion.calibrating.board import write_sheet
+
+    if paper not in ("a4", "a3", "letter"):
+        raise typer.BadParameter(f"--paper {paper}: one of a4, a3, letter")
+    console = Console()
+    if sheet is not None:
+        made = write_sheet(sheet, paper)  # type: ignore[arg-type]
+        console.print(
+            f"{sheet}: print it at 100 % on {paper}, glue it on something flat; a square is "
+            f"{made.square_mm:g} mm then (its size does not matter, that it is flat does)",
+            soft_wrap=True, highlight=False,
+        )  # fmt: skip
+    if source is None:
+        if sheet is None:
+            raise typer.BadParameter("give the stream, or --print a file for the board")
+        return
+    _film(console, source, seconds, keep, config)
+
+
+def _film(
+    console: Console, source: str, seconds: float, keep: Path | None, config: Path | None
+) -> None:
+    from companion.calibrating.lens import solve_lens
+    from companion.calibrating.proposal import lens_changes, write_changed
+    from companion.calibrating.watching import watch_board
+    from companion.config import load_config
+
+    def told(taken: int, word: str, missing: list[str]) -> None:
+        wanted = "; ".join(missing[:3]) or "nothing: enough"
+        console.print(f"{taken:2d} views ({word}); missing: {wanted}", highlight=False)
+
+    filmed = watch_board(source, seconds, told, keep)
+    lens = solve_lens(filmed.views, filmed.width, filmed.height)
+    c = lens.camera
+    console.print(
+        f"{lens.views[0]} of {lens.views[1]} views, {lens.rms_px:.2f} px rms; focal lengths "
+        f"{c.fx:.2f}, {c.fy:.2f} px (sigma {lens.sigmas[0]:.2f}), principal point {c.cx:.2f}, "
+        f"{c.cy:.2f} px (sigma {lens.sigmas[2]:.2f})",
+        soft_wrap=True, highlight=False,
+    )  # fmt: skip
+    if filmed.missing:
+        console.print(f"not seen: {'; '.join(filmed.missing)}", style="yellow", soft_wrap=True)
+    before = load_config(config) if config is not None else None
+    wanted = lens_changes(before, lens)
+    console.print(_changes(wanted))
+    if config is not None:
+        kept = write_changed(config, wanted, "lens by `companion calibrate board`")
+        console.print(f"{config} is changed; before it: {kept}", style="green", soft_wrap=True)

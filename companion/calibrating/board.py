@@ -1,0 +1,123 @@
+"""The calibration board (ChArUco), as a sheet to print at true scale."""
+
+from __future__ import annotations
+
+import struct
+import zlib
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+import cv2
+import numpy as np
+
+from companion.errors import ReportError
+from localizer.types import Image
+
+Paper = Literal["a4", "a3", "letter"]
+ACROSS, DOWN = 8, 11  # squares
+_MARKER = 0.72  # of a square's side
+_DICTIONARY = cv2.aruco.DICT_4X4_100
+_SHEETS_MM: dict[str, tuple[float, float, float]] = {  # width, height, square
+    "a4": (210.0, 297.0, 23.0), "a3": (297.0, 420.0, 33.0), "letter": (215.9, 279.4, 22.0),
+}  # fmt: skip
+_DOTS_PER_SQUARE = 200
+_POINTS_PER_MM = 72.0 / 25.4
+
+
+@dataclass(frozen=True)
+class Sheet:
+    """A page with the board in its middle, millimetres."""
+
+    width_mm: float
+    height_mm: float
+    square_mm: float
+
+    @classmethod
+    def of(cls, paper: Paper) -> Sheet:
+        """The largest board that leaves a printer's margins."""
+        return cls(*_SHEETS_MM[paper])
+
+
+def charuco() -> cv2.aruco.CharucoBoard:
+    """The board, a square's side being one: the optics do not depend on its size."""
+    dictionary = cv2.aruco.getPredefinedDictionary(_DICTIONARY)
+    return cv2.aruco.CharucoBoard((ACROSS, DOWN), 1.0, _MARKER, dictionary)
+
+
+def board_picture(dots: int = _DOTS_PER_SQUARE) -> Image:
+    """(11 dots, 8 dots) grey, without a margin."""
+    picture = charuco().generateImage((ACROSS * dots, DOWN * dots), marginSize=0)
+    return np.asarray(picture, np.uint8)
+
+
+def write_sheet(path: Path, paper: Paper) -> Sheet:
+    """A PDF or PNG, by the name's ending; `ReportError` for another or where it cannot be written.
+
+    Printed at 100 %, a square has the side that the sheet says: a ruler tells.
+    """
+    sheet = Sheet.of(paper)
+    endings = {".pdf": _pdf, ".png": _png}
+    if path.suffix.lower() not in endings:
+        raise ReportError(f"{path}: a board is printed from .pdf or .png")
+    data = endings[path.suffix.lower()](sheet)
+    try:
+        path.write_bytes(data)
+    except OSError as error:
+        raise ReportError(f"{path}: cannot be written: {error.strerror}") from error
+    return sheet
+
+
+def _pdf(sheet: Sheet) -> bytes:
+    """One page, the board an image that is placed by millimetres (PDF 1.4)."""
+    picture = board_picture(_DOTS_PER_SQUARE // 4)
+    rows, columns = picture.shape
+    packed = zlib.compress(picture.tobytes())
+    w, h = (_POINTS_PER_MM * x for x in (sheet.width_mm, sheet.height_mm))
+    bw, bh = (_POINTS_PER_MM * sheet.square_mm * n for n in (ACROSS, DOWN))
+    x, y = (w - bw) / 2, (h - bh) / 2
+    say = f"print at 100 %: a square is {sheet.square_mm:g} mm. ChArUco 8 x 11, DICT_4X4_100"
+    page = (
+        f"q {bw:.3f} 0 0 {bh:.3f} {x:.3f} {y:.3f} cm /I Do Q "
+        f"BT /F 8 Tf {x:.1f} {max(y - 14, 8):.1f} Td ({say}) Tj ET"
+    ).encode()
+    objects = [
+        b"<< /Type /Catalog /Pages 2 0 R >>",
+        b"<< /Type /Pages /Kids [3 0 R] /Count 1 >>",
+        (
+            f"<< /Type /Page /Parent 2 0 R /MediaBox [0 0 {w:.3f} {h:.3f}] /Contents 4 0 R "
+            "/Resources << /XObject << /I 5 0 R >> /Font << /F 6 0 R >> >> >>"
+        ).encode(),
+        b"<< /Length %d >>\nstream\n%s\nendstream" % (len(page), page),
+        b"<< /Type /XObject /Subtype /Image /Width %d /Height %d /ColorSpace /DeviceGray "
+        b"/BitsPerComponent 8 /Filter /FlateDecode /Length %d >>\nstream\n%s\nendstream"
+        % (columns, rows, len(packed), packed),
+        b"<< /Type /Font /Subtype /Type1 /BaseFont /Helvetica >>",
+    ]
+    out, places = bytearray(b"%PDF-1.4\n"), []
+    for number, body in enumerate(objects, 1):
+        places.append(len(out))
+        out += b"%d 0 obj\n%s\nendobj\n" % (number, body)
+    table = len(out)
+    out += b"xref\n0 %d\n0000000000 65535 f \n" % (len(objects) + 1)
+    out += b"".join(b"%010d 00000 n \n" % place for place in places)
+    out += b"trailer << /Size %d /Root 1 0 R >>\nstartxref\n%d\n%%%%EOF\n" % (
+        len(objects) + 1, table,
+    )  # fmt: skip
+    return bytes(out)
+
+
+def _png(sheet: Sheet) -> bytes:
+    """A white page with its dots per metre (pHYs), so that it prints at true scale."""
+    dots = _DOTS_PER_SQUARE
+    per_mm = dots / sheet.square_mm
+    board = board_picture(dots)
+    page = np.full((round(sheet.height_mm * per_mm), round(sheet.width_mm * per_mm)), 255, np.uint8)
+    top, left = (page.shape[0] - board.shape[0]) // 2, (page.shape[1] - board.shape[1]) // 2
+    page[top : top + board.shape[0], left : left + board.shape[1]] = board
+    data = cv2.imencode(".png", page)[1].tobytes()
+    density = struct.pack(">IIB", round(1000 * per_mm), round(1000 * per_mm), 1)
+    body = b"pHYs" + density
+    chunk = struct.pack(">I", len(density)) + body + struct.pack(">I", zlib.crc32(body))
+    header = 33  # signature and IHDR
+    return data[:header] + chunk + data[header:]

@@ -1,0 +1,61 @@
+"""A stream watched for views of the board, until there are enough."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+from companion.calibrating.views import BoardViews, View
+from companion.setup.asking import first_picture
+from companion.sources import SourceSettings, open_source
+from localizer.geometry.camera import Camera
+from localizer.pictures import write_rgb
+
+Told = Callable[[int, str, list[str]], None]
+_QUIET_PICTURES = 30  # of the same word, after which it is said again
+
+
+@dataclass(frozen=True)
+class Filmed:
+    """What was seen. missing: what was not."""
+
+    views: tuple[View, ...]
+    missing: tuple[str, ...]
+    width: int
+    height: int
+
+
+def watch_board(source: str, seconds: float, told: Told, keep: Path | None = None) -> Filmed:
+    """Watch for at most so long, or to the end of a file or folder, or until nothing is missing.
+
+    told: views, the newest picture's fate and what is missing, whenever that changes. keep: folder
+    for the pictures that were taken.
+    """
+    size = first_picture(source)
+    views = BoardViews(size.width, size.height)
+    # Any model of the pictures' size: it is what is being looked for.
+    camera = Camera.from_fov(size.width, size.height, 65.0)
+    feed = open_source(source, camera, SourceSettings())
+    timer = threading.Timer(seconds, feed.close)
+    timer.daemon = True
+    timer.start()
+    if keep is not None:
+        keep.mkdir(parents=True, exist_ok=True)
+    last, quiet = "", 0
+    try:
+        for frame in feed.frames():
+            word = views.take(frame.image)
+            quiet = 0 if word != last else quiet + 1
+            if word == "taken" and keep is not None:
+                write_rgb(keep / f"view-{len(views.views):03d}.png", frame.image)
+            if quiet % _QUIET_PICTURES == 0:
+                told(len(views.views), word, views.missing())
+            last = word
+            if word == "taken" and not views.missing():
+                break
+    finally:
+        timer.cancel()
+        feed.close()
+    return Filmed(tuple(views.views), tuple(views.missing()), size.width, size.height)
