@@ -107,10 +107,10 @@ def test_a_board_that_moves_or_was_seen_is_not_taken():
 def test_the_sheet_prints_at_true_scale(tmp_path):
     sheet = write_sheet(tmp_path / "board.pdf", "a4")
     data = (tmp_path / "board.pdf").read_bytes()
-    width = float(re.search(rb"q ([\d.]+) 0 0 ([\d.]+)", data)[1])
+    width = float(re.findall(rb"q ([\d.]+) 0 0", data)[0])
     assert width == pytest.approx(ACROSS * sheet.square_mm * 72 / 25.4, abs=0.01)
     assert sheet.square_mm * DOWN < sheet.height_mm - 2 * 10
-    start = int(re.search(rb"startxref\n(\d+)", data)[1])
+    start = int(re.findall(rb"startxref\n(\d+)", data)[0])
     assert data[start : start + 4] == b"xref"
     packed = data.split(b"/FlateDecode", 1)[1].split(b"stream\n", 1)[1].split(b"\nendstream")[0]
     assert len(zlib.decompress(packed)) == ACROSS * DOWN * 50 * 50

@@ -1,0 +1,187 @@
+"""The reference pages that are made from the program itself.
+
+The command line's from its commands, the configuration's from its schema: so they cannot say
+anything else than the program.
+"""
+
+from __future__ import annotations
+
+import inspect
+import re
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from enum import Enum
+from pathlib import Path
+from types import NoneType, UnionType
+from typing import Annotated, Any, Literal, Union, get_args, get_origin, get_type_hints
+
+import typer
+from typer.models import ArgumentInfo, OptionInfo
+
+from companion.cli.commands import app
+from companion.setup.reference import reference
+
+_CLI = """# Command line
+
+Made from the commands by `python -m benchmarks.site`; do not edit. `companion COMMAND --help`
+prints the same in a terminal.
+
+| exit code | means |
+|---|---|
+| 0 | done |
+| 1 | `doctor` found advice, `plan` a bad leg, `map verify` damage, `localize` nothing, `replay` a difference |
+| 2 | wrong usage, an error that is named in one line, or `doctor`: not fit to fly |
+| 130 | interrupted (`run` that was flying ends with 0) |
+"""
+
+_CONFIGURATION = """# Configuration
+
+Made from the schema by `python -m benchmarks.site`; do not edit. Every value is the true default;
+`companion init --reference` prints the same as one file. A deployment needs only what differs, and
+`companion init FILE` writes such a one. An unknown key, a value out of bounds or of the wrong kind
+is refused by name at the start. When to touch which:
+[configs/deployment.yaml](../../configs/deployment.yaml).
+"""
+
+_TOP = re.compile(r"^(\w+):", re.M)
+_KINDS = {int: "N", float: "X", str: "TEXT", Path: "PATH"}
+
+
+@dataclass(frozen=True)
+class _Parameter:
+    """One argument or option, as its function declares it."""
+
+    name: str
+    kind: Any
+    info: ArgumentInfo | OptionInfo
+    default: Any
+
+    @property
+    def is_argument(self) -> bool:
+        """Whether it is given by its place."""
+        return isinstance(self.info, ArgumentInfo)
+
+    @property
+    def words(self) -> str:
+        """What is written on the command line."""
+        if self.is_argument:
+            return self.name.upper()
+        # In an annotation the first name stands where the default of older typers stood.
+        first = [self.info.default] if isinstance(self.info.default, str) else []
+        named = ", ".join([*first, *(self.info.param_decls or ())])
+        plain = "--" + self.name.replace("_", "-")
+        return named or (f"{plain}, --no-{plain[2:]}" if self.default is True else plain)
+
+    @property
+    def is_required(self) -> bool:
+        """Whether the command ends without it."""
+        return self.default is inspect.Parameter.empty
+
+
+def command_page() -> str:
+    """docs/reference/cli.md."""
+    lines = [_CLI]
+    for name, function in _commands("companion", app):
+        parameters = list(_parameters(function))
+        help_text = _sentence((function.__doc__ or "").split("\n\n")[0])
+        lines += [f"## {name}\n", help_text, "", f"```\n{_usage(name, parameters)}\n```\n"]
+        if parameters:
+            lines += ["| argument, option | default | meaning |", "|---|---|---|"]
+            lines += [*map(_row, parameters), ""]
+    return "\n".join(lines)
+
+
+def configuration_page() -> str:
+    """docs/reference/configuration.md."""
+    text = reference().split("\n", 2)[2]  # without its head of two lines
+    lines, block = [_CONFIGURATION], list[str]()
+    name = ""
+    for line in text.splitlines():
+        block.append(line)
+        top = _TOP.match(line)
+        if top is not None:
+            lines += _section(name, block, top.group(1))
+            name = top.group(1)
+    return "\n".join([*lines, *block, "```", ""])
+
+
+def _section(before: str, block: list[str], name: str) -> list[str]:
+    """Ends the section before and begins the next; its first comments belong to its own block."""
+    key = block.pop()
+    comments: list[str] = []
+    while block and block[-1].startswith("#"):
+        comments.insert(0, block.pop())
+    ended = [*block, "```", ""] if before else block[:]
+    block[:] = [*comments, key]
+    return [*ended, f"## {name}\n", "```yaml"]
+
+
+def _commands(name: str, group: typer.Typer) -> Iterator[tuple[str, Callable[..., Any]]]:
+    """Every command's function, with the words that call it."""
+    for command in group.registered_commands:
+        if command.callback is not None:
+            word = command.name or command.callback.__name__.replace("_", "-")
+            yield f"{name} {word}", command.callback
+    for part in group.registered_groups:
+        if part.typer_instance is not None:
+            yield from _commands(f"{name} {part.name}", part.typer_instance)
+
+
+def _parameters(function: Callable[..., Any]) -> Iterator[_Parameter]:
+    hints = get_type_hints(function, include_extras=True)
+    for name, parameter in inspect.signature(function).parameters.items():
+        if get_origin(hints.get(name)) is not Annotated:
+            continue
+        kind, *notes = get_args(hints[name])
+        info = next(n for n in notes if isinstance(n, ArgumentInfo | OptionInfo))
+        if not info.hidden:
+            yield _Parameter(name, kind, info, parameter.default)
+
+
+def _usage(name: str, parameters: list[_Parameter]) -> str:
+    words = [name]
+    for parameter in parameters:
+        several = "..." if get_origin(parameter.kind) is list else ""
+        if parameter.is_argument:
+            word = parameter.words + several
+            words.append(word if parameter.is_required else f"[{word}]")
+        elif parameter.is_required:
+            words.append(f"{parameter.words} {_kind(parameter.kind)}")
+    return " ".join([*words, "[OPTIONS]"])
+
+
+def _row(parameter: _Parameter) -> str:
+    kind = "" if parameter.is_argument else _kind(parameter.kind)
+    name = f"`{parameter.words}`{kind and ' ' + kind}"
+    meaning = "; ".join(filter(None, (_sentence(parameter.info.help), _bounds(parameter.info))))
+    return f"| {name} | {_default(parameter)} | {meaning} |"
+
+
+def _kind(kind: Any) -> str:
+    """What an option takes; nothing for a switch."""
+    if get_origin(kind) in (Union, UnionType):
+        kind = next(part for part in get_args(kind) if part is not NoneType)
+    if get_origin(kind) is list:
+        return f"{_kind(get_args(kind)[0])} (again for more)"
+    if get_origin(kind) is Literal:
+        return ", ".join(f"`{choice}`" for choice in get_args(kind))
+    if isinstance(kind, type) and issubclass(kind, Enum):
+        return ", ".join(f"`{choice.value}`" for choice in kind)
+    return _KINDS.get(kind, "")
+
+
+def _bounds(info: ArgumentInfo | OptionInfo) -> str:
+    bounds = [f"at least {info.min:g}"] if info.min is not None else []
+    return " and ".join([*bounds, *([f"at most {info.max:g}"] if info.max is not None else [])])
+
+
+def _default(parameter: _Parameter) -> str:
+    value = parameter.default.value if isinstance(parameter.default, Enum) else parameter.default
+    if parameter.is_required:
+        return "required"
+    return "" if value is None or isinstance(value, bool) or value in ("", []) else f"`{value}`"
+
+
+def _sentence(text: str | None) -> str:
+    """On one line, as Markdown takes it."""
+    return " ".join((text or "").split()).replace("|", "\\|").replace("<", "&lt;")
