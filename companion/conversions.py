@@ -44,6 +44,7 @@ from mavlink_bridge.messages import (
 
 # An autopilot position older than this does not start tracking.
 _MAX_POSITION_AGE_NS = 2_000_000_000
+_FARTHEST_M = 1e7  # from the map's origin; beyond it something said what is no number
 
 
 @dataclass(frozen=True)
@@ -148,6 +149,9 @@ def vehicle_prior(
     ned_from_camera = matrix_from_quaternion(gimbal.quaternion) @ GIMBAL_FROM_CAMERA
     arm = installation.lever_arm_m
     camera = world_from_camera(body, ned_from_body, ned_from_camera, arm, to_ned)
+    numbers = np.concatenate((camera.rotation.ravel(), camera.translation))
+    if not np.abs(numbers).max() < _FARTHEST_M:  # NaN is below nothing
+        return None
     covariance = np.diag(np.repeat(np.square(sigma), 3))
     return PosePrior(camera, covariance, time_ns, velocity)
 

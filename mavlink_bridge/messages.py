@@ -177,7 +177,7 @@ class TargetReport:
         _check_velocity("target report", self.velocity_ned)
         accuracies = (self.h_accuracy_m, self.v_accuracy_m, self.velocity_accuracy_mps)
         _check_accuracies("target report", accuracies)
-        if not 0.0 <= self.elsewhere <= 1.0:
+        if not -1e-6 <= self.elsewhere <= 1.0 + 1e-6:  # a sum of shares is not quite 1
             raise FixError(f"target report: elsewhere is a probability, got {self.elsewhere}")
         for place in (self.pixel, self.rectangle):
             if place is not None and not all(0.0 <= c <= 1.0 for c in place):

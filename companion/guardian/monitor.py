@@ -6,13 +6,13 @@ import math
 from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import Protocol
 
 from companion.calibration.sighting import Figure, Sighting
 from companion.calibration.watch import CalibrationWatch
 from companion.guardian import findings as f
 from companion.guardian.config import GuardianConfig
 from companion.guardian.ekf import EkfWatch
+from companion.guardian.evidence import CheckedVehicle, Vehicle, known_state
 from companion.guardian.findings import Action, Latch, Reading
 from companion.guardian.inertial import InertialTrack
 from companion.guardian.motion import MotionCheck, MotionVerdict
@@ -21,9 +21,6 @@ from companion.guardian.place_checks import GnssCheck, HeightCheck, JumpCheck
 from companion.guardian.protection import ProtectionLevel, protection_level
 from localizer.types import Image
 from mavlink_bridge.messages import (
-    Attitude,
-    GimbalAttitude,
-    InertialSample,
     VehicleState,
     VisionFix,
 )
@@ -42,30 +39,6 @@ _CALM_SHARE = 0.5  # of a motion limit, below which vision agrees with the IMU
 _MOVES_S = 5.0  # a position that stood still for less moves
 _BACKWARDS = 5  # pictures or fixes in a row whose stamps do not advance
 _QUEUE = 256
-
-
-class Vehicle(Protocol):
-    """Where the guardian's own evidence comes from; the bridge is one."""
-
-    def state(self) -> VehicleState:
-        """What the vehicle says about itself."""
-        ...
-
-    def attitude_at(self, time_ns: int) -> Attitude | None:
-        """Its attitude at a time."""
-        ...
-
-    def inertial_since(self, time_ns: int) -> tuple[InertialSample, ...]:
-        """What its IMU read after a time, oldest first."""
-        ...
-
-    def gimbal_at(self, time_ns: int) -> GimbalAttitude | None:
-        """The camera's attitude to NED at a time."""
-        ...
-
-    def gnss_place_at(self, time_ns: int) -> tuple[float, ...] | None:
-        """The EKF's latitude, longitude and altitude at a time, while GNSS is what it follows."""
-        ...
 
 
 @dataclass(frozen=True)
@@ -176,6 +149,7 @@ class Monitor:
 
     def admit(self, fix: VisionFix, state: VehicleState) -> VisionFix | None:
         """The fix, if it may be injected; with a reset where the last ones were wrong."""
+        state = known_state(state)
         known_m = self._known_m(state)
         self._level = level = protection_level(fix, state, self._config.protection, known_m)
         fix = replace(fix, protection_m=(level.horizontal_m, level.vertical_m))
@@ -198,6 +172,7 @@ class Monitor:
 
     def step(self, now_ns: int, vehicle: Vehicle) -> list[Line]:
         """Look at everything, a few times a second; the lines to be told."""
+        vehicle = CheckedVehicle(vehicle)
         state = vehicle.state()
         for sample in vehicle.inertial_since(self._track.newest_ns):
             self._track.add(sample, vehicle.attitude_at)
