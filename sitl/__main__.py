@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import logging
+import shlex
 import shutil
 import signal
 import sys
@@ -21,7 +22,7 @@ from companion.terminal.links import file_link
 from localizer.errors import LocalizerError
 from localizer.synth.appearance.model import CONDITIONS
 from sitl.demo.assets import FlightAssets, prepare
-from sitl.demo.companion_process import free_console_port
+from sitl.demo.companion_process import THIS_PROGRAM, free_console_port
 from sitl.demo.flight import Onlookers, fly
 from sitl.demo.kinematic import record_scenario
 from sitl.demo.progress import LogProgress, shown_progress
@@ -93,6 +94,9 @@ def demo(
     mission: Annotated[
         Path | None, typer.Option(help=".plan or .waypoints over --map; none: a triangle")
     ] = None,
+    companion: Annotated[
+        str | None, typer.Option(help="command of an installed companion that flies instead")
+    ] = None,
 ) -> None:
     """Fly a GNSS-denied mission on vision alone and report its accuracy."""
     kinds: dict[str, VehicleChoice] = {
@@ -124,7 +128,8 @@ def demo(
         console.print(f"watch it: [green]http://127.0.0.1:{port}/[/] (once the companion is up)")
     with shown_progress(console) as progress:
         onlookers = Onlookers(progress, partial(_tell_endpoint, console), port)
-        record = fly(assets, script, kinds[fc], seed, out, onlookers)
+        program = shlex.split(companion) if companion else THIS_PROGRAM
+        record = fly(assets, script, kinds[fc], seed, out, onlookers, program)
     print_report(make_report(record, script, seed), out)
     console.print("open:", file_link(write_page(out).resolve()), soft_wrap=True)
 

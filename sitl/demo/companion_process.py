@@ -9,7 +9,7 @@ import signal
 import socket
 import subprocess
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
@@ -23,6 +23,9 @@ from sitl.vehicles.process import VehicleProcess
 
 _COMPANION_STOP_S = 20.0
 _GNSS_AT_FIRST_S = 2.0
+
+THIS_PROGRAM = (sys.executable, "-m", "companion")
+"""The companion of this checkout."""
 
 
 @dataclass(frozen=True)
@@ -108,13 +111,16 @@ def _known_to(scenario: Scenario) -> dict[str, float]:
 
 @contextmanager
 def running_companion(
-    config: Path, folder: Path, *options: str
+    config: Path, folder: Path, *options: str, program: Sequence[str] = THIS_PROGRAM
 ) -> Iterator[subprocess.Popen[bytes]]:
-    """``companion run`` as a process; interrupted, as an operator would, at the end."""
+    """``companion run`` as a process; interrupted, as an operator would, at the end.
+
+    program: the words before ``run``, of an installed companion or of what starts it.
+    """
     environment = os.environ | {"PYTHONUNBUFFERED": "1", "COLUMNS": "160"}
     with (folder / "companion.log").open("wb") as log:
         process = subprocess.Popen(
-            [sys.executable, "-m", "companion", "run", str(config.resolve()), *options],
+            [*program, "run", str(config.resolve()), *options],
             stdout=log, stderr=subprocess.STDOUT, env=environment,
             cwd=Path(__file__).resolve().parents[2],
         )  # fmt: skip

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import csv
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
@@ -27,7 +27,13 @@ from sitl.camera.process import CameraStatistics, WorldCameraConfig, WorldCamera
 from sitl.camera.traffic import traffic
 from sitl.demo.assets import FlightAssets
 from sitl.demo.budget import FlightErrors, draw_errors
-from sitl.demo.companion_process import Ports, free_udp_port, running_companion, write_deployment
+from sitl.demo.companion_process import (
+    THIS_PROGRAM,
+    Ports,
+    free_udp_port,
+    running_companion,
+    write_deployment,
+)
 from sitl.demo.scenario import Scenario, VehicleChoice
 from sitl.demo.script import FlightError, FlightScript, Progress
 from sitl.demo.targets import observed_targets
@@ -79,8 +85,9 @@ def fly(
     seed: int,
     folder: Path,
     onlookers: Onlookers | None = None,
+    program: Sequence[str] = THIS_PROGRAM,
 ) -> FlightRecord:
-    """Fly the scenario; `folder` receives every record."""
+    """Fly the scenario; `folder` receives every record. program: the companion that flies."""
     onlookers = onlookers or Onlookers()
     progress = onlookers.progress
     folder.mkdir(parents=True, exist_ok=True)
@@ -110,7 +117,7 @@ def fly(
         camera = WorldCameraProcess(camera_config(filmed, folder))
         stack.enter_context(camera)
         stack.enter_context(truth_feed(pilot, camera, cache, gimbal_error, errors.map_shift_m))
-        companion = stack.enter_context(running_companion(config, folder))
+        companion = stack.enter_context(running_companion(config, folder, program=program))
         run = FlightScript(pilot, scenario, home, folder, companion, progress)
         denied_ns = run.fly()
         home_error_m = run.distance_from_home()
