@@ -1,6 +1,8 @@
 """What operators install: the wheel in an environment of its own, and the service's unit."""
 
 import configparser
+import json
+import os
 import shutil
 import subprocess
 import sys
@@ -23,7 +25,9 @@ def _run(*command, **options):
 
 @pytest.fixture(scope="module")
 def built(tmp_path_factory):
-    """Source distribution and wheel, built from a copy: setuptools writes into its source."""
+    """Source distribution, and the wheel that is built from it. From a copy of the source, into
+    which setuptools writes.
+    """
     folder = tmp_path_factory.mktemp("package")
     source = folder / "source"
     names = subprocess.run(
@@ -33,8 +37,12 @@ def built(tmp_path_factory):
         if (ROOT / name).is_file() and not name.startswith(("tests/", "docs/")):
             (source / name).parent.mkdir(parents=True, exist_ok=True)
             shutil.copy2(ROOT / name, source / name)
-    backend = "import setuptools.build_meta as b; b.build_sdist({0!r}); b.build_wheel({0!r})"
-    _run(sys.executable, "-c", backend.format(str(folder)), cwd=source)
+    backend = "import setuptools.build_meta as b; b.build_{}({!r})"
+    _run(sys.executable, "-c", backend.format("sdist", str(folder)), cwd=source)
+    (archive,) = folder.glob("*.tar.gz")
+    shutil.unpack_archive(archive, folder / "unpacked", filter="data")
+    (unpacked,) = (folder / "unpacked").iterdir()
+    _run(sys.executable, "-c", backend.format("wheel", str(folder)), cwd=unpacked)
     return folder
 
 
@@ -72,7 +80,7 @@ def test_the_command_runs_outside_the_checkout(environment, tmp_path):
 
 
 @pytest.mark.long  # compiles every kernel anew: minutes
-def test_it_computes_outside_the_checkout(environment, tmp_path):
+def test_it_computes_outside_the_checkout(environment, small_assets, small_sequence, tmp_path):
     deployment = str(ROOT / "configs" / "deployment.yaml")
     done = subprocess.run(
         [environment, "-m", "companion", "doctor", "--no-vehicle", deployment],
@@ -83,6 +91,10 @@ def test_it_computes_outside_the_checkout(environment, tmp_path):
     assert "Traceback" not in done.stderr
     said = _run(environment, "-m", "companion", "self-test", cwd=tmp_path)
     assert "self-test passed" in said
+    words = ("eval", small_sequence, "--map", small_assets.map_cache, "--limit", "5")
+    _run(environment, "-m", "companion", *words, "--report", tmp_path / "report", cwd=tmp_path)
+    report = json.loads((tmp_path / "report" / "report.json").read_text(encoding="utf-8"))
+    assert report["recall_1"] == 100.0
 
 
 def test_the_units_restrictions_leave_what_the_program_needs():
@@ -101,3 +113,51 @@ def test_the_units_restrictions_leave_what_the_program_needs():
 def test_the_unit_is_hardened():
     said = _run("systemd-analyze", "security", "--offline=true", "--threshold=30", str(UNIT))
     assert "Overall exposure level" in said
+
+
+_AS_SERVICE = ROOT / "configs" / "package" / "as_service.py"
+_TRIES = """
+import os, pathlib, socket
+def tried(what, *given):
+    try:
+        what(*given)
+    except OSError as error:
+        return error.strerror
+    return "done"
+status = pathlib.Path("/proc/self/status").read_text()
+print(tried(pathlib.Path("/usr/mine").touch))
+print(tried(pathlib.Path("mine").touch))
+print(tried(socket.socket, socket.AF_PACKET, socket.SOCK_RAW))
+print(tried(socket.socket, socket.AF_INET, socket.SOCK_DGRAM))
+print(tried(os.sched_setscheduler, 0, os.SCHED_FIFO, os.sched_param(1)))
+print(os.listdir("/root"), "CapBnd:\\t0000000000000000" in status, "NoNewPrivs:\\t1" in status)
+"""
+
+
+def _cannot_be_restricted():
+    if os.geteuid() != 0 or shutil.which("systemd-analyze") is None:
+        return "needs root and systemd-analyze"
+    for command in (["/usr/bin/python3", "-c", "import seccomp"], ["unshare", "--mount", "true"]):
+        if subprocess.run(command, check=False, capture_output=True).returncode != 0:
+            return f"needs what allows: {' '.join(command)}"
+    return ""
+
+
+@pytest.mark.skipif(bool(_cannot_be_restricted()), reason=_cannot_be_restricted() or "restricted")
+def test_a_command_runs_under_the_units_restrictions(tmp_path):
+    state = Path("/var/lib/companion")
+    if state.exists():  # with it, there is a cache that must stay
+        pytest.skip(f"{state} is an installed companion's")
+    try:
+        done = subprocess.run(
+            [_AS_SERVICE, "--user", "65534:65534", "/usr/bin/python3", "-c", _TRIES],
+            capture_output=True, text=True, check=False,
+        )  # fmt: skip
+    finally:
+        for folder in (state, Path("/var/cache/companion")):
+            shutil.rmtree(folder, ignore_errors=True)
+    refused = "Operation not permitted"
+    assert done.stdout.splitlines() == [
+        "Read-only file system", "done", refused, "done", refused, "[] True True",
+    ], done.stderr  # fmt: skip
+    assert "not applied ProtectProc" in done.stderr

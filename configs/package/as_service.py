@@ -4,11 +4,11 @@
     sudo configs/package/as_service.py [--write FOLDER]... [--user NAME|UID:GID] COMMAND ARGUMENT...
 
 Reads configs/companion.service and applies of it what a process may be given without systemd: its
-own view of the file system (ProtectSystem, ProtectHome, PrivateTmp, ReadWritePaths), its folders and
-environment, devices (DevicePolicy, DeviceAllow), system calls, address families and namespaces (a seccomp filter of the
-sets that systemd-analyze knows), no capabilities, no new privileges, memory (MemoryMax, by cgroup
-v1), umask. It says on standard error what it applied and what it did not, then becomes the command,
-so that signals reach it. Needs root, python3-seccomp and systemd-analyze.
+own view of the file system (ProtectSystem, ProtectHome, PrivateTmp, ReadWritePaths), its folders
+and environment, devices (DevicePolicy, DeviceAllow), system calls, address families and namespaces
+(a seccomp filter of the sets that systemd-analyze knows), no capabilities, no new privileges,
+memory (MemoryMax, by cgroup v1), umask. It says on standard error what it applied and what not,
+then becomes the command, so that signals reach it. Needs root, python3-seccomp and systemd-analyze.
 """
 
 import argparse
