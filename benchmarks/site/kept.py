@@ -143,7 +143,7 @@ def _flight_table(report: dict[str, Any], title: str) -> tuple[Table, Table]:
     row = (
         title,
         _three(report["localizer_m"]),
-        " / ".join(f"{localizer[f'recall_{limit}']:.1f}" for limit in (1, 3, 5)),
+        " / ".join(_short(localizer[f"recall_{limit}"]) for limit in (1, 3, 5)),
         f"{localizer['completeness']:.1f}",
         _three(ekf),
         f"{report['inside_bound']:.1f}" if "inside_bound" in report else "-",
@@ -172,11 +172,15 @@ def _sequence_table(data: dict[str, Any], title: str) -> Table:
         str(data["frames"]),
         f"{data['median_translation_m']:.3f} m, {data['median_rotation_deg']:.3f}°",
         f"{data['p95_translation_m']:.2f}" if "p95_translation_m" in data else "-",
-        " / ".join(f"{data[f'recall_{limit}']:.1f}" for limit in (1, 3, 5)),
+        " / ".join(_short(data[f"recall_{limit}"]) for limit in (1, 3, 5)),
         f"{data['completeness']:.1f}",
         f"{data['fps']:.1f}",
     )
     return Table(_SEQUENCE, (row,))
+
+
+def _short(percent: float) -> str:
+    return f"{percent:.1f}".removesuffix(".0")
 
 
 def _three(figures: dict[str, float]) -> str:

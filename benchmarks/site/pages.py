@@ -29,7 +29,8 @@ prints the same in a terminal.
 | exit code | means |
 |---|---|
 | 0 | done |
-| 1 | `doctor` found advice, `plan` a bad leg, `map verify` damage, `localize` nothing, `replay` a difference |
+| 1 | `doctor` found advice, `plan` a bad leg, `map verify` damage, `localize` nothing |
+| 1 | `replay`: the flights differ |
 | 2 | wrong usage, an error that is named in one line, or `doctor`: not fit to fly |
 | 130 | interrupted (`run` that was flying ends with 0) |
 """
