@@ -111,6 +111,8 @@ class _LoopFlight:
         if case.earns:
             pilot.link.wait_wall(self._has_go, _GO_S)
             self._shadow = self._companion.health().shadow
+        if case.gated:
+            self._open_gate()
 
     def _wait_tracking(self) -> None:
         """Wait for a health that is ok; where something is wrong it may never be, or say why."""
@@ -174,6 +176,7 @@ class _LoopFlight:
         settings = yaml.safe_load(path.read_text(encoding="utf-8"))
         for axis in ("fx", "fy"):
             settings["camera"]["model"][axis] *= case.wrong.focal
+        settings["bridge"]["mode"] = "rc" if case.gated else settings["bridge"]["mode"]
         settings["bridge"]["injection"]["force"] = not case.earns and not case.cold
         settings["record"]["snapshot_interval_s"] = 5.0
         settings["bridge"]["tlog"] = str(self._tlog)
@@ -227,6 +230,15 @@ class _LoopFlight:
             self._companion.kill()
         if event.kill and not self._case.supervised:
             self._later(event.restart_after_s, self._companion.start)
+
+    def _open_gate(self) -> None:
+        """MAV_CMD_USER_1 to the localizer, as the pilot's button: inject."""
+        self._pilot.link.send(
+            mavlink.MAVLink_command_long_message(
+                VEHICLE, _LOCALIZER, mavlink.MAV_CMD_USER_1, 0, 1.0, *[0.0] * 6
+            )
+        )
+        self._pilot.link.sleep(1.0)
 
     def _tell_place(self, hint: PlaceHint) -> None:
         place = self._pilot.record.truth.location.offset(hint.off_north_m, 0.0, 0.0)
