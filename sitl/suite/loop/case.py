@@ -126,9 +126,10 @@ class LoopCase(_Model):
     """One flight. seconds: length of the recorded part. hover: stay; else the corners are flown in
     AUTO (metres east and north of home, at `height_m`). wind_m_s: from the west. deny: GNSS is
     switched off when it begins. cold: no companion runs until an event starts it. supervised: by
-    `companion run --supervised`. gated: injection is opened by the pilot's command (mode ``rc``). size_m: of the world. ci: flown in every test run on the embedded
-    vehicle. deployment: keys that differ from the demo's deployment file; vehicle: parameters
-    likewise (FS_EKF_ACTION 0: no landing while the place is searched).
+    `companion run --supervised`. gated: injection is opened by the pilot's command (mode ``rc``).
+    size_m: of the world. ci: flown in every test run on the embedded vehicle. deployment: keys that
+    differ from the demo's deployment file; vehicle: parameters likewise (FS_EKF_ACTION 0: no
+    landing while the place is searched).
     """
 
     name: str
