@@ -18,19 +18,22 @@ _PERIOD_S = 0.25
 class Pulse:
     """Writes ``NAME MILLISECONDS`` lines: the part whose last turn is longest ago, and how long.
 
-    beats: the CLOCK_MONOTONIC times of the parts' last turns, ns. descriptor: of a pipe's end,
-    which is closed at the end. A supervisor that does not read is not waited for.
+    beats: the CLOCK_MONOTONIC times of the parts' last turns, ns; none is older than the start: the
+    parts are made long before on a slow computer, and each begins with a wait. descriptor: of a
+    pipe's end, which is closed at the end. A supervisor that does not read is not waited for.
     """
 
     def __init__(self, beats: Callable[[], Mapping[str, int]], descriptor: int) -> None:
         self._beats, self._descriptor = beats, descriptor
         os.set_inheritable(descriptor, False)
         os.set_blocking(descriptor, False)
+        self._begun_ns = 0
         self._stop = threading.Event()
         self._thread = threading.Thread(target=self._run, name="pulse")
 
     def start(self) -> None:
         """Start telling."""
+        self._begun_ns = monotonic_ns()
         self._thread.start()
 
     def stop(self) -> None:
@@ -42,7 +45,8 @@ class Pulse:
 
     def _run(self) -> None:
         while not self._stop.wait(_PERIOD_S):
-            self._say(line(self._beats(), monotonic_ns()))
+            turns = {name: max(at, self._begun_ns) for name, at in self._beats().items()}
+            self._say(line(turns, monotonic_ns()))
 
     def _say(self, text: bytes) -> None:
         try:

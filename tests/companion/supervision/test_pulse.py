@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import sys
 import threading
+import time
 
 from companion.flight.feed import Feed
 from companion.supervision.processes import Beat, FlightProcess
@@ -74,3 +75,19 @@ def test_what_is_no_beat_is_no_sign_of_life() -> None:
     assert process.beats() == ()
     process.close()
     process.close()
+
+
+def test_a_part_that_was_made_long_before_the_start_is_no_hang() -> None:
+    """A slow computer compiles for half a minute between: the process was ended at its first beat,
+    "hangs (health)", and would have been each time.
+    """
+    reading, writing = os.pipe()
+    made_ns = time.monotonic_ns() - 60_000_000_000
+    pulse = Pulse(lambda: {"health": made_ns, "feed": time.monotonic_ns()}, writing)
+    pulse.start()
+    first = os.read(reading, 100).split(b"\n")[0]
+    pulse.stop()
+    os.close(reading)
+    name, age_ms = first.split()
+    assert name == b"health"
+    assert int(age_ms) < 30_000  # since the start, whatever the machine does meanwhile
