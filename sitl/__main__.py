@@ -19,6 +19,7 @@ from rich.markup import escape
 from companion.errors import CompanionError
 from companion.reporting.report import write_page
 from companion.terminal.links import file_link
+from companion.terminal.steps import shown_steps
 from localizer.errors import LocalizerError
 from localizer.synth.appearance.model import CONDITIONS
 from sitl.demo.assets import FlightAssets, prepare
@@ -124,10 +125,10 @@ def demo(
         check_inside(script, assets.world.size_m)
     _clear(out)
     port = free_console_port()
-    if port is not None:
-        console.print(f"watch it: [green]http://127.0.0.1:{port}/[/] (once the companion is up)")
     with shown_progress(console) as progress:
-        onlookers = Onlookers(progress, partial(_tell_endpoint, console), port)
+        onlookers = Onlookers(
+            progress, partial(_tell_endpoint, console), port, partial(_tell_page, console)
+        )
         program = shlex.split(companion) if companion else THIS_PROGRAM
         record = fly(assets, script, kinds[fc], seed, out, onlookers, program)
     print_report(make_report(record, script, seed), out)
@@ -160,7 +161,8 @@ def sequence(
     console = Console()
     assets = _world_of(script, seed, worlds, ideal, console)
     check_inside(script, assets.world.size_m)
-    with console.status("rendering"):
+    with shown_steps(console) as say:
+        say("rendering the path; a minute or more")
         count = record_scenario(assets, script, seed, out)
     console.print(f"[green]{out}[/]: {count} frames; its map is {assets.map_cache}")
 
@@ -234,6 +236,10 @@ def loop_table(
     if out is not None:
         out.write_text(json.dumps(as_data(rows), indent=1, allow_nan=False), encoding="utf-8")
     print(markdown(rows))
+
+
+def _tell_page(console: Console, address: str) -> None:
+    console.print(f"watch it: [green]{address}[/]", highlight=False)
 
 
 def _tell_endpoint(console: Console, endpoint: str) -> None:

@@ -378,6 +378,7 @@ def main() -> None:
     parser.add_argument("--frames", type=whole(100, 100_000), default=300, help="of the sequence")
     parser.add_argument("--rounds", type=whole(1, 20), default=2, help="runs of each condition")
     parser.add_argument("--console-nice", type=whole(-20, 19), help="instead of 15")
+    parser.add_argument("--only", choices=CONDITIONS, help="one condition")
     parser.add_argument("--browser", action="store_true", help="the page in Chromium")
     parser.add_argument("--browser-nice", type=whole(0, 19), default=5, help="behind the flight's")
     parser.add_argument("--out", type=output, help="JSON file of all runs")
@@ -393,6 +394,8 @@ def main() -> None:
     for number in range(options.rounds):
         # There and back: what warms up, or other work that begins, is nobody's in particular.
         for condition in CONDITIONS if number % 2 == 0 else CONDITIONS[::-1]:
+            if options.only not in (None, condition):
+                continue
             home = Path(tempfile.mkdtemp(prefix="console-"))
             try:
                 runs.append(fly(work, condition, home))

@@ -5,7 +5,7 @@ from __future__ import annotations
 import csv
 import json
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from tempfile import TemporaryFile
 from typing import Annotated
@@ -14,13 +14,13 @@ import numpy as np
 import typer
 from rich.console import Console
 from rich.markup import escape
-from rich.progress import Progress
 from rich.table import Table
 
 from companion.errors import ConfigError
 from companion.offline.plots import ErrorSeries, overlay_sheet, plot_errors, save_image
 from companion.reporting.report import write_page
 from companion.terminal.links import file_link
+from companion.terminal.steps import COMPILES, shown_count, tally
 from companion.trajectory import stamped, write_trajectory
 from companion.versions import versions
 from companion.writing import made_folder, writing
@@ -95,39 +95,42 @@ def evaluate_command(
     config = LocalizerConfig(
         width=width, model=model, seed=seed, renderer=renderer, device=device, feature_threads=2
     )
-    stack = MapStack(map_cache, config)
-    try:
-        data = load_sequence(sequence, stack.cache.frame, name)
-        data = data if limit is None else data.first(limit)
-        localizer = build_localizer(stack, data.camera, config)
-        known = KnownOfPlace(prior == "lost", known_heading, seed=seed) if searched else None
-        with place_finder(stack, config, known) as find, Progress() as bar:
-            task = bar.add_task("localizing", total=len(data.images))
-            frames, metrics = evaluate(
-                localizer,
-                data,
-                Perturbation(noise_m, noise_deg, seed),
-                mode,
-                progress=lambda _: bar.advance(task),
-                find=find,
-            )
-        settings = {
-            "sequence": str(sequence), "map": str(map_cache), "prior": prior, "seed": seed,
-            "known_heading": known_heading,
-            "noise_m": noise_m, "noise_deg": noise_deg, "width": localizer.camera.width,
-            "height": localizer.camera.height, "features": load_extractor(model).name,
-            "renderer": stack.renderer.name, "optimizer": localizer.optimizer_name,
-        }  # fmt: skip
-        _print_problems(frames)
-        unusable = sum(f.unusable for f in frames)
-        # Before the files: they are told even if the disk is full.
-        print_metrics(metrics, unusable, str(sequence))
-        with writing(report, "--report"):
-            _write_report(report, frames, metrics, settings, stack.cache.frame)
-            _write_trajectories(report, frames, data, stack.cache.frame)
-            _write_overlays(report, frames, data, stack.renderer, localizer.camera)
-    finally:
-        stack.close()
+    counting = shown_count(Console(stderr=True), "localizing", begins=COMPILES)
+    with ExitStack() as progress:
+        show = progress.enter_context(counting)
+        stack = MapStack(map_cache, config)
+        try:
+            data = load_sequence(sequence, stack.cache.frame, name)
+            data = data if limit is None else data.first(limit)
+            localizer = build_localizer(stack, data.camera, config)
+            known = KnownOfPlace(prior == "lost", known_heading, seed=seed) if searched else None
+            with place_finder(stack, config, known) as find:
+                frames, metrics = evaluate(
+                    localizer,
+                    data,
+                    Perturbation(noise_m, noise_deg, seed),
+                    mode,
+                    progress=tally(show, len(data.images)),
+                    find=find,
+                )
+            progress.close()  # before the tables are printed
+            settings = {
+                "sequence": str(sequence), "map": str(map_cache), "prior": prior, "seed": seed,
+                "known_heading": known_heading,
+                "noise_m": noise_m, "noise_deg": noise_deg, "width": localizer.camera.width,
+                "height": localizer.camera.height, "features": load_extractor(model).name,
+                "renderer": stack.renderer.name, "optimizer": localizer.optimizer_name,
+            }  # fmt: skip
+            _print_problems(frames)
+            unusable = sum(f.unusable for f in frames)
+            # Before the files: they are told even if the disk is full.
+            print_metrics(metrics, unusable, str(sequence))
+            with writing(report, "--report"):
+                _write_report(report, frames, metrics, settings, stack.cache.frame)
+                _write_trajectories(report, frames, data, stack.cache.frame)
+                _write_overlays(report, frames, data, stack.renderer, localizer.camera)
+        finally:
+            stack.close()
     page = write_page(report)
     Console().print("report:", file_link(page), soft_wrap=True, highlight=False)
 

@@ -8,10 +8,9 @@ from typing import Annotated
 import typer
 from rich.console import Console
 from rich.markup import escape
-from rich.progress import Progress
 
 from companion.errors import ConfigError
-from companion.terminal.steps import shown_steps
+from companion.terminal.steps import shown_count, shown_steps, tally
 
 
 def export_command(
@@ -63,11 +62,10 @@ def klv_command(
     from companion.reporting.klv_recording import describe_recording
 
     path = out or video.with_suffix(".klv.ts")
-    with Progress(transient=True) as bar:
-        task = bar.add_task("describing", total=None)
+    with shown_count(Console(stderr=True), "describing") as show:
         written = describe_recording(
             video, record, path, map_cache=map_cache, begin_s=begin, mission=mission,
-            progress=lambda: bar.advance(task),
+            progress=tally(show),
         )  # fmt: skip
     Console().print(
         f"{written.described} of {written.pictures} pictures described: "

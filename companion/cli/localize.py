@@ -11,12 +11,12 @@ import numpy as np
 import typer
 from rich.console import Console
 from rich.markup import escape
-from rich.progress import Progress
 
 from companion.cli.geographic import numbers
 from companion.errors import ConfigError
 from companion.offline.localize import LocalizedImage, Sigmas, image_times, localize_images
 from companion.sources.folder_source import list_images
+from companion.terminal.steps import COMPILES, shown_count, tally
 from companion.trajectory import stamped, write_trajectory
 from companion.writing import made_folder, writing
 from localizer.config import LocalizerConfig
@@ -82,17 +82,16 @@ def localize_command(
         width=width, model=model, renderer=renderer, device=device, feature_threads=2
     )
     times = image_times(paths, rate_hz)
-    with open_localizer(map_cache, intrinsics, config) as localizer, Progress() as bar:
+    count = shown_count(Console(stderr=True), "localizing", begins=COMPILES)
+    with open_localizer(map_cache, intrinsics, config) as localizer, count as show:
         frame = localizer.frame
         known: Mapping[str, Pose] = {row.name: world_from_camera(row, frame) for row in rows}
         sigmas = Sigmas(prior_sigma_m, prior_sigma_deg)
-        found = list(
-            bar.track(
-                localize_images(localizer, paths, times, intrinsics, known, sigmas),
-                total=len(paths),
-                description="localizing",
-            )
-        )
+        more = tally(show, len(paths))
+        found = []
+        for one in localize_images(localizer, paths, times, intrinsics, known, sigmas):
+            found.append(one)
+            more()
     accepted = _print(found, frame)
     with writing(out, "--out"):
         _write(out, found, frame)

@@ -14,7 +14,7 @@ from rich.table import Table
 
 from companion.cli.before.map_check import check_command
 from companion.cli.before.map_fetch import fetch_command, sources_command
-from companion.terminal.import_bar import ImportBar
+from companion.terminal.steps import READING, shown_count
 from companion.writing import writing
 
 app = typer.Typer(no_args_is_help=True)
@@ -99,7 +99,7 @@ def build(
 
     rules = ImportRules.of(limit or (), trust or ())
     try:
-        with ImportBar() as bar:
+        with shown_count(Console(stderr=True), "importing tiles", begins=READING) as bar:
             manifest = build_cache(
                 source,
                 out,
@@ -279,19 +279,16 @@ def export(
 
 
 def _make_overview(cache: Path) -> None:
-    """The map's features from above, with a bar."""
-    from rich.progress import Progress
-
+    """The map's features from above, and how far it is."""
     from localizer.config import LocalizerConfig
     from localizer.map.cache.cache import TileCache
     from localizer.relocalization.relocalizer import open_relocalizer
 
-    with Progress() as bar:
-        task = bar.add_task("overview", total=None)
+    with shown_count(Console(stderr=True), "overview", begins="the map from above") as show:
         opened = open_relocalizer(
             TileCache.open(cache),
             LocalizerConfig(),
-            progress=lambda done, total: bar.update(task, completed=done, total=total),
+            progress=show,
         )
     if opened is not None:
         with opened as relocalizer:

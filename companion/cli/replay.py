@@ -9,14 +9,13 @@ from typing import Annotated
 import numpy as np
 import typer
 from rich.console import Console
-from rich.progress import Progress
 from rich.table import Table
 
 from companion.cli.console import require_extra, serve
 from companion.errors import ConfigError, RecordError
 from companion.live.config import ConsoleConfig
 from companion.settings_file import SettingsError, validated
-from companion.terminal.steps import shown_steps
+from companion.terminal.steps import COMPILES, shown_count, shown_steps, tally
 from localizer.geometry.pose import Array
 
 
@@ -47,9 +46,8 @@ def replay_command(
     if map_cache is not None:
         config = loaded.config.model_copy(update={"map": map_cache})
         loaded = replace(loaded, config=config)
-    with Progress() as bar:
-        task = bar.add_task("localizing", total=len(loaded.estimates))
-        summary = summarize(replay(loaded, log, lambda: bar.advance(task)))
+    with shown_count(Console(stderr=True), "localizing", begins=COMPILES) as show:
+        summary = summarize(replay(loaded, log, tally(show, len(loaded.estimates))))
     table = Table(title=str(record))
     for column in ("", "median", "p95", "max"):
         table.add_column(column, justify="right" if column else "left")

@@ -57,6 +57,9 @@ class MapPicture:
     north: float
 
 
+_SHAPES = "os^D"
+
+
 def plot_tracks(
     path: Path,
     tracks: Mapping[str, Array],
@@ -77,8 +80,13 @@ def plot_tracks(
     for i, (name, track) in enumerate(tracks.items()):
         width, colour = TRACK_STYLES[min(i, len(TRACK_STYLES) - 1)]
         axes.plot(track[:, 0], track[:, 1], color=colour, linewidth=width, label=name)
-    for name, track in (located or {}).items():
-        axes.plot(track[:, 0], track[:, 1], "o", markersize=5, mfc="none", label=name)
+    for i, (name, track) in enumerate((located or {}).items()):
+        # Ten colours, then another shape: no two look alike.
+        shape = _SHAPES[i // 10 % len(_SHAPES)]
+        colour = f"C{i % 10}"
+        axes.plot(
+            track[:, 0], track[:, 1], shape, color=colour, markersize=5, mfc="none", label=name
+        )
     for name, mark in marks.items():
         axes.plot(mark[0], mark[1], "k+", markersize=9)
         axes.annotate(name, (mark[0], mark[1]), textcoords="offset points", xytext=(5, 5))

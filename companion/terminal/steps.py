@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import itertools
+import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -10,6 +12,9 @@ from rich.console import Console
 from rich.markup import escape
 
 Say = Callable[[str], None]
+_SILENT_S = 2.0
+COMPILES = "makes the localizer ready; a first start on a machine compiles its kernels"
+READING = "reads the source"
 
 
 @contextmanager
@@ -28,8 +33,12 @@ def shown_steps(console: Console, clock: Callable[[], float] = time.monotonic) -
 
 
 @contextmanager
-def shown_count(console: Console, what: str, every_s: float = 5.0) -> Iterator[Callable[..., None]]:
-    """A callback (done, total) for work that is counted: a bar, or a line every few seconds."""
+def shown_count(
+    console: Console, what: str, every_s: float = 5.0, begins: str = "begun"
+) -> Iterator[Callable[..., None]]:
+    """A callback (done, total) for work that is counted: a bar, or a line every few seconds where
+    there is no terminal. What has counted nothing after two seconds says what it is at: `begins`.
+    """
     if console.is_terminal:
         from rich.progress import Progress
 
@@ -37,14 +46,49 @@ def shown_count(console: Console, what: str, every_s: float = 5.0) -> Iterator[C
             task = bar.add_task(what, total=None)
             yield lambda done, total: bar.update(task, completed=done, total=total)
         return
-    begun_s = time.monotonic()
-    printed_s = -every_s
+    lines = _Lines(console, what, every_s, begins)
+    timer = threading.Timer(_SILENT_S, lines.begin)
+    timer.daemon = True
+    timer.start()
+    try:
+        yield lines.show
+    finally:
+        timer.cancel()
 
-    def show(done: int, total: int) -> None:
-        nonlocal printed_s
-        now_s = time.monotonic() - begun_s
-        if now_s - printed_s >= every_s or done == total:
-            printed_s = now_s
-            console.print(f"{now_s:4.0f} s {what}: {done} of {total}", highlight=False)
 
-    yield show
+def tally(show: Callable[..., None], total: int | None = None) -> Callable[..., None]:
+    """For work that only tells that one more is done."""
+    count = itertools.count(1)
+    return lambda *_: show(next(count), total)
+
+
+class _Lines:
+    """A log's: the first after two seconds, then one every few, and the last."""
+
+    def __init__(self, console: Console, what: str, every_s: float, begins: str) -> None:
+        self._console, self._what = console, what
+        self._every_s, self._begins = every_s, begins
+        self._begun_s = time.monotonic()
+        self._lock = threading.Lock()
+        self._printed_s: float | None = None
+
+    def begin(self) -> None:
+        """Nothing was counted yet."""
+        with self._lock:
+            if self._printed_s is None:
+                self._print(self._begins)
+
+    def show(self, done: int, total: int | None) -> None:
+        """So much is."""
+        with self._lock:
+            now_s = time.monotonic() - self._begun_s
+            is_first = self._printed_s is None and now_s >= _SILENT_S
+            later = self._printed_s is not None and now_s - self._printed_s >= self._every_s
+            is_last = done == total and self._printed_s is not None
+            if is_first or later or is_last:
+                self._print(f"{done}" if total is None else f"{done} of {total}")
+
+    def _print(self, text: str) -> None:
+        self._printed_s = time.monotonic() - self._begun_s
+        line = f"{self._printed_s:4.0f} s {self._what}: {text}"
+        self._console.print(line, highlight=False, soft_wrap=True, markup=False)

@@ -9,6 +9,7 @@ import signal
 import socket
 import subprocess
 import sys
+import time
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
@@ -22,6 +23,7 @@ from sitl.demo.scenario import Scenario
 from sitl.vehicles.process import VehicleProcess
 
 _COMPANION_STOP_S = 20.0
+_CONSOLE_START_S = 30.0
 _GNSS_AT_FIRST_S = 2.0
 
 THIS_PROGRAM = (sys.executable, "-m", "companion")
@@ -54,6 +56,21 @@ def free_console_port() -> int | None:
             probe.bind(("127.0.0.1", port))
             return int(probe.getsockname()[1])
     return None
+
+
+def answers(port: int, companion: subprocess.Popen[bytes]) -> bool:
+    """Wait until the companion's page can be opened; False where it cannot in half a minute, or the
+    companion has ended.
+    """
+    end_s = time.monotonic() + _CONSOLE_START_S
+    while time.monotonic() < end_s and companion.poll() is None:
+        try:
+            socket.create_connection(("127.0.0.1", port), 1.0).close()
+        except OSError:
+            time.sleep(0.2)
+        else:
+            return True
+    return False
 
 
 def write_deployment(

@@ -30,6 +30,7 @@ from sitl.demo.budget import FlightErrors, draw_errors
 from sitl.demo.companion_process import (
     THIS_PROGRAM,
     Ports,
+    answers,
     free_udp_port,
     running_companion,
     write_deployment,
@@ -70,12 +71,13 @@ class FlightRecord:
 class Onlookers:
     """Who watches a flight. progress: told its phase and the share of it that is done; connectable:
     told where a ground station may connect to the vehicle ("tcp:HOST:PORT"); console: port of the
-    operator's page, if there is to be one.
+    operator's page, if there is to be one; watchable: told its address once it can be opened.
     """
 
     progress: Progress = lambda _phase, _share: None
     connectable: Callable[[str], None] = lambda _endpoint: None
     console: int | None = None
+    watchable: Callable[[str], None] = lambda _address: None
 
 
 def fly(
@@ -117,7 +119,10 @@ def fly(
         camera = WorldCameraProcess(camera_config(filmed, folder))
         stack.enter_context(camera)
         stack.enter_context(truth_feed(pilot, camera, cache, gimbal_error, errors.map_shift_m))
+        progress("starting the companion", 0.0)
         companion = stack.enter_context(running_companion(config, folder, program=program))
+        if ports.console is not None and answers(ports.console, companion):
+            onlookers.watchable(f"http://127.0.0.1:{ports.console}/")
         run = FlightScript(pilot, scenario, home, folder, companion, progress)
         denied_ns = run.fly()
         home_error_m = run.distance_from_home()

@@ -17,7 +17,7 @@ from rich.markup import escape
 from rich.table import Table
 
 from companion.errors import ConfigError
-from companion.terminal.steps import shown_count
+from companion.terminal.steps import READING, shown_count
 
 if TYPE_CHECKING:
     from localizer.map.fetch.area import Area
@@ -213,7 +213,6 @@ def _told_count(console: Console, what: str) -> Iterator[Callable[[int, int], No
 def _built(
     console: Console, parts: list[_Part], out: Path, overwrite: bool, workers: int | None
 ) -> None:
-    from companion.terminal.import_bar import ImportBar
     from localizer.map.building.build import build_cache
     from localizer.map.building.options import BuildOptions
     from localizer.map.cache.cache import TileCache
@@ -230,7 +229,7 @@ def _built(
         workers=workers,
         apart=True,
     )
-    with ImportBar() as bar:
+    with shown_count(console, "importing tiles", begins=READING) as bar:
         manifest = build_cache([parts[1].out, parts[0].out], out, options, progress=bar)
     for text in manifest.warnings:
         console.print(f"[yellow]warning:[/] {escape(text)}", soft_wrap=True)

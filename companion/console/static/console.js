@@ -15,8 +15,8 @@ export async function ask(path, body) {
   try {
     const answer = await fetch(path, options);
     return await answer.json();
-  } catch (error) {
-    return { ok: false, text: String(error) };
+  } catch {
+    return { ok: false, text: "the console does not answer" };
   }
 }
 
@@ -53,8 +53,10 @@ function showState() {
   const header = $("state");
   if (!connected || !state) {
     header.dataset.level = "off";
-    $("word").textContent = page.about?.replay ? "record" : "no flight";
-    $("reason").textContent = "the companion is not running; records, doctor and settings are at hand";
+    $("word").textContent = page.gone ? "no console" : page.about?.replay ? "record" : "no flight";
+    $("reason").textContent = page.gone
+      ? "the console does not answer: it ended with the flight; `companion console` shows the records"
+      : "the companion is not running; records, doctor and settings are at hand";
     if (!state) return;
   } else {
     header.dataset.level = health.level ?? "off";
@@ -237,8 +239,8 @@ function wish() {
 function connect() {
   socket = new WebSocket(`${location.protocol === "https:" ? "wss" : "ws"}://${location.host}/ws`);
   socket.binaryType = "arraybuffer";
-  socket.onopen = () => { shown = 0; wish(); };
-  socket.onclose = () => { page.connected = false; showState(); setTimeout(connect, 1000); };
+  socket.onopen = () => { shown = 0; page.gone = false; wish(); };
+  socket.onclose = () => { page.connected = false; page.gone = true; showState(); setTimeout(connect, 1000); };
   socket.onmessage = ({ data }) => {
     if (typeof data !== "string") { video.show(data).finally(() => { shown += 1; wish(); }); return; }
     const message = JSON.parse(data);

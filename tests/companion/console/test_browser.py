@@ -22,7 +22,8 @@ pytestmark = [
     pytest.mark.skipif(CHROMIUM is None, reason="no Chromium on this machine"),
 ]
 SOFTWARE_GL = ("--no-sandbox", "--use-gl=angle", "--use-angle=swiftshader",
-               "--enable-unsafe-swiftshader", "--ignore-gpu-blocklist")  # fmt: skip
+               "--enable-unsafe-swiftshader", "--ignore-gpu-blocklist",
+               "--disable-gpu-compositing", "--disable-accelerated-2d-canvas")  # fmt: skip
 
 
 @pytest.fixture(scope="module")
