@@ -1,31 +1,31 @@
 """In a log, work that is counted says what it is at within seconds, and does not flood."""
 
 import io
+from types import SimpleNamespace
 
 import pytest
 from rich.console import Console
 
-from companion.terminal import steps
 from companion.terminal.steps import shown_count, tally
 
 
 @pytest.fixture
 def log(monkeypatch):
     """A console that is none, with a clock and a timer that the test moves."""
-    state = {"now": 0.0, "timers": []}
+    state = SimpleNamespace(now=0.0, timers=[])
 
     class Timer:
         def __init__(self, seconds, call):
             self.seconds, self.call, self.is_cancelled = seconds, call, False
-            state["timers"].append(self)
+            state.timers.append(self)
 
         def start(self): ...
 
         def cancel(self):
             self.is_cancelled = True
 
-    monkeypatch.setattr(steps.threading, "Timer", Timer)
-    monkeypatch.setattr(steps.time, "monotonic", lambda: state["now"])
+    monkeypatch.setattr("companion.terminal.steps.threading.Timer", Timer)
+    monkeypatch.setattr("companion.terminal.steps.time.monotonic", lambda: state.now)
     file = io.StringIO()
     return state, Console(file=file, force_terminal=False), file
 
@@ -33,13 +33,13 @@ def log(monkeypatch):
 def test_after_two_seconds_it_says_what_it_is_at_then_now_and_then_and_at_the_end(log):
     state, console, file = log
     with shown_count(console, "localizing", begins="compiles [kernels]") as show:
-        (timer,) = state["timers"]
+        (timer,) = state.timers
         assert timer.seconds == 2.0
-        state["now"] = 2.0
+        state.now = 2.0
         timer.call()
         more = tally(show, 100)
         for i in range(100):
-            state["now"] = 2.0 + 0.1 * i
+            state.now = 2.0 + 0.1 * i
             more()
     assert timer.is_cancelled
     assert file.getvalue().splitlines() == [
@@ -53,16 +53,16 @@ def test_what_is_done_at_once_says_nothing(log):
     state, console, file = log
     with shown_count(console, "localizing") as show:
         show(1, 2)
-        state["now"] = 1.0
+        state.now = 1.0
         show(2, 2)
     assert file.getvalue() == ""
-    assert state["timers"][0].is_cancelled
+    assert state.timers[0].is_cancelled
 
 
 def test_what_counts_before_it_is_asked_is_told_by_its_count(log):
     state, console, file = log
     with shown_count(console, "describing") as show:
-        state["now"] = 3.0
+        state.now = 3.0
         show(5, None)
-        state["timers"][0].call()
+        state.timers[0].call()
     assert file.getvalue() == "   3 s describing: 5\n"
