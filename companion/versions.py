@@ -1,16 +1,22 @@
-"""Versions for reports: of this package, of Python, and of what the numbers depend on."""
+"""For reports: versions of this package, of Python and of what the numbers depend on; the commit
+of a checkout; the processor.
+"""
 
 from __future__ import annotations
 
+import os
 import platform
+import re
+import subprocess
 from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
 
 _PACKAGES = ("pilot-companion", "numpy", "numba", "onnxruntime", "opencv-python-headless", "av",
              "pymavlink")  # fmt: skip
 
 
 def versions() -> dict[str, str]:
-    """Package name to version; a package that is not installed is left out."""
+    """Package name to version; what is not installed or not known is left out."""
     found = {"python": platform.python_version(), "machine": platform.machine()}
     for name in _PACKAGES:
         try:
@@ -18,3 +24,33 @@ def versions() -> dict[str, str]:
         except PackageNotFoundError:
             continue
     return found
+
+
+def made_by() -> dict[str, str]:
+    """The versions, the processor and, in a checkout, the commit: what a figure depends on."""
+    commit = checkout()
+    return versions() | {"processor": processor()} | ({"commit": commit} if commit else {})
+
+
+def processor() -> str:
+    """How many of which, as Linux names it."""
+    try:
+        text = Path("/proc/cpuinfo").read_text(encoding="utf-8", errors="replace")
+    except OSError:
+        text = ""
+    named = re.search(r"^(?:model name|Model)\s*: (.+)$", text, re.M)
+    name = named.group(1).strip() if named else platform.machine()
+    return f"{os.cpu_count()} x {name}"
+
+
+def checkout() -> str:
+    """The commit that runs, with `+` where files differ from it; empty where it is installed."""
+    root = Path(__file__).resolve().parents[1]
+    if not (root / ".git").exists():
+        return ""
+    command = ["git", "-C", str(root), "describe", "--always", "--abbrev=8", "--dirty=+"]
+    try:
+        done = subprocess.run(command, capture_output=True, text=True, check=False, timeout=5.0)
+    except (OSError, subprocess.TimeoutExpired):
+        return ""
+    return done.stdout.strip()

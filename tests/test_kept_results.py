@@ -7,6 +7,7 @@ import pytest
 
 from benchmarks.site.kept import DATA, Kept, Table, load, save, tables_of, with_tables
 from companion.errors import ReportError
+from companion.versions import made_by
 
 ROOT = Path(__file__).parents[1]
 KEPT = Kept("make x", "abc1234", "2026-11-22", "2 cores", "", Table(("a", "b"), (("1", "2"),)))
@@ -78,3 +79,10 @@ def test_every_kept_result_stands_on_a_page():
     for path in (ROOT / DATA).glob("*.json"):
         assert load(path).command
         assert f" {path.stem} " in pages, path
+
+
+def test_reports_name_commit_and_processor():
+    found = made_by()
+    assert found["processor"].split(" x ")[0].isdigit()
+    if (ROOT / ".git").exists():
+        assert len(found["commit"].rstrip("+")) >= 7

@@ -22,7 +22,7 @@ from companion.reporting.report import write_page
 from companion.terminal.links import file_link
 from companion.terminal.steps import COMPILES, shown_count, tally
 from companion.trajectory import stamped, write_trajectory
-from companion.versions import versions
+from companion.versions import made_by
 from companion.writing import made_folder, writing
 from localizer.config import LocalizerConfig
 from localizer.evaluation.metrics import LocalizationMetrics
@@ -198,7 +198,7 @@ def _write_report(
 ) -> None:
     unusable = [f.name for f in frames if f.unusable]
     report = metrics.to_dict() | {
-        "unusable_images": unusable, "settings": settings, "versions": versions()
+        "unusable_images": unusable, "settings": settings, "versions": made_by()
     }  # fmt: skip
     (folder / "report.json").write_text(json.dumps(report, indent=2))
     with (folder / "frames.csv").open("w", newline="", encoding="utf-8") as file:

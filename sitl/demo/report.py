@@ -23,7 +23,7 @@ from companion.offline.plots import (
 )
 from companion.offline.tables import Columns, poses, read_columns
 from companion.reporting.verdicts import advice
-from companion.versions import versions
+from companion.versions import made_by
 from localizer.evaluation.metrics import LocalizationMetrics
 from localizer.features.extractor import load_extractor
 from localizer.geometry.camera import Camera
@@ -195,7 +195,7 @@ def _write_json(
 ) -> None:
     document = {
         "report": asdict(report) | {"passed": all(c.ok for c in report.criteria)},
-        "versions": versions(),
+        "versions": made_by(),
         "seed": seed,
         "features": load_extractor(config.localizer.model).name,
         "scenario": scenario.model_dump(mode="json"),
