@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from datetime import date
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -95,6 +96,9 @@ class FeedConfig(_Model):
 
     source: str = Field(description="udp://, rtsp://, /dev/videoN, a video file or a folder")
     model: CameraModel
+    calibrated: date | None = Field(
+        None, description="when `companion calibrate` last changed model or mounting; null: never"
+    )
     lever_arm_m: tuple[Arm, Arm, Arm] = Field(
         (0.0, 0.0, 0.0), description="camera from the autopilot, body axes: forward right down"
     )

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
@@ -141,6 +142,8 @@ def write_changed(path: Path, wanted: tuple[Change, ...], heading: str) -> Path:
     """Replace the deployment file; the old one stays beside it under the name that is returned."""
     document = read_settings(path, ConfigError)
     _apply(document, wanted)
+    today = datetime.now(UTC).date().isoformat()
+    _apply(document, (Change(("camera", "calibrated"), None, today),))
     number, kept = 1, path.with_name(f"{path.name}.before-calibration")
     while kept.exists():
         number += 1

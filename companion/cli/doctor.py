@@ -4,6 +4,7 @@ does the program compute rightly on this computer."""
 from __future__ import annotations
 
 import tempfile
+from datetime import UTC, datetime
 from pathlib import Path
 from typing import Annotated
 
@@ -30,6 +31,12 @@ def doctor_command(
         bool,
         typer.Option("--beside-flight", help="leave out vehicle and feed: a flight has them"),
     ] = False,
+    page: Annotated[
+        Path | None, typer.Option(help="one page to sign: .html, and as .txt beside it")
+    ] = None,
+    plan: Annotated[
+        Path | None, typer.Option(help="plan.json of `companion plan`, for the page's forecast")
+    ] = None,
 ) -> None:
     """Check a deployment; exit code 0 good, 1 advice, 2 not fit to fly."""
     settings = load_config(config)
@@ -50,6 +57,12 @@ def doctor_command(
             with shown_steps(console) as say:
                 diagnosis = examine_deployment(settings, vehicle=vehicle, feed=feed, say=say)
             print_diagnosis(console, diagnosis)
+    if page is not None:
+        from companion.preflight.sheet import make_sheet, write_sheet
+
+        made = make_sheet(config, settings, diagnosis, plan, datetime.now(UTC))
+        html, text = write_sheet(made, page)
+        console.print(f"to sign: {html}, {text}", soft_wrap=True, highlight=False)
     raise typer.Exit(diagnosis.exit_code)
 
 

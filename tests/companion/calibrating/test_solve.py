@@ -128,6 +128,8 @@ def test_the_deployment_is_changed_and_the_old_one_kept(rich: Calibrated, tmp_pa
     assert after.camera.model.fx == pytest.approx(500.0 * np.exp(0.025), rel=0.003)
     assert after.camera.settings.stamps_late_ms == pytest.approx(120.0, abs=10.0)
     assert after.bridge.camera.mount_pitch_deg == pytest.approx(-1.5, abs=0.2)
-    assert after == changed(load_config(kept), wanted)
+    assert after.camera.calibrated is not None
+    dated = after.camera.model_copy(update={"calibrated": None})
+    assert after.model_copy(update={"camera": dated}) == changed(load_config(kept), wanted)
     assert write_changed(path, wanted, "again") != kept
     json.dumps({".".join(c.key): [c.before, c.after] for c in wanted})

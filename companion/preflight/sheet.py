@@ -1,0 +1,243 @@
+"""The doctor's one page that a pilot signs: what was found, how old it is, and what to do."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from dataclasses import dataclass
+from datetime import UTC, date, datetime
+from html import escape
+from pathlib import Path
+from typing import Any
+
+from companion.config import CompanionConfig
+from companion.errors import ReportError
+from companion.versions import versions
+from companion.writing import writing
+from localizer.errors import LocalizerError
+from localizer.map.cache.cache import TileCache
+from mavlink_bridge.preflight.doctor import Diagnosis, Finding
+
+_OLD_CALIBRATION_DAYS, _OLD_MAP_DAYS, _OLD_SHADOW_DAYS = 90, 730, 7
+WHEN_VISION_ENDS = (
+    ("degraded, bridging N s", "odometry carries it on: turn back over ground that the map knows"),
+    ("lost; not sent: ...", "take over in ALT_HOLD or STABILIZE, or select GNSS if it is good"),
+    ("5 to 8 s later", "ArduPilot lands (EKF Failsafe) unless somebody has taken over"),
+    ("withheld: ...", "do not believe the position; look which of the two is wrong"),
+    ("place found, the EKF follows", "choose the mode again: ArduPilot stays in LAND"),
+)
+
+
+@dataclass(frozen=True)
+class Row:
+    """One line. good: None where it only tells."""
+
+    name: str
+    text: str
+    good: bool | None = None
+
+
+@dataclass(frozen=True)
+class Sheet:
+    """The page. fit: by the doctor; parameters: its lines that are not right, and how many are."""
+
+    deployment: str
+    day: datetime
+    fit: bool
+    rows: tuple[Row, ...]
+    findings: tuple[Finding, ...]
+
+
+def make_sheet(
+    path: Path, config: CompanionConfig, diagnosis: Diagnosis, plan: Path | None, now: datetime
+) -> Sheet:
+    """What is known of a deployment now. plan: ``plan.json`` of `companion plan`."""
+    rows = (
+        _parameters(diagnosis),
+        _calibration(config, now.date()),
+        *_map(config, now.date()),
+        _shadow(config, now),
+        _forecast(plan),
+        Row("mode", f"{config.bridge.mode}, {config.bridge.injection.message}"),
+        Row("software", str(versions().get("pilot-companion", "not installed"))),
+    )
+    return Sheet(str(path), now, diagnosis.ok, rows, diagnosis.findings)
+
+
+def _parameters(diagnosis: Diagnosis) -> Row:
+    if not diagnosis.findings:
+        return Row("parameters and parts", "nothing was examined", False)
+    wrong = [f.name for f in diagnosis.findings if not f.ok and f.required]
+    advice = [f.name for f in diagnosis.findings if not f.ok and not f.required]
+    good = len(diagnosis.findings) - len(wrong) - len(advice)
+    parts = [f"{good} of {len(diagnosis.findings)} checks good"]
+    parts += [f"wrong: {', '.join(wrong)}"] if wrong else []
+    parts += [f"advice: {', '.join(advice)}"] if advice else []
+    return Row("parameters and parts", "; ".join(parts), not wrong)
+
+
+def _age(day: date, today: date) -> str:
+    days = (today - day).days
+    return "today" if days == 0 else f"{days} days ago"
+
+
+def _calibration(config: CompanionConfig, today: date) -> Row:
+    done = config.camera.calibrated
+    if done is None:
+        return Row("calibration", "never by `companion calibrate`, or not told", False)
+    c = config.localizer.calibration
+    text = f"{done.isoformat()} ({_age(done, today)}), focal length to {c.focal_percent:g} %, "
+    text += f"stamps to {c.stamp_ms:g} ms"
+    return Row("calibration", text, (today - done).days <= _OLD_CALIBRATION_DAYS)
+
+
+def _map(config: CompanionConfig, today: date) -> tuple[Row, ...]:
+    try:
+        m = TileCache.open(config.map).manifest
+    except LocalizerError as error:
+        return (Row("map", str(error), False),)
+    latitudes, longitudes = zip(*m.extent, strict=True)
+    pinned = "pinned by sha256" if config.map_sha256 else "not pinned: any map is flown"
+    where = (
+        f"{min(latitudes):.5f} to {max(latitudes):.5f}, {min(longitudes):.5f} to "
+        f"{max(longitudes):.5f}; {m.gsd_m:.2f} m a texel; {pinned}"
+    )
+    stated = str(m.build.get("imagery_date") or "")
+    try:
+        taken = date.fromisoformat(stated)
+    except ValueError:
+        dated = Row("map's imagery", stated or "date not known", False if not stated else None)
+    else:
+        dated = Row("map's imagery", f"{stated} ({_age(taken, today)})",
+                    (today - taken).days <= _OLD_MAP_DAYS)  # fmt: skip
+    return Row("map covers", where), dated
+
+
+def _shadow(config: CompanionConfig, now: datetime) -> Row:
+    """The newest record's score; from beside the record's folder, as `run` numbers them."""
+    folder = config.record.folder if config.record is not None else None
+    if folder is None:
+        return Row("shadow score", "no record is kept, so none is known", False)
+    kept = sorted(
+        folder.parent.glob(f"{folder.name}*/health.json"), key=lambda p: p.stat().st_mtime
+    )
+    for path in reversed(kept):
+        shadow = _read(path).get("shadow")
+        if isinstance(shadow, str) and shadow:
+            when = datetime.fromtimestamp(path.stat().st_mtime, UTC)
+            text = f"{shadow} ({path.parent.name}, {_age(when.date(), now.date())})"
+            recent = (now - when).days <= _OLD_SHADOW_DAYS
+            return Row("shadow score", text, shadow.startswith("go") and recent)
+    return Row("shadow score", "none: fly in shadow mode first", False)
+
+
+def _forecast(plan: Path | None) -> Row:
+    if plan is None:
+        return Row("forecast", "none: `companion plan MISSION`, then --plan plan/plan.json", False)
+    data = _read(plan)
+    legs = data.get("legs")
+    if not isinstance(legs, list) or not isinstance(data.get("holds"), bool):
+        raise ReportError(f"--plan {plan}: not a plan.json of `companion plan`")
+    bad = [str(leg.get("name")) for leg in legs if not leg.get("holds")]
+    conditions = ", ".join(map(str, data.get("conditions", ())))
+    if not bad:
+        return Row("forecast", f"vision should hold on all {len(legs)} legs ({conditions})", True)
+    text = f"vision will not do on {len(bad)} of {len(legs)} legs ({conditions}): {', '.join(bad)}"
+    return Row("forecast", text, False)
+
+
+def _read(path: Path) -> dict[str, Any]:
+    try:
+        data = json.loads(path.read_text(encoding="utf-8"))
+    except (OSError, ValueError):
+        return {}
+    return data if isinstance(data, dict) else {}
+
+
+def write_sheet(sheet: Sheet, path: Path) -> tuple[Path, Path]:
+    """The page as HTML, and as text beside it."""
+    text_path = path.with_suffix(".txt")
+    with writing(path, "--page"):
+        path.write_text(as_html(sheet), encoding="utf-8")
+        text_path.write_text(as_text(sheet), encoding="utf-8")
+    return path, text_path
+
+
+def _mark(good: bool | None) -> str:
+    return {True: "ok", False: "LOOK", None: ""}[good]
+
+
+def _title(sheet: Sheet) -> str:
+    return "fit to fly" if sheet.fit else "NOT fit to fly"
+
+
+def _marked(finding: Finding) -> str:
+    return "ok" if finding.ok else "WRONG" if finding.required else "advice"
+
+
+def as_text(sheet: Sheet) -> str:
+    """For a terminal or a printer; 78 columns but for long findings."""
+    lines = [
+        f"BEFORE THE FLIGHT: {_title(sheet)}",
+        f"{sheet.deployment}   {sheet.day.isoformat(timespec='minutes')}", "",
+        *(f"[{_mark(r.good):4}] {r.name}: {r.text}" for r in sheet.rows), "",
+        "IF VISION ENDS",
+        *(f"  {says:30} {do}" for says, do in WHEN_VISION_ENDS), "",
+        "FOUND",
+        *(f"  {_marked(f):6} {f.name}: {f.found} (needed: {f.needed})" for f in sheet.findings),
+        "", "Pilot ______________________  Place ______________  Time (UTC) __________", "",
+    ]  # fmt: skip
+    return "\n".join(lines)
+
+
+_CSS = """
+@page{size:A4;margin:10mm}*{box-sizing:border-box}
+body{font:12.5px/1.35 system-ui,sans-serif;max-width:190mm;margin:6mm auto;padding:0 4mm;
+color:#1c2430}
+h1{font-size:19px;margin:0;padding:.35em .6em;border-left:7px solid #2a9d4a;background:#e8f5ec}
+h1.no{border-color:#c62828;background:#fbe4e4}h2{font-size:14px;margin:1em 0 .2em}
+p{margin:.3em 0;color:#5b6470}table{border-collapse:collapse;width:100%}
+td{border-bottom:1px solid #d7dce2;padding:.22em .5em;vertical-align:top;overflow-wrap:anywhere}
+td:first-child{width:4.6em;font-weight:700;white-space:nowrap}td:nth-child(2){width:12em}
+.ends td:first-child{width:17em}.ok{color:#1d7a38}.LOOK,.WRONG{color:#b71c1c}.advice{color:#9a6a00}
+.found{columns:2;column-gap:6mm;font-size:11px}.found div{break-inside:avoid;
+overflow-wrap:anywhere;padding:.1em 0}
+.sign{display:flex;gap:8mm;margin-top:12mm}.sign span{flex:1;border-top:1px solid #1c2430;
+padding-top:.2em}.sign span:first-child{flex:2}
+"""
+
+
+def as_html(sheet: Sheet) -> str:
+    """One page that needs no other file, and prints on one sheet."""
+
+    def row(mark: str, *cells: str) -> str:
+        tail = "".join(f"<td>{escape(c)}</td>" for c in cells)
+        return f'<tr><td class="{mark}">{mark}</td>{tail}</tr>'
+
+    facts = "".join(row(_mark(r.good), r.name, r.text) for r in sheet.rows)
+    ends = "".join(f"<tr><td>{escape(a)}</td><td>{escape(b)}</td></tr>"
+                   for a, b in WHEN_VISION_ENDS)  # fmt: skip
+    found = "".join(_found(f) for f in _wrong_first(sheet.findings))
+    title = f"Before the flight: {_title(sheet)}"
+    style = "" if sheet.fit else ' class="no"'
+    when = f"{escape(sheet.deployment)} · {sheet.day.strftime('%Y-%m-%d %H:%M UTC')}"
+    return (
+        f'<!doctype html><html lang="en"><meta charset="utf-8"><title>{title}</title>'
+        f'<meta name="viewport" content="width=device-width"><style>{_CSS}</style>'
+        f"<h1{style}>{title}</h1><p>{when}</p><table>{facts}</table>"
+        f'<h2>If vision ends</h2><table class="ends">{ends}</table>'
+        f'<h2>What the doctor found</h2><div class="found">{found}</div>'
+        '<div class="sign"><span>Pilot (name, signature)</span><span>Place</span>'
+        "<span>Time, UTC</span></div></html>\n"
+    )
+
+
+def _wrong_first(findings: Sequence[Finding]) -> list[Finding]:
+    return sorted(findings, key=lambda f: (f.ok, not f.required))
+
+
+def _found(finding: Finding) -> str:
+    mark = _marked(finding)
+    needed = "" if finding.ok else f" (needed: {escape(finding.needed)})"
+    words = f"{escape(finding.name)}: {escape(finding.found)}{needed}"
+    return f'<div><b class="{mark}">{mark}</b> {words}</div>'

@@ -1,0 +1,82 @@
+"""The page that a pilot signs: each fact is of its source, and what is old or lacks is marked."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from datetime import UTC, date, datetime
+from pathlib import Path
+
+import pytest
+import yaml
+
+from companion.config import CompanionConfig, load_config
+from companion.errors import ReportError
+from companion.preflight.sheet import Sheet, as_html, as_text, make_sheet, write_sheet
+from mavlink_bridge.preflight.doctor import Diagnosis, Finding
+
+NOW = datetime(2026, 11, 22, 12, 0, tzinfo=UTC)
+GOOD = Finding("EK3_SRC2_POSXY", "6", "6", "", True, True)
+WRONG = Finding("VISO_TYPE", "0 <b>", "1", "no vision", False, True)
+
+
+@pytest.fixture
+def deployment(tmp_path: Path) -> tuple[Path, CompanionConfig]:
+    path = tmp_path / "deployment.yaml"
+    model = {"width": 640, "height": 480, "fx": 500, "fy": 500, "cx": 320, "cy": 240}
+    document = {
+        "map": "no-map",
+        "camera": {"source": "udp://0.0.0.0:5600", "model": model, "calibrated": date(2026, 11, 2)},
+        "bridge": {"connection": "udpin:127.0.0.1:14550", "mode": "shadow"},
+        "record": {"folder": "flights/day"},
+    }
+    path.write_text(yaml.safe_dump(document))
+    return path, load_config(path)
+
+
+def rows(sheet: Sheet) -> dict[str, tuple[str, bool | None]]:
+    return {r.name: (r.text, r.good) for r in sheet.rows}
+
+
+def test_each_line_is_of_its_source(deployment, tmp_path):
+    path, config = deployment
+    plan = tmp_path / "plan.json"
+    legs = [{"name": "1-2", "holds": True}, {"name": "2-3", "holds": False}]
+    plan.write_text(json.dumps({"holds": False, "legs": legs, "conditions": ["dusk"]}))
+    record = config.record.folder.with_name("day-2")
+    record.mkdir(parents=True)
+    (record / "health.json").write_text(json.dumps({"shadow": "go: 0.4 m for 120 s"}))
+    now = datetime.now(UTC)
+    found = rows(make_sheet(path, config, Diagnosis((GOOD, WRONG)), plan, now))
+    assert found["parameters and parts"] == ("1 of 2 checks good; wrong: VISO_TYPE", False)
+    assert found["forecast"][0] == "vision will not do on 1 of 2 legs (dusk): 2-3"
+    assert found["shadow score"] == ("go: 0.4 m for 120 s (day-2, today)", True)
+    assert found["map"][1] is False
+    assert "2026-11-02" in found["calibration"][0]
+
+
+def test_what_is_old_or_lacks_is_marked(deployment):
+    path, config = deployment
+    recent = rows(make_sheet(path, config, Diagnosis((GOOD,)), None, NOW))
+    assert recent["calibration"][0].startswith("2026-11-02 (20 days ago)")
+    assert recent["calibration"][1] is True
+    later = rows(make_sheet(path, config, Diagnosis((GOOD,)), None, NOW.replace(year=2027)))
+    assert later["calibration"][1] is False
+    never = config.camera.model_copy(update={"calibrated": None})
+    none = make_sheet(path, config.model_copy(update={"camera": never}), Diagnosis(()), None, NOW)
+    assert rows(none)["calibration"][1] is False
+    assert rows(none)["shadow score"] == ("none: fly in shadow mode first", False)
+    assert rows(none)["parameters and parts"][1] is False
+
+
+def test_the_page_escapes_and_says_unfit(deployment, tmp_path):
+    path, config = deployment
+    sheet = make_sheet(path, config, Diagnosis((GOOD, WRONG)), None, NOW)
+    page, text = write_sheet(sheet, tmp_path / "sign.html")
+    assert "NOT fit to fly" in page.read_text()
+    assert "0 &lt;b&gt;" in as_html(sheet)
+    assert as_html(sheet).index("VISO_TYPE: 0") < as_html(sheet).index("EK3_SRC2_POSXY")
+    assert "ALT_HOLD" in text.read_text()
+    assert "Pilot ____" in as_text(replace(sheet, fit=True))
+    with pytest.raises(ReportError, match=r"not a plan\.json"):
+        make_sheet(path, config, Diagnosis(()), tmp_path / "sign.txt", NOW)
