@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from datetime import UTC, datetime
+from datetime import datetime, timezone
 from pathlib import Path
 from typing import Any
 
@@ -142,7 +142,7 @@ def write_changed(path: Path, wanted: tuple[Change, ...], heading: str) -> Path:
     """Replace the deployment file; the old one stays beside it under the name that is returned."""
     document = read_settings(path, ConfigError)
     _apply(document, wanted)
-    today = datetime.now(UTC).date().isoformat()
+    today = datetime.now(timezone.utc).date().isoformat()
     _apply(document, (Change(("camera", "calibrated"), None, today),))
     number, kept = 1, path.with_name(f"{path.name}.before-calibration")
     while kept.exists():

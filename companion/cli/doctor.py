@@ -4,7 +4,7 @@ does the program compute rightly on this computer."""
 from __future__ import annotations
 
 import tempfile
-from datetime import UTC, datetime
+from datetime import datetime, timezone
 from pathlib import Path
 from typing import Annotated
 
@@ -60,7 +60,7 @@ def doctor_command(
     if page is not None:
         from companion.preflight.sheet import make_sheet, write_sheet
 
-        made = make_sheet(config, settings, diagnosis, plan, datetime.now(UTC))
+        made = make_sheet(config, settings, diagnosis, plan, datetime.now(timezone.utc))
         html, text = write_sheet(made, page)
         console.print(f"to sign: {html}, {text}", soft_wrap=True, highlight=False)
     raise typer.Exit(diagnosis.exit_code)

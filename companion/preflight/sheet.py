@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 from collections.abc import Sequence
 from dataclasses import dataclass
-from datetime import UTC, date, datetime
+from datetime import date, datetime, timezone
 from html import escape
 from pathlib import Path
 from typing import Any
@@ -124,7 +124,7 @@ def _shadow(config: CompanionConfig, now: datetime) -> Row:
     for path in reversed(kept):
         shadow = _read(path).get("shadow")
         if isinstance(shadow, str) and shadow:
-            when = datetime.fromtimestamp(path.stat().st_mtime, UTC)
+            when = datetime.fromtimestamp(path.stat().st_mtime, timezone.utc)
             text = f"{shadow} ({path.parent.name}, {_age(when.date(), now.date())})"
             recent = (now - when).days <= _OLD_SHADOW_DAYS
             return Row("shadow score", text, shadow.startswith("go") and recent)
@@ -199,7 +199,7 @@ h1.no{border-color:#c62828;background:#fbe4e4}h2{font-size:14px;margin:1em 0 .2e
 p{margin:.3em 0;color:#5b6470}table{border-collapse:collapse;width:100%}
 td{border-bottom:1px solid #d7dce2;padding:.22em .5em;vertical-align:top;overflow-wrap:anywhere}
 td:first-child{width:4.6em;font-weight:700;white-space:nowrap}td:nth-child(2){width:12em}
-.ends td:first-child{width:17em}.ok{color:#1d7a38}.LOOK,.WRONG{color:#b71c1c}.advice{color:#9a6a00}
+.ends td:first-child{width:17em}.ends td:nth-child(2){width:auto}.ok{color:#1d7a38}.LOOK,.WRONG{color:#b71c1c}.advice{color:#9a6a00}
 .found{columns:2;column-gap:6mm;font-size:11px}.found div{break-inside:avoid;
 overflow-wrap:anywhere;padding:.1em 0}
 .sign{display:flex;gap:8mm;margin-top:12mm}.sign span{flex:1;border-top:1px solid #1c2430;

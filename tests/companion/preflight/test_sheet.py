@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from dataclasses import replace
-from datetime import UTC, date, datetime
+from datetime import date, datetime, timezone
 from pathlib import Path
 
 import pytest
@@ -15,7 +15,7 @@ from companion.errors import ReportError
 from companion.preflight.sheet import Sheet, as_html, as_text, make_sheet, write_sheet
 from mavlink_bridge.preflight.doctor import Diagnosis, Finding
 
-NOW = datetime(2026, 11, 22, 12, 0, tzinfo=UTC)
+NOW = datetime(2026, 11, 22, 12, 0, tzinfo=timezone.utc)
 GOOD = Finding("EK3_SRC2_POSXY", "6", "6", "", True, True)
 WRONG = Finding("VISO_TYPE", "0 <b>", "1", "no vision", False, True)
 
@@ -46,7 +46,7 @@ def test_each_line_is_of_its_source(deployment, tmp_path):
     record = config.record.folder.with_name("day-2")
     record.mkdir(parents=True)
     (record / "health.json").write_text(json.dumps({"shadow": "go: 0.4 m for 120 s"}))
-    now = datetime.now(UTC)
+    now = datetime.now(timezone.utc)
     found = rows(make_sheet(path, config, Diagnosis((GOOD, WRONG)), plan, now))
     assert found["parameters and parts"] == ("1 of 2 checks good; wrong: VISO_TYPE", False)
     assert found["forecast"][0] == "vision will not do on 1 of 2 legs (dusk): 2-3"
