@@ -199,7 +199,8 @@ h1.no{border-color:#c62828;background:#fbe4e4}h2{font-size:14px;margin:1em 0 .2e
 p{margin:.3em 0;color:#5b6470}table{border-collapse:collapse;width:100%}
 td{border-bottom:1px solid #d7dce2;padding:.22em .5em;vertical-align:top;overflow-wrap:anywhere}
 td:first-child{width:4.6em;font-weight:700;white-space:nowrap}td:nth-child(2){width:12em}
-.ends td:first-child{width:17em}.ends td:nth-child(2){width:auto}.ok{color:#1d7a38}.LOOK,.WRONG{color:#b71c1c}.advice{color:#9a6a00}
+.ends td:first-child{width:17em}.ends td:nth-child(2){width:auto}
+.ok{color:#1d7a38}.LOOK,.WRONG{color:#b71c1c}.advice{color:#9a6a00}
 .found{columns:2;column-gap:6mm;font-size:11px}.found div{break-inside:avoid;
 overflow-wrap:anywhere;padding:.1em 0}
 .sign{display:flex;gap:8mm;margin-top:12mm}.sign span{flex:1;border-top:1px solid #1c2430;
