@@ -1,0 +1,1 @@
+"""How fast the dual-thread engine is, and where its processor time goes."""
