@@ -62,10 +62,16 @@ def test_a_short_flight_without_gnss_comes_home(real_time, small_assets, tmp_pat
         report = make_report(record, SCENARIO, 3)
         print_report(report, folder)
         assert report.vehicle == kind
+        # The report's own criteria, but for the rate: this camera's is lower than the demo's.
         missed = [f"{c.name} {c.value}" for c in report.criteria if not c.ok]
         assert [m for m in missed if not m.startswith("localized frames")] == []
         assert report.localizer.fps > 0.9 * SCENARIO.camera.rate_hz
-        assert report.home_error_m < 2.0
+        # 0.06 m and 0.2 to 0.7 m are measured in this ideal world, where the criteria are the
+        # honest one's: what is twice as bad must not pass.
+        median_m = report.localizer.median_translation_m
+        assert median_m is not None
+        assert median_m < 0.15
+        assert report.home_error_m < 1.5
     written = json.loads((folder / "report.json").read_text())
     assert written["report"]["frames_sent"] == report.frames_sent > 100
     page = write_page(folder).read_text()
