@@ -17,7 +17,6 @@ from __future__ import annotations
 
 import argparse
 import json
-import os
 from concurrent.futures import ProcessPoolExecutor
 from multiprocessing import get_context
 from pathlib import Path
@@ -25,17 +24,13 @@ from pathlib import Path
 from benchmarks.common.arguments import Parser, existing, number, output, whole
 from benchmarks.common.named_errors import named_errors
 from benchmarks.throughput.accuracy import paired
-from benchmarks.throughput.engine import engine_run
-from benchmarks.throughput.stages import stage_times
+from benchmarks.throughput.settings import map_of, one_setting
 from localizer.config import LocalizerConfig
-from localizer.errors import SequenceError
-from localizer.evaluation.sequences import Sequence, load_sequence
+from localizer.evaluation.sequences import load_sequence
 from localizer.tracking.opening import MapStack
 from sitl.demo.assets import prepare
 from sitl.demo.kinematic import record_scenario
 from sitl.demo.scenario import CameraSpec, Leg, Scenario
-
-_STAGE_FRAMES = 60
 
 
 def scenario(rate_hz: float = 30.0) -> Scenario:
@@ -65,7 +60,7 @@ def record(args: argparse.Namespace) -> None:
 def accuracy(args: argparse.Namespace) -> None:
     """One line for each limit of `reference_shift_px`."""
     config = LocalizerConfig(width=args.widths[0], threads=1, renderer="numba", device="cpu")
-    stack = MapStack(args.map or _map_of(args.folder), config)
+    stack = MapStack(args.map or map_of(args.folder), config)
     found: list[dict[str, object]] = []
     try:
         sequence = load_sequence(args.folder, stack.cache.frame).first(args.frames)
@@ -76,60 +71,6 @@ def accuracy(args: argparse.Namespace) -> None:
         stack.close()
     if args.json:
         args.json.write_text(json.dumps({"rows": found}, indent=1) + "\n")
-
-
-def _map_of(folder: Path) -> Path:
-    try:
-        return Path((folder / "map.txt").read_text().strip())
-    except OSError as error:
-        raise SequenceError(f"{folder}: no map.txt: give --map, or run `record`") from error
-
-
-def one_setting(
-    folder: Path, width: int, cores: int, frames: int, shift_px: float | None, stages: bool
-) -> list[dict[str, object]]:
-    """Every figure of one width on so many cores; in a process of its own, which is bound first."""
-    os.sched_setaffinity(0, sorted(os.sched_getaffinity(0))[:cores])
-    map_cache = _map_of(folder)
-    found: list[dict[str, object]] = []
-    config = LocalizerConfig(width=width, threads=cores, renderer="numba", device="cpu")
-    if shift_px is not None:
-        config = config.model_copy(update={"reference_shift_px": shift_px})
-    for paced in (True, False):
-        stack = MapStack(map_cache, config)
-        try:
-            sequence = _sequence(folder, stack, frames)
-            figures = engine_run(stack, sequence, config, paced=paced)
-        finally:
-            stack.close()
-        how = "real time" if paced else "next when done"
-        share = 100 * figures["cores_used"] / cores
-        found.append(
-            {
-                "width": width,
-                "cores": cores,
-                "offered": how,
-                "share_percent": share,
-                "reference_shift_px": config.reference_shift_px,
-                **figures,
-            }
-        )
-    if stages:
-        single = config.model_copy(update={"threads": 1})
-        stack = MapStack(map_cache, single)
-        try:
-            spent = stage_times(stack, _sequence(folder, stack, _STAGE_FRAMES), single)
-        finally:
-            stack.close()
-        found.append({"width": width, "cores": 1, "offered": "stages", "stage_ms": spent})
-    return found
-
-
-def _sequence(folder: Path, stack: MapStack, frames: int) -> Sequence:
-    sequence = load_sequence(folder, stack.cache.frame).first(frames)
-    if len(sequence.images) < _STAGE_FRAMES:
-        raise SequenceError(f"{folder}: needs {_STAGE_FRAMES} frames: run `record` first")
-    return sequence
 
 
 def run(args: argparse.Namespace) -> None:
