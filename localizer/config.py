@@ -35,6 +35,12 @@ class LocalizerConfig(BaseModel):
     width: int = Field(320, ge=64, le=2048, description="width of query and reference, pixels")
     model: Path | None = Field(None, description="ONNX feature network; none: the shipped one")
     anchors: int = Field(4000, ge=50, le=8000, description="geo-anchors per reference view")
+    reference_shift_px: float = Field(
+        2.0,
+        ge=0,
+        le=100,
+        description="a reference serves while its anchors move less, working px; 0: a frame each",
+    )
     renderer: RendererName = Field("auto", description="auto: a GPU where there is one, else numba")
     device: DeviceChoice = Field(
         "auto", description="of the optimizer; auto, cuda: a GPU that works, else the CPU"

@@ -2,10 +2,10 @@
 
 The localization thread takes the newest frame, registers it against the newest reference and
 publishes the estimate. Each estimate wakes the render thread, which predicts the pose at the next
-exposure, renders the reference for it and has the map loaded along the way ahead. Neither waits for
-a subscriber, and neither dies of an error: errors are counted, logged and reported as the engine's
-health. While no place is known a third thread searches for one; what it finds is tried by the
-localization thread, which goes on trying meanwhile.
+exposure, renders the reference for it, unless the last one still serves, and has the map loaded
+along the way ahead. Neither waits for a subscriber, and neither dies of an error: errors are
+counted, logged and reported as the engine's health. While no place is known a third thread searches
+for one; what it finds is tried by the localization thread, which goes on trying meanwhile.
 """
 
 from __future__ import annotations
@@ -144,11 +144,13 @@ class DualThreadEngine:
             return
         stage_ms: dict[str, float] = {}
         with stopwatch(stage_ms, "reference"):
-            bundle = self._localizer.make_reference(prior)
+            bundle = self._localizer.reference_for(prior, self._bundle)
+        is_new = bundle is not self._bundle
         self._bundle, self._reference_ms = bundle, stage_ms
         self._book.clear_error()
-        self._book.count(references=1)
-        self._localizer.prefetch(time_ns)  # last: nothing waits for it
+        if is_new:
+            self._book.count(references=1)
+            self._localizer.prefetch(time_ns)  # last: nothing waits for it
 
     def _localize_once(self) -> None:
         frame = self._frames.take(_IDLE_S)

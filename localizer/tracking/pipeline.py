@@ -33,6 +33,7 @@ from localizer.render.base import MapRenderer
 from localizer.render.holes import fill_holes
 from localizer.tracking.bridging import Bridging
 from localizer.tracking.motion import OtherSensors
+from localizer.tracking.reference import still_serves
 from localizer.tracking.tracker import Tracker, TrackerState
 from localizer.types import (
     Anchors,
@@ -143,6 +144,7 @@ class Localizer:
         self._sensors = sensors or OtherSensors()
         self.camera = working_camera(camera, config.width)
         self._undistorter = Undistorter(camera, self.camera)
+        self._reference: ReferenceBundle | None = None  # the last one of `track`
         self._tracker = Tracker(config, self._sensors, self._bridging(config, optimizer))
 
     def _bridging(self, config: LocalizerConfig, optimizer: JNGO) -> Bridging | None:
@@ -241,7 +243,8 @@ class Localizer:
             if prior is None:
                 raise OutsideMapError(_NO_PRIOR)
             with stopwatch(stage_ms, "reference"):
-                bundle = self.make_reference(prior, wait=True)
+                last = self._reference if passes == 1 else None
+                bundle = self._reference = self.reference_for(prior, last, wait=True)
             if features is None:
                 with stopwatch(stage_ms, "extract"):
                     features = query() if query is not None else self.extract_query(frame)
@@ -263,6 +266,19 @@ class Localizer:
             return None
         tilt, heading = np.radians([sigma.tilt_sigma_deg, sigma.heading_sigma_deg])
         return attitude_constraint(rotation, float(tilt), float(heading))
+
+    def reference_for(
+        self, prior: PosePrior, last: ReferenceBundle | None, *, wait: bool = False
+    ) -> ReferenceBundle:
+        """The last reference as long as it serves (`reference_shift_px`), else a new one."""
+        standing = self.tracker.standing
+        holds = standing.state is TrackingState.TRACKING and standing.rejected_in_row == 0
+        steady = holds and not self._is_loading()
+        shift_px = self._config.reference_shift_px
+        pose, time_ns = prior.world_from_camera, prior.time_ns
+        if last is not None and steady and still_serves(last, pose, time_ns, shift_px):
+            return last
+        return self.make_reference(prior, wait=wait)
 
     def make_reference(self, prior: PosePrior, *, wait: bool = False) -> ReferenceBundle:
         """Render the view at the prior's pose and select its geo-anchors (paper, Eq. 1 and 2)."""

@@ -95,7 +95,8 @@ def _localizer(renderer=None, optimizer=None) -> Localizer:
         FakeExtractor(),
         optimizer or FakeOptimizer(),  # type: ignore[arg-type]
         CAMERA,
-        LocalizerConfig(odometry=None),  # the fake optimizer registers to the map alone
+        # The fake optimizer registers to the map alone; each frame has its own reference.
+        LocalizerConfig(odometry=None, reference_shift_px=0),
     )
 
 
