@@ -10,6 +10,7 @@ from typing import Any, TypeVar
 import yaml
 from pydantic import BaseModel, ValidationError
 
+from localizer.plain_files import plain_text
 from localizer.strict_yaml import load_yaml, misread_booleans
 
 _ModelT = TypeVar("_ModelT", bound=BaseModel)
@@ -24,11 +25,7 @@ class SettingsError(ValueError):
 def read_settings(path: Path, error_type: type[Exception]) -> dict[str, Any]:
     """The mapping in a YAML file, empty for an empty file; `error_type` names file and fault."""
     try:
-        with path.open("rb") as file:
-            raw = file.read(_MAX_BYTES + 1)
-        if len(raw) > _MAX_BYTES:
-            raise error_type(f"{path}: over {_MAX_BYTES >> 20} MiB; that is no file of settings")
-        data = load_yaml(raw.decode("utf-8"))
+        data = load_yaml(plain_text(path, _MAX_BYTES))
     except OSError as error:
         raise error_type(f"{path}: cannot be read: {error.strerror}") from error
     # ValueError: no UTF-8, or a date that does not exist; RecursionError: endless nesting.

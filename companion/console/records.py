@@ -10,6 +10,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from localizer.plain_files import plain_text
+
 MANIFEST = "record.json"
 _MOST = 200  # newest first
 _MOST_FILES = 100_000
@@ -91,7 +93,7 @@ def _plain_files(folder: Path) -> Iterator[Path]:
 
 def _document(path: Path) -> dict[str, Any]:
     try:
-        value = json.loads(path.read_text(encoding="utf-8"))
+        value = json.loads(plain_text(path))
     except (OSError, ValueError, RecursionError):
         return {}
     return value if isinstance(value, dict) else {}

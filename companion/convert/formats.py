@@ -28,6 +28,7 @@ from localizer.geometry.geo import Geodetic, LocalFrame
 from localizer.geometry.pose import Pose, matrix_from_quaternion, quaternion_from_matrix
 from localizer.geometry.posefile import pose_row, read_poses, world_from_camera, write_poses
 from localizer.geometry.trajectory import StampedPose, read_tum, write_tum
+from localizer.plain_files import plain_text
 
 AUTOPILOT_COLUMNS = (
     "name", "time_ns", "latitude_deg", "longitude_deg", "height_m",
@@ -189,7 +190,7 @@ def _write_photos(path: Path, poses: Sequence[StampedPose], place: Place) -> Non
 
 def _lines(path: Path) -> list[str]:
     try:
-        return path.read_text(encoding="utf-8").splitlines()
+        return plain_text(path).splitlines()
     except (OSError, UnicodeDecodeError) as error:
         raise PoseFileError(f"{path}: cannot be read: {error}") from error
 

@@ -19,6 +19,7 @@ from companion.convert.angles import Angles, gimbal_of_pose, pose_of_gimbal
 from localizer.errors import GeoreferenceError, PoseFileError
 from localizer.geometry.geo import Geodetic, LocalFrame
 from localizer.geometry.trajectory import StampedPose
+from localizer.plain_files import plain_text
 
 _PHOTO_SUFFIXES = frozenset({".jpg", ".jpeg"})
 _XMP_HEADER = b"http://ns.adobe.com/xap/1.0/\x00"
@@ -112,7 +113,7 @@ def _xmp_tags(path: Path) -> dict[str, str]:
     sidecar = path.with_suffix(".xmp")
     try:
         if sidecar.is_file():
-            text = sidecar.read_text(encoding="utf-8")
+            text = plain_text(sidecar)
         else:
             with path.open("rb") as file:
                 head = file.read(_LARGEST_BYTES)

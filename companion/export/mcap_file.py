@@ -17,6 +17,7 @@ from companion.export import messages
 from companion.export.messages import Row
 from companion.versions import versions
 from localizer.geometry.camera import Camera
+from localizer.plain_files import plain_bytes
 
 _CHUNK = 256 << 10  # what a loss of power costs at most, before compression
 _PROFILE = ""  # Foxglove's schemas need none
@@ -81,7 +82,7 @@ class McapFile:
         """A document of the record, as it is."""
         time_ns = path.stat().st_mtime_ns
         self._writer.add_attachment(
-            time_ns, time_ns, path.name, "application/json", path.read_bytes()
+            time_ns, time_ns, path.name, "application/json", plain_bytes(path)
         )
 
     def flush(self) -> None:

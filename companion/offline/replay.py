@@ -7,12 +7,12 @@ in flight is localized again, with what the autopilot had said by then.
 from __future__ import annotations
 
 import csv
+import io
 import json
 import logging
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TextIO
 
 import numpy as np
 
@@ -28,6 +28,7 @@ from companion.trajectory import snapshot_name
 from localizer.errors import OutsideMapError
 from localizer.geometry.camera import Camera
 from localizer.geometry.pose import Array, Pose, matrix_from_quaternion
+from localizer.plain_files import plain_text
 from localizer.tracking.opening import MapStack, build_localizer
 from localizer.tracking.pipeline import Localizer
 from localizer.types import Frame, PoseEstimate
@@ -97,7 +98,7 @@ def load_record(folder: Path, kept_share: float = _MIN_IMAGES) -> FlightRecord:
     kept_share: of the localized frames that must have their picture.
     """
     try:
-        manifest = json.loads((folder / MANIFEST_NAME).read_text(encoding="utf-8"))
+        manifest = json.loads(plain_text(folder / MANIFEST_NAME))
         start_ns = int(manifest["monotonic_ns"])
         offset_ns = int(manifest["utc_ns"]) - start_ns
         config = parse_config(manifest["config"], str(folder / MANIFEST_NAME))
@@ -127,11 +128,11 @@ def read_estimates(path: Path) -> tuple[RecordedEstimate, ...]:
 
 
 def _estimates(path: Path) -> tuple[RecordedEstimate, ...]:
-    with path.open(newline="", encoding="utf-8") as file:
-        return tuple(_estimate(row) for row in _whole_rows(file))
+    text = io.StringIO(plain_text(path, None), newline="")
+    return tuple(_estimate(row) for row in _whole_rows(text))
 
 
-def _whole_rows(file: TextIO) -> Iterator[dict[str, str]]:
+def _whole_rows(file: io.StringIO) -> Iterator[dict[str, str]]:
     """The rows, without a last one that a loss of power cut short."""
     lines = file.readlines()
     if lines and not lines[-1].endswith("\n"):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import io
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
@@ -10,6 +11,7 @@ import numpy as np
 
 from companion.errors import RecordError
 from localizer.geometry.pose import Pose, matrix_from_quaternion
+from localizer.plain_files import plain_text
 
 Columns = Mapping[str, np.ndarray]
 
@@ -20,8 +22,7 @@ def read_columns(path: Path, text: Sequence[str] = ()) -> dict[str, np.ndarray]:
     Those named in `text` are strings, those that end in ``_ns`` int64 (a float64 would round them).
     A last row that a loss of power cut short is left out.
     """
-    with path.open(newline="", encoding="utf-8") as file:
-        lines = file.readlines()
+    lines = io.StringIO(plain_text(path, None), newline="").readlines()
     if lines and not lines[-1].endswith("\n"):
         lines.pop()
     try:

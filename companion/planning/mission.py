@@ -15,6 +15,7 @@ from typing import Any
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from companion.errors import MissionFileError
+from localizer.plain_files import plain_text
 
 _MOST_BYTES = 16 << 20  # a mission of 32,767 items, the most that MAVLink counts, takes 8 MB
 _PLACES = (
@@ -85,11 +86,7 @@ class _Item:
 def read_mission(path: Path) -> PlannedMission:
     """Read either format; MissionFileError says what is wrong with a file."""
     try:
-        with path.open("rb") as file:
-            raw = file.read(_MOST_BYTES + 1)
-        if len(raw) > _MOST_BYTES:
-            raise MissionFileError(f"{path}: over {_MOST_BYTES >> 20} MiB; that is no mission")
-        text = raw.decode("utf-8")
+        text = plain_text(path, _MOST_BYTES)
         home: tuple[float, float] | None
         if path.suffix == ".plan":
             home, items = _plan(json.loads(text))

@@ -7,6 +7,7 @@ from pathlib import Path
 
 from companion.errors import ConfigError
 from localizer.map.cache.cache import MANIFEST_NAME
+from localizer.plain_files import plain_bytes
 
 
 def map_hash(cache: Path) -> str:
@@ -17,7 +18,7 @@ def map_hash(cache: Path) -> str:
     """
     path = cache / MANIFEST_NAME
     try:
-        return hashlib.sha256(path.read_bytes()).hexdigest()
+        return hashlib.sha256(plain_bytes(path)).hexdigest()
     except OSError as error:
         raise ConfigError(f"{path}: cannot be read: {error}") from error
 

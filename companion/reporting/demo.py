@@ -24,6 +24,7 @@ from companion.reporting.record import (
 )
 from companion.reporting.record import uncertainty_plots as uncertainty
 from companion.reporting.verdicts import advice
+from localizer.plain_files import plain_text
 
 _TRUTH, _EKF = "#ffffff", "#1fd1ff"
 _LARGE_M = 3.0  # an error that the first-fault line names
@@ -34,11 +35,11 @@ def demo_report(folder: Path) -> Report:
     """The report of `python -m sitl demo --out folder`."""
     record = read_record(folder / "companion")
     try:
-        document = json.loads((folder / "report.json").read_text(encoding="utf-8"))
+        document = json.loads(plain_text(folder / "report.json"))
         truth = read_columns(folder / "frames.csv")
         vehicle = read_columns(folder / "vehicle.csv")
         denied = read_columns(folder / "frames_report.csv")["exposure_time_ns"]
-    except (OSError, ValueError, KeyError) as error:
+    except (OSError, ValueError, KeyError, RecursionError) as error:
         raise RecordError(f"{folder}: not a demo's folder: {error}") from error
     figures_of = document["report"]
     start_ns = int(denied[0]) if len(denied) else record.start_ns

@@ -14,6 +14,7 @@ from companion.reporting.pictures import map_pictures
 from companion.reporting.record import VISION
 from companion.reporting.verdicts import advice
 from companion.sources.folder_source import read_image
+from localizer.plain_files import plain_text
 
 _TEXT = ("name", "state", "status", "problem")
 _SHEETS = 3  # pictures side by side on an overlay sheet: video, render, checkerboard
@@ -22,10 +23,10 @@ _SHEETS = 3  # pictures side by side on an overlay sheet: video, render, checker
 def evaluation_report(folder: Path) -> Report:
     """The report of `companion eval --report folder`."""
     try:
-        document = json.loads((folder / "report.json").read_text(encoding="utf-8"))
+        document = json.loads(plain_text(folder / "report.json"))
         frames = read_columns(folder / "frames.csv", _TEXT)
         settings = document["settings"]
-    except (OSError, ValueError, KeyError, TypeError) as error:
+    except (OSError, ValueError, KeyError, TypeError, RecursionError) as error:
         raise RecordError(f"{folder}: not an evaluation's folder: {error}") from error
     if not frames:
         raise RecordError(f"{folder}: frames.csv holds no frame")

@@ -20,6 +20,7 @@ from companion.offline.tables import Columns
 from companion.reporting.record import RecordTables, is_time_ns, read_record
 from localizer.errors import LocalizerError
 from localizer.map.cache.cache import TileCache
+from localizer.plain_files import plain_bytes
 from mavlink_bridge.errors import BridgeError
 from mavlink_bridge.link.tlog import read_tlog
 
@@ -137,7 +138,7 @@ def _pictures(folder: Path, offset_ns: int, take: Callable[[bytes, int], None]) 
 
 def _take_picture(take: Callable[[bytes, int], None], path: Path, time_ns: int) -> None:
     """Read when its turn comes: a flight's pictures do not fit in memory together."""
-    take(path.read_bytes(), time_ns)
+    take(plain_bytes(path), time_ns)
 
 
 def _mavlink(file: Any, path: Path, tables: RecordTables) -> Iterator[Step]:

@@ -21,6 +21,7 @@ from companion.reporting.content import Curve, Overlay, Plot, Report, Track, Ver
 from companion.reporting.pictures import ShownFrame, map_pictures
 from localizer.errors import CameraError
 from localizer.geometry.camera import Camera
+from localizer.plain_files import plain_text
 
 _OVERLAYS = 8
 KEPT_FRAMES = "the frames that the record kept (record.snapshot_interval_s), not of all"
@@ -337,7 +338,7 @@ def _how_it_ended(tables: RecordTables) -> str:
 
 def _document(path: Path) -> dict[str, Any]:
     try:
-        value = json.loads(path.read_text(encoding="utf-8"))
+        value = json.loads(plain_text(path))
     except (OSError, ValueError, RecursionError):
         return {}
     return value if isinstance(value, dict) else {}

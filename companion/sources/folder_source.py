@@ -21,6 +21,7 @@ from companion.sources.base import (
     scaling_text,
 )
 from localizer.geometry.camera import Camera
+from localizer.plain_files import plain_bytes, plain_text
 from localizer.types import Frame, Image
 
 IMAGE_SUFFIXES = frozenset({".jpg", ".jpeg", ".png", ".bmp", ".tif", ".tiff"})
@@ -45,7 +46,7 @@ def read_image(path: Path) -> Image:
     flags = cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION
     try:
         # imdecode, because imread prints a warning for what becomes a named error here.
-        bgr = cv2.imdecode(np.frombuffer(path.read_bytes(), np.uint8), flags)
+        bgr = cv2.imdecode(np.frombuffer(plain_bytes(path), np.uint8), flags)
     except (OSError, cv2.error) as error:
         raise StreamDecodeError(f"{path}: cannot be read: {error}") from error
     if bgr is None:
@@ -56,7 +57,11 @@ def read_image(path: Path) -> Image:
 def read_timestamps(path: Path) -> dict[str, int]:
     """Image name to exposure time in ns, from lines ``name time_ns`` (blank or comma between)."""
     times: dict[str, int] = {}
-    for number, line in enumerate(path.read_text().splitlines(), start=1):
+    try:
+        lines = plain_text(path).splitlines()
+    except (OSError, UnicodeDecodeError) as error:
+        raise StreamDecodeError(f"{path}: cannot be read: {error}") from error
+    for number, line in enumerate(lines, start=1):
         text = line.split("#", 1)[0].replace(",", " ").split()
         if not text:
             continue

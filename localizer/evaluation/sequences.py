@@ -23,6 +23,7 @@ from localizer.geometry.geo import LocalFrame
 from localizer.geometry.pose import Array, Pose, so3_exp
 from localizer.geometry.posefile import read_poses, world_from_camera
 from localizer.pictures import read_rgb
+from localizer.plain_files import plain_text
 from localizer.tracking.pipeline import Localizer
 from localizer.types import Frame, PoseEstimate, PosePrior, RegistrationStatus
 
@@ -140,7 +141,7 @@ def _times(images: Path, paths: tuple[Path, ...]) -> tuple[int, ...]:
     try:
         stamps = {
             name: int(time_ns)
-            for name, time_ns in (x.split() for x in file.read_text().split("\n") if x)
+            for name, time_ns in (x.split() for x in plain_text(file).split("\n") if x)
         }
         times = tuple(stamps[path.name] for path in paths)
     except (OSError, ValueError, KeyError) as error:

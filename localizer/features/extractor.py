@@ -22,11 +22,13 @@ from localizer.features.bound_session import BoundSession
 from localizer.features.gradient import GradientExtractor
 from localizer.features.image import check_image
 from localizer.features.providers import Expected, provider_of, start_session
+from localizer.plain_files import plain_bytes, plain_text
 from localizer.types import FeatureLevel, FeaturePyramid, Image
 
 _log = logging.getLogger(__name__)
 
 SHIPPED_MODEL = Path(__file__).parent / "weights" / "tiny.onnx"
+_MOST_BYTES = 1 << 30
 
 
 class FeatureExtractor(Protocol):
@@ -83,7 +85,7 @@ def read_model_info(model: Path) -> ModelInfo:
     """Metadata of `model`, with the graph's hash verified against it."""
     path = model.with_suffix(".json")
     try:
-        info = ModelInfo.model_validate_json(path.read_text())
+        info = ModelInfo.model_validate_json(plain_text(path))
     except OSError as error:
         raise ModelError(
             f"{path}: cannot be read ({error.strerror}); every model needs its JSON file beside it"
@@ -94,7 +96,7 @@ def read_model_info(model: Path) -> ModelInfo:
     except ValueError as error:  # no UTF-8
         raise ModelError(f"{path}: not a valid model description: {error}") from error
     try:
-        digest = hashlib.sha256(model.read_bytes()).hexdigest()
+        digest = hashlib.sha256(plain_bytes(model, _MOST_BYTES)).hexdigest()
     except OSError as error:
         raise ModelError(f"{model}: cannot be read: {error.strerror}") from error
     if digest != info.sha256:

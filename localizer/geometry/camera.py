@@ -17,6 +17,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from localizer.errors import CameraError
 from localizer.geometry.pose import Array
+from localizer.plain_files import plain_text
 
 MAX_READOUT_MS = 200.0
 _KEYS = ("width", "height", "fx", "fy", "cx", "cy")
@@ -84,10 +85,10 @@ class Camera:
     def from_json(cls, path: Path | str) -> Camera:
         """From a ``camera.json`` file."""
         try:
-            data = json.loads(Path(path).read_text(encoding="utf-8"))
+            data = json.loads(plain_text(Path(path)))
         except FileNotFoundError as error:
             raise CameraError(f"{path}: does not exist") from error
-        except (OSError, ValueError) as error:
+        except (OSError, ValueError, RecursionError) as error:
             raise CameraError(f"{path}: cannot be read as JSON: {error}") from error
         if not isinstance(data, dict):
             raise CameraError(f"{path}: expected an object with {', '.join(_KEYS)}")

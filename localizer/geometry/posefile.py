@@ -16,6 +16,7 @@ import numpy as np
 from localizer.errors import GeoreferenceError, PoseFileError
 from localizer.geometry.geo import Geodetic, LocalFrame
 from localizer.geometry.pose import Array, Pose
+from localizer.plain_files import plain_text
 
 _OPENCV_FROM_OPENGL: Array = np.diag([1.0, -1.0, -1.0])
 
@@ -37,7 +38,7 @@ def read_poses(path: Path | str) -> tuple[PoseRow, ...]:
     A line is ``name lon lat alt roll pitch yaw``: degrees, metres above the ellipsoid.
     """
     try:
-        lines = Path(path).read_text(encoding="utf-8").splitlines()
+        lines = plain_text(Path(path)).splitlines()
     except (OSError, UnicodeDecodeError) as error:
         raise PoseFileError(f"{path}: cannot be read: {error}") from error
     rows = [

@@ -16,6 +16,7 @@ import numpy as np
 
 from localizer.errors import PoseFileError
 from localizer.geometry.pose import Array, Pose, matrix_from_quaternion, quaternion_from_matrix
+from localizer.plain_files import plain_text
 
 _TUM_FIELDS = "time x y z qx qy qz qw"
 COVARIANCE_COLUMNS = (
@@ -59,7 +60,7 @@ def tum_line(pose: StampedPose) -> str:
 def read_tum(path: Path) -> tuple[StampedPose, ...]:
     """Every pose of a TUM file, named by its time in ns; blank lines and comments are skipped."""
     try:
-        lines = path.read_text(encoding="utf-8").splitlines()
+        lines = plain_text(path).splitlines()
     except (OSError, UnicodeDecodeError) as error:
         raise PoseFileError(f"{path}: cannot be read: {error}") from error
     poses = tuple(

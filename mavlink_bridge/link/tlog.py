@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import errno
 import logging
+import stat
 import struct
 import threading
 from collections import deque
@@ -161,6 +162,11 @@ def read_tlog(path: Path) -> Iterator[tuple[int, Any]]:
     Raises `RecordError` where the file cannot be read or holds something else.
     """
     try:
+        status = path.stat()
+        if not stat.S_ISREG(status.st_mode):  # a record names it: a pipe or a device has no end
+            raise RecordError(f"{path}: is not a plain file")
+        if status.st_size > _MAX_BYTES:
+            raise RecordError(f"{path}: is larger than the {_MAX_BYTES >> 30} GiB of a .tlog")
         data = path.read_bytes()
     except OSError as error:
         raise RecordError(f"{path}: cannot be read: {error.strerror}") from error

@@ -102,8 +102,16 @@ def test_files_that_are_no_mapping(tmp_path, text):
 
 
 def test_a_file_without_end_is_not_read_to_its_end():
-    with pytest.raises(ConfigError, match="over 1 MiB; that is no file of settings"):
+    with pytest.raises(ConfigError, match="cannot be read: is not a plain file"):
         load_config(Path("/dev/zero"))
+
+
+def test_a_log_given_by_mistake_is_not_read_to_its_end(tmp_path):
+    path = tmp_path / "flight.log"
+    with path.open("wb") as file:
+        file.truncate(1 << 40)  # sparse
+    with pytest.raises(ConfigError, match="cannot be read: is larger than 1 MiB"):
+        load_config(path)
 
 
 def test_aliases_that_multiply_do_not_multiply_the_error(tmp_path):

@@ -12,6 +12,7 @@ from localizer.geometry.geo import Geodetic, LocalFrame, geodetic_from_ecef
 from localizer.geometry.pose import Array
 from localizer.map.building.quadtree import mips_of, quadtree
 from localizer.map.building.topdown import Textured, made_error, seen_from_above
+from localizer.map.importers.rules import ImportRules
 from localizer.map.importers.tiles3d import ContentFile
 from localizer.map.source import SourceMesh, SourceNode, SourceTree, TileSource
 
@@ -32,6 +33,11 @@ class ContentModel:
     def name(self) -> str:
         """How errors name it."""
         return self.content.name
+
+    @property
+    def rules(self) -> ImportRules:
+        """See `Model.rules`."""
+        return self.content.rules
 
     def load(self) -> list[SourceMesh]:
         """See `Model.load`."""

@@ -14,6 +14,7 @@ from localizer.map.building.cutting import cropped
 from localizer.map.building.staging import texel_size
 from localizer.map.building.topdown import TEXELS, made_error, seen_from_above
 from localizer.map.cache.tile import build_mips
+from localizer.map.importers.rules import ImportRules
 from localizer.map.source import SourceMesh, SourceNode
 from localizer.types import Image
 
@@ -29,6 +30,11 @@ class Model(Protocol):
     @property
     def name(self) -> str:
         """How errors name it."""
+        ...
+
+    @property
+    def rules(self) -> ImportRules:
+        """What its import may take."""
         ...
 
     def load(self) -> list[SourceMesh]:
@@ -109,6 +115,9 @@ def quadtree(model: Model) -> SourceNode:
     triangles = sum(len(m.faces) for m in meshes)
     leaves = max(texels / TEXELS, np.sqrt(triangles / LEAF_TRIANGLES), 1.0)
     grid = MeshGrid(float(low[0]), float(high[1]), extent, 1 + int(np.ceil(np.log2(leaves))))
+    # One vertex far aside asks for squares of the finest texels all the way there.
+    what = f"{model.name}, {extent:.0f} m wide with texels from {min(sizes, default=extent):.2g} m"
+    model.rules.require("nodes", (4**grid.levels - 1) // 3, what)
     return _node(MeshTile(model, grid, 0, 0, 0))
 
 

@@ -96,7 +96,10 @@ def mesh_tree(path: Path, georeference: Georeference, options: SourceOptions) ->
     centre = georeference.ecef(np.array([middle]))[0]
     files = (path, *files_beside(path))
     missing = colour_pictures(path)[1] if path.suffix.lower() == ".obj" else ()
-    warnings = tuple(f"{path.name}: its texture {name!r} is not there" for name in missing)
+    warnings = [f"{path.name}: its texture {name!r} is not there" for name in missing]
+    text = georeference.far_outside(np.array([low, high]))
+    if text is not None:
+        warnings.append(options.rules.doubt("area", f"{path}: {text}"))
     return SourceTree(
         quadtree(model),
         centre,
@@ -104,5 +107,5 @@ def mesh_tree(path: Path, georeference: Georeference, options: SourceOptions) ->
         "",
         files,
         options=f"{georeference} {axis}",
-        warnings=warnings,
+        warnings=tuple(warnings),
     )

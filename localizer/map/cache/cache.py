@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import hashlib
 import json
-import os
-import stat
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -22,6 +20,7 @@ from localizer.errors import GeoreferenceError, MapCacheError
 from localizer.geometry.geo import Geodetic, LocalFrame
 from localizer.geometry.pose import Array, Pose
 from localizer.map.cache.tile import PackedTexture, TileMesh, mesh_fault
+from localizer.plain_files import plain_bytes
 from localizer.types import Float32, Image
 
 FORMAT_VERSION = 1
@@ -141,7 +140,7 @@ class TileCache:
         path = Path(path)
         manifest = _read_manifest(path)
         try:
-            data = _file_bytes(path / INDEX_NAME)
+            data = plain_bytes(path / INDEX_NAME, None)
         except OSError as error:
             raise MapCacheError(f"{path / INDEX_NAME}: cannot be read: {error}") from error
         if hashlib.sha256(data).hexdigest() != manifest.index_sha256:
@@ -188,7 +187,7 @@ class TileCache:
             raise MapCacheError(f"{self.path}: no tile {tile_id}; the index has {self.tile_ids}")
         path = self.tile_path(tile_id)
         try:
-            data = _file_bytes(path)
+            data = plain_bytes(path, None)
         except OSError as error:
             raise MapCacheError(f"tile {tile_id}, {path}: cannot be read: {error}") from error
         if hashlib.sha256(data).digest() != self.index.digest[tile_id].tobytes():
@@ -266,15 +265,6 @@ def _decode_image(data: NDArray[np.uint8]) -> Image:
     return decoded
 
 
-def _file_bytes(path: Path) -> bytes:
-    """A regular file's content; OSError for a pipe or a device, on which a read waits for ever."""
-    descriptor = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC)
-    with open(descriptor, "rb") as file:
-        if not stat.S_ISREG(os.fstat(descriptor).st_mode):
-            raise OSError(f"{path} is no regular file")
-        return file.read()
-
-
 def _read_manifest(path: Path) -> Manifest:
     where = path / MANIFEST_NAME
     if not where.is_file():
@@ -283,8 +273,8 @@ def _read_manifest(path: Path) -> Manifest:
             f"`companion map build SOURCE --out {path}`"
         )
     try:
-        data = json.loads(where.read_bytes())
-    except (OSError, ValueError) as error:
+        data = json.loads(plain_bytes(where))
+    except (OSError, ValueError, RecursionError) as error:
         raise MapCacheError(f"{where}: cannot be read as JSON: {error}") from error
     version = data.get("format_version") if isinstance(data, dict) else None
     if version != FORMAT_VERSION:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import re
 from dataclasses import dataclass
 from functools import lru_cache
@@ -16,7 +17,8 @@ from pyproj.exceptions import CRSError
 from localizer.errors import GeoreferenceError
 from localizer.geometry.geo import Geodetic, LocalFrame, ecef_from_geodetic
 from localizer.geometry.pose import Array, so3_exp
-from localizer.map.importers.height_crs import horizontal_unit_m
+from localizer.map.importers.height_crs import far_outside, horizontal_unit_m
+from localizer.plain_files import plain_text
 
 UpAxis = Literal["y", "z"]
 
@@ -41,6 +43,16 @@ class Georeference:
         turn = so3_exp([0.0, 0.0, -np.radians(self.heading_deg)])
         return LocalFrame(self.origin).ecef_from_enu.apply(points @ turn.T)
 
+    def far_outside(self, points: Array) -> str | None:
+        """What points (N, 3) of the mesh lie far outside of, see `height_crs.far_outside`."""
+        if self.crs is None:
+            return None
+        placed = points + np.array(self.offset)
+        lon, lat = _geographic(self.crs).transform(placed[:, 0], placed[:, 1])
+        if not np.isfinite(lon).all():
+            return None  # an error where it is placed
+        return far_outside(CRS(self.crs), np.asarray(lon), np.asarray(lat))
+
 
 def read_georeference(path: Path) -> Georeference:
     """Read OpenDroneMap's offset file (``WGS84 UTM 29N`` and ``easting northing``), or JSON:
@@ -48,14 +60,16 @@ def read_georeference(path: Path) -> Georeference:
     ``{"epsg": 32629, "offset": [easting, northing, height]}``.
     """
     try:
-        text = path.read_text()
+        text = plain_text(path)
     except (OSError, UnicodeDecodeError) as error:
         raise GeoreferenceError(f"{path}: cannot be read: {error}") from error
     try:
         if text.lstrip().startswith("{"):
             return _from_json(json.loads(text))
         return _from_odm(text)
-    except (ValueError, TypeError, KeyError, AttributeError, CRSError) as error:
+    except (
+        ValueError, TypeError, KeyError, AttributeError, CRSError, GeoreferenceError, RecursionError
+    ) as error:  # fmt: skip
         raise GeoreferenceError(f"{path}: not a georeference: {error!r}") from error
 
 
@@ -70,7 +84,10 @@ def _from_json(data: dict[str, Any]) -> Georeference:
         return Georeference(crs.to_2d().to_wkt(), (x, y, z))
     o = data["origin"]
     origin = Geodetic(float(o["lat"]), float(o["lon"]), float(o["height"]))
-    return Georeference(origin=origin, heading_deg=float(data.get("heading_deg", 0.0)))
+    heading_deg = float(data.get("heading_deg", 0.0))
+    if not math.isfinite(heading_deg):
+        raise ValueError(f"heading_deg is {heading_deg}")
+    return Georeference(origin=origin, heading_deg=heading_deg)
 
 
 def _from_odm(text: str) -> Georeference:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import base64
 import binascii
 import json
+import reprlib
 import struct
 from collections.abc import Callable
 from typing import Any
@@ -154,8 +155,8 @@ def vector(values: Any, length: int, what: str) -> Array:
 
 def whole(value: Any, what: str) -> int:
     """A whole number of the JSON, from 0 up."""
-    if not isinstance(value, int) or isinstance(value, bool) or value < 0:
-        raise MapSourceError(f"{what} is {value!r}, not a whole number from 0 up")
+    if not isinstance(value, int) or isinstance(value, bool) or not 0 <= value < 1 << 63:
+        raise MapSourceError(f"{what} is {reprlib.repr(value)}, not a whole number from 0 up")
     return value
 
 

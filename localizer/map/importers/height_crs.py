@@ -4,9 +4,11 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+import numpy as np
 from pyproj import CRS
 
 from localizer.errors import GeoreferenceError
+from localizer.geometry.pose import Array
 from localizer.map.source import VerticalDatum
 
 _FOOT, _US_FOOT = 0.3048, 1200 / 3937
@@ -19,6 +21,7 @@ UNITS = {
     "mm": 0.001, "millimetre": 0.001,
 }  # fmt: skip
 _EGM96 = "EGM96"
+_FAR_DEG = 10.0  # beyond the neighbouring zones that projects on a border are drawn in
 
 
 @dataclass(frozen=True)
@@ -66,6 +69,29 @@ def horizontal_unit_m(crs: CRS) -> float:
     """Metres per unit of a projected CRS; 1 for degrees, which say nothing of heights."""
     flat = crs.sub_crs_list[0] if crs.is_compound else crs
     return float(flat.axis_info[0].unit_conversion_factor) if flat.is_projected else 1.0
+
+
+def far_outside(crs: CRS, lon: Array, lat: Array) -> str | None:
+    """What places (N,), degrees, lie far outside of: the area that a CRS is for; None where they
+    do not, or it is not known. Easting and northing swapped lead there.
+    """
+    flat = crs.sub_crs_list[0] if crs.is_compound else crs.to_2d()
+    area = flat.area_of_use
+    if area is None and (epsg := flat.to_epsg()) is not None:
+        area = CRS.from_epsg(epsg).area_of_use
+    if area is None:
+        return None
+    width = (area.east - area.west) % 360.0 or 360.0
+    past = (lon - area.west) % 360.0
+    aside = np.where(past <= width, 0.0, np.minimum(past - width, 360.0 - past))
+    beyond = np.maximum(np.maximum(area.south - lat, lat - area.north), aside)
+    worst = int(np.argmax(beyond))
+    if beyond[worst] <= _FAR_DEG:
+        return None
+    return (
+        f"lies at {lat[worst]:.4f}, {lon[worst]:.4f}, {beyond[worst]:.0f} degrees outside the area "
+        f"of its CRS, {flat.name}; are easting and northing swapped?"
+    )
 
 
 def unit_of(name: str) -> float:

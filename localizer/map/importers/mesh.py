@@ -56,6 +56,8 @@ class MeshFile:
             fault = mesh_fault(mesh.positions, mesh.uvs, mesh.faces)
             if fault is not None:
                 raise MapSourceError(f"{self.path}: {fault}")
+        if not any(_has_area(m) for m in meshes):
+            raise MapSourceError(f"{self.path}: its triangles have no area")
         if self.up_axis == "y":
             meshes = [replace(m, positions=m.positions @ _Z_UP_FROM_Y_UP.T) for m in meshes]
         return meshes
@@ -63,6 +65,11 @@ class MeshFile:
     def ecef(self, points: Array) -> Array:
         """See `Model.ecef`."""
         return self.georeference.ecef(points)
+
+
+def _has_area(mesh: SourceMesh) -> bool:
+    a, b, c = (mesh.positions[mesh.faces[:, i]] for i in range(3))
+    return bool(np.any(np.cross(b - a, c - a)))
 
 
 def _read_obj(path: Path, rules: ImportRules) -> list[SourceMesh]:

@@ -19,6 +19,7 @@ import rasterio.warp
 from affine import Affine
 from numpy.typing import NDArray
 from pyproj import CRS, Transformer
+from pyproj.exceptions import ProjError
 from rasterio._err import CPLE_BaseError
 from rasterio.enums import ColorInterp, Resampling
 from rasterio.errors import RasterioError
@@ -106,7 +107,7 @@ class RasterTile:
                     return []
                 image, shown = self._image()
         except (RasterioError, CPLE_BaseError, OSError, ValueError) as error:
-            raise MapSourceError(f"cannot be read: {error}") from error
+            raise MapSourceError(f"cannot be read: {error.__cause__ or error}") from error
         mesh = height_mesh(heights, shown, self.step, lossless=self._finest)
         if mesh is None:
             return []
@@ -188,18 +189,22 @@ def read_rasters(
     for a missing height where the DSM does not say it.
     """
     rules = rules or ImportRules()
-    with offline():
-        return _read_rasters(paths, rules, height_unit, nodata)
+    try:
+        with offline():
+            return _read_rasters(paths, rules, height_unit, nodata)
+    except (RasterioError, CPLE_BaseError, ProjError) as error:
+        names = ", ".join(map(str, paths))
+        raise MapSourceError(f"{names}: cannot be read: {error.__cause__ or error}") from error
 
 
 def _read_rasters(
     paths: Sequence[Path], rules: ImportRules, height_unit: str | None, nodata: float | None
 ) -> SourceTree:
-    dsm, ortho = _told_apart(paths, rules)
+    dsm, ortho, doubts = _told_apart(paths, rules)
     with open_raster(dsm) as heights, open_raster(ortho) as colours:
         stated = stated_heights(CRS(heights.crs), heights.units[0], dsm)
         band, warnings = _height_band(dsm, heights, stated, height_unit, nodata, rules)
-        warnings += check_heights(dsm, heights, band, rules)
+        warnings += doubts + check_heights(dsm, heights, band, rules)
         warnings += check_overlap(heights, band, colours, rules)
         grid = _grid(heights, colours)
         centre = ecef_from_crs(grid.crs, np.array([[*_centre(heights, grid.crs), 0.0]]))[0]
@@ -252,6 +257,11 @@ def _height_band(
             )
         unit = 1.0
     gain, offset = float(data.scales[0] or 1.0), float(data.offsets[0])
+    if not (math.isfinite(gain) and gain > 0 and math.isfinite(offset)):
+        raise MapSourceError(
+            f"{path}: its band's scale {gain:g} and offset {offset:g} make no heights of its "
+            "numbers; correct them (gdal_edit -scale -offset)"
+        )
     if nodata is not None and data.nodata is not None and nodata != data.nodata:
         warnings.append(f"{path.name}: --nodata {nodata:g} instead of its own {data.nodata:g}")
     return HeightBand(gain * unit, offset * unit, nodata), warnings
@@ -283,11 +293,12 @@ class _Tree:
         return SourceNode(error, True, (tile,), children)
 
 
-def _told_apart(paths: Sequence[Path], rules: ImportRules) -> tuple[Path, Path]:
+def _told_apart(paths: Sequence[Path], rules: ImportRules) -> tuple[Path, Path, list[str]]:
     found: dict[str, Path] = {}
+    warnings: list[str] = []
     for path in paths:
         with open_raster(path) as data:
-            require_sane(path, data, rules)
+            warnings += require_sane(path, data, rules)
             kind = _kind(data)
         if kind in found:
             raise MapSourceError(f"{path}: a second {kind}; give one DSM and one orthophoto")
@@ -298,14 +309,14 @@ def _told_apart(paths: Sequence[Path], rules: ImportRules) -> tuple[Path, Path]:
                 "a map of rasters needs a DSM and an orthophoto of the same ground: "
                 f"the {kind} is missing"
             )
-    return found["DSM"], found["orthophoto"]
+    return found["DSM"], found["orthophoto"], warnings
 
 
 def _kind(data: DatasetReader) -> str:
     """By the bands: heights are one band wider than a byte, colours are bytes."""
     bands = zip(data.dtypes, data.colorinterp, strict=True)
     colours = [dtype for dtype, meaning in bands if meaning != ColorInterp.alpha]
-    if len(colours) == 1 and colours[0] != "uint8":
+    if len(colours) == 1 and colours[0] != "uint8" and not colours[0].startswith("complex"):
         return "DSM"
     if all(dtype == "uint8" for dtype in colours) and len(colours) in (1, 3, 4):
         return "orthophoto"

@@ -13,12 +13,14 @@ import rasterio
 from affine import Affine
 from numpy.typing import NDArray
 from pyproj import CRS, Transformer
+from pyproj.exceptions import ProjError
 from rasterio.enums import ColorInterp, MaskFlags
 from rasterio.errors import RasterioError
 from rasterio.io import DatasetReader
 
 from localizer.errors import GeoreferenceError, MapSourceError
 from localizer.geometry.pose import Array
+from localizer.map.importers.height_crs import far_outside
 from localizer.map.importers.rules import ImportRules, require_plain_file
 
 _TIFF = (b"II*\0", b"MM\0*", b"II+\0", b"MM\0+")
@@ -88,8 +90,10 @@ def _require_plain_sidecar(path: Path) -> None:
         raise MapSourceError(f"{path}: names other files or addresses; remove it")
 
 
-def require_sane(path: Path, data: DatasetReader, rules: ImportRules) -> None:
-    """What every raster of a map must have: a size within the limits, a CRS and a place."""
+def require_sane(path: Path, data: DatasetReader, rules: ImportRules) -> list[str]:
+    """What every raster of a map must have: a size within the limits, a CRS and a place. Returns
+    the doubts that were set aside.
+    """
     rules.require("pixels", float(data.width) * data.height, path)
     if data.crs is None:
         raise GeoreferenceError(f"{path}: the raster has no CRS; assign it one")
@@ -101,6 +105,38 @@ def require_sane(path: Path, data: DatasetReader, rules: ImportRules) -> None:
         )
     if not np.isfinite(numbers).all() or abs(data.transform.determinant) < 1e-18:
         raise GeoreferenceError(f"{path}: the raster's geotransform {numbers.tolist()} is singular")
+    return _placed(path, data, rules)
+
+
+def _placed(path: Path, data: DatasetReader, rules: ImportRules) -> list[str]:
+    """Doubts about where its corners lie; an error where that is nowhere on Earth."""
+    crs = CRS(data.crs)
+    if not crs.is_geographic and not crs.is_projected:
+        raise GeoreferenceError(
+            f"{path}: its CRS, {crs.name}, is neither geographic nor projected: nothing says where "
+            "on Earth it lies; assign it one that does"
+        )
+    x, y = applied(
+        data.transform,
+        np.array([0.0, data.width, 0.0, data.width]),
+        np.array([0.0, 0.0, data.height, data.height]),
+    )
+    try:
+        lon, lat = _flat(crs.to_wkt(), "EPSG:4326").transform(x, y)
+    except ProjError as error:
+        raise GeoreferenceError(f"{path}: its CRS, {crs.name}: {error}") from error
+    if not (np.isfinite(lon).all() and (np.abs(lat) <= 90.0).all()):
+        raise GeoreferenceError(
+            f"{path}: its corners ({x[0]:g}, {y[0]:g} ...) lie outside the area where its CRS, "
+            f"{crs.name}, is defined; are easting and northing, or longitude and latitude, swapped?"
+        )
+    if crs.is_geographic and max(abs(x)) > 180.0:  # GDAL leaves out what lies beyond
+        raise GeoreferenceError(
+            f"{path}: reaches from longitude {min(x):.4f} to {max(x):.4f}, beyond the date line; "
+            "warp it into a projected CRS, such as the UTM zone there (gdalwarp -t_srs)"
+        )
+    text = far_outside(crs, lon, lat)
+    return [] if text is None else [rules.doubt("area", f"{path}: {text}")]
 
 
 def has_own_mask(data: DatasetReader) -> bool:

@@ -12,6 +12,7 @@ from typing import Any
 from localizer.errors import MapSourceError
 
 DOUBTS = {
+    "area": "a place far outside the area that its CRS is for",
     "datum": "the heights' unit or datum contradicts what was given, or is not known",
     "geoid": "the geoid separation is not that of the place",
     "heights": "heights that no ground on Earth has",

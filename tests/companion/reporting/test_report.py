@@ -2,6 +2,7 @@
 
 import csv
 import json
+import os
 import re
 
 import cv2
@@ -134,6 +135,19 @@ def test_a_damaged_record_still_gives_what_it_holds(record):
     assert any("record.json cannot be read" in note for note in report.notes)
     assert any("map" in note for note in report.notes)
     assert "no health.json" in render(report)
+
+
+def test_a_record_keeps_no_reader_waiting(record):
+    """A foreign record may hold a pipe that nobody writes into, or lead to a device."""
+    (record / "health.json").unlink()
+    os.mkfifo(record / "health.json")
+    (record / "record.json").unlink()
+    (record / "record.json").symlink_to("/dev/zero")
+    assert "no health.json" in render(record_report(record))
+    (record / "events.csv").unlink()
+    os.mkfifo(record / "events.csv")
+    with pytest.raises(RecordError, match=r"is not a plain file: .*events\.csv"):
+        read_record(record)
 
 
 def test_a_flight_that_localized_nothing_has_a_report(record):

@@ -19,7 +19,7 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 from mavlink_bridge import Bridge, BridgeConfig
 from mavlink_bridge.errors import RecordError
 from mavlink_bridge.link.link import sleep_until
-from mavlink_bridge.link.tlog import TlogRecorder
+from mavlink_bridge.link.tlog import TlogRecorder, read_tlog
 
 FULL = Path("/dev/full")
 
@@ -159,3 +159,15 @@ def test_mavlogdump_and_mavutil_read_every_frame(tmp_path: Path) -> None:
     ).stdout.splitlines()
     assert len(printed) == 201  # and the header
     assert "ATTITUDE.time_boot_ms" in printed[0]
+
+
+@pytest.mark.parametrize("kind", ["pipe", "device", "endless"])
+def test_a_tlog_that_a_record_names_keeps_no_reader_waiting(tmp_path: Path, kind: str) -> None:
+    path = Path("/dev/zero") if kind == "device" else tmp_path / "a.tlog"
+    if kind == "pipe":
+        os.mkfifo(path)
+    if kind == "endless":
+        with path.open("wb") as file:
+            file.truncate(1 << 40)  # sparse
+    with pytest.raises(RecordError, match=r"not a plain file|larger than the 2 GiB"):
+        list(read_tlog(path))

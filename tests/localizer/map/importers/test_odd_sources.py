@@ -12,6 +12,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 import pytest
 import rasterio
@@ -163,6 +164,60 @@ def singular(folder):
 
 def no_crs(folder):
     return rasters(folder, crs=None)
+
+
+def degrees_swapped(folder):
+    """Latitude where longitude belongs: rows beyond the pole."""
+    there = {"crs": "EPSG:4326", "step": 1e-5, "place": (47.2, 189.0)}
+    return rasters(folder, ortho=dict(there), **there)
+
+
+def across_the_date_line(folder):
+    there = {"crs": "EPSG:4326", "step": 1e-5, "place": (180.0 - 24e-5, 10.0)}
+    return rasters(folder, ortho=dict(there), **there)
+
+
+def site_grid(folder):
+    crs = 'LOCAL_CS["site grid",UNIT["metre",1]]'
+    return rasters(folder, crs=crs, ortho={"crs": crs})
+
+
+def geocentric(folder):
+    return rasters(folder, crs="EPSG:4978", ortho={"crs": "EPSG:4978"})
+
+
+def on_the_moon(folder):
+    crs = (
+        'GEOGCS["Moon",DATUM["D_Moon",SPHEROID["Moon",1737400,0]],PRIMEM["m",0],'
+        'UNIT["degree",0.0174532925199433]]'
+    )
+    there = {"crs": crs, "step": 1e-5, "place": (9.0, 47.2)}
+    return rasters(folder, ortho=dict(there), **there)
+
+
+def upside_down(folder):
+    """A band whose scale makes depths of heights."""
+    return rasters(folder, scales=(-1.0,))
+
+
+def scale_not_a_number(folder):
+    return rasters(folder, scales=(float("nan"),))
+
+
+def complex_numbers(folder):
+    return rasters(folder, ground().astype(np.complex64))
+
+
+def cut_in_half(folder):
+    paths = rasters(folder)
+    data = paths[0].read_bytes()
+    paths[0].write_bytes(data[: len(data) // 2])
+    return paths
+
+
+def metres_swapped(folder):
+    there = {"place": (TOP, LEFT)}
+    return rasters(folder, ortho=dict(there), **there)
 
 
 def palette(folder):
@@ -361,6 +416,27 @@ def obj_device_texture(folder, make):
     return obj(folder, "map_Kd /dev/zero\n")
 
 
+def obj_of(folder, text):
+    path = folder / "m.obj"
+    path.write_text(text)
+    return path
+
+
+def obj_without_area(folder, make):
+    return obj_of(folder, "v 0 0 0\nv 10 0 0\nv 20 0 0\nf 1 2 3\n")
+
+
+def obj_swapped(folder, make):
+    return obj_of(folder, "v 0 0 0\nv 10 0 0\nv 0 10 0\nf 1 2 3\n")
+
+
+def obj_with_one_vertex_far_aside(folder, make):
+    obj(folder)
+    cv2.imwrite(str(folder / "t.png"), np.zeros((64, 64, 3), np.uint8))
+    text = (folder / "m.obj").read_text() + "v 500000 0 0\nf 1/1 2/2 4/3\n"
+    return obj_of(folder, text)
+
+
 def obj_pipe_texture(folder, make):
     os.mkfifo(folder / "t.png")
     return obj(folder)
@@ -401,6 +477,16 @@ RASTERS = [
     Refused(no_place, "no geotransform"),
     Refused(singular, "singular"),
     Refused(no_crs, "no CRS"),
+    Refused(degrees_swapped, "dsm.tif: its corners .* lie outside .* swapped"),
+    Refused(across_the_date_line, "dsm.tif: reaches from longitude 179.9998 to 180.0002, beyond"),
+    Refused(site_grid, "dsm.tif: its CRS, site grid, is neither geographic nor projected"),
+    Refused(geocentric, "neither geographic nor projected"),
+    Refused(on_the_moon, "dsm.tif: its CRS.* celestial body"),
+    Refused(upside_down, "dsm.tif: its band's scale -1"),
+    Refused(scale_not_a_number, "dsm.tif: its band's scale nan"),
+    Refused(complex_numbers, "1 bands of complex64: neither a DSM"),
+    Refused(cut_in_half, "dsm.tif.*: cannot be read: .*IReadBlock failed"),
+    Refused(metres_swapped, "dsm.tif: lies at .* outside the area of its CRS", trust="area"),
     Refused(palette, "indices into a palette"),
     Refused(empty_file, "no GeoTIFF"),
     Refused(text_named_tif, "no GeoTIFF"),
@@ -429,6 +515,14 @@ OTHERS = [
     Refused(obj_cut_texture, "t.png: a texture that cannot be read", MESH),
     Refused(obj_device_texture, "/dev/zero is not a plain file", MESH),
     Refused(obj_pipe_texture, "t.png is not a plain file", MESH),
+    Refused(obj_without_area, "m.obj: its triangles have no area", MESH),
+    Refused(
+        obj_swapped,
+        "m.obj: lies at .* outside the area of its CRS",
+        ELLIPSOIDAL | {"georeference": Georeference(UTM, (TOP, LEFT, 400.0))},
+        "area",
+    ),
+    Refused(obj_with_one_vertex_far_aside, "m.obj, 5000.. m wide .* nodes", MESH),
 ]
 
 
@@ -677,7 +771,7 @@ def test_limits_and_doubts_are_named():
     for text in ("pixels", "pixels=many", "stars=3", "nodes=0", "depth=1e6"):
         with pytest.raises(MapSourceError, match="--limit"):
             ImportRules.of([text])
-    with pytest.raises(MapSourceError, match="no such doubt; there are datum"):
+    with pytest.raises(MapSourceError, match="no such doubt; there are area, datum"):
         ImportRules.of(trusted=["everything"])
 
 

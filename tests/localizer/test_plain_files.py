@@ -1,0 +1,54 @@
+"""Files that are read by name: plain ones, whole, and nothing that keeps a reader waiting."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+import pytest
+
+from localizer.errors import CameraError, MapCacheError, PoseFileError
+from localizer.geometry.camera import Camera
+from localizer.geometry.posefile import read_poses
+from localizer.geometry.trajectory import read_tum
+from localizer.map.cache.cache import TileCache
+from localizer.plain_files import plain_bytes, plain_text
+
+
+def test_a_plain_file_is_read_whole_up_to_its_bound(tmp_path):
+    path = tmp_path / "a"
+    path.write_bytes("é\r\n".encode())
+    assert plain_text(path) == "é\r\n"
+    assert plain_bytes(path, 4) == plain_bytes(path, None) == path.read_bytes()
+    with pytest.raises(OSError, match="is larger than 0 MiB"):
+        plain_bytes(path, 3)
+
+
+def test_a_link_to_a_plain_file_is_one(tmp_path):
+    (tmp_path / "a").write_text("x")
+    (tmp_path / "b").symlink_to(tmp_path / "a")
+    assert plain_text(tmp_path / "b") == "x"
+
+
+@pytest.mark.parametrize(
+    ("read", "error"),
+    [(read_poses, PoseFileError), (read_tum, PoseFileError), (Camera.from_json, CameraError)],
+)
+@pytest.mark.parametrize("kind", ["pipe", "device"])
+def test_what_has_no_end_is_a_named_error(tmp_path, read, error, kind):
+    path = Path("/dev/zero")
+    if kind == "pipe":
+        path = tmp_path / "pipe"
+        os.mkfifo(path)
+    with pytest.raises(error, match=f"{path}.*is not a plain file"):
+        read(path)
+
+
+def test_json_that_nests_without_end_is_a_named_error(tmp_path):
+    path = tmp_path / "camera.json"
+    path.write_text("[" * 100_000)
+    with pytest.raises(CameraError, match="cannot be read as JSON"):
+        Camera.from_json(path)
+    (tmp_path / "manifest.json").write_text("[" * 100_000)
+    with pytest.raises(MapCacheError, match="cannot be read as JSON"):
+        TileCache.open(tmp_path)
