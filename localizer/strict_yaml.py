@@ -8,6 +8,9 @@ from typing import Any
 import yaml
 
 
+_MOST_KEYS = 10_000
+
+
 class _StrictLoader(yaml.SafeLoader):
     """A safe loader that refuses a repeated key. A key merged with `<<` may be overridden."""
 
@@ -25,6 +28,14 @@ class _StrictLoader(yaml.SafeLoader):
                 )
             seen.add(key)
         return node
+
+    def flatten_mapping(self, node: yaml.MappingNode) -> None:
+        """Take in what `<<` merges: mappings that merge each other grow ninefold with each line."""
+        super().flatten_mapping(node)
+        if len(node.value) > _MOST_KEYS:
+            raise yaml.constructor.ConstructorError(
+                None, None, f"over {_MOST_KEYS} keys are merged into one mapping", node.start_mark
+            )
 
 
 def load_yaml(text: str) -> Any:

@@ -83,6 +83,8 @@ def _parse_tum(line: str, where: str) -> StampedPose:
         x, y, z, qx, qy, qz, qw = (float(part) for part in parts[1:])
     except (ValueError, ArithmeticError, InvalidOperation) as error:
         raise PoseFileError(f"{where}: {error}") from error
+    if abs(time_ns) >= 1 << 63:
+        raise PoseFileError(f"{where}: {parts[0][:20]} is no time in seconds")
     position, q = np.array([x, y, z]), np.array([qw, qx, qy, qz])
     if not np.isfinite([*position, *q]).all() or abs(np.linalg.norm(q) - 1.0) > 0.01:
         raise PoseFileError(f"{where}: not a position and a unit quaternion")

@@ -33,6 +33,7 @@ _FORCE_MPS2 = 1_000.0
 _DISTANCE_M = 1e6
 _SPEED_MPS = 1_000.0
 _FIX_3D = 3  # GPS_FIX_TYPE
+_DISARMED_NS = 3_000_000_000  # two heartbeats of an armed vehicle may be lost in it
 _HEIGHTS_MM = (-1_000_000, 50_000_000)  # AMSL: the Dead Sea's shore, and above any aircraft
 _ACCURACY_MM = 100_000_000  # beyond it, as of UINT32_MAX, a receiver says that it does not know
 _SATURATED = 32_767  # of an int16: what the sensor could not say
@@ -67,6 +68,7 @@ class VehicleReadings:
     def __init__(self, gimbal: tuple[int, int] = (0, 0)) -> None:
         self.state = VehicleState()
         self.heartbeat_ns: int | None = None
+        self._armed_ns = 0  # when it last said so
         self.attitudes = AttitudeBuffer()
         self.gimbals = GimbalBuffer(gimbal)
         self.globals = VectorBuffer()
@@ -97,6 +99,7 @@ class VehicleReadings:
         if not is_autopilot(m):
             return
         self.heartbeat_ns = time_ns
+        armed = self._is_armed(bool(m.base_mode & mavlink.MAV_MODE_FLAG_SAFETY_ARMED), time_ns)
         autopilot = autopilot_name(m.autopilot)
         self.state = replace(
             self.state,
@@ -104,12 +107,21 @@ class VehicleReadings:
             component_id=m.get_srcComponent(),
             autopilot=autopilot,
             vehicle_type=m.type,
-            armed=bool(m.base_mode & mavlink.MAV_MODE_FLAG_SAFETY_ARMED),
+            armed=armed,
             custom_mode=m.custom_mode,
             mode=mavutil.mode_string_v10(m),
             system_status=m.system_status,
             profile=select_profile(autopilot, self.state.version).name,
         )
+
+    def _is_armed(self, said: bool, time_ns: int) -> bool:
+        """Disarmed is believed once nothing else was heard for `_DISARMED_NS`: a forged heartbeat
+        between the autopilot's own would open in flight what is shut while armed.
+        """
+        if said:
+            self._armed_ns = time_ns
+            return True
+        return self.state.armed and time_ns - self._armed_ns < _DISARMED_NS
 
     def _version(self, m: Any, _: int) -> None:
         version = decode_version(m.flight_sw_version)

@@ -53,6 +53,30 @@ def test_a_forged_origin_does_not_drag_the_positions(monkeypatch: pytest.MonkeyP
     assert all(abs(message.x) < 1.0 for _, message in sent)
 
 
+def test_a_forged_disarming_opens_nothing_in_flight(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Between the autopilot's own heartbeats, a stranger's that says disarmed."""
+    flight = Flight(monkeypatch)
+    flight.armed = True
+    flight.run(12.0)
+    before, told = flight.end.origin.origin, len(flight.texts)
+    for _ in range(40):
+        flight.say(heartbeat(armed=False))
+        flight.say(origin_message(60.0))
+        flight.run(0.1)
+    assert flight.end.origin.origin == before
+    assert flight.texts[told:] == ["PiLoT: EKF origin off by 60 m in flight: refused"]
+    assert flight.shared.tracker.snapshot(flight.now_ns).armed
+
+
+def test_a_disarming_that_lasts_is_believed(monkeypatch: pytest.MonkeyPatch) -> None:
+    flight = Flight(monkeypatch)
+    flight.armed = True
+    flight.run(3.0)
+    flight.armed = False
+    flight.run(4.0)
+    assert not flight.shared.tracker.snapshot(flight.now_ns).armed
+
+
 def test_an_origin_that_moves_on_the_ground_or_with_a_reboot_is_followed(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:

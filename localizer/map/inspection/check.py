@@ -9,6 +9,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from localizer.errors import MapCacheError
 from localizer.map.cache.cache import TileCache
 from localizer.map.inspection.alignment import Alignment, alignment_of
 from localizer.map.inspection.mosaic import Mosaic, mosaic_of
@@ -94,6 +95,7 @@ def check_map(cache: TileCache, use: Use) -> MapCheck:
     seams = seams_of(cache, mosaic)
     shift = alignment_of(mosaic)
     findings = (
+        _intact(cache),
         _coverage(mosaic, gaps),
         _holes_finding(mosaic, holes),
         _blank_finding(mosaic, blank),
@@ -163,6 +165,20 @@ def _blank(mosaic: Mosaic) -> NDArray[np.bool_]:
     large = stats[:, cv2.CC_STAT_AREA] * mosaic.gsd_m**2 >= _LEAST_BLANK_M2
     large[0] = False
     return np.asarray(large[labels])
+
+
+def _intact(cache: TileCache) -> Finding:
+    """The pictures are drawn from one level; a flight needs all."""
+    damaged = []
+    for tile in cache.tile_ids:
+        try:
+            cache.load_geometry(tile)
+        except MapCacheError as error:
+            damaged.append(str(error))
+    found = f"{len(damaged)} of {len(cache.tile_ids)} tiles"
+    if not damaged:
+        return Finding("damaged", found, Grade.GOOD, "each as its hash says")
+    return Finding("damaged", found, Grade.BAD, f"build it again: {damaged[0]}")
 
 
 def _coverage(mosaic: Mosaic, gaps: NDArray[np.bool_]) -> Finding:

@@ -1,5 +1,7 @@
 """A map is examined before it is flown over: each fault is found, and a sound map has none."""
 
+import shutil
+
 import cv2
 import numpy as np
 import pytest
@@ -65,6 +67,18 @@ def test_a_sound_map_is_good(cache):
     assert [n for n, f in made.items() if f.grade is Grade.BAD] == []
     assert made["coverage"].found.startswith("0.159 km², 99 %")
     assert (made["imagery of"].found, made["imagery of"].grade) == ("2024-06", Grade.GOOD)
+
+
+def test_a_damaged_tile_is_told_though_its_pictures_do_without_it(cache, tmp_path):
+    shutil.copytree(cache.path, tmp_path / "map")
+    hurt = TileCache.open(tmp_path / "map")
+    path = hurt.tile_path(0)  # of the root: no view from above needs it
+    path.write_bytes(path.read_bytes()[:-1])
+    made = check_map(hurt, FINE)
+    damaged = made.findings[0]
+    assert not made.ok
+    assert (damaged.name, damaged.grade) == ("damaged", Grade.BAD)
+    assert path.name in damaged.words
 
 
 def test_a_date_that_is_none_is_refused_before_the_build(tmp_path):
