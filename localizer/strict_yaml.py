@@ -7,7 +7,6 @@ from typing import Any
 
 import yaml
 
-
 _MOST_KEYS = 10_000
 
 
