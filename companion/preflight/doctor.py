@@ -8,13 +8,14 @@ from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 from companion.config import CompanionConfig
-from companion.errors import CompanionError
+from companion.errors import CompanionError, DetectorError
 from companion.preflight.coverage import check_mission, check_origin
 from companion.preflight.heights import check_heights
 from companion.preflight.map_pin import require_pinned
 from companion.preflight.places import check_places
 from companion.redaction import redacted
 from companion.sources import SourceSettings, open_source
+from companion.targets.detector.network import DetectorNetwork
 from localizer.errors import LocalizerError
 from localizer.features.extractor import load_extractor
 from localizer.geometry.geo import LocalFrame
@@ -54,6 +55,7 @@ def examine_deployment(
         diagnosis = examine(config.bridge, say) if vehicle else None
         findings += [*([] if camera is None else [camera.result()]), _check_power()]
     findings += check_places(config)
+    findings += _check_detector(config)
     if cache is not None and config.bridge.origin is not None:
         findings.append(check_origin(config.bridge.origin, cache))
     if diagnosis is not None:
@@ -107,6 +109,18 @@ def _check_localizer(config: CompanionConfig, has_map: bool) -> Finding:
         return _failed("localizer", "cannot be made", needed, str(error))
     why = "features without training: fetch the shipped weights again"
     return Finding("localizer", name, needed, why, "fallback" not in name, False)
+
+
+def _check_detector(config: CompanionConfig) -> list[Finding]:
+    """The detection network, which a flight would not start with; nothing where none is named."""
+    if config.targets.detector is None:
+        return []
+    needed = "a detection network"
+    try:
+        network = DetectorNetwork(config.targets.detector)
+    except DetectorError as error:
+        return [_failed("detector", "cannot be made", needed, str(error))]
+    return [Finding("detector", f"{len(network.labels)} classes", needed, "", True, False)]
 
 
 def _localizer_name(config: CompanionConfig) -> str:

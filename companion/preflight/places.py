@@ -26,6 +26,12 @@ def check_places(config: CompanionConfig) -> list[Finding]:
                 load_key(signing.key_file)
             except BridgeError as error:
                 faults.append(f"{key}: {error}")
+    if config.console is not None:
+        page = config.console
+        read = {"token_file": page.token_file, "tls_certificate": page.tls_certificate}
+        for key, path in (read | {"tls_key": page.tls_key}).items():
+            if path is not None and not path.is_file():
+                faults.append(f"console.{key} {path}: is no file")
     needed = "folders to write to, keys to read"
     return [Finding("files", "unusable", needed, fault, False, True) for fault in faults if fault]
 

@@ -142,3 +142,15 @@ def test_the_table_fits_a_terminal_of_80_columns_and_reasons_come_last(capsys):
     shown = " ".join(" ".join(lines).split())
     assert "GIMBAL_DEVICE_ATTITUDE_STATUS" in shown.replace(" ", "")
     assert shown.endswith(f"wrong GIMBAL_[MANAGER]_X: {why}")
+
+
+def test_a_detection_network_that_a_flight_would_not_start_with_is_told(tmp_path):
+    camera = {"source": "udp://127.0.0.1:5600", "model": MODEL}
+    (tmp_path / "detector.onnx").write_text("no network")
+    detector = {"model": str(tmp_path / "detector.onnx")}
+    settings = {"map": "none", "camera": camera, "targets": {"detector": detector}}
+    config = parse_config(settings, "test")
+    found = examine_deployment(config, vehicle=False, feed=False).findings
+    (told,) = (f for f in found if f.name == "detector")
+    assert (told.ok, told.required) == (False, True)
+    assert "detector.onnx: no ONNX network" in told.why

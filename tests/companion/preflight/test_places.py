@@ -61,3 +61,10 @@ def test_what_a_start_makes_itself_is_no_fault(tmp_path: Path) -> None:
         },
     )
     assert {path.name for path in tmp_path.iterdir()} == {"mavlink.key"}
+
+
+def test_what_the_page_reads_and_is_no_file_is_told(tmp_path: Path) -> None:
+    (tmp_path / "token").write_text("x")
+    assert not faults(console={"token_file": str(tmp_path / "token")})
+    (why,) = faults(console={"token_file": "/dev/zero"})
+    assert why == "console.token_file /dev/zero: is no file"
