@@ -9,6 +9,7 @@ from __future__ import annotations
 import contextlib
 import importlib.util
 import logging
+import signal
 import subprocess
 import sys
 import threading
@@ -25,15 +26,19 @@ _NEEDED = ("starlette", "uvicorn", "websockets")
 @contextlib.contextmanager
 def running_console(deployment: Path, config: ConsoleConfig | None) -> Iterator[None]:
     """Serve the page while this lasts; a flight goes on without it."""
-    process = None if config is None else _begun(deployment, config)
+    ending = threading.Event()
+    process = None if config is None else _begun(deployment, config, ending)
     try:
         yield
     finally:
+        ending.set()
         if process is not None:
             _end(process)
 
 
-def _begun(deployment: Path, config: ConsoleConfig) -> subprocess.Popen[bytes] | None:
+def _begun(
+    deployment: Path, config: ConsoleConfig, ending: threading.Event
+) -> subprocess.Popen[bytes] | None:
     missing = [name for name in _NEEDED if importlib.util.find_spec(name) is None]
     if missing:
         _log.warning("no console: install pilot-companion[console] (%s missing)", missing[0])
@@ -48,18 +53,24 @@ def _begun(deployment: Path, config: ConsoleConfig) -> subprocess.Popen[bytes] |
         _log.warning("no console: %s", error)
         return None
     _log.info("console: %s", config.url)
-    threading.Thread(target=_tell_end, args=(process,), name="console end", daemon=True).start()
+    told = threading.Thread(
+        target=_tell_end, args=(process, ending), name="console end", daemon=True
+    )
+    told.start()
     return process
 
 
-def _tell_end(process: subprocess.Popen[bytes]) -> None:
+def _tell_end(process: subprocess.Popen[bytes], ending: threading.Event) -> None:
     assert process.stderr is not None
     last = b""
     for line in process.stderr:
         last = line.strip() or last
     code = process.wait()
-    if code > 0:  # below zero: ended by order
-        _log.warning("the console ended (%d): %s", code, last.decode("utf-8", "replace")[:300])
+    if ending.is_set():
+        return
+    why = last.decode("utf-8", "replace")[:300] if code > 0 else ""
+    what = signal.Signals(-code).name if code < 0 else str(code)
+    _log.warning("the console ended (%s): %s", what, why or "`companion console` begins it again")
 
 
 def _end(process: subprocess.Popen[bytes]) -> None:

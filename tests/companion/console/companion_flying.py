@@ -53,6 +53,7 @@ class Flight:
     said: list[str] = field(default_factory=list)
     hints: list[tuple[float, float, float]] = field(default_factory=list)
     targets: dict[str, np.ndarray] = field(default_factory=dict)
+    sent: int = 0
 
     def __post_init__(self) -> None:
         self.vehicle = VehicleState(connected=True, mode="GUIDED", system_id=1, armed=self.armed)
@@ -133,6 +134,7 @@ class Flight:
         while not self._stop.wait(1.0 / self.hz):
             self.send(number)
             number += 1
+            self.sent = number
 
     @contextmanager
     def flying(self):
