@@ -8,6 +8,7 @@ from typing import Annotated
 import typer
 from rich.console import Console
 
+from companion.errors import ReportError
 from companion.terminal.links import file_link
 from companion.terminal.steps import shown_steps
 
@@ -21,6 +22,8 @@ def report_command(
     ] = None,
 ) -> None:
     """Write one self-contained HTML file and print its path."""
+    if out is not None and out.suffix.lower() not in (".html", ".htm") and not out.is_dir():
+        raise ReportError(f"{out}: give a name that ends in .html")
     console = Console()
     with shown_steps(console) as say:
         say(f"reading {folder} and drawing its map")

@@ -69,6 +69,7 @@ def export_mcap(
     folder = record_folder(folder)
     tables = read_record(folder)
     path = out or folder / MCAP_NAME
+    _require_free(path)
     partial = path.with_name(f".{path.name}.part")
     notes = list(tables.notes)
     if not tables.utc_ns:
@@ -127,6 +128,14 @@ def _rows(
     for i in np.argsort(columns[time], kind="stable"):
         row = {name: columns[name][i] for name in names}
         yield int(row[time]) + offset_ns, partial(take, row)
+
+
+def _require_free(path: Path) -> None:
+    """It takes the file's place at the end: never a device's, nor that of a record's table."""
+    if path.exists() and not path.is_file():
+        raise ReportError(f"{path}: cannot be written: is not a plain file")
+    if path.suffix != ".mcap":
+        raise ReportError(f"{path}: give a name that ends in .mcap")
 
 
 def _pictures(folder: Path, offset_ns: int, take: Callable[[bytes, int], None]) -> Iterator[Step]:

@@ -1,6 +1,7 @@
 """A record as MCAP, read back by MCAP's own reader with the schemas that the file carries."""
 
 import json
+import os
 import time
 from dataclasses import replace
 from typing import Any
@@ -18,7 +19,7 @@ from mcap_protobuf.decoder import DecoderFactory
 
 from companion.cli.commands import app
 from companion.config import CompanionConfig, RecordConfig
-from companion.errors import RecordError
+from companion.errors import RecordError, ReportError
 from companion.flight.recorder import RecordKeeper
 from companion.reporting.mcap_export import export_mcap
 from localizer.geometry.pose import Pose
@@ -224,3 +225,18 @@ def test_the_clock_of_the_flight_is_the_one_of_its_file(flight):
     messages, _ = _read(keeper.folder / "record.mcap")
     ((_, logged, _),) = messages["/events"]
     assert abs(logged - time.time_ns()) < 600e9  # UTC, not the time since the machine began
+
+
+def test_it_is_put_in_the_place_of_no_device_and_no_table(flight, tmp_path):
+    """A rename puts it there, by which root would have lost /dev/full."""
+    keeper = flight()
+    os.mkfifo(tmp_path / "a.mcap")
+    with pytest.raises(ReportError, match=r"a\.mcap: cannot be written: is not a plain file"):
+        export_mcap(keeper.folder, tmp_path / "a.mcap")
+    table = keeper.folder / "estimates.csv"
+    before = table.read_bytes()
+    with pytest.raises(ReportError, match=r"estimates\.csv: give a name that ends in \.mcap"):
+        export_mcap(keeper.folder, table)
+    report = CliRunner().invoke(app, ["report", str(keeper.folder), "--out", str(table)])
+    assert "give a name that ends in .html" in str(report.exception)
+    assert table.read_bytes() == before
