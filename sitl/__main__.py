@@ -38,6 +38,7 @@ from sitl.demo.scenario import (
     scenario_names,
 )
 from sitl.errors import SimulationError
+from sitl.operator.run import ClickOptions, fly_clicks, summary
 from sitl.rehearsal.rehearse import rehearse
 from sitl.suite.case import SCENARIOS, load_cases
 from sitl.suite.loop.case import LOOP_SCENARIOS, load_loop_cases
@@ -223,6 +224,36 @@ def loop(
     )
     rows = fly_loop(cases, options)
     console.print(escape(markdown(rows)))
+    raise typer.Exit(0 if all(row.ok for row in rows) else 1)
+
+
+@app.command()
+def targets(
+    fc: Annotated[str, typer.Option(help="embedded, ardupilot or both")] = "embedded",
+    out: Annotated[Path, typer.Option(help="folder of the records")] = Path("report-targets"),
+    seeds: Annotated[str, typer.Option(help="world, errors and clicks: 5, or 5..7")] = "5..7",
+    clicks: Annotated[int, typer.Option(min=1, max=100, help="in each flight")] = 14,
+    worlds: Annotated[Path | None, typer.Option(help="folder of generated worlds")] = None,
+) -> None:
+    """Fly an operator who clicks, drags and stops; hold every report against what he pointed at."""
+    if fc not in _SUITE_KINDS:
+        raise ScenarioError(f"--fc is embedded, ardupilot or both, not {fc!r}")
+    if out.exists() and not out.is_dir():
+        raise ScenarioError(f"{out}: is a file; give a folder as --out")
+    console = Console()
+    if not console.is_terminal:
+        console = Console(width=_LOG_WIDTH)
+    options = ClickOptions(
+        _SUITE_KINDS[fc],
+        parse_seeds(seeds),
+        out,
+        clicks,
+        worlds,
+        lambda line: console.print(escape(line), highlight=False),
+        LogProgress(console),
+    )
+    rows = fly_clicks(options)
+    console.print_json(json.dumps(summary(rows)))
     raise typer.Exit(0 if all(row.ok for row in rows) else 1)
 
 

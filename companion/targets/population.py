@@ -30,7 +30,8 @@ _PICTURES = 24  # kept, of accepted frames: longer than an operator's delay
 _PICTURE_NS = 60_000_000  # between a click's frame and the picture that stands for it
 _PASSED_NS = 450_000_000  # a picture so much earlier or later shows the ground that a car covers
 _FOLLOWED_PX = 1.5
-_STILL_M = 1.0  # around where a standing target is expected
+_STILL_M = 1.0  # around where a standing target is expected; nearer than this it has not left
+_STANDS_M = 0.4
 _NEAR_M = 1.5  # around where a moving one is, and three sigmas of its motion, at most so many:
 _FAR_M = 15.0
 _DEPARTS_S = 1.0  # after a click: so long it may be one that moves
@@ -38,6 +39,10 @@ _DEPARTED = 0.85  # correlation: what has just left looks as it did
 _FASTEST_MPS = 25.0
 _LOST_S = 4.0
 _PIXELS = 0.05  # of the picture's width: a delay's error beyond it is told as that much
+
+
+def _off(a: Array, b: Array) -> float:
+    return float(np.linalg.norm(a - b))
 
 
 def clicked_name(number: int) -> str:
@@ -212,7 +217,7 @@ class Population:
             p for p in self._pictures
             if abs(p[0].exposure_time_ns - estimate.exposure_time_ns) > _PASSED_NS
         ]  # fmt: skip
-        life.moved_at_once = follower.isolate(others, fix.position_world)
+        life.moved_at_once = follower.isolate(others)
         life.follower = follower
         for newer, picture in [
             p for p in self._pictures if p[0].exposure_time_ns > estimate.exposure_time_ns
@@ -234,10 +239,16 @@ class Population:
         elif track.moves:
             sigma = float(np.sqrt(max(np.linalg.eigvalsh(P)[-1], 0.0)))
             found = follower.find(gray, estimate, position, _NEAR_M + min(3.0 * sigma, _FAR_M))
-        else:
-            found = follower.find(gray, estimate, position, _STILL_M)
-            if found is None and since_s <= _DEPARTS_S:
-                found = self._departed(life, follower, estimate, gray, position)
+        elif (near := follower.find(gray, estimate, position, _STILL_M)) is not None and (
+            _off(near.position, position) < _STANDS_M or not life.moved_at_once
+        ):
+            # It stands, and geometry holds it better than its look, which slides with every change
+            # of view on what is not flat.
+            life.found_ns = time_ns
+        elif near is not None:
+            found = near
+        elif since_s <= _DEPARTS_S:
+            found = self._departed(life, follower, estimate, gray, position)
         fix = None
         if found is not None:
             fix = track.see(estimate, found.pixel, pixel_sigma=_FOLLOWED_PX)
@@ -259,7 +270,9 @@ class Population:
         """A target that moves, though nobody has measured how: the ground that it left tells its
         shape. A car that passes over a place takes nothing of it along.
         """
-        if not follower.is_isolated and not follower.isolate(((estimate, gray),), position):
+        if (estimate.exposure_time_ns - life.found_ns) * 1e-9 > _DEPARTS_S:
+            return None
+        if not follower.is_isolated and not follower.isolate(((estimate, gray),)):
             return None
         since_s = (estimate.exposure_time_ns - life.found_ns) * 1e-9
         found = follower.find(gray, estimate, position, _NEAR_M + _FASTEST_MPS * since_s)

@@ -38,6 +38,8 @@ _CLEAR = 1.15  # by how much the best place leads the second
 _RENEWED_NS = 2_000_000_000
 _OTHER, _NOISES = 10.0, 3.0  # grey levels, and medians of the chart: what differs by more has moved
 _SHARES = (0.03, 0.7)  # of a chart that may be the target
+_PART = 5  # cells: a smaller part of it is noise
+_ABOUT = 0.6  # of a chart's half side: parts of one thing reach so near to its middle
 _FLAT = 4.0  # grey levels: a template of less contrast tells nothing
 
 
@@ -67,6 +69,7 @@ class ImageFollower:
         half = int(np.clip(round(self._half_m / cell), *_CELLS))
         self._cell, self._half = self._half_m / half, half
         self._course = 0.0
+        self._origin = position
         first = self._chart(gray, estimate, position, half)
         self._first, self._late = first, first
         self._mask: Grey | None = None
@@ -102,31 +105,29 @@ class ImageFollower:
             self._renew(gray, estimate, position)
         return Found(position, pixel, best[0])
 
-    def isolate(self, pictures: Sequence[tuple[PoseEstimate, Gray]], position: Array) -> bool:
-        """Tell it from the ground by pictures of the same ground (3,) without it; False if it
+    def isolate(self, pictures: Sequence[tuple[PoseEstimate, Gray]]) -> bool:
+        """Tell it from the ground by pictures of where it was first seen, without it; False if it
         cannot be told: it does not move, or the pictures do not show that.
 
-        In charts the ground stands still, so what differs from their median is what has moved.
+        In charts the ground stands still, so what differs from their median is what has moved. A
+        grey car on a grey road differs in parts: all of them about its middle are taken for it.
         """
-        charts = [self._chart(gray, estimate, position, self._half) for estimate, gray in pictures]
+        charts = [
+            self._chart(gray, estimate, self._origin, self._half, course=0.0)
+            for estimate, gray in pictures
+        ]
         known = [chart for chart in charts if chart is not None]
         if not known or self._first is None:
             return False
-        off = np.abs(self._first - np.median(known, axis=0))
-        off = cv2.GaussianBlur(off, (0, 0), 1.0)
+        off = self._first - np.median(known, axis=0)
+        off = np.abs(off - np.median(off))  # the camera may expose otherwise by now
+        off = cv2.GaussianBlur(off.astype(np.float32), (0, 0), 1.0)
         least = max(_OTHER, _NOISES * float(np.median(off)))
-        close = cv2.morphologyEx((off > least).astype(np.uint8), cv2.MORPH_CLOSE, np.ones((3, 3)))
-        _, labels, stats, _ = cv2.connectedComponentsWithStats(close)
-        middle = labels[self._half - 1 : self._half + 2, self._half - 1 : self._half + 2]
-        here = [label for label in np.unique(middle) if label != 0]
-        if not here:
+        mask = _outline((off > least).astype(np.uint8), self._half)
+        share = 0.0 if mask is None else float(mask.mean())
+        if mask is None or not _SHARES[0] <= share <= _SHARES[1]:
             return False
-        label = max(here, key=lambda k: int(stats[k, cv2.CC_STAT_AREA]))
-        share = float(stats[label, cv2.CC_STAT_AREA]) / labels.size
-        if not _SHARES[0] <= share <= _SHARES[1]:
-            return False
-        mask = cv2.dilate((labels == label).astype(np.uint8), np.ones((3, 3)))
-        self._mask = mask.astype(np.float32)
+        self._mask = cv2.dilate(mask, np.ones((3, 3))).astype(np.float32)
         return True
 
     def forget_shape(self) -> None:
@@ -163,10 +164,18 @@ class ImageFollower:
         c, s = np.cos(self._course), np.sin(self._course)
         return np.array([c * along[0] - s * along[1], s * along[0] + c * along[1], 0.0])
 
-    def _chart(self, gray: Gray, estimate: PoseEstimate, middle: Array, half: int) -> Grey | None:
+    def _chart(
+        self,
+        gray: Gray,
+        estimate: PoseEstimate,
+        middle: Array,
+        half: int,
+        course: float | None = None,
+    ) -> Grey | None:
         """(2 half + 1, 2 half + 1) grey levels about `middle`; None where some are not in view."""
         steps = np.arange(-half, half + 1) * self._cell
-        c, s = np.cos(self._course), np.sin(self._course)
+        turned = self._course if course is None else course
+        c, s = np.cos(turned), np.sin(turned)
         x, y = np.meshgrid(steps, steps)
         points = np.stack([middle[0] + c * x - s * y, middle[1] + s * x + c * y,
                            np.full_like(x, middle[2])], axis=-1)  # fmt: skip
@@ -177,6 +186,25 @@ class ImageFollower:
         at = np.nan_to_num(pixels - 0.5, nan=-1e3).astype(np.float32)
         chart = cv2.remap(gray, at, None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
         return np.asarray(chart, dtype=np.float32)
+
+
+def _outline(differs: NDArray[np.uint8], half: int) -> NDArray[np.uint8] | None:
+    """The convex outline (1 inside) of what differs about the middle of a chart; None where that
+    does not hold the middle: it is something beside.
+    """
+    count, labels, stats, _ = cv2.connectedComponentsWithStats(
+        cv2.morphologyEx(differs, cv2.MORPH_CLOSE, np.ones((3, 3)))
+    )
+    reach = max(1, round(_ABOUT * half))
+    about = labels[half - reach : half + reach + 1, half - reach : half + reach + 1]
+    parts = [k for k in range(1, count) if stats[k, cv2.CC_STAT_AREA] >= _PART and k in about]
+    if not parts:
+        return None
+    rows, columns = np.nonzero(np.isin(labels, parts))
+    outline = cv2.convexHull(np.column_stack([columns, rows]).astype(np.int32))
+    mask = np.zeros_like(differs)
+    cv2.fillConvexPoly(mask, outline, 1)
+    return mask if mask[half - 1 : half + 2, half - 1 : half + 2].any() else None
 
 
 def _match(

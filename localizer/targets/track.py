@@ -15,7 +15,13 @@ from localizer.geometry.pose import Array
 from localizer.targets.bias import SharedBias
 from localizer.targets.filter import TargetFilter
 from localizer.targets.limits import LastPlace, is_at_seen_depth, is_on_map
-from localizer.targets.locate import RayCaster, locate, ray_in_world, ray_spread
+from localizer.targets.locate import (
+    RayCaster,
+    locate,
+    ray_in_world,
+    ray_spread,
+    surface_covariance,
+)
 from localizer.targets.static import Place, SightedRay, StaticTarget
 from localizer.types import PoseEstimate, TargetFix, TargetSighting, TargetSurface, Visibility
 
@@ -56,6 +62,7 @@ class TargetTrack:
         self._outliers = 0
         self._last = LastPlace()
         self._seen_ns = 0
+        self._aim: Array = np.zeros((3, 3))
         self.refusal = ""
 
     @property
@@ -81,6 +88,8 @@ class TargetTrack:
         distance = float(np.linalg.norm(surfaces[0].position - eye))
         if distance > settings.max_range_m:
             return self._refuse(f"{distance:.0f} m away")
+        if any(drift):
+            self._aim = _aim(estimate, pixel, drift, surfaces[0], eye)
         if self._moves and time_ns - self._seen_ns > _GAP_S * 1e9:
             self._moving = TargetFilter()
         ray = SightedRay(eye, d, ray_spread(estimate, pixel, sigma, distance, drift))
@@ -101,7 +110,7 @@ class TargetTrack:
             return self._refuse("elsewhere than before: one such sighting is not believed")
         if self._moves:
             bias = settings.bias.covariance(fix.position_world - eye)
-            fix = replace(fix, covariance=fix.covariance + bias)
+            fix = replace(fix, covariance=fix.covariance + bias + self._aim)
         why = self._objection(fix, ray, surfaces)
         if why:
             return self._refuse(why)
@@ -130,7 +139,7 @@ class TargetTrack:
         bias = self._settings.bias.covariance(position - estimate.world_from_camera.translation)
         pixel = projected(estimate, position)
         fix = TargetFix(
-            self._id, position, P + bias, pixel,
+            self._id, position, P + bias + self._aim, pixel,
             estimate.exposure_time_ns, 0.0, self._moving.velocity,
             self._moving.velocity_covariance, Visibility.HIDDEN,
         )  # fmt: skip
@@ -215,6 +224,23 @@ class TargetTrack:
     def _refuse(self, why: str) -> TargetFix | None:
         self.refusal = why
         return None
+
+
+def _aim(
+    estimate: PoseEstimate,
+    pixel: tuple[float, float],
+    drift: tuple[float, float],
+    surface: TargetSurface,
+    eye: Array,
+) -> Array:
+    """(3, 3) m²: by how much another place was meant than the one under the pixel. To follow that
+    place takes nothing away from it.
+    """
+    offset = surface.position - eye
+    spread = ray_spread(estimate, pixel, 0.0, float(np.linalg.norm(offset)), drift)
+    only = replace(spread, pose=np.zeros((2, 2)))
+    normal = surface.normal if surface.normal is not None else np.array([0.0, 0.0, 1.0])
+    return surface_covariance(offset, normal, only, 0.0)
 
 
 def projected(estimate: PoseEstimate, point: Array) -> tuple[float, float] | None:

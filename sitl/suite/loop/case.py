@@ -127,8 +127,9 @@ class LoopCase(_Model):
     AUTO (metres east and north of home, at `height_m`). wind_m_s: from the west. deny: GNSS is
     switched off when it begins. cold: no companion runs until an event starts it. supervised: by
     `companion run --supervised`. gated: injection is opened by the pilot's command (mode ``rc``).
-    size_m: of the world. ci: flown in every test run on the embedded vehicle. deployment: keys that
-    differ from the demo's deployment file; vehicle: parameters likewise (FS_EKF_ACTION 0: no
+    size_m: of the world. honest: that world as another visit shows it, with the demo's camera and
+    the errors drawn for it. ci: flown in every test run on the embedded vehicle. deployment: keys
+    that differ from the demo's deployment file; vehicle: parameters likewise (FS_EKF_ACTION 0: no
     landing while the place is searched).
     """
 
@@ -142,6 +143,7 @@ class LoopCase(_Model):
     corners_m: tuple[tuple[float, float], ...] = Field(_CORNERS, min_length=1)
     size_m: float = Field(400.0, ge=400, le=4000, multiple_of=400)
     wind_m_s: float = Field(0.0, ge=0, le=15)
+    honest: bool = False
     deny: bool = True
     cold: bool = False
     supervised: bool = False
@@ -184,6 +186,11 @@ class LoopCase(_Model):
             Leg(east_m=east, north_m=north, height_m=self.height_m, gimbal_pitch_deg=_PITCH_DEG)
             for east, north in self.corners_m
         )
+        if self.honest:
+            return Scenario(
+                takeoff_height_m=self.height_m, deny_after_s=3, speed_m_s=self.speed_m_s,
+                legs=legs, cars=3, people=3,
+            )  # fmt: skip
         return Scenario(
             takeoff_height_m=self.height_m, deny_after_s=3, speed_m_s=self.speed_m_s, legs=legs,
             cars=3, people=3, camera=_CAMERA, localizer_width=256,

@@ -5,9 +5,10 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Callable, Iterable
-from contextlib import ExitStack
+from contextlib import AbstractContextManager, ExitStack, nullcontext
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Protocol
 
 import numpy as np
 import yaml
@@ -17,6 +18,7 @@ from companion.offline.replay import read_estimates
 from localizer.map.cache.cache import TileCache
 from mavlink_bridge.link.tlog import read_tlog
 from sitl.camera.gimbal_error import GimbalError
+from sitl.camera.movers import Mover
 from sitl.camera.pose_sender import truth_feed
 from sitl.camera.process import WorldCameraProcess
 from sitl.camera.traffic import traffic
@@ -49,11 +51,38 @@ class LoopAssets:
     wrong_map: Path | None = None
 
 
-def fly(case: LoopCase, assets: LoopAssets, kind: VehicleKind, seed: int, out: Path) -> LoopRecord:
+@dataclass(frozen=True)
+class Cabin:
+    """What a passenger finds. frames: the world camera's log; movers: everything that moves, in
+    the map's ENU.
+    """
+
+    vehicle: VehicleProcess
+    pilot: Pilot
+    frames: Path
+    movers: tuple[Mover, ...]
+
+
+class Passenger(Protocol):
+    """Someone who takes part in a flight: an operator, or who flies it by hand."""
+
+    def movers(self, epoch_ns: int) -> tuple[Mover, ...]:
+        """What is in the world besides its traffic, from that CLOCK_MONOTONIC time on."""
+        ...
+
+    def ride(self, cabin: Cabin) -> AbstractContextManager[None]:
+        """Entered when the recorded part begins, left at its end."""
+        ...
+
+
+def fly(
+    case: LoopCase, assets: LoopAssets, kind: VehicleKind, seed: int, out: Path,
+    passenger: Passenger | None = None,
+) -> LoopRecord:  # fmt: skip
     """Fly a case; `out` receives the records. SimulationError when it could not be flown at all."""
     out.mkdir(parents=True, exist_ok=True)
     with ExitStack() as stack:
-        flight = _LoopFlight(case, assets, kind, seed, out, stack)
+        flight = _LoopFlight(case, assets, kind, seed, out, stack, passenger)
         flight.prepare()
         flight.run()
     return flight.record()
@@ -67,9 +96,11 @@ class _LoopFlight:
 
     def __init__(
         self, case: LoopCase, assets: LoopAssets, kind: VehicleKind, seed: int, out: Path,
-        stack: ExitStack,
+        stack: ExitStack, passenger: Passenger | None = None,
     ) -> None:  # fmt: skip
         self._case, self._assets, self._kind = case, assets, kind
+        self._passenger = passenger
+        self._movers: tuple[Mover, ...] = ()
         self._seed, self._out, self._stack = seed, out, stack
         self._home = home_of(assets.world)
         self._samples: list[LoopSample] = []
@@ -86,7 +117,7 @@ class _LoopFlight:
         """From power on to a companion that tracks at the flight's height."""
         case = self._case
         self._ports = Ports(free_udp_port(), free_udp_port())
-        vehicle = self._open_vehicle()
+        vehicle = self._vehicle = self._open_vehicle()
         self._pilot = self._stack.enter_context(Pilot(vehicle.gcs_endpoint, alive=vehicle.check))
         with self._pilot.fast_forward():
             self._pilot.wait_ready()
@@ -130,13 +161,14 @@ class _LoopFlight:
         if not self._case.hover:
             self._pilot.start_mission()
         self._start_ns = time.monotonic_ns()
-        while self._now_s < self._case.seconds:
-            while self._waiting and self._waiting[0].at_s <= self._now_s:
-                self._happen(self._waiting.pop(0))
-            while self._due and self._due[0][0] <= self._now_s:
-                self._due.pop(0)[1]()
-            self._sample()
-            self._pilot.link.sleep(_STEP_S)
+        with self._riding():
+            while self._now_s < self._case.seconds:
+                while self._waiting and self._waiting[0].at_s <= self._now_s:
+                    self._happen(self._waiting.pop(0))
+                while self._due and self._due[0][0] <= self._now_s:
+                    self._due.pop(0)[1]()
+                self._sample()
+                self._pilot.link.sleep(_STEP_S)
         self._end_ns = time.monotonic_ns()
         self._camera.stop()
 
@@ -186,11 +218,13 @@ class _LoopFlight:
     def _open_camera(self) -> None:
         case, world = self._case, self._assets.world
         cache = TileCache.open(world.map_cache)
-        movers = traffic(
-            world.world, cache.frame, cars=3, people=3, seed=self._seed,
-            epoch_ns=time.monotonic_ns(),
-        )  # fmt: skip
-        filmed = FilmedFlight(world, case.scenario, self._ports, self._seed, movers)
+        epoch_ns = time.monotonic_ns()
+        self._movers = traffic(
+            world.world, cache.frame, cars=3, people=3, seed=self._seed, epoch_ns=epoch_ns
+        )
+        if self._passenger is not None:
+            self._movers += self._passenger.movers(epoch_ns)
+        filmed = FilmedFlight(world, case.scenario, self._ports, self._seed, self._movers)
         config = camera_config(filmed, self._out)
         self._camera = WorldCameraProcess(config)
         self._stack.enter_context(self._camera)
@@ -200,6 +234,12 @@ class _LoopFlight:
         self._stack.enter_context(truth_feed(self._pilot, self._camera, cache, gimbal, shift))
 
     # --- during ----------------------------------------------------------------------------------
+
+    def _riding(self) -> AbstractContextManager[None]:
+        if self._passenger is None:
+            return nullcontext()
+        frames = self._out / "frames.csv"
+        return self._passenger.ride(Cabin(self._vehicle, self._pilot, frames, self._movers))
 
     @property
     def _now_s(self) -> float:

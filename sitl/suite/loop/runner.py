@@ -61,7 +61,7 @@ def loop_assets(
     case: LoopCase, seed: int, worlds: Path | None, progress: Callable[[str, float], None]
 ) -> LoopAssets:
     """What a case flies over, and the map that it gives the companion; made where missing."""
-    world = prepare(seed, worlds, progress, case.size_m, ideal=True)
+    world = prepare(seed, worlds, progress, case.size_m, ideal=not case.honest)
     if case.wrong.other_map:
         other = prepare(seed + _OTHER_SEED, worlds, progress, case.size_m, ideal=True)
         return LoopAssets(world, other.map_cache)
