@@ -12,11 +12,16 @@ from mavlink_bridge.camera.look_at import LOOK_AHEAD, LOOK_AT_PLACE, LOOK_AT_TAR
 from mavlink_bridge.config import CameraConfig
 from mavlink_bridge.link.link import sleep_until
 from sitl.geodesy import Location
+from sitl.vehicles.ardupilot import ArduPilotSitl, find_arducopter
 from sitl.vehicles.launch import GIMBAL, EmbeddedSitl
 
 SECOND = 10**9
 OK, DENIED = mavlink.MAV_RESULT_ACCEPTED, mavlink.MAV_RESULT_DENIED
 HOME = Location(47.397742, 8.545594, 488.0)
+REAL = [
+    pytest.mark.sitl,
+    pytest.mark.skipif(find_arducopter() is None, reason="no arducopter binary"),
+]
 
 
 class Station:
@@ -136,13 +141,16 @@ def test_a_stations_command_reaches_the_autopilot_through_the_bridge(autopilot):
         assert sleep_until(lambda: text in bridge.texts(), 30.0)
 
 
-@pytest.mark.long
-def test_the_gimbal_turns_to_a_target_through_the_autopilot_and_stays_there():
-    """The whole way on the embedded vehicle: station, routing, camera component, autopilot, mount.
+@pytest.mark.parametrize(
+    "kind",
+    [pytest.param(EmbeddedSitl, marks=pytest.mark.long), pytest.param(ArduPilotSitl, marks=REAL)],
+)
+def test_the_gimbal_turns_to_a_target_through_the_autopilot_and_stays_there(kind):
+    """The whole way: station, routing, camera component, autopilot, mount.
 
     From the ground at home, a target 100 m to the west at the same height: 270 degrees, level.
     """
-    with EmbeddedSitl(HOME, parameters=GIMBAL) as vehicle:
+    with kind(HOME, parameters=GIMBAL) as vehicle:
         config = BridgeConfig(connection=vehicle.companion_endpoint, look_at=True)
         station = mavutil.mavlink_connection(vehicle.spare_endpoint, source_system=255)
         west = 8.545594 - 100.0 / (111_320 * math.cos(math.radians(HOME.latitude_deg)))
