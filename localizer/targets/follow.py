@@ -29,6 +29,8 @@ _LARGEST_REACH = 80  # cells that are searched to each side
 _SEEN = 0.65  # correlation from which on it is the target where it is expected,
 _FOUND = 0.72  # and where much ground is searched: somewhere some of it looks a little like it
 _EXPECTED_M = 5.0
+_WORSE = 0.1  # what correlates so much less than lately is half hidden, or another
+_LATELY = 0.2  # weight of the newest in what is usual
 # rad, by which it may have turned since it was last found: a moment ago, or some seconds.
 _TURNS, _FAR_TURNS = (0.0, 0.2, -0.2), (0.0, 0.25, -0.25, 0.5, -0.5, 0.75, -0.75)
 _LONG_AGO_M = 3.0  # of reach
@@ -69,6 +71,7 @@ class ImageFollower:
         half = int(np.clip(round(self._half_m / cell), *_CELLS))
         self._cell, self._half = self._half_m / half, half
         self._course = 0.0
+        self._usual = 0.0
         self._origin = position
         first = self._chart(gray, estimate, position, half)
         self._first, self._late = first, first
@@ -93,8 +96,10 @@ class ImageFollower:
                 one = _match(chart, turned, mask, reach)
                 if one[0] > best[0] + _PREFERRED:
                     best, turn = one, angle
-        if best[0] < (_SEEN if reach_m <= _EXPECTED_M else _FOUND):
+        least = _SEEN if reach_m <= _EXPECTED_M else _FOUND
+        if best[0] < max(least, self._usual - _WORSE):
             return None
+        self._usual += _LATELY * (best[0] - self._usual)
         position = expected + self._on_ground(best[1] * self._cell)
         pixel = projected(estimate, position)
         if pixel is None:
