@@ -35,8 +35,10 @@ class TileName:
     @property
     def is_valid(self) -> bool:
         """Whether there is such a tile on Earth, at a zoom that is drawn."""
-        side = 1 << max(self.zoom, 0)
-        return _LEAST_ZOOM <= self.zoom <= _MOST_ZOOM and 0 <= self.x < side and 0 <= self.y < side
+        if not _LEAST_ZOOM <= self.zoom <= _MOST_ZOOM:
+            return False
+        side = 1 << self.zoom  # of a checked zoom: an address could ask for gigabytes of it
+        return 0 <= self.x < side and 0 <= self.y < side
 
     @property
     def centre(self) -> tuple[float, float]:

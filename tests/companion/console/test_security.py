@@ -26,6 +26,7 @@ from companion.console.records import Records
 from companion.console.security import MOST_BODY, Guarded, read_token
 from companion.console.server import Site, make_application
 from companion.console.source import Newest
+from companion.console.tiles import TileName
 from companion.errors import ConfigError
 from companion.live.config import ConsoleConfig
 
@@ -243,6 +244,12 @@ def test_sizes_are_bounded(site):
 
         answer = client.post("/api/order", content=endless(), headers=headers)
         assert (answer.status_code, answer.json()["text"]) == (409, "the body is too long")
+
+
+@pytest.mark.parametrize("zoom", [7, 23, 10**10, 10**21])
+def test_a_zoom_that_no_map_has_is_no_tile(zoom):
+    assert not TileName(zoom, 0, 0).is_valid
+    assert TileName(17, 0, 0).is_valid
 
 
 def test_floods_are_refused_until_they_are_over():
