@@ -16,6 +16,7 @@ from mavlink_bridge.errors import BridgeStateError
 from mavlink_bridge.flight_controller import FC_WANTED, FlightControllerEnd, message_id
 from mavlink_bridge.ground import GroundEnd
 from mavlink_bridge.injection.closed_loop import LoopVerdict
+from mavlink_bridge.injection.gate_memory import GateMemory
 from mavlink_bridge.injection.rc_gate import InjectionGate
 from mavlink_bridge.injection.shadow import ShadowScore, gnss_healthy
 from mavlink_bridge.link.clock import SteadyUtc, monotonic_ns
@@ -106,7 +107,7 @@ class Bridge:
             on_track,
             on_hint,
             VehicleWatch(self.say),
-            InjectionGate(config.rc, teller.notice) if config.mode == "rc" else None,
+            _gate(config, teller),
             LookAt(config, geoid_separation_m, self.say),
         )
         self._fc = FlightControllerEnd(shared)
@@ -362,6 +363,13 @@ class _LinkMaker:
             opener=self.opener,
         )
         return Link(Endpoint.parse(connection), handler, options)
+
+
+def _gate(config: BridgeConfig, teller: Teller) -> InjectionGate | None:
+    if config.mode != "rc":
+        return None
+    memory = GateMemory(config.state_file) if config.state_file is not None else None
+    return InjectionGate(config.rc, teller.notice, memory)
 
 
 def _mount(config: BridgeConfig) -> quat.Quaternion:

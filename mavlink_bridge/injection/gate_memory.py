@@ -32,7 +32,7 @@ class GateMemory:
         self._path = path
         self._wall_s = wall_s
         self._wake = threading.Event()
-        self._stopping = False
+        self._stopping = self._in_use = False
         self._channel: bool | None = None
         self._thread = threading.Thread(target=self._run, name="gate-memory", daemon=True)
         self._thread.start()
@@ -41,6 +41,7 @@ class GateMemory:
         """Whether the gate was opened by a channel (else by a command), and how long ago that was
         last true, s; None if it was closed, or nothing is known that may be trusted.
         """
+        self._in_use = True
         try:
             status = os.lstat(self._path)
             private = stat.S_ISREG(status.st_mode) and not status.st_mode & 0o077
@@ -59,6 +60,7 @@ class GateMemory:
 
     def opened(self, *, by_channel: bool) -> None:
         """The gate is open from now on."""
+        self._in_use = True
         self._channel = by_channel
         self._wake.set()
 
@@ -68,7 +70,10 @@ class GateMemory:
         self._wake.set()
 
     def stop(self) -> None:
-        """End the thread. An orderly end is the pilot's: nothing is remembered of it."""
+        """End the thread. An orderly end is the pilot's: nothing is remembered of it.
+
+        A standby that never flew leaves the file alone: it is of the process that flies.
+        """
         self._channel, self._stopping = None, True
         self._wake.set()
         self._thread.join(_STOP_S)
@@ -81,7 +86,7 @@ class GateMemory:
             try:
                 if self._channel is not None:
                     self._write(self._channel)
-                else:
+                elif self._in_use:
                     self._path.unlink(missing_ok=True)
                 known = True
             except OSError as error:

@@ -7,11 +7,13 @@ import os
 import signal
 import subprocess
 import sys
+import time
 from pathlib import Path
 
 import pytest
 
-from mavlink_bridge.config import RcGateConfig
+from mavlink_bridge.bridge import Bridge
+from mavlink_bridge.config import BridgeConfig, RcGateConfig
 from mavlink_bridge.injection.gate_memory import GateMemory
 from mavlink_bridge.injection.rc_gate import InjectionGate
 
@@ -97,3 +99,28 @@ def test_a_damaged_file_or_another_users_is_ignored(tmp_path: Path, text: str) -
     path.chmod(0o666)
     assert memory.recall() is None
     memory.stop()
+
+
+def _left_open(path: Path) -> None:
+    path.write_text(json.dumps({"open": True, "by_channel": False, "utc_s": time.time()}))
+    path.chmod(0o600)
+
+
+def _bridge(path: Path, told: list[str]) -> Bridge:
+    config = BridgeConfig(connection="udpout:127.0.0.1:9", mode="rc", state_file=path)
+    return Bridge(config, 0.0, on_text=lambda _, text: told.append(text))
+
+
+def test_the_bridge_restores_the_gate_that_a_killed_one_left_open(tmp_path: Path) -> None:
+    path, told = tmp_path / "gate.json", list[str]()
+    _left_open(path)
+    with _bridge(path, told):
+        assert any("injection on (restored" in text for text in told)
+    assert not path.exists()
+
+
+def test_a_standby_that_never_flew_leaves_the_file_alone(tmp_path: Path) -> None:
+    path = tmp_path / "gate.json"
+    _left_open(path)
+    _bridge(path, []).stop()
+    assert path.exists()
