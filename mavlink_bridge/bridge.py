@@ -96,6 +96,7 @@ class Bridge:
             config.camera.mount == "fixed",
             (config.camera.gimbal_component, config.camera.gimbal_device),
         )
+        gate = _gate(config, teller)
         self._shared = shared = Shared(
             config,
             geoid_separation_m,
@@ -106,8 +107,8 @@ class Bridge:
             self.say,
             on_track,
             on_hint,
-            VehicleWatch(self.say),
-            _gate(config, teller),
+            VehicleWatch(self.say, gate.announce if gate is not None else lambda: None),
+            gate,
             LookAt(config, geoid_separation_m, self.say),
         )
         self._fc = FlightControllerEnd(shared)

@@ -45,17 +45,25 @@ class InjectionGate:
         self._open = False
         self._high: bool | None = None
         self._memory = memory
+        self._at_start = "injection off, shadow (at the start)"
 
     def recall(self) -> None:
-        """Open it if it was left open by a process that did not end in order; told in any case."""
+        """Open it if it was left open by a process that did not end in order; `announce` tells."""
         remembered = self._memory.recall() if self._memory is not None else None
         if remembered is None:
-            self._changed("injection off, shadow (at the start)")
             return
         by_channel, age_s = remembered
-        if by_channel:
-            self._high = True  # a switch that was turned off meanwhile closes it at its first look
-        self._set(True, f"restored, {age_s:.0f} s old", by_channel=by_channel)
+        with self._lock:
+            if by_channel:
+                self._high = True  # a switch turned off meanwhile closes it at its first look
+            self._open = True
+            self._at_start = f"injection on (restored, {age_s:.0f} s old)"
+        if self._memory is not None:
+            self._memory.opened(by_channel=by_channel)
+
+    def announce(self) -> None:
+        """Tell how it stood at the start: once the links have somebody who hears it."""
+        self._changed(self._at_start)
 
     def stop(self) -> None:
         """An orderly end: nothing is remembered."""

@@ -23,11 +23,13 @@ _TEXTS = {
 class VehicleWatch:
     """Every link asks with each tick: the flight controller's own may be waiting to reconnect.
 
-    say: tell the operator (severity, text).
+    say: tell the operator (severity, text). first: called after the first of these texts.
     """
 
-    def __init__(self, say: Callable[[int, str], None]) -> None:
-        self._say = say
+    def __init__(
+        self, say: Callable[[int, str], None], first: Callable[[], None] = lambda: None
+    ) -> None:
+        self._say, self._first = say, first
         self._lock = threading.Lock()
         # Of the first tick: an application may compile for minutes before it starts the bridge.
         self._begun_ns: int | None = None
@@ -50,6 +52,8 @@ class VehicleWatch:
         if before == "lost":
             text = "flight controller is back"
         self._say(severity, f"PiLoT: {text}")
+        if before == "nothing":
+            self._first()
 
 
 class TwinWatch:

@@ -9,6 +9,7 @@ import subprocess
 import sys
 import time
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -16,6 +17,7 @@ from mavlink_bridge.bridge import Bridge
 from mavlink_bridge.config import BridgeConfig, RcGateConfig
 from mavlink_bridge.injection.gate_memory import GateMemory
 from mavlink_bridge.injection.rc_gate import InjectionGate
+from mavlink_bridge.link.link import sleep_until
 
 _CHILD = """
 import sys, time
@@ -54,6 +56,7 @@ def restarted(path: Path, later_s: float = 4.0) -> tuple[InjectionGate, list[str
     utc_s = json.loads(path.read_text())["utc_s"] if path.exists() else 0.0
     gate = InjectionGate(RcGateConfig(), told.append, GateMemory(path, lambda: utc_s + later_s))
     gate.recall()
+    gate.announce()
     return gate, told
 
 
@@ -106,21 +109,25 @@ def _left_open(path: Path) -> None:
     path.chmod(0o600)
 
 
-def _bridge(path: Path, told: list[str]) -> Bridge:
-    config = BridgeConfig(connection="udpout:127.0.0.1:9", mode="rc", state_file=path)
+def _bridge(path: Path, connection: str, told: list[str]) -> Bridge:
+    config = BridgeConfig(connection=connection, mode="rc", state_file=path)
     return Bridge(config, 0.0, on_text=lambda _, text: told.append(text))
 
 
-def test_the_bridge_restores_the_gate_that_a_killed_one_left_open(tmp_path: Path) -> None:
+def test_the_bridge_restores_the_gate_that_a_killed_one_left_open(
+    tmp_path: Path, autopilot: Any
+) -> None:
     path, told = tmp_path / "gate.json", list[str]()
     _left_open(path)
-    with _bridge(path, told):
-        assert any("injection on (restored" in text for text in told)
+    with _bridge(path, f"udpout:127.0.0.1:{autopilot.port}", told):
+        # Told once somebody may hear it: after the first word about the flight controller.
+        assert sleep_until(lambda: any("injection on (restored" in text for text in told), 30.0)
+    assert "flight controller" in told[0]
     assert not path.exists()
 
 
 def test_a_standby_that_never_flew_leaves_the_file_alone(tmp_path: Path) -> None:
     path = tmp_path / "gate.json"
     _left_open(path)
-    _bridge(path, []).stop()
+    _bridge(path, "udpout:127.0.0.1:9", []).stop()
     assert path.exists()
