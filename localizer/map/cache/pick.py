@@ -15,7 +15,7 @@ from localizer.types import RenderedView
 
 _JUMP = 0.02  # relative change of depth between neighbouring pixels that may be an edge
 # Between tiles, whose corners are rounded each to its own float32, nothing is open: metres, and the
-# same as a share of a triangle's side.
+# same as a share of a triangle's side, by which it is widened for rays that meet nothing else.
 _SEAM_M, _SEAM = 1e-3, 1e-4
 _CORNERS = np.array(list(np.ndindex(2, 2, 2)), np.bool_)
 
@@ -88,13 +88,23 @@ def cast_rays(meshes: Sequence[TileMesh], origin: ArrayLike, directions: ArrayLi
     World frame; NaN where a ray meets nothing. Both sides of a triangle count.
     """
     directions = np.asarray(directions, dtype=np.float64).reshape(-1, 3)
+    nearest = _nearest(meshes, origin, directions, 0.0)
+    missed = ~np.isfinite(nearest)
+    if missed.any():
+        nearest[missed] = _nearest(meshes, origin, directions[missed], _SEAM)
+    return np.where(np.isfinite(nearest), nearest, np.nan)
+
+
+def _nearest(
+    meshes: Sequence[TileMesh], origin: ArrayLike, directions: Array, seam: float
+) -> Array:
     nearest = np.full(len(directions), np.inf)
     for mesh in meshes:
         tile_from_world = mesh.world_from_tile.inverse
         local = np.ascontiguousarray(directions @ tile_from_world.rotation.T)
-        low, high = mesh.bounds
-        _cast(mesh.positions, mesh.faces, low, high, tile_from_world.apply(origin), local, nearest)
-    return np.where(np.isfinite(nearest), nearest, np.nan)
+        box, eye = mesh.bounds, tile_from_world.apply(origin)
+        _cast(mesh.positions, mesh.faces, box, eye, local, seam, nearest)
+    return nearest
 
 
 def cast_bundle(meshes: Sequence[TileMesh], origin: Array, directions: Array) -> BundleHits:
@@ -103,6 +113,17 @@ def cast_bundle(meshes: Sequence[TileMesh], origin: Array, directions: Array) ->
     For N rays about as fast as `cast_rays` for one: a triangle on the far side of one of the
     bundle's four bounding planes is passed over for all of them.
     """
+    nearest, normals = _nearest_of_bundle(meshes, origin, directions, 0.0)
+    missed = ~np.isfinite(nearest)
+    if missed.any():
+        found = _nearest_of_bundle(meshes, origin, directions[missed], _SEAM)
+        nearest[missed], normals[missed] = found
+    return BundleHits(np.where(np.isfinite(nearest), nearest, np.nan), normals)
+
+
+def _nearest_of_bundle(
+    meshes: Sequence[TileMesh], origin: Array, directions: Array, seam: float
+) -> tuple[Array, Array]:
     pyramid = Pyramid.about(directions)
     nearest = np.full(len(directions), np.inf)
     normals = np.zeros((len(directions), 3))
@@ -116,10 +137,10 @@ def cast_bundle(meshes: Sequence[TileMesh], origin: Array, directions: Array) ->
             continue
         beyond = turned.beyond(mesh.positions - eye)
         hit = np.full(len(directions), -1, np.int32)
-        _cast_bundle(mesh.positions, mesh.faces, beyond, eye, local, nearest, hit)
+        _cast_bundle(mesh.positions, mesh.faces, beyond, eye, local, seam, nearest, hit)
         new = hit >= 0
         normals[new] = _normals(mesh, hit[new], local[new]) @ turn.T
-    return BundleHits(np.where(np.isfinite(nearest), nearest, np.nan), normals)
+    return nearest, normals
 
 
 def warm_up() -> None:
@@ -127,7 +148,7 @@ def warm_up() -> None:
     corner = np.array([[0.0, 0, 1], [1, 0, 1], [0, 1, 1]], np.float32)
     faces, beyond = np.array([[0, 1, 2]], np.int32), np.zeros(3, np.uint8)
     hit, nearest = np.zeros(1, np.int32), np.full(1, np.inf)
-    _cast_bundle(corner, faces, beyond, np.zeros(3), np.ones((1, 3)), nearest, hit)
+    _cast_bundle(corner, faces, beyond, np.zeros(3), np.ones((1, 3)), 0.0, nearest, hit)
 
 
 def _normals(mesh: TileMesh, faces: NDArray[np.int32], directions: Array) -> Array:
@@ -159,8 +180,9 @@ def _interpolated_depth(depth: NDArray[np.float32], pixels: Array) -> Array:
 
 
 @njit(cache=True, nogil=True)
-def _cast(positions, faces, low, high, origin, directions, nearest):  # type: ignore[no-untyped-def]
+def _cast(positions, faces, box, origin, directions, seam, nearest):  # type: ignore[no-untyped-def]
     """The intersection of every ray that meets the box with every triangle."""
+    low, high = box
     for r in range(directions.shape[0]):
         d = directions[r]
         enter, leave = 0.0, nearest[r]
@@ -175,29 +197,32 @@ def _cast(positions, faces, low, high, origin, directions, nearest):  # type: ig
         if enter > leave + 1e-6 * abs(leave):
             continue
         for f in range(faces.shape[0]):
-            t = _meet(positions, faces[f], origin, d)
+            t = _meet(positions, faces[f], origin, d, seam)
             if 0.0 < t < nearest[r]:
                 nearest[r] = t
 
 
 @njit(cache=True, nogil=True)
 def _cast_bundle(  # type: ignore[no-untyped-def]
-    positions, faces, beyond, origin, directions, nearest, hit
+    positions, faces, beyond, origin, directions, seam, nearest, hit
 ):
     """The same for all rays of a bundle, with the face that each hits; `beyond` of the vertices."""
     for f in range(faces.shape[0]):
         if beyond[faces[f, 0]] & beyond[faces[f, 1]] & beyond[faces[f, 2]]:
             continue
         for r in range(directions.shape[0]):
-            t = _meet(positions, faces[f], origin, directions[r])
+            t = _meet(positions, faces[f], origin, directions[r], seam)
             if 0.0 < t < nearest[r]:
                 nearest[r] = t
                 hit[r] = f
 
 
 @njit(cache=True, nogil=True)
-def _meet(positions, face, origin, d):  # type: ignore[no-untyped-def]
-    """Where a ray meets a triangle (Möller and Trumbore), in multiples of `d`; -1 if nowhere."""
+def _meet(positions, face, origin, d, seam):  # type: ignore[no-untyped-def]
+    """Where a ray meets a triangle (Möller and Trumbore), in multiples of `d`; -1 if nowhere.
+
+    seam: share of its sides by which it is widened.
+    """
     p, q, s = positions[face[0]], positions[face[1]], positions[face[2]]
     ax, ay, az = float(p[0]), float(p[1]), float(p[2])
     ux, uy, uz = q[0] - ax, q[1] - ay, q[2] - az
@@ -209,10 +234,10 @@ def _meet(positions, face, origin, d):  # type: ignore[no-untyped-def]
     inv = 1.0 / det
     ox, oy, oz = origin[0] - ax, origin[1] - ay, origin[2] - az
     b = (ox * hx + oy * hy + oz * hz) * inv
-    if b < -_SEAM or b > 1.0 + _SEAM:
+    if b < -seam or b > 1.0 + seam:
         return -1.0
     gx, gy, gz = oy * uz - oz * uy, oz * ux - ox * uz, ox * uy - oy * ux
     c = (d[0] * gx + d[1] * gy + d[2] * gz) * inv
-    if c < -_SEAM or b + c > 1.0 + _SEAM:
+    if c < -seam or b + c > 1.0 + seam:
         return -1.0
     return (vx * gx + vy * gy + vz * gz) * inv
