@@ -28,7 +28,7 @@ def parser() -> Parser:
     """The command line."""
     p = Parser(__doc__)
     p.add_argument("folder", type=Path, help="of flights and outcomes")
-    p.add_argument("--draws", type=whole(1, 1000), default=10)
+    p.add_argument("--draws", type=whole(1, 1000), default=10, help="how many flights")
     p.add_argument("--first", type=whole(0, 10**6), default=200, help="seed of the first draw")
     p.add_argument("--world", type=whole(0, 10**9), default=1, help="seed of the world")
     p.add_argument("--minutes", type=number(0.1, 1e4), default=5.0, help="until it pauses")
