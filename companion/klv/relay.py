@@ -23,12 +23,12 @@ from companion.klv.metadata import Scene, picture_fields
 from companion.klv.transport import TransportWriter
 from companion.targets.population import Target
 from localizer.geometry.pose import Array
-from localizer.types import PoseEstimate
+from localizer.types import PoseEstimate, TargetFix
 
 _log = logging.getLogger(__name__)
 _QUEUE = 512  # packets: seconds of video
-_KEPT = 64  # exposures and estimates
-_TARGET_NS = 1_000_000_000  # a target that was told so lately is the picture's
+_KEPT = 64  # exposures, estimates, targets
+_TARGET_NS = 1_000_000_000  # a target that was seen so near to a picture is the picture's
 
 
 @dataclass(frozen=True)
@@ -62,7 +62,7 @@ class KlvRelay:
         self._exposures: dict[Fraction, int] = {}
         self._estimates: dict[int, PoseEstimate] = {}
         self._newest_ns = 0
-        self._target: Target | None = None
+        self._targets: dict[int, Target] = {}
         self._writer: TransportWriter | None = None
         self._condition = threading.Condition()
         self._stopping = False
@@ -112,7 +112,10 @@ class KlvRelay:
 
     def add_target(self, target: Target) -> None:
         """Note a located target. Never blocks."""
-        self._target = target
+        with self._condition:
+            self._targets[target.fix.exposure_time_ns] = target
+            while len(self._targets) > _KEPT:
+                self._targets.pop(next(iter(self._targets)))
 
     def _put(self, item: _Item) -> None:
         with self._condition:
@@ -167,12 +170,21 @@ class KlvRelay:
         self.sent += 1
 
     def _metadata(self, estimate: PoseEstimate) -> bytes:
-        time_ns, target = estimate.exposure_time_ns, self._target
-        fix = None if target is None else target.fix
-        if fix is not None and abs(time_ns - fix.exposure_time_ns) > _TARGET_NS:
-            fix = None
-        fields = picture_fields(estimate, self._scene, self._attitude(time_ns), fix)
+        time_ns = estimate.exposure_time_ns
+        fields = picture_fields(
+            estimate, self._scene, self._attitude(time_ns), self._target_at(time_ns)
+        )
         return encode((time_ns + self._utc_ns) // 1000, fields)
+
+    def _target_at(self, time_ns: int) -> TargetFix | None:
+        """The target that was seen nearest to a picture's time. Newer ones may have been told since
+        the picture came: it may have waited for its pose.
+        """
+        with self._condition:
+            seen_ns = min(self._targets, key=lambda t: abs(t - time_ns), default=None)
+            if seen_ns is None or abs(seen_ns - time_ns) > _TARGET_NS:
+                return None
+            return self._targets[seen_ns].fix
 
     def _close(self) -> None:
         if self._writer is not None:

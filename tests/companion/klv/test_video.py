@@ -26,6 +26,7 @@ from companion.klv.relay import KlvRelay
 from companion.reporting.klv_recording import describe_recording
 from companion.sources import SourceSettings, VideoFileSource
 from companion.sources.misp import MispTime, sei_nal
+from companion.targets.population import Target
 from localizer.geometry.camera import Camera
 from localizer.geometry.geo import Geodetic, LocalFrame
 from localizer.geometry.pose import Pose, matrix_from_euler, so3_exp
@@ -143,12 +144,17 @@ def test_a_live_video_is_sent_on_byte_for_byte_with_its_metadata_in_step(tmp_pat
             output=f"udp://127.0.0.1:{listener.getsockname()[1]}", mission="survey 7", hold_ms=2000
         )
         relay = KlvRelay(config, SCENE, lambda _: np.eye(3), 1_790_000_000 * SECOND)
-        relay.start()
         source = VideoFileSource(tmp_path / "in.ts", CAMERA, SourceSettings(), None, relay)
         times = []
         for frame in source.frames():
             times.append(frame.exposure_time_ns)
-            relay.add_estimate(estimate(times[-1], 2.0 * len(times), len(times) % 3 != 0))
+            east = 2.0 * len(times)
+            one = estimate(times[-1], east, len(times) % 3 != 0)
+            below = np.array([east, 0.0, 0.0])
+            fix = TargetFix("car", below, np.eye(3), None, times[-1])
+            relay.add_target(Target(fix, one))
+            relay.add_estimate(one)
+        relay.start()  # all targets are told by now, and each picture has its own
         end = time.monotonic() + 30.0
         while relay.sent < 12 and time.monotonic() < end:
             time.sleep(0.01)
@@ -174,6 +180,7 @@ def test_a_live_video_is_sent_on_byte_for_byte_with_its_metadata_in_step(tmp_pat
         assert round(fields[2].timestamp() * 1e6) == taken_us
         place = SCENE.frame.position(np.array([2.0 * (k + 1), 0.0, 100.0]))
         assert fields[14] == pytest.approx(place.longitude_deg, abs=1e-7)
+        assert fields[41] == pytest.approx(place.longitude_deg, abs=1e-7)
 
 
 def test_a_picture_without_a_pose_does_not_hold_the_video_up_for_ever(tmp_path):
