@@ -17,7 +17,9 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 from companion.errors import MissionFileError
 from localizer.plain_files import plain_text
 
-_MOST_BYTES = 16 << 20  # a mission of 32,767 items, the most that MAVLink counts, takes 8 MB
+# ArduPilot counts its commands in a signed 16-bit number (AP_Mission, MIS_TOTAL).
+_MOST_ITEMS = 32_767
+_MOST_BYTES = 16 << 20  # so many items take 8 MB
 _PLACES = (
     mavlink.MAV_CMD_NAV_WAYPOINT,
     mavlink.MAV_CMD_NAV_SPLINE_WAYPOINT,
@@ -92,6 +94,11 @@ def read_mission(path: Path) -> PlannedMission:
             home, items = _plan(json.loads(text))
         else:
             home, items = _waypoints(text)
+        if len(items) > _MOST_ITEMS:
+            raise MissionFileError(
+                f"{path}: holds {len(items):,} items; an autopilot counts {_MOST_ITEMS:,} at the "
+                "most: split the mission"
+            )
         return _mission(path, home, items)
     except OSError as error:
         raise MissionFileError(f"{path}: cannot be read: {error.strerror}") from error

@@ -118,6 +118,23 @@ def test_missions_that_cannot_be_placed_are_named(tmp_path, cache):
         read_mission(local)
 
 
+@pytest.mark.parametrize("suffix", ["plan", "waypoints"])
+def test_a_mission_that_no_autopilot_counts_is_refused(tmp_path, cache, suffix):
+    """32,767 items are the most; a home row is none of them."""
+
+    def mission_of(count):
+        path = tmp_path / f"long.{suffix}"
+        if suffix == "plan":
+            return plan_file(path, cache, *[waypoint(cache, 0, 0, 50)] * count)
+        row = "0\t0\t3\t16\t0\t0\t0\t0\t47.2\t8.2\t50\t1\n"
+        path.write_text("QGC WPL 110\n" + row * (count + 1))
+        return path
+
+    assert len(read_mission(mission_of(32_767)).waypoints) == 32_767
+    with pytest.raises(MissionFileError, match=r"long.* holds 32,768 items.*split the mission"):
+        read_mission(mission_of(32_768))
+
+
 def forecast(risk=0.01, sigma=0.2, share=1.0, rival=0.1, ground=80.0, condition="day"):
     figures = Figures(sigma, 0.9, 0.6, share, 0.0, 0.2)
     return ViewForecast(condition, figures, sigma, risk, ground, 20.0, Rival(rival, 12.0))
