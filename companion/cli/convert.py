@@ -74,7 +74,8 @@ def convert_command(
     from companion.convert.photos import Heights
 
     frame, separation = _frame(map_cache, origin)
-    separation = separation if geoid_separation is None else geoid_separation
+    if geoid_separation is not None:
+        separation = _on_earth(geoid_separation)
     above = None
     if heights is not None:
         if heights is HeightDatum.AMSL and separation is None:
@@ -85,6 +86,14 @@ def convert_command(
     with writing(out):
         WRITERS[to.value](out, poses, place)
     typer.echo(f"{out}: {len(poses)} poses")
+
+
+def _on_earth(separation_m: float) -> float:
+    from localizer.map.cache.cache import HIGHEST_GEOID_M, LOWEST_GEOID_M
+
+    if not LOWEST_GEOID_M <= separation_m <= HIGHEST_GEOID_M:  # NaN is not either
+        raise ConfigError(f"--geoid-separation {separation_m}: no such separation occurs on Earth")
+    return separation_m
 
 
 def _frame(map_cache: Path | None, origin: str | None) -> tuple[LocalFrame | None, float | None]:

@@ -36,7 +36,11 @@ from localizer.map.importers.height_crs import (
     unit_of,
 )
 from localizer.map.importers.heightmesh import ERROR_PER_STEP, height_mesh
-from localizer.map.importers.raster_checks import check_heights, check_overlap
+from localizer.map.importers.raster_checks import (
+    check_colours,
+    check_heights,
+    check_overlap,
+)
 from localizer.map.importers.raster_file import (
     METRES,
     HeightBand,
@@ -206,6 +210,8 @@ def _read_rasters(
         band, warnings = _height_band(dsm, heights, stated, height_unit, nodata, rules)
         warnings += doubts + check_heights(dsm, heights, band, rules)
         warnings += check_overlap(heights, band, colours, rules)
+        bands = colour_bands(ortho, colours)
+        warnings += check_colours(ortho, colours, bands)
         grid = _grid(heights, colours)
         centre = ecef_from_crs(grid.crs, np.array([[*_centre(heights, grid.crs), 0.0]]))[0]
         bounds = rasterio.warp.transform_bounds(_flat_crs(heights), grid.crs, *heights.bounds)
@@ -213,9 +219,7 @@ def _read_rasters(
         bottom, top = sorted(bounds[1::2])
         # With what lies beside them: world files, statistics, overviews, masks.
         beside = {Path(name) for data in (heights, colours) for name in data.files}
-        root = RasterTile(
-            dsm, ortho, grid, 0, 0, 0, band, colour_bands(ortho, colours), rules
-        )  # fmt: skip
+        root = RasterTile(dsm, ortho, grid, 0, 0, 0, band, bands, rules)
     files = (dsm, ortho, *sorted(beside - {dsm, ortho}))
     if stated.other_geoid:
         warnings.append(

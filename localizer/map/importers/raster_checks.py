@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import rasterio.enums
+from numpy.typing import NDArray
 from rasterio.io import DatasetReader
 from rasterio.windows import Window
 
@@ -17,6 +18,11 @@ from localizer.map.importers.rules import HIGHEST_M, LOWEST_M, ImportRules
 _SAMPLES = 4000  # of a side
 _FILL_SHARE, _FILL_GAP_M = 1e-3, 30.0
 _WINDOW = 1500  # cells of a side, where slopes are measured
+_SPIKE_M = 500.0  # no tower or chimney stands so high over one cell's neighbours
+_SPIKE_NEIGHBOURS = 3  # as many as a corner has
+_STRIP_CELLS = 4_000_000  # read at once
+_ONE_COLOUR = 2  # levels of 255 between a picture's darkest and brightest, and it shows nothing
+_COLOUR_SAMPLES = 1000  # of a side
 _STEEP, _STEEP_SHARE = 5.7, 0.25  # 80 degrees; photogrammetry of a dense town has 0.05 of it
 _LEAST_OVERLAP, _GOOD_OVERLAP = 0.05, 0.5
 
@@ -47,7 +53,7 @@ def check_heights(
         )
     elif not has_own_mask(data) and band.missing is None:
         warnings += _fill(path, known, band, rules)
-    return warnings + _steepness(path, data, band, rules)
+    return warnings + _steepness(path, data, band, rules) + _spikes(path, data, band)
 
 
 def _sampled(data: DatasetReader, band: HeightBand) -> np.ma.MaskedArray:
@@ -105,6 +111,60 @@ def _steepness(path: Path, data: DatasetReader, band: HeightBand, rules: ImportR
             f"{path}: {100 * share:.0f} % of its cells rise by more than 80 degrees: noise, "
             "another unit (--height-unit), or not heights",
         )
+    ]
+
+
+def _spikes(path: Path, data: DatasetReader, band: HeightBand) -> list[str]:
+    """Single cells far above or below all their neighbours: a bird, a cloud, a damaged number."""
+    found: list[tuple[float, float, float]] = []
+    rows = max(1, _STRIP_CELLS // data.width)
+    for first in range(0, data.height, rows):
+        top, bottom = max(first - 1, 0), min(first + rows + 1, data.height)  # with neighbours
+        window = Window(0, top, data.width, bottom - top)
+        metres = band.metres(_masked(data, band, window=window).filled(np.nan))
+        own = slice(first - top, first - top + rows)
+        for row, column in np.argwhere(_stands_alone(metres)[own]):
+            found.append((*data.xy(first + row, column), metres[own][row, column]))
+    if not found:
+        return []
+    x, y, height = found[0]
+    more = f", and {len(found) - 1} other cells" if len(found) > 1 else ""
+    return [
+        f"{path.name}: {height:.0f} m in a single cell at {x:.10g}, {y:.10g}{more}: more than "
+        f"{_SPIKE_M:.0f} m from all its neighbours; no ground is like that: repair it, or mark it "
+        "as missing"
+    ]
+
+
+def _stands_alone(metres: Array) -> NDArray[np.bool_]:
+    """Cells with enough known neighbours, all far from it. metres: (h, w), NaN is unknown."""
+    height, width = metres.shape
+    padded = np.pad(metres, 1, constant_values=np.nan)
+    alone = np.isfinite(metres)
+    known = np.zeros(metres.shape, np.uint8)
+    for row in range(3):
+        for column in range(3):
+            if (row, column) != (1, 1):
+                gap = np.abs(metres - padded[row : row + height, column : column + width])
+                alone &= ~(gap <= _SPIKE_M)
+                known += np.isfinite(gap)
+                if not alone.any():
+                    return alone
+    return alone & (known >= _SPIKE_NEIGHBOURS)
+
+
+def check_colours(path: Path, data: DatasetReader, bands: tuple[int, int, int]) -> list[str]:
+    """A warning about an orthophoto of one colour: nothing can be registered against it."""
+    shape = min(data.height, _COLOUR_SAMPLES), min(data.width, _COLOUR_SAMPLES)
+    how = {"out_shape": shape, "resampling": rasterio.enums.Resampling.nearest}
+    shown = data.dataset_mask(**how) > 0
+    colours = np.stack([data.read(band, **how)[shown] for band in bands], -1)
+    if not len(colours) or np.ptp(colours, axis=0).max() > _ONE_COLOUR:
+        return []
+    colour = ", ".join(str(int(level)) for level in np.median(colours, axis=0))
+    return [
+        f"{path.name}: shows one colour ({colour}) all over: no picture can be registered against "
+        "it; is it the right file, and were its bands exported?"
     ]
 
 

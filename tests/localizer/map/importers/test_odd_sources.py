@@ -28,7 +28,8 @@ from localizer.map.building.isolation import call_apart
 from localizer.map.building.options import BuildOptions
 from localizer.map.cache.cache import TileCache
 from localizer.map.importers.georeference import Georeference, ecef_from_crs
-from localizer.map.importers.raster_file import offline, open_raster
+from localizer.map.importers.raster_checks import check_heights
+from localizer.map.importers.raster_file import METRES, offline, open_raster
 from localizer.map.importers.rules import ImportRules
 
 UTM = "EPSG:32632"
@@ -579,6 +580,61 @@ def test_outside_the_orthophoto_is_no_map(tmp_path, built):
     assert box[:2] == pytest.approx([30, 30], abs=1.5)
     cache.manifest.model_dump_json()
     assert any("shows 39" in text for text in cache.manifest.warnings)
+
+
+@pytest.mark.parametrize("place", [(20, 20), (0, 0), (CELLS - 1, 30)], ids=str)
+@pytest.mark.parametrize("strip", [1, 10**6])
+def test_a_single_cell_far_above_all_its_neighbours_is_told(
+    tmp_path, monkeypatch, place, strip
+):  # fmt: skip
+    monkeypatch.setattr("localizer.map.importers.raster_checks._STRIP_CELLS", strip)
+    data = ground()
+    data[place] = 3500.0
+    data[40:44, 40:44] = np.nan
+    x, y = LEFT + (place[1] + 0.5) * STEP, TOP - (place[0] + 0.5) * STEP
+    with offline(), open_raster(dsm_of(tmp_path, data)) as dsm:
+        (told,) = check_heights(Path("dsm.tif"), dsm, METRES, ImportRules())
+    assert f"dsm.tif: 3500 m in a single cell at {x:.10g}, {y:.10g}: more than 500 m" in told
+
+
+def test_a_tower_and_a_gorge_are_no_spikes(tmp_path):
+    data = ground()
+    data[20, 20:22] = 3500.0  # two cells agree
+    data[:, 40:] += 2000.0  # a wall
+    data[5, 5] += 400.0  # a mast
+    data[10:13, 10:13] = np.nan
+    data[11, 11] = 3500.0  # nobody knows what is about it
+    with offline(), open_raster(dsm_of(tmp_path, data, nodata=-9999)) as dsm:
+        assert check_heights(Path("dsm.tif"), dsm, METRES, ImportRules()) == []
+
+
+def test_a_spike_is_in_the_maps_warnings(tmp_path, built):
+    data = ground()
+    data[20, 20] = 3500.0
+    cache = built(rasters(tmp_path, data), **ELLIPSOIDAL)
+    assert [text for text in cache.manifest.warnings if "in a single cell" in text]
+
+
+@pytest.mark.parametrize("level", [0, 200])
+def test_an_orthophoto_of_one_colour_is_told(tmp_path, built, level):
+    blank = np.full((3, CELLS, CELLS), level, np.uint8)
+    blank[:, 3, 3] += 1  # a lossy file's noise
+    cache = built(rasters(tmp_path, ortho={"data": blank}), **ELLIPSOIDAL)
+    (told,) = cache.manifest.warnings
+    assert f"ortho.tif: shows one colour ({level}, {level}, {level}) all over" in told
+
+
+def test_a_dark_orthophoto_that_shows_something_is_not_doubted(tmp_path, built):
+    dark = picture() // 40
+    assert built(rasters(tmp_path, ortho={"data": dark}), **ELLIPSOIDAL).manifest.warnings == ()
+
+
+@pytest.mark.parametrize("given", [float("nan"), float("inf"), -4000.0])
+def test_a_geoid_separation_that_is_none_is_refused(tmp_path, given):
+    options = BuildOptions(geoid_separation_m=given, vertical_datum="amsl", workers=1)
+    with pytest.raises(GeoreferenceError, match=r"geoid separation of .* does not occur on Earth"):
+        build_cache(rasters(tmp_path), tmp_path / "c", options)
+    assert not (tmp_path / "c").exists()
 
 
 def test_what_a_mask_hides_is_no_map(tmp_path, built):
