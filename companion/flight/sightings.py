@@ -6,7 +6,7 @@ from collections.abc import Callable
 
 import numpy as np
 
-from companion.calibration.sighting import Sighting
+from companion.calibration_watch.sighting import Sighting
 from companion.conversions import Installation, vision_fix
 from companion.geometry import ned_from_world
 from localizer.types import Float32, PoseEstimate, ReferenceBundle, TrackingState

@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from companion.calibration.map_shift import MapShift
+from companion.calibration_watch.map_shift import MapShift
 from companion.config import CompanionConfig
 from companion.conversions import Installation, target_report
 from companion.errors import ConfigError

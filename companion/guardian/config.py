@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pydantic import BaseModel, ConfigDict, Field
 
-from companion.calibration.config import CalibrationLimits
+from companion.calibration_watch.config import CalibrationLimits
 
 
 class _Model(BaseModel):

@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 import threading
 
-from companion.calibration.sighting import Sighting
+from companion.calibration_watch.sighting import Sighting
 from companion.guardian.config import GuardianConfig
 from companion.guardian.monitor import Limits, Monitor
 from companion.guardian.protection import ProtectionLevel

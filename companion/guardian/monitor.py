@@ -7,8 +7,8 @@ from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 
-from companion.calibration.sighting import Figure, Sighting
-from companion.calibration.watch import CalibrationWatch
+from companion.calibration_watch.sighting import Figure, Sighting
+from companion.calibration_watch.watch import CalibrationWatch
 from companion.guardian import findings as f
 from companion.guardian.config import GuardianConfig
 from companion.guardian.ekf import EkfWatch

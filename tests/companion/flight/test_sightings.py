@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from companion.calibration.sighting import Sighting
+from companion.calibration_watch.sighting import Sighting
 from companion.conversions import Installation
 from companion.flight.sightings import Sightings, middle_depth_m
 from localizer.geometry.camera import Camera

@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 import pytest
 
-from companion.calibration.sighting import Sighting
+from companion.calibration_watch.sighting import Sighting
 from companion.geometry import GIMBAL_FROM_CAMERA
 from companion.guardian.config import GuardianConfig
 from companion.guardian.monitor import Limits, Monitor

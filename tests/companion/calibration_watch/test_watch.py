@@ -7,12 +7,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from companion.calibration.config import CalibrationLimits
-from companion.calibration.sighting import Sighting
-from companion.calibration.watch import CalibrationFigures
+from companion.calibration_watch.config import CalibrationLimits
+from companion.calibration_watch.sighting import Sighting
+from companion.calibration_watch.watch import CalibrationFigures
 from mavlink_bridge import quaternion as quat
 from mavlink_bridge.messages import GimbalAttitude
-from tests.companion.calibration.simulated import Flown, Wrong, square
+from tests.companion.calibration_watch.simulated import Flown, Wrong, square
 
 LIMITS = CalibrationLimits()
 SURVEYED = square(60.0)  # climbs to its height on GNSS, then turns

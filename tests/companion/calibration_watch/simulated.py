@@ -9,9 +9,9 @@ from functools import cached_property, lru_cache
 import numpy as np
 from numpy.typing import NDArray
 
-from companion.calibration.config import CalibrationLimits
-from companion.calibration.sighting import Sighting
-from companion.calibration.watch import CalibrationFigures, CalibrationWatch
+from companion.calibration_watch.config import CalibrationLimits
+from companion.calibration_watch.sighting import Sighting
+from companion.calibration_watch.watch import CalibrationFigures, CalibrationWatch
 from companion.geometry import GIMBAL_FROM_CAMERA
 from companion.guardian.inertial import GRAVITY, InertialTrack
 from localizer.geometry.pose import matrix_from_euler, so3_exp

@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 import numpy as np
 import pytest
 
-from companion.calibration.map_shift import MapShift, Policy
+from companion.calibration_watch.map_shift import MapShift, Policy
 from companion.guardian.config import GuardianConfig
 from companion.guardian.place_checks import GnssCheck
 from localizer.types import PoseEstimate, TrackingState

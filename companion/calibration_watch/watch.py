@@ -11,10 +11,10 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from companion.calibration.attitude_filter import AXES, AttitudeFilter
-from companion.calibration.config import CalibrationLimits
-from companion.calibration.position_filter import PositionFilter
-from companion.calibration.sighting import Evidence, Figure, Sighting
+from companion.calibration_watch.attitude_filter import AXES, AttitudeFilter
+from companion.calibration_watch.config import CalibrationLimits
+from companion.calibration_watch.position_filter import PositionFilter
+from companion.calibration_watch.sighting import Evidence, Figure, Sighting
 from companion.geometry import GIMBAL_FROM_CAMERA
 from localizer.geometry.pose import matrix_from_quaternion, so3_log
 from mavlink_bridge.messages import GimbalAttitude, VehicleState

@@ -13,7 +13,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from companion.calibration.sighting import Evidence, Figure, Sighting
+from companion.calibration_watch.sighting import Evidence, Figure, Sighting
 
 Array = NDArray[np.float64]
 
