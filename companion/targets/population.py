@@ -87,7 +87,8 @@ class _Life:
     extent_m: tuple[float, float] | None = None
     follower: ImageFollower | None = None
     moved_at_once: bool = False
-    """The pictures about the click's own show that it moves."""
+    """The pictures about the click's own show that it moves, or that a roof does beside it."""
+    begun_ns: int = 0
     found_ns: int = 0
     """When it was last found in the image."""
     refusals: int = 0
@@ -136,7 +137,7 @@ class Population:
             self._say(_WARNING, f"PiLoT: target {click.number} refused: {track.refusal}")
             self._gone(name)
             return
-        life = _Life(track, time_ns, True, time_ns, found_ns=time_ns)
+        life = _Life(track, time_ns, True, time_ns, found_ns=time_ns, begun_ns=time_ns)
         away = fix.position_world - click.estimate.world_from_camera.translation
         if click.extent is not None:
             cell = float(np.linalg.norm(away)) / click.estimate.camera.fx
@@ -240,11 +241,17 @@ class Population:
             sigma = float(np.sqrt(max(np.linalg.eigvalsh(P)[-1], 0.0)))
             found = follower.find(gray, estimate, position, _NEAR_M + min(3.0 * sigma, _FAR_M))
         elif (near := follower.find(gray, estimate, position, _STILL_M)) is not None and (
-            _off(near.position, position) < _STANDS_M or not life.moved_at_once
+            _off(near.position, position) < _STANDS_M
+            or not life.moved_at_once
+            or time_ns - life.begun_ns > _DEPARTS_S * 1e9
         ):
             # It stands, and geometry holds it better than its look, which slides with every change
-            # of view on what is not flat.
+            # of view on what is not flat. What moved between pictures has left its place by now: if
+            # it is still here, a roof or a crown about it moved against the ground instead.
             life.found_ns = time_ns
+            if life.moved_at_once and time_ns - life.begun_ns > _DEPARTS_S * 1e9:
+                life.moved_at_once = False
+                follower.forget_shape()
         elif near is not None:
             found = near
         elif since_s <= _DEPARTS_S:

@@ -4,8 +4,10 @@ import cv2
 import numpy as np
 import pytest
 
+from companion.targets import population
 from localizer.geometry.camera import Camera
 from localizer.geometry.pose import Pose, so3_exp
+from localizer.targets.follow import Found
 from localizer.targets.track import projected
 from localizer.types import Visibility
 from tests.companion.targets import scene
@@ -153,3 +155,63 @@ def test_a_car_that_does_not_come_back_is_lost_with_a_word():
     watcher.fly(100)
     assert watcher.texts[-1] == "PiLoT: target 1 lost"
     assert watcher.gone == ["ground station 1"]
+
+
+class _Slides:
+    """A look that slides off a standing place at `speed` m/s and seems to have moved at once, as a
+    roof's edge 10 m above the ground does in charts of it.
+    """
+
+    speed = 0.45
+    ready = True
+
+    def __init__(self, _gray, estimate, position, _half_m):
+        self._begun_ns, self._place = estimate.exposure_time_ns, position
+        self.is_isolated = False
+
+    def isolate(self, pictures):
+        self.is_isolated = len(pictures) > 1
+        return self.is_isolated
+
+    def forget_shape(self):
+        self.is_isolated = False
+
+    def find(self, _gray, estimate, expected, reach_m):
+        since_s = (estimate.exposure_time_ns - self._begun_ns) * 1e-9
+        at = self._place + np.array([0.0, self.speed * since_s, 0.0])
+        pixel = projected(estimate, at)
+        near = pixel is not None and np.linalg.norm(at - expected) <= reach_m
+        return Found(at, pixel, 0.9) if near else None
+
+
+class _Drives(_Slides):
+    speed = 4.0
+
+
+@pytest.mark.parametrize("follower", [_Slides, _Drives])
+def test_what_has_not_left_after_a_second_does_not_move(monkeypatch, follower):
+    monkeypatch.setattr(population, "ImageFollower", follower)
+    watcher = Operator(rate_hz=10.0)
+    gray = np.zeros((480, 640), np.uint8)
+
+    def fly(frames):
+        for _ in range(frames):
+            seen = scene.estimate(scene.pose_at(watcher.time_ms / 1e3), watcher.time_ms * MS)
+            watcher.clicks.add_estimate(seen)
+            watcher.population.look(seen, gray)
+            watcher.population.hold(seen)
+            watcher.time_ms += 100
+        watcher.now_ms = watcher.time_ms - 100
+
+    fly(10)
+    watcher.clicks_at(0.5, 0.3)
+    fly(30)
+    fixes = [t.fix for t in watcher.of(1)]
+    assert len(fixes) > 20
+    moved = np.linalg.norm(fixes[-1].position_world - fixes[0].position_world)
+    if follower is _Drives:  # a car is told to move as before
+        assert moved > 8.0
+        assert fixes[-1].velocity is not None
+    else:
+        assert moved < 0.5
+        assert all(f.velocity is None for f in fixes)
