@@ -122,9 +122,7 @@ def _model(
             )
         return lens.to_dict()
     width, height = size or (1280, 720)
-    notes.append(
-        "camera.model is a field of view, not a calibration: docs/how-to/install.md, calibration"
-    )
+    notes.append("camera.model is a field of view, not a calibration: docs/tutorials/my-camera.md")
     return Camera.from_fov(width, height, fov or _DEFAULT_FOV_DEG).to_dict()
 
 
