@@ -76,3 +76,9 @@ def test_the_site_builds_strictly_and_asks_no_network(tmp_path):
     }
     assert not asked
     assert (tmp_path / "reference" / "cli.html").is_file()
+
+
+def test_every_tutorial_says_what_comes_next() -> None:
+    # A page that an edit cut off in its middle has good links, short lines, and no end.
+    for page in sorted((ROOT / "docs" / "tutorials").glob("*.md")):
+        assert page.read_text(encoding="utf-8").rstrip().splitlines()[-1].startswith("Next: ["), page
