@@ -81,4 +81,5 @@ def test_the_site_builds_strictly_and_asks_no_network(tmp_path):
 def test_every_tutorial_says_what_comes_next() -> None:
     # A page that an edit cut off in its middle has good links, short lines, and no end.
     for page in sorted((ROOT / "docs" / "tutorials").glob("*.md")):
-        assert page.read_text(encoding="utf-8").rstrip().splitlines()[-1].startswith("Next: ["), page
+        last = page.read_text(encoding="utf-8").rstrip().splitlines()[-1]
+        assert last.startswith("Next: ["), page
