@@ -137,10 +137,10 @@ class Bridge:
         self._started = True
         if self._recorder is not None:
             self._recorder.start()
+        if self._shared.gate is not None:
+            self._shared.gate.recall()  # before a link finds the vehicle and has it announced
         for link in self._links:
             link.start()
-        if self._shared.gate is not None:
-            self._shared.gate.recall()
 
     def stop(self) -> None:
         """Close the links; the bridge cannot be started again. Harmless when called again."""
