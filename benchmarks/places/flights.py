@@ -16,10 +16,8 @@ import numpy as np
 
 from benchmarks.places.worlds import LIVE, OUTDATED, PLACES, Place, PlaceFolder
 from localizer.evaluation.sequences import Sequence, load_sequence
-from localizer.geometry.posefile import pose_row, write_poses
 from localizer.map.cache.cache import TileCache
 from localizer.map.cache.stream import TileStreamer
-from localizer.pictures import write_rgb
 from localizer.render.numba_raster import NumbaRenderer
 from localizer.synth.appearance.model import sample_appearance
 from sitl.camera.realism import Stamps
@@ -29,6 +27,7 @@ from sitl.camera.world_camera import CameraOptions, WorldCamera
 from sitl.demo.budget import draw_errors
 from sitl.demo.kinematic import camera_path
 from sitl.demo.scenario import Leg, Scenario
+from sitl.demo.sequence import record_sequence
 
 CONDITIONS = ("day", "dusk", "night", "fog", "rain/snow", "season")
 HEIGHTS = ("low", "high")
@@ -37,7 +36,6 @@ HEIGHT_M = {"low": 50.0, "high": 150.0}
 _PITCH_DEG = {"low": (-65.0, -75.0), "high": (-80.0, -85.0)}
 _RATE_HZ = 10.0
 _BEGIN_S = 2.0  # the vehicle has gathered speed
-_JPEG_QUALITY = 90
 
 
 @dataclass(frozen=True)
@@ -118,27 +116,14 @@ def _record(cell: Cell, home: PlaceFolder, out: Path, frames: int) -> None:
     errors = draw_errors(scenario, seed)
     appearance = sample_appearance(np.random.default_rng([seed, 11]), cell.weather)
     movers = traffic(home.world, frame, cars=scenario.cars, people=scenario.people, seed=seed)
-    images = out / "images"
-    images.mkdir(parents=True, exist_ok=True)
+    begin = path[0][0] + round((_BEGIN_S + first_frame(cell, frames) / _RATE_HZ) * 1e9)
+    times_ns = [begin + round(k * 1e9 / _RATE_HZ) for k in range(frames)]
+    stamps, told = Stamps(errors.realism, seed), scenario.camera.camera()
     with TileStreamer(TileCache.open(home.seen_cache)) as streamer:
         options = CameraOptions(movers, seed=seed, realism=errors.realism)
         camera = WorldCamera(NumbaRenderer(streamer, 1), errors.camera, appearance, options)
-        stamps, rows, told = Stamps(errors.realism, seed), [], []
-        begin = path[0][0] + round((_BEGIN_S + first_frame(cell, frames) / _RATE_HZ) * 1e9)
-        for k in range(frames):
-            time_ns = begin + round(k * 1e9 / _RATE_HZ)
-            exposure = camera.expose(time_ns, track)
-            if exposure is None:
-                break
-            name = f"{k:06d}.jpg"
-            write_rgb(images / name, exposure.image, _JPEG_QUALITY)
-            rows.append(pose_row(name, exposure.world_from_camera, frame))
-            told.append(f"{name} {stamps.of(time_ns)}\n")
-    write_poses(out / "poses.txt", rows)
-    (images / "timestamps.txt").write_text("".join(told), encoding="utf-8")
-    calibrated = scenario.camera.camera().to_dict()
-    (out / "camera.json").write_text(json.dumps(calibrated, indent=2) + "\n")
-    drawn = {"weather": cell.weather, "camera": errors.camera.to_dict(), "frames": len(rows)}
+        count = record_sequence(camera, track, times_ns, frame, out, told, stamps.of)
+    drawn = {"weather": cell.weather, "camera": errors.camera.to_dict(), "frames": count}
     partial = out / "errors.json.partial"
     partial.write_text(json.dumps(drawn, indent=1) + "\n")
     os.replace(partial, out / "errors.json")

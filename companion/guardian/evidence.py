@@ -77,10 +77,10 @@ class CheckedVehicle:
 
 def known_state(state: VehicleState) -> VehicleState:
     """The state, None for each field that holds what is no number."""
-    unknown = {
+    unknown: dict[str, Any] = {
         field.name: None for field in fields(state) if not _is_number(getattr(state, field.name))
     }
-    return replace(state, **unknown) if unknown else state  # type: ignore[arg-type]
+    return replace(state, **unknown) if unknown else state
 
 
 def _known(told: _Told | None) -> _Told | None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from pathlib import Path
 
 from localizer.geometry.camera import Camera
@@ -23,11 +23,13 @@ def record_sequence(
     frame: LocalFrame,
     out: Path,
     calibrated: Camera | None = None,
+    stamped: Callable[[int], int] = lambda time_ns: time_ns,
 ) -> int:
     """Writes the pictures at the given times; returns how many (times off the track have none).
 
     calibrated: what the evaluation is told of the camera, where that is not the truth. frame: the
-    ENU frame of the track. ``images/timestamps.txt`` keeps the exposure times.
+    ENU frame of the track. ``images/timestamps.txt`` keeps the exposure times, as `stamped` by the
+    camera.
     """
     images = out / "images"
     images.mkdir(parents=True, exist_ok=True)
@@ -40,7 +42,7 @@ def record_sequence(
         name = f"{len(rows):06d}.jpg"
         write_rgb(images / name, exposure.image, _JPEG_QUALITY)
         rows.append(pose_row(name, exposure.world_from_camera, frame))
-        stamps.append(f"{name} {time_ns}\n")
+        stamps.append(f"{name} {stamped(time_ns)}\n")
     write_poses(out / "poses.txt", rows)
     (images / "timestamps.txt").write_text("".join(stamps), encoding="utf-8")
     told = (calibrated or camera.camera).to_dict()

@@ -77,10 +77,10 @@ class RecordingServer(MavlinkServer):
 
     def __init__(self, recorded: RecordedPort) -> None:
         super().__init__((0,), 1)  # a port of the system's choice, which nobody connects to
-        link = self.links[0]
-        listener = link.listener
-        self.links[0] = _Link("recorded", listener, 1, client=listener)
-        self.links[0].recorded = recorded  # type: ignore[attr-defined]
+        listener = self.links[0].listener
+        link = _Link("recorded", listener, 1, client=listener)
+        link.recorded = recorded
+        self.links[0] = link
 
     def poll(self) -> Iterator[tuple[SerialPort, Any]]:
         """Nobody asks the vehicle anything."""

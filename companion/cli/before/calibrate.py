@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 from dataclasses import replace
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 import typer
 from rich.box import SIMPLE_HEAD
@@ -123,7 +123,7 @@ def board_command(
     sheet: Annotated[
         Path | None, typer.Option("--print", help="write the board to print: .pdf or .png")
     ] = None,
-    paper: Annotated[str, typer.Option(help="a4, a3 or letter")] = "a4",
+    paper: Annotated[Literal["a4", "a3", "letter"], typer.Option(help="of the board")] = "a4",
     seconds: Annotated[
         float, typer.Option(min=1, max=3600, help="of a stream, at the most")
     ] = 180.0,
@@ -133,11 +133,9 @@ def board_command(
     """The camera's model from views of a printed board, with what is still missing told."""
     from companion.calibrating.board import write_sheet
 
-    if paper not in ("a4", "a3", "letter"):
-        raise typer.BadParameter(f"--paper {paper}: one of a4, a3, letter")
     console = Console()
     if sheet is not None:
-        made = write_sheet(sheet, paper)  # type: ignore[arg-type]
+        made = write_sheet(sheet, paper)
         console.print(
             f"{sheet}: print it at 100 % on {paper}, glue it on something flat; a square is "
             f"{made.square_mm:g} mm then (its size does not matter, that it is flat does)",
