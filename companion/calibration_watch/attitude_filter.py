@@ -41,6 +41,10 @@ class AttitudeFilter:
         """By how much pictures are stamped late, s."""
         return self._figure(_LATE)
 
+    def forget_stamps(self) -> None:
+        """How late pictures are is not known."""
+        self._forget([_LATE])
+
     def take(self, seen: Sighting, known: Evidence, seconds: float) -> None:
         """A sighting so many seconds after the one before."""
         self._cov = self._cov + np.diag(np.square(_WALKS) * min(seconds, 10.0))

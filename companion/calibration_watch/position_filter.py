@@ -57,6 +57,10 @@ class PositionFilter:
         for at in (_P, _V, _A):
             self._loosen(at, 2)
 
+    def forget_stamps(self) -> None:
+        """How late pictures are is not known."""
+        self._loosen(_T, 1)
+
     def predict(self, moved: Array, faster: Array, seconds: float) -> None:
         """What the IMU says: displacement beyond what the velocity leads to, and change of
         velocity, (2,) each, over so many seconds.

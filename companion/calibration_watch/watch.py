@@ -116,6 +116,7 @@ class CalibrationWatch:
         self._depth_m = 0.0
         self._fixed = self._on_gnss = False
         self._kept: deque[_Known] = deque(maxlen=_KEPT)
+        self._doubted_ns: int | None = None
 
     def add(self, sighting: Sighting) -> None:
         """A registered picture that was accepted against the map."""
@@ -134,6 +135,10 @@ class CalibrationWatch:
         known = copy.deepcopy(self._kept[-1]) if self._kept else known
         self._position, self._attitude = known.position, known.attitude
         self._last, self._last_ns = None, since_ns
+
+    def doubt_stamps(self, since_ns: int) -> None:
+        """From a time on the stamps may be others: what was known of them before says nothing."""
+        self._doubted_ns = since_ns
 
     def step(self, now_ns: int, vehicle: Vehicle, track: Track) -> None:
         """Take in what has come; a few times a second."""
@@ -171,6 +176,8 @@ class CalibrationWatch:
         A gimbal's angles may be late themselves. A camera without gimbal turns with the autopilot's
         own attitude: there the surer account counts, if the other does not speak against it.
         """
+        if self._doubted_ns is not None:
+            return Figure(0.0, math.inf)
         way, turns = self._position.late_s, self._attitude.late_s
         if not self._fixed:
             return _fused(way, turns) if _tells(way) and _agree(way, turns) else way
@@ -183,6 +190,10 @@ class CalibrationWatch:
         gap_s = (seen.time_ns - self._last_ns) * 1e-9
         self._last_ns = seen.time_ns
         self._depth_m = seen.depth_m
+        if self._doubted_ns is not None and seen.time_ns >= self._doubted_ns:
+            self._doubted_ns = None
+            self._position.forget_stamps()
+            self._attitude.forget_stamps()
         if not self._kept or seen.time_ns - self._kept[-1].time_ns >= _KEEPS_NS:
             known_now = _Known(seen.time_ns - 1, self._position, self._attitude)
             self._kept.append(copy.deepcopy(known_now))

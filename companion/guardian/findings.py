@@ -58,6 +58,7 @@ VIDEO_REPEATS = Rule("video_repeats", "video repeats, {0:.0f} s old", Action.WIT
 MOTION = Rule("motion", "motion is not the IMU's ({0:.0f} m)", Action.WITHDRAW, 0.2, 5.0)
 HEIGHT = Rule("height", "height {0:.0f} m off barometer", Action.WITHDRAW, 2.0, 5.0)
 JUMP = Rule("jump", "position jumped {0:.0f} m", Action.WITHDRAW, 0.0, 0.0)
+STEP = Rule("step", "position stepped {0:.0f} m, unexplained", Action.NONE, 0.0, 0.0, 60.0)
 GNSS = Rule("gnss", "GNSS {0:.0f} m from vision: neither proven", Action.NONE, 2.0, 5.0, 10.0)
 EKF_REFUSES = Rule("ekf_refuses", "EKF refuses vision ({0:.1f})", Action.NONE, 2.0, 3.0, 10.0)
 EKF_JUMPED = Rule("ekf_jumped", "EKF jumped {0:.0f} m: unconfirmed", Action.NONE, 0.0, 0.0)
@@ -79,6 +80,7 @@ RULES = (
     MOTION,
     HEIGHT,
     JUMP,
+    STEP,
     GNSS,
     EKF_REFUSES,
     EKF_JUMPED,

@@ -19,6 +19,7 @@ from companion.guardian.motion import MotionCheck, MotionVerdict
 from companion.guardian.picture import PictureVerdict, PictureWatch
 from companion.guardian.place_checks import GnssCheck, HeightCheck, JumpCheck
 from companion.guardian.protection import ProtectionLevel, protection_level
+from companion.guardian.step import StepDoubt
 from localizer.types import Image
 from mavlink_bridge.messages import (
     VehicleState,
@@ -76,6 +77,7 @@ class Monitor:
         self._height = HeightCheck(config)
         self._gnss = GnssCheck(config)
         self._jumps = JumpCheck(config)
+        self._steps = StepDoubt(config.untold_jump_m)
         self._ekf = EkfWatch()
         self._calibration = CalibrationWatch(config.calibration)
         alert_s = min(f.LIMIT.alert_s, limits.time_to_alert_s)
@@ -150,12 +152,13 @@ class Monitor:
     def admit(self, fix: VisionFix, state: VehicleState) -> VisionFix | None:
         """The fix, if it may be injected; with a reset where the last ones were wrong."""
         state = known_state(state)
-        known_m = self._known_m(state)
-        self._level = level = protection_level(fix, state, self._config.protection, known_m)
-        fix = replace(fix, protection_m=(level.horizontal_m, level.vertical_m))
         verdict = self._verdict
         agrees = verdict is None or not verdict.settled or verdict.share < _CALM_SHARE
         admitted = self._jumps.admit(fix, state, agrees=agrees)
+        self._doubt_steps(fix, state, admitted=admitted)
+        known_m = self._known_m(state)
+        self._level = level = protection_level(fix, state, self._config.protection, known_m)
+        fix = replace(fix, protection_m=(level.horizontal_m, level.vertical_m))
         self._jump_held = not admitted
         # The jump has a line of its own; how the place moves after it is judged anew.
         leaps = self._jump_held != self._was_held
@@ -187,6 +190,19 @@ class Monitor:
                 withholds = latch.rule.action is not Action.NONE
                 lines.append(Line(text, latch.raised, withholds))
         return lines
+
+    def _doubt_steps(self, fix: VisionFix, state: VehicleState, *, admitted: bool) -> None:
+        """What the newest fix, or the stamps since, leave in doubt of the positions."""
+        if not state.armed:
+            self._steps.begins_anew()
+        elif self._jumps.step is not None:
+            self._steps.add(self._jumps.step)
+            self._calibration.doubt_stamps(fix.time_ns)
+        elif fix.reset and admitted:
+            self._steps.is_found_anew()
+        no_delay_s = max(self._config.calibration.time_s, 0.5 * self._steps.delay_s)
+        if self._calibration.figures().late_s.is_within(no_delay_s):
+            self._steps.stamps_are_right()
 
     def _leave_out_old_pictures(self) -> None:
         """A picture that stands still or comes again shows no camera: its sightings agree with no
@@ -225,6 +241,7 @@ class Monitor:
             f.MOTION.name: lambda: self._moves_otherwise() if fresh else none,
             f.HEIGHT.name: lambda: self._height_reading if fresh else none,
             f.JUMP.name: lambda: Reading(self._jump_held, self._jumps.distance_m),
+            f.STEP.name: lambda: Reading(self._steps.metres > 0.0, self._steps.metres),
             f.GNSS.name: lambda: self._against_gnss(state, now_ns) if fresh else none,
             f.EKF_REFUSES.name: lambda: self._ekf.refuses(state) if fresh else Reading(False),
             f.EKF_JUMPED.name: lambda: self._ekf_jump(state, now_ns),
@@ -249,12 +266,11 @@ class Monitor:
 
     def _known_m(self, state: VehicleState) -> float:
         """By how much a fix is wrong for what was found of the calibration, metres."""
-        velocity = state.local_velocity_ned or (0.0, 0.0, 0.0)
-        return self._calibration.known_m(
-            math.hypot(*velocity[:2]),
-            focal=self._latches[f.FOCAL.name].raised,
-            time=self._latches[f.TIME_OFFSET.name].raised,
-        )
+        speed = math.hypot(*(state.local_velocity_ned or (0.0, 0.0, 0.0))[:2])
+        focal, late = self._latches[f.FOCAL.name].raised, self._latches[f.TIME_OFFSET.name].raised
+        focal_m = self._calibration.known_m(speed, focal=focal, time=False)
+        late_m = self._calibration.known_m(speed, focal=False, time=late)
+        return focal_m + max(late_m, self._steps.metres)  # late stamps are how a step is explained
 
     def _frozen(self, now_ns: int, state: VehicleState) -> Reading:
         if self._picture is None or now_ns - self._picture[0] > _PICTURE_FRESH_NS:

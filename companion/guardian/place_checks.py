@@ -11,6 +11,7 @@ import numpy as np
 from companion.guardian.config import GuardianConfig
 from companion.guardian.findings import Reading
 from companion.guardian.place import LocalPlace
+from companion.guardian.step import STEP_M, Step
 from mavlink_bridge.injection.shadow import gnss_healthy
 from mavlink_bridge.messages import VehicleState, VisionFix
 
@@ -100,14 +101,20 @@ class JumpCheck:
         self._held: VisionFix | None = None
         self._held_since_ns = 0
         self.distance_m = 0.0
+        self.step: Step | None = None
+        """Of the newest fix: it passed, but nothing explains where it is."""
 
     def admit(self, fix: VisionFix, state: VehicleState, *, agrees: bool) -> bool:
         """Whether the fix may pass. agrees: vision moves as the IMU does, or nobody knows."""
         jump_m = 0.0
+        self.step = step = None
         if self._passed is not None:
-            jump_m = self._beyond(self._passed, fix)
+            step, allowed_m = self._leap(self._passed, fix)
+            jump_m = math.hypot(*step.offset_m) - allowed_m
         limit_m = self._config.jump_m if fix.reset else self._config.untold_jump_m
         if jump_m <= limit_m:
+            if step is not None and jump_m > 0.0 and not fix.reset:
+                self.step = step if math.hypot(*step.offset_m) >= STEP_M else None
             self._pass(fix, state)
             return True
         self.distance_m = jump_m
@@ -125,19 +132,19 @@ class JumpCheck:
         velocity = state.local_velocity_ned or (0.0, 0.0, 0.0)
         self._passed, self._held = _Passed(fix, velocity), None
 
-    def _beyond(self, last: _Passed, fix: VisionFix) -> float:
-        """Metres by which the fix is farther from where the last one leads than may be."""
+    def _leap(self, last: _Passed, fix: VisionFix) -> tuple[Step, float]:
+        """How far the fix is from where the last one leads, and how far it may be, metres."""
         dt = max((fix.time_ns - last.fix.time_ns) * 1e-9, 0.0)
         there, here = self._place.ned(last.fix), self._place.ned(fix)
-        led = [p + v * dt for p, v in zip(there[:2], last.velocity_ned[:2], strict=True)]
-        apart = math.hypot(here[0] - led[0], here[1] - led[1])
+        v_north, v_east, _ = last.velocity_ned
+        off = (here[0] - there[0] - v_north * dt, here[1] - there[1] - v_east * dt)
         sigma = math.hypot(_sigma(last.fix), _sigma(fix))
         # After a gap the way may have turned. A fix that is held is no gap: its jump would pass by
         # waiting for a second (5 degrees of a turned frame, 10 m at 120 m from home).
         gap = dt > 1.0 and self._held is None
-        reach = math.hypot(*last.velocity_ned[:2]) * dt if gap else 0.0
+        reach = math.hypot(v_north, v_east) * dt if gap else 0.0
         allowed = _SIGMAS * sigma + _SPEED_MPS * dt + 0.5 * _DRIFT_MPS2 * dt * dt + reach
-        return apart - allowed
+        return Step(fix.time_ns, off, (v_north, v_east)), allowed
 
     def _near(self, held: VisionFix, fix: VisionFix) -> bool:
         """Whether the fix follows the held one as an aircraft flies."""

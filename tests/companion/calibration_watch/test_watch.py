@@ -91,6 +91,25 @@ def test_a_wrong_calibration_is_found_within_a_minute(
     assert figures.axis == "yaw" or finding != "boresight"
 
 
+@pytest.mark.parametrize("late_s", [0.0, 0.3])
+def test_stamps_in_doubt_are_known_again(late_s: float) -> None:
+    """From 20 s on, in a straight leg: what was known before does not outweigh what comes (it did:
+    0.3 s were 0.12 after 40 s, and the first step tells them).
+    """
+
+    class Doubted(Flown):
+        def _sighting(self, at_s: float) -> Sighting:
+            if at_s == 20.0:
+                self.watch.doubt_stamps(20_000_000_000)
+            return super()._sighting(at_s)
+
+    flown = Doubted(Wrong(late_s=late_s, late_from_s=20.0), square(60.0, climb_s=0.0), lost).fly()
+    soon = next(figures for at_s, figures in flown.found if at_s >= 25.0)
+    for late in (soon.late_s, flown.found[-1][1].late_s):
+        assert late.is_within(0.15) == (late_s == 0.0)
+        assert late.exceeds(LIMITS.time_s) == (late_s > 0.0)
+
+
 def test_a_shifted_map_and_a_biased_receiver_are_no_focal_length() -> None:
     """4 m apart in a turning flight: whoever is wrong, it is not the lens."""
     assert ever(Flown(Wrong(map_m=(3.0, 2.0), gnss_m=(0.0, 1.0)), SURVEYED).fly()) == set()
