@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import socket
 import sys
 import threading
 from importlib import import_module
@@ -23,7 +22,6 @@ if TYPE_CHECKING:
     from companion.console.server import Site
 
 _NICE = 15  # below everything that flies
-_MOST_CONNECTIONS = 64
 
 
 def console_command(
@@ -73,28 +71,12 @@ def require_extra() -> None:
 
 def serve(site: Site) -> None:
     """Serve until interrupted. The address is printed once it can be opened."""
-    import uvicorn
+    from companion.console.serving import Server
 
-    from companion.console.server import make_application
+    def tell() -> None:
+        Console().print(f"console: [green]{site.config.url}[/]", soft_wrap=True, highlight=False)
 
-    config = site.config
-
-    class Announced(uvicorn.Server):
-        """Says where it is when it is there."""
-
-        async def startup(self, sockets: list[socket.socket] | None = None) -> None:
-            await super().startup(sockets=sockets)
-            if self.started:
-                Console().print(f"console: [green]{config.url}[/]", soft_wrap=True, highlight=False)
-
-    server = Announced(
-        uvicorn.Config(
-            make_application(site), host=config.host, port=config.port, log_level="warning",
-            ws="websockets-sansio", ws_max_size=4096, limit_concurrency=_MOST_CONNECTIONS,
-            timeout_keep_alive=5, timeout_graceful_shutdown=1, server_header=False,
-            ssl_certfile=config.tls_certificate, ssl_keyfile=config.tls_key, lifespan="on",
-        )
-    )  # fmt: skip
+    server = Server(site, tell)
     with console_log(verbose=False):
         server.run()
 

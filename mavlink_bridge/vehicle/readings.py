@@ -58,6 +58,28 @@ def gimbal_in_earth_frame(flags: int) -> bool:
     return bool(flags & mavlink.GIMBAL_DEVICE_FLAGS_YAW_LOCK)
 
 
+class Arming:
+    """Whether the vehicle is armed, by its heartbeats. turns: how often one said the other thing
+    than the one before.
+    """
+
+    def __init__(self) -> None:
+        self.turns = 0
+        self._said = self._armed = False
+        self._armed_ns = 0  # when it last said so
+
+    def heard(self, said: bool, time_ns: int) -> bool:
+        """Disarmed is believed once nothing else was heard for `_DISARMED_NS`: a forged heartbeat
+        between the autopilot's own would open in flight what is shut while armed.
+        """
+        self.turns += said != self._said
+        self._said = said
+        if said:
+            self._armed_ns = time_ns
+        self._armed = said or (self._armed and time_ns - self._armed_ns < _DISARMED_NS)
+        return self._armed
+
+
 class VehicleReadings:
     """The newest of everything and buffers of what is interpolated; the tracker's lock guards it.
 
@@ -68,7 +90,7 @@ class VehicleReadings:
     def __init__(self, gimbal: tuple[int, int] = (0, 0)) -> None:
         self.state = VehicleState()
         self.heartbeat_ns: int | None = None
-        self._armed_ns = 0  # when it last said so
+        self.arming = Arming()
         self.attitudes = AttitudeBuffer()
         self.gimbals = GimbalBuffer(gimbal)
         self.globals = VectorBuffer()
@@ -99,7 +121,7 @@ class VehicleReadings:
         if not is_autopilot(m):
             return
         self.heartbeat_ns = time_ns
-        armed = self._is_armed(bool(m.base_mode & mavlink.MAV_MODE_FLAG_SAFETY_ARMED), time_ns)
+        armed = self.arming.heard(bool(m.base_mode & mavlink.MAV_MODE_FLAG_SAFETY_ARMED), time_ns)
         autopilot = autopilot_name(m.autopilot)
         self.state = replace(
             self.state,
@@ -113,15 +135,6 @@ class VehicleReadings:
             system_status=m.system_status,
             profile=select_profile(autopilot, self.state.version).name,
         )
-
-    def _is_armed(self, said: bool, time_ns: int) -> bool:
-        """Disarmed is believed once nothing else was heard for `_DISARMED_NS`: a forged heartbeat
-        between the autopilot's own would open in flight what is shut while armed.
-        """
-        if said:
-            self._armed_ns = time_ns
-            return True
-        return self.state.armed and time_ns - self._armed_ns < _DISARMED_NS
 
     def _version(self, m: Any, _: int) -> None:
         version = decode_version(m.flight_sw_version)

@@ -12,6 +12,9 @@ from mavlink_bridge.vehicle.presence import TwinWatch
 from mavlink_bridge.vehicle.readings import is_autopilot
 from mavlink_bridge.vehicle.tracker import VehicleTracker
 
+_TURNS = 6  # armed and disarmed again three times: nobody flies so
+_TURNS_IN_NS = 10_000_000_000
+
 
 class StrangerWatch:
     """Tells the operator of them, once each; one thread."""
@@ -28,6 +31,7 @@ class StrangerWatch:
         self._teller = teller
         self._counters = counters
         self._twins = TwinWatch()
+        self._turns = (0, 0)  # arming's at a time
 
     def on_message(self, link: Link, message: Any) -> None:
         """A message that is not the vehicle's; only its heartbeat says who it is from."""
@@ -56,7 +60,19 @@ class StrangerWatch:
         if others and not self._config.camera.gimbal_component:
             component, device = others[0]
             self._teller.tell("gimbals", f"another gimbal ignored: {component}, device {device}")
+        self._check_arming(link, now_ns)
         clock = self._tracker.clock
         if self._twins.two(now_ns, clock.strays + clock.reboots):
             system = link.system_id
             self._teller.tell("twins", f"two autopilots speak as system {system}: change one's id")
+
+    def _check_arming(self, link: Link, now_ns: int) -> None:
+        """Forged heartbeats of the autopilot's ids: what is shut while armed stays shut then."""
+        turns, since_ns = self._turns
+        now = self._tracker.arming.turns
+        if now - turns >= _TURNS:
+            self._teller.tell(
+                "arming", f"system {link.system_id} says armed and disarmed in turn: sign the link"
+            )
+        if now - turns >= _TURNS or now_ns - since_ns > _TURNS_IN_NS:
+            self._turns = (now, now_ns)

@@ -43,6 +43,7 @@ class VehicleTracker:
         self.clock = BootClock()
         self._lock = threading.Lock()
         self._readings = VehicleReadings(gimbal)
+        self.arming = self._readings.arming
         self._wanted_id = system_id
         self._mount = mount
         self._fixed = fixed_camera

@@ -216,9 +216,11 @@ class Flight:
                 )
             )
 
-    def say(self, message: Any) -> None:
-        """One message from the vehicle."""
+    def say(self, message: Any, system: int = 1, component: int = 1) -> None:
+        """One message, of the vehicle's autopilot if nothing else is said."""
+        self.codec.srcSystem, self.codec.srcComponent = system, component
         frame = bytes(message.pack(self.codec))
+        self.codec.srcSystem, self.codec.srcComponent = 1, 1
         self.codec.seq = (self.codec.seq + 1) % 256
         for decoded in self.reader.feed(self.mangle(frame)):
             self.end.on_message(self.link, decoded, self.now_ns)  # type: ignore[arg-type]

@@ -64,8 +64,45 @@ def test_a_forged_disarming_opens_nothing_in_flight(monkeypatch: pytest.MonkeyPa
         flight.say(origin_message(60.0))
         flight.run(0.1)
     assert flight.end.origin.origin == before
-    assert flight.texts[told:] == ["PiLoT: EKF origin off by 60 m in flight: refused"]
+    assert flight.texts[told:] == [
+        "PiLoT: EKF origin off by 60 m in flight: refused",
+        "PiLoT: system 1 says armed and disarmed in turn: sign the link",
+    ]
     assert flight.shared.tracker.snapshot(flight.now_ns).armed
+
+
+@pytest.mark.parametrize(("system", "component"), [(2, 1), (255, 190), (1, 25), (1, 191)])
+def test_another_systems_arming_does_not_shut_what_is_open_on_the_ground(
+    monkeypatch: pytest.MonkeyPatch, system: int, component: int
+) -> None:
+    """Only the heartbeat of the autopilot that is followed tells whether it is armed."""
+    flight = Flight(monkeypatch)
+    flight.run(12.0)
+    for _ in range(40):
+        flight.say(heartbeat(armed=True), system=system, component=component)
+        flight.run(0.1)
+        assert not flight.shared.tracker.snapshot(flight.now_ns).armed
+    flight.say(heartbeat(armed=True))
+    assert flight.shared.tracker.snapshot(flight.now_ns).armed
+
+
+@pytest.mark.parametrize("forged", [True, False])
+def test_armed_and_disarmed_in_turn_is_told_and_arming_twice_is_not(
+    monkeypatch: pytest.MonkeyPatch, forged: bool
+) -> None:
+    """Of the autopilot's own ids, which an unsigned link cannot tell apart: what is open on the
+    ground is shut by it, and the operator learns why.
+    """
+    flight = Flight(monkeypatch)
+    flight.run(12.0)
+    for turn in range(4):
+        if forged:
+            flight.say(heartbeat(armed=True))
+        else:
+            flight.armed = turn % 2 == 0
+        flight.run(1.1)
+    told = [text for text in flight.texts if "in turn" in text]
+    assert told == (["PiLoT: system 1 says armed and disarmed in turn: sign the link"] * forged)
 
 
 def test_a_disarming_that_lasts_is_believed(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -288,7 +288,7 @@ async function showHistory() {
   const history = await ask("/api/history");
   page.earlier = history.events ?? [];
   plots.clear(); map?.clear();
-  (history.samples ?? []).forEach((sample) => { plots.add(sample, false); map?.addSample(sample, false); });
+  (history.samples ?? []).forEach((sample) => { plots.add(sample, false); map?.addSample(sample); });
   plots.draw(); map?.draw();
 }
 

@@ -3,6 +3,19 @@ const EMPTY = { type: "FeatureCollection", features: [] };
 const TRACKS = [["gnss", "#ffffff", 6], ["autopilot", "#1fd1ff", 4], ["vision", "#ff8c1a", 2.5]];
 const CHI95 = 2.4477; // of two dimensions
 const KEPT = 600;
+// Each drawing of a map by the processor takes it from the flight, and holds the page up meanwhile.
+const BY_GPU = { everyMs: 500, offCentre: 0 };
+const BY_PROCESSOR = { everyMs: 2000, offCentre: 0.2 };
+
+// Whether WebGL here is the processor's work.
+export function isDrawnByProcessor() {
+  const gl = document.createElement("canvas").getContext("webgl2");
+  if (!gl) return true;
+  const names = gl.getExtension("WEBGL_debug_renderer_info");
+  const name = String(gl.getParameter(names ? names.UNMASKED_RENDERER_WEBGL : gl.RENDERER));
+  gl.getExtension("WEBGL_lose_context")?.loseContext();
+  return /swiftshader|llvmpipe|softpipe|software|basic render/i.test(name);
+}
 
 export class MapView {
   constructor(maplibre, $, ask, about) {
@@ -13,6 +26,10 @@ export class MapView {
     this.following = true;
     this.hinting = false;
     this.pins = new Map();
+    this.moving = new Map(); // name: its features; of one source, so that a change is drawn once
+    this.pace = isDrawnByProcessor() ? BY_PROCESSOR : BY_GPU;
+    this.drawnAt = -Infinity;
+    this.drawings = 0;
     maplibre.setWorkerUrl("/static/vendor/maplibre-gl-worker.mjs");
     this.maplibre = maplibre;
     this.map = new maplibre.Map({
@@ -22,6 +39,7 @@ export class MapView {
     this.map.addControl(new maplibre.ScaleControl());
     this.map.addControl(new maplibre.AttributionControl({ compact: true, customAttribution: about.attribution }));
     this.map.on("load", () => { this.loaded = true; this.draw(); });
+    this.map.on("render", () => { this.drawings += 1; });
     this.map.on("dragstart", () => this.follow(false));
     this.map.on("click", (event) => this.clicked(event.lngLat));
     this.craft = this.marker(craftSvg(), "craft");
@@ -48,15 +66,15 @@ export class MapView {
     if (!this.hinting) return;
     this.hinting = false;
     const radius = Number(this.$("radius").value);
-    this.source("hint", polygon([lng, lat], circle(lat, radius)));
+    this.put("hint", polygon([lng, lat], circle(lat, radius)));
+    this.draw();
     const answer = await this.ask("/api/order", { do: "hint", latitude_deg: lat, longitude_deg: lng, radius_m: radius });
     this.$("map-note").textContent = answer.text;
   }
 
-  addSample(sample, draw = true) {
+  addSample(sample) {
     this.samples.push(sample);
     while (this.samples.length > KEPT) this.samples.shift();
-    if (draw) this.draw();
   }
 
   clear() { this.samples = []; }
@@ -68,22 +86,21 @@ export class MapView {
     if (at) {
       const place = [at.longitude_deg, at.latitude_deg];
       this.craft.setLngLat(place).setRotation(at.heading_deg).addTo(this.map);
-      this.source("ellipse", polygon(place, ellipse(at.covariance_m2, at.latitude_deg)));
-      if (this.following) {
-        const zoomed = this.zoomed || this.map.getZoom() >= 16;
-        this.zoomed = true;
-        this.map.jumpTo(zoomed ? { center: place } : { center: place, zoom: 17 });
-      }
+      if (this.following) this.centre(place);
     }
-    const targets = state.targets ?? [];
-    this.source("targets", {
-      type: "FeatureCollection",
-      features: targets.map((t) => polygon([t.longitude_deg, t.latitude_deg], ellipse(t.covariance_m2, t.latitude_deg, 1)).features[0]),
-    });
-    this.pin(targets);
+    this.pin(state.targets ?? []);
     this.plan(state.mission ?? []);
-    this.paintFootprint();
-    this.draw();
+    if (performance.now() - this.drawnAt >= this.pace.everyMs) this.draw();
+  }
+
+  // The aircraft's sign moves by itself; the map under it is drawn anew for every move of its own.
+  centre(place) {
+    const zoomed = this.zoomed || this.map.getZoom() >= 16;
+    this.zoomed = true;
+    if (!zoomed) { this.map.jumpTo({ center: place, zoom: 17 }); return; }
+    const at = this.map.project(place), box = this.map.getContainer();
+    const off = Math.max(Math.abs(at.x / box.clientWidth - 0.5), Math.abs(at.y / box.clientHeight - 0.5));
+    if (off > this.pace.offCentre) this.map.jumpTo({ center: place });
   }
 
   pin(targets) {
@@ -102,21 +119,13 @@ export class MapView {
     this.planned = key;
     this.missionLength = places.length;
     const points = places.map(([, lat, lon]) => [lon, lat]);
-    this.source("mission", points.length < 2 ? EMPTY : feature({ type: "LineString", coordinates: points }));
+    this.put("mission", points.length < 2 ? [] : feature({ type: "LineString", coordinates: points }));
     this.stations?.forEach((station) => station.remove());
     this.stations = places.map(([number, lat, lon]) => this.marker(String(number), "station").setLngLat([lon, lat]).addTo(this.map));
   }
 
-  // With the next state: a map that is drawn anew with every picture takes a slow machine's time.
+  // Drawn with what is drawn next, not with every picture.
   footprint(points) { this.seen = points; }
-
-  paintFootprint() {
-    if (!this.seen) return;
-    const points = this.seen;
-    this.seen = null;
-    const ring = points.map(([e, n]) => this.fromEnu(e, n));
-    this.source("footprint", ring.length < 3 ? EMPTY : feature({ type: "Polygon", coordinates: [[...ring, ring[0]]] }));
-  }
 
   fromEnu(east, north) {
     const [lat, lon] = this.about.origin;
@@ -126,44 +135,61 @@ export class MapView {
 
   draw() {
     if (!this.loaded) return;
+    this.drawnAt = performance.now();
     for (const [name] of TRACKS) {
       const points = this.samples.map((s) => s[name]).filter(Boolean).map(([lat, lon]) => [lon, lat]);
-      this.source(name, points.length < 2 ? EMPTY : feature({ type: "LineString", coordinates: points }));
+      this.put(name, points.length < 2 ? [] : feature({ type: "LineString", coordinates: points }));
     }
+    const { estimate, targets } = this.state ?? {};
+    if (estimate) {
+      const outline = ellipse(estimate.covariance_m2, estimate.latitude_deg);
+      this.put("ellipse", polygon([estimate.longitude_deg, estimate.latitude_deg], outline));
+    }
+    this.put("targets", (targets ?? []).flatMap((t) =>
+      polygon([t.longitude_deg, t.latitude_deg], ellipse(t.covariance_m2, t.latitude_deg, 1))));
+    if (this.seen) {
+      const ring = this.seen.map(([e, n]) => this.fromEnu(e, n));
+      this.put("footprint", ring.length < 3 ? [] : feature({ type: "Polygon", coordinates: [[...ring, ring[0]]] }));
+      this.seen = null;
+    }
+    const features = [...this.moving].flatMap(([kind, some]) => some.map((one) => ({ ...one, properties: { kind } })));
+    const text = JSON.stringify(features);
+    if (text === this.drawn) return;
+    this.drawn = text;
+    this.map.getSource("moving").setData({ type: "FeatureCollection", features });
   }
 
-  source(name, data) { this.map.getSource(name)?.setData(data); }
+  put(name, features) { this.moving.set(name, features); }
 
   resize() { this.map.resize(); }
 }
 
 function style(about) {
-  const source = { type: "geojson", data: EMPTY };
-  const sources = { top: { type: "raster", tiles: [`${location.origin}/tiles/{z}/{x}/{y}.jpg`], tileSize: 256, minzoom: 8, maxzoom: 21, bounds: about.bounds.flat() } };
+  const sources = {
+    top: { type: "raster", tiles: [`${location.origin}/tiles/{z}/{x}/{y}.jpg`], tileSize: 256, minzoom: 8, maxzoom: 21, bounds: about.bounds.flat() },
+    coverage: { type: "geojson", data: about.outline.length > 2 ? { type: "Polygon", coordinates: [[...about.outline, about.outline[0]]] } : EMPTY },
+    moving: { type: "geojson", data: EMPTY },
+  };
   const layers = [
     { id: "ground", type: "background", paint: { "background-color": "#9aa3ad" } },
     { id: "top", type: "raster", source: "top", paint: { "raster-fade-duration": 0 } },
+    { id: "coverage", type: "line", source: "coverage", paint: { "line-color": "#101418", "line-width": 2, "line-dasharray": [3, 2] } },
   ];
-  const outline = about.outline.length > 2 ? feature({ type: "Polygon", coordinates: [[...about.outline, about.outline[0]]] }) : EMPTY;
-  sources.coverage = { type: "geojson", data: outline };
-  layers.push({ id: "coverage", type: "line", source: "coverage", paint: { "line-color": "#101418", "line-width": 2, "line-dasharray": [3, 2] } });
-  sources.mission = source;
-  layers.push({ id: "mission-rim", type: "line", source: "mission", paint: { "line-color": "#101418", "line-width": 4 } });
-  layers.push({ id: "mission", type: "line", source: "mission", paint: { "line-color": "#7dff5c", "line-width": 2, "line-dasharray": [4, 2] } });
+  const layer = (kind, id, type, paint) => layers.push({ id, type, source: "moving", filter: ["==", ["get", "kind"], kind], paint });
+  layer("mission", "mission-rim", "line", { "line-color": "#101418", "line-width": 4 });
+  layer("mission", "mission", "line", { "line-color": "#7dff5c", "line-width": 2, "line-dasharray": [4, 2] });
   for (const [name, colour, width] of TRACKS) {
-    sources[name] = source;
-    layers.push({ id: `${name}-rim`, type: "line", source: name, paint: { "line-color": "#101418", "line-width": width + 2 } });
-    layers.push({ id: name, type: "line", source: name, paint: { "line-color": colour, "line-width": width } });
+    layer(name, `${name}-rim`, "line", { "line-color": "#101418", "line-width": width + 2 });
+    layer(name, name, "line", { "line-color": colour, "line-width": width });
   }
   for (const [name, colour] of [["footprint", "#ffe14d"], ["ellipse", "#ff8c1a"], ["targets", "#ff2fd0"], ["hint", "#0b4f9e"]]) {
-    sources[name] = source;
-    layers.push({ id: `${name}-fill`, type: "fill", source: name, paint: { "fill-color": colour, "fill-opacity": 0.18 } });
-    layers.push({ id: name, type: "line", source: name, paint: { "line-color": colour, "line-width": 2 } });
+    layer(name, `${name}-fill`, "fill", { "fill-color": colour, "fill-opacity": 0.18 });
+    layer(name, name, "line", { "line-color": colour, "line-width": 2 });
   }
   return { version: 8, sources, layers };
 }
 
-const feature = (geometry) => ({ type: "FeatureCollection", features: [{ type: "Feature", properties: {}, geometry }] });
+const feature = (geometry) => [{ type: "Feature", geometry }];
 
 export function metresPerDegree(latitude) {
   const phi = (latitude * Math.PI) / 180;

@@ -204,6 +204,21 @@ def test_a_hint_arrives_where_the_map_was_clicked(page, flight):
     assert radius == 150.0
 
 
+def test_without_a_gpu_the_map_is_drawn_seldom_and_all_at_once(page, flight):
+    """The processor's drawings are taken from the flight: as many as pictures were 24 % of it."""
+    page, _ = page
+    _until(page, lambda: page.evaluate("window.consoleMap?.loaded === true"))
+    assert page.evaluate("window.consoleMap.pace.everyMs") == 2000
+    before = page.evaluate("[window.consoleMap.drawings, window.consoleFrames]")
+    _until(page, lambda: page.evaluate("window.consoleFrames") >= before[1] + 40)
+    after = page.evaluate("[window.consoleMap.drawings, window.consoleFrames]")
+    assert after[0] - before[0] < (after[1] - before[1]) / 2
+    drawn = page.evaluate(
+        "[...window.consoleMap.moving].filter(([, f]) => f.length).map(([k]) => k)"
+    )
+    assert {"vision", "ellipse", "footprint", "mission"} <= set(drawn)
+
+
 def test_the_mission_is_drawn_and_one_that_changed_is_drawn_anew(page, flight):
     page, _ = page
     _until(page, lambda: page.locator(".station").count() == 3)

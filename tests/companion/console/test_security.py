@@ -11,6 +11,8 @@ import ssl
 import subprocess
 import sys
 import tarfile
+from types import SimpleNamespace
+from unittest.mock import Mock
 from xml.etree import ElementTree
 
 import pytest
@@ -19,12 +21,15 @@ from pydantic import ValidationError
 
 pytest.importorskip("starlette")
 pytest.importorskip("httpx2")
+import uvicorn
 from starlette.testclient import TestClient
 from starlette.websockets import WebSocketDisconnect
+from uvicorn.server import ServerState
 
 from companion.console.records import Records
 from companion.console.security import MOST_BODY, Guarded, read_token
 from companion.console.server import Site, make_application
+from companion.console.serving import HurriedProtocol, Server
 from companion.console.source import Newest
 from companion.console.tiles import TileName
 from companion.errors import ConfigError
@@ -388,6 +393,108 @@ def test_with_a_certificate_only_tls_is_spoken_and_only_with_the_token(deploymen
         finally:
             process.stdin.close()
             process.wait(20)
+
+
+def _asked(site, attack):
+    """What a client gets that comes after `attack`, a coroutine function of the port, has begun."""
+
+    async def both():
+        up = asyncio.Event()
+        server = Server(site, up.set)
+        serving = asyncio.create_task(server.serve([listening]))
+        await up.wait()
+        open_ends = await attack(port)
+        reader, writer = await asyncio.open_connection("127.0.0.1", port)
+        writer.write(f"GET /api/records HTTP/1.1\r\nHost: 127.0.0.1:{port}\r\n\r\n".encode())
+        status = (await reader.readline()).split()[1]
+        for end in (writer, *open_ends):
+            end.close()
+        server.should_exit = True
+        await serving
+        return int(status)
+
+    with socket.socket() as listening:
+        listening.bind(("127.0.0.1", 0))
+        listening.listen(256)
+        port = listening.getsockname()[1]
+        return asyncio.run(both())
+
+
+@pytest.mark.parametrize(
+    "begun", [b"", b"GET / HTTP/1.1\r\nHost:", b"POST /api/order HTTP/1.1\r\n"]
+)
+def test_clients_that_never_finish_a_request_do_not_keep_the_operator_out(site, begun):
+    async def attack(port):
+        ends = []
+        for _ in range(100):
+            ends.append((await asyncio.open_connection("127.0.0.1", port))[1])
+            ends[-1].write(begun)
+            await ends[-1].drain()
+        return ends
+
+    assert _asked(site(), attack) == 200
+
+
+class Loop:
+    """Notes what is to be called, and when; the test lets it happen."""
+
+    def __init__(self):
+        self.calls = []
+
+    def call_later(self, delay, call):
+        return self.call_at(delay, call)
+
+    def call_at(self, when, call):
+        handle = asyncio.TimerHandle(when, call, (), self)
+        self.calls.append((handle, call))
+        return handle
+
+    def _timer_handle_cancelled(self, _):
+        pass
+
+    def get_debug(self):
+        return False
+
+    def create_task(self, coroutine):
+        coroutine.close()
+        return Mock()
+
+    def pass_time(self):
+        for handle, call in self.calls:
+            if not handle.cancelled():
+                call()
+
+
+def _connected(*pieces):
+    """Whether a connection that brought these pieces is still open when the time has passed."""
+    loop, gone = Loop(), []
+    transport = SimpleNamespace(
+        get_extra_info=lambda *_: None, abort=lambda: gone.append(1), is_closing=lambda: False,
+        pause_reading=lambda: None, resume_reading=lambda: None,
+    )  # fmt: skip
+    config = uvicorn.Config(Mock(), interface="asgi3", http=HurriedProtocol)
+    protocol = HurriedProtocol(config, ServerState(), {}, loop)
+    protocol.connection_made(transport)
+    for piece in pieces:
+        protocol.data_received(piece)
+    loop.pass_time()
+    return not gone
+
+
+@pytest.mark.parametrize(
+    ("pieces", "stays"),
+    [
+        ((), False),
+        ((b"GET / HT",), False),
+        ((b"GET / HTTP/1.1\r\n", b"Host: a\r\n", b"X: "), False),
+        ((b"POST / HTTP/1.1\r\nHost: a\r\nContent-Length: 9\r\n\r\n", b"12"), False),
+        ((b"GET / HT", b"TP/1.1\r\nHost: a\r\n\r\n"), True),
+        ((b"POST / HTTP/1.1\r\nHost: a\r\nContent-Length: 2\r\n\r\n", b"12"), True),
+        ((b"GET / HTTP/1.1\r\nHost: a\r\n\r\n", b"GET / HT"), True),  # it is answered first
+    ],
+)  # fmt: skip
+def test_a_request_has_to_be_whole_in_time_and_an_answer_has_all_of_it(pieces, stays):
+    assert _connected(*pieces) is stays
 
 
 def _answer(line):

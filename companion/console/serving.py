@@ -1,0 +1,97 @@
+"""The HTTP server under the page: uvicorn's, with no patience for requests that never become whole.
+
+uvicorn waits for ever for the rest of a request, and counts who waits among the connections that
+may be open: a hundred clients that send half a line each would keep the operator out.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import socket
+from collections.abc import Callable
+
+import h11
+import uvicorn
+from uvicorn.protocols.http.h11_impl import H11Protocol
+
+from companion.console.server import Site, make_application
+
+REQUEST_S = 10.0  # from the connection, or from a request's first byte, to its last
+MOST_WAITING = 32  # connections without a whole request: one more, and the oldest goes
+_MOST_CONNECTIONS = 64
+
+
+class HurriedProtocol(H11Protocol):
+    """Closes what does not bring a whole request in time, and the oldest such where many wait."""
+
+    _deadline: asyncio.TimerHandle | None = None
+
+    @property
+    def due_s(self) -> float | None:
+        """When the request must be whole, on the loop's clock; None while none is waited for."""
+        return None if self._deadline is None else self._deadline.when()
+
+    def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]
+        """Begin to wait; see asyncio."""
+        super().connection_made(transport)
+        self._begin()
+        waiting = [
+            (other.due_s, id(other), other) for other in self.connections
+            if isinstance(other, HurriedProtocol) and other.due_s is not None
+        ]  # fmt: skip
+        if len(waiting) > MOST_WAITING:
+            min(waiting)[-1].give_up()
+
+    def data_received(self, data: bytes) -> None:
+        """Take what came; see asyncio."""
+        if self._deadline is None:
+            self._begin()
+        super().data_received(data)
+        if self.conn.their_state not in (h11.IDLE, h11.SEND_BODY):
+            self._end()
+
+    def handle_websocket_upgrade(self, event: h11.Request) -> None:
+        """The request is whole; what follows is the page's own."""
+        self._end()
+        super().handle_websocket_upgrade(event)
+
+    def connection_lost(self, exc: Exception | None) -> None:
+        """Nobody is waited for; see asyncio."""
+        self._end()
+        super().connection_lost(exc)
+
+    def give_up(self) -> None:
+        """Close it, without a word to who would not read it."""
+        self._end()
+        self.transport.abort()
+
+    def _begin(self) -> None:
+        self._deadline = self.loop.call_later(REQUEST_S, self.give_up)
+
+    def _end(self) -> None:
+        if self._deadline is not None:
+            self._deadline.cancel()
+            self._deadline = None
+
+
+class Server(uvicorn.Server):
+    """The site's server. told: called once the page can be opened."""
+
+    def __init__(self, site: Site, told: Callable[[], None]) -> None:
+        config = site.config
+        super().__init__(
+            uvicorn.Config(
+                make_application(site), host=config.host, port=config.port, log_level="warning",
+                http=HurriedProtocol, ws="websockets-sansio", ws_max_size=4096,
+                limit_concurrency=_MOST_CONNECTIONS, timeout_keep_alive=5,
+                timeout_graceful_shutdown=1, server_header=False, lifespan="on",
+                ssl_certfile=config.tls_certificate, ssl_keyfile=config.tls_key,
+            )
+        )  # fmt: skip
+        self._told = told
+
+    async def startup(self, sockets: list[socket.socket] | None = None) -> None:
+        """Listen; see uvicorn."""
+        await super().startup(sockets=sockets)
+        if self.started:
+            self._told()
