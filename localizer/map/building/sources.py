@@ -100,6 +100,12 @@ def mesh_tree(path: Path, georeference: Georeference, options: SourceOptions) ->
     text = georeference.far_outside(np.array([low, high]))
     if text is not None:
         warnings.append(options.rules.doubt("area", f"{path}: {text}"))
+    elif (unsure := georeference.datum_doubt(np.array([low, high]))) is not None:
+        warnings.append(f"{path.name}: {unsure}")
+    if georeference.unread:
+        warnings.append(
+            f"{path.name}: not read of its georeference: {', '.join(georeference.unread)}"
+        )
     return SourceTree(
         quadtree(model),
         centre,

@@ -17,7 +17,7 @@ from pyproj.exceptions import CRSError
 from localizer.errors import GeoreferenceError
 from localizer.geometry.geo import Geodetic, LocalFrame, ecef_from_geodetic
 from localizer.geometry.pose import Array, so3_exp
-from localizer.map.importers.height_crs import far_outside, horizontal_unit_m
+from localizer.map.importers.height_crs import datum_doubt, far_outside, horizontal_unit_m
 from localizer.plain_files import plain_text
 
 UpAxis = Literal["y", "z"]
@@ -27,12 +27,14 @@ UpAxis = Literal["y", "z"]
 class Georeference:
     """Either a projected CRS (WKT) and the offset (easting, northing, height) that is added to the
     vertices, or an ENU origin and the heading of the mesh's y axis, clockwise from north.
+    unread: keys of its file that mean nothing here.
     """
 
     crs: str | None = None
     offset: tuple[float, float, float] = (0.0, 0.0, 0.0)
     origin: Geodetic | None = None
     heading_deg: float = 0.0
+    unread: tuple[str, ...] = ()
 
     def ecef(self, points: Array) -> Array:
         """ECEF (N, 3) of the mesh's points (N, 3), z up, metres."""
@@ -42,6 +44,14 @@ class Georeference:
             raise GeoreferenceError("a georeference needs a CRS or an origin")
         turn = so3_exp([0.0, 0.0, -np.radians(self.heading_deg)])
         return LocalFrame(self.origin).ecef_from_enu.apply(points @ turn.T)
+
+    def datum_doubt(self, points: Array) -> str | None:
+        """What is not known of the way from its CRS to WGS84, see `height_crs.datum_doubt`."""
+        if self.crs is None:
+            return None
+        placed = points.mean(axis=0) + np.array(self.offset)
+        lon, lat = _geographic(self.crs).transform(placed[0], placed[1])
+        return datum_doubt(CRS(self.crs), float(lon), float(lat)) if np.isfinite(lon) else None
 
     def far_outside(self, points: Array) -> str | None:
         """What points (N, 3) of the mesh lie far outside of, see `height_crs.far_outside`."""
@@ -65,12 +75,25 @@ def read_georeference(path: Path) -> Georeference:
         raise GeoreferenceError(f"{path}: cannot be read: {error}") from error
     try:
         if text.lstrip().startswith("{"):
-            return _from_json(json.loads(text))
+            return _from_json(json.loads(text, object_pairs_hook=_told_once))
         return _from_odm(text)
     except (
         ValueError, TypeError, KeyError, AttributeError, CRSError, GeoreferenceError, RecursionError
     ) as error:  # fmt: skip
         raise GeoreferenceError(f"{path}: not a georeference: {error!r}") from error
+
+
+def _told_once(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+    """An object whose keys stand once: of two origins the last won, silently."""
+    found = dict(pairs)
+    if len(found) < len(pairs):
+        raise ValueError("a key stands twice")
+    return found
+
+
+def _unread(data: dict[str, Any], known: set[str]) -> tuple[str, ...]:
+    """What stands in a file beside what is read: a remark, or a scale that is not applied."""
+    return tuple(sorted(set(data) - known))
 
 
 def _from_json(data: dict[str, Any]) -> Georeference:
@@ -81,13 +104,15 @@ def _from_json(data: dict[str, Any]) -> Georeference:
             raise ValueError(f"EPSG:{data['epsg']} is not a projected CRS")
         if horizontal_unit_m(crs) != 1.0:
             raise ValueError(f"EPSG:{data['epsg']} is in feet: a mesh must be in metres")
-        return Georeference(crs.to_2d().to_wkt(), (x, y, z))
+        unread = _unread(data, {"epsg", "offset"})
+        return Georeference(crs.to_2d().to_wkt(), (x, y, z), unread=unread)
     o = data["origin"]
+    unread = _unread(data, {"origin", "heading_deg"}) + _unread(o, {"lat", "lon", "height"})
     origin = Geodetic(float(o["lat"]), float(o["lon"]), float(o["height"]))
     heading_deg = float(data.get("heading_deg", 0.0))
     if not math.isfinite(heading_deg):
         raise ValueError(f"heading_deg is {heading_deg}")
-    return Georeference(origin=origin, heading_deg=heading_deg)
+    return Georeference(origin=origin, heading_deg=heading_deg, unread=unread)
 
 
 def _from_odm(text: str) -> Georeference:

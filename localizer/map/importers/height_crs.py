@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import warnings
 from dataclasses import dataclass
 
 import numpy as np
 from pyproj import CRS
+from pyproj.aoi import AreaOfInterest
+from pyproj.transformer import TransformerGroup
 
 from localizer.errors import GeoreferenceError
 from localizer.geometry.pose import Array
@@ -21,6 +24,7 @@ UNITS = {
     "mm": 0.001, "millimetre": 0.001,
 }  # fmt: skip
 _EGM96 = "EGM96"
+_DATUM_M = 1.5  # ETRS89, GDA2020 and the like are taken for WGS84 to within a metre
 _FAR_DEG = 10.0  # beyond the neighbouring zones that projects on a border are drawn in
 
 
@@ -57,6 +61,11 @@ def stated_heights(crs: CRS, band_unit: str | None, where: object) -> StatedHeig
         axis, name = crs.axis_info[2], crs.name
         unit, datum = float(axis.unit_conversion_factor), "ellipsoidal"
     tagged = _unit(band_unit)
+    if tagged is None and (band_unit or "").strip():
+        raise GeoreferenceError(
+            f"{where}: the band's unit is {band_unit!r}, which is none of heights that is known; "
+            "correct it (gdal_edit -units), or convert the heights to metres"
+        )
     if tagged is not None and unit is not None and abs(tagged / unit - 1) > 1e-4:
         raise GeoreferenceError(
             f"{where}: the band's unit is {band_unit!r}, {name} has units of {unit:g} m; correct "
@@ -91,6 +100,30 @@ def far_outside(crs: CRS, lon: Array, lat: Array) -> str | None:
     return (
         f"lies at {lat[worst]:.4f}, {lon[worst]:.4f}, {beyond[worst]:.0f} degrees outside the area "
         f"of its CRS, {flat.name}; are easting and northing swapped?"
+    )
+
+
+def datum_doubt(crs: CRS, lon: float, lat: float) -> str | None:
+    """What is not known of the way from a CRS to WGS84 at a place, degrees; None below 1.5 m.
+
+    An older national datum needs a grid that may not be installed; without it a map is silently
+    metres off (EPSG:27700: 2 to 21 m, NAD27: 8 to 20 m).
+    """
+    flat = (crs.sub_crs_list[0] if crs.is_compound else crs).to_2d()
+    area = AreaOfInterest(lon - 0.01, lat - 0.01, lon + 0.01, lat + 0.01)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", UserWarning)  # that a grid is missing is said here
+        ways = TransformerGroup(flat, CRS.from_epsg(4326), always_xy=True, area_of_interest=area)
+    if not ways.transformers:
+        return f"{flat.name}: no way to WGS84 is known"
+    accuracy = ways.transformers[0].accuracy
+    if ways.best_available and 0.0 <= accuracy <= _DATUM_M:
+        return None
+    known = f"to {accuracy:g} m only" if accuracy >= 0.0 else "to nobody knows what"
+    missing = "" if ways.best_available else "; the better way needs a grid that is not installed"
+    return (
+        f"{flat.name} is known against WGS84 {known}{missing}: warp the source with its national "
+        "grid (gdalwarp -t_srs), or the map may lie so far off"
     )
 
 

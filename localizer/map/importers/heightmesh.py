@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 from localizer.geometry.pose import Array
 
 REDUCTION = 0.5  # share of triangles that simplification takes away above the finest level
+_KEPT_SHARE = 0.99  # of the ground that simplification must leave covered
 # Detail limits are set for photogrammetric tilesets, whose stated error is several times the step
 # of their grid; a height field's is put on the same scale.
 ERROR_PER_STEP = 2.0
@@ -56,9 +57,17 @@ def _simplified(
         out, kept = fast_simplification.simplify(local, faces, 0.5, lossless=True)
     else:
         out, kept = fast_simplification.simplify(local, faces, REDUCTION)
-    if len(kept) == 0:
+    # Ground that is flat to the last digit, as lakes are made, loses its rim: 40 % of a tile.
+    if len(kept) == 0 or _covered(out, kept) < _KEPT_SHARE * _covered(local, faces):
         return points, faces
     return np.asarray(out, np.float64) + base, np.asarray(kept)
+
+
+def _covered(points: NDArray[np.floating], faces: NDArray[np.integer]) -> float:
+    """Area of the triangles as seen from above, square metres."""
+    a, b, c = (points[faces[:, k], :2] for k in range(3))
+    (x1, y1), (x2, y2) = (b - a).T, (c - a).T
+    return float(np.abs(x1 * y2 - x2 * y1).sum() / 2.0)
 
 
 def _skirted(

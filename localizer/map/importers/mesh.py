@@ -20,6 +20,7 @@ from localizer.map.importers.textures import palette_mesh, require_readable
 from localizer.map.importers.tiles3d import inside, read_file
 from localizer.map.source import SourceMesh
 
+_LINE_BYTES = 1 << 16  # of an OBJ
 _Z_UP_FROM_Y_UP = np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]])
 
 
@@ -75,6 +76,7 @@ def _has_area(mesh: SourceMesh) -> bool:
 def _read_obj(path: Path, rules: ImportRules) -> list[SourceMesh]:
     require_plain_file(path)
     rules.require("file_bytes", path.stat().st_size, path)
+    _require_short_lines(path)
     for beside in files_beside(path):
         if beside.exists() and not beside.is_dir():
             require_plain_file(beside)
@@ -90,6 +92,17 @@ def _read_obj(path: Path, rules: ImportRules) -> list[SourceMesh]:
         raise MapSourceError(f"{path}: cannot be read as OBJ: {error!r}") from error
     rules.require("vertices", sum(len(m.positions) for m in meshes), path)
     return meshes
+
+
+def _require_short_lines(path: Path) -> None:
+    """One face of 900,000 corners took more than 90 s to be made triangles of."""
+    with path.open("rb") as file:
+        while line := file.readline(_LINE_BYTES + 1):
+            if len(line) > _LINE_BYTES:
+                raise MapSourceError(
+                    f"{path}: a line is longer than {_LINE_BYTES} bytes: no face has so many "
+                    "corners; export it as triangles"
+                )
 
 
 def _from_trimesh(mesh: Any) -> SourceMesh:

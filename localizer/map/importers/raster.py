@@ -140,7 +140,7 @@ class RasterTile:
         n = self.grid.cells + 1
         with _warped(self.dsm, self.grid.crs, transform, n, how, self.band.missing) as vrt:
             raw = vrt.read(1, masked=True).astype(np.float64)
-            bad = ~np.isfinite(raw.filled(np.nan)) | (vrt.dataset_mask() == 0)
+            bad = ~np.isfinite(raw.filled(np.nan)) | ~_shown(vrt, opened(self.dsm))
         if self.band.missing is None:
             bad |= ~self._on(self.dsm, left + east * np.arange(n), top - south * np.arange(n))
         heights = self.band.metres(raw.data)
@@ -174,7 +174,7 @@ class RasterTile:
         transform = Affine(east * size, 0, left, 0, -south * size, top)
         with _warped(self.ortho, self.grid.crs, transform, TEXELS, Resampling.average) as vrt:
             image = np.moveaxis(vrt.read(self.colours), 0, -1)
-            shown = vrt.dataset_mask() > 0
+            shown = _shown(vrt, opened(self.ortho))
         middles = size * (np.arange(TEXELS) + 0.5)
         shown &= self._on(self.ortho, left + east * middles, top - south * middles)
         return np.ascontiguousarray(image, np.uint8), shown
@@ -383,6 +383,16 @@ def _texel_size(ortho: DatasetReader, crs: CRS) -> float:
     return float(math.sqrt(abs(transform.a * transform.e)))
 
 
+def _shown(vrt: WarpedVRT, data: DatasetReader) -> NDArray[np.bool_]:
+    """Where a warped raster has something: by its own mask, and by the alpha that warping added,
+    which is no mask to GDAL where the heights are no bytes.
+    """
+    shown: NDArray[np.bool_] = vrt.dataset_mask() > 0
+    if vrt.count > data.count:
+        shown &= vrt.read(vrt.count) > 0
+    return shown
+
+
 @contextmanager
 def _warped(
     path: Path,
@@ -397,7 +407,10 @@ def _warped(
     flat = _flat_crs(data)
     same = flat == CRS(crs)
     own = data.crs if flat == CRS(data.crs) else flat.to_wkt()
-    marks: dict[str, float | bool] = {"add_alpha": True} if has_separate_mask(data) else {}
+    # Beside a file that does not say what is missing GDAL's warper leaves zeros: a turned DSM got
+    # vertices 400 m below its edge.
+    unsaid = has_separate_mask(data) or not has_own_mask(data)
+    marks: dict[str, float | bool] = {"add_alpha": True} if unsaid else {}
     if missing is not None:
         marks = {"src_nodata": missing, "nodata": missing}
     with WarpedVRT(

@@ -20,7 +20,7 @@ from rasterio.io import DatasetReader
 
 from localizer.errors import GeoreferenceError, MapSourceError
 from localizer.geometry.pose import Array
-from localizer.map.importers.height_crs import far_outside
+from localizer.map.importers.height_crs import datum_doubt, far_outside
 from localizer.map.importers.rules import ImportRules, require_plain_file
 
 _TIFF = (b"II*\0", b"MM\0*", b"II+\0", b"MM\0+")
@@ -136,7 +136,10 @@ def _placed(path: Path, data: DatasetReader, rules: ImportRules) -> list[str]:
             "warp it into a projected CRS, such as the UTM zone there (gdalwarp -t_srs)"
         )
     text = far_outside(crs, lon, lat)
-    return [] if text is None else [rules.doubt("area", f"{path}: {text}")]
+    if text is not None:
+        return [rules.doubt("area", f"{path}: {text}")]
+    unsure = datum_doubt(crs, float(np.mean(lon)), float(np.mean(lat)))
+    return [] if unsure is None else [f"{path.name}: {unsure}"]
 
 
 def has_own_mask(data: DatasetReader) -> bool:

@@ -6,6 +6,7 @@ import base64
 import http.server
 import json
 import os
+import re
 import threading
 from collections.abc import Callable
 from dataclasses import dataclass, field
@@ -27,9 +28,9 @@ from localizer.map.building.build import build_cache
 from localizer.map.building.isolation import call_apart
 from localizer.map.building.options import BuildOptions
 from localizer.map.cache.cache import TileCache
-from localizer.map.importers.georeference import Georeference, ecef_from_crs
+from localizer.map.importers.georeference import Georeference, ecef_from_crs, read_georeference
 from localizer.map.importers.raster_checks import check_heights
-from localizer.map.importers.raster_file import METRES, offline, open_raster
+from localizer.map.importers.raster_file import METRES, offline, open_raster, require_sane
 from localizer.map.importers.rules import ImportRules
 
 UTM = "EPSG:32632"
@@ -219,6 +220,10 @@ def cut_in_half(folder):
 def metres_swapped(folder):
     there = {"place": (TOP, LEFT)}
     return rasters(folder, ortho=dict(there), **there)
+
+
+def decimetres(folder):
+    return rasters(folder, (10 * ground()).astype(np.int16), units=("dm",))
 
 
 def palette(folder):
@@ -427,6 +432,10 @@ def obj_without_area(folder, make):
     return obj_of(folder, "v 0 0 0\nv 10 0 0\nv 20 0 0\nf 1 2 3\n")
 
 
+def obj_with_a_face_without_end(folder, make):
+    return obj_of(folder, "v 0 0 0\nv 50 0 0\nv 0 50 0\nf " + "1 2 3 " * 30_000 + "\n")
+
+
 def obj_swapped(folder, make):
     return obj_of(folder, "v 0 0 0\nv 10 0 0\nv 0 10 0\nf 1 2 3\n")
 
@@ -488,6 +497,7 @@ RASTERS = [
     Refused(complex_numbers, "1 bands of complex64: neither a DSM"),
     Refused(cut_in_half, "dsm.tif.*: cannot be read: .*IReadBlock failed"),
     Refused(metres_swapped, "dsm.tif: lies at .* outside the area of its CRS", trust="area"),
+    Refused(decimetres, "dsm.tif: the band's unit is 'dm'"),
     Refused(palette, "indices into a palette"),
     Refused(empty_file, "no GeoTIFF"),
     Refused(text_named_tif, "no GeoTIFF"),
@@ -517,6 +527,7 @@ OTHERS = [
     Refused(obj_device_texture, "/dev/zero is not a plain file", MESH),
     Refused(obj_pipe_texture, "t.png is not a plain file", MESH),
     Refused(obj_without_area, "m.obj: its triangles have no area", MESH),
+    Refused(obj_with_a_face_without_end, "m.obj: a line is longer than 65536 bytes", MESH),
     Refused(
         obj_swapped,
         "m.obj: lies at .* outside the area of its CRS",
@@ -572,6 +583,51 @@ def test_outside_a_dsm_without_a_nodata_tag_is_no_ground(tmp_path, built):
     assert 385 < low < high < 406  # with the coarse levels' skirts; it was -2
     box = cache.index.box_max[0] - cache.index.box_min[0]
     assert box[:2] == pytest.approx([89, 39], abs=1.5)
+
+
+def test_beside_a_turned_dsm_without_a_nodata_tag_is_no_ground(tmp_path, built):
+    """Three vertices at its corners were 400 m below the ground."""
+    turned = Affine.translation(LEFT, TOP) * Affine.rotation(10) * Affine.scale(1, -1)
+    source = [
+        write(tmp_path / "dsm.tif", ground(80), transform=turned),
+        write(tmp_path / "ortho.tif", picture(80), transform=turned),
+    ]
+    low, high = heights_of(built(source, **ELLIPSOIDAL))
+    assert 394 < low < high < 406
+
+
+def test_ground_that_is_flat_to_the_last_digit_keeps_its_rim(tmp_path, built):
+    """A lake, or flat test ground: 29 x 40 of 47 x 47 m were left."""
+    cache = built(rasters(tmp_path, np.full((CELLS, CELLS), 400, np.float32)), **ELLIPSOIDAL)
+    box = cache.index.box_max[0] - cache.index.box_min[0]
+    assert box[:2] == pytest.approx([47, 47], abs=0.1)
+
+
+@pytest.mark.parametrize(
+    ("crs", "place", "says"),
+    [
+        ("EPSG:27700", (530_000, 180_000), "OSGB36 / British National Grid is known against WGS84"),
+        ("EPSG:26710", (550_000, 4_180_000), "needs a grid that is not installed"),
+        ("EPSG:26910", (550_000, 4_180_000), "NAD83 / UTM zone 10N .* to 4 m only"),
+        ("EPSG:25832", (LEFT, TOP), None),
+        ("EPSG:3857", (1e6, 6e6), None),
+    ],
+)
+def test_a_datum_that_is_known_to_metres_only_is_told(tmp_path, crs, place, says):
+    """Silently a map of Britain lay up to 21 m off: its grid is not installed with PROJ."""
+    with offline(), open_raster(dsm_of(tmp_path, crs=crs, place=place)) as dsm:
+        told = require_sane(Path("dsm.tif"), dsm, ImportRules())
+    assert (told == []) if says is None else re.search(says, told[0])
+
+
+def test_a_georeference_says_each_thing_once_and_what_is_not_read_is_told(tmp_path):
+    path = tmp_path / "geo.json"
+    origin = '"origin": {"lat": 47.2, "lon": 9.0, "height": 400.0}'
+    path.write_text("{" + origin + ', "origin": {"lat": 48.2, "lon": 9.0, "height": 400.0}}')
+    with pytest.raises(GeoreferenceError, match="a key stands twice"):
+        read_georeference(path)
+    path.write_text("{" + origin + ', "scale": 2.0}')
+    assert read_georeference(path).unread == ("scale",)
 
 
 def test_outside_the_orthophoto_is_no_map(tmp_path, built):
