@@ -3,7 +3,9 @@ does the program compute rightly on this computer."""
 
 from __future__ import annotations
 
+import json
 import tempfile
+from dataclasses import asdict
 from datetime import datetime, timezone
 from pathlib import Path
 from typing import Annotated
@@ -17,6 +19,7 @@ from rich.text import Text
 
 from companion.config import load_config
 from companion.terminal.steps import shown_steps
+from companion.versions import made_by
 from mavlink_bridge.preflight.doctor import Diagnosis, Finding
 
 
@@ -86,7 +89,11 @@ def _mark(finding: Finding) -> str:
     return "[red]wrong[/]" if finding.required else "[yellow]advice[/]"
 
 
-def self_test_command() -> None:
+def self_test_command(
+    out: Annotated[
+        Path | None, typer.Option(help="its figures, and of which versions, JSON")
+    ] = None,
+) -> None:
     """Localize over a made map: compiles what a flight needs, and shows that it works here."""
     from companion.preflight.self_test import self_test
 
@@ -98,3 +105,6 @@ def self_test_command() -> None:
         f"{report.found_error_m:.4f} m, {report.frame_ms:.0f} ms of processor a frame, the first "
         f"after {report.compiled_s:.0f} s"
     )
+    if out is not None:
+        data = asdict(report) | {"versions": made_by()}
+        out.write_text(json.dumps(data, indent=1) + "\n", encoding="utf-8")

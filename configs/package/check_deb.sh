@@ -1,12 +1,22 @@
 #!/bin/sh
-# Install, start, upgrade, remove and purge the package in a clean Debian root: check_deb.sh DEB [SUITE]
-# Needs root and mmdebstrap, and qemu-user with binfmt for another architecture than this one's.
-# What it cannot show in a root without a running systemd: the unit's own restrictions.
+# Install, start, upgrade, remove and purge the package in a clean Debian root:
+#   check_deb.sh DEB [SUITE [REPORT.json]]
+# Needs root and mmdebstrap, and qemu-user with binfmt for another architecture than this one's:
+# there the upgrade leaves the self-test for later, since the installation has just passed it.
+# What it cannot show in a root without a running systemd: the unit's own restrictions, which
+# as_service.py applies.
 set -eu
-deb=$(realpath "$1") suite=${2:-bookworm}
+deb=$(realpath "$1") suite=${2:-bookworm} report=${3:-/dev/null}
 arch=$(dpkg-deb --field "$deb" Architecture)
 root=${ROOT:-$(mktemp -d)/root}
+step=root began=$(date +%s) seconds=
 say() { echo "== $*"; }
+begin() {
+    now=$(date +%s)
+    seconds="$seconds${seconds:+, }\"$step\": $((now - began))"
+    step=$1 began=$now
+    say "$1"
+}
 # QEMU_CPU: float32 products are NaN under qemu's default processor; cortex-a72 computes rightly.
 in_root() { chroot "$root" env -i ${QEMU_CPU:+QEMU_CPU=$QEMU_CPU} PATH=/usr/sbin:/usr/bin:/sbin:/bin HOME=/root LC_ALL=C.UTF-8 \
     DEBIAN_FRONTEND=noninteractive "$@"; }
@@ -23,7 +33,7 @@ mountpoint -q "$root/proc" || mount -t proc proc "$root/proc"
 mountpoint -q "$root/dev" || mount --rbind --make-rslave /dev "$root/dev"
 trap 'umount -l "$root/proc" "$root/dev"' EXIT
 
-say install
+begin install
 cp /etc/resolv.conf "$root/etc/resolv.conf"
 in_root apt-get -q update
 cp "$deb" "$root/tmp/new.deb"
@@ -33,33 +43,40 @@ in_root companion --version
     || fail "the deployment file can be read by others"
 as_service sh -c 'echo > /opt/companion/x' 2> /dev/null && fail "the service may write its program"
 
-say "start: as the unit does, over a map, with no vehicle and no camera"
-as_service sh -c 'cd /var/lib/companion && companion self-test'
+begin start
+# As the unit does, over a map, with no vehicle and no camera.
+as_service sh -c 'cd /var/lib/companion && companion self-test --out self-test.json'
+tested=$(cat "$root/var/lib/companion/self-test.json")
 # A failure by name where there is no map yet, as on a fresh computer.
 code=0; as_service companion run /etc/companion/deployment.yaml || code=$?
 [ "$code" = 2 ] || fail "without a map the exit code is $code, not 2"
 
-say upgrade
+begin upgrade
 dpkg-deb -R "$root/tmp/new.deb" "$root/tmp/next"
 sed -i 's/^Version: .*/&+next/' "$root/tmp/next/DEBIAN/control"
 dpkg-deb --root-owner-group -Znone --build "$root/tmp/next" "$root/tmp/next.deb" > /dev/null
 rm -rf "$root/tmp/next"
 echo "# mine" >> "$root/etc/companion/deployment.yaml"
 echo keep > "$root/var/lib/companion/flights/mine"
-in_root dpkg --force-confold -i /tmp/next.deb
+later=; [ "$arch" = "$(dpkg --print-architecture)" ] || later=PILOT_SELF_TEST=later
+in_root ${later:+"$later"} dpkg --force-confold -i /tmp/next.deb
 in_root companion --version
 grep -q "^# mine" "$root/etc/companion/deployment.yaml" || fail "the upgrade replaced the deployment"
 [ -f "$root/var/lib/companion/flights/mine" ] || fail "the upgrade took a record"
 
-say remove
+begin remove
 in_root dpkg --remove pilot-companion
 [ ! -e "$root/opt/companion/venv" ] || fail "the program is still there"
 [ -f "$root/var/lib/companion/flights/mine" ] || fail "removing took a record"
-say purge
+begin purge
 in_root dpkg --purge pilot-companion
 for left in /opt/companion /var/lib/companion /var/cache/companion /etc/companion; do
     [ ! -e "$root$left" ] || fail "$left is still there"
 done
 in_root getent passwd companion > /dev/null && fail "the user is still there"
 rm "$root/tmp/new.deb" "$root/tmp/next.deb"
+begin passed
+printf '{"package": "%s", "suite": "%s", "upgrade_tested": %s, "seconds": {%s}, "self_test": %s}\n' \
+    "$(basename "$deb")" "$suite" "$([ -z "$later" ] && echo true || echo false)" "$seconds" \
+    "$tested" > "$report"
 say "passed: $(basename "$deb")"
