@@ -9,6 +9,7 @@ from pathlib import Path
 import pytest
 
 from benchmarks.site.__main__ import outdated
+from benchmarks.site.kept import DATA, load
 
 ROOT = Path(__file__).parents[1]
 PAGES = sorted(
@@ -25,7 +26,7 @@ def _prose(page):
     code = False
     for number, line in enumerate(page.read_text(encoding="utf-8").splitlines(), start=1):
         code ^= line.lstrip().startswith("```")
-        if not code and not line.startswith("|"):
+        if not code and not line.startswith(("|", "<!-- kept")):
             yield number, line
 
 
@@ -83,3 +84,43 @@ def test_every_tutorial_says_what_comes_next() -> None:
     for page in sorted((ROOT / "docs" / "tutorials").glob("*.md")):
         last = page.read_text(encoding="utf-8").rstrip().splitlines()[-1]
         assert last.startswith("Next: ["), page
+
+
+_FIGURE = re.compile(r"(?<![\w.])(\d+(?:\.\d+)? (?:m|%|ms)|\d+\.\d+)(?!\w)")
+
+
+def test_the_readmes_figures_are_of_kept_results() -> None:
+    cells = [
+        cell
+        for name in ("demo-seed0", "by-condition")
+        for table in (load(ROOT / DATA / f"{name}.json"),)
+        for part in (table.table, table.criteria)
+        if part is not None
+        for row in part.rows
+        for cell in row
+    ]
+    known = set(re.findall(r"\d+(?:\.\d+)?", " ".join(cells)))
+    text = (ROOT / "README.md").read_text(encoding="utf-8")
+    without = re.sub(
+        r"Python 3\.\d+|127\.0\.0\.1|within 1 m and 1°|100 % returned|20 % GNSS|1.4 km", "", text
+    )
+    strangers = {f for f in _FIGURE.findall(without) if f.split(" ")[0] not in known}
+    assert not strangers, "kept by no command: docs/results/data"
+
+
+def test_tables_of_results_say_their_origin() -> None:
+    # Made from a command's JSON, or with the command beside it: in the table, before or behind it.
+    without = []
+    for page in sorted((ROOT / "docs" / "results").glob("*.md")):
+        text = re.sub(
+            r"<!-- (?:kept|criteria) .*?<!-- end -->", "", page.read_text("utf-8"), flags=re.S
+        )
+        parts = text.split("\n\n")
+        for k, part in enumerate(parts):
+            beside = "\n".join(parts[max(k - 1, 0) : k + 2])
+            is_table = part.lstrip().startswith("|")
+            if is_table and not re.search(
+                r"`(?:python -m|make|pytest|companion|configs/|benchmarks\.)|\]\(", beside
+            ):
+                without.append(f"{page.name}: {part.lstrip().splitlines()[0]}")
+    assert not without

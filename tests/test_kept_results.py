@@ -5,7 +5,8 @@ from pathlib import Path
 
 import pytest
 
-from benchmarks.site.kept import DATA, Kept, Table, load, save, tables_of, with_tables
+from benchmarks.site.forms import tables_of
+from benchmarks.site.kept import DATA, Kept, Table, load, save, with_tables
 from companion.errors import ReportError
 from companion.versions import made_by
 
@@ -52,7 +53,7 @@ def test_results_of_several_commits_say_which(tmp_path):
 def test_a_flights_report_is_read_in_the_maps_frame(tmp_path):
     path = tmp_path / "report.json"
     path.write_text(json.dumps(FLIGHT))
-    table, criteria = tables_of(path, "seed 7")
+    table, criteria = tables_of([path], "seed 7")
     (row,) = table.rows
     assert row[0] == "seed 7"
     assert row[4] == "0.30 / 0.70 / 1.10"
@@ -65,7 +66,7 @@ def test_what_is_no_report_is_named(tmp_path, text):
     path = tmp_path / "report.json"
     path.write_text(text)
     with pytest.raises(ReportError, match=r"report\.json"):
-        tables_of(path, "x")
+        tables_of([path], "x")
 
 
 def test_a_kept_file_that_is_damaged_is_named(tmp_path):

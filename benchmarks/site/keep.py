@@ -3,8 +3,9 @@
     python -m benchmarks.site.keep report/report.json NAME --title "seed 0, embedded" \\
         --command 'make demo ARGS="--seed 0"' [--machine "2 cores, nothing else running"]
 
-Takes the JSON of a demo flight, of `companion eval` and of `sitl loop-table --out`; then
-`python -m benchmarks.site` writes the tables.
+Takes the JSON of a demo flight, of `companion eval`, of `sitl suite` and `sitl loop`, of the
+benchmarks and of `configs/package/check_deb.sh`, and `pytest --junitxml`'s XML; `--also` adds
+further files of the same form. Then `python -m benchmarks.site` writes the tables.
 """
 
 from __future__ import annotations
@@ -15,7 +16,8 @@ from pathlib import Path
 
 from benchmarks.common.arguments import Parser, existing
 from benchmarks.common.named_errors import named_errors
-from benchmarks.site.kept import DATA, Kept, save, tables_of
+from benchmarks.site.forms import tables_of
+from benchmarks.site.kept import DATA, Kept, save
 from companion.errors import ReportError
 from companion.versions import processor
 
@@ -25,8 +27,9 @@ _ROOT = Path(__file__).parents[2]
 def made_by(report: Path) -> dict[str, str]:
     """What the report itself says of commit and processor."""
     try:
-        versions = json.loads(report.read_text(encoding="utf-8")).get("versions", {})
-    except (OSError, ValueError, AttributeError):
+        data = json.loads(report.read_text(encoding="utf-8"))
+        versions = data.get("versions") or data["self_test"]["versions"]
+    except (OSError, ValueError, AttributeError, KeyError, TypeError):
         return {}
     return versions if isinstance(versions, dict) else {}
 
@@ -34,14 +37,17 @@ def made_by(report: Path) -> dict[str, str]:
 def main() -> None:
     """Keep one."""
     parser = Parser(__doc__)
-    parser.add_argument("report", type=existing, help="report.json or a loop table's JSON")
+    parser.add_argument("report", type=existing, help="what the command wrote")
     parser.add_argument("name", help="of the kept file")
+    parser.add_argument("--also", type=existing, nargs="+", default=[], help="more of that form")
+    parser.add_argument("--only", nargs="+", default=[], help="rows of these names")
     parser.add_argument("--title", default="", help="of its row")
     parser.add_argument("--command", required=True, help="that made it")
     parser.add_argument("--commit", help="of the code that ran; else as the report says")
     parser.add_argument("--machine", help="and what else ran on it; else as the report says")
     options = parser.parse_args()
-    table, criteria = tables_of(options.report, options.title or options.name)
+    reports = [options.report, *options.also]
+    table, criteria = tables_of(reports, options.title, options.only)
     versions = made_by(options.report)
     commit = options.commit or versions.get("commit")
     if commit is None:
@@ -49,8 +55,8 @@ def main() -> None:
     made = datetime.date.fromtimestamp(options.report.stat().st_mtime)
     kept = Kept(
         options.command, commit, made.isoformat(),
-        options.machine or versions.get("processor") or processor(), options.report.name,
-        table, criteria,
+        options.machine or versions.get("processor") or processor(),
+        ", ".join(dict.fromkeys(report.name for report in reports)), table, criteria,
     )  # fmt: skip
     path = _ROOT / DATA / f"{options.name}.json"
     path.parent.mkdir(exist_ok=True)

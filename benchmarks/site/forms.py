@@ -1,0 +1,255 @@
+"""The tables of what the repository's commands write: one function for each form of JSON.
+
+`benchmarks.common.figures.write_figures` is the form of benchmarks that have a table of their own.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import statistics
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+from xml.etree import ElementTree
+
+from benchmarks.common.shares import exact_interval
+from benchmarks.site.kept import Table
+from companion.errors import ReportError
+from sitl.demo.scenario import ScenarioError
+from sitl.suite.loop.report import markdown, read_rows
+
+_FLIGHT = (
+    "flight", "localizer median / p95 / max, m", "R@1 / 3 / 5, %", "complete, %",
+    "EKF median / p95 / max, m", "in bound, %", "home, m", "fixed targets median / p95, m",
+    "frames/s", "latency p50 / p95, ms",
+)  # fmt: skip
+_SEQUENCE = ("sequence", "frames", "median", "p95, m", "R@1 / 3 / 5, %", "complete, %", "frames/s")
+_SUITE = ("scenario", "what happens", "vehicle", "EKF median / p95 / max, m", "verdict")
+_INTEGRITY = ("set", "acceptance", "accepted, > 3 m or 3° off", "> 10 m off", "right ones lost")
+_PLACES = (
+    "set", "heading", "by day", "dusk", "night", "all", "false", "processor s: search, confirm",
+)  # fmt: skip
+_COST = ("area", "heading", "overview, MiB", "transforms kept, MiB", "processor s")
+_PACKAGE = (
+    "package", "install, with self-test, s", "start, s", "upgrade, s", "remove, s", "purge, s",
+    "self-test: tracked, found to", "processor ms a frame",
+)  # fmt: skip
+_TESTS = ("tests", "passed", "failed", "skipped", "seconds")
+
+
+def tables_of(
+    paths: Sequence[Path], title: str, only: Sequence[str] = ()
+) -> tuple[Table, Table | None]:
+    """The table of one result, and what was needed beside what was found where the report says.
+
+    paths: several files of one form; title: of a row that has no name of its own, behind the names
+    of those that have one; only: rows of these names. ReportError: no form that is known.
+    """
+    if not paths:
+        raise ReportError("no report to keep")
+    try:
+        if paths[0].suffix == ".xml":
+            return _tests(paths, title), None
+        data = [json.loads(path.read_text(encoding="utf-8")) for path in paths]
+        if isinstance(data[0], dict) and "report" in data[0]:
+            return _flight(data[0]["report"], title)
+        if isinstance(data[0], dict) and "flights" in data[0]:
+            return _loop(paths, title, only), None
+        table = _form(data[0])(data, title)
+    except (OSError, ValueError, KeyError, IndexError, TypeError, ElementTree.ParseError,
+            ScenarioError) as error:  # fmt: skip
+        raise ReportError(f"{paths[0]}: not a report of a form that is known: {error!r}") from error
+    return _picked(table, only), None
+
+
+def _picked(table: Table, only: Sequence[str]) -> Table:
+    rows = tuple(row for row in table.rows if not only or row[0] in only)
+    return Table(table.columns, rows)
+
+
+def _form(data: Any) -> Callable[[list[Any], str], Table]:
+    marks = data if isinstance(data, dict) else data[0]
+    for mark, made in (
+        ("columns", _figures), ("package", _package), ("recall_1", _sequence), ("verdict", _suite),
+        ("acceptance", _integrity), ("search_cpu_s", _places), ("overview_mib", _cost),
+    ):  # fmt: skip
+        if mark in marks:
+            return made
+    raise KeyError("none of the marks of a form")
+
+
+def _figures(data: list[Any], _title: str) -> Table:
+    rows = (tuple(map(str, row)) for one in data for row in one["rows"])
+    return Table(tuple(data[0]["columns"]), tuple(rows))
+
+
+def _loop(paths: Sequence[Path], title: str, only: Sequence[str]) -> Table:
+    rows = [row for path in paths for row in read_rows(path) if not only or row.name in only]
+    table = _of_markdown(markdown(rows))
+    if not title:
+        return table
+    return Table(table.columns, tuple((f"{row[0]} ({title})", *row[1:]) for row in table.rows))
+
+
+def _of_markdown(text: str) -> Table:
+    lines = [line for line in text.splitlines() if line.startswith("|")]
+    cells = [tuple(cell.strip() for cell in line.strip("|").split("|")) for line in lines]
+    return Table(cells[0], tuple(cells[2:]))
+
+
+def _flight(report: dict[str, Any], title: str) -> tuple[Table, Table]:
+    localizer, latency = report["localizer"], report["stages_ms"]["latency"]
+    ekf = report.get("ekf_in_map_m") or report["ekf_horizontal_m"]
+    row = (
+        title,
+        _three(report["localizer_m"]),
+        " / ".join(_short(localizer[f"recall_{limit}"]) for limit in (1, 3, 5)),
+        f"{localizer['completeness']:.1f}",
+        _three(ekf),
+        f"{report['inside_bound']:.1f}" if "inside_bound" in report else "-",
+        f"{report['home_error_m']:.1f}",
+        " / ".join(f"{report['fixed_targets_m'][key]:.2f}" for key in ("median", "p95")),
+        f"{localizer['fps']:.1f}",
+        f"{latency['median']:.0f} / {latency['p95']:.0f}",
+    )
+    return Table(_FLIGHT, (row,)), _criteria(report["criteria"])
+
+
+def _criteria(criteria: Sequence[dict[str, Any]]) -> Table:
+    rows = []
+    for one in criteria:
+        enough = one["value"] >= one["limit"] if one["at_least"] else one["value"] <= one["limit"]
+        sign = ">=" if one["at_least"] else "<="
+        held = "yes" if enough else "**missed**"
+        # A third digit where two hide that it was missed.
+        digits = 2 if enough or round(one["value"], 2) != round(one["limit"], 2) else 3
+        found, needed = (_number(one[key], one["unit"], digits) for key in ("value", "limit"))
+        rows.append((one["name"], found, f"{sign} {needed}", held))
+    return Table(("figure", "found", "needed", "held"), tuple(rows))
+
+
+def _sequence(data: list[Any], title: str) -> Table:
+    one = data[0]
+    row = (
+        title,
+        str(one["frames"]),
+        f"{one['median_translation_m']:.3f} m, {one['median_rotation_deg']:.3f}°",
+        f"{one['p95_translation_m']:.2f}" if "p95_translation_m" in one else "-",
+        " / ".join(_short(one[f"recall_{limit}"]) for limit in (1, 3, 5)),
+        f"{one['completeness']:.1f}",
+        f"{one['fps']:.1f}",
+    )
+    return Table(_SEQUENCE, (row,))
+
+
+def _suite(data: list[Any], _title: str) -> Table:
+    rows = []
+    for one in (row for part in data for row in part):
+        broken = "; ".join(f["what"] for f in one["findings"] or () if not f["ok"])
+        verdict = f"**{one['verdict']}**" if one["verdict"] in ("FAIL", "ERROR") else one["verdict"]
+        told = " ".join(filter(None, (verdict, broken, one["error"].split("\n")[0])))
+        measured = " / ".join(f"{m:.2f}" for m in one["measured"] or ())
+        rows.append((one["scenario"], one["title"], one["vehicle"], measured, told))
+    return Table(_SUITE, tuple(sorted(rows)))
+
+
+def _integrity(data: list[Any], _title: str) -> Table:
+    rows = (
+        (one["set"], one["acceptance"], *(_rate(one[k]) for k in ("false", "false_far", "lost")))
+        for part in data
+        for one in part
+        if one["acceptance"] in ("no added test", "ours: parts agree")
+        and (one["acceptance"] != "no added test" or one["set"] == "all")
+    )
+    return Table(_INTEGRITY, tuple(rows))
+
+
+def _rate(rate: dict[str, float]) -> str:
+    share = 100 * rate["hits"] / max(rate["count"], 1)
+    interval = f"[{rate['low']:.2f}, {rate['high']:.2f}]"
+    return f"{rate['hits']} of {rate['count']}, {share:.2f} {interval}"
+
+
+def _places(data: list[Any], _title: str) -> Table:
+    outcomes = [one for part in data for one in part]
+    rows = []
+    for name, known in dict.fromkeys((o["set"], o["heading_known"]) for o in outcomes):
+        mine = [o for o in outcomes if (o["set"], o["heading_known"]) == (name, known)]
+        rows.append(_place(f"{name}, {mine[0]['area_km2']:.2g} km²", known, mine))
+    return Table(_PLACES, tuple(rows))
+
+
+def _place(name: str, known: bool, mine: Sequence[dict[str, Any]]) -> tuple[str, ...]:
+    by = {light: [o for o in mine if o["condition"] == light] for light in ("dusk", "night")}
+    by["day"] = [o for o in mine if o["condition"] in ("day", "photo")]
+    cost = (statistics.median(o[key] for o in mine) for key in ("search_cpu_s", "verify_cpu_s"))
+    return (
+        name,
+        "15°" if known else "unknown",
+        *(_share(by[light]) for light in ("day", "dusk", "night")),
+        _share(mine),
+        str(sum(o["false"] for o in mine)),
+        ", ".join(f"{s:.2f}" for s in cost),
+    )
+
+
+def _share(some: Sequence[dict[str, Any]]) -> str:
+    if not some:
+        return "-"
+    hits = sum(o["found"] for o in some)
+    low, high = exact_interval(hits, len(some))
+    return f"{hits} of {len(some)} [{low:.0f}, {high:.0f}]"
+
+
+def _cost(data: list[Any], _title: str) -> Table:
+    rows = (
+        (f"{one['area_km2']:.1f} km²", "15°" if one["heading_known"] else "unknown",
+         f"{one['overview_mib']:.0f}", f"{one['kept_mib']:.0f}", f"{one['cpu_s']:.2f}")
+        for part in data
+        for one in part
+    )  # fmt: skip
+    return Table(_COST, tuple(rows))
+
+
+def _package(data: list[Any], _title: str) -> Table:
+    rows = []
+    for one in data:
+        tested, seconds = one["self_test"], one["seconds"]
+        upgrade = str(seconds["upgrade"]) + ("" if one["upgrade_tested"] else " without self-test")
+        rows.append(
+            (
+                one["package"],
+                *(str(seconds[step]) for step in ("install", "start")),
+                upgrade,
+                *(str(seconds[step]) for step in ("remove", "purge")),
+                f"{tested['error_m']:.4f} m, {tested['found_error_m']:.4f} m",
+                f"{tested['frame_ms']:.0f}",
+            )
+        )
+    return Table(_PACKAGE, tuple(rows))
+
+
+def _tests(paths: Sequence[Path], title: str) -> Table:
+    """Of `pytest --junitxml`."""
+    count = dict.fromkeys(("tests", "failures", "errors", "skipped", "time"), 0.0)
+    for path in paths:
+        for suite in ElementTree.parse(path).getroot().iter("testsuite"):
+            for key in count:
+                count[key] += float(suite.get(key, 0.0))
+    failed = count["failures"] + count["errors"]
+    passed = count["tests"] - failed - count["skipped"]
+    cells = (f"{n:.0f}" for n in (passed, failed, count["skipped"], count["time"]))
+    return Table(_TESTS, ((title, *cells),))
+
+
+def _short(percent: float) -> str:
+    return f"{percent:.1f}".removesuffix(".0")
+
+
+def _three(figures: dict[str, float]) -> str:
+    return " / ".join(f"{figures[key]:.2f}" for key in ("median", "p95", "maximum"))
+
+
+def _number(value: float, unit: str, digits: int) -> str:
+    return "-" if not math.isfinite(value) else f"{value:.{digits}f} {unit}"
