@@ -156,11 +156,17 @@ class TargetConfig(_Model):
     map_sigma_m: float = Field(
         0.3, ge=0.001, le=100, description="error of the map's surface, metres"
     )
+    outline_sigma_m: float = Field(
+        0.5, ge=0.0, le=100, description="how far outlines of roofs and crowns are off, metres"
+    )
     bias_sigma_m: float = Field(
         0.2, ge=0.0, le=100, description="error that all targets of a flight share, metres"
     )
     max_sigma_m: float = Field(
         50.0, ge=0.1, le=10_000, description="what is known worse is not told, metres"
+    )
+    confirm_s: float = Field(
+        0.5, ge=0.0, le=60, description="detections must agree for so long before the first report"
     )
     operator_delay_ms: float = Field(
         250.0,

@@ -19,7 +19,15 @@ import numpy as np
 
 from benchmarks.common.arguments import Parser, existing, number, output, whole
 from benchmarks.common.named_errors import named_errors
-from benchmarks.targets.flights import PoseErrors, Step, Thing, sightings, standing, steps
+from benchmarks.targets.flights import (
+    PoseErrors,
+    Step,
+    Thing,
+    heights_of,
+    sightings,
+    standing,
+    steps,
+)
 from benchmarks.targets.report import Sample, rows
 from localizer.geometry.pose import Array
 from localizer.map.cache.cache import TileCache
@@ -31,7 +39,7 @@ from localizer.types import PoseEstimate, TargetFix, TargetSighting
 from sitl.camera.traffic import traffic
 from sitl.demo.assets import prepare
 from sitl.demo.kinematic import camera_path
-from sitl.demo.scenario import Scenario, load_scenario
+from sitl.demo.scenario import load_scenario
 
 _SETTINGS = TargetSettings()
 _LOOKED_S = 20.0  # at most: a target is looked at, then left
@@ -109,7 +117,7 @@ def fly(args: argparse.Namespace) -> list[dict[str, object]]:
     """All targets of one seed; the file is written as they come."""
     assets, scenario = prepare(args.seed, size_m=args.size), load_scenario(args.scenario)
     if args.height is not None:
-        scenario = at_height(scenario, args.height)
+        scenario = heights_of(scenario, args.height)
     live, survey = TileCache.open(assets.live_cache), TileCache.open(assets.map_cache)
     camera = scenario.camera.camera()
     path = list(camera_path(scenario, float(assets.world.ground_height(0.0, 0.0))))
@@ -137,12 +145,6 @@ def fly(args: argparse.Namespace) -> list[dict[str, object]]:
             document["samples"] = [asdict(s) for s in samples]
             args.json.write_text(json.dumps(document))
     return found
-
-
-def at_height(scenario: Scenario, height_m: float) -> Scenario:
-    """The same legs, all of them at one height above home."""
-    legs = tuple(leg.model_copy(update={"height_m": height_m}) for leg in scenario.legs)
-    return scenario.model_copy(update={"takeoff_height_m": height_m, "legs": legs})
 
 
 def _plain(args: argparse.Namespace) -> dict[str, object]:

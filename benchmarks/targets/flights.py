@@ -12,6 +12,7 @@ from localizer.geometry.pose import Array, Pose, so3_exp
 from localizer.targets.locate import RayCaster, ray_in_world
 from localizer.targets.track import projected
 from localizer.types import PoseEstimate, RegistrationStatus, TrackingState
+from sitl.demo.scenario import Scenario
 
 _TOLERANCE = 0.02  # of the distance: as `sitl.camera.detector`, an operator looks past an edge
 _MARGIN_PX = 6.0
@@ -48,6 +49,12 @@ class Thing:
     kind: str
     positions: Array
     velocities: Array
+
+
+def heights_of(scenario: Scenario, height_m: float) -> Scenario:
+    """The same legs, all of them at one height above home."""
+    legs = tuple(leg.model_copy(update={"height_m": height_m}) for leg in scenario.legs)
+    return scenario.model_copy(update={"takeoff_height_m": height_m, "legs": legs})
 
 
 def steps(

@@ -6,7 +6,6 @@ No thread and no clock: what time it is, the frames' exposures say.
 from __future__ import annotations
 
 import logging
-from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 
@@ -14,11 +13,13 @@ import numpy as np
 
 from companion.config import TargetConfig
 from companion.targets.detections import CLICKED, Detection
+from companion.targets.pictures import RecentPictures
 from localizer.geometry.pose import Array
 from localizer.targets.bias import SharedBias
 from localizer.targets.follow import Found, Gray, ImageFollower
+from localizer.targets.limits import UNCONFIRMED
 from localizer.targets.locate import RayCaster, ray_in_world
-from localizer.targets.track import TargetSettings, TargetTrack, projected
+from localizer.targets.track import NO_MAP, TargetSettings, TargetTrack, projected
 from localizer.types import PoseEstimate, TargetFix, Visibility
 
 _log = logging.getLogger(__name__)
@@ -26,6 +27,7 @@ _MAX_DETECTED = 32  # at a time: what a telemetry link bears
 # A detected target unseen for so long makes room for another.
 _GONE_NS = 10_000_000_000
 _WARNING, _INFO = 4, 6  # MAV_SEVERITY
+_CONFIRMS_NS = 0.18e9
 _PICTURES = 24  # kept, of accepted frames: longer than an operator's delay
 _PICTURE_NS = 60_000_000  # between a click's frame and the picture that stands for it
 _PASSED_NS = 450_000_000  # a picture so much earlier or later shows the ground that a car covers
@@ -120,9 +122,13 @@ class Population:
             config.map_sigma_m,
             SharedBias(config.bias_sigma_m),
             config.max_sigma_m,
+            outline_sigma_m=config.outline_sigma_m,
+            confirm_s=config.confirm_s,
         )
         self._lives: dict[str, _Life] = {}
-        self._pictures: deque[tuple[PoseEstimate, Gray]] = deque(maxlen=_PICTURES)
+        self._pictures = RecentPictures[tuple[PoseEstimate, Gray]](
+            _PICTURES, lambda picture: picture[1].nbytes
+        )
         self.missed = 0
         self.doubted = 0
         self.refused = 0
@@ -130,7 +136,7 @@ class Population:
     def begin(self, click: Click) -> None:
         """A clicked target begins; the operator is told where it is, or why it is not."""
         name, time_ns = clicked_name(click.number), click.estimate.exposure_time_ns
-        track = TargetTrack(name, self._settings, self._cast)
+        track = TargetTrack(name, replace(self._settings, confirm_s=0.0), self._cast)
         fix = track.see(click.estimate, click.pixel, drift=self._drift(click))
         if fix is None:
             self.missed += 1
@@ -152,7 +158,7 @@ class Population:
         """A detection in its frame, at most `rate_hz` times a second."""
         name, time_ns = detection.target_id, estimate.exposure_time_ns
         life = self._lives.get(name)
-        if life is not None and not self._is_due(life, time_ns):
+        if life is not None and time_ns - life.seen_ns < self._period_ns(life):
             return
         if life is None and not self._has_room(time_ns):
             return  # before the work: a flood of names must cost next to nothing
@@ -162,13 +168,15 @@ class Population:
             return
         if life is None:
             track = TargetTrack(name, self._settings, self._cast)
-            life = _Life(track, time_ns, False, time_ns)
+            life = _Life(track, 0, False, time_ns)
         fix = life.track.see(estimate, pixel)
+        if life.track.refusal != NO_MAP:
+            self._lives[name] = life
+        life.seen_ns = time_ns
         if fix is None:
             self._doubt(name, life)
             return
-        self._lives[name] = life
-        life.told_ns = life.seen_ns = time_ns
+        life.told_ns = time_ns
         self._report(life, fix, estimate)
 
     def look(self, estimate: PoseEstimate, gray: Gray) -> None:
@@ -298,13 +306,19 @@ class Population:
         self._tell(Target(fix, estimate))
 
     def _is_due(self, life: _Life, time_ns: int) -> bool:
+        return time_ns - life.told_ns >= self._period_ns(life)
+
+    def _period_ns(self, life: _Life) -> float:
+        """Between two reports; at most 0.2 s until the first one is confirmed."""
         # 0.9: frames do not fall on the period exactly.
-        return time_ns - life.told_ns >= 0.9e9 / self._config.rate_hz
+        wanted = 0.9e9 / self._config.rate_hz
+        return wanted if life.told_ns else min(wanted, _CONFIRMS_NS)
 
     def _doubt(self, name: str, life: _Life) -> None:
         """Count what is not told, and why."""
-        if life.track.refusal == "no map under it":
+        if life.track.refusal == NO_MAP:
             self.missed += 1
+        if life.track.refusal in (NO_MAP, UNCONFIRMED):
             return
         self.doubted += 1
         life.refusals += 1
@@ -330,7 +344,7 @@ class Population:
         detected = {n: x for n, x in self._lives.items() if not x.is_clicked}
         if len(detected) < _MAX_DETECTED:
             return True
-        gone = [n for n, life in detected.items() if now_ns - life.told_ns > _GONE_NS]
+        gone = [n for n, life in detected.items() if now_ns - life.seen_ns > _GONE_NS]
         self.end(tuple(gone))
         if len(detected) - len(gone) < _MAX_DETECTED:
             return True

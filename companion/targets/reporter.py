@@ -12,6 +12,7 @@ import cv2
 
 from companion.config import TargetConfig
 from companion.targets.detections import Detection
+from companion.targets.pictures import RecentPictures
 from companion.targets.population import Click, Population, Target
 from localizer.targets.locate import RayCaster
 from localizer.types import Frame, PoseEstimate
@@ -48,7 +49,7 @@ class TargetReporter:
         self._estimates: deque[PoseEstimate] = deque(maxlen=_KEPT)
         self._detections: deque[Detection] = deque(maxlen=_KEPT)
         self._held: PoseEstimate | None = None
-        self._pictures: deque[Frame] = deque(maxlen=_PICTURES)
+        self._pictures = RecentPictures[Frame](_PICTURES, lambda frame: frame.image.nbytes)
         self._condition = threading.Condition()
         self._stopping = False
         self.failed = 0
@@ -171,9 +172,7 @@ class TargetReporter:
             (found[f.exposure_time_ns], f) for f in self._pictures if f.exposure_time_ns in found
         ]
         newest = self._estimates[-1].exposure_time_ns if self._estimates else 0
-        self._pictures = deque(
-            (f for f in self._pictures if f.exposure_time_ns > newest), maxlen=_PICTURES
-        )
+        self._pictures.keep(lambda frame: frame.exposure_time_ns > newest)
         return pairs
 
     def _match(self, detection: Detection) -> PoseEstimate | None:

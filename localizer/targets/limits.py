@@ -21,6 +21,11 @@ _LEAP_NS = 3_000_000_000  # a leap is believed once sightings have agreed on it 
 _LEAP_GAP_NS = 1_000_000_000  # and none was missing for so long
 _OFF_SURFACE_M = 25.0  # between a place and the map: a bridge, a tree, a roof's edge
 _DEPTH_M = 3.0
+_ABOUT_M = 25.0  # around a place: what the map shows there tells a hole from a street
+_HOLE, _HOLE_M = 1.5, 20.0  # so much farther than all of it: no courtyard is, from a flying height
+_NEAR_M = 2.5
+_RING = np.array([[np.cos(a), np.sin(a)] for a in np.arange(8) * np.pi / 4])
+UNCONFIRMED = "not confirmed yet"
 _ASIDE = np.array([[0, 0, 0], [1, 0, 0], [-1, 0, 0], [0, 1, 0], [0, -1, 0]], dtype=np.float64)
 
 
@@ -33,9 +38,12 @@ class _Leap:
 
 
 class LastPlace:
-    """Where a target was last told. Not thread-safe."""
+    """Where a target was last told. Not thread-safe. confirm_ns: for so long its first sightings
+    must agree; a hole in the depth of the first pictures is gone by then.
+    """
 
-    def __init__(self) -> None:
+    def __init__(self, confirm_ns: int = 0) -> None:
+        self._confirm_ns = confirm_ns
         self.fix: TargetFix | None = None
         self._leap: _Leap | None = None
         self._begun_ns = 0
@@ -47,8 +55,9 @@ class LastPlace:
         seen for as long as the old one was, 3 s at the most.
         """
         last, time_ns = self.fix, fix.exposure_time_ns
-        if last is None or _reachable(last, fix, moves=moves):
-            self._begun_ns = time_ns if last is None else self._begun_ns
+        if last is None:
+            return self._first(fix)
+        if _reachable(last, fix, moves=moves):
             self.fix, self._leap = fix, None
             return ""
         leap = self._leap
@@ -65,6 +74,38 @@ class LastPlace:
             return ""
         moved = float(np.linalg.norm(fix.position_world - last.position_world))
         return f"{moved:.0f} m from where it was, which its error does not cover"
+
+    def _first(self, fix: TargetFix) -> str:
+        """Nothing was told yet: the first place is believed once sightings have agreed on it."""
+        begun, time_ns = self._leap, fix.exposure_time_ns
+        if begun is None:
+            begun = _Leap(time_ns, fix)
+        elif not _reachable(
+            begun.newest, fix, moves=time_ns - begun.newest.exposure_time_ns <= _LEAP_NS
+        ):
+            return "elsewhere than a moment ago"
+        self._leap = _Leap(begun.since_ns, fix)
+        if time_ns - begun.since_ns < self._confirm_ns:
+            return UNCONFIRMED
+        self.fix, self._leap, self._begun_ns = fix, None, begun.since_ns
+        return ""
+
+
+def is_by_hole(eye: Array, direction: Array, distance: float, cast: RayCaster) -> bool:
+    """Whether a ray passes through a hole of the map, or close by one or by the map's end: what it
+    meets is then what lies behind. eye, direction: (3,); distance: metres to what it meets.
+
+    A hole shows as nothing at all, or as a place much farther away than all that is about it.
+    """
+    sideways = np.linalg.svd(direction[None, :])[2][1:]
+    rings = np.concatenate([_NEAR_M * _RING, _ABOUT_M * _RING])
+    rays = direction + rings / distance @ sideways
+    found = cast(eye, rays / np.linalg.norm(rays, axis=1)[:, None]).distances
+    near, about = np.split(found, 2)
+    if not np.isfinite(near).all() or not np.isfinite(about).any():
+        return True
+    farthest = float(np.nanmax(about))
+    return distance > max(_HOLE * farthest, farthest + _HOLE_M)
 
 
 def is_on_map(fix: TargetFix, cast: RayCaster) -> bool:

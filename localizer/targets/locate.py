@@ -25,6 +25,9 @@ _STEP_SIGMA = 1.5  # the widest gap between neighbouring nodes
 # Neighbouring rays of one surface differ in distance by their spacing times the tangent of the
 # incidence: 4 stands for 76 degrees.
 _STEEPNESS = 4.0
+# Most outlines lie within the map's error, but a crown that has grown and an extension that was
+# built lie metres beside theirs: so many sigmas, in one case of ten.
+_GROWN_SIGMAS, _GROWN_SHARE, _GROWN_RAYS = 4.0, 0.1, 8
 _SMALLEST_STEP_M = 1.0
 # At grazing incidence the plane model explodes: 3 degrees is where we stop believing it.
 _MIN_COSINE = 0.05
@@ -102,31 +105,30 @@ def locate(
     pixel_sigma: float,
     map_sigma_m: float,
     drift: tuple[float, float] = (0.0, 0.0),
+    outline_sigma_m: float = 0.0,
 ) -> tuple[TargetSurface, ...]:
     """The surfaces that a pixel may show, the most probable one first; none if it shows no map.
 
     Where the whole bundle meets one surface, its position is the exact hit of the pixel's ray; else
-    a surface's is the mean of its own hits. drift: as of `ray_spread`.
+    a surface's is the mean of its own hits. drift: as of `ray_spread`. outline_sigma_m: how far the
+    map's outlines (roofs, crowns) lie beside today's; it decides which surfaces are met, and is no
+    error of a place on one.
     """
     eye, d = ray_in_world(estimate, pixel)
     distance = float(cast(eye, d[None, :]).distances[0])
     if not np.isfinite(distance):
         return ()
     spread = ray_spread(estimate, pixel, pixel_sigma, distance, drift)
-    nodes, weights = _nodes()
-    offsets = nodes @ np.linalg.cholesky(spread.covariance).T @ spread.sideways
-    directions = d + offsets
-    directions /= np.linalg.norm(directions, axis=1)[:, None]
+    directions, weights = _bundle(d, spread, outline_sigma_m / distance)
     hits = cast(eye, directions)
     centre = int(np.argmax(weights))
-    step = _STEEPNESS * _STEP_SIGMA * distance * float(np.sqrt(spread.covariance.trace()))
-    groups = _surfaces(hits.distances, max(step, _SMALLEST_STEP_M))
+    gap = _STEP_SIGMA * distance * float(np.sqrt(spread.covariance.trace())) + outline_sigma_m
+    groups = _surfaces(hits, directions, gap)
     surfaces = []
     for group in groups:
         share = weights[group] / weights[group].sum()
         points = directions[group] * hits.distances[group, None]
-        exact = len(groups) == 1 and centre in group
-        offset = points[group == centre][0] if exact else share @ points
+        offset = points[group == centre][0] if centre in group else share @ points
         normal = share @ hits.normals[group]
         normal = normal / max(float(np.linalg.norm(normal)), 1e-9)
         own = ray_spread(estimate, pixel, pixel_sigma, float(np.linalg.norm(offset)), drift)
@@ -151,8 +153,29 @@ def _nodes() -> tuple[Array, Array]:
     return grid, np.outer(w, w).ravel() / w.sum() ** 2
 
 
-def _surfaces(distances: Array, step: float) -> list[np.ndarray]:
-    """Indices of the hits, grouped where sorted distances (N,) leap by more than `step`."""
-    order = np.argsort(distances)
-    order = order[np.isfinite(distances[order])]
-    return np.split(order, np.flatnonzero(np.diff(distances[order]) > step) + 1)
+def _bundle(d: Array, spread: RaySpread, outline_rad: float) -> tuple[Array, Array]:
+    """Directions (N, 3) about d (3,) that sample what may lie under a pixel, and weights (N,)."""
+    nodes, weights = _nodes()
+    met = spread.covariance + outline_rad**2 * np.eye(2)
+    offsets = nodes @ np.linalg.cholesky(met).T @ spread.sideways
+    if outline_rad > 0.0:
+        turns = np.arange(_GROWN_RAYS) * 2 * np.pi / _GROWN_RAYS
+        ring = np.column_stack([np.cos(turns), np.sin(turns)]) @ spread.sideways
+        offsets = np.vstack([offsets, _GROWN_SIGMAS * outline_rad * ring])
+        of_ring = np.full(_GROWN_RAYS, _GROWN_SHARE / _GROWN_RAYS)
+        weights = np.concatenate([(1 - _GROWN_SHARE) * weights, of_ring])
+    directions = d + offsets
+    directions /= np.linalg.norm(directions, axis=1)[:, None]
+    return directions, weights
+
+
+def _surfaces(hits: BundleHits, directions: Array, gap: float) -> list[np.ndarray]:
+    """Indices of the hits, grouped where sorted distances leap by more than their surfaces' slope
+    explains; gap: metres between neighbouring rays.
+    """
+    order = np.argsort(hits.distances)
+    order = order[np.isfinite(hits.distances[order])]
+    cosines = np.abs(np.einsum("ni,ni->n", hits.normals, directions))[order]
+    slopes = np.minimum(np.sqrt(1.0 / np.maximum(cosines, 1e-3) ** 2 - 1.0), _STEEPNESS)
+    steps = np.maximum(gap * np.maximum(slopes[1:], slopes[:-1]), _SMALLEST_STEP_M)
+    return np.split(order, np.flatnonzero(np.diff(hits.distances[order]) > steps) + 1)

@@ -14,7 +14,13 @@ import numpy as np
 from localizer.geometry.pose import Array
 from localizer.targets.bias import SharedBias
 from localizer.targets.filter import TargetFilter
-from localizer.targets.limits import LastPlace, is_at_seen_depth, is_on_map
+from localizer.targets.limits import (
+    UNCONFIRMED,
+    LastPlace,
+    is_at_seen_depth,
+    is_by_hole,
+    is_on_map,
+)
 from localizer.targets.locate import (
     RayCaster,
     locate,
@@ -33,12 +39,15 @@ _OUTLIERS = 3
 _REPROJECTED = 5.0  # sigmas of pixel and pose between a fix and the pixel that it was seen at
 _ENTERS_S = 0.5
 _HIDDEN_M = 1.5  # what stands before a place by more than this hides it
+NO_MAP = "no map under it"
 
 
 @dataclass(frozen=True)
 class TargetSettings:
     """pixel_sigma: of a sighting, pixels; map_sigma_m: of the map's surface; max_sigma_m: nothing
-    is told that may be off by more; max_range_m: nor what is farther away.
+    is told that may be off by more; max_range_m: nor what is farther away; outline_sigma_m: of the
+    map's outlines, across the ray; confirm_s: for so long sightings must agree before the first is
+    told, 0 for what is seen once only.
     """
 
     pixel_sigma: float = 1.5
@@ -46,6 +55,8 @@ class TargetSettings:
     bias: SharedBias = field(default_factory=SharedBias)
     max_sigma_m: float = 50.0
     max_range_m: float = 5000.0
+    outline_sigma_m: float = 0.5
+    confirm_s: float = 0.5
 
 
 class TargetTrack:
@@ -60,7 +71,7 @@ class TargetTrack:
         self._moves = False
         self._stands_since_ns = 0
         self._outliers = 0
-        self._last = LastPlace()
+        self._last = LastPlace(round(settings.confirm_s * 1e9))
         self._seen_ns = 0
         self._aim: Array = np.zeros((3, 3))
         self.refusal = ""
@@ -82,12 +93,18 @@ class TargetTrack:
         settings, sigma = self._settings, pixel_sigma or self._settings.pixel_sigma
         time_ns, self.refusal = estimate.exposure_time_ns, ""
         eye, d = ray_in_world(estimate, pixel)
-        surfaces = locate(estimate, pixel, self._cast, sigma, settings.map_sigma_m, drift)
+        surfaces = locate(
+            estimate, pixel, self._cast, sigma, settings.map_sigma_m, drift,
+            settings.outline_sigma_m,
+        )  # fmt: skip
         if not surfaces:
-            return self._refuse("no map under it")
+            return self._refuse(NO_MAP)
         distance = float(np.linalg.norm(surfaces[0].position - eye))
         if distance > settings.max_range_m:
             return self._refuse(f"{distance:.0f} m away")
+        if self._last.fix is None and is_by_hole(eye, d, distance, self._cast):
+            self._begin_anew()
+            return self._refuse("the map has a hole there")
         if any(drift):
             self._aim = _aim(estimate, pixel, drift, surfaces[0], eye)
         if self._moves and time_ns - self._seen_ns > _GAP_S * 1e9:
@@ -112,10 +129,22 @@ class TargetTrack:
             bias = settings.bias.covariance(fix.position_world - eye)
             fix = replace(fix, covariance=fix.covariance + bias + self._aim)
         why = self._objection(fix, ray, surfaces)
+        if why and self._last.fix is None and why != UNCONFIRMED:
+            # Nothing was told yet, so nothing speaks for what was seen before rather than for this.
+            self._begin_anew()
+            self._static.update(ray, surfaces)
+            self._moving.update(TargetSighting(self._id, surfaces, pixel, time_ns))
         if why:
             return self._refuse(why)
         self._seen_ns = time_ns
         return fix
+
+    def _begin_anew(self) -> None:
+        self._static = StaticTarget(self._settings.map_sigma_m)
+        self._moving = TargetFilter()
+        self._moves = False
+        self._outliers = 0
+        self._last = LastPlace(round(self._settings.confirm_s * 1e9))
 
     def expected(self, time_ns: int) -> tuple[Array, Array] | None:
         """Position (3,) and covariance (3, 3) where it should be at a time; None before a fix."""

@@ -19,6 +19,7 @@ from companion.targets.detections import Detection
 from companion.targets.detector.boxes import Box
 from companion.targets.detector.names import Sight, ThingNames
 from companion.targets.detector.network import DetectorNetwork
+from companion.targets.pictures import RecentPictures
 from localizer.targets.locate import RayCaster, ray_in_world
 from localizer.types import Frame, PoseEstimate
 
@@ -49,7 +50,7 @@ class BoxDetector:
         self._config, self._cast = config, cast
         self._on_detection, self._say, self._load = on_detection, say, load
         self._names = ThingNames()
-        self._frames: deque[Frame] = deque(maxlen=_KEPT)
+        self._frames = RecentPictures[Frame](_KEPT, lambda frame: frame.image.nbytes)
         self._estimates: deque[PoseEstimate] = deque(maxlen=_KEPT)
         self._condition = threading.Condition()
         self._stopping = threading.Event()

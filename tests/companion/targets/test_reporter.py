@@ -36,7 +36,9 @@ class Session:
     def __init__(self, cast=_ground, rate_hz=5.0):
         self.targets = []
         self.came = threading.Event()
-        self.reporter = TargetReporter(TargetConfig(rate_hz=rate_hz), cast, self._add)
+        self.reporter = TargetReporter(
+            TargetConfig(rate_hz=rate_hz, confirm_s=0.0), cast, self._add
+        )
         self.reporter.start()
 
     def _add(self, target):

@@ -6,6 +6,7 @@ from localizer.geometry.pose import Pose, so3_exp
 from localizer.map.cache.pick import BundleHits, cast_bundle
 from localizer.map.cache.tile import TileMesh
 from localizer.targets.locate import locate, ray_in_world, ray_spread, surface_covariance
+from localizer.targets.track import TargetSettings, TargetTrack
 from localizer.types import PoseEstimate, RegistrationStatus, TrackingState
 
 CAMERA = Camera(640, 480, 550.0, 550.0, 322.0, 238.0, (-0.1, 0.02, 0.001, -0.001, 0.0))
@@ -134,3 +135,44 @@ def test_what_strays_from_the_tangent_plane_widens_the_covariance():
     rough = locate(_estimate(NADIR, EXACT), pixel, steps, 1.5, 0.1)
     assert len(flat) == len(rough) == 1
     assert rough[0].covariance[2, 2] > flat[0].covariance[2, 2] + 0.2**2
+
+
+def _roofs(half_m):
+    """A roof at 8 m over ground, both about the origin: half its side."""
+    meshes = [_square(400.0, 0.0), _square(2.0 * half_m, 8.0)]
+    return lambda origin, directions: cast_bundle(meshes, origin, directions)
+
+
+def _told(today_half_m, east, **settings):
+    """(error, its share of the bound, sigma) of a click at what is seen through (east, 3, 8).
+
+    The map's roof ends at 10 m.
+    """
+    oblique = Pose(so3_exp([np.radians(40), 0, 0]) @ NADIR.rotation, np.array([0.0, -75.0, 90.0]))
+    estimate = _estimate(oblique, np.diag([0.06, 0.06, 0.06, 5e-4, 5e-4, 5e-4]) ** 2)
+    pixel = _pixel_of(oblique, (east, 3.0, 8.0))
+    track = TargetTrack("click", TargetSettings(confirm_s=0.0, **settings), _roofs(10.0))
+    fix = track.see(estimate, pixel)
+    eye, ray = ray_in_world(estimate, pixel)
+    truth = eye + ray * _roofs(today_half_m)(eye, ray[None]).distances[0]
+    off = fix.position_world - truth
+    bound = float(off @ np.linalg.solve(fix.covariance, off)) / 7.815  # 95 % of three dimensions
+    return float(np.linalg.norm(off)), bound, float(np.sqrt(np.trace(fix.covariance)))
+
+
+@pytest.mark.parametrize(("outline_m", "east"), [(8.0, 8.6), (8.2, 8.7), (12.0, 11.4)])
+def test_beside_an_outline_that_lies_elsewhere_today_the_error_says_so(outline_m, east):
+    """Attack: without the outline's error a roof's edge is told 9 m off, known to 0.6 m."""
+    error, bound, sigma = _told(outline_m, east, outline_sigma_m=0.0)
+    assert error > 8.0
+    assert bound > 2.0
+    error, bound, sigma = _told(outline_m, east)
+    assert bound < 1.0
+    assert sigma > 2.5
+
+
+@pytest.mark.parametrize("east", [0.0, 6.0, 16.0])
+def test_in_the_middle_of_a_roof_or_a_field_the_outlines_error_says_nothing(east):
+    plain, told = _told(10.0, east, outline_sigma_m=0.0), _told(10.0, east)
+    assert told == pytest.approx(plain, rel=0.02)
+    assert told[2] < 0.85
