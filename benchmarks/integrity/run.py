@@ -22,7 +22,7 @@ from localizer.map.cache.cache import TileCache
 from localizer.map.cache.stream import TileStreamer
 from localizer.registration import JNGO, Registration
 from localizer.render.numba_raster import NumbaRenderer
-from localizer.tracking.motion import mahalanobis_squared
+from localizer.tracking.motion import mahalanobis_squared, place_sigma_m
 from localizer.tracking.pipeline import reference_anchors
 from localizer.types import Anchors, FeaturePyramid, RegistrationStatus
 
@@ -36,7 +36,8 @@ _FAR_M = 1e6  # error where the place is not on the map
 class Outcome:
     """One registration. metres, degrees: its error, and off_map_m: against the picture of a map
     whose picture is shifted; sigma_m: the largest of its position; gate: squared Mahalanobis
-    distance from the prior; the rest as `Registration` has it.
+    distance from the prior, prior_sigma_m: of its horizontal place; the rest as `Registration` has
+    it.
     """
 
     set: str
@@ -57,6 +58,8 @@ class Outcome:
     votes: int = 0
     peak: float = 0.0
     lead: float = 0.0
+    focal_gain: float = -1.0
+    prior_sigma_m: float = 0.0
 
     @property
     def right(self) -> bool:
@@ -107,7 +110,8 @@ class Registrar:
             anchors = self._anchors(begun, begun.camera, index)
         if anchors is None:
             return None
-        return self._optimizer.register(query, begun.camera, anchors, begun.prior, seed=index)
+        found = self._optimizer.register(query, begun.camera, anchors, begun.prior, seed=index)
+        return self._optimizer.focal_tested(query, begun.camera, anchors, found)
 
     def _anchors(self, begun: Beginning, camera: Camera, seed: int) -> Anchors | None:
         pose = begun.prior.world_from_camera
@@ -156,6 +160,8 @@ def _outcome(
         votes=votes.votes,
         peak=votes.peak,
         lead=min(found.lead, 1e3),
+        focal_gain=max(found.focal_gain, -1.0),
+        prior_sigma_m=place_sigma_m(begun.prior),
     )
 
 

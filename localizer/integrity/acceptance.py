@@ -2,7 +2,8 @@
 
 An estimate is acceptable when the registration succeeded, enough anchors were seen, its quality is
 high enough, the image's parts agree on it one by one, and it agrees with the prediction
-(Mahalanobis gate). What runs of acceptances and
+(Mahalanobis gate). Where the prediction is wide, the place has to stand out among those beside it;
+where a place is on trial, no other focal length may fit better. What runs of acceptances and
 rejections make of the tracker's state stands in `localizer.tracking.states`.
 """
 
@@ -30,6 +31,24 @@ class IntegrityConfig(BaseModel):
     max_sigma_m: float = Field(
         4.0, ge=0.01, le=100, description="position sigma of a usable estimate"
     )
+    max_focal_gain: float = Field(
+        0.002,
+        ge=0,
+        le=1,
+        description="share by which another focal length may fit a place on trial better",
+    )
+    distinct_from_m: float = Field(
+        6.0,
+        ge=0,
+        le=1e4,
+        description="sigma of the prior's place from which on the place has to stand out",
+    )
+    min_peak: float = Field(
+        4.5,
+        ge=0,
+        le=100,
+        description="the image's match over its matches beside, in their sigmas, to stand out",
+    )
     gate: float = Field(40.0, ge=1, le=1e4, description="squared Mahalanobis distance, 6 dof")
     confirmations: int = Field(
         3, ge=1, le=1000, description="acceptances in a row that begin TRACKING"
@@ -55,17 +74,36 @@ class IntegrityConfig(BaseModel):
     )
 
 
-def is_acceptable(config: IntegrityConfig, result: Registration, distance_squared: float) -> bool:
-    """Whether one registration may be used; distance_squared: Mahalanobis, from the prediction."""
+def is_acceptable(
+    config: IntegrityConfig,
+    result: Registration,
+    distance_squared: float,
+    prior_sigma_m: float = 0.0,
+) -> bool:
+    """Whether one registration may be used. distance_squared: Mahalanobis, from the prediction;
+    prior_sigma_m: of the prediction's horizontal place, the larger axis.
+    """
     if result.status is not RegistrationStatus.OK:
         return False
     if result.overlap < config.min_overlap or result.quality < config.min_quality:
         return False
     if result.covariance.diagonal()[:3].max() > config.max_sigma_m**2:
         return False
-    if not parts_agree(config, result):
+    if not parts_agree(config, result) or result.focal_gain > config.max_focal_gain:
+        return False
+    if prior_sigma_m >= config.distinct_from_m and not stands_out(config, result):
         return False
     return distance_squared <= config.gate
+
+
+def stands_out(config: IntegrityConfig, result: Registration) -> bool:
+    """Whether the image matches its place clearly better than what lies beside it.
+
+    Equal roofs in rows match each other as well as themselves. A prior that is narrower than a
+    lot says which of them is seen; a wider one does not, and no test of one picture can. On a GPU
+    there are no votes: what is searched there is judged by the relocalizer's verdict alone.
+    """
+    return result.agreement is None or result.agreement.peak >= config.min_peak
 
 
 def parts_agree(config: IntegrityConfig, result: Registration) -> bool:

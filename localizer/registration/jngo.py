@@ -50,6 +50,7 @@ from localizer.registration.selection import (
     thinned,
 )
 from localizer.registration.whole import WholeBackend
+from localizer.registration.zoom import FocalTest
 from localizer.types import Anchors, FeaturePyramid, PosePrior, RegistrationStatus
 
 _log = logging.getLogger(__name__)
@@ -124,6 +125,13 @@ class JNGO:
         winner = self._sharpen(swarm, problems[searched - 1 :], constraint, origin)
         found = self._found(swarm, winner, problems[searched - 1], query.levels[-1].stride)
         return registration(found, self.config, prior, origin)
+
+    def focal_tested(
+        self, query: FeaturePyramid, camera: Camera, anchors: Anchors, found: Registration
+    ) -> Registration:
+        """What `register` found from the same, with its `focal_gain`; 2 to 3 ms."""
+        gain = FocalTest(self.backend, self.config).gain(query, camera, anchors, found)
+        return replace(found, focal_gain=gain)
 
     def _refine(
         self,

@@ -32,7 +32,8 @@ class Registration:
     overlap: share of the anchors in view. quality: 0 (no better than chance) to 1.
     evaluations: cost evaluations spent. agreement: of the image's parts, None where it is not
     known (a registration on a GPU, or one that failed). lead: by how much the best other mode of
-    the swarm is worse, as a share of the score, inf without another.
+    the swarm is worse, as a share of the score, inf without another. focal_gain: how much better
+    another focal length fits (`zoom.FocalTest`), -inf where that was not tested.
     """
 
     world_from_camera: Pose
@@ -44,6 +45,7 @@ class Registration:
     evaluations: int
     agreement: Agreement | None = None
     lead: float = np.inf
+    focal_gain: float = -np.inf
 
 
 @dataclass(frozen=True)

@@ -139,9 +139,10 @@ class Verifier:
             return failure(prior, RegistrationStatus.NO_OVERLAP)
         anchors = select_anchors(reference.view, reference.features, self.anchors, self.seed)
         constraint = self._constraint(prior.world_from_camera, query)
-        return self.optimizer.register(
+        found = self.optimizer.register(
             features, camera, anchors, prior, constraint=constraint, seed=self.seed
         )
+        return self.optimizer.focal_tested(features, camera, anchors, found)
 
     def again(self, prior: PosePrior, result: Registration) -> PosePrior:
         """The prior of the next pass: the same image is no new evidence, sigma only halves."""
@@ -160,6 +161,8 @@ class Verifier:
             return False
         votes = result.agreement  # None on a GPU: the other tests decide
         if votes is not None and votes.share < c.min_agreement:
+            return False
+        if result.focal_gain > c.max_focal_gain:
             return False
         return self.agrees(result.world_from_camera, candidate, query)
 

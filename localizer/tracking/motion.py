@@ -159,6 +159,11 @@ def mahalanobis_squared(prior: PosePrior, pose: Pose, extra: Array | float = 0.0
     return float(delta @ np.linalg.solve(S, delta))
 
 
+def place_sigma_m(prior: PosePrior) -> float:
+    """Sigma of the prior's horizontal place along its least known axis."""
+    return float(np.sqrt(max(np.linalg.eigvalsh(prior.covariance[:2, :2])[-1], 0.0)))
+
+
 def pose_difference(a: Pose, b: Pose) -> Array:
     """``b - a`` as (position, left rotation vector), shape (6,), world axes."""
     return np.concatenate([b.translation - a.translation, so3_log(b.rotation @ a.rotation.T)])

@@ -329,15 +329,18 @@ class Localizer:
         if anchors is not None:
             with stopwatch(stage_ms, "register"):
                 about = ahead.prior.world_from_camera
+                seen_anchors = swept(anchors, sweep, about, frame.camera)
                 result = self._optimizer.register(
                     query,
                     self.camera,
-                    swept(anchors, sweep, about, frame.camera),
+                    seen_anchors,
                     ahead.prior,
                     motion=ahead.prior if seen.standing.trusts_prediction else None,
                     constraint=self._attitude(frame.exposure_time_ns),
                     seed=self._config.seed + frame.sequence,
                 )
+                if seen.standing.on_trial and not seen.standing.independent:
+                    result = self._optimizer.focal_tested(query, self.camera, seen_anchors, result)
         estimate = self._tracker.judge(seen, ahead, frame, query, anchors, result)
         if anchors is not None and estimate.status is RegistrationStatus.OK:
             # Added to what is told and not to what is filtered: the next frame errs alike.

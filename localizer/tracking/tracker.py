@@ -149,7 +149,8 @@ class Tracker:
     def _is_acceptable(self, result: Registration, prior: PosePrior) -> bool:
         # Also before tracking: the gate is against the prior's own covariance, which is wide then.
         distance = motion.mahalanobis_squared(prior, result.world_from_camera, result.covariance)
-        return is_acceptable(self._config.integrity, result, distance)
+        sigma_m = motion.place_sigma_m(prior)
+        return is_acceptable(self._config.integrity, result, distance, sigma_m)
 
     def _carry(
         self, seen: TrackerState, ahead: MotionState, frame: Frame, query: FeaturePyramid,

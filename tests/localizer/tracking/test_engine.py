@@ -88,6 +88,9 @@ class FakeOptimizer:
         pose = Pose(NADIR.rotation, NADIR.translation + 0.01 + self.offset)
         return Registration(pose, np.eye(6) * 0.01, 0.1, 0.9, 0.8, self.status, 1)
 
+    def focal_tested(self, query, camera, anchors, found):
+        return found
+
 
 def _localizer(renderer=None, optimizer=None) -> Localizer:
     return Localizer(

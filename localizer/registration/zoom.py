@@ -1,0 +1,95 @@
+"""Whether another focal length fits an image better (docs/explanation/registration.md, section 8b).
+
+A camera that zooms 5 % more than is believed seems 5 % closer to what it sees: the registration
+ends metres beside the place, with as good a quality, and most parts of the image agree. What tells
+is depth: but over flat ground seen straight down, a zoom and a shift are not quite the same. So the
+winner is refined once more under a focal length that is longer, one that is shorter and its own.
+Half a step is tolerated by construction: there the two fit alike.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from localizer.device_array import DeviceArray
+from localizer.geometry.camera import Camera
+from localizer.geometry.pose import Pose
+from localizer.registration.backend import (
+    Backend,
+    LevelProblem,
+    camera_from_local,
+    level_problems,
+    local_origin,
+)
+from localizer.registration.config import JNGOConfig
+from localizer.registration.result import Registration
+from localizer.registration.selection import median_residual, thinned
+from localizer.types import Anchors, FeaturePyramid, RegistrationStatus
+
+FOCAL_STEP = 0.05
+_FINE_ANCHORS, _ANCHORS = 500, 2000  # of the network's finest level, and of the last
+_ITERATIONS = 8  # on either
+_LEAST_SCALE = 0.02  # of the loss, where features fit perfectly
+# Costs are compared with each other alone: the unit that priors have where features fit perfectly
+# (`selection.LEAST_SCORE`) would make a perfect fit look worse than another focal length's.
+_NO_COST = 1e-9
+
+
+@dataclass(frozen=True)
+class FocalTest:
+    """Refines under other focal lengths, on the registration's own backend."""
+
+    backend: Backend
+    config: JNGOConfig
+
+    def gain(
+        self, query: FeaturePyramid, camera: Camera, anchors: Anchors, found: Registration
+    ) -> float:
+        """How much lower a registration's cost is, as a share, with a focal length `FOCAL_STEP`
+        longer or shorter, the pose refined for it; the better one of the two.
+
+        Negative where the camera's own fits best; -inf where that cannot be tested (a registration
+        that failed, features on a GPU).
+        """
+        on_device = any(isinstance(level.features, DeviceArray) for level in query.levels)
+        if found.status is not RegistrationStatus.OK or on_device:
+            return -np.inf
+        scores = self._scores(query, camera, anchors, found.world_from_camera)
+        own = scores.pop(1.0)
+        if not np.isfinite(own):
+            return -np.inf
+        return 1.0 - min(scores.values()) / max(own, _NO_COST)
+
+    def _scores(
+        self, query: FeaturePyramid, camera: Camera, anchors: Anchors, pose: Pose
+    ) -> dict[float, float]:
+        """The last level's cost by factor of the focal length."""
+        origin = local_origin(anchors, pose)
+        problems = level_problems(query, camera, anchors, origin)
+        searched = len(self.config.iterations)
+        fine, last = thinned(problems[searched - 1], _FINE_ANCHORS), thinned(problems[-1], _ANCHORS)
+        R, t = camera_from_local(pose.rotation[None], pose.translation[None], origin)
+        depth = float((R[0] @ fine.points + t[0][:, None])[2].mean())
+        scores = {}
+        for factor in (1.0 - FOCAL_STEP, 1.0, 1.0 + FOCAL_STEP):
+            # The camera drawn back as far as the longer focal length seems to bring it on.
+            rotations, translations = R, t + np.array([0.0, 0.0, depth * (factor - 1.0)])
+            for problem in (fine, last):
+                scale = max(median_residual(problem, R[0], t[0]), _LEAST_SCALE)
+                settings = replace(
+                    self.config.settings, scale=scale, redescending=True,
+                    damping=self.config.sharpen_damping,
+                )  # fmt: skip
+                refined = self.backend.refine(
+                    _zoomed(problem, factor), rotations, translations, _ITERATIONS, settings
+                )
+                rotations, translations = refined.rotations, refined.translations
+            scores[factor] = float(refined.scores[0])
+        return scores
+
+
+def _zoomed(problem: LevelProblem, factor: float) -> LevelProblem:
+    fx, fy = problem.focal
+    return replace(problem, focal=(fx * factor, fy * factor), prior=None)
