@@ -2,8 +2,9 @@
 
 "tuning" and "generated" are worlds of different seeds. The made maps are hard on purpose: forest
 (few photographs of crowns, turned and mirrored, over and over), water (nothing but waves, others
-in the query), roofs (one house on equal lots), terraces (one house in rows), "outdated" (portugal, of which three squares in ten
-show other ground, heights included), "shifted" (portugal's orthophoto 5 m off its heights).
+in the query), roofs (one house on equal lots), terraces (one house in rows), "outdated" (portugal,
+of which three squares in ten show other ground, heights included), "shifted" (portugal's orthophoto
+5 m off its heights).
 """
 
 from __future__ import annotations

@@ -9,6 +9,7 @@ Half a step is tolerated by construction: there the two fit alike.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -56,11 +57,7 @@ class FocalTest:
         on_device = any(isinstance(level.features, DeviceArray) for level in query.levels)
         if found.status is not RegistrationStatus.OK or on_device:
             return -np.inf
-        scores = self._scores(query, camera, anchors, found.world_from_camera)
-        own = scores.pop(1.0)
-        if not np.isfinite(own):
-            return -np.inf
-        return 1.0 - min(scores.values()) / max(own, _NO_COST)
+        return focal_gain(self._scores(query, camera, anchors, found.world_from_camera))
 
     def _scores(
         self, query: FeaturePyramid, camera: Camera, anchors: Anchors, pose: Pose
@@ -88,6 +85,15 @@ class FocalTest:
                 rotations, translations = refined.rotations, refined.translations
             scores[factor] = float(refined.scores[0])
         return scores
+
+
+def focal_gain(scores: Mapping[float, float]) -> float:
+    """The gain of the best other focal length, from costs by factor; -inf without an own cost."""
+    own = scores[1.0]
+    if not np.isfinite(own):
+        return -np.inf
+    best = min(score for factor, score in scores.items() if factor != 1.0)
+    return 1.0 - best / max(own, _NO_COST)
 
 
 def _zoomed(problem: LevelProblem, factor: float) -> LevelProblem:

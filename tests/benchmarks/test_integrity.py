@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from benchmarks.common.shares import exact_interval
-from benchmarks.integrity.report import OURS, WITHOUT, rows
+from benchmarks.integrity.report import AGREE, DISTINCT, FOCAL, OURS, WITHOUT, rows
 from benchmarks.integrity.run import Outcome, read, turn
 from localizer.integrity.acceptance import IntegrityConfig
 
@@ -59,6 +59,16 @@ def test_a_wrong_focal_length_and_equal_roofs_are_counted_apart_and_in_all():
     assert (
         of([focal, roofs, RIGHT], OURS, "all, focal length right, no equal roofs").false.hits == 0
     )
+
+
+def test_a_better_focal_length_and_a_place_that_does_not_stand_out_are_refused_by_ours():
+    zoomed = replace(WRONG, kind="focal", votes=58, focal_gain=0.01)
+    alike = replace(WRONG, set="roofs", votes=58, peak=3.0, prior_sigma_m=14.0)
+    narrow = replace(RIGHT, set="roofs", peak=3.0, prior_sigma_m=2.0)
+    outcomes = [zoomed, alike, narrow]
+    assert (of(outcomes, AGREE).false.hits, of(outcomes, OURS).false.hits) == (2, 0)
+    assert (of(outcomes, FOCAL).false.hits, of(outcomes, DISTINCT).false.hits) == (1, 1)
+    assert (of(outcomes, OURS).lost.hits, of(outcomes, OURS).lost.count) == (0, 1)
 
 
 def test_a_line_that_was_cut_short_costs_its_view_alone(tmp_path):

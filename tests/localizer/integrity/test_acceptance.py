@@ -10,6 +10,7 @@ import pytest
 
 from localizer.geometry.pose import Pose
 from localizer.integrity.acceptance import IntegrityConfig, is_acceptable
+from localizer.registration.agreement import Agreement
 from localizer.registration.result import Registration
 from localizer.types import RegistrationStatus
 
@@ -37,3 +38,21 @@ def test_every_criterion_can_reject(change: dict[str, Any]) -> None:
 
 def test_the_gate_rejects() -> None:
     assert not is_acceptable(CONFIG, _registration(), 1e4)
+
+
+def test_equal_roofs_are_refused_where_the_prior_cannot_tell_them_apart() -> None:
+    """All parts agree, the quality is good: with a prior of 20 m it may be the next roof."""
+    alike = _registration(agreement=Agreement(parts=60, votes=58, peak=3.2))
+    assert not is_acceptable(CONFIG, alike, 1.0, prior_sigma_m=20.0)
+    assert is_acceptable(CONFIG, alike, 1.0, prior_sigma_m=3.0)
+
+
+def test_a_place_like_no_other_needs_no_narrow_prior() -> None:
+    seen = _registration(agreement=Agreement(parts=60, votes=58, peak=6.2))
+    assert is_acceptable(CONFIG, seen, 1.0, prior_sigma_m=200.0)
+    assert is_acceptable(CONFIG, _registration(), 1.0, prior_sigma_m=200.0)  # a GPU has no votes
+
+
+def test_another_focal_length_that_fits_better_rejects() -> None:
+    assert not is_acceptable(CONFIG, _registration(focal_gain=0.01), 1.0)
+    assert is_acceptable(CONFIG, _registration(focal_gain=-0.01), 1.0)

@@ -14,6 +14,7 @@ from localizer.config import LocalizerConfig
 from localizer.errors import CameraError, MapCacheError, OutsideMapError
 from localizer.geometry.camera import Camera
 from localizer.geometry.pose import Pose
+from localizer.registration.agreement import Agreement
 from localizer.registration.result import Registration
 from localizer.render.base import SKY
 from localizer.tracking.engine import DualThreadEngine
@@ -81,15 +82,17 @@ class FakeOptimizer:
         self.error: Exception | None = None
         self.status = RegistrationStatus.OK
         self.offset = np.zeros(3)
+        self.agreement: Agreement | None = None
+        self.focal_gain = -np.inf
 
     def register(self, query, camera, anchors, prior, *, motion=None, constraint=None, seed=0):
         if self.error is not None:
             raise self.error
         pose = Pose(NADIR.rotation, NADIR.translation + 0.01 + self.offset)
-        return Registration(pose, np.eye(6) * 0.01, 0.1, 0.9, 0.8, self.status, 1)
+        return Registration(pose, np.eye(6) * 0.01, 0.1, 0.9, 0.8, self.status, 1, self.agreement)
 
     def focal_tested(self, query, camera, anchors, found):
-        return found
+        return replace(found, focal_gain=self.focal_gain)
 
 
 def _localizer(renderer=None, optimizer=None) -> Localizer:
@@ -261,6 +264,25 @@ def test_a_jump_against_the_prediction_is_not_accepted():
     optimizer.offset = np.array([40.0, 0.0, 0.0])
     frame = _frame(6)
     assert not localizer.localize(frame, localizer.extract_query(frame), anchors).accepted
+
+
+@pytest.mark.parametrize(("sigma_m", "accepted"), [(3.0, True), (20.0, False)])
+def test_of_equal_roofs_only_a_narrow_prior_says_which(sigma_m, accepted):
+    optimizer = FakeOptimizer()
+    optimizer.agreement = Agreement(parts=60, votes=58, peak=3.2)
+    localizer = _localizer(optimizer=optimizer)
+    localizer.set_prior(PosePrior(NADIR, np.diag([sigma_m**2] * 3 + [1.0] * 3), 10**9))
+    assert localizer.track(_frame(0)).accepted is accepted
+
+
+@pytest.mark.parametrize(("gain", "tried"), [(-0.01, 1), (0.05, 0)])
+def test_a_found_place_is_refused_where_another_focal_length_fits_better(gain, tried):
+    optimizer = FakeOptimizer()
+    optimizer.focal_gain = gain
+    localizer = _localizer(optimizer=optimizer)
+    localizer.offer(replace(_prior(10**9), independent=False))
+    localizer.track(_frame(0))
+    assert localizer.tracker.standing.accepted_in_row == tried
 
 
 def test_localizing_before_a_prior_is_an_error():
