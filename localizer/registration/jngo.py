@@ -155,7 +155,7 @@ class JNGO:
             evaluations += found.evaluations
             R, t, totals = found.rotations, found.translations, found.scores
             if level is problems[-1]:
-                totals = self._totals(R, t, totals, origin, motion)
+                totals = _totals(c.motion_weight, R, t, totals, origin, motion)
             order = distinct(problem, R, t, totals, c.distinct_px)[:survivors]
             R, t = R[order], t[order]
             scores, overlaps = found.scores[order], found.overlaps[order]
@@ -212,20 +212,6 @@ class JNGO:
         target = Pose(rotation[0], translation[0])
         weight = self.config.prior_weight * max(float(best), LEAST_SCORE)
         return replace(problem, prior=QuadraticPrior(target, constraint.information, weight))
-
-    def _totals(
-        self, R: Array, t: Array, scores: Array, origin: Array, motion: PosePrior | None
-    ) -> Array:
-        """Eq. 10: photometric cost plus the squared Mahalanobis distance to the prediction."""
-        best = max(scores.min(), LEAST_SCORE)
-        if motion is None or not np.isfinite(best) or self.config.motion_weight == 0:
-            return scores
-        information = np.linalg.pinv(motion.covariance, hermitian=True)
-        rotations, centres = world_from_camera(R, t, origin)
-        d = pose_differences(rotations, centres, motion.world_from_camera)
-        squared = np.einsum("mi,ij,mj->m", d, information, d)
-        totals: Array = scores + self.config.motion_weight * best * squared
-        return totals
 
     def _found(self, swarm: _Swarm, winner: _Winner, level: LevelProblem, stride: int) -> Found:
         """The survivors with the winner in the first's place, and the sums at its pose; level: the
@@ -289,6 +275,21 @@ class _Winner:
     rotation: Array
     translation: Array
     evaluations: int
+
+
+def _totals(
+    weight: float, R: Array, t: Array, scores: Array, origin: Array, motion: PosePrior | None
+) -> Array:
+    """Eq. 10: photometric cost plus the squared Mahalanobis distance to the prediction."""
+    best = max(scores.min(), LEAST_SCORE)
+    if motion is None or not np.isfinite(best) or weight == 0:
+        return scores
+    information = np.linalg.pinv(motion.covariance, hermitian=True)
+    rotations, centres = world_from_camera(R, t, origin)
+    d = pose_differences(rotations, centres, motion.world_from_camera)
+    squared = np.einsum("mi,ij,mj->m", d, information, d)
+    totals: Array = scores + weight * best * squared
+    return totals
 
 
 def make_backend(name: str, threads: int = 2) -> Backend:
