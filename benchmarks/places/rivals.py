@@ -245,8 +245,11 @@ def _pixloc(stack: MapStack, setting: Setting) -> Tracking:
 
 
 def _gradient(stack: MapStack, setting: Setting) -> Tracking:
-    """Ours, with hand-made features in the network's place."""
-    config = setting.config
+    """Ours, with hand-made features in the network's place, and without the votes of the image's
+    parts: their limits were drawn for the network's features and refuse right poses of these.
+    """
+    no_votes = setting.config.integrity.model_copy(update={"min_parts": 0, "min_agreement": 0.0})
+    config = setting.config.model_copy(update={"integrity": no_votes})
     localizer = Localizer(
         stack.renderer, DetailExtractor(GradientExtractor()), JNGO(config.registration, threads=1),
         setting.camera, config, map_frame=stack.cache.frame,
@@ -287,7 +290,8 @@ RIVALS = {
                     "(the authors'), N = 2,000", _pixloc),
     "paper": Rival("the paper's optimizer, our features", "M = 144, N = 500, 2/3/4 steps, no "
                    "detail level, motion term with the filter's prediction", _paper),
-    "gradient": Rival("gradient features in ours", "as ours", _gradient),
+    "gradient": Rival("gradient features in ours", "as ours, without the votes of the parts of the "
+                      "image, whose limits are those of the network's features", _gradient),
     OURS: Rival("ours", "the product's defaults", _ours),
 }  # fmt: skip
 MISSING = (
