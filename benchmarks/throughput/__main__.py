@@ -6,11 +6,12 @@
 
 `record` renders 300 frames, 30 a second, over the demo's world of a seed (made if it is missing):
 straight on, a corner, straight on, with a rolling shutter and an erring calibration. `run` measures
-the engine for each width and number of cores: in real time, and with the next frame offered as soon
-as the last is done; and, on one thread, the processor time of each stage. Run it on an idle
-machine; figures of a loaded one say nothing. The share is the processor time used over what the
-cores had. `accuracy` compares, frame by frame, references that serve several frames with one for
-every frame; FOLDER may be any sequence with its map.
+the engine for each width and number of cores: in real time; with the next frame offered as soon as
+the last is done; and with two frames in the engine all the time, so that one is registered while
+the other's features are extracted; and, on one thread, the processor time of each stage. Run it on
+an idle machine; figures of a loaded one say nothing. The share is the processor time used over what
+the cores had. `accuracy` compares, frame by frame, references that serve several frames with one
+for every frame; FOLDER may be any sequence with its map.
 """
 
 from __future__ import annotations
@@ -24,7 +25,7 @@ from pathlib import Path
 from benchmarks.common.arguments import Parser, existing, number, output, whole
 from benchmarks.common.named_errors import named_errors
 from benchmarks.throughput.accuracy import paired
-from benchmarks.throughput.settings import map_of, one_setting
+from benchmarks.throughput.settings import OFFERED, map_of, one_setting
 from localizer.config import LocalizerConfig
 from localizer.evaluation.sequences import load_sequence
 from localizer.tracking.opening import MapStack
@@ -84,7 +85,7 @@ def run(args: argparse.Namespace) -> None:
                     one_setting, args.folder, width, cores, args.frames, args.shift, stages
                 )
                 found += job.result()
-            for row in found[-2 - stages :]:
+            for row in found[-len(OFFERED) - stages :]:
                 print(json.dumps(row), flush=True)
             if args.json:
                 args.json.write_text(json.dumps({"rows": found}, indent=1) + "\n")

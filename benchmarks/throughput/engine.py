@@ -16,7 +16,8 @@ from localizer.tracking.opening import MapStack, build_localizer
 from localizer.types import Frame, PoseEstimate, ReferenceBundle
 
 _WARM = 20  # estimates that are not counted
-_PATIENCE_S = 2.0  # for an estimate of a frame that was offered alone
+_LOOK_S = 5e-4
+_PATIENCE_S = 2.0  # for an estimate of one frame
 
 
 @dataclass
@@ -27,17 +28,22 @@ class _Answers:
     latency_ms: list[float] = field(default_factory=list)
     metres: list[float] = field(default_factory=list)
     refused: int = 0
-    done: threading.Event = field(default_factory=threading.Event)
+    last: int = -1
+    changed: threading.Condition = field(default_factory=threading.Condition)
+
+    def wait_for(self, sequence: int) -> None:
+        """Until this frame or a later one has been answered; not for ever."""
+        with self.changed:
+            self.changed.wait_for(lambda: self.last >= sequence, _PATIENCE_S)
 
 
 def engine_run(
-    stack: MapStack, sequence: Recorded, config: LocalizerConfig, *, paced: bool
+    stack: MapStack, sequence: Recorded, config: LocalizerConfig, in_flight: int
 ) -> dict[str, float]:
     """Frames a second, latency and processor time of the engine.
 
-    paced: frames come when they were recorded, and one that finds the engine busy replaces the one
-    that waits; else the next is offered as soon as the last is done. Frames are decoded before, and
-    the sequence is gone through to its end and back, so that no frame is a jump.
+    in_flight: how many frames the engine has at a time; 0: they come when they were recorded, and
+    one that finds the engine busy replaces the one that waits. Frames are decoded before.
     """
     frames = [sequence.frame(index) for index in range(len(sequence.images))]
     localizer = build_localizer(stack, sequence.camera, config)
@@ -56,27 +62,30 @@ def engine_run(
             answers.metres.append(truth.distance_to(estimate.world_from_camera)[0])
         else:
             answers.refused += 1
-        answers.done.set()
+        with answers.changed:
+            answers.last = estimate.sequence
+            answers.changed.notify()
 
     engine = DualThreadEngine(localizer, (take,), lambda _: None)
     engine.start()
     began, cpu, offered = time.perf_counter(), time.process_time(), 0
-    counted_from = 0
+    counted_from, first_ns, references = 0, 0, 0
     try:
         for k, frame in enumerate(frames):
+            if in_flight or k <= _WARM:
+                answers.wait_for(k - (1 if k <= _WARM else in_flight))
+                while engine.is_full:  # the next would displace it
+                    time.sleep(_LOOK_S)
             if k == _WARM:
                 counted_from = len(answers.latency_ms)
                 began, cpu, offered = time.perf_counter(), time.process_time(), 0
-            if paced:
-                due = (frame.exposure_time_ns - frames[min(k, _WARM)].exposure_time_ns) * 1e-9
-                start = began if k >= _WARM else time.perf_counter()
-                time.sleep(max(start + due - time.perf_counter(), 0.0))
-            answers.done.clear()
+                first_ns, references = frame.exposure_time_ns, engine.health.references
+            if not in_flight and k > _WARM:
+                due = began + (frame.exposure_time_ns - first_ns) * 1e-9
+                time.sleep(max(due - time.perf_counter(), 0.0))
             _offer(engine, answers, replace(frame, sequence=k))
             offered += 1
-            if not paced or k < _WARM:
-                answers.done.wait(_PATIENCE_S)
-        answers.done.wait(_PATIENCE_S)
+        answers.wait_for(len(frames) - 1)
         seconds = time.perf_counter() - began
         cpu_s = time.process_time() - cpu
     finally:
@@ -86,6 +95,7 @@ def engine_run(
     return {
         "frames_offered": offered,
         "frames_answered": len(latency),
+        "references": engine.health.references - references,
         "frames_per_s": len(latency) / seconds,
         "latency_p50_ms": float(np.percentile(latency, 50)),
         "latency_p95_ms": float(np.percentile(latency, 95)),

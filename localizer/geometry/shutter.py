@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from localizer.geometry.camera import Camera
-from localizer.geometry.pose import Array, Pose
+from localizer.geometry.pose import Array, Pose, hat
 
 _PASSES = 2  # a point's row decides where it is seen, and so its row
 _LEAST_PX = 0.02  # a sweep that moves nothing by more is none
@@ -47,11 +47,12 @@ class Sweep:
         """
         away = points - world_from_camera.translation
         moved = away
+        turn = hat(self.turn).T
         for _ in range(_PASSES):
             s = self._share(moved, world_from_camera, camera)
             turned = away - s * self.way
-            across = np.cross(self.turn, turned)
-            moved = turned - s * across + 0.5 * s**2 * np.cross(self.turn, across)
+            across = turned @ turn
+            moved = turned - s * across + 0.5 * s**2 * (across @ turn)
         seen: Array = world_from_camera.translation + moved
         return seen
 

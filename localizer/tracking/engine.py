@@ -1,11 +1,12 @@
 """The dual-thread engine (paper, Sec. 3.2): rendering runs beside localization.
 
 The localization thread takes the newest frame, registers it against the newest reference and
-publishes the estimate. Each estimate wakes the render thread, which predicts the pose at the next
-exposure, renders the reference for it, unless the last one still serves, and has the map loaded
-along the way ahead. Neither waits for a subscriber, and neither dies of an error: errors are
-counted, logged and reported as the engine's health. While no place is known a third thread searches
-for one; what it finds is tried by the localization thread, which goes on trying meanwhile.
+publishes the estimate; meanwhile the next frame's features are extracted on a thread of their own.
+Each estimate wakes the render thread, which predicts the pose at the next exposure, renders the
+reference for it, unless the last one still serves, and has the map loaded along the way ahead.
+None waits for a subscriber, and none dies of an error: errors are counted, logged and reported as
+the engine's health. While no place is known a further thread searches for one; what it finds is
+tried by the localization thread, which goes on trying meanwhile.
 """
 
 from __future__ import annotations
@@ -17,6 +18,7 @@ from collections.abc import Callable
 from dataclasses import replace
 
 from localizer.errors import LocalizerError
+from localizer.tracking.ahead import Ahead, Prepared
 from localizer.tracking.engine_health import EngineHealth, HealthBook
 from localizer.tracking.mailbox import Mailbox
 from localizer.tracking.pipeline import Localizer, stopwatch
@@ -32,11 +34,12 @@ PriorProvider = Callable[[int], PosePrior | None]
 # stop: the place was found otherwise, or the engine ends.
 Searcher = Callable[[Frame, Callable[[], bool]], PosePrior | None]
 
+_FIX_THREADS = ("render", "extract", "localize")
 _TRIED_FRAMES = 5  # with what is known outside, before a search begins
 
 
 class DualThreadEngine:
-    """Runs a `Localizer` on a render thread and a localization thread.
+    """Runs a `Localizer` on a render thread and a localization thread, features ahead of both.
 
     subscribers: called on the localization thread with every estimate; they must not block.
     prior_provider: asked, with a time in ns, for a pose from outside when there is none or when
@@ -57,7 +60,8 @@ class DualThreadEngine:
         self._sought: Mailbox[Frame] = Mailbox()
         self._found: PosePrior | None = None
         self._unknown_frames = 0
-        self._frames: Mailbox[Frame] = Mailbox()
+        self._ahead = Ahead(localizer.extract_query, self._may_extract_ahead)
+        self._registers = False  # whether the last frame was registered: the next will be, too
         self._render_times: Mailbox[int] = Mailbox()
         self._bundle: ReferenceBundle | None = None
         self._interval_ns = _DEFAULT_INTERVAL_NS
@@ -68,6 +72,7 @@ class DualThreadEngine:
         self._turns: dict[str, int] = {}
         self._threads = [
             threading.Thread(target=self._run, args=(self._render_once,), name="render"),
+            threading.Thread(target=self._run, args=(self._extract_once,), name="extract"),
             threading.Thread(target=self._run, args=(self._localize_once,), name="localize"),
         ]
         if searcher is not None:
@@ -75,14 +80,14 @@ class DualThreadEngine:
             self._threads.append(search)
 
     def start(self) -> None:
-        """Start both threads."""
+        """Start the threads."""
         for thread in self._threads:
             thread.start()
 
     def stop(self) -> None:
-        """Stop both threads and wait for them."""
+        """Stop the threads and wait for them."""
         self._stop.set()
-        self._frames.close()
+        self._ahead.close()
         self._render_times.close()
         self._sought.close()
         for thread in self._threads:
@@ -90,17 +95,22 @@ class DualThreadEngine:
 
     def submit(self, frame: Frame) -> None:
         """Offer a frame; an older one that was not yet taken is dropped. Never blocks."""
-        self._frames.put(frame)
+        self._ahead.put(frame)
         self._book.count(frames_in=1)
+
+    @property
+    def is_full(self) -> bool:
+        """Whether the newest frame has not been taken yet: the next one would displace it."""
+        return self._ahead.is_full
 
     @property
     def health(self) -> EngineHealth:
         """A snapshot of the counters."""
-        return self._book.read(self._frames.dropped, self._localizer.optimizer_name)
+        return self._book.read(self._ahead.dropped, self._localizer.optimizer_name)
 
     def turns(self) -> dict[str, int]:
         """When each thread that makes fixes began its newest turn, CLOCK_MONOTONIC ns, by name."""
-        return {n: self._turns[n] for n in ("render", "localize") if n in self._turns}
+        return {n: self._turns[n] for n in _FIX_THREADS if n in self._turns}
 
     def _run(self, once: Callable[[], None]) -> None:
         name = threading.current_thread().name
@@ -152,29 +162,48 @@ class DualThreadEngine:
             self._book.count(references=1)
             self._localizer.prefetch(time_ns)  # last: nothing waits for it
 
+    def _extract_once(self) -> None:
+        self._ahead.prepare(_IDLE_S)
+
+    def _may_extract_ahead(self) -> bool:
+        """Whether a frame's features will be asked for, and may be computed beside another's."""
+        return self._registers and self._localizer.keeps_features
+
     def _localize_once(self) -> None:
-        frame = self._frames.take(_IDLE_S)
-        if frame is None:
+        prepared = self._ahead.take(_IDLE_S)
+        if prepared is None:
             return
+        registered = False
+        try:
+            registered = self._localize(prepared)
+        finally:
+            self._registers = registered
+
+    def _localize(self, prepared: Prepared) -> bool:
+        """Register a frame and publish the estimate; False where there is nothing to do it with."""
+        frame = prepared.frame
         self._seek(frame)
         if not self._has_prior(frame.exposure_time_ns):
-            return
+            return False
         bundle, stage_ms = self._bundle, dict(self._reference_ms)
         try:
             if bundle is None:
-                return
+                return False
             # Where the map ends there is no reference of now: the odometry may carry on.
             anchors = None if self._is_stale(bundle, frame) else bundle.anchors
             if anchors is None and not self._localizer.can_carry:
-                return
-            with stopwatch(stage_ms, "extract"):
-                query = self._localizer.extract_query(frame)
+                return False
+            query, stage_ms["extract"] = prepared.features, prepared.extract_ms
+            if query is None:
+                with stopwatch(stage_ms, "extract"):
+                    query = self._localizer.extract_query(frame)
             estimate = self._localizer.localize(frame, query, anchors)
         finally:  # whatever became of this frame, the next one needs a reference
             self._render_times.put(self._next_exposure(frame))
         latency_ms = (time.monotonic_ns() - frame.exposure_time_ns) * 1e-6
         stage_ms |= estimate.stage_ms | {"latency": latency_ms}
         self._publish(replace(estimate, stage_ms=stage_ms), bundle)
+        return True
 
     def _has_prior(self, time_ns: int) -> bool:
         """Whether there is a prediction to start from.

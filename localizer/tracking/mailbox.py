@@ -24,6 +24,12 @@ class Mailbox(Generic[T]):
         with self._changed:
             return self._dropped
 
+    @property
+    def is_full(self) -> bool:
+        """Whether an item waits, which the next one would displace."""
+        with self._changed:
+            return self._item is not None
+
     def put(self, item: T) -> bool:
         """Place an item, over an older one that nobody took; never waits. False if closed."""
         with self._changed:

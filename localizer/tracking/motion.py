@@ -12,7 +12,6 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
-from filterpy.common import Q_discrete_white_noise
 from filterpy.kalman import predict as kalman_predict
 from filterpy.kalman import update as kalman_update
 from pydantic import BaseModel, ConfigDict, Field
@@ -255,15 +254,7 @@ def _turn_variance(turn: Array, dt: float, config: MotionConfig) -> float:
 
 
 def _process_noise(dt: float, config: MotionConfig) -> Array:
-    """Discrete white-noise acceleration, (12, 12)."""
-    Q = np.zeros((12, 12))
-    for start_index, sigma in (
-        (0, config.acceleration_sigma),
-        (3, config.angular_acceleration_sigma),
-    ):
-        q = Q_discrete_white_noise(2, dt, sigma**2)
-        for axis in range(start_index, start_index + 3):
-            for i in range(2):
-                for j in range(2):
-                    Q[axis + 6 * i, axis + 6 * j] = q[i, j]
-    return Q
+    """Discrete white-noise acceleration, (12, 12) (Bar-Shalom, Estimation, 6.3.2)."""
+    sigmas = np.repeat([config.acceleration_sigma, config.angular_acceleration_sigma], 3)
+    by_derivative = np.array([[0.25 * dt**4, 0.5 * dt**3], [0.5 * dt**3, dt**2]])
+    return np.kron(by_derivative, np.diag(sigmas**2))

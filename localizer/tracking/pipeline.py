@@ -33,7 +33,7 @@ from localizer.render.base import MapRenderer
 from localizer.render.holes import fill_holes
 from localizer.tracking.bridging import Bridging
 from localizer.tracking.motion import OtherSensors
-from localizer.tracking.reference import still_serves
+from localizer.tracking.reference import lead_share, still_serves
 from localizer.tracking.tracker import Tracker, TrackerState
 from localizer.types import (
     Anchors,
@@ -51,6 +51,9 @@ from localizer.types import (
 # The map is loaded for where the motion model leads in so many seconds: what comes next, and as far
 # as a turn rate can be believed at all.
 _LOOK_AHEAD_S = (1.0, 3.0)
+
+# The longest time that a reference is rendered ahead of the frame that it is made for.
+_LEAD_NS = 200_000_000
 
 # A reference view with less of the map in it than this has nothing to register against.
 _MIN_MAP_SHARE = 0.1
@@ -145,6 +148,7 @@ class Localizer:
         self.camera = working_camera(camera, config.width)
         self._undistorter = Undistorter(camera, self.camera)
         self._reference: ReferenceBundle | None = None  # the last one of `track`
+        self._asked_ns = 0  # what time the last reference was asked for
         self._tracker = Tracker(config, self._sensors, self._bridging(config, optimizer))
 
     def _bridging(self, config: LocalizerConfig, optimizer: JNGO) -> Bridging | None:
@@ -189,6 +193,11 @@ class Localizer:
     def can_carry(self) -> bool:
         """Whether `localize` has an answer where there is no reference (None for its anchors)."""
         return self._tracker.can_carry
+
+    @property
+    def keeps_features(self) -> bool:
+        """Whether `extract_query`'s features outlast its next call: a GPU's do not."""
+        return not self._optimizer.on_gpu
 
     @property
     def reference_age_s(self) -> float:
@@ -276,17 +285,31 @@ class Localizer:
         steady = holds and not self._is_loading()
         shift_px = self._config.reference_shift_px
         pose, time_ns = prior.world_from_camera, prior.time_ns
-        if last is not None and steady and still_serves(last, pose, time_ns, shift_px):
+        interval_ns, self._asked_ns = time_ns - self._asked_ns, time_ns
+        if last is None or not steady or shift_px == 0:
+            return self.make_reference(prior, wait=wait)
+        if still_serves(last, pose, time_ns, shift_px):
             return last
-        return self.make_reference(prior, wait=wait)
+        later = self.predict(time_ns + _LEAD_NS)
+        if later is not None:
+            frame = abs(interval_ns) / _LEAD_NS
+            share = lead_share(last, pose, later.world_from_camera, shift_px, frame)
+            later = self.predict(time_ns + round(share * _LEAD_NS)) if share else None
+        return self.make_reference(prior, at=later, wait=wait)
 
-    def make_reference(self, prior: PosePrior, *, wait: bool = False) -> ReferenceBundle:
-        """Render the view at the prior's pose and select its geo-anchors (paper, Eq. 1 and 2)."""
-        view = self._renderer.render(prior.world_from_camera, self.camera, wait=wait)
+    def make_reference(
+        self, prior: PosePrior, *, at: PosePrior | None = None, wait: bool = False
+    ) -> ReferenceBundle:
+        """Render the view at the prior's pose and select its geo-anchors (paper, Eq. 1 and 2).
+
+        at: where the camera will be soon, if the view is to be rendered from there.
+        """
+        pose = (at or prior).world_from_camera
+        view = self._renderer.render(pose, self.camera, wait=wait)
         if np.count_nonzero(view.depth) < _MIN_MAP_SHARE * view.depth.size:
             if not wait and self._is_loading():
                 raise MapLoadingError("the map is being loaded")
-            e, n, u = prior.world_from_camera.translation
+            e, n, u = pose.translation
             raise OutsideMapError(
                 f"the view from east {e:.1f} north {n:.1f} up {u:.1f} m (map frame) does not meet "
                 "the map, as far as it is loaded: if it stays so, check the prior, the map's "
@@ -306,9 +329,10 @@ class Localizer:
 
         They may be on the GPU, and are then valid until the next call.
         """
-        if frame.camera != self._undistorter.source:  # the stream changed its size in flight
-            self._undistorter = Undistorter(frame.camera, self.camera)
-        image = self._undistorter(frame)
+        undistorter = self._undistorter
+        if frame.camera != undistorter.source:  # the stream changed its size in flight
+            undistorter = self._undistorter = Undistorter(frame.camera, self.camera)
+        image = undistorter(frame)
         if self._optimizer.on_gpu and isinstance(self._extractor, DeviceExtractor):
             return self._extractor.extract_on_device(image)
         return self._extractor.extract(image)

@@ -9,6 +9,7 @@ from localizer.types import ReferenceBundle
 
 _PROBES = 64  # anchors whose places in the picture are compared
 _LEAST_PROBES = 16
+_LEAD = 0.75  # of the limit
 _LONGEST_NS = 1_000_000_000  # finer tiles may have come, also for a camera that hovers
 
 
@@ -21,10 +22,31 @@ def still_serves(bundle: ReferenceBundle, pose: Pose, time_ns: int, most_px: flo
     """
     if most_px <= 0 or not 0 <= time_ns - bundle.time_ns <= _LONGEST_NS:
         return False
-    points, pixels = bundle.anchors.points_world, bundle.anchors.pixels
+    return _apart_px(bundle, bundle.view.world_from_camera, pose) <= most_px
+
+
+def lead_share(
+    bundle: ReferenceBundle, pose: Pose, later: Pose, most_px: float, frame: float
+) -> float:
+    """How far on the way from `pose` to `later` the next reference is rendered, 0 to 1.
+
+    A reference serves before and after the camera is where it was rendered: so far ahead that it
+    serves now, with something left for what is not foreseen, it serves nearly twice as long. Where
+    it would serve one frame only without that, it is rendered where that frame is: a few
+    millimetres better. frame: share of the way that lies between two frames.
+    """
+    apart = _apart_px(bundle, pose, later)
+    if apart * frame > most_px:
+        return 0.0
+    return min(_LEAD * most_px / max(apart, 1e-9), 1.0)
+
+
+def _apart_px(bundle: ReferenceBundle, one: Pose, other: Pose) -> float:
+    """How far apart cameras at both poses see the anchors, 95 of 100 of them; inf for too few."""
+    points = bundle.anchors.points_world
     if len(points) < _LEAST_PROBES:
-        return False
-    step = max(1, len(points) // _PROBES)
-    seen, _ = bundle.view.camera.project(pose.inverse.apply(points[::step]))
-    away = np.linalg.norm(seen - pixels[::step], axis=1)  # NaN behind the camera
-    return bool(np.quantile(np.nan_to_num(away, nan=np.inf), 0.95, method="lower") <= most_px)
+        return np.inf
+    some, camera = points[:: max(1, len(points) // _PROBES)], bundle.view.camera
+    seen = [camera.project(pose.inverse.apply(some))[0] for pose in (one, other)]
+    away = np.linalg.norm(seen[0] - seen[1], axis=1)  # NaN behind the camera
+    return float(np.quantile(np.nan_to_num(away, nan=np.inf), 0.95, method="lower"))

@@ -23,6 +23,7 @@ from localizer.geometry.geo import NED_FROM_ENU
 from localizer.geometry.pose import quaternion_from_matrix
 from localizer.geometry.posefile import read_poses, world_from_camera
 from localizer.map.cache.cache import TileCache
+from localizer.tracking.engine import DualThreadEngine
 from mavlink_bridge.errors import RecordError as TlogError
 from mavlink_bridge.link.tlog import read_tlog
 from sitl.demo.kinematic import record_scenario
@@ -87,6 +88,25 @@ def _free_port():
         return s.getsockname()[1]
 
 
+def at_the_engines_pace(submit):
+    """`DualThreadEngine.submit` that holds the feed until every thread has done with the frame,
+    however busy the machine is: a frame that is dropped, or registered to a reference of a second
+    ago, makes another flight than the one that is localized again.
+    """
+
+    def paced(engine, frame):
+        at, deadline_s = time.monotonic_ns(), time.monotonic() + 30.0
+        submit(engine, frame)
+        for thread in ("extract", "localize", "render"):
+            while (begun_ns := engine.turns().get(thread, 0)) <= at:
+                if time.monotonic() > deadline_s:
+                    return
+                time.sleep(1e-3)
+            at = begun_ns
+
+    return paced
+
+
 @pytest.fixture(scope="module")
 def record(small_assets, tmp_path_factory):
     """The folder that a flight of some seconds leaves."""
@@ -107,7 +127,7 @@ def record(small_assets, tmp_path_factory):
             "camera": {
                 "source": str(sequence / "images"),
                 "model": model,
-                "settings": {"realtime": True, "rate_hz": 3.0},  # slower: a busy machine keeps up
+                "settings": {"realtime": True, "rate_hz": 3.0},
             },
             "localizer": {"width": 256},
             "bridge": {
@@ -119,8 +139,11 @@ def record(small_assets, tmp_path_factory):
     )  # fmt: skip
     autopilot = Autopilot(port, row, pose, cache.manifest.geoid_separation_m)
     autopilot.start()
+    paced = at_the_engines_pace(DualThreadEngine.submit)
     try:
-        Companion(config).run()  # until the images end
+        with pytest.MonkeyPatch.context() as patched:
+            patched.setattr(DualThreadEngine, "submit", paced)
+            Companion(config).run()  # until the images end
     finally:
         autopilot.stop()
     return folder / "record"

@@ -132,7 +132,7 @@ class Flight:
 
     def feed_until(self, condition, timeout_s=60.0):
         """Frames until something holds, at the engine's pace: the exposures' clock stands still
-        until both threads have done with a frame, or a starved machine would run through seconds
+        until all threads have done with a frame, or a starved machine would run through seconds
         of flight (and begin searches) between two frames that are looked at.
         """
         deadline = time.monotonic() + timeout_s
@@ -141,7 +141,8 @@ class Flight:
             submitted_ns = time.monotonic_ns()
             self.engine.submit(_frame(self.sequence))
             self.sequence += 1
-            localized_ns = self._turn_after("localize", submitted_ns, deadline)
+            handed_over_ns = self._turn_after("extract", submitted_ns, deadline)
+            localized_ns = self._turn_after("localize", handed_over_ns, deadline)
             self._turn_after("render", localized_ns, deadline)
 
     def _turn_after(self, thread: str, time_ns: int, deadline: float) -> int:
@@ -167,7 +168,7 @@ def flight(request):
 
 def threads() -> set[str]:
     """The engine's that run; others may be an earlier test's."""
-    return {t.name for t in threading.enumerate()} & {"render", "localize"}
+    return {t.name for t in threading.enumerate()} & {"render", "extract", "localize"}
 
 
 def test_reaches_tracking_from_a_prior_and_stops_cleanly(flight):
@@ -176,7 +177,7 @@ def test_reaches_tracking_from_a_prior_and_stops_cleanly(flight):
     estimate = f.estimates[-1]
     assert estimate.accepted
     assert set(estimate.stage_ms) == {"reference", "extract", "register", "latency"}
-    assert threads() == {"render", "localize"}
+    assert threads() == {"render", "extract", "localize"}
     f.engine.stop()
     assert not threads()
 

@@ -13,7 +13,7 @@ from localizer.geometry.camera import Camera
 from localizer.geometry.pose import Pose, so3_exp
 from localizer.registration.result import Registration
 from localizer.tracking.pipeline import Localizer
-from localizer.tracking.reference import still_serves
+from localizer.tracking.reference import lead_share, still_serves
 from localizer.types import (
     Anchors,
     FeatureLevel,
@@ -82,10 +82,12 @@ class _Renderer:
     name = "fake"
 
     def __init__(self) -> None:
-        self.count = 0
+        self.count, self.frame = 0, 0
+        self.rendered: list[tuple[int, Pose]] = []
 
     def render(self, world_from_camera, camera, extra=(), *, wait=False):
         self.count += 1
+        self.rendered.append((self.frame, world_from_camera))
         shape = (camera.height, camera.width)
         depth = np.full(shape, world_from_camera.translation[2], np.float32)
         return RenderedView(np.zeros((*shape, 3), np.uint8), depth, world_from_camera, camera)
@@ -133,7 +135,7 @@ class _Flight:
         """How many references the frames took."""
         before = self.renderer.count
         for k in frames:
-            self.optimizer.east_m = self.step_m * k
+            self.optimizer.east_m, self.renderer.frame = self.step_m * k, k
             image = np.zeros((240, 320, 3), np.uint8)
             self.localizer.track(Frame(image, SECOND_NS + k * SECOND_NS // 10, CAMERA, k))
         return self.renderer.count - before
@@ -143,10 +145,43 @@ def test_a_slow_flight_takes_fewer_references_than_frames_and_a_fast_one_as_many
     slow = _Flight(step_m=2.0 * METRES_PER_PX)
     slow.fly(range(5))
     assert slow.localizer.tracker.standing.state is TrackingState.TRACKING
-    assert slow.fly(range(5, 25)) in (4, 5, 6)  # 2 px a frame, 8 px a reference
+    # 2 px a frame; a reference serves from 6 px before its place to 8 px behind it
+    assert slow.fly(range(5, 25)) in (2, 3)
     fast = _Flight(step_m=10.0 * METRES_PER_PX)
     fast.fly(range(5))
     assert fast.fly(range(5, 15)) == 10
+
+
+def test_it_is_rendered_ahead_and_serves_at_once():
+    flight = _Flight(step_m=4.0 * METRES_PER_PX)
+    flight.fly(range(20))
+    ahead_px = [
+        (pose.translation[0] - flight.step_m * k) / METRES_PER_PX
+        for k, pose in flight.renderer.rendered
+        if k >= 10
+    ]
+    assert ahead_px
+    assert min(ahead_px) > 5.0
+    assert max(ahead_px) < 7.0  # with more than 8 it would not serve the frame it is made for
+
+
+def test_how_far_ahead_it_is_rendered():
+    reference, here = _reference(), _moved()
+    assert lead_share(reference, here, _moved(east_px=12.0), 8.0, 0.5) == pytest.approx(0.5)
+    assert lead_share(reference, here, _moved(east_px=0.01), 8.0, 0.5) == 1.0
+    assert lead_share(reference, here, here, 8.0, 0.5) == 1.0
+    # one frame moves by more than the limit: the reference is that frame's alone
+    assert lead_share(reference, here, _moved(east_px=18.0), 8.0, 0.5) == 0.0
+    few = Anchors(np.zeros((3, 3)), np.zeros((3, 2), np.float32), (), ())
+    assert lead_share(replace(reference, anchors=few), here, here, 8.0, 0.5) == 0.0
+
+
+def test_a_flight_that_needs_one_for_every_frame_has_it_where_the_frame_is():
+    fast = _Flight(step_m=10.0 * METRES_PER_PX)
+    fast.fly(range(15))
+    for k, pose in fast.renderer.rendered:
+        if k >= 5:
+            assert pose.translation[0] == pytest.approx(fast.step_m * k, abs=METRES_PER_PX)
 
 
 def test_every_frame_has_its_own_where_that_is_wanted():
