@@ -1,13 +1,13 @@
 """The paper's tables from the JSON of the benchmarks, as Markdown; nothing is measured anew.
 
     python -m benchmarks.tables [--targets a.json ...] [--ablation basin.json] [--axes axes.json]
-        [--throughput out.json] [--out tables.md]
+        [--optimizer out.json] [--depths depths.json] [--throughput out.json] [--out tables.md]
 
 Table 2 is `python -m benchmarks.places table`. --targets: of `benchmarks.targets` (Table 3, flights
 of one height pooled). --ablation, --axes: of `benchmarks.basin --json` (Table 4; Table 6 and
-Fig. 10). --throughput: of `benchmarks.throughput run`. The paper's Table 5 describes its network,
-whose weights are not public; Table 7 is printed by `benchmarks.optimizer`, and Fig. 14 has no
-benchmark. The paper's own figures stand beside as such.
+Fig. 10). --optimizer: of `benchmarks.optimizer --json` (Table 7). --depths: of `benchmarks.depths`
+(Fig. 14). --throughput: of `benchmarks.throughput run`. The paper's Table 5 describes its network,
+whose weights are not public. The paper's own figures stand beside as such.
 """
 
 from __future__ import annotations
@@ -15,6 +15,7 @@ from __future__ import annotations
 import json
 from collections import defaultdict
 from collections.abc import Callable, Iterator, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -102,6 +103,34 @@ def axes_table(path: Path) -> Iterator[str]:
     yield f"| *paper, Table 6: limits* | *{limits}* |" + " |" * len(sizes)
 
 
+def optimizer_table(path: Path) -> Iterator[str]:
+    """Table 7: milliseconds of one LM iteration by backend and picture size."""
+    document = _read(path)
+    yield (
+        "| milliseconds of an iteration | "
+        + " | ".join(f"{s} px" for s in document["sizes"])
+        + " |"
+    )
+    yield "|---" * (len(document["sizes"]) + 1) + "|"
+    for name, values in document["iteration_ms"].items():
+        cells = ["-" if v is None else f"{v:.2f}" for v in values]
+        yield f"| {name} | {' | '.join(cells)} |"
+    for name, values in document["paper_ms"].items():
+        yield f"| *{name}* | {' | '.join(f'*{v:.2f}*' for v in values)} |"
+
+
+def depths_table(path: Path) -> Iterator[str]:
+    """Fig. 14 in numbers: how far two views' depths of one surface differ, both ways."""
+    yield "| height, m | pixels | median | 95 % | 99 % | within 1 % | hidden from the other view |"
+    yield "|---|---|---|---|---|---|---|"
+    for r in _read(path)["rows"]:
+        quantiles = " | ".join(f"{r[k]:.1e}" for k in ("median", "p95", "p99"))
+        yield (
+            f"| {r['height_m']:.0f} | {r['pixels']} | {quantiles} | "
+            f"{r['within_1_percent']:.2f} % | {r['hidden_percent']:.1f} % |"
+        )
+
+
 def throughput_table(path: Path) -> Iterator[str]:
     """The engine's rate, latency and processor time, then the stages of a frame."""
     document = _read(path)["rows"]
@@ -155,18 +184,20 @@ def main() -> None:
     parser.add_argument("--targets", type=existing, nargs="+", help="JSON of benchmarks.targets")
     parser.add_argument("--ablation", type=existing, help="JSON of benchmarks.basin ablation")
     parser.add_argument("--axes", type=existing, help="JSON of benchmarks.basin axes")
+    parser.add_argument("--optimizer", type=existing, help="JSON of benchmarks.optimizer")
+    parser.add_argument("--depths", type=existing, help="JSON of benchmarks.depths")
     parser.add_argument("--throughput", type=existing, help="JSON of benchmarks.throughput run")
     parser.add_argument("--out", type=output, help="Markdown; none: printed")
     args = parser.parse_args()
-    made = []
-    if args.targets:
-        made.append(section("Targets (the paper's Table 3)", lambda: targets_table(args.targets)))
-    if args.ablation:
-        made.append(section("Ablation (Table 4)", lambda: ablation_table(args.ablation)))
-    if args.axes:
-        made.append(section("Convergence (Table 6, Fig. 10)", lambda: axes_table(args.axes)))
-    if args.throughput:
-        made.append(section("Throughput", lambda: throughput_table(args.throughput)))
+    wanted = (
+        (args.targets, "Targets (the paper's Table 3)", targets_table),
+        (args.ablation, "Ablation (Table 4)", ablation_table),
+        (args.axes, "Convergence (Table 6, Fig. 10)", axes_table),
+        (args.optimizer, "One iteration (Table 7)", optimizer_table),
+        (args.depths, "Geometric consistency (Fig. 14)", depths_table),
+        (args.throughput, "Throughput", throughput_table),
+    )
+    made = [section(title, partial(lines, given)) for given, title, lines in wanted if given]
     if not made:
         parser.error("name the JSON of at least one benchmark: see --help")
     text = "\n".join(made)

@@ -1,6 +1,6 @@
 """Milliseconds per LM iteration and per registration, beside the paper's Table 7.
 
-    python -m benchmarks.optimizer [--threads 2] [--quick]
+    python -m benchmarks.optimizer [--threads 2] [--quick] [--json out.json]
 
 M = 144 hypotheses, N = 500 anchors, C = 32 channels, random smooth features, one process. "naive"
 is the obvious batched PyTorch: gather C x 6 Jacobians of every anchor and hypothesis, then einsum;
@@ -10,6 +10,7 @@ its normal equations and one 6x6 solution; a registration counts iterations + 1 
 
 from __future__ import annotations
 
+import json
 import os
 import time
 from collections.abc import Callable, Sequence
@@ -19,7 +20,7 @@ import numpy as np
 from rich.console import Console
 from rich.table import Table
 
-from benchmarks.common.arguments import Parser, whole
+from benchmarks.common.arguments import Parser, output, whole
 from benchmarks.common.named_errors import named_errors
 from benchmarks.optimizer.gpu import print_tables
 from benchmarks.optimizer.problem import (
@@ -123,14 +124,13 @@ def schedule(
     return milliseconds(run, repeats)
 
 
-def iteration_table(problems: Problems, counts: Sequence[int], *, quick: bool) -> Table:
-    """Milliseconds per LM iteration of every backend, beside the paper's."""
-    table = Table(title=f"ms per LM iteration, M={HYPOTHESES} N={ANCHORS} C={CHANNELS}")
-    for heading in ("backend", *(f"{s} x {s}" for s in SIZES), "times faster than naive at 256"):
-        table.add_column(heading, justify="right")
+Rows = dict[str, list[float | None]]
+
+
+def iteration_rows(problems: Problems, counts: Sequence[int], *, quick: bool) -> Rows:
+    """Milliseconds per LM iteration at `SIZES` of every backend."""
     swarm = make_swarm()
     rows = naive_rows(problems, counts, sizes=(256,) if quick else SIZES)
-    baseline = list(rows.values())[-1][1] if rows else None
     few = (swarm[0][:4], swarm[1][:4])
     reference = ReferenceBackend()
     rows[reference.name] = [
@@ -141,6 +141,16 @@ def iteration_table(problems: Problems, counts: Sequence[int], *, quick: bool) -
         rows[backend.name] = [
             per_iteration(backend, problems[s], swarm, repeats_of(quick)) for s in SIZES
         ]
+    return rows
+
+
+def iteration_table(rows: Rows) -> Table:
+    """The rows beside the paper's."""
+    table = Table(title=f"ms per LM iteration, M={HYPOTHESES} N={ANCHORS} C={CHANNELS}")
+    for heading in ("backend", *(f"{s} x {s}" for s in SIZES), "times faster than naive at 256"):
+        table.add_column(heading, justify="right")
+    naive = [values[1] for name, values in rows.items() if name.startswith("naive")]
+    baseline = naive[-1] if naive else None
     for name, values in rows.items():
         ratio = f"{baseline / values[1]:.0f}" if baseline and values[1] else "-"
         table.add_row(name, *("-" if v is None else f"{v:.2f}" for v in values), ratio)
@@ -149,13 +159,11 @@ def iteration_table(problems: Problems, counts: Sequence[int], *, quick: bool) -
     return table
 
 
-def naive_rows(
-    problems: Problems, counts: Sequence[int], sizes: Sequence[int]
-) -> dict[str, list[float | None]]:
+def naive_rows(problems: Problems, counts: Sequence[int], sizes: Sequence[int]) -> Rows:
     """Milliseconds of one naive iteration by threads and size, None of what was not measured; no
     row without PyTorch.
     """
-    rows: dict[str, list[float | None]] = {}
+    rows: Rows = {}
     for threads in counts:
         name = f"naive PyTorch ({threads} thread{'s' if threads > 1 else ''})"
         try:
@@ -210,6 +218,7 @@ def main() -> None:
         "--threads", type=whole(1, 256), default=min(2, os.cpu_count() or 1), help="beside one"
     )
     parser.add_argument("--quick", action="store_true", help="fewer repeats, 256 px only for naive")
+    parser.add_argument("--json", type=output, help="the iterations' figures (the paper's Table 7)")
     arguments = parser.parse_args()
     problems = {size: make_problem(size) for size in SIZES}
     counts = sorted({1, arguments.threads})
@@ -219,7 +228,11 @@ def main() -> None:
         f"{os.cpu_count()} cores, load average {load:.1f} at the start: idle is below 0.5"
     )
     repeats = repeats_of(arguments.quick)
-    console.print(iteration_table(problems, counts, quick=arguments.quick))
+    rows = iteration_rows(problems, counts, quick=arguments.quick)
+    console.print(iteration_table(rows))
+    if arguments.json:
+        document = {"sizes": SIZES, "iteration_ms": rows, "paper_ms": PAPER_TABLE_7, "load": load}
+        arguments.json.write_text(json.dumps(document, indent=1) + "\n")
     console.print(schedule_table(problems, counts, repeats))
     console.print(registration_table(counts, repeats))
     print_tables(console, problems, make_swarm())
