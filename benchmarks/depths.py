@@ -146,7 +146,10 @@ def draw(found: list[dict[str, object]], path: Path) -> None:
 def main() -> None:
     parser = Parser(__doc__)
     parser.add_argument("map", type=existing, help="tile cache")
-    parser.add_argument("--heights", type=number(20, 5000), nargs="+", default=[100, 200, 400, 800])
+    parser.add_argument(
+        "--heights", type=number(20, 5000), nargs="+", default=[100, 200, 400, 800],
+        help="above ground, m",
+    )  # fmt: skip
     parser.add_argument("--pairs", type=whole(1, 10_000), default=6, help="of each height")
     parser.add_argument("--side", type=number(50, 1e6), default=1600.0, help="of the map, m")
     parser.add_argument("--json", type=output, help="every figure")

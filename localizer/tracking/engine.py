@@ -41,6 +41,8 @@ _TRIED_FRAMES = 5  # with what is known outside, before a search begins
 class DualThreadEngine:
     """Runs a `Localizer` on a render thread and a localization thread, features ahead of both.
 
+    Above 200 lines: each thread's turn is a few lines here, and they share one state.
+
     subscribers: called on the localization thread with every estimate; they must not block.
     prior_provider: asked, with a time in ns, for a pose from outside when there is none or when
     tracking is LOST. searcher: finds a place without a prior, on a thread of its own.
