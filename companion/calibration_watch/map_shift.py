@@ -27,6 +27,7 @@ _LEAST_BLOCKS = 6
 _BIAS_FLOOR_M = 0.5  # per axis: of the receiver, for minutes, however good it says it is
 _UNTOLD_ACCURACY_M = 2.5  # of a receiver that does not say
 _SIGNIFICANT = 11.83  # chi-square of two degrees of freedom, 99.73 %
+_WAITS_NS, _WAITING = 700_000_000, 64  # until the EKF's report of the exposure is there
 _LARGEST_M = 15.0  # beyond it the map is not shifted but wrong: the guardian's matter
 _AGAIN_M = 2.0  # by which another estimate is told anew
 _OUTLIER = 3.0  # robust sigmas of a block's median
@@ -107,6 +108,7 @@ class MapShift:
         self._vehicle, self._policy, self._event = vehicle, policy, event
         self._gnss_is_ours = gnss_is_ours
         self._lock = threading.Lock()
+        self._waiting: deque[VisionFix] = deque(maxlen=_WAITING)
         self._block: list[tuple[float, float]] = []
         self._block_ns = 0
         self._blocks: deque[Array] = deque(maxlen=_BLOCKS)
@@ -140,7 +142,9 @@ class MapShift:
     def judge(self, seen: PoseEstimate, fix: VisionFix) -> VisionFix:
         """Learn from the fix, and apply what is known, if that is the policy."""
         if seen.state is TrackingState.TRACKING and not self._gnss_is_ours:
-            self._learn(fix)
+            self._waiting.append(fix)
+        while self._waiting and fix.time_ns - self._waiting[0].time_ns >= _WAITS_NS:
+            self._learn(self._waiting.popleft())
         return self._shifted(fix) if self._policy == "apply" else fix
 
     def _learn(self, fix: VisionFix) -> None:

@@ -17,12 +17,14 @@ from mavlink_bridge.vehicle.origin import north_east, offset
 HOME = (47.397742, 8.545594)
 HZ = 10
 SECOND = 10**9
+LATENCY_NS = 150_000_000  # from the exposure to the judgement
+REPORT_NS, REPORTED_NS = 200_000_000, 70_000_000  # GLOBAL_POSITION_INT at 5 Hz, the first of them
 
 
 @dataclass
 class Flight:
     """Circles for a while; GNSS has a bias, an error that wanders, and noise. It is lost at
-    `lost_s`.
+    `lost_s`. As the bridge's, its places are known up to the vehicle's newest report.
     """
 
     shift: tuple[float, float]
@@ -32,6 +34,7 @@ class Flight:
     said: list[str] = field(default_factory=list)
     fixes: list[VisionFix] = field(default_factory=list)
     _now: int = 0
+    _clock_ns: int = 0
 
     def __post_init__(self) -> None:
         rng = np.random.default_rng(self.seed)
@@ -46,7 +49,8 @@ class Flight:
 
     def gnss_place_at(self, time_ns: int) -> tuple[float, ...] | None:
         k = round(time_ns * 1e-9 * HZ)
-        if k / HZ >= self.lost_s:
+        newest_ns = (self._clock_ns - REPORTED_NS) // REPORT_NS * REPORT_NS + REPORTED_NS
+        if k / HZ >= self.lost_s or time_ns > newest_ns:
             return None
         keep = 1.0 - 1.0 / (30.0 * HZ)  # half a minute
         self._wander = keep * self._wander + self._rng.normal(0, 0.3 * np.sqrt(2 / 300), 2)
@@ -63,6 +67,7 @@ class Flight:
         for k in range(self._now, self._now + round(seconds * HZ)):
             place = np.array(self.true(k)) + self.shift + self._rng.normal(0, 0.1, 2)
             fix = VisionFix(k * SECOND // HZ, *offset(*HOME, *place), 550.0)
+            self._clock_ns = fix.time_ns + LATENCY_NS
             self.fixes.append(judge.judge(seen, fix))
         self._now += round(seconds * HZ)
 
