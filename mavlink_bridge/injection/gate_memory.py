@@ -83,6 +83,7 @@ class GateMemory:
         while True:
             self._wake.wait(_RENEW_S if self._channel is not None else None)
             self._wake.clear()
+            stopping = self._stopping  # before the write: an order to end that comes in it is next
             try:
                 if self._channel is not None:
                     self._write(self._channel)
@@ -93,7 +94,7 @@ class GateMemory:
                 if known is not False:
                     _log.warning("the gate's state is not kept: %s: %s", self._path, error)
                 known = False
-            if self._stopping:
+            if stopping:
                 return
 
     def _write(self, by_channel: bool) -> None:

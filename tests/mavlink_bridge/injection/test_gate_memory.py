@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import os
 import signal
 import subprocess
 import sys
+import threading
 import time
 from pathlib import Path
 from typing import Any
@@ -102,6 +104,27 @@ def test_a_damaged_file_or_another_users_is_ignored(tmp_path: Path, text: str) -
     path.chmod(0o666)
     assert memory.recall() is None
     memory.stop()
+
+
+def test_an_orderly_end_in_the_middle_of_a_write_leaves_no_open_gate(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The write was finished after the order to end, and the next start injected unasked."""
+    path, flush, ends = tmp_path / "gate.json", os.fsync, threading.Event()
+
+    def ordered_to_end(descriptor: int) -> None:
+        flush(descriptor)
+        if not ends.is_set():
+            ends.set()
+            with contextlib.suppress(RuntimeError):  # a thread does not wait for itself
+                memory.stop()
+
+    monkeypatch.setattr(os, "fsync", ordered_to_end)
+    memory = GateMemory(path)
+    memory.opened(by_channel=False)
+    assert ends.wait(20.0)
+    memory.stop()
+    assert not path.exists()
 
 
 def _left_open(path: Path) -> None:
