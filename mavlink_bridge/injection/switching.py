@@ -154,12 +154,10 @@ class SourceSwitch:
         fault = gnss_fault(
             state, vision if fresh else None, self._config.inconsistency_sigmas, now_ns
         )
-        if fault is None:
-            self._bad_since_ns = None
-            self._good_since_ns = self._good_since_ns or now_ns
-        else:
-            self._good_since_ns = None
-            self._bad_since_ns = self._bad_since_ns or now_ns
+        self._bad_since_ns = None if fault is None else self._bad_since_ns or now_ns
+        # Without vision nobody contradicts a spoofed receiver that says it is well.
+        good_gnss = fault is None and fresh
+        self._good_since_ns = (self._good_since_ns or now_ns) if good_gnss else None
         # As far as GNSS alone is asked: vision's word against it does not count once that is gone.
         sound = fault is None or not fault.reason.startswith(("GNSS lost", "GNSS glitch"))
         self._sound_since_ns = (self._sound_since_ns or now_ns) if sound else None

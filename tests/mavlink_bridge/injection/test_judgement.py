@@ -250,6 +250,16 @@ def test_back_to_gnss_only_if_configured_and_after_long_health() -> None:
     assert [order.source_set for _, order in orders] == [1]
 
 
+def test_no_return_to_a_far_receiver_of_which_nobody_says_that_it_is_bad() -> None:
+    """Vision ended, and with it the only word against a spoofed receiver that says it is well."""
+    back = SourceSwitch(CONFIG.model_copy(update={"return_to_gnss": True}))
+    drive(back, 5.0, north=60.0)
+    assert back.current == 2
+    assert drive(back, 60.0, 5.0, seen=False, ekf=60.0) == []
+    orders = drive(back, 12.0, 65.0)
+    assert [order.source_set for _, order in orders] == [1]
+
+
 def test_healthy_gnss_is_not_left_for_a_wrong_map() -> None:
     """The EKF's inertial navigation is with the receiver: two against one."""
     switch = SourceSwitch(CONFIG)
