@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import threading
 import time
 from collections.abc import Callable
@@ -10,9 +11,13 @@ from companion.sources import FrameSource
 from localizer.types import Frame
 
 
+_log = logging.getLogger(__name__)
+
+
 class Feed:
     """Hands every frame of a source on. ended: set when the source has no more; error: what ended
-    it, None for a regular end.
+    it, None for a regular end. failures: frames on which whoever takes them failed; none of that
+    ends the flight.
     """
 
     def __init__(self, source: FrameSource, take: Callable[[Frame], None]) -> None:
@@ -20,6 +25,7 @@ class Feed:
         self._take = take
         self.ended = threading.Event()
         self.error: Exception | None = None
+        self.failures = 0
         self._taken_ns: int | None = None
         self._thread = threading.Thread(target=self._run, name="feed")
 
@@ -42,8 +48,16 @@ class Feed:
         try:
             for frame in self._source.frames():
                 self._taken_ns = time.monotonic_ns()
-                self._take(frame)
+                self._hand_on(frame)
                 self._taken_ns = None
         except Exception as error:
             self.error = error
         self.ended.set()
+
+    def _hand_on(self, frame: Frame) -> None:
+        try:
+            self._take(frame)
+        except Exception:  # a part's fault, which the others and the next frames do not share
+            self.failures += 1
+            if self.failures in (1, 10, 100, 1000):
+                _log.exception("a part failed on a frame (%d times)", self.failures)
