@@ -18,7 +18,7 @@ from typing import Any, Protocol
 
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
-from mavlink_bridge.errors import BridgeStateError, EndpointError
+from mavlink_bridge.errors import BridgeStateError
 from mavlink_bridge.link import signing
 from mavlink_bridge.link.clock import monotonic_ns, utc_us
 from mavlink_bridge.link.framing import FrameReader
@@ -231,7 +231,7 @@ class Link:
     def _try_open(self) -> Transport | None:
         try:
             return self._with_peer(self._open(self.endpoint))
-        except (OSError, EndpointError) as error:
+        except Exception as error:  # not OSError alone: a name or baud rate that a driver refuses
             self.counters.open_failures += 1
             if self.counters.open_failures == 1:
                 _log.warning(

@@ -371,6 +371,27 @@ def test_serial_port_both_ways_and_unplugged(
     assert sleep_until(lambda: link.counters.open_failures > 0, 30.0)
 
 
+def test_whatever_opening_raises_it_is_tried_again() -> None:
+    """A host name with an empty label is a UnicodeError, an odd baud rate a ValueError: the thread
+    ended, and with it every position, untold.
+    """
+    refusals = iter([UnicodeError("label empty or too long"), ValueError("invalid baud rate")])
+
+    def opener(endpoint: Endpoint) -> Any:
+        error = next(refusals, None)
+        if error is not None:
+            raise error
+        return open_transport(endpoint)
+
+    link = Link(Endpoint.parse("udpin:127.0.0.1:0"), Recorder(), LinkOptions(opener=opener))
+    link.start()
+    try:
+        assert sleep_until(lambda: link.connected, 30.0)
+    finally:
+        link.stop()
+    assert link.counters.open_failures == 2
+
+
 def test_failing_handler_is_counted_and_the_link_lives(
     start: Callable[..., tuple[Link, Recorder]],
 ) -> None:
