@@ -194,7 +194,9 @@ class Bridge:
         self._fc.outcome.doubt = why
 
     def forbid(self, why: str) -> None:
-        """Until it is called with an empty text, injection and a switch to vision do not begin."""
+        """Until it is called with an empty text, injection and a switch to vision do not begin, but
+        by the pilot's gate (mode ``rc``) or `injection.force`.
+        """
         self._fc.forbid(why)
 
     def look(self, view: CameraView) -> None:

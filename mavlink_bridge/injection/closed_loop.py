@@ -94,7 +94,10 @@ class ClosedLoopCheck:
         difference = differences[len(differences) // 2] if differences else None
         span_s = (recent[-1][0] - recent[0][0]) * 1e-9
         rate = (len(recent) - 1) / span_s if span_s > 0.0 else 0.0
-        reason = self._reason(rate, state, difference, recent[-1][3])
+        sigma = recent[-1][3]
+        reason = self._reason(rate, state, difference, sigma)
+        if difference is not None and _is_there(difference, sigma):
+            self._repeats = 0  # another jump may be missed as often
         return LoopVerdict(not reason, reason, difference)
 
     def waiting(self) -> dict[str, int]:
@@ -119,7 +122,7 @@ class ClosedLoopCheck:
             return False
         self._jump_ns = None
         distance, sigma = sorted(after)[len(after) // 2]
-        if distance <= _JUMP_SIGMAS * sigma + _JUMP_SLACK_M:
+        if _is_there(distance, sigma):
             self._repeats = 0
             return False
         self._repeats += 1
@@ -164,3 +167,8 @@ class ClosedLoopCheck:
             ),
         )
         return next((reason for holds, reason in reasons if holds), "")
+
+
+def _is_there(distance_m: float, sigma_m: float) -> bool:
+    """Whether the EKF is where it was told to jump to."""
+    return distance_m <= _JUMP_SIGMAS * sigma_m + _JUMP_SLACK_M

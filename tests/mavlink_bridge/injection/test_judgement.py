@@ -168,6 +168,28 @@ def test_no_verdict_before_it_has_settled_or_after_sending_ended() -> None:
     assert check.verdict(60 * SECOND, vehicle(), lambda _: (0.0, 0.0, 0.0)) is None
 
 
+def test_a_jump_after_one_that_was_given_up_is_repeated_again() -> None:
+    """The five repeats of the first were those of the whole flight."""
+    check, now, counter, repeats = ClosedLoopCheck("odometry"), 0, 0, []
+
+    def fly(seconds: float, off: float) -> None:
+        nonlocal now, counter
+        for _ in range(int(seconds * 10)):
+            now += 100 * MS
+            check.sent(now - 100 * MS, now, 0.0, 0.0, 0.5, counter)
+            check.verdict(now, vehicle(), lambda _: (off, 0.0, -60.0))
+            if check.jump_missed():
+                repeats.append(now)
+                counter += 1
+
+    fly(5.0, off=0.0)
+    for _ in range(2):
+        counter, repeats = counter + 1, []
+        fly(30.0, off=20.0)  # not to be moved
+        assert 5 <= len(repeats) <= 8
+        fly(10.0, off=0.0)  # it came by itself
+
+
 # --- source switch ------------------------------------------------------------------------------
 
 CONFIG = SourceSwitchConfig(enabled=True, bad_after_s=1.5, good_after_s=10.0)
