@@ -10,7 +10,6 @@ from collections.abc import Callable
 from companion.sources import FrameSource
 from localizer.types import Frame
 
-
 _log = logging.getLogger(__name__)
 
 
