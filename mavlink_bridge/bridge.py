@@ -66,6 +66,8 @@ class Bridge:
     on_track: called (in a link's thread; must return at once) when the operator asks for tracking.
     on_hint: called likewise when the operator says where the vehicle is; whether it can be used.
     on_text: called likewise with every line for the operator (severity, text), for a record.
+    on_vehicle_text: called likewise with every STATUSTEXT of the autopilot (severity, text, sender
+    as "system/component"), long ones in their parts.
     opener: opens the links' transports; raises OSError or EndpointError while it cannot.
     Raises errors of `mavlink_bridge.errors` for keys, files and endpoints that cannot be used.
     """
@@ -78,6 +80,7 @@ class Bridge:
         on_track: Callable[[TrackRequest], None] | None = None,
         on_hint: Callable[[PlaceHint], bool] | None = None,
         on_text: Callable[[int, str], None] = lambda _severity, _text: None,
+        on_vehicle_text: Callable[[int, str, str], None] = lambda _severity, _text, _sender: None,
         opener: Callable[[Endpoint], Transport] = open_transport,
     ) -> None:
         self._config = config
@@ -110,6 +113,7 @@ class Bridge:
             VehicleWatch(self.say, gate.announce if gate is not None else lambda: None),
             gate,
             LookAt(config, geoid_separation_m, self.say),
+            on_vehicle_text,
         )
         self._fc = FlightControllerEnd(shared)
         make = _LinkMaker(config, self._recorder, opener)

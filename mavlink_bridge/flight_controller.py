@@ -158,6 +158,9 @@ class FlightControllerEnd:
             self._acknowledged(link, message)
         elif self._tracker.handle(message, time_ns):
             self._rebooted()
+        elif kind == "STATUSTEXT":
+            sender = f"{message.get_srcSystem()}/{message.get_srcComponent()}"
+            self._shared.on_vehicle_text(int(message.severity), str(message.text), sender)
         elif kind == "RC_CHANNELS" and self._shared.gate is not None:
             self._shared.gate.channels(self._tracker.snapshot(time_ns).rc_channels_us)
 

@@ -34,6 +34,7 @@ class Shared:
     watch: VehicleWatch
     gate: InjectionGate | None
     look: LookAt
+    on_vehicle_text: Callable[[int, str, str], None] = lambda _severity, _text, _sender: None
     target_numbers: Iterator[int] = field(default_factory=lambda: count(1))
     """Of clicked targets, over all links; none is given twice."""
 

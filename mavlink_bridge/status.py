@@ -12,7 +12,7 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from mavlink_bridge.link.clock import monotonic_ns
 from mavlink_bridge.messages import HealthLevel, without_figures
-from mavlink_bridge.texts import FloodBrake, Settling
+from mavlink_bridge.texts import Settling
 
 _log = logging.getLogger(__name__)
 
@@ -45,7 +45,6 @@ class OperatorStatus:
         self._text_lock = threading.Lock()
         self._health = (HealthLevel.STARTING, "")
         self._settling = Settling()
-        self._brake = FloodBrake()
         self._told_ns: dict[tuple[HealthLevel, str], int] = {}
         self._last_told = self._health
         self._texts: deque[tuple[int, str]] = deque(maxlen=_TEXTS)
@@ -76,13 +75,10 @@ class OperatorStatus:
             if news:
                 self._last_told, self._told_ns[key] = key, now_ns
         if news and tell:
-            self.say(_SEVERITY[level], f"PiLoT: {text or level.value}", now_ns)
+            self.say(_SEVERITY[level], f"PiLoT: {text or level.value}")
 
-    def say(self, severity: int, text: str, now_ns: int | None = None) -> None:
-        """STATUSTEXT, and the log; the same line three times in 10 s at most."""
-        with self._text_lock:
-            if not self._brake.lets(text, monotonic_ns() if now_ns is None else now_ns):
-                return
+    def say(self, severity: int, text: str) -> None:
+        """STATUSTEXT, and the log."""
         self._texts.append((severity, text))
         grave = severity <= mavlink.MAV_SEVERITY_WARNING
         _log.log(logging.WARNING if grave else logging.INFO, text)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections import deque
 from collections.abc import Callable, Mapping
 
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
@@ -10,7 +9,6 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 from mavlink_bridge.messages import without_figures
 
 _RELAPSE_NS = 8_000_000_000
-_LINES = 256
 
 
 class Settling:
@@ -41,33 +39,6 @@ class Settling:
         if now_ns - self._bad_ns < self._wait_ns:
             return False
         self._bad_ns, self._over_ns = None, now_ns
-        return True
-
-
-class FloodBrake:
-    """The same line, figures aside, at most so often in a while.
-
-    Whoever can make the vehicle's clock run back made "flight controller rebooted" come ten times a
-    second: nothing else was to be read.
-    """
-
-    def __init__(self, most: int = 3, within_s: float = 10.0) -> None:
-        self._most, self._within_ns = most, int(within_s * 1e9)
-        self._told_ns: dict[str, deque[int]] = {}
-        self.held = 0
-        """Lines that were not told."""
-
-    def lets(self, text: str, now_ns: int) -> bool:
-        """Whether a line may be told now; it counts as told then."""
-        line = without_figures(text)
-        times = self._told_ns.pop(line, deque(maxlen=self._most))
-        self._told_ns[line] = times  # the newest last
-        if len(self._told_ns) > _LINES:
-            self._told_ns.pop(next(iter(self._told_ns)))
-        if len(times) == self._most and now_ns - times[0] < self._within_ns:
-            self.held += 1
-            return False
-        times.append(now_ns)
         return True
 
 

@@ -16,7 +16,7 @@ import typer
 from rich.console import Console
 from rich.markup import escape
 
-from companion.errors import CompanionError
+from companion.errors import CompanionError, ReportError
 from companion.reporting.report import write_page
 from companion.terminal.links import file_link
 from companion.terminal.steps import shown_steps
@@ -24,7 +24,7 @@ from localizer.errors import LocalizerError
 from localizer.synth.appearance.model import CONDITIONS
 from sitl.demo.assets import FlightAssets, prepare
 from sitl.demo.companion_process import THIS_PROGRAM, free_console_port
-from sitl.demo.flight import Onlookers, fly
+from sitl.demo.flight import FlightRecord, Onlookers, fly
 from sitl.demo.kinematic import record_scenario
 from sitl.demo.progress import LogProgress, shown_progress
 from sitl.demo.report import make_report, print_report
@@ -37,6 +37,7 @@ from sitl.demo.scenario import (
     named_scenario,
     scenario_names,
 )
+from sitl.demo.script import FlightError
 from sitl.errors import SimulationError
 from sitl.operator.run import ClickOptions, fly_clicks, summary
 from sitl.rehearsal.rehearse import rehearse
@@ -132,8 +133,7 @@ def demo(
         )
         program = shlex.split(companion) if companion else THIS_PROGRAM
         record = fly(assets, script, kinds[fc], seed, out, onlookers, program)
-    print_report(make_report(record, script, seed), out)
-    console.print("open:", file_link(write_page(out).resolve()), soft_wrap=True)
+    _report(console, record, script, seed)
 
 
 @app.command()
@@ -284,6 +284,21 @@ def _world_of(
 ) -> FlightAssets:
     with shown_progress(console) as progress:
         return prepare(seed, worlds, progress, script.world_m, ideal, script.world)
+
+
+def _report(console: Console, record: FlightRecord, script: Scenario, seed: int) -> None:
+    """Of a flight that broke off, too: FlightError then says why, after its report."""
+    try:
+        report = make_report(record, script, seed)
+    except ReportError as error:
+        if record.broken is None:
+            raise
+        raise FlightError(f"{record.broken}; {error}") from error
+    print_report(report, record.folder)
+    console.print("open:", file_link(write_page(record.folder).resolve()), soft_wrap=True)
+    if report.broken is not None:
+        cause = "" if report.slow is None else f"; likely because {report.slow}"
+        raise FlightError(f"{report.broken}{cause}")
 
 
 def _clear(out: Path) -> None:

@@ -35,7 +35,7 @@ import yaml
 
 from benchmarks.common.arguments import Parser, existing, output, whole
 from benchmarks.common.named_errors import named_errors
-from benchmarks.console.chromium import NOTE_AGES, opened_browser
+from benchmarks.console.chromium import NOTE_AGES, ages, opened_browser
 from benchmarks.console.vehicle import Sequence, Vehicle, begun_ns
 from companion.errors import ReportError
 from companion.offline.tables import read_columns
@@ -122,6 +122,7 @@ class BrowserPage(Page):
         super().__init__(listen, pictures=True)
         self._nice = nice
         self._fresh = threading.Event()
+        self.shares: dict[str, float] = {}
         self.complaints: list[str] = []
 
     def forget(self) -> None:
@@ -144,7 +145,8 @@ class BrowserPage(Page):
                     self._fresh.clear()
                     page.evaluate("window.measured.length = 0")
                 shown = page.evaluate("window.measured")
-                self.ages_ms = [at - exposed for at, exposed in shown]
+                self.ages_ms = [times[-1] - times[0] for times in shown]
+                self.shares = ages(shown)
                 used = page.evaluate("window.consoleLinkS ?? null")
                 if used is not None:
                     self.link_s.append(used)
@@ -204,6 +206,8 @@ def fly(work: Work, condition: Condition, folder: Path) -> dict[str, Any]:
         cost["frames_per_s"] = len(page.ages_ms) / elapsed
         for name, q in (("p50", 50), ("p95", 95), ("max", 100)):
             cost[f"age_{name}_ms"] = float(np.percentile(page.ages_ms or [np.nan], q))
+        if isinstance(page, BrowserPage):
+            cost |= page.shares
     return cost | quality(record, work.sequence)
 
 

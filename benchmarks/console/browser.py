@@ -28,11 +28,9 @@ import time
 from pathlib import Path
 from typing import Any, Literal
 
-import numpy as np
-
 from benchmarks.common.arguments import Parser, existing, output, whole
 from benchmarks.common.named_errors import named_errors
-from benchmarks.console.chromium import NOTE_AGES, opened_browser
+from benchmarks.console.chromium import NOTE_AGES, ages, opened_browser
 from companion.errors import ReportError
 
 Condition = Literal["no page", "one page"]
@@ -178,15 +176,11 @@ def _until(page: Any, demo: Demo, holds: Any, what: str) -> None:
 
 
 def _ages(shown: list[list[float]]) -> dict[str, float]:
-    """shown: when, and exposed when, of each picture; ms of UTC."""
-    times = np.array(shown, dtype=np.float64).reshape(-1, 2)
-    if len(times) < 2:
-        raise ReportError(f"the page showed {len(times)} pictures in {_WATCHED_S:.0f} s")
-    ages = times[:, 0] - times[:, 1]
-    return {
-        "pictures_per_s": 1e3 * (len(times) - 1) / float(times[-1, 0] - times[0, 0]),
-        **{f"age_p{q}_ms": float(np.percentile(ages, q)) for q in (50, 95, 100)},
-    }
+    """shown: as `NOTE_AGES` notes them."""
+    if len(shown) < 2:
+        raise ReportError(f"the page showed {len(shown)} pictures in {_WATCHED_S:.0f} s")
+    painted = [times[-1] for times in shown]
+    return {"pictures_per_s": 1e3 * (len(shown) - 1) / (painted[-1] - painted[0]), **ages(shown)}
 
 
 def _hint(page: Any) -> str:

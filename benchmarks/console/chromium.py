@@ -6,15 +6,36 @@ import os
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from benchmarks.screens import BROWSER_OPTIONS, chromium
 
 # Each picture's age once the frame that shows it was painted: the page tells of each that it drew.
 NOTE_AGES = """() => {
   window.measured = [];
   addEventListener("console-picture", ({ detail }) => {
-    window.measured.push([detail.shown_utc_ms, detail.exposure_utc_ms]);
+    window.measured.push([detail.exposure_utc_ms, detail.published_utc_ms, detail.made_utc_ms,
+      detail.arrived_utc_ms, detail.shown_utc_ms]);
   });
 }"""
+_SHARES = ("flight", "console", "way", "browser")
+
+
+def ages(shown: list[list[float]]) -> dict[str, float]:
+    """Of pictures as `NOTE_AGES` notes them: age when painted, and what each part has of it, ms:
+    flight until it gave the picture out with its pose, console until JPEG and edges were made, way
+    to the page, browser until painted. All on one machine's clock.
+    """
+    times = np.array(shown, dtype=np.float64).reshape(-1, len(_SHARES) + 1)
+    parts = {"age": times[:, -1] - times[:, 0]}
+    parts |= dict(zip(_SHARES, np.diff(times, axis=1).T, strict=True))
+    return {
+        f"{name}_{'max' if q == 100 else f'p{q}'}_ms": float(
+            np.percentile(part, q) if len(part) else np.nan
+        )
+        for name, part in parts.items()
+        for q in (50, 95, 100)
+    }
 
 
 def opened_browser(driver: Any, nice: int) -> Any:

@@ -9,6 +9,7 @@ import typer
 from rich.console import Console
 
 from companion.errors import ConfigError
+from companion.terminal.steps import shown_work
 from mavlink_bridge.errors import EndpointError
 from mavlink_bridge.link.signing import create_key
 from mavlink_bridge.link.transport import Endpoint
@@ -37,7 +38,9 @@ def key_command(
         from mavlink_bridge.preflight.signing_setup import install_key
 
         console.print("the key goes over this connection in clear: use a cable", soft_wrap=True)
-        if install_key(install, file):
+        with shown_work(console, f"waiting for the flight controller at {install}"):
+            installed = install_key(install, file)
+        if installed:
             console.print("installed: the autopilot's heartbeat is signed with it")
         else:
             console.print(

@@ -14,7 +14,7 @@ from rich.table import Table
 
 from companion.cli.before.map_check import check_command
 from companion.cli.before.map_fetch import fetch_command, sources_command
-from companion.terminal.steps import READING, shown_count
+from companion.terminal.steps import READING, shown_count, shown_work
 from companion.writing import writing
 
 app = typer.Typer(no_args_is_help=True)
@@ -208,7 +208,8 @@ def verify(cache: CachePath) -> None:
     from localizer.map.inspection.inspect import verify as check
 
     opened = TileCache.open(cache)
-    result = check(opened)
+    with shown_work(Console(stderr=True), f"hashing {opened.manifest.tiles} tiles, seeking holes"):
+        result = check(opened)
     console = Console()
     _print_warnings(opened.manifest.warnings)
     for line in result.damaged:
@@ -251,7 +252,8 @@ def render(
 
     opened = TileCache.open(cache)
     pose = inspect.camera_pose(opened, latitude, longitude, height, heading, pitch)
-    view = inspect.render_view(opened, pose, Camera.from_fov(width, image_height, fov))
+    with shown_work(Console(stderr=True), "rendering; the first time compiles the renderer"):
+        view = inspect.render_view(opened, pose, Camera.from_fov(width, image_height, fov))
     with writing(out, "--out"):
         inspect.write_picture(out, view.rgb)
         inspect.write_picture(depth, inspect.depth_picture(view.depth))
@@ -273,7 +275,7 @@ def export(
     from localizer.map.inspection.inspect import export_glb
 
     opened = TileCache.open(cache)
-    with writing(out, "--out"):
+    with writing(out, "--out"), shown_work(Console(stderr=True), "joining the tiles"):
         triangles = export_glb(opened, out, level)
     Console().print(f"{out}: {triangles} triangles, {out.stat().st_size / 1e6:.1f} MB")
 

@@ -76,15 +76,17 @@ def page_message(message: Message, with_map: bool) -> bytes:
     parts = [_jpeg(picture.image), edges(picture).tobytes(), b""]
     if with_map and (warped := map_at_pose(picture)) is not None:
         parts[2] = _jpeg(warped)
+    live = not message.head.get("recorded")
     head: dict[str, Any] = {
         "kind": "frame",
         "image": message.head["image"],
         "width_px": message.head["camera"]["width"],
         "estimate": message.head.get("estimate"),
         "exposure_ns": message.head["exposure_ns"],
-        "exposure_utc_ms": None
-        if message.head.get("recorded")
-        else exposure_utc_ms(message.head["exposure_ns"]),
+        "exposure_utc_ms": utc_ms(message.head["exposure_ns"]) if live else None,
+        # Where the age comes from: given out by the flight, made here.
+        "published_utc_ms": utc_ms(message.head["published_ns"]) if live else None,
+        "made_utc_ms": time.time() * 1e3,
         "footprint_enu_m": footprint(picture),
         "parts": [len(part) for part in parts],
     }
@@ -94,9 +96,9 @@ def page_message(message: Message, with_map: bool) -> bytes:
     return struct.pack("<I", len(text)) + text + b"".join(parts)
 
 
-def exposure_utc_ms(exposure_ns: int) -> float:
-    """The exposure on this machine's clock."""
-    return time.time() * 1e3 - (time.monotonic_ns() - exposure_ns) * 1e-6
+def utc_ms(monotonic_ns: int) -> float:
+    """A time of CLOCK_MONOTONIC, which all processes of a machine share, on its UTC clock."""
+    return time.time() * 1e3 - (time.monotonic_ns() - monotonic_ns) * 1e-6
 
 
 def edges(picture: Picture) -> np.ndarray:

@@ -70,6 +70,11 @@ class McapFile:
             self.put("/camera/calibration", calibration, time_ns)
         self.put("/camera/image", messages.image(jpeg, time_ns), time_ns)
 
+    def text(self, text: str, severity: int, sender: str, time_ns: int) -> None:
+        """A line of MAVLink's STATUSTEXT, of the autopilot or the companion's own."""
+        utc_ns = self._utc_ns(time_ns)
+        self.put("/mavlink/text", messages.status_text(text, severity, sender, utc_ns), utc_ns)
+
     def put(self, topic: str, message: Any, time_ns: int) -> None:
         """A message of Foxglove's schemas, at its time in UTC."""
         kind = type(message)

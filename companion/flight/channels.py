@@ -56,5 +56,7 @@ class Channels:
     """What the ground station asks the camera to track, on a MAVLink link's thread."""
     texts: Channel[[int, str]] = field(default_factory=Channel)
     """Every line (MAV_SEVERITY, text) that the bridge told the operator, on any thread."""
+    vehicle_texts: Channel[[int, str, str]] = field(default_factory=Channel)
+    """Every line (MAV_SEVERITY, text, sender) of the autopilot, on a MAVLink link's thread."""
     events: Channel[[str, str]] = field(default_factory=Channel)
     """What happens (level, text) and is told nobody in flight: for log and record, any thread."""

@@ -157,6 +157,10 @@ class RecordStream(Protocol):
         """A snapshot."""
         ...
 
+    def text(self, text: str, severity: int, sender: str, time_ns: int) -> None:
+        """A line of MAVLink text (MAV_SEVERITY), heard at a time of CLOCK_MONOTONIC."""
+        ...
+
     def flush(self) -> None:
         """Hand what is written to the operating system."""
         ...
@@ -228,6 +232,14 @@ class Recorder:
         row = (time.monotonic_ns(), level, text)
         self._put("events", lambda: row)
 
+    def text(self, severity: int, text: str, sender: str) -> None:
+        """Record a line of MAVLink text, now; the tables have the companion's own as events, the
+        stream takes all of them.
+        """
+        if self._stream is not None:
+            row = (text, severity, sender, time.monotonic_ns())
+            self._put("text", lambda: row)
+
     def snapshot(self, frame: Frame) -> None:
         """Keep the frame's image, named by its exposure time, if it is time for one."""
         if self._interval_ns and frame.exposure_time_ns >= self._next_snapshot_ns:
@@ -268,6 +280,9 @@ class Recorder:
             (self._snapshots / snapshot_name(frame.exposure_time_ns)).write_bytes(data)
             if self._stream is not None:
                 self._stream.image(data, frame.exposure_time_ns)
+        elif name == "text":
+            if self._stream is not None:
+                self._stream.text(*row())
         elif name == "trajectory":
             (estimate,) = row()
             self._append(estimate)

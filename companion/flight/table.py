@@ -92,6 +92,7 @@ def _bridge(making: Making) -> Bridge:
         on_track=making.channels.clicks.send,
         on_hint=lambda hint: search().hint_at(hint),
         on_text=making.channels.texts.send,
+        on_vehicle_text=making.channels.vehicle_texts.send,
     )
 
 
@@ -121,6 +122,8 @@ def _record(making: Making) -> RecordKeeper:
         channels.events.subscribe(recorder.event)
         # What the operator was told belongs in the record; the bridge has logged it.
         channels.texts.subscribe(lambda severity, text: recorder.event(_level(severity), text))
+        channels.texts.subscribe(lambda severity, text: recorder.text(severity, text, "companion"))
+        channels.vehicle_texts.subscribe(recorder.text)
     return keeper
 
 

@@ -153,6 +153,7 @@ class Shown:
         head: dict[str, Any] = {
             "kind": "frame",
             "exposure_ns": frame.exposure_time_ns,
+            "published_ns": time.monotonic_ns(),
             "image": [image.shape[1], image.shape[0]],
             "camera": frame.camera.to_dict(),
             "estimate": None,

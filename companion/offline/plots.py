@@ -87,11 +87,16 @@ def plot_tracks(
         axes.plot(
             track[:, 0], track[:, 1], shape, color=colour, markersize=5, mfc="none", label=name
         )
-    for name, mark in marks.items():
-        axes.plot(mark[0], mark[1], "k+", markersize=9)
-        axes.annotate(name, (mark[0], mark[1]), textcoords="offset points", xytext=(5, 5))
     points = np.vstack([t[:, :2] for t in tracks.values()])
     low, high = points.min(axis=0) - 80, points.max(axis=0) + 80
+    for name, mark in marks.items():
+        axes.plot(mark[0], mark[1], "k+", markersize=9)
+        # On the side where there is room: a name at the right edge would be cut.
+        side = -1 if mark[0] > 0.25 * low[0] + 0.75 * high[0] else 1
+        axes.annotate(
+            name, (mark[0], mark[1]), textcoords="offset points", xytext=(5 * side, 5),
+            ha="right" if side < 0 else "left",
+        )  # fmt: skip
     axes.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]), xlabel="east, m", ylabel="north, m")
     axes.set_aspect("equal")
     # Below the map, which it would hide; a white line is seen on grey.

@@ -23,7 +23,7 @@ from companion.reporting.record import (
     worst_frames,
 )
 from companion.reporting.record import uncertainty_plots as uncertainty
-from companion.reporting.verdicts import advice
+from companion.reporting.verdicts import advice, compared
 from localizer.plain_files import plain_text
 
 _TRUTH, _EKF = "#ffffff", "#1fd1ff"
@@ -70,13 +70,13 @@ def demo_report(folder: Path) -> Report:
         if (camera := record.camera) is not None:
             shown = worst_frames(record, goodness, "error in m", time_s)
             overlays = pictures.overlays(shown, camera)
-        notes = (*record.notes, *pictures.notes)
+        notes = (*record.notes, *pictures.notes, *filter(None, (figures_of.get("slow"),)))
     spans = (Span(0.0, end_s, "GNSS denied"),)
     return Report(
         f"Demo flight, seed {document.get('seed')}",
         f"{figures_of['vehicle']}, GNSS denied for {figures_of['denied_s']:.0f} s, "
         f"{figures_of['flown_m']:.0f} m flown; {record.health.get('text', '')}",
-        figures.first_fault(estimates, time_s, happened, large),
+        _broken(figures_of) + figures.first_fault(estimates, time_s, happened, large),
         _verdicts(figures_of),
         sheet,
         _plots(record, time_s, errors, vehicle, start_ns),
@@ -94,9 +94,15 @@ def demo_report(folder: Path) -> Report:
     )
 
 
+def _broken(report: Mapping[str, Any]) -> str:
+    """That the flight was not flown to its end, in front of what went wrong first."""
+    return f"{report['won']}; before that: " if report.get("broken") else ""
+
+
 def _empty(folder: Path, document: Mapping[str, Any]) -> Report:
     return Report(
-        f"Demo flight, seed {document.get('seed')}", str(folder), "never localized",
+        f"Demo flight, seed {document.get('seed')}", str(folder),
+        _broken(document["report"]) + "never localized",
         settings={"config": document.get("config", {})},
         versions=dict(document.get("versions", {})),
     )  # fmt: skip
@@ -121,8 +127,7 @@ def _verdicts(report: Mapping[str, Any]) -> tuple[Verdict, ...]:
         value, known = c["value"], advice(c["name"])
         missing = value is None or not np.isfinite(value)
         ok = not missing and (value >= c["limit"] if c["at_least"] else value <= c["limit"])
-        needed = f"{'>=' if c['at_least'] else '<='} {c['limit']:g} {c['unit']}"
-        found = "-" if missing else f"{value:.2f} {c['unit']}"
+        found, needed = compared(value, c["limit"], c["unit"], at_least=c["at_least"])
         verdicts.append(Verdict(c["name"], found, needed, bool(ok), known.meaning, known.look))
     return tuple(verdicts)
 

@@ -12,7 +12,7 @@ from companion.offline.tables import read_columns
 from companion.reporting.content import Curve, MapSheet, Overlay, Plot, Report, Span, Track, Verdict
 from companion.reporting.pictures import map_pictures
 from companion.reporting.record import VISION
-from companion.reporting.verdicts import advice
+from companion.reporting.verdicts import advice, compared
 from companion.sources.folder_source import read_image
 from localizer.plain_files import plain_text
 
@@ -68,10 +68,8 @@ def _verdicts(document: dict[str, float]) -> tuple[Verdict, ...]:
     for name, value, limit, unit, at_least in wanted:
         ok = value is not None and (value >= limit if at_least else value <= limit)
         known = advice(name)
-        needed = f"{'>=' if at_least else '<='} {limit:g} {unit}"
-        verdicts.append(
-            Verdict(name, _text(value, unit), needed, bool(ok), known.meaning, known.look)
-        )
+        found, needed = compared(value, limit, unit, at_least=at_least)
+        verdicts.append(Verdict(name, found, needed, bool(ok), known.meaning, known.look))
     return tuple(verdicts)
 
 

@@ -21,6 +21,7 @@ from localizer.types import Image
 
 _JPEG_QUALITY = 82
 _MOST_POINTS = 3000  # of a curve or track: beyond it nobody sees them
+_LETTER = 0.65  # of a sans serif's size, the widest mean of a name's letters
 _COLOURS = {
     "tracking": "#2a9d4a", "initializing": "#8a8f98", "degraded": "#e0a100",
     "bridging": "#d97706", "lost": "#c62828", "refused": "#c62828", "accepted": "#2a9d4a",
@@ -115,7 +116,6 @@ def _map(sheet: MapSheet) -> str:
         parts.append(f'<rect width="{width:.2f}" height="{height:.2f}" fill="#9aa3ad"/>')
     for track in sheet.tracks:
         parts.append(_polyline(track, [xy(*p) for p in _thinned(track.points)]))
-    font = size / 45
     for mark in sheet.marks:
         x, y = mark.east_m - sheet.west, sheet.north - mark.north_m
         arm = size / 90
@@ -123,8 +123,7 @@ def _map(sheet: MapSheet) -> str:
             f'<g class="mark {escape(mark.kind)}">'
             f'<circle cx="{x:.2f}" cy="{y:.2f}" r="{max(mark.sigma_m, size / 180):.2f}"/>'
             f'<path d="M{x - arm:.2f} {y:.2f}h{2 * arm:.2f}M{x:.2f} {y - arm:.2f}v{2 * arm:.2f}"/>'
-            f'<text x="{x + arm:.2f}" y="{y - arm:.2f}" font-size="{font:.2f}">'
-            f"{escape(mark.name)}</text></g>"
+            f"{_label(mark.name, (x, y), arm, width)}</g>"
         )
     tens = 10 ** math.floor(math.log10(max(size / 4, 1e-9)))
     bar = max(step * tens for step in (1, 2, 5) if step * tens <= max(size / 4, tens))
@@ -137,6 +136,19 @@ def _map(sheet: MapSheet) -> str:
         f'<svg class=map viewBox="0 0 {width:.2f} {height:.2f}" role=img '
         f'aria-label="map with tracks">{"".join(parts)}'
         f'<path class=scale d="M{size * 0.03:.2f} {height - size * 0.03:.2f}h{bar:g}"/></svg>'
+    )
+
+
+def _label(name: str, at: tuple[float, float], arm: float, width: float) -> str:
+    """A mark's name beside it, on the side where the map has room for it."""
+    font = 2.0 * arm
+    x, y = at
+    ends = x + arm + _LETTER * font * len(name) > width
+    height = y + arm + font if y - arm < font else y - arm
+    left, anchor = (x - arm, "end") if ends else (x + arm, "start")
+    return (
+        f'<text x="{left:.2f}" y="{height:.2f}" font-size="{font:.2f}" text-anchor="{anchor}">'
+        f"{escape(name)}</text>"
     )
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 
@@ -48,6 +49,21 @@ _ADVICE = {
         "the targets' own lines: one bad target is an edge or a roof, all of them are the pose",
     ),
 }
+
+
+def compared(value: float | None, limit: float, unit: str, *, at_least: bool) -> tuple[str, str]:
+    """A value and what it needs as text, with as many digits, two or more, as show who is right:
+    never "0.25 m, needed <= 0.25 m: missed".
+    """
+    needed = f"{'>=' if at_least else '<='} {limit:g} {unit}"
+    if value is None or not math.isfinite(value):
+        return "-", needed
+
+    def holds(figure: float) -> bool:
+        return figure >= limit if at_least else figure <= limit
+
+    digits = next((d for d in range(2, 9) if holds(round(value, d)) == holds(value)), 9)
+    return f"{value:.{digits}f} {unit}", needed
 
 
 def advice(name: str) -> Advice:

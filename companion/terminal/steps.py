@@ -56,6 +56,23 @@ def shown_count(
         timer.cancel()
 
 
+@contextmanager
+def shown_work(console: Console, what: str, every_s: float = 10.0) -> Iterator[None]:
+    """Says what is at work where that cannot be counted: a spinner, or in a log a line once it has
+    taken two seconds, and then every ten.
+    """
+    if console.is_terminal:
+        with console.status(escape(what)):
+            yield
+        return
+    work = _Work(console, what, every_s)
+    work.wait(_SILENT_S)
+    try:
+        yield
+    finally:
+        work.end()
+
+
 def tally(show: Callable[..., None], total: int | None = None) -> Callable[..., None]:
     """For work that only tells that one more is done."""
     count = itertools.count(1)
@@ -92,3 +109,34 @@ class _Lines:
         self._printed_s = time.monotonic() - self._begun_s
         line = f"{self._printed_s:4.0f} s {self._what}: {text}"
         self._console.print(line, highlight=False, soft_wrap=True, markup=False)
+
+
+class _Work:
+    """A log's lines about work that goes on."""
+
+    def __init__(self, console: Console, what: str, every_s: float) -> None:
+        self._console, self._what, self._every_s = console, what, every_s
+        self._begun_s = time.monotonic()
+        self._lock = threading.Lock()
+        self._timer: threading.Timer | None = None
+        self._over = False
+
+    def wait(self, seconds: float) -> None:
+        """Tell of it in so many seconds."""
+        with self._lock:
+            if not self._over:
+                self._timer = threading.Timer(seconds, self._tell)
+                self._timer.daemon = True
+                self._timer.start()
+
+    def end(self) -> None:
+        """It is done."""
+        with self._lock:
+            self._over = True
+            if self._timer is not None:
+                self._timer.cancel()
+
+    def _tell(self) -> None:
+        line = f"{time.monotonic() - self._begun_s:4.0f} s {self._what}"
+        self._console.print(line, highlight=False, soft_wrap=True, markup=False)
+        self.wait(self._every_s)

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import os
 from dataclasses import dataclass
 
 from localizer.evaluation.metrics import LocalizationMetrics
 from sitl.demo.analysis import Spread
 
+_SLOW = 0.9  # of what is wanted: a computer with room loses next to nothing
 _MAX_LATENCY_MS = 250.0  # the oldest measurement that ArduPilot fuses; VISO_DELAY_MS's maximum
 
 
@@ -66,6 +68,37 @@ def headline(flight: Judged, home_error_m: float, denied_s: float) -> str:
     if median is not None:
         said.append(f"localizer {median:.2f} m in the median, {m.completeness:.1f} % of frames")
     return "; ".join(said)
+
+
+@dataclass(frozen=True)
+class Pace:
+    """How fast a flight was computed. sent_hz, wanted_hz: the world camera's pictures a second;
+    taken: share of them that the localizer took; latency_ms: p95 from exposure to estimate.
+    """
+
+    sent_hz: float
+    wanted_hz: float
+    taken: float
+    latency_ms: float | None
+    delay_ms: float
+    load: float
+
+    def complaint(self) -> str | None:
+        """What the computer did not keep up with; None where it did."""
+        limit_ms = min(self.delay_ms, _MAX_LATENCY_MS)
+        said = []
+        if self.sent_hz < _SLOW * self.wanted_hz:
+            said.append(f"the camera sent {self.sent_hz:.1f} of {self.wanted_hz:g} pictures/s")
+        if self.taken < _SLOW:
+            said.append(f"{100 * self.taken:.0f} % of the pictures were localized in time")
+        if self.latency_ms is not None and self.latency_ms > limit_ms:
+            said.append(f"latency p95 {self.latency_ms:.0f} ms ({limit_ms:.0f} at most)")
+        if not said:
+            return None
+        return (
+            f"this computer did not keep up: {', '.join(said)}, load {self.load:.1f} on "
+            f"{os.cpu_count() or 1} processors; end other work, or fly configs/demo_small.yaml"
+        )
 
 
 def latency_warning(latency_ms: Spread, delay_ms: float) -> str | None:

@@ -8,6 +8,7 @@ the video stream, and detections.
 from __future__ import annotations
 
 import csv
+import os
 import time
 from collections.abc import Callable, Sequence
 from contextlib import ExitStack
@@ -38,6 +39,7 @@ from sitl.demo.companion_process import (
 from sitl.demo.scenario import Scenario, VehicleChoice
 from sitl.demo.script import FlightError, FlightScript, Progress
 from sitl.demo.targets import observed_targets
+from sitl.errors import SimulationError
 from sitl.geodesy import Location
 from sitl.ground.pilot import Pilot
 from sitl.vehicles.launch import (
@@ -53,7 +55,10 @@ from sitl.vehicles.launch import (
 @dataclass(frozen=True)
 class FlightRecord:
     """What a flight left behind. denied_ns: from GNSS off to the end of the mission. errors: what
-    was drawn; gimbal_alignment_deg: roll, pitch, yaw that the gimbal does not report.
+    was drawn; gimbal_alignment_deg: roll, pitch, yaw that the gimbal does not report. broken: why
+    the flight was not flown to its end, None where it was; denied_ns then ends where it broke off,
+    and begins where the companion was started if GNSS was never switched off. load: of the
+    computer, one minute's mean, at the end.
     """
 
     folder: Path
@@ -65,6 +70,8 @@ class FlightRecord:
     texts: tuple[str, ...]
     errors: FlightErrors
     gimbal_alignment_deg: tuple[float, float, float]
+    broken: str | None = None
+    load: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -89,7 +96,10 @@ def fly(
     onlookers: Onlookers | None = None,
     program: Sequence[str] = THIS_PROGRAM,
 ) -> FlightRecord:
-    """Fly the scenario; `folder` receives every record. program: the companion that flies."""
+    """Fly the scenario; `folder` receives every record. program: the companion that flies.
+
+    A flight that breaks off leaves its record, too: what was flown until then tells why.
+    """
     onlookers = onlookers or Onlookers()
     progress = onlookers.progress
     folder.mkdir(parents=True, exist_ok=True)
@@ -120,11 +130,18 @@ def fly(
         stack.enter_context(camera)
         stack.enter_context(truth_feed(pilot, camera, cache, gimbal_error, errors.map_shift_m))
         progress("starting the companion", 0.0)
+        begun_ns, broken = time.monotonic_ns(), None
         companion = stack.enter_context(running_companion(config, folder, program=program))
         if ports.console is not None and answers(ports.console, companion):
             onlookers.watchable(f"http://127.0.0.1:{ports.console}/")
         run = FlightScript(pilot, scenario, home, folder, companion, progress)
-        denied_ns = run.fly()
+        try:
+            denied_ns = run.fly()
+        except SimulationError as error:
+            broken = str(error)
+            denied_ns = run.denied_ns or begun_ns, time.monotonic_ns()
+            progress("the flight broke off", 1.0)
+        load = os.getloadavg()[0]
         home_error_m = run.distance_from_home()
         camera.stop()
         texts = tuple(t.text for t in pilot.record.texts)
@@ -141,6 +158,8 @@ def fly(
         texts,
         errors,
         gimbal_error.alignment_deg,
+        broken,
+        load,
     )
 
 

@@ -13,6 +13,7 @@ from rich.console import Console
 from rich.table import Table
 
 from companion.config import CompanionConfig, load_config
+from companion.errors import ReportError
 from companion.offline.plots import (
     ErrorSeries,
     MapPicture,
@@ -22,7 +23,7 @@ from companion.offline.plots import (
     save_image,
 )
 from companion.offline.tables import Columns, poses, read_columns
-from companion.reporting.verdicts import advice
+from companion.reporting.verdicts import advice, compared
 from companion.versions import made_by
 from localizer.evaluation.metrics import LocalizationMetrics
 from localizer.features.extractor import load_extractor
@@ -45,7 +46,7 @@ from sitl.demo.analysis import (
     stage_latencies,
     target_errors,
 )
-from sitl.demo.criteria import Criterion, Judged, headline, judge, latency_warning
+from sitl.demo.criteria import Criterion, Judged, Pace, headline, judge, latency_warning
 from sitl.demo.flight import FlightRecord
 from sitl.demo.scenario import Scenario
 
@@ -63,7 +64,8 @@ class FlightReport:
     accepted estimate. ekf_in_map_m: against where the map shows the vehicle, ekf_horizontal_m:
     against where GNSS would have it; the map lies map_shift_m beside GNSS. inside_bound: per cent
     of fixes within their own 95 % ellipse. targets: name to 3-D error, in the map's frame. warning:
-    of late estimates. won: the flight in one line.
+    of late estimates. won: the flight in one line; broken: why it was not flown to its end; slow:
+    what the computer did not keep up with.
     """
 
     won: str
@@ -91,6 +93,8 @@ class FlightReport:
     camera_ms: Mapping[str, tuple[float, float]]
     criteria: tuple[Criterion, ...]
     warning: str | None
+    broken: str | None = None
+    slow: str | None = None
 
 
 @dataclass(frozen=True)
@@ -106,6 +110,9 @@ class _Tables:
     def read(cls, folder: Path) -> _Tables:
         """What the camera, the companion and the vehicle left."""
         record = folder / "companion"
+        for name in ("estimates.csv", "targets.csv"):  # of a companion that never came up
+            if not (record / name).exists():
+                raise ReportError(f"{folder}: no report of this flight: {name} was never written")
         return cls(
             read_columns(folder / "frames.csv"),
             read_columns(record / "estimates.csv", text=("state", "status")),
@@ -137,9 +144,12 @@ def make_report(record: FlightRecord, scenario: Scenario, seed: int) -> FlightRe
     inside = inside_bounds(truth, estimates, span)
     judged = Judged(summary, Spread.of(horizontal), fixed_targets, inside)
     denied_s = (span[1] - span[0]) * 1e-9
-    stages = stage_latencies(estimates, span)
+    stages = stage_latencies(estimates, span) if estimates else {}
+    latency = stages.get("latency", Spread(None, None, None))
     report = FlightReport(
-        won=headline(judged, record.home_error_m, denied_s),
+        won=headline(judged, record.home_error_m, denied_s)
+        if record.broken is None
+        else f"the flight broke off after {denied_s:.0f} s: {record.broken}",
         vehicle=record.vehicle,
         denied_s=denied_s,
         flown_m=_flown(vehicle, span),
@@ -163,12 +173,31 @@ def make_report(record: FlightRecord, scenario: Scenario, seed: int) -> FlightRe
         stages_ms=stages,
         camera_ms=record.camera.stage_ms,
         criteria=judge(judged),
-        warning=latency_warning(stages["latency"], config.bridge.injection.delay_ms),
+        warning=latency_warning(latency, config.bridge.injection.delay_ms),
+        broken=record.broken,
+        slow=_pace(record, scenario, errors, latency, config).complaint(),
     )
     _write_json(folder, report, record, scenario, seed, config)
     _write_frames(folder / "frames_report.csv", errors)
-    _plot(record, tables, (ekf_times, horizontal), config)
+    if estimates:
+        _plot(record, tables, (ekf_times, horizontal), config)
     return report
+
+
+def _pace(
+    record: FlightRecord, scenario: Scenario, errors: FrameErrors, latency: Spread,
+    config: CompanionConfig,
+) -> Pace:  # fmt: skip
+    frames = len(errors.time_ns)
+    seconds = float(errors.time_ns[-1] - errors.time_ns[0]) * 1e-9 if frames > 1 else 0.0
+    return Pace(
+        (frames - 1) / seconds if seconds else 0.0,
+        scenario.camera.rate_hz,
+        float(errors.processed.mean()) if frames else 0.0,
+        latency.p95,
+        config.bridge.injection.delay_ms,
+        record.load,
+    )
 
 
 def _target_errors(record: FlightRecord, targets: Columns) -> dict[str, Array]:
@@ -325,7 +354,8 @@ def _overlays(
 def print_report(report: FlightReport, folder: Path) -> None:
     """The tables that end a flight."""
     console = Console()
-    console.print(f"[bold green]{report.won}[/]", highlight=False)
+    if report.broken is None:
+        console.print(f"[bold green]{report.won}[/]", highlight=False)
     m = report.localizer
     table = Table(title=f"GNSS denied for {report.denied_s:.0f} s, {report.flown_m:.0f} m flown "
                         f"({report.vehicle})")  # fmt: skip
@@ -371,6 +401,8 @@ def print_report(report: FlightReport, folder: Path) -> None:
                       highlight=False)  # fmt: skip
     if report.warning is not None:
         console.print(f"[yellow]warning:[/] {report.warning}", highlight=False)
+    if report.slow is not None:
+        console.print(f"[yellow]warning:[/] {report.slow}", highlight=False)
     console.print(f"report: [green]{folder}[/]/report.json, tracks.png, errors.png, overlay-*.png")
 
 
@@ -380,9 +412,8 @@ def _verdict(report: FlightReport) -> Table:
     for column in ("target", "found", "needed", ""):
         table.add_column(column, justify="left" if column in ("target", "") else "right")
     for c in report.criteria:
-        needed = f"{'>=' if c.at_least else '<='} {c.limit:g} {c.unit}"
+        value, needed = compared(c.value, c.limit, c.unit, at_least=c.at_least)
         mark = "[green]ok" if c.ok else "[red]missed"
-        value = "-" if c.value is None else f"{c.value:.2f} {c.unit}"
         table.add_row(c.name, value, needed, mark)
     return table
 

@@ -48,12 +48,14 @@ class FlightScript:
         self._folder = folder
         self._companion = companion
         self._progress = progress
+        self.denied_ns: int | None = None
+        """When GNSS went off, CLOCK_MONOTONIC; None before."""
 
     def fly(self) -> tuple[int, int]:
         """Returns the span without GNSS up to the last waypoint, CLOCK_MONOTONIC ns."""
         pilot, scenario = self._pilot, self._scenario
         self._progress("starting the companion", 0.0)
-        self._await_companion()
+        self.await_companion()
         steps = mission(scenario, self._home)
         pilot.missions.upload(steps)
         pilot.point_gimbal(scenario.legs[0].gimbal_pitch_deg, 0.0)
@@ -67,7 +69,7 @@ class FlightScript:
         pilot.link.sleep(max(0.0, scenario.deny_after_s - (pilot.record.time_s - at_height_s)))
         self._require_companion()
         self._deny()
-        begin_ns = time.monotonic_ns()
+        begin_ns = self.denied_ns = time.monotonic_ns()
         pilot.start_mission()
         self._follow(len(steps))
         end_ns = time.monotonic_ns()
@@ -111,7 +113,7 @@ class FlightScript:
         self._progress("landing on vision alone", 0.99)
         self._pilot.land(_LANDING_TIMEOUT_S)
 
-    def _await_companion(self) -> None:
+    def await_companion(self) -> None:
         """On the ground: its first start on a machine compiles for a minute or more."""
         started = time.monotonic()
         while self._health() is None:

@@ -78,6 +78,8 @@ class Flight:
         self.tracked: list[TrackRequest] = []
         self.hinted: list[PlaceHint] = []
 
+        self.vehicle_texts: list[tuple[int, str, str]] = []
+
         def say(_: int, text: str) -> None:
             self.texts.append(text)
 
@@ -94,6 +96,7 @@ class Flight:
             VehicleWatch(say),
             gate,
             LookAt(config, GEOID, say),
+            lambda *told: self.vehicle_texts.append(told),
         )
         self.shared = shared
         self.end = FlightControllerEnd(shared)

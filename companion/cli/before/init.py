@@ -11,6 +11,8 @@ from rich.markup import escape
 
 from companion.config import CompanionConfig, parse_config
 from companion.errors import CompanionError, ConfigError
+from companion.redaction import redacted
+from companion.terminal.steps import shown_work
 from localizer.errors import LocalizerError
 from mavlink_bridge.errors import BridgeError
 
@@ -66,7 +68,10 @@ def init_command(
         fov = typer.prompt(
             "horizontal field of view, degrees", default=_DEFAULT_FOV_DEG, type=float
         )
-    size = _stream_size(feed, notes) if listen else None
+    size = None
+    if listen:
+        with shown_work(Console(stderr=True), f"waiting for a picture of {redacted(feed)}"):
+            size = _stream_size(feed, notes)
     placed = feed if "://" in feed else str(Path(feed).resolve())
     settings["camera"] = {"source": placed, "model": _model(camera, fov, size, notes)}
     bridge: dict[str, Any] = {"connection": wire, "camera": {"mount": mounted}}
@@ -76,7 +81,8 @@ def init_command(
     settings["record"] = {"folder": str((record / "flight").resolve())}
     config = parse_config(settings, str(out))
     if listen:
-        config = _with_vehicle(config, notes)
+        with shown_work(Console(stderr=True), f"waiting for the autopilot at {wire}"):
+            config = _with_vehicle(config, notes)
     write_deployment(deployment_text(config, notes), out, overwrite)
     for note in notes:
         Console().print(escape(note), style="yellow", soft_wrap=True, highlight=False)

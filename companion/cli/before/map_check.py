@@ -12,6 +12,7 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
+from companion.terminal.steps import shown_work
 from companion.writing import made_folder
 
 _COLOURS = {"good": "green", "advice": "yellow", "bad": "red"}
@@ -47,7 +48,8 @@ def check_command(
         pixel_rad = 1 / camera.fx
     opened = TileCache.open(cache)
     made_folder(out, "--out")
-    made = check_map(opened, Use(height, pixel_rad))
+    with shown_work(Console(stderr=True), f"looking at {opened.manifest.tiles} tiles"):
+        made = check_map(opened, Use(height, pixel_rad))
     for name, rgb in made.pictures.items():
         write_picture(out / f"{name}.png", rgb)
     table = Table(box=SIMPLE_HEAD)

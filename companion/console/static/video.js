@@ -40,11 +40,14 @@ export class VideoView {
   }
 
   async order(order) {
-    const answer = await this.ask("/api/order", { ...order, exposure_ns: this.head?.exposure_ns });
+    const whole = { ...order, exposure_ns: this.head?.exposure_ns };
+    dispatchEvent(new CustomEvent("console-order", { detail: whole }));
+    const answer = await this.ask("/api/order", whole);
     this.$("video-told").textContent = answer.text;
   }
 
   async show(buffer) {
+    const arrived = Date.now();
     if (this.busy) return; // the next one is newer
     this.busy = true;
     try {
@@ -61,20 +64,21 @@ export class VideoView {
       this.$("video-note").hidden = true;
       this.paint();
       // Once the screen's next frame, in which it is painted, is done.
-      requestAnimationFrame(() => setTimeout(() => this.tellAge(head)));
+      requestAnimationFrame(() => setTimeout(() => this.tellAge(head, arrived)));
       window.consoleMap?.footprint(head.footprint_enu_m);
       window.consoleFrames = (window.consoleFrames ?? 0) + 1;
     } finally { this.busy = false; }
   }
 
-  tellAge(head) {
+  tellAge(head, arrived) {
     if (head.exposure_utc_ms === null) {
       this.$("video-age").textContent = "a kept picture, the newest before this moment";
       return;
     }
     const shown = Date.now();
     this.$("video-age").textContent = `shown ${Math.round(shown - head.exposure_utc_ms)} ms after its exposure`;
-    const detail = { shown_utc_ms: shown, exposure_utc_ms: head.exposure_utc_ms };
+    const { exposure_utc_ms, published_utc_ms, made_utc_ms } = head;
+    const detail = { exposure_utc_ms, published_utc_ms, made_utc_ms, arrived_utc_ms: arrived, shown_utc_ms: shown };
     dispatchEvent(new CustomEvent("console-picture", { detail }));
   }
 

@@ -79,6 +79,7 @@ def flight(tmp_path, small_assets):
             TargetFix("car", np.array([20.0, 5.0, 1.0]), np.eye(3), (3.0, 4.0), later_ns)
         )
         recorder.event("warning", "PiLoT: withheld")
+        recorder.text(4, "EKF3 lane switch 1", "1/1")
         recorder.snapshot(Frame(np.full((48, 64, 3), 90, np.uint8), BEGIN_NS, camera, 0))
         if close:
             keeper.close()
@@ -218,6 +219,14 @@ def test_the_command_asks_for_a_format_and_names_the_file(flight):
     assert done.exit_code == 0, done.output
     assert "record.mcap" in done.output
     assert "no MAVLink" in done.output  # the .tlog was never written
+
+
+def test_what_the_autopilot_said_stands_in_the_live_file_too(flight):
+    messages, _ = _read(flight(mcap=True).folder / "record.mcap")
+    ((schema, logged, said),) = messages["/mavlink/text"]
+    assert (schema, said.message, said.name) == ("foxglove.Log", "EKF3 lane switch 1", "1/1")
+    assert abs(logged - time.time_ns()) < 600e9
+    assert not (flight().folder / "text.csv").exists()
 
 
 def test_the_clock_of_the_flight_is_the_one_of_its_file(flight):

@@ -11,7 +11,7 @@ import pytest
 
 from companion.errors import RecordError
 from companion.flight.recorder import ESTIMATE_COLUMNS, EVENT_COLUMNS, TARGET_COLUMNS
-from companion.reporting.content import Stanford
+from companion.reporting.content import MapSheet, Mark, Report, Stanford
 from companion.reporting.layout import render
 from companion.reporting.record import read_record, record_report, worst_frames
 from companion.reporting.report import report_of, write_page
@@ -122,6 +122,25 @@ def test_each_target_has_its_own_line_and_its_place_on_the_map(record):
     assert [row[:2] for row in report.targets.rows] == [("A", "1"), ("B", "1")]
     assert [m.name for m in report.sheet.marks] == ["A", "B"]
     assert report.sheet.rgb.std() > 5  # the map was drawn
+
+
+@pytest.mark.parametrize(
+    ("at", "anchor", "above"),
+    [((50, 50), "start", True), ((98, 50), "end", True), ((50, 99), "start", False)],
+)
+def test_a_name_at_the_maps_edge_is_not_cut(at, anchor, above):
+    """at: metres from the west and the south of a map of 100 m."""
+    marks = (Mark("point A", *at, "target"),)
+    page = render(Report("", "", "", sheet=MapSheet(None, 0.0, 100.0, 0.0, 100.0, marks=marks)))
+    x, y, font, side = re.search(
+        r'<text x="([\d.]+)" y="([\d.]+)" font-size="([\d.]+)" text-anchor="(\w+)">point A', page
+    ).groups()
+    assert side == anchor
+    assert (float(y) < 100 - at[1]) == above
+    assert float(y) >= float(font)
+    length = 0.65 * float(font) * len("point A")
+    assert float(x) - (length if side == "end" else 0) >= 0
+    assert float(x) + (0 if side == "end" else length) <= 100
 
 
 def test_a_damaged_record_still_gives_what_it_holds(record):

@@ -6,7 +6,7 @@ from types import SimpleNamespace
 import pytest
 from rich.console import Console
 
-from companion.terminal.steps import shown_count, tally
+from companion.terminal.steps import shown_count, shown_work, tally
 
 
 @pytest.fixture
@@ -66,3 +66,26 @@ def test_what_counts_before_it_is_asked_is_told_by_its_count(log):
         show(5, None)
         state.timers[0].call()
     assert file.getvalue() == "   3 s describing: 5\n"
+
+
+def test_work_that_cannot_be_counted_is_told_of_after_two_seconds_and_then_every_ten(log):
+    state, console, file = log
+    with shown_work(console, "hashing [tiles]"):
+        assert file.getvalue() == ""
+        for now, waited in ((2.0, 2.0), (12.0, 10.0)):
+            timer = state.timers[-1]
+            assert timer.seconds == waited
+            state.now = now
+            timer.call()
+    assert file.getvalue() == "   2 s hashing [tiles]\n  12 s hashing [tiles]\n"
+    assert state.timers[-1].is_cancelled
+    state.timers[-2].call()  # one that was under way when it ended begins no other
+    assert len(state.timers) == 3
+
+
+def test_work_that_is_soon_done_says_nothing(log):
+    state, console, file = log
+    with shown_work(console, "hashing"):
+        pass
+    assert file.getvalue() == ""
+    assert state.timers[0].is_cancelled

@@ -263,23 +263,6 @@ def test_an_overloaded_computer_is_told_once_and_not_every_second() -> None:
     assert told[2:] == ["PiLoT: localization tracking"]
 
 
-def test_one_line_does_not_drown_the_others() -> None:
-    """A second clock on the link: "flight controller rebooted" came ten times a second."""
-    told: list[str] = []
-    sent: list[Any] = []
-    status = OperatorStatus(lambda _, m: sent.append(m), lambda _, text: told.append(text))
-    for tenth in range(300):
-        status.say(4, f"PiLoT: flight controller rebooted {tenth} times", tenth * 10**8)
-        if tenth == 5:
-            status.say(4, "PiLoT: video frozen", tenth * 10**8)
-    assert len(told) == len(sent) == 10  # three in each of three spans of 10 s, and the other
-    assert told[3] == "PiLoT: video frozen"
-    for k in range(1000):  # who sends ever other lines does not fill the memory
-        status.say(4, "PiLoT: " + chr(65 + k % 26) * (k // 26 + 1), k * 10**6)
-    status.say(4, "PiLoT: flight controller rebooted 9 times", 60 * 10**9)
-    assert told[-1] == "PiLoT: flight controller rebooted 9 times"
-
-
 def test_a_worse_state_is_told_at_once_and_an_older_one_again_after_a_while() -> None:
     told: list[str] = []
     status = OperatorStatus(lambda *_: None, lambda _, text: told.append(text))

@@ -1,8 +1,9 @@
 import pytest
 
+from companion.reporting.verdicts import compared
 from localizer.evaluation.metrics import LocalizationMetrics
 from sitl.demo.analysis import Spread
-from sitl.demo.criteria import Judged, headline, judge, latency_warning
+from sitl.demo.criteria import Judged, Pace, headline, judge, latency_warning
 
 GOOD = LocalizationMetrics(100, 0.2, 0.2, 90.0, 100.0, 100.0, 100.0, 9.0)
 
@@ -52,3 +53,47 @@ def test_what_was_won_is_said_first_and_with_its_figures():
     assert text.startswith("came home on vision alone after 162 s, 0.5 m from home")
     assert "EKF p95 0.50 m" in text
     assert "0.20 m in the median, 100.0 % of frames" in text
+
+
+@pytest.mark.parametrize(
+    ("value", "limit", "at_least", "shown"),
+    [
+        (0.253, 0.25, False, "0.253 m"),
+        (0.2500001, 0.25, False, "0.2500001 m"),
+        (99.996, 100.0, True, "99.996 m"),
+        (0.247, 0.25, False, "0.25 m"),
+        (0.25, 0.25, False, "0.25 m"),
+        (99.94, 100.0, True, "99.94 m"),
+        (None, 1.0, False, "-"),
+        (float("nan"), 1.0, False, "-"),
+    ],
+)
+def test_what_was_missed_is_seen_in_its_digits(value, limit, at_least, shown):
+    found, needed = compared(value, limit, "m", at_least=at_least)
+    assert found == shown
+    assert needed == f"{'>=' if at_least else '<='} {limit:g} m"
+
+
+GOOD_PACE = {"sent_hz": 10.0, "wanted_hz": 10, "taken": 1.0, "latency_ms": 150.0,
+             "delay_ms": 220.0, "load": 1.5}  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("changes", "said"),
+    [
+        ({"sent_hz": 6.1}, "the camera sent 6.1 of 10 pictures/s"),
+        ({"taken": 0.5}, "50 % of the pictures were localized in time"),
+        ({"latency_ms": 612.0}, "latency p95 612 ms (220 at most)"),
+        ({"latency_ms": 260.0, "delay_ms": 300.0}, "latency p95 260 ms (250 at most)"),
+    ],
+)
+def test_a_computer_that_is_too_slow_is_named_and_what_it_did_not_keep_up_with(changes, said):
+    text = Pace(**(GOOD_PACE | changes)).complaint()
+    assert text is not None
+    assert said in text
+    assert "did not keep up" in text
+
+
+@pytest.mark.parametrize("changes", [{}, {"latency_ms": None}, {"sent_hz": 9.6, "taken": 0.97}])
+def test_a_computer_that_keeps_up_is_not_blamed(changes):
+    assert Pace(**(GOOD_PACE | changes)).complaint() is None

@@ -14,6 +14,7 @@ from sitl.demo.companion_process import Ports, write_deployment
 from sitl.demo.flight import fly
 from sitl.demo.report import make_report, print_report
 from sitl.demo.scenario import CameraSpec, Injection, Leg, Scenario
+from sitl.demo.script import FlightError, FlightScript
 
 # Light, because it flies in real time on what may be two cores.
 SCENARIO = Scenario(
@@ -59,6 +60,7 @@ def test_a_short_flight_without_gnss_comes_home(real_time, small_assets, tmp_pat
     folder = tmp_path / "report"
     with real_time():
         record = fly(small_assets, SCENARIO, kind, 3, folder)
+        assert record.broken is None
         report = make_report(record, SCENARIO, 3)
         print_report(report, folder)
         assert report.vehicle == kind
@@ -79,3 +81,28 @@ def test_a_short_flight_without_gnss_comes_home(real_time, small_assets, tmp_pat
     assert "point A" in page
     for name in ("tracks.png", "errors.png", "frames_report.csv", "overlay-0.png"):
         assert (folder / name).stat().st_size > 0
+
+
+class _BreaksOff(FlightScript):
+    """Ends once the companion is up, as a flight that is lost does."""
+
+    def fly(self):
+        self.await_companion()
+        raise FlightError("the vehicle left AUTO for LAND: no position")
+
+
+@pytest.mark.long
+def test_a_flight_that_breaks_off_leaves_its_report_and_then_fails(
+    small_assets, tmp_path, monkeypatch, capsys
+):
+    monkeypatch.setattr(flight, "FlightScript", _BreaksOff)
+    folder = tmp_path / "report"
+    record = fly(small_assets, SCENARIO, "embedded", 3, folder)
+    assert record.broken == "the vehicle left AUTO for LAND: no position"
+    report = make_report(record, SCENARIO, 3)
+    print_report(report, folder)
+    said = " ".join(capsys.readouterr().out.split())
+    assert "came home" not in said
+    written = json.loads((folder / "report.json").read_text())["report"]
+    assert written["broken"] == record.broken
+    assert "the flight broke off after" in write_page(folder).read_text()
