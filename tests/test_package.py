@@ -3,6 +3,7 @@
 import configparser
 import json
 import os
+import re
 import shutil
 import subprocess
 import sys
@@ -107,6 +108,17 @@ def test_the_units_restrictions_leave_what_the_program_needs():
     assert "MemoryDenyWriteExecute" not in service  # numba compiles
     assert service["RestrictRealtime"] == "yes"
     assert {"AF_INET", "AF_INET6", "AF_UNIX"} <= set(service["RestrictAddressFamilies"].split())
+
+
+def test_versions_and_labels_agree():
+    version = re.search(r'^version = "(.+)"', (ROOT / "pyproject.toml").read_text(), re.M)[1]
+    changelog = (ROOT / "CHANGELOG.md").read_text(encoding="utf-8")
+    container = (ROOT / "configs" / "package" / "Containerfile").read_text(encoding="utf-8")
+    assert f"## [{version}]" in changelog
+    assert f'LABEL version="{version}"' in container
+    for name in ("permissions", "authors", "company", "links", "tags"):
+        value = re.search(rf"^    {name}=(['\"])(.+)\1 \\?$|^    {name}='(.+)'$", container, re.M)
+        json.loads((value[2] or value[3]).replace('\\"', '"'))
 
 
 @pytest.mark.skipif(shutil.which("systemd-analyze") is None, reason="no systemd-analyze")
