@@ -3,7 +3,7 @@
 import configparser
 import json
 import os
-import re
+import shlex
 import shutil
 import subprocess
 import sys
@@ -111,14 +111,15 @@ def test_the_units_restrictions_leave_what_the_program_needs():
 
 
 def test_versions_and_labels_agree():
-    version = re.search(r'^version = "(.+)"', (ROOT / "pyproject.toml").read_text(), re.M)[1]
-    changelog = (ROOT / "CHANGELOG.md").read_text(encoding="utf-8")
+    project = (ROOT / "pyproject.toml").read_text(encoding="utf-8")
+    version = project.split('\nversion = "', 1)[1].split('"', 1)[0]
+    assert f"## [{version}]" in (ROOT / "CHANGELOG.md").read_text(encoding="utf-8")
     container = (ROOT / "configs" / "package" / "Containerfile").read_text(encoding="utf-8")
-    assert f"## [{version}]" in changelog
-    assert f'LABEL version="{version}"' in container
+    label = container.split("\nLABEL ", 1)[1].split("\nENTRYPOINT", 1)[0]
+    words = dict(word.split("=", 1) for word in shlex.split(label.replace("\\\n", " ")))
+    assert words["version"] == version
     for name in ("permissions", "authors", "company", "links", "tags"):
-        value = re.search(rf"^    {name}=(['\"])(.+)\1 \\?$|^    {name}='(.+)'$", container, re.M)
-        json.loads((value[2] or value[3]).replace('\\"', '"'))
+        json.loads(words[name])
 
 
 @pytest.mark.skipif(shutil.which("systemd-analyze") is None, reason="no systemd-analyze")
