@@ -1,8 +1,9 @@
-"""What a disk does not take, as a named error."""
+"""What a disk does not take, as a named error; and writing that nobody waits for."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+import threading
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -27,3 +28,54 @@ def made_folder(path: Path, option: str = "") -> Path:
     with writing(path, option):
         path.mkdir(parents=True, exist_ok=True)
     return path
+
+
+class NewestFile:
+    """A file that always holds the newest text, whole. A thread of its own writes it: a disk that
+    stands still keeps nobody else from working, and what it is too slow for is left out.
+
+    failed: called once, in that thread, with what the disk said.
+    """
+
+    def __init__(self, path: Path, failed: Callable[[OSError], None]) -> None:
+        self._path, self._failed = path, failed
+        self._newest: str | None = None
+        self._has_failed = self._stopping = False
+        self._wake = threading.Event()
+        self._thread = threading.Thread(target=self._run, name=path.name, daemon=True)
+
+    def start(self) -> None:
+        """Begin to write."""
+        self._thread.start()
+
+    def put(self, text: str) -> None:
+        """The text that it is to hold from now on. Never blocks."""
+        self._newest = text
+        self._wake.set()
+
+    def stop(self, patience_s: float = 2.0) -> None:
+        """Write the last text and end; a disk that stands still is left behind."""
+        self._stopping = True
+        self._wake.set()
+        self._thread.join(patience_s)
+
+    def _run(self) -> None:
+        while True:
+            self._wake.wait()
+            self._wake.clear()
+            stopping = self._stopping  # before the write: what comes in it is written next
+            text, self._newest = self._newest, None
+            if text is not None:
+                self._write(text)
+            if stopping:
+                return
+
+    def _write(self, text: str) -> None:
+        temporary = self._path.with_suffix(".tmp")
+        try:
+            temporary.write_text(text, encoding="utf-8")
+            temporary.replace(self._path)
+        except OSError as error:
+            if not self._has_failed:
+                self._failed(error)
+            self._has_failed = True

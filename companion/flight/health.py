@@ -18,6 +18,7 @@ import numpy as np
 
 from companion.guardian.guardian import Guardian
 from companion.sources import StreamState
+from companion.writing import NewestFile
 from localizer.tracking.engine_health import EngineHealth
 from localizer.types import PoseEstimate, TrackingState
 from mavlink_bridge.bridge import Bridge
@@ -66,7 +67,7 @@ class Besides:
 
 
 class HealthMonitor:
-    """Watches the parts and reports transitions. Its thread owns ``health.json``."""
+    """Watches the parts and reports transitions, and keeps ``health.json``."""
 
     def __init__(
         self,
@@ -81,7 +82,6 @@ class HealthMonitor:
         self._engine_health = engine_health
         self._bridge = bridge
         self._feed_state = feed_state
-        self._event = event
         self._is_recorded = besides.is_recorded
         self._position_sigma_m = besides.position_sigma_m
         self._guardian = besides.guardian
@@ -90,10 +90,9 @@ class HealthMonitor:
         self._ended = ""
         self.newest: dict[str, Any] = {"level": "starting", "text": "starting"}
         """The newest report, as health.json has it."""
-        self._file = record_folder / "health.json" if record_folder else None
+        self._file = _file(record_folder, event) if record_folder is not None else None
         self._estimates: deque[tuple[float, PoseEstimate]] = deque(maxlen=_WINDOW)
         self._came: deque[tuple[float, int]] = deque(maxlen=_WINDOW)
-        self._write_failed = False
         self._failures = 0
         self.turn_ns = time.monotonic_ns()
         """When its thread began its newest turn, CLOCK_MONOTONIC."""
@@ -102,12 +101,16 @@ class HealthMonitor:
 
     def start(self) -> None:
         """Start watching."""
+        if self._file is not None:
+            self._file.start()
         self._thread.start()
 
     def stop(self) -> None:
         """Stop, after one last report."""
         self._stop.set()
         self._thread.join()
+        if self._file is not None:
+            self._file.stop()
 
     def end(self, how: str) -> None:
         """The flight ends, and how: the last report says it instead of what was true until then."""
@@ -228,16 +231,8 @@ class HealthMonitor:
             "targets": self._targets(),
         }
         self.newest = report
-        if self._file is None:
-            return
-        temporary = self._file.with_suffix(".tmp")
-        try:
-            temporary.write_text(json.dumps(_finite(report), indent=1, default=str))
-            temporary.replace(self._file)
-        except OSError as error:  # a full disk must not end the reports to the vehicle
-            if not self._write_failed:
-                self._event("warning", f"{self._file} cannot be written: {error}")
-            self._write_failed = True
+        if self._file is not None:
+            self._file.put(json.dumps(_finite(report), indent=1, default=str))
 
     def _guardian_report(self) -> dict[str, Any] | None:
         """Standing findings with their figures, and the newest protection level."""
@@ -254,6 +249,12 @@ class HealthMonitor:
         """Localized frames per second over the last few seconds."""
         now = time.monotonic()
         return sum(1 for t, _ in list(self._estimates) if now - t < _RATE_S) / _RATE_S
+
+
+def _file(folder: Path, event: Callable[[str, str], None]) -> NewestFile:
+    """``health.json``, told once where a full disk does not take it."""
+    path = folder / "health.json"
+    return NewestFile(path, lambda e: event("warning", f"{path} cannot be written: {e}"))
 
 
 def _stages(estimates: list[PoseEstimate]) -> dict[str, dict[str, float]]:

@@ -1,8 +1,10 @@
 """What the health monitor makes of its parts, and that a bad disk does not silence it."""
 
 import json
+import threading
 import time
 from functools import partial
+from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
@@ -115,6 +117,31 @@ def test_a_file_that_cannot_be_written_is_an_event_and_the_bridge_is_still_told(
     told, events = _one_report(tmp_path / "gone", StreamState.LIVE, True)
     assert told
     assert any("cannot be written" in text for _, text in events)
+
+
+def test_a_disk_that_stands_still_keeps_the_health_from_nobody(tmp_path, monkeypatch):
+    """Its thread stood, too: the last level was told for ever, and after 4 s the supervisor ended
+    the process as one that hangs.
+    """
+    monkeypatch.setattr("companion.flight.health._PERIOD_S", 0.02)
+    stands, goes_on = threading.Event(), threading.Event()
+
+    def replace(*_):
+        stands.set()
+        goes_on.wait(60.0)
+
+    monkeypatch.setattr(Path, "replace", replace)
+    bridge = FakeBridge(True)
+    monitor = HealthMonitor(
+        EngineHealth, bridge, lambda: StreamState.LIVE, lambda *_: None, tmp_path
+    )
+    monitor.start()
+    assert stands.wait(30.0)
+    told, turn_ns = len(bridge.told), monitor.turn_ns
+    assert sleep_until(lambda: len(bridge.told) >= told + 3, 30.0)
+    assert monitor.turn_ns > turn_ns
+    goes_on.set()
+    monitor.stop()
 
 
 def test_a_record_that_fails_is_told_as_long_as_it_does(tmp_path):
