@@ -12,6 +12,7 @@ from enum import Enum
 
 import numpy as np
 
+from localizer.errors import OdometryError
 from localizer.geometry.camera import Camera
 from localizer.geometry.pose import Array, Pose
 from localizer.geometry.shutter import Sweep
@@ -106,7 +107,11 @@ class Bridging:
         seen = OdometryFrame(query, frame.exposure_time_ns, examine(frame.image), sweep)
         surface = anchors.points_world if anchors is not None else None
         constraint = self._constraint(frame.exposure_time_ns)
-        estimate = self._odometry.step(seen, prediction, surface=surface, constraint=constraint)
+        try:
+            estimate = self._odometry.step(seen, prediction, surface=surface, constraint=constraint)
+        except OdometryError as error:  # no depth for a first keyframe: there will be none later
+            self._odometry.forget()
+            return Carried(Carry.BROKEN, reason=str(error))
         if estimate.status is OdometryStatus.LOST:
             self._odometry.forget()
             return Carried(Carry.BROKEN, reason=estimate.reason)
@@ -127,7 +132,3 @@ class Bridging:
         if height_m is not None:
             known.append(height_constraint(height_m, _HEIGHT_M))
         return combine(*known) if known else None
-
-    def forget(self) -> None:
-        """A place was given from outside: what was carried is worth nothing."""
-        self._odometry.forget()

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -11,6 +12,7 @@ from localizer.config import LocalizerConfig
 from localizer.evaluation.sequences import Sequence, load_sequence
 from localizer.geometry.pose import Pose
 from localizer.map.cache.cache import TileCache
+from localizer.odometry.keyframe import DepthSource
 from localizer.tracking.opening import open_localizer
 from localizer.tracking.pipeline import Localizer
 from localizer.types import Frame, PoseEstimate, PosePrior, TrackingState
@@ -74,3 +76,22 @@ def test_a_covered_lens_ends_the_bridge(small_assets: FlightAssets, sequence: Se
             estimate = without_map(localizer, black)
             assert not estimate.accepted
         assert estimate.state is TrackingState.LOST
+
+
+def test_a_beginning_without_depth_ends_the_bridge_and_not_the_judging(
+    small_assets: FlightAssets, sequence: Sequence, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Each frame raised: none was judged, the state stayed "tracking", and nobody searched."""
+    config = LocalizerConfig(width=256)
+    with open_localizer(small_assets.map_cache, sequence.frame(0).camera, config) as localizer:
+        first = sequence.frame(0)
+        localizer.set_prior(PosePrior(sequence.truth[0], np.eye(6) * 0.01, first.exposure_time_ns))
+        for k in range(SEEN):
+            localizer.track(sequence.frame(k))
+        nothing = (SimpleNamespace(points_world=()), DepthSource.GROUND)
+        monkeypatch.setattr("localizer.odometry.odometry.keyframe_anchors", lambda *_: nothing)
+        for k in range(SEEN, EDGE):
+            estimate = without_map(localizer, sequence.frame(k))
+            assert not estimate.accepted
+        assert estimate.state is TrackingState.LOST
+        assert localizer.tracker.standing.wants_prior
