@@ -127,11 +127,6 @@ def comparable_level(extractor: FeatureExtractor, rgb: Image) -> FeatureLevel:
     raise MapCacheError(f"{extractor.name}: no features of stride {STRIDE} to compare places with")
 
 
-def overview_folder(cache: TileCache, model_key: str) -> Path:
-    """Where a map's overview by a model is kept."""
-    return cache.path / "overview" / overview_key(cache, model_key)
-
-
 def overview_key(cache: TileCache, model_key: str) -> str:
     """Of map, model and format."""
     settings = (_FORMAT, GSD_M, STRIDE, CHANNELS, GROUND_CELLS, _QUANTUM)

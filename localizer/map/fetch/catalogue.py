@@ -20,7 +20,6 @@ Kind = Literal["wms", "wmts", "wcs", "xyz", "tms", "cog", "stac"]
 Role = Literal["imagery", "surface", "terrain"]
 SHIPPED = Path(__file__).with_name("sources.yaml")
 _MOST_BYTES = 1 << 20
-_IN_PROJECTION = ("wms", "wcs")
 
 
 class Source(BaseModel):
