@@ -1,7 +1,7 @@
 """The paper's tables from the JSON of the benchmarks, as Markdown; nothing is measured anew.
 
     python -m benchmarks.tables [--targets a.json ...] [--ablation basin.json] [--axes axes.json]
-        [--optimizer out.json] [--depths depths.json] [--throughput out.json] [--out tables.md]
+        [--optimizer out.json] [--depths depths.json] [--throughput a.json ...] [--out tables.md]
 
 Table 2 is `python -m benchmarks.places table`. --targets: of `benchmarks.targets` (Table 3, flights
 of one height pooled). --ablation, --axes: of `benchmarks.basin --json` (Table 4; Table 6 and
@@ -131,9 +131,9 @@ def depths_table(path: Path) -> Iterator[str]:
         )
 
 
-def throughput_table(path: Path) -> Iterator[str]:
+def throughput_table(paths: Sequence[Path]) -> Iterator[str]:
     """The engine's rate, latency and processor time, then the stages of a frame."""
-    document = _read(path)["rows"]
+    document = [row for path in paths for row in _read(path)["rows"]]
     yield (
         "| width | cores | frames offered | frames/s | latency p50 / p95, ms | CPU ms a frame | "
         "share of the cores | median error, m |"
@@ -186,7 +186,7 @@ def main() -> None:
     parser.add_argument("--axes", type=existing, help="JSON of benchmarks.basin axes")
     parser.add_argument("--optimizer", type=existing, help="JSON of benchmarks.optimizer")
     parser.add_argument("--depths", type=existing, help="JSON of benchmarks.depths")
-    parser.add_argument("--throughput", type=existing, help="JSON of benchmarks.throughput run")
+    parser.add_argument("--throughput", type=existing, nargs="+", help="JSON of benchmarks.throughput")
     parser.add_argument("--out", type=output, help="Markdown; none: printed")
     args = parser.parse_args()
     wanted = (

@@ -74,7 +74,7 @@ def test_the_throughput_has_rates_and_stages(tmp_path):
            "latency_p50_ms": 30.0, "latency_p95_ms": 50.0, "cpu_ms_per_frame": 40.0,
            "share_percent": 60.0, "median_m": 0.2}  # fmt: skip
     stages = {"width": 320, "cores": 1, "offered": "stages", "stage_ms": {"render": 9.0, "all": 66}}
-    text = "\n".join(throughput_table(_written(tmp_path / "a.json", {"rows": [run, stages]})))
+    text = "\n".join(throughput_table([_written(tmp_path / "a.json", {"rows": [run, stages]})]))
     assert "| 320 | 2 | real time | 29.9 | 30 / 50 | 40.0 | 60 % | 0.20 |" in text
     assert "| render | 9.0 |" in text
 
