@@ -186,7 +186,9 @@ def main() -> None:
     parser.add_argument("--axes", type=existing, help="JSON of benchmarks.basin axes")
     parser.add_argument("--optimizer", type=existing, help="JSON of benchmarks.optimizer")
     parser.add_argument("--depths", type=existing, help="JSON of benchmarks.depths")
-    parser.add_argument("--throughput", type=existing, nargs="+", help="JSON of benchmarks.throughput")
+    parser.add_argument(
+        "--throughput", type=existing, nargs="+", help="JSON of benchmarks.throughput"
+    )
     parser.add_argument("--out", type=output, help="Markdown; none: printed")
     args = parser.parse_args()
     wanted = (

@@ -87,3 +87,25 @@ def test_reports_name_commit_and_processor():
     assert found["processor"].split(" x ")[0].isdigit()
     if (ROOT / ".git").exists():
         assert len(found["commit"].rstrip("+")) >= 7
+
+
+def test_rates_of_several_runs_stand_together_without_their_stages(tmp_path):
+    run = {"width": 320, "cores": 2, "offered": "two at a time", "frames_answered": 279,
+           "frames_offered": 280, "frames_per_s": 37.8, "latency_p50_ms": 48.5,
+           "latency_p95_ms": 75.9, "cpu_ms_per_frame": 43.3, "share_percent": 81.9,
+           "median_m": 0.159, "p95_m": 0.307}  # fmt: skip
+    paths = [tmp_path / "a.json", tmp_path / "b.json"]
+    for path in paths:
+        path.write_text(json.dumps({"rows": [run, {"width": 320, "stage_ms": {"all": 61.0}}]}))
+    table, _ = tables_of(paths, "")
+    assert len(table.rows) == 2
+    assert table.rows[0][3:6] == ("279 of 280", "37.8", "48 / 76")
+
+
+def test_depths_are_kept_by_height(tmp_path):
+    row = {"height_m": 100.0, "pixels": 9, "median": 8e-8, "p95": 2e-4, "p99": 5.7e-3,
+           "within_1_percent": 99.384, "hidden_percent": 2.85}  # fmt: skip
+    path = tmp_path / "d.json"
+    path.write_text(json.dumps({"bins": [0.1], "rows": [row]}))
+    table, _ = tables_of([path], "")
+    assert table.rows[0] == ("100", "9", "8.0e-08", "2.0e-04", "5.7e-03", "99.38 %", "2.9 %")

@@ -35,6 +35,11 @@ _PACKAGE = (
     "package", "install, with self-test, s", "start, s", "upgrade, s", "remove, s", "purge, s",
     "self-test: tracked, found to", "processor ms a frame",
 )  # fmt: skip
+_DEPTHS = ("height, m", "pixels", "median", "95 %", "99 %", "within 1 %", "hidden from the other")
+_THROUGHPUT = (
+    "width", "cores", "frames offered", "frames", "frames/s", "latency p50 / p95, ms",
+    "CPU ms a frame", "share of the cores", "median / p95 error, m",
+)  # fmt: skip
 _TESTS = ("tests", "passed", "failed", "skipped", "seconds")
 
 
@@ -73,6 +78,7 @@ def _form(data: Any) -> Callable[[list[Any], str], Table]:
     for mark, made in (
         ("columns", _figures), ("package", _package), ("recall_1", _sequence), ("verdict", _suite),
         ("acceptance", _integrity), ("search_cpu_s", _places), ("overview_mib", _cost),
+        ("bins", _depths), ("rows", _throughput),
     ):  # fmt: skip
         if mark in marks:
             return made
@@ -82,6 +88,33 @@ def _form(data: Any) -> Callable[[list[Any], str], Table]:
 def _figures(data: list[Any], _title: str) -> Table:
     rows = (tuple(map(str, row)) for one in data for row in one["rows"])
     return Table(tuple(data[0]["columns"]), tuple(rows))
+
+
+def _depths(data: list[Any], _title: str) -> Table:
+    rows = tuple(
+        (
+            f"{one['height_m']:.0f}", str(one["pixels"]),
+            *(f"{one[key]:.1e}" for key in ("median", "p95", "p99")),
+            f"{one['within_1_percent']:.2f} %", f"{one['hidden_percent']:.1f} %",
+        )
+        for part in data for one in part["rows"]
+    )  # fmt: skip
+    return Table(_DEPTHS, rows)
+
+
+def _throughput(data: list[Any], _title: str) -> Table:
+    """Without the stages, which are of another shape."""
+    rows = tuple(
+        (
+            str(one["width"]), str(one["cores"]), one["offered"],
+            f"{one['frames_answered']} of {one['frames_offered']}", f"{one['frames_per_s']:.1f}",
+            f"{one['latency_p50_ms']:.0f} / {one['latency_p95_ms']:.0f}",
+            f"{one['cpu_ms_per_frame']:.1f}", f"{one['share_percent']:.0f} %",
+            f"{one['median_m']:.2f} / {one['p95_m']:.2f}",
+        )
+        for part in data for one in part["rows"] if "stage_ms" not in one
+    )  # fmt: skip
+    return Table(_THROUGHPUT, rows)
 
 
 def _loop(paths: Sequence[Path], title: str, only: Sequence[str]) -> Table:
