@@ -57,6 +57,7 @@ class ClosedLoopCheck:
         self._began_ns: int | None = None
         self._reset_counter: int | None = None
         self._jump_ns: int | None = None
+        self._announced_ns = 0
         self._repeats = 0
 
     def sent(
@@ -71,6 +72,7 @@ class ClosedLoopCheck:
         """A position went out: valid at stamp_ns, NE metres from the EKF origin."""
         if self._reset_counter not in (None, reset_counter):
             self._jump_ns = now_ns + _TAKES_NS
+            self._announced_ns = now_ns
         self._reset_counter = reset_counter
         if not self._sent or now_ns - self._sent[-1][0] > _SETTLE_NS:
             self._began_ns = now_ns
@@ -96,7 +98,8 @@ class ClosedLoopCheck:
         rate = (len(recent) - 1) / span_s if span_s > 0.0 else 0.0
         sigma = recent[-1][3]
         reason = self._reason(rate, state, difference, sigma)
-        if difference is not None and _is_there(difference, sigma):
+        after_jump = now_ns - self._announced_ns > _WINDOW_NS + _COMPARE_AFTER_NS + _TAKES_NS
+        if after_jump and difference is not None and _is_there(difference, sigma):
             self._repeats = 0  # another jump may be missed as often
         return LoopVerdict(not reason, reason, difference)
 
