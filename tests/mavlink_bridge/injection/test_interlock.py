@@ -8,7 +8,11 @@ from typing import Any
 import pytest
 
 from mavlink_bridge.config import InjectionConfig, RcGateConfig, SourceSwitchConfig
+from mavlink_bridge.injection.interlock import ShadowInterlock
 from mavlink_bridge.injection.rc_gate import InjectionGate
+from mavlink_bridge.injection.shadow import ShadowScore
+from mavlink_bridge.messages import VehicleState
+from mavlink_bridge.texts import Teller
 from tests.mavlink_bridge.simulated import SECOND, Flight
 
 SWITCH = SourceSwitchConfig(enabled=True)
@@ -151,6 +155,41 @@ def test_the_pilots_gate_is_obeyed_and_told_without_a_go(monkeypatch: pytest.Mon
     flight.run(5.0)
     assert flight.vision()
     assert told(flight, "go from") == ["injecting without a go from shadow"]
+
+
+class Compared:
+    """An interlock whose score and comparisons are said."""
+
+    def __init__(self) -> None:
+        self._go, self._compared_ns = False, 0
+        self._interlock = ShadowInterlock(
+            False,
+            lambda _: ShadowScore(self._go, 100, () if self._go else ("3.0 Hz, needs 4",)),
+            lambda: self._compared_ns,
+            Teller(lambda _severity, _text: None),
+        )
+
+    def may_switch(self, second: int, *, go: bool, gnss: bool = True) -> bool:
+        now_ns = second * SECOND
+        self._go, self._compared_ns = go, now_ns if gnss else self._compared_ns
+        state = VehicleState(connected=True, gps_fix_type=3, gps_time_ns=now_ns if gnss else 1)
+        self._interlock.mode("shadow", state, now_ns, by_pilot=False)
+        return self._interlock.may_switch(now_ns)
+
+
+def test_a_go_that_comparisons_have_outlived_by_half_a_minute_is_none() -> None:
+    """A receiver that is jammed slowly spoils the score's end, and no more than its end."""
+    compared = Compared()
+    assert compared.may_switch(100, go=True)
+    assert compared.may_switch(129, go=False)
+    assert not compared.may_switch(131, go=False)
+
+
+def test_a_go_is_forgotten_after_ten_minutes_without_gnss() -> None:
+    compared = Compared()
+    assert compared.may_switch(100, go=True)
+    assert compared.may_switch(699, go=False, gnss=False)
+    assert not compared.may_switch(701, go=False, gnss=False)
 
 
 @pytest.mark.parametrize(
