@@ -15,7 +15,7 @@ levels, with the exact 95 % interval. A run goes on where its file ends.
 
 With --flights (folders of `python -m sitl loop` or `demo`) it counts how many positions lay inside
 the level that they had in flight: those that were injected, and those that were withheld or flown
-in shadow.
+in shadow; and what the guardian said, by finding.
 """
 
 from __future__ import annotations

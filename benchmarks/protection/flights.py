@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import csv
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from benchmarks.protection.fit import exact_interval
+from companion.guardian.findings import RULES, Action
 from mavlink_bridge.errors import RecordError
 from mavlink_bridge.link.tlog import read_tlog
 from sitl.demo.scenario import ScenarioError
@@ -34,11 +35,19 @@ class Position:
 
 @dataclass(frozen=True)
 class FlownPositions:
-    """Those of one flight. normal: nothing was wrong in it."""
+    """Those of one flight. normal: nothing was wrong in it. told: what the guardian found, by name
+    of the finding, and how often it was said.
+    """
 
     name: str
     normal: bool
     positions: tuple[Position, ...]
+    told: dict[str, int] = field(default_factory=dict)
+
+    @property
+    def was_withheld(self) -> bool:
+        """Whether the guardian withheld positions."""
+        return any(r.name in self.told for r in RULES if r.action is not Action.NONE)
 
 
 @dataclass(frozen=True)
@@ -78,7 +87,7 @@ def read_flight(folder: Path) -> FlownPositions:
     sent = _sent(folder / "flight.tlog")
     found = [position for row in rows if (position := _position(row, truth, sent)) is not None]
     normal = case.is_normal if case is not None else True
-    return FlownPositions(folder.name, normal, tuple(found))
+    return FlownPositions(folder.name, normal, tuple(found), _told(folder))
 
 
 def report(flights: Sequence[FlownPositions]) -> dict[str, Any]:
@@ -95,6 +104,18 @@ def report(flights: Sequence[FlownPositions]) -> dict[str, Any]:
     }
     return {
         "shares": {name: asdict(one) for name, one in shares.items() if one is not None},
+        "guardian": {
+            name: {
+                "flights": len(some),
+                "with a finding": sum(bool(f.told) for f in some),
+                "withheld": sum(f.was_withheld for f in some),
+            }
+            for name, some in (
+                ("normal", [f for f in flights if f.normal]),
+                ("faults", [f for f in flights if not f.normal]),
+            )
+        },
+        "told": {f.name: f.told for f in flights},
         "flights": {
             f.name: {
                 what: None if (one := share([f], injected=injected)) is None else asdict(one)
@@ -139,6 +160,11 @@ def table(found: dict[str, Any]) -> str:
             f"{s['within_vpl']} | {s['hpl_median_m']:.2f}, {s['vpl_median_m']:.2f} | "
             f"{s['worst_share']:.2f} |"
         )
+    rows += [
+        f"\nguardian, {name}: {g['with a finding']} of {g['flights']} with a finding, "
+        f"{g['withheld']} withheld"
+        for name, g in found["guardian"].items()
+    ]
     return "\n".join(rows)
 
 
@@ -161,6 +187,13 @@ def _truth(path: Path) -> np.ndarray:
         ]
     poses = {int(row[0]): row for row in rows}
     return np.array([poses[time_ns] for time_ns in sorted(poses)], dtype=np.float64)
+
+
+def _told(folder: Path) -> dict[str, int]:
+    """How often each finding of the guardian was said, by the companion's events."""
+    rows = [row for path in sorted(folder.glob("companion*/events.csv")) for row in _rows(path)]
+    said = {rule.name: sum(rule.is_line(row["text"]) for row in rows) for rule in RULES}
+    return {name: count for name, count in said.items() if count}
 
 
 def _rows(path: Path) -> list[dict[str, str]]:

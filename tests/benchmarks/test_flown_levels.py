@@ -57,6 +57,19 @@ def test_what_was_injected_is_told_from_what_was_not(tmp_path: Path) -> None:
         assert list(position.error_m) == pytest.approx([0.1, 0.2], abs=1e-3)
 
 
+def test_what_the_guardian_said_is_counted(tmp_path: Path) -> None:
+    quiet = read_flight(flown(tmp_path / "embedded-normal-fast-3"))
+    folder = flown(tmp_path / "embedded-normal-fast-4")
+    lines = ["PiLoT: withheld: video frozen 4 s", "PiLoT: withheld: video frozen 9 s",
+             "PiLoT: over: video frozen", "PiLoT: GNSS lost, injecting"]  # fmt: skip
+    events = "".join(f"{BEGIN_NS},warning,{line}\n" for line in lines)
+    (folder / "companion" / "events.csv").write_text("time_ns,level,text\n" + events)
+    loud = read_flight(folder)
+    assert (quiet.told, loud.told) == ({}, {"video_frozen": 2})
+    found = report([quiet, loud])
+    assert found["guardian"]["normal"] == {"flights": 2, "with a finding": 1, "withheld": 1}
+
+
 def test_late_stamps_are_errors_of_the_way_flown_meanwhile(tmp_path: Path) -> None:
     """By the stamped times the pictures would agree with themselves."""
     found = read_flight(flown(tmp_path / "embedded-late-300ms-5", late_ns=125_000_000))
