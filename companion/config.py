@@ -22,6 +22,7 @@ from mavlink_bridge.config import BridgeConfig
 
 _FIELDS_OF_VIEW_DEG = (1.0, 170.0)
 _CENTRAL = (0.1, 0.9)  # share of the picture in which the principal point must lie
+_SQUAREST = 1.5  # between fx and fy: pixels of 4:3 and 16:11 are the oddest in use
 _MOST_BENT = 0.7  # of a corner's distance from the principal point
 
 
@@ -56,6 +57,11 @@ class CameraModel(_Model):
                     f"{name} {f:g} on {side} pixels is a field of view of {fov_deg:.3g} degrees; "
                     "give the focal length in pixels"
                 )
+        if not 1.0 / _SQUAREST <= self.fx / self.fy <= _SQUAREST:
+            raise ValueError(
+                f"fx {self.fx:g} and fy {self.fy:g} are of pixels that no camera has; of one lens "
+                "they are nearly the same"
+            )
         for name, side, c in (("cx", self.width, self.cx), ("cy", self.height, self.cy)):
             if not _CENTRAL[0] * side <= c <= _CENTRAL[1] * side:
                 raise ValueError(

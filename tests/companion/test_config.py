@@ -68,6 +68,7 @@ def test_minimal_config_and_paths_relative_to_the_file(tmp_path):
         ({"camera": CAMERA | {"model": MODEL | {"fx": 0.86}}}, "camera.model: .*fx 0.86 on 640"),
         ({"camera": CAMERA | {"model": MODEL | {"fy": 550e3}}}, "give the focal length in pixels"),
         ({"camera": CAMERA | {"model": MODEL | {"cx": 0.5}}}, "camera.model: .*cx 0.5 is far"),
+        ({"camera": CAMERA | {"model": MODEL | {"fy": 1650}}}, "fx 550 and fy 1650 are of pixels"),
         ({"camera": CAMERA | {"model": MODEL | {"cy": 3600}}}, "principal point in pixels"),
         ({"camera": CAMERA | {"model": MODEL | {"distortion": [9, 0, 0, 0, 0]}}}, "this order"),
         ({"camera": CAMERA | {"model": MODEL | {"distortion": [0, 0, 9, 0, 0]}}}, "this order"),
