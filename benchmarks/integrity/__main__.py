@@ -1,6 +1,7 @@
 """False accepts: single registrations from wrong beginnings, and the right ones that tests cost.
 
     python -m benchmarks.integrity FOLDER [--sets generated quito ...] [--minutes 10]
+    python -m benchmarks.integrity FOLDER --again
     python -m benchmarks.integrity FOLDER --report [--json out.json] [--plot out.png]
 
 FOLDER keeps worlds, maps, views and one file of outcomes a set (`integrity/SET.jsonl`); a run goes
@@ -10,7 +11,9 @@ with a focal length that is 5 % off. Roll, pitch and height are known as an auto
 and every prior tells its own error, so that the gate against the prior is as wide as it deserves. A
 false accept is a wrong beginning that ends accepted and more than 3 m or 3 degrees off (beside it:
 more than 10 m). The set
-"tuning" is for choosing thresholds and in no figure of the report. On "shifted" a result counts by
+"tuning" is for choosing thresholds and in no figure of the report. --again brings outcomes of an
+older version up to date: what its tests accepted is registered once more, has to end where it did,
+and gets what is tested since; what they refused no further test lets in. On "shifted" a result counts by
 the place that the map's picture shows: no single picture tells that a map is shifted.
 """
 
@@ -27,7 +30,7 @@ from benchmarks.common.named_errors import named_errors, needs_torch
 with needs_torch():
     from benchmarks.integrity.maps import SETS, SHIFT_M, TUNING, load_set
     from benchmarks.integrity.report import by_condition, plot, rows, table
-    from benchmarks.integrity.run import Outcome, read, run_set, turn
+    from benchmarks.integrity.run import Outcome, again, read, run_set, turn
 from localizer.integrity.acceptance import IntegrityConfig
 
 _TURN = 8  # views of a set before it is the next one's turn
@@ -40,6 +43,7 @@ def parser() -> Parser:
     p.add_argument("--sets", nargs="+", choices=list(SETS), default=list(SETS), help="to run")
     p.add_argument("--data", type=Path, default=Path("../shared/data"), help="real sets")
     p.add_argument("--minutes", type=number(0.1, 1e4), default=10.0, help="until it pauses")
+    p.add_argument("--again", action="store_true", help="bring older outcomes up to date")
     p.add_argument("--report", action="store_true", help="tables of what is there; no run")
     p.add_argument("--json", type=output, help="the report's rows")
     p.add_argument("--plot", type=output, help="PNG: agreement over quality")
@@ -61,7 +65,8 @@ def main() -> None:
                 kept = [] if name == TUNING else [v for n in views if n != TUNING for v in views[n]]
                 shift = SHIFT_M if name == "shifted" else (0.0, 0.0)
                 path = home / f"{name}.jsonl"
-                left[name] = run_set(name, views[name], kept, path, shift, turn(more_time, _TURN))
+                do = again if args.again else run_set
+                left[name] = do(name, views[name], kept, path, shift, turn(more_time, _TURN))
                 print(f"{name}: {left[name]} of {len(views[name])} views left", flush=True)
         return
     outcomes: list[Outcome] = []

@@ -2,9 +2,8 @@
 
 "tuning" and "generated" are worlds of different seeds. The made maps are hard on purpose: forest
 (few photographs of crowns, turned and mirrored, over and over), water (nothing but waves, others
-in the query), roofs (one house on equal lots), terraces (one house in rows), "outdated" (portugal,
-of which three squares in ten show other ground, heights included), "shifted" (portugal's orthophoto
-5 m off its heights).
+in the query), roofs (one house on equal lots), "outdated" (portugal, of which three squares in ten
+show other ground, heights included), "shifted" (portugal's orthophoto 5 m off its heights).
 """
 
 from __future__ import annotations
@@ -33,7 +32,7 @@ from localizer.types import Float32, Image
 TUNING = "tuning"  # thresholds may be chosen on it, figures are those of the others
 SETS = {
     TUNING: 40, "generated": 40, "quito": 40, "portugal": 40, "caliterra": 50, "outdated": 30,
-    "shifted": 20, "forest": 30, "water": 15, "roofs": 30, "terraces": 20,
+    "shifted": 20, "forest": 30, "water": 15, "roofs": 30,
 }  # fmt: skip
 _CHANGED, _CHANGE_M = 0.3, 24.0  # share of an outdated map that has changed, side of a change
 SHIFT_M = (4.0, -3.0)  # of the orthophoto, east and north
@@ -113,7 +112,7 @@ def _shifted(home: Path, folder: Path, data: Path, count: int) -> None:
 def _made(home: Path, _folder: Path, data: Path, count: int) -> None:
     """A made map, and, where the ground itself moves, another one that the queries see."""
     paint: Callable[[Path, int], tuple[Image, Float32]] = {
-        "forest": _forest, "water": _water, "roofs": _roofs, "terraces": _terraces,
+        "forest": _forest, "water": _water, "roofs": _roofs,
     }[home.name]  # fmt: skip
     moves = home.name == "water"
     for name, seed in (("map", 0), ("day", 1)) if moves else (("map", 0),):
@@ -209,33 +208,3 @@ def _roofs(_data: Path, seed: int) -> tuple[Image, Float32]:
                 cv2.circle(lawn, at, 14, (52.0, 78.0, 40.0), -1)
                 cv2.circle(height, at, 14, 7.0, -1)
     return lawn.clip(0, 255).astype(np.uint8), _posts(height)
-
-
-def _terraces(_data: Path, seed: int) -> tuple[Image, Float32]:
-    """Rows of one house 8 m wide, gardens 12 m deep, a street every second row, a tree in a
-    quarter of the gardens.
-    """
-    rng = np.random.default_rng((24, seed))
-    side = round(_SIDE_M / _GSD_M)
-    ground = np.array([88.0, 118.0, 64.0]) + 6.0 * _noise(rng, side, 8)[..., None]
-    height = np.zeros((side, side), np.float32)
-    width, deep, garden, street = (round(m / _GSD_M) for m in (8.0, 10.0, 12.0, 7.0))
-    y = 0
-    for row in range(side):
-        if row % 2 == 0:
-            ground[y : y + street] = (104, 104, 108)
-            y += street
-        if y + deep + garden > side:
-            break
-        height[y : y + deep] = 7.0
-        ground[y : y + deep] = (136.0, 70.0, 58.0)
-        ground[y + deep // 2 : y + deep] *= 0.74  # the roofs' other slope
-        for x in range(0, side - width, width):
-            ground[y : y + deep, x : x + 2] = (176.0, 170.0, 160.0)  # the wall between two
-            ground[y + 10 : y + 16, x + 14 : x + 20] = (60.0, 60.0, 66.0)  # a window in the roof
-            if rng.random() < 0.25:
-                at = (x + int(rng.integers(8, 32)), y + deep + int(rng.integers(12, garden - 12)))
-                cv2.circle(ground, at, 10, (52.0, 78.0, 40.0), -1)
-                cv2.circle(height, at, 10, 5.0, -1)
-        y += deep + garden
-    return ground.clip(0, 255).astype(np.uint8), _posts(height)

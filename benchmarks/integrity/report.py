@@ -26,7 +26,7 @@ _TOGETHER: dict[str, Acceptance] = {
     "all": lambda o: True,
     "all, focal length right": lambda o: not o.kind.startswith("focal"),
     "all, focal length right, no equal roofs": lambda o: (
-        not o.kind.startswith("focal") and o.set not in ("roofs", "terraces")
+        not o.kind.startswith("focal") and o.set != "roofs"
     ),
 }
 
