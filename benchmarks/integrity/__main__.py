@@ -10,11 +10,11 @@ on where the last one ended, and ends after so many minutes. Every view begins n
 with a focal length that is 5 % off. Roll, pitch and height are known as an autopilot knows them,
 and every prior tells its own error, so that the gate against the prior is as wide as it deserves. A
 false accept is a wrong beginning that ends accepted and more than 3 m or 3 degrees off (beside it:
-more than 10 m). The set
-"tuning" is for choosing thresholds and in no figure of the report. --again brings outcomes of an
-older version up to date: what its tests accepted is registered once more, has to end where it did,
-and gets what is tested since; what they refused no further test lets in. On "shifted" a result counts by
-the place that the map's picture shows: no single picture tells that a map is shifted.
+more than 10 m). The set "tuning" is for choosing thresholds and in no figure of the report. On
+"shifted" a result counts by the place that the map's picture shows: no single picture tells that a
+map is shifted. --again brings outcomes of an older version up to date: what its tests accepted is
+registered once more, has to end where it did, and gets what is tested since; what they refused no
+further test lets in.
 """
 
 from __future__ import annotations

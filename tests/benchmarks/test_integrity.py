@@ -3,15 +3,25 @@
 from __future__ import annotations
 
 import json
+from contextlib import ExitStack
 from dataclasses import asdict, replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
+from benchmarks.basin.views import View
 from benchmarks.common.shares import exact_interval
+from benchmarks.integrity.beginnings import beginnings
 from benchmarks.integrity.report import AGREE, DISTINCT, FOCAL, OURS, WITHOUT, rows
-from benchmarks.integrity.run import Outcome, read, turn
+from benchmarks.integrity.run import Outcome, Registrar, again, read, turn
+from localizer.errors import SequenceError
+from localizer.geometry.camera import Camera
+from localizer.geometry.pose import Pose
 from localizer.integrity.acceptance import IntegrityConfig
+from localizer.registration.agreement import Agreement
+from localizer.registration.result import Registration
+from localizer.types import RegistrationStatus
 
 RIGHT = Outcome(
     "quito", 0, "day", "near", 3.0, 3.0, True, metres=0.2, degrees=0.1, off_map_m=0.2,
@@ -69,6 +79,60 @@ def test_a_better_focal_length_and_a_place_that_does_not_stand_out_are_refused_b
     assert (of(outcomes, AGREE).false.hits, of(outcomes, OURS).false.hits) == (2, 0)
     assert (of(outcomes, FOCAL).false.hits, of(outcomes, DISTINCT).false.hits) == (1, 1)
     assert (of(outcomes, OURS).lost.hits, of(outcomes, OURS).lost.count) == (0, 1)
+
+
+@pytest.fixture
+def older(tmp_path):
+    """A view and its outcomes as an older version kept them: without the newer tests' figures."""
+    camera = Camera.from_fov(32, 24, 60.0)
+    truth = Pose(np.diag([1.0, -1.0, -1.0]), np.array([0.0, 0.0, 100.0]))
+    view = View(tmp_path / "map", np.zeros((24, 32, 3), np.uint8), truth, camera, "day", 100.0)
+    path, rows = tmp_path / "quito.jsonl", []
+    for begun in beginnings(view, 0, [view], []):
+        kept = RIGHT if begun.kind == "near" else WRONG
+        row = asdict(
+            replace(kept, kind=begun.kind, start_m=begun.start_m, start_deg=begun.start_deg)
+        )
+        rows.append({k: v for k, v in row.items() if k not in ("focal_gain", "prior_sigma_m")})
+    del rows[4]  # one that did not meet the map
+    path.write_text("".join(json.dumps(row) + "\n" for row in rows))
+    return view, path, len(rows)
+
+
+def test_of_older_outcomes_what_was_accepted_is_registered_again(older, monkeypatch):
+    view, path, count = older
+    repeated = []
+
+    def register(self, query, begun, index):
+        repeated.append(begun.kind)
+        near = Pose(view.truth.rotation, view.truth.translation + np.array([0.2, 0, 0]))
+        votes = Agreement(parts=60, votes=57, peak=7.0)
+        return Registration(
+            near, 0.04 * np.eye(6), 0.1, 0.9, 0.6, RegistrationStatus.OK, 1, votes, 1.0, -0.03
+        )
+
+    monkeypatch.setattr(Registrar, "_register", register)
+    monkeypatch.setattr(Registrar, "__init__", lambda self, config: vars(self).update(
+        _extractor=SimpleNamespace(extract=lambda rgb: None), _stack=ExitStack()))  # fmt: skip
+    left = again("quito", [view], [view], path, (0.0, 0.0), lambda: True)
+    assert left == 0
+    assert repeated == ["near"] * 3
+    found = read(path)
+    assert len(found) == count
+    assert [o.focal_gain for o in found if o.kind == "near"] == [-0.03] * 3
+    far = next(o for o in found if o.kind == "far")
+    assert (far.votes, far.prior_sigma_m) == (WRONG.votes, pytest.approx(20 / np.sqrt(2)))
+    assert again("quito", [view], [view], path, (0.0, 0.0), lambda: True) == 0
+    assert len(repeated) == 3
+
+
+def test_an_answer_that_is_another_than_was_kept_is_named(older, monkeypatch):
+    view, path, _ = older
+    monkeypatch.setattr(Registrar, "_register", lambda *_: None)
+    monkeypatch.setattr(Registrar, "__init__", lambda self, config: vars(self).update(
+        _extractor=SimpleNamespace(extract=lambda rgb: None), _stack=ExitStack()))  # fmt: skip
+    with pytest.raises(SequenceError, match="begin anew"):
+        again("quito", [view], [view], path, (0.0, 0.0), lambda: True)
 
 
 def test_a_line_that_was_cut_short_costs_its_view_alone(tmp_path):
