@@ -16,7 +16,7 @@ from __future__ import annotations
 import json
 import re
 from collections.abc import Iterator, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -24,9 +24,11 @@ from typing import Any
 import numpy as np
 
 from benchmarks.common.arguments import Parser, existing, output
+from benchmarks.common.figures import write_figures
 from benchmarks.common.named_errors import named_errors
 from companion.flight.priors import drift_sigma_m
 
+COLUMNS = ("after", "losses", "EKF error median, worst, m", "believed sigma, one axis, m")
 AT_S = (5.0, 10.0, 15.0, 20.0, 30.0)
 RIGHT_M = 2.0
 _FED_WRONG = ("spoofed", "frozen", "shifted", "late", "focal", "gimbal", "other-map", "jump")
@@ -48,11 +50,13 @@ class Drift:
 
 @dataclass(frozen=True)
 class Fit:
-    """sigma = speed t + acceleration t², one axis; stretches: that it was fitted on."""
+    """sigma = speed t + acceleration t², one axis. flights, errors: that it was fitted on;
+    believed_covers: errors within the believed 95 %.
+    """
 
     speed_m_s: float
     acceleration_m_s2: float
-    stretches: int
+    flights: int
     errors: int
     believed_covers: int
     worst_over_believed: float
@@ -135,33 +139,39 @@ def read(folder: Path) -> list[Drift]:
     return found
 
 
+def table(found: Sequence[Drift]) -> list[tuple[str, ...]]:
+    """One line for each time, and one for the fit."""
+    rows: list[tuple[str, ...]] = []
+    for at in AT_S:
+        errors = [d.error_m for d in found if abs(d.seconds - at) <= _NEAR_S]
+        if errors:
+            extremes = f"{np.median(errors):.1f}, {max(errors):.1f}"
+            rows.append((f"{at:.0f} s", str(len(errors)), extremes, f"{drift_sigma_m(at):.1f}"))
+    fit = fitted(found)
+    rows.append(
+        (
+            f"fit: {fit.speed_m_s:.2f} t + {fit.acceleration_m_s2:.3f} t²",
+            f"{fit.flights} flights, {fit.errors} errors",
+            f"{fit.believed_covers} within the believed 95 %",
+            f"worst {fit.worst_over_believed:.2f} sigmas",
+        )
+    )
+    return rows
+
+
 def main() -> None:
     p = Parser(__doc__)
     p.add_argument("flights", type=existing, help="folder of flights")
-    p.add_argument("--json", type=output, help="errors and fit")
+    p.add_argument("--json", type=output, help="the table")
     args = p.parse_args()
     found = read(args.flights)
     if not found:
         p.error(f"{args.flights}: no flight with a loss that the companion told")
-    fit = fitted(found)
-    print("| after, s | stretches | EKF error median, worst, m | believed, one axis, m |")
-    print("|---|---|---|---|")
-    for at in AT_S:
-        some = [d for d in found if abs(d.seconds - at) <= _NEAR_S]
-        if some:
-            errors = [d.error_m for d in some]
-            print(
-                f"| {at:.0f} | {len(some)} | {np.median(errors):.1f}, {max(errors):.1f} "
-                f"| {drift_sigma_m(at):.1f} |"
-            )
-    print(
-        f"fit: {fit.speed_m_s:.2f} t + {fit.acceleration_m_s2:.3f} t², one axis; of {fit.errors} "
-        f"errors {fit.believed_covers} within the believed 95 %, worst "
-        f"{fit.worst_over_believed:.2f} believed sigmas"
-    )
+    rows = table(found)
+    for row in (COLUMNS, *rows):
+        print("| " + " | ".join(row) + " |")
     if args.json:
-        data = {"fit": asdict(fit), "errors": [asdict(d) for d in found]}
-        args.json.write_text(json.dumps(data, indent=1))
+        write_figures(args.json, COLUMNS, rows)
 
 
 if __name__ == "__main__":

@@ -16,8 +16,8 @@ from localizer.integrity.acceptance import IntegrityConfig
 
 Acceptance = Callable[[Outcome], bool]
 
-WITHOUT, AGREE = "no added test", "parts agree: ours while tracking"
-DISTINCT, FOCAL = "and stands out where the prior is wide", "parts agree, no other focal length"
+WITHOUT, AGREE = "no added test", "parts agree"
+DISTINCT, FOCAL = "parts agree, stands out: ours", "parts agree, no other focal length"
 OURS = "all three: ours on trial"
 
 # What is put together beside all: a picture cannot tell a focal length from a distance, nor one of
