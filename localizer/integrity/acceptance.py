@@ -32,7 +32,7 @@ class IntegrityConfig(BaseModel):
         4.0, ge=0.01, le=100, description="position sigma of a usable estimate"
     )
     max_focal_gain: float = Field(
-        0.002,
+        0.01,
         ge=0,
         le=1,
         description="share by which another focal length may fit a place on trial better",

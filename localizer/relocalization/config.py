@@ -44,7 +44,7 @@ class RelocalizationConfig(BaseModel):
         0.6, ge=0, le=1, description="share of the image's parts that agree on an answer"
     )
     max_focal_gain: float = Field(
-        0.002, ge=0, le=1, description="share by which another focal length may fit better"
+        0.01, ge=0, le=1, description="share by which another focal length may fit better"
     )
     min_overlap: float = Field(0.5, ge=0, le=1, description="share of the anchors in view")
     max_sigma_m: float = Field(4.0, ge=0.01, le=100, description="position sigma of an answer")

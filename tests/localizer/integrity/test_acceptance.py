@@ -54,5 +54,5 @@ def test_a_place_like_no_other_needs_no_narrow_prior() -> None:
 
 
 def test_another_focal_length_that_fits_better_rejects() -> None:
-    assert not is_acceptable(CONFIG, _registration(focal_gain=0.01), 1.0)
+    assert not is_acceptable(CONFIG, _registration(focal_gain=0.05), 1.0)
     assert is_acceptable(CONFIG, _registration(focal_gain=-0.01), 1.0)
