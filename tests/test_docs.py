@@ -10,6 +10,7 @@ import pytest
 
 from benchmarks.site.__main__ import outdated
 from benchmarks.site.kept import DATA, load
+from companion.guardian.findings import RULES
 
 ROOT = Path(__file__).parents[1]
 PAGES = sorted(
@@ -48,6 +49,24 @@ def test_prose_fits_a_screen():
         if len(line) > 120
     ]
     assert not long
+
+
+def test_what_the_safety_page_names_exists_and_each_finding_is_on_it():
+    """Every test and flight of its tables; every text, there and where the operator looks it up."""
+    page = (ROOT / "docs/explanation/integrity.md").read_text(encoding="utf-8")
+    rows = [line.split("|") for line in page.splitlines() if line.startswith("|")]
+    named = set(
+        re.findall(r"`([a-z0-9]+[-_][a-z0-9_-]+)`", " ".join(c for r in rows for c in r[-3:]))
+    )
+    known = {p.stem for p in (ROOT / "tests").rglob("test_*.py")}
+    known |= {p.stem for p in (ROOT / "sitl/scenarios").rglob("*.yaml")}
+    settings = {"gimbal_component"}
+    assert named - known - settings == set()
+    operator = (ROOT / "docs/how-to/when-vision-ends.md").read_text(encoding="utf-8")
+    for rule in RULES:
+        words = re.split(r"\{[^}]*\}", rule.text)[0].strip(" (,") or rule.text.split("} ")[1]
+        assert words in page, rule.name
+        assert words in operator, rule.name
 
 
 def test_the_readme_is_read_as_text_too():
