@@ -18,7 +18,8 @@ _START = b"\x00\x00\x01"
 # With these, profile_idc says that the SPS has a chroma format and perhaps scaling lists.
 _HIGH_PROFILES = frozenset({100, 110, 122, 244, 44, 83, 86, 118, 128, 138, 139, 134, 135})
 _LONGEST_NS = 5_000_000_000
-_GAPS_IN_A_ROW = 10  # no link loses every second picture; an encoder may count otherwise
+_GAPS_IN_A_ROW = 10  # no link loses every second picture for long; an encoder may count otherwise
+_REGULAR_IN_A_ROW = 30  # pictures without a gap, after which it was the link
 
 
 class _EndOfDataError(Exception):
@@ -87,7 +88,7 @@ class References:
         self._last: int | None = None
         self._broken_ns: int | None = None
         self._recovers_in: int | None = None
-        self._gaps_in_a_row = 0
+        self._gaps_in_a_row = self._regular_in_a_row = 0
         for nal in _nal_units(extradata):
             self._learn(nal)
 
@@ -103,24 +104,38 @@ class References:
             found = self._slice(nal)
             if found is not None:
                 slices.append(found)
-        if slices and self._gaps_in_a_row < _GAPS_IN_A_ROW:
+        if slices:
             self._follow(slices, arrival_ns)
         return self._broken_ns is not None
 
     def _follow(self, slices: list[_Slice], arrival_ns: int) -> None:
         first = slices[0]
         gap = self._is_gap(first)
-        self._gaps_in_a_row = self._gaps_in_a_row + 1 if gap and not first.idr else 0
-        if self._gaps_in_a_row == _GAPS_IN_A_ROW:
+        if self._counts_otherwise(gap and not first.idr):
             self._broken_ns = None
-        elif first.idr or all(s.intra for s in slices) or self._has_waited(arrival_ns):
+        else:
+            self._judge(first, slices, arrival_ns, gap=gap)
+        if first.reference or self._last is None:
+            self._last = first.frame_num
+
+    def _counts_otherwise(self, gap: bool) -> bool:
+        """Whether the encoder's numbers say nothing: each picture in a row was a gap."""
+        if self._gaps_in_a_row < _GAPS_IN_A_ROW:
+            self._gaps_in_a_row = self._gaps_in_a_row + 1 if gap else 0
+            self._regular_in_a_row = 0
+        else:
+            self._regular_in_a_row = 0 if gap else self._regular_in_a_row + 1
+            if self._regular_in_a_row >= _REGULAR_IN_A_ROW:
+                self._gaps_in_a_row = 0
+        return self._gaps_in_a_row >= _GAPS_IN_A_ROW
+
+    def _judge(self, first: _Slice, slices: list[_Slice], arrival_ns: int, *, gap: bool) -> None:
+        if first.idr or all(s.intra for s in slices) or self._has_waited(arrival_ns):
             self._broken_ns = self._recovers_in = None
         elif gap:
             self._broken_ns, self._recovers_in = arrival_ns, None
         elif self._recovers_in is not None:
             self._recovers_in -= 1
-        if first.reference or self._last is None:
-            self._last = first.frame_num
 
     def _has_waited(self, arrival_ns: int) -> bool:
         if self._broken_ns is None:

@@ -125,3 +125,15 @@ def test_an_encoder_that_counts_otherwise_is_let_pass() -> None:
     packets = list(_encoded(70, g="250"))
     every_second = [(i, p) for i, p in enumerate(packets) if i % 2 == 0]
     assert len(_broken(every_second)) == 9
+
+
+def test_a_link_that_was_bad_for_a_while_is_watched_again() -> None:
+    """Ten gaps in a row are an encoder that counts otherwise, or a link that loses every second
+    picture for a while: after it nothing was watched any more, until the next connection.
+    """
+    packets = list(_encoded(100, g="1000"))
+    kept = [p for p in enumerate(packets) if p[0] > 40 or p[0] % 2 == 0]
+    lost = 90
+    broken = _broken([p for p in kept if p[0] != lost])
+    assert broken[-1] == 99
+    assert min(i for i in broken if i > 41) == lost + 1
