@@ -17,7 +17,8 @@ import numpy as np
 from rich.console import Console
 from rich.table import Table
 
-from benchmarks.common.arguments import Parser, number, whole
+from benchmarks.common.arguments import Parser, number, output, whole
+from benchmarks.common.figures import write_figures
 from benchmarks.common.named_errors import named_errors
 from localizer.errors import RenderError
 from localizer.geometry.camera import Camera
@@ -133,12 +134,14 @@ def main() -> None:
     parser.add_argument("--size", type=size, default="512x384", help="of the image, pixels")
     parser.add_argument("--frames", type=whole(1, 10_000), default=20, help="poses measured")
     parser.add_argument("--threads", type=whole(1, 256), default=2, help="of numba")
+    parser.add_argument("--json", type=output, help="the table, for benchmarks.site.keep")
     options = parser.parse_args()
     width, height = options.size
     camera = Camera.from_fov(width, height, 60.0)
-    table = Table(
-        "backend", "M triangles", "CPU ms", "wall ms", "CPU / numba", "depth median", "depth p99.9"
-    )
+    columns = (
+        "backend", "M triangles", "CPU ms", "wall ms", "CPU / numba", "depth median", "depth p99.9",
+    )  # fmt: skip
+    table, rows = Table(*columns), list[tuple[str, ...]]()
     console = Console()
     for millions in options.triangles:
         meshes = town(millions * 1e6)
@@ -153,17 +156,22 @@ def main() -> None:
             cpu, wall = measure(renderer, camera, options.frames)
             reference = cpu if reference is None else reference
             errors = 1e3 * depth_error(renderer, meshes, camera)
-            table.add_row(
-                renderer.name,
-                f"{count / 1e6:.2f}",
-                f"{cpu:.1f}",
-                f"{wall:.1f}",
-                f"{cpu / reference:.1f}",
-                f"{np.median(errors):.3f} mm",
-                f"{np.percentile(errors, 99.9):.3f} mm",
+            rows.append(
+                (
+                    renderer.name,
+                    f"{count / 1e6:.2f}",
+                    f"{cpu:.1f}",
+                    f"{wall:.1f}",
+                    f"{cpu / reference:.1f}",
+                    f"{np.median(errors):.3f} mm",
+                    f"{np.percentile(errors, 99.9):.3f} mm",
+                )
             )
+            table.add_row(*rows[-1])
             renderer.close()
     console.print(table)
+    if options.json:
+        write_figures(options.json, columns, rows)
 
 
 if __name__ == "__main__":
