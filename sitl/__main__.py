@@ -39,6 +39,7 @@ from sitl.demo.scenario import (
 )
 from sitl.demo.script import FlightError
 from sitl.errors import SimulationError
+from sitl.operator.follow_run import FollowOptions, fly_follows
 from sitl.operator.run import ClickOptions, fly_clicks, summary
 from sitl.rehearsal.rehearse import rehearse
 from sitl.suite.case import SCENARIOS, load_cases
@@ -254,6 +255,35 @@ def targets(
     )
     rows = fly_clicks(options)
     console.print_json(json.dumps(summary(rows)))
+    raise typer.Exit(0 if all(row.ok for row in rows) else 1)
+
+
+@app.command()
+def follow(
+    fc: Annotated[str, typer.Option(help="embedded, ardupilot or both")] = "embedded",
+    out: Annotated[Path, typer.Option(help="folder of the records")] = Path("report-follow"),
+    seed: Annotated[int, typer.Option(min=0, max=10**6, help="of the world")] = 0,
+    draws: Annotated[str, typer.Option(help="of car and errors: 5, or 5..7")] = "5..7",
+    worlds: Annotated[Path | None, typer.Option(help="folder of generated worlds")] = None,
+) -> None:
+    """Fly along with a car that an operator clicks at; it is hidden twice, for two seconds."""
+    if fc not in _SUITE_KINDS:
+        raise ScenarioError(f"--fc is embedded, ardupilot or both, not {fc!r}")
+    if out.exists() and not out.is_dir():
+        raise ScenarioError(f"{out}: is a file; give a folder as --out")
+    console = Console()
+    if not console.is_terminal:
+        console = Console(width=_LOG_WIDTH)
+    options = FollowOptions(
+        _SUITE_KINDS[fc],
+        seed,
+        parse_seeds(draws),
+        out,
+        worlds,
+        lambda line: console.print(escape(line), highlight=False),
+        LogProgress(console),
+    )
+    rows = fly_follows(options)
     raise typer.Exit(0 if all(row.ok for row in rows) else 1)
 
 

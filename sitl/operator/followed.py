@@ -107,11 +107,12 @@ def _velocities(
     """Errors of the horizontal velocity (m/s) and what they are of their covariance, squared."""
     off, honest = [], []
     for fix, is_chosen in zip(fixes, chosen, strict=True):
-        if not is_chosen or fix.velocity is None or fix.velocity_covariance is None:
+        if not is_chosen or fix.velocity is None:
             continue
         error = (fix.velocity - chase.car.velocity_at(fix.time_ns))[:2]
         off.append(float(np.linalg.norm(error)))
-        honest.append(_nees(error, fix.velocity_covariance))
+        if fix.velocity_covariance is not None:
+            honest.append(_nees(error, fix.velocity_covariance))
     return np.array(off), np.array(honest)
 
 

@@ -1,0 +1,148 @@
+"""Flights that follow a car, one after the other: flown, judged, kept as JSON."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, dataclass, replace
+from itertools import product
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from companion.offline.tables import read_columns
+from companion.targets.detections import CLICKED
+from sitl.demo.budget import draw_errors
+from sitl.errors import SimulationError
+from sitl.operator.followed import FollowedFix, FollowVerdict, follow_verdict
+from sitl.operator.operator import LATE_S, LATE_SIGMA_S
+from sitl.operator.pursuer import SECONDS, Pursuer
+from sitl.suite.loop.case import LoopCase
+from sitl.suite.loop.flight import fly
+from sitl.suite.loop.runner import loop_assets
+from sitl.vehicles.process import VehicleKind
+
+HEIGHT_M = 90.0
+# Honest, over a world in which a minute of road is free.
+FLIGHT = LoopCase(
+    name="follow",
+    title="a car is followed through two occlusions",
+    height_m=HEIGHT_M,
+    seconds=SECONDS,
+    size_m=1600,
+    hover=True,
+    honest=True,
+    deployment={
+        "targets": {
+            "operator_delay_ms": 1e3 * LATE_S,
+            "operator_delay_sigma_ms": 1e3 * LATE_SIGMA_S,
+        }
+    },
+)
+
+
+@dataclass(frozen=True)
+class FollowRow:
+    """One flight's outcome; error says why it could not be flown."""
+
+    vehicle: VehicleKind
+    seed: int
+    draw: int
+    verdict: FollowVerdict | None = None
+    error: str = ""
+    pace: float = 1.0
+    stall_s: float = 0.0
+
+    @property
+    def ok(self) -> bool:
+        """Whether it was flown and the car was followed."""
+        return self.verdict is not None and self.verdict.is_followed
+
+
+@dataclass(frozen=True)
+class FollowOptions:
+    """draws: of the car, one flight each, over the world of `seed`."""
+
+    vehicles: tuple[VehicleKind, ...]
+    seed: int
+    draws: tuple[int, ...]
+    out: Path
+    worlds: Path | None = None
+    say: Callable[[str], None] = lambda _: None
+    building: Callable[[str, float], None] = lambda _phase, _share: None
+
+
+def fly_follows(options: FollowOptions) -> tuple[FollowRow, ...]:
+    """Fly them all; ``out/follow.json`` holds what was measured, from the first flight on."""
+    options.out.mkdir(parents=True, exist_ok=True)
+    rows: list[FollowRow] = []
+    for kind, draw in product(options.vehicles, options.draws):
+        options.say(f"following a car on {kind}, world {options.seed}, draw {draw}")
+        rows.append(_flown(kind, draw, options))
+        text = json.dumps([asdict(row) for row in rows], indent=1, default=str)
+        (options.out / "follow.json").write_text(text, encoding="utf-8")
+        options.say(line_of(rows[-1]))
+    return tuple(rows)
+
+
+def _flown(kind: VehicleKind, draw: int, options: FollowOptions) -> FollowRow:
+    seed = options.seed
+    assets = loop_assets(FLIGHT, seed, options.worlds, options.building)
+    folder = options.out / f"{kind}-{seed}-{draw}"
+    shutil.rmtree(folder, ignore_errors=True)
+    camera = draw_errors(FLIGHT.scenario, draw).camera
+    pursuer = Pursuer(assets.world, camera, HEIGHT_M, draw)
+    try:
+        record = fly(FLIGHT, assets, kind, draw, folder, pursuer)
+    except SimulationError as error:
+        return FollowRow(kind, seed, draw, error=f"{type(error).__name__}: {error}")
+    assert pursuer.chase is not None
+    targets = folder / "companion" / "targets.csv"
+    texts = [text for _, text in pursuer.heard.texts]
+    fixes = read_fixes(targets, pursuer.number) if targets.exists() else []
+    verdict = follow_verdict(fixes, pursuer.chase, pursuer.end_ns, texts)
+    if pursuer.failure:
+        verdict = replace(verdict, is_followed=False, why=(pursuer.failure, *verdict.why))
+    return FollowRow(kind, seed, draw, verdict, "", record.pace, record.stall_s)
+
+
+def read_fixes(targets: Path, number: int) -> list[FollowedFix]:
+    """A clicked target's rows of ``targets.csv``."""
+    table = read_columns(targets, ("target_id", "visibility"))
+    rows = np.flatnonzero(np.asarray(table.get("target_id", [])) == f"{CLICKED}{number}")
+    return [_fix(table, int(k)) for k in rows]
+
+
+def _fix(table: dict[str, np.ndarray], k: int) -> FollowedFix:
+    ee, en, eu, nn, nu, uu = (table[f"cov_{c}"][k] for c in ("ee", "en", "eu", "nn", "nu", "uu"))
+    velocity = np.array([table[f"velocity_{a}"][k] for a in ("east", "north", "up")])
+    return FollowedFix(
+        int(table["exposure_time_ns"][k]),
+        np.array([table[f"{a}_m"][k] for a in ("east", "north", "up")]),
+        np.array([[ee, en, eu], [en, nn, nu], [eu, nu, uu]]),
+        velocity if np.isfinite(velocity).all() else None,
+        None,  # not in the record
+        str(table["visibility"][k]) == "seen",
+    )
+
+
+def summary(rows: Sequence[FollowRow]) -> dict[str, Any]:
+    """How many of the flights followed their car."""
+    flown = [row for row in rows if row.verdict is not None]
+    return {"flights": len(rows), "flown": len(flown), "followed": sum(row.ok for row in rows)}
+
+
+def line_of(row: FollowRow) -> str:
+    """A flight in one line, what does not hold first."""
+    head = f"{row.vehicle}, world {row.seed}, draw {row.draw}: "
+    if row.verdict is None:
+        return head + f"not flown: {row.error}"
+    v = row.verdict
+    told = "; ".join(v.why) or "followed"
+    return (
+        f"{head}{told} (seen in {v.seen} of {v.reports} reports, p95 {v.p95_m:.2f} m, at most "
+        f"{v.max_m:.2f} m, {v.inside_percent:.0f} % inside, back after a roof "
+        f"{', '.join(f'{b:.1f}' for b in v.back_s)} s)"
+    )

@@ -1,0 +1,134 @@
+"""A flight that follows a car: the aircraft flies along, the operator clicks once and watches."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+import numpy as np
+
+from companion.offline.tables import poses, read_columns
+from localizer.geometry.camera import Camera
+from localizer.geometry.geo import LocalFrame
+from localizer.geometry.pose import Array
+from localizer.map.cache.cache import TileCache
+from sitl.camera.movers import Mover
+from sitl.camera.true_motion import PoseTrack
+from sitl.demo.assets import FlightAssets
+from sitl.operator.chase import Chase, make_chase, pursuit
+from sitl.operator.operator import LATE_S, Frames
+from sitl.operator.station import Heard, Station
+from sitl.suite.loop.flight import Cabin
+
+FOLLOWED_S = 60.0
+LEAD_S = 140.0  # from the world's beginning to the click: take-off and shadow flight need 60 to 130
+SECONDS = LEAD_S - 60.0 + FOLLOWED_S + 3.0
+_STEER_NS = 400_000_000
+_AHEAD_NS = 1_500_000_000  # by what a multirotor lags behind the place that it is sent to
+_BEHIND_M = 12.0
+_HAND_PX = 1.5
+_CAR_TOP_M = 0.75
+
+
+class Pursuer:
+    """A `Passenger`. camera: the true one; seed: of the car and of the operator's hand."""
+
+    def __init__(self, assets: FlightAssets, camera: Camera, height_m: float, seed: int) -> None:
+        self._assets, self._camera, self._height_m = assets, camera, height_m
+        self._frame: LocalFrame = TileCache.open(assets.map_cache).frame
+        self._seed = seed
+        self._stop = threading.Event()
+        self.chase: Chase | None = None
+        self.number = 0
+        self.heard = Heard()
+        self.failure = ""
+        self.end_ns = 0
+
+    def movers(self, epoch_ns: int) -> tuple[Mover, ...]:
+        """The car and the roofs that hide it."""
+        self.chase = make_chase(self._assets.world, self._frame, epoch_ns, LEAD_S, self._seed)
+        return self.chase.movers
+
+    @contextmanager
+    def ride(self, cabin: Cabin) -> Iterator[None]:
+        """Fly along and click while the flight goes on."""
+        thread = threading.Thread(target=self._run, args=(cabin,), name="pursuer")
+        thread.start()
+        try:
+            yield
+        finally:
+            self._stop.set()
+            thread.join()
+
+    def _run(self, cabin: Cabin) -> None:
+        station = Station(cabin.vehicle.spare_endpoint, cabin.vehicle.check)
+        self.heard = station.heard
+        chase = self.chase
+        assert chase is not None
+        begin_ns = chase.begins_ns()
+        self.end_ns = begin_ns + round(FOLLOWED_S * 1e9)
+        try:
+            if time.monotonic_ns() > begin_ns:
+                raise RuntimeError("the car had gone by before the aircraft was ready")
+            click_ns = begin_ns + round(LATE_S * 1e9)
+            if self._fly_along(cabin, station, chase, click_ns):
+                return
+            self._click(cabin, station, chase, begin_ns)
+            self._fly_along(cabin, station, chase, self.end_ns)
+        except Exception as error:  # told by the verdict: a dead pursuer is no passed flight
+            self.failure = f"{type(error).__name__}: {error}"
+        finally:
+            station.close()
+
+    def _fly_along(self, cabin: Cabin, station: Station, chase: Chase, until_ns: int) -> bool:
+        """Steer above the car until a time; True when the flight ended before it."""
+        home_m = self._home_up_m()
+        while time.monotonic_ns() < until_ns:
+            ahead_ns = time.monotonic_ns() + _AHEAD_NS
+            # Until the car comes, the aircraft waits where it will be met.
+            place = pursuit(chase.car, max(ahead_ns, chase.begins_ns()), self._height_m, _BEHIND_M)
+            latitude, longitude, _ = self._frame.geodetic_from_enu(place)
+            cabin.pilot.go_to(float(latitude), float(longitude), float(place[2]) - home_m)
+            if station.run_until(self._stop.is_set, min(time.monotonic_ns() + _STEER_NS, until_ns)):
+                return True
+        return False
+
+    def _home_up_m(self) -> float:
+        ground = float(self._assets.world.ground_height(0.0, 0.0))
+        world = self._assets.world
+        frame_from_world = self._frame.ecef_from_enu.inverse @ world.frame.ecef_from_enu
+        return float(frame_from_world.apply(np.array([0.0, 0.0, ground]))[2])
+
+    def _click(self, cabin: Cabin, station: Station, chase: Chase, frame_ns: int) -> None:
+        """A point on the car in the newest picture that the operator has seen by then."""
+        frames = Frames(cabin.frames)
+        try:
+            seen = frames.newest_before(frame_ns)
+        finally:
+            frames.close()
+        if seen is None:
+            raise RuntimeError("no picture has been taken yet")
+        u, v = self._pixel_of_car(cabin, chase, seen[1])
+        late_s = LATE_S - (time.monotonic_ns() - seen[1]) * 1e-9
+        time.sleep(max(late_s, 0.0))
+        camera = self._camera
+        result, self.number = station.ask("point", (u / camera.width, v / camera.height))
+        if result != 0:
+            raise RuntimeError(f"the click was answered by {result}")
+
+    def _pixel_of_car(self, cabin: Cabin, chase: Chase, frame_ns: int) -> tuple[float, float]:
+        columns = read_columns(cabin.frames)
+        samples = zip((int(t) for t in columns["true_time_ns"]), poses(columns), strict=True)
+        pose = PoseTrack(samples).at(frame_ns)
+        if pose is None:
+            raise RuntimeError(f"no picture was taken at {frame_ns}")
+        top: Array = chase.car.position_at(frame_ns) + np.array([0.0, 0.0, _CAR_TOP_M])
+        pixel, inside = self._camera.project(pose.inverse.apply(top))
+        width, height = self._camera.width, self._camera.height
+        if not bool(inside) or not (0 < pixel[0] < width and 0 < pixel[1] < height):
+            raise RuntimeError("the car is not in the picture when it is clicked at")
+        hand = np.random.default_rng([self._seed, 103]).normal(0.0, _HAND_PX, 2)
+        u, v = np.asarray(pixel) + hand
+        return float(u), float(v)
