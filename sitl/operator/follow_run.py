@@ -54,6 +54,8 @@ class FollowRow:
     error: str = ""
     pace: float = 1.0
     stall_s: float = 0.0
+    late_s: float = 0.0
+    """From the picture's exposure to the click."""
 
     @property
     def ok(self) -> bool:
@@ -105,7 +107,7 @@ def _flown(kind: VehicleKind, draw: int, options: FollowOptions) -> FollowRow:
     verdict = follow_verdict(fixes, pursuer.chase, pursuer.end_ns, texts)
     if pursuer.failure:
         verdict = replace(verdict, is_followed=False, why=(pursuer.failure, *verdict.why))
-    return FollowRow(kind, seed, draw, verdict, "", record.pace, record.stall_s)
+    return FollowRow(kind, seed, draw, verdict, "", record.pace, record.stall_s, pursuer.late_s)
 
 
 def read_fixes(targets: Path, number: int) -> list[FollowedFix]:

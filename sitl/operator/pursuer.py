@@ -2,34 +2,59 @@
 
 from __future__ import annotations
 
+import csv
 import threading
 import time
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
+from pathlib import Path
 
 import numpy as np
 
-from companion.offline.tables import poses, read_columns
 from localizer.geometry.camera import Camera
 from localizer.geometry.geo import LocalFrame
-from localizer.geometry.pose import Array
+from localizer.geometry.pose import Array, Pose, matrix_from_quaternion
 from localizer.map.cache.cache import TileCache
 from sitl.camera.movers import Mover
-from sitl.camera.true_motion import PoseTrack
+from sitl.camera.world_camera import FRAME_COLUMNS
 from sitl.demo.assets import FlightAssets
 from sitl.operator.chase import Chase, make_chase, pursuit
-from sitl.operator.operator import LATE_S, Frames
+from sitl.operator.operator import LATE_S
 from sitl.operator.station import Heard, Station
 from sitl.suite.loop.flight import Cabin
 
 FOLLOWED_S = 60.0
-LEAD_S = 140.0  # from the world's beginning to the click: take-off and shadow flight need 60 to 130
-SECONDS = LEAD_S - 60.0 + FOLLOWED_S + 3.0
+LEAD_S = 110.0  # from the world's beginning to the click: take-off and shadow flight need 40 to 100
+SECONDS = LEAD_S - 30.0 + FOLLOWED_S + 3.0
 _STEER_NS = 400_000_000
 _AHEAD_NS = 1_500_000_000  # by what a multirotor lags behind the place that it is sent to
 _BEHIND_M = 12.0
 _HAND_PX = 1.5
 _CAR_TOP_M = 0.75
+
+
+class _Pictures:
+    """The world camera's log as it grows: when each picture was truly taken, and from where."""
+
+    def __init__(self, path: Path) -> None:
+        self._file = path.open(newline="", encoding="utf-8")
+        self._rest = ""
+        self._rows: list[dict[str, str]] = []
+
+    def close(self) -> None:
+        self._file.close()
+
+    def newest(self) -> tuple[int, Pose]:
+        """(true exposure, camera's true pose) of the newest one."""
+        lines = (self._rest + self._file.read()).split("\n")
+        self._rest = lines.pop()
+        self._rows = [*self._rows, *csv.DictReader(lines, FRAME_COLUMNS)][-1:]
+        if not self._rows or self._rows[0]["sequence"] == "sequence":
+            raise RuntimeError("no picture has been taken yet")
+        row = self._rows[0]
+        q = np.array([float(row[k]) for k in ("qw", "qx", "qy", "qz")])
+        eye = np.array([float(row[k]) for k in ("east_m", "north_m", "up_m")])
+        return int(row["true_time_ns"]), Pose(matrix_from_quaternion(q), eye)
 
 
 class Pursuer:
@@ -45,6 +70,7 @@ class Pursuer:
         self.heard = Heard()
         self.failure = ""
         self.end_ns = 0
+        self.late_s = 0.0
 
     def movers(self, epoch_ns: int) -> tuple[Mover, ...]:
         """The car and the roofs that hide it."""
@@ -72,10 +98,13 @@ class Pursuer:
         try:
             if time.monotonic_ns() > begin_ns:
                 raise RuntimeError("the car had gone by before the aircraft was ready")
-            click_ns = begin_ns + round(LATE_S * 1e9)
-            if self._fly_along(cabin, station, chase, click_ns):
-                return
-            self._click(cabin, station, chase, begin_ns)
+            with closing(_Pictures(cabin.frames)) as pictures:
+                if self._fly_along(cabin, station, chase, begin_ns - _STEER_NS):
+                    return
+                pictures.newest()  # what there is so far is read before it counts
+                if station.run_until(self._stop.is_set, begin_ns):
+                    return
+                self._click(station, chase, *pictures.newest())
             self._fly_along(cabin, station, chase, self.end_ns)
         except Exception as error:  # told by the verdict: a dead pursuer is no passed flight
             self.failure = f"{type(error).__name__}: {error}"
@@ -101,34 +130,17 @@ class Pursuer:
         frame_from_world = self._frame.ecef_from_enu.inverse @ world.frame.ecef_from_enu
         return float(frame_from_world.apply(np.array([0.0, 0.0, ground]))[2])
 
-    def _click(self, cabin: Cabin, station: Station, chase: Chase, frame_ns: int) -> None:
-        """A point on the car in the newest picture that the operator has seen by then."""
-        frames = Frames(cabin.frames)
-        try:
-            seen = frames.newest_before(frame_ns)
-        finally:
-            frames.close()
-        if seen is None:
-            raise RuntimeError("no picture has been taken yet")
-        u, v = self._pixel_of_car(cabin, chase, seen[1])
-        late_s = LATE_S - (time.monotonic_ns() - seen[1]) * 1e-9
-        time.sleep(max(late_s, 0.0))
-        camera = self._camera
-        result, self.number = station.ask("point", (u / camera.width, v / camera.height))
-        if result != 0:
-            raise RuntimeError(f"the click was answered by {result}")
-
-    def _pixel_of_car(self, cabin: Cabin, chase: Chase, frame_ns: int) -> tuple[float, float]:
-        columns = read_columns(cabin.frames)
-        samples = zip((int(t) for t in columns["true_time_ns"]), poses(columns), strict=True)
-        pose = PoseTrack(samples).at(frame_ns)
-        if pose is None:
-            raise RuntimeError(f"no picture was taken at {frame_ns}")
+    def _click(self, station: Station, chase: Chase, frame_ns: int, pose: Pose) -> None:
+        """A point on the car in the newest picture, once the operator has seen it."""
         top: Array = chase.car.position_at(frame_ns) + np.array([0.0, 0.0, _CAR_TOP_M])
         pixel, inside = self._camera.project(pose.inverse.apply(top))
-        width, height = self._camera.width, self._camera.height
-        if not bool(inside) or not (0 < pixel[0] < width and 0 < pixel[1] < height):
+        size = np.array([self._camera.width, self._camera.height])
+        if not bool(inside) or (pixel < 0).any() or (pixel > size).any():
             raise RuntimeError("the car is not in the picture when it is clicked at")
         hand = np.random.default_rng([self._seed, 103]).normal(0.0, _HAND_PX, 2)
-        u, v = np.asarray(pixel) + hand
-        return float(u), float(v)
+        time.sleep(max(LATE_S - (time.monotonic_ns() - frame_ns) * 1e-9, 0.0))
+        self.late_s = (time.monotonic_ns() - frame_ns) * 1e-9
+        x, y = (np.asarray(pixel) + hand) / size
+        result, self.number = station.ask("point", (float(x), float(y)))
+        if result != 0:
+            raise RuntimeError(f"the click was answered by {result}")
