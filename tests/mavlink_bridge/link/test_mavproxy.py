@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import os
 import shutil
+import signal
 import subprocess
 import threading
 import time
@@ -46,7 +47,7 @@ class Console:
         self._process = subprocess.Popen(
             [PROGRAM, f"--master={endpoint}", "--logfile=flight.tlog", "--force-connected"],
             stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.STDOUT,
-            text=True, cwd=folder, env={**os.environ, "HOME": str(folder)},
+            text=True, cwd=folder, env={**os.environ, "HOME": str(folder)}, start_new_session=True,
         )  # fmt: skip
         self.lines: list[str] = []
         threading.Thread(target=self._read, daemon=True).start()
@@ -64,7 +65,7 @@ class Console:
         return any(part in line for line in self.lines)
 
     def close(self) -> None:
-        self._process.kill()
+        os.killpg(self._process.pid, signal.SIGKILL)  # it has children of its own
         self._process.wait(20)
 
 
