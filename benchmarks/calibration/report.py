@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from companion.calibrating import unknowns as u
+from companion.calibrate import unknowns as u
 
 # What is asked: the largest error of each group, in its numbers' own units.
 TARGETS = {

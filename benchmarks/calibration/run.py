@@ -10,9 +10,9 @@ from typing import Any
 import numpy as np
 
 from benchmarks.calibration.draws import Draw, Sortie, drawn, fly, true_camera, true_mount
-from companion.calibrating import unknowns as u
-from companion.calibrating.flight import Calibrated, calibrate
-from companion.calibrating.proposal import blind_spots, changed, changes
+from companion.calibrate import unknowns as u
+from companion.calibrate.flight import Calibrated, calibrate
+from companion.calibrate.proposal import blind_spots, changed, changes
 from companion.config import CompanionConfig
 from companion.offline.replay import load_record
 from localizer.geometry.pose import Array, euler_from_matrix, so3_log
@@ -21,7 +21,7 @@ from sitl.demo.assets import FlightAssets
 from sitl.demo.scenario import CameraSpec
 from sitl.desk.film import Localized
 
-_FRAMES = 100
+_FRAMES = 200  # as the command's default
 _AGAIN_S = 50.0
 _AGAIN = 7_000  # added to the seed of the flight after the calibration
 

@@ -1,1 +1,3 @@
-"""Whether the camera is as the deployment says: watched in flight, from the fixes themselves."""
+"""In flight: whether the camera is as the deployment says, from the fixes themselves. Told, and no
+number changed; ``companion.calibrate`` finds the numbers.
+"""

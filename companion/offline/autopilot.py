@@ -9,7 +9,7 @@ import numpy as np
 from mavlink_bridge import quaternion as quat
 from mavlink_bridge.config import BridgeConfig
 from mavlink_bridge.link.tlog import read_tlog
-from mavlink_bridge.messages import Attitude, GimbalAttitude, VehicleState
+from mavlink_bridge.messages import Attitude, GimbalAttitude, InertialSample, VehicleState
 from mavlink_bridge.vehicle.tracker import VehicleTracker
 
 
@@ -64,3 +64,7 @@ class RecordedAutopilot:
     def global_at(self, time_ns: int) -> tuple[float, ...] | None:
         """The EKF's (latitude, longitude in degrees, altitude AMSL) at a time."""
         return self._tracker.global_at(time_ns)
+
+    def inertial_since(self, time_ns: int) -> tuple[InertialSample, ...]:
+        """What the IMU read after a time, oldest first; at most the last 10 s."""
+        return self._tracker.inertial_since(time_ns)

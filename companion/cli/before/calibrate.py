@@ -26,7 +26,7 @@ def flight_command(
     map_cache: Annotated[
         Path | None, typer.Option("--map", help="instead of the record's map")
     ] = None,
-    frames: Annotated[int, typer.Option(min=20, max=2000, help="pictures read at most")] = 150,
+    frames: Annotated[int, typer.Option(min=20, max=2000, help="pictures read at most")] = 200,
     config: Annotated[
         Path | None, typer.Option(help="deployment file that the record was flown with")
     ] = None,
@@ -36,8 +36,8 @@ def flight_command(
     report: Annotated[Path | None, typer.Option("--json", help="all figures, to a file")] = None,
 ) -> None:
     """Camera, boresight, lever arm, times and map shift from a shadow flight with pictures."""
-    from companion.calibrating.flight import calibrate
-    from companion.calibrating.proposal import blind_spots, changes, write_changed
+    from companion.calibrate.flight import calibrate
+    from companion.calibrate.proposal import blind_spots, changes, write_changed
     from companion.offline.replay import load_record
 
     if write and config is None:
@@ -74,7 +74,7 @@ def flight_command(
 
 
 def _numbers(found: Any) -> Table:
-    from companion.calibrating.unknowns import UNKNOWNS, USEFUL
+    from companion.calibrate.unknowns import UNKNOWNS, USEFUL
 
     table = Table(title="against the deployment", box=SIMPLE_HEAD)
     for column in ("", "differs by", "1 sigma", "", "told"):
@@ -100,7 +100,7 @@ def _changes(wanted: tuple[Any, ...]) -> Table:
 
 
 def _figures(found: Any, wanted: tuple[Any, ...], blind: tuple[str, ...]) -> dict[str, Any]:
-    from companion.calibrating.unknowns import UNKNOWNS
+    from companion.calibrate.unknowns import UNKNOWNS
 
     return {
         "numbers": [
@@ -131,7 +131,7 @@ def board_command(
     keep: Annotated[Path | None, typer.Option(help="folder for the views that were taken")] = None,
 ) -> None:
     """The camera's model from views of a printed board, with what is still missing told."""
-    from companion.calibrating.board import write_sheet
+    from companion.calibrate.board import write_sheet
 
     console = Console()
     if sheet is not None:
@@ -151,9 +151,9 @@ def board_command(
 def _film(
     console: Console, source: str, seconds: float, keep: Path | None, config: Path | None
 ) -> None:
-    from companion.calibrating.lens import solve_lens
-    from companion.calibrating.proposal import lens_changes, write_changed
-    from companion.calibrating.watching import watch_board
+    from companion.calibrate.lens import solve_lens
+    from companion.calibrate.proposal import lens_changes, write_changed
+    from companion.calibrate.watching import watch_board
     from companion.config import load_config
 
     def told(taken: int, word: str, missing: list[str]) -> None:

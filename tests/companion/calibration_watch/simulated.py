@@ -63,11 +63,14 @@ def square(seconds: float, leg_s: float = 15.0, climb_s: float = 16.0, hold: boo
 
 @dataclass(frozen=True)
 class Wrong:
-    """What is wrong. focal: share; boresight_deg: yaw, pitch; late_s from `late_from_s` on; the
-    sensors' honest errors: barometer's scale, GNSS bias (m), compass (deg), map shift (m), tilt.
+    """What is wrong. focal: share, from `zoom_s` on reached within `zooms_for_s`; boresight_deg:
+    yaw, pitch; late_s from `late_from_s` on; the sensors' honest errors: barometer's scale, GNSS
+    bias (m), compass (deg), map shift (m), tilt.
     """
 
     focal: float = 0.0
+    zoom_s: float = 0.0
+    zooms_for_s: float = 0.0
     boresight_deg: tuple[float, float] = (0.0, 0.0)
     late_s: float = 0.0
     late_from_s: float = 0.0
@@ -202,7 +205,9 @@ class Flown:
         axis = camera[:, 2]
         depth = where[2] / max(float(axis[2]), 0.1)
         noise = self._slow + 0.05 * self._rng.standard_normal(3)
-        north, east, down = -wrong.focal * depth * axis
+        grown = (at_s - wrong.zoom_s) / max(wrong.zooms_for_s, 1e-6)
+        focal = wrong.focal * min(max(grown, 0.0), 1.0) if wrong.zoom_s else wrong.focal
+        north, east, down = -focal * depth * axis
         place = offset(
             LATITUDE,
             LONGITUDE,
@@ -218,5 +223,5 @@ class Flown:
             (*place, GROUND + where[2] - down + noise[2]),
             0.1,
             turned,
-            depth * (1.0 + wrong.focal),
+            depth * (1.0 + focal),
         )

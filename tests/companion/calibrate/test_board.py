@@ -11,9 +11,9 @@ import pytest
 import yaml
 from typer.testing import CliRunner
 
-from companion.calibrating.board import ACROSS, DOWN, board_picture, write_sheet
-from companion.calibrating.lens import solve_lens
-from companion.calibrating.views import BoardViews
+from companion.calibrate.board import ACROSS, DOWN, board_picture, write_sheet
+from companion.calibrate.lens import solve_lens
+from companion.calibrate.views import BoardViews
 from companion.cli.commands import app
 from companion.config import load_config
 from companion.errors import RecordError, ReportError

@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 import pytest
 
-from companion.calibrating.pictures import PictureReader
+from companion.calibrate.pictures import PictureReader
 from localizer.features.detail import DetailExtractor
 from localizer.features.gradient import GradientExtractor
 from localizer.geometry.camera import Camera

@@ -13,8 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import cho_factor, cho_solve
 
-from companion.calibrating import unknowns as u
-from companion.calibrating.evidence import Evidence, Guess
+from companion.calibrate import unknowns as u
+from companion.calibrate.evidence import Evidence, Guess
 from localizer.geometry.pose import Array
 
 _ROUNDS, _STEPS = 4, 5  # of noise, and of the poses and numbers under it
@@ -24,6 +24,7 @@ _MEMORIES_S = np.array([0.1, 0.3, 1.0, 2.0, 4.0, 8.0, 15.0, 30.0, 60.0])
 _WHITE = {"attitudes": np.radians(0.03), "places": 0.03}  # of what has no memory: rad, m
 _LEAST = {"attitudes": np.radians(0.05), "places": 0.08}
 _FIRST = {"attitudes": np.radians(0.5), "places": 0.4}
+_AS_LIKELY = 1.0  # of minus twice the logarithm of the likelihood
 _DIFFERENCE = 1e-5
 _CONVERGED = 1e-3  # of a sigma
 
@@ -44,21 +45,28 @@ class Wander:
 
     @classmethod
     def of(cls, left: Array, times_s: Array, least: float) -> Wander:
-        """The likeliest of what is left over, (K, 3)."""
+        """Of what is left over, (K, 3), whose mean was taken off it: by restricted likelihood
+        (Patterson and Thompson 1971), and of memories that are about as likely the longest. Else
+        what lasts looks shorter and smaller than it is, and so do the sigmas of what is found.
+        """
         sigmas, memories = np.zeros(3), np.zeros(3)
-        gaps = np.diff(times_s)
+        gaps, free_of_mean = np.diff(times_s), len(times_s) - 1
         for axis in range(3):
             e = left[:, axis]
-            best = np.inf
+            found = []
             for memory_s in _MEMORIES_S:
                 kept = np.exp(-gaps / memory_s)
                 free = np.maximum(1.0 - kept**2, 1e-6)
-                squares = np.concatenate([e[:1] ** 2, (e[1:] - kept * e[:-1]) ** 2 / free])
-                variance = max(float(squares.mean()), least**2)
-                cost = float(squares.sum()) / variance + len(e) * np.log(variance)
-                cost += float(np.log(free).sum())
-                if cost < best:
-                    best, sigmas[axis], memories[axis] = cost, np.sqrt(variance), memory_s
+                white = np.concatenate([e[:1], (e[1:] - kept * e[:-1]) / np.sqrt(free)])
+                ones = np.concatenate([[1.0], (1.0 - kept) / np.sqrt(free)])
+                told = float(ones @ ones)
+                squares = float(white @ white) - float(ones @ white) ** 2 / told
+                variance = max(squares / free_of_mean, least**2)
+                cost = squares / variance + free_of_mean * np.log(variance)
+                found.append((cost + float(np.log(free).sum()) + np.log(told), np.sqrt(variance)))
+            costs = np.array([cost for cost, _ in found])
+            longest = int(np.flatnonzero(costs < costs.min() + _AS_LIKELY)[-1])
+            sigmas[axis], memories[axis] = found[longest][1], _MEMORIES_S[longest]
         return cls(sigmas, memories)
 
 

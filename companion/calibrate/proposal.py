@@ -10,10 +10,10 @@ from typing import Any
 import numpy as np
 import yaml
 
-from companion.calibrating import unknowns as u
-from companion.calibrating.evidence import changed_camera
-from companion.calibrating.flight import Calibrated
-from companion.calibrating.lens import Lens
+from companion.calibrate import unknowns as u
+from companion.calibrate.evidence import changed_camera
+from companion.calibrate.flight import Calibrated
+from companion.calibrate.lens import Lens
 from companion.config import CompanionConfig
 from companion.errors import ConfigError
 from companion.settings_file import read_settings, validated

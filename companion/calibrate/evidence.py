@@ -14,9 +14,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from companion.calibrating import unknowns as u
-from companion.calibrating.pictures import Parts
-from companion.calibrating.said import Said, at
+from companion.calibrate import unknowns as u
+from companion.calibrate.pictures import Parts
+from companion.calibrate.said import Said, at
 from companion.geometry import GIMBAL_FROM_CAMERA
 from localizer.geometry.camera import Camera
 from localizer.geometry.pose import Array, Pose, so3_exp

@@ -9,11 +9,11 @@ from pathlib import Path
 
 import numpy as np
 
-from companion.calibrating import unknowns as u
-from companion.calibrating.evidence import Evidence, Guess, Sighted, changed_camera
-from companion.calibrating.pictures import PictureReader
-from companion.calibrating.said import REACH_S, Said, what_was_said
-from companion.calibrating.solve import Solution, solve
+from companion.calibrate import unknowns as u
+from companion.calibrate.evidence import Evidence, Guess, Sighted, changed_camera
+from companion.calibrate.pictures import PictureReader
+from companion.calibrate.said import REACH_S, Said, what_was_said
+from companion.calibrate.solve import Solution, solve
 from companion.config import CompanionConfig
 from companion.errors import RecordError, StreamDecodeError
 from companion.geometry import Mount
@@ -36,6 +36,8 @@ _LEAST_FRAMES = 20
 _READ_TWICE = 2  # with the deployment's camera, and with the one that was found
 _LATER_NS = round(1e9 * (REACH_S + 0.3))
 _GNSS_BIAS_M = 0.5  # of a receiver, for minutes, however good it says it is
+# TIMESYNC halves the round trip: what the link's two ways differ by, no flight shows.
+_CLOCKS_S = 0.002
 _OURS = ("inject", "rc")
 
 
@@ -84,7 +86,7 @@ def calibrate(
     record: FlightRecord,
     tlog: Path,
     map_cache: Path,
-    frames: int = 150,
+    frames: int = 200,
     progress: Callable[[int, int], None] = lambda _done, _total: None,
 ) -> Calibrated:
     """Numbers of the record's deployment by its own pictures, over a map.
@@ -134,6 +136,7 @@ def calibrate(
         raise RecordError(f"{record.folder}: nothing was solved")
     covariance = solution.covariance.copy()
     covariance[u.SHIFT, u.SHIFT] += np.eye(3) * bias_m**2
+    covariance[u.LATE, u.LATE] += _CLOCKS_S**2
     return Calibrated(
         camera, mount, arm_m, solution, covariance, before_px, solution.pixel_sigma, len(sighted),
         len(evidence.owner), bias_m, _notes(evidence, config),

@@ -7,7 +7,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
-from companion.calibrating.views import BoardViews, View
+from companion.calibrate.views import BoardViews, View
 from companion.setup.asking import first_picture
 from companion.sources import SourceSettings, open_source
 from localizer.geometry.camera import Camera

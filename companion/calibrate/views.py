@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from companion.calibrating.board import ACROSS, charuco
+from companion.calibrate.board import ACROSS, charuco
 from localizer.geometry.camera import Camera
 from localizer.geometry.pose import Array
 from localizer.types import Image

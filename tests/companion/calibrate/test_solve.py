@@ -9,13 +9,13 @@ import numpy as np
 import pytest
 import yaml
 
-from companion.calibrating import unknowns as u
-from companion.calibrating.evidence import Evidence, Sighted, changed_camera
-from companion.calibrating.flight import Calibrated
-from companion.calibrating.pictures import Parts
-from companion.calibrating.proposal import blind_spots, changed, changes, write_changed
-from companion.calibrating.said import OFFSETS_S, Said
-from companion.calibrating.solve import solve
+from companion.calibrate import unknowns as u
+from companion.calibrate.evidence import Evidence, Sighted, changed_camera
+from companion.calibrate.flight import Calibrated
+from companion.calibrate.pictures import Parts
+from companion.calibrate.proposal import blind_spots, changed, changes, write_changed
+from companion.calibrate.said import OFFSETS_S, Said
+from companion.calibrate.solve import solve
 from companion.config import load_config
 from companion.geometry import GIMBAL_FROM_CAMERA
 from localizer.geometry.camera import Camera

@@ -1,1 +1,0 @@
-"""``companion calibrate``: a deployment's camera, mounting and times from what was filmed."""
