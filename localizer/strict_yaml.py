@@ -1,13 +1,17 @@
-"""YAML as settings need it: plain types, no key twice, no `yes` where a number belongs."""
+"""YAML as settings need it: plain types, no key twice, no `yes` where a number belongs, and no
+number that says another one than is read: YAML 1.1 takes 8:20 for 500 and 0100 for 64.
+"""
 
 from __future__ import annotations
 
+import re
 from collections.abc import Hashable, Iterator
 from typing import Any
 
 import yaml
 
 _MOST_KEYS = 10_000
+_OCTAL = re.compile(r"[-+]?0[0-9_]+")
 
 
 class _StrictLoader(yaml.SafeLoader):
@@ -28,6 +32,14 @@ class _StrictLoader(yaml.SafeLoader):
             seen.add(key)
         return node
 
+    def construct_yaml_int(self, node: yaml.ScalarNode) -> int:
+        """Of a number that says itself."""
+        return int(_plain(node, super().construct_yaml_int(node)))
+
+    def construct_yaml_float(self, node: yaml.ScalarNode) -> float:
+        """Likewise."""
+        return float(_plain(node, super().construct_yaml_float(node)))
+
     def flatten_mapping(self, node: yaml.MappingNode) -> None:
         """Take in what `<<` merges: mappings that merge each other grow ninefold with each line."""
         super().flatten_mapping(node)
@@ -37,8 +49,28 @@ class _StrictLoader(yaml.SafeLoader):
             )
 
 
+for _kind, _read in (
+    ("int", _StrictLoader.construct_yaml_int), ("float", _StrictLoader.construct_yaml_float),
+):  # fmt: skip
+    _StrictLoader.add_constructor(f"tag:yaml.org,2002:{_kind}", _read)
+
+
+def _plain(node: yaml.ScalarNode, number: float) -> float:
+    """The number of a scalar, unless YAML 1.1 reads it to base 60 or 8."""
+    text = str(node.value)
+    if ":" in text or _OCTAL.fullmatch(text):
+        base = "60" if ":" in text else "8"
+        raise yaml.constructor.ConstructorError(
+            None, None,
+            f"{text!r} is read to base {base}, as {number:g}: write decimal digits with a point, "
+            "or in quotes where it is text", node.start_mark,
+        )  # fmt: skip
+    return number
+
+
 def load_yaml(text: str) -> Any:
-    """The document in `text`; yaml.YAMLError also for a repeated key, with its line and column.
+    """The document in `text`; yaml.YAMLError, with line and column, also for a repeated key and
+    for a number to base 60 or 8.
 
     As with `yaml.safe_load`, ValueError for an impossible date, RecursionError for endless nesting.
     """

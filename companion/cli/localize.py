@@ -24,6 +24,7 @@ from localizer.geometry.camera import Camera
 from localizer.geometry.geo import Geodetic, LocalFrame
 from localizer.geometry.pose import Pose
 from localizer.geometry.posefile import PoseRow, read_poses, world_from_camera
+from localizer.map.cache.cache import TileCache
 from localizer.registration.devices import DeviceChoice
 from localizer.render.select import RendererName
 from localizer.tracking.opening import open_localizer
@@ -70,10 +71,13 @@ def localize_command(
     model: Annotated[Path | None, typer.Option(help="ONNX feature network")] = None,
 ) -> None:
     """Localize images against a map; exit code 1 if not one of them was localized."""
+    if not images.exists():
+        raise ConfigError(f"{images}: no such image or folder")
+    paths = list_images(images) if images.is_dir() else [images]
+    TileCache.open(map_cache)  # paths first: what is missing is said before anything is computed
+    intrinsics = Camera.from_json(camera)
     if (prior is None) == (priors is None):
         raise ConfigError("give either --prior (of the first image) or --priors (a pose file)")
-    paths = list_images(images) if images.is_dir() else [images]
-    intrinsics = Camera.from_json(camera)
     rows = read_poses(priors) if priors is not None else [_row(paths[0].name, str(prior))]
     if paths[0].name not in {row.name for row in rows}:
         raise ConfigError(f"--priors {priors}: has no line for the first image, {paths[0].name}")

@@ -35,3 +35,28 @@ def test_a_merged_key_may_be_overridden() -> None:
 def test_it_makes_plain_types_only(text: str) -> None:
     with pytest.raises(yaml.YAMLError):
         load_yaml(text)
+
+
+@pytest.mark.parametrize(
+    ("text", "read"),
+    [
+        ("fx: 8:20\n", "base 60, as 500"),
+        ("fx: 8:20.5\n", "base 60, as 500.5"),
+        ("fx: -1:30\n", "base 60, as -90"),
+        ("fx: 0100\n", "base 8, as 64"),
+        ("8:20: fx\n", "base 60, as 500"),
+        ("k: [0.1, {deep: 1:00}]\n", "base 60, as 60"),
+    ],
+)
+def test_a_number_that_says_another_one_is_refused(text: str, read: str) -> None:
+    with pytest.raises(yaml.YAMLError, match=read) as error:
+        load_yaml(text)
+    assert "line 1, column" in str(error.value)
+
+
+def test_plain_numbers_and_text_with_colons_are_read_as_they_stand() -> None:
+    text = "a: 500\nb: 1_000\nc: 0x10\nd: '8:20'\ne: udp://127.0.0.1:5600\nf: 0\ng: 0.5\nh: -07.5"
+    assert load_yaml(text) == {
+        "a": 500, "b": 1000, "c": 16, "d": "8:20", "e": "udp://127.0.0.1:5600", "f": 0, "g": 0.5,
+        "h": -7.5,
+    }  # fmt: skip

@@ -15,6 +15,7 @@ from localizer.errors import MapFetchError
 from localizer.map.fetch.area import Area
 from localizer.map.fetch.terms import require_allowed
 from localizer.map.source import VerticalDatum
+from localizer.strict_yaml import load_yaml
 
 Kind = Literal["wms", "wmts", "wcs", "xyz", "tms", "cog", "stac"]
 Role = Literal["imagery", "surface", "terrain"]
@@ -116,8 +117,8 @@ def _entries(path: Path) -> list[Any]:
         text = path.read_bytes()
         if len(text) > _MOST_BYTES:
             raise MapFetchError(f"{path}: over {_MOST_BYTES >> 20} MiB; that is no file of sources")
-        document = yaml.safe_load(text.decode("utf-8"))
-    except (OSError, UnicodeDecodeError, yaml.YAMLError, RecursionError) as error:
+        document = load_yaml(text.decode("utf-8"))
+    except (OSError, ValueError, yaml.YAMLError, RecursionError) as error:
         raise MapFetchError(f"{path}: cannot be read: {error}") from error
     entries = document.get("sources") if isinstance(document, dict) else None
     if not isinstance(entries, list):

@@ -89,6 +89,18 @@ def test_a_place_where_it_was_not_taken_is_no_place(small_assets, small_sequence
     assert (out / "poses.txt").read_text() == ""
 
 
+@pytest.mark.parametrize("missing", ["images", "--map", "--camera"])
+def test_a_wrong_path_is_named_before_the_prior_that_is_missing(
+    small_assets, small_sequence, tmp_path, missing
+):
+    given = {
+        "images": small_sequence / "images", "--map": small_assets.map_cache,
+        "--camera": small_sequence / "camera.json", missing: tmp_path / "nowhere",
+    }  # fmt: skip
+    result = _run(given.pop("images"), *(text for pair in given.items() for text in pair))
+    assert str(tmp_path / "nowhere") in str(result.exception)
+
+
 @pytest.mark.parametrize(
     ("options", "why"),
     [
