@@ -6,9 +6,9 @@ from pathlib import Path
 
 import numpy as np
 import rasterio.enums
-from numpy.typing import NDArray
 from rasterio.io import DatasetReader
 from rasterio.windows import Window
+from scipy.ndimage import find_objects, grey_opening, label
 
 from localizer.errors import MapSourceError
 from localizer.geometry.pose import Array
@@ -18,8 +18,12 @@ from localizer.map.importers.rules import HIGHEST_M, LOWEST_M, ImportRules
 _SAMPLES = 4000  # of a side
 _FILL_SHARE, _FILL_GAP_M = 1e-3, 30.0
 _WINDOW = 1500  # cells of a side, where slopes are measured
-_SPIKE_M = 500.0  # no tower or chimney stands so high over one cell's neighbours
+# Slender: height by width; the tallest chimneys have 25. From 500 m on nothing stands so, however
+# coarse the cells; trees, lamps and aerials on a roof stay below 80 m.
+_SLENDER, _SPIKE_LEAST_M, _SPIKE_M = 30.0, 80.0, 500.0
+_SPIKE_CELLS = 3  # wide at most
 _SPIKE_NEIGHBOURS = 3  # as many as a corner has
+_DEGREE_M = 111_000.0
 _STRIP_CELLS = 4_000_000  # read at once
 _ONE_COLOUR = 2  # levels of 255 between a picture's darkest and brightest, and it shows nothing
 _COLOUR_SAMPLES = 1000  # of a side
@@ -97,10 +101,7 @@ def _steepness(path: Path, data: DatasetReader, band: HeightBand, rules: ImportR
     window = Window((data.width - width) // 2, (data.height - height) // 2, width, height)
     raw = _masked(data, band, window=window)
     metres = band.metres(raw.filled(np.nan))
-    step = abs(data.transform.determinant) ** 0.5
-    if data.crs.is_geographic:
-        step *= 111_000.0
-    rises = np.abs(np.diff(metres, axis=1)) / step
+    rises = np.abs(np.diff(metres, axis=1)) / _step_m(data)
     rises = rises[np.isfinite(rises)]
     share = float((rises > _STEEP).mean()) if len(rises) else 0.0
     if share < _STEEP_SHARE:
@@ -115,42 +116,68 @@ def _steepness(path: Path, data: DatasetReader, band: HeightBand, rules: ImportR
 
 
 def _spikes(path: Path, data: DatasetReader, band: HeightBand) -> list[str]:
-    """Single cells far above or below all their neighbours: a bird, a cloud, a damaged number."""
-    found: list[tuple[float, float, float]] = []
+    """Few cells far above or below all that is about them: a bird, a cloud, a damaged number."""
+    step = _step_m(data)
+    found: list[tuple[float, float, float, float]] = []
     rows = max(1, _STRIP_CELLS // data.width)
     for first in range(0, data.height, rows):
-        top, bottom = max(first - 1, 0), min(first + rows + 1, data.height)  # with neighbours
+        margin = _SPIKE_CELLS + 1
+        top, bottom = max(first - margin, 0), min(first + rows + margin, data.height)
         window = Window(0, top, data.width, bottom - top)
         metres = band.metres(_masked(data, band, window=window).filled(np.nan))
-        own = slice(first - top, first - top + rows)
-        for row, column in np.argwhere(_stands_alone(metres)[own]):
-            found.append((*data.xy(first + row, column), metres[own][row, column]))
+        for row, column, gap in _stand_alone(metres, step):
+            if first <= top + row < first + rows:  # else the strip beside it tells
+                found.append((*data.xy(top + row, column), metres[row, column], gap))
     if not found:
         return []
-    x, y, height = found[0]
-    more = f", and {len(found) - 1} other cells" if len(found) > 1 else ""
+    x, y, height, gap = max(found, key=lambda spike: abs(spike[3]))
+    more = f", and {len(found) - 1} other places" if len(found) > 1 else ""
+    side = "above" if gap > 0 else "below"
     return [
-        f"{path.name}: {height:.0f} m in a single cell at {x:.10g}, {y:.10g}{more}: more than "
-        f"{_SPIKE_M:.0f} m from all its neighbours; no ground is like that: repair it, or mark it "
-        "as missing"
+        f"{path.name}: {height:.0f} m at {x:.10g}, {y:.10g}, {abs(gap):.0f} m {side} all that is "
+        f"about it and at most {_SPIKE_CELLS} cells wide{more}: no ground or building is like "
+        "that, a guyed mast is; repair it or mark it as missing, unless one stands there"
     ]
 
 
-def _stands_alone(metres: Array) -> NDArray[np.bool_]:
-    """Cells with enough known neighbours, all far from it. metres: (h, w), NaN is unknown."""
-    height, width = metres.shape
-    padded = np.pad(metres, 1, constant_values=np.nan)
-    alone = np.isfinite(metres)
-    known = np.zeros(metres.shape, np.uint8)
-    for row in range(3):
-        for column in range(3):
-            if (row, column) != (1, 1):
-                gap = np.abs(metres - padded[row : row + height, column : column + width])
-                alone &= ~(gap <= _SPIKE_M)
-                known += np.isfinite(gap)
-                if not alone.any():
-                    return alone
-    return alone & (known >= _SPIKE_NEIGHBOURS)
+def _step_m(data: DatasetReader) -> float:
+    step: float = abs(data.transform.determinant) ** 0.5
+    return step * _DEGREE_M if data.crs.is_geographic else step
+
+
+def _stand_alone(metres: Array, step_m: float) -> list[tuple[int, int, float]]:
+    """Row, column and height over its surroundings of each spike. metres: (h, w), NaN is unknown.
+
+    A spike is at most three cells wide and more slender than any chimney: 30 times as high as wide,
+    at least 80 m; from 500 m on nothing stands so.
+    """
+    least = float(np.clip(_SLENDER * step_m, _SPIKE_LEAST_M, _SPIKE_M))
+    steps = (np.abs(np.diff(metres, axis=axis)) > least for axis in (0, 1))
+    if not any(step.any() for step in steps):
+        return []
+    found = []
+    size = _SPIKE_CELLS + 1
+    for sign in (1.0, -1.0):
+        up = np.where(np.isfinite(metres), sign * metres, -np.inf)
+        # What is left of a surface when all that is narrower than `size` is taken off it.
+        bare = grey_opening(np.pad(up, size, constant_values=-np.inf), (size, size))
+        with np.errstate(invalid="ignore"):
+            groups, _ = label(up - bare[size:-size, size:-size] > least, np.ones((3, 3)))
+        for number, box in enumerate(find_objects(groups), 1):
+            extent = max(s.stop - s.start for s in box)
+            if extent > _SPIKE_CELLS:
+                continue
+            rows, columns = (slice(max(s.start - 1, 0), s.stop + 1) for s in box)
+            own = groups[rows, columns] == number
+            about = up[rows, columns][~own]
+            about = about[np.isfinite(about)]
+            limit = float(np.clip(_SLENDER * extent * step_m, _SPIKE_LEAST_M, _SPIKE_M))
+            heights = np.where(own, up[rows, columns], -np.inf)
+            gap = heights.max() - about.max(initial=-np.inf)
+            if len(about) >= _SPIKE_NEIGHBOURS and gap > limit:
+                row, column = np.unravel_index(int(heights.argmax()), heights.shape)
+                found.append((rows.start + int(row), columns.start + int(column), sign * gap))
+    return found
 
 
 def check_colours(path: Path, data: DatasetReader, bands: tuple[int, int, int]) -> list[str]:
