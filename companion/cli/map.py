@@ -13,7 +13,7 @@ from rich.markup import escape
 from rich.table import Table
 
 from companion.cli.before.map_check import check_command
-from companion.cli.before.map_fetch import fetch_command, sources_command
+from companion.cli.before.map_fetch import fetch_command, raise_command, sources_command
 from companion.terminal.steps import READING, shown_count, shown_work
 from companion.writing import writing
 
@@ -29,6 +29,7 @@ def _group() -> None:
 
 app.command("check")(check_command)
 app.command("fetch")(fetch_command)
+app.command("raise")(raise_command)
 app.command("sources")(sources_command)
 
 

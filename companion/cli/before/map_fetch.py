@@ -5,7 +5,7 @@ from __future__ import annotations
 import shutil
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -24,12 +24,17 @@ if TYPE_CHECKING:
     from localizer.map.fetch.catalogue import Source
     from localizer.map.fetch.polite import PoliteClient
     from localizer.map.fetch.raster import Plan
+    from localizer.map.footprints.footprint import Footprints
 
 _FINEST_M = 0.2  # what a flight at 100 m and a working width of 320 can use, and some more
 _MB = 1e6
 
 Sources = Annotated[
     list[Path] | None, typer.Option(help="YAML file of more sources; may be repeated")
+]
+
+HeightProperty = Annotated[
+    str | None, typer.Option(help="of a GeoJSON's features; none: height and its usual spellings")
 ]
 
 
@@ -70,6 +75,11 @@ def fetch_command(
     only_estimate: Annotated[
         bool, typer.Option("--estimate", help="say what it would take, and end")
     ] = False,
+    footprints: Annotated[
+        Path | None,
+        typer.Option(help="buildings to raise on a bare terrain: GeoJSON or CityGML with heights"),
+    ] = None,
+    height_property: HeightProperty = None,
     keep: Annotated[
         bool, typer.Option("--keep", help="keep the fetched GeoTIFFs beside the cache")
     ] = False,
@@ -80,6 +90,11 @@ def fetch_command(
     from localizer.map.fetch.catalogue import choose, load_sources
 
     area = _area(rectangle, circle, mission, margin)
+    buildings = None
+    if footprints is not None:
+        from localizer.map.footprints.raise_buildings import read_footprints
+
+        buildings = read_footprints(footprints, height_property)
     known = load_sources(tuple(sources or ()))
     console = Console()
     console.print(f"area: {area}", highlight=False, soft_wrap=True)
@@ -88,6 +103,11 @@ def fetch_command(
         _planned(choose(known, area, role, name), area, resolution, most_mb, work, role)
         for role, name in (("imagery", imagery), ("heights", heights))
     ]
+    if buildings is not None and parts[1].source.role != "terrain":
+        raise ConfigError(
+            f"--footprints: {parts[1].source.name} is a surface, which has its buildings; name a "
+            "terrain with --heights"
+        )
     total = _print_estimate(console, parts)
     if total > most_mb:
         raise ConfigError(
@@ -98,9 +118,24 @@ def fetch_command(
         return
     for part in parts:
         _fetched(console, part, area)
+    if buildings is not None:
+        parts[1] = _raised(console, parts[1], buildings)
     _built(console, parts, out, overwrite, workers)
     if not keep:
         shutil.rmtree(work, ignore_errors=True)
+
+
+def raise_command(
+    terrain: Annotated[Path, typer.Argument(help="GeoTIFF of bare heights in metres")],
+    footprints: Annotated[Path, typer.Argument(help="GeoJSON or CityGML with heights")],
+    out: Annotated[Path, typer.Option(help="GeoTIFF of the surface to write")],
+    height_property: HeightProperty = None,
+) -> None:
+    """Raise buildings on a terrain by their footprints: a surface for `map build`."""
+    from localizer.map.footprints.raise_buildings import raise_buildings, read_footprints
+
+    done = raise_buildings(terrain, read_footprints(footprints, height_property), out)
+    Console().print(f"{out}: {done.line()}", markup=False, highlight=False, soft_wrap=True)
 
 
 def sources_command(
@@ -208,6 +243,18 @@ def _told_count(console: Console, what: str) -> Iterator[Callable[[int, int], No
     except KeyboardInterrupt:
         Console(stderr=True).print("interrupted: the same command goes on with what has come")
         raise
+
+
+def _raised(console: Console, part: _Part, footprints: Footprints) -> _Part:
+    """The terrain with buildings, and a source that says whose they are."""
+    from localizer.map.footprints.raise_buildings import raise_buildings
+
+    out = part.out.with_name("raised.tif")
+    done = raise_buildings(part.out, footprints, out)
+    console.print(f"{footprints.path.name}: {done.line()}", markup=False, highlight=False,
+                  soft_wrap=True)  # fmt: skip
+    whose = f"{part.source.attribution}; buildings: {footprints.path.name}"
+    return replace(part, out=out, source=part.source.model_copy(update={"attribution": whose}))
 
 
 def _built(

@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import email.utils
+import json
 import threading
 import time
 from collections.abc import Callable, Collection, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from urllib.parse import urljoin, urlsplit
 
 import urllib3
@@ -20,6 +21,7 @@ _FIRST_WAIT_S, _LONGEST_WAIT_S = 1.0, 60.0
 _MOST_REDIRECTS = 4
 _AGAIN = (408, 425, 429, 500, 502, 503, 504)
 _REDIRECTED = (301, 302, 303, 307, 308)
+_KEEPS_METHOD = (307, 308)  # RFC 9110, 15.4: after the others a POST becomes a GET
 _TIMEOUT = urllib3.Timeout(connect=15.0, read=60.0)
 _MOST_ANSWER = 256 << 20
 _BLOCK = 1 << 16
@@ -43,9 +45,18 @@ class Answer:
     headers: Mapping[str, str] = field(default_factory=dict)
 
 
+@dataclass(frozen=True)
+class _Request:
+    """body: of a POST; None: a GET."""
+
+    url: str
+    headers: Mapping[str, str]
+    body: bytes | None = None
+
+
 class PoliteClient:
-    """GET, from any number of threads. `MapFetchError` says what a server refused, or that a limit
-    was reached. sleep, clock: seconds.
+    """GET and POST, from any number of threads. `MapFetchError` says what a server refused, or that
+    a limit was reached. sleep, clock: seconds.
     """
 
     def __init__(
@@ -81,15 +92,26 @@ class PoliteClient:
         """The answer to a GET, redirections followed, repeated while the server is busy. missing:
         statuses that mean that there is nothing, and are an answer, too.
         """
+        return self._followed(_Request(url, headers or {}), missing)
+
+    def post(self, url: str, document: object) -> Answer:
+        """The answer to a POST of a JSON document, as of `get`."""
+        body = json.dumps(document).encode()
+        return self._followed(_Request(url, {"Content-Type": "application/json"}, body), ())
+
+    def _followed(self, request: _Request, missing: Collection[int]) -> Answer:
         for _ in range(_MOST_REDIRECTS + 1):
-            require_allowed(url)
-            answer = self._patiently(url, headers or {}, missing)
+            require_allowed(request.url)
+            answer = self._patiently(request, missing)
             if answer.status not in _REDIRECTED:
                 return answer
-            url = urljoin(url, answer.headers.get("location", ""))
-        raise MapFetchError(f"{url}: redirected more than {_MOST_REDIRECTS} times")
+            there = urljoin(request.url, answer.headers.get("location", ""))
+            body = request.body if answer.status in _KEEPS_METHOD else None
+            request = replace(request, url=there, body=body)
+        raise MapFetchError(f"{shown(request.url)}: redirected more than {_MOST_REDIRECTS} times")
 
-    def _patiently(self, url: str, headers: Mapping[str, str], missing: Collection[int]) -> Answer:
+    def _patiently(self, request: _Request, missing: Collection[int]) -> Answer:
+        url = request.url
         wait_s, why = _FIRST_WAIT_S, ""
         for attempt in range(_TRIES):
             if attempt:
@@ -97,7 +119,7 @@ class PoliteClient:
                 wait_s = min(2 * wait_s, _LONGEST_WAIT_S)
             self._wait_turn(urlsplit(url).netloc)
             try:
-                answer = self._once(url, headers)
+                answer = self._once(request)
             except urllib3.exceptions.HTTPError as error:
                 why = str(error)
                 continue
@@ -118,10 +140,11 @@ class PoliteClient:
         if due > now:
             self._sleep(due - now)
 
-    def _once(self, url: str, headers: Mapping[str, str]) -> Answer:
+    def _once(self, request: _Request) -> Answer:
+        url, headers = request.url, {"User-Agent": _AGENT, **request.headers}
         reply = self._pool.request(
-            "GET", url, headers={"User-Agent": _AGENT, **headers}, timeout=_TIMEOUT,
-            retries=False, redirect=False, preload_content=False,
+            "GET" if request.body is None else "POST", url, headers=headers, body=request.body,
+            timeout=_TIMEOUT, retries=False, redirect=False, preload_content=False,
         )  # fmt: skip
         try:
             data = bytearray()

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterator
+from dataclasses import dataclass
 from fnmatch import fnmatchcase
 from typing import Any
 from urllib.parse import urlencode, urljoin
@@ -16,6 +17,7 @@ from localizer.map.fetch.polite import PoliteClient, shown
 from localizer.map.fetch.terms import require_allowed
 
 _MOST_ITEMS, _MOST_PAGES = 2000, 50
+_PAGE = 100  # items that are asked for at once; a service may give fewer
 _TIFFS = ("image/tiff", "image/vnd.stac.geotiff")
 
 
@@ -64,27 +66,68 @@ def _asset(source: Source, item: Any) -> Any:
 
 
 def _searched(source: Source, area: Area, client: PoliteClient) -> Iterator[Any]:
-    """GET /search of the STAC API, page by page."""
+    """Item Search of the STAC API, page by page: by GET, or by POST where only that is offered."""
     import pystac
 
-    box = (area.west, area.south, area.east, area.north)
-    parameters = {"bbox": ",".join(f"{v:.7f}" for v in box), "limit": "100"}
-    if source.layer:
-        parameters["collections"] = source.layer
-    url: str | None = f"{source.url.rstrip('/')}/search?{urlencode(parameters)}"
+    page = _first_page(source, area, client)
     for _ in range(_MOST_PAGES):
-        if url is None:
-            return
-        page = json.loads(client.get(url).data)
-        for feature in page["features"]:
+        for feature in page.document["features"]:
             item = pystac.Item.from_dict(feature)
+            if item.get_self_href() is None:
+                item.set_self_href(page.url)  # what relative addresses are relative to
             if item.bbox is not None and area.meets(_flat(item.bbox)):
                 yield item
-        links = [
-            li["href"] for li in page.get("links", ())
-            if li.get("rel") == "next" and li.get("method", "GET") == "GET"
-        ]  # fmt: skip
-        url = urljoin(url, links[0]) if links else None
+        following = page.next(client)
+        if following is None:
+            return
+        page = following
+    raise MapFetchError(f"{source.name}: over {_MOST_PAGES} pages of items: a smaller area")
+
+
+@dataclass(frozen=True)
+class _Page:
+    """An answer to a search. asked: the document that was posted; None: it was a GET."""
+
+    url: str
+    document: dict[str, Any]
+    asked: dict[str, Any] | None
+
+    @classmethod
+    def got(cls, url: str, asked: dict[str, Any] | None, client: PoliteClient) -> _Page:
+        """Ask for it."""
+        answer = client.get(url) if asked is None else client.post(url, asked)
+        return cls(url, json.loads(answer.data), asked)
+
+    def next(self, client: PoliteClient) -> _Page | None:
+        """The page after it. A link may say POST, with a body that replaces or is merged into what
+        was posted before (STAC API 1.0, Item Search, paging).
+        """
+        for link in self.document.get("links", ()):
+            if link.get("rel") == "next":
+                asked = None
+                if str(link.get("method", "GET")).upper() == "POST":
+                    earlier = (self.asked or {}) if link.get("merge") else {}
+                    asked = {**earlier, **(link.get("body") or {})}
+                return _Page.got(urljoin(self.url, link["href"]), asked, client)
+        return None
+
+
+def _first_page(source: Source, area: Area, client: PoliteClient) -> _Page:
+    box = [round(v, 7) for v in (area.west, area.south, area.east, area.north)]
+    home = source.url.rstrip("/")
+    landing = json.loads(client.get(home).data)
+    offered = [li for li in landing.get("links", ()) if li.get("rel") == "search"]
+    methods = {str(li.get("method", "GET")).upper(): li["href"] for li in offered}
+    if set(methods) == {"POST"}:
+        asked: dict[str, Any] = {"bbox": box, "limit": _PAGE}
+        if source.layer:
+            asked["collections"] = [source.layer]
+        return _Page.got(urljoin(f"{home}/", methods["POST"]), asked, client)
+    parameters = {"bbox": ",".join(f"{v:.7f}" for v in box), "limit": str(_PAGE)}
+    if source.layer:
+        parameters["collections"] = source.layer
+    there = urljoin(f"{home}/", methods.get("GET", f"{home}/search"))
+    return _Page.got(f"{there}?{urlencode(parameters)}", None, client)
 
 
 def _walked(source: Source, area: Area, client: PoliteClient) -> Iterator[Any]:

@@ -1,5 +1,6 @@
 """From an empty folder to a verified cache by one command, against services on loopback."""
 
+import json
 import re
 
 import numpy as np
@@ -83,6 +84,58 @@ def test_one_command_makes_a_cache_whose_heights_are_right(server, sources, tmp_
     assert np.isfinite(wrong).all()
     assert np.abs(wrong).max() < 0.5
     assert not (tmp_path / "area.fetch").exists()
+
+
+def test_footprints_become_buildings_on_a_fetched_terrain(server, sources, tmp_path):
+    """From an empty folder: the roof's height and the ground's beside it, each to half a metre."""
+    entries = yaml.safe_load(sources.read_text())
+    entries["sources"][1] |= {"role": "terrain", "name": "terrain"}
+    sources.write_text(yaml.safe_dump(entries))
+    corners = [(LEFT + x, TOP - y) for x, y in ((180, 180), (220, 180), (220, 215), (180, 215))]
+    places = [list(reversed(geographic(*corner))) for corner in corners]
+    feature = {"type": "Feature", "properties": {"height": 17.0},
+               "geometry": {"type": "Polygon", "coordinates": [places]}}  # fmt: skip
+    file = tmp_path / "houses.geojson"
+    file.write_text(json.dumps({"type": "FeatureCollection", "features": [feature]}))
+    out = tmp_path / "area"
+    done = run(
+        "fetch", "--rectangle", BOX, "--imagery", "photos", "--heights", "terrain", "--sources",
+        sources, "--out", out, "--workers", 1, "--footprints", file,
+    )  # fmt: skip
+    assert done.exit_code == 0, done.output
+    assert "1 buildings raised in cells of 0.50 m" in done.output
+    cache = TileCache.open(out)
+    assert "buildings: houses.geojson" in cache.manifest.attribution
+    edge = LEFT + np.arange(180.0, 221.0)
+    low = min(height_m(edge, TOP - y).min() for y in (180.0, 215.0))
+    for east, north, truth in (
+        (LEFT + 200.0, TOP - 200.0, low + 17.0), (LEFT + 181.0, TOP - 214.0, low + 17.0),
+        (LEFT + 178.5, TOP - 200.0, None), (LEFT + 200.0, TOP - 216.5, None),
+    ):  # fmt: skip
+        above = height_m(east, north) if truth is None else truth
+        assert _surface_m(cache, east, north) == pytest.approx(above, abs=0.5)
+
+
+def _surface_m(cache: TileCache, east: float, north: float) -> float:
+    """Above the geoid, where a plumb line meets the map."""
+    latitude, longitude = geographic(east, north)
+    geoid = geoid_separation(latitude, longitude)
+    at, below = (cache.frame.enu_from_geodetic(latitude, longitude, h) for h in (900.0, 800.0))
+    down = (below - at) / np.linalg.norm(below - at)
+    return 900.0 - float(MapSurface(cache).cast(at, down[None]).distances[0]) - geoid
+
+
+def test_footprints_on_a_surface_are_refused(server, sources, tmp_path):
+    file = tmp_path / "houses.geojson"
+    ring = [[8.0, 47.0], [8.1, 47.0], [8.1, 47.1]]
+    feature = {"properties": {"height": 9}, "geometry": {"type": "Polygon", "coordinates": [ring]}}
+    file.write_text(json.dumps({"features": [feature]}))
+    done = run(
+        "fetch", "--rectangle", BOX, "--imagery", "photos", "--heights", "surface", "--sources",
+        sources, "--out", tmp_path / "a", "--footprints", file,
+    )  # fmt: skip
+    assert done.exit_code != 0
+    assert "has its buildings" in str(done.exception)
 
 
 def test_the_estimate_asks_for_nothing_large_and_a_bound_stops_before(server, sources, tmp_path):

@@ -5,6 +5,7 @@ Nothing here or in the tests goes beyond this machine.
 
 from __future__ import annotations
 
+import json
 import os
 import subprocess
 import threading
@@ -12,7 +13,8 @@ import time
 from contextlib import contextmanager
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
-from urllib.parse import urlsplit
+from typing import Any
+from urllib.parse import parse_qsl, urlencode, urlsplit
 
 import cv2
 import numpy as np
@@ -93,6 +95,48 @@ def tile(folder: Path, zoom: int, x: int, y: int) -> bytes | None:
     ].tobytes()
 
 
+class SearchedCatalogue:
+    """A STAC API of `write_stac`'s items and many more, one a page. methods: by which it can be
+    searched; endless: its pages never end.
+    """
+
+    def __init__(self) -> None:
+        self.items: list[dict[str, Any]] = []
+        self.methods: tuple[str, ...] = ("GET", "POST")
+        self.endless = False
+
+    def answer(
+        self, url: str, path: str, query: dict[str, str] | None, posted: Any
+    ) -> dict[str, Any] | None:
+        """Of the landing page and of its search; None where the method is not offered."""
+        if path == "/api":
+            offered = [{"rel": "search", "href": f"{url}/api/search", "method": m}
+                       for m in self.methods]  # fmt: skip
+            return {"type": "Catalog", "stac_version": "1.0.0", "id": "api", "links": offered}
+        if ("POST" if query is None else "GET") not in self.methods:
+            return None
+        asked = posted if query is None else query
+        box = asked["bbox"] if query is None else [float(v) for v in query["bbox"].split(",")]
+        layers: Any = asked.get("collections", [])
+        found = [
+            item for item in self.items
+            if (not layers or item["collection"] in layers)
+            and item["bbox"][0] < box[2] and item["bbox"][2] > box[0]
+            and item["bbox"][1] < box[3] and item["bbox"][3] > box[1]
+        ]  # fmt: skip
+        at = int(asked.get("token", 0))
+        links: list[dict[str, Any]] = []
+        if at + 1 < len(found) or self.endless:
+            token = (at + 1) % len(found)
+            if query is None:
+                links.append({"rel": "next", "href": f"{url}/api/search", "method": "POST",
+                              "merge": True, "body": {"token": token}})  # fmt: skip
+            else:
+                more = urlencode(query | {"token": token})
+                links.append({"rel": "next", "href": f"{url}/api/search?{more}"})
+        return {"type": "FeatureCollection", "features": found[at : at + 1], "links": links}
+
+
 class Served:
     """What a server was asked, and how it shall behave. broken: answers of the next requests
     instead of their own: a status, with headers.
@@ -107,6 +151,7 @@ class Served:
         self.ranged = True
         self.bytes = 0
         self.port = 0
+        self.catalogue = SearchedCatalogue()
 
     @property
     def url(self) -> str:
@@ -135,8 +180,19 @@ def serving(folder: Path):
                 self._mapserver(parts.query)
             elif parts.path.startswith(("/tiles/", "/tms/")):
                 self._tile(parts.path)
+            elif parts.path.startswith("/api"):
+                self._search(parts.path, dict(parse_qsl(parts.query)))
             else:
                 self._file(parts.path)
+
+        def do_POST(self) -> None:
+            served.asked.append(self.path)
+            length = int(self.headers["Content-Length"])
+            self._search(urlsplit(self.path).path, None, json.loads(self.rfile.read(length)))
+
+        def _search(self, path: str, query: dict[str, str] | None, posted: Any = None) -> None:
+            document = served.catalogue.answer(served.url, path, query, posted)
+            self._send(405 if document is None else 200, json.dumps(document or {}).encode())
 
         def _mapserver(self, query: str) -> None:
             environment = os.environ | {
@@ -241,8 +297,10 @@ END
     )
 
 
-def write_stac(folder: Path, url: str) -> None:
-    """A static catalogue by pystac: a collection of the orthophoto here, one of it elsewhere."""
+def write_stac(folder: Path, url: str) -> list[dict[str, Any]]:
+    """A static catalogue by pystac: a collection of the orthophoto here, one of it elsewhere.
+    Returns its items.
+    """
     import datetime
 
     import pystac
@@ -268,7 +326,9 @@ def write_stac(folder: Path, url: str) -> None:
             collection.add_item(item)
         catalogue.add_child(collection)
     catalogue.normalize_hrefs(f"{url}/stac")
+    written = [item.to_dict() for item in catalogue.get_items(recursive=True)]
     catalogue.save(pystac.CatalogType.ABSOLUTE_PUBLISHED, dest_href=str(folder / "stac"))
+    return written
 
 
 def wmts_capabilities(url: str) -> str:

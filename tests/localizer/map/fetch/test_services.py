@@ -41,7 +41,7 @@ def server(tmp_path_factory):
     folder = write_world(tmp_path_factory.mktemp("world"))
     with serving(folder) as served:
         write_map_file(folder, served.url)
-        write_stac(folder, served.url)
+        served.catalogue.items = write_stac(folder, served.url)
         (folder / "wmts.xml").write_text(wmts_capabilities(served.url))
         yield served
 
@@ -114,6 +114,33 @@ def test_a_catalogue_leads_to_the_newest_file_there_and_asks_nothing_elsewhere(s
 def test_another_collection_has_nothing_there(server, tmp_path):
     with pytest.raises(MapFetchError, match="no file at"):
         fetched(source("stac", f"{server.url}/stac/catalog.json", layer="elsewhere"), tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("methods", "layer"), [(("GET", "POST"), ""), (("POST",), ""), (("POST",), "photos"), ((), "")]
+)
+def test_a_searched_catalogue_is_read_to_its_last_page(
+    server, tmp_path, monkeypatch, methods, layer
+):
+    """Items one a page, the newest last; by GET, by POST with a merged body, or told of neither."""
+    server.asked.clear()
+    monkeypatch.setattr(server.catalogue, "methods", methods or ("GET",))
+    if not methods:
+        answer = server.catalogue.answer
+        monkeypatch.setattr(
+            server.catalogue, "answer",
+            lambda url, path, *rest: {} if path == "/api" else answer(url, path, *rest),
+        )  # fmt: skip
+    compare(fetched(source("stac", f"{server.url}/api", layer=layer), tmp_path), **PICTURE)
+    assert sum(path.startswith("/api/search") for path in server.asked) == 2
+    assert any("ortho.tif" in path for path in server.asked)
+
+
+def test_a_search_that_never_ends_is_given_up(server, tmp_path, monkeypatch):
+    monkeypatch.setattr(server.catalogue, "endless", True)
+    wanted = source("stac", f"{server.url}/api")
+    with pytest.raises(MapFetchError, match="over 50 pages"):
+        fetched(wanted, tmp_path, PoliteClient(Manners(1000.0)))
 
 
 @pytest.mark.parametrize("kind", ["xyz", "tms", "wmts"])
