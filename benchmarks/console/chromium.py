@@ -65,6 +65,9 @@ def _slow_down(before: set[int], nice: int) -> None:
     """The browser stands behind the flight by so much: what it starts later inherits that."""
     for pid in _children() - before:
         try:
+            # What else began meanwhile, as the companion of a flight, is no part of it.
+            if b"chrom" not in Path(f"/proc/{pid}/cmdline").read_bytes():
+                continue
             for task in Path(f"/proc/{pid}/task").iterdir():
                 number = int(task.name)
                 now = os.getpriority(os.PRIO_PROCESS, number)
