@@ -25,6 +25,11 @@ class Verdict:
     look: str = ""
 
 
+# Widths of tracks that nearly coincide: each is seen inside the one below, rim and all; pixels.
+OUTER, MIDDLE, INNER = 10.0, 6.5, 2.5
+RIM = 1.5  # of dark about a track, both sides together
+
+
 @dataclass(frozen=True)
 class Track:
     """A way in the map's frame. points: (N, 2) east, north, m."""

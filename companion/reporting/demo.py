@@ -13,7 +13,19 @@ import numpy as np
 from companion.errors import RecordError
 from companion.offline.tables import Columns, poses, read_columns
 from companion.reporting import figures
-from companion.reporting.content import Curve, Overlay, Plot, Report, Span, Stanford, Track, Verdict
+from companion.reporting.content import (
+    INNER,
+    MIDDLE,
+    OUTER,
+    Curve,
+    Overlay,
+    Plot,
+    Report,
+    Span,
+    Stanford,
+    Track,
+    Verdict,
+)
 from companion.reporting.pictures import map_pictures
 from companion.reporting.record import (
     KEPT_FRAMES,
@@ -58,11 +70,11 @@ def demo_report(folder: Path) -> Report:
     large = f"{time_s[off[0]]:.3f} the position was {errors['3-D'][off[0]]:.1f} m off" \
         if len(off) else ""  # fmt: skip
     with map_pictures(record.map_path) as pictures:
-        vision = figures.track("vision (camera)", VISION, 2.0, estimates)
+        vision = figures.track("vision (camera)", VISION, INNER, estimates)
         tracks = [
-            figures.track("truth", _TRUTH, 6.0, vehicle),
-            figures.track("autopilot's EKF", _EKF, 4.0, vehicle, "ekf_"),
-            Track(vision.name, VISION, 2.0, np.where(accepted[:, None], vision.points, np.nan)),
+            figures.track("truth", _TRUTH, OUTER, vehicle),
+            figures.track("autopilot's EKF", _EKF, MIDDLE, vehicle, "ekf_"),
+            Track(vision.name, VISION, INNER, np.where(accepted[:, None], vision.points, np.nan)),
         ]
         sheet = pictures.sheet(tracks, figures.target_marks(record.targets))
         goodness = np.where(accepted, -errors["3-D"], np.nan)

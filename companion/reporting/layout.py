@@ -14,7 +14,7 @@ import cv2
 import numpy as np
 
 from companion.errors import ReportError
-from companion.reporting.content import MapSheet, Plot, Report, Stanford, Table, Track
+from companion.reporting.content import RIM, MapSheet, Plot, Report, Stanford, Table, Track
 from companion.vendored import licence_of, vendored
 from companion.writing import writing
 from localizer.types import Image
@@ -156,7 +156,7 @@ def _polyline(track: Track, points: list[str]) -> str:
     """A track with a dark rim, which is seen on any ground."""
     line = " ".join(points)
     return (
-        f'<polyline points="{line}" class=rim stroke-width="{track.width + 2}"/>'
+        f'<polyline points="{line}" class=rim stroke-width="{track.width + RIM}"/>'
         f'<polyline points="{line}" stroke="{track.colour}" stroke-width="{track.width}"/>'
     )
 

@@ -17,7 +17,17 @@ from companion.flight.recorder import MANIFEST_NAME
 from companion.offline.tables import Columns, poses, read_columns
 from companion.reporting import figures
 from companion.reporting.autopilot import AutopilotTracks, read_autopilot
-from companion.reporting.content import Curve, Overlay, Plot, Report, Track, Verdict
+from companion.reporting.content import (
+    INNER,
+    MIDDLE,
+    OUTER,
+    Curve,
+    Overlay,
+    Plot,
+    Report,
+    Track,
+    Verdict,
+)
 from companion.reporting.pictures import ShownFrame, map_pictures
 from localizer.errors import CameraError
 from localizer.geometry.camera import Camera
@@ -219,11 +229,20 @@ def worst_frames(
         ShownFrame(
             path,
             pose,
-            f"t = {time_s[k]:.1f} s, {what} {abs(goodness[k]):.2f}, {estimates['state'][k]}, "
-            + ("accepted" if accepted[k] else f"refused ({estimates['status'][k]})"),
+            f"t = {time_s[k]:.1f} s, {what} {_known(goodness[k])}, {estimates['state'][k]}, "
+            + ("accepted" if accepted[k] else _refused(str(estimates["status"][k]))),
         )
         for (path, k), pose in zip(chosen, placed, strict=True)
     ]
+
+
+def _known(figure: float) -> str:
+    return f"{abs(figure):.2f}" if np.isfinite(figure) else "not known"
+
+
+def _refused(status: str) -> str:
+    """status: of the registration, which may be well and its pose not believed."""
+    return "registered, not accepted" if status == "OK" else f"refused ({status})"
 
 
 def uncertainty_plots(estimates: Columns, time_s: np.ndarray) -> tuple[Plot, ...]:
@@ -258,13 +277,13 @@ def _plots(
 
 def _tracks(estimates: Columns, autopilot: AutopilotTracks) -> list[Track]:
     accepted = np.asarray(estimates["accepted"]) > 0
-    vision = figures.track("vision (camera)", VISION, 2.5, estimates)
+    vision = figures.track("vision (camera)", VISION, INNER, estimates)
     points = np.where(accepted[:, None], vision.points, np.nan)
     tracks = []
     if autopilot.gnss is not None:
-        tracks.append(Track("GNSS", GNSS, 5.0, autopilot.gnss.points))
+        tracks.append(Track("GNSS", GNSS, OUTER, autopilot.gnss.points))
     if autopilot.ekf is not None:
-        tracks.append(Track("autopilot's EKF", AUTOPILOT, 3.5, autopilot.ekf.points))
+        tracks.append(Track("autopilot's EKF", AUTOPILOT, MIDDLE, autopilot.ekf.points))
     return [*tracks, Track(vision.name, vision.colour, vision.width, points)]
 
 

@@ -1,6 +1,7 @@
 // The map from above, with everything that has a place.
 const EMPTY = { type: "FeatureCollection", features: [] };
-const TRACKS = [["gnss", "#ffffff", 6], ["autopilot", "#1fd1ff", 4], ["vision", "#ff8c1a", 2.5]];
+// Tracks that coincide are seen one inside the other, the rim of each narrower than the one below.
+const TRACKS = [["gnss", "#ffffff", 10], ["autopilot", "#1fd1ff", 6.5], ["vision", "#ff8c1a", 2.5]];
 const CHI95 = 2.4477; // of two dimensions
 const KEPT = 600;
 // Each drawing of a map by the processor takes it from the flight, and holds the page up meanwhile.
@@ -179,7 +180,7 @@ function style(about) {
   layer("mission", "mission-rim", "line", { "line-color": "#101418", "line-width": 4 });
   layer("mission", "mission", "line", { "line-color": "#7dff5c", "line-width": 2, "line-dasharray": [4, 2] });
   for (const [name, colour, width] of TRACKS) {
-    layer(name, `${name}-rim`, "line", { "line-color": "#101418", "line-width": width + 2 });
+    layer(name, `${name}-rim`, "line", { "line-color": "#101418", "line-width": width + 1.5 });
     layer(name, name, "line", { "line-color": colour, "line-width": width });
   }
   for (const [name, colour] of [["footprint", "#ffe14d"], ["ellipse", "#ff8c1a"], ["targets", "#ff2fd0"], ["hint", "#0b4f9e"]]) {

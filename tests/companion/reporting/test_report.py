@@ -11,7 +11,16 @@ import pytest
 
 from companion.errors import RecordError
 from companion.flight.recorder import ESTIMATE_COLUMNS, EVENT_COLUMNS, TARGET_COLUMNS
-from companion.reporting.content import MapSheet, Mark, Report, Stanford
+from companion.reporting.content import (
+    INNER,
+    MIDDLE,
+    OUTER,
+    MapSheet,
+    Mark,
+    Report,
+    Stanford,
+    Track,
+)
 from companion.reporting.layout import render
 from companion.reporting.record import read_record, record_report, worst_frames
 from companion.reporting.report import report_of, write_page
@@ -113,7 +122,7 @@ def test_the_worst_frames_come_first_and_refused_ones_take_half_the_places(recor
     seconds = (tables.estimates["exposure_time_ns"] - START_NS) * 1e-9
     shown = worst_frames(tables, quality, "quality", seconds)
     assert shown[0].caption == "t = 0.7 s, quality 0.30, tracking, accepted"
-    assert sum("refused" in s.caption for s in shown) == 4
+    assert sum(not s.caption.endswith(", accepted") for s in shown) == 4
     assert shown[0].world_from_camera.translation[0] == 14.0
 
 
@@ -122,6 +131,16 @@ def test_each_target_has_its_own_line_and_its_place_on_the_map(record):
     assert [row[:2] for row in report.targets.rows] == [("A", "1"), ("B", "1")]
     assert [m.name for m in report.sheet.marks] == ["A", "B"]
     assert report.sheet.rgb.std() > 5  # the map was drawn
+
+
+def test_tracks_that_coincide_are_seen_one_inside_the_other():
+    """A rim as wide as the track below hid the truth and the autopilot's way."""
+    points = np.array([[0.0, 0.0], [50.0, 50.0]])
+    tracks = [Track(str(w), "#fff", w, points) for w in (OUTER, MIDDLE, INNER)]
+    page = render(Report("", "", "", sheet=MapSheet(None, 0.0, 100.0, 0.0, 100.0, tuple(tracks))))
+    rims = [float(w) for w in re.findall(r'class=rim stroke-width="([\d.]+)"', page)]
+    for below, rim in zip(tracks[:-1], rims[1:], strict=True):
+        assert below.width - rim >= 2.0  # a pixel on each side
 
 
 @pytest.mark.parametrize(
