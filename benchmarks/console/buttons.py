@@ -256,7 +256,9 @@ def _word(page: Any) -> str:
 def main() -> None:
     """Fly, print, write."""
     parser = Parser(__doc__)
-    parser.add_argument("--fc", choices=("embedded", "ardupilot"), default="embedded")
+    parser.add_argument(
+        "--fc", choices=("embedded", "ardupilot"), default="embedded", help="the simulated vehicle"
+    )
     parser.add_argument("--seed", type=whole(0, 10_000), default=0, help="of world and noise")
     parser.add_argument("--browser-nice", type=whole(0, 19), default=5, help="behind the flight's")
     parser.add_argument("--keep", type=Path, help="folder for the flight's records")

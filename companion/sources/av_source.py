@@ -14,6 +14,7 @@ from pathlib import Path
 import av
 import numpy as np
 from av.sidedata.sidedata import Type as SideDataType
+from av.video.frame import PictureType
 
 from companion.errors import StreamDecodeError, StreamError, StreamOpenError, StreamSizeError
 from companion.redaction import redacted
@@ -33,7 +34,7 @@ from companion.sources.datagrams import (
     VideoDatagrams,
 )
 from companion.sources.misp import MispTime, parse_message
-from companion.sources.references import References
+from companion.sources.references import Damage, References
 from companion.sources.timing import ExposureClock, Stamps
 from localizer.geometry.camera import Camera
 from localizer.tracking.mailbox import Mailbox
@@ -84,7 +85,9 @@ class Decoder:
         self.stream = self._container.streams.video[0]
         self.late = 0  # pictures that packets before theirs held back (B-frames)
         context = self.stream.codec_context
-        h264 = context.name == "h264" and read_timeout_s is not None
+        live = read_timeout_s is not None
+        h264 = context.name == "h264" and live
+        self._damage = Damage() if live else None
         self._references = References(bytes(context.extradata or b"")) if h264 else None
         context.thread_count = 1
         if read_timeout_s is not None:
@@ -100,15 +103,23 @@ class Decoder:
                 pictures = packet.decode()
             except av.error.InvalidDataError:
                 pictures = []
+                if self._damage is not None:
+                    self._damage.undecodable(arrival_ns)
             if self._tap is not None and packet.size:
                 self._tap.packet(packet)
             late = self._leans_on_lost(packet, arrival_ns)  # each packet: it counts them
-            whole = [p for p in pictures if not p.is_corrupt and not late]
+            whole = [p for p in pictures if not self._is_damaged(p, arrival_ns) and not late]
             self.late += max(0, len(whole) - (1 if packet.size else 0))
             for picture in whole:
                 yield picture, arrival_ns
             if not whole and packet.size:
                 yield None, arrival_ns
+
+    def _is_damaged(self, picture: av.VideoFrame, arrival_ns: int) -> bool:
+        if self._damage is None:
+            return bool(picture.is_corrupt)
+        clean = bool(picture.key_frame) or picture.pict_type == PictureType.I
+        return self._damage.is_damaged(arrival_ns, marked=bool(picture.is_corrupt), clean=clean)
 
     def _leans_on_lost(self, packet: av.Packet, arrival_ns: int) -> bool:
         follows = self._references

@@ -1,8 +1,11 @@
-"""Whether an H.264 picture was predicted from one that was lost (ITU-T H.264, 7.3 and 7.4.3).
+"""Whether a picture was predicted from one that was lost or damaged.
 
-A decoder that misses a whole picture repeats the one before in its place and goes on: what follows
-is sharp, of good quality, without a mark, and shows the ground as it was one picture earlier until
-the next key frame. `frame_num` counts reference pictures, so that a gap in it tells the loss.
+A decoder marks a picture of which a part did not come, and fills the part from the picture before;
+those that are predicted from it carry the part on without a mark (`Damage`, any codec). A decoder
+that misses a whole picture repeats the one before in its place and goes on: what follows is sharp,
+of good quality, without a mark, and shows the ground as it was one picture earlier until the next
+key frame. H.264's `frame_num` counts reference pictures, so that a gap in it tells the loss
+(`References`; ITU-T H.264, 7.3 and 7.4.3).
 """
 
 from __future__ import annotations
@@ -73,6 +76,33 @@ class _Slice:
     idr: bool
     reference: bool
     sequence: _Sequence
+
+
+class Damage:
+    """Follows what a decoder says of its pictures, in order, whatever the codec."""
+
+    def __init__(self) -> None:
+        self._since_ns: int | None = None
+        self._has_begun = False
+
+    def is_damaged(self, arrival_ns: int, *, marked: bool, clean: bool) -> bool:
+        """Whether this picture is damaged itself or leans on one that is.
+
+        marked: the decoder says so of it. clean: it is predicted from none. After 5 s the stream
+        has mended itself, or never will: one without key frames is refreshed part by part.
+        """
+        self._has_begun = True
+        waited = self._since_ns is not None and arrival_ns - self._since_ns > _LONGEST_NS
+        if clean or waited:
+            self._since_ns = None
+        if marked and self._since_ns is None:
+            self._since_ns = arrival_ns
+        return marked or self._since_ns is not None
+
+    def undecodable(self, arrival_ns: int) -> None:
+        """A packet was so damaged that it gave no picture; before the first one all are."""
+        if self._has_begun:
+            self.is_damaged(arrival_ns, marked=True, clean=False)
 
 
 class References:

@@ -406,31 +406,50 @@ def test_pictures_too_small_for_a_camera_are_misfits(size: tuple[int, int]) -> N
         fitted_camera(*size, CAMERA, "udp://x:1")
 
 
-class _HoledLink:
-    """A link that loses whole pictures while `lost` is set."""
+_TS_PACKET = 188
 
-    def __init__(self, url: str) -> None:
+
+class _HoledLink:
+    """A link that loses whole pictures, or a transport packet in their middle, while `lost`."""
+
+    def __init__(self, url: str, *, whole: bool) -> None:
         self.lost = False
+        self._whole = whole
         self._link = LossyLink(url, 0.0)
 
     def write(self, data: bytes) -> int:
-        return len(data) if self.lost else self._link.write(data)
+        if not self.lost:
+            return self._link.write(data)
+        if not self._whole:
+            middle = len(data) // _TS_PACKET // 2 * _TS_PACKET
+            self._link.write(data[:middle] + data[middle + _TS_PACKET :])
+        return len(data)
 
 
-def test_pictures_after_a_lost_one_are_not_given(url: str) -> None:
-    link, rate_hz = _HoledLink(url), 8.0
+def _rough_image(number: int) -> Image:
+    """A counter image over grain that moves, so that a picture fills many packets."""
+    image = counter_image(number)
+    rows = CAMERA.height - 2 * _CELL
+    grain = np.random.default_rng(number).integers(0, 120, (rows // 4, CAMERA.width // 4))
+    image[2 * _CELL :] = np.kron(grain, np.ones((4, 4)))[..., None].astype(np.uint8)
+    return image
+
+
+@pytest.mark.parametrize("whole", [True, False], ids=["whole", "a part"])
+def test_pictures_after_a_lost_one_are_not_given(url: str, whole: bool) -> None:
+    link, rate_hz = _HoledLink(url, whole=whole), 8.0
     with Watch(url, stall_timeout_s=5.0) as watch:
         sender = VideoSender(url, CAMERA.width, CAMERA.height, rate_hz, link=link)
         number = 0
         while not watch.frames:  # it joins at a key frame
-            sender.send(counter_image(number), time.monotonic_ns())
+            sender.send(_rough_image(number), time.monotonic_ns())
             number += 1
             time.sleep(0.02)
         joined = number + (-number) % int(rate_hz)  # the next key frame
         lost = joined + 3
         for n in range(number, joined + 2 * int(rate_hz)):
             link.lost = n == lost
-            sender.send(counter_image(n), time.monotonic_ns())
+            sender.send(_rough_image(n), time.monotonic_ns())
             if not lost <= n < joined + rate_hz:
                 watch.wait_until(partial(_shows, watch, n))
         sender.close()

@@ -9,7 +9,7 @@ import av
 import numpy as np
 import pytest
 
-from companion.sources.references import References
+from companion.sources.references import Damage, References
 from localizer.types import Image
 
 _SIZE = (160, 120)
@@ -80,21 +80,62 @@ def test_a_lost_key_frame_is_a_gap_too() -> None:
     assert broken == list(range(_KEY_EVERY + 1, 2 * _KEY_EVERY))
 
 
-@pytest.mark.parametrize(
-    "options",
-    [
-        {},
-        {"profile": "baseline"},
-        {"profile": "high", "preset": "medium"},
-        {"bf": "2", "tune": "psnr", "preset": "medium"},  # pictures that nothing is predicted from
-        {"x264-params": "repeat-headers=1:threads=1:intra-refresh=1:scenecut=0"},
-        {"x264-params": "repeat-headers=1:threads=1:slices=4:scenecut=0"},
-    ],
-)
+_KINDS = [
+    {},
+    {"profile": "baseline"},
+    {"profile": "high", "preset": "medium"},
+    {"bf": "2", "tune": "psnr", "preset": "medium"},  # pictures that nothing is predicted from
+    {"x264-params": "repeat-headers=1:threads=1:intra-refresh=1:scenecut=0"},
+    {"x264-params": "repeat-headers=1:threads=1:slices=4:scenecut=0"},
+]
+
+
+@pytest.mark.parametrize("options", _KINDS)
 def test_no_false_alarm_on_a_whole_stream(options: dict[str, str]) -> None:
     packets = list(_encoded(70, **options))
     assert len(packets) > 60
     assert _broken(list(enumerate(packets))) == []
+
+
+def _damaged(packets: list[tuple[int, bytes]]) -> list[int]:
+    """The pictures that `Damage` withholds, by their packets."""
+    decoder, damage = av.CodecContext.create("h264", "r"), Damage()
+    decoder.thread_count = 1
+    found = []
+    for i, packet in packets:
+        now_ns = i * _SECOND_NS // 10
+        try:
+            pictures = decoder.decode(av.Packet(packet))
+        except av.error.InvalidDataError:
+            damage.undecodable(now_ns)
+            continue
+        for p in pictures:
+            clean = bool(p.key_frame)
+            if damage.is_damaged(now_ns, marked=bool(p.is_corrupt), clean=clean):
+                found.append(i)
+    return found
+
+
+@pytest.mark.parametrize("options", _KINDS)
+@pytest.mark.parametrize("joined", [0, 5])
+def test_a_whole_stream_is_not_damaged(options: dict[str, str], joined: int) -> None:
+    assert _damaged(list(enumerate(_encoded(70, **options)))[joined:]) == []
+
+
+def test_what_leans_on_a_damaged_picture_is_damaged_until_the_next_key_frame() -> None:
+    packets = [(i, p[: len(p) // 2] if i == 3 else p) for i, p in enumerate(_encoded(24))]
+    shown = _shown(packets)
+    assert shown[3][1]  # the decoder marks the picture itself,
+    assert not any(shown[i][1] for i in range(4, 24))  # and nothing that leans on it
+    wrong = [np.abs(shown[i][0].astype(int) - _picture(i)).mean() for i in (2, 5)]
+    print(f"\nmean error before {wrong[0]:.1f}, two pictures after {wrong[1]:.1f}")
+    assert wrong[1] > 2.0 * wrong[0]
+    assert _damaged(packets) == [3, 4, 5, 6, 7]
+
+
+def test_a_damaged_stream_without_key_frames_is_taken_again() -> None:
+    packets = [(i, p[: len(p) // 2] if i == 3 else p) for i, p in enumerate(_encoded(70, g="250"))]
+    assert _damaged(packets) == list(range(3, 3 + 51))
 
 
 def test_frame_numbers_that_begin_again_are_no_gap() -> None:
