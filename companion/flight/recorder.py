@@ -30,6 +30,7 @@ from mavlink_bridge.link.tlog import is_disk_fault
 
 _log = logging.getLogger(__name__)
 _QUEUE_SIZE = 4096
+_PICTURES_BYTES = 96 << 20  # of pictures that wait for a disk; one may always
 _FLUSH_S = 1.0
 _CLOSE_S = 5.0
 MANIFEST_NAME = "record.json"
@@ -194,6 +195,8 @@ class Recorder:
         self._frame = frame
         self._rows: queue.Queue[tuple[str, Callable[[], Iterable[Any]]] | None]
         self._rows = queue.Queue(_QUEUE_SIZE)
+        self._pictures_lock = threading.Lock()
+        self._pictures_bytes = 0
         self.dropped = 0
         self._on_failure = on_failure
         self._failed = False
@@ -244,7 +247,14 @@ class Recorder:
         """Keep the frame's image, named by its exposure time, if it is time for one."""
         if self._interval_ns and frame.exposure_time_ns >= self._next_snapshot_ns:
             self._next_snapshot_ns = frame.exposure_time_ns + self._interval_ns
-            self._put("snapshot", lambda: (frame,))
+            with self._pictures_lock:
+                waiting = self._pictures_bytes
+                if waiting and waiting + frame.image.nbytes > _PICTURES_BYTES:
+                    self.dropped += 1
+                    return
+                self._pictures_bytes += frame.image.nbytes
+            if not self._put("snapshot", lambda: (frame,)):
+                self._written(frame)
 
     def close(self) -> None:
         """Write what is queued and close the files; a disk that stands still is left behind."""
@@ -264,22 +274,26 @@ class Recorder:
         writer.writerow(columns)
         return writer
 
-    def _put(self, name: str, row: Callable[[], Iterable[Any]]) -> None:
+    def _put(self, name: str, row: Callable[[], Iterable[Any]]) -> bool:
         """Queue what makes a row: its coordinates and figures are the recorder's thread's work."""
         try:
             self._rows.put_nowait((name, row))
         except queue.Full:
             self.dropped += 1
+            return False
+        return True
+
+    def _written(self, frame: Frame) -> None:
+        with self._pictures_lock:
+            self._pictures_bytes -= frame.image.nbytes
 
     def _write(self, name: str, row: Callable[[], Iterable[Any]]) -> None:
         if name == "snapshot":
             (frame,) = row()
-            # Not imwrite, which does not tell why it could not.
-            _, jpeg = cv2.imencode(".jpg", cv2.cvtColor(frame.image, cv2.COLOR_RGB2BGR))
-            data = jpeg.tobytes()
-            (self._snapshots / snapshot_name(frame.exposure_time_ns)).write_bytes(data)
-            if self._stream is not None:
-                self._stream.image(data, frame.exposure_time_ns)
+            try:
+                self._write_picture(frame)
+            finally:
+                self._written(frame)
         elif name == "text":
             if self._stream is not None:
                 self._stream.text(*row())
@@ -291,6 +305,14 @@ class Recorder:
             self._writers[name].writerow(values)
             if self._stream is not None:
                 self._stream.row(name, dict(zip(_COLUMNS[name], values, strict=True)))
+
+    def _write_picture(self, frame: Frame) -> None:
+        # Not imwrite, which does not tell why it could not.
+        _, jpeg = cv2.imencode(".jpg", cv2.cvtColor(frame.image, cv2.COLOR_RGB2BGR))
+        data = jpeg.tobytes()
+        (self._snapshots / snapshot_name(frame.exposure_time_ns)).write_bytes(data)
+        if self._stream is not None:
+            self._stream.image(data, frame.exposure_time_ns)
 
     def _append(self, estimate: PoseEstimate) -> None:
         if self._trajectory is None:

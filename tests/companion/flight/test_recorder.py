@@ -238,26 +238,48 @@ def test_what_cannot_be_written_costs_itself_only(tmp_path):
     assert "afterwards" in (tmp_path / "events.csv").read_text()
 
 
+class _StandingDisk:
+    """A target whose row takes as long as a disk that stands still."""
+
+    def __init__(self):
+        self.still, self.stands = threading.Event(), threading.Event()
+
+    @property
+    def position_world(self):
+        self.stands.set()
+        self.still.wait(60.0)
+        raise OSError(errno.EIO, "it stood still")
+
+
+def test_pictures_that_wait_for_a_disk_are_bounded(tmp_path, monkeypatch):
+    """A disk that stood still kept each picture in memory: hundreds of MB in a minute."""
+    image = np.zeros((48, 64, 3), np.uint8)
+    monkeypatch.setattr("companion.flight.recorder._PICTURES_BYTES", 3 * image.nbytes)
+    recorder = Recorder(RecordConfig(folder=tmp_path, snapshot_interval_s=0.001), FRAME)
+    disk = _StandingDisk()
+    recorder.target(disk)
+    assert disk.stands.wait(60.0)
+    for number in range(20):
+        recorder.snapshot(Frame(image, 10**9 * (1 + number), CAMERA, number))
+    assert recorder.dropped == 17
+    disk.still.set()
+    recorder.close()
+    assert len(list((tmp_path / "snapshots").iterdir())) == 3
+
+
 def test_a_disk_that_stands_still_is_left_behind(tmp_path, monkeypatch):
     monkeypatch.setattr("companion.flight.recorder._CLOSE_S", 0.2)
     recorder = Recorder(RecordConfig(folder=tmp_path), FRAME)
-    still = threading.Event()
-
-    class Standing:
-        """A target whose row takes as long as a disk that stands still."""
-
-        @property
-        def fix(self):
-            still.wait(60.0)
-
-    recorder.target(Standing())
+    disk = _StandingDisk()
+    recorder.target(disk)
+    assert disk.stands.wait(60.0)
     for _ in range(5000):  # more than the queue holds
         recorder.event("info", "x")
     assert recorder.dropped > 0  # it stands
     began = time.monotonic()
     recorder.close()
     assert time.monotonic() - began < 30.0
-    still.set()  # and its thread ends
+    disk.still.set()  # and its thread ends
     monkeypatch.setattr("companion.flight.recorder._CLOSE_S", 30.0)
     recorder.close()
 
