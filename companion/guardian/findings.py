@@ -102,10 +102,7 @@ class Reading:
 
 
 class Latch:
-    """A rule over time: raised after alert_s of bad evidence, released after release_s of good.
-
-    Time without evidence counts for neither.
-    """
+    """A rule over time: raised after alert_s of bad evidence, released after release_s of good."""
 
     def __init__(self, rule: Rule) -> None:
         self.rule = rule
@@ -113,17 +110,12 @@ class Latch:
         self.figure = 0.0
         self.word = ""
         self._since_ns: int | None = None
-        self._updated_ns = 0
         self._told_ns = 0
 
     def update(self, now_ns: int, reading: Reading) -> str | None:
         """Take in a reading; the line to tell the operator, if there is news."""
-        silent_ns, self._updated_ns = now_ns - self._updated_ns, now_ns
         if reading.bad is None:
-            if not self.raised:
-                self._since_ns = None
-            elif self._since_ns is not None:
-                self._since_ns += silent_ns
+            self._since_ns = None if not self.raised else self._since_ns
             return self._again(now_ns)
         if reading.bad:
             self.figure, self.word = reading.figure, reading.word
