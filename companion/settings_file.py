@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import difflib
 import reprlib
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -43,7 +44,7 @@ def validated(model: type[_ModelT], data: dict[str, Any]) -> _ModelT:
     try:
         settings = model.model_validate(data)
     except ValidationError as error:
-        lines = [_line(e["loc"], _reason(e["type"], e["msg"]), e["input"]) for e in error.errors()]
+        lines = [_line(e["loc"], _reason(model, dict(e)), e["input"]) for e in error.errors()]
         raise SettingsError("\n".join(lines)) from error
     if lines := [_line(where, "Input should not be a boolean", value)
                  for where, value in misread_booleans(data, settings)]:  # fmt: skip
@@ -55,8 +56,22 @@ def _line(where: Iterable[str | int], what: str, given: object) -> str:
     return f"  {'.'.join(str(p) for p in where)}: {what} (got {_short(given)})"
 
 
-def _reason(kind: str, text: str) -> str:
-    return "no such setting" if kind == "extra_forbidden" else text
+def _reason(model: type[BaseModel], error: dict[str, Any]) -> str:
+    if error["type"] != "extra_forbidden":
+        return str(error["msg"])
+    return f"no such setting{_meant(model, error['loc'])}"
+
+
+def _meant(model: type[BaseModel], where: Sequence[str | int]) -> str:
+    """The setting of a similar name in the same place, if there is one."""
+    for part in where[:-1]:
+        field = model.model_fields.get(str(part))
+        kind = field.annotation if field is not None else None
+        if not (isinstance(kind, type) and issubclass(kind, BaseModel)):
+            return ""
+        model = kind
+    close = difflib.get_close_matches(str(where[-1]), model.model_fields, n=1)
+    return f", did you mean {close[0]}?" if close else ""
 
 
 def _short(value: object) -> str:

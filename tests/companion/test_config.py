@@ -36,7 +36,12 @@ def test_minimal_config_and_paths_relative_to_the_file(tmp_path):
 @pytest.mark.parametrize(
     ("change", "named"),
     [
-        ({"mapp": "x"}, r"mapp: no such setting \(got 'x'\)"),
+        ({"mapp": "x"}, r"mapp: no such setting, did you mean map\? \(got 'x'\)"),
+        (
+            {"bridge": {"conection": 1}},
+            r"bridge.conection: no such setting, did you mean connection\?",
+        ),
+        ({"zzz": 1}, r"zzz: no such setting \(got 1\)"),
         ({"localizer": {"width": "wide"}}, "localizer.width"),
         ({"camera": {**CAMERA, "source": "frames", "settings": {"sender": "127.0.0.1"}}}, "udp://"),
         ({"targets": {"rate_hz": True}}, "targets.rate_hz: Input should not be a boolean"),
