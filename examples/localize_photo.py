@@ -16,9 +16,7 @@ from localizer import Camera, Frame, Geodetic, PosePrior, PoseRow, open_localize
 photo, cache, camera_file, *numbers = sys.argv[1:] if len(sys.argv) == 10 else sys.exit(__doc__)
 latitude, longitude, height, roll, pitch, yaw = map(float, numbers)
 camera = Camera.from_json(Path(camera_file))
-if (pixels := cv2.imread(photo)) is None:
-    sys.exit(f"{photo}: no photo that can be read")
-image = cv2.cvtColor(pixels, cv2.COLOR_BGR2RGB)
+image = cv2.cvtColor(cv2.imread(photo), cv2.COLOR_BGR2RGB)
 with open_localizer(cache, camera) as localizer:
     about = PoseRow(photo, Geodetic(latitude, longitude, height), roll, pitch, yaw)
     localizer.set_prior(PosePrior.around(pose_of_row(about, localizer.frame)))
