@@ -74,6 +74,7 @@ BORESIGHT = Rule(
 TIME_OFFSET = Rule(
     "time_offset", "pictures stamped {0:.0f} ms {1}", Action.NONE, 1.0, 10.0, 60.0, forbids=True
 )
+FAILED = Rule("guardian_failed", "guardian failed", Action.WITHHOLD, 0.0, 3.0, 10.0)
 RULES = (
     VIDEO_FROZEN,
     VIDEO_REPEATS,
@@ -102,7 +103,10 @@ class Reading:
 
 
 class Latch:
-    """A rule over time: raised after alert_s of bad evidence, released after release_s of good."""
+    """A rule over time: raised after alert_s of bad evidence, released after release_s of good.
+
+    Time without evidence counts for neither.
+    """
 
     def __init__(self, rule: Rule) -> None:
         self.rule = rule
@@ -110,12 +114,17 @@ class Latch:
         self.figure = 0.0
         self.word = ""
         self._since_ns: int | None = None
+        self._updated_ns = 0
         self._told_ns = 0
 
     def update(self, now_ns: int, reading: Reading) -> str | None:
         """Take in a reading; the line to tell the operator, if there is news."""
+        silent_ns, self._updated_ns = now_ns - self._updated_ns, now_ns
         if reading.bad is None:
-            self._since_ns = None if not self.raised else self._since_ns
+            if not self.raised:
+                self._since_ns = None
+            elif self._since_ns is not None:
+                self._since_ns += silent_ns
             return self._again(now_ns)
         if reading.bad:
             self.figure, self.word = reading.figure, reading.word

@@ -57,6 +57,19 @@ def test_it_holds_until_good_evidence_lasts() -> None:
     assert not latch.raised
 
 
+def test_silence_is_no_good_evidence() -> None:
+    """Good once, then nothing for long, then good once more does not release it."""
+    latch = Latch(rule())
+    latch.update(0, BAD)
+    latch.update(SECOND, BAD)
+    latch.update(2 * SECOND, GOOD)
+    for k in range(3, 10):
+        latch.update(k * SECOND, UNKNOWN)
+    assert latch.update(10 * SECOND, GOOD) is None
+    assert latch.raised
+    assert latch.update(12 * SECOND, GOOD) == f"{PREFIX}over: a fault"
+
+
 def test_silence_is_no_evidence_of_a_fault() -> None:
     """Bad, then nothing for long, then bad again is not a fault that lasted."""
     latch = Latch(rule())
