@@ -1,7 +1,7 @@
 """What the vehicle says, without what cannot be a number of a vehicle.
 
 The bridge lets none of it in. Behind it stands the guardian's own gate: a guardian that fails lets
-every fix pass, and one number that is none would stay for good in what it integrates.
+no fix pass, and one number that is none would stay for good in what it integrates.
 """
 
 from __future__ import annotations

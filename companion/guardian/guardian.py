@@ -7,6 +7,7 @@ import threading
 
 from companion.calibration_watch.sighting import Sighting
 from companion.guardian.config import GuardianConfig
+from companion.guardian.findings import FAILED, PREFIX, Latch, Reading
 from companion.guardian.monitor import Limits, Monitor
 from companion.guardian.protection import ProtectionLevel
 from localizer.types import Image
@@ -16,6 +17,7 @@ from mavlink_bridge.messages import VisionFix
 
 _log = logging.getLogger(__name__)
 _PERIOD_S = 0.1
+_BLIND_TURNS = 10  # that failed in a row
 _ERROR, _WARNING, _NOTICE = 3, 4, 5  # MAV_SEVERITY
 
 
@@ -24,6 +26,9 @@ class Guardian:
 
     Pictures come from the feed's thread and fixes from the localization thread; neither waits for
     more than the lock. What is costly happens on a thread of its own, ten times a second.
+
+    What cannot be judged is withheld: a position that nobody watches is believed unwarned. A fix
+    that fails it costs itself; a thread that fails for a second costs all until it turns again.
     """
 
     def __init__(self, config: GuardianConfig, limits: Limits, bridge: Bridge) -> None:
@@ -31,7 +36,9 @@ class Guardian:
         self._bridge = bridge
         self._lock = threading.Lock()
         self._picture: tuple[int, Image] | None = None
-        self._failures = 0
+        self._failed = Latch(FAILED)
+        self._fails: dict[str, int] = {}  # how often in a row, by what is failing
+        self._failures = threading.Lock()
         self.turn_ns = monotonic_ns()
         """When its thread began its newest turn, CLOCK_MONOTONIC."""
         self._stop = threading.Event()
@@ -60,10 +67,12 @@ class Guardian:
         try:
             state = self._bridge.state()
             with self._lock:
-                return self._monitor.admit(fix, state)
+                admitted = self._monitor.admit(fix, state)
         except Exception:
-            self._failed()
-            return fix
+            self._fail("judging")
+            return None
+        self._works("judging")
+        return None if self._is_blind else admitted
 
     def submit(self, fix: VisionFix) -> None:
         """Judge a fix and hand it to the bridge, if it may be injected."""
@@ -74,6 +83,8 @@ class Guardian:
     @property
     def reason(self) -> str:
         """Why fixes are withheld; empty while they are not."""
+        if self._failed.raised:
+            return self._failed.line().removeprefix(PREFIX)
         with self._lock:
             return self._monitor.reason
 
@@ -90,18 +101,37 @@ class Guardian:
 
     def _run(self) -> None:
         while not self._stop.wait(_PERIOD_S):
-            self.turn_ns = monotonic_ns()
-            try:
-                self._step()
-            except Exception:
-                self._failed()
+            self.turn()
 
-    def _failed(self) -> None:
-        """A guardian that died in silence would be believed: told once, from its own exception."""
-        self._failures += 1
-        if self._failures == 1:
-            _log.exception("the guardian failed")
-            self._bridge.say(_ERROR, "PiLoT: guardian failed: fixes are not watched")
+    def turn(self) -> None:
+        """Look at everything once; ten times a second by its thread."""
+        self.turn_ns = monotonic_ns()
+        try:
+            self._step()
+        except Exception:
+            self._fail("watching")
+        else:
+            self._works("watching")
+        with self._failures:
+            text = self._failed.update(self.turn_ns, Reading(bool(self._fails)))
+        if text is not None:
+            self._bridge.say(_ERROR if self._failed.raised else _NOTICE, text)
+
+    @property
+    def _is_blind(self) -> bool:
+        with self._failures:
+            return self._fails.get("watching", 0) >= _BLIND_TURNS
+
+    def _fail(self, what: str) -> None:
+        """A guardian that died in silence would be believed: told with its next turn."""
+        with self._failures:
+            count = self._fails[what] = self._fails.get(what, 0) + 1
+        if count == 1:
+            _log.exception("the guardian failed %s", what)
+
+    def _works(self, what: str) -> None:
+        with self._failures:
+            self._fails.pop(what, None)
 
     def _step(self) -> None:
         picture, self._picture = self._picture, None

@@ -15,9 +15,10 @@ from companion.guardian.ekf import EkfWatch
 from companion.guardian.evidence import CheckedVehicle, Vehicle, known_state
 from companion.guardian.findings import Action, Latch, Reading
 from companion.guardian.inertial import InertialTrack
+from companion.guardian.jump import JumpCheck
 from companion.guardian.motion import MotionCheck, MotionVerdict
 from companion.guardian.picture import PictureVerdict, PictureWatch
-from companion.guardian.place_checks import GnssCheck, HeightCheck, JumpCheck
+from companion.guardian.place_checks import GnssCheck, HeightCheck
 from companion.guardian.protection import ProtectionLevel, protection_level
 from companion.guardian.step import StepDoubt
 from localizer.types import Image
@@ -179,6 +180,7 @@ class Monitor:
         state = vehicle.state()
         for sample in vehicle.inertial_since(self._track.newest_ns):
             self._track.add(sample, vehicle.attitude_at)
+        self._jumps.hear(state)
         self._follow(now_ns, state)
         self._leave_out_old_pictures()
         self._calibration.step(now_ns, vehicle, self._track)
@@ -195,11 +197,12 @@ class Monitor:
         """What the newest fix, or the stamps since, leave in doubt of the positions."""
         if not state.armed:
             self._steps.begins_anew()
-        elif self._jumps.step is not None:
-            self._steps.add(self._jumps.step)
-            self._calibration.doubt_stamps(fix.time_ns)
         elif fix.reset and admitted:
             self._steps.is_found_anew()
+        elif self._jumps.step is not None:
+            found = self._steps.add(self._jumps.step)
+            if found is not None:
+                self._calibration.doubt_stamps(found.time_ns)
         no_delay_s = max(self._config.calibration.time_s, 0.5 * self._steps.delay_s)
         if self._calibration.figures().late_s.is_within(no_delay_s):
             self._steps.stamps_are_right()
@@ -270,7 +273,9 @@ class Monitor:
         focal, late = self._latches[f.FOCAL.name].raised, self._latches[f.TIME_OFFSET.name].raised
         focal_m = self._calibration.known_m(speed, focal=focal, time=False)
         late_m = self._calibration.known_m(speed, focal=False, time=late)
-        return focal_m + max(late_m, self._steps.metres)  # late stamps are how a step is explained
+        return focal_m + max(
+            late_m, self._steps.possible_m
+        )  # late stamps are how a step is explained
 
     def _frozen(self, now_ns: int, state: VehicleState) -> Reading:
         if self._picture is None or now_ns - self._picture[0] > _PICTURE_FRESH_NS:

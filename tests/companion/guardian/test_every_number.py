@@ -1,7 +1,7 @@
 """Every number that the guardian and the priors take from the vehicle, set to what is none.
 
 The bridge lets nothing of it in (tests/mavlink_bridge/test_every_field.py). Behind it nothing may
-fail all the same: a guardian that fails lets every fix pass.
+fail all the same: a guardian that fails lets no fix pass.
 """
 
 from __future__ import annotations

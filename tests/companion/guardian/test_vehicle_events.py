@@ -11,7 +11,7 @@ import pytest
 from companion.guardian.config import GuardianConfig
 from companion.guardian.guardian import Guardian
 from companion.guardian.monitor import Limits, Monitor
-from mavlink_bridge.messages import VehicleState, VisionFix
+from mavlink_bridge.messages import Attitude, InertialSample, VehicleState, VisionFix
 from tests.companion.guardian.simulated import Flight, hover, leg, second
 
 PICTURE = np.random.default_rng(3).integers(0, 255, (120, 160, 3)).astype(np.uint8)
@@ -109,30 +109,101 @@ def test_pictures_that_come_twice_now_and_then_are_no_broken_clock() -> None:
     assert not [text for _, text in flight.lines if "clock" in text]
 
 
-class Broken:
-    """A bridge that fails where the guardian asks it."""
+class Faulty:
+    """A bridge that fails where the guardian asks it, while it is told to."""
 
-    def __init__(self) -> None:
+    def __init__(self, flight: Flight) -> None:
+        self.flight = flight
+        self.fails_at: set[str] = set()
         self.said: list[tuple[int, str]] = []
 
     def state(self) -> VehicleState:
-        raise RuntimeError("boom")
+        if "state" in self.fails_at:
+            raise RuntimeError("boom")
+        return self.flight.state()
+
+    def inertial_since(self, time_ns: int) -> tuple[InertialSample, ...]:
+        if "inertial_since" in self.fails_at:
+            raise RuntimeError("bang")
+        return ()
+
+    def attitude_at(self, time_ns: int) -> Attitude | None:
+        return None
 
     def say(self, severity: int, text: str) -> None:
         self.said.append((severity, text))
 
+    def doubt(self, why: str) -> None:
+        pass
 
-def test_a_guardian_that_fails_is_told_once_and_positions_flow(
-    caplog: pytest.LogCaptureFixture,
+    def forbid(self, why: str) -> None:
+        pass
+
+
+@pytest.fixture
+def faulty(monkeypatch: pytest.MonkeyPatch) -> tuple[Guardian, Any]:
+    """A guardian whose clock goes on by its period at each turn, and its bridge."""
+    clock = iter(range(second(10.0), second(100.0), second(0.1)))
+    monkeypatch.setattr("companion.guardian.guardian.monotonic_ns", lambda: next(clock))
+    bridge: Any = Faulty(Flight(monitor()))
+    return Guardian(GuardianConfig(), Limits(), bridge), bridge
+
+
+FIX = VisionFix(second(1.0), 47.0, 8.0, 500.0)
+
+
+def test_a_fix_that_cannot_be_judged_is_withheld_told_and_costs_itself_only(
+    faulty: tuple[Guardian, Any], caplog: pytest.LogCaptureFixture
 ) -> None:
-    """Withholding for a fault of our own would land the aircraft."""
-    bridge: Any = Broken()
-    guardian = Guardian(GuardianConfig(), Limits(), bridge)
-    fix = VisionFix(second(1.0), 47.0, 8.0, 500.0)
-    assert guardian.judge(fix) is fix
-    assert guardian.judge(fix) is fix
-    assert bridge.said == [(3, "PiLoT: guardian failed: fixes are not watched")]
+    """It passed unjudged: whatever position fails the guardian would have been believed."""
+    guardian, bridge = faulty
+    bridge.fails_at = {"state"}
+    assert guardian.judge(FIX) is None
     assert "boom" in caplog.text
+    bridge.fails_at = set()
+    assert guardian.judge(FIX) is not None
+    guardian.turn()
+    assert bridge.said == []  # one of many
+    bridge.fails_at = {"state"}
+    assert guardian.judge(FIX) is None
+    guardian.turn()
+    assert bridge.said == [(3, "PiLoT: withheld: guardian failed")]
+    assert guardian.reason == "withheld: guardian failed"
+    bridge.fails_at = set()
+    assert guardian.judge(FIX) is not None
+    for _ in range(30):
+        guardian.turn()
+    assert [text for _, text in bridge.said[1:]] == ["PiLoT: over: guardian failed"]
+    assert guardian.reason == ""
+
+
+def test_a_guardian_that_sees_nothing_for_a_second_withholds_until_it_does(
+    faulty: tuple[Guardian, Any],
+) -> None:
+    """Fixes can be judged, but nobody watches the pictures, the IMU, the EKF."""
+    guardian, bridge = faulty
+    bridge.fails_at = {"inertial_since"}
+    guardian.turn()
+    assert guardian.judge(FIX) is not None
+    for _ in range(9):
+        guardian.turn()
+    assert guardian.judge(FIX) is None
+    assert (3, "PiLoT: withheld: guardian failed") in bridge.said
+    bridge.fails_at = set()
+    guardian.turn()
+    assert guardian.judge(FIX) is not None
+
+
+def test_a_failure_is_told_again_as_long_as_it_lasts_and_not_more_often(
+    faulty: tuple[Guardian, Any],
+) -> None:
+    """The operator of an aircraft without positions must know why."""
+    guardian, bridge = faulty
+    bridge.fails_at = {"inertial_since"}
+    for _ in range(125):  # of 0.2 s by this clock
+        guardian.turn()
+    told = [text for _, text in bridge.said]
+    assert told == 3 * ["PiLoT: withheld: guardian failed"]
 
 
 def test_a_gnss_that_jumps_is_told_and_nothing_is_withheld() -> None:
