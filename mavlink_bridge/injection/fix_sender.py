@@ -19,6 +19,7 @@ from mavlink_bridge.vehicle.profile import FirmwareProfile
 _QUEUE = 64
 _NEWS_AFTER_NS = 1_000_000_000  # a gap in the fixes that is told
 _NOT_SENT = "not sent: "
+_FULL = "the link takes no more"
 _GOOD_NS = 1_000_000_000
 
 
@@ -45,6 +46,8 @@ class FixSender:
         self._outcome = outcome
         self._teller = teller
         self._counters = counters
+        self._reason = ""
+        self._taken = True  # by the link, of the last position
         self._delivered_ns = 0
 
     def take(self, now_ns: int) -> None:
@@ -59,34 +62,39 @@ class FixSender:
         if injection is not None:
             self.vision = injection.estimate.position
             self._deliver(link, mode, injection, now_ns)
-        reason = self.injector.reason
+        reason = self._reason = self.injector.reason or ("" if self._taken else _FULL)
         # A late fix or two is no news: the texts would follow every hiccup of a busy computer.
-        brief = reason == NO_FRESH_FIX and now_ns - self._delivered_ns < _NEWS_AFTER_NS
+        recent = now_ns - self._delivered_ns < _NEWS_AFTER_NS
+        brief = recent and reason in (NO_FRESH_FIX, _FULL)
         if reason != NO_FIX_YET and not brief:
             problem = f"{_NOT_SENT}{reason}" if reason else ""
             self._teller.tell_settled("inject", problem, "injecting", now_ns, prefix=mode)
 
     def is_good(self, now_ns: int) -> bool:
-        """Whether positions came of late, and the yaw guard is content."""
+        """Whether positions came of late (and went, where they are to), and the yaw guard is
+        content.
+        """
         return not self.injector.guard.blocked and now_ns - self._delivered_ns < _GOOD_NS
 
     @property
     def refusal(self) -> str:
         """Why positions that are due are not made, once it has lasted and was told; else empty."""
         told = self._teller.told("inject").startswith(_NOT_SENT)
-        return f"{_NOT_SENT}{self.injector.reason}" if told and self.injector.reason else ""
+        return f"{_NOT_SENT}{self._reason}" if told and self._reason else ""
 
     def waiting(self) -> dict[str, int]:
         """Lengths of everything that waits here."""
         return {"fixes": len(self.fixes), "due": self.injector.waiting}
 
     def _deliver(self, link: Link, mode: Mode, injection: Injection, now_ns: int) -> None:
-        self._delivered_ns = now_ns
         self._outcome.made(injection.estimate)
+        # What a port that is full does not take, the EKF does not have: no source to switch to.
+        self._taken = mode != "inject" or link.send(injection.message, self._component)
+        if not self._taken:
+            return
+        self._delivered_ns = now_ns
         if mode != "inject":
             self._counters["shadowed"] += 1
-            return
-        if not link.send(injection.message, self._component):
             return
         self._counters["injected"] += 1
         self._outcome.sent(injection.estimate, now_ns)

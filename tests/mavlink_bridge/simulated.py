@@ -36,12 +36,15 @@ TURN_RATE = 0.2  # rad/s of the vehicle's yaw
 
 @dataclass
 class SimulatedLink:
-    """What an end sees of its link; `open` false drops as a closed one does."""
+    """What an end sees of its link; `open` false drops as a closed one does, `full` as a port does
+    that takes no more.
+    """
 
     sent: list[tuple[int, Any, int]] = field(default_factory=list)
     system_id: int = 0
     open: bool = True
     congested: bool = False
+    full: bool = False
     kept: int = 0
     stranger: str = ""
     endpoint: Endpoint = field(default_factory=lambda: Endpoint.parse("tcp:vehicle:5760"))
@@ -53,9 +56,10 @@ class SimulatedLink:
 
     def send(self, message: Any, component: int) -> bool:
         """Record it if the link is open."""
-        if self.open and self.system_id:
+        takes = self.open and not self.full and self.system_id != 0
+        if takes:
             self.sent.append((self.now_ns, message, component))
-        return self.open and self.system_id != 0
+        return takes
 
 
 class Flight:

@@ -77,6 +77,39 @@ def test_a_right_map_is_injected_after_the_go_and_switched_to_when_gnss_is_lost(
     assert told(flight, "GNSS is back") == ["GNSS is back"]
 
 
+def test_a_port_that_takes_nothing_is_no_vision_to_switch_to(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """The EKF would be left to positions that never reach it, and land."""
+    flight = on_gnss(monkeypatch, switch=SWITCH)
+    flight.run(20.0)
+    assert flight.end.sender.is_good(flight.now_ns)
+    flight.link.full = True
+    flight.run(3.0)
+    assert not flight.end.sender.is_good(flight.now_ns)
+    assert told(flight, "not sent") == ["not sent: the link takes no more"]
+    assert flight.end.trouble == "not sent: the link takes no more"
+    flight.gnss_north_m = None
+    flight.run(6.0)
+    assert told(flight, "source set") == []
+    flight.link.full = False
+    flight.run(4.0)
+    assert told(flight, "source set") == ["EKF source set 2: GNSS lost"]
+    assert flight.end.trouble == ""
+
+
+def test_a_port_that_is_full_for_half_a_second_is_no_news(monkeypatch: pytest.MonkeyPatch) -> None:
+    flight = on_gnss(monkeypatch, switch=SWITCH)
+    flight.run(20.0)
+    for _ in range(5):
+        flight.link.full = True
+        flight.run(0.5)
+        assert flight.end.sender.is_good(flight.now_ns)
+        flight.link.full = False
+        flight.run(2.0)
+    assert told(flight, "not sent") == []
+
+
 def test_a_spoofed_receiver_that_the_ekf_refuses_is_left(monkeypatch: pytest.MonkeyPatch) -> None:
     flight = on_gnss(monkeypatch, switch=SWITCH)
     flight.run(20.0)
