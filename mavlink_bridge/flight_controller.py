@@ -159,6 +159,7 @@ class FlightControllerEnd:
         elif self._tracker.handle(message, time_ns):
             self._rebooted()
         elif kind == "STATUSTEXT":
+            self.sources.on_text(str(message.text))
             sender = f"{message.get_srcSystem()}/{message.get_srcComponent()}"
             self._shared.on_vehicle_text(int(message.severity), str(message.text), sender)
         elif kind == "RC_CHANNELS" and self._shared.gate is not None:
@@ -221,6 +222,7 @@ class FlightControllerEnd:
         self._connected = state.connected
         if state.connected:
             self.requests.reset()
+            self.sources.met(state)
         else:
             self.counters["lost"] += 1
             # It may come back as another: after a reboot, with another origin.
@@ -248,16 +250,20 @@ class FlightControllerEnd:
     def _check(self, link: Link, state: VehicleState, now_ns: int) -> None:
         """What came of it, ten times a second: score, verdict, source switch."""
         sender = self.sender
-        self.outcome.compare(state, now_ns, on_gnss=self.sources.on_gnss)
+        on_gnss = None if self.sources.current is None else self.sources.on_gnss
+        self.outcome.compare(state, now_ns, on_gnss=on_gnss)
         self._strangers.check(link, now_ns)
         if self.outcome.judge(state, now_ns):
             sender.injector.announce_jump()
         came = sender.is_good(now_ns)
         may_switch = self._interlock.may_switch(now_ns)
         good = came and self.injecting
-        self.sources.tick(
-            link, state, sender.vision, good=good, may_switch=may_switch, now_ns=now_ns
-        )
-        held = came and self._shared.mode() == "inject"
+        may_inject = self._shared.mode() == "inject"
+        # A set that is not known is ordered, so that it is; shadow mode orders nothing.
+        if may_inject or self.sources.current is not None:
+            self.sources.tick(
+                link, state, sender.vision, good=good, may_switch=may_switch, now_ns=now_ns
+            )
+        held = came and may_inject
         self.news.held(self._interlock.reason if held else "", now_ns)
         self.news.look(state, now_ns, injecting=good)

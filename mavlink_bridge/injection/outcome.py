@@ -11,11 +11,12 @@ from mavlink_bridge.injection.shadow import ShadowScorer, gnss_healthy
 from mavlink_bridge.messages import VehicleState
 from mavlink_bridge.shared import Shared
 from mavlink_bridge.texts import Teller
-from mavlink_bridge.vehicle.origin import north_east
+from mavlink_bridge.vehicle.origin import north_east, offset
 from mavlink_bridge.vehicle.origin_exchange import OriginExchange
 
 _QUEUE = 64
 _REFERENCE_WAIT_NS = 500_000_000
+_RECEIVER_LATE_NS = 200_000_000  # from what it measured to the arrival of its report
 
 
 class InjectionOutcome:
@@ -65,12 +66,16 @@ class InjectionOutcome:
             estimate.reset_counter,
         )
 
-    def compare(self, state: VehicleState, now_ns: int, *, on_gnss: bool) -> None:
-        """Score against the EKF's position at the same time, while GNSS made that."""
+    def compare(self, state: VehicleState, now_ns: int, *, on_gnss: bool | None) -> None:
+        """Score against the EKF's position at the same time, while GNSS made that; against the
+        receiver's own where it is not known what made the EKF's (None).
+        """
         while self._to_compare and now_ns - self._to_compare[0].time_ns > _REFERENCE_WAIT_NS:
             fix = self._to_compare.popleft()
             reference = self._tracker.global_at(fix.time_ns)
-            if reference is not None and on_gnss and gnss_healthy(state, now_ns):
+            if reference is not None and on_gnss is None:
+                reference = _by_receiver(state, fix, reference[2])
+            if reference is not None and on_gnss is not False and gnss_healthy(state, now_ns):
                 self.shadow.compare(fix, reference)
                 self.compared_ns = fix.time_ns
 
@@ -88,3 +93,17 @@ class InjectionOutcome:
     def waiting(self) -> dict[str, int]:
         """Lengths of everything that waits here."""
         return {"to compare": len(self._to_compare), **self._loop.waiting()}
+
+
+def _by_receiver(
+    state: VehicleState, fix: PropagatedFix, altitude_m: float
+) -> tuple[float, float, float] | None:
+    """The receiver's place, brought to a fix's time by its velocity, as latitude, longitude and the
+    altitude AMSL that is given; None where it says none.
+    """
+    if state.gps_latitude_deg is None or state.gps_longitude_deg is None:
+        return None
+    seconds = (fix.time_ns - state.gps_time_ns + _RECEIVER_LATE_NS) * 1e-9
+    north, east = (float(v) * seconds for v in fix.velocity_ned[:2])
+    latitude, longitude = offset(state.gps_latitude_deg, state.gps_longitude_deg, north, east)
+    return latitude, longitude, altitude_m

@@ -10,6 +10,7 @@ refuses a receiver that jumps, and stays with one from which a wrong map differs
 from __future__ import annotations
 
 import math
+import re
 from collections import Counter
 from dataclasses import dataclass
 
@@ -33,6 +34,8 @@ _VISION_GONE_NS = 3_000_000_000
 _GNSS_BACK_NS = 3_000_000_000  # ArduPilot's failsafe comes 8 s after the last position
 _RETURN_M = 25.0  # of GNSS from where the EKF has come by itself
 _AGAIN_NS = 10_000_000_000
+# ArduPilot's word where a switch of the transmitter, a script or the bridge chose the set.
+_CHOSEN = re.compile(r"Using EKF Source Set ([1-3])\b")
 
 
 @dataclass(frozen=True)
@@ -110,29 +113,46 @@ def gnss_fault(
 class SourceSwitch:
     """Decides; the caller sends and reports the acknowledgement. One thread.
 
-    refusal: why GNSS that is bad is not left for vision; empty when that is not so.
+    refusal: why GNSS that is bad is not left for vision; empty when that is not so. current: the
+    set in use; None where it is not known.
     """
 
     def __init__(self, config: SourceSwitchConfig) -> None:
         self._config = config
-        self.current = config.gnss_set
+        self.current: int | None = config.gnss_set
         self.refusal = ""
         self._bad_since_ns: int | None = None
         self._good_since_ns: int | None = None
         self._sound_since_ns: int | None = None
         self._vision_ns: int | None = None
         self._ordered: int | None = None
+        self._was_chosen = self._overruled = False
         self._next_ns = 0
 
     def reset(self) -> None:
         """The flight controller rebooted: it starts with its first set."""
         self.current, self._ordered = self._config.gnss_set, None
         self._bad_since_ns = self._good_since_ns = self._sound_since_ns = None
+        self._was_chosen = self._overruled = False
+
+    def met_in_flight(self) -> None:
+        """The flight controller has flown before it was heard: nobody says on which set."""
+        self.current = None
+
+    def chosen(self, source_set: int) -> None:
+        """The autopilot says which set it uses from now on. Where that is no order of ours, it is
+        the pilot's choice, and not undone: a vision set stays, and so does the set of GNSS as long
+        as the fault lasts at which he chose it.
+        """
+        if source_set in (self.current, self._ordered):
+            return
+        self.current, self._was_chosen = source_set, True
+        self._overruled = self._bad_since_ns is not None
 
     def acknowledged(self, accepted: bool) -> None:
         """COMMAND_ACK of the order."""
         if self._ordered is not None and accepted:
-            self.current = self._ordered
+            self.current, self._was_chosen = self._ordered, False
         self._ordered = None
 
     def decide(
@@ -155,6 +175,7 @@ class SourceSwitch:
             state, vision if fresh else None, self._config.inconsistency_sigmas, now_ns
         )
         self._bad_since_ns = None if fault is None else self._bad_since_ns or now_ns
+        self._overruled = self._overruled and fault is not None
         # Without vision nobody contradicts a spoofed receiver that says it is well.
         good_gnss = fault is None and fresh
         self._good_since_ns = (self._good_since_ns or now_ns) if good_gnss else None
@@ -181,7 +202,9 @@ class SourceSwitch:
         since = self._bad_since_ns
         if since is None or now_ns - since < self._config.bad_after_s * 1e9:
             return None
-        if not fault.proven:
+        if self._overruled:
+            self.refusal = f"{fault.reason}, set {self.current} was chosen"
+        elif not fault.proven:
             self.refusal = f"{fault.reason}, EKF with GNSS"
         elif not may_switch:
             self.refusal = f"{fault.reason}, no go from shadow"
@@ -190,11 +213,11 @@ class SourceSwitch:
         return None
 
     def _to_gnss(self, now_ns: int, state: VehicleState) -> SwitchOrder | None:
-        if self.current != self._config.vision_set:
+        if self.current not in (self._config.vision_set, None) or self._was_chosen:
             return None
         since = self._good_since_ns
         waited = since is not None and now_ns - since >= self._config.good_after_s * 1e9
-        if waited and self._config.return_to_gnss:
+        if waited and self._config.return_to_gnss and self.current is not None:
             return SwitchOrder(self._config.gnss_set, "GNSS good again")
         if self._vision_ns is None or now_ns - self._vision_ns < _VISION_GONE_NS:
             return None
@@ -225,16 +248,36 @@ class SourceOrders:
         self._teller = teller
         self._counters = counters
         self._refused_ns: int | None = None
+        self._has_met = False
 
     @property
-    def current(self) -> int:
-        """The source set that the flight controller uses, as far as it was acknowledged."""
+    def current(self) -> int | None:
+        """The source set that the flight controller uses, by its acknowledgements and its own
+        words; None where it is not known.
+        """
         return self._switch.current
 
     @property
     def on_gnss(self) -> bool:
-        """Whether the flight controller uses the set of GNSS."""
+        """Whether the flight controller is known to use the set of GNSS."""
         return self.current == self._gnss_set
+
+    def met(self, state: VehicleState) -> None:
+        """The vehicle is heard. An ArduPilot that was in the air before this process (it died, and
+        began anew) may be on any set; one on the ground has begun with its first.
+        """
+        if self._has_met:
+            return
+        self._has_met = True
+        if state.armed and state.autopilot == "ardupilot":
+            self._switch.met_in_flight()
+            self._teller.warn("EKF source set is not known: met in flight")
+
+    def on_text(self, text: str) -> None:
+        """A STATUSTEXT of the autopilot."""
+        told = _CHOSEN.match(text)
+        if told is not None:
+            self._switch.chosen(int(told[1]))
 
     def rebooted(self) -> None:
         """The flight controller starts with its first set."""

@@ -6,6 +6,7 @@ from collections import Counter
 from typing import Any
 
 import pytest
+from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from mavlink_bridge.config import InjectionConfig, RcGateConfig, SourceSwitchConfig
 from mavlink_bridge.injection.interlock import ShadowInterlock
@@ -146,6 +147,118 @@ def test_a_rate_that_was_low_on_gnss_does_not_forbid_for_ever(
     assert told(flight, "shadow") == ["injecting without shadow check"]
 
 
+def chosen(flight: Flight, source_set: int) -> None:
+    """Somebody else than the bridge selects a set: what ArduPilot says then."""
+    text = f"Using EKF Source Set {source_set}".encode()
+    flight.say(mavlink.MAVLink_statustext_message(6, text))
+
+
+def accept(flight: Flight, *, echo: bool) -> None:
+    """The vehicle carries out the order, and acknowledges it."""
+    if echo:
+        chosen(flight, int(orders(flight)[-1]))
+    flight.say(mavlink.MAVLink_command_ack_message(42007, 0))
+
+
+def test_an_ekf_that_flies_on_vision_since_before_the_start_is_no_word_for_vision(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """A companion that begins anew in the air: a wrong map was compared with itself, and a go."""
+    flight = on_gnss(monkeypatch, switch=SWITCH)
+    flight.armed = True
+    flight.north_m = flight.ekf_north_m = 20.0  # it follows the wrong map
+    flight.run(20.0)
+    assert flight.vision() == []
+    assert told(flight, "source set") == [
+        "EKF source set is not known: met in flight",
+        "EKF source set 1: vision gone, GNSS is there",  # injection has not begun
+    ]
+    assert told(flight, "not sent: no go") == ["not sent: no go: median error 20.0 m"]
+
+
+def test_a_start_in_the_air_on_gnss_is_compared_with_the_receiver_and_switches(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    flight = on_gnss(monkeypatch, switch=SWITCH)
+    flight.armed = True
+    flight.run(20.0)
+    assert flight.vision()
+    assert not flight.end.sources.on_gnss  # the order of the set of GNSS was not acknowledged
+    assert set(orders(flight)) == {1.0}
+    flight.gnss_north_m = None
+    flight.run(6.0)
+    assert orders(flight)[-1] == 2.0
+    accept(flight, echo=True)
+    assert flight.end.sources.current == 2
+
+
+def test_a_start_in_the_air_on_vision_goes_back_to_gnss_where_vision_ends(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """The EKF had no position at all then, and the vehicle landed."""
+    flight = on_gnss(monkeypatch, switch=SWITCH)
+    flight.armed, flight.sees = True, False
+    flight.run(7.0)
+    assert set(orders(flight)) == {1.0}
+    accept(flight, echo=True)
+    assert flight.end.sources.on_gnss
+
+
+def test_shadow_mode_orders_nothing_in_flight(monkeypatch: pytest.MonkeyPatch) -> None:
+    flight = on_gnss(monkeypatch, switch=SWITCH, mode="shadow")
+    flight.armed, flight.sees = True, False
+    flight.run(7.0)
+    assert orders(flight) == []
+
+
+@pytest.mark.parametrize("echo", [True, False])
+def test_what_the_pilot_chooses_is_followed_and_not_undone(
+    monkeypatch: pytest.MonkeyPatch, echo: bool
+) -> None:
+    switch = SourceSwitchConfig(enabled=True, return_to_gnss=True, good_after_s=2)
+    flight = on_gnss(monkeypatch, switch=switch)
+    flight.run(20.0)
+    chosen(flight, 2)  # before a denial that is meant
+    compared_ns = flight.end.outcome.compared_ns
+    flight.run(10.0)
+    assert not flight.end.sources.on_gnss
+    assert flight.end.outcome.compared_ns == compared_ns
+    assert orders(flight) == []
+    chosen(flight, 1)
+    flight.run(10.0)
+    assert flight.end.sources.on_gnss
+    # A choice is no word on what comes later.
+    flight.gnss_north_m = None
+    flight.run(4.0)
+    accept(flight, echo=echo)
+    assert set(orders(flight)) == {2.0}
+    # He does not trust vision: back, against what the bridge takes for a fault.
+    chosen(flight, 1)
+    begun = len(orders(flight))
+    flight.run(8.0)
+    assert len(orders(flight)) == begun
+    assert told(flight, "no switch") == ["no switch: GNSS lost, set 1 was chosen"]
+    # Once GNSS was well again, the next fault is another one.
+    flight.gnss_north_m = 0.0
+    flight.run(4.0)
+    flight.gnss_north_m = None
+    flight.run(4.0)
+    assert orders(flight)[begun:]
+
+
+def test_the_echo_of_our_own_order_is_nobodys_choice(monkeypatch: pytest.MonkeyPatch) -> None:
+    switch = SourceSwitchConfig(enabled=True, return_to_gnss=True, good_after_s=2)
+    flight = on_gnss(monkeypatch, switch=switch)
+    flight.run(20.0)
+    flight.gnss_north_m = None
+    flight.run(4.0)
+    accept(flight, echo=True)
+    chosen(flight, 2)  # heard twice, the second time after the acknowledgement
+    flight.gnss_north_m = 0.0
+    flight.run(5.0)
+    assert orders(flight)[-1] == 1.0
+
+
 def test_force_overrules_and_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
     injection = InjectionConfig(rate_hz=10, delay_ms=100, force=True)
     flight = on_gnss(monkeypatch, injection=injection)
@@ -243,8 +356,9 @@ def test_arming_without_gnss_tells_whether_positions_flow(
 def test_a_flight_by_the_book_in_texts(monkeypatch: pytest.MonkeyPatch) -> None:
     """Each event once, in its order, and nothing else."""
     flight = on_gnss(monkeypatch, switch=SWITCH)
+    flight.run(2.0)
     flight.armed = True
-    flight.run(30.0)  # shadow, go, injecting
+    flight.run(28.0)  # shadow, go, injecting
     flight.gnss_north_m = None
     flight.run(1.0)
     flight.gnss_north_m = 0.0  # a second without a report is none
