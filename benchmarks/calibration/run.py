@@ -59,11 +59,12 @@ def true_numbers(draw: Draw, seed: int, sortie: Sortie) -> Array:
     return truth
 
 
-def _noise(found: Calibrated) -> dict[str, list[float]]:
+def _noise(found: Calibrated) -> dict[str, Any]:
     s = found.solution
     return {
         "attitude_deg": np.degrees(s.attitude.sigma).tolist(),
-        "attitude_memory_s": s.attitude.memory_s.tolist(),
+        "attitude_upright_deg": float(np.degrees(s.attitude.upright)),
+        "attitude_memory_s": s.attitude.memory_s,
         "place_m": s.place.sigma.tolist(), "place_memory_s": s.place.memory_s.tolist(),
     }  # fmt: skip
 

@@ -1,7 +1,8 @@
 """Least squares over all frames: the shared numbers and every frame's pose together.
 
 The pictures' noise is white between parts; attitude and place by the autopilot wander for seconds,
-so each is a Gauss-Markov process whose strength and memory are taken from what is left over.
+so each is a Gauss-Markov process (`wander`) whose strength and memory are taken from what is left
+over.
 """
 
 from __future__ import annotations
@@ -15,59 +16,18 @@ from scipy.linalg import cho_factor, cho_solve
 
 from companion.calibrate import unknowns as u
 from companion.calibrate.evidence import Evidence, Guess
+from companion.calibrate.wander import AttitudeWander, Wander
 from localizer.geometry.pose import Array
 
 _ROUNDS, _STEPS = 4, 5  # of noise, and of the poses and numbers under it
 _ALIKE = 6.0  # variance of the pictures' parts counts so often: neighbours err alike
 _CAUCHY = 2.5  # sigmas
-_MEMORIES_S = np.array([0.1, 0.3, 1.0, 2.0, 4.0, 8.0, 15.0, 30.0, 60.0])
 _WHITE = {"attitudes": np.radians(0.03), "places": 0.03}  # of what has no memory: rad, m
 _LEAST = {"attitudes": np.radians(0.05), "places": 0.08}
 _FIRST = {"attitudes": np.radians(0.5), "places": 0.4}
-_AS_LIKELY = 1.0  # of minus twice the logarithm of the likelihood
+_FIRST_MEMORY_S = 5.0
 _DIFFERENCE = 1e-5
 _CONVERGED = 1e-3  # of a sigma
-
-
-@dataclass(frozen=True)
-class Wander:
-    """A Gauss-Markov process per axis. sigma: (3,); memory_s: (3,)."""
-
-    sigma: Array
-    memory_s: Array
-
-    def whitening(self, times_s: Array, white: float) -> tuple[Array, Array]:
-        """(K, 3) factors of a value and of the one before it, by which what is left is white."""
-        gaps = np.diff(times_s)[:, None]
-        kept = np.concatenate([np.zeros((1, 3)), np.exp(-gaps / self.memory_s)])
-        variance = self.sigma**2 * (1.0 - kept**2) + white**2 * (1.0 + kept**2)
-        return 1.0 / np.sqrt(variance), kept / np.sqrt(variance)
-
-    @classmethod
-    def of(cls, left: Array, times_s: Array, least: float) -> Wander:
-        """Of what is left over, (K, 3), whose mean was taken off it: by restricted likelihood
-        (Patterson and Thompson 1971), and of memories that are about as likely the longest. Else
-        what lasts looks shorter and smaller than it is, and so do the sigmas of what is found.
-        """
-        sigmas, memories = np.zeros(3), np.zeros(3)
-        gaps, free_of_mean = np.diff(times_s), len(times_s) - 1
-        for axis in range(3):
-            e = left[:, axis]
-            found = []
-            for memory_s in _MEMORIES_S:
-                kept = np.exp(-gaps / memory_s)
-                free = np.maximum(1.0 - kept**2, 1e-6)
-                white = np.concatenate([e[:1], (e[1:] - kept * e[:-1]) / np.sqrt(free)])
-                ones = np.concatenate([[1.0], (1.0 - kept) / np.sqrt(free)])
-                told = float(ones @ ones)
-                squares = float(white @ white) - float(ones @ white) ** 2 / told
-                variance = max(squares / free_of_mean, least**2)
-                cost = squares / variance + free_of_mean * np.log(variance)
-                found.append((cost + float(np.log(free).sum()) + np.log(told), np.sqrt(variance)))
-            costs = np.array([cost for cost, _ in found])
-            longest = int(np.flatnonzero(costs < costs.min() + _AS_LIKELY)[-1])
-            sigmas[axis], memories[axis] = found[longest][1], _MEMORIES_S[longest]
-        return cls(sigmas, memories)
 
 
 @dataclass(frozen=True)
@@ -80,7 +40,7 @@ class Solution:
     covariance: Array
     information: Array
     pixel_sigma: float
-    attitude: Wander
+    attitude: AttitudeWander
     place: Wander
 
 
@@ -90,7 +50,7 @@ class _Noise:
 
     pixel_sigma: float
     weight: Array
-    attitude: Wander
+    attitude: AttitudeWander
     place: Wander
 
 
@@ -98,8 +58,11 @@ def solve(evidence: Evidence, fixed: NDArray[np.bool_] | None = None) -> Solutio
     """The numbers that explain both accounts best. fixed: (COUNT,) bool, which keep their value."""
     guess = evidence.start
     still = np.zeros(u.COUNT, bool) if fixed is None else fixed
-    wander = {k: Wander(np.full(3, s), np.full(3, 5.0)) for k, s in _FIRST.items()}
-    noise = _Noise(1.0, np.ones(len(evidence.owner)), wander["attitudes"], wander["places"])
+    sigmas = {name: np.full(3, first) for name, first in _FIRST.items()}
+    up = guess.rotations[:, 2]
+    attitude = AttitudeWander(sigmas["attitudes"], _FIRST["attitudes"], _FIRST_MEMORY_S, up)
+    place = Wander(sigmas["places"], np.full(3, _FIRST_MEMORY_S))
+    noise = _Noise(1.0, np.ones(len(evidence.owner)), attitude, place)
     for _ in range(_ROUNDS):
         for _ in range(_STEPS):
             H, g = _normal(evidence, guess, noise, still)
@@ -128,7 +91,10 @@ def _noise(evidence: Evidence, guess: Guess, before: _Noise) -> _Noise:
     squares = (off**2).sum(axis=1)
     sigma = float(np.sqrt(np.median(squares) / (2.0 * np.log(2.0))))
     weight = 1.0 / (1.0 + squares / (_CAUCHY * sigma) ** 2)
-    attitude = Wander.of(evidence.attitudes(guess), evidence.times_s, _LEAST["attitudes"])
+    attitude = AttitudeWander.of(
+        evidence.attitudes(guess), guess.rotations[:, 2], evidence.times_s,
+        _LEAST["attitudes"], _WHITE["attitudes"],
+    )  # fmt: skip
     place, placed = before.place, evidence.placed
     if placed.any():
         left = evidence.places(guess)[placed]
@@ -197,8 +163,8 @@ def _add_pictures(evidence: Evidence, guess: Guess, noise: _Noise, H: Array, g: 
 
 
 def _add_wander(
-    function: Callable[[Guess], Array], name: str, wander: Wander, evidence: Evidence,
-    guess: Guess, H: Array, g: Array,
+    function: Callable[[Guess], Array], name: str, wander: Wander | AttitudeWander,
+    evidence: Evidence, guess: Guess, H: Array, g: Array,
 ) -> None:  # fmt: skip
     """One account of the autopilot's: each value less what is left of the one before it."""
     used = evidence.placed if name == "places" else np.ones(len(guess.places), bool)
@@ -208,13 +174,13 @@ def _add_wander(
     rows, S = 3 * len(which), u.COUNT
     J = np.zeros((len(which), 3, len(g)))
     for i, k in enumerate(which):
-        J[i, :, S + 6 * k : S + 6 * k + 6] = now[i][:, None] * by_frame[k]
+        J[i, :, S + 6 * k : S + 6 * k + 6] = now[i] @ by_frame[k]
         if i:
             b = which[i - 1]
-            J[i, :, S + 6 * b : S + 6 * b + 6] = -before[i][:, None] * by_frame[b]
+            J[i, :, S + 6 * b : S + 6 * b + 6] = -before[i] @ by_frame[b]
     earlier = np.concatenate([which[:1], which[:-1]])
-    J[:, :, :S] = now[..., None] * by_shared[which] - before[..., None] * by_shared[earlier]
-    left = now * value[which] - before * value[earlier]
+    J[:, :, :S] = now @ by_shared[which] - before @ by_shared[earlier]
+    left = (now @ value[which][..., None] - before @ value[earlier][..., None])[..., 0]
     flat = J.reshape(rows, -1)
     H += flat.T @ flat
     g += flat.T @ left.reshape(rows)

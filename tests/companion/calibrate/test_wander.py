@@ -1,0 +1,91 @@
+"""A heading's error turns about the vertical: what is said of mounting and heading must know it."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from companion.calibrate.wander import AttitudeWander, Wander
+from companion.geometry import GIMBAL_FROM_CAMERA
+from localizer.geometry.pose import Array, matrix_from_euler
+
+TIMES_S = np.arange(200) * 0.9
+MEMORY_S = 6.0
+# Of roll and pitch of a gimbal, and of a heading: a compass's and the gimbal's own yaw, rad.
+ROLL, PITCH, HEADING = np.radians([0.3, 0.3, 0.42])
+LEAST, WHITE = np.radians(0.05), np.radians(0.03)
+PITCHES_DEG = np.array([-90.0, -60.0, -75.0, -50.0, -85.0, -65.0])
+
+
+def axes() -> tuple[Array, Array]:
+    """(K, 3, 3) roll, pitch and heading in the camera's axes; (K, 3) its up."""
+    made, up = [], []
+    for t in TIMES_S:
+        pitch = np.radians(PITCHES_DEG[int(t // 12) % len(PITCHES_DEG)])
+        gimbal = matrix_from_euler(0.0, float(pitch), 0.0)
+        camera = (gimbal @ GIMBAL_FROM_CAMERA).T
+        made.append(camera @ np.stack([gimbal[:, 0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]], axis=1))
+        up.append(camera @ [0.0, 0.0, -1.0])
+    return np.array(made), np.array(up)
+
+
+def true_covariance(sources: Array) -> Array:
+    """(3 K, 3 K) of the errors, exactly."""
+    kept = np.exp(-np.abs(TIMES_S[:, None] - TIMES_S) / MEMORY_S)
+    scaled = sources * [ROLL, PITCH, HEADING]
+    size = 3 * len(TIMES_S)
+    made = np.einsum("kip,ljp,kl->kilj", scaled, scaled, kept).reshape(size, size)
+    return np.asarray(made + np.eye(size) * WHITE**2)
+
+
+def said_and_true(wander: Wander | AttitudeWander) -> tuple[Array, Array]:
+    """(4,) sigmas of mounting and heading as they are said, and as they are."""
+    sources, up = axes()
+    now, before = wander.whitening(TIMES_S, WHITE)
+    size = 3 * len(TIMES_S)
+    whiten = np.zeros((size, size))
+    for k in range(len(TIMES_S)):
+        whiten[3 * k : 3 * k + 3, 3 * k : 3 * k + 3] = now[k]
+        if k:
+            whiten[3 * k : 3 * k + 3, 3 * k - 3 : 3 * k] = -before[k]
+    columns = np.concatenate([np.broadcast_to(np.eye(3), (len(up), 3, 3)), up[..., None]], axis=2)
+    x = whiten @ columns.reshape(size, 4)
+    said = np.linalg.inv(x.T @ x)
+    gain = said @ x.T @ whiten
+    return np.sqrt(np.diag(said)), np.sqrt(np.diag(gain @ true_covariance(sources) @ gain.T))
+
+
+def test_what_is_said_of_mounting_and_heading_is_as_unsure_as_it_is():
+    """By axis of the camera alone, the heading was said twice as surely as it is."""
+    _, up = axes()
+    by_axis = Wander(np.hypot([PITCH, 0.5 * HEADING, ROLL], [0, 0, HEADING]), np.full(3, MEMORY_S))
+    said, true = said_and_true(by_axis)
+    assert true[3] > 1.5 * said[3]
+    better = AttitudeWander(np.array([PITCH, LEAST, ROLL]), float(HEADING), MEMORY_S, up)
+    said_better, true_better = said_and_true(better)
+    ratio = said_better / true_better
+    assert ratio.min() > 0.8
+    assert ratio.max() < 1.4
+    assert true_better[2] < 0.85 * true[2]  # of the mounting about the boresight
+    assert true_better[3] < 0.95 * true[3]
+
+
+def test_errors_about_the_vertical_are_told_from_those_of_the_mounting():
+    sources, up = axes()
+    rng = np.random.default_rng(4)
+    kept = np.exp(-0.9 / MEMORY_S)
+    errors = rng.normal(0.0, 1.0, (len(TIMES_S), 3))
+    for k in range(1, len(errors)):
+        errors[k] = kept * errors[k - 1] + np.sqrt(1.0 - kept**2) * errors[k]
+    left = np.einsum("kip,kp->ki", sources * [ROLL, PITCH, HEADING], errors)
+    left = left + rng.normal(0.0, WHITE, left.shape)
+    found = AttitudeWander.of(left, up, TIMES_S, LEAST, WHITE)
+    assert found.upright == pytest.approx(HEADING, rel=0.35)
+    assert found.sigma[[0, 2]] == pytest.approx([PITCH, ROLL], rel=0.35)
+    assert found.sigma[1] < 0.5 * HEADING
+    assert 3.0 < found.memory_s < 20.0
+    now, before = found.whitening(TIMES_S, WHITE)
+    white = np.einsum("kij,kj->ki", now, left)
+    white[1:] -= np.einsum("kij,kj->ki", before[1:], left[:-1])
+    assert np.cov(white.T) == pytest.approx(np.eye(3), abs=0.35)
+    assert abs(np.corrcoef(white[1:].ravel(), white[:-1].ravel())[0, 1]) < 0.15
