@@ -16,10 +16,11 @@ from __future__ import annotations
 import json
 from pathlib import Path
 
-from benchmarks.calibration.report import summary, table
+from benchmarks.calibration.report import COLUMNS, rows_of, summary, table
 from benchmarks.calibration.run import read, run_draw
 from benchmarks.common.arguments import Parser, number, output, whole
 from benchmarks.common.deadline import deadline
+from benchmarks.common.figures import write_figures
 from benchmarks.common.named_errors import named_errors
 from sitl.demo.assets import prepare
 
@@ -58,7 +59,7 @@ def main() -> None:
         made = summary(rows)
         print(table(made))
         if args.json:
-            args.json.write_text(json.dumps(made, indent=1))
+            write_figures(args.json, COLUMNS, rows_of(made), made)
 
 
 if __name__ == "__main__":

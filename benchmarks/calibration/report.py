@@ -18,6 +18,7 @@ TARGETS = {
     "map, height": ((17,), 0.3, 1.0, "m"),
 }
 _INSIDE = 1.96
+COLUMNS = ("number", "wanted", "draws within", "rms", "worst", "stated sigma", "inside 95 %")
 
 
 def summary(rows: list[dict[str, Any]]) -> dict[str, Any]:
@@ -57,6 +58,28 @@ def summary(rows: list[dict[str, Any]]) -> dict[str, Any]:
             sum(f <= 1.1 * t for f, t in zip(flights["found"], flights["true"], strict=True))
         ),
     }  # fmt: skip
+
+
+def rows_of(made: dict[str, Any]) -> list[tuple[str, ...]]:
+    """Cells under `COLUMNS`."""
+    rows = [
+        (
+            f"{name}, {g['unit']}", f"{g['target']:.3g}", f"{g['draws_within']} of {g['draws']}",
+            *(f"{g[key]:.2g}" for key in ("rms", "worst", "sigma_median")),
+            f"{100 * g['inside_95']:.0f} %",
+        )
+        for name, g in made["groups"].items()
+    ]  # fmt: skip
+    found = np.array(made["found_over_true"])
+    share = f"{made['within_10_percent']} of {made['draws']}"
+    rows.append(
+        (
+            "median error of the flight after it, over the true deployment's", "1.1", share,
+            f"{np.median(found):.2f} (median)", f"{found.max():.2f}", "-", "-",
+        )
+    )  # fmt: skip
+    rows.append(("all numbers", "-", "-", "-", "-", "-", f"{100 * made['inside_95_of_all']:.0f} %"))
+    return rows
 
 
 def table(made: dict[str, Any]) -> str:

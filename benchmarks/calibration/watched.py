@@ -3,10 +3,11 @@
     python -m benchmarks.calibration.watched FLIGHT... [--json out.json]
 
 A FLIGHT is a folder of `python -m sitl loop` or `demo` (VEHICLE-CASE-SEED with companion*/ and
-flight.tlog), or a draw of `python -m benchmarks.calibration` (SEED beside its draws.jsonl). Its
-fixes and the autopilot's messages go through `companion.calibration_watch` again in the order of
-their times. A finding is false where the flight's own error is below half its limit, and neither
-right nor wrong between there and the limit; it is told once it has stood for as long as in flight.
+flight.tlog), or one of `python -m benchmarks.calibration` (SEED beside its draws.jsonl) or of
+`benchmarks.calibration.zoomed`. Its fixes and the autopilot's messages go through
+`companion.calibration_watch` again in the order of their times. A finding is false where the
+flight's own error is below half its limit, and neither right nor wrong between there and the limit;
+it is told once it has stood for as long as in flight.
 """
 
 from __future__ import annotations
@@ -22,6 +23,7 @@ import numpy as np
 
 from benchmarks.calibration.draws import drawn
 from benchmarks.common.arguments import Parser, output
+from benchmarks.common.figures import write_figures
 from benchmarks.common.named_errors import named_errors
 from companion.calibrate import unknowns as u
 from companion.calibration_watch.config import CalibrationLimits
@@ -54,6 +56,10 @@ _HALF = CalibrationLimits(
 _OURS = ("VISION_POSITION_ESTIMATE", "ODOMETRY", "GPS_INPUT")
 _INTERVAL_NS, _STEP_NS = 250_000_000, 250_000_000
 _LATER_NS = 1_000_000_000
+COLUMNS = (
+    "error", "beyond its limit", "found within 60 s", "after s", "within half of the limit, told",
+    "others", "falsely",
+)  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -236,7 +242,12 @@ def _ours_ns(record: FlightRecord, tlog: Path) -> int | None:
 
 
 def _errors(folder: Path) -> Errors:
-    """What is wrong by the draw's truth, or by the case that the folder's name says."""
+    """What is wrong by the flight's own `errors.json`, by the draw's truth, or by the case that
+    the folder's name says.
+    """
+    told = folder / "errors.json"
+    if told.exists():
+        return Errors(**json.loads(told.read_text()))
     rows = folder.parent / "draws.jsonl"
     if rows.exists():
         for line in rows.read_text().splitlines():
@@ -299,6 +310,22 @@ def summary(flights: Sequence[Watched]) -> dict[str, Any]:
     }  # fmt: skip
 
 
+def rows_of(made: dict[str, Any]) -> list[tuple[str, ...]]:
+    """Cells under `COLUMNS`."""
+    rows = [
+        (
+            name, str(g["beyond"]), str(g["found_within_60_s"]),
+            ", ".join(f"{t:.0f}" for t in g["seconds"]) or "-",
+            f"{g['near_told']} of {g['near']}", str(g["far"]), str(len(g["false"])),
+        )
+        for name, g in made["errors"].items()
+    ]  # fmt: skip
+    minutes = f"nothing wrong ({60 * made['nothing_wrong_hours']:.0f} minutes)"
+    falsely = str(len(made["false_alarms_of_them"]))
+    rows.append((minutes, "-", "-", "-", "-", str(made["nothing_wrong"]), falsely))
+    return rows
+
+
 def table(made: dict[str, Any]) -> str:
     """The summary in lines."""
     lines = [
@@ -332,8 +359,9 @@ def main() -> None:
     made = summary(flights)
     print(table(made))
     if args.json:
-        made["each"] = [asdict(f) for f in flights]
-        args.json.write_text(json.dumps(made, indent=1))
+        write_figures(
+            args.json, COLUMNS, rows_of(made), made | {"each": [asdict(f) for f in flights]}
+        )
 
 
 if __name__ == "__main__":

@@ -30,6 +30,8 @@ _VISION_M = 0.25  # errors of vision that last longer than from one sighting to 
 _GNSS_M, _GNSS_HEIGHT_M, _PRESSURE_M = 0.5, 1.0, 0.5
 _OUTLIER = 5.0  # sigmas; one is dropped, several in a row begin anew
 _ANEW = 8
+_SLOW_MPS = 1.0
+_ZOOMED = 3  # sightings in a row that contradict what was known: the lens may be another now
 
 
 class PositionFilter:
@@ -39,6 +41,7 @@ class PositionFilter:
         self._x = np.zeros(_SIZE)
         self._cov = np.diag(np.square(_SIGMAS))
         self._outliers = 0
+        self._contradicted = 0
         self._height0: float | None = None
         self._zeros: dict[int, float] = {}
 
@@ -85,13 +88,18 @@ class PositionFilter:
         """A sighting at `place` (2,), north and east of a fixed point, m."""
         axis = seen.ned_from_camera[:, 2]
         behind = seen.depth_m * axis  # by which a share of 1 would put the camera back
+        # Heights first: they tell a lens from a lag, which is all horizontal.
+        contradicted = not self._heights(seen, known, behind[2], climb_mps)
         agreed = True
+        velocity = self._x[_V : _V + 2].copy()
+        if np.hypot(*velocity) < _SLOW_MPS:
+            velocity[:] = 0.0  # who stands tells no lateness: the filter would invent a velocity
         for i in (0, 1):
             H = np.zeros(_SIZE)
-            H[_P + i], H[_V + i] = 1.0, -self._x[_T]
-            H[_F], H[_T] = -behind[i], -self._x[_V + i]
+            H[_P + i], H[_V + i] = 1.0, -self._x[_T] if velocity.any() else 0.0
+            H[_F], H[_T] = -behind[i], -velocity[i]
             # v tau is bilinear: its value is subtracted once, its two slopes are in H.
-            predicted = float(H @ self._x) + self._x[_T] * self._x[_V + i]
+            predicted = float(H @ self._x) + self._x[_T] * velocity[i]
             sigma = float(np.hypot(seen.sigma_m, _VISION_M))
             agreed &= self._correct(H, place[i] - predicted, sigma)
         self._outliers = 0 if agreed else self._outliers + 1
@@ -104,11 +112,17 @@ class PositionFilter:
                 H = np.zeros(_SIZE)
                 H[_P + i] = H[_B + i] = 1.0
                 measured = place[i] + known.north_east_m[i]
-                self._correct(H, measured - float(H @ self._x), _GNSS_M)
-        self._heights(seen, known, behind[2], climb_mps)
+                agreed &= self._correct(H, measured - float(H @ self._x), _GNSS_M)
+        self._contradicted = self._contradicted + 1 if contradicted or not agreed else 0
+        if self._contradicted >= _ZOOMED:
+            self._loosen(_F, 1, keep=True)
+            self._contradicted = 0
 
-    def _heights(self, seen: Sighting, known: Evidence, down_m: float, climb_mps: float) -> None:
-        """Vision's height is `focal x down_m` too large, and behind a climb by what it is late."""
+    def _heights(self, seen: Sighting, known: Evidence, down_m: float, climb_mps: float) -> bool:
+        """Vision's height is `focal x down_m` too large, and behind a climb by what it is late.
+        Returns whether the other heights agree with what is known.
+        """
+        agreed = True
         height = seen.place[2]
         if self._height0 is None:
             self._height0 = height
@@ -125,7 +139,8 @@ class PositionFilter:
             H[_F], H[_T], H[state] = down_m, -climb_mps, 1.0
             if state == _C:
                 H[_S] = height - self._height0
-            self._correct(H, difference - zero - float(H @ self._x), sigma)
+            agreed &= self._correct(H, difference - zero - float(H @ self._x), sigma)
+        return agreed
 
     def _correct(self, H: Array, innovation: float, sigma: float) -> bool:
         """One scalar measurement; False if it is an outlier, which is left out."""
@@ -139,12 +154,12 @@ class PositionFilter:
         self._cov = 0.5 * (self._cov + self._cov.T)
         return True
 
-    def _loosen(self, at: int, count: int) -> None:
-        """Forget some states, and how they are tied to the others."""
+    def _loosen(self, at: int, count: int, *, keep: bool = False) -> None:
+        """Forget some states, and how they are tied to the others. keep: not their values."""
         for i in range(at, at + count):
             self._cov[i, :] = self._cov[:, i] = 0.0
             self._cov[i, i] = _SIGMAS[i] ** 2
-            self._x[i] = 0.0
+            self._x[i] = self._x[i] if keep else 0.0
 
     def _figure(self, at: int) -> Figure:
         return Figure(float(self._x[at]), float(np.sqrt(max(self._cov[at, at], 0.0))))

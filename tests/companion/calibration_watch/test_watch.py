@@ -110,6 +110,34 @@ def test_stamps_in_doubt_are_known_again(late_s: float) -> None:
         assert late.exceeds(LIMITS.time_s) == (late_s > 0.0)
 
 
+@pytest.mark.parametrize(
+    ("focal", "seconds", "denied", "within_s"),
+    [
+        (0.1, 0.0, False, 6.0),
+        (-0.1, 3.0, True, 6.0),
+        (0.2, 3.0, False, 6.0),
+        (0.05, 0.0, True, 6.0),
+        (-0.2, 3.0, True, 6.0),
+    ],
+)
+def test_a_stream_that_zooms_without_saying_so_is_told(
+    focal: float, seconds: float, denied: bool, within_s: float
+) -> None:
+    """After 50 s of a right lens, in which all was learned; and nothing else is blamed."""
+    wrong = Wrong(focal=focal, zoom_s=50.0, zooms_for_s=seconds)
+    flown = Flown(wrong, square(80.0), (lambda t: t < 40.0) if denied else lambda _: True).fly()
+    assert ever(flown) == {"focal"}
+    assert 50.0 < flown.first(lambda f: "focal" in findings(f)) < 50.0 + within_s
+    assert flown.found[-1][1].focal.value == pytest.approx(focal, rel=0.35)
+
+
+def test_a_zoom_in_a_hover_is_told_and_not_called_late_stamps() -> None:
+    """Heights alone tell it there; who stands can tell nothing of stamps."""
+    flown = Flown(Wrong(focal=0.1, zoom_s=50.0), square(80.0, hold=True)).fly()
+    assert ever(flown) == {"focal"}
+    assert flown.first(lambda f: "focal" in findings(f)) < 80.0
+
+
 def test_a_shifted_map_and_a_biased_receiver_are_no_focal_length() -> None:
     """4 m apart in a turning flight: whoever is wrong, it is not the lens."""
     assert ever(Flown(Wrong(map_m=(3.0, 2.0), gnss_m=(0.0, 1.0)), SURVEYED).fly()) == set()
