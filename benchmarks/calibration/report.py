@@ -62,7 +62,7 @@ def summary(rows: list[dict[str, Any]]) -> dict[str, Any]:
 
 def rows_of(made: dict[str, Any]) -> list[tuple[str, ...]]:
     """Cells under `COLUMNS`."""
-    rows = [
+    rows: list[tuple[str, ...]] = [
         (
             f"{name}, {g['unit']}", f"{g['target']:.3g}", f"{g['draws_within']} of {g['draws']}",
             *(f"{g[key]:.2g}" for key in ("rms", "worst", "sigma_median")),

@@ -35,7 +35,7 @@ from sitl.demo.assets import FlightAssets, prepare
 from sitl.desk.film import Exposed, Localized, exposures, write_record
 
 SECONDS, ZOOMS_AT_S, SLOWLY_S, STEPS = 110.0, 60.0, 3.0, 4
-SHARES = (0.0, 0.05, -0.05, 0.1, -0.1, 0.2, -0.2)
+SHARES = (0.1, -0.1, 0.05, -0.05, 0.2, -0.2, 0.0)
 _FIRST = 400  # seed
 COLUMNS = (
     "the stream zooms by", "within, s", "told", "pictures accepted afterwards", "their error, m",
@@ -78,11 +78,13 @@ def run_one(
         sortie.clocks,
     )  # fmt: skip
     watched = watch_flight(folder)
-    late = [x for x in seen if x.estimate is not None and x.estimate.exposure_time_ns * 1e-9
-            >= start_ns * 1e-9 + zoomed_s + lasts_s]  # fmt: skip
+    after_ns = start_ns + round(1e9 * (zoomed_s + lasts_s))
+    known = [x for x in seen if x.estimate is not None]
+    after = [x for x in known if x.estimate and x.estimate.exposure_time_ns >= after_ns]
+    before = [x for x in known if x.estimate and x.estimate.exposure_time_ns < after_ns]
     return {
         "seed": seed, "zoom": share, "lasts_s": lasts_s, "watched": asdict(watched),
-        "after": _accepted(late), "before": _accepted([x for x in seen if x not in late]),
+        "after": _accepted(after), "before": _accepted(before),
     }  # fmt: skip
 
 
@@ -105,7 +107,7 @@ def flights() -> list[tuple[float, float]]:
 
 def rows_of(rows: list[dict[str, Any]]) -> list[tuple[str, ...]]:
     """Cells under `COLUMNS`, a row a flight."""
-    cells = []
+    cells: list[tuple[str, ...]] = []
     for row in sorted(rows, key=lambda row: int(row["seed"])):
         times = zip(_NAMES, row["watched"]["told_s"], strict=True)
         told = ", ".join(f"{name} after {t:.0f} s" for name, t in times if t is not None)
