@@ -312,7 +312,7 @@ def summary(flights: Sequence[Watched]) -> dict[str, Any]:
 
 def rows_of(made: dict[str, Any]) -> list[tuple[str, ...]]:
     """Cells under `COLUMNS`."""
-    rows = [
+    rows: list[tuple[str, ...]] = [
         (
             name, str(g["beyond"]), str(g["found_within_60_s"]),
             ", ".join(f"{t:.0f}" for t in g["seconds"]) or "-",
