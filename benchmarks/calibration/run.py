@@ -63,7 +63,6 @@ def _noise(found: Calibrated) -> dict[str, Any]:
     s = found.solution
     return {
         "attitude_deg": np.degrees(s.attitude.sigma).tolist(),
-        "attitude_upright_deg": float(np.degrees(s.attitude.upright)),
         "attitude_memory_s": s.attitude.memory_s,
         "place_m": s.place.sigma.tolist(), "place_memory_s": s.place.memory_s.tolist(),
     }  # fmt: skip

@@ -58,10 +58,9 @@ def solve(evidence: Evidence, fixed: NDArray[np.bool_] | None = None) -> Solutio
     """The numbers that explain both accounts best. fixed: (COUNT,) bool, which keep their value."""
     guess = evidence.start
     still = np.zeros(u.COUNT, bool) if fixed is None else fixed
-    sigmas = {name: np.full(3, first) for name, first in _FIRST.items()}
     up = guess.rotations[:, 2]
-    attitude = AttitudeWander(sigmas["attitudes"], _FIRST["attitudes"], _FIRST_MEMORY_S, up)
-    place = Wander(sigmas["places"], np.full(3, _FIRST_MEMORY_S))
+    attitude = AttitudeWander(np.full(5, _FIRST["attitudes"]), _FIRST_MEMORY_S, up)
+    place = Wander(np.full(3, _FIRST["places"]), np.full(3, _FIRST_MEMORY_S))
     noise = _Noise(1.0, np.ones(len(evidence.owner)), attitude, place)
     for _ in range(_ROUNDS):
         for _ in range(_STEPS):
@@ -170,17 +169,12 @@ def _add_wander(
     used = evidence.placed if name == "places" else np.ones(len(guess.places), bool)
     value, by_frame, by_shared = _derivatives(function, guess, range(u.LATE, u.COUNT))
     which = np.flatnonzero(used)
-    now, before = wander.whitening(evidence.times_s[which], _WHITE[name])
-    rows, S = 3 * len(which), u.COUNT
-    J = np.zeros((len(which), 3, len(g)))
+    times_s, S = evidence.times_s[which], u.COUNT
+    J = np.zeros((len(which), 3, len(g) + 1))
     for i, k in enumerate(which):
-        J[i, :, S + 6 * k : S + 6 * k + 6] = now[i] @ by_frame[k]
-        if i:
-            b = which[i - 1]
-            J[i, :, S + 6 * b : S + 6 * b + 6] = -before[i] @ by_frame[b]
-    earlier = np.concatenate([which[:1], which[:-1]])
-    J[:, :, :S] = now @ by_shared[which] - before @ by_shared[earlier]
-    left = (now @ value[which][..., None] - before @ value[earlier][..., None])[..., 0]
-    flat = J.reshape(rows, -1)
-    H += flat.T @ flat
-    g += flat.T @ left.reshape(rows)
+        J[i, :, S + 6 * k : S + 6 * k + 6] = by_frame[k]
+    J[:, :, :S] = by_shared[which]
+    J[:, :, -1] = value[which]
+    flat = wander.whitened(J, times_s, _WHITE[name])
+    H += flat[:, :-1].T @ flat[:, :-1]
+    g += flat[:, :-1].T @ flat[:, -1]

@@ -1,9 +1,10 @@
 """Errors that last from one picture to the next: how large they are, and for how long.
 
 Each source is a Gauss-Markov process. Places err along the world's axes, each for itself. Attitudes
-err about the camera's axes, and about the vertical: a heading's error (compass, the gimbal's yaw)
-turns a camera that looks straight down about its boresight, and one that looks ahead sideways.
-Told apart, heading does not hide the mounting, and what is said of both is as unsure as it is.
+err about the camera's axes, and about the vertical: a heading's error turns a camera that looks
+straight down about its boresight, and one that looks ahead sideways. A gimbal's own errors change
+within seconds, a compass's within a minute. Told apart, a heading does not hide the mounting, and
+what is said of both is as unsure as it is.
 """
 
 from __future__ import annotations
@@ -11,6 +12,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.linalg import cho_factor, cho_solve, solve_triangular
 from scipy.optimize import minimize
 
 from companion.calibrate import unknowns as u
@@ -18,8 +20,11 @@ from localizer.geometry.pose import Array
 
 _MEMORIES_S = np.array([0.1, 0.3, 1.0, 2.0, 4.0, 8.0, 15.0, 30.0, 60.0])
 _AS_LIKELY = 1.0  # of minus twice the logarithm of the likelihood
-_LARGEST = 30.0  # times the least: where the search for a sigma ends
-_STEEPEST = 0.999  # of what is kept from one picture to the next
+_COMPASS_S = 60.0
+_USUAL_S, _UNUSUAL = 8.0, 1.0  # of a gimbal's memory: the middle, and one sigma of its logarithm
+_SHORTEST_S, _LONGEST_S = 0.5, 60.0
+_LARGEST = 40.0  # times the least: where the search for a sigma ends
+_FEW = 100  # frames suffice for the sigmas
 
 
 @dataclass(frozen=True)
@@ -29,16 +34,17 @@ class Wander:
     sigma: Array
     memory_s: Array
 
-    def whitening(self, times_s: Array, white: float) -> tuple[Array, Array]:
-        """(K, 3, 3) factors of a value and of the one before it, by which what is left is white.
+    def whitened(self, values: Array, times_s: Array, white: float) -> Array:
+        """(K, 3, n) values less what is left of the ones before them, in sigmas: (3 K, n).
 
         white: of what has no memory.
         """
         gaps = np.diff(times_s)[:, None]
         kept = np.concatenate([np.zeros((1, 3)), np.exp(-gaps / self.memory_s)])
-        variance = self.sigma**2 * (1.0 - kept**2) + white**2 * (1.0 + kept**2)
-        axes = np.eye(3)
-        return axes / np.sqrt(variance)[..., None], axes * (kept / np.sqrt(variance))[..., None]
+        sigma = np.sqrt(self.sigma**2 * (1.0 - kept**2) + white**2 * (1.0 + kept**2))[..., None]
+        made = values / sigma
+        made[1:] -= kept[1:, :, None] * values[:-1] / sigma[1:]
+        return made.reshape(-1, values.shape[2])
 
     @classmethod
     def of(cls, left: Array, times_s: Array, least: float) -> Wander:
@@ -61,32 +67,31 @@ class Wander:
                 variance = max(squares / free_of_mean, least**2)
                 cost = squares / variance + free_of_mean * np.log(variance)
                 found.append((cost + float(np.log(free).sum()) + np.log(told), np.sqrt(variance)))
-            longest = _longest([cost for cost, _ in found])
+            costs = np.array([cost for cost, _ in found])
+            longest = int(np.flatnonzero(costs < costs.min() + _AS_LIKELY)[-1])
             sigmas[axis], memories[axis] = found[longest][1], _MEMORIES_S[longest]
         return cls(sigmas, memories)
 
 
 @dataclass(frozen=True)
 class AttitudeWander:
-    """Of attitudes. sigma: (3,) about the camera's axes; upright: about the vertical, rad; all keep
-    their errors for memory_s. up: (K, 3), the vertical in each camera's axes.
+    """Of attitudes, rad. sigma: (5,) about the camera's axes, and about the vertical of a gimbal
+    and of a compass; the gimbal's errors last for memory_s. up: (K, 3), the vertical in each
+    camera's axes.
     """
 
     sigma: Array
-    upright: float
     memory_s: float
     up: Array
 
-    def whitening(self, times_s: Array, white: float) -> tuple[Array, Array]:
-        """As `Wander.whitening`."""
-        covariance = self._covariance()
-        now, before, _ = _whitening(covariance, np.diff(times_s), self.memory_s, white)
-        return now, before
-
-    def _covariance(self) -> Array:
-        """(K, 3, 3) of one error."""
-        outer: Array = self.up[:, :, None] * self.up[:, None, :]
-        return np.diag(self.sigma**2) + self.upright**2 * outer
+    def whitened(self, values: Array, times_s: Array, white: float) -> Array:
+        """As `Wander.whitened`."""
+        C: Array = np.eye(self.up.size) * white**2
+        for part in _covariances(np.log(self.sigma), self.memory_s, self.up, times_s):
+            C += part
+        factor = np.linalg.cholesky(C)
+        flat = values.reshape(len(C), -1)
+        return np.asarray(solve_triangular(factor, flat, lower=True, check_finite=False))
 
     @classmethod
     def of(
@@ -96,62 +101,67 @@ class AttitudeWander:
         restricted likelihood, as `Wander.of`. A flight that cannot tell the vertical from the
         boresight shares the error out between them.
         """
-        gaps = np.diff(times_s)
+        few = np.unique(np.linspace(0, len(times_s) - 1, min(_FEW, len(times_s))).round())
+        k = few.astype(int)
+        likelihood = Likelihood(left[k], up[k], times_s[k], white)
+        low, high = np.log(least), np.log(_LARGEST * least)
+        first = np.clip(np.log(max(float(left.std()), least)), low, high)
+        slow = low - 1.0
+        bounds = [(low, high)] * 3 + [(slow, high)] * 2
+        start = np.append(np.full(5, first), np.log(_USUAL_S))
+        found = minimize(
+            likelihood, start, jac=True, method="L-BFGS-B",
+            bounds=[*bounds, (np.log(_SHORTEST_S), np.log(_LONGEST_S))],
+        )  # fmt: skip
+        return cls(np.exp(found.x[:5]), float(np.exp(found.x[5])), up)
+
+
+class Likelihood:
+    """Minus twice the logarithm of the restricted likelihood, and its derivatives by the logarithms
+    of five sigmas and of the memory.
+    """
+
+    def __init__(self, left: Array, up: Array, times_s: Array, white: float) -> None:
+        self._left, self._up, self._times_s, self._white = left.ravel(), up, times_s, white
         columns = np.concatenate([np.broadcast_to(np.eye(3), (len(up), 3, 3)), up[..., None]], 2)
-        taken = np.diag(1.0 / u.SIGMAS[[*range(u.MOUNT.start, u.MOUNT.stop), u.HEADING]] ** 2)
-        start = np.log(np.maximum(left.std(axis=0).mean(), least)) * np.ones(4)
-        found = []
-        for memory_s in _MEMORIES_S:
+        self._columns = columns.reshape(-1, 4)
+        taken = [*range(u.MOUNT.start, u.MOUNT.stop), u.HEADING]
+        self._prior = np.diag(1.0 / u.SIGMAS[taken] ** 2)
 
-            def cost(logs: Array, memory_s: float = float(memory_s)) -> float:
-                made = _made(logs, memory_s, up)
-                now, before, size = _whitening(made._covariance(), gaps, memory_s, white)
-                e, x = _whitened(now, before, left[..., None]), _whitened(now, before, columns)
-                x = x.reshape(-1, 4)
-                normal, pull = x.T @ x + taken, x.T @ e.ravel()
-                squares = float(e.ravel() @ e.ravel() - pull @ np.linalg.solve(normal, pull))
-                return squares + size + float(np.linalg.slogdet(normal)[1])
-
-            low, high = np.log(least), np.log(_LARGEST * least)
-            best = minimize(cost, np.clip(start, low, high), method="L-BFGS-B",
-                            bounds=[(low, high)] * 3 + [(low - 2.0, high)])  # fmt: skip
-            start = best.x
-            found.append((float(best.fun), _made(best.x, float(memory_s), up)))
-        return found[_longest([cost for cost, _ in found])][1]
-
-
-def _made(logs: Array, memory_s: float, up: Array) -> AttitudeWander:
-    sigmas = np.exp(logs)
-    return AttitudeWander(sigmas[:3], float(sigmas[3]), memory_s, up)
-
-
-def _longest(costs: list[float]) -> int:
-    """Of memories that are about as likely as the likeliest."""
-    values = np.array(costs)
-    return int(np.flatnonzero(values < values.min() + _AS_LIKELY)[-1])
+    def __call__(self, logs: Array) -> tuple[float, Array]:
+        """At six logarithms: the value, and its derivatives (6,)."""
+        memory_s = float(np.exp(logs[5]))
+        parts = _covariances(logs[:5], memory_s, self._up, self._times_s)
+        C = sum(parts) + np.eye(len(self._left)) * self._white**2
+        factor = cho_factor(C, lower=True, check_finite=False)
+        inverse = cho_solve(factor, np.eye(len(C)), check_finite=False)
+        x = inverse @ self._columns
+        normal = self._columns.T @ x + self._prior
+        projected = inverse - x @ np.linalg.solve(normal, x.T)
+        e = projected @ self._left
+        unusual = (logs[5] - np.log(_USUAL_S)) / _UNUSUAL
+        cost = float(self._left @ e) + float(np.linalg.slogdet(normal)[1]) + unusual**2
+        cost += 2.0 * float(np.log(np.diagonal(factor[0])).sum())
+        gaps = np.abs(self._times_s[:, None] - self._times_s) / memory_s
+        lasting = sum(parts[:4]) * np.kron(gaps, np.ones((3, 3)))
+        slopes = [2.0 * part for part in parts] + [lasting]
+        gradient = np.array([float((projected * d).sum() - e @ d @ e) for d in slopes])
+        gradient[5] += 2.0 * unusual / _UNUSUAL
+        return cost, gradient
 
 
-def _whitening(
-    covariance: Array, gaps_s: Array, memory_s: float, white: float
-) -> tuple[Array, Array, float]:
-    """Factors (K, 3, 3) of a value and of the one before; log of their errors' determinants."""
-    values, vectors = np.linalg.eigh(covariance)
-    root = (vectors * np.sqrt(values)[:, None]) @ np.swapaxes(vectors, 1, 2)
-    undo = (vectors / np.sqrt(values)[:, None]) @ np.swapaxes(vectors, 1, 2)
-    kept = np.minimum(np.exp(-gaps_s / memory_s), _STEEPEST)[:, None, None]
-    carried = np.zeros_like(covariance)
-    carried[1:] = kept * root[1:] @ undo[:-1]
-    new = covariance.copy()
-    new[1:] *= 1.0 - kept**2
-    new += white**2 * (np.eye(3) + carried @ np.swapaxes(carried, 1, 2))
-    factor = np.linalg.cholesky(new)
-    now = np.linalg.inv(factor)
-    size = 2.0 * float(np.log(np.diagonal(factor, axis1=1, axis2=2)).sum())
-    return now, now @ carried, size
-
-
-def _whitened(now: Array, before: Array, values: Array) -> Array:
-    """Values (K, 3, n) less what is left of the ones before them."""
-    made = now @ values
-    made[1:] -= before[1:] @ values[:-1]
-    return made
+def _covariances(logs: Array, memory_s: float, up: Array, times_s: Array) -> list[Array]:
+    """(3 K, 3 K) of each of the five sources."""
+    gaps = np.abs(times_s[:, None] - times_s)
+    quick, slow = np.exp(-gaps / memory_s), np.exp(-gaps / _COMPASS_S)
+    upright = up.reshape(-1, 1) @ up.reshape(1, -1)
+    variances = np.exp(2.0 * logs)
+    axes = [
+        variance * np.kron(quick, np.diag(axis))
+        for variance, axis in zip(variances[:3], np.eye(3), strict=True)
+    ]
+    ones = np.ones((3, 3))
+    return [
+        *axes, variances[3] * upright * np.kron(quick, ones),
+        variances[4] * upright * np.kron(slow, ones),
+    ]  # fmt: skip
