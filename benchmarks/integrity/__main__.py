@@ -1,6 +1,7 @@
 """False accepts: single registrations from wrong beginnings, and the right ones that tests cost.
 
     python -m benchmarks.integrity FOLDER [--sets generated quito ...] [--minutes 10]
+    python -m benchmarks.integrity FOLDER --without SEEN
     python -m benchmarks.integrity FOLDER --again
     python -m benchmarks.integrity FOLDER --report [--json out.json] [--plot out.png]
 
@@ -14,7 +15,8 @@ more than 10 m). The set "tuning" is for choosing thresholds and in no figure of
 "shifted" a result counts by the place that the map's picture shows: no single picture tells that a
 map is shifted. --again brings outcomes of an older version up to date: what its tests accepted is
 registered once more, has to end where it did, and gets what is tested since; what they refused no
-further test lets in.
+further test lets in. --without: the views that another folder has outcomes of are left out, so that
+a limit that was chosen on those is held against others.
 """
 
 from __future__ import annotations
@@ -23,16 +25,17 @@ import json
 from dataclasses import asdict
 from pathlib import Path
 
-from benchmarks.common.arguments import Parser, number, output
+from benchmarks.common.arguments import Parser, existing, number, output
 from benchmarks.common.deadline import deadline
 from benchmarks.common.named_errors import named_errors, needs_torch
 
 with needs_torch():
-    from benchmarks.integrity.maps import SETS, SHIFT_M, TUNING, load_set
+    from benchmarks.integrity.maps import SETS, TUNING, UNSEEN, load_set
     from benchmarks.integrity.report import by_condition, plot, rows, table
     from benchmarks.integrity.run import Outcome, again, read, run_set, turn
 from localizer.integrity.acceptance import IntegrityConfig
 
+_USUAL = [name for name in SETS if name != UNSEEN]
 _TURN = 8  # views of a set before it is the next one's turn
 
 
@@ -40,10 +43,11 @@ def parser() -> Parser:
     """The command line."""
     p = Parser(__doc__)
     p.add_argument("folder", type=Path, help="of worlds, maps, views and outcomes")
-    p.add_argument("--sets", nargs="+", choices=list(SETS), default=list(SETS), help="to run")
+    p.add_argument("--sets", nargs="+", choices=list(SETS), default=_USUAL, help="to run")
     p.add_argument("--data", type=Path, default=Path("../shared/data"), help="real sets")
     p.add_argument("--minutes", type=number(0.1, 1e4), default=10.0, help="until it pauses")
     p.add_argument("--again", action="store_true", help="bring older outcomes up to date")
+    p.add_argument("--without", type=existing, help="folder whose outcomes' views are left out")
     p.add_argument("--report", action="store_true", help="tables of what is there; no run")
     p.add_argument("--json", type=output, help="the report's rows")
     p.add_argument("--plot", type=output, help="PNG: agreement over quality")
@@ -56,17 +60,20 @@ def main() -> None:
     home.mkdir(parents=True, exist_ok=True)
     if not args.report:
         more_time = deadline(args.minutes)
-        wanted = args.sets if args.sets == [TUNING] else list(SETS)
+        wanted = args.sets if args.sets == [TUNING] else list(dict.fromkeys(_USUAL + args.sets))
         views = {n: load_set(n, args.folder, args.data, SETS[n]) for n in wanted}
+        usual = [n for n in _USUAL if n in views and n != TUNING]
         left = dict.fromkeys(args.sets, 1)
         while any(left.values()) and more_time():
             for name in (n for n in args.sets if left[n]):  # in turns, so that a part tells, too
                 # Thresholds were chosen on the tuning set's map: no other set sees it, nor it them.
-                kept = [] if name == TUNING else [v for n in views if n != TUNING for v in views[n]]
-                shift = SHIFT_M if name == "shifted" else (0.0, 0.0)
-                path = home / f"{name}.jsonl"
-                do = again if args.again else run_set
-                left[name] = do(name, views[name], kept, path, shift, turn(more_time, _TURN))
+                kept = [] if name == TUNING else [v for n in usual for v in views[n]]
+                mine = name, views[name], kept, home / f"{name}.jsonl", turn(more_time, _TURN)
+                if args.again:
+                    left[name] = again(*mine)
+                else:
+                    seen = args.without and args.without / "integrity" / f"{name}.jsonl"
+                    left[name] = run_set(*mine, seen)
                 print(f"{name}: {left[name]} of {len(views[name])} views left", flush=True)
         return
     outcomes: list[Outcome] = []

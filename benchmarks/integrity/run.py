@@ -12,7 +12,7 @@ import numpy as np
 
 from benchmarks.basin.views import View
 from benchmarks.integrity.beginnings import Beginning, beginnings
-from benchmarks.integrity.maps import place_of
+from benchmarks.integrity.maps import place_of, shift_of
 from localizer.config import LocalizerConfig
 from localizer.errors import SequenceError
 from localizer.features import load_extractor
@@ -187,19 +187,20 @@ def run_set(
     views: Sequence[View],
     everywhere: Sequence[View],
     path: Path,
-    shift: tuple[float, float],
     more_time: Callable[[], bool],
+    seen: Path | None = None,
 ) -> int:
     """Append the views that `path` lacks, as long as there is time; how many are left.
 
-    everywhere: views, of which some of other places serve as wrong beginnings.
+    everywhere: views, of which some of other places serve as wrong beginnings; seen: another run's
+    outcomes of the set, whose views are left out (photos that are given again, too).
     """
-    places = places_of(everywhere)
+    places, shift = places_of(everywhere), shift_of(name)
     kept = read(path) if path.exists() else []
     if path.exists() and len(kept) != len(path.read_text().splitlines()):
         path.write_text("".join(json.dumps(asdict(o)) + "\n" for o in kept))
     done = {o.view for o in kept}
-    left = [k for k in range(len(views)) if k not in done]
+    left = [k for k in unseen(views, seen) if k not in done]
     with Registrar(LocalizerConfig()) as registrar, path.open("a") as file:
         while left and more_time():
             k = left.pop(0)
@@ -216,7 +217,6 @@ def again(
     views: Sequence[View],
     everywhere: Sequence[View],
     path: Path,
-    shift: tuple[float, float],
     more_time: Callable[[], bool],
 ) -> int:
     """Bring a file of an older version up to date; how many views are left.
@@ -226,7 +226,7 @@ def again(
     """
     rows = [json.loads(line) for line in path.read_text().splitlines()]
     old = list(dict.fromkeys(r["view"] for r in rows if "focal_gain" not in r))
-    places, config = places_of(everywhere), IntegrityConfig()
+    places, shift, config = places_of(everywhere), shift_of(name), IntegrityConfig()
     with Registrar(LocalizerConfig()) as registrar:
         while old and more_time():
             k = old.pop(0)
@@ -248,6 +248,15 @@ def again(
             rows[at:at] = fresh
             path.write_text("".join(json.dumps(r) + "\n" for r in rows))
     return len(old)
+
+
+def unseen(views: Sequence[View], seen: Path | None) -> list[int]:
+    """The numbers of the views that another run's outcomes do not have, each picture once."""
+    if seen is None:
+        return list(range(len(views)))
+    known = {id(views[o.view]) for o in read(seen)} if seen.exists() else set()
+    first = {id(view): k for k, view in reversed(list(enumerate(views)))}
+    return [k for k, view in enumerate(views) if id(view) not in known and first[id(view)] == k]
 
 
 def votes_accept(outcome: Outcome, config: IntegrityConfig) -> bool:

@@ -12,7 +12,7 @@ from benchmarks.basin.views import View
 from benchmarks.common.shares import exact_interval
 from benchmarks.integrity.beginnings import beginnings
 from benchmarks.integrity.report import AGREE, DISTINCT, FOCAL, OURS, WITHOUT, rows
-from benchmarks.integrity.run import Outcome, Registrar, again, read, turn
+from benchmarks.integrity.run import Outcome, Registrar, again, read, turn, unseen
 from localizer.errors import SequenceError
 from localizer.geometry.camera import Camera
 from localizer.geometry.pose import Pose
@@ -104,7 +104,7 @@ def test_of_older_outcomes_what_was_accepted_is_registered_again(older, monkeypa
 
     monkeypatch.setattr(Registrar, "repeated", repeat)
     for _ in range(2):  # the second time nothing is left
-        assert again("quito", [view], [view], path, (0.0, 0.0), lambda: True) == 0
+        assert again("quito", [view], [view], path, lambda: True) == 0
     assert repeated == ["near"] * 3
     found = read(path)
     assert len(found) == count
@@ -119,7 +119,21 @@ def test_outcomes_of_other_beginnings_are_named(older, monkeypatch):
     monkeypatch.setattr(Registrar, "repeated", lambda *given: given[-1])
     path.write_text(path.read_text().replace('"start_m": 200.0', '"start_m": 250.0'))
     with pytest.raises(SequenceError, match="begin anew"):
-        again("quito", [view], [view], path, (0.0, 0.0), lambda: True)
+        again("quito", [view], [view], path, lambda: True)
+
+
+def test_views_that_another_run_has_seen_are_left_out_and_photos_given_again_are_one(tmp_path):
+    camera = Camera.from_fov(32, 24, 60.0)
+    truth = Pose(np.diag([1.0, -1.0, -1.0]), np.array([0.0, 0.0, 100.0]))
+    photos = [
+        View(tmp_path, np.full((24, 32, 3), k, np.uint8), truth, camera, "day", 100.0)
+        for k in range(3)
+    ]
+    seen = tmp_path / "quito.jsonl"
+    assert unseen(photos * 2, None) == list(range(6))
+    assert unseen(photos * 2, seen) == [0, 1, 2]
+    seen.write_text(json.dumps(asdict(replace(RIGHT, view=4))) + "\n")
+    assert unseen(photos * 2, seen) == [0, 2]
 
 
 def test_a_line_that_was_cut_short_costs_its_view_alone(tmp_path):
