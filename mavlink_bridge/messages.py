@@ -376,3 +376,6 @@ class VehicleState:
     pressure_altitude_m: float | None = None
     """Of the barometer alone in the standard atmosphere: only its changes mean something."""
     pressure_time_ns: int = 0
+    rangefinder_m: float | None = None
+    """From the vehicle to what lies below it, along its own axis (DISTANCE_SENSOR)."""
+    rangefinder_time_ns: int = 0

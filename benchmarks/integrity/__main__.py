@@ -16,7 +16,7 @@ more than 10 m). The set "tuning" is for choosing thresholds and in no figure of
 map is shifted. --again brings outcomes of an older version up to date: what its tests accepted is
 registered once more, has to end where it did, and gets what is tested since; what they refused no
 further test lets in. --without: the views that another folder has outcomes of are left out, so that
-a limit that was chosen on those is held against others.
+a limit that was chosen on those is held against others. The set "unseen" is run where it is named.
 """
 
 from __future__ import annotations

@@ -1,9 +1,9 @@
 """The sets of the integrity benchmark: maps with query views, kept in a folder between runs.
 
-"tuning", "generated" and "unseen" are worlds of different seeds. The made maps are hard on purpose: forest
-(few photographs of crowns, turned and mirrored, over and over), water (nothing but waves, others
-in the query), roofs (one house on equal lots), "outdated" (portugal, of which three squares in ten
-show other ground, heights included), "shifted" (portugal's orthophoto 5 m off its heights).
+"tuning", "generated" and "unseen" are worlds of different seeds. The made maps are hard on purpose:
+forest (few photographs of crowns, turned and mirrored, over and over), water (nothing but waves,
+others in the query), roofs (one house on equal lots), "outdated" (portugal, of which three squares
+in ten show other ground, heights included), "shifted" (portugal's orthophoto 5 m off its heights).
 """
 
 from __future__ import annotations

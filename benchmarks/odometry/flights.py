@@ -27,8 +27,11 @@ from localizer.render.base import MapRenderer
 from localizer.synth.appearance.model import Appearance, apply_appearance, sample_appearance
 from localizer.types import FeaturePyramid, Image
 
+DEPTHS = ("map", "ground", "plane", "range")
 _BEGIN_M, _BEGIN_RAD = 0.1, float(np.radians(0.05))  # sigmas: the tracker's last good fix
 _STARTED_NS = 1_000_000_000
+_RANGE_SCALE, _RANGE_M, _RANGE_MISSED = 0.01, 0.1, 0.1  # a rangefinder's errors, readings lost
+_BEAM, _DOWN = Camera.from_fov(8, 8, 1.0), np.diag([1.0, -1.0, -1.0])
 _SURFACE = 4000  # points: anchors of a reference view, as configured for flight
 
 
@@ -88,11 +91,13 @@ class Flyer:
         rng = np.random.default_rng((stretch.seed, 2))
         begun, covariance = _beginning(stretch, rng)
         runs = [_Run(self._odometry(depth), depth, begun) for depth in depths]
+        ranges = self._ranges(stretch) if "range" in depths else {}
         for k, frame in enumerate(self._frames(stretch, rng)):
             for run in runs:
                 if k:
                     look = partial(self._surface, run.ahead) if run.depth == "map" else None
-                    run.step(frame, look, stretch, k)
+                    sounded = ranges.get(k) if run.depth == "range" else None
+                    run.step(frame, look, sounded, stretch, k)
                 else:
                     run.odometry.begin(
                         frame, begun, covariance, velocity=stretch.velocity,
@@ -107,6 +112,21 @@ class Flyer:
     def _odometry(self, depth: str) -> VisualOdometry:
         ground = self._scene.terrain if depth == "ground" else None
         return VisualOdometry(self._scene.camera, self._optimizer, self._config, ground)
+
+    def _ranges(self, stretch: Stretch) -> dict[int, float]:
+        """A rangefinder's readings by number of the frame: what lies below in the seen world, roofs
+        and crowns as well as ground.
+        """
+        rng = np.random.default_rng((stretch.seed, 3))
+        scale, found = 1.0 + _RANGE_SCALE * rng.normal(), {}
+        for k, pose in enumerate(stretch.poses):
+            down = Pose(_DOWN, pose.translation)
+            depth = self._scene.seen.render(down, _BEAM, wait=True).depth
+            if depth.any() and rng.random() >= _RANGE_MISSED:
+                # What reflects first, as laser altimeters report it.
+                reading = scale * float(depth[depth > 0].min()) + _RANGE_M * rng.normal()
+                found[k] = float(reading)
+        return found
 
     def _frames(self, stretch: Stretch, rng: np.random.Generator) -> Iterator[OdometryFrame]:
         look = sample_appearance(rng, stretch.condition)
@@ -144,10 +164,15 @@ class _Run:
         self.steps: list[Step] = []
         self._begun = self._last = begun
 
-    def step(self, frame: OdometryFrame, surface: Surface, stretch: Stretch, k: int) -> None:
+    def step(
+        self, frame: OdometryFrame, surface: Surface, clearance_m: float | None,
+        stretch: Stretch, k: int,
+    ) -> None:  # fmt: skip
         """Carry on by one frame, and measure it."""
         started = time.perf_counter()
-        estimate = self.odometry.step(frame, surface=surface, constraint=stretch.sensed[k])
+        estimate = self.odometry.step(
+            frame, surface=surface, constraint=stretch.sensed[k], clearance_m=clearance_m
+        )
         ms = (time.perf_counter() - started) * 1e3
         found = estimate.world_from_camera
         moved = found.translation - self._last.translation

@@ -6,12 +6,13 @@ MAP is a tile cache. Its overview is laid side by side until it covers each area
 is real and the places are not: nothing is found here, only timed. The query is coloured noise, as
 seen from 110 m above the ground: what is compared does not change the work. Processor seconds of a
 search on one thread, the map's transforms kept as far as the budget goes; beyond the largest area
-it is linear, since every block is compared with every trial.
+it is linear, since every block is compared with every trial: --on-paper draws that line.
 """
 
 from __future__ import annotations
 
 import json
+import resource
 import time
 from collections.abc import Iterator
 from dataclasses import asdict, dataclass, replace
@@ -41,7 +42,7 @@ _HEADING_RAD = np.radians(7.5)  # sigma: known to 15 degrees
 class Cost:
     """Of one search. overview_mib: on the disk and in memory, all scales; kept_mib: of the
     transforms that are kept if the budget allows; cpu_s: of the process, wall_s: beside whatever
-    else runs.
+    else runs; peak_mib: resident, of the process so far. Not measured: on paper.
     """
 
     area_km2: float
@@ -51,6 +52,8 @@ class Cost:
     blocks: int
     cpu_s: float
     wall_s: float
+    peak_mib: float
+    measured: bool = True
 
 
 def laid_out(level: OverviewLevel, area_km2: float) -> OverviewLevel:
@@ -87,7 +90,33 @@ def costs(
             blocks,
             cpu,
             wall,
+            resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024,
         )
+
+
+def on_paper(costs: list[Cost], area_km2: float) -> Cost:
+    """A larger area, by the straight line through the two largest of the measured ones."""
+    a, b = sorted(costs, key=lambda c: c.area_km2)[-2:]
+    share = (area_km2 - b.area_km2) / (b.area_km2 - a.area_km2)
+
+    def at(name: str) -> float:
+        low, high = float(getattr(a, name)), float(getattr(b, name))
+        return high + share * (high - low)
+
+    return Cost(
+        area_km2, b.heading_known, at("overview_mib"), at("kept_mib"), round(at("blocks")),
+        at("cpu_s"), at("wall_s"), at("peak_mib"), measured=False,
+    )  # fmt: skip
+
+
+def line(cost: Cost) -> str:
+    """For the reader."""
+    return (
+        f"{cost.area_km2:.2f} km2{'' if cost.measured else ' (on paper)'}: overview "
+        f"{cost.overview_mib:.0f} MiB, transforms {cost.kept_mib:.0f} MiB, process "
+        f"{cost.peak_mib:.0f} MiB, {cost.blocks} blocks, {cost.cpu_s:.2f} s of processor, "
+        f"{cost.wall_s:.2f} s"
+    )
 
 
 def main() -> None:
@@ -99,6 +128,7 @@ def main() -> None:
     p.add_argument(
         "--heading", choices=("known", "unknown"), default="known", help="to 15 degrees, or not"
     )
+    p.add_argument("--on-paper", type=number(0.01, 1e5), default=100.0, help="km2, extrapolated")
     p.add_argument("--spectra-mib", type=whole(0, 1 << 20), help="budget of kept transforms")
     p.add_argument("--out", type=output, help="JSON")
     args = p.parse_args()
@@ -121,12 +151,10 @@ def main() -> None:
         made = []
         for cost in costs(relocalizer, query, args.areas, config):
             made.append(cost)
-            print(
-                f"{cost.area_km2:.2f} km2: overview {cost.overview_mib:.0f} MiB, transforms "
-                f"{cost.kept_mib:.0f} MiB, {cost.blocks} blocks, {cost.cpu_s:.2f} s of processor, "
-                f"{cost.wall_s:.2f} s",
-                flush=True,
-            )
+            print(line(cost), flush=True)
+        if len(made) > 1 and args.on_paper > max(c.area_km2 for c in made):
+            made.append(on_paper(made, args.on_paper))
+            print(line(made[-1]))
         if args.out:
             args.out.write_text(json.dumps([asdict(c) for c in made], indent=1))
 

@@ -32,6 +32,8 @@ _DRIFT_SPEED_M_S = 0.15
 _DRIFT_ACCELERATION_M_S2 = 0.05
 _LARGEST_SIGMA_M = 5000.0
 _AHEAD_S = 0.3  # by which a velocity carries a position on
+_RANGE_AGE_S = 0.5  # a rangefinder's reading on the way: 5 m at 10 m/s
+_LEAST_UPRIGHT = math.cos(math.radians(25.0))  # else a beam meets the ground far to one side
 _UNTOLD_SIGMA_M = 25.0  # of a position of which nobody says where it comes from
 
 
@@ -147,7 +149,9 @@ class AutopilotPose:
     @property
     def sensors(self) -> OtherSensors:
         """These accounts, as the localizer asks for them."""
-        return OtherSensors(self.rotation, self.displacement, lambda _time_ns: self.height_m)
+        return OtherSensors(
+            self.rotation, self.displacement, lambda _time_ns: self.height_m, self.clearance_m
+        )
 
     @property
     def height_m(self) -> float | None:
@@ -160,6 +164,17 @@ class AutopilotPose:
             return None
         origin_m = self._installation.frame.origin.height_m
         return altitude_m + self._installation.geoid_separation_m - origin_m
+
+    def clearance_m(self, time_ns: int) -> float | None:
+        """The vehicle's height above what lies below it, by its rangefinder; None without a reading
+        of about that CLOCK_MONOTONIC time, or where the vehicle leans too much for it to look down.
+        """
+        state, attitude = self._autopilot.state(), self._autopilot.attitude_at(time_ns)
+        away_s = abs(time_ns - state.rangefinder_time_ns) * 1e-9
+        if state.rangefinder_m is None or attitude is None or away_s > _RANGE_AGE_S:
+            return None
+        upright = math.cos(attitude.roll_rad) * math.cos(attitude.pitch_rad)
+        return state.rangefinder_m * upright if upright >= _LEAST_UPRIGHT else None
 
     @property
     def velocity(self) -> Array | None:

@@ -304,6 +304,7 @@ def _localizer(making: Making) -> Localizer:
         lambda time_ns: autopilot().rotation(time_ns),
         lambda begin_ns, end_ns: autopilot().displacement(begin_ns, end_ns),
         lambda _time_ns: autopilot().height_m,
+        lambda time_ns: autopilot().clearance_m(time_ns),
     )
     return build_localizer(making[MapStack], camera, config.localizer, sensors)
 

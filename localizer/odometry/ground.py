@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import deque
 from dataclasses import dataclass
 from typing import Protocol
 
@@ -14,6 +15,8 @@ from localizer.geometry.pose import Array, Pose
 _STEPS = 8  # of the fixed-point iteration; terrain flatter than the rays are steep converges
 _LEAST_DOWN = 0.05  # sine of the angle below the horizon of the flattest ray that is used
 _LOW_SHARE = 0.3  # of the points, what counts as ground: below roofs and crowns
+_SOUNDED_NS = 5_000_000_000  # of a rangefinder's readings: longer than a house lasts at 5 m/s
+_LEAST_READINGS = 5
 
 
 class Ground(Protocol):
@@ -39,6 +42,30 @@ class FlatGround:
         """See `Ground.height`."""
         del north
         return np.full(np.shape(east), self.height_m)
+
+
+class SoundedGround:
+    """The ground as a rangefinder met it on the way: a plane at the height of what lay lowest.
+
+    One beam meets roofs and crowns, too, and a picture's depth from a roof would be short by it; so
+    of the last readings those count that are as low as what counts as ground elsewhere.
+    """
+
+    def __init__(self) -> None:
+        self._met: deque[tuple[int, float]] = deque()
+
+    def add(self, time_ns: int, height_m: float) -> None:
+        """World z of what lay below at a time."""
+        self._met.append((time_ns, height_m))
+        while self._met[0][0] < time_ns - _SOUNDED_NS:
+            self._met.popleft()
+
+    def at(self, time_ns: int) -> FlatGround | None:
+        """The plane by the readings up to a time; None where they are few."""
+        heights = [height for t, height in self._met if 0 <= time_ns - t <= _SOUNDED_NS]
+        if len(heights) < _LEAST_READINGS:
+            return None
+        return FlatGround(float(np.quantile(heights, _LOW_SHARE)))
 
 
 def ground_points(

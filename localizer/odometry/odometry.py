@@ -12,7 +12,7 @@ from localizer.geometry.camera import Camera
 from localizer.geometry.pose import Array, Pose, so3_log
 from localizer.odometry.config import OdometryConfig
 from localizer.odometry.estimate import OdometryEstimate, OdometryFrame, OdometryStatus
-from localizer.odometry.ground import FlatGround, Ground
+from localizer.odometry.ground import FlatGround, Ground, SoundedGround
 from localizer.odometry.growth import carried, scaled
 from localizer.odometry.keyframe import DepthSource, Keyframe, keyframe_anchors
 from localizer.odometry.parallax import View, align
@@ -43,8 +43,8 @@ class VisualOdometry:
     thread); nothing is rendered here, and no thread is started.
 
     camera: the working pinhole of the features. optimizer: see `odometry_optimizer`. ground: a
-    terrain model for where the map has no geometry; None: a plane at the height of the ground where
-    the map was last seen.
+    terrain model for where the map has no geometry; None: a plane at the height that a rangefinder
+    meets on the way, else at that of the ground where the map was last seen.
 
     Above 200 lines: one frame's way, from keyframe to estimate, over one state.
     """
@@ -62,6 +62,7 @@ class VisualOdometry:
         self.config = config or OdometryConfig()
         self._ground = ground
         self._plane: Ground | None = None
+        self._sounded = SoundedGround()
         self._seed = seed
         self._beginning: Beginning | None = None
         self._keyframe: Keyframe | None = None
@@ -112,6 +113,7 @@ class VisualOdometry:
         *,
         surface: Array | Callable[[], Array | None] | None = None,
         constraint: PoseConstraint | None = None,
+        clearance_m: float | None = None,
     ) -> OdometryEstimate:
         """The pose of the next frame.
 
@@ -121,7 +123,8 @@ class VisualOdometry:
         that was rendered for this frame, or None where the map has no geometry; or what gives
         them, asked where a keyframe begins. constraint: what the autopilot knows at the frame's
         time (`registration.priors`): height by the barometer, roll and pitch, heading with the
-        compass's real error; `combine` them.
+        compass's real error; `combine` them. clearance_m: the height above what lies below, by a
+        rangefinder.
 
         A status that is not OK means: do not use the pose; once it is LOST, only `begin` helps.
         """
@@ -150,6 +153,8 @@ class VisualOdometry:
             return self._failed(OdometryStatus.NOT_REGISTERED, reason, frame, prior, keyframe)
         sensed = (constraint, beginning.corrected(constraint))
         after = followed(self.config, track, keyframe, result, frame.time_ns, sensed)
+        if clearance_m is not None:
+            self._sounded.add(frame.time_ns, float(after.pose.translation[2]) - clearance_m)
         spent = self._is_spent(keyframe, result, after)
         if spent:
             after = self._aligned(keyframe, frame, after)
@@ -180,7 +185,8 @@ class VisualOdometry:
         surface: Array | None, constraint: PoseConstraint | None,
     ) -> Keyframe | None:  # fmt: skip
         anchors, source = keyframe_anchors(
-            frame.features, self._camera, pose, surface, self._ground or self._plane,
+            frame.features, self._camera, pose, surface,
+            self._ground or self._sounded.at(frame.time_ns) or self._plane,
             self.config.anchors, self._seed, frame.sweep,
         )  # fmt: skip
         if len(anchors.points_world) < 2 * self._optimizer.config.min_anchors:

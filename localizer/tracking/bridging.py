@@ -108,7 +108,13 @@ class Bridging:
         surface = anchors.points_world if anchors is not None else None
         constraint = self._constraint(frame.exposure_time_ns)
         try:
-            estimate = self._odometry.step(seen, prediction, surface=surface, constraint=constraint)
+            estimate = self._odometry.step(
+                seen,
+                prediction,
+                surface=surface,
+                constraint=constraint,
+                clearance_m=self._sensors.clearance_at(frame.exposure_time_ns),
+            )
         except OdometryError as error:  # no depth for a first keyframe: there will be none later
             self._odometry.forget()
             return Carried(Carry.BROKEN, reason=str(error))

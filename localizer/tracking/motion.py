@@ -185,12 +185,14 @@ class OtherSensors:
 
     rotation_at: (3, 3) world_from_camera at a time in ns. displacement_between: the way (3,)
     between two times in world axes (m) with its sigma (m). height_at: the camera's world z (m),
-    which may have a constant error.
+    which may have a constant error. clearance_at: the height above what lies below (m), by a
+    rangefinder.
     """
 
     rotation_at: RotationAt = lambda _time_ns: None
     displacement_between: DisplacementBetween = lambda _begin_ns, _end_ns: None
     height_at: Callable[[int], float | None] = lambda _time_ns: None
+    clearance_at: Callable[[int], float | None] = lambda _time_ns: None
 
 
 class MeasuredMotion:

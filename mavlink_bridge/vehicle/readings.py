@@ -36,6 +36,7 @@ _FIX_3D = 3  # GPS_FIX_TYPE
 _DISARMED_NS = 3_000_000_000  # two heartbeats of an armed vehicle may be lost in it
 _HEIGHTS_MM = (-1_000_000, 50_000_000)  # AMSL: the Dead Sea's shore, and above any aircraft
 _ACCURACY_MM = 100_000_000  # beyond it, as of UINT32_MAX, a receiver says that it does not know
+_INVALID_SIGNAL = 1  # signal_quality of DISTANCE_SENSOR; 0: not said
 _SATURATED = 32_767  # of an int16: what the sensor could not say
 
 
@@ -268,6 +269,19 @@ class VehicleReadings:
         altitude = 44_330.77 * (1.0 - (m.press_abs / _SEA_LEVEL_HPA) ** 0.190263)
         self.state = replace(self.state, pressure_altitude_m=altitude, pressure_time_ns=time_ns)
 
+    def _distance(self, m: Any, time_ns: int) -> None:
+        """Of a sensor that looks down. What is out of its range, as it says itself, or marked as
+        invalid is no reading: the one before grows old.
+        """
+        in_range = max(m.min_distance, 1) <= m.current_distance < m.max_distance
+        invalid = getattr(m, "signal_quality", 0) == _INVALID_SIGNAL
+        if m.orientation == mavlink.MAV_SENSOR_ROTATION_PITCH_270 and in_range and not invalid:
+            self.state = replace(
+                self.state,
+                rangefinder_m=m.current_distance * 1e-2,
+                rangefinder_time_ns=time_ns,
+            )
+
     def _text(self, m: Any, _: int) -> None:
         self.state = replace(self.state, last_text=str(m.text))
 
@@ -324,5 +338,6 @@ _HANDLERS = {
     "RAW_IMU": VehicleReadings._raw_imu,
     "HIGHRES_IMU": VehicleReadings._highres_imu,
     "SCALED_PRESSURE": VehicleReadings._pressure,
+    "DISTANCE_SENSOR": VehicleReadings._distance,
 }
 MESSAGES_IN: tuple[str, ...] = tuple(_HANDLERS)

@@ -44,6 +44,7 @@ def wanted_streams(config: BridgeConfig, autopilot: str) -> tuple[Stream, ...]:
         # Evidence of its own for whoever watches the fixes: what no estimator has touched.
         Stream("HIGHRES_IMU" if autopilot == "px4" else "RAW_IMU", 50.0, optional=True),
         Stream("SCALED_PRESSURE", 5.0, optional=True),
+        Stream("DISTANCE_SENSOR", 5.0, optional=True),
     ]
     if config.camera.mount == "gimbal":
         device = "GIMBAL_DEVICE_ATTITUDE_STATUS"

@@ -48,6 +48,12 @@ _HONEST: dict[str, dict[str, Any]] = {
     "GPS_RAW_INT": {"fix_type": 3, "lat": 473977420, "lon": 85455940, "alt": 988_000},
     "HEARTBEAT": {"type": 2, "autopilot": 3, "base_mode": 209, "mavlink_version": 3},
     "SCALED_PRESSURE": {"press_abs": 900.0},
+    "DISTANCE_SENSOR": {
+        "min_distance": 20,
+        "max_distance": 9000,
+        "current_distance": 5000,
+        "orientation": 25,
+    },
 }
 # Of what the vehicle may say of itself: where no aircraft of ours is.
 _RANGES = {
@@ -61,6 +67,7 @@ _RANGES = {
     "gps_height_m": 50e3,
     "gps_h_accuracy_m": 100e3,
     "pressure_altitude_m": 50e3,
+    "rangefinder_m": 656.0,
 }
 Values = dict[str, Any]
 

@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 
+import numpy as np
 import pytest
 
 from companion.config import PriorConfig
-from companion.flight.priors import PositionBelief, drift_sigma_m
-from mavlink_bridge.messages import VehicleState
+from companion.conversions import Installation
+from companion.flight.priors import AutopilotPose, PositionBelief, drift_sigma_m
+from localizer.geometry.geo import Geodetic, LocalFrame
+from mavlink_bridge.messages import Attitude, VehicleState
 
 SECOND = 10**9
 FLYING = VehicleState(connected=True, ekf_flags=8 | 16)
@@ -65,6 +69,38 @@ def test_a_glitching_gnss_is_not_healthy() -> None:
     beliefs = PositionBelief(PriorConfig())
     state = replace(with_gnss(10), ekf_flags=8 | 16 | 32768)
     assert not beliefs.at(state, 10 * SECOND).independent
+
+
+class Ranging:
+    """An autopilot with a rangefinder, leaning by so much."""
+
+    def __init__(self, lean_deg: float) -> None:
+        self._lean = math.radians(lean_deg)
+
+    def state(self) -> VehicleState:
+        return replace(FLYING, rangefinder_m=50.0, rangefinder_time_ns=SECOND)
+
+    def attitude_at(self, time_ns: int) -> Attitude:
+        return Attitude(time_ns, self._lean, 0.0, 0.0, (1.0, 0.0, 0.0, 0.0))
+
+    def gimbal_at(self, time_ns: int) -> None:
+        return None
+
+    def local_at(self, time_ns: int) -> None:
+        return None
+
+
+def clearance(lean_deg: float, at_s: float) -> float | None:
+    installation = Installation(LocalFrame(Geodetic(47.0, 8.0, 500.0)), 48.0, np.zeros(3))
+    pose = AutopilotPose(Ranging(lean_deg), installation, PriorConfig())
+    return pose.sensors.clearance_at(round(at_s * SECOND))
+
+
+def test_a_rangefinder_tells_the_height_above_what_lies_below() -> None:
+    assert clearance(0.0, 1.1) == pytest.approx(50.0)
+    assert clearance(20.0, 1.1) == pytest.approx(50.0 * math.cos(math.radians(20.0)))
+    assert clearance(40.0, 1.1) is None  # its beam meets the ground far to one side
+    assert clearance(0.0, 2.0) is None  # of another place
 
 
 def test_the_drift_covers_what_was_measured() -> None:

@@ -1,5 +1,6 @@
 """Carrying a pose on: how far off it is, what it says of itself, and when it stops."""
 
+from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
@@ -17,6 +18,7 @@ from localizer.odometry import (
     VisualOdometry,
     odometry_optimizer,
 )
+from localizer.odometry.ground import SoundedGround
 from localizer.registration import JNGO, attitude_constraint, combine, height_constraint
 from tests.localizer.odometry.conftest import BEGUN, CAMERA, STEP_NS, VELOCITY, Flight
 from tests.localizer.registration.conftest import SyntheticPlace
@@ -79,6 +81,53 @@ def test_at_the_maps_edge_the_ground_goes_on_at_the_last_height(plain):
     assert sources[0] is DepthSource.MAP
     assert sources[-1] is DepthSource.GROUND
     assert horizontal(estimate.world_from_camera, plain.pose(20)) < 0.02 * 80
+
+
+def slope() -> Flight:
+    """Ground that rises by 15 m within 125 m of the way."""
+    place = SyntheticPlace.from_seed(7, relief_m=0.6)
+    rise = np.array([[15.0, 0.0, 2 * np.pi / 500, 0.0]])
+    return Flight(replace(place, hills=np.vstack([place.hills, rise])))
+
+
+def carried_over(flight: Flight, above: Callable[[int], float | None]) -> float:
+    """Horizontal error after 100 m of which the map knows the first."""
+    vo = begun(flight, odometry(max_sigma_m=10.0), mapped=True)
+    for k in range(1, 26):
+        estimate = vo.step(flight.frame(k), clearance_m=above(k))
+        assert estimate.usable, estimate.reason
+    return horizontal(estimate.world_from_camera, flight.pose(25))
+
+
+def test_a_rangefinder_tells_of_ground_that_rises():
+    flight = slope()
+
+    def above(k: int) -> float:
+        east, north, up = flight.pose(k).translation
+        return float(up - flight.place.height(np.array(east), np.array(north)))
+
+    assert carried_over(flight, lambda k: None) > 2.0
+    assert carried_over(flight, above) < 0.8
+
+
+def test_a_rangefinder_that_meets_roofs_half_of_the_time_does_no_harm(plain):
+    def over_a_town(k: int) -> float:
+        return float(plain.pose(k).translation[2]) - (8.0 if k % 4 < 2 else 0.0)
+
+    alone = carried_over(plain, lambda k: None)
+    assert carried_over(plain, over_a_town) < alone + 0.3
+
+
+def test_few_readings_are_no_ground():
+    sounded = SoundedGround()
+    for k in range(4):
+        sounded.add(k * STEP_NS, 5.0)
+    assert sounded.at(4 * STEP_NS) is None
+    sounded.add(4 * STEP_NS, 13.0)
+    found = sounded.at(4 * STEP_NS)
+    assert found is not None
+    assert found.height_m == 5.0
+    assert sounded.at(40 * STEP_NS) is None  # of long ago
 
 
 def test_without_any_depth_there_is_nothing_to_carry_on_with(hills):

@@ -322,6 +322,41 @@ def test_what_a_hard_flight_measures_is_taken() -> None:
     assert len(it.inertial_since(0)) == 1
 
 
+def distance(ms: int, cm: int, *, orientation: int = 25, quality: int = 0) -> Any:
+    return mavlink.MAVLink_distance_sensor_message(
+        ms, 20, 9000, cm, 0, 0, orientation, 255, signal_quality=quality
+    )
+
+
+def test_a_rangefinder_that_looks_down_is_taken() -> None:
+    it = tracker()
+    it.handle(sent(distance(20, 4512)), 10 * SECOND)
+    state = it.snapshot(10 * SECOND)
+    assert state.rangefinder_m == pytest.approx(45.12)
+    assert state.rangefinder_time_ns > 0
+
+
+@pytest.mark.parametrize(
+    "odd",
+    [
+        distance(40, 300, orientation=0),  # what lies ahead
+        distance(40, 9000),  # as far as it reaches: nothing came back
+        distance(40, 0),
+        distance(40, 19),
+        distance(40, 65535),
+        distance(40, 300, quality=1),  # invalid, as it says itself
+    ],
+)
+def test_what_is_no_reading_of_the_ground_is_left_out(odd: Any) -> None:
+    it = tracker()
+    it.handle(sent(distance(20, 4512)), 10 * SECOND)
+    before = it.snapshot(10 * SECOND).rangefinder_time_ns
+    it.handle(sent(odd), 10 * SECOND + 20 * MS)
+    state = it.snapshot(10 * SECOND + 20 * MS)
+    assert state.rangefinder_m == pytest.approx(45.12)
+    assert state.rangefinder_time_ns == before
+
+
 # --- origin -----------------------------------------------------------------------------------
 
 
