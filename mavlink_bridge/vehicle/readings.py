@@ -86,6 +86,8 @@ class VehicleReadings:
 
     globals: the EKF's latitude, longitude, altitude AMSL. locals: its NED from the origin. gimbal:
     component and device whose angles count, 0 for any.
+
+    Above 200 lines: one short method for each of its messages.
     """
 
     def __init__(self, gimbal: tuple[int, int] = (0, 0)) -> None:
