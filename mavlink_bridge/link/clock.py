@@ -100,6 +100,7 @@ class BootClock:
         self.rate = 1.0
         self.source = "none"
         self.round_trip_ns: int | None = None
+        self.answered_ns: int | None = None  # when the last TIMESYNC answer that counts came
         self._lag: deque[tuple[int, int]] = deque(maxlen=_MAX_SAMPLES)
         self._sync: deque[_Sync] = deque(maxlen=_MAX_SAMPLES)
         self._doubted: _Sync | None = None
@@ -138,6 +139,7 @@ class BootClock:
         round_trip = received_ns - sent_ns
         if not 0 <= round_trip <= _MAX_ROUND_TRIP_NS:
             return False
+        self.answered_ns = received_ns
         sample = _Sync((sent_ns + received_ns) // 2, boot_ns, round_trip)
         rebooted = False
         if self._sync and not self._sync[-1].explains(sample, self.rate):
@@ -232,7 +234,7 @@ class BootClock:
         self._doubted = None
         self._behind.clear()
         self._ahead.clear()
-        self._anchor = None
+        self._anchor = self.answered_ns = None
         self.rate = 1.0
         self._newest_boot_ns = self._newest_at_ns = 0
         self.source = "none"

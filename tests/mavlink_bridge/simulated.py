@@ -116,6 +116,7 @@ class Flight:
         self.armed = False
         self.reset_next = False
         self.latency_ms = 50
+        self.answers_timesync = True
         self.sees = True
         self.yaw_is_seen = True
         self.yaw_error_rad = 0.0
@@ -211,7 +212,7 @@ class Flight:
 
     def _answer(self, m: Any) -> None:
         kind = m.get_type()
-        if kind == "TIMESYNC" and m.tc1 == 0:
+        if kind == "TIMESYNC" and m.tc1 == 0 and self.answers_timesync:
             self.say(mavlink.MAVLink_timesync_message(self.boot_ns(m.ts1 + 4 * MS), m.ts1))
         elif kind == "SET_GPS_GLOBAL_ORIGIN" and self.origin is None:
             self.origin = (m.latitude * 1e-7, m.longitude * 1e-7, m.altitude * 1e-3)

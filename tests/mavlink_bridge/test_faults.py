@@ -111,6 +111,32 @@ def test_only_a_gap_of_a_second_is_told(flight: Flight) -> None:
     assert blind(3.0) == ["PiLoT: not sent: no fresh fix", "PiLoT: injecting"]
 
 
+def test_a_clock_that_is_not_compared_any_more_is_told(flight: Flight) -> None:
+    """Two crystals part by up to 0.2 ms a second: after ten minutes a fix is 1 m late."""
+    flight.run(20.0)
+    flight.answers_timesync = False
+    flight.run(14.0)
+    assert not [t for t in flight.texts if "TIMESYNC" in t]
+    flight.run(20.0)
+    assert [t for t in flight.texts if "TIMESYNC" in t] == [
+        "PiLoT: TIMESYNC unanswered: stamps may drift"
+    ]
+    flight.answers_timesync = True
+    flight.run(3.0)
+    assert flight.texts[-1] == "PiLoT: TIMESYNC is answered again"
+
+
+def test_a_link_that_was_gone_owes_no_answers(flight: Flight) -> None:
+    flight.run(20.0)
+    flight.link.open = False
+    flight.run(40.0)
+    flight.link.open = True
+    flight.run(10.0)
+    flight.reboot()
+    flight.run(10.0)
+    assert not [t for t in flight.texts if "TIMESYNC" in t]
+
+
 @pytest.mark.parametrize("step_s", [-0.4, 0.4, 7.0, -40.0])
 def test_step_of_the_vehicles_clock(flight: Flight, step_s: float) -> None:
     """Up to 1 s back is a step, more is what a reboot looks like; both are followed."""
