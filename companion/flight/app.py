@@ -88,7 +88,8 @@ class Companion:
             if self._pulse is not None:
                 pulse = Pulse(self._turns, self._pulse)
                 pulse.start()
-                up.callback(pulse.stop)  # first of all: what comes down takes no turns
+                # First of all: what comes down takes no turns.
+                up.push(lambda error, *_: pulse.stop(in_order=self._is_in_order(error)))
             self._tell_what_runs()
             feed = self._parts[Feed]
             # In slices: signals are handled between them.
@@ -113,6 +114,10 @@ class Companion:
         """Remove the record of a start that comes to nothing. It may be at any of its steps."""
         for undo in self._parts.abandonments:
             undo()
+
+    def _is_in_order(self, error: type[BaseException] | None) -> bool:
+        """Whether `run` comes to an end as it should. error: what ends it, or None."""
+        return error is None and self._parts[Feed].error is None
 
     def _turns(self) -> dict[str, int]:
         """When each thread without which no position comes began its newest turn, ns, by name."""

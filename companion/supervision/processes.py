@@ -11,6 +11,7 @@ from dataclasses import dataclass
 _DISMISS_S = 5.0
 _KILL_S = 10.0  # its ports are free once it is gone, and not before
 _READ = 4096
+ENDING = "ending"  # the last word of a process whose end is in order
 
 
 @dataclass(frozen=True)

@@ -10,6 +10,7 @@ import os
 import threading
 from collections.abc import Callable, Mapping
 
+from companion.supervision.processes import ENDING
 from mavlink_bridge.link.clock import monotonic_ns
 
 _PERIOD_S = 0.25
@@ -36,11 +37,13 @@ class Pulse:
         self._begun_ns = monotonic_ns()
         self._thread.start()
 
-    def stop(self) -> None:
-        """Say that the end begins, which may take its time, and end."""
+    def stop(self, *, in_order: bool) -> None:
+        """Say that the end begins, and end. One in order (stopped, the feed is over) is given the
+        time that a recording takes; after an error another process should fly soon.
+        """
         self._stop.set()
         self._thread.join()
-        self._say(b"ending 0\n")
+        self._say(f"{ENDING if in_order else 'failing'} 0\n".encode())
         os.close(self._descriptor)
 
     def _run(self) -> None:

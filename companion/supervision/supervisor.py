@@ -19,7 +19,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Protocol
 
-from companion.supervision.processes import Beat
+from companion.supervision.processes import ENDING, Beat
 
 _log = logging.getLogger(__name__)
 _WATCH_S = 0.25  # between looks at what else is due; a death wakes at once
@@ -67,7 +67,8 @@ class RestartPolicy:
 
     A part without a turn for `part_s` hangs, and a process without a sign of life for `silent_s`:
     beyond what an overloaded computer does, and below the autopilot's patience. Before its first
-    sign a standby that was released has `released_s`, another `cold_s`: it may compile.
+    sign a standby that was released has `released_s`, another `cold_s`: it may compile. One that
+    ends in order by itself has `ending_s` to put its recording away.
     """
 
     deaths: int = 5
@@ -78,6 +79,7 @@ class RestartPolicy:
     silent_s: float = 3.0
     released_s: float = 30.0
     cold_s: float = 300.0
+    ending_s: float = 60.0
 
 
 class Manager(Protocol):
@@ -181,8 +183,10 @@ class Supervisor:
         self._looked_s = now_s
         hangs = ""
         if beats:
-            self._heard_s, self._patience_s = now_s, self._policy.silent_s
             last = beats[-1]
+            is_ending = last.part == ENDING
+            self._heard_s = now_s
+            self._patience_s = self._policy.ending_s if is_ending else self._policy.silent_s
             hangs = last.part[:_PART] if last.age_s > self._policy.part_s else ""
             self._tell_ready(now_s, last)
         elif looked_away:

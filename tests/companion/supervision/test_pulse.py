@@ -7,8 +7,10 @@ import sys
 import threading
 import time
 
+import pytest
+
 from companion.flight.feed import Feed
-from companion.supervision.processes import Beat, FlightProcess
+from companion.supervision.processes import ENDING, Beat, FlightProcess
 from companion.supervision.pulse import Pulse, line
 
 
@@ -36,8 +38,19 @@ def test_a_pulse_is_read_and_a_supervisor_that_does_not_read_is_not_waited_for()
     pulse = Pulse(turns, writing)
     pulse.start()
     assert beating.wait(20.0)
-    pulse.stop()
+    pulse.stop(in_order=True)
     os.close(reading)
+
+
+@pytest.mark.parametrize("in_order", [True, False])
+def test_the_last_word_says_whether_the_end_is_in_order(in_order: bool) -> None:
+    reading, writing = os.pipe()
+    pulse = Pulse(lambda: {}, writing)
+    pulse.start()
+    pulse.stop(in_order=in_order)
+    last = os.read(reading, 4096).splitlines()[-1]
+    os.close(reading)
+    assert last == (f"{ENDING} 0" if in_order else "failing 0").encode()
 
 
 def test_a_frame_that_a_part_keeps_is_seen() -> None:
@@ -86,7 +99,7 @@ def test_a_part_that_was_made_long_before_the_start_is_no_hang() -> None:
     pulse = Pulse(lambda: {"health": made_ns, "feed": time.monotonic_ns()}, writing)
     pulse.start()
     first = os.read(reading, 100).split(b"\n")[0]
-    pulse.stop()
+    pulse.stop(in_order=True)
     os.close(reading)
     name, age_ms = first.split()
     assert name == b"health"

@@ -15,7 +15,7 @@ from pathlib import Path
 
 import pytest
 
-from companion.supervision.processes import Beat, FlightProcess
+from companion.supervision.processes import ENDING, Beat, FlightProcess
 from companion.supervision.service_manager import ServiceManager
 from companion.supervision.supervisor import RestartPolicy, Supervisor, described, mark_dead
 
@@ -279,6 +279,29 @@ def test_a_process_that_never_shows_life_is_ended_after_its_patience() -> None:
     assert stage.told == []
     stage = Stage([Scripted(1000, 0, says=mute), Scripted(9, 0)], cold_s=120.0)
     assert stage.supervisor.run() == 0
+    assert stage.told == [(2, "PiLoT: companion hangs (process), restarting")]
+
+
+def ends(word: str) -> Callable[[int], Beat | None]:
+    """Says that word once, 20 looks before its end, and nothing more."""
+    return lambda looks: Beat("all", 0.1) if looks > 20 else Beat(word, 0.0) if looks == 20 else None
+
+
+def test_an_end_in_order_takes_its_time() -> None:
+    """A recording is closed: a kill would leave it in pieces, and fly again what was over."""
+    stage = Stage([Scripted(40, 0, says=ends(ENDING))], standby_after_s=60.0)
+    assert stage.supervisor.run() == 0
+    assert stage.told == []
+    assert not stage.spawned[0].killed
+
+
+@pytest.mark.parametrize(("word", "policy"), [("failing", {}), (ENDING, {"ending_s": 4.0})])
+def test_an_end_that_is_none_or_comes_to_none_is_not_waited_for(
+    word: str, policy: dict[str, float]
+) -> None:
+    stage = Stage([Scripted(40, 0, says=ends(word)), Scripted(3, 0)], standby_after_s=60, **policy)
+    assert stage.supervisor.run() == 0
+    assert stage.spawned[0].killed
     assert stage.told == [(2, "PiLoT: companion hangs (process), restarting")]
 
 
