@@ -253,7 +253,7 @@ def _target_counts(making: Making) -> Callable[[], dict[str, int]]:
             "doubted": reporter.doubted,
             "refused": reporter.refused,
             "failed": reporter.failed + (0 if detector is None else detector().failed),
-            "unmatched": 0 if times is None else times.unmatched,
+            "unmatched": reporter.unmatched + (0 if times is None else times.unmatched),
         }
 
     return counts

@@ -343,7 +343,7 @@ def _untold_targets(counts: Any) -> list[Verdict]:
         Verdict(
             "clicks and detections not told", text, "none", False,
             "missed: no map under the pixel; doubted: its place may not be told; refused: more "
-            "than 32 at a time; unmatched: names a frame that never came; failed: an error",
+            "than 32 at a time; unmatched: of a frame without a position; failed: an error",
             "events at that time; what the detector sends (docs/reference/formats.md)",
         )
     ]  # fmt: skip

@@ -57,9 +57,14 @@ class FrameTimes:
         self._release()
 
     def begin(self, stream: av.VideoStream) -> None:
-        """A new connection counts its presentation times anew."""
+        """A new connection counts its presentation times anew: what waits for one of the old's would
+        be given another picture's exposure.
+        """
         with self._lock:
             self._by_pts.clear()
+            kept = deque((d, n) for d, n in self._waiting if n.pts_s is None)
+            self.unmatched += len(self._waiting) - len(kept)
+            self._waiting = kept
 
     def packet(self, packet: av.Packet) -> None:
         """Packets say nothing here."""

@@ -44,10 +44,11 @@ class PoseHistory:
         with self._lock:
             kept = list(self._estimates)
         times = [e.exposure_time_ns for e in kept]
-        for estimate in kept[max(0, bisect(times, time_ns) - 1) : bisect(times, time_ns) + 1]:
-            if abs(estimate.exposure_time_ns - time_ns) <= _NEAR_NS:
-                return estimate
         k = bisect(times, time_ns)
+        beside = kept[max(0, k - 1) : k + 1]
+        near = min(beside, key=lambda e: abs(e.exposure_time_ns - time_ns), default=None)
+        if near is not None and abs(near.exposure_time_ns - time_ns) <= _NEAR_NS:
+            return near
         if k in (0, len(kept)) or times[k] - times[k - 1] > _GAP_NS:
             return None
         return _between(kept[k - 1], kept[k], time_ns)

@@ -18,7 +18,8 @@ from localizer.targets.locate import RayCaster
 from localizer.types import Frame, PoseEstimate
 
 _log = logging.getLogger(__name__)
-_KEPT = 64
+_KEPT = 64  # detections that wait
+_ESTIMATES = 256  # as many as `FrameTimes` knows frames: a slow detector is seconds behind
 _PICTURES = 16
 _MATCH_NS = 5_000_000  # detection and estimate must be of the same frame
 
@@ -32,7 +33,7 @@ class TargetReporter:
 
     on_gone: called on the targets' thread with each name that ended, after the last on_target of
     that name. say: tells the operator (MAV_SEVERITY, text). failed counts what raised an error, of
-    which the first is logged.
+    which the first is logged; unmatched detections whose frame has no accepted estimate.
     """
 
     def __init__(
@@ -46,13 +47,13 @@ class TargetReporter:
         self._population = Population(config, cast, on_target, on_gone, say)
         self._forgotten: tuple[str, ...] = ()
         self._clicks: list[Click] = []
-        self._estimates: deque[PoseEstimate] = deque(maxlen=_KEPT)
+        self._estimates: deque[PoseEstimate] = deque(maxlen=_ESTIMATES)
         self._detections: deque[Detection] = deque(maxlen=_KEPT)
         self._held: PoseEstimate | None = None
         self._pictures = RecentPictures[Frame](_PICTURES, lambda frame: frame.image.nbytes)
         self._condition = threading.Condition()
         self._stopping = False
-        self.failed = 0
+        self.failed = self.unmatched = 0
         self._thread = threading.Thread(target=self._run, name="targets")
 
     @property
@@ -91,6 +92,7 @@ class TargetReporter:
     def add_detection(self, detection: Detection) -> None:
         """Offer a detection; it waits for its frame's estimate. Never blocks."""
         with self._condition:
+            self.unmatched += len(self._detections) == _KEPT  # the oldest makes room
             self._detections.append(detection)
             self._condition.notify()
 
@@ -162,6 +164,8 @@ class TargetReporter:
                 pairs.append((detection, estimate))
             elif detection.time_ns > newest - _MATCH_NS:
                 waiting.append(detection)
+            else:
+                self.unmatched += 1
         self._detections = deque(waiting, maxlen=_KEPT)
         return pairs
 
@@ -179,6 +183,8 @@ class TargetReporter:
         for estimate in reversed(self._estimates):
             if abs(estimate.exposure_time_ns - detection.time_ns) <= _MATCH_NS:
                 return estimate
+            if estimate.exposure_time_ns < detection.time_ns:
+                return None  # older ones are farther from it
         return None
 
 

@@ -55,6 +55,20 @@ def test_after_a_reconnection_old_presentation_times_mean_nothing():
     assert [d.time_ns for d in told] == [99]
 
 
+def test_what_waits_for_a_picture_of_the_old_connection_gets_none_of_the_new():
+    """The camera was switched off and on: its presentation times begin anew."""
+    told: list[Detection] = []
+    times = FrameTimes(told.append)
+    times.add_detection(Detection("car", 0, 1.0, 2.0), FrameName(pts_s=5.0))
+    times.add_detection(Detection("van", 0, 1.0, 2.0), FrameName(sequence=3))
+    times.begin(None)
+    times.picture(Fraction(5), 99)
+    assert told == []
+    assert times.unmatched == 1
+    times.add_frame(Frame(IMAGE, 120, CAMERA, 3))  # frames are counted on
+    assert [d.target_id for d in told] == ["van"]
+
+
 def test_frames_that_never_come_are_counted_and_a_flood_of_them_takes_no_memory():
     times = FrameTimes(lambda _: pytest.fail("no frame came"))
     for k in range(1000):

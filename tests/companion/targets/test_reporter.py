@@ -74,6 +74,28 @@ def test_rejected_estimates_and_other_frames_are_not_used():
         assert not s.came.wait(0.5)
 
 
+def test_a_detector_seven_seconds_behind_a_fast_camera_is_heard():
+    """It names frames up to 256 back (`FrameTimes`); half of them had lost their pose by then."""
+    with Session() as s:
+        for k in range(250):
+            s.reporter.add_estimate(_estimate((k + 1) * 33 * MS))
+        s.reporter.add_detection(Detection("a", 33 * MS, 320.0, 240.0))
+        assert s.came.wait(30)
+        assert s.reporter.unmatched == 0
+
+
+def test_detections_whose_frame_has_no_position_are_counted():
+    with Session() as s:
+        s.reporter.add_detection(Detection("a", 50 * MS, 320.0, 240.0))
+        s.reporter.add_estimate(_estimate(50 * MS, accepted=False))
+        s.reporter.add_estimate(_estimate(150 * MS))
+        assert sleep_until(lambda: s.reporter.unmatched == 1, 30.0)
+        for k in range(1000):  # of a clock that is ahead: they wait for frames that never come
+            s.reporter.add_detection(Detection("a", 10**18 + k, 320.0, 240.0))
+        assert s.reporter.unmatched == 1 + 1000 - 64
+        assert not s.targets
+
+
 def test_a_ray_into_the_sky_is_counted():
     with Session(cast=_sky) as s:
         s.reporter.add_detection(Detection("a", 50 * MS, 320.0, 240.0))
