@@ -68,13 +68,15 @@ def vision_fix(
     """The vehicle's position and attitude as the camera's estimate implies them.
 
     attitude and gimbal at the exposure: together they give the camera's orientation on the body.
-    Without them the vehicle's attitude is unknown and the lever arm is not applied.
+    Without them the vehicle's attitude is unknown, and the place that is told is the camera's: the
+    lever arm's length is added to its covariance.
     """
     frame = installation.frame
     camera = frame.position(estimate.world_from_camera.translation)
     to_ned = ned_from_world(frame, camera)
     roll = pitch = yaw = None
     body = estimate.world_from_camera.translation
+    covariance = to_ned @ estimate.covariance[:3, :3] @ to_ned.T
     if attitude is not None and gimbal is not None:
         body, ned_from_body = vehicle_from_camera_pose(
             estimate.world_from_camera,
@@ -83,6 +85,9 @@ def vision_fix(
             to_ned,
         )
         roll, pitch, yaw = euler_from_matrix(ned_from_body)
+    else:
+        arm = installation.lever_arm_m
+        covariance = covariance + np.eye(3) * float(arm @ arm)
     position = frame.position(body)
     return VisionFix(
         time_ns=estimate.exposure_time_ns,
@@ -92,7 +97,7 @@ def vision_fix(
         roll_rad=roll,
         pitch_rad=pitch,
         yaw_rad=yaw,
-        position_covariance_ned=to_ned @ estimate.covariance[:3, :3] @ to_ned.T,
+        position_covariance_ned=covariance,
         attitude_sigma_rad=float(np.sqrt(estimate.covariance.diagonal()[3:].max())),
         reset=reset,
         quality=round(100 * min(max(estimate.quality, 0.0), 1.0)),

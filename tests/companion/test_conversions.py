@@ -89,6 +89,11 @@ def test_without_the_gimbal_the_attitude_is_unknown_not_guessed():
     fix = vision_fix(estimate, INSTALLATION, _attitude(0, 0, 0), None, reset=True)
     assert fix.yaw_rad is None
     assert fix.reset
+    # It is the camera's place that is told for the vehicle's: off by the lever arm, no one knows
+    # which way, and within its covariance.
+    known = vision_fix(estimate, INSTALLATION, _attitude(0, 0, 0), _gimbal(-1.5, 0), reset=True)
+    wider = fix.position_covariance_ned - known.position_covariance_ned
+    np.testing.assert_allclose(wider, np.eye(3) * (LEVER @ LEVER), atol=1e-9)
 
 
 def test_prior_follows_the_velocity_and_refuses_old_or_missing_positions():
