@@ -57,8 +57,8 @@ class FrameTimes:
         self._release()
 
     def begin(self, stream: av.VideoStream) -> None:
-        """A new connection counts its presentation times anew: what waits for one of the old's would
-        be given another picture's exposure.
+        """A new connection counts its presentation times anew: what waits for one of the old
+        would be given another picture's exposure.
         """
         with self._lock:
             self._by_pts.clear()

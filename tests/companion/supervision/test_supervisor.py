@@ -284,7 +284,9 @@ def test_a_process_that_never_shows_life_is_ended_after_its_patience() -> None:
 
 def ends(word: str) -> Callable[[int], Beat | None]:
     """Says that word once, 20 looks before its end, and nothing more."""
-    return lambda looks: Beat("all", 0.1) if looks > 20 else Beat(word, 0.0) if looks == 20 else None
+    return lambda looks: (
+        Beat("all", 0.1) if looks > 20 else Beat(word, 0.0) if looks == 20 else None
+    )
 
 
 def test_an_end_in_order_takes_its_time() -> None:
