@@ -24,6 +24,7 @@ _GAP_S = 1.0
 _RECKONED_MPS = 0.12
 _RECKONED_MPS2 = 0.04
 _RECKONS_S = 10.0  # afterwards an EKF without positions gives up: no evidence any more
+_CALM_FIXES = 5  # to which it led in a row: after a gap it is off by 10 m/s and more
 _KEPT = 600
 
 Metres = tuple[float, float]
@@ -106,9 +107,14 @@ class JumpCheck:
         self._reckoning = DeadReckoning()
         self._passed: _Passed | None = None
         self._held: _Held | None = None
+        self._led = 0  # fixes in a row, up to the last that passed, to which the EKF's velocity led
         self.distance_m = 0.0
         self.step: Step | None = None
         """Of the newest fix, if it passed: how far from where the one before led."""
+        self.leaps = False
+        """Whether the newest fix is at another place than the one before: how it moves is judged
+        anew from here on.
+        """
 
     def hear(self, state: VehicleState) -> None:
         """The vehicle's state, a few times a second whether fixes come or not."""
@@ -117,16 +123,24 @@ class JumpCheck:
     def admit(self, fix: VisionFix, state: VehicleState, *, agrees: bool) -> bool:
         """Whether the fix may pass. agrees: vision moves as the IMU does, or nobody knows."""
         self._reckoning.add(state)
+        was_held = self._held
+        passes = self._passes(fix, state, agrees=agrees)
+        self.leaps = self._held is not was_held
+        return passes
+
+    def _passes(self, fix: VisionFix, state: VehicleState, *, agrees: bool) -> bool:
         self.step = None
         step = None if self._passed is None else self._leap(self._passed, fix)
         jump_m = 0.0 if step is None else math.hypot(*step.offset_m) - step.allowed_m
         if jump_m <= (self._config.jump_m if fix.reset else self._config.untold_jump_m):
             self.step = step
+            self._led = self._led + 1 if step is not None and step.is_led else 0
             self._pass(fix, state)
             return True
         self.distance_m = jump_m
         held = self._hold(fix)
         if agrees and not held.contradicted and held.seconds >= self._config.jump_hold_s:
+            self._led = 0
             self._pass(fix, state)
             return True
         return False
@@ -149,7 +163,7 @@ class JumpCheck:
 
     def _moves_otherwise(self, held: _Held, since_s: float) -> bool:
         """Whether what is held moved as the EKF's velocity does not: a turned frame on the way."""
-        led = self._reckoning.moved(held.first.time_ns, held.newest.time_ns)
+        led = self._reckoned(held.first, held.newest)
         if led is None:
             return False
         apart_m = math.hypot(*self._off(held.first, led, held.newest))
@@ -163,9 +177,7 @@ class JumpCheck:
         sigma = _SIGMAS * _sigmas(last.fix, fix)
         # While another is held, to let the allowance grow would let it pass by waiting (5 degrees
         # of a turned frame, 10 m at 120 m from home: after 3.8 s), and hold the right one behind.
-        led = None
-        if self._held is not None:
-            led = self._reckoning.moved(last.fix.time_ns, fix.time_ns)
+        led = self._reckoned(last.fix, fix) if self._held is not None else None
         if led is not None:
             allowed = math.hypot(sigma, _SIGMAS * _reckoned_m(dt))
         else:
@@ -174,7 +186,13 @@ class JumpCheck:
             if dt > _GAP_S and self._held is None:  # the way may have turned
                 allowed += math.hypot(*led)
         off = self._off(last.fix, led, fix)
-        return Step(fix.time_ns, off, last.velocity, _sigma(fix), allowed, allowed - sigma)
+        return Step(fix.time_ns, off, last.velocity, _sigma(fix), allowed, allowed - sigma, dt)
+
+    def _reckoned(self, last: VisionFix, fix: VisionFix) -> Metres | None:
+        """Where the EKF's velocity leads; None where it did not lead rightly before."""
+        return (
+            self._reckoning.moved(last.time_ns, fix.time_ns) if self._led >= _CALM_FIXES else None
+        )
 
     def _off(self, last: VisionFix, led: Metres, fix: VisionFix) -> Metres:
         """From where a fix leads to another, metres."""

@@ -93,7 +93,7 @@ class Monitor:
         self._waiting: deque[VisionFix] = deque(maxlen=_QUEUE)
         self._newest: VisionFix | None = None
         self._level: ProtectionLevel | None = None
-        self._jump_held = self._was_held = False
+        self._jump_held = self._announced = False
         self._reset_due = False
         self._backwards = 0
 
@@ -161,10 +161,11 @@ class Monitor:
         self._level = level = protection_level(fix, state, self._config.protection, known_m)
         fix = replace(fix, protection_m=(level.horizontal_m, level.vertical_m))
         self._jump_held = not admitted
-        # The jump has a line of its own; how the place moves after it is judged anew.
-        leaps = self._jump_held != self._was_held
-        self._was_held = self._jump_held
-        self._waiting.append(replace(fix, reset=True) if leaps else fix)
+        # The jump has a line of its own; how the place moves after it is judged anew. An announced
+        # one is announced with each fix until one has passed: it began with the first.
+        leaps = self._jumps.leaps or (fix.reset and not self._announced)
+        self._announced = fix.reset
+        self._waiting.append(replace(fix, reset=leaps))
         self._newest = fix
         if self.action >= Action.WITHHOLD or not admitted:
             self._reset_due = self._reset_due or self._jump_held or self.action is Action.WITHDRAW

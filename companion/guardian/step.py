@@ -17,7 +17,9 @@ from dataclasses import dataclass, replace
 
 STEP_M = 1.0  # what is less is within any level
 _MOVES_MPS = 1.0  # below it late stamps explain no step
+_SOON_S = 1.0
 _FIXES = 5  # on either side, whose means are compared
+_LEAST_BEFORE = 3  # to which the one before led: the velocity of an EKF just found is not known
 _DECIDES_S = 2.0  # at latest, however often it steps meanwhile
 _SIGMAS = 4.0
 _SPEED_MPS = 1.0  # what leads from one to the next may be off by
@@ -28,7 +30,7 @@ class Step:
     """A position off from where the one before led. offset_m, velocity: (north, east), m, m/s.
 
     sigma_m: of the position. allowed_m: what the offset may be; growth_m: of that, what the time
-    between the two adds.
+    between the two adds; after_s: that time.
     """
 
     time_ns: int
@@ -37,6 +39,12 @@ class Step:
     sigma_m: float = 0.0
     allowed_m: float = 0.0
     growth_m: float = 0.0
+    after_s: float = 0.0
+
+    @property
+    def is_led(self) -> bool:
+        """Whether it came soon, to where the one before led."""
+        return self.after_s <= _SOON_S and math.hypot(*self.offset_m) <= self.allowed_m
 
     @property
     def is_suspect(self) -> bool:
@@ -68,7 +76,7 @@ class StepFinder:
         """By how much the newest position may have stepped, while it is not yet known to last."""
         if self._suspect is None:
             return 0.0
-        before, newest = _mean(self._before or self._after), self._after[-1]
+        before, newest = _mean(self._before), self._after[-1]
         return math.hypot(newest.north - before.north, newest.east - before.east)
 
     def add(self, step: Step) -> Step | None:
@@ -77,7 +85,9 @@ class StepFinder:
         self._east += step.offset_m[1]
         here = _Off(step.time_ns, self._north, self._east, step.sigma_m)
         if step.is_suspect:
-            if self._suspect is None:
+            if len(self._before) < _LEAST_BEFORE:
+                self.forget()
+            elif self._suspect is None:
                 self._suspect = step
             elif step.time_ns - self._suspect.time_ns < _DECIDES_S * 1e9:
                 self._after.clear()  # from here on it may last; what was before it stays
@@ -94,16 +104,24 @@ class StepFinder:
         self._suspect = None
 
     def _decided(self, suspect: Step) -> Step | None:
-        before, after = _mean(self._before or self._after[:1]), _mean(self._after)
+        before, after = _mean(self._before), _mean(self._after)
         north, east = after.north - before.north, after.east - before.east
         apart_s = (after.time_ns - before.time_ns) * 1e-9
         noise = math.hypot(before.sigma_m, after.sigma_m)
-        most_m = _SIGMAS * noise + suspect.growth_m + _SPEED_MPS * apart_s
+        drift_mps = max(_SPEED_MPS, _drift(self._before), _drift(self._after))
+        most_m = _SIGMAS * noise + suspect.growth_m + drift_mps * apart_s
         self._before = deque(self._after, maxlen=_FIXES)
         self._after, self._suspect = [], None
         if math.hypot(north, east) <= max(most_m, STEP_M):
             return None
         return replace(suspect, offset_m=(north, east))
+
+
+def _drift(some: Sequence[_Off]) -> float:
+    """By how much they go on to step, m/s: what leads to them is off by so much."""
+    first, last = some[0], some[-1]
+    span_s = (last.time_ns - first.time_ns) * 1e-9
+    return math.hypot(last.north - first.north, last.east - first.east) / span_s if span_s else 0.0
 
 
 def _mean(some: Sequence[_Off]) -> _Off:

@@ -48,6 +48,11 @@ def cruise(at_s: float) -> tuple[float, float]:
     return 10.0 * at_s, 0.0
 
 
+def swung(at_s: float) -> tuple[float, float]:
+    """To and fro by 12 m with 12 s."""
+    return 6.0 * np.sin(2 * np.pi * at_s / 12.0), 0.0
+
+
 def turned(path: Path, from_s: float, until_s: float, degrees: float = 5.0) -> Path:
     """What a frame shows that turns about home for a while."""
     angle = np.radians(degrees)
@@ -160,6 +165,42 @@ def test_without_the_ekfs_velocity_what_is_held_is_taken_after_its_time() -> Non
     assert 17.0 <= taken(flight, 12.0) < 17.3
 
 
+@dataclass
+class Announced(Flight):
+    """A flight whose jump stays announced until a fix has carried it, as `FixInjection` does."""
+
+    def _offer(self, fix: VisionFix) -> None:
+        carried = any(f.reset for f in self.passed)
+        is_due = self.reset_at_s <= self.at_s and not carried
+        super()._offer(replace(fix, reset=is_due))
+
+
+def test_an_announced_jump_that_does_not_move_is_never_taken() -> None:
+    """A jump that is announced again with each fix that is withheld began its evidence anew with
+    each: nothing was settled, so nothing spoke against it, and it was taken after its time.
+    """
+
+    def elsewhere(at_s: float) -> tuple[float, float]:
+        return swung(at_s) if at_s < 12.0 else (200.0, 60.0)
+
+    flight = Announced(monitor(), swung, elsewhere, noise_m=0.03, reset_at_s=12.0).fly(34.0)
+    assert flight.told("withheld: position jumped") < 12.3
+    assert taken(flight, 12.0) == np.inf
+
+
+def test_an_announced_jump_that_moves_rightly_is_taken_after_its_time() -> None:
+    """Found again after a wrong place, 40 m aside."""
+
+    def found(at_s: float) -> tuple[float, float]:
+        north, east = leg(at_s)
+        return north, east + (40.0 if at_s < 12.0 else 0.0)
+
+    flight = Announced(monitor(), leg, found, noise_m=0.1, reset_at_s=12.0).fly(24.0)
+    assert 17.0 <= taken(flight, 12.0) < 17.3
+    assert max(flight.withheld) < 17.3
+    assert {text.split(":")[1].strip() for _, text in flight.lines} == {"withheld", "over"}
+
+
 @pytest.mark.parametrize("path", [leg, lambda at_s: (0.0, 0.0)])
 def test_one_fix_far_off_is_no_step(path: Path) -> None:
     """`frame-rotates` (ArduPilot, vision only): "position stepped 2 m" at take-off in 3 of 5: two
@@ -176,6 +217,24 @@ def test_one_fix_far_off_is_no_step(path: Path) -> None:
     level = [fix.protection_m[0] for fix in flight.passed if fix.protection_m is not None]
     assert max(level) > level[100] + 1.0  # until it is known
     assert level[-1] == pytest.approx(level[100], abs=0.01)
+
+
+def test_an_ekf_that_flew_on_alone_makes_no_step_of_what_is_found() -> None:
+    """fog-bank (ArduPilot): found again to 0.3 m, and told as a step of 3 m: the EKF's velocity was
+    off by 15 m/s.
+    """
+
+    def alone(at_s: float) -> Velocity:
+        return (15.0, -9.0) if 12.0 <= at_s < 33.5 else (0.0, 0.0)
+
+    flight = Reckoned(
+        monitor(), cruise, noise_m=0.1, claimed_m=0.12, error=alone,
+        silent=(12.0, 32.0), reset_at_s=32.0,
+    ).fly(36.0)  # fmt: skip
+    assert [text for _, text in flight.lines if "stepped" in text] == []
+    assert flight.withheld == []
+    level = [fix.protection_m[0] for fix in flight.passed if fix.protection_m is not None]
+    assert level[-1] == pytest.approx(level[100], abs=0.1)
 
 
 def test_noise_as_it_is_claimed_is_no_step() -> None:
