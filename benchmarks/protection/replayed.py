@@ -1,0 +1,200 @@
+"""Recorded flights through the guardian of now: what it would tell and withhold.
+
+The fixes are those of estimates.csv, handed over when they came; the vehicle is the flight.tlog.
+The pictures are not recorded, so the checks of them, and of the calibration, do not run.
+"""
+
+from __future__ import annotations
+
+import csv
+import json
+from collections import Counter
+from collections.abc import Iterator, Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from companion.flight.injection import JumpPolicy
+from companion.guardian.config import GuardianConfig
+from companion.guardian.findings import RULES
+from companion.guardian.monitor import Limits, Monitor
+from companion.guardian.protection import budget
+from localizer.types import TrackingState
+from mavlink_bridge.errors import RecordError
+from mavlink_bridge.link.tlog import read_tlog
+from mavlink_bridge.messages import (
+    Attitude,
+    GimbalAttitude,
+    InertialSample,
+    VehicleState,
+    VisionFix,
+)
+from mavlink_bridge.vehicle.tracker import VehicleTracker
+
+_STEP_NS = 100_000_000
+_SOURCES = ("noise", "map", "calibration", "time")
+_COLUMNS = (
+    "flight", "fixes", "withheld", "told", "HPL median, m", "noise, map, calibration, time, %",
+)  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Replayed:
+    """One flight. told: how often each finding, by name. hpl_m: the median level of what passed;
+    shares: of its square, by source, medians; widened: fixes whose level is wider than its budget.
+    """
+
+    flight: str
+    fixes: int
+    withheld: int
+    widened: int
+    told: dict[str, int]
+    hpl_m: float
+    shares: dict[str, float]
+
+
+class _Recorded:
+    """The vehicle as the record has it at a time."""
+
+    def __init__(self) -> None:
+        self.tracker = VehicleTracker(None, (1.0, 0.0, 0.0, 0.0), fixed_camera=False)
+        self.now_ns = 0
+
+    def state(self) -> VehicleState:
+        return self.tracker.snapshot(self.now_ns)
+
+    def attitude_at(self, time_ns: int) -> Attitude | None:
+        return self.tracker.attitude_at(time_ns)
+
+    def gimbal_at(self, time_ns: int) -> GimbalAttitude | None:
+        return self.tracker.gimbal_at(time_ns)
+
+    def inertial_since(self, time_ns: int) -> tuple[InertialSample, ...]:
+        return self.tracker.inertial_since(time_ns)
+
+    def gnss_place_at(self, _time_ns: int) -> tuple[float, ...] | None:
+        return None  # the calibration watch does not run
+
+
+def replay(folder: Path, config: GuardianConfig | None = None) -> Replayed:
+    """A folder of `python -m sitl loop` or `demo`. RecordError says why it cannot be replayed."""
+    config = config or GuardianConfig()
+    try:
+        arrivals, since_utc_ns = _fixes(folder)
+    except (OSError, ValueError, KeyError, csv.Error) as error:
+        raise RecordError(f"{folder}: not a flight's record: {error!r}") from error
+    if not arrivals:
+        raise RecordError(f"{folder}: no estimate in it has a protection level")
+    vehicle, monitor = _Recorded(), Monitor(config, Limits())
+    told: Counter[str] = Counter()
+    levels, parts = [], []
+    waiting, step_ns = iter([*arrivals, (np.inf, None)]), None
+    due_ns, fix = next(waiting)
+    for utc_ns, message in read_tlog(folder / "flight.tlog"):
+        now_ns = utc_ns + since_utc_ns
+        step_ns = now_ns if step_ns is None else step_ns
+        while min(due_ns, step_ns) <= now_ns:
+            vehicle.now_ns = int(min(due_ns, step_ns))
+            if due_ns <= step_ns and fix is not None:
+                state = vehicle.state()
+                admitted = monitor.admit(fix, state)
+                if admitted is not None and admitted.protection_m is not None:
+                    levels.append(admitted.protection_m[0])
+                    parts.append(_parts(fix, state, config))
+                due_ns, fix = next(waiting)
+            else:
+                lines = monitor.step(vehicle.now_ns, vehicle)
+                told.update(r.name for r in RULES for one in lines if r.is_line(one.text))
+                step_ns += _STEP_NS
+        if vehicle.tracker.accepts(message):
+            vehicle.tracker.handle(message, now_ns)
+    return _counted(folder.name, len(arrivals), told, np.array(levels), np.array(parts))
+
+
+def report(flights: Sequence[Replayed]) -> dict[str, Any]:
+    """Each flight's, and all together."""
+    fixes, withheld = sum(f.fixes for f in flights), sum(f.withheld for f in flights)
+    rows = [_row(f) for f in flights]
+    quiet = sum(not f.told and not f.withheld for f in flights)
+    rows.append((f"{len(flights)} flights, {quiet} quiet", str(fixes), str(withheld), "", "", ""))
+    return {"replayed": [asdict(f) for f in flights], "columns": _COLUMNS, "rows": rows}
+
+
+def _counted(
+    name: str, fixes: int, told: Counter[str], levels: np.ndarray, parts: np.ndarray
+) -> Replayed:
+    if not len(levels):
+        return Replayed(name, fixes, fixes, 0, dict(told), 0.0, {})
+    known = np.sqrt((parts**2).sum(axis=1))
+    shares = np.median((parts / known[:, None]) ** 2, axis=0)
+    return Replayed(
+        name, fixes, fixes - len(levels), int((levels > known + 0.01).sum()), dict(told),
+        float(np.median(levels)), dict(zip(_SOURCES, map(float, shares), strict=True)),
+    )  # fmt: skip
+
+
+def _parts(fix: VisionFix, state: VehicleState, config: GuardianConfig) -> tuple[float, ...]:
+    """What each source alone makes of a level, metres."""
+    p = config.protection
+    none = p.model_copy(
+        update={"map_m": 0.0, "map_height_m": 0.0, "calibration_share": 0.0, "time_bias_s": 0.0}
+    )
+    sigma = float(np.sqrt(np.linalg.eigvalsh(fix.position_covariance_ned[:2, :2])[-1]))
+    north, east, _ = state.local_velocity_ned or (0.0, 0.0, 0.0)
+    height, speed = max(state.altitude_relative_m or 0.0, 0.0), float(np.hypot(north, east))
+    alone = (
+        none,
+        none.model_copy(update={"map_m": p.map_m}),
+        none.model_copy(update={"calibration_share": p.calibration_share}),
+        none.model_copy(update={"time_bias_s": p.time_bias_s}),
+    )
+    sigmas = (sigma, 0.0, 0.0, 0.0)
+    return tuple(
+        budget((s, 0.0), height, (speed, 0.0), one)[0] for s, one in zip(sigmas, alone, strict=True)
+    )
+
+
+def _row(flight: Replayed) -> tuple[str, ...]:
+    told = ", ".join(f"{name} {count}" for name, count in flight.told.items())
+    shares = ", ".join(f"{100 * share:.0f}" for share in flight.shares.values())
+    return (
+        flight.flight, str(flight.fixes), str(flight.withheld), told or "-",
+        f"{flight.hpl_m:.2f}", shares,
+    )  # fmt: skip
+
+
+def _fixes(folder: Path) -> tuple[list[tuple[float, VisionFix | None]], int]:
+    """When each fix came, and it; and CLOCK_MONOTONIC less UTC, ns."""
+    records = sorted(p.parent for p in folder.glob("companion*/estimates.csv"))
+    made = json.loads((records[0] / "record.json").read_text(encoding="utf-8")) if records else {}
+    policy, fixes = JumpPolicy(), []
+    for record in records:
+        for row in _rows(record / "estimates.csv"):
+            policy.note(TrackingState(row["state"]))
+            if row["accepted"] == "1" and row.get("hpl_m"):
+                time_ns = int(row["exposure_time_ns"])
+                came_ns = time_ns + round(float(row["latency_ms"]) * 1e6)
+                fixes.append((float(came_ns), _fix(row, time_ns, reset=policy.is_due)))
+                policy.carried()
+    fixes.sort(key=lambda one: one[0])
+    return fixes, int(made.get("monotonic_ns", 0)) - int(made.get("utc_ns", 0))
+
+
+def _fix(row: dict[str, str], time_ns: int, *, reset: bool) -> VisionFix | None:
+    sigmas = [float(row[f"sigma_{axis}_m"]) for axis in ("north", "east", "up")]
+    covariance = np.diag(np.square(sigmas))
+    return VisionFix(
+        time_ns,
+        float(row["latitude_deg"]),
+        float(row["longitude_deg"]),
+        float(row["height_m"]),
+        position_covariance_ned=covariance,
+        reset=reset,
+    )
+
+
+def _rows(path: Path) -> Iterator[dict[str, str]]:
+    with path.open(newline="", encoding="utf-8") as file:
+        yield from csv.DictReader(file)
