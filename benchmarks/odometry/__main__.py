@@ -40,6 +40,7 @@ from localizer.render.numba_raster import NumbaRenderer
 from localizer.synth.world import WorldInfo
 
 _HIGH_M = 1500.0
+_GROWTHS = ("with_map", "with_ground", "with_range", "with_plane")
 _NONE = GrowthModel(scale=0.0, horizontal=0.0, vertical=0.0, tilt=0.0, heading=0.0)
 
 
@@ -73,7 +74,7 @@ def fly(args: argparse.Namespace, known: TileStreamer, seen: TileStreamer) -> li
     scene = Scene(args.map.parent.name, NumbaRenderer(seen, 1), NumbaRenderer(known, 1), camera,
                   terrain)  # fmt: skip
     extractor = DetailExtractor(load_extractor(threads=1, size=(camera.width, camera.height)))
-    config = OdometryConfig(with_map=_NONE, with_ground=_NONE) if args.fit else OdometryConfig()
+    config = OdometryConfig(**dict.fromkeys(_GROWTHS, _NONE)) if args.fit else OdometryConfig()
     flyer = Flyer(scene, extractor, JNGO(threads=args.threads), config)
     plan = Plan(args.seconds, args.rate, args.speed, args.height, tuple(args.half))
     flown: list[Flown] = []

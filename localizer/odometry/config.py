@@ -80,5 +80,17 @@ class OdometryConfig(BaseModel):
         GrowthModel(
             registration=49.0, scale=0.005, horizontal=0.04, vertical=0.03, tilt=2e-4, heading=1e-3
         ),
-        description="growth with depth from the ground's height alone",
+        description="growth with depth from a terrain model's height alone",
+    )
+    with_range: GrowthModel = Field(
+        GrowthModel(
+            registration=49.0, scale=0.045, horizontal=0.04, vertical=0.03, tilt=2e-4, heading=1e-3
+        ),
+        description="growth over ground whose height a rangefinder met",
+    )
+    with_plane: GrowthModel = Field(
+        GrowthModel(
+            registration=49.0, scale=0.1, horizontal=0.04, vertical=0.03, tilt=2e-4, heading=1e-3
+        ),
+        description="growth over ground that is taken as level; over hills of 40 m it errs so much",
     )

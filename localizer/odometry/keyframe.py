@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 from enum import Enum
 
 import numpy as np
@@ -27,6 +28,8 @@ class DepthSource(Enum):
 
     MAP = "the map's geometry"
     GROUND = "the ground's height"
+    RANGE = "the ground as a rangefinder met it"
+    PLANE = "level ground"
 
 
 @dataclass(frozen=True)
@@ -35,7 +38,8 @@ class Keyframe:
 
     anchors: its features at world points, as the map registration's. covariance: (6, 6) of its
     pose, as `PosePrior`'s. source: of its depth. way_m: flown up to it. constraint: what other
-    sensors said of its pose. features, surface: what it was made of.
+    sensors said of its pose. features, surface: what it was made of. behind: (3,) displacement from
+    the beginning up to it, by the source of depth over which it was measured.
     """
 
     anchors: Anchors
@@ -47,6 +51,12 @@ class Keyframe:
     features: FeaturePyramid
     surface: Array | None = None
     constraint: PoseConstraint | None = None
+    behind: Mapping[DepthSource, Array] = field(default_factory=dict)
+
+    def ways(self, pose: Pose) -> dict[DepthSource, Array]:
+        """Displacements (3,) from the beginning to a pose that was measured against this one."""
+        hop = pose.translation - self.world_from_camera.translation
+        return {**self.behind, self.source: self.behind.get(self.source, np.zeros(3)) + hop}
 
 
 def keyframe_anchors(

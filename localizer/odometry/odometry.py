@@ -184,17 +184,27 @@ class VisualOdometry:
         self, frame: OdometryFrame, pose: Pose, covariance: Array, way_m: float,
         surface: Array | None, constraint: PoseConstraint | None,
     ) -> Keyframe | None:  # fmt: skip
+        ground, below = self._below(frame.time_ns)
         anchors, source = keyframe_anchors(
-            frame.features, self._camera, pose, surface,
-            self._ground or self._sounded.at(frame.time_ns) or self._plane,
+            frame.features, self._camera, pose, surface, ground,
             self.config.anchors, self._seed, frame.sweep,
         )  # fmt: skip
+        source = below if source is DepthSource.GROUND else source
+        behind = {} if self._keyframe is None else self._keyframe.ways(pose)
         if len(anchors.points_world) < 2 * self._optimizer.config.min_anchors:
             return None
         return Keyframe(
             anchors, pose, covariance, frame.time_ns, source, way_m, frame.features,
-            surface if source is DepthSource.MAP else None, constraint,
+            surface if source is DepthSource.MAP else None, constraint, behind,
         )  # fmt: skip
+
+    def _below(self, time_ns: int) -> tuple[Ground | None, DepthSource]:
+        """The ground where the map has none, and how it is known."""
+        if self._ground is not None:
+            return self._ground, DepthSource.GROUND
+        if (sounded := self._sounded.at(time_ns)) is not None:
+            return sounded, DepthSource.RANGE
+        return self._plane, DepthSource.PLANE
 
     def _aligned(self, keyframe: Keyframe, frame: OdometryFrame, track: Track) -> Track:
         """The track once more, from the keyframe's pose by the parallax over the map's shape."""
@@ -264,9 +274,12 @@ class VisualOdometry:
     ) -> OdometryEstimate:
         assert self._beginning is not None
         begun = self._beginning
-        way = pose.translation - begun.pose.translation
-        covariance = track.covariance + scaled(growth_of(self.config, keyframe), way)
-        known = carried(begun.covariance, way)
+        errors = [
+            scaled(growth_of(self.config, source), way)
+            for source, way in keyframe.ways(pose).items()
+        ]
+        covariance = track.covariance + np.sum(errors, axis=0)
+        known = carried(begun.covariance, pose.translation - begun.pose.translation)
         added = np.linalg.eigvalsh((covariance - known)[:2, :2])[-1]
         return OdometryEstimate(
             pose, covariance, quality, status, reason, time_ns,

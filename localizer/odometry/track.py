@@ -74,9 +74,14 @@ class Track:
         return PosePrior(pose, np.diag(sigma**2), time_ns, self.velocity)
 
 
-def growth_of(config: OdometryConfig, keyframe: Keyframe) -> GrowthModel:
-    """The model of growth for the keyframe's source of depth."""
-    return config.with_map if keyframe.source is DepthSource.MAP else config.with_ground
+def growth_of(config: OdometryConfig, source: DepthSource) -> GrowthModel:
+    """The model of growth for a source of depth."""
+    return {
+        DepthSource.MAP: config.with_map,
+        DepthSource.GROUND: config.with_ground,
+        DepthSource.RANGE: config.with_range,
+        DepthSource.PLANE: config.with_plane,
+    }[source]
 
 
 def fault(config: OdometryConfig, result: Registration, prior: PosePrior) -> str:
@@ -108,7 +113,7 @@ def followed(
     sensed: what other sensors say of this frame, as they say it and less their constant error.
     """
     constraint, corrected = sensed
-    model, begun = growth_of(config, keyframe), keyframe.world_from_camera
+    model, begun = growth_of(config, keyframe.source), keyframe.world_from_camera
     hop = float(np.linalg.norm(result.world_from_camera.translation - begun.translation))
     relative = model.registration * result.covariance + walked(model, hop)
     pose = result.world_from_camera

@@ -26,7 +26,7 @@ from tests.localizer.registration.conftest import SyntheticPlace
 COVERED = Usability(ImageFault.FLAT, 0.0, 0.0, 0.0, 0.0)
 
 
-def odometry(ground: FlatGround | None = None, **changes: float) -> VisualOdometry:
+def odometry(ground: FlatGround | None = None, **changes: object) -> VisualOdometry:
     optimizer = odometry_optimizer(JNGO(threads=1))
     return VisualOdometry(CAMERA, optimizer, OdometryConfig(**{"anchors": 600, **changes}), ground)
 
@@ -79,8 +79,33 @@ def test_at_the_maps_edge_the_ground_goes_on_at_the_last_height(plain):
         assert estimate.usable, estimate.reason
         sources.append(estimate.source)
     assert sources[0] is DepthSource.MAP
-    assert sources[-1] is DepthSource.GROUND
+    assert sources[-1] is DepthSource.PLANE
     assert horizontal(estimate.world_from_camera, plain.pose(20)) < 0.02 * 80
+
+
+def test_ground_that_is_only_taken_as_level_is_told_to_be_so():
+    """Over a slope the position was farther off than the covariance of a known ground allowed."""
+    flight = slope()
+    vo = begun(flight, odometry(max_sigma_m=10.0), mapped=True)
+    for k in range(1, 26):
+        estimate = vo.step(flight.frame(k))
+    known = odometry(max_sigma_m=10.0, with_plane=OdometryConfig().with_ground)
+    begun(flight, known, mapped=True)
+    for k in range(1, 26):
+        before = known.step(flight.frame(k))
+    # A tenth of what was flown over such ground; the first keyframe still knew the map's.
+    added = estimate.covariance[1, 1] - before.covariance[1, 1]
+    assert (0.1 * 60.0) ** 2 < added < (0.1 * 100.0) ** 2
+
+
+def test_the_way_over_the_map_is_not_told_to_be_over_level_ground(plain):
+    vo = begun(plain, odometry(), mapped=True)
+    for k in range(1, 16):
+        estimate = vo.step(plain.frame(k), surface=plain.surface(k))
+    on_map = estimate.covariance[1, 1] ** 0.5
+    for k in range(16, 19):  # the keyframe of the map serves on
+        estimate = vo.step(plain.frame(k))
+    assert estimate.covariance[1, 1] ** 0.5 < on_map + 0.1 * 12.0 + 0.5
 
 
 def slope() -> Flight:
