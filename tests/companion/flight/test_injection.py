@@ -14,6 +14,7 @@ from localizer.types import PoseEstimate, RegistrationStatus, TrackingState
 
 LOST, TRACKING = TrackingState.LOST, TrackingState.TRACKING
 DEGRADED, INITIALIZING = TrackingState.DEGRADED, TrackingState.INITIALIZING
+BRIDGING = TrackingState.BRIDGING
 CAMERA = Camera.from_fov(640, 480, 60)
 INSTALLATION = Installation(LocalFrame(Geodetic(47.3, 8.5, 450.0)), 47.5, np.zeros(3))
 
@@ -45,6 +46,8 @@ def _estimate(state, accepted=True):
         ((INITIALIZING, TRACKING, TRACKING), [True, False]),
         ((TRACKING, DEGRADED, TRACKING), [True, False]),  # it kept the filter's track
         ((TRACKING, LOST, INITIALIZING, TRACKING, TRACKING), [True, True, False]),
+        # What odometry drifted by ends where the map is found again.
+        ((TRACKING, BRIDGING, BRIDGING, TRACKING, TRACKING), [True, False, False, True, False]),
     ],
 )
 def test_only_a_new_start_carries_a_jump(states, resets):

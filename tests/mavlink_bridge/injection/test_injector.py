@@ -5,12 +5,13 @@ from __future__ import annotations
 import itertools
 import math
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 import pytest
 
-from mavlink_bridge.config import InjectionConfig
+from mavlink_bridge.config import InjectionConfig, YawGuardConfig
 from mavlink_bridge.injection.encode import DIAGONAL
 from mavlink_bridge.injection.injector import Injector
 from mavlink_bridge.injection.message_maker import Injection, InjectionContext
@@ -154,6 +155,23 @@ def test_fix_too_old_to_fuse_is_propagated() -> None:
     steady = [i for t, i in sent if t > 3 * SECOND]
     errors = [i.message.x - 8.0 * i.estimate.position.time_ns / SECOND for i in steady]
     assert np.abs(errors).max() < 0.2
+
+
+@pytest.mark.parametrize("climb", [4.0, -4.0])
+def test_a_climb_is_carried_on_upwards(climb: float) -> None:
+    it = injector(rate_hz=10, delay_ms=200)
+
+    def height_m(time_ns: int) -> float:
+        return 600.0 + climb * time_ns / SECOND
+
+    sent = fly(
+        it, seconds=4, fix_hz=10, latency_ms=400,
+        change=lambda f: replace(f, height_m=height_m(f.time_ns)),
+    )  # fmt: skip
+    steady = [i.estimate.position for t, i in sent if t > 3 * SECOND]
+    assert steady
+    assert not any(i.estimate.fresh for t, i in sent if t > 3 * SECOND)
+    assert max(abs(p.height_m - height_m(p.time_ns)) for p in steady) < 0.2
 
 
 def test_covariance_grows_between_fixes_and_sending_ends_at_the_bound() -> None:
@@ -316,6 +334,33 @@ def test_gyros_are_trusted_over_a_dropout() -> None:
 
     sent = fly(it, seconds=17, fix_hz=10, latency_ms=0, where=where, change=dropout)
     assert [t for t, _ in sent if t > 15.5 * SECOND]
+
+
+def test_after_a_long_dropout_the_gyros_are_not_trusted() -> None:
+    """They drift: what they say of a minute ago is no evidence against the autopilot's yaw."""
+    it = injector(rate_hz=10, delay_ms=0, yaw_guard=YawGuardConfig(memory_s=2.0))
+    where = context(yaw_error_deg=lambda t: 6.0 if t > 5.0 else 0.0)
+
+    def dropout(f: VisionFix) -> VisionFix | None:
+        return None if 4 * SECOND <= f.time_ns < 10 * SECOND else f
+
+    sent = fly(it, seconds=14, fix_hz=10, latency_ms=0, where=where, change=dropout)
+    assert [t for t, _ in sent if t < 4 * SECOND]
+    assert not [t for t, i in sent if t > 10 * SECOND and i.estimate.fresh]
+    assert it.guard.blocked
+
+
+def test_what_was_refused_is_released_by_a_tighter_limit_than_it_was_held_to() -> None:
+    """A frame at the limit itself would be sent and withheld by turns."""
+    it = injector(rate_hz=10, delay_ms=0, yaw_guard=YawGuardConfig(limit_deg=3.5))
+    change = turned_by(lambda t: 5.0 if t < 3.0 else 3.0 if t < 6.0 else 2.0)
+    sent = fly(it, seconds=8, fix_hz=10, latency_ms=0, change=change)
+    assert 6 * SECOND < min(t for t, _ in sent) < 7 * SECOND
+    never_turned = injector(rate_hz=10, delay_ms=0, yaw_guard=YawGuardConfig(limit_deg=3.5))
+    change = turned_by(lambda _: 3.0)
+    sent = fly(never_turned, seconds=3, fix_hz=10, latency_ms=0, change=change)
+    assert never_turned.counters["fixes_yaw_refused"] == 0
+    assert len(sent) >= 28
 
 
 def test_single_wild_yaw_is_dropped_without_blocking() -> None:
