@@ -8,6 +8,9 @@ from contextlib import contextmanager
 from pathlib import Path
 
 from companion.errors import ReportError
+from mavlink_bridge.whole_file import replace_whole
+
+_BY_UMASK = 0o666
 
 
 @contextmanager
@@ -71,10 +74,8 @@ class NewestFile:
                 return
 
     def _write(self, text: str) -> None:
-        temporary = self._path.with_suffix(".tmp")
         try:
-            temporary.write_text(text, encoding="utf-8")
-            temporary.replace(self._path)
+            replace_whole(self._path, text, _BY_UMASK)
         except OSError as error:
             if not self._has_failed:
                 self._failed(error)

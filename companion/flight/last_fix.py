@@ -26,6 +26,7 @@ from companion.flight.priors import AutopilotPose, drift_sigma_m
 from localizer.geometry.geo import NED_FROM_ENU
 from localizer.geometry.pose import Pose
 from localizer.types import PoseEstimate, PosePrior, ReferenceBundle, TrackingState
+from mavlink_bridge.whole_file import replace_whole
 
 _log = logging.getLogger(__name__)
 _WRITE_S = 0.5
@@ -195,8 +196,4 @@ class FixMemory:
             place.height_m, float(np.sqrt(np.linalg.eigvalsh(estimate.covariance[:3, :3])[-1])),
             (local[0], local[1], local[2]),
         )  # fmt: skip
-        temporary = path.with_suffix(".tmp")
-        temporary.unlink(missing_ok=True)
-        with open(os.open(temporary, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600), "w") as file:
-            file.write(json.dumps(asdict(row)))
-        temporary.replace(path)
+        replace_whole(path, json.dumps(asdict(row)))

@@ -15,6 +15,8 @@ import time
 from collections.abc import Callable
 from pathlib import Path
 
+from mavlink_bridge.whole_file import replace_whole
+
 _log = logging.getLogger(__name__)
 _OLDEST_S = 600.0
 _RENEW_S = 30.0
@@ -100,10 +102,4 @@ class GateMemory:
     def _write(self, by_channel: bool) -> None:
         """Whole or not at all."""
         text = json.dumps({"open": True, "by_channel": by_channel, "utc_s": self._wall_s()})
-        temporary = self._path.with_suffix(".tmp")
-        temporary.unlink(missing_ok=True)
-        with open(os.open(temporary, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600), "w") as file:
-            file.write(text)
-            file.flush()
-            os.fsync(file.fileno())
-        temporary.replace(self._path)
+        replace_whole(self._path, text, durable=True)

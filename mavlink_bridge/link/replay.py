@@ -9,9 +9,10 @@ from __future__ import annotations
 
 import json
 import logging
-import os
 import threading
 from pathlib import Path
+
+from mavlink_bridge.whole_file import replace_whole
 
 _log = logging.getLogger(__name__)
 
@@ -66,21 +67,16 @@ class ReplayWindow:
         while True:
             self._due.wait()
             self._due.clear()
+            closing = self._closing  # before the write: what comes in it is written next
             self._write()
-            if self._closing:
+            if closing:
                 return
 
     def _write(self) -> None:
         with self._lock:
             document = {":".join(map(str, key)): stamp for key, stamp in self._leases.items()}
-        temporary = self._path.with_name(f"{self._path.name}.tmp")
         try:
-            descriptor = os.open(temporary, os.O_WRONLY | os.O_CREAT | os.O_TRUNC, 0o600)
-            with os.fdopen(descriptor, "w", encoding="ascii") as file:
-                json.dump(document, file)
-                file.flush()
-                os.fsync(file.fileno())
-            temporary.replace(self._path)
+            replace_whole(self._path, json.dumps(document), durable=True)
         except OSError as error:
             if not self._failed:
                 _log.warning(

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import contextlib
 import logging
+import threading
 from pathlib import Path
 from typing import Any
 
@@ -250,6 +252,31 @@ def test_a_recorded_order_is_refused_after_a_restart_though_the_clock_is_unset(
         "recorded when it was not heard"
     )
     assert second.takes(signed(STAMP + 300_000)), "3 s later: the station goes on"
+    second.end()
+
+
+@pytest.mark.usefixtures("unset_clock")
+def test_an_order_that_comes_in_the_last_write_is_not_taken_again(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The end came while the disk wrote what was heard before it."""
+    first, late, wrote = Process(tmp_path / "seen"), [], threading.Event()
+
+    def meanwhile(_: int) -> None:
+        if wrote.is_set():
+            return
+        late.append(first.takes(signed(STAMP + 600_000, system=254)))
+        with contextlib.suppress(RuntimeError):  # the writer does not wait for itself
+            first.end()
+        wrote.set()
+
+    monkeypatch.setattr("mavlink_bridge.whole_file.os.fsync", meanwhile)
+    assert first.takes(signed(STAMP))
+    assert wrote.wait(20.0)
+    first.end()
+    assert late == [True]
+    second = Process(tmp_path / "seen")
+    assert not second.takes(signed(STAMP + 600_000, system=254))
     second.end()
 
 
