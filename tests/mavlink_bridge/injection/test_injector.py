@@ -223,6 +223,17 @@ def test_firmware_reads_the_error_that_was_meant(profile: FirmwareProfile, sigma
     assert error_from_entry(covariance[0], profile.covariance) == pytest.approx(sigma, rel=1e-4)
 
 
+@pytest.mark.parametrize("profile", [ARDUPILOT, ARDUPILOT_SQRT])
+def test_ardupilot_reads_the_worst_axis(profile: FirmwareProfile) -> None:
+    """A street seen along: 2 m along it, half a metre across. One number has to do."""
+    turn = np.array([[0.6, -0.8, 0.0], [0.8, 0.6, 0.0], [0.0, 0.0, 1.0]])
+    it = injector(rate_hz=10, delay_ms=0, sigma_floor_m=1e-6)
+    P = turn @ np.diag([4.0, 0.25, 0.01]) @ turn.T
+    it.submit(fix(SECOND, position_covariance_ned=P), SECOND)
+    covariance = it.step(SECOND, context(profile=profile)).message.covariance  # type: ignore[union-attr]
+    assert error_from_entry(covariance[0], profile.covariance) == pytest.approx(2.0, rel=1e-4)
+
+
 def test_reset_counter_changes_on_the_very_message_that_carries_the_jump() -> None:
     it = injector(rate_hz=20, delay_ms=100)
     jump_at = 3 * SECOND
@@ -466,13 +477,13 @@ def test_gps_input_fills_every_field() -> None:
 def test_gps_input_claims_no_more_than_its_protection_level() -> None:
     """12 satellites and a dilution of 0.8 were claimed of anything, 9 m of error included."""
     said = []
-    for level_m in (1.0, 3.0, 6.0, 9.0, 11.0):
+    for level_m in (1.0, 3.0, 6.0, 9.0, 10.4, 11.0):
         it = injector(message="gps_input", rate_hz=5, delay_ms=0, alert_limit_m=10.0)
         it.submit(fix(SECOND, protection_m=(level_m, 2.0 * level_m)), SECOND)
         m = it.step(SECOND, context()).message  # type: ignore[union-attr]
         said.append((m.satellites_visible, m.hdop, m.vdop))
     satellites, hdop, vdop = zip(*said, strict=True)
-    assert satellites == (11, 10, 8, 7, 5)  # ArduPilot arms with 6 and more
+    assert satellites == (11, 10, 8, 7, 5, 5)  # ArduPilot arms with 6 and more
     assert list(hdop) == sorted(set(hdop))
     assert hdop[0] < 1.4 < hdop[2]  # GPS_HDOP_GOOD
     assert vdop[1] > hdop[1]
