@@ -8,8 +8,7 @@ that flies the truth. Processor time is the processes' own (not wall time); of t
 the console's thread is timed apart, since two flights differ by more than it takes. The page is a
 client of the same messages: a picture's age is taken when it has arrived; with --browser it is the
 page in Chromium, and the age is that of what has been painted. --console-nice: priority of the
-console's process instead of its own 15, for machines on which other work runs; the product's is 15
-below a flight at 0.
+console's process instead of its own, which is 10 behind the flight's.
 """
 
 from __future__ import annotations
@@ -35,7 +34,7 @@ import yaml
 
 from benchmarks.common.arguments import Parser, existing, output, whole
 from benchmarks.common.named_errors import named_errors
-from benchmarks.console.chromium import NOTE_AGES, ages, opened_browser
+from benchmarks.console.chromium import NOTE_AGES, ages, browser_used_s, opened_browser
 from benchmarks.console.vehicle import Sequence, Vehicle, begun_ns
 from companion.errors import ReportError
 from companion.offline.tables import read_columns
@@ -183,10 +182,12 @@ def fly(work: Work, condition: Condition, folder: Path) -> dict[str, Any]:
             page.forget()
         link = _link_s(listen) if condition == "no page" else None
         before = _used_s(process.pid), _used_s(console), time.monotonic()
+        browser = browser_used_s()
         first_link = page.link_s[-1] if page is not None and page.link_s else link
         end_s = (begun.read() or time.monotonic_ns()) * 1e-9 + work.sequence.length_s - 2.0
         time.sleep(max(end_s - time.monotonic(), 1.0))
         after = _used_s(process.pid), _used_s(console), time.monotonic()
+        browser = {kind: used - browser.get(kind, 0.0) for kind, used in browser_used_s().items()}
         last_link = page.link_s[-1] if page is not None and page.link_s else None
         if condition == "no page":
             last_link = _link_s(listen)
@@ -208,6 +209,7 @@ def fly(work: Work, condition: Condition, folder: Path) -> dict[str, Any]:
             cost[f"age_{name}_ms"] = float(np.percentile(page.ages_ms or [np.nan], q))
         if isinstance(page, BrowserPage):
             cost |= page.shares
+            cost |= {f"browser_{k}_percent": 100.0 * v / elapsed for k, v in browser.items()}
     return cost | quality(record, work.sequence)
 
 
@@ -381,7 +383,7 @@ def main() -> None:
     parser.add_argument("--map", type=existing, required=True, help="its tile cache")
     parser.add_argument("--frames", type=whole(100, 100_000), default=300, help="of the sequence")
     parser.add_argument("--rounds", type=whole(1, 20), default=2, help="runs of each condition")
-    parser.add_argument("--console-nice", type=whole(-20, 19), help="instead of 15")
+    parser.add_argument("--console-nice", type=whole(-20, 19), help="instead of 10 behind")
     parser.add_argument("--only", choices=CONDITIONS, help="one condition")
     parser.add_argument("--browser", action="store_true", help="the page in Chromium")
     parser.add_argument("--browser-nice", type=whole(0, 19), default=5, help="behind the flight's")

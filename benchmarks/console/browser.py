@@ -30,7 +30,7 @@ from typing import Any, Literal
 
 from benchmarks.common.arguments import Parser, existing, output, whole
 from benchmarks.common.named_errors import named_errors
-from benchmarks.console.chromium import NOTE_AGES, ages, opened_browser
+from benchmarks.console.chromium import NOTE_AGES, ages, browser_used_s, opened_browser
 from companion.errors import ReportError
 
 Condition = Literal["no page", "one page"]
@@ -137,7 +137,12 @@ def watch(demo: Demo, browser: Any, screens: Path | None) -> dict[str, Any]:
     _until(page, demo, lambda: page.inner_text("#word").lower() == "tracking", "position")
     told["first_position_s"] = time.monotonic() - begun
     page.evaluate("window.measured.length = 0")
+    used, begun_watching = browser_used_s(), time.monotonic()
     page.wait_for_timeout(1e3 * _WATCHED_S)
+    watched_s = time.monotonic() - begun_watching
+    told["browser_percent"] = {
+        kind: 100.0 * (now - used[kind]) / watched_s for kind, now in browser_used_s().items()
+    }
     told |= _ages(page.evaluate("window.measured"))
     told["mission_points"] = page.evaluate("window.consoleMap?.missionLength ?? 0")
     if screens is not None:

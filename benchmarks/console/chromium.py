@@ -46,6 +46,25 @@ def opened_browser(driver: Any, nice: int) -> Any:
     return browser
 
 
+def browser_used_s() -> dict[str, float]:
+    """Processor time of the browsers that this process opened, until now: of the pages
+    ("renderer"), of what draws their map and the screen ("gpu-process"), of the "rest".
+    """
+    used = {"renderer": 0.0, "gpu-process": 0.0, "rest": 0.0}
+    for pid in _children():
+        try:
+            words = Path(f"/proc/{pid}/cmdline").read_bytes().replace(b" ", b"\0").split(b"\0")
+            if b"chrom" not in words[0]:
+                continue
+            fields = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
+        except OSError:  # it ended meanwhile
+            continue
+        kind = next((w[7:].decode() for w in words if w.startswith(b"--type=")), "rest")
+        ticks = int(fields[11]) + int(fields[12])
+        used[kind if kind in used else "rest"] += ticks / os.sysconf("SC_CLK_TCK")
+    return used
+
+
 def _children() -> set[int]:
     """This process's own, and theirs."""
     found: set[int] = set()

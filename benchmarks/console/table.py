@@ -23,6 +23,10 @@ _ROWS: tuple[tuple[str, str, tuple[str, ...], int], ...] = (
     ("console's process, % of a core", "", ("console_percent",), 2),
     ("its thread in the flight's process, %", "", ("link_percent",), 2),
     ("flight's process, %", "", ("flight_percent",), 0),
+    (
+        "the browser's processes, page / map and screen / rest, %", "",
+        ("browser_renderer_percent", "browser_gpu-process_percent", "browser_rest_percent"), 1,
+    ),
     ("localized frames a second", "unchanged", ("localized_per_s",), 2),
     ("latency p50 / p95, ms", "unchanged", ("latency_p50_ms", "latency_p95_ms"), 0),
     ("error median / p95, m", "unchanged", ("error_median_m", "error_p95_m"), 3),

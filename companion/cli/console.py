@@ -21,7 +21,8 @@ from companion.terminal.console_log import console_log
 if TYPE_CHECKING:
     from companion.console.server import Site
 
-_NICE = 15  # below everything that flies
+_NICE = 10  # below what flies, which starts it
+_LOWEST = 19
 
 
 def console_command(
@@ -43,7 +44,7 @@ def console_command(
             given = validated(ConsoleConfig, given.model_dump() | {"listen": listen})
         except SettingsError as error:
             raise ConfigError(f"--listen {listen}: {str(error).strip()}") from error
-    os.setpriority(os.PRIO_PROCESS, 0, _NICE)  # whatever priority the flight has
+    os.setpriority(os.PRIO_PROCESS, 0, min(os.getpriority(os.PRIO_PROCESS, 0) + _NICE, _LOWEST))
     if lifeline:
         threading.Thread(target=_end_with_input, name="lifeline", daemon=True).start()
     require_extra()

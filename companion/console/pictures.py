@@ -9,7 +9,7 @@ from __future__ import annotations
 import json
 import struct
 import time
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import cv2
@@ -24,6 +24,9 @@ _MOST_EDGES = 6000
 _BLUR_PX = 1.2
 _CANNY = (70, 150)
 _STEPS = 2  # of the fixed point that finds where a ray meets the reference's surface
+_NOWHERE = -1e4  # a pixel where nothing is seen
+_GRID_PX = 4  # rays of the map's view are followed so far apart, and what they meet interpolated
+WIDTHS_PX = (480, 640, 800, 960)  # of the pictures that pages get, so that they can share them
 
 
 @dataclass(frozen=True)
@@ -67,19 +70,20 @@ def unpack(message: Message) -> Picture:
     return Picture(image, camera, pose, view)
 
 
-def page_message(message: Message, with_map: bool) -> bytes:
+def page_message(message: Message, with_map: bool, width_px: int = WIDTHS_PX[-1]) -> bytes:
     """What the page gets: uint32 length of the head, the head, then its parts one after the other.
 
     The head's `parts` are the lengths of JPEG, edges (uint16 pairs, pixels) and the map's JPEG.
+    width_px: the picture is not wider.
     """
-    picture = unpack(message)
+    picture = narrowed(unpack(message), width_px)
     parts = [_jpeg(picture.image), edges(picture).tobytes(), b""]
     if with_map and (warped := map_at_pose(picture)) is not None:
         parts[2] = _jpeg(warped)
     live = not message.head.get("recorded")
     head: dict[str, Any] = {
         "kind": "frame",
-        "image": message.head["image"],
+        "image": [picture.camera.width, picture.camera.height],
         "width_px": message.head["camera"]["width"],
         "estimate": message.head.get("estimate"),
         "exposure_ns": message.head["exposure_ns"],
@@ -94,6 +98,17 @@ def page_message(message: Message, with_map: bool) -> bytes:
     # Aligned, so that the page can look at the edges in place.
     text += b" " * (-(4 + len(text) + len(parts[0])) % 2)
     return struct.pack("<I", len(text)) + text + b"".join(parts)
+
+
+def narrowed(picture: Picture, width_px: int) -> Picture:
+    """No wider than that: what a screen cannot show is neither sent nor drawn."""
+    camera = picture.camera
+    if camera.width <= width_px:
+        return picture
+    smaller = camera.resized(width_px, max(round(camera.height * width_px / camera.width), 1))
+    size = (smaller.width, smaller.height)
+    image = np.asarray(cv2.resize(picture.image, size, interpolation=cv2.INTER_AREA))
+    return replace(picture, image=image, camera=smaller)
 
 
 def utc_ms(monotonic_ns: int) -> float:
@@ -129,25 +144,37 @@ def map_at_pose(picture: Picture) -> np.ndarray | None:
     if view is None or pose is None:
         return None
     half = picture.camera.resized(picture.camera.width // 2, picture.camera.height // 2)
-    columns, rows = np.meshgrid(np.arange(half.width) + 0.5, np.arange(half.height) + 0.5)
+    columns, rows = np.meshgrid(_knots(half.width), _knots(half.height))
     rays = half.rays(np.stack([columns, rows], axis=-1))
     view_from_camera = view.pose.inverse @ pose
     known = view.depth[view.depth > 0]
     if not len(known):
         return None
     depth = np.full(columns.shape, float(np.median(known)))
-    pixels = np.zeros((*columns.shape, 2))
+    at = np.zeros((*columns.shape, 2), np.float32)
     for _ in range(_STEPS + 1):
         points = view_from_camera.apply((rays * depth[..., None]).reshape(-1, 3))
-        pixels = view.camera.project(points)[0].reshape(pixels.shape)
-        at = np.nan_to_num(pixels, nan=-1.0).astype(np.float32)
+        pixels = view.camera.project(points)[0].reshape(at.shape)
+        at = np.nan_to_num(pixels, nan=_NOWHERE).astype(np.float32)
         found = cv2.remap(
             view.depth, at[..., 0] - 0.5, at[..., 1] - 0.5, cv2.INTER_NEAREST,
             borderMode=cv2.BORDER_REPLICATE,
         )  # fmt: skip
         depth = np.where(found > 0, found, depth)
-    at = np.nan_to_num(pixels, nan=-9.0).astype(np.float32)
+    at = _between_knots(at, half.width, half.height)
     return np.asarray(cv2.remap(view.rgb, at[..., 0] - 0.5, at[..., 1] - 0.5, cv2.INTER_LINEAR))
+
+
+def _knots(size: int) -> np.ndarray:
+    """Every `_GRID_PX` pixels from the first pixel's centre, the last at or beyond the last's."""
+    return np.arange(-(-(size - 1) // _GRID_PX) + 1) * _GRID_PX + 0.5
+
+
+def _between_knots(at: np.ndarray, width: int, height: int) -> np.ndarray:
+    """Values at `_knots` (rows, columns, 2) for each pixel (height, width, 2), bilinear."""
+    columns, rows = np.meshgrid(np.arange(width) / _GRID_PX, np.arange(height) / _GRID_PX)
+    grid = (columns.astype(np.float32), rows.astype(np.float32))
+    return np.asarray(cv2.remap(at, *grid, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE))
 
 
 def footprint(picture: Picture) -> list[list[float]]:

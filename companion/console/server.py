@@ -21,7 +21,7 @@ from starlette.websockets import WebSocket, WebSocketDisconnect
 
 from companion.console import deployment, exports
 from companion.console.examination import Examination
-from companion.console.pictures import page_message
+from companion.console.pictures import WIDTHS_PX, page_message
 from companion.console.records import Records, archive
 from companion.console.security import REPORT_POLICY, Guarded
 from companion.console.source import Source, sample_of
@@ -65,7 +65,7 @@ class Pages:
     def __init__(self, source: Source) -> None:
         self._source = source
         self._open: dict[int, dict[str, Any]] = {}
-        self._made: tuple[tuple[int, bool], bytes] | None = None
+        self._made: dict[tuple[bool, int], tuple[int, bytes]] = {}
         self._making = asyncio.Lock()
 
     async def serve(self, socket: WebSocket) -> None:
@@ -74,7 +74,7 @@ class Pages:
         if len(self._open) >= _MOST_PAGES:
             await socket.close(1013, "too many pages are open")
             return
-        wishes = {"frames": False, "map": False, "shown": 0}
+        wishes = {"frames": False, "map": False, "shown": 0, "width": WIDTHS_PX[-1]}
         self._open[id(socket)] = wishes
         listener = asyncio.create_task(self._listen(socket, wishes))
         try:
@@ -101,7 +101,8 @@ class Pages:
             fresh = newest.frame is not None and newest.frames != frames
             if wishes["frames"] and fresh and sent - wishes["shown"] < _UNDER_WAY:
                 frames, sent = newest.frames, sent + 1
-                await _sent(socket.send_bytes(await self._picture(bool(wishes["map"]))))
+                picture = await self._picture(bool(wishes["map"]), wishes["width"])
+                await _sent(socket.send_bytes(picture))
             await asyncio.wait({waiting, listener}, return_when=asyncio.FIRST_COMPLETED)
             waiting.cancel()
 
@@ -116,15 +117,17 @@ class Pages:
             "sample": None if state is None else sample_of(state),
         }
 
-    async def _picture(self, with_map: bool) -> bytes:
-        newest = self._source.newest
+    async def _picture(self, with_map: bool, width_px: int) -> bytes:
+        """Of the newest frame; made once for all pages that wish the same."""
+        newest, key = self._source.newest, (with_map, width_px)
         async with self._making:
-            key = (newest.frames, with_map)
-            if self._made is None or self._made[0] != key:
+            made = self._made.get(key)
+            if made is None or made[0] != newest.frames:
                 assert newest.frame is not None
-                data = await run_in_threadpool(page_message, newest.frame, with_map)
-                self._made = (key, data)
-            return self._made[1]
+                number = newest.frames
+                data = await run_in_threadpool(page_message, newest.frame, with_map, width_px)
+                made = self._made[key] = (number, data)
+            return made[1]
 
     async def _listen(self, socket: WebSocket, wishes: dict[str, Any]) -> None:
         """What the page wants to see, and how many pictures it showed; anything else ends it."""
@@ -138,12 +141,20 @@ class Pages:
                     wishes[name] = value.get(name) is True
                 shown = value.get("shown", 0)
                 wishes["shown"] = max(wishes["shown"], int(shown))
+                wishes["width"] = _width_px(value.get("width"))
             except (ValueError, TypeError, OverflowError, AttributeError, RecursionError):
                 return
             self._watch()
 
     def _watch(self) -> None:
         self._source.watch(any(w["frames"] for w in self._open.values()))
+
+
+def _width_px(wished: Any) -> int:
+    """The smallest of the widths that fills so much of a screen; the largest if none was wished."""
+    if not isinstance(wished, int | float):
+        return WIDTHS_PX[-1]
+    return next((width for width in WIDTHS_PX if width >= wished), WIDTHS_PX[-1])
 
 
 class Views:

@@ -24,6 +24,7 @@ from companion.live.shown import Shown
 _log = logging.getLogger(__name__)
 _MOST_CONSOLES = 3
 _STATE_S = 0.5
+_PAUSE_S = 1.0  # after a failure, which may last: nothing is tried more often
 _ANSWERS = 8
 
 
@@ -59,8 +60,9 @@ class Publisher:
         for end in (self._woken, self._waker):
             end.setblocking(False)
         self._listening = _listen(path)
-        self._stopping = False
+        self._stopping = threading.Event()
         self._next_state_s = 0.0
+        self._accept_again_s: float | None = None  # while no connection can be taken
         self._thread = threading.Thread(target=self._run, name="console link", daemon=True)
 
     @property
@@ -76,7 +78,7 @@ class Publisher:
 
     def stop(self) -> None:
         """Close every connection."""
-        self._stopping = True
+        self._stopping.set()
         self.wake()
         if self._thread.ident is not None:
             self._thread.join(2.0)
@@ -100,22 +102,26 @@ class Publisher:
     def _run(self) -> None:
         # Of the process's own priority: a thread of a lower one that is put aside while it holds
         # the interpreter would hold up every thread that flies.
-        while not self._stopping:
+        while not self._stopping.is_set():
             try:
                 self._turn()
             except Exception:  # whatever the console does, the flight goes on without it
                 _log.exception("the console's link failed and starts over")
                 self._drop_all()
+                self._stopping.wait(_PAUSE_S)
         self._drop_all()
         self._selector.close()
 
     def _turn(self) -> None:
-        timeout = None
-        if self._consoles:
-            timeout = max(self._next_state_s - time.monotonic(), 0.0)
+        due = [self._next_state_s] if self._consoles else []
+        due += [] if self._accept_again_s is None else [self._accept_again_s]
+        timeout = max(min(due) - time.monotonic(), 0.0) if due else None
         for key, events in self._selector.select(timeout):
             key.data(key.fileobj, events)
         now = time.monotonic()
+        if self._accept_again_s is not None and now >= self._accept_again_s:
+            self._accept_again_s = None
+            self._selector.register(self._listening, selectors.EVENT_READ, self._accept)
         if self._consoles and now >= self._next_state_s:
             self._next_state_s = now + _STATE_S
             for console in self._idle():
@@ -132,17 +138,25 @@ class Publisher:
         return [c for c in self._consoles.values() if c.is_idle]
 
     def _accept(self, listening: Any, _: int) -> None:
-        with contextlib.suppress(OSError):
+        try:
             connection, _address = listening.accept()
-            if len(self._consoles) >= _MOST_CONSOLES:
-                connection.close()
-                return
-            connection.setblocking(False)
-            console = _Console(connection)
-            self._consoles[connection] = console
-            self._selector.register(connection, selectors.EVENT_READ, self._serve)
-            self._next_state_s = 0.0
-            self._offer(console, encode(self._shown.hello()))
+        except (BlockingIOError, ConnectionAbortedError):
+            return  # it went again
+        except OSError as error:
+            # Whoever waits keeps the socket readable: without a pause this thread would spin.
+            _log.warning("no console can connect for %.0f s: %s", _PAUSE_S, error)
+            self._selector.unregister(listening)
+            self._accept_again_s = time.monotonic() + _PAUSE_S
+            return
+        if len(self._consoles) >= _MOST_CONSOLES:
+            connection.close()
+            return
+        connection.setblocking(False)
+        console = _Console(connection)
+        self._consoles[connection] = console
+        self._selector.register(connection, selectors.EVENT_READ, self._serve)
+        self._next_state_s = 0.0
+        self._offer(console, encode(self._shown.hello()))
 
     def _drain(self, woken: Any, _: int) -> None:
         with contextlib.suppress(OSError):

@@ -233,7 +233,7 @@ function wish() {
   if (socket?.readyState !== WebSocket.OPEN) return;
   const narrow = matchMedia("(max-width: 800px)").matches;
   const frames = !document.hidden && (!narrow || ["map", "video"].includes(document.body.dataset.view));
-  socket.send(JSON.stringify({ frames, map: video.needsMap, shown }));
+  socket.send(JSON.stringify({ frames, map: video.needsMap, shown, width: video.widthPx }));
 }
 
 function connect() {

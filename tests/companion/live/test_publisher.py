@@ -1,7 +1,9 @@
 """The flight's side of the console: it never waits, whatever the other side does."""
 
+import errno
 import socket
 import stat
+import threading
 from typing import Any
 
 import numpy as np
@@ -136,6 +138,29 @@ def test_garbage_ends_that_console_alone(serving, garbage):
     assert (answer["number"], answer["ok"]) == (7, True)
     assert ship.hints == [(47.0, 8.0, 50.0)]
     assert ship.said == ["PiLoT: console: hint 47.00000 8.00000 +-50 m"]
+
+
+def test_who_cannot_be_let_in_does_not_make_the_link_spin(serving, monkeypatch):
+    """Out of file descriptors: the connection waits, and its socket stays readable."""
+    publisher, _, _ = serving
+    console = Console(publisher.path)
+    console.next("hello")
+    refusals, refused = [], threading.Event()
+
+    def out_of_files(_):
+        refusals.append(1)
+        refused.set()
+        raise OSError(errno.EMFILE, "Too many open files")
+
+    with monkeypatch.context() as patched:
+        patched.setattr(socket.socket, "accept", out_of_files)
+        late = Console(publisher.path)
+        assert refused.wait(30.0)
+        for number in range(50):  # each is at least one turn of the link
+            console.send({"do": "nothing", "number": number})
+            console.next("answer")
+    assert len(refusals) < 50
+    late.next("hello")  # let in once it can be
 
 
 def test_more_consoles_than_a_few_are_sent_away(serving):
