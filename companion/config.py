@@ -284,6 +284,11 @@ def _resolve(config: CompanionConfig, folder: Path) -> CompanionConfig:
     if localizer.model is not None:
         model = _path(folder, localizer.model, "localizer.model")
         localizer = localizer.model_copy(update={"model": model})
+    odometry = localizer.odometry
+    if odometry is not None and odometry.terrain is not None:
+        terrain = _path(folder, odometry.terrain, "localizer.odometry.terrain")
+        odometry = odometry.model_copy(update={"terrain": terrain})
+        localizer = localizer.model_copy(update={"odometry": odometry})
     record = config.record
     if record is not None:
         place = _path(folder, record.folder, "record.folder")

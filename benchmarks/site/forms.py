@@ -31,7 +31,13 @@ _ACCEPTANCES = ("no added test", "parts agree", "parts agree, stands out: ours")
 _PLACES = (
     "set", "heading", "by day", "dusk", "night", "all", "false", "processor s: search, confirm",
 )  # fmt: skip
-_COST = ("area", "heading", "overview, MiB", "transforms kept, MiB", "processor s")
+_COST = (
+    "area", "heading", "overview, MiB", "transforms kept, MiB", "process, MiB", "processor s",
+)  # fmt: skip
+_DRIFT = (
+    "depth from", "light", "stretches", "drift median, p95, % of the way", "median, p95, m",
+    "inside its 95 %, % of frames", "at the end", "carried to the end",
+)  # fmt: skip
 _PACKAGE = (
     "package", "install, s", "start, s", "upgrade, s", "remove, s", "purge, s",
     "self-test: tracked, found to", "processor ms a frame",
@@ -79,7 +85,7 @@ def _form(data: Any) -> Callable[[list[Any], str], Table]:
     for mark, made in (
         ("columns", _figures), ("package", _package), ("recall_1", _sequence), ("verdict", _suite),
         ("acceptance", _integrity), ("search_cpu_s", _places), ("overview_mib", _cost),
-        ("bins", _depths), ("rows", _throughput),
+        ("bins", _depths), ("rows", _throughput), ("end_percent_p95", _drift),
     ):  # fmt: skip
         if mark in marks:
             return made
@@ -211,6 +217,10 @@ def _places(data: list[Any], _title: str) -> Table:
     for name, known in dict.fromkeys((o["set"], o["heading_known"]) for o in outcomes):
         mine = [o for o in outcomes if (o["set"], o["heading_known"]) == (name, known)]
         rows.append(_place(f"{name}, {mine[0]['area_km2']:.2g} km²", known, mine))
+    for known in (True, False):
+        mine = [o for o in outcomes if o["heading_known"] is known]
+        if len({o["set"] for o in mine}) > 1:
+            rows.append(_place("together", known, mine))
     return Table(_PLACES, tuple(rows))
 
 
@@ -238,12 +248,27 @@ def _share(some: Sequence[dict[str, Any]]) -> str:
 
 def _cost(data: list[Any], _title: str) -> Table:
     rows = (
-        (f"{one['area_km2']:.1f} km²", "15°" if one["heading_known"] else "unknown",
-         f"{one['overview_mib']:.0f}", f"{one['kept_mib']:.0f}", f"{one['cpu_s']:.2f}")
+        (f"{one['area_km2']:.1f} km²{'' if one['measured'] else ', on paper'}",
+         "15°" if one["heading_known"] else "unknown", f"{one['overview_mib']:.0f}",
+         f"{one['kept_mib']:.0f}", f"{one['peak_mib']:.0f}", f"{one['cpu_s']:.2f}")
         for part in data
         for one in part
     )  # fmt: skip
     return Table(_COST, tuple(rows))
+
+
+def _drift(data: list[Any], _title: str) -> Table:
+    rows = tuple(
+        (
+            one["depth"], one["condition"], str(one["stretches"]),
+            f"{one['end_percent_p50']:.2f}, {one['end_percent_p95']:.2f}",
+            f"{one['end_m_p50']:.1f}, {one['end_m_p95']:.1f}",
+            f"{one['inside_95_percent']:.1f}", one["inside_95_at_end"].replace("/", " of "),
+            f"{one['carried_to_the_end']} of {one['stretches']}",
+        )
+        for part in data for one in part
+    )  # fmt: skip
+    return Table(_DRIFT, rows)
 
 
 def _package(data: list[Any], _title: str) -> Table:

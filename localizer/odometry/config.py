@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 from pydantic import BaseModel, ConfigDict, Field
 
 
@@ -66,6 +68,9 @@ class OdometryConfig(BaseModel):
     )
     rise_sigma_m: float = Field(
         0.3, ge=0.01, le=100, description="of the barometer's rise since the keyframe"
+    )
+    terrain: Path | None = Field(
+        None, description="GeoTIFF of the ground's heights, for where the map has none"
     )
     parallax_noise: float | None = Field(
         0.02, ge=1e-4, le=10, description="sigma of a parallax's cost, as a share; null: not used"

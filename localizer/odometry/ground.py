@@ -44,6 +44,24 @@ class FlatGround:
         return np.full(np.shape(east), self.height_m)
 
 
+@dataclass(frozen=True)
+class RaisedGround:
+    """Another ground, raised by so much: its shape counts and not its datum."""
+
+    ground: Ground
+    by_m: float
+
+    @classmethod
+    def onto(cls, ground: Ground, points_world: Array) -> RaisedGround:
+        """So that it lies under surface points (N, 3) as ground does, e.g. the map's last ones."""
+        above = points_world[:, 2] - ground.height(points_world[:, 0], points_world[:, 1])
+        return cls(ground, float(np.quantile(above, _LOW_SHARE)))
+
+    def height(self, east: Array, north: Array) -> Array:
+        """See `Ground.height`."""
+        return self.ground.height(east, north) + self.by_m
+
+
 class SoundedGround:
     """The ground as a rangefinder met it on the way: a plane at the height of what lay lowest.
 

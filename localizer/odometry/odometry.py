@@ -12,7 +12,7 @@ from localizer.geometry.camera import Camera
 from localizer.geometry.pose import Array, Pose, so3_log
 from localizer.odometry.config import OdometryConfig
 from localizer.odometry.estimate import OdometryEstimate, OdometryFrame, OdometryStatus
-from localizer.odometry.ground import FlatGround, Ground, SoundedGround
+from localizer.odometry.ground import FlatGround, Ground, RaisedGround, SoundedGround
 from localizer.odometry.growth import carried, scaled
 from localizer.odometry.keyframe import DepthSource, Keyframe, keyframe_anchors
 from localizer.odometry.parallax import View, align
@@ -43,8 +43,9 @@ class VisualOdometry:
     thread); nothing is rendered here, and no thread is started.
 
     camera: the working pinhole of the features. optimizer: see `odometry_optimizer`. ground: a
-    terrain model for where the map has no geometry; None: a plane at the height that a rangefinder
-    meets on the way, else at that of the ground where the map was last seen.
+    terrain model for where the map has no geometry, of which the shape counts: it is raised or
+    lowered to the ground where the map was last seen; None: a plane at the height that a
+    rangefinder meets on the way, else at that of the ground where the map was last seen.
 
     Above 200 lines: one frame's way, from keyframe to estimate, over one state.
     """
@@ -60,7 +61,7 @@ class VisualOdometry:
         self._camera = camera
         self._optimizer = optimizer
         self.config = config or OdometryConfig()
-        self._ground = ground
+        self._ground = self._terrain = ground
         self._plane: Ground | None = None
         self._sounded = SoundedGround()
         self._seed = seed
@@ -101,6 +102,8 @@ class VisualOdometry:
         )
         if surface is not None and len(surface) > self._optimizer.config.min_anchors:
             self._plane = FlatGround.under(surface)
+            if self._terrain is not None:
+                self._ground = RaisedGround.onto(self._terrain, surface)
 
     def forget(self) -> None:
         """Nothing is known any more: `step` needs a new beginning."""

@@ -17,6 +17,7 @@ from localizer.geometry.camera import Camera
 from localizer.geometry.pose import Array, Pose
 from localizer.geometry.shutter import Sweep
 from localizer.odometry import (
+    Ground,
     OdometryConfig,
     OdometryFrame,
     OdometryStatus,
@@ -66,15 +67,16 @@ _TILT_RAD, _HEADING_RAD, _HEIGHT_M = float(np.radians(0.4)), float(np.radians(3.
 class Bridging:
     """The odometry beside the map's registration; one thread, the localization thread's.
 
-    sensors: other sensors' accounts of the camera, see `Localizer`.
+    sensors: other sensors' accounts of the camera, terrain: the ground's shape, see `Localizer`.
     """
 
     def __init__(
         self, camera: Camera, optimizer: JNGO, config: OdometryConfig, threads: int,
-        sensors: OtherSensors,
+        sensors: OtherSensors, terrain: Ground | None = None,
     ) -> None:  # fmt: skip
         self._sensors = sensors
-        self._odometry = VisualOdometry(camera, odometry_optimizer(optimizer, threads), config)
+        registration = odometry_optimizer(optimizer, threads)
+        self._odometry = VisualOdometry(camera, registration, config, terrain)
         self._longest_sigma_m = config.longest_sigma_m
 
     @property

@@ -14,6 +14,7 @@ from localizer.features.extractor import DeviceExtractor, FeatureExtractor, load
 from localizer.geometry.camera import Camera
 from localizer.map.cache.cache import TileCache
 from localizer.map.cache.stream import TileStreamer
+from localizer.map.terrain import open_terrain
 from localizer.registration.devices import open_backend
 from localizer.registration.jngo import JNGO
 from localizer.render.base import MapRenderer
@@ -85,10 +86,12 @@ def build_localizer(
     optimizer = JNGO(
         config.registration, open_backend(config.device, config.threads), config.threads
     )
+    path = config.odometry.terrain if config.odometry is not None else None
+    terrain = open_terrain(path, stack.cache.frame) if path is not None else None
     _warm_up(stack.renderer, extractor, optimizer, camera, config)
     return Localizer(
         stack.renderer, extractor, optimizer, camera, config, sensors,
-        map_frame=stack.cache.frame, on_close=on_close,
+        map_frame=stack.cache.frame, terrain=terrain, on_close=on_close,
         is_loading=lambda: not stack.streamer.idle,
     )  # fmt: skip
 

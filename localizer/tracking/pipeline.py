@@ -25,6 +25,7 @@ from localizer.errors import (
 from localizer.features.extractor import DeviceExtractor, FeatureExtractor
 from localizer.geometry.camera import Camera
 from localizer.geometry.geo import LocalFrame
+from localizer.odometry import Ground
 from localizer.registration.anchors import select_anchors, swept
 from localizer.registration.calibration import calibration_covariance
 from localizer.registration.jngo import JNGO
@@ -121,8 +122,9 @@ class Localizer:
     sensors: other sensors' accounts (autopilot and gimbal). Their turns replace the constant
     angular rate of the motion model, their attitude enters the registration as a weak prior
     (`AttitudePrior`), and with the displacement it confirms or refutes a place that was searched.
-    map_frame: the map's. on_close: releases what was opened for this localizer alone. is_loading:
-    whether tiles that were asked for are still on their way.
+    map_frame: the map's. terrain: the ground's shape where the map has none. on_close: releases
+    what was opened for this localizer alone. is_loading: whether tiles that were asked for are
+    still on their way.
     """
 
     def __init__(
@@ -135,6 +137,7 @@ class Localizer:
         sensors: OtherSensors | None = None,
         *,
         map_frame: LocalFrame | None = None,
+        terrain: Ground | None = None,
         on_close: Callable[[], None] = lambda: None,
         is_loading: Callable[[], bool] = lambda: False,
     ) -> None:
@@ -149,13 +152,17 @@ class Localizer:
         self._undistorter = Undistorter(camera, self.camera)
         self._reference: ReferenceBundle | None = None  # the last one of `track`
         self._asked_ns = 0  # what time the last reference was asked for
-        self._tracker = Tracker(config, self._sensors, self._bridging(config, optimizer))
+        self._tracker = Tracker(config, self._sensors, self._bridging(config, optimizer, terrain))
 
-    def _bridging(self, config: LocalizerConfig, optimizer: JNGO) -> Bridging | None:
+    def _bridging(
+        self, config: LocalizerConfig, optimizer: JNGO, terrain: Ground | None
+    ) -> Bridging | None:
         # A GPU's features are valid until the next frame only: there is no keyframe to keep.
         if config.odometry is None or optimizer.on_gpu:
             return None
-        return Bridging(self.camera, optimizer, config.odometry, config.threads, self._sensors)
+        return Bridging(
+            self.camera, optimizer, config.odometry, config.threads, self._sensors, terrain
+        )
 
     def __enter__(self) -> Localizer:
         return self

@@ -87,7 +87,8 @@ class Wrong(_Model):
     map_shift_m: east, north, up of where the map shows the ground. gimbal_deg: roll, pitch, yaw
     that the gimbal does not report. focal: the calibration's focal length over the true one.
     other_map: the map of another generated place. map_reach_m: nothing is in the map further east,
-    west, north or south of home; a multiple of 200 m.
+    west, north or south of home; a multiple of 200 m. terrain_off_m: the companion has a terrain
+    model of the whole world, a height each 30 m, so much too high.
     """
 
     map_shift_m: tuple[float, float, float] = (0.0, 0.0, 0.0)
@@ -95,6 +96,7 @@ class Wrong(_Model):
     focal: float = Field(1.0, gt=0.5, lt=2.0)
     other_map: bool = False
     map_reach_m: float | None = Field(None, ge=200, multiple_of=200)
+    terrain_off_m: float | None = Field(None, ge=-100, le=100)
 
 
 class Expectation(_Model):

@@ -33,6 +33,7 @@ from sitl.suite.loop.case import LoopCase, LoopEvent, PlaceHint, Wrong
 from sitl.suite.loop.companion import LoopCompanion
 from sitl.suite.loop.disturbances import GnssDrag, OtherWork
 from sitl.suite.loop.judge import Back, LoopRecord, LoopSample, LoopText
+from sitl.suite.loop.terrain_file import terrain_file
 from sitl.vehicles.launch import VISION_SOURCE, VehicleSetup, open_vehicle
 from sitl.vehicles.process import VehicleKind, VehicleProcess
 
@@ -210,6 +211,9 @@ class _LoopFlight:
             settings["camera"]["model"][axis] *= case.wrong.focal
         settings["bridge"]["mode"] = "rc" if case.gated else settings["bridge"]["mode"]
         settings["bridge"]["injection"]["force"] = not case.earns and not case.cold
+        if case.wrong.terrain_off_m is not None:
+            terrain = terrain_file(flown.world, self._out / "terrain.tif", case.wrong.terrain_off_m)
+            settings["localizer"].setdefault("odometry", {})["terrain"] = str(terrain)
         settings["record"]["snapshot_interval_s"] = 5.0
         settings["bridge"]["tlog"] = str(self._tlog)
         path.write_text(yaml.safe_dump(_merged(settings, case.deployment), sort_keys=False))

@@ -1,7 +1,7 @@
 """Carrying a pose on: how far off it is, what it says of itself, and when it stops."""
 
 from collections.abc import Callable
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 import pytest
@@ -11,6 +11,7 @@ from localizer.geometry.pose import Pose, so3_exp
 from localizer.odometry import (
     DepthSource,
     FlatGround,
+    Ground,
     ImageFault,
     OdometryConfig,
     OdometryStatus,
@@ -26,7 +27,7 @@ from tests.localizer.registration.conftest import SyntheticPlace
 COVERED = Usability(ImageFault.FLAT, 0.0, 0.0, 0.0, 0.0)
 
 
-def odometry(ground: FlatGround | None = None, **changes: object) -> VisualOdometry:
+def odometry(ground: Ground | None = None, **changes: object) -> VisualOdometry:
     optimizer = odometry_optimizer(JNGO(threads=1))
     return VisualOdometry(CAMERA, optimizer, OdometryConfig(**{"anchors": 600, **changes}), ground)
 
@@ -141,6 +142,27 @@ def test_a_rangefinder_that_meets_roofs_half_of_the_time_does_no_harm(plain):
 
     alone = carried_over(plain, lambda k: None)
     assert carried_over(plain, over_a_town) < alone + 0.3
+
+
+@dataclass(frozen=True)
+class Shape:
+    """The slope's ground, by a terrain model of another datum."""
+
+    place: SyntheticPlace
+
+    def height(self, east: np.ndarray, north: np.ndarray) -> np.ndarray:
+        return self.place.height(np.asarray(east), np.asarray(north)) + 48.0
+
+
+def test_a_terrain_models_shape_counts_and_not_its_datum():
+    flight = slope()
+    vo = odometry(max_sigma_m=10.0, ground=Shape(flight.place))
+    begun(flight, vo, mapped=True)
+    for k in range(1, 26):
+        estimate = vo.step(flight.frame(k))
+        assert estimate.usable, estimate.reason
+    assert estimate.source is DepthSource.GROUND
+    assert horizontal(estimate.world_from_camera, flight.pose(25)) < 0.8
 
 
 def test_few_readings_are_no_ground():

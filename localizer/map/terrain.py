@@ -1,0 +1,117 @@
+"""A terrain model beside the map: how high the ground is where the map has nothing.
+
+Any GeoTIFF of heights will do (Copernicus' 30 m, a surveyed one; `companion map fetch` brings
+some). Its datum plays no part: the odometry takes it for the shape of the ground and not for its
+height (docs/explanation/odometry.md).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import cv2
+import numpy as np
+from pyproj import CRS, Transformer
+from pyproj.exceptions import ProjError
+from rasterio.errors import RasterioError
+from rasterio.io import DatasetReader
+
+from localizer.errors import MapSourceError
+from localizer.geometry.geo import LocalFrame
+from localizer.geometry.pose import Array
+from localizer.map.importers.raster_file import offline, open_raster
+from localizer.types import Float32
+
+_REACH_M = 20_000.0  # from the map's origin
+_MOST_CELLS = 2_000  # of a side
+_LEAST_CELL_M = 5.0
+_MOST_PIXELS = 100_000_000
+_EARTH_M = 6.371e6
+_OUTLINE = 9  # places per side of the raster, to find its box
+
+
+@dataclass(frozen=True)
+class TerrainGrid:
+    """Heights (rows, columns) of the ground in the map's frame, north first. west, north: of the
+    first one, m. Beyond its edge the ground goes on level.
+    """
+
+    heights: Float32
+    west: float
+    north: float
+    cell_m: float
+
+    def height(self, east: Array, north: Array) -> Array:
+        """World z (...) in metres at world places (...), bilinear."""
+        rows, columns = self.heights.shape
+        u = np.clip((np.asarray(east) - self.west) / self.cell_m, 0.0, columns - 1.0)
+        v = np.clip((self.north - np.asarray(north)) / self.cell_m, 0.0, rows - 1.0)
+        i = np.minimum(v.astype(np.int64), rows - 2)
+        j = np.minimum(u.astype(np.int64), columns - 2)
+        a, b = v - i, u - j
+        h = self.heights
+        upper = (1 - b) * h[i, j] + b * h[i, j + 1]
+        lower = (1 - b) * h[i + 1, j] + b * h[i + 1, j + 1]
+        found: Array = (1 - a) * upper + a * lower
+        return found
+
+
+def open_terrain(path: Path, frame: LocalFrame) -> TerrainGrid:
+    """The part of a GeoTIFF of heights that lies within 20 km of a map's origin.
+
+    MapSourceError: no such raster, no coordinate system, or nothing known there.
+    """
+    with offline():
+        try:
+            with open_raster(path) as raster:
+                return _read(raster, path, frame)
+        except (RasterioError, ProjError) as error:
+            raise MapSourceError(f"{path}: cannot be read as a terrain model: {error}") from error
+
+
+def _read(raster: DatasetReader, path: Path, frame: LocalFrame) -> TerrainGrid:
+    if raster.crs is None:
+        raise MapSourceError(f"{path}: no coordinate system: a terrain model needs one")
+    if raster.width * raster.height > _MOST_PIXELS:
+        raise MapSourceError(f"{path}: more than {_MOST_PIXELS:.0e} pixels: cut it to the area")
+    there = Transformer.from_crs("EPSG:4326", CRS.from_user_input(raster.crs), always_xy=True)
+    low, high = _box(raster, there, frame)
+    if not (low < high).all():
+        raise MapSourceError(f"{path}: lies more than {_REACH_M / 1e3:.0f} km from the map")
+    across = float(np.hypot(raster.width, raster.height))
+    cell_m = max(_LEAST_CELL_M, float(np.linalg.norm(high - low)) / across)
+    cell_m = max(cell_m, float((high - low).max()) / _MOST_CELLS)
+    columns, rows = (int(n) for n in np.maximum(np.ceil((high - low) / cell_m) + 1, 2))
+    east, north = np.meshgrid(
+        low[0] + cell_m * np.arange(columns), high[1] - cell_m * np.arange(rows)
+    )
+    fallen = (east**2 + north**2) / (2 * _EARTH_M)
+    flat = np.stack([east, north, -fallen], axis=-1)
+    latitude, longitude, _ = np.moveaxis(frame.geodetic_from_enu(flat), -1, 0)
+    x, y = there.transform(longitude, latitude)
+    u, v = ~raster.transform * (np.asarray(x), np.asarray(y))
+    band = raster.read(1, masked=True).astype(np.float32).filled(np.nan)
+    heights = cv2.remap(
+        band, (u - 0.5).astype(np.float32), (v - 0.5).astype(np.float32), cv2.INTER_LINEAR,
+        borderMode=cv2.BORDER_CONSTANT, borderValue=float("nan"),
+    )  # fmt: skip
+    known = np.isfinite(heights)
+    if not known.any():
+        raise MapSourceError(f"{path}: no height is known within {_REACH_M / 1e3:.0f} km")
+    filled = np.where(known, heights, np.median(heights[known]))
+    height = filled - frame.origin.height_m - fallen
+    return TerrainGrid(height.astype(np.float32), float(low[0]), float(high[1]), cell_m)
+
+
+def _box(raster: DatasetReader, there: Transformer, frame: LocalFrame) -> tuple[Array, Array]:
+    """West and south, east and north (2,) of the raster in the map's frame, as far as it counts."""
+    side = np.linspace(0.0, 1.0, _OUTLINE)
+    u, v = (g.ravel() for g in np.meshgrid(side * raster.width, side * raster.height))
+    x, y = raster.transform * (u, v)
+    longitude, latitude = there.transform(x, y, direction="INVERSE")
+    places = frame.enu_from_geodetic(latitude, longitude, np.zeros_like(u))
+    return (
+        np.maximum(places[:, :2].min(axis=0), -_REACH_M),
+        np.minimum(places[:, :2].max(axis=0), _REACH_M),
+    )
