@@ -42,7 +42,8 @@ _HEADING_RAD = np.radians(7.5)  # sigma: known to 15 degrees
 class Cost:
     """Of one search. overview_mib: on the disk and in memory, all scales; kept_mib: of the
     transforms that are kept if the budget allows; cpu_s: of the process, wall_s: beside whatever
-    else runs; peak_mib: resident, of the process so far. Not measured: on paper.
+    else runs; peak_mib: resident, of the process so far; cell_m: of the map's features. Not
+    measured: on paper.
     """
 
     area_km2: float
@@ -53,6 +54,7 @@ class Cost:
     cpu_s: float
     wall_s: float
     peak_mib: float
+    cell_m: float
     measured: bool = True
 
 
@@ -68,13 +70,16 @@ def laid_out(level: OverviewLevel, area_km2: float) -> OverviewLevel:
 
 
 def costs(
-    relocalizer: Relocalizer, query: PlaceQuery, areas: list[float], config: LocalizerConfig
-) -> Iterator[Cost]:
-    """One search on each area, after one that fills what is kept."""
+    relocalizer: Relocalizer, query: PlaceQuery, areas: list[float], config: LocalizerConfig,
+    coarser: int = 0,
+) -> Iterator[Cost]:  # fmt: skip
+    """One search on each area, after one that fills what is kept. coarser: of the overview's scales
+    the finest are left out, as a coarser first stage would.
+    """
     c = config.relocalization
     view = View(query.frame.image, _CAMERA)
     for area in areas:
-        levels = [laid_out(x, area) for x in relocalizer.overview.levels]
+        levels = [laid_out(x, area) for x in relocalizer.overview.levels[coarser:]]
         correlators = tuple(LevelCorrelator(x, c.spectra_mib * 2**20) for x in levels)
         one = replace(query, heading_sigma_rad=1e-3)
         search(view, one, correlators, relocalizer.extractor, c)
@@ -91,6 +96,7 @@ def costs(
             cpu,
             wall,
             resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024,
+            levels[0].cell_m,
         )
 
 
@@ -105,7 +111,7 @@ def on_paper(costs: list[Cost], area_km2: float) -> Cost:
 
     return Cost(
         area_km2, b.heading_known, at("overview_mib"), at("kept_mib"), round(at("blocks")),
-        at("cpu_s"), at("wall_s"), at("peak_mib"), measured=False,
+        at("cpu_s"), at("wall_s"), at("peak_mib"), b.cell_m, measured=False,
     )  # fmt: skip
 
 
@@ -129,6 +135,7 @@ def main() -> None:
         "--heading", choices=("known", "unknown"), default="known", help="to 15 degrees, or not"
     )
     p.add_argument("--on-paper", type=number(0.01, 1e5), default=100.0, help="km2, extrapolated")
+    p.add_argument("--coarser", type=whole(0, 2), default=0, help="finest scales to leave out")
     p.add_argument("--spectra-mib", type=whole(0, 1 << 20), help="budget of kept transforms")
     p.add_argument("--out", type=output, help="JSON")
     args = p.parse_args()
@@ -149,7 +156,7 @@ def main() -> None:
             Frame(image, 0, _CAMERA, 0), pose.rotation, 0.01, sigma, ground + _HEIGHT_M, 2.0
         )
         made = []
-        for cost in costs(relocalizer, query, args.areas, config):
+        for cost in costs(relocalizer, query, args.areas, config, args.coarser):
             made.append(cost)
             print(line(cost), flush=True)
         if len(made) > 1 and args.on_paper > max(c.area_km2 for c in made):

@@ -32,7 +32,8 @@ _PLACES = (
     "set", "heading", "by day", "dusk", "night", "all", "false", "processor s: search, confirm",
 )  # fmt: skip
 _COST = (
-    "area", "heading", "overview, MiB", "transforms kept, MiB", "process, MiB", "processor s",
+    "area", "cell, m", "heading", "overview, MiB", "transforms kept, MiB", "process, MiB",
+    "processor s",
 )  # fmt: skip
 _DRIFT = (
     "depth from", "light", "stretches", "drift median, p95, % of the way", "median, p95, m",
@@ -249,7 +250,8 @@ def _share(some: Sequence[dict[str, Any]]) -> str:
 def _cost(data: list[Any], _title: str) -> Table:
     rows = (
         (f"{one['area_km2']:.1f} km²{'' if one['measured'] else ', on paper'}",
-         "15°" if one["heading_known"] else "unknown", f"{one['overview_mib']:.0f}",
+         f"{one['cell_m']:g}", "15°" if one["heading_known"] else "unknown",
+         f"{one['overview_mib']:.0f}",
          f"{one['kept_mib']:.0f}", f"{one['peak_mib']:.0f}", f"{one['cpu_s']:.2f}")
         for part in data
         for one in part

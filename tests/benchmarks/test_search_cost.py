@@ -9,9 +9,9 @@ from benchmarks.relocalization.curve import Cost, on_paper
 
 def test_a_larger_area_lies_on_the_line_of_the_two_largest():
     made = [
-        Cost(1.0, True, 5.0, 60.0, 8, 0.9, 1.0, 300.0),
-        Cost(4.0, True, 20.0, 200.0, 32, 2.0, 2.4, 400.0),
-        Cost(10.0, True, 50.0, 400.0, 80, 4.0, 4.8, 600.0),
+        Cost(1.0, True, 5.0, 60.0, 8, 0.9, 1.0, 300.0, 2.0),
+        Cost(4.0, True, 20.0, 200.0, 32, 2.0, 2.4, 400.0, 2.0),
+        Cost(10.0, True, 50.0, 400.0, 80, 4.0, 4.8, 600.0, 2.0),
     ]
     paper = on_paper(made, 100.0)
     assert not paper.measured
