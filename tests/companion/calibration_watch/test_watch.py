@@ -11,12 +11,26 @@ from companion.calibration_watch.config import CalibrationLimits
 from companion.calibration_watch.sighting import Sighting
 from companion.calibration_watch.watch import CalibrationFigures
 from mavlink_bridge import quaternion as quat
-from mavlink_bridge.messages import GimbalAttitude
+from mavlink_bridge.messages import GimbalAttitude, VehicleState
 from tests.companion.calibration_watch.simulated import Flown, Wrong, square
 
 LIMITS = CalibrationLimits()
 SURVEYED = square(60.0)  # climbs to its height on GNSS, then turns
 DENIED = square(60.0, climb_s=0.0)
+
+
+CORNERS = square(60.0, leg_s=10.0, climb_s=0.0)
+LATE = Wrong(late_s=0.3, late_from_s=8.0)
+
+
+class Dragged(Flown):
+    """An EKF whose heading late positions turn away: 5.6 degrees from 40 s on."""
+
+    def gimbal_at(self, time_ns: int) -> GimbalAttitude:
+        q = super().gimbal_at(time_ns).quaternion
+        away = float(np.radians(np.clip(time_ns * 1e-9 - 40.0, 0.0, 8.0) * 0.7))
+        turned = quat.multiply(quat.from_euler(0.0, 0.0, away), q)
+        return GimbalAttitude(time_ns, 0.0, 0.0, 0.0, 0.0, turned, "test")
 
 
 def findings(figures: CalibrationFigures) -> set[str]:
@@ -168,16 +182,24 @@ def test_an_ekf_that_late_positions_turned_away_is_no_camera_that_is_off() -> No
     8 s, and the camera's yaw was blamed beside the stamps.
     """
 
-    class Dragged(Flown):
-        def gimbal_at(self, time_ns: int) -> GimbalAttitude:
-            q = super().gimbal_at(time_ns).quaternion
-            away = float(np.radians(np.clip(time_ns * 1e-9 - 40.0, 0.0, 8.0) * 0.7))
-            turned = quat.multiply(quat.from_euler(0.0, 0.0, away), q)
-            return GimbalAttitude(time_ns, 0.0, 0.0, 0.0, 0.0, turned, "test")
-
-    route = square(60.0, leg_s=10.0, climb_s=0.0)
-    flown = Dragged(Wrong(late_s=0.3, late_from_s=8.0), route, lambda at_s: at_s < 5.0).fly()
+    flown = Dragged(LATE, CORNERS, lambda at_s: at_s < 5.0).fly()
     assert ever(flown) == {"time"}
+
+
+def test_an_ekf_that_is_not_where_the_receiver_is_bears_no_witness() -> None:
+    """The receiver is well, but the EKF flies on vision, 12 m from it, whoever chose that: what it
+    agrees with is itself.
+    """
+
+    class OnVision(Dragged):
+        def gnss_place_at(self, time_ns: int) -> tuple[float, ...] | None:
+            return self._sighting(time_ns * 1e-9).place
+
+        def state(self) -> VehicleState:
+            north, east, _ = self._sighting(self._at_s).place
+            return replace(super().state(), latitude_deg=north, longitude_deg=east)
+
+    assert ever(OnVision(replace(LATE, map_m=(12.0, 0.0)), CORNERS).fly()) == {"time"}
 
 
 def test_pictures_that_come_again_are_forgotten() -> None:

@@ -108,6 +108,15 @@ def test_tracking_that_the_ekf_does_not_get_is_not_ok(tmp_path):
     assert lost[-1][0] is HealthLevel.FAILED  # the worse news
 
 
+def test_tracking_that_the_guardian_withholds_is_a_failure(tmp_path):
+    """The heartbeat says CRITICAL: nobody has a position of ours."""
+    guardian = SimpleNamespace(reason="withheld: frozen", level=None, standing=list)
+    told, _ = _one_report(
+        tmp_path, StreamState.LIVE, True, tracking=TrackingState.TRACKING, guardian=guardian
+    )
+    assert told[-1] == (HealthLevel.FAILED, "withheld: frozen")
+
+
 def test_scaled_video_is_told_beside_what_localization_makes_of_it(tmp_path):
     told, _ = _one_report(tmp_path, StreamState.SCALED, True, TrackingState.TRACKING)
     assert told[-1] == (HealthLevel.OK, "localization tracking, video scaled")

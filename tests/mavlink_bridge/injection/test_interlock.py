@@ -131,6 +131,22 @@ def test_without_gnss_it_begins_and_says_that_nothing_was_compared(
     assert told(flight, "shadow") == ["injecting without shadow check"]
 
 
+def test_a_receiver_that_misses_a_second_is_no_flight_without_gnss(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Injection would begin unproven, and would not be taken back."""
+    flight = on_gnss(monkeypatch)
+    for _ in range(3):  # too short for a score, and a gap of 1.8 s: lost for 0.3 s
+        flight.gnss_north_m = 0.0
+        flight.run(1.0)
+        flight.gnss_north_m = None
+        flight.run(1.8)
+    flight.gnss_north_m = 0.0
+    flight.run(1.0)
+    assert flight.vision() == []
+    assert told(flight, "shadow") == []
+
+
 def test_a_rate_that_was_low_on_gnss_does_not_forbid_for_ever(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
