@@ -62,7 +62,8 @@ def wms_url(source: Source, window: Grid) -> str:
         {
             "SERVICE": "WMS", "VERSION": version, "REQUEST": "GetMap", "LAYERS": source.layer,
             "STYLES": source.style, "CRS" if version == "1.3.0" else "SRS": source.crs,
-            "BBOX": ",".join(f"{v:.9g}" if abs(v) < 1e3 else f"{v:.4f}" for v in bounds),
+            # The picture says no place of its own: 9 digits were 6 cm off at 151 degrees east.
+            "BBOX": ",".join(f"{v:.9f}" if abs(v) < 1e3 else f"{v:.4f}" for v in bounds),
             "WIDTH": str(window.width), "HEIGHT": str(window.height),
             "FORMAT": source.format or ("image/tiff" if source.has_heights else "image/jpeg"),
         },

@@ -2,15 +2,20 @@
 
 from __future__ import annotations
 
+from urllib.parse import parse_qs, urlsplit
+
 import numpy as np
 import pytest
 import yaml
+from pyproj import CRS
 
 pytest.importorskip("urllib3")
 from localizer.errors import MapFetchError
 from localizer.map.fetch.area import Area, around, utm_zone
-from localizer.map.fetch.catalogue import choose, load_sources
+from localizer.map.fetch.catalogue import Source, choose, load_sources
 from localizer.map.fetch.cloud import degree_files
+from localizer.map.fetch.raster import Grid
+from localizer.map.fetch.web_map import wms_url
 
 BERN = around(np.array([[46.948, 7.447]]), 300.0)
 SAHARA = around(np.array([[23.0, 5.0]]), 300.0)
@@ -102,3 +107,15 @@ def test_areas():
     for corners in ((8, 46, 7, 47), (7, 46, 7, 47), (0, 0, 90, 10), (float("nan"), 0, 1, 1)):
         with pytest.raises(MapFetchError):
             Area(*corners)
+
+
+@pytest.mark.parametrize("version", ["1.1.1", "1.3.0"])
+def test_a_wms_in_degrees_is_asked_to_a_millimetre_east_of_100_degrees_too(version):
+    """Nine digits were 6 cm off there, and its picture says no place of its own."""
+    source = Source(**{**MINE, "crs": "EPSG:4326", "version": version})
+    window = Grid(CRS.from_epsg(4326), 151.2093123456, -33.8688197531, (2e-6, 2e-6), 1000, 1000)
+    asked = parse_qs(urlsplit(wms_url(source, window)).query)["BBOX"][0]
+    numbers = [float(v) for v in asked.split(",")]
+    left, bottom, right, top = window.bounds
+    wanted = (bottom, left, top, right) if version == "1.3.0" else (left, bottom, right, top)
+    np.testing.assert_allclose(numbers, wanted, rtol=0, atol=5e-9)
