@@ -12,7 +12,7 @@ import numpy as np
 from companion.planning.way import Leg, Sample
 from localizer.forecast.forecast import ViewForecast
 from localizer.forecast.risk import RISK_LIMIT
-from localizer.odometry.config import GrowthModel
+from localizer.odometry.config import OdometryConfig
 
 _LEAST_MAP_SHARE = 0.5  # of the picture: with less it is the map that ends
 _LIKENESS = 0.7  # of another place's match, beyond which it may be taken for this one
@@ -121,24 +121,28 @@ def _reason(forecast: ViewForecast, limits: Limits) -> Reason:
 
 
 def stretches(
-    verdicts: Sequence[LegVerdict], speed_m_s: float, growth: GrowthModel, longest_sigma_m: float
+    verdicts: Sequence[LegVerdict], speed_m_s: float, odometry: OdometryConfig
 ) -> tuple[Stretch, ...]:
     """What must be bridged, in the order of the way; neighbouring samples are one stretch."""
-    found: list[tuple[float, float]] = []
+    found: list[tuple[float, float, bool]] = []
     for verdict in verdicts:
         half = verdict.leg.step_m / 2
         for judged in (j for j in verdict.judged if not j.holds):
             begin, end = judged.sample.way_m - half, judged.sample.way_m + half
+            off_map = judged.reason in (Reason.NO_MAP, Reason.EDGE)
             if found and begin - found[-1][1] < 1e-6 + 0.01 * half:
-                found[-1] = (found[-1][0], end)
+                found[-1] = (found[-1][0], end, found[-1][2] or off_map)
             else:
-                found.append((begin, end))
-    return tuple(_stretch(b, e, speed_m_s, growth, longest_sigma_m) for b, e in found)
+                found.append((begin, end, off_map))
+    return tuple(_stretch(*one, speed_m_s, odometry) for one in found)
 
 
 def _stretch(
-    begin_m: float, end_m: float, speed_m_s: float, growth: GrowthModel, longest_sigma_m: float
+    begin_m: float, end_m: float, off_map: bool, speed_m_s: float, odometry: OdometryConfig
 ) -> Stretch:
-    length = end_m - begin_m
+    """off_map: the map has no geometry there, at one place at least."""
+    ground = odometry.with_plane if odometry.terrain is None else odometry.with_ground
+    growth, length = ground if off_map else odometry.with_map, end_m - begin_m
     drift = math.hypot(growth.horizontal * math.sqrt(length), growth.scale * length)
-    return Stretch(begin_m, end_m, length / speed_m_s, drift, drift <= longest_sigma_m)
+    can_bridge = drift <= odometry.longest_sigma_m
+    return Stretch(begin_m, end_m, length / speed_m_s, drift, can_bridge)

@@ -89,7 +89,7 @@ def make_plan(
     odometry = deployment.localizer.odometry or OdometryConfig()
     speed = mission.speed_m_s if (mission.speed_m_s or 0) > 0 else None
     speed_m_s = speed or question.speed_m_s
-    bridged = stretches(verdicts, speed_m_s, odometry.with_map, odometry.longest_sigma_m)
+    bridged = stretches(verdicts, speed_m_s, odometry)
     notes = _notes(mission, deployment, aim, max(thinned, question.spacing_m))
     return Plan(question, length_m(legs), speed_m_s, verdicts, bridged, options, notes)
 

@@ -175,13 +175,27 @@ def test_neighbours_are_bridged_together_and_no_stretch_is_invented(leg):
         return [LegVerdict(leg, tuple(judged))]
 
     odometry = OdometryConfig()
-    assert stretches(verdict(()), 5.0, odometry.with_map, 15.0) == ()
-    first, second = stretches(verdict((0, 1, 3)), 5.0, odometry.with_map, 15.0)
+    assert stretches(verdict(()), 5.0, odometry) == ()
+    first, second = stretches(verdict((0, 1, 3)), 5.0, odometry)
     assert (first.begin_m, first.length_m) == pytest.approx((0, 40), abs=0.1)
     assert first.seconds == pytest.approx(8, abs=0.1)
     assert second.length_m == pytest.approx(20, abs=0.1)
     assert 0 < second.drift_m < first.drift_m
-    assert not stretches(verdict((0, 1)), 5.0, odometry.with_map, 0.01)[0].can_bridge
+    strict = OdometryConfig(longest_sigma_m=0.1)
+    assert not stretches(verdict((0, 1)), 5.0, strict)[0].can_bridge
+
+
+def test_off_the_map_a_stretch_drifts_as_over_ground_that_nobody_knows(leg, tmp_path):
+    def drift_m(share, odometry):
+        off = forecast(risk=0.9, share=share, ground=0.0 if share == 0.0 else 0.3)
+        judged = tuple(judge(s, [off], Limits()) for s in leg.samples)
+        return stretches([LegVerdict(leg, judged)], 5.0, odometry)[0].drift_m
+
+    level, terrain = OdometryConfig(), OdometryConfig(terrain=tmp_path / "terrain.tif")
+    mapped, off = drift_m(1.0, level), drift_m(0.0, level)
+    assert off == pytest.approx(0.1 * leg.length_m, rel=0.1)
+    assert mapped < drift_m(0.0, terrain) < 0.2 * off
+    assert drift_m(0.3, level) == off
 
 
 def test_a_fixed_camera_is_offered_no_gimbal_angle(leg):
