@@ -37,6 +37,12 @@ SETS: dict[str, tuple[tuple[int, float, Character], ...]] = {
         (2_500_003, 400.0, "mixed"),
         (2_500_004, 400.0, "dense"),
     ),
+    "fresh": (
+        (2_600_001, 400.0, "mixed"),
+        (2_600_002, 400.0, "dense"),
+        (2_600_003, 400.0, "fields"),
+        (2_600_004, 400.0, "forest"),
+    ),
 }
 
 
