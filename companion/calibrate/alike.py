@@ -1,9 +1,9 @@
 """How far neighbouring pictures err alike, and what that does to the sigmas.
 
-Pictures that follow one another show the same roofs and trees from nearly the same place: where the
-map errs there, all of them err, and a second picture tells little that the first did not. So the
-pictures' part of the covariance is not the sum of each one's own noise, but is taken from how each
-of them does pull at the numbers, with those up to some seconds from it (Newey and West 1987).
+Pictures of the same ground show the same roofs and trees: where the map errs there, all of them
+err, and a second picture tells little that the first did not, be it the next one or of another
+leg over it. So the pictures' part of the covariance is not the sum of each one's own noise, but is
+taken from how each of them does pull at the numbers, with those that look near it (Conley 1999).
 """
 
 from __future__ import annotations
@@ -15,8 +15,8 @@ from numpy.typing import NDArray
 
 from localizer.geometry.pose import Array
 
-_REACH_S = 20.0  # at 8 m/s the picture shows other ground
-_MOST_OF_FLIGHT = 1.0 / 6.0
+_REACH_M = 100.0  # on the ground: about a picture's width at the heights that are flown
+_MOST_ALIKE = 0.5  # of all pairs: beyond it the flight was over one place, and tells nothing of it
 
 
 @dataclass(frozen=True)
@@ -57,12 +57,13 @@ class PictureNormals:
 
 
 def pictures_part(
-    gain: Array, count: int, pictures: PictureNormals, times_s: Array
+    gain: Array, count: int, pictures: PictureNormals, grounds: Array
 ) -> tuple[Array, Array]:
     """The pictures' part (C, C) of the shared numbers' covariance if each erred for itself, and the
     factor (C,) of each sigma of it that how they do err asks for, at least 1.
 
-    gain: (C, C + 6 K), the first rows of the normal equations' inverse; count: C.
+    gain: (C, C + 6 K), the first rows of the normal equations' inverse; count: C; grounds: (K, 2),
+    east and north of what each picture shows, m.
     """
     K, S = pictures.shared_pull.shape
     alone, pulls = np.zeros((count, count)), np.zeros((K, count))
@@ -72,12 +73,10 @@ def pictures_part(
         normal = np.block([[pictures.shared[k], both.T], [both, pictures.own[k]]])
         alone += mine @ normal @ mine.T
         pulls[k] = mine @ np.concatenate([pictures.shared_pull[k], pictures.pull[k]])
-    length_s = float(times_s[-1] - times_s[0])
-    reach_s = min(_REACH_S, _MOST_OF_FLIGHT * length_s)
-    gaps = np.abs(times_s[:, None] - times_s)
-    weight = np.maximum(1.0 - gaps / max(reach_s, 1e-9), 0.0)
+    apart = np.abs(grounds[:, None] - grounds)
+    weight = np.maximum(1.0 - apart / _REACH_M, 0.0).prod(axis=2)
     together = np.einsum("kc,kl,lc->c", pulls, weight, pulls, optimize=True)
     # All pulls together are nothing, which takes a part of each from those around it.
-    together /= 1.0 - reach_s / max(length_s, 1e-9)
+    together /= 1.0 - min(float(weight.mean()), _MOST_ALIKE)
     share = together / np.maximum(np.diag(alone), 1e-30)
     return alone, np.sqrt(np.maximum(share, 1.0))

@@ -78,7 +78,7 @@ def solve(evidence: Evidence, fixed: NDArray[np.bool_] | None = None) -> Solutio
     shared = np.eye(len(H), u.COUNT)
     gain: Array = cho_solve(cho_factor(H, lower=True), shared).T
     pictures = _pictures(evidence, guess, noise)
-    alone, larger = pictures_part(gain, u.COUNT, pictures, evidence.times_s)
+    alone, larger = pictures_part(gain, u.COUNT, pictures, evidence.grounds)
     P = gain[:, : u.COUNT] + alone * (np.outer(larger, larger) - 1.0)
     P = 0.5 * (P + P.T)
     information: Array = np.linalg.inv(P).astype(np.float64) - np.diag(_prior(still))
