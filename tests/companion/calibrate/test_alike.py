@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 
 from companion.calibrate.alike import PictureNormals, pictures_part
 from localizer.geometry.pose import Array
@@ -25,9 +26,9 @@ def larger(pulls: Array, grounds: Array) -> float:
     return float(factor[0])
 
 
-def places(rng: np.random.Generator) -> tuple[Array, Array]:
+def places(rng: np.random.Generator) -> tuple[NDArray[np.intp], Array]:
     """Each picture's place, and what it shows, m: ten of each place, legs apart in time."""
-    of = np.arange(PICTURES) % PLACES
+    of: NDArray[np.intp] = np.arange(PICTURES) % PLACES
     middles = np.stack([300.0 * (np.arange(PLACES) % 5), 300.0 * (np.arange(PLACES) // 5)], axis=1)
     return of, middles[of] + rng.uniform(-5.0, 5.0, (PICTURES, 2))
 
