@@ -94,7 +94,7 @@ def _origins(parts: Sequence[Kept]) -> list[str]:
     lines = []
     for (command, machine, written), some in alike.items():
         sources = ", ".join(dict.fromkeys(f"`{part.source}`" for part in some))
-        of = f"from its {sources} of" if written else "as printed, recorded at"
+        of = f"from its {sources} of" if written else "a print of it, whose JSON was not kept, at"
         commits = ", ".join(dict.fromkeys(part.commit for part in some))
         days = ", ".join(dict.fromkeys(part.date for part in some))
         word = "commits" if "," in commits else "commit"
