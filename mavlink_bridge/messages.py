@@ -287,8 +287,6 @@ class GimbalAttitude:
     pitch_rad: float
     yaw_rad: float
     """From true north."""
-    yaw_vehicle_rad: float
-    """From the vehicle's heading."""
     quaternion: tuple[float, float, float, float]
     """(w, x, y, z), gimbal (x forward, y right, z down) to NED."""
     source: str

@@ -7,8 +7,6 @@ import math
 Quaternion = tuple[float, float, float, float]
 Vector = tuple[float, float, float]
 
-IDENTITY: Quaternion = (1.0, 0.0, 0.0, 0.0)
-
 
 def wrap_pi(angle: float) -> float:
     """The angle in [-pi, pi)."""

@@ -50,4 +50,3 @@ FOCAL, CENTRE, BEND, LATE = 0, slice(1, 3), slice(3, 7), 7
 MOUNT, HEADING, ARM, SHIFT, CLIMB = slice(8, 11), 11, slice(12, 15), slice(15, 18), 18
 SIGMAS: Array = np.array([u.sigma for u in UNKNOWNS])
 USEFUL: Array = np.array([u.useful for u in UNKNOWNS])
-SCALES: Array = np.array([u.scale for u in UNKNOWNS])

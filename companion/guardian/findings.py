@@ -7,7 +7,6 @@ import re
 from dataclasses import dataclass
 
 PREFIX = "PiLoT: "
-TEXT_LENGTH = 50  # STATUSTEXT.text
 
 
 class Action(enum.IntEnum):

@@ -2,19 +2,40 @@
 
 from __future__ import annotations
 
+import threading
+
 from companion.targets.detections import CLICKED
 
 _FIRST_DETECTED = 1001  # below are the clicks, which bring their numbers with them
+_MOST = 256  # names; many times as many as are followed at a time
 
 
 class TargetNumbers:
-    """A number for each target's name: a click's own, or the next one of what was detected."""
+    """A number for each target's name: a click's own, or the next one of what was detected.
+
+    No number is given twice. A name that 256 others came after is forgotten, since a detector
+    makes new ones as long as it flies.
+    """
 
     def __init__(self) -> None:
         self._numbers: dict[str, int] = {}
+        self._next = _FIRST_DETECTED
+        self._lock = threading.Lock()
+
+    @property
+    def known(self) -> int:
+        """How many names of detected things are remembered."""
+        return len(self._numbers)
 
     def of(self, name: str) -> int:
         """The number of the target of that name."""
         if name.startswith(CLICKED):
             return int(name[len(CLICKED) :])
-        return self._numbers.setdefault(name, _FIRST_DETECTED + len(self._numbers))
+        with self._lock:
+            number = self._numbers.pop(name, None)
+            if number is None:
+                number, self._next = self._next, self._next + 1
+                if len(self._numbers) >= _MOST:
+                    del self._numbers[next(iter(self._numbers))]
+            self._numbers[name] = number  # at the end: the newest
+            return number

@@ -28,9 +28,20 @@ class Geodetic:
 
     def __post_init__(self) -> None:
         if not all(np.isfinite((self.latitude_deg, self.longitude_deg, self.height_m))):
-            raise GeoreferenceError(f"not a position on Earth: {self}")
+            raise GeoreferenceError(f"not a position on Earth: {self._said}")
         if not (-90 <= self.latitude_deg <= 90 and -360 <= self.longitude_deg <= 360):
-            raise GeoreferenceError(f"latitude or longitude out of range: {self}")
+            swapped = abs(self.latitude_deg) <= 360 and abs(self.longitude_deg) <= 90
+            raise GeoreferenceError(
+                f"latitude or longitude out of range: {self._said}"
+                + (" (the other way round?)" if swapped else "")
+            )
+
+    @property
+    def _said(self) -> str:
+        return (
+            f"latitude {self.latitude_deg:g}, longitude {self.longitude_deg:g}, height "
+            f"{self.height_m:g} m"
+        )
 
 
 def ecef_from_geodetic(latitude_deg: ArrayLike, longitude_deg: ArrayLike, h_m: ArrayLike) -> Array:

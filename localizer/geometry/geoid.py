@@ -14,7 +14,6 @@ import numpy as np
 
 from localizer.geometry.pose import Array
 
-EGM96_ERROR_M = 0.2  # of the cubic between the grid's values, at most; see tests/localizer/geometry
 _GRID = Path(__file__).parent / "grids" / "egm96-15.npz"
 _PER_DEGREE = 4
 

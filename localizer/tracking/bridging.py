@@ -53,7 +53,6 @@ class Carried:
     world_from_camera: Pose | None = None
     covariance: Array | None = None
     quality: float = 0.0
-    reason: str = ""
 
 
 _NOTHING = Carried(Carry.NONE)
@@ -117,17 +116,17 @@ class Bridging:
                 constraint=constraint,
                 clearance_m=self._sensors.clearance_at(frame.exposure_time_ns),
             )
-        except OdometryError as error:  # no depth for a first keyframe: there will be none later
+        except OdometryError:  # no depth for a first keyframe: there will be none later
             self._odometry.forget()
-            return Carried(Carry.BROKEN, reason=str(error))
+            return Carried(Carry.BROKEN)
         if estimate.status is OdometryStatus.LOST:
             self._odometry.forget()
-            return Carried(Carry.BROKEN, reason=estimate.reason)
+            return Carried(Carry.BROKEN)
         if not estimate.usable:
-            return Carried(Carry.GAP, reason=estimate.reason)
+            return Carried(Carry.GAP)
         if np.sqrt(estimate.covariance.diagonal()[:3].max()) > self._longest_sigma_m:
             self._odometry.forget()
-            return Carried(Carry.BROKEN, reason="the carried position is too uncertain")
+            return Carried(Carry.BROKEN)
         return Carried(
             Carry.CARRIED, estimate.world_from_camera, estimate.covariance, estimate.quality
         )

@@ -8,12 +8,13 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Any
 
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from mavlink_bridge.camera.look_at import LOOKS, LookAt
+from mavlink_bridge.camera.marks import Marks
 from mavlink_bridge.camera.messages import (
     camera_fov_status,
     camera_information,
@@ -23,7 +24,6 @@ from mavlink_bridge.camera.messages import (
 from mavlink_bridge.camera.targets import (
     adsb_vehicle,
     image_captured,
-    is_confirmed,
     tracking_geo_status,
     tracking_image_status,
 )
@@ -33,7 +33,6 @@ from mavlink_bridge.messages import CameraView, Origin, TargetReport, TrackReque
 
 Send = Callable[[Any, int], bool]
 _TARGET_AGE_NS = 2_000_000_000
-_MARKS_AGAIN_NS = 2_000_000_000  # a mark is said three times: it may be lost, and no one asks again
 _IDLE_PERIOD_NS = 1_000_000_000
 _IDLE_TIMES = 3  # "idle" is told when tracking ends, not for ever
 _REPEATED_NS = 10_000_000_000  # how long a station repeats a command that nobody answered
@@ -55,16 +54,6 @@ _MIN_INTERVAL_US = 20_000
 _PER_TICK = 4  # targets: more in one go would fill a slow port, and positions wait behind them
 
 
-@dataclass
-class _Mark:
-    """A confirmed target's place as it is told. left: how often still."""
-
-    report: TargetReport
-    index: int
-    left: int = 3
-    sent_ns: int = -_MARKS_AGAIN_NS
-
-
 class CameraComponent:
     """One link's view of the camera. All methods run in that link's owner thread."""
 
@@ -81,8 +70,8 @@ class CameraComponent:
     ) -> None:
         self._camera = config.camera
         self._utc, self._look = utc or SteadyUtc(), look
-        self._confirmed_m = config.targets.confirmed_sigma_m if config.targets.captured else None
-        self._captured: dict[int, _Mark] = {}
+        sigma_m = config.targets.confirmed_sigma_m
+        self._marks = Marks(sigma_m) if config.targets.captured else None
         self._component = config.camera_component
         self._adsb = config.targets.adsb and ground_link
         self._geoid_m = geoid_separation_m
@@ -129,8 +118,8 @@ class CameraComponent:
         for number in self._due("geo", told, self._geo_ns, now_ns):
             message = tracking_geo_status(self._targets[number], self._geoid_m, vehicle)
             send(message, self._component)
-        if self._confirmed_m is not None:
-            self._capture(self._confirmed_m, now_ns, uptime_ms, send)
+        if self._marks is not None:
+            self._capture(self._marks, now_ns, uptime_ms, send)
         if self._adsb:
             for number in self._due("adsb", list(self._targets), self._period_ns, now_ns):
                 send(adsb_vehicle(self._targets[number], self._geoid_m), self._component)
@@ -146,18 +135,13 @@ class CameraComponent:
             send(message, self._component)
             self._view = None
 
-    def _capture(self, sigma_m: float, now_ns: int, uptime_ms: int, send: Send) -> None:
-        """A mark on the map for each target once it is confirmed, repeated against a lossy link."""
-        for number, report in self._targets.items():
-            if number not in self._captured and is_confirmed(report, sigma_m):
-                self._captured[number] = _Mark(report, len(self._captured))
-        for mark in self._captured.values():
-            if mark.left and now_ns - mark.sent_ns >= _MARKS_AGAIN_NS:
-                utc_us = self._utc.utc_ns(mark.report.time_ns) // 1000
-                mark.left, mark.sent_ns = mark.left - 1, now_ns
-                message = image_captured(mark.report, self._geoid_m, mark.index, uptime_ms, utc_us)
-                send(message, self._component)
-                return  # one in a tick: a slow port carries positions
+    def _capture(self, marks: Marks, now_ns: int, uptime_ms: int, send: Send) -> None:
+        """A mark on the map for each target once it is confirmed."""
+        mark = marks.due(self._targets, now_ns)
+        if mark is not None:
+            utc_us = self._utc.utc_ns(mark.report.time_ns) // 1000
+            message = image_captured(mark.report, self._geoid_m, mark.index, uptime_ms, utc_us)
+            send(message, self._component)
 
     def _told(self) -> list[int]:
         """Whom the camera protocol tells of: it knows one target, and no number of it.

@@ -128,12 +128,3 @@ def covariance_entry(error: float, formula: CovarianceFormula) -> float:
     if formula == "sqrt":
         return error**2 / 3.0
     return error**2
-
-
-def error_from_entry(entry: float, formula: CovarianceFormula) -> float:
-    """The error a firmware reads from three equal diagonal entries; inverse of the above."""
-    if formula == "cbrt":
-        return math.pow(3.0 * entry**2, 1.0 / 3.0)
-    if formula == "sqrt":
-        return math.sqrt(3.0 * entry)
-    return math.sqrt(entry)

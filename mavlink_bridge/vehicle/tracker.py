@@ -92,9 +92,7 @@ class VehicleTracker:
             q, source = quat.multiply(heading, sample.quaternion), sample.source
         q = quat.normalise(quat.multiply(q, self._mount))
         roll, pitch, yaw = quat.to_euler(q)
-        return GimbalAttitude(
-            time_ns, roll, pitch, yaw, quat.wrap_pi(yaw - body.yaw_rad), q, source
-        )
+        return GimbalAttitude(time_ns, roll, pitch, yaw, q, source)
 
     def global_at(self, time_ns: int) -> tuple[float, ...] | None:
         """The EKF's (latitude, longitude in degrees, altitude AMSL) at a time."""

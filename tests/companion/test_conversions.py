@@ -25,7 +25,7 @@ def _attitude(roll, pitch, yaw, time_ns=0) -> Attitude:
 
 def _gimbal(pitch, yaw, time_ns=0) -> GimbalAttitude:
     q = quaternion_from_matrix(matrix_from_euler(0.0, pitch, yaw))
-    return GimbalAttitude(time_ns, 0.0, pitch, yaw, 0.0, tuple(float(x) for x in q), "test")
+    return GimbalAttitude(time_ns, 0.0, pitch, yaw, tuple(float(x) for x in q), "test")
 
 
 def _state(position: Geodetic, time_ns: int = 0, velocity=None) -> VehicleState:

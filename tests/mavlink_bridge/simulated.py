@@ -91,7 +91,7 @@ class Flight:
             config,
             GEOID,
             SteadyUtc(1_790_000_000 * SECOND, self.now_ns),
-            VehicleTracker(None, quat.IDENTITY, True),
+            VehicleTracker(None, (1.0, 0.0, 0.0, 0.0), True),
             self.now_ns,
             lambda: HealthLevel.OK,
             say,

@@ -6,6 +6,7 @@ from typing import Any
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from mavlink_bridge.camera.component import CameraComponent
+from mavlink_bridge.camera.marks import Marks
 from mavlink_bridge.config import BridgeConfig
 from mavlink_bridge.messages import TargetReport
 
@@ -30,6 +31,28 @@ def test_a_target_that_is_forgotten_is_told_no_more_and_the_others_are():
     component.forget(4)
     assert told(11 * SECOND + SECOND // 2) == []
     assert component.targets == 0
+
+
+def test_marks_of_fresh_targets_without_end_take_no_memory_without_end():
+    """A detector that names each thing anew: each is marked three times, with its own index."""
+    marks, seen = Marks(3.0), []
+    for number in range(1, 601):
+        for k in range(4):
+            now_ns = (number * 10 + k * 2) * SECOND
+            report = TargetReport(now_ns, 47.3, 8.5, 450.0, h_accuracy_m=0.5, target_id=number)
+            mark = marks.due({number: report}, now_ns)
+            seen += [] if mark is None else [mark.index]
+    assert seen == [index for index in range(600) for _ in range(3)]
+    assert len(marks) <= 256
+
+
+def test_a_target_that_comes_back_is_not_marked_again():
+    marks = Marks(3.0)
+    report = TargetReport(SECOND, 47.3, 8.5, 450.0, h_accuracy_m=0.5, target_id=4)
+    sent = [marks.due({4: report}, k * 2 * SECOND) for k in range(4)]
+    assert [mark is not None for mark in sent] == [True, True, True, False]
+    assert marks.due({}, 20 * SECOND) is None
+    assert marks.due({4: report}, 30 * SECOND) is None
 
 
 class Station:

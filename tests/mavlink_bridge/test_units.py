@@ -147,7 +147,7 @@ def test_the_origin_is_set_and_read_in_the_units_of_the_definition() -> None:
 
 def read(name: str, values: dict[str, float], **others: Any) -> VehicleTracker:
     """A tracker that took in one message, its fields given in degrees, metres, m/s."""
-    tracker = VehicleTracker(None, quat.IDENTITY, False)
+    tracker = VehicleTracker(None, (1.0, 0.0, 0.0, 0.0), False)
     for message, time_ns in sent(name, values, **others):
         tracker.handle(message, time_ns)
     return tracker

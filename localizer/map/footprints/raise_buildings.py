@@ -26,7 +26,7 @@ from localizer.map.footprints.citygml import read_citygml
 from localizer.map.footprints.footprint import Footprint, Footprints
 from localizer.map.footprints.geojson import read_geojson
 from localizer.map.importers.height_crs import horizontal_unit_m, stated_heights
-from localizer.map.importers.raster_file import offline, open_raster
+from localizer.map.importers.raster_file import applied, offline, open_raster
 
 _WALL_M = 0.5  # a cell, over which a wall may lean
 _DEGREE_M = 111_000.0
@@ -122,7 +122,7 @@ def _divided(data: DatasetReader, parts: int) -> tuple[Array, Affine]:
     """Heights (h, w), NaN where unknown, and their transform."""
     shape = data.height * parts, data.width * parts
     raw = data.read(1, masked=True, out_shape=shape, resampling=Resampling.bilinear)
-    transform = data.transform * Affine.scale(1 / parts, 1 / parts)
+    transform = data.transform @ Affine.scale(1 / parts, 1 / parts)
     return raw.astype(np.float32).filled(np.nan), transform
 
 
@@ -157,7 +157,7 @@ def _burn(heights: Array, bare: Array, transform: Affine, building: Footprint) -
     ring = np.concatenate([ring for rings in building.polygons for ring in rings])
     if not np.isfinite(ring).all():
         return "missed"
-    columns, rows = ~transform * (ring[:, 0], ring[:, 1])
+    columns, rows = applied(~transform, ring[:, 0], ring[:, 1])
     height, width = heights.shape
     first = max(int(np.floor(rows.min())), 0), max(int(np.floor(columns.min())), 0)
     last = (
@@ -170,7 +170,7 @@ def _burn(heights: Array, bare: Array, transform: Affine, building: Footprint) -
         ({"type": "Polygon", "coordinates": [ring.tolist() for ring in rings]}, 1)
         for rings in building.polygons
     ]
-    here = transform * Affine.translation(*first[::-1])
+    here = transform @ Affine.translation(*first[::-1])
     inside = rasterize(shapes, window.shape, transform=here, dtype="uint8").astype(bool)
     if not inside.any():
         return "small"

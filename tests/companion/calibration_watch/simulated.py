@@ -162,7 +162,7 @@ class Flown:
         yaw = self._yaw(time_ns * 1e-9) + np.radians(self.wrong.compass_deg)
         pitch = np.radians(self.pitch_deg)
         q = quat.from_euler(0.0, float(pitch), float(yaw))
-        return GimbalAttitude(time_ns, 0.0, float(pitch), float(yaw), 0.0, q, "test")
+        return GimbalAttitude(time_ns, 0.0, float(pitch), float(yaw), q, "test")
 
     # --- what is true ---------------------------------------------------------------------------
 

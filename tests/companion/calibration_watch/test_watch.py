@@ -30,7 +30,7 @@ class Dragged(Flown):
         q = super().gimbal_at(time_ns).quaternion
         away = float(np.radians(np.clip(time_ns * 1e-9 - 40.0, 0.0, 8.0) * 0.7))
         turned = quat.multiply(quat.from_euler(0.0, 0.0, away), q)
-        return GimbalAttitude(time_ns, 0.0, 0.0, 0.0, 0.0, turned, "test")
+        return GimbalAttitude(time_ns, 0.0, 0.0, 0.0, turned, "test")
 
 
 def findings(figures: CalibrationFigures) -> set[str]:

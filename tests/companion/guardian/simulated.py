@@ -124,7 +124,7 @@ class Flight:
         """A camera that looks straight north and 45 degrees down, as it is reported."""
         half = -np.pi / 8.0
         q = (float(np.cos(half)), 0.0, float(np.sin(half)), 0.0)
-        return GimbalAttitude(time_ns, 0.0, 2.0 * half, 0.0, 0.0, q, "test")
+        return GimbalAttitude(time_ns, 0.0, 2.0 * half, 0.0, q, "test")
 
     def gnss_place_at(self, time_ns: int) -> tuple[float, ...] | None:
         """The EKF follows vision here."""

@@ -120,7 +120,7 @@ STATE = VehicleState(
 )
 LEVEL = (1.0, 0.0, 0.0, 0.0)
 ATTITUDE = Attitude(second(1.0), 0.0, 0.0, 0.0, LEVEL)
-GIMBAL = GimbalAttitude(second(1.0), 0.0, 0.0, 0.0, 0.0, LEVEL, "test")
+GIMBAL = GimbalAttitude(second(1.0), 0.0, 0.0, 0.0, LEVEL, "test")
 
 
 @pytest.mark.parametrize("value", SPOILT)

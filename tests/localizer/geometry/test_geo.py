@@ -104,6 +104,7 @@ def test_ned_is_enu_with_north_and_east_swapped_and_down():
     [
         ((91.0, 0.0, 0.0), "out of range"),
         ((0.0, 361.0, 0.0), "out of range"),
+        ((-98.1, 30.2, 425.0), r"latitude -98\.1, longitude 30\.2.*the other way round"),
         ((float("nan"), 0.0, 0.0), "not a position"),
         ((0.0, 0.0, float("inf")), "not a position"),
     ],

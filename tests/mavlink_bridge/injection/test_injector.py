@@ -23,7 +23,6 @@ from mavlink_bridge.vehicle.profile import (
     ARDUPILOT_SQRT,
     PX4,
     FirmwareProfile,
-    error_from_entry,
 )
 
 MS = 1_000_000
@@ -207,20 +206,22 @@ def test_sending_ends_when_the_next_fix_is_overdue(fix_hz: float, silent_after_s
     assert it.reason == "no fresh fix"
 
 
+def firmware_error_m(covariance: Any, profile: FirmwareProfile) -> float:
+    """What a firmware makes of the message's covariance."""
+    if profile is ARDUPILOT:  # GCS_Common.cpp: cbrtf(sq(c0) + sq(c6) + sq(c11))
+        return float(sum(covariance[i] ** 2 for i in DIAGONAL[:3]) ** (1 / 3))
+    if profile is ARDUPILOT_SQRT:  # pull request 32084
+        return math.sqrt(sum(covariance[i] for i in DIAGONAL[:3]))
+    return math.sqrt(covariance[0])
+
+
 @pytest.mark.parametrize("profile", [ARDUPILOT, ARDUPILOT_SQRT, PX4])
 @pytest.mark.parametrize("sigma", [0.5, 2.0])
 def test_firmware_reads_the_error_that_was_meant(profile: FirmwareProfile, sigma: float) -> None:
     it = injector(rate_hz=10, delay_ms=0, sigma_floor_m=1e-6)
     it.submit(fix(SECOND, position_covariance_ned=np.eye(3) * sigma**2), SECOND)
     covariance = it.step(SECOND, context(profile=profile)).message.covariance  # type: ignore[union-attr]
-    if profile is ARDUPILOT:  # GCS_Common.cpp: cbrtf(sq(c0) + sq(c6) + sq(c11))
-        read = sum(covariance[i] ** 2 for i in DIAGONAL[:3]) ** (1 / 3)
-    elif profile is ARDUPILOT_SQRT:  # pull request 32084
-        read = math.sqrt(sum(covariance[i] for i in DIAGONAL[:3]))
-    else:
-        read = math.sqrt(covariance[0])
-    assert read == pytest.approx(sigma, rel=1e-4)
-    assert error_from_entry(covariance[0], profile.covariance) == pytest.approx(sigma, rel=1e-4)
+    assert firmware_error_m(covariance, profile) == pytest.approx(sigma, rel=1e-4)
 
 
 @pytest.mark.parametrize("profile", [ARDUPILOT, ARDUPILOT_SQRT])
@@ -231,7 +232,7 @@ def test_ardupilot_reads_the_worst_axis(profile: FirmwareProfile) -> None:
     P = turn @ np.diag([4.0, 0.25, 0.01]) @ turn.T
     it.submit(fix(SECOND, position_covariance_ned=P), SECOND)
     covariance = it.step(SECOND, context(profile=profile)).message.covariance  # type: ignore[union-attr]
-    assert error_from_entry(covariance[0], profile.covariance) == pytest.approx(2.0, rel=1e-4)
+    assert firmware_error_m(covariance, profile) == pytest.approx(2.0, rel=1e-4)
 
 
 def test_reset_counter_changes_on_the_very_message_that_carries_the_jump() -> None:

@@ -1,0 +1,51 @@
+"""Marks on the ground station's map: each target once, as it is confirmed."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+from mavlink_bridge.camera.targets import is_confirmed
+from mavlink_bridge.messages import TargetReport
+
+_AGAIN_NS = 2_000_000_000  # a mark is said three times: it may be lost, and no one asks again
+_MOST = 256  # remembered of targets that are gone, so that none that comes back is marked twice
+
+
+@dataclass
+class Mark:
+    """A confirmed target's place as it is told. left: how often still."""
+
+    report: TargetReport
+    index: int
+    left: int = 3
+    sent_ns: int = -_AGAIN_NS
+
+
+class Marks:
+    """Which mark is due. Those of targets that are gone are forgotten beyond the newest 256, since
+    a detector names things anew as long as it flies.
+    """
+
+    def __init__(self, sigma_m: float) -> None:
+        self._sigma_m = sigma_m
+        self._marks: dict[int, Mark] = {}
+        self._next = 0
+
+    def __len__(self) -> int:
+        return len(self._marks)
+
+    def due(self, targets: Mapping[int, TargetReport], now_ns: int) -> Mark | None:
+        """The one to send now, noted as sent; one at a time: a slow port carries positions."""
+        for number, report in targets.items():
+            if number not in self._marks and is_confirmed(report, self._sigma_m):
+                self._marks[number] = Mark(report, self._next)
+                self._next += 1
+        gone = [number for number in self._marks if number not in targets]
+        for number in gone[: max(0, len(self._marks) - _MOST)]:
+            del self._marks[number]
+        for mark in self._marks.values():
+            if mark.left and now_ns - mark.sent_ns >= _AGAIN_NS:
+                mark.left, mark.sent_ns = mark.left - 1, now_ns
+                return mark
+        return None
