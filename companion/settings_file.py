@@ -46,7 +46,7 @@ def validated(model: type[_ModelT], data: dict[str, Any]) -> _ModelT:
     except ValidationError as error:
         lines = [_line(e["loc"], _reason(model, dict(e)), e["input"]) for e in error.errors()]
         raise SettingsError("\n".join(lines)) from error
-    if lines := [_line(where, "Input should not be a boolean", value)
+    if lines := [_line(where, "must not be a boolean", value)
                  for where, value in misread_booleans(data, settings)]:  # fmt: skip
         raise SettingsError("\n".join(lines))
     return settings
@@ -57,9 +57,14 @@ def _line(where: Iterable[str | int], what: str, given: object) -> str:
 
 
 def _reason(model: type[BaseModel], error: dict[str, Any]) -> str:
-    if error["type"] != "extra_forbidden":
-        return str(error["msg"])
-    return f"no such setting{_meant(model, error['loc'])}"
+    if error["type"] == "extra_forbidden":
+        return f"no such setting{_meant(model, error['loc'])}"
+    if error["type"] == "missing":
+        return "is missing and has no default"
+    # Pydantic's "Input should be a valid integer, unable to parse string as an integer".
+    text = str(error["msg"]).removeprefix("Value error, ").split(", unable to parse", 1)[0]
+    text = text.replace("Input should", "must").replace("a valid ", "a ")
+    return text.replace("a integer", "an integer")
 
 
 def _meant(model: type[BaseModel], where: Sequence[str | int]) -> str:

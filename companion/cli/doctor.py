@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import json
 import tempfile
+from collections.abc import Sequence
 from dataclasses import asdict
 from datetime import datetime, timezone
 from pathlib import Path
@@ -51,7 +52,9 @@ def doctor_command(
         from mavlink_bridge.preflight.doctor import repair
 
         diagnosis = examine_deployment(settings, vehicle=vehicle, feed=feed, say=say)
-    print_diagnosis(console, diagnosis)
+    left_out = [] if vehicle else ["vehicle"]
+    left_out += [] if feed else ["camera"]
+    print_diagnosis(console, diagnosis, left_out)
     if fix and diagnosis.fixable:
         names = ", ".join(f"{f.name} = {f.fix:.7g}" for f in diagnosis.fixable if f.fix is not None)
         if yes or typer.confirm(f"Write {names}?"):
@@ -59,7 +62,7 @@ def doctor_command(
             console.print("written" + ("; reboot the flight controller" if reboot else ""))
             with shown_steps(console) as say:
                 diagnosis = examine_deployment(settings, vehicle=vehicle, feed=feed, say=say)
-            print_diagnosis(console, diagnosis)
+            print_diagnosis(console, diagnosis, left_out)
     if page is not None:
         from companion.preflight.sheet import make_sheet, write_sheet
 
@@ -69,9 +72,15 @@ def doctor_command(
     raise typer.Exit(diagnosis.exit_code)
 
 
-def print_diagnosis(console: Console, diagnosis: Diagnosis) -> None:
-    """A table that fits 80 columns, then a line or two for each thing that is not right."""
-    table = Table(title="fit to fly" if diagnosis.ok else "NOT fit to fly", box=SIMPLE_HEAD)
+def print_diagnosis(console: Console, diagnosis: Diagnosis, left_out: Sequence[str] = ()) -> None:
+    """A table that fits 80 columns, then a line or two for each thing that is not right.
+
+    left_out: what was not examined, which a title that says "fit" must not hide.
+    """
+    title = "fit to fly" if diagnosis.ok else "NOT fit to fly"
+    if left_out:
+        title += " as far as examined"
+    table = Table(title=title, box=SIMPLE_HEAD)
     for column in ("", "what", "found", "needed"):
         table.add_column(column, overflow="fold")  # never hide the end of a name
     for f in diagnosis.findings:
@@ -81,6 +90,8 @@ def print_diagnosis(console: Console, diagnosis: Diagnosis) -> None:
         if not f.ok:
             line = Text.from_markup(f"{_mark(f)} {escape(f.name)}: {escape(f.why)}")
             console.print(line, highlight=False)
+    for name in left_out:
+        console.print(f"{name}: not examined", style="yellow", highlight=False)
 
 
 def _mark(finding: Finding) -> str:

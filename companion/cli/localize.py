@@ -77,7 +77,11 @@ def localize_command(
     TileCache.open(map_cache)  # paths first: what is missing is said before anything is computed
     intrinsics = Camera.from_json(camera)
     if (prior is None) == (priors is None):
-        raise ConfigError("give either --prior (of the first image) or --priors (a pose file)")
+        raise ConfigError(
+            "give either --prior LAT,LON,HEIGHT,ROLL,PITCH,YAW (of the first image; degrees, "
+            "metres above the ellipsoid, pitch 0 looks straight down, yaw counter-clockwise from "
+            "north) or --priors FILE (lines of: name lon lat alt roll pitch yaw)"
+        )
     rows = read_poses(priors) if priors is not None else [_row(paths[0].name, str(prior))]
     if paths[0].name not in {row.name for row in rows}:
         raise ConfigError(f"--priors {priors}: has no line for the first image, {paths[0].name}")

@@ -13,7 +13,7 @@ from localizer.errors import OutsideMapError
 from localizer.geometry.camera import Camera
 from localizer.geometry.pose import Pose
 from localizer.tracking.pipeline import Localizer
-from localizer.types import Frame, PoseEstimate, PosePrior
+from localizer.types import Frame, PoseEstimate, PosePrior, RegistrationStatus
 
 _PASSES = 3  # of an image that starts from a prior: the view from there shows another place
 
@@ -70,9 +70,11 @@ def localize_images(
             frame = _frame(path, camera, time_ns, sequence)
             estimate = localizer.track(frame, passes=1 if prior is None else _PASSES)
         except (OutsideMapError, StreamDecodeError, StreamSizeError) as error:
-            yield LocalizedImage(path.name, None, str(error))
+            # The caller names the image, too.
+            text = str(error).removeprefix(f"{path}: ").removeprefix(f"{path.name}: ")
+            yield LocalizedImage(path.name, None, text)
             continue
-        problem = "" if estimate.accepted else f"rejected: {_why(estimate)}"
+        problem = "" if estimate.accepted else f"not localized: {_why(estimate)}"
         yield LocalizedImage(path.name, estimate, problem)
 
 
@@ -83,4 +85,9 @@ def _frame(path: Path, camera: Camera, time_ns: int, sequence: int) -> Frame:
 
 
 def _why(estimate: PoseEstimate) -> str:
+    if estimate.status is RegistrationStatus.OK:
+        return (
+            "registered, but not believed: picture and map agree too little (quality "
+            f"{estimate.quality:.2f}); check the prior, or give a smaller --prior-sigma-m"
+        )
     return f"{estimate.status.value}, quality {estimate.quality:.2f}"

@@ -185,10 +185,24 @@ def _position(
         place = cache.frame.position([*below, 0.0])
         raise MissionFileError(
             f"{what} at {place.latitude_deg:.6f}, {place.longitude_deg:.6f} is not over the map "
-            f"{cache.path}, so nobody knows how high its ground is: plan it over the map, or with "
-            "altitudes above mean sea level"
+            f"{cache.path} ({_extent(cache, below)}), so nobody knows how high its ground is: plan "
+            "it over the map, or with altitudes above mean sea level"
         )
     return np.array([east, north, surface + waypoint.height_m])
+
+
+def _extent(cache: TileCache, below: tuple[float, float]) -> str:
+    """Where the map lies, and how far a place (east, north in metres) is from its rectangle."""
+    corners = np.array(
+        [_enu(*corner, cache) for corner in cache.manifest.extent]
+    )  # of the rectangle, (n, 2)
+    nearest = np.clip(below, corners.min(axis=0), corners.max(axis=0))
+    away_m = float(np.hypot(*(np.asarray(below) - nearest)))
+    latitudes, longitudes = zip(*cache.manifest.extent, strict=True)
+    return (
+        f"latitude {min(latitudes):.5f} to {max(latitudes):.5f}, longitude {min(longitudes):.5f} "
+        f"to {max(longitudes):.5f}; it is {away_m:.0f} m away"
+    )
 
 
 def length_m(legs: Sequence[Leg]) -> float:

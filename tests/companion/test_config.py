@@ -36,6 +36,10 @@ def test_minimal_config_and_paths_relative_to_the_file(tmp_path):
 @pytest.mark.parametrize(
     ("change", "named"),
     [
+        (
+            {"camera": {"source": "a", "model": {"width": "big"}}},
+            r"camera\.model\.width: must be an integer \(got 'big'\)",
+        ),
         ({"mapp": "x"}, r"mapp: no such setting, did you mean map\? \(got 'x'\)"),
         (
             {"bridge": {"conection": 1}},
@@ -44,7 +48,7 @@ def test_minimal_config_and_paths_relative_to_the_file(tmp_path):
         ({"zzz": 1}, r"zzz: no such setting \(got 1\)"),
         ({"localizer": {"width": "wide"}}, "localizer.width"),
         ({"camera": {**CAMERA, "source": "frames", "settings": {"sender": "127.0.0.1"}}}, "udp://"),
-        ({"targets": {"rate_hz": True}}, "targets.rate_hz: Input should not be a boolean"),
+        ({"targets": {"rate_hz": True}}, "targets.rate_hz: must not be a boolean"),
         ({"camera": CAMERA | {"lever_arm_m": [0, True, 0]}}, r"camera.lever_arm_m.1.*\(got True"),
         ({"localizer": {"motion": {"acceleration_sigma": -1}}}, "acceleration_sigma"),
         ({"camera": {"source": "udp://x:1", "model": MODEL | {"fx": -1}}}, "camera.model.fx"),

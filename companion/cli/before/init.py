@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import sys
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, TypeVar
 
 import typer
 from rich.console import Console
@@ -17,6 +18,7 @@ from localizer.errors import LocalizerError
 from mavlink_bridge.errors import BridgeError
 
 _DEFAULT_FOV_DEG = 65.0
+_Answer = TypeVar("_Answer", str, float)
 
 
 def init_command(
@@ -59,15 +61,13 @@ def init_command(
     if out.exists() and not overwrite:
         raise ConfigError(f"{out}: is there already; --overwrite replaces it")
     notes: list[str] = []
-    asked = map_cache or Path(typer.prompt("map: folder of the tile cache"))
+    asked = map_cache or Path(_asked("map: folder of the tile cache", "--map"))
     settings: dict[str, Any] = {"map": str(asked.resolve()), "map_sha256": _pinned(asked)}
-    feed = source or typer.prompt("video source", default="udp://0.0.0.0:5600")
-    wire = connection or typer.prompt("autopilot", default="serial:/dev/ttyTHS1:921600")
-    mounted = mount or typer.prompt("camera mount (gimbal, fixed)", default="gimbal")
+    feed = source or _asked("video source", "--source", "udp://0.0.0.0:5600")
+    wire = connection or _asked("autopilot", "--connection", "serial:/dev/ttyTHS1:921600")
+    mounted = mount or _asked("camera mount (gimbal, fixed)", "--mount", "gimbal")
     if camera is None and fov is None:
-        fov = typer.prompt(
-            "horizontal field of view, degrees", default=_DEFAULT_FOV_DEG, type=float
-        )
+        fov = _asked("horizontal field of view, degrees", "--camera or --fov", _DEFAULT_FOV_DEG)
     size = None
     if listen:
         with shown_work(Console(stderr=True), f"waiting for a picture of {redacted(feed)}"):
@@ -88,6 +88,18 @@ def init_command(
         Console().print(escape(note), style="yellow", soft_wrap=True, highlight=False)
     Console().print(f"{escape(str(out))} is written; next: companion doctor {escape(str(out))}",
                     soft_wrap=True)  # fmt: skip
+
+
+def _asked(what: str, option: str, default: _Answer | None = None) -> _Answer:
+    """What the operator answers; ConfigError where there is nobody to ask."""
+    try:
+        answer: _Answer = typer.prompt(what, default=default)
+    except typer.Abort as error:
+        if sys.stdin.isatty():  # he does not want to go on
+            raise
+        typer.echo(err=True)
+        raise ConfigError(f"{what}: nobody answers here; give {option}") from error
+    return answer
 
 
 def _pinned(map_cache: Path) -> str:

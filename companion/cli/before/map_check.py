@@ -15,6 +15,7 @@ from rich.table import Table
 from companion.terminal.steps import shown_work
 from companion.writing import made_folder
 
+_SPEED_M_S = 10.0
 _COLOURS = {"good": "green", "advice": "yellow", "bad": "red"}
 
 
@@ -60,6 +61,12 @@ def check_command(
         table.add_row(mark, f.name, escape(f.found), escape(f.words))
     Console().print(table)
     bad = [f.name for f in made.findings if f.grade.value == "bad"]
-    verdict = f"This map will not do: {', '.join(bad)}." if bad else "This map will do."
+    east_m, north_m = made.size_m
+    area = f"{east_m:.0f} x {north_m:.0f} m, {max(made.size_m) / _SPEED_M_S:.0f} s of flight"
+    verdict = (
+        f"This map will not do: {', '.join(bad)}."
+        if bad
+        else f"This map will do where it is: {area} from end to end at {_SPEED_M_S:.0f} m/s."
+    )
     Console().print(f"{verdict} Pictures: {escape(str(out))}", soft_wrap=True)
     raise typer.Exit(0 if made.ok else 1)

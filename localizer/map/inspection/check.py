@@ -60,10 +60,13 @@ class Use:
 
 @dataclass(frozen=True)
 class MapCheck:
-    """findings: each question's; pictures: name to RGB."""
+    """findings: each question's; pictures: name to RGB; size_m: east and north of the rectangle
+    about the map.
+    """
 
     findings: tuple[Finding, ...]
     pictures: dict[str, Image]
+    size_m: tuple[float, float]
 
     @property
     def ok(self) -> bool:
@@ -110,7 +113,8 @@ def check_map(cache: TileCache, use: Use) -> MapCheck:
         "seams": _seam_picture(mosaic, seams),
         "alignment": _alignment_picture(mosaic),
     }
-    return MapCheck(findings, pictures)
+    rows, columns = gaps.shape
+    return MapCheck(findings, pictures, (columns * mosaic.gsd_m, rows * mosaic.gsd_m))
 
 
 def seams_of(cache: TileCache, mosaic: Mosaic) -> list[Seam]:

@@ -144,6 +144,14 @@ def test_the_table_fits_a_terminal_of_80_columns_and_reasons_come_last(capsys):
     assert shown.endswith(f"wrong GIMBAL_[MANAGER]_X: {why}")
 
 
+def test_what_was_not_examined_is_said_beside_fit_to_fly(capsys):
+    good = Diagnosis((Finding("map", "42 tiles", "a tile cache", "", True, True),))
+    print_diagnosis(Console(width=80, force_terminal=False), good, ["vehicle"])
+    lines = capsys.readouterr().out.splitlines()
+    assert "fit to fly as far as examined" in lines[0]
+    assert lines[-1].strip() == "vehicle: not examined"
+
+
 def test_a_detection_network_that_a_flight_would_not_start_with_is_told(tmp_path):
     camera = {"source": "udp://127.0.0.1:5600", "model": MODEL}
     (tmp_path / "detector.onnx").write_text("no network")

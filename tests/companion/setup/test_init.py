@@ -11,6 +11,7 @@ from typer.testing import CliRunner
 
 from companion.cli.commands import app
 from companion.config import CompanionConfig, load_config, parse_config
+from companion.errors import ConfigError
 from companion.preflight.map_pin import map_hash
 from companion.setup.difference import differing
 from companion.setup.reference import reference
@@ -104,6 +105,15 @@ def test_map_and_stream_are_asked_and_a_silent_vehicle_is_noted(
     again = CliRunner().invoke(app, ["init", str(out)], input=answers)
     assert again.exit_code != 0
     assert out.read_text() == text
+
+
+def test_where_nobody_answers_the_option_is_named(cache, tmp_path):
+    """In a script it ended with "Aborted." before."""
+    words = ["init", str(tmp_path / "d.yaml"), "--map", str(cache), "--source", "a", "--no-listen",
+             "--connection", "udpin:127.0.0.1:14551", "--fov", "60"]  # fmt: skip
+    done = CliRunner().invoke(app, words, input="")
+    assert isinstance(done.exception, ConfigError)
+    assert "camera mount (gimbal, fixed): nobody answers here; give --mount" in str(done.exception)
 
 
 def test_a_calibration_of_another_size_is_told(cache, video, tmp_path):

@@ -57,7 +57,7 @@ def case_text(**changes: str) -> str:
         ({"vehicle": "{sources: magic}"}, "vehicle.sources"),
         ({"fixes": "{rate_hz: -1}"}, "fixes.rate_hz"),
         ({"fixes": "{colour: red}"}, "fixes.colour"),
-        ({"fixes": "{sigma_m: yes}"}, "fixes.sigma_m: Input should not be a boolean"),
+        ({"fixes": "{sigma_m: yes}"}, "fixes.sigma_m: must not be a boolean"),
         ({"bridge": "{injection: {rate_hz: 99}}"}, "rate_hz"),
         ({"bridge": ""}, "exactly one of `bridge` and `raw`"),
         ({"raw": "{}"}, "exactly one of `bridge` and `raw`"),

@@ -1,5 +1,6 @@
 """A map is examined before it is flown over: each fault is found, and a sound map has none."""
 
+import re
 import shutil
 
 import cv2
@@ -113,7 +114,7 @@ def test_seams_show_where_tiles_do_not_meet(cache):
 def test_the_command_says_it_in_words_pictures_and_its_exit_code(cache, tmp_path):
     good = CliRunner().invoke(app, ["map", "check", str(cache.path), "--out", str(tmp_path / "a")])
     assert good.exit_code == 0, good.output
-    assert "This map will do." in good.output
+    assert re.search(r"will do where it is: \d+ x \d+ m, \d+ s of flight", good.output)
     names = {p.name for p in (tmp_path / "a").iterdir()}
     assert names == {"coverage.png", "texels.png", "seams.png", "alignment.png"}
     assert cv2.imread(str(tmp_path / "a" / "coverage.png")) is not None
