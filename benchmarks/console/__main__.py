@@ -34,7 +34,8 @@ import yaml
 
 from benchmarks.common.arguments import Parser, existing, output, whole
 from benchmarks.common.named_errors import named_errors
-from benchmarks.console.chromium import NOTE_AGES, ages, browser_used_s, opened_browser
+from benchmarks.console.chromium import NOTE_AGES, ages, browser_used_s, opened_browser, used_s
+from benchmarks.console.limits import LIMITS
 from benchmarks.console.vehicle import Sequence, Vehicle, begun_ns
 from companion.errors import ReportError
 from companion.offline.tables import read_columns
@@ -43,7 +44,6 @@ from localizer.map.cache.cache import TileCache
 
 Condition = Literal["no console", "no page", "one page"]
 CONDITIONS: tuple[Condition, ...] = ("no console", "no page", "one page")
-LIMITS = {"no page": 3.0, "one page": 15.0, "age_ms": 300.0, "frames_per_s": 5.0}
 _PATIENCE_S = 120.0
 _SETTLED_S = 5.0  # after the first estimate: the way up is no part of the cost
 
@@ -332,11 +332,7 @@ def _console_of(flight: int) -> int:
 
 
 def _used_s(process: int | None) -> float:
-    """Processor time of a process, all threads; `proc(5)`: utime and stime, in clock ticks."""
-    if process is None:
-        return 0.0
-    after_name = Path(f"/proc/{process}/stat").read_text().rpartition(")")[2].split()
-    return (int(after_name[11]) + int(after_name[12])) / os.sysconf("SC_CLK_TCK")
+    return 0.0 if process is None else used_s(process)
 
 
 def _link_s(listen: str) -> float | None:

@@ -30,7 +30,15 @@ from typing import Any, Literal
 
 from benchmarks.common.arguments import Parser, existing, output, whole
 from benchmarks.common.named_errors import named_errors
-from benchmarks.console.chromium import NOTE_AGES, ages, browser_used_s, opened_browser
+from benchmarks.console.chromium import (
+    NOTE_AGES,
+    ages,
+    browser_used_s,
+    descendants,
+    opened_browser,
+    used_s,
+)
+from benchmarks.console.limits import LIMITS
 from companion.errors import ReportError
 
 Condition = Literal["no page", "one page"]
@@ -38,8 +46,9 @@ SHORT = Path(__file__).with_name("short.yaml")
 _ADDRESS = re.compile(r"watch it: (http://\S+)")
 _PATIENCE_S = 420.0
 _OPEN_S = 180.0
-_WATCHED_S = 20.0  # pictures are measured so long, undisturbed, before buttons are pressed
-_DOCTOR_S = 60.0
+_DENIED, _RETURNED = "GNSS denied", "returned on vision"
+_WATCHED_S = 45.0  # pictures are measured so long, undisturbed, before buttons are pressed
+_SOON_S = 60.0
 
 
 class Demo:
@@ -95,6 +104,10 @@ class Demo:
         """Whether it ended."""
         return self._process.poll() is not None
 
+    def has_said(self, text: str) -> bool:
+        """Whether a line had that in it."""
+        return any(text in line for _, line in tuple(self.lines))
+
     def tail(self) -> str:
         """What it said last."""
         return " | ".join(text for _, text in self.lines[-4:])
@@ -111,7 +124,49 @@ class Demo:
                 self._said.notify_all()
 
 
-def watch(demo: Demo, browser: Any, screens: Path | None) -> dict[str, Any]:
+class ConsoleCost(threading.Thread):
+    """Processor time of the console's process beside the flight, noted every second."""
+
+    def __init__(self) -> None:
+        super().__init__(name="console cost", daemon=True)
+        self._over = threading.Event()
+        self._noted: list[tuple[float, float]] = []
+
+    def run(self) -> None:
+        """Note until `end`."""
+        pid: int | None = None
+        while not self._over.wait(1.0):
+            try:
+                if pid is None:
+                    pid = _console()
+                if pid is not None:
+                    self._noted.append((time.monotonic(), used_s(pid)))
+            except OSError:  # it ended
+                pid = None
+
+    def end(self) -> None:
+        """Note no more."""
+        self._over.set()
+        self.join()
+
+    def percent(self, begin_s: float, end_s: float) -> float | None:
+        """Of a core, between two times (monotonic); None where it was not there."""
+        noted = [(at, used) for at, used in self._noted if begin_s <= at <= end_s]
+        if len(noted) < 2:
+            return None
+        (begun, before), (ended, after) = noted[0], noted[-1]
+        return 100.0 * (after - before) / (ended - begun)
+
+
+def _console() -> int | None:
+    for pid in descendants():
+        words = Path(f"/proc/{pid}/cmdline").read_bytes().split(b"\0")
+        if b"console" in words and b"--lifeline" in words:
+            return pid
+    return None
+
+
+def watch(demo: Demo, browser: Any, screens: Path | None, cost: ConsoleCost) -> dict[str, Any]:
     """What the page showed, and when."""
     page = browser.new_page(viewport={"width": 1280, "height": 800})
     complaints: list[str] = []
@@ -136,24 +191,51 @@ def watch(demo: Demo, browser: Any, screens: Path | None) -> dict[str, Any]:
     told["first_picture_s"] = time.monotonic() - begun
     _until(page, demo, lambda: page.inner_text("#word").lower() == "tracking", "position")
     told["first_position_s"] = time.monotonic() - begun
+    _until(page, demo, lambda: demo.has_said(_DENIED), "flight without GNSS")
     page.evaluate("window.measured.length = 0")
-    used, begun_watching = browser_used_s(), time.monotonic()
+    used, link_s, begun_s = browser_used_s(), _link_s(page), time.monotonic()
     page.wait_for_timeout(1e3 * _WATCHED_S)
-    watched_s = time.monotonic() - begun_watching
-    told["browser_percent"] = {
-        kind: 100.0 * (now - used[kind]) / watched_s for kind, now in browser_used_s().items()
+    link_s, ended_s = _link_s(page) - link_s, time.monotonic()
+    share = 100.0 / (ended_s - begun_s)
+    told |= {
+        f"browser_{kind}_percent": share * (now - used[kind])
+        for kind, now in browser_used_s().items()
     }
+    told["link_percent"], told["console_percent"] = share * link_s, cost.percent(begun_s, ended_s)
     told |= _ages(page.evaluate("window.measured"))
+    told["problems"] = problems(told)
     told["mission_points"] = page.evaluate("window.consoleMap?.missionLength ?? 0")
-    if screens is not None:
-        _pictures(page, screens)
     told["hint"] = _hint(page)
     told["doctor"] = _refused_doctor(page)
+    told["in_flight"] = not demo.is_over
+    if screens is not None:
+        _pictures(page, demo, screens)
     told |= {"complaints": complaints, "hosts": sorted(hosts)}
     told["only_itself"] = hosts == {address.split("/")[2]}
     demo.wait()
     page.close()
     return told
+
+
+def problems(told: dict[str, Any]) -> list[str]:
+    """Of what is asked for beside a flight, what does not hold."""
+    found = []
+    if not told["frames_per_s"] >= LIMITS["frames_per_s"]:
+        found.append(f"{told['frames_per_s']:.1f} pictures a second")
+    if not told["age_p50_ms"] <= LIMITS["age_ms"]:
+        found.append(f"a picture is {told['age_p50_ms']:.0f} ms old in the median")
+    if not told["age_p95_ms"] <= LIMITS["age_ms"]:
+        found.append(f"one picture in twenty is older than {told['age_p95_ms']:.0f} ms")
+    taken = (told["console_percent"] or float("nan")) + told["link_percent"]
+    if not taken <= LIMITS["one page"]:
+        found.append(f"the console takes {taken:.1f} % of a core")
+    if told["first_position_s"] > _SOON_S:
+        found.append(f"the flight is seen {told['first_position_s']:.0f} s after its address")
+    return found
+
+
+def _link_s(page: Any) -> float:
+    return float(page.evaluate("window.consoleLinkS ?? 0"))
 
 
 def _opened(page: Any, address: str, demo: Demo) -> int:
@@ -185,7 +267,7 @@ def _ages(shown: list[list[float]]) -> dict[str, float]:
     if len(shown) < 2:
         raise ReportError(f"the page showed {len(shown)} pictures in {_WATCHED_S:.0f} s")
     painted = [times[-1] for times in shown]
-    return {"pictures_per_s": 1e3 * (len(shown) - 1) / (painted[-1] - painted[0]), **ages(shown)}
+    return {"frames_per_s": 1e3 * (len(shown) - 1) / (painted[-1] - painted[0]), **ages(shown)}
 
 
 def _hint(page: Any) -> str:
@@ -213,12 +295,15 @@ def _answer(page: Any, where: str, before: str) -> str:
     return text
 
 
-def _pictures(page: Any, folder: Path) -> None:
+def _pictures(page: Any, demo: Demo, folder: Path) -> None:
+    """As many as the flight is long enough for."""
     folder.mkdir(parents=True, exist_ok=True)
     views = page.eval_on_selector_all("nav button", "all => all.map(b => b.dataset.view)")
     for width, height in ((1280, 800), (390, 844)):
         page.set_viewport_size({"width": width, "height": height})
         for view in views:
+            if demo.has_said(_RETURNED):
+                return
             page.click(f"nav button[data-view={view}]")
             page.wait_for_timeout(1500)
             page.screenshot(path=folder / f"{view}-{width}.png")
@@ -228,10 +313,17 @@ def _pictures(page: Any, folder: Path) -> None:
 def quality(folder: Path) -> dict[str, Any]:
     """The localizer's figures of a flight's report."""
     report = json.loads((folder / "report.json").read_text())["report"]
+    latency, error = report["stages_ms"].get("latency") or {}, report["localizer_m"]
     return {
+        # As `benchmarks.console` names them: `benchmarks.console.table` joins both.
+        "localized_per_s": report["localizer"]["fps"],
+        "latency_p50_ms": latency.get("median"),
+        "latency_p95_ms": latency.get("p95"),
+        "error_median_m": error["median"],
+        "error_p95_m": error["p95"],
         "localizer": report["localizer"],
-        "localizer_m": report["localizer_m"],
-        "latency_ms": report["stages_ms"].get("latency"),
+        "localizer_m": error,
+        "latency_ms": latency,
         "completeness_sent": report["completeness_sent"],
         "inside_bound": report["inside_bound"],
         "ekf_in_map_m": report["ekf_in_map_m"],
@@ -241,6 +333,8 @@ def quality(folder: Path) -> dict[str, Any]:
 def fly(condition: Condition, options: Any) -> dict[str, Any]:
     """One flight."""
     folder = Path(tempfile.mkdtemp(prefix="console-"))
+    cost = ConsoleCost()
+    cost.start()
     try:
         with Demo(folder, options.scenario, options.seed, options.fc) as demo:
             told: dict[str, Any] = {"condition": condition, "load": os.getloadavg()[0]}
@@ -249,15 +343,18 @@ def fly(condition: Condition, options: Any) -> dict[str, Any]:
 
                 with sync_playwright() as driver:
                     browser = opened_browser(driver, options.browser_nice)
-                    told |= watch(demo, browser, options.screens)
+                    told |= watch(demo, browser, options.screens, cost)
                     browser.close()
             else:
+                begun_s, _ = demo.wait_for_address()
                 demo.wait()
+                told["console_percent"] = cost.percent(begun_s, time.monotonic())
             begun = demo.lines[0][0] if demo.lines else 0.0
             told["said"] = [f"{at - begun:.1f} {text}" for at, text in demo.lines]
             print(json.dumps(told), file=sys.stderr, flush=True)  # whatever the report lacks
             return told | quality(demo.report)
     finally:
+        cost.end()
         if options.keep is not None:
             kept = options.keep / condition.replace(" ", "-")
             shutil.rmtree(kept, ignore_errors=True)

@@ -1,6 +1,6 @@
 """The console's buttons pressed in a flight, in a real browser: hint, click, doctor.
 
-    python -m benchmarks.console.buttons [--fc embedded] [--seed 0] [--out FILE.json] [--keep DIR]
+    python -m benchmarks.console.buttons [--fc embedded] [--out FILE.json] [--screens DIR]
 
 The vehicle hovers without GNSS when its companion is started: it knows no place (the loop's
 `cold-start`, over a map of 2.6 km2, which takes its search longer than the operator). In the page,
@@ -46,8 +46,9 @@ _RADIUS_M = 60
 _PATIENCE_S = 100.0
 _LAND_S = 90.0
 _CLOSE_S = 20.0
+_PICTURE_MS = 10_000.0
 _SIZE_M = 1600.0
-_LENGTH_S = 110.0
+_LENGTH_S = 90.0
 _HEIGHT_M = 50.0  # low, so that it is soon on the ground
 _NOTE_ORDERS = """() => {
   window.orders = [];
@@ -58,8 +59,8 @@ _NOTE_ORDERS = """() => {
 class PageOperator:
     """A `Passenger` with the page before him. told: what he saw, and when since he got aboard."""
 
-    def __init__(self, listen: str, browser_nice: int) -> None:
-        self._listen, self._nice = listen, browser_nice
+    def __init__(self, listen: str, browser_nice: int, screens: Path | None) -> None:
+        self._listen, self._nice, self._screens = listen, browser_nice, screens
         self._over = threading.Event()
         self._landed = threading.Event()
         self._pressed = threading.Event()
@@ -117,15 +118,20 @@ class PageOperator:
         self._note("page_s")
         self.told["word_before"] = _word(page)
         self._hint(page)
+        self._picture(page, "hint")
         self._until(page, lambda: _word(page) == "tracking", "tracking")
         self._note("tracking_s")
         self._click(page)
+        self._picture(page, "target")
         page.click("nav button[data-view=doctor]")
         page.click("#examine")
         self._until(page, lambda: page.inner_text("#doctor-told") != "", "answer of the doctor")
         self.told["doctor_in_the_air"] = page.inner_text("#doctor-told")
+        self._note("doctor_refused_s")
         self._pressed.set()
-        self._until(page, self._landed.is_set, "landing")
+        self._picture(page, "doctor-in-the-air")
+        # The flight hovers to its end whatever was pressed when, and lands then.
+        self._until(page, self._landed.is_set, "landing", _LENGTH_S + _LAND_S)
         self._until(page, lambda: "disarmed" in page.inner_text("#figures"), "disarmed vehicle")
         page.click("#examine")
         begun_s = time.monotonic()
@@ -134,6 +140,7 @@ class PageOperator:
         self.told["doctor_took_s"] = time.monotonic() - begun_s
         self.told["doctor_on_the_ground"] = page.inner_text("#doctor-told")
         self.told["doctor_lines"] = page.inner_text("#doctor").splitlines()
+        self._picture(page, "doctor-on-the-ground")
 
     def _hint(self, page: Any) -> None:
         assert self._cabin is not None
@@ -165,13 +172,26 @@ class PageOperator:
         self.told["target"] = {"place": cells[1], "ellipsoidal_m": float(cells[4])}
         self.told["target_said"] = page.inner_text("#video-told")
 
+    def _picture(self, page: Any, name: str) -> None:
+        """For somebody who looks; whatever was pressed was pressed without it."""
+        from playwright.sync_api import Error
+
+        if self._screens is None:
+            return
+        try:
+            page.screenshot(path=self._screens / f"{name}.png", timeout=_PICTURE_MS)
+        except Error as error:
+            self.told.setdefault("no_pictures", []).append(f"{name}: {error.message[:80]}")
+
     def _note(self, name: str) -> None:
         self.told[name] = time.monotonic() - self._begun_s
         print(f"{name}: {self.told[name]:.1f}", file=sys.stderr, flush=True)
 
-    def _until(self, page: Any, holds: Callable[[], bool], what: str) -> None:
+    def _until(
+        self, page: Any, holds: Callable[[], bool], what: str, patience_s: float = _PATIENCE_S
+    ) -> None:
         """The page's own policy forbids playwright's way to wait for a condition."""
-        end = time.monotonic() + _PATIENCE_S
+        end = time.monotonic() + patience_s
         while not holds():
             if self._over.is_set() or time.monotonic() > end:
                 raise ReportError(f"the page showed no {what}")
@@ -192,14 +212,16 @@ def flight(listen: str) -> LoopCase:
     )
 
 
-def press(kind: Any, seed: int, folder: Path, browser_nice: int) -> dict[str, Any]:
+def press(
+    kind: Any, seed: int, folder: Path, browser_nice: int, screens: Path | None = None
+) -> dict[str, Any]:
     """Fly it; what was pressed, what came of it, and what is wrong with that (`problems`)."""
     with socket.socket() as probe:
         probe.bind(("127.0.0.1", 0))
         listen = f"127.0.0.1:{probe.getsockname()[1]}"
     case = flight(listen)
     assets = loop_assets(case, seed, None, lambda _phase, _share: None)
-    operator = PageOperator(listen, browser_nice)
+    operator = PageOperator(listen, browser_nice, screens)
     fly(case, assets, kind, seed, folder, operator)
     told = operator.told
     if "order" in told:
@@ -262,11 +284,14 @@ def main() -> None:
     parser.add_argument("--seed", type=whole(0, 10_000), default=0, help="of world and noise")
     parser.add_argument("--browser-nice", type=whole(0, 19), default=5, help="behind the flight's")
     parser.add_argument("--keep", type=Path, help="folder for the flight's records")
+    parser.add_argument("--screens", type=Path, help="folder for a PNG after each button")
     parser.add_argument("--out", type=output, help="JSON file")
     options = parser.parse_args()
     folder = Path(tempfile.mkdtemp(prefix="buttons-"))
+    if options.screens is not None:
+        options.screens.mkdir(parents=True, exist_ok=True)
     try:
-        told = press(options.fc, options.seed, folder, options.browser_nice)
+        told = press(options.fc, options.seed, folder, options.browser_nice, options.screens)
         print(json.dumps(told, indent=1, default=str))
         if options.out is not None:
             options.out.write_text(json.dumps(told, indent=1, default=str))

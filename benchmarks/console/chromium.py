@@ -40,10 +40,16 @@ def ages(shown: list[list[float]]) -> dict[str, float]:
 
 def opened_browser(driver: Any, nice: int) -> Any:
     """The system's, so much behind this process in priority. driver: of playwright."""
-    before = _children()
+    before = descendants()
     browser = driver.chromium.launch(executable_path=chromium(), args=list(BROWSER_OPTIONS))
     _slow_down(before, nice)
     return browser
+
+
+def used_s(process: int) -> float:
+    """Processor time of a process, all threads; `proc(5)`: utime and stime, in clock ticks."""
+    after_name = Path(f"/proc/{process}/stat").read_text().rpartition(")")[2].split()
+    return (int(after_name[11]) + int(after_name[12])) / os.sysconf("SC_CLK_TCK")
 
 
 def browser_used_s() -> dict[str, float]:
@@ -51,22 +57,21 @@ def browser_used_s() -> dict[str, float]:
     ("renderer"), of what draws their map and the screen ("gpu-process"), of the "rest".
     """
     used = {"renderer": 0.0, "gpu-process": 0.0, "rest": 0.0}
-    for pid in _children():
+    for pid in descendants():
         try:
             words = Path(f"/proc/{pid}/cmdline").read_bytes().replace(b" ", b"\0").split(b"\0")
             if b"chrom" not in words[0]:
                 continue
-            fields = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
+            taken_s = used_s(pid)
         except OSError:  # it ended meanwhile
             continue
         kind = next((w[7:].decode() for w in words if w.startswith(b"--type=")), "rest")
-        ticks = int(fields[11]) + int(fields[12])
-        used[kind if kind in used else "rest"] += ticks / os.sysconf("SC_CLK_TCK")
+        used[kind if kind in used else "rest"] += taken_s
     return used
 
 
-def _children() -> set[int]:
-    """This process's own, and theirs."""
+def descendants() -> set[int]:
+    """This process, the processes that it started, and theirs."""
     found: set[int] = set()
     waiting = [os.getpid()]
     while waiting:
@@ -82,7 +87,7 @@ def _children() -> set[int]:
 
 def _slow_down(before: set[int], nice: int) -> None:
     """The browser stands behind the flight by so much: what it starts later inherits that."""
-    for pid in _children() - before:
+    for pid in descendants() - before:
         try:
             # What else began meanwhile, as the companion of a flight, is no part of it.
             if b"chrom" not in Path(f"/proc/{pid}/cmdline").read_bytes():

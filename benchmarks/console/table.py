@@ -1,4 +1,4 @@
-"""One table of several runs of `python -m benchmarks.console`, for the documentation.
+"""One table of several runs of `benchmarks.console`, or of `.browser`, for the documentation.
 
     python -m benchmarks.console.table RUN.json... --out TABLE.json
 
@@ -15,7 +15,8 @@ import numpy as np
 
 from benchmarks.common.arguments import Parser, existing, output
 from benchmarks.common.named_errors import named_errors
-from benchmarks.console.__main__ import CONDITIONS, LIMITS
+from benchmarks.console.__main__ import CONDITIONS
+from benchmarks.console.limits import LIMITS
 from companion.errors import ReportError
 
 # Label, limit, keys of a run whose medians stand in a cell, digits.
@@ -68,7 +69,9 @@ def _cell(runs: list[dict[str, Any]], keys: tuple[str, ...], digits: int) -> str
 def main() -> None:
     """Join, print, write."""
     parser = Parser(__doc__)
-    parser.add_argument("runs", type=existing, nargs="+", help="JSON of `benchmarks.console`")
+    parser.add_argument(
+        "runs", type=existing, nargs="+", help="JSON of `benchmarks.console`, or of `.browser`"
+    )
     parser.add_argument("--out", type=output, required=True, help="JSON file of the table")
     options = parser.parse_args()
     runs = [run for path in options.runs for run in json.loads(path.read_text())["runs"]]

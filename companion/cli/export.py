@@ -33,11 +33,12 @@ def export_command(
         say(f"reading {record}")
         from companion.reporting.mcap_export import export_mcap
 
-        written = export_mcap(record, out, tlog, lambda n: say(f"{n} messages written"))
+        written = export_mcap(record, out, tlog, lambda n: say(f"{n} rows written"))
     for note in written.notes:
         console.print(f"note: {escape(note)}", soft_wrap=True, highlight=False)
+    told = f"{written.messages} messages of {written.rows} rows, pictures and MAVLink messages"
     path = escape(str(written.path))
-    console.print(f"{written.messages} messages: [green]{path}[/]", soft_wrap=True, highlight=False)
+    console.print(f"{told}: [green]{path}[/]", soft_wrap=True, highlight=False)
 
 
 def klv_command(

@@ -26,8 +26,8 @@ def report_command(
         raise ReportError(f"{out}: give a name that ends in .html")
     console = Console()
     with shown_steps(console) as say:
-        say(f"reading {folder} and drawing its map")
+        say(f"reading {folder}")
         from companion.reporting.report import write_page
 
-        path = write_page(folder, out)
+        path = write_page(folder, out, say)
     console.print("report:", file_link(path), soft_wrap=True, highlight=False)

@@ -37,6 +37,8 @@ class McapFile:
         self._writer.start(_PROFILE, name)
         self._schemas: dict[str, int] = {}
         self._channels: dict[str, int] = {}
+        self.messages = 0
+        """How many were written, of all topics; a row can be several."""
 
     def row(self, table: str, row: Row) -> None:
         """A row of one of the record's tables."""
@@ -115,3 +117,4 @@ class McapFile:
         if topic not in self._channels:
             self._channels[topic] = self._writer.register_channel(topic, encoding, schema)
         self._writer.add_message(self._channels[topic], time_ns, data, time_ns)
+        self.messages += 1

@@ -26,7 +26,7 @@ from companion.reporting.content import (
     Track,
     Verdict,
 )
-from companion.reporting.pictures import map_pictures
+from companion.reporting.pictures import map_pictures, silent
 from companion.reporting.record import (
     KEPT_FRAMES,
     VISION,
@@ -36,6 +36,7 @@ from companion.reporting.record import (
 )
 from companion.reporting.record import uncertainty_plots as uncertainty
 from companion.reporting.verdicts import advice, compared
+from companion.terminal.steps import Say
 from localizer.plain_files import plain_text
 
 _TRUTH, _EKF = "#ffffff", "#1fd1ff"
@@ -43,7 +44,7 @@ _LARGE_M = 3.0  # an error that the first-fault line names
 _TARGET_LIMIT_M = 3.0
 
 
-def demo_report(folder: Path) -> Report:
+def demo_report(folder: Path, say: Say = silent) -> Report:
     """The report of `python -m sitl demo --out folder`."""
     record = read_record(folder / "companion")
     try:
@@ -69,7 +70,7 @@ def demo_report(folder: Path) -> Report:
     off = np.flatnonzero(accepted & (errors["3-D"] > _LARGE_M) & (time_s >= 0))
     large = f"{time_s[off[0]]:.3f} the position was {errors['3-D'][off[0]]:.1f} m off" \
         if len(off) else ""  # fmt: skip
-    with map_pictures(record.map_path) as pictures:
+    with map_pictures(record.map_path, say) as pictures:
         vision = figures.track("vision (camera)", VISION, INNER, estimates)
         tracks = [
             figures.track("truth", _TRUTH, OUTER, vehicle),

@@ -10,17 +10,18 @@ import numpy as np
 from companion.errors import RecordError, StreamDecodeError
 from companion.offline.tables import read_columns
 from companion.reporting.content import Curve, MapSheet, Overlay, Plot, Report, Span, Track, Verdict
-from companion.reporting.pictures import map_pictures
+from companion.reporting.pictures import map_pictures, silent
 from companion.reporting.record import VISION
 from companion.reporting.verdicts import advice, compared
 from companion.sources.folder_source import read_image
+from companion.terminal.steps import Say
 from localizer.plain_files import plain_text
 
 _TEXT = ("name", "state", "status", "problem")
 _SHEETS = 3  # pictures side by side on an overlay sheet: video, render, checkerboard
 
 
-def evaluation_report(folder: Path) -> Report:
+def evaluation_report(folder: Path, say: Say = silent) -> Report:
     """The report of `companion eval --report folder`."""
     try:
         document = json.loads(plain_text(folder / "report.json"))
@@ -34,7 +35,7 @@ def evaluation_report(folder: Path) -> Report:
     accepted = np.nan_to_num(np.asarray(frames["accepted"], dtype=np.float64)) > 0
     position = np.where(accepted, frames["translation_error_m"], np.nan)
     rotation = np.where(accepted, frames["rotation_error_deg"], np.nan)
-    sheet, notes = _sheet(Path(settings["map"]), frames, accepted)
+    sheet, notes = _sheet(Path(settings["map"]), frames, accepted, say)
     return Report(
         f"Evaluation of {Path(settings['sequence']).name}",
         f"{document['frames']} frames, median {_text(document['median_translation_m'], 'm')} "
@@ -97,9 +98,9 @@ def _spans(number: np.ndarray, accepted: np.ndarray) -> tuple[Span, ...]:
 
 
 def _sheet(
-    path: Path, frames: dict[str, np.ndarray], accepted: np.ndarray
+    path: Path, frames: dict[str, np.ndarray], accepted: np.ndarray, say: Say
 ) -> tuple[MapSheet | None, list[str]]:
-    with map_pictures(path) as pictures:
+    with map_pictures(path, say) as pictures:
         if pictures.cache is None:
             return None, pictures.notes
         local, known = pictures.cache.frame, np.isfinite(frames["latitude_deg"]) & accepted

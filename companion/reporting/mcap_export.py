@@ -30,10 +30,13 @@ _FIX_3D = 3
 
 @dataclass(frozen=True)
 class Exported:
-    """What was written. notes: what the record lacks."""
+    """What was written: `rows` of tables, pictures and MAVLink, as so many messages of all topics.
+    notes: what the record lacks.
+    """
 
     path: Path
     messages: int
+    rows: int
     notes: tuple[str, ...]
 
 
@@ -60,7 +63,7 @@ def export_mcap(
     """Write the record's rows, pictures and MAVLink in the order of their times.
 
     out: ``record.mcap`` in the record if None; tlog: instead of the record's own; progress: takes
-    the number of messages written now and then. `RecordError` for a folder that is no record,
+    the number of rows written now and then. `RecordError` for a folder that is no record,
     `ReportError` where the file cannot be written.
     """
     require_extra()
@@ -96,7 +99,7 @@ def export_mcap(
     finally:
         partial.unlink(missing_ok=True)
     progress(count)
-    return Exported(path, count, tuple(notes))
+    return Exported(path, file.messages, count, tuple(notes))
 
 
 def _sources(

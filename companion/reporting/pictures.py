@@ -12,6 +12,7 @@ import numpy as np
 from companion.errors import StreamDecodeError
 from companion.reporting.content import MapSheet, Mark, Overlay, Track
 from companion.sources.folder_source import read_image
+from companion.terminal.steps import Say
 from localizer.errors import LocalizerError
 from localizer.geometry.camera import Camera
 from localizer.geometry.pose import Pose
@@ -27,6 +28,10 @@ _SHEET_PX = 900
 _MARGIN_M = 60.0
 
 
+def silent(_: str) -> None:
+    """Nobody is told."""
+
+
 @dataclass(frozen=True)
 class ShownFrame:
     """A recorded picture with the pose that was estimated for it."""
@@ -38,11 +43,12 @@ class ShownFrame:
 
 @dataclass(frozen=True)
 class MapPictures:
-    """Draws from one map. notes: what could not be drawn, and why."""
+    """Draws from one map. notes: what could not be drawn, and why; say: told what is drawn now."""
 
     cache: TileCache | None
     renderer: MapRenderer | None
     notes: list[str] = field(default_factory=list)
+    say: Say = silent
 
     def sheet(self, tracks: Sequence[Track], marks: Sequence[Mark]) -> MapSheet | None:
         """The square about all tracks and marks; None without any."""
@@ -61,6 +67,7 @@ class MapPictures:
     def _from_above(self, centre: np.ndarray, half_m: float) -> Image | None:
         if self.renderer is None or self.cache is None:
             return None
+        self.say("drawing the map from above")
         base_m = float(self.cache.index.box_min[0, 2])
         gsd_m = 2 * half_m / _SHEET_PX
         return render_top_view(self.renderer, centre, _SHEET_PX, gsd_m, base_m).rgb
@@ -72,7 +79,8 @@ class MapPictures:
         target = camera.without_distortion()
         undistort = Undistorter(camera, target)
         sheets = []
-        for shown in frames:
+        for number, shown in enumerate(frames, 1):
+            self.say(f"drawing overlay {number} of {len(frames)}")
             try:
                 image = read_image(shown.path)
             except (StreamDecodeError, OSError) as error:  # power may have gone while written
@@ -88,7 +96,7 @@ class MapPictures:
 
 
 @contextmanager
-def map_pictures(path: Path | None) -> Iterator[MapPictures]:
+def map_pictures(path: Path | None, say: Say = silent) -> Iterator[MapPictures]:
     """Pictures of the map in that folder; without one, the report says so and goes on."""
     if path is None:
         yield MapPictures(None, None, ["the map is not named: no pictures of it"])
@@ -100,6 +108,6 @@ def map_pictures(path: Path | None) -> Iterator[MapPictures]:
         return
     streamer = TileStreamer(cache)
     try:
-        yield MapPictures(cache, NumbaRenderer(streamer))
+        yield MapPictures(cache, NumbaRenderer(streamer), say=say)
     finally:
         streamer.close()

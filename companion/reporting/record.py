@@ -28,7 +28,8 @@ from companion.reporting.content import (
     Track,
     Verdict,
 )
-from companion.reporting.pictures import ShownFrame, map_pictures
+from companion.reporting.pictures import ShownFrame, map_pictures, silent
+from companion.terminal.steps import Say
 from localizer.errors import CameraError
 from localizer.geometry.camera import Camera
 from localizer.plain_files import plain_text
@@ -157,7 +158,7 @@ def read_record(folder: Path) -> RecordTables:
     return RecordTables(folder, estimates, targets, events, manifest, health, tuple(notes))
 
 
-def record_report(folder: Path) -> Report:
+def record_report(folder: Path, say: Say = silent) -> Report:
     """The report of one record."""
     tables = read_record(folder)
     camera, estimates = tables.camera, tables.estimates
@@ -171,7 +172,7 @@ def record_report(folder: Path) -> Report:
             versions=tables.versions,
         )  # fmt: skip
     time_s = figures.seconds(estimates["exposure_time_ns"], start_ns)
-    with map_pictures(tables.map_path) as pictures:
+    with map_pictures(tables.map_path, say) as pictures:
         autopilot = read_autopilot(tables, pictures)
         tracks = _tracks(estimates, autopilot)
         sheet = pictures.sheet(tracks, figures.target_marks(tables.targets))

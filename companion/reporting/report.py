@@ -9,20 +9,27 @@ from companion.reporting.content import Report
 from companion.reporting.demo import demo_report
 from companion.reporting.evaluation import evaluation_report
 from companion.reporting.layout import write_report
+from companion.reporting.pictures import silent
 from companion.reporting.record import record_report
+from companion.terminal.steps import Say
 
 NAME = "report.html"
 
 
-def write_page(folder: Path, out: Path | None = None) -> Path:
-    """Write the report of a record, a demo or an evaluation; returns its path."""
-    return write_report(report_of(folder), out or folder / NAME)
+def write_page(folder: Path, out: Path | None = None, say: Say = silent) -> Path:
+    """Write the report of a record, a demo or an evaluation; returns its path. say: told what is
+    done now.
+    """
+    report = report_of(folder, say)
+    path = out or folder / NAME
+    say(f"drawing the plots and writing {path}")
+    return write_report(report, path)
 
 
-def report_of(folder: Path) -> Report:
+def report_of(folder: Path, say: Say = silent) -> Report:
     """The folder's report; `RecordError` for a folder that is none of the three, or damaged."""
     try:
-        return _report_of(folder)
+        return _report_of(folder, say)
     # What a damaged or a foreign file raises where a report takes it apart.
     except (ValueError, KeyError, TypeError, IndexError, AttributeError, ArithmeticError) as error:
         why = f"{type(error).__name__}: {error}"
@@ -30,13 +37,16 @@ def report_of(folder: Path) -> Report:
         raise RecordError(told) from error
 
 
-def _report_of(folder: Path) -> Report:
+def _report_of(folder: Path, say: Say) -> Report:
+    if not folder.is_dir():
+        there = "is a file, not a folder" if folder.exists() else "there is no such folder"
+        raise RecordError(f"{folder}: {there}; give a record's, a demo's or an evaluation's")
     if (folder / "frames_report.csv").exists() and (folder / "companion").is_dir():
-        return demo_report(folder)
+        return demo_report(folder, say)
     if (folder / "estimates.csv").exists():
-        return record_report(folder)
+        return record_report(folder, say)
     if (folder / "report.json").exists() and (folder / "frames.csv").exists():
-        return evaluation_report(folder)
+        return evaluation_report(folder, say)
     raise RecordError(
         f"{folder}: neither a flight's record (estimates.csv), nor the folder of a demo or of "
         "`companion eval`"

@@ -119,7 +119,7 @@ export class VideoView {
       const colour = this.head.estimate?.state === "tracking" ? 0xff6eff3d : 0xff20b0ff; // ABGR
       for (let i = 0; i + 1 < this.edges.length; i += 2) {
         const at = this.edges[i + 1] * width + this.edges[i];
-        pixels[at] = pixels[at + 1] = pixels[at + width] = pixels[at + width + 1] = colour;
+        pixels[at] = pixels[at + 1] = colour;
       }
       this.layer.getContext("2d").putImageData(this.dots, 0, 0);
     }
@@ -153,6 +153,9 @@ export class VideoView {
     // Of the size that the picture has on the screen, not in itself.
     const px = Math.round((14 * this.canvas.width) / Math.max(this.canvas.getBoundingClientRect().width, 1));
     this.context.font = `bold ${px}px sans-serif`;
-    this.context.fillText(target.name, u + 12, v - 8);
+    // Beside the mark where there is room for it.
+    const left = u + 12 + this.context.measureText(target.name).width > this.canvas.width;
+    this.context.textAlign = left ? "right" : "left";
+    this.context.fillText(target.name, left ? u - 12 : u + 12, Math.max(v - 8, px));
   }
 }

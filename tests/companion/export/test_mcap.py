@@ -218,6 +218,11 @@ def test_the_command_asks_for_a_format_and_names_the_file(flight):
     done = CliRunner().invoke(app, ["export", str(keeper.folder), "--mcap"])
     assert done.exit_code == 0, done.output
     assert "record.mcap" in done.output
+    read, _ = _read(keeper.folder / "record.mcap")
+    diagnostics = _diagnostics(keeper.folder / "record.mcap")
+    count = len(diagnostics) + sum(len(of_topic) for of_topic in read.values())
+    # Two estimates, a target, an event, a picture: rows, of which some are several messages.
+    assert f"{count} messages of 5 rows" in done.output
     assert "no MAVLink" in done.output  # the .tlog was never written
 
 

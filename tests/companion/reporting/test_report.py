@@ -97,7 +97,9 @@ def test_a_flight_without_fault_names_none(record):
 
 
 def test_the_page_needs_nothing_else_and_runs_nothing_of_the_record(record):
-    path = write_page(record)
+    told = []
+    path = write_page(record, say=told.append)
+    assert [text.split()[0] for text in told].count("drawing") >= 2  # the map, and the plots
     text = path.read_text()
     assert path == record / "report.html"
     addresses = set(re.findall(r"""(?:src|href)=["']?([^"'\s>]{0,12})""", text))
@@ -196,6 +198,11 @@ def test_a_flight_that_localized_nothing_has_a_report(record):
 def test_a_folder_that_is_none_is_named(tmp_path):
     with pytest.raises(RecordError, match="neither a flight's record"):
         report_of(tmp_path)
+    with pytest.raises(RecordError, match="there is no such folder"):
+        report_of(tmp_path / "typo")
+    (tmp_path / "file").touch()
+    with pytest.raises(RecordError, match="is a file, not a folder"):
+        report_of(tmp_path / "file")
 
 
 def test_the_stanford_diagram_counts_what_misleads():

@@ -1,6 +1,6 @@
 import pytest
 
-from companion.reporting.verdicts import compared
+from companion.reporting.verdicts import advice, compared
 from localizer.evaluation.metrics import LocalizationMetrics
 from sitl.demo.analysis import Spread
 from sitl.demo.criteria import Judged, Pace, headline, judge, latency_warning
@@ -97,3 +97,9 @@ def test_a_computer_that_is_too_slow_is_named_and_what_it_did_not_keep_up_with(c
 @pytest.mark.parametrize("changes", [{}, {"latency_ms": None}, {"sent_hz": 9.6, "taken": 0.97}])
 def test_a_computer_that_keeps_up_is_not_blamed(changes):
     assert Pace(**(GOOD_PACE | changes)).complaint() is None
+
+
+def test_every_target_says_what_a_miss_means_and_where_to_look():
+    known = [advice(criterion.name) for criterion in judge(_judged())]
+    assert advice("something else") not in known
+    assert len({a.look for a in known}) == len(known)
