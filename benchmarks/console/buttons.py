@@ -261,6 +261,24 @@ def problems(told: dict[str, Any]) -> list[str]:
     return found
 
 
+def table(told: dict[str, Any]) -> dict[str, Any]:
+    """As `python -m benchmarks.site.keep` takes it."""
+    air, ground = (told.get(f"doctor_{where}", "-") for where in ("in_the_air", "on_the_ground"))
+    rows = [
+        ["page with map and picture, after the start, s", f"{told.get('page_s', np.nan):.1f}"],
+        ["*I am here* to tracking, s", f"{told['hint_to_tracking_s']:.1f}"],
+        [
+            "target of a click, 3-D off what was clicked, m",
+            f"{told.get('target_off_m', np.nan):.3f}",
+        ],
+        ["the doctor in the air", air],
+        ["the doctor after landing", f"{ground}, {told.get('doctor_took_s', np.nan):.1f} s"],
+        ["wrong", "; ".join(told["problems"]) or "nothing"],
+    ]
+    flown = f"{told['vehicle']}, seed {told['seed']}"
+    return {"columns": ["pressed in flight", flown], "rows": rows}
+
+
 def _opened(page: Any, listen: str) -> bool:
     from playwright.sync_api import Error
 
@@ -294,10 +312,11 @@ def main() -> None:
         told = press(options.fc, options.seed, folder, options.browser_nice, options.screens)
         print(json.dumps(told, indent=1, default=str))
         if options.out is not None:
-            options.out.write_text(json.dumps(told, indent=1, default=str))
+            options.out.write_text(json.dumps(told | table(told), indent=1, default=str))
     finally:
         if options.keep is not None:
-            shutil.copytree(folder, options.keep, symlinks=True, dirs_exist_ok=True)
+            shutil.rmtree(options.keep, ignore_errors=True)
+            shutil.copytree(folder, options.keep, symlinks=True)
         shutil.rmtree(folder, ignore_errors=True)
     sys.exit(1 if told["problems"] else 0)
 

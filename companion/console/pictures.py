@@ -20,7 +20,7 @@ from localizer.geometry.camera import Camera
 from localizer.geometry.pose import Pose, matrix_from_quaternion
 
 _QUALITY = 75
-_MOST_EDGES = 6000
+_MOST_EDGES = 4000
 _BLUR_PX = 1.2
 _CANNY = (70, 150)
 _STEPS = 2  # of the fixed point that finds where a ray meets the reference's surface

@@ -83,6 +83,8 @@ class Server(uvicorn.Server):
             uvicorn.Config(
                 make_application(site), host=config.host, port=config.port, log_level="warning",
                 http=HurriedProtocol, ws="websockets-sansio", ws_max_size=4096,
+                # JPEGs do not get smaller, and trying costs both ends.
+                ws_per_message_deflate=False,
                 limit_concurrency=_MOST_CONNECTIONS, timeout_keep_alive=5,
                 timeout_graceful_shutdown=1, server_header=False, lifespan="on",
                 ssl_certfile=config.tls_certificate, ssl_keyfile=config.tls_key,

@@ -6,7 +6,7 @@ const CHI95 = 2.4477; // of two dimensions
 const KEPT = 600;
 // Each drawing of a map by the processor takes it from the flight, and holds the page up meanwhile.
 const BY_GPU = { everyMs: 500, offCentre: 0 };
-const BY_PROCESSOR = { everyMs: 2000, offCentre: 0.2 };
+const BY_PROCESSOR = { everyMs: 4000, offCentre: 0.25 };
 
 // Whether WebGL here is the processor's work.
 export function isDrawnByProcessor() {

@@ -208,7 +208,7 @@ def test_without_a_gpu_the_map_is_drawn_seldom_and_all_at_once(page, flight):
     """The processor's drawings are taken from the flight: as many as pictures were 24 % of it."""
     page, _ = page
     _until(page, lambda: page.evaluate("window.consoleMap?.loaded === true"))
-    assert page.evaluate("window.consoleMap.pace.everyMs") == 2000
+    assert page.evaluate("window.consoleMap.pace.everyMs") == 4000
     before = page.evaluate("[window.consoleMap.drawings, window.consoleFrames]")
     _until(page, lambda: page.evaluate("window.consoleFrames") >= before[1] + 40)
     after = page.evaluate("[window.consoleMap.drawings, window.consoleFrames]")
