@@ -1,10 +1,10 @@
 """Pictures of the console for the docs, one a size of screen.
 
-    python -m benchmarks.screens URL [--report report/report.html] [--out docs/img] [--wait 15]
+    python -m benchmarks.screens [URL] [--report report/report.html] [--out docs/img] [--wait 15]
 
-Needs a console that shows a flight or a record (`make demo` and `companion replay --console` print
-its address), Chromium and playwright (the extra `dev`). --wait: seconds for the map's tiles;
---report: a report, too.
+URL: of a console that shows a flight or a record (`make demo` and `companion replay --console`
+print it). --wait: seconds for the map's tiles; --report: a report, too, or alone. Needs Chromium
+and playwright (the extra `dev`). Screens of a flight: `python -m benchmarks.console.browser`.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ def chromium() -> str | None:
     return shutil.which("chromium") or shutil.which("chromium-browser")
 
 
-def take(url: str, out: Path, wait_s: float, report: Path | None = None) -> None:
+def take(url: str | None, out: Path, wait_s: float, report: Path | None = None) -> None:
     """JPEGs of the page and of the report. ReportError where they or the browser cannot be had."""
     try:
         from playwright.sync_api import Error, sync_playwright
@@ -42,7 +42,7 @@ def take(url: str, out: Path, wait_s: float, report: Path | None = None) -> None
     try:
         with sync_playwright() as driver:
             browser = driver.chromium.launch(executable_path=chromium(), args=list(BROWSER_OPTIONS))
-            for name, (width, height) in _SIZES.items():
+            for name, (width, height) in _SIZES.items() if url is not None else ():
                 page = browser.new_page(viewport={"width": width, "height": height})
                 page.set_default_timeout(_PATIENCE_MS)
                 page.goto(url)
@@ -57,17 +57,21 @@ def take(url: str, out: Path, wait_s: float, report: Path | None = None) -> None
                 page.screenshot(path=out / "report.jpg", type="jpeg", quality=60)
             browser.close()
     except Error as error:
-        raise ReportError(f"{url}: no pictures of it: {error.message.splitlines()[0]}") from error
+        raise ReportError(
+            f"{url or report}: no pictures of it: {error.message.splitlines()[0]}"
+        ) from error
 
 
 def main() -> None:
     """Take them."""
     parser = Parser(__doc__)
-    parser.add_argument("url", help="of the console")
+    parser.add_argument("url", nargs="?", help="of the console")
     parser.add_argument("--out", type=Path, default=Path("docs/img"), help="folder")
     parser.add_argument("--wait", type=number(0.0, 600.0), default=15.0, help="seconds")
     parser.add_argument("--report", type=existing, help="report.html of a flight")
     options = parser.parse_args()
+    if options.url is None and options.report is None:
+        raise ReportError("give the address of a console, or --report")
     take(options.url, options.out, options.wait, options.report)
 
 

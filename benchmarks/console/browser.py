@@ -306,7 +306,7 @@ def _pictures(page: Any, demo: Demo, folder: Path) -> None:
                 return
             page.click(f"nav button[data-view={view}]")
             page.wait_for_timeout(1500)
-            page.screenshot(path=folder / f"{view}-{width}.png")
+            page.screenshot(path=folder / f"{view}-{width}.jpg", type="jpeg", quality=75)
     page.set_viewport_size({"width": 1280, "height": 800})
 
 
@@ -371,7 +371,7 @@ def main() -> None:
     parser.add_argument("--seed", type=whole(0, 10_000), default=0, help="of world and errors")
     parser.add_argument("--fc", default="embedded", help="ardupilot or embedded")
     parser.add_argument("--browser-nice", type=whole(0, 19), default=5, help="behind the flight's")
-    parser.add_argument("--screens", type=Path, help="folder for a PNG of each view and size")
+    parser.add_argument("--screens", type=Path, help="folder for a JPEG of each view and size")
     parser.add_argument("--keep", type=Path, help="folder for the flights' reports")
     parser.add_argument("--out", type=output, help="JSON file of all flights")
     options = parser.parse_args()
