@@ -97,7 +97,7 @@ def test_a_flight_without_fault_names_none(record):
 
 
 def test_the_page_needs_nothing_else_and_runs_nothing_of_the_record(record):
-    told = []
+    told: list[str] = []
     path = write_page(record, say=told.append)
     assert [text.split()[0] for text in told].count("drawing") >= 2  # the map, and the plots
     text = path.read_text()
