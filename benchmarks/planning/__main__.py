@@ -22,20 +22,29 @@ from typing import Any
 
 from benchmarks.common.arguments import Parser, number, output, whole
 from benchmarks.common.deadline import deadline
+from benchmarks.common.figures import write_figures
 from benchmarks.common.named_errors import named_errors
-from benchmarks.planning.report import fitted, summary
+from benchmarks.planning.report import COLUMNS, fitted, rows_of, summary
 from benchmarks.planning.run import Flown, read, run_world
-from localizer.forecast.risk import RISK_LIMIT, SIGMA_FACTOR
+from localizer.forecast.risk import RISK_LIMIT, SIGMA
 from localizer.synth.config import Character
 from sitl.demo.assets import prepare
 
 SETS: dict[str, tuple[tuple[int, float, Character], ...]] = {
-    "tuning": ((2_400_000, 800.0, "mixed"), (0, 1600.0, "mixed"), (5, 400.0, "mixed")),
-    "held-out": (
+    "tuning": (
+        (2_400_000, 800.0, "mixed"),
+        (0, 1600.0, "mixed"),
+        (5, 400.0, "mixed"),
         (2_500_001, 400.0, "fields"),
         (2_500_002, 400.0, "forest"),
         (2_500_003, 400.0, "mixed"),
         (2_500_004, 400.0, "dense"),
+    ),
+    "held-out": (
+        (2_600_001, 400.0, "mixed"),
+        (2_600_002, 400.0, "dense"),
+        (2_600_003, 400.0, "fields"),
+        (2_600_004, 400.0, "forest"),
     ),
 }
 
@@ -59,7 +68,7 @@ def report(legs: list[Flown]) -> dict[str, Any]:
     for key in ("condition", "world"):
         for value in sorted({getattr(x, key) for x in legs}):
             parts[f"{key} {value}"] = [x for x in legs if getattr(x, key) == value]
-    return {name: summary(part, SIGMA_FACTOR, RISK_LIMIT) for name, part in parts.items()}
+    return {name: summary(part, SIGMA, RISK_LIMIT) for name, part in parts.items()}
 
 
 def main() -> None:
@@ -76,7 +85,7 @@ def main() -> None:
             low_high = "{:.2f} [{:.2f}, {:.2f}]".format(*part["auc"])
             print(f"{name}: {part['legs']} legs, {part['failed']} failed, AUC {low_high}")
         if args.json:
-            args.json.write_text(json.dumps(made, indent=1))
+            write_figures(args.json, COLUMNS, rows_of(made), made)
         return
     more_time = deadline(args.minutes)
     for seed, size_m, character in SETS[args.set]:

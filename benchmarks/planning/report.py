@@ -14,14 +14,27 @@ from scipy.stats import rankdata, spearmanr
 
 from benchmarks.planning.legs import FORECASTS, PICTURES
 from benchmarks.planning.run import Flown, Picture
-from localizer.forecast.risk import RIGHT_M, RISK_LIMIT, WEIGHTS, Figures, failure_risk, predictors
+from localizer.forecast.risk import (
+    RIGHT_M,
+    RISK_LIMIT,
+    WEIGHTS,
+    Figures,
+    expected_sigma_m,
+    failure_risk,
+    predictors,
+)
 from localizer.geometry.pose import Array
 
 FAILED_SHARE = 0.2  # of a leg's pictures, refused or more than 1 m off: beyond it the leg failed
 _BOOTSTRAPS = 400
+COLUMNS = (
+    "legs", "number", "failed, told", "good, called bad", "AUC", "error / sigma, by the median",
+    "by the root mean square", "rank correlation",
+)  # fmt: skip
 _RIDGE = 0.005
 # A figure that is better must not tell of more risk: signs of the weights of `predictors`.
 _SIGNS = ((0, None), (None, 0), (None, 0), (None, 0), (0, None), (0, None))
+_STUDENT = 4.0  # degrees of freedom
 _CHI2_MEDIAN = 0.789  # of a third of chi-square with three degrees of freedom
 
 
@@ -58,22 +71,24 @@ class Scored:
     error_m: float
 
     @classmethod
-    def of(cls, leg: Flown, factor: float, weights: Sequence[float] = WEIGHTS) -> Scored:
-        """Under a factor of sigma and weights of the risk."""
+    def of(
+        cls, leg: Flown, sigma: tuple[float, float], weights: Sequence[float] = WEIGHTS
+    ) -> Scored:
+        """Under the constants of sigma and the weights of the risk."""
         told = [failure_risk(f, weights) for f in leg.figures]
         each = PICTURES // FORECASTS
         kept = [
-            (factor * leg.figures[k // each].sigma_m, p.error_m)
+            (expected_sigma_m(leg.figures[k // each], sigma), p.error_m)
             for k, p in enumerate(leg.pictures)
             if p.accepted and told[k // each] <= RISK_LIMIT
         ]
-        sigma, error = np.array(kept).reshape(-1, 2).T
+        told_m, error = np.array(kept).reshape(-1, 2).T
         some = len(kept) > 0
         return cls(
             float(np.mean(told)),
             is_bad(leg),
-            error**2 / 3 / sigma**2,
-            float(sigma.mean()) if some else np.nan,
+            error**2 / 3 / told_m**2,
+            float(told_m.mean()) if some else np.nan,
             float(np.sqrt((error**2).mean())) if some else np.nan,
         )
 
@@ -121,9 +136,9 @@ def rank_correlation(legs: Sequence[Scored]) -> float:
     return float(spearmanr(*pairs.T).statistic)
 
 
-def summary(legs: Sequence[Flown], factor: float, threshold: float) -> dict[str, Any]:
+def summary(legs: Sequence[Flown], sigma: tuple[float, float], threshold: float) -> dict[str, Any]:
     """All figures of some legs."""
-    scored = [Scored.of(leg, factor) for leg in legs]
+    scored = [Scored.of(leg, sigma) for leg in legs]
     bad, risk = np.array([x.bad for x in scored]), np.array([x.risk for x in scored])
     told = risk > threshold
     return {
@@ -139,6 +154,20 @@ def summary(legs: Sequence[Flown], factor: float, threshold: float) -> dict[str,
         "rank_correlation": interval(scored, rank_correlation),
         "risk_table": _reliability(risk, legs),
     }  # fmt: skip
+
+
+def rows_of(parts: dict[str, dict[str, Any]]) -> list[tuple[str, ...]]:
+    """Cells under `COLUMNS`, a row a part of the legs."""
+    return [
+        (
+            name, str(part["legs"]), part["told_of_failed"], part["false_alarms"],
+            *(
+                "{:.2f} [{:.2f}, {:.2f}]".format(*part[key])
+                for key in ("auc", "sigma_ratio_median", "sigma_ratio_rms", "rank_correlation")
+            ),
+        )
+        for name, part in parts.items()
+    ]  # fmt: skip
 
 
 def _reliability(risk: Array, legs: Sequence[Flown]) -> list[dict[str, Any]]:
@@ -161,7 +190,9 @@ def _reliability(risk: Array, legs: Sequence[Flown]) -> list[dict[str, Any]]:
 
 
 def fitted(legs: Sequence[Flown]) -> dict[str, Any]:
-    """`SIGMA_FACTOR` and `WEIGHTS` of these legs: ridge-regularized logistic regression."""
+    """`SIGMA` and `WEIGHTS` of these legs: ridge-regularized logistic regression; errors of
+    Student's distribution with four degrees of freedom.
+    """
     pairs = [pair for leg in legs for pair in paired(leg)]
     x = np.stack([predictors(f) for f, _ in pairs])
     y = np.array([failed(p) for _, p in pairs], float)
@@ -179,6 +210,27 @@ def fitted(legs: Sequence[Flown]) -> dict[str, Any]:
     constant = float(found[0] - slopes @ mean)
     weights = [round(float(w), 3) for w in (constant, *slopes)]
     return {
-        "SIGMA_FACTOR": sigma_ratio([Scored.of(x, 1.0, weights) for x in legs]),
+        "SIGMA": _spread(pairs, weights),
         "WEIGHTS": weights,
     }
+
+
+def _spread(pairs: Sequence[tuple[Figures, Picture]], weights: Sequence[float]) -> list[float]:
+    """`SIGMA`: likeliest for what is accepted where vision is said to do, then scaled until half of
+    the errors are below their median.
+    """
+    kept = [
+        (f.sigma_m, p.error_m) for f, p in pairs
+        if p.accepted and failure_risk(f, weights) <= RISK_LIMIT
+    ]  # fmt: skip
+    simulated, error = np.array(kept).T
+
+    def loss(logs: Array) -> float:
+        sigma = np.hypot(*np.exp(logs)[:, None] * [simulated, np.ones(len(simulated))])
+        tails = (_STUDENT + 3) / 2 * np.log1p((error / sigma) ** 2 / _STUDENT)
+        return float((3 * np.log(sigma) + tails).mean())
+
+    found = np.exp(minimize(loss, np.log([0.8, 0.1]), method="Nelder-Mead").x)
+    sigma = np.hypot(found[0] * simulated, found[1])
+    scale = float(np.sqrt(np.median(error**2 / 3 / sigma**2) / _CHI2_MEDIAN))
+    return [round(float(scale * x), 3) for x in found]

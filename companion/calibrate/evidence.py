@@ -82,6 +82,14 @@ class Evidence:
         """The deployment's numbers, and the poses that came with the frames."""
         return self._start
 
+    @property
+    def grounds(self) -> Array:
+        """(K, 2): east and north of the middle of what each picture shows, m."""
+        begins = np.flatnonzero(np.diff(self.owner, prepend=-1))
+        counts = np.diff(np.append(begins, len(self.owner)))
+        middles: Array = np.add.reduceat(self._points[:, :2], begins, axis=0) / counts[:, None]
+        return middles
+
     def camera_of(self, shared: Array) -> Camera:
         """The camera's model under these numbers."""
         return changed_camera(self._camera, shared)

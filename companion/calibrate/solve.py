@@ -15,12 +15,14 @@ from numpy.typing import NDArray
 from scipy.linalg import cho_factor, cho_solve
 
 from companion.calibrate import unknowns as u
+from companion.calibrate.alike import PictureNormals, pictures_part
 from companion.calibrate.evidence import Evidence, Guess
 from companion.calibrate.wander import AttitudeWander, Wander
 from localizer.geometry.pose import Array
 
 _ROUNDS, _STEPS = 4, 5  # of noise, and of the poses and numbers under it
-_ALIKE = 6.0  # variance of the pictures' parts counts so often: neighbours err alike
+# Variance of the pictures' parts counts so often against the autopilot's: neighbours err alike.
+_ALIKE = 6.0
 _CAUCHY = 2.5  # sigmas
 _WHITE = {"attitudes": np.radians(0.03), "places": 0.03}  # of what has no memory: rad, m
 _LEAST = {"attitudes": np.radians(0.05), "places": 0.08}
@@ -74,7 +76,11 @@ def solve(evidence: Evidence, fixed: NDArray[np.bool_] | None = None) -> Solutio
         noise = _noise(evidence, guess, noise)
     H, _ = _normal(evidence, guess, noise, still)
     shared = np.eye(len(H), u.COUNT)
-    P: Array = cho_solve(cho_factor(H, lower=True), shared)[: u.COUNT]
+    gain: Array = cho_solve(cho_factor(H, lower=True), shared).T
+    pictures = _pictures(evidence, guess, noise)
+    alone, larger = pictures_part(gain, u.COUNT, pictures, evidence.grounds)
+    P = gain[:, : u.COUNT] + alone * (np.outer(larger, larger) - 1.0)
+    P = 0.5 * (P + P.T)
     information: Array = np.linalg.inv(P).astype(np.float64) - np.diag(_prior(still))
     return Solution(guess, P, information, noise.pixel_sigma, noise.attitude, noise.place)
 
@@ -108,7 +114,7 @@ def _normal(
     K = len(evidence.times_s)
     M = u.COUNT + 6 * K
     H, g = np.zeros((M, M)), np.zeros(M)
-    _add_pictures(evidence, guess, noise, H, g)
+    _add_pictures(_pictures(evidence, guess, noise), H, g)
     _add_wander(evidence.attitudes, "attitudes", noise.attitude, evidence, guess, H, g)
     if evidence.placed.any():
         _add_wander(evidence.places, "places", noise.place, evidence, guess, H, g)
@@ -141,24 +147,24 @@ def _derivatives(
     return value, by_frame, by_shared
 
 
-def _add_pictures(evidence: Evidence, guess: Guess, noise: _Noise, H: Array, g: Array) -> None:
-    value, by_frame, by_shared = _derivatives(evidence.pixels, guess, range(*u.OPTICS.indices(99)))
+def _pictures(evidence: Evidence, guess: Guess, noise: _Noise) -> PictureNormals:
+    optics = range(*u.OPTICS.indices(u.COUNT))
+    value, by_frame, by_shared = _derivatives(evidence.pixels, guess, optics)
     weight = noise.weight / (noise.pixel_sigma**2 * _ALIKE)
-    K, S = len(guess.places), u.COUNT
-    own = np.einsum("n,nai,naj->nij", weight, by_frame, by_frame)
-    both = np.einsum("n,nai,naj->nij", weight, by_frame, by_shared)
-    pull = np.einsum("n,nai,na->ni", weight, by_frame, value)
-    H[:S, :S] += np.einsum("n,nai,naj->ij", weight, by_shared, by_shared, optimize=True)
-    g[:S] += np.einsum("n,nai,na->i", weight, by_shared, value)
-    frames = np.zeros((K, 6, 6)), np.zeros((K, 6, S)), np.zeros((K, 6))
-    for total, each in zip(frames, (own, both, pull), strict=True):
-        np.add.at(total, evidence.owner, each)
-    for k in range(K):
+    by_optics = by_shared[..., u.OPTICS]
+    return PictureNormals.of(evidence.owner, weight, value, by_frame, by_optics)
+
+
+def _add_pictures(pictures: PictureNormals, H: Array, g: Array) -> None:
+    S, of = u.COUNT, u.OPTICS
+    H[of, of] += pictures.shared.sum(axis=0)
+    g[of] += pictures.shared_pull.sum(axis=0)
+    for k, both in enumerate(pictures.both):
         at = slice(S + 6 * k, S + 6 * k + 6)
-        H[at, at] += frames[0][k]
-        H[at, :S] += frames[1][k]
-        H[:S, at] += frames[1][k].T
-        g[at] += frames[2][k]
+        H[at, at] += pictures.own[k]
+        H[at, of] += both
+        H[of, at] += both.T
+        g[at] += pictures.pull[k]
 
 
 def _add_wander(

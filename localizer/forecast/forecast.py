@@ -8,7 +8,7 @@ import numpy as np
 
 from localizer.config import LocalizerConfig
 from localizer.features.extractor import FeatureExtractor
-from localizer.forecast.risk import RIGHT_M, SIGMA_FACTOR, WORST_M, Figures, failure_risk
+from localizer.forecast.risk import RIGHT_M, WORST_M, Figures, expected_sigma_m, failure_risk
 from localizer.forecast.rivals import Rival, likest_rival
 from localizer.forecast.visit import another_visit
 from localizer.geometry.camera import Camera
@@ -108,7 +108,7 @@ class Forecaster:
         return ViewForecast(
             condition,
             figures,
-            SIGMA_FACTOR * figures.sigma_m,
+            expected_sigma_m(figures),
             failure_risk(figures),
             _ground_m(view),
             texture(view.rgb),

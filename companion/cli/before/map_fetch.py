@@ -80,6 +80,9 @@ def fetch_command(
         typer.Option(help="buildings to raise on a bare terrain: GeoJSON or CityGML with heights"),
     ] = None,
     height_property: HeightProperty = None,
+    footprints_attribution: Annotated[
+        str | None, typer.Option(help="whose the footprints are, where their file does not say")
+    ] = None,
     keep: Annotated[
         bool, typer.Option("--keep", help="keep the fetched GeoTIFFs beside the cache")
     ] = False,
@@ -95,6 +98,8 @@ def fetch_command(
         from localizer.map.footprints.raise_buildings import read_footprints
 
         buildings = read_footprints(footprints, height_property)
+        if footprints_attribution is not None:
+            buildings = replace(buildings, attribution=footprints_attribution)
     known = load_sources(tuple(sources or ()))
     console = Console()
     console.print(f"area: {area}", highlight=False, soft_wrap=True)
@@ -253,7 +258,11 @@ def _raised(console: Console, part: _Part, footprints: Footprints) -> _Part:
     done = raise_buildings(part.out, footprints, out)
     console.print(f"{footprints.path.name}: {done.line()}", markup=False, highlight=False,
                   soft_wrap=True)  # fmt: skip
-    whose = f"{part.source.attribution}; buildings: {footprints.path.name}"
+    if not footprints.attribution:
+        console.print("[yellow]warning:[/] nobody says whose the footprints are: name them with "
+                      "--footprints-attribution", soft_wrap=True)  # fmt: skip
+    buildings = footprints.attribution or footprints.path.name
+    whose = f"{part.source.attribution}; buildings: {buildings}"
     return replace(part, out=out, source=part.source.model_copy(update={"attribution": whose}))
 
 

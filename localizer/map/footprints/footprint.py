@@ -14,6 +14,7 @@ from localizer.geometry.pose import Array
 MOST_BYTES = 512 << 20
 _MOST = 500_000
 _HIGHEST_M = 1000.0
+_LONGEST = 300  # characters of an attribution
 
 
 @dataclass(frozen=True, eq=False)
@@ -30,7 +31,7 @@ class Footprint:
 class Footprints:
     """A file's. crs: as pyproj takes it; either_order: whether its CRS may be written north first;
     by_storeys: how many have their height by their number of storeys; left_out: how many have no
-    height or no area.
+    height or no area; attribution: whose they are, as far as the file says.
     """
 
     path: Path
@@ -39,6 +40,7 @@ class Footprints:
     either_order: bool = False
     by_storeys: int = 0
     left_out: int = 0
+    attribution: str = ""
 
     def require(self) -> Footprints:
         """Itself; `MapSourceError` where it holds no building, or too many."""
@@ -66,6 +68,14 @@ def ring_of(places: object) -> Array | None:
     x, y = (ring - ring.mean(axis=0)).T
     area = 0.5 * abs(float(x[:-1] @ y[1:] - x[1:] @ y[:-1]))
     return ring if area > 0.0 else None
+
+
+def one_line(text: object) -> str:
+    """A text from a file for the map's manifest: printable, in one line, not endless."""
+    if not isinstance(text, str):
+        return ""
+    plain = "".join(c if c.isprintable() else " " for c in text)
+    return " ".join(plain.split())[:_LONGEST]
 
 
 def sane_height(value: object) -> float | None:

@@ -13,6 +13,7 @@ from localizer.map.footprints.footprint import (
     MOST_BYTES,
     Footprint,
     Footprints,
+    one_line,
     ring_of,
     sane_height,
 )
@@ -21,6 +22,8 @@ from localizer.plain_files import plain_text
 HEIGHTS = ("height", "building:height", "measuredHeight", "measured_height", "HEIGHT", "Height")
 _STOREYS = ("building:levels", "num_floors", "levels", "storeysAboveGround")
 _STOREY_M = 3.0
+# Members of the collection: Overpass writes the first, exports of cadastres the others.
+_WHOSE = ("copyright", "attribution", "licence", "license")
 
 
 def read_geojson(path: Path, height_property: str | None = None) -> Footprints:
@@ -46,8 +49,10 @@ def read_geojson(path: Path, height_property: str | None = None) -> Footprints:
             left_out += 1
             continue
         found.append(Footprint(tuple(outlines), height))
-    made = Footprints(path, crs, tuple(found), by_storeys=by_storeys, left_out=left_out)
-    return made.require()
+    whose = "; ".join(dict.fromkeys(filter(None, (one_line(document.get(k)) for k in _WHOSE))))
+    return Footprints(
+        path, crs, tuple(found), by_storeys=by_storeys, left_out=left_out, attribution=whose
+    ).require()
 
 
 def _crs(document: dict[str, Any]) -> str:

@@ -96,7 +96,8 @@ def test_footprints_become_buildings_on_a_fetched_terrain(server, sources, tmp_p
     feature = {"type": "Feature", "properties": {"height": 17.0},
                "geometry": {"type": "Polygon", "coordinates": [places]}}  # fmt: skip
     file = tmp_path / "houses.geojson"
-    file.write_text(json.dumps({"type": "FeatureCollection", "features": [feature]}))
+    whose = {"copyright": "OpenStreetMap\ncontributors", "license": "ODbL 1.0"}
+    file.write_text(json.dumps({"type": "FeatureCollection", "features": [feature]} | whose))
     out = tmp_path / "area"
     done = run(
         "fetch", "--rectangle", BOX, "--imagery", "photos", "--heights", "terrain", "--sources",
@@ -105,7 +106,9 @@ def test_footprints_become_buildings_on_a_fetched_terrain(server, sources, tmp_p
     assert done.exit_code == 0, done.output
     assert "1 buildings raised in cells of 0.50 m" in done.output
     cache = TileCache.open(out)
-    assert "buildings: houses.geojson" in cache.manifest.attribution
+    named = "buildings: OpenStreetMap contributors; ODbL 1.0"
+    assert named in cache.manifest.attribution
+    assert "whose the footprints are" not in done.output
     edge = LEFT + np.arange(180.0, 221.0)
     low = min(height_m(edge, TOP - y).min() for y in (180.0, 215.0))
     for east, north, truth in (

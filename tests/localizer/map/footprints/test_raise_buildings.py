@@ -126,6 +126,21 @@ def test_what_has_no_height_or_lies_beside_is_counted_and_told(tmp_path, terrain
 
 
 @pytest.mark.parametrize(
+    ("members", "whose"),
+    [
+        ({}, ""), ({"copyright": ["a"], "license": 3}, ""),
+        ({"attribution": "the\x1b[31m town\n"}, "the [31m town"),
+        ({"copyright": "the town", "attribution": "the town", "licence": "CC0"}, "the town; CC0"),
+        ({"copyright": "x" * 10_000}, "x" * 300),
+    ],
+)  # fmt: skip
+def test_a_file_says_whose_its_buildings_are(tmp_path, members, whose):
+    file = geojson(tmp_path / "a.geojson", ({"height": 9}, [lonlat(HOUSE)]))
+    file.write_text(json.dumps(json.loads(file.read_text()) | members))
+    assert read_footprints(file).attribution == whose
+
+
+@pytest.mark.parametrize(
     ("text", "why"),
     [
         ("{}", "no GeoJSON"), ("[1", "no GeoJSON"), ('{"features": []}', "no building"),
