@@ -42,7 +42,9 @@ def take(url: str | None, out: Path, wait_s: float, report: Path | None = None) 
     try:
         with sync_playwright() as driver:
             browser = driver.chromium.launch(executable_path=chromium(), args=list(BROWSER_OPTIONS))
-            for name, (width, height) in _SIZES.items() if url is not None else ():
+            for name, (width, height) in _SIZES.items():
+                if url is None:
+                    break
                 page = browser.new_page(viewport={"width": width, "height": height})
                 page.set_default_timeout(_PATIENCE_MS)
                 page.goto(url)
