@@ -87,7 +87,8 @@ def _frame(path: Path, camera: Camera, time_ns: int, sequence: int) -> Frame:
 def _why(estimate: PoseEstimate) -> str:
     if estimate.status is RegistrationStatus.OK:
         return (
-            "registered, but not believed: picture and map agree too little (quality "
-            f"{estimate.quality:.2f}); check the prior, or give a smaller --prior-sigma-m"
+            "registered, but not believed: picture and map agree too little "
+            f"(quality {estimate.quality:.2f}); check the prior, or say by --prior-sigma-m how far "
+            "it may be off"
         )
     return f"{estimate.status.value}, quality {estimate.quality:.2f}"
