@@ -301,6 +301,11 @@ class Bridge:
         return self._fc.injecting
 
     @property
+    def reaches_ekf(self) -> bool:
+        """Whether positions went to the flight controller in the last second."""
+        return self._fc.sender.reaches_ekf(monotonic_ns())
+
+    @property
     def trouble(self) -> str:
         """Why the EKF does not have what it should while injecting: positions are not sent, or not
         followed; empty while all is well. The operator was told.

@@ -16,7 +16,7 @@ from localizer.geometry.geo import NED_FROM_ENU
 from localizer.geometry.pose import Array
 from localizer.tracking.engine import PriorProvider
 from localizer.tracking.motion import OtherSensors
-from localizer.types import PoseEstimate, PosePrior, ReferenceBundle
+from localizer.types import PoseEstimate, PosePrior
 from mavlink_bridge.injection.shadow import gnss_healthy
 from mavlink_bridge.messages import Attitude, GimbalAttitude, VehicleState
 
@@ -101,7 +101,7 @@ class PositionBelief:
         self._fix_ns: int | None = None
 
     def note_fix(self, time_ns: int) -> None:
-        """A fix of ours was accepted; it may have gone to the EKF."""
+        """A fix of ours was accepted, and went to the EKF."""
         with self._lock:
             self._fix_ns = time_ns
 
@@ -136,9 +136,13 @@ class AutopilotPose:
         self._config = config
         self.belief = PositionBelief(config)
 
-    def add_estimate(self, estimate: PoseEstimate, _: ReferenceBundle) -> None:
-        """Note a fix of ours. Never blocks."""
-        if estimate.accepted:
+    def add_estimate(self, estimate: PoseEstimate, *, reaches_ekf: bool) -> None:
+        """Note a fix of ours. Never blocks.
+
+        reaches_ekf: whether positions go to it. One in shadow, or withheld, holds no EKF in place:
+        taken for one that does, it would let the search look too near where a drifted EKF is.
+        """
+        if estimate.accepted and reaches_ekf:
             self.belief.note_fix(estimate.exposure_time_ns)
 
     @property

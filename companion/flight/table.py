@@ -274,8 +274,11 @@ def _vital_signs(making: Making) -> VitalSigns:
 
 
 def _autopilot(making: Making) -> AutopilotPose:
-    autopilot = AutopilotPose(making[Bridge], making[Installation], making.config.prior)
-    making.channels.estimates.subscribe(autopilot.add_estimate)
+    bridge = making[Bridge]
+    autopilot = AutopilotPose(bridge, making[Installation], making.config.prior)
+    making.channels.estimates.subscribe(
+        lambda estimate, _: autopilot.add_estimate(estimate, reaches_ekf=bridge.reaches_ekf)
+    )
     return autopilot
 
 

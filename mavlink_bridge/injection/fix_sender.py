@@ -49,6 +49,7 @@ class FixSender:
         self._reason = ""
         self._taken = True  # by the link, of the last position
         self._delivered_ns = 0
+        self._sent_ns: int | None = None  # to the flight controller
 
     def take(self, now_ns: int) -> None:
         """The fixes that came since the last call."""
@@ -76,6 +77,12 @@ class FixSender:
         """
         return not self.injector.guard.blocked and now_ns - self._delivered_ns < _GOOD_NS
 
+    def reaches_ekf(self, now_ns: int) -> bool:
+        """Whether positions went to the flight controller of late: not while a shadow, withheld,
+        or refused by the port.
+        """
+        return self._sent_ns is not None and now_ns - self._sent_ns < _GOOD_NS
+
     @property
     def refusal(self) -> str:
         """Why positions that are due are not made, once it has lasted and was told; else empty."""
@@ -97,4 +104,5 @@ class FixSender:
             self._counters["shadowed"] += 1
             return
         self._counters["injected"] += 1
+        self._sent_ns = now_ns
         self._outcome.sent(injection.estimate, now_ns)

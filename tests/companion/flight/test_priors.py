@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -54,6 +56,19 @@ def test_a_fix_of_ours_begins_the_drift_anew_but_is_no_evidence() -> None:
     assert not belief.independent
 
 
+def test_a_fix_that_never_went_to_the_ekf_holds_it_nowhere() -> None:
+    """In shadow, or withheld: the search would look too near to where the EKF drifted to."""
+    pose = autopilot_pose()
+    pose.belief.at(with_gnss(10), 10 * SECOND)
+    fix: Any = SimpleNamespace(accepted=True, exposure_time_ns=100 * SECOND)
+    pose.add_estimate(fix, reaches_ekf=False)
+    drifted_m = pose.belief.at(FLYING, 101 * SECOND).sigma_m
+    assert drifted_m is not None
+    assert drifted_m > 150.0
+    pose.add_estimate(fix, reaches_ekf=True)
+    assert pose.belief.at(FLYING, 101 * SECOND).sigma_m == pytest.approx(5.0, abs=0.1)
+
+
 def test_an_ekf_without_a_position_knows_nothing() -> None:
     blind = replace(FLYING, ekf_flags=1)  # EKF_ATTITUDE alone
     assert PositionBelief(PriorConfig()).at(blind, 10 * SECOND).sigma_m is None
@@ -90,9 +105,13 @@ class Ranging:
         return None
 
 
-def clearance(lean_deg: float, at_s: float) -> float | None:
+def autopilot_pose(lean_deg: float = 0.0) -> AutopilotPose:
     installation = Installation(LocalFrame(Geodetic(47.0, 8.0, 500.0)), 48.0, np.zeros(3))
-    pose = AutopilotPose(Ranging(lean_deg), installation, PriorConfig())
+    return AutopilotPose(Ranging(lean_deg), installation, PriorConfig())
+
+
+def clearance(lean_deg: float, at_s: float) -> float | None:
+    pose = autopilot_pose(lean_deg)
     return pose.sensors.clearance_at(round(at_s * SECOND))
 
 

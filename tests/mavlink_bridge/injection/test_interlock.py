@@ -85,11 +85,13 @@ def test_a_port_that_takes_nothing_is_no_vision_to_switch_to(
     flight = on_gnss(monkeypatch, switch=SWITCH)
     flight.run(20.0)
     assert flight.end.sender.is_good(flight.now_ns)
+    assert flight.end.sender.reaches_ekf(flight.now_ns)
     flight.link.full = True
     flight.run(3.0)
     assert not flight.end.sender.is_good(flight.now_ns)
     assert told(flight, "not sent") == ["not sent: the link takes no more"]
     assert flight.end.trouble == "not sent: the link takes no more"
+    assert not flight.end.sender.reaches_ekf(flight.now_ns)
     flight.gnss_north_m = None
     flight.run(6.0)
     assert told(flight, "source set") == []
@@ -222,6 +224,9 @@ def test_a_start_in_the_air_on_vision_goes_back_to_gnss_where_vision_ends(
 
 def test_shadow_mode_orders_nothing_in_flight(monkeypatch: pytest.MonkeyPatch) -> None:
     flight = on_gnss(monkeypatch, switch=SWITCH, mode="shadow")
+    flight.run(3.0)
+    assert flight.end.sender.is_good(flight.now_ns)
+    assert not flight.end.sender.reaches_ekf(flight.now_ns)
     flight.armed, flight.sees = True, False
     flight.run(7.0)
     assert orders(flight) == []
