@@ -35,7 +35,7 @@ def test_a_marked_table_is_made_anew_and_what_stands_around_it_stays(tmp_path):
     page = "before\n<!-- kept x -->\n| old |\n<!-- end -->\nafter\n"
     made = with_tables(page, tmp_path)
     assert made.startswith("before\n<!-- kept x -->\n| a | b |\n|---|---|\n| 1 | 2 |\n\n*`make x`;")
-    assert "recorded at commit abc1234, 2026-11-22; 2 cores" in made
+    assert "was not kept, at commit abc1234, 2026-11-22; 2 cores" in made
     assert made.endswith("<!-- end -->\nafter\n")
     assert with_tables(made, tmp_path) == made
 
