@@ -111,9 +111,15 @@ class RecordTables:
 
     @property
     def tlog(self) -> Path | None:
-        """The flight's MAVLink log, if one was kept."""
+        """The flight's MAVLink log, if one was kept: where the settings say, or, of a record that
+        was brought elsewhere, in it or beside it.
+        """
         named = self._setting("bridge", "tlog")
-        return Path(named) if isinstance(named, str) else None
+        if not isinstance(named, str):
+            return None
+        name = Path(named).name
+        places = (Path(named), self.folder / name, self.folder.parent / name)
+        return next((path for path in places if path.is_file()), places[0])
 
     @property
     def delay_ms(self) -> float | None:

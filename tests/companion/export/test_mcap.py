@@ -177,6 +177,13 @@ def test_mavlink_text_and_the_autopilots_place_come_from_the_tlog(flight, tmp_pa
     ((_, _, gnss),) = messages["/gnss/location"]
     assert autopilot.latitude == pytest.approx(47.3)
     assert gnss.position_covariance[0] == pytest.approx(0.64)
+    # Brought elsewhere, with its log beside it: the settings name a place that is gone.
+    elsewhere = tmp_path / "stick"
+    elsewhere.mkdir()
+    for path in (keeper.folder, tmp_path / "flight.tlog"):
+        path.rename(elsewhere / path.name)
+    moved, _ = _read(export_mcap(elsewhere / keeper.folder.name).path)
+    assert len(moved["/mavlink/text"]) == 1
 
 
 def test_in_flight_the_same_is_written_and_a_loss_of_power_leaves_what_was_written(
