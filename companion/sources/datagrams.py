@@ -178,6 +178,7 @@ class VideoDatagrams:
         self._told: set[str] = set()
         self._socket: socket.socket | None = None
         self._pending = b""
+        self._silent = False
         self._closed = threading.Event()
         self._waker = WakePipe()
 
@@ -187,7 +188,7 @@ class VideoDatagrams:
         Raises OSError while the address cannot be bound.
         """
         self.patience_s = patience_s
-        self._pending = b""
+        self._pending, self._silent = b"", False
         if self._socket is None:
             self._socket = self._address.bound()
         for _ in range(100 * _PER_READ):  # bounded: a flood would be drained for ever
@@ -201,8 +202,12 @@ class VideoDatagrams:
     def read(self, size: int) -> bytes:
         """What has come from the sender, at most `size` bytes, as soon as there is something.
 
-        b"" after `close`; raises `SilentSenderError` when nothing came within `patience_s`.
+        b"" after `close`; raises `SilentSenderError` when nothing came within `patience_s`, and
+        gives b"" from then on until `begin`: the demuxer asks again, and PyAV would print the trace
+        of a second error over the first.
         """
+        if self._silent:
+            return b""
         if not self._pending:
             self._pending = self._next()
         given, self._pending = self._pending[:size], self._pending[size:]
@@ -231,6 +236,7 @@ class VideoDatagrams:
                 return data
             left_s = deadline - time.monotonic()
             if left_s <= 0.0:
+                self._silent = True
                 raise SilentSenderError(f"no data for {self.patience_s:g} s")
             poller.poll(left_s * 1e3)
         return b""

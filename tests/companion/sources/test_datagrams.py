@@ -167,7 +167,9 @@ def test_silence_and_closing_end_a_read(sockets: Sockets) -> None:
     sockets.feed.begin(0.0)
     with pytest.raises(SilentSenderError):
         sockets.feed.read(10)
-    sockets.feed.patience_s = 30.0
+    sockets.sender("127.0.0.1").send(TS)
+    assert sockets.feed.read(10) == b""  # a demuxer asks again: it is over
+    sockets.feed.begin(30.0)
     sockets.feed.close()
     assert sockets.feed.read(10) == b""
 
