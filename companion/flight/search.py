@@ -10,16 +10,17 @@ import math
 import threading
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from companion.flight.priors import AutopilotPose
 from localizer.config import LocalizerConfig
 from localizer.errors import LocalizerError
+from localizer.geometry.pose import Array
 from localizer.map.cache.cache import TileCache
 from localizer.relocalization.relocalizer import OpenRelocalizer, open_relocalizer
-from localizer.relocalization.types import PlaceQuery, SearchRegion
+from localizer.relocalization.types import PlaceQuery, Relocalization, SearchRegion
 from localizer.types import Frame, PosePrior
 from mavlink_bridge.messages import PlaceHint
 
@@ -37,6 +38,16 @@ _HEIGHT_SIGMA_M = 6.0  # of the barometer since the take-off
 _SIGMAS = 3.0
 _PLACE_SIGMA_M, _PLACE_SIGMA_RAD = 2.0, math.radians(1.0)  # of a found place, at the least
 
+# A search takes seconds where the processors fly, too. Farther from where the camera is by now than
+# this, a place found is no place to begin at: a second search, of the newest frame, looks for it
+# about there, which takes a tenth.
+_STALE_M = 5.0
+_SPEED_SIGMA_M_S, _UNKNOWN_SPEED_M_S = 2.0, 8.0  # with the EKF's velocity, and without
+_FOLLOWED_M, _LONGEST_S = 10.0, 10.0
+_FOLLOWED_TILT_RAD, _FOLLOWED_HEADING_RAD = math.radians(1.0), math.radians(2.0)
+_FOLLOWED_HEIGHT_M = 2.0  # of the barometer over seconds
+_LEAST_BASE_S = 0.3  # between two places, for a velocity
+
 Event = Callable[[str, str], None]
 
 
@@ -47,6 +58,52 @@ class Hint:
     centre: tuple[float, float]
     radius_m: float
     time_s: float
+
+
+@dataclass(frozen=True)
+class Sighting:
+    """A place that was found, with the query that it answers."""
+
+    query: PlaceQuery
+    found: Relocalization
+
+    def followed(self, query: PlaceQuery, velocity: Array | None) -> PlaceQuery | None:
+        """A later frame's query, narrowed to where the camera can have got to; None after too long.
+
+        velocity: (3,) m/s in the map's axes by the EKF, None where it knows none.
+        """
+        elapsed_s = self._elapsed_s(query.frame.exposure_time_ns)
+        if not 0.0 < elapsed_s <= _LONGEST_S:
+            return None
+        way = np.zeros(3) if velocity is None else velocity * elapsed_s
+        pose = self.found.world_from_camera
+        turn = query.rotation @ self.query.rotation.T
+        return replace(
+            query,
+            rotation=turn @ pose.rotation,
+            tilt_sigma_rad=_FOLLOWED_TILT_RAD,
+            heading_sigma_rad=_FOLLOWED_HEADING_RAD,
+            height_m=float(pose.translation[2]) + query.height_m - self.query.height_m,
+            height_sigma_m=_FOLLOWED_HEIGHT_M,
+            region=SearchRegion.circle(
+                pose.translation + way, _FOLLOWED_M + _speed_sigma(velocity) * elapsed_s
+            ),
+        )
+
+    def velocity_to(self, later: Relocalization) -> Array | None:
+        """The camera's velocity (3,), m/s, from here to where it was found later."""
+        elapsed_s = self._elapsed_s(later.exposure_time_ns)
+        if elapsed_s < _LEAST_BASE_S:
+            return None
+        way = later.world_from_camera.translation - self.found.world_from_camera.translation
+        return np.asarray(way / elapsed_s)
+
+    def _elapsed_s(self, time_ns: int) -> float:
+        return (time_ns - self.found.exposure_time_ns) * 1e-9
+
+
+def _speed_sigma(velocity: Array | None) -> float:
+    return _UNKNOWN_SPEED_M_S if velocity is None else _SPEED_SIGMA_M_S
 
 
 def place_on_map(
@@ -77,7 +134,10 @@ class PlaceSearch:
         autopilot: AutopilotPose,
         event: Event,
         reach: Callable[[int], SearchRegion | None] = lambda _time_ns: None,
+        clock: Callable[[], float] = time.monotonic,
     ) -> None:
+        self._clock = clock
+        self._sighting: Sighting | None = None  # too old to be given out
         self._cache, self._config = cache, config
         self._autopilot, self._event, self._reach = autopilot, event, reach
         self._in_reach = 0  # searches since the whole map was searched
@@ -118,24 +178,35 @@ class PlaceSearch:
         return True
 
     def search(self, frame: Frame, should_stop: Callable[[], bool]) -> PosePrior | None:
-        """The camera's pose at the frame's exposure, to be tried; None where nothing convinces."""
+        """The camera's pose at the frame's exposure, to be tried; None where nothing convinces, or
+        where what was found took so long that the next call looks again about there.
+        """
         if self._open is None:
             return None
         query = self._query(frame)
         if query is None:
             return None
-        began = time.monotonic()
-        found = self._open.relocalizer.find(query, should_stop)
+        seen, self._sighting = self._sighting, None
+        velocity = self._autopilot.velocity
+        followed = seen.followed(query, velocity) if seen is not None else None
+        began = self._clock()
+        found = self._open.relocalizer.find(followed or query, should_stop)
         if found is None:
             return None
-        seconds = time.monotonic() - began
+        seconds = self._clock() - began
+        if followed is None and seconds * _speed_sigma(velocity) > _STALE_M:
+            self._sighting = Sighting(query, found)
+            self._event("info", f"place found by search in {seconds:.1f} s, where we were then")
+            return None
         self._event("info", f"place found by search in {seconds:.1f} s, to be confirmed")
+        if velocity is None and followed is not None and seen is not None:
+            velocity = seen.velocity_to(found)
         least = np.repeat([_PLACE_SIGMA_M, _PLACE_SIGMA_RAD], 3) ** 2
         return PosePrior(
             found.world_from_camera,
             found.covariance + np.diag(least),
             found.exposure_time_ns,
-            self._autopilot.velocity,
+            velocity,
             independent=False,
         )
 

@@ -1,12 +1,15 @@
-"""The operator's hint: where the search looks, and what is refused."""
+"""Where the search looks, by the operator's hint and by what it found; what is refused."""
 
 import numpy as np
 import pytest
 
 from companion.flight.search import PlaceSearch, place_on_map
 from localizer.config import LocalizerConfig
+from localizer.geometry.camera import Camera
+from localizer.geometry.pose import Pose
 from localizer.map.cache.cache import TileCache
-from localizer.relocalization.types import SearchRegion
+from localizer.relocalization.types import Relocalization, SearchRegion
+from localizer.types import Frame
 from mavlink_bridge.messages import PlaceHint
 
 
@@ -64,3 +67,127 @@ def test_the_operators_word_comes_before_what_was_seen(cache):
     search = PlaceSearch(cache, LocalizerConfig(), Lost(), lambda *_: None, lambda _t: about)
     search.hint(300.0, 400.0, 50.0)
     assert search.region(0).centre == pytest.approx([300.0, 400.0])
+
+
+class Falling:
+    """An autopilot without a position, whose vehicle drifts east at 3 m/s and comes down at 2."""
+
+    knows_heading = True
+
+    def __init__(self, velocity=None):
+        self.time_s, self.velocity = 0.0, velocity
+
+    @property
+    def height_m(self):
+        return self.place[2] + 5.0  # the barometer's constant error
+
+    @property
+    def place(self):
+        return np.array([3.0 * self.time_s, 10.0, 70.0 - 2.0 * self.time_s])
+
+    def prior(self, _time_ns):
+        return None
+
+    def rotation(self, _time_ns):
+        return np.eye(3)
+
+    def frame(self):
+        return Frame(
+            image=np.zeros((8, 8, 3), np.uint8),
+            camera=Camera(8, 8, 8.0, 8.0, 4.0, 4.0),
+            exposure_time_ns=round(self.time_s * 1e9),
+            sequence=round(self.time_s * 10),
+        )
+
+
+class Slow:
+    """A relocalizer that is right, and takes 4 s for the map and 0.4 s for a small part of it."""
+
+    def __init__(self, autopilot):
+        self.autopilot, self.queries, self.blind = autopilot, [], False
+
+    @property
+    def relocalizer(self):
+        return self
+
+    def close(self):
+        pass
+
+    def find(self, query, _should_stop):
+        place = self.autopilot.place
+        self.queries.append(query)
+        wide = query.region is None or query.region.shape[0, 0] > 50.0**2
+        self.autopilot.time_s += 4.0 if wide else 0.4
+        if self.blind or not (query.region is None or query.region.contains(place[:2])):
+            return None
+        pose = Pose(np.eye(3), place)
+        return Relocalization(
+            pose, np.eye(6) * 0.01, query.frame.exposure_time_ns, 0.8, 1.0, 0.8, 0.1, 0, 0.0, {}
+        )
+
+
+@pytest.fixture
+def slowly(cache, monkeypatch):
+    """Makes a search with a slow relocalizer, all on the autopilot's clock."""
+
+    def make(autopilot):
+        slow = Slow(autopilot)
+        monkeypatch.setattr("companion.flight.search.open_relocalizer", lambda *_, **__: slow)
+        about = SearchRegion.circle(np.zeros(2), 100.0)
+        search = PlaceSearch(
+            cache, LocalizerConfig(), autopilot, lambda *_: None, lambda _t: about,
+            clock=lambda: autopilot.time_s,
+        )  # fmt: skip
+        search.start()
+        search.stop()
+        return search, slow
+
+    return make
+
+
+def test_a_place_of_seconds_ago_is_looked_for_again_where_it_can_be_by_now(slowly):
+    falling = Falling()
+    search, slow = slowly(falling)
+    assert search.search(falling.frame(), lambda: False) is None  # 12 m from where we are by now
+    prior = search.search(falling.frame(), lambda: False)
+    assert np.linalg.norm(prior.world_from_camera.translation - falling.place) < 2.0
+    assert prior.velocity == pytest.approx([3.0, 0.0, -2.0], abs=0.01)
+    assert slow.queries[1].height_m == pytest.approx(62.0)  # without the barometer's error
+    assert slow.queries[1].heading_sigma_rad < slow.queries[0].heading_sigma_rad
+
+
+def test_with_the_autopilots_velocity_the_next_search_is_as_near(slowly):
+    falling = Falling(velocity=np.array([3.0, 0.0, -2.0]))
+    search, slow = slowly(falling)
+    assert search.search(falling.frame(), lambda: False) is None
+    assert search.search(falling.frame(), lambda: False) is not None
+    assert slow.queries[1].region.centre == pytest.approx([12.0, 10.0])
+
+
+def test_a_place_that_is_not_seen_again_is_forgotten(slowly):
+    falling = Falling()
+    search, slow = slowly(falling)
+    search.search(falling.frame(), lambda: False)
+    slow.blind = True
+    assert search.search(falling.frame(), lambda: False) is None
+    slow.blind = False
+    assert search.search(falling.frame(), lambda: False) is None  # the wide search anew
+    radii = [float(np.sqrt(q.region.shape[0, 0])) for q in slow.queries]
+    assert radii == pytest.approx([100.0, 42.0, 100.0])
+
+
+def test_a_place_that_is_found_at_once_is_given_at_once(slowly, cache):
+    falling = Falling()
+    search, slow = slowly(falling)
+    search.hint(0.0, 10.0, 30.0)
+    assert search.search(falling.frame(), lambda: False) is not None
+    assert len(slow.queries) == 1
+
+
+def test_a_place_of_long_ago_says_nothing(slowly):
+    falling = Falling()
+    search, slow = slowly(falling)
+    search.search(falling.frame(), lambda: False)
+    falling.time_s += 20.0
+    search.search(falling.frame(), lambda: False)
+    assert slow.queries[1].region.centre == pytest.approx([0.0, 0.0])
