@@ -62,20 +62,35 @@ class Hint:
 
 @dataclass(frozen=True)
 class Sighting:
-    """A place that was found, with the query that it answers."""
+    """A place that was found, with the query that it answers, and where the camera could have been
+    then by its IMU; None where nobody knows.
+    """
 
     query: PlaceQuery
     found: Relocalization
+    reach: SearchRegion | None = None
 
-    def followed(self, query: PlaceQuery, velocity: Array | None) -> PlaceQuery | None:
+    def followed(
+        self, query: PlaceQuery, velocity: Array | None, reach: SearchRegion | None
+    ) -> PlaceQuery | None:
         """A later frame's query, narrowed to where the camera can have got to; None after too long.
 
-        velocity: (3,) m/s in the map's axes by the EKF, None where it knows none.
+        velocity: (3,) m/s in the map's axes by the EKF, None where it knows none; reach: as then.
         """
         elapsed_s = self._elapsed_s(query.frame.exposure_time_ns)
         if not 0.0 < elapsed_s <= _LONGEST_S:
             return None
-        way = np.zeros(3) if velocity is None else velocity * elapsed_s
+        way, sigma_m = np.zeros(2), _speed_sigma(velocity) * elapsed_s
+        if velocity is not None:
+            way = velocity[:2] * elapsed_s
+        elif self.reach is not None and reach is not None:
+            by_imu, grown_m = (
+                reach.centre - self.reach.centre,
+                _radius_m(reach) - _radius_m(self.reach),
+            )
+            # A record of the IMU that broke meanwhile has another centre, and says nothing.
+            if 0.0 < grown_m <= sigma_m and np.linalg.norm(by_imu) <= sigma_m:
+                way, sigma_m = by_imu, grown_m
         pose = self.found.world_from_camera
         turn = query.rotation @ self.query.rotation.T
         return replace(
@@ -85,9 +100,7 @@ class Sighting:
             heading_sigma_rad=_FOLLOWED_HEADING_RAD,
             height_m=float(pose.translation[2]) + query.height_m - self.query.height_m,
             height_sigma_m=_FOLLOWED_HEIGHT_M,
-            region=SearchRegion.circle(
-                pose.translation + way, _FOLLOWED_M + _speed_sigma(velocity) * elapsed_s
-            ),
+            region=SearchRegion.circle(pose.translation[:2] + way, _FOLLOWED_M + sigma_m),
         )
 
     def velocity_to(self, later: Relocalization) -> Array | None:
@@ -100,6 +113,10 @@ class Sighting:
 
     def _elapsed_s(self, time_ns: int) -> float:
         return (time_ns - self.found.exposure_time_ns) * 1e-9
+
+
+def _radius_m(circle: SearchRegion) -> float:
+    return float(np.sqrt(circle.shape[0, 0]))
 
 
 def _speed_sigma(velocity: Array | None) -> float:
@@ -187,15 +204,15 @@ class PlaceSearch:
         if query is None:
             return None
         seen, self._sighting = self._sighting, None
-        velocity = self._autopilot.velocity
-        followed = seen.followed(query, velocity) if seen is not None else None
+        velocity, about = self._autopilot.velocity, self._reach(frame.exposure_time_ns)
+        followed = seen.followed(query, velocity, about) if seen is not None else None
         began = self._clock()
         found = self._open.relocalizer.find(followed or query, should_stop)
         if found is None:
             return None
         seconds = self._clock() - began
         if followed is None and seconds * _speed_sigma(velocity) > _STALE_M:
-            self._sighting = Sighting(query, found)
+            self._sighting = Sighting(query, found, about)
             self._event("info", f"place found by search in {seconds:.1f} s, where we were then")
             return None
         self._event("info", f"place found by search in {seconds:.1f} s, to be confirmed")

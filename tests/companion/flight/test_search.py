@@ -130,12 +130,12 @@ class Slow:
 def slowly(cache, monkeypatch):
     """Makes a search with a slow relocalizer, all on the autopilot's clock."""
 
-    def make(autopilot):
+    def make(autopilot, reach=None):
         slow = Slow(autopilot)
         monkeypatch.setattr("companion.flight.search.open_relocalizer", lambda *_, **__: slow)
         about = SearchRegion.circle(np.zeros(2), 100.0)
         search = PlaceSearch(
-            cache, LocalizerConfig(), autopilot, lambda *_: None, lambda _t: about,
+            cache, LocalizerConfig(), autopilot, lambda *_: None, reach or (lambda _t: about),
             clock=lambda: autopilot.time_s,
         )  # fmt: skip
         search.start()
@@ -191,3 +191,22 @@ def test_a_place_of_long_ago_says_nothing(slowly):
     falling.time_s += 20.0
     search.search(falling.frame(), lambda: False)
     assert slow.queries[1].region.centre == pytest.approx([0.0, 0.0])
+
+
+@pytest.mark.parametrize(
+    ("jump_m", "centre", "radius_m"),
+    [(0.0, 12.0, 14.0), (60.0, 0.0, 42.0)],
+    ids=["whole", "broken"],
+)
+def test_the_imu_narrows_where_it_can_be_while_its_record_holds(slowly, jump_m, centre, radius_m):
+    def reach(time_ns):
+        t = time_ns * 1e-9
+        return SearchRegion.circle(np.array([3.0 * t + jump_m * (t > 1.0), 0.0]), 80.0 + t)
+
+    falling = Falling()
+    search, slow = slowly(falling, reach)
+    search.search(falling.frame(), lambda: False)
+    search.search(falling.frame(), lambda: False)
+    region = slow.queries[1].region
+    assert region.centre[0] == pytest.approx(centre)
+    assert float(np.sqrt(region.shape[0, 0])) == pytest.approx(radius_m)
