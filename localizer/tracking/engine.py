@@ -36,6 +36,10 @@ Searcher = Callable[[Frame, Callable[[], bool]], PosePrior | None]
 
 _FIX_THREADS = ("render", "extract", "localize")
 _TRIED_FRAMES = 5  # with what is known outside, before a search begins
+# While a search runs, one frame in so many is tried with what is known outside: what led nowhere
+# for `_TRIED_FRAMES` seldom does, and takes half a processor from the search, which then answers
+# for where the vehicle was seconds ago.
+_TRIED_BESIDE = 3
 
 
 class DualThreadEngine:
@@ -61,7 +65,8 @@ class DualThreadEngine:
         self._searcher = searcher
         self._sought: Mailbox[Frame] = Mailbox()
         self._found: PosePrior | None = None
-        self._unknown_frames = 0
+        self._unknown_frames = self._left_frames = 0
+        self._searching = False
         self._ahead = Ahead(localizer.extract_query, self._may_extract_ahead)
         self._registers = False  # whether the last frame was registered: the next will be, too
         self._render_times: Mailbox[int] = Mailbox()
@@ -137,14 +142,18 @@ class DualThreadEngine:
         frame = self._sought.take(_IDLE_S)
         if frame is None or self._searcher is None or self._knows_place():
             return
-        self._book.set_searching(True)
+        self._searches(True)
         try:
             found = self._searcher(frame, self._knows_place)
         finally:
-            self._book.set_searching(False)
+            self._searches(False)
         self._book.count(searches=1, found=int(found is not None))
         self._book.clear_error()
         self._found = found
+
+    def _searches(self, searching: bool) -> None:
+        self._searching = searching
+        self._book.set_searching(searching)
 
     def _knows_place(self) -> bool:
         """Whether a search has become idle: the place is known or on probation, or we end."""
@@ -185,7 +194,7 @@ class DualThreadEngine:
         """Register a frame and publish the estimate; False where there is nothing to do it with."""
         frame = prepared.frame
         self._seek(frame)
-        if not self._has_prior(frame.exposure_time_ns):
+        if self._is_left_to_search() or not self._has_prior(frame.exposure_time_ns):
             return False
         bundle, stage_ms = self._bundle, dict(self._reference_ms)
         try:
@@ -233,6 +242,14 @@ class DualThreadEngine:
         self._unknown_frames = self._unknown_frames + 1 if wanting else 0
         if self._unknown_frames > _TRIED_FRAMES:
             self._sought.put(frame)
+
+    def _is_left_to_search(self) -> bool:
+        """Whether a frame is left out so that a search that runs has the processor."""
+        if not self._searching or self._found is not None or self._knows_place():
+            self._left_frames = 0
+            return False
+        self._left_frames = (self._left_frames + 1) % _TRIED_BESIDE
+        return self._left_frames != 0
 
     def _is_stale(self, bundle: ReferenceBundle, frame: Frame) -> bool:
         """Whether the reference is of long ago; a render thread that fails for good is no secret.

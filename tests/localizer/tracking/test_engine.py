@@ -474,3 +474,23 @@ def test_while_lost_a_search_finds_the_place_and_the_way_flown_confirms_it(fligh
     assert f.estimates[-1].accepted
     assert set(searched) == {"search"}
     assert f.engine.health.searches >= f.engine.health.found > 0
+
+
+def test_beside_a_search_fewer_frames_are_tried_until_it_answers(flight):
+    optimizer, answer = FakeOptimizer(), threading.Event()
+
+    def search(_frame, _is_idle):
+        answer.wait(60.0)
+
+    f = flight(_localizer(optimizer=optimizer), searcher=search)
+    f.feed_until(lambda: f.estimates and f.estimates[-1].state is TrackingState.TRACKING)
+    optimizer.offset = np.array([300.0, 0.0, 0.0])
+    f.feed_until(lambda: f.engine.health.searching)
+    tried, fed = len(f.estimates), f.sequence
+    f.feed_until(lambda: f.sequence == fed + 12)
+    assert len(f.estimates) - tried == 4
+    optimizer.offset = np.zeros(3)  # it is where the prior says, after all: that is seen, too
+    f.feed_until(lambda: f.estimates[-1].accepted)
+    answer.set()
+    f.feed_until(lambda: not f.engine.health.searching)
+    f.feed_until(lambda: f.estimates[-1].state is TrackingState.TRACKING)
