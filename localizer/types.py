@@ -121,6 +121,7 @@ class RegistrationStatus(Enum):
     NO_TEXTURE = "no texture: the normal equations are singular"
     BAD_FEATURES = "features are not finite"
     TOO_FEW_ANCHORS = "too few anchors in the reference view"
+    NOT_TRIED = "not tried: elsewhere the map looks more like the image"
 
 
 class TrackingState(Enum):

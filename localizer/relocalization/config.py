@@ -31,10 +31,10 @@ class RelocalizationConfig(BaseModel):
         130.0, ge=40, le=2000, description="largest side of the ground compared, at 0.5 m a pixel"
     )
     candidates: int = Field(
-        24, ge=1, le=100, description="places that are rendered and registered, at the most"
+        96, ge=1, le=400, description="places that are rendered at half the size, at the most"
     )
     finalists: int = Field(
-        4, ge=1, le=100, description="of these, the best are registered to the end"
+        4, ge=1, le=100, description="of these, the best are registered, to the end"
     )
     passes: int = Field(
         3, ge=1, le=10, description="renderings of a place, each from the last pose"

@@ -14,7 +14,7 @@ from localizer.types import Image
 
 _MULTIPLE = 32  # px: sides of patches, so that few sizes occur
 _BORDER_PX = 2  # of the image, where resampling has one side only
-_FARTHEST = 2.0  # of the ground that is used, in heights: what is farther is seen too flat
+FARTHEST = 2.0  # of the ground that is used, in heights: what is farther is seen too flat
 _EDGE_RAYS = 9  # per side of the image, to outline what is seen
 
 
@@ -55,7 +55,7 @@ def footprint(camera: Camera, rotation: Array, height_m: float, largest_m: float
     rays = camera.rays(grid) @ rotation.T
     flat = np.linalg.norm(rays[:, :2], axis=1)
     down = np.maximum(-rays[:, 2], 1e-9)
-    reach = np.minimum(flat / down, _FARTHEST)
+    reach = np.minimum(flat / down, FARTHEST)
     points = height_m * reach[:, None] * rays[:, :2] / np.maximum(flat, 1e-9)[:, None]
     centre = 0.5 * (points.min(axis=0) + points.max(axis=0))
     radius = float(np.linalg.norm(points - centre, axis=1).max())

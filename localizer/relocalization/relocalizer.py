@@ -4,7 +4,6 @@ beyond `RelocalizationConfig.threads`, so that the caller decides when and how u
 
 from __future__ import annotations
 
-import math
 import time
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
@@ -20,25 +19,24 @@ from localizer.geometry.camera import Camera
 from localizer.map.cache.cache import TileCache
 from localizer.map.cache.stream import TileStreamer
 from localizer.registration.jngo import JNGO
-from localizer.registration.result import Registration
 from localizer.relocalization.align import FrameShift
+from localizer.relocalization.confirm import Confirmation, compared
 from localizer.relocalization.correlate import LevelCorrelator
 from localizer.relocalization.overview import MapOverview, Progress, open_overview
 from localizer.relocalization.search import View, search
 from localizer.relocalization.types import PlaceCandidate, PlaceQuery, Relocalization
-from localizer.relocalization.verdict import NEARLY, Judged, answer, is_decisive
-from localizer.relocalization.verify import Aligned, Verifier
+from localizer.relocalization.verdict import Judged, answer
+from localizer.relocalization.verify import Sight, Verifier
 from localizer.render.base import MapRenderer
 from localizer.render.numba_raster import NumbaRenderer
 from localizer.tracking.pipeline import Undistorter, working_camera
-from localizer.types import FeaturePyramid, PosePrior
 
 _SEARCH_WIDTH = 480  # px of the frame that the ground is rectified from
+_SCREEN_WIDTH = 160  # px, at which all candidates are rendered
 _BLUR_PX = 0.6  # the map is sampled more coarsely than the frame
 # Grey levels (sigma) without fine noise. A covered lens has 0.5 and kept a busy computer searching
 # until long after the cover was gone; the dullest of 190 views at night, dusk and fog has 1.8.
 _COARSE_PX, _LEAST_CONTRAST = 2.0, 1.0
-_LEAST_JUDGED = 3  # candidates
 
 
 class Relocalizer:
@@ -62,7 +60,7 @@ class Relocalizer:
         self._width = config.width
         self._detail = DetailExtractor(extractor)
         self._verifier = Verifier(
-            renderer, self._detail, optimizer, self._config, config.anchors, config.seed
+            renderer, self._detail, extractor, optimizer, self._config, config.anchors, config.seed
         )
         budget = self._config.spectra_mib * 2**20
         self._correlators = tuple(LevelCorrelator(x, budget) for x in overview.levels)
@@ -95,7 +93,9 @@ class Relocalizer:
         began = time.perf_counter()
         judged = self.verify(query, candidates, should_stop) if candidates else []
         stages = {"confirm": time.perf_counter() - began}
-        return answer(query, candidates, judged, self._config, stages) if judged else None
+        if not judged:
+            return None
+        return answer(query, compared(candidates, judged), judged, self._config, stages)
 
     def search(
         self, query: PlaceQuery, should_stop: Callable[[], bool] = lambda: False
@@ -129,81 +129,22 @@ class Relocalizer:
         candidates: list[PlaceCandidate],
         should_stop: Callable[[], bool] = lambda: False,
     ) -> list[Judged]:
-        """The candidates registered: all once, those that can win to the end; best first."""
+        """The places that were registered, the best of them to the end; best first."""
+        sight, small = self._sights(query)
+        return Confirmation(
+            self._verifier, sight, small, query, candidates, self._config, should_stop
+        ).run()
+
+    def _sights(self, query: PlaceQuery) -> tuple[Sight, Sight]:
+        """The frame as the tracker sees it, and smaller."""
         camera = working_camera(query.frame.camera, self._width)
+        small = working_camera(query.frame.camera, min(_SCREEN_WIDTH, self._width))
         features = self._detail.extract(self._undistorted(query, camera))
-        first = self._first_pass(features, camera, query, candidates, should_stop)
-        order = sorted(first, key=lambda j: -j.result.quality)
-        final = []
-        for k, begun in enumerate(order):
-            j = begun
-            hopeless = k > 0 and j.result.quality < 0.5 * order[0].result.quality
-            hopeless = hopeless or k >= self._config.finalists
-            for _ in range(0 if hopeless else self._config.passes - 1):
-                if should_stop():
-                    return []
-                if not math.isfinite(j.result.score):
-                    break
-                prior = self._verifier.again(j.prior, j.result)
-                result = self._verifier.register(features, camera, prior, query)
-                j = self._judged(result, query, j.candidate, j.rank, prior)
-            final.append(j)
-        return sorted(final, key=lambda j: (-int(j.credible), -j.result.quality))
-
-    def _first_pass(
-        self,
-        features: FeaturePyramid,
-        camera: Camera,
-        query: PlaceQuery,
-        candidates: list[PlaceCandidate],
-        should_stop: Callable[[], bool],
-    ) -> list[Judged]:
-        """Each aligned and registered; where none convinces, the best aligned from all sides. None
-        if stopped.
-        """
-        frame = FrameShift(features.levels)
-        judged: list[Judged] = []
-        places: list[Aligned] = []
-        for rank, candidate in enumerate(candidates[: self._config.candidates]):
-            if should_stop():
-                return []
-            place = self._verifier.aligned(frame, camera, self._verifier.prior(candidate, query))
-            result = self._verifier.register(features, camera, place.prior, query, place.reference)
-            judged.append(self._judged(result, query, candidate, rank, place.prior))
-            places.append(replace(place, reference=None))  # of so many, they are large
-            if self._is_settled(judged, candidates[rank + 1 :]):
-                break
-        if any(j.credible for j in judged):
-            return judged
-        best = sorted(range(len(judged)), key=lambda k: -places[k].score)
-        for k in best[: self._config.finalists]:
-            if should_stop():
-                return []
-            result = self._verifier.around(features, camera, places[k], query)
-            if result.quality > judged[k].result.quality:
-                candidate = judged[k].candidate
-                judged[k] = self._judged(result, query, candidate, k, places[k].prior)
-        return judged
-
-    def _is_settled(self, judged: list[Judged], left: list[PlaceCandidate]) -> bool:
-        """Whether the rest need not be looked at: one of the first few is decisive, and nowhere
-        else does the ground look nearly as much like the frame, as among equal roofs it does.
-        """
-        decisive = [j.candidate.score for j in judged if is_decisive(j, self._config)]
-        if len(judged) < _LEAST_JUDGED or not decisive:
-            return False
-        return all(c.score < NEARLY * max(decisive) for c in left)
-
-    def _judged(
-        self,
-        result: Registration,
-        query: PlaceQuery,
-        candidate: PlaceCandidate,
-        rank: int,
-        prior: PosePrior,
-    ) -> Judged:
-        credible = self._verifier.is_credible(result, candidate, query)
-        return Judged(candidate, rank, result, prior, credible)
+        few = self.extractor.extract(self._undistorted(query, small))
+        return (
+            Sight(camera, features, FrameShift(features.levels)),
+            Sight(small, few, FrameShift(few.levels)),
+        )
 
     def _undistorted(self, query: PlaceQuery, camera: Camera) -> np.ndarray:
         key = (query.frame.camera, camera.width)

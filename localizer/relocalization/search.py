@@ -29,7 +29,14 @@ from localizer.relocalization.overview import (
     comparable_level,
     without_local_mean,
 )
-from localizer.relocalization.patch import Footprint, footprint, patch_side, rectify, turned
+from localizer.relocalization.patch import (
+    FARTHEST,
+    Footprint,
+    footprint,
+    patch_side,
+    rectify,
+    turned,
+)
 from localizer.relocalization.types import PlaceCandidate, PlaceQuery, SearchRegion
 from localizer.types import Float32, Image
 
@@ -81,6 +88,26 @@ def level_for(levels: tuple[OverviewLevel, ...], side_m: float) -> OverviewLevel
     return levels[-1]
 
 
+def ground_of(level: OverviewLevel, query: PlaceQuery) -> Float32:
+    """Heights of the ground that a camera in the query's region can see, any shape; the whole map's
+    where there is no region.
+    """
+    if query.region is None or not np.isfinite(level.ground).any():
+        return level.ground
+    above = query.height_m + query.height_sigma_m - float(np.nanmin(level.ground))
+    low, high = query.region.bounds
+    reach = FARTHEST * max(above, _LEAST_HEIGHT_M)
+    cell = level.cell_m * GROUND_CELLS
+    north, south = level.north - high[1] - reach, level.north - low[1] + reach
+    west, east = low[0] - reach - level.west, high[0] + reach - level.west
+    rows, columns = (
+        slice(max(0, math.floor(first / cell)), max(0, math.ceil(last / cell)))
+        for first, last in ((north, south), (west, east))
+    )
+    seen: Float32 = level.ground[rows, columns]
+    return seen
+
+
 def scales(query: PlaceQuery, ground: Float32, config: RelocalizationConfig) -> Array:
     """Heights above ground (n,) to rectify for, so that each place has one close to its own."""
     known = ground[np.isfinite(ground)]
@@ -116,8 +143,7 @@ def search(
     should_stop: Callable[[], bool] = lambda: False,
 ) -> list[PlaceCandidate] | None:
     """The places that look most like the frame from above, best first; None if stopped."""
-    ground = correlators[0].level.ground
-    heights = scales(query, ground, config)
+    heights = scales(query, ground_of(correlators[0].level, query), config)
     if len(heights) == 0:
         return []
     largest = config.patch_m * max(1.0, float(np.median(heights)) / 120.0)

@@ -13,7 +13,7 @@ from localizer.types import PosePrior
 
 NEARLY = 0.8  # of the winner's correlation: a place that has to be looked at, too
 _STANDS_OUT = 1.5  # times the quality of any other place. Equal houses: 1.0 to 1.19
-_SAME_PLACE_M = 5.0  # answers that are closer are one
+SAME_PLACE_M = 5.0  # answers that are closer are one
 
 
 @dataclass(frozen=True)
@@ -45,13 +45,13 @@ def answer(
     rivals = [
         j.result.quality
         for j in judged[1:]
-        if j.credible and _distance(j.result, best.result) > _SAME_PLACE_M
+        if j.credible and _distance(j.result, best.result) > SAME_PLACE_M
     ]
     rival = max(rivals, default=0.0)
     if not best.credible or best.result.quality < rival + config.margin:
         return None
     # Candidates that registration brings to one place are one: its score is the best of theirs.
-    same = {j.rank for j in judged if _distance(j.result, best.result) <= _SAME_PLACE_M}
+    same = {j.rank for j in judged if _distance(j.result, best.result) <= SAME_PLACE_M}
     own = max(candidates[rank].score for rank in same)
     others = {k: c.score for k, c in enumerate(candidates) if k not in same}
     alike = {k for k, score in others.items() if score >= NEARLY * own}
@@ -79,7 +79,7 @@ def _stands_out(best: Judged, alike: set[int], judged: list[Judged]) -> bool:
     if not alike <= {j.rank for j in judged}:
         return False
     elsewhere = (
-        j.result.quality for j in judged if _distance(j.result, best.result) > _SAME_PLACE_M
+        j.result.quality for j in judged if _distance(j.result, best.result) > SAME_PLACE_M
     )
     return best.result.quality >= _STANDS_OUT * max(elsewhere, default=0.0)
 
@@ -90,4 +90,4 @@ def _distance(a: Registration, b: Registration) -> float:
     return float(np.linalg.norm(away))
 
 
-__all__ = ["NEARLY", "Judged", "answer", "is_decisive"]
+__all__ = ["NEARLY", "SAME_PLACE_M", "Judged", "answer", "is_decisive"]

@@ -30,7 +30,7 @@ _HEADING_SIGMA_RAD = np.radians(5.0)  # half a step of the headings tried
 _LEAST_TILT_SIGMA_RAD = np.radians(0.3)
 _FARTHEST_M = 60.0  # of an answer from its candidate: a registration that ran so far ran away
 _MIN_MAP_SHARE = 0.1  # of the view
-_ALIGNMENTS = 2  # the second sees the houses from nearly the right side
+_ALIGNMENTS = 1  # after the one at half the size, from nearly the right side of the houses
 _MOVED_M = 1.0  # less than a registration minds
 _ALIGNED_M = 25.0  # from a candidate: farther is another one's
 _AROUND, _AROUND_HEIGHTS_M = 0.1, (30.0, 100.0)  # of the height above ground, which is cut
@@ -56,22 +56,31 @@ class Reference:
 
 @dataclass(frozen=True)
 class Aligned:
-    """A candidate's prior after alignment. reference: rendered there; score: of `Shift`."""
+    """A candidate's prior after alignment. score: of `Shift`, 0 where there is hardly any map."""
 
     prior: PosePrior
-    reference: Reference | None
     score: float
+
+
+@dataclass(frozen=True)
+class Sight:
+    """The query's frame at one size. camera: its pinhole; features: of the frame."""
+
+    camera: Camera
+    features: FeaturePyramid
+    shift: FrameShift
 
 
 @dataclass(frozen=True)
 class Verifier:
     """Renders the map at a candidate and registers the frame to it.
 
-    extractor: with the detail level, as the tracker's; camera: the pinhole of the query's features.
+    extractor: with the detail level, as the tracker's; coarse: without.
     """
 
     renderer: MapRenderer
     extractor: FeatureExtractor
+    coarse: FeatureExtractor
     optimizer: JNGO
     config: RelocalizationConfig
     anchors: int
@@ -87,62 +96,74 @@ class Verifier:
         time_ns = query.frame.exposure_time_ns
         return PosePrior(candidate.world_from_camera, np.diag(sigma**2), time_ns)
 
-    def reference(self, prior: PosePrior, camera: Camera) -> Reference | None:
+    def reference(
+        self, prior: PosePrior, camera: Camera, extractor: FeatureExtractor | None = None
+    ) -> Reference | None:
         """The map as the prior's pose sees it; None where that is hardly any."""
         view = self.renderer.render(prior.world_from_camera, camera, wait=True)
         if np.count_nonzero(view.depth) < _MIN_MAP_SHARE * view.depth.size:
             return None
-        return Reference(view, self.extractor.extract(fill_holes(view)))
+        return Reference(view, (extractor or self.extractor).extract(fill_holes(view)))
 
-    def aligned(self, frame: FrameShift, camera: Camera, prior: PosePrior) -> Aligned:
-        """The prior moved to where the frame lies over its rendering, and the rendering there."""
-        start = prior.world_from_camera.translation
-        reference, score = self.reference(prior, camera), 0.0
+    def screened(self, small: Sight, prior: PosePrior) -> Aligned:
+        """The prior moved to where the frame, at a small size, lies over its rendering."""
+        reference = self.reference(prior, small.camera, self.coarse)
+        if reference is None:
+            return Aligned(prior, 0.0)
+        shift = small.shift.over(reference.features.levels)
+        away = moved(prior.world_from_camera, small.camera, shift, reference.ground_m)
+        near = float(np.linalg.norm(away)) <= _ALIGNED_M
+        return Aligned(shifted(prior, away) if near else prior, shift.score)
+
+    def from_place(
+        self, sight: Sight, place: Aligned, query: PlaceQuery
+    ) -> tuple[PosePrior, Registration]:
+        """A screened place aligned once more, at full size, and registered from there."""
+        prior = place.prior
+        reference = self.reference(prior, sight.camera)
         for _ in range(_ALIGNMENTS):
             if reference is None:
                 break
-            shift = frame.over(reference.features.levels)
-            score = max(score, shift.score)
-            away = moved(prior.world_from_camera, camera, shift, reference.ground_m)
-            there = shifted(prior, away)
-            far = float(np.linalg.norm(there.world_from_camera.translation - start))
-            if np.linalg.norm(away) < _MOVED_M or far > _ALIGNED_M:
+            shift = sight.shift.over(reference.features.levels)
+            away = moved(prior.world_from_camera, sight.camera, shift, reference.ground_m)
+            if not _MOVED_M <= np.linalg.norm(away) <= _ALIGNED_M:
                 break
-            prior = there
-            reference = self.reference(prior, camera)
-        return Aligned(prior, reference, score)
+            prior = shifted(prior, away)
+            reference = self.reference(prior, sight.camera)
+        return prior, self.register(sight, prior, query, reference)
 
-    def around(
-        self, features: FeaturePyramid, camera: Camera, aligned: Aligned, query: PlaceQuery
-    ) -> Registration:
+    def around(self, sight: Sight, prior: PosePrior, query: PlaceQuery) -> Registration:
         """The best of registrations that begin to all sides of an aligned place."""
-        reference = aligned.reference or self.reference(aligned.prior, camera)
+        reference = self.reference(prior, sight.camera)
         if reference is None:
-            return failure(aligned.prior, RegistrationStatus.NO_OVERLAP)
-        above = aligned.prior.world_from_camera.translation[2] - reference.ground_m
+            return failure(prior, RegistrationStatus.NO_OVERLAP)
+        above = prior.world_from_camera.translation[2] - reference.ground_m
         reach = _AROUND * float(np.clip(above, *_AROUND_HEIGHTS_M))
-        starts = [shifted(aligned.prior, reach * np.array(side)) for side in _SIDES]
-        found = [self.register(features, camera, start, query, reference) for start in starts]
+        starts = [shifted(prior, reach * np.array(side)) for side in _SIDES]
+        found = [self.register(sight, start, query, reference) for start in starts]
         return max(found, key=lambda result: result.quality)
 
     def register(
         self,
-        features: FeaturePyramid,
-        camera: Camera,
+        sight: Sight,
         prior: PosePrior,
         query: PlaceQuery,
         reference: Reference | None = None,
     ) -> Registration:
-        """One pass: the frame registered to the view at the prior's pose, rendered if not given."""
-        reference = reference or self.reference(prior, camera)
+        """One pass: the frame registered to the view at the prior's pose, rendered if not given;
+        another focal length is tried where the result is good.
+        """
+        reference = reference or self.reference(prior, sight.camera)
         if reference is None:
             return failure(prior, RegistrationStatus.NO_OVERLAP)
         anchors = select_anchors(reference.view, reference.features, self.anchors, self.seed)
         constraint = self._constraint(prior.world_from_camera, query)
         found = self.optimizer.register(
-            features, camera, anchors, prior, constraint=constraint, seed=self.seed
+            sight.features, sight.camera, anchors, prior, constraint=constraint, seed=self.seed
         )
-        return self.optimizer.focal_tested(features, camera, anchors, found)
+        if not self.is_good(found):
+            return found
+        return self.optimizer.focal_tested(sight.features, sight.camera, anchors, found)
 
     def again(self, prior: PosePrior, result: Registration) -> PosePrior:
         """The prior of the next pass: the same image is no new evidence, sigma only halves."""
@@ -152,6 +173,12 @@ class Verifier:
         self, result: Registration, candidate: PlaceCandidate, query: PlaceQuery
     ) -> bool:
         """Whether a registration is good in itself and agrees with the other sensors."""
+        if not self.is_good(result) or result.focal_gain > self.config.max_focal_gain:
+            return False
+        return self.agrees(result.world_from_camera, candidate, query)
+
+    def is_good(self, result: Registration) -> bool:
+        """Whether a registration is good in itself, as far as one focal length tells."""
         c = self.config
         if result.status is not RegistrationStatus.OK:
             return False
@@ -160,11 +187,7 @@ class Verifier:
         if result.covariance.diagonal()[:3].max() > c.max_sigma_m**2:
             return False
         votes = result.agreement  # None on a GPU: the other tests decide
-        if votes is not None and votes.share < c.min_agreement:
-            return False
-        if result.focal_gain > c.max_focal_gain:
-            return False
-        return self.agrees(result.world_from_camera, candidate, query)
+        return votes is None or votes.share >= c.min_agreement
 
     def agrees(self, pose: Pose, candidate: PlaceCandidate, query: PlaceQuery) -> bool:
         """Whether a pose is where the candidate was, as high and as level as the sensors say."""

@@ -1,5 +1,7 @@
 """The search's parts, each against what it should be by definition."""
 
+from dataclasses import replace
+
 import cv2
 import numpy as np
 import pytest
@@ -14,7 +16,7 @@ from localizer.relocalization.config import RelocalizationConfig
 from localizer.relocalization.correlate import STEP, LevelCorrelator, transform_patch
 from localizer.relocalization.overview import OverviewLevel, Projection
 from localizer.relocalization.patch import footprint, rectify, turned
-from localizer.relocalization.search import headings, scales, shared_extractions
+from localizer.relocalization.search import ground_of, headings, scales, shared_extractions
 from localizer.relocalization.topview import DOWN
 from localizer.relocalization.types import PlaceCandidate, PlaceQuery, SearchRegion
 from localizer.relocalization.verify import Verifier, tilt_and_heading
@@ -43,6 +45,20 @@ def test_a_region_is_an_ellipse():
     ]  # fmt: skip
     low, high = region.bounds
     np.testing.assert_allclose((*low, *high), (4, -35, 16, 25))
+
+
+def test_only_ground_that_a_region_sees_asks_for_heights():
+    """A hill at the map's other end asked every search in a town for heights of 10 m."""
+    features = np.zeros((3, 1024, 1024), np.int8)
+    flat = level(features)
+    flat.ground[:, -4:] = 80.0
+    asked = replace(query(), region=SearchRegion.circle(np.array([200.0, -200.0]), 50.0))
+    assert ground_of(flat, asked).max() == 0
+    near = replace(asked, region=SearchRegion.circle(np.array([1700.0, -200.0]), 50.0))
+    assert ground_of(flat, near).max() == 80  # within what is seen, if not below
+    off = replace(asked, region=SearchRegion.circle(np.array([9000.0, 0.0]), 50.0))
+    assert len(scales(off, ground_of(flat, off), CONFIG)) == 0
+    assert ground_of(flat, query()).shape == flat.ground.shape
 
 
 def test_scores_are_normalised_correlations():
@@ -207,5 +223,5 @@ def test_an_answer_needs_the_parts_of_the_image(votes, credible):
     found = Registration(
         pose, 0.01 * np.eye(6), 0.2, 0.9, 0.5, RegistrationStatus.OK, 1, agreement=votes
     )
-    verifier = Verifier(None, None, None, CONFIG, 1000, 0)
+    verifier = Verifier(None, None, None, None, CONFIG, 1000, 0)
     assert verifier.is_credible(found, PlaceCandidate(pose, 0.4), query()) == credible

@@ -12,6 +12,7 @@ from localizer.geometry.camera import Camera
 from localizer.geometry.pose import Pose, so3_exp
 from localizer.map.cache.cache import TileCache
 from localizer.map.cache.stream import TileStreamer
+from localizer.registration.jngo import JNGO
 from localizer.relocalization.overview import open_overview, overview_key
 from localizer.relocalization.patch import turned
 from localizer.relocalization.relocalizer import open_relocalizer
@@ -115,6 +116,28 @@ def test_a_place_that_stands_out_needs_no_decisive_votes(opened, query, truth, m
     assert answer(0.5) is not None
     assert answer(0.9) is None
     assert answer(0.5, looked_at=False) is None
+
+
+def test_ground_that_looks_alike_costs_few_registrations(cache, query, truth, monkeypatch):
+    """Forty places whose ground looks like the frame from above: rendered, the others do not. Each
+    was registered before, and the one that was not left no answer.
+    """
+    registered = []
+    register = JNGO.register
+    monkeypatch.setattr(JNGO, "register", lambda *a, **k: registered.append(1) or register(*a, **k))
+    doubtful = CONFIG.relocalization.model_copy(update={"decisive_agreement": 1.0})
+    with open_relocalizer(cache, CONFIG.model_copy(update={"relocalization": doubtful})) as found:
+        best = found.search(query)[0]
+        places = [np.array([x, y]) for x in range(-160, 161, 40) for y in (-150, -90, 30, 90, 150)]
+        alike = [
+            replace(best, world_from_camera=Pose(truth.rotation, np.array([*p, query.height_m])))
+            for p in places
+        ]
+        registered.clear()
+        answer = found.confirm(query, [*alike[:20], best, *alike[20:]])
+    assert answer is not None
+    assert answer.world_from_camera.distance_to(truth)[0] < 1.0
+    assert len(registered) <= 12
 
 
 def test_a_low_camera_among_high_houses_is_found_from_candidates_aside(opened, small_assets):

@@ -1,0 +1,195 @@
+"""Which candidates are rendered and registered, and in which order: the cheap before the dear.
+
+Rendered at half the size, a candidate costs a tenth of a registration, and the place has nearly
+always the best score of all. So all are screened, and only those that can win are registered.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, field
+
+from localizer.registration.result import Registration, failure
+from localizer.relocalization.config import RelocalizationConfig
+from localizer.relocalization.types import PlaceCandidate, PlaceQuery
+from localizer.relocalization.verdict import NEARLY, SAME_PLACE_M, Judged, is_decisive
+from localizer.relocalization.verify import Aligned, Sight, Verifier
+from localizer.types import PosePrior, RegistrationStatus
+
+_ROUNDS = (3, 24)  # candidates screened before the best are registered; then all
+_SAME_START = 1.0  # m and degrees: a registration from so near is the same one
+_HOPELESS = 0.5  # of the best quality
+
+
+class StopAskedError(Exception):
+    """The answer is not wanted any more."""
+
+
+def compared(candidates: list[PlaceCandidate], judged: list[Judged]) -> list[PlaceCandidate]:
+    """The candidates that an answer is held against: the best of the search, or all where it took
+    those farther down to find it.
+    """
+    few = _ROUNDS[-1]
+    return candidates if any(j.rank >= few for j in judged) else candidates[:few]
+
+
+@dataclass
+class Confirmation:
+    """The candidates of one query while they are judged. Used once.
+
+    sight: the frame as the tracker sees it; small: at the size of the screening. places: of the
+    candidates screened so far, judged: of those registered, by rank.
+    """
+
+    verifier: Verifier
+    sight: Sight
+    small: Sight
+    query: PlaceQuery
+    candidates: list[PlaceCandidate]
+    config: RelocalizationConfig
+    should_stop: Callable[[], bool]
+    places: list[Aligned] = field(default_factory=list)
+    judged: dict[int, Judged] = field(default_factory=dict)
+    surrounded: set[int] = field(default_factory=set)
+
+    def run(self) -> list[Judged]:
+        """Those that were registered, the best of them to the end; best first. None if stopped."""
+        try:
+            self._first_pass()
+            final = self._final_passes()
+        except StopAskedError:
+            return []
+        return sorted(final, key=lambda j: (-int(j.credible), -j.result.quality))
+
+    def _first_pass(self) -> None:
+        """Ever more candidates, until one convinces."""
+        most = min(len(self.candidates), self.config.candidates)
+        few, several = (min(n, most) for n in _ROUNDS)
+        self._screen(few)
+        if few:
+            self._register(self._best_placed()[0])
+        if self._is_settled(self.candidates[few : _ROUNDS[-1]]):
+            return
+        for end in dict.fromkeys((several, most)):
+            self._screen(end)
+            for rank in self._best_placed()[: self.config.finalists]:
+                self._register(rank)
+                if self._leads():
+                    return
+            if not self._is_any_credible():
+                self._look_around()
+            if self._is_any_credible():
+                break
+        self._settle_alike()
+
+    def _screen(self, end: int) -> None:
+        for candidate in self.candidates[len(self.places) : end]:
+            self._go_on()
+            prior = self.verifier.prior(candidate, self.query)
+            self.places.append(self.verifier.screened(self.small, prior))
+
+    def _best_placed(self) -> list[int]:
+        """Ranks of what was screened, best first."""
+        return sorted(range(len(self.places)), key=lambda k: -self.places[k].score)
+
+    def _register(self, rank: int) -> None:
+        """One candidate, unless it was; two that were moved to the same place have one result."""
+        if rank in self.judged:
+            return
+        self._go_on()
+        place = self.places[rank]
+        for other, done in self.judged.items():
+            metres, degrees = self._apart(rank, other)
+            if other not in self.surrounded and max(metres, degrees) <= _SAME_START:
+                self.judged[rank] = self._judged(rank, done.prior, done.result)
+                return
+        self.judged[rank] = self._judged(
+            rank, *self.verifier.from_place(self.sight, place, self.query)
+        )
+
+    def _look_around(self) -> None:
+        """The best placed from all sides: some registrations have one way in."""
+        for rank in self._best_placed()[: self.config.finalists]:
+            if rank in self.surrounded or rank not in self.judged:
+                continue
+            self._go_on()
+            self.surrounded.add(rank)
+            begun = self.judged[rank]
+            result = self.verifier.around(self.sight, begun.prior, self.query)
+            if result.quality > begun.result.quality:
+                self.judged[rank] = self._judged(rank, begun.prior, result)
+
+    def _settle_alike(self) -> None:
+        """Where one is credible: the others whose ground looks nearly as much like the frame, so
+        that it is known whether it stands out. They are registered where their rendering looks
+        nearly as much like it, too, and are not the place where it does not.
+        """
+        credible = [j for j in self.judged.values() if j.credible]
+        if not credible:
+            return
+        best = max(credible, key=lambda j: j.result.quality)
+        for rank, place in enumerate(self.places):
+            if self.candidates[rank].score < NEARLY * best.candidate.score:
+                continue
+            if place.score >= NEARLY * self.places[best.rank].score:
+                self._register(rank)
+            elif rank not in self.judged:
+                none = failure(place.prior, RegistrationStatus.NOT_TRIED)
+                self.judged[rank] = self._judged(rank, place.prior, none)
+
+    def _final_passes(self) -> list[Judged]:
+        order = sorted(self.judged.values(), key=lambda j: -j.result.quality)
+        final = []
+        for k, begun in enumerate(order):
+            j = begun
+            hopeless = k > 0 and j.result.quality < _HOPELESS * order[0].result.quality
+            hopeless = hopeless or k >= self.config.finalists
+            for _ in range(0 if hopeless else self.config.passes - 1):
+                self._go_on()
+                if not math.isfinite(j.result.score):
+                    break
+                prior = self.verifier.again(j.prior, j.result)
+                result = self.verifier.register(self.sight, prior, self.query)
+                j = self._judged(j.rank, prior, result)
+            final.append(j)
+        return final
+
+    def _is_any_credible(self) -> bool:
+        return any(j.credible for j in self.judged.values())
+
+    def _is_settled(self, left: list[PlaceCandidate]) -> bool:
+        """Whether the rest need not be looked at: one of the first few is decisive, and nowhere
+        else does the ground look nearly as much like the frame, as among equal roofs it does.
+        """
+        decisive = [j.candidate.score for j in self._decisive()]
+        return bool(decisive) and all(c.score < NEARLY * max(decisive) for c in left)
+
+    def _leads(self) -> bool:
+        """The same of what was screened: nowhere else is the map nearly as much like the frame."""
+        for winner in self._decisive():
+            enough = NEARLY * self.places[winner.rank].score
+            if all(
+                place.score < enough or self._apart(k, winner.rank)[0] <= SAME_PLACE_M
+                for k, place in enumerate(self.places)
+                if k not in self.judged
+            ):
+                return True
+        return False
+
+    def _decisive(self) -> list[Judged]:
+        return [j for j in self.judged.values() if is_decisive(j, self.config)]
+
+    def _judged(self, rank: int, prior: PosePrior, result: Registration) -> Judged:
+        candidate = self.candidates[rank]
+        credible = self.verifier.is_credible(result, candidate, self.query)
+        return Judged(candidate, rank, result, prior, credible)
+
+    def _apart(self, a: int, b: int) -> tuple[float, float]:
+        """Two screened places, metres and degrees."""
+        first, second = (self.places[k].prior.world_from_camera for k in (a, b))
+        return first.distance_to(second)
+
+    def _go_on(self) -> None:
+        if self.should_stop():
+            raise StopAskedError
