@@ -142,10 +142,11 @@ class DetectorConfig(_Model):
     @classmethod
     def _are_names(cls, value: tuple[str, ...]) -> tuple[str, ...]:
         for label in value:
-            if not 0 < len(label) <= 48 or not label.isprintable() or label.startswith(CLICKED):
+            is_name = 0 < len(label) <= 48 and label.isprintable()
+            if not is_name or f"{label} ".startswith(CLICKED):  # a number may follow
                 raise ValueError(
                     f"{label!r}: a name has 1 to 48 printable characters, and those that begin "
-                    f"with {CLICKED!r} are the operator's clicks"
+                    f"with {' or '.join(map(repr, CLICKED))} are the operator's clicks"
                 )
         return value
 

@@ -238,6 +238,8 @@ class TrackRequest:
     """Of a point, normalised 0..1."""
     number: int = 0
     """Of the target that a point or rectangle begins; of the one that a stop ends, 0: of all."""
+    asked_by: str = "ground station"
+    """Where the operator did; the target is called after it."""
 
 
 @dataclass(frozen=True)

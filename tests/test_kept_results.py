@@ -109,3 +109,13 @@ def test_depths_are_kept_by_height(tmp_path):
     path.write_text(json.dumps({"bins": [0.1], "rows": [row]}))
     table, _ = tables_of([path], "")
     assert table.rows[0] == ("100", "9", "8.0e-08", "2.0e-04", "5.7e-03", "99.38 %", "2.9 %")
+
+
+def test_the_units_exposure_is_read_from_what_systemd_says(tmp_path):
+    path = tmp_path / "security.txt"
+    path.write_text("→ Overall exposure level for companion.service: 1.8 OK 🙂\n")
+    table, _ = tables_of([path], "")
+    assert table.rows == (("companion.service", "1.8 OK", "below 3"),)
+    path.write_text("Failed to load unit\n")
+    with pytest.raises(ReportError, match=r"security\.txt.*no overall exposure"):
+        tables_of([path], "")

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import json
 import math
+import re
 import statistics
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -48,6 +49,8 @@ _THROUGHPUT = (
     "width", "cores", "frames offered", "frames", "frames/s", "latency p50 / p95, ms",
     "CPU ms a frame", "share of the cores", "median / p95 error, m",
 )  # fmt: skip
+_EXPOSURE = ("unit", "overall exposure", "wanted")
+_EXPOSED = re.compile(r"Overall exposure level for (\S+): ([\d.]+) (\w+)")
 _TESTS = ("tests", "passed", "failed", "skipped", "seconds")
 
 
@@ -64,6 +67,8 @@ def tables_of(
     try:
         if paths[0].suffix == ".xml":
             return _tests(paths, title), None
+        if paths[0].suffix == ".txt":
+            return _exposure(paths), None
         data = [json.loads(path.read_text(encoding="utf-8")) for path in paths]
         if isinstance(data[0], dict) and "report" in data[0]:
             return _flight(data[0]["report"], title)
@@ -291,6 +296,17 @@ def _package(data: list[Any], _title: str) -> Table:
             )
         )
     return Table(_PACKAGE, tuple(rows))
+
+
+def _exposure(paths: Sequence[Path]) -> Table:
+    """Of `systemd-analyze security`."""
+    rows = []
+    for path in paths:
+        found = _EXPOSED.search(path.read_text(encoding="utf-8"))
+        if found is None:
+            raise ValueError("no overall exposure level")
+        rows.append((found[1], f"{found[2]} {found[3]}", "below 3"))
+    return Table(_EXPOSURE, tuple(rows))
 
 
 def _tests(paths: Sequence[Path], title: str) -> Table:

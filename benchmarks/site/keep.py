@@ -4,8 +4,9 @@
         --command 'make demo ARGS="--seed 0"' [--machine "2 cores, nothing else running"]
 
 Takes the JSON of a demo flight, of `companion eval`, of `sitl suite` and `sitl loop`, of the
-benchmarks and of `configs/package/check_deb.sh`, and `pytest --junitxml`'s XML; `--also` adds
-further files of the same form. Then `python -m benchmarks.site` writes the tables.
+benchmarks and of configs/package's checks, `pytest --junitxml`'s XML, and what `systemd-analyze
+security` says, as .txt; `--also` adds further files of the same form. Then `python -m
+benchmarks.site` writes the tables.
 """
 
 from __future__ import annotations

@@ -21,7 +21,8 @@ import numpy as np
 from benchmarks.common.arguments import Parser, number, output, whole
 from benchmarks.common.named_errors import named_errors
 from companion.config import TargetConfig
-from companion.targets.population import Click, Population, Target, clicked_name
+from companion.targets.detections import clicked_name
+from companion.targets.population import Click, Population, Target
 from localizer.geometry.pose import Pose, so3_exp
 from localizer.map.cache.cache import TileCache
 from localizer.map.cache.stream import TileStreamer

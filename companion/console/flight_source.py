@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import itertools
 import logging
+import socket
 from pathlib import Path
 from typing import Any
 
 from companion.console.source import Newest
-from companion.live.protocol import Decoder, LinkError, encode
+from companion.live.protocol import Decoder, LinkError, Message, encode
+from companion.live.shared import Arrivals
 
 _log = logging.getLogger(__name__)
 _AGAIN_S = 1.0
@@ -23,7 +26,7 @@ class FlightSource:
     def __init__(self, path: Path) -> None:
         self._path = path
         self.newest = Newest()
-        self._writer: asyncio.StreamWriter | None = None
+        self._connection: socket.socket | None = None
         self._wanted = False
         self._answers: dict[int, asyncio.Future[tuple[bool, str]]] = {}
         self._numbers = itertools.count(1)
@@ -32,7 +35,7 @@ class FlightSource:
     @property
     def is_connected(self) -> bool:
         """Whether the flight is there."""
-        return self._writer is not None
+        return self._connection is not None
 
     async def changed(self) -> None:
         """Returns when something new came, or the flight came or went."""
@@ -46,7 +49,7 @@ class FlightSource:
 
     async def order(self, order: dict[str, Any]) -> tuple[bool, str]:
         """Send an order and wait for what becomes of it."""
-        if self._writer is None:
+        if self._connection is None:
             return False, "no flight is connected"
         number = next(self._numbers)
         future: asyncio.Future[tuple[bool, str]] = asyncio.get_running_loop().create_future()
@@ -63,28 +66,59 @@ class FlightSource:
         """Connect, read, and begin again."""
         while True:
             try:
-                reader, self._writer = await asyncio.open_unix_connection(str(self._path))
-                if self._wanted:
-                    self._send({"kind": "watch", "frames": True})
-                await self._read(reader)
+                await self._serve()
             except (OSError, LinkError) as error:
                 _log.debug("no flight at %s: %s", self._path, error)
-            finally:
-                writer, self._writer = self._writer, None
-                if writer is not None:
-                    writer.close()
-                self._tell()
+            self._tell()
             await asyncio.sleep(_AGAIN_S)
 
-    async def _read(self, reader: asyncio.StreamReader) -> None:
-        decoder = Decoder()
-        while data := await reader.read(_READ):
-            for message in decoder.feed(data):
-                if message.head.get("kind") == "answer":
-                    self._answer(message.head)
-                else:
-                    self.newest.take(message)
-            self._tell()
+    async def _serve(self) -> None:
+        """One connection, until it ends."""
+        connection = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
+        arrivals = Arrivals(connection)
+        try:
+            connection.setblocking(False)
+            await asyncio.get_running_loop().sock_connect(connection, str(self._path))
+            self._connection = connection
+            if self._wanted:
+                self._send({"kind": "watch", "frames": True})
+            await self._read(connection, arrivals)
+        finally:
+            self._connection = None
+            arrivals.close()
+
+    async def _read(self, connection: socket.socket, arrivals: Arrivals) -> None:
+        """What came until now is taken whole; of it the newest is shown."""
+        loop, decoder = asyncio.get_running_loop(), Decoder()
+        readable = asyncio.Event()
+        loop.add_reader(connection, readable.set)
+        try:
+            while True:
+                await readable.wait()
+                readable.clear()
+                try:
+                    data = arrivals.receive(_READ)
+                except BlockingIOError:
+                    continue
+                if not data:
+                    return
+                for message in decoder.feed(data):
+                    self._take(message, arrivals)
+                self._tell()
+        finally:
+            loop.remove_reader(connection)
+
+    def _take(self, message: Message, arrivals: Arrivals) -> None:
+        head = message.head
+        if head.get("kind") == "answer":
+            self._answer(head)
+            return
+        if (size := head.get("shared")) is not None:
+            if not isinstance(size, int):
+                raise LinkError("a picture whose size is no number")
+            message = Message(head, arrivals.read(size))
+            self._send({"kind": "read"})
+        self.newest.take(message)
 
     def _answer(self, head: dict[str, Any]) -> None:
         future = self._answers.get(head.get("number", 0))
@@ -97,5 +131,14 @@ class FlightSource:
         event.set()
 
     def _send(self, head: dict[str, Any]) -> None:
-        if self._writer is not None:
-            self._writer.write(encode(head))
+        """Whole or not at all: the flight reads at once, or it hangs and is left."""
+        if self._connection is not None:
+            data = encode(head)
+            try:
+                sent = self._connection.send(data)
+            except OSError as error:
+                _log.debug("the flight takes no orders: %s", error)
+                sent = 0
+            if sent != len(data):
+                with contextlib.suppress(OSError):
+                    self._connection.shutdown(socket.SHUT_RDWR)

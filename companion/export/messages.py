@@ -91,6 +91,14 @@ def transform(row: Row, time_ns: int) -> FrameTransforms:
     )  # fmt: skip
 
 
+# Of each who tells a place, on a viewer's map; Rerun's check refuses a place without a colour.
+_COLOURS = {
+    CAMERA: Color(r=0.16, g=0.62, b=0.95, a=1.0),
+    AUTOPILOT: Color(r=1.0, g=0.65, b=0.1, a=1.0),
+    RECEIVER: Color(r=0.6, g=0.6, b=0.6, a=1.0),
+}
+
+
 def location(row: Row, time_ns: int) -> LocationFix:
     """The camera on the Earth; of its covariance the diagonal is recorded."""
     sigma = [float(row[f"sigma_{axis}_m"]) for axis in _AXES]
@@ -99,6 +107,7 @@ def location(row: Row, time_ns: int) -> LocationFix:
         timestamp=stamp(time_ns), frame_id=CAMERA, latitude=float(row["latitude_deg"]),
         longitude=float(row["longitude_deg"]), altitude=float(row["height_m"]),
         position_covariance=covariance, position_covariance_type=LocationFix.DIAGONAL_KNOWN,
+        color=_COLOURS[CAMERA],
     )  # fmt: skip
 
 
@@ -115,6 +124,7 @@ def reported_location(
         timestamp=stamp(time_ns), frame_id=frame, latitude=place[0], longitude=place[1],
         altitude=place[2], position_covariance_type=kind,
         position_covariance=[variance, 0.0, 0.0, 0.0, variance, 0.0, 0.0, 0.0, 0.0],
+        color=_COLOURS[frame],
     )  # fmt: skip
 
 

@@ -362,7 +362,7 @@ def _console(making: Making) -> Publisher:
     geoid_m = cache.manifest.geoid_separation_m
     instruments = Instruments(
         lambda: health.newest, bridge.state, bridge.shadow_score, bridge.loop_verdict,
-        lambda: bridge.injecting, bridge.mission,
+        lambda: bridge.injecting and bridge.reaches_ekf, bridge.mission,
     )  # fmt: skip
     folder = making[RecordKeeper].folder
     about = {

@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from companion.errors import CompanionError
+from companion.targets.detections import CONSOLE
 from mavlink_bridge.messages import TrackRequest
 
 _NOTICE = 5  # MAV_SEVERITY_NOTICE
@@ -74,7 +75,7 @@ class Orders:
         time_ns = order.get("exposure_ns", now_ns)
         if not isinstance(time_ns, int) or not 0 <= now_ns - time_ns < 10_000_000_000:
             time_ns = now_ns
-        self._helm.track(TrackRequest(kind, time_ns, at))
+        self._helm.track(TrackRequest(kind, time_ns, at, asked_by=CONSOLE))
         return self._told(text)
 
     def _told(self, text: str) -> str:

@@ -1,7 +1,8 @@
 """Messages between flight and console over a local stream socket.
 
 One message: two big-endian uint32 (bytes of the head, bytes of the body), the head as JSON, the
-body as it is (pictures). Both sides bound what they take.
+body as it is. A picture's body is not in the message: its head's "shared" is how many bytes of it
+lie in the memory that both share (`live.shared`). Both sides bound what they take.
 """
 
 from __future__ import annotations
@@ -37,11 +38,10 @@ class Message:
     body: bytes = b""
 
 
-def encode(head: dict[str, Any], *parts: bytes | memoryview) -> bytes:
+def encode(head: dict[str, Any], body: bytes = b"") -> bytes:
     """A message as bytes. NaN is refused: browsers do not read it."""
     text = json.dumps(head, allow_nan=False, separators=(",", ":")).encode()
-    size = sum(len(part) for part in parts)
-    return b"".join((_SIZES.pack(len(text), size), text, *parts))
+    return b"".join((_SIZES.pack(len(text), len(body)), text, body))
 
 
 class Decoder:

@@ -1,7 +1,8 @@
 """The flight's side of the console: a local socket, served by one thread.
 
 It keeps at most one unfinished message per console: what does not fit is dropped, never queued.
-While nobody is connected it sleeps.
+Pictures pass through memory that both share (`live.shared`), one at a time: before the console has
+read it, no other is given out, and then the newest. While nobody is connected it sleeps.
 """
 
 from __future__ import annotations
@@ -19,7 +20,8 @@ from typing import Any
 from companion.live.orders import OrderError, Orders
 from companion.live.pace import Pace
 from companion.live.protocol import MOST_ORDER, Decoder, LinkError, encode
-from companion.live.shown import Shown
+from companion.live.shared import SharedMemory
+from companion.live.shown import Shot, Shown
 
 _log = logging.getLogger(__name__)
 _MOST_CONSOLES = 3
@@ -38,10 +40,31 @@ class _Console:
         self.answers: deque[bytes] = deque(maxlen=_ANSWERS)
         self.told = 0
         self.watching = False
+        self.memory: SharedMemory | None = None  # once it wants pictures
 
     @property
     def is_idle(self) -> bool:
         return not self.sending
+
+    @property
+    def is_ready(self) -> bool:
+        """For a picture."""
+        return self.watching and self.is_idle and (self.memory is None or self.memory.is_read)
+
+    def send(self) -> None:
+        """As much of the message as goes."""
+        while self.sending:
+            taking = self.connection.send if self.memory is None else self._send_with_memory
+            self.sending = self.sending[taking(self.sending) :]
+
+    def close(self) -> None:
+        if self.memory is not None:
+            self.memory.close()
+        self.connection.close()
+
+    def _send_with_memory(self, data: memoryview) -> int:
+        assert self.memory is not None
+        return self.memory.send(self.connection, data)
 
 
 class Publisher:
@@ -128,11 +151,11 @@ class Publisher:
                 head, told = self._shown.state(console.told)
                 if self._offer(console, encode(head)):
                     console.told = told
-        ready = [c for c in self._idle() if c.watching]
-        if ready and self._pictures.is_due(now) and (message := self._shown.take_frame()):
+        ready = [c for c in self._consoles.values() if c.is_ready]
+        if ready and self._pictures.is_due(now) and (shot := self._shown.take_frame()):
             self._pictures.went(now)
             for console in ready:
-                self._offer(console, message)
+                self._show(console, shot)
 
     def _idle(self) -> list[_Console]:
         return [c for c in self._consoles.values() if c.is_idle]
@@ -182,6 +205,10 @@ class Publisher:
         if head.get("kind") == "watch":
             console.watching = head.get("frames") is True
             return
+        if head.get("kind") == "read":
+            if console.memory is not None:
+                console.memory.is_read = True
+            return
         try:
             ok, text = True, self._orders.take(head)
         except OrderError as error:
@@ -192,6 +219,17 @@ class Publisher:
             console.answers.append(encode(answer))
         if console.is_idle:
             self._next_answer(console)
+
+    def _show(self, console: _Console, shot: Shot) -> None:
+        try:
+            if console.memory is None:
+                console.memory = SharedMemory()
+            size = console.memory.write(shot.parts)
+        except OSError as error:  # no memory, or no descriptor: what is flown needs both more
+            _log.warning("a console cannot be given pictures and is left: %s", error)
+            self._drop(console)
+            return
+        self._offer(console, encode(shot.head | {"shared": size}))
 
     def _offer(self, console: _Console, message: bytes) -> bool:
         """Begin to send, if nothing else is under way."""
@@ -209,8 +247,7 @@ class Publisher:
 
     def _send(self, console: _Console) -> None:
         try:
-            while console.sending:
-                console.sending = console.sending[console.connection.send(console.sending) :]
+            console.send()
         finally:
             if console.connection in self._consoles:
                 wanted = selectors.EVENT_READ | (selectors.EVENT_WRITE if console.sending else 0)
@@ -224,7 +261,7 @@ class Publisher:
     def _drop(self, console: _Console) -> None:
         if self._consoles.pop(console.connection, None) is not None:
             self._selector.unregister(console.connection)
-            console.connection.close()
+            console.close()
 
     def _drop_all(self) -> None:
         for console in tuple(self._consoles.values()):

@@ -17,7 +17,6 @@ import cv2
 import numpy as np
 
 from companion.live.machine import MachineLoad
-from companion.live.protocol import encode
 from companion.targets.population import Target
 from localizer.geometry.geo import LocalFrame
 from localizer.geometry.pose import Pose, quaternion_from_matrix
@@ -29,13 +28,14 @@ from mavlink_bridge.vehicle.mission import Waypoint
 
 _FRAMES = 12  # pictures that wait for their estimate: a second or so
 _WIDEST = 960  # pixels that are sent
+_FRESH_NS = 60_000_000  # a picture that waited longer for its turn is not given out any more
 _EVENTS = 300
 _TARGETS = 64
 
 
 @dataclass(frozen=True)
 class Instruments:
-    """What is asked for each state document. injecting: whether fixes go out now;
+    """What is asked for each state document. injecting: whether positions go out now;
     mission: the places that the autopilot's flies to.
     """
 
@@ -45,6 +45,16 @@ class Instruments:
     verdict: Callable[[], LoopVerdict | None]
     injecting: Callable[[], bool]
     mission: Callable[[], tuple[Waypoint, ...]] = tuple
+
+
+@dataclass(frozen=True)
+class Shot:
+    """A picture as it is given out. parts: image (h, w, 3) uint8; of the map's view, if there is
+    one, rgb (h, w, 3) uint8 and depth (h, w) float32.
+    """
+
+    head: dict[str, Any]
+    parts: tuple[np.ndarray, ...]
 
 
 class Shown:
@@ -59,6 +69,7 @@ class Shown:
         self._lock = threading.Lock()
         self._pictures: OrderedDict[int, Frame] = OrderedDict()
         self._paired: tuple[Frame, PoseEstimate | None, RenderedView | None] | None = None
+        self._paired_ns = 0
         self._estimate: PoseEstimate | None = None
         self._targets: OrderedDict[str, Target] = OrderedDict()
         self._events: deque[tuple[int, int, str, str]] = deque(maxlen=_EVENTS)
@@ -80,6 +91,7 @@ class Shown:
             frame = self._pictures.pop(estimate.exposure_time_ns, None)
             if frame is not None:
                 self._paired = (frame, estimate, None if bundle is None else bundle.view)
+                self._paired_ns = time.monotonic_ns()
 
     def add_target(self, target: Target) -> None:
         """Keep the newest fix of each target."""
@@ -139,10 +151,12 @@ class Shown:
         plain: dict[str, Any] = _plain(document)
         return plain, count
 
-    def take_frame(self) -> bytes | None:
+    def take_frame(self) -> Shot | None:
         """The newest picture with its pose and the map's view of it; None if none is new."""
         with self._lock:
             paired, self._paired = self._paired, None
+            if paired is not None and time.monotonic_ns() - self._paired_ns > _FRESH_NS:
+                return None  # it was not due then; the next is near
             if paired is None and self._pictures and self._is_unlocalized():
                 _, frame = self._pictures.popitem(last=True)
                 paired = (frame, None, None)
@@ -159,7 +173,7 @@ class Shown:
             "estimate": None,
             "view": None,
         }
-        parts = [image.tobytes()]
+        parts = [image]
         if estimate is not None:
             head["estimate"] = self._position(estimate) | {
                 "pose": _pose(estimate.world_from_camera)
@@ -168,8 +182,8 @@ class Shown:
                 head["view"] = {
                     "camera": view.camera.to_dict(), "pose": _pose(view.world_from_camera)
                 }  # fmt: skip
-                parts += [view.rgb.tobytes(), view.depth.tobytes()]
-        return encode(_plain(head), *parts)
+                parts += [view.rgb, view.depth]
+        return Shot(_plain(head), tuple(parts))
 
     def _is_unlocalized(self) -> bool:
         newest = self._estimate

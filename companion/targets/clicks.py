@@ -12,7 +12,7 @@ from collections.abc import Callable
 
 from companion.config import TargetConfig
 from companion.targets.history import PoseHistory
-from companion.targets.population import Click, clicked_name
+from companion.targets.population import Click
 from companion.targets.reporter import TargetReporter
 from localizer.types import PoseEstimate, ReferenceBundle, TrackingState
 from mavlink_bridge.messages import TrackRequest
@@ -40,7 +40,7 @@ class ClickPolicy:
         self._sigma_ns = round(config.operator_delay_sigma_ms * 1e6)
         self._history = PoseHistory()
         self._waiting: list[TrackRequest] = []
-        self._alive: list[int] = []
+        self._alive: list[Click] = []
         self._refused: tuple[int, str] | None = None
         self._lock = threading.Lock()  # two links may both have a ground station
 
@@ -66,14 +66,14 @@ class ClickPolicy:
     def on_gone(self, name: str) -> None:
         """A target ended by itself."""
         with self._lock:
-            self._alive = [n for n in self._alive if clicked_name(n) != name]
+            self._alive = [c for c in self._alive if c.name != name]
 
     def _stop(self, number: int) -> None:
         """End one clicked target, or with 0 all of them."""
         self._waiting = [r for r in self._waiting if number not in (0, r.number)]
-        ended = [n for n in self._alive if number in (0, n)]
-        self._alive = [n for n in self._alive if n not in ended]
-        self._targets.forget(tuple(clicked_name(n) for n in ended))
+        ended = [c for c in self._alive if number in (0, c.number)]
+        self._alive = [c for c in self._alive if number not in (0, c.number)]
+        self._targets.forget(tuple(c.name for c in ended))
 
     def _place(self, request: TrackRequest, now_ns: int) -> bool:
         """Begin or refuse the request's target; False while its frame's pose may still come."""
@@ -111,12 +111,13 @@ class ClickPolicy:
             for at in (self._history.at(frame_ns + s * self._sigma_ns) for s in (-1, 1))
             if at is not None
         )
-        self._alive.append(request.number)
+        click = Click(request.number, estimate, pixel, around, extent, request.asked_by)
+        self._alive.append(click)
         if len(self._alive) > _MOST:
             oldest = self._alive.pop(0)
-            self._targets.forget((clicked_name(oldest),))
-            self._say(_INFO, f"PiLoT: target {oldest} ended: more than {_MOST}")
-        self._targets.begin(Click(request.number, estimate, pixel, around, extent))
+            self._targets.forget((oldest.name,))
+            self._say(_INFO, f"PiLoT: target {oldest.number} ended: more than {_MOST}")
+        self._targets.begin(click)
 
     def _refuse(self, request: TrackRequest, why: str) -> None:
         """Say it once to an impatient operator."""

@@ -21,9 +21,20 @@ from companion.errors import ConfigError, DetectionError
 _log = logging.getLogger(__name__)
 _MAX_DATAGRAM = 2048
 _MAX_NAME = 64
-# What the targets that the operator clicked at are called: a number follows.
-CLICKED = "ground station "
+GROUND_STATION, CONSOLE = "ground station", "console"
+# What the targets that the operator clicked at are called: by where he did it, a number follows.
+CLICKED = (f"{GROUND_STATION} ", f"{CONSOLE} ")
 _PAUSE_S = 0.001  # at most a thousand detections a second: a flood must not take the interpreter
+
+
+def clicked_name(number: int, asked_by: str = GROUND_STATION) -> str:
+    """What the target of the click with that number is called."""
+    return f"{asked_by} {number}"
+
+
+def clicked_number(name: str) -> int | None:
+    """The number of the click that a target is called after; None for a detector's."""
+    return int(name.rpartition(" ")[2]) if name.startswith(CLICKED) else None
 
 
 @dataclass(frozen=True)

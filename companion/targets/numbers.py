@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import threading
 
-from companion.targets.detections import CLICKED
+from companion.targets.detections import clicked_number
 
 _FIRST_DETECTED = 1001  # below are the clicks, which bring their numbers with them
 _MOST = 256  # names; many times as many as are followed at a time
@@ -29,8 +29,8 @@ class TargetNumbers:
 
     def of(self, name: str) -> int:
         """The number of the target of that name."""
-        if name.startswith(CLICKED):
-            return int(name[len(CLICKED) :])
+        if (clicked := clicked_number(name)) is not None:
+            return clicked
         with self._lock:
             number = self._numbers.pop(name, None)
             if number is None:

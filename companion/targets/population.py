@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from companion.config import TargetConfig
-from companion.targets.detections import CLICKED, Detection
+from companion.targets.detections import GROUND_STATION, Detection, clicked_name, clicked_number
 from companion.targets.pictures import RecentPictures
 from localizer.geometry.pose import Array
 from localizer.targets.bias import SharedBias
@@ -47,16 +47,11 @@ def _off(a: Array, b: Array) -> float:
     return float(np.linalg.norm(a - b))
 
 
-def clicked_name(number: int) -> str:
-    """What the target of the click with that number is called."""
-    return f"{CLICKED}{number}"
-
-
 @dataclass(frozen=True)
 class Click:
     """What the operator pointed at. estimate: of the frame that he saw; pixel: in it; around: the
     estimates one sigma of his delay before and after it, where they are known; extent: width and
-    height of his rectangle, pixels.
+    height of his rectangle, pixels; asked_by: `GROUND_STATION` or `CONSOLE`.
     """
 
     number: int
@@ -64,6 +59,12 @@ class Click:
     pixel: tuple[float, float]
     around: tuple[PoseEstimate, ...] = ()
     extent: tuple[float, float] | None = None
+    asked_by: str = GROUND_STATION
+
+    @property
+    def name(self) -> str:
+        """Of its target."""
+        return clicked_name(self.number, self.asked_by)
 
 
 @dataclass(frozen=True)
@@ -135,7 +136,7 @@ class Population:
 
     def begin(self, click: Click) -> None:
         """A clicked target begins; the operator is told where it is, or why it is not."""
-        name, time_ns = clicked_name(click.number), click.estimate.exposure_time_ns
+        name, time_ns = click.name, click.estimate.exposure_time_ns
         track = TargetTrack(name, replace(self._settings, confirm_s=0.0), self._cast)
         fix = track.see(click.estimate, click.pixel, drift=self._drift(click))
         if fix is None:
@@ -198,7 +199,7 @@ class Population:
             if fix.visibility is not Visibility.OUTSIDE:
                 life.seen_ns = time_ns
             elif time_ns - life.seen_ns > self._config.timeout_s * 1e9:
-                self._say(_INFO, f"PiLoT: target {name[len(CLICKED) :]} ended: out of the picture")
+                self._say(_INFO, f"PiLoT: target {clicked_number(name)} ended: out of the picture")
                 self.end((name,))
                 continue
             self._report(life, fix, estimate)
@@ -269,7 +270,7 @@ class Population:
             fix = track.see(estimate, found.pixel, pixel_sigma=_FOLLOWED_PX)
             life.found_ns = life.seen_ns = time_ns
         elif track.moves and since_s > _LOST_S:
-            self._say(_INFO, f"PiLoT: target {name[len(CLICKED) :]} lost")
+            self._say(_INFO, f"PiLoT: target {clicked_number(name)} lost")
             self.end((name,))
             return
         elif track.moves:

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from companion.offline.tables import read_columns
-from companion.targets.detections import CLICKED
+from companion.targets.detections import clicked_name
 from sitl.demo.budget import draw_errors
 from sitl.errors import SimulationError
 from sitl.operator.followed import FollowedFix, FollowVerdict, follow_verdict
@@ -113,7 +113,7 @@ def _flown(kind: VehicleKind, draw: int, options: FollowOptions) -> FollowRow:
 def read_fixes(targets: Path, number: int) -> list[FollowedFix]:
     """A clicked target's rows of ``targets.csv``."""
     table = read_columns(targets, ("target_id", "visibility"))
-    rows = np.flatnonzero(np.asarray(table.get("target_id", [])) == f"{CLICKED}{number}")
+    rows = np.flatnonzero(np.asarray(table.get("target_id", [])) == clicked_name(number))
     return [_fix(table, int(k)) for k in rows]
 
 

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from companion.offline.tables import Columns, read_columns
-from companion.targets.detections import CLICKED
+from companion.targets.detections import clicked_name
 from localizer.geometry.pose import Array
 from sitl.operator.operator import Asked
 from sitl.operator.station import GeoReport, Heard
@@ -85,7 +85,7 @@ def judge(
     ends = {n: a.answered_ns for a in asked for n in a.ended}
     lines, untold = [], []
     for number, point in pointed.items():
-        rows = np.flatnonzero(names == f"{CLICKED}{number}")
+        rows = np.flatnonzero(names == clicked_name(number))
         if len(rows) and point.place is not None:
             others = [p.place for n, p in pointed.items() if n != number and p.place is not None]
             lines.append(_line(witness, point, others, {k: v[rows] for k, v in table.items()},

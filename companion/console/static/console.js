@@ -76,12 +76,18 @@ function showState() {
     ["sigma", text(estimate?.accepted ? estimate.sigma_m : null, 2, " m")],
     ["HPL", text(health.guardian?.hpl_m, 1, " m"), health.guardian?.hpl_m > about.alert_limit_m],
     ["latency p95", `${text(latency, 0)}/${text(limit, 0, " ms")}`, latency > limit],
-    ["mode", `${about.mode ?? "-"}${state.injecting ? ", injecting" : ""}`, false, true],
+    ["mode", mode(about.mode, state.injecting), false, true],
     ["EKF", ekf(vehicle, state.follows), state.follows?.used === false, true],
     ["vehicle", aboutVehicle(vehicle), !vehicle.connected && !page.about?.replay, true],
     ["shadow", state.shadow ? (state.shadow.go ? "go" : "no-go") : "-", false, true],
   ]);
   $("figures").title = state.shadow?.line ?? "";
+}
+
+// What happens, not what is allowed: lost, nothing is sent, whatever the gate says.
+function mode(name, injecting) {
+  if (name !== "inject" || page.about?.replay) return name ?? "-";
+  return injecting ? "inject: sends positions" : "inject: sends none";
 }
 
 function aboutVehicle(vehicle) {

@@ -103,7 +103,8 @@ def _labels(config: DetectorConfig, session: ort.InferenceSession) -> dict[int, 
 
 
 def _is_name(label: str) -> bool:
-    return 0 < len(label) <= _LONGEST and label.isprintable() and not label.startswith(CLICKED)
+    is_name = 0 < len(label) <= _LONGEST and label.isprintable()
+    return is_name and not f"{label} ".startswith(CLICKED)
 
 
 def _wanted(config: DetectorConfig, labels: dict[int, str]) -> frozenset[int] | None:

@@ -73,7 +73,7 @@ class Flight:
             lambda: ShadowScore(False, 3, ("only 3 fixes of 50",)), lambda: None, lambda: False,
             lambda: self.mission,
         )  # fmt: skip
-        about = {"mode": "shadow", "delay_ms": 220.0, "alert_limit_m": 10.0, "record": None}
+        about = {"mode": "inject", "delay_ms": 220.0, "alert_limit_m": 10.0, "record": None}
         self.shown = Shown(self.cache.frame, 48.0, instruments, about)
         self.origin = origin
         self.reporter = TargetReporter(

@@ -115,6 +115,8 @@ def _until(page, holds, seconds=60):
 def test_it_shows_the_flight_and_asks_nobody_else(page, flight):
     page, seen = page
     assert page.inner_text("#word").lower() == "tracking"
+    # It may inject, and nothing goes out: that it injects would be wrong.
+    assert "inject: sends none" in page.inner_text("#figures").lower()
     for size in ((1280, 800), (390, 844)):
         page.set_viewport_size({"width": size[0], "height": size[1]})
         wide = page.evaluate("document.documentElement.scrollWidth")

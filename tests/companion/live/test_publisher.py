@@ -1,6 +1,9 @@
 """The flight's side of the console: it never waits, whatever the other side does."""
 
+import asyncio
+import contextlib
 import errno
+import os
 import socket
 import stat
 import threading
@@ -9,10 +12,12 @@ from typing import Any
 import numpy as np
 import pytest
 
+from companion.console.flight_source import FlightSource
 from companion.errors import CompanionError
 from companion.live.orders import Helm, OrderError, Orders
 from companion.live.protocol import Decoder, LinkError, encode, runtime_folder, socket_path
 from companion.live.publisher import Publisher
+from companion.live.shared import Arrivals
 from companion.live.shown import Instruments, Shown
 from localizer.geometry.camera import Camera
 from localizer.geometry.geo import Geodetic, LocalFrame
@@ -59,6 +64,7 @@ class Console:
         self.socket = socket.socket(socket.AF_UNIX)
         self.socket.settimeout(30.0)
         self.socket.connect(str(path))
+        self.arrivals = Arrivals(self.socket)
         self._decoder = Decoder()
         self._messages = []
 
@@ -74,12 +80,15 @@ class Console:
         """The next message of that kind, if it is whole with what comes next."""
         found = self._found(kind)
         if found is None:
-            data = self.socket.recv(1 << 20)
+            data = self.arrivals.receive(1 << 20)
             if not data:
                 raise EOFError
             self._messages += self._decoder.feed(data)
             found = self._found(kind)
         return found
+
+    def has(self, kind):
+        return any(message.head["kind"] == kind for message in self._messages)
 
     def _found(self, kind):
         for i, message in enumerate(self._messages):
@@ -115,8 +124,101 @@ def test_a_console_that_does_not_read_costs_one_message_and_the_next_gets_the_ne
         _give(publisher, shown, number)  # returns at once, however many there are
         if number % 20 == 0 and (message := reader.poll("frame")) is not None:
             seen.append(message.head["exposure_ns"])
+            reader.send({"kind": "read"})
     assert seen == sorted(seen)
-    assert max(publisher.waiting()) <= 640 * 480 * 3 + 65536
+    assert max(publisher.waiting()) <= 65536
+
+
+def _watching(publisher):
+    console = Console(publisher.path)
+    console.next("hello")
+    console.send({"kind": "watch", "frames": True})
+    return console
+
+
+def _given(publisher, shown, console, number):
+    """Give pictures until the console has one; its message, and the number of the last."""
+    while True:
+        number += 1
+        _give(publisher, shown, number)
+        console.send({"do": "nothing", "number": number})  # answered: so something always comes
+        if (message := console.poll("frame")) is not None:
+            return message, number
+
+
+def test_a_console_that_stands_still_gets_the_newest_picture_and_none_of_those_between(serving):
+    publisher, shown, _ = serving
+    console = _watching(publisher)
+    message, number = _given(publisher, shown, console, 0)
+    first = np.frombuffer(console.arrivals.read(message.head["shared"]), np.uint8)
+    # It has not said that it read: whatever it is kept waiting with, no picture is.
+    stood_at = number
+    while not console.has("state") or number < stood_at + 50:
+        number += 1
+        _give(publisher, shown, number)
+        console.send({"do": "nothing", "number": number})
+        console.next("answer")
+        assert not console.has("frame")
+    still = np.frombuffer(console.arrivals.read(message.head["shared"]), np.uint8)
+    assert np.array_equal(first, still)  # nor is what it looks at overwritten
+    console.send({"kind": "read"})
+    message, number = _given(publisher, shown, console, number)
+    assert message.head["exposure_ns"] > stood_at + 50
+    data = np.frombuffer(console.arrivals.read(message.head["shared"]), np.uint8)
+    assert data.size == 640 * 480 * 3
+    assert np.all(data == message.head["exposure_ns"] % 256)
+
+
+def test_a_console_that_cuts_its_memory_short_harms_itself_alone(serving):
+    publisher, shown, _ = serving
+    bad = _watching(publisher)
+    message, number = _given(publisher, shown, bad, 0)
+    for name in os.listdir("/proc/self/fd"):  # the console's copy is of this process, too
+        with contextlib.suppress(OSError):
+            if "console picture" in os.readlink(f"/proc/self/fd/{name}"):
+                os.ftruncate(int(name), 0)
+    with pytest.raises(LinkError, match="of which 0"):
+        bad.arrivals.read(message.head["shared"])
+    with pytest.raises(LinkError, match="without memory"):
+        bad.arrivals.read(1 << 40)
+    bad.send({"kind": "read"})
+    message, _ = _given(publisher, shown, bad, number)  # the flight goes on
+    assert len(bad.arrivals.read(message.head["shared"])) == 640 * 480 * 3
+
+
+def test_the_consoles_own_process_standing_still_shows_the_newest_afterwards(serving):
+    publisher, shown, _ = serving
+
+    async def run():
+        source = FlightSource(publisher.path)
+        source.watch(True)
+        task = asyncio.create_task(source.run())
+        number = 0
+
+        async def until(holds):
+            nonlocal number
+            while not holds():
+                number += 1
+                _give(publisher, shown, number)
+                await asyncio.sleep(0)
+
+        await until(lambda: source.newest.frames >= 1)
+        before = source.newest.frames
+        stood_at = number
+        witness = await asyncio.to_thread(_watching, publisher)
+        for _ in range(3):  # three more pictures go out meanwhile: this loop takes none of them
+            _, number = _given(publisher, shown, witness, number)
+            witness.send({"kind": "read"})
+        await until(lambda: source.newest.frames >= before + 2)
+        assert source.newest.frame.head["exposure_ns"] > stood_at + 3
+        assert source.newest.frame.body == bytes(
+            [source.newest.frame.head["exposure_ns"] % 256]
+        ) * (640 * 480 * 3)
+        task.cancel()
+        with contextlib.suppress(asyncio.CancelledError):
+            await task
+
+    asyncio.run(asyncio.wait_for(run(), 60))
 
 
 GARBAGE = (b"\xff" * 64, b"\0\0\x10\0\0\0\0\0x", b"\0\0\0\2\0\0\0\0[]")
@@ -226,6 +328,7 @@ def test_every_order_is_told_to_the_operator(order, told):
     ship = Ship()
     Orders(True, ship.helm).take(order)
     assert ship.said == [told]
+    assert {t.asked_by for t in ship.tracked} <= {"console"}  # so is the target called
     assert len(told) <= 50
 
 

@@ -9,6 +9,7 @@ def test_a_name_keeps_its_number_and_a_click_its_own():
     assert first != second
     assert numbers.of("car a") == first
     assert numbers.of("ground station 7") == 7
+    assert numbers.of("console 8") == 8
 
 
 def test_names_without_end_take_no_memory_without_end():

@@ -7,8 +7,8 @@ import pytest
 
 from companion.config import TargetConfig
 from companion.targets.clicks import ClickPolicy
-from companion.targets.detections import Detection
-from companion.targets.population import Population, clicked_name
+from companion.targets.detections import Detection, clicked_name
+from companion.targets.population import Population
 from localizer.targets.track import projected
 from localizer.types import TrackingState, Visibility
 from mavlink_bridge.messages import TrackRequest

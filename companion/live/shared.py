@@ -1,0 +1,86 @@
+"""Memory in which a picture passes from the flight to one console, without a copy through a socket.
+
+2 MB through a stream socket are a dozen pieces: for each the flight's thread is woken, and waits
+for a console that stands far behind it in priority. Here the flight writes once, into memory that
+it allocated; the console is told by a message and says when it has read. Neither side maps it: who
+shortens a mapped file kills who reads there, and each may be anybody's to the other.
+"""
+
+from __future__ import annotations
+
+import os
+import socket
+from collections.abc import Sequence
+
+import numpy as np
+
+from companion.live.protocol import MOST_BODY, LinkError
+
+
+class SharedMemory:
+    """The flight's side: one picture at a time. Its file descriptor goes to the console once."""
+
+    def __init__(self) -> None:
+        # Without MFD_ALLOW_SEALING: else the other side could forbid that it is written.
+        self._file = os.memfd_create("console picture", os.MFD_CLOEXEC)
+        self.is_read = True
+        """Whether the console has read what was written last; not before is it overwritten."""
+        self._given = False
+
+    def write(self, parts: Sequence[np.ndarray]) -> int:
+        """One after the other, from the beginning; how many bytes."""
+        at = 0
+        for part in parts:
+            rest = np.ascontiguousarray(part).reshape(-1).view(np.uint8).data
+            while rest:
+                written = os.pwrite(self._file, rest, at)
+                rest, at = rest[written:], at + written
+        self.is_read = False
+        return at
+
+    def send(self, connection: socket.socket, data: memoryview) -> int:
+        """As `socket.send`; with the first byte goes the descriptor."""
+        if self._given:
+            return connection.send(data)
+        sent = socket.send_fds(connection, [data], [self._file])
+        self._given = sent > 0
+        return sent
+
+    def close(self) -> None:
+        """Release the flight's hold on it."""
+        os.close(self._file)
+
+
+class Arrivals:
+    """The console's side of the socket: its bytes, and the descriptor that came with them."""
+
+    def __init__(self, connection: socket.socket) -> None:
+        self._connection = connection
+        self._file: int | None = None
+
+    def receive(self, most: int) -> bytes:
+        """As `socket.recv`."""
+        data, files, _, _ = socket.recv_fds(self._connection, most, 1, socket.MSG_CMSG_CLOEXEC)
+        for file in files:
+            self._forget()
+            self._file = file
+        return data
+
+    def read(self, size: int) -> bytes:
+        """What lies in the memory."""
+        if self._file is None or not 0 <= size <= MOST_BODY:
+            raise LinkError(f"a picture of {size} bytes without memory that holds it")
+        data = os.pread(self._file, size, 0)
+        if len(data) != size:
+            raise LinkError(f"a picture of {size} bytes of which {len(data)} are there")
+        return data
+
+    def close(self) -> None:
+        """Release socket and memory."""
+        self._forget()
+        self._connection.close()
+
+    def _forget(self) -> None:
+        if self._file is not None:
+            os.close(self._file)
+            self._file = None
