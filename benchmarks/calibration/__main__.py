@@ -1,6 +1,7 @@
 """`companion calibrate flight` on drawn errors: what it finds, and the flight after it.
 
     python -m benchmarks.calibration FOLDER [--minutes 5]
+    python -m benchmarks.calibration FOLDER --record-only
     python -m benchmarks.calibration FOLDER --report [--json out.json]
 
 Each draw is an aircraft whose deployment is wrong (focal length to 3 %, boresight to 3 deg an axis,
@@ -17,7 +18,7 @@ import json
 from pathlib import Path
 
 from benchmarks.calibration.report import COLUMNS, rows_of, summary, table
-from benchmarks.calibration.run import read, run_draw
+from benchmarks.calibration.run import TRUTH, read, record_draw, solve_draw
 from benchmarks.common.arguments import Parser, number, output, whole
 from benchmarks.common.deadline import deadline
 from benchmarks.common.figures import write_figures
@@ -33,6 +34,8 @@ def parser() -> Parser:
     p.add_argument("--first", type=whole(0, 10**6), default=200, help="seed of the first draw")
     p.add_argument("--world", type=whole(0, 10**9), default=1, help="seed of the world")
     p.add_argument("--minutes", type=number(0.1, 1e4), default=5.0, help="until it pauses")
+    p.add_argument("--record-only", action="store_true", help="fly and localize; solve later")
+    p.add_argument("--no-flight-after", action="store_true", help="calibrate only")
     p.add_argument("--report", action="store_true", help="of what is there; no run")
     p.add_argument("--json", type=output, help="the report")
     return p
@@ -50,9 +53,14 @@ def main() -> None:
         left = [s for s in range(args.first, args.first + args.draws) if s not in done]
         while left and more_time():
             seed = left.pop(0)
-            row = run_draw(assets, seed, args.folder / f"{seed}")
-            with path.open("a") as file:
-                file.write(json.dumps(row) + "\n")
+            folder = args.folder / f"{seed}"
+            if not (folder / TRUTH).is_file():
+                record_draw(assets, seed, folder)
+            if not args.record_only:
+                known = json.loads((folder / TRUTH).read_text())
+                row = solve_draw(assets, known, folder, not args.no_flight_after)
+                with path.open("a") as file:
+                    file.write(json.dumps(row) + "\n")
             print(f"draw {seed}: done, {len(left)} left", flush=True)
         rows = read(path)
     if rows:

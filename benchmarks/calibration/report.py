@@ -42,9 +42,8 @@ def summary(rows: list[dict[str, Any]]) -> dict[str, Any]:
             "sigma_median": float(np.median(bound)) * scale,
         }  # fmt: skip
     z = (found - truth) / sigma
-    flights = {
-        name: [r["again"][name]["median"] for r in rows] for name in ("old", "found", "true")
-    }
+    after = [r["again"] for r in rows if "again" in r]
+    flights = {name: [a[name]["median"] for a in after] for name in ("old", "found", "true")}
     return {
         "draws": len(rows), "groups": groups,
         "inside_95_by_number": {
@@ -71,13 +70,14 @@ def rows_of(made: dict[str, Any]) -> list[tuple[str, ...]]:
         for name, g in made["groups"].items()
     ]  # fmt: skip
     found = np.array(made["found_over_true"])
-    share = f"{made['within_10_percent']} of {made['draws']}"
-    rows.append(
-        (
-            "median error of the flight after it, over the true deployment's", "1.1", share,
-            f"{np.median(found):.2f} (median)", f"{found.max():.2f}", "-", "-",
-        )
-    )  # fmt: skip
+    if len(found):
+        share = f"{made['within_10_percent']} of {len(found)}"
+        rows.append(
+            (
+                "median error of the flight after it, over the true deployment's", "1.1", share,
+                f"{np.median(found):.2f} (median)", f"{found.max():.2f}", "-", "-",
+            )
+        )  # fmt: skip
     rows.append(("all numbers", "-", "-", "-", "-", "-", f"{100 * made['inside_95_of_all']:.0f} %"))
     return rows
 
@@ -92,10 +92,12 @@ def table(made: dict[str, Any]) -> str:
             f"{100 * g['inside_95']:.0f} % inside 1.96 sigma"
         )
     lines.append(f"all numbers inside 1.96 sigma: {100 * made['inside_95_of_all']:.0f} %")
+    if not made["found_over_true"]:
+        return "\n".join(lines)
     for name, values in made["flights_after_median_m"].items():
         lines.append(f"flight after it, {name} deployment: median {np.median(values):.3f} m")
     lines.append(
         f"found against true: {np.median(made['found_over_true']):.3f} in the median, "
-        f"{made['within_10_percent']} of {made['draws']} within 10 %"
+        f"{made['within_10_percent']} of {len(made['found_over_true'])} within 10 %"
     )
     return "\n".join(lines)

@@ -13,7 +13,7 @@ from benchmarks.calibration.draws import Draw, Sortie, drawn, fly, true_camera, 
 from companion.calibrate import unknowns as u
 from companion.calibrate.flight import Calibrated, calibrate
 from companion.calibrate.proposal import blind_spots, changed, changes
-from companion.config import CompanionConfig
+from companion.config import CompanionConfig, load_config
 from companion.offline.replay import load_record
 from localizer.geometry.pose import Array, euler_from_matrix, so3_log
 from sitl.camera.gimbal_error import GimbalError
@@ -21,29 +21,49 @@ from sitl.demo.assets import FlightAssets
 from sitl.demo.scenario import CameraSpec
 from sitl.desk.film import Localized
 
+TRUTH = "truth.json"
 _FRAMES = 200  # as the command's default
 _AGAIN_S = 50.0
 _AGAIN = 7_000  # added to the seed of the flight after the calibration
 
 
-def run_draw(assets: FlightAssets, seed: int, folder: Path) -> dict[str, Any]:
-    """One draw: errors of what was found, its sigmas, and the flight after it."""
+def record_draw(assets: FlightAssets, seed: int, folder: Path) -> None:
+    """One draw's shadow flight, localized under the wrong deployment; `TRUTH` is written last."""
     draw = drawn(seed)
     sortie = fly(assets, draw, seed, folder, gimbal=GimbalError(seed))
     seen = sortie.localized(sortie.deployment, seed, keep=True)
+    known = {
+        "seed": seed, "draw": asdict(draw), "truth": true_numbers(draw, seed, sortie).tolist(),
+        "ekf_off_m": sortie.flown.ekf_off_m.tolist(), "in_flight_m": _errors(seen),
+    }  # fmt: skip
+    (folder / TRUTH).write_text(json.dumps(known))
+
+
+def solve_draw(
+    assets: FlightAssets, known: dict[str, Any], folder: Path, after: bool = True
+) -> dict[str, Any]:
+    """A recorded draw calibrated: errors of what was found, its sigmas, the flight after it.
+
+    known: of its `TRUTH`. after: fly and localize once more, under three deployments.
+    """
+    seed = int(known["seed"])
     record = load_record(folder / "record", 0.0)
     found = calibrate(record, folder / "flight.tlog", record.config.map, _FRAMES)
-    truth = true_numbers(draw, seed, sortie)
-    wanted = changes(sortie.deployment, found)
+    row = known | _found_numbers(found)
+    if after:
+        deployment = load_config(folder / "deployment.yaml")
+        corrected = changed(deployment, changes(deployment, found))
+        row["again"] = _again(assets, drawn(seed), seed, folder, corrected)
+    return row
+
+
+def _found_numbers(found: Calibrated) -> dict[str, Any]:
     return {
-        "seed": seed, "draw": asdict(draw), "names": [n.name for n in u.UNKNOWNS],
-        "found": found.shared.tolist(), "truth": truth.tolist(), "sigma": found.sigmas.tolist(),
+        "names": [n.name for n in u.UNKNOWNS],
+        "found": found.shared.tolist(), "sigma": found.sigmas.tolist(),
         "lsq_sigma": np.sqrt(np.diag(found.solution.covariance)).tolist(),
-        "ekf_off_m": sortie.flown.ekf_off_m.tolist(), "frames": found.frames,
-        "before_px": found.before_px, "after_px": found.after_px,
-        "blind": list(blind_spots(found)), "in_flight_m": _errors(seen),
-        "again": _again(assets, draw, seed, folder, changed(sortie.deployment, wanted)),
-        "noise": _noise(found),
+        "frames": found.frames, "before_px": found.before_px, "after_px": found.after_px,
+        "blind": list(blind_spots(found)), "noise": _noise(found),
     }  # fmt: skip
 
 

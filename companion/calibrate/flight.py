@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -30,7 +30,6 @@ from localizer.tracking.opening import MapStack
 from localizer.tracking.pipeline import working_camera
 from localizer.types import Frame, Image
 from mavlink_bridge.injection.shadow import gnss_healthy
-from mavlink_bridge.messages import VehicleState
 
 _LEAST_FRAMES = 20
 _READ_TWICE = 2  # with the deployment's camera, and with the one that was found
@@ -172,7 +171,8 @@ def _chosen(
     picked = np.unique(np.linspace(0, len(good) - 1, min(most, len(good))).round().astype(int))
     geoid_m, frame = stack.cache.manifest.geoid_separation_m, stack.cache.frame
     trusted = bridge.mode not in _OURS
-    pictures, bias_m = [], _GNSS_BIAS_M
+    pictures: list[_Picture] = []
+    accuracies_m: list[float | None] = []
     for index in picked:
         estimate = good[index]
         autopilot.advance(estimate.exposure_time_ns + _LATER_NS)
@@ -180,25 +180,32 @@ def _chosen(
         if said is None:
             continue
         state = autopilot.state()
-        if not trusted or not _on_gnss(state, estimate.exposure_time_ns + _LATER_NS):
-            said = replace(said, place=np.full_like(said.place, np.nan))
-        else:
-            bias_m = max(_GNSS_BIAS_M, state.gps_h_accuracy_m or 0.0)
         try:
             image = read_image(image_path(record.folder, estimate))
         except StreamDecodeError:
             continue
+        if not trusted or not gnss_healthy(state, estimate.exposure_time_ns + _LATER_NS):
+            said = replace(said, place=np.full_like(said.place, np.nan))
+        elif said.has_place:
+            accuracies_m.append(state.gps_h_accuracy_m)
         pictures.append(_Picture(estimate, image, said, estimate.world_from_camera))
     if len(pictures) < _LEAST_FRAMES:
         raise RecordError(
             f"{tlog}: attitude and gimbal are known at {len(pictures)} of {len(picked)} pictures; "
             f"calibration needs {_LEAST_FRAMES}: is it this flight's log?"
         )
-    return pictures, bias_m
+    return pictures, receiver_bias_m(accuracies_m)
 
 
-def _on_gnss(state: VehicleState, now_ns: int) -> bool:
-    return gnss_healthy(state, now_ns)
+def receiver_bias_m(accuracies_m: Sequence[float | None]) -> float:
+    """What a flight's mean place may be off by for the receiver's sake, m, 1 sigma.
+
+    accuracies_m: what the receiver said of itself at each picture whose place counts; None where it
+    did not say. Errors that last all flight do not average out: the sigma of their mean is the mean
+    of their sigmas.
+    """
+    said = [max(_GNSS_BIAS_M, a) for a in accuracies_m if a is not None]
+    return float(np.mean(said)) if said else _GNSS_BIAS_M
 
 
 def _sighted(

@@ -29,6 +29,7 @@ _HISTORY = 64
 _STALE_NS = 1_500_000_000
 _FROM_GNSS_M = 3.0  # an EKF farther from the receiver follows something else
 _LOW_M = 10.0  # above ground; the first metres show neither focal length nor place
+_SPEAKS_AGAINST = 1.5  # sigmas between two accounts of one lateness, of which only one is sure
 _KEEPS_NS, _KEPT = 1_000_000_000, 20  # what was known at earlier times
 
 
@@ -183,8 +184,10 @@ class CalibrationWatch:
             return _fused(way, turns) if _tells(way) and _agree(way, turns) else way
         surer, other = (way, turns) if way.sigma <= turns.sigma else (turns, way)
         limit = self._limits.time_s
-        contradicted = surer.exceeds(limit) and other.is_within(limit)
-        return Figure(0.0, math.inf) if contradicted else surer
+        # The autopilot's own attitude may lag, too: then the turns are sure of a time that the way
+        # over ground does not have, long before the way is sure of its own.
+        contradicted = other.is_within(limit) or not _agree(surer, other, _SPEAKS_AGAINST)
+        return Figure(0.0, math.inf) if surer.exceeds(limit) and contradicted else surer
 
     def _take(self, seen: Sighting, state: VehicleState, vehicle: Vehicle, track: Track) -> None:
         gap_s = (seen.time_ns - self._last_ns) * 1e-9
@@ -258,8 +261,8 @@ def _tells(figure: Figure) -> bool:
     return abs(figure.value) > 2.0 * figure.sigma
 
 
-def _agree(a: Figure, b: Figure) -> bool:
-    return abs(a.value - b.value) < 3.0 * math.hypot(a.sigma, b.sigma)
+def _agree(a: Figure, b: Figure, sigmas: float = 3.0) -> bool:
+    return abs(a.value - b.value) < sigmas * math.hypot(a.sigma, b.sigma)
 
 
 def _fused(a: Figure, b: Figure) -> Figure:

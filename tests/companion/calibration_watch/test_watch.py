@@ -177,6 +177,33 @@ def test_what_contradicts_itself_is_not_told() -> None:
     assert "time" not in ever(Lagging(Wrong(), square(60.0, leg_s=10.0)).fly())
 
 
+class Bolted(Flown):
+    """A camera without a gimbal, under an autopilot whose own attitude lags by 180 ms."""
+
+    def gimbal_at(self, time_ns: int) -> GimbalAttitude:
+        return replace(super().gimbal_at(time_ns - 180_000_000), source="fixed")
+
+
+@pytest.mark.parametrize("denied", [False, True])
+def test_an_attitude_that_lags_is_no_time_of_a_bolted_camera(denied: bool) -> None:
+    """The turns were sure of "-0.18 s" before the way over ground was sure of none, and it was told
+    until then.
+    """
+    flown = Bolted(Wrong(), square(60.0, leg_s=10.0), lost if denied else lambda _: True).fly()
+    assert "time" not in ever(flown)
+
+
+@pytest.mark.parametrize("late_s", [0.2, -0.18])
+def test_stamps_of_a_bolted_camera_that_are_off_are_still_told(late_s: float) -> None:
+    class Prompt(Bolted):
+        def gimbal_at(self, time_ns: int) -> GimbalAttitude:
+            return super().gimbal_at(time_ns + 180_000_000)
+
+    flown = Prompt(Wrong(late_s=late_s), square(40.0, leg_s=10.0), lost).fly()
+    assert flown.first(lambda f: "time" in findings(f)) < 30.0
+    assert flown.found[-1][1].late_s.value == pytest.approx(late_s, rel=0.2)
+
+
 def test_an_ekf_that_late_positions_turned_away_is_no_camera_that_is_off() -> None:
     """`late-300ms` at 10 m/s on ArduPilot: on vision alone the EKF's heading went 5 degrees off in
     8 s, and the camera's yaw was blamed beside the stamps.
