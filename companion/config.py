@@ -14,6 +14,7 @@ from companion.guardian.config import GuardianConfig
 from companion.live.config import ConsoleConfig
 from companion.settings_file import SettingsError, read_settings, validated
 from companion.sources.base import SourceSettings
+from companion.sources.zoom import ZoomTable
 from companion.targets.detections import CLICKED, parse_host_port
 from localizer.config import LocalizerConfig
 from localizer.errors import CameraError
@@ -107,6 +108,9 @@ class FeedConfig(_Model):
     )
     lever_arm_m: tuple[Arm, Arm, Arm] = Field(
         (0.0, 0.0, 0.0), description="camera from the autopilot, body axes: forward right down"
+    )
+    zoom: ZoomTable | None = Field(
+        None, description="focal length by the zoom that the camera reports; null: `model`'s always"
     )
     settings: SourceSettings = SourceSettings()
 

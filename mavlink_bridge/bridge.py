@@ -254,6 +254,12 @@ class Bridge:
         """The camera's attitude to NED at a time: gimbal or body, and mounting."""
         return self._tracker.gimbal_at(time_ns)
 
+    def zoom_at(self, time_ns: int, hold_s: float) -> float | None:
+        """The camera's reported zoom at a time, per cent of its range; None: not known. hold_s: for
+        how long a report counts after which none came.
+        """
+        return self._tracker.zoom_at(time_ns, hold_s)
+
     def local_at(self, time_ns: int) -> tuple[float, ...] | None:
         """The EKF's position (north, east, down) from its origin at a time, m; None: unknown."""
         return self._tracker.local_at(time_ns)

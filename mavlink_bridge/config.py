@@ -169,6 +169,9 @@ class CameraConfig(_Model):
     gimbal_device: int = Field(
         default=0, ge=0, le=255, description="its gimbal_device_id; 0: the first that is heard"
     )
+    zoom_rate_hz: float = Field(
+        default=0.0, ge=0.0, le=50.0, description="CAMERA_SETTINGS is asked for so often; 0: not"
+    )
     mount_roll_deg: float = Field(default=0.0, ge=-180.0, le=180.0)
     mount_pitch_deg: float = Field(default=0.0, ge=-180.0, le=180.0)
     mount_yaw_deg: float = Field(default=0.0, ge=-180.0, le=180.0)

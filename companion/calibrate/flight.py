@@ -14,7 +14,7 @@ from companion.calibrate.evidence import Evidence, Guess, Sighted, changed_camer
 from companion.calibrate.pictures import PictureReader
 from companion.calibrate.said import REACH_S, Said, what_was_said
 from companion.calibrate.solve import Solution, solve
-from companion.config import CompanionConfig
+from companion.config import CompanionConfig, FeedConfig
 from companion.errors import RecordError, StreamDecodeError
 from companion.geometry import Mount
 from companion.offline.autopilot import RecordedAutopilot
@@ -37,6 +37,7 @@ _LATER_NS = round(1e9 * (REACH_S + 0.3))
 _GNSS_BIAS_M = 0.5  # of a receiver, for minutes, however good it says it is
 # TIMESYNC halves the round trip: what the link's two ways differ by, no flight shows.
 _CLOCKS_S = 0.002
+_SAME_LENS = 1e-3  # share of the focal length
 _OURS = ("inject", "rc")
 
 
@@ -156,7 +157,7 @@ def _chosen(
     record: FlightRecord, tlog: Path, stack: MapStack, mount: Array, most: int
 ) -> tuple[list[_Picture], float]:
     """At most so many accepted estimates with their pictures, and the receiver's own error, m."""
-    bridge = record.config.bridge
+    config, bridge = record.config, record.config.bridge
     autopilot = RecordedAutopilot(bridge, tlog, record.start_ns, record.utc_minus_monotonic_ns)
     good = [
         e for e in record.estimates
@@ -177,7 +178,7 @@ def _chosen(
         estimate = good[index]
         autopilot.advance(estimate.exposure_time_ns + _LATER_NS)
         said = what_was_said(autopilot, estimate.exposure_time_ns, frame, geoid_m, mount)
-        if said is None:
+        if said is None or not _unzoomed(config.camera, autopilot, estimate.exposure_time_ns):
             continue
         state = autopilot.state()
         try:
@@ -195,6 +196,15 @@ def _chosen(
             f"calibration needs {_LEAST_FRAMES}: is it this flight's log?"
         )
     return pictures, receiver_bias_m(accuracies_m)
+
+
+def _unzoomed(camera: FeedConfig, autopilot: RecordedAutopilot, time_ns: int) -> bool:
+    """Whether a picture was taken with the model's own focal length, as far as it is told."""
+    if camera.zoom is None:
+        return True
+    level = autopilot.zoom_at(time_ns, camera.zoom.hold_s)
+    factor = None if level is None else camera.zoom.factor(level)
+    return factor is not None and abs(factor - 1.0) <= _SAME_LENS
 
 
 def receiver_bias_m(accuracies_m: Sequence[float | None]) -> float:

@@ -42,6 +42,7 @@ from companion.preflight.coverage import check_origin
 from companion.preflight.map_pin import require_pinned
 from companion.sources import FrameSource, PacketTap, PacketTaps, StreamState, open_source
 from companion.sources.timing import system_minus_monotonic
+from companion.sources.zoom import ZoomedFrames
 from companion.targets.clicks import ClickPolicy
 from companion.targets.detections import DetectionListener
 from companion.targets.detector.worker import BoxDetector
@@ -62,6 +63,7 @@ from mavlink_bridge.config import BridgeConfig
 from mavlink_bridge.messages import TrackRequest
 
 _log = logging.getLogger(__name__)
+_ZOOM_RATE_HZ = 5.0  # at which CAMERA_SETTINGS is asked for where a table waits for it
 _WARNING = 4  # MAV_SEVERITY_WARNING; lower is worse
 _BAD_FEED = (StreamState.STALLED, StreamState.FAILED, StreamState.SCALED, StreamState.MISFIT)
 
@@ -428,7 +430,14 @@ def _engine(making: Making) -> DualThreadEngine:
         making[PriorSources].at,
         making[PlaceSearch].search,
     )
-    channels.frames.subscribe(engine.submit)
+    table, bridge = making.config.camera.zoom, making[Bridge]
+    if table is None:
+        channels.frames.subscribe(engine.submit)
+        return engine
+    zoomed = ZoomedFrames(
+        table, bridge.zoom_at, lambda text: bridge.say(_WARNING, f"PiLoT: {text}")
+    )
+    channels.frames.subscribe(zoomed.before(engine.submit))
     return engine
 
 
@@ -518,7 +527,8 @@ PARTS: tuple[Part[Any], ...] = (
         wanted=lambda config: config.console is not None,
     ),
     Part(
-        "engine", DualThreadEngine, _engine, depends=(Localizer, PriorSources, PlaceSearch),
+        "engine", DualThreadEngine, _engine,
+        depends=(Localizer, PriorSources, PlaceSearch, Bridge),
         start=DualThreadEngine.start, stop=DualThreadEngine.stop,
     ),
     Part(
@@ -552,12 +562,14 @@ def _require_origin_at_map(config: CompanionConfig, cache: TileCache) -> None:
 def _bridge_config(config: CompanionConfig) -> BridgeConfig:
     """The bridge announces the feed's real camera, and keeps its state beside the record."""
     camera = config.camera.model.camera()
+    asked = config.bridge.camera.zoom_rate_hz or _ZOOM_RATE_HZ
     announced = config.bridge.camera.model_copy(
         update={
             "width_px": camera.width,
             "height_px": camera.height,
             "horizontal_fov_deg": camera.horizontal_fov_deg,
         }
+        | ({"zoom_rate_hz": asked} if config.camera.zoom is not None else {})
     )
     state_file = config.bridge.state_file
     if state_file is None and config.record is not None:

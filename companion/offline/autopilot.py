@@ -57,6 +57,10 @@ class RecordedAutopilot:
         """The camera's attitude to NED at a CLOCK_MONOTONIC time."""
         return self._tracker.gimbal_at(time_ns)
 
+    def zoom_at(self, time_ns: int, hold_s: float) -> float | None:
+        """The camera's reported zoom at a time, per cent of its range."""
+        return self._tracker.zoom_at(time_ns, hold_s)
+
     def local_at(self, time_ns: int) -> tuple[float, ...] | None:
         """The EKF's NED position from its origin at a time."""
         return self._tracker.local_at(time_ns)

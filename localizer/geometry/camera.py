@@ -20,6 +20,7 @@ from localizer.geometry.pose import Array
 from localizer.plain_files import plain_text
 
 MAX_READOUT_MS = 200.0
+_ALIKE, _ALIKE_PX = 1e-3, 0.01  # of a focal length, a share: 0.2 px at a working picture's edge
 _KEYS = ("width", "height", "fx", "fy", "cx", "cy")
 
 
@@ -109,6 +110,19 @@ class Camera:
     def is_distorted(self) -> bool:
         """Whether any distortion coefficient is not zero."""
         return any(k != 0.0 for k in self.distortion)
+
+    def is_like(self, other: Camera) -> bool:
+        """Whether pictures of both can be taken for one another: focal lengths to 0.1 %, principal
+        points to 0.01 px, size and distortion the same.
+        """
+        scales = self.fx / other.fx, self.fy / other.fy
+        apart = max(abs(self.cx - other.cx), abs(self.cy - other.cy))
+        same = ("width", "height", "distortion")
+        return (
+            all(abs(s - 1.0) <= _ALIKE for s in scales)
+            and apart <= _ALIKE_PX
+            and all(getattr(self, name) == getattr(other, name) for name in same)
+        )
 
     @property
     def horizontal_fov_deg(self) -> float:

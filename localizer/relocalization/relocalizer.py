@@ -37,6 +37,7 @@ _BLUR_PX = 0.6  # the map is sampled more coarsely than the frame
 # Grey levels (sigma) without fine noise. A covered lens has 0.5 and kept a busy computer searching
 # until long after the cover was gone; the dullest of 190 views at night, dusk and fog has 1.8.
 _COARSE_PX, _LEAST_CONTRAST = 2.0, 1.0
+_MOST_UNDISTORTERS = 8
 
 
 class Relocalizer:
@@ -149,6 +150,8 @@ class Relocalizer:
     def _undistorted(self, query: PlaceQuery, camera: Camera) -> np.ndarray:
         key = (query.frame.camera, camera.width)
         if key not in self._undistorters:
+            if len(self._undistorters) >= _MOST_UNDISTORTERS:  # a camera that zooms
+                self._undistorters.clear()
             self._undistorters[key] = Undistorter(query.frame.camera, camera)
         return self._undistorters[key](query.frame)
 

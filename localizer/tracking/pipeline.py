@@ -80,7 +80,8 @@ class Undistorter:
         shrinks = source.width > double[0]
         self._middle = source.resized(*double) if shrinks else source
         pinhole = target.resized(self._middle.width, self._middle.height)
-        self._maps = self._middle.undistortion_maps(pinhole) if source.is_distorted else None
+        bent = not self._middle.is_like(pinhole)  # by its lens, or by its zoom
+        self._maps = self._middle.undistortion_maps(pinhole) if bent else None
 
     def __call__(self, frame: Frame) -> Image:
         """The frame's image (height, width, 3) uint8 at the target's size."""
@@ -337,7 +338,7 @@ class Localizer:
         They may be on the GPU, and are then valid until the next call.
         """
         undistorter = self._undistorter
-        if frame.camera != undistorter.source:  # the stream changed its size in flight
+        if not frame.camera.is_like(undistorter.source):  # another size in flight, or a zoom
             undistorter = self._undistorter = Undistorter(frame.camera, self.camera)
         image = undistorter(frame)
         if self._optimizer.on_gpu and isinstance(self._extractor, DeviceExtractor):

@@ -104,6 +104,47 @@ class VectorBuffer:
         return tuple(a + t * (b - a) for a, b in zip(before.values, after.values, strict=True))
 
 
+class ZoomBuffer:
+    """Zoom levels of one camera, per cent of its range: of the component that spoke first."""
+
+    def __init__(self) -> None:
+        self._samples: deque[VectorSample] = deque(maxlen=_LENGTH)
+        self._component: int | None = None
+
+    def clear(self) -> None:
+        """Forget all."""
+        self._samples.clear()
+        self._component = None
+
+    def add(self, time_ns: int, component: int, level: float) -> None:
+        """Append. level: NaN where the camera does not know it."""
+        if self._component is None:
+            self._component = component
+        newer = not self._samples or time_ns > self._samples[-1].time_ns
+        if component == self._component and newer:
+            self._samples.append(VectorSample(time_ns, (level,)))
+
+    def at(self, time_ns: int, hold_s: float) -> float | None:
+        """The level at a time, linear between reports. The newest one holds for so long, or only
+        until the next is due while the levels change: then nobody knows where the lens is.
+        """
+        samples = list(self._samples)
+        if not samples or time_ns < samples[0].time_ns:
+            return None
+        newest = samples[-1]
+        if time_ns > newest.time_ns:
+            moves = len(samples) > 1 and samples[-2].values != newest.values
+            held_ns = MAX_GAP_NS if moves else round(1e9 * hold_s)
+            level = newest.values[0] if time_ns - newest.time_ns <= held_ns else math.nan
+        else:
+            before, after, t = _around(samples, time_ns)
+            level = before.values[0] + t * (after.values[0] - before.values[0])
+            long_ago = after.time_ns - before.time_ns > round(1e9 * hold_s)
+            if before.values != after.values and long_ago:
+                level = math.nan  # it changed at some time between the two
+        return level if math.isfinite(level) else None
+
+
 class AttitudeBuffer:
     """The last attitudes, spherical between samples."""
 

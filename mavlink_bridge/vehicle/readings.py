@@ -18,6 +18,7 @@ from mavlink_bridge.vehicle.buffers import (
     GimbalSample,
     InertialBuffer,
     VectorBuffer,
+    ZoomBuffer,
     attitude,
 )
 from mavlink_bridge.vehicle.profile import autopilot_name, decode_version, select_profile
@@ -27,6 +28,7 @@ _SEA_LEVEL_HPA = 1013.25
 _PRESSURE_HPA = (1.0, 1200.0)  # of air that an aircraft flies in
 # Beyond these no sensor measures and no aircraft flies. One such value would stay for good in what
 # is integrated (the heading of the gyros, the way of the IMU) or make a flight look like a jump.
+_ZOOM_PERCENT = 100.0
 _ANGLE_RAD = 10.0
 _RATE_RADPS = 100.0
 _FORCE_MPS2 = 1_000.0
@@ -99,6 +101,7 @@ class VehicleReadings:
         self.globals = VectorBuffer()
         self.locals = VectorBuffer()
         self.inertial = InertialBuffer()
+        self.zooms = ZoomBuffer()
 
     def take(self, message: Any, time_ns: int) -> None:
         """One of MESSAGES_IN. Raises ValueError where no sensor says that, or no rotation."""
@@ -116,6 +119,7 @@ class VehicleReadings:
             self.globals,
             self.locals,
             self.inertial,
+            self.zooms,
         ):
             buffer.clear()
         self.set_origin(None)
@@ -176,6 +180,12 @@ class VehicleReadings:
         _check_within(_ANGLE_RAD, roll, pitch, yaw)
         q = quat.from_euler(roll, pitch, yaw)
         self.gimbals.add(GimbalSample(time_ns, q, False, GIMBAL_SOURCES[2]))
+
+    def _camera_settings(self, m: Any, time_ns: int) -> None:
+        level = float(m.zoomLevel)
+        if math.isfinite(level):
+            _check_within(_ZOOM_PERCENT, level)
+        self.zooms.add(time_ns, m.get_srcComponent(), level if level >= 0.0 else math.nan)
 
     def _local_position(self, m: Any, time_ns: int) -> None:
         _check_within(_DISTANCE_M, m.x, m.y, m.z)
@@ -330,6 +340,7 @@ _HANDLERS = {
     "GIMBAL_DEVICE_ATTITUDE_STATUS": VehicleReadings._gimbal_device,
     "MOUNT_ORIENTATION": VehicleReadings._mount_orientation,
     "MOUNT_STATUS": VehicleReadings._mount_status,
+    "CAMERA_SETTINGS": VehicleReadings._camera_settings,
     "LOCAL_POSITION_NED": VehicleReadings._local_position,
     "GLOBAL_POSITION_INT": VehicleReadings._global_position,
     "EKF_STATUS_REPORT": VehicleReadings._ekf_status,

@@ -50,6 +50,8 @@ def wanted_streams(config: BridgeConfig, autopilot: str) -> tuple[Stream, ...]:
         device = "GIMBAL_DEVICE_ATTITUDE_STATUS"
         streams.append(Stream(device, min(config.attitude_rate_hz, 25.0), optional=True))
         streams.append(Stream("MOUNT_STATUS", 10.0, optional=True, unless=device))
+    if config.camera.zoom_rate_hz:
+        streams.append(Stream("CAMERA_SETTINGS", config.camera.zoom_rate_hz))
     if config.mode == "rc":
         streams.append(Stream("RC_CHANNELS", 5.0))
     return tuple(streams)

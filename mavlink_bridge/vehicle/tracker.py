@@ -23,6 +23,7 @@ from mavlink_bridge.vehicle.readings import (
     is_autopilot,
 )
 
+_COMPONENTS_SAY = (*GIMBAL_SOURCES, "CAMERA_SETTINGS")
 _HEARTBEAT_LOST_NS = 3_000_000_000
 _OLD_NS = 2_000_000_000
 
@@ -94,6 +95,11 @@ class VehicleTracker:
         roll, pitch, yaw = quat.to_euler(q)
         return GimbalAttitude(time_ns, roll, pitch, yaw, q, source)
 
+    def zoom_at(self, time_ns: int, hold_s: float) -> float | None:
+        """The camera's zoom level at a time, per cent of its range; see `ZoomBuffer.at`."""
+        with self._lock:
+            return self._readings.zooms.at(time_ns, hold_s)
+
     def global_at(self, time_ns: int) -> tuple[float, ...] | None:
         """The EKF's (latitude, longitude in degrees, altitude AMSL) at a time."""
         with self._lock:
@@ -121,8 +127,8 @@ class VehicleTracker:
         if state.system_id is not None:
             if system != state.system_id:
                 return False
-            # Gimbals of other vendors are components of their own.
-            return component == state.component_id or message.get_type() in GIMBAL_SOURCES
+            # Gimbals of other vendors, and cameras, are components of their own.
+            return component == state.component_id or message.get_type() in _COMPONENTS_SAY
         return is_autopilot(message) and self._wanted_id in (None, system)
 
     def handle(self, message: Any, received_ns: int) -> bool:

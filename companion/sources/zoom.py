@@ -1,0 +1,126 @@
+"""The focal length of a camera that zooms: a table over the zoom level that the camera reports.
+
+CAMERA_SETTINGS (260) gives `zoomLevel`, a per cent of the range: no focal length. The table says
+what it means for this lens. Between its points the logarithm of the factor is linear, so that a
+longer level never gives a shorter focal length.
+"""
+
+from __future__ import annotations
+
+import math
+import threading
+from collections.abc import Callable
+from dataclasses import replace
+from itertools import pairwise
+from typing import Annotated
+
+import numpy as np
+from pydantic import BaseModel, ConfigDict, Field, field_validator
+
+from localizer.geometry.camera import Camera
+from localizer.types import Frame
+
+Level = Annotated[float, Field(ge=0.0, le=100.0)]
+Factor = Annotated[float, Field(ge=0.2, le=50.0)]
+_ALIKE = 1e-3  # a share of the focal length that is no other lens: below what a calibration knows
+_AGAIN_NS = 10_000_000_000  # the same trouble is told so often
+
+
+class ZoomTable(BaseModel):
+    """Which focal length each zoom level has."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+    points: tuple[tuple[Level, Factor], ...] = Field(
+        min_length=2,
+        description="level of CAMERA_SETTINGS and focal length as a multiple of `model`'s",
+    )
+    hold_s: float = Field(
+        2.0, ge=0.1, le=3600.0, description="a report that is no longer followed counts so long"
+    )
+
+    @field_validator("points")
+    @classmethod
+    def _rise(cls, points: tuple[tuple[float, float], ...]) -> tuple[tuple[float, float], ...]:
+        for (level, factor), (later, longer) in pairwise(points):
+            if later <= level or longer <= factor:
+                raise ValueError(
+                    f"[{later:g}, {longer:g}] after [{level:g}, {factor:g}]: levels and factors "
+                    "both rise from point to point"
+                )
+        return points
+
+    def factor(self, level: float) -> float | None:
+        """Multiple of the model's focal length; None beyond the table, where nothing is known."""
+        levels, factors = zip(*self.points, strict=True)
+        if not levels[0] <= level <= levels[-1]:
+            return None
+        return math.exp(float(np.interp(level, levels, np.log(factors))))
+
+
+def longer(camera: Camera, factor: float) -> Camera:
+    """The same picture's camera behind a lens of another focal length: principal point and
+    distortion (of the ray's tangent) as they were.
+    """
+    return replace(camera, fx=camera.fx * factor, fy=camera.fy * factor)
+
+
+class ZoomedFrames:
+    """Gives every frame the camera of its zoom; the feed's thread, `factor` from any.
+
+    level_at: the reported level at a time, None where it is not known. tell: a text for the
+    operator, told when the trouble begins and every ten seconds of it.
+    """
+
+    def __init__(
+        self,
+        table: ZoomTable,
+        level_at: Callable[[int, float], float | None],
+        tell: Callable[[str], None],
+    ) -> None:
+        self._table, self._level_at, self._tell = table, level_at, tell
+        self._lock = threading.Lock()
+        self._factor: float | None = None
+        self._told_ns: int | None = None
+        self.unknown = 0  # frames
+
+    def __call__(self, frame: Frame) -> Frame | None:
+        """The frame with its camera; None where its focal length is not known: a fix of it would be
+        metres off and look as good as any.
+        """
+        level = self._level_at(frame.exposure_time_ns, self._table.hold_s)
+        factor = None if level is None else self._table.factor(level)
+        if factor is None:
+            self._doubt(level, frame.exposure_time_ns)
+            return None
+        self._told_ns = None
+        with self._lock:
+            if self._factor is None or abs(factor / self._factor - 1.0) > _ALIKE:
+                self._factor = factor
+            factor = self._factor
+        return replace(frame, camera=longer(frame.camera, factor))
+
+    def before(self, take: Callable[[Frame], object]) -> Callable[[Frame], None]:
+        """Hands on what is known, with its camera."""
+
+        def hand_on(frame: Frame) -> None:
+            known = self(frame)
+            if known is not None:
+                take(known)
+
+        return hand_on
+
+    @property
+    def factor(self) -> float | None:
+        """Of the newest frame whose zoom was known."""
+        with self._lock:
+            return self._factor
+
+    def _doubt(self, level: float | None, time_ns: int) -> None:
+        self.unknown += 1
+        if self._told_ns is not None and 0 <= time_ns - self._told_ns < _AGAIN_NS:
+            return
+        self._told_ns = time_ns
+        if level is None:
+            self._tell("zoom unknown, no fixes: no CAMERA_SETTINGS")
+        else:
+            self._tell(f"zoom {level:.0f} not in table, no fixes")
