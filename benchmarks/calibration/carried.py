@@ -98,8 +98,8 @@ def main() -> None:
     worse_m, all_m = (np.array([r[key] for r in made]) for key in ("worse_m", "all"))
     alike = float(np.corrcoef(worse_m, all_m)[0, 1]) if len(made) > 2 else float("nan")
     cells.append(("correlation with the excess", "-", "-", f"{alike:.2f}", *["-"] * 3))
-    for row in cells:
-        print(*row, sep=" | ")
+    for line in cells:
+        print(*line, sep=" | ")
     if args.json:
         write_figures(args.json, COLUMNS, cells, {"draws": made, "correlation": alike})
 
