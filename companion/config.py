@@ -95,6 +95,7 @@ class CameraModel(_Model):
         )  # fmt: skip
 
 
+OLD_CALIBRATION_DAYS = 90
 Arm = Annotated[float, Field(ge=-20.0, le=20.0)]  # metres; larger ones were given in cm or mm
 
 
@@ -113,6 +114,14 @@ class FeedConfig(_Model):
         None, description="focal length by the zoom that the camera reports; null: `model`'s always"
     )
     settings: SourceSettings = SourceSettings()
+
+    def is_calibrated(self, today: date) -> bool:
+        """Whether what the localizer knows of the camera is a calibration's result, not long ago:
+        focus, temperature and a knock change a camera. A clock that is not set says no.
+        """
+        if self.calibrated is None:
+            return False
+        return 0 <= (today - self.calibrated).days <= OLD_CALIBRATION_DAYS
 
     @property
     def is_video(self) -> bool:

@@ -9,18 +9,19 @@
 
 Sets are those of `python -m benchmarks.basin`: generated worlds of seeds that no training uses on
 another day under made weather, quito (a real mesh), caliterra (real photos). Each view is
-registered with a camera whose focal length, principal point and distortion are off as a calibration
-leaves them; map shift, lever arm and late stamps times speed are added (`draws.py`). The report
-fits the guardian's budget on the even views and says how many errors of the odd ones are within the
-levels, with the exact 95 % interval; with the defaults of every view, too, which is a check where
---seed drew other faults than those that the defaults were chosen on (0). A run goes on where its
-file ends.
+registered with a camera whose focal length, principal point and distortion are off as --lens has
+it: "careful", whose deployment states nothing of it, "calibrated", which states so much, or
+"overstated", which states the least that a calibration ever does. Map shift, lever arm and late
+stamps times speed are added (`draws.py`). The report fits the guardian's budget on the even views
+and says how many errors of the odd ones are within the levels, with the exact 95 % interval; with
+the defaults of every view, too, which is a check where --seed drew other faults than those that the
+defaults were chosen on (0). A run goes on where its file ends.
 
 With --flights (folders of `python -m sitl loop` or `demo`) it counts how many positions lay inside
 the level that they had in flight: those that were injected, and those that were withheld or flown
 in shadow; and what the guardian said, by finding. With --replay their fixes and the vehicle's
 messages go through the guardian of now: what it would tell and withhold, and what the levels are
-made of.
+made of; with --calibrated as if their deployments had said when they were calibrated.
 """
 
 from __future__ import annotations
@@ -34,9 +35,10 @@ from benchmarks.basin.views import load_views
 from benchmarks.common.arguments import Parser, existing, number, output, whole
 from benchmarks.common.named_errors import named_errors
 from benchmarks.protection import flights, replayed
+from benchmarks.protection.draws import LENSES
 from benchmarks.protection.fit import RISKS, Coverage, along_axis, coverage, fitted, halves
 from benchmarks.protection.run import Outcome, run
-from companion.guardian.config import ProtectionConfig
+from companion.guardian.config import GuardianConfig, ProtectionConfig
 from companion.versions import made_by
 from mavlink_bridge.errors import RecordError
 
@@ -52,12 +54,14 @@ def parser() -> Parser:
     p.add_argument("--views", type=whole(2, 100_000), default=80, help="how many")
     p.add_argument("--draws", type=whole(1, 100), default=2, help="faults of each view")
     p.add_argument("--focal", type=number(-0.2, 0.2), help="share; instead of a drawn one")
+    p.add_argument("--lens", choices=tuple(LENSES), default="careful", help="how well known")
     p.add_argument("--seed", type=whole(0, 1_000_000), default=0, help="of the faults")
     p.add_argument("--cache", type=Path, default=Path(".cache/basin"), help="of views and maps")
     p.add_argument("--data", type=Path, default=Path("../shared/data"), help="real sets")
     p.add_argument("--out", type=output, help="JSON of every outcome, or of the report")
     p.add_argument("--flights", type=existing, nargs="+", help="flown folders, no run")
     p.add_argument("--replay", type=existing, nargs="+", help="flown folders, once more")
+    p.add_argument("--calibrated", action="store_true", help="with --replay: the cameras are")
     p.add_argument("--report", type=existing, nargs="+", help="earlier files, no run")
     return p
 
@@ -103,8 +107,10 @@ def report(outcomes: list[Outcome]) -> dict[str, Any]:
 
 
 def _by_set(outcomes: list[Outcome]) -> dict[str, list[Outcome]]:
-    names = dict.fromkeys(o.set for o in outcomes)
-    return {"all": outcomes} | {name: [o for o in outcomes if o.set == name] for name in names}
+    several = len({o.lens for o in outcomes}) > 1
+    named = [(f"{o.set} {o.lens}" if several else o.set, o) for o in outcomes]
+    by = {name: [o for other, o in named if other == name] for name, _ in named}
+    return {"all": outcomes} | by
 
 
 def _row(name: str, c: Coverage) -> tuple[str, ...]:
@@ -139,12 +145,14 @@ def count_flights(folders: list[Path], out: Path | None) -> None:
         out.write_text(json.dumps(found, indent=1, allow_nan=False))
 
 
-def replay_flights(folders: list[Path], out: Path | None) -> None:
+def replay_flights(folders: list[Path], out: Path | None, *, calibrated: bool) -> None:
     """Print what the guardian of now makes of flights; what cannot be replayed is named."""
+    protection = ProtectionConfig().of_camera(calibrated=calibrated)
+    config = GuardianConfig(protection=protection)
     flown, left_out = [], {}
     for folder in folders:
         try:
-            flown.append(replayed.replay(folder))
+            flown.append(replayed.replay(folder, config))
         except RecordError as error:
             left_out[str(folder)] = str(error)
             print(f"left out: {error}")
@@ -160,7 +168,7 @@ def main() -> None:
         count_flights(args.flights, args.out)
         return
     if args.replay:
-        replay_flights(args.replay, args.out)
+        replay_flights(args.replay, args.out, calibrated=args.calibrated)
         return
     if args.report:
         found = report([o for path in args.report for o in read(path)])
@@ -173,7 +181,9 @@ def main() -> None:
     done = {o.view for o in outcomes[: len(outcomes) // args.draws * args.draws]}
     outcomes = [o for o in outcomes if o.view in done]
     views = load_views(args.set, args.cache, args.data, args.views)
-    for outcome in run(args.set, views, args.draws, args.seed, args.focal, skip=len(done)):
+    for outcome in run(
+        args.set, views, args.draws, args.seed, args.focal, args.lens, skip=len(done)
+    ):
         outcomes.append(outcome)
         if args.out:  # after each one: an interrupted run keeps what it has
             args.out.write_text(json.dumps([asdict(o) for o in outcomes], indent=1))

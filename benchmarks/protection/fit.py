@@ -28,8 +28,9 @@ class Fitted:
     time_bias_s: float
 
     def config(self, risk: float) -> ProtectionConfig:
-        """As the guardian takes it."""
-        return ProtectionConfig(risk=risk, **asdict(self))
+        """As the guardian takes it, whatever the lens."""
+        share = self.calibration_share
+        return ProtectionConfig(risk=risk, calibrated_share=share, **asdict(self))
 
 
 def halves(outcomes: Sequence[Outcome]) -> tuple[list[Outcome], list[Outcome]]:
@@ -89,7 +90,7 @@ class Coverage:
 
 def coverage(outcomes: Sequence[Outcome], config: ProtectionConfig) -> Coverage:
     """How often the error is within the level at the configured risk."""
-    levels = np.array([budget(o.sigma_m, o.height_m, (o.speed_mps, 0.0), config) for o in outcomes])
+    levels = np.array([_level(o, config) for o in outcomes])
     errors = np.array([total_m(o) for o in outcomes])
     inside = errors <= levels
     hits, n = int(inside[:, 0].sum()), len(outcomes)
@@ -99,6 +100,12 @@ def coverage(outcomes: Sequence[Outcome], config: ProtectionConfig) -> Coverage:
         float(np.median(levels[:, 0])), float(np.median(levels[:, 1])),
         float((errors[:, 0] / levels[:, 0]).max()),
     )  # fmt: skip
+
+
+def _level(o: Outcome, config: ProtectionConfig) -> tuple[float, float]:
+    """By the budget of its lens, as the flight's table chooses it by the deployment."""
+    config = config.of_camera(calibrated=o.lens != "careful")
+    return budget(o.sigma_m, o.height_m, (o.speed_mps, 0.0), config)
 
 
 def exact_interval(hits: int, count: int) -> tuple[float, float]:

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import groupby
 
 import numpy as np
 
 from benchmarks.basin.views import View
-from benchmarks.protection.draws import Fault, drawn
+from benchmarks.protection.draws import LENSES, Fault, drawn
 from localizer.config import LocalizerConfig
 from localizer.features import load_extractor
 from localizer.features.detail import DetailExtractor
@@ -45,16 +45,18 @@ class Outcome:
     error_m: tuple[float, float, float]
     beside_m: tuple[float, float, float]
     axis: tuple[float, float, float]
+    lens: str = "careful"
 
 
 def run(
-    name: str, views: Sequence[View], draws: int, seed: int, focal: float | None, *, skip: int = 0
-) -> Iterator[Outcome]:
+    name: str, views: Sequence[View], draws: int, seed: int, focal: float | None, lens: str,
+    *, skip: int = 0,
+) -> Iterator[Outcome]:  # fmt: skip
     """Every view from number `skip` on with so many faults; each view's are the same whatever else
     is run.
     """
     extractor, optimizer = DetailExtractor(load_extractor(None, threads=1)), JNGO(threads=1)
-    config = LocalizerConfig(odometry=None)
+    config = LocalizerConfig(odometry=None, calibration=LENSES[lens].stated)
     numbered = list(enumerate(views))[skip:]
     for cache, some in groupby(numbered, key=lambda item: item[1].map_cache):
         with TileStreamer(TileCache.open(cache)) as streamer:
@@ -64,10 +66,11 @@ def run(
                 depth_m = float(np.median(seen[seen > 0]))
                 rng = np.random.default_rng((seed, k))
                 for _ in range(draws):
-                    fault = drawn(rng, focal=focal)
+                    fault = drawn(rng, LENSES[lens], focal=focal)
                     camera = fault.calibrated(view.camera)
                     localizer = Localizer(renderer, extractor, optimizer, camera, config)
-                    yield _one(name, k, view, fault, localizer, depth_m, rng)
+                    found = _one(name, k, view, fault, localizer, depth_m, rng)
+                    yield replace(found, lens=lens)
 
 
 def _one(

@@ -85,6 +85,9 @@ class Companion:
                 self.discard_record()
                 raise
             self._parts.start(up)
+            guardian = self._parts.get(Guardian)
+            if guardian is not None:
+                guardian.watch(self._untold_turns)
             if self._pulse is not None:
                 pulse = Pulse(self._turns, self._pulse)
                 pulse.start()
@@ -126,6 +129,12 @@ class Companion:
         health, guardian = parts.get(HealthMonitor), parts.get(Guardian)
         turns |= {} if health is None else {"health": health.turn_ns}
         return turns | ({} if guardian is None else {"guardian": guardian.turn_ns})
+
+    def _untold_turns(self) -> dict[str, int]:
+        """The turns of what nobody else tells of. What hangs on a frame's way, health tells."""
+        health = self._parts.get(HealthMonitor)
+        ends = self._is_stopping or self._parts[Feed].ended.is_set()
+        return {} if health is None or ends else {"health": health.turn_ns}
 
     def _tell_what_runs(self) -> None:
         events = self._parts.channels.events

@@ -180,7 +180,7 @@ class FixMemory:
             try:
                 self._write(newest, self._path)
                 self._failed = False
-            except (OSError, ValueError) as error:  # ValueError: a covariance that is none
+            except Exception as error:  # a full disk, a covariance that is none: flight goes on
                 if not self._failed:
                     _log.warning("the last fix is not kept: %s: %s", self._path, error)
                 self._failed = True

@@ -9,6 +9,7 @@ from __future__ import annotations
 import logging
 from collections.abc import Callable
 from dataclasses import replace
+from datetime import datetime, timezone
 from pathlib import Path
 from typing import Any
 
@@ -340,7 +341,10 @@ def _guardian(making: Making) -> Guardian:
         gnss_is_ours=injection.message == "gps_input",
         horizontal_fov_deg=config.camera.model.camera().horizontal_fov_deg,
     )
-    guardian = Guardian(config.guardian, limits, making[Bridge])
+    calibrated = config.camera.is_calibrated(datetime.now(timezone.utc).date())
+    protection = config.guardian.protection.of_camera(calibrated=calibrated)
+    watched = config.guardian.model_copy(update={"protection": protection})
+    guardian = Guardian(watched, limits, making[Bridge])
     making[FixInjection].add_judge(lambda _, fix: guardian.judge(fix))
     making.channels.frames.subscribe(lambda f: guardian.see(f.exposure_time_ns, f.image))
     if config.guardian.calibration.enabled:

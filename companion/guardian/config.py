@@ -45,6 +45,9 @@ class MotionConfig(_Model):
 class ProtectionConfig(_Model):
     """The budget of a protection level: what a fix's covariance does not know of, each as one
     standard deviation along an axis.
+
+    The covariance holds what `localizer.calibration` states of the camera. Where that is the result
+    of a calibration, little is left beside it; else it is a guess, and the camera may be worse.
     """
 
     risk: float = Field(
@@ -53,11 +56,22 @@ class ProtectionConfig(_Model):
     map_m: float = Field(default=0.28, ge=0.0, le=100.0, description="the map, north and east")
     map_height_m: float = Field(default=0.4, ge=0.0, le=100.0, description="the map's height")
     calibration_share: float = Field(
-        default=0.003, ge=0.0, le=0.5, description="the camera's, of the height above take-off"
-    )
+        default=0.003, ge=0.0, le=0.5,
+        description="the camera's, of the height above take-off, where nothing says how well it is "
+        "known: `camera.calibrated` null or long ago",
+    )  # fmt: skip
+    calibrated_share: float = Field(
+        default=0.001, ge=0.0, le=0.5,
+        description="the same beside what a calibration stated in `localizer.calibration`",
+    )  # fmt: skip
     time_bias_s: float = Field(
         default=0.01, ge=0.0, le=1.0, description="the time stamps', times the speed"
     )
+
+    def of_camera(self, *, calibrated: bool) -> ProtectionConfig:
+        """The budget of a camera whose deployment states what its calibration left, or guesses."""
+        share = self.calibrated_share if calibrated else self.calibration_share
+        return self.model_copy(update={"calibration_share": share})
 
 
 class GuardianConfig(_Model):

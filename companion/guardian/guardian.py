@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 import logging
+import sys
 import threading
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
 
 from companion.calibration_watch.sighting import Sighting
 from companion.guardian.config import GuardianConfig
-from companion.guardian.findings import FAILED, PREFIX, Latch, Reading
+from companion.guardian.findings import FAILED, PREFIX, STANDS, Latch, Reading
 from companion.guardian.monitor import Limits, Monitor
 from companion.guardian.protection import ProtectionLevel
 from localizer.types import Image
@@ -18,6 +21,9 @@ from mavlink_bridge.messages import VisionFix
 _log = logging.getLogger(__name__)
 _PERIOD_S = 0.1
 _BLIND_TURNS = 10  # that failed in a row
+_STANDS_NS = 2_000_000_000  # since its last turn: its thread hangs, or is gone
+_PART_STANDS_NS = 4_000_000_000  # of another part, as the supervisor has it
+_LOCK_S = 1.0  # a turn takes a twentieth of it
 _ERROR, _WARNING, _NOTICE = 3, 4, 5  # MAV_SEVERITY
 
 
@@ -28,7 +34,8 @@ class Guardian:
     more than the lock. What is costly happens on a thread of its own, ten times a second.
 
     What cannot be judged is withheld: a position that nobody watches is believed unwarned. A fix
-    that fails it costs itself; a thread that fails for a second costs all until it turns again.
+    that fails it costs itself; a thread that fails for a second, or takes no turn for two, costs
+    all until it turns again. Then those who ask tell it: its own thread cannot.
     """
 
     def __init__(self, config: GuardianConfig, limits: Limits, bridge: Bridge) -> None:
@@ -36,22 +43,28 @@ class Guardian:
         self._bridge = bridge
         self._lock = threading.Lock()
         self._picture: tuple[int, Image] | None = None
-        self._failed = Latch(FAILED)
+        self._failed, self._stands = Latch(FAILED), Latch(STANDS)
+        self._turns: Callable[[], Mapping[str, int]] = dict
         self._fails: dict[str, int] = {}  # how often in a row, by what is failing
         self._failures = threading.Lock()
         self.turn_ns = monotonic_ns()
         """When its thread began its newest turn, CLOCK_MONOTONIC."""
         self._stop = threading.Event()
-        self._thread = threading.Thread(target=self._run, name="guardian")
+        self._thread = threading.Thread(target=self._run, name="guardian", daemon=True)
 
     def start(self) -> None:
         """Start watching."""
+        self.turn_ns = monotonic_ns()
         self._thread.start()
 
     def stop(self) -> None:
-        """Stop watching."""
+        """Stop watching. A thread that hangs is left behind."""
         self._stop.set()
-        self._thread.join()
+        self._thread.join(2.0 * _LOCK_S)
+
+    def watch(self, turns: Callable[[], Mapping[str, int]]) -> None:
+        """Tell of parts that stand. turns: when each began its newest turn, CLOCK_MONOTONIC ns."""
+        self._turns = turns
 
     def see(self, time_ns: int, image: Image) -> None:
         """Offer a picture; the newest is looked at. Never blocks."""
@@ -59,14 +72,19 @@ class Guardian:
 
     def sight(self, sighting: Sighting) -> None:
         """Offer a registered picture as evidence of the calibration."""
-        with self._lock:
-            self._monitor.sight(sighting)
+        with self._asked() as answers:
+            if answers:
+                self._monitor.sight(sighting)
 
     def judge(self, fix: VisionFix) -> VisionFix | None:
         """The fix as it may be injected; None withholds it."""
         try:
+            if self._hangs():
+                return None
             state = self._bridge.state()
-            with self._lock:
+            with self._asked() as answers:
+                if not answers:
+                    return None
                 admitted = self._monitor.admit(fix, state)
         except Exception:
             self._fail("judging")
@@ -83,21 +101,40 @@ class Guardian:
     @property
     def reason(self) -> str:
         """Why fixes are withheld; empty while they are not."""
-        if self._failed.raised:
-            return self._failed.line().removeprefix(PREFIX)
-        with self._lock:
-            return self._monitor.reason
+        if self._hangs() or self._failed.raised:
+            return FAILED.line(0.0).removeprefix(PREFIX)
+        with self._asked() as answers:
+            return self._monitor.reason if answers else ""
 
     @property
     def level(self) -> ProtectionLevel | None:
         """The newest fix's protection level."""
-        with self._lock:
-            return self._monitor.level
+        with self._asked() as answers:
+            return self._monitor.level if answers else None
 
     def standing(self) -> dict[str, float]:
         """The findings that stand, by name, with their figures."""
-        with self._lock:
-            return self._monitor.standing()
+        with self._asked() as answers:
+            return self._monitor.standing() if answers else {}
+
+    @contextmanager
+    def _asked(self) -> Iterator[bool]:
+        """The monitor's lock; False where it is not given: who asks must not hang, too."""
+        given = not self._hangs() and self._lock.acquire(timeout=_LOCK_S)
+        try:
+            yield given
+        finally:
+            if given:
+                self._lock.release()
+
+    def _hangs(self) -> bool:
+        """Whether its thread stands; told by whoever asks."""
+        now_ns = monotonic_ns()
+        if now_ns - self.turn_ns < _STANDS_NS:
+            return False
+        self._fail("taking turns")
+        self._tell_failure(now_ns)
+        return True
 
     def _run(self) -> None:
         while not self._stop.wait(_PERIOD_S):
@@ -106,16 +143,30 @@ class Guardian:
     def turn(self) -> None:
         """Look at everything once; ten times a second by its thread."""
         self.turn_ns = monotonic_ns()
+        self._works("taking turns")
         try:
             self._step()
         except Exception:
             self._fail("watching")
         else:
             self._works("watching")
+        self._tell_failure(self.turn_ns)
+        self._tell_what_stands(self.turn_ns)
+
+    def _tell_failure(self, now_ns: int) -> None:
         with self._failures:
-            text = self._failed.update(self.turn_ns, Reading(bool(self._fails)))
+            text = self._failed.update(now_ns, Reading(bool(self._fails)))
         if text is not None:
             self._bridge.say(_ERROR if self._failed.raised else _NOTICE, text)
+
+    def _tell_what_stands(self, now_ns: int) -> None:
+        """Another part that takes no turns tells nothing any more: its last word would stand."""
+        turns = self._turns()
+        name = min(turns, key=lambda one: turns[one], default="")
+        age_ns = now_ns - turns.get(name, now_ns)
+        text = self._stands.update(now_ns, Reading(age_ns >= _PART_STANDS_NS, age_ns * 1e-9, name))
+        if text is not None:
+            self._bridge.say(_WARNING if self._stands.raised else _NOTICE, text)
 
     @property
     def _is_blind(self) -> bool:
@@ -127,7 +178,7 @@ class Guardian:
         with self._failures:
             count = self._fails[what] = self._fails.get(what, 0) + 1
         if count == 1:
-            _log.exception("the guardian failed %s", what)
+            _log.error("the guardian failed %s", what, exc_info=sys.exc_info()[0] is not None)
 
     def _works(self, what: str) -> None:
         with self._failures:

@@ -18,7 +18,7 @@ from localizer.errors import LocalizerError
 from localizer.map.cache.cache import TileCache
 from mavlink_bridge.preflight.doctor import Diagnosis, Finding
 
-_OLD_CALIBRATION_DAYS, _OLD_MAP_DAYS, _OLD_SHADOW_DAYS = 90, 730, 7
+_OLD_MAP_DAYS, _OLD_SHADOW_DAYS = 730, 7
 WHEN_VISION_ENDS = (
     ("degraded, bridging N s", "odometry carries it on: turn back over ground that the map knows"),
     ("lost; not sent: ...", "take over in ALT_HOLD or STABILIZE, or select GNSS if it is good"),
@@ -88,7 +88,7 @@ def _calibration(config: CompanionConfig, today: date) -> Row:
     c = config.localizer.calibration
     text = f"{done.isoformat()} ({_age(done, today)}), focal length to {c.focal_percent:g} %, "
     text += f"stamps to {c.stamp_ms:g} ms"
-    return Row("calibration", text, (today - done).days <= _OLD_CALIBRATION_DAYS)
+    return Row("calibration", text, config.camera.is_calibrated(today))
 
 
 def _map(config: CompanionConfig, today: date) -> tuple[Row, ...]:

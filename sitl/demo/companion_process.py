@@ -13,6 +13,7 @@ import time
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
+from datetime import datetime, timezone
 from pathlib import Path
 from typing import Any
 
@@ -87,6 +88,8 @@ def write_deployment(
         "camera": {
             "source": f"udp://127.0.0.1:{ports.video}",
             "model": camera.to_dict(),
+            # Drawn from what a calibration leaves, and stated so (`_known_to`).
+            "calibrated": datetime.now(timezone.utc).date().isoformat(),
         },
         "localizer": {"width": scenario.localizer_width, "calibration": _known_to(scenario)},
         "bridge": {

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import threading
 from dataclasses import replace
 from typing import Any
 
@@ -211,3 +212,91 @@ def test_a_gnss_that_jumps_is_told_and_nothing_is_withheld() -> None:
     flight = Flight(monitor(), gnss_north_m=lambda at_s: 1e5 if at_s >= 5.0 else 0.0).fly(9.0)
     assert 7.0 <= flight.told("GNSS 100000 m from vision") < 8.0
     assert flight.withheld == []
+
+
+class Hand:
+    """A clock that goes on when it is told to."""
+
+    def __init__(self) -> None:
+        self.now_ns = second(10.0)
+
+    def __call__(self) -> int:
+        return self.now_ns
+
+
+@pytest.fixture
+def clock(monkeypatch: pytest.MonkeyPatch) -> Hand:
+    hand = Hand()
+    monkeypatch.setattr("companion.guardian.guardian.monotonic_ns", hand)
+    return hand
+
+
+def test_a_guardian_whose_thread_is_gone_withholds_and_whoever_asks_tells(clock: Hand) -> None:
+    """Its last findings stood for ever: fixes passed, and neither health nor a text said a word."""
+    bridge: Any = Faulty(Flight(monitor()))
+    guardian = Guardian(GuardianConfig(), Limits(), bridge)
+    guardian.turn()
+    clock.now_ns += second(1.9)  # a busy computer
+    assert guardian.judge(FIX) is not None
+    clock.now_ns += second(0.2)
+    assert guardian.judge(FIX) is None
+    assert bridge.said == [(3, "PiLoT: withheld: guardian failed")]
+    assert guardian.reason == "withheld: guardian failed"
+    assert (guardian.level, guardian.standing()) == (None, {})
+    clock.now_ns += second(10.0)
+    guardian.judge(FIX)
+    assert len(bridge.said) == 2
+    guardian.turn()  # it was only asleep
+    assert guardian.judge(FIX) is not None
+    clock.now_ns += second(1.5)
+    guardian.turn()
+    clock.now_ns += second(1.6)
+    guardian.turn()
+    assert [text for _, text in bridge.said[2:]] == ["PiLoT: over: guardian failed"]
+
+
+def test_a_guardian_that_hangs_under_its_lock_hangs_nobody_else(clock: Hand) -> None:
+    """The localization thread waited for it for ever, and the health behind it."""
+    stuck, on = threading.Event(), threading.Event()
+    bridge: Any = Faulty(Flight(monitor()))
+
+    def hangs(time_ns: int) -> tuple[InertialSample, ...]:
+        stuck.set()
+        on.wait()
+        return ()
+
+    bridge.inertial_since = hangs
+    guardian = Guardian(GuardianConfig(), Limits(), bridge)
+    guardian.start()
+    try:
+        assert stuck.wait(30.0)
+        clock.now_ns += second(2.5)
+        assert guardian.judge(FIX) is None
+        assert guardian.reason == "withheld: guardian failed"
+        assert bridge.said == [(3, "PiLoT: withheld: guardian failed")]
+    finally:
+        on.set()
+        guardian.stop()
+
+
+def test_a_health_monitor_that_stands_is_told_again_as_long_as_it_does(clock: Hand) -> None:
+    """Its last level went out with every heartbeat, for ever."""
+    bridge: Any = Faulty(Flight(monitor()))
+    guardian = Guardian(GuardianConfig(), Limits(), bridge)
+    turned_ns = clock.now_ns
+    guardian.watch(lambda: {"health": turned_ns})
+    for _ in range(39):
+        guardian.turn()
+        clock.now_ns += second(0.1)
+    assert bridge.said == []
+    for _ in range(112):
+        clock.now_ns += second(0.1)
+        guardian.turn()
+    assert [text for _, text in bridge.said] == [
+        "PiLoT: health stands 4 s", "PiLoT: health stands 14 s"
+    ]  # fmt: skip
+    guardian.watch(lambda: {"health": clock.now_ns})
+    for _ in range(32):
+        clock.now_ns += second(0.1)
+        guardian.turn()
+    assert [text for _, text in bridge.said[2:]] == ["PiLoT: over: part stands"]
