@@ -69,6 +69,22 @@ def test_what_the_safety_page_names_exists_and_each_finding_is_on_it():
         assert words in operator, rule.name
 
 
+def test_every_leaf_of_the_hazard_analysis_has_its_test_and_each_test_exists():
+    page = (ROOT / "docs/safety.md").read_text(encoding="utf-8")
+    rows = [line.split("|") for line in page.splitlines() if line.startswith("| ")]
+    leaves = [r for r in rows if len(r) == 8 and not r[1].strip().startswith(("**", "leaf"))]
+    known = {p.stem for p in (ROOT / "tests").rglob("test_*.py")}
+    known |= {p.stem for p in (ROOT / "sitl/scenarios").rglob("*.yaml")}
+    known |= {"benchmarks." + p.name for p in (ROOT / "benchmarks").iterdir()}
+    known |= {
+        f"benchmarks.calibration.{p.stem}" for p in (ROOT / "benchmarks/calibration").iterdir()
+    }
+    held = {r[1].strip(): set(re.findall(r"`([^`]+)`", r[4])) for r in leaves}
+    assert len(held) > 30
+    assert [leaf for leaf, names in held.items() if not names] == []
+    assert set().union(*held.values()) - known == set()
+
+
 def test_the_readme_is_read_as_text_too():
     lines = (ROOT / "README.md").read_text(encoding="utf-8").splitlines()
     assert max(map(len, lines)) <= 120

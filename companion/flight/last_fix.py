@@ -26,7 +26,7 @@ from companion.flight.priors import AutopilotPose, drift_sigma_m
 from localizer.geometry.geo import NED_FROM_ENU
 from localizer.geometry.pose import Pose
 from localizer.types import PoseEstimate, PosePrior, ReferenceBundle, TrackingState
-from mavlink_bridge.whole_file import replace_whole
+from mavlink_bridge.whole_file import read_whole, replace_whole
 
 _log = logging.getLogger(__name__)
 _WRITE_S = 0.5
@@ -70,7 +70,7 @@ def read_last_fix(path: Path, boot: str) -> LastFix | None:
         if status.st_uid != os.geteuid() or status.st_mode & 0o022:
             _log.warning("%s may be written by others: ignored", path)
             return None
-        row = json.loads(path.read_text(encoding="utf-8")[:1000])
+        row = json.loads(read_whole(path))
         north, east, down = (float(v) for v in row["local_ned"])
         found = LastFix(
             str(row["boot"]), int(row["time_ns"]), float(row["latitude_deg"]),

@@ -119,7 +119,7 @@ class DetectionListener:
         self._on_detection = on_detection
         self._stop = threading.Event()
         self.received = 0
-        self.rejected = 0
+        self.rejected = self.failed = 0
         self._thread = threading.Thread(target=self._run, name="detections")
         self._thread.start()
 
@@ -144,4 +144,9 @@ class DetectionListener:
                     _log.warning("targets.detections: %s", error)
                 continue
             self.received += 1
-            self._on_detection(detection, name)
+            try:
+                self._on_detection(detection, name)
+            except Exception:  # one detection's fault; the door stays open for the others
+                self.failed += 1
+                if self.failed == 1:
+                    _log.exception("targets.detections: a detection could not be taken")

@@ -14,19 +14,24 @@ import cv2
 import numpy as np
 from pyproj import CRS, Transformer
 from pyproj.exceptions import ProjError
+from rasterio.enums import ColorInterp, Resampling
 from rasterio.errors import RasterioError
 from rasterio.io import DatasetReader
+from rasterio.windows import Window
 
 from localizer.errors import MapSourceError
 from localizer.geometry.geo import LocalFrame
 from localizer.geometry.pose import Array
-from localizer.map.importers.raster_file import offline, open_raster
+from localizer.map.importers.height_crs import stated_heights
+from localizer.map.importers.raster_file import HeightBand, height_band, offline, open_raster
+from localizer.map.importers.rules import DEFAULT_RULES, HIGHEST_M, LOWEST_M
 from localizer.types import Float32
 
 _REACH_M = 20_000.0  # from the map's origin
 _MOST_CELLS = 2_000  # of a side
 _LEAST_CELL_M = 5.0
 _MOST_PIXELS = 100_000_000
+_STEEP, _STEEP_SHARE = 5.7, 0.25  # 80 degrees in so many cells is noise, as in a surface model
 _EARTH_M = 6.371e6
 _OUTLINE = 9  # places per side of the raster, to find its box
 
@@ -60,7 +65,7 @@ class TerrainGrid:
 def open_terrain(path: Path, frame: LocalFrame) -> TerrainGrid:
     """The part of a GeoTIFF of heights that lies within 20 km of a map's origin.
 
-    MapSourceError: no such raster, no coordinate system, or nothing known there.
+    MapSourceError: no such raster, no coordinate system, nothing known there, or no heights.
     """
     with offline():
         try:
@@ -73,8 +78,7 @@ def open_terrain(path: Path, frame: LocalFrame) -> TerrainGrid:
 def _read(raster: DatasetReader, path: Path, frame: LocalFrame) -> TerrainGrid:
     if raster.crs is None:
         raise MapSourceError(f"{path}: no coordinate system: a terrain model needs one")
-    if raster.width * raster.height > _MOST_PIXELS:
-        raise MapSourceError(f"{path}: more than {_MOST_PIXELS:.0e} pixels: cut it to the area")
+    band = _band(raster, path)
     there = Transformer.from_crs("EPSG:4326", CRS.from_user_input(raster.crs), always_xy=True)
     low, high = _box(raster, there, frame)
     if not (low < high).all():
@@ -91,17 +95,72 @@ def _read(raster: DatasetReader, path: Path, frame: LocalFrame) -> TerrainGrid:
     latitude, longitude, _ = np.moveaxis(frame.geodetic_from_enu(flat), -1, 0)
     x, y = there.transform(longitude, latitude)
     u, v = ~raster.transform * (np.asarray(x), np.asarray(y))
-    band = raster.read(1, masked=True).astype(np.float32).filled(np.nan)
-    heights = cv2.remap(
-        band, (u - 0.5).astype(np.float32), (v - 0.5).astype(np.float32), cv2.INTER_LINEAR,
-        borderMode=cv2.BORDER_CONSTANT, borderValue=float("nan"),
-    )  # fmt: skip
+    heights = _heights(raster, path, band, np.asarray(u), np.asarray(v))
     known = np.isfinite(heights)
     if not known.any():
         raise MapSourceError(f"{path}: no height is known within {_REACH_M / 1e3:.0f} km")
+    _require_ground(path, heights, cell_m)
     filled = np.where(known, heights, np.median(heights[known]))
     height = filled - frame.origin.height_m - fallen
     return TerrainGrid(height.astype(np.float32), float(low[0]), float(high[1]), cell_m)
+
+
+def _band(raster: DatasetReader, path: Path) -> HeightBand:
+    """How the raster's numbers become metres; colours and phases are no heights."""
+    colours = (ColorInterp.red, ColorInterp.palette)
+    if raster.count >= 3 or raster.colorinterp[0] in colours:
+        raise MapSourceError(f"{path}: a picture, not heights: {raster.count} bands of colours")
+    if np.dtype(raster.dtypes[0]).kind == "c":
+        raise MapSourceError(f"{path}: complex numbers are no heights")
+    crs = CRS.from_user_input(raster.crs)
+    stated = stated_heights(crs, raster.units[0], path)
+    return height_band(path, raster, stated, None, None, DEFAULT_RULES)[0]
+
+
+def _heights(raster: DatasetReader, path: Path, band: HeightBand, u: Array, v: Array) -> Float32:
+    """Metres at places of the raster (rows, columns), pixels; only what lies about them is read."""
+    left, top = (int(np.clip(np.floor(a.min()) - 1, 0, n - 1)) for a, n in _sides(raster, u, v))
+    right, bottom = (int(np.clip(np.ceil(a.max()) + 1, 1, n)) for a, n in _sides(raster, u, v))
+    width, height = max(right - left, 1), max(bottom - top, 1)
+    if width * height > _MOST_PIXELS:
+        raise MapSourceError(
+            f"{path}: more than {_MOST_PIXELS:.0e} pixels within {_REACH_M / 1e3:.0f} km: make it "
+            "coarser"
+        )
+    shape = min(height, 2 * u.shape[0]), min(width, 2 * u.shape[1])
+    read = raster.read(
+        1, window=Window(left, top, width, height), out_shape=shape, masked=True,
+        out_dtype=np.float32, resampling=Resampling.average,
+    )  # fmt: skip
+    metres = np.asarray(band.metres(read.filled(np.nan)), np.float32)
+    x, y = (u - left) * (shape[1] / width) - 0.5, (v - top) * (shape[0] / height) - 0.5
+    found: Float32 = cv2.remap(
+        metres, x.astype(np.float32), y.astype(np.float32), cv2.INTER_LINEAR,
+        borderMode=cv2.BORDER_CONSTANT, borderValue=float("nan"),
+    )  # fmt: skip
+    return found
+
+
+def _sides(raster: DatasetReader, u: Array, v: Array) -> tuple[tuple[Array, int], ...]:
+    return (u, raster.width), (v, raster.height)
+
+
+def _require_ground(path: Path, heights: Float32, cell_m: float) -> None:
+    """The odometry would believe any number: missing ones that are not marked, noise."""
+    known = heights[np.isfinite(heights)]
+    low, high = float(known.min()), float(known.max())
+    if low < LOWEST_M or high > HIGHEST_M:
+        raise MapSourceError(
+            f"{path}: heights from {low:.4g} to {high:.4g} m occur nowhere on Earth: missing ones "
+            "that are not marked so (gdal_edit -a_nodata), or another unit (gdal_edit -units)"
+        )
+    marked = np.where(np.isfinite(heights), heights, np.nan)
+    rises = np.abs(np.diff(marked, axis=1)) / cell_m
+    rises = rises[np.isfinite(rises)]
+    if len(rises) and float((rises > _STEEP).mean()) >= _STEEP_SHARE:
+        raise MapSourceError(
+            f"{path}: a quarter of its cells rise by more than 80 degrees: noise, or no heights"
+        )
 
 
 def _box(raster: DatasetReader, there: Transformer, frame: LocalFrame) -> tuple[Array, Array]:

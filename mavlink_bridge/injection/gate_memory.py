@@ -15,7 +15,7 @@ import time
 from collections.abc import Callable
 from pathlib import Path
 
-from mavlink_bridge.whole_file import replace_whole
+from mavlink_bridge.whole_file import read_whole, replace_whole
 
 _log = logging.getLogger(__name__)
 _OLDEST_S = 600.0
@@ -50,7 +50,7 @@ class GateMemory:
             if not private or status.st_uid != os.geteuid():
                 _log.warning("%s is not this user's alone (mode 0600): ignored", self._path)
                 return None
-            content = json.loads(self._path.read_text(encoding="utf-8")[:1000])
+            content = json.loads(read_whole(self._path))
             age_s = self._wall_s() - float(content["utc_s"])
             opened, channel = content["open"] is True, content["by_channel"] is True
         except FileNotFoundError:

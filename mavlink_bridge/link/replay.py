@@ -12,12 +12,13 @@ import logging
 import threading
 from pathlib import Path
 
-from mavlink_bridge.whole_file import replace_whole
+from mavlink_bridge.whole_file import read_whole, replace_whole
 
 _log = logging.getLogger(__name__)
 
 _LEASE = 200_000  # 10 us ticks: 2 s
 _MAX_SIZE = 1 << 20
+_NO_STAMP = 1 << 47  # of 48 bits; the half of them last until 2059
 
 Stream = tuple[int, int, int]
 """Link id, system, component of a signed frame."""
@@ -88,12 +89,11 @@ class ReplayWindow:
 
     def _read(self) -> dict[Stream, int]:
         try:
-            with self._path.open(encoding="ascii") as file:
-                document = json.loads(file.read(_MAX_SIZE))
-            return {_stream(key): int(stamp) for key, stamp in document.items()}
+            document = json.loads(read_whole(self._path, _MAX_SIZE))
+            return {_stream(key): _stamp(stamp) for key, stamp in document.items()}
         except FileNotFoundError:
             return {}
-        except (OSError, ValueError, AttributeError, TypeError) as error:
+        except (OSError, ValueError, AttributeError, TypeError, RecursionError) as error:
             _log.warning(
                 "%s: unreadable (%s): begun anew, messages from before can be repeated once",
                 self._path, error,
@@ -103,4 +103,13 @@ class ReplayWindow:
 
 def _stream(key: str) -> Stream:
     link, system, component = (int(part) for part in key.split(":"))
+    if not all(0 <= part <= 255 for part in (link, system, component)):
+        raise ValueError(f"{key} names no stream")
     return link, system, component
+
+
+def _stamp(given: object) -> int:
+    """A stamp that a frame can carry: our own would begin beyond it, and none could be packed."""
+    if not isinstance(given, int) or isinstance(given, bool) or not 0 <= given < _NO_STAMP:
+        raise ValueError(f"{str(given)[:40]} is no stamp of a frame")
+    return given

@@ -26,14 +26,11 @@ from rasterio.errors import RasterioError
 from rasterio.io import DatasetReader
 from rasterio.vrt import WarpedVRT
 
-from localizer.errors import GeoreferenceError, MapSourceError
+from localizer.errors import MapSourceError
 from localizer.geometry.pose import Array
 from localizer.map.importers.georeference import ecef_from_crs
 from localizer.map.importers.height_crs import (
-    StatedHeights,
-    horizontal_unit_m,
     stated_heights,
-    unit_of,
 )
 from localizer.map.importers.heightmesh import ERROR_PER_STEP, height_mesh
 from localizer.map.importers.raster_checks import (
@@ -47,6 +44,7 @@ from localizer.map.importers.raster_file import (
     colour_bands,
     has_own_mask,
     has_separate_mask,
+    height_band,
     inside,
     offline,
     open_raster,
@@ -207,7 +205,7 @@ def _read_rasters(
     dsm, ortho, doubts = _told_apart(paths, rules)
     with open_raster(dsm) as heights, open_raster(ortho) as colours:
         stated = stated_heights(CRS(heights.crs), heights.units[0], dsm)
-        band, warnings = _height_band(dsm, heights, stated, height_unit, nodata, rules)
+        band, warnings = height_band(dsm, heights, stated, height_unit, nodata, rules)
         warnings += doubts + check_heights(dsm, heights, band, rules)
         warnings += check_overlap(heights, band, colours, rules)
         bands = colour_bands(ortho, colours)
@@ -231,44 +229,6 @@ def _read_rasters(
     return SourceTree(
         node, centre, None, "", files, stated.datum, options, stated.crs, tuple(warnings)
     )
-
-
-def _height_band(
-    path: Path,
-    data: DatasetReader,
-    stated: StatedHeights,
-    height_unit: str | None,
-    nodata: float | None,
-    rules: ImportRules,
-) -> tuple[HeightBand, list[str]]:
-    """How the DSM's numbers become metres; a unit that nothing tells is an error."""
-    unit, warnings = stated.unit_m, []
-    if height_unit is not None:
-        given = unit_of(height_unit)
-        if unit is not None and abs(given / unit - 1) > 1e-4:
-            warnings.append(
-                rules.doubt(
-                    "datum",
-                    f"{path}: --height-unit {height_unit}, but the file says units of {unit:g} m",
-                )
-            )
-        unit = given
-    if unit is None:
-        if horizontal_unit_m(CRS(data.crs)) != 1.0:
-            raise GeoreferenceError(
-                f"{path}: its CRS is in feet and it does not say whether its heights are; give "
-                "--height-unit m, ft or us-ft"
-            )
-        unit = 1.0
-    gain, offset = float(data.scales[0] or 1.0), float(data.offsets[0])
-    if not (math.isfinite(gain) and gain > 0 and math.isfinite(offset)):
-        raise MapSourceError(
-            f"{path}: its band's scale {gain:g} and offset {offset:g} make no heights of its "
-            "numbers; correct them (gdal_edit -scale -offset)"
-        )
-    if nodata is not None and data.nodata is not None and nodata != data.nodata:
-        warnings.append(f"{path.name}: --nodata {nodata:g} instead of its own {data.nodata:g}")
-    return HeightBand(gain * unit, offset * unit, nodata), warnings
 
 
 class _Tree:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -20,7 +21,13 @@ from rasterio.io import DatasetReader
 
 from localizer.errors import GeoreferenceError, MapSourceError
 from localizer.geometry.pose import Array
-from localizer.map.importers.height_crs import datum_doubt, far_outside
+from localizer.map.importers.height_crs import (
+    StatedHeights,
+    datum_doubt,
+    far_outside,
+    horizontal_unit_m,
+    unit_of,
+)
 from localizer.map.importers.rules import ImportRules, require_plain_file
 
 _TIFF = (b"II*\0", b"MM\0*", b"II+\0", b"MM\0+")
@@ -213,3 +220,41 @@ class HeightBand:
 
 
 METRES = HeightBand()
+
+
+def height_band(
+    path: Path,
+    data: DatasetReader,
+    stated: StatedHeights,
+    height_unit: str | None,
+    nodata: float | None,
+    rules: ImportRules,
+) -> tuple[HeightBand, list[str]]:
+    """How the DSM's numbers become metres; a unit that nothing tells is an error."""
+    unit, warnings = stated.unit_m, []
+    if height_unit is not None:
+        given = unit_of(height_unit)
+        if unit is not None and abs(given / unit - 1) > 1e-4:
+            warnings.append(
+                rules.doubt(
+                    "datum",
+                    f"{path}: --height-unit {height_unit}, but the file says units of {unit:g} m",
+                )
+            )
+        unit = given
+    if unit is None:
+        if horizontal_unit_m(CRS(data.crs)) != 1.0:
+            raise GeoreferenceError(
+                f"{path}: its CRS is in feet and it does not say whether its heights are; give "
+                "--height-unit m, ft or us-ft"
+            )
+        unit = 1.0
+    gain, offset = float(data.scales[0] or 1.0), float(data.offsets[0])
+    if not (math.isfinite(gain) and gain > 0 and math.isfinite(offset)):
+        raise MapSourceError(
+            f"{path}: its band's scale {gain:g} and offset {offset:g} make no heights of its "
+            "numbers; correct them (gdal_edit -scale -offset)"
+        )
+    if nodata is not None and data.nodata is not None and nodata != data.nodata:
+        warnings.append(f"{path.name}: --nodata {nodata:g} instead of its own {data.nodata:g}")
+    return HeightBand(gain * unit, offset * unit, nodata), warnings

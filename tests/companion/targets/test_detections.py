@@ -1,4 +1,5 @@
 import socket
+import threading
 import time
 
 import pytest
@@ -64,3 +65,28 @@ def test_listener_survives_garbage():
         listener.close()
     assert got == [Detection("a", 1, 2.0, 3.0)]
     assert listener.rejected == 1
+
+
+def test_what_fails_on_one_detection_does_not_close_the_door():
+    """Its thread ended without a word, and every later detection was lost."""
+    got, came = [], threading.Event()
+
+    def take(detection, name):
+        if detection.target_id == "bad":
+            raise RuntimeError("a part's fault")
+        got.append(detection.target_id)
+        came.set()
+
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sender:
+        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as free:
+            free.bind(("127.0.0.1", 0))
+            port = free.getsockname()[1]
+        listener = DetectionListener(f"127.0.0.1:{port}", take)
+        try:
+            for name in ("bad", "good"):
+                one = encode_detection(Detection(name, 1, 2.0, 3.0))
+                sender.sendto(one, ("127.0.0.1", port))
+            assert came.wait(30.0)
+        finally:
+            listener.close()
+    assert (got, listener.failed) == (["good"], 1)

@@ -63,3 +63,52 @@ def test_no_raster_is_named(tmp_path):
     path.write_bytes(b"no tiff")
     with pytest.raises(MapSourceError, match=r"t\.tif"):
         open_terrain(path, FRAME)
+
+
+HILL = np.linspace(600.0, 640.0, 72 * 72).reshape(72, 72)
+
+
+def other(path: Path, data: np.ndarray, step=(STEP, STEP), **tags):
+    bands = data if data.ndim == 3 else data[None]
+    profile = {
+        "driver": "GTiff", "width": bands.shape[2], "height": bands.shape[1],
+        "count": bands.shape[0], "dtype": bands.dtype, "crs": "EPSG:4326",
+        "transform": from_origin(7.99, 47.01, *step),
+    }  # fmt: skip
+    with rasterio.open(path, "w", **profile) as out:
+        out.write(bands)
+        for name, value in tags.items():
+            setattr(out, name, (value,))
+    return path
+
+
+@pytest.mark.parametrize(
+    ("data", "why"),
+    [
+        (np.full((3, 72, 72), 90, np.uint8), "a picture"),
+        (HILL.astype(np.complex64), "complex"),
+        (np.where(HILL < 610.0, -9999.0, HILL), "nowhere on Earth"),
+        (np.full((72, 72), 1e30), "nowhere on Earth"),
+        (np.random.default_rng(1).uniform(0.0, 3000.0, (72, 72)), "80 degrees"),
+    ],
+)
+def test_what_holds_no_heights_is_no_ground(tmp_path, data, why):
+    """Each was taken for the shape of the ground, and odometry off the map was wrong by it."""
+    with pytest.raises(MapSourceError, match=why):
+        open_terrain(other(tmp_path / "t.tif", data), FRAME)
+
+
+@pytest.mark.parametrize(
+    ("data", "tags"),
+    [(HILL * 100.0, {"scales": 0.01}), (HILL / 0.3048, {"units": "ft"})],
+)
+def test_scale_and_unit_are_honoured(tmp_path, data, tags):
+    found = open_terrain(other(tmp_path / "t.tif", data, **tags), FRAME).heights
+    assert np.ptp(found) < 45.0
+
+
+def test_a_raster_wider_than_opencv_takes_is_read(tmp_path):
+    """It ended in OpenCV's own assertion at the start."""
+    wide = np.full((60, 40_000), 600.0, np.float32)
+    path = other(tmp_path / "t.tif", wide, step=(STEP / 40, STEP))
+    assert np.ptp(open_terrain(path, FRAME).heights) < 40.0  # of the Earth's curve
