@@ -10,6 +10,7 @@ from localizer.geometry.pose import Array
 
 REDUCTION = 0.5  # share of triangles that simplification takes away above the finest level
 _KEPT_SHARE = 0.99  # of the ground that simplification must leave covered
+_REACH = 6.0  # grid steps about a tile's corner in which simplification may have cut it off
 # Detail limits are set for photogrammetric tilesets, whose stated error is several times the step
 # of their grid; a height field's is put on the same scale.
 ERROR_PER_STEP = 2.0
@@ -43,7 +44,10 @@ def height_mesh(
     points = np.stack([gx * step[0], -gy * step[1], np.where(known, heights.data, 0.0)], -1)
     used, index = np.unique(faces, return_inverse=True)
     points, faces = points.reshape(-1, 3)[used], index.reshape(-1, 3)
+    ends = np.flatnonzero(np.isin(used, (0, n, n * (n + 1), (n + 1) ** 2 - 1)))
+    corners = points[ends]
     points, faces = _simplified(points, faces, lossless)
+    points, faces = _with_corners(points, faces, corners, reach=_REACH * max(step))
     extent = (n * step[0], n * step[1])
     return _skirted(points, faces.astype(np.int32), extent, depth=2 * max(step))
 
@@ -61,6 +65,32 @@ def _simplified(
     if len(kept) == 0 or _covered(out, kept) < _KEPT_SHARE * _covered(local, faces):
         return points, faces
     return np.asarray(out, np.float64) + base, np.asarray(kept)
+
+
+def _with_corners(
+    points: Array, faces: NDArray[np.integer], corners: Array, reach: float
+) -> tuple[Array, NDArray[np.integer]]:
+    """With the tile's corners (K, 3) where simplification cut them off.
+
+    It draws a corner's vertex along the border; the neighbours' likewise, so that where four tiles
+    meet the ground had a hole of one to two steps. The edges of the rim within `reach` metres that
+    turn their outer side to the corner are joined with it.
+    """
+    sides = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
+    _, first, count = np.unique(
+        np.sort(sides, axis=1), axis=0, return_index=True, return_counts=True
+    )
+    rim = sides[first[count == 1]]
+    for corner in corners:
+        a, b = points[rim[:, 0], :2] - corner[:2], points[rim[:, 1], :2] - corner[:2]
+        away = np.stack([np.abs(a).max(axis=1), np.abs(b).max(axis=1)], 1)
+        if away.min() < 1e-3 * reach:
+            continue  # its vertex is still there
+        outer = a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0] < 0.0
+        cut = rim[outer & (away.max(axis=1) < reach)]
+        joined = np.stack([cut[:, 1], cut[:, 0], np.full(len(cut), len(points))], 1)
+        points, faces = np.concatenate([points, corner[None]]), np.concatenate([faces, joined])
+    return points, faces
 
 
 def _covered(points: NDArray[np.floating], faces: NDArray[np.integer]) -> float:
