@@ -3,14 +3,15 @@ printed, and the same flight without a page.
 
     python -m benchmarks.console.browser [--rounds 1] [--out FILE.json] [--screens FOLDER]
 
-Each round flies `python -m sitl demo` twice, once with the page open. From the page: seconds from
-the printed address to the page, its first picture and the first position; age of each picture when
-the frame that shows it has been painted, exposure and paint on this machine's clock; what a hint
-and the doctor, pressed in the page, were answered; what it complained of and whom it asked. From
-each flight's report: rate, latency and accuracy of the localizer. Needs Chromium and playwright
-(the extra `dev`). The browser runs already when the address comes. It shares the processors with
-the flight (--browser-nice lower in priority); its map is drawn by the processor, too, which no
-operator's machine does.
+Each round flies `python -m sitl demo` without a page, with a client that takes and decodes what a
+page gets (`benchmarks.console`), and with the page open; latency and rate of the localizer are
+those of the same 45 s without GNSS. From the page: seconds from the printed address to the page,
+its first picture and the first position; age of each picture when the frame that shows it has been
+painted, exposure and paint on this machine's clock; what a hint and the doctor, pressed in the
+page, were answered; what it complained of and whom it asked. From each flight's report: rate,
+latency and accuracy of the localizer. Needs Chromium and playwright (the extra `dev`). The browser
+runs already when the address comes. It shares the processors with the flight (--browser-nice lower
+in priority); its map is drawn by the processor, too, which no operator's machine does.
 """
 
 from __future__ import annotations
@@ -28,8 +29,11 @@ import time
 from pathlib import Path
 from typing import Any, Literal
 
+import numpy as np
+
 from benchmarks.common.arguments import Parser, existing, output, whole
 from benchmarks.common.named_errors import named_errors
+from benchmarks.console.__main__ import Page
 from benchmarks.console.chromium import (
     NOTE_AGES,
     ages,
@@ -40,8 +44,10 @@ from benchmarks.console.chromium import (
 )
 from benchmarks.console.limits import LIMITS
 from companion.errors import ReportError
+from companion.offline.tables import read_columns
 
-Condition = Literal["no page", "one page"]
+Condition = Literal["no page", "light client", "one page"]
+CONDITIONS: tuple[Condition, ...] = ("no page", "light client", "one page")
 SHORT = Path(__file__).with_name("short.yaml")
 _ADDRESS = re.compile(r"watch it: (http://\S+)")
 _PATIENCE_S = 420.0
@@ -202,6 +208,7 @@ def watch(demo: Demo, browser: Any, screens: Path | None, cost: ConsoleCost) -> 
         for kind, now in browser_used_s().items()
     }
     told["link_percent"], told["console_percent"] = share * link_s, cost.percent(begun_s, ended_s)
+    told["watched_s"] = begun_s, ended_s
     told |= _ages(page.evaluate("window.measured"))
     told["problems"] = problems(told)
     told["mission_points"] = page.evaluate("window.consoleMap?.missionLength ?? 0")
@@ -214,6 +221,27 @@ def watch(demo: Demo, browser: Any, screens: Path | None, cost: ConsoleCost) -> 
     told["only_itself"] = hosts == {address.split("/")[2]}
     demo.wait()
     page.close()
+    return told
+
+
+def listen(demo: Demo, cost: ConsoleCost) -> dict[str, Any]:
+    """What a client gets, decoded, as long as `watch` looks at the page."""
+    begun, address = demo.wait_for_address()
+    page = Page(address.split("/")[2], pictures=True)
+    page.start()
+    _wait(demo, lambda: bool(page.measured and page.link_s), "picture")
+    told: dict[str, Any] = {"first_picture_s": time.monotonic() - begun}
+    _wait(demo, lambda: demo.has_said(_DENIED), "flight without GNSS")
+    page.forget()
+    link_s, begun_s = page.link_s[-1], time.monotonic()
+    time.sleep(_WATCHED_S)
+    ended_s = time.monotonic()
+    told["link_percent"] = 100.0 * (page.link_s[-1] - link_s) / (ended_s - begun_s)
+    told["console_percent"] = cost.percent(begun_s, ended_s)
+    told["watched_s"] = begun_s, ended_s
+    told |= _ages(list(page.measured))
+    page.end()
+    demo.wait()
     return told
 
 
@@ -255,11 +283,15 @@ def _opened(page: Any, address: str, demo: Demo) -> int:
 
 
 def _until(page: Any, demo: Demo, holds: Any, what: str) -> None:
+    _wait(demo, holds, what, lambda: page.wait_for_timeout(100))
+
+
+def _wait(demo: Demo, holds: Any, what: str, pause: Any = lambda: time.sleep(0.1)) -> None:
     end = time.monotonic() + _OPEN_S
     while not holds():
         if time.monotonic() > end or demo.is_over:
             raise ReportError(f"the page showed no {what}: {demo.tail()}")
-        page.wait_for_timeout(100)
+        pause()
 
 
 def _ages(shown: list[list[float]]) -> dict[str, float]:
@@ -310,15 +342,20 @@ def _pictures(page: Any, demo: Demo, folder: Path) -> None:
     page.set_viewport_size({"width": 1280, "height": 800})
 
 
-def quality(folder: Path) -> dict[str, Any]:
-    """The localizer's figures of a flight's report."""
+def quality(folder: Path, begun_s: float, ended_s: float) -> dict[str, Any]:
+    """The localizer's figures: latency and rate between two times (monotonic), in which nothing but
+    the condition differs, the others of the whole flight's report.
+    """
     report = json.loads((folder / "report.json").read_text())["report"]
     latency, error = report["stages_ms"].get("latency") or {}, report["localizer_m"]
+    columns = read_columns(folder / "companion" / "estimates.csv", ("state", "status"))
+    exposed_s = columns["exposure_time_ns"] * 1e-9
+    watched = columns["latency_ms"][(exposed_s >= begun_s) & (exposed_s <= ended_s)]
     return {
         # As `benchmarks.console` names them: `benchmarks.console.table` joins both.
-        "localized_per_s": report["localizer"]["fps"],
-        "latency_p50_ms": latency.get("median"),
-        "latency_p95_ms": latency.get("p95"),
+        "localized_per_s": len(watched) / (ended_s - begun_s),
+        "latency_p50_ms": float(np.percentile(watched, 50)),
+        "latency_p95_ms": float(np.percentile(watched, 95)),
         "error_median_m": error["median"],
         "error_p95_m": error["p95"],
         "localizer": report["localizer"],
@@ -345,14 +382,18 @@ def fly(condition: Condition, options: Any) -> dict[str, Any]:
                     browser = opened_browser(driver, options.browser_nice)
                     told |= watch(demo, browser, options.screens, cost)
                     browser.close()
+            elif condition == "light client":
+                told |= listen(demo, cost)
             else:
-                begun_s, _ = demo.wait_for_address()
+                _wait(demo, lambda: demo.has_said(_DENIED), "flight without GNSS")
+                begun_s = time.monotonic()
+                told["watched_s"] = begun_s, begun_s + _WATCHED_S
                 demo.wait()
-                told["console_percent"] = cost.percent(begun_s, time.monotonic())
+                told["console_percent"] = cost.percent(*told["watched_s"])
             begun = demo.lines[0][0] if demo.lines else 0.0
             told["said"] = [f"{at - begun:.1f} {text}" for at, text in demo.lines]
             print(json.dumps(told), file=sys.stderr, flush=True)  # whatever the report lacks
-            return told | quality(demo.report)
+            return told | quality(demo.report, *told["watched_s"])
     finally:
         cost.end()
         if options.keep is not None:
@@ -366,7 +407,7 @@ def main() -> None:
     """Fly, print, write."""
     parser = Parser(__doc__)
     parser.add_argument("--rounds", type=whole(1, 20), default=1, help="flights of each condition")
-    parser.add_argument("--only", choices=("no page", "one page"), help="one condition")
+    parser.add_argument("--only", choices=CONDITIONS, help="one condition")
     parser.add_argument("--scenario", type=existing, default=SHORT, help="YAML")
     parser.add_argument("--seed", type=whole(0, 10_000), default=0, help="of world and errors")
     parser.add_argument("--fc", default="embedded", help="ardupilot or embedded")
@@ -375,11 +416,10 @@ def main() -> None:
     parser.add_argument("--keep", type=Path, help="folder for the flights' reports")
     parser.add_argument("--out", type=output, help="JSON file of all flights")
     options = parser.parse_args()
-    order: tuple[Condition, ...] = ("no page", "one page")
     runs = []
     for number in range(options.rounds):
         # There and back: what warms up, or other work that begins, is nobody's in particular.
-        for condition in order if number % 2 == 0 else order[::-1]:
+        for condition in CONDITIONS if number % 2 == 0 else CONDITIONS[::-1]:
             if options.only in (None, condition):
                 runs.append(fly(condition, options))
                 print(json.dumps(runs[-1]), flush=True)
