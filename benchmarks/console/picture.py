@@ -23,7 +23,7 @@ from typing import Any
 
 import numpy as np
 
-from benchmarks.common.arguments import Parser, number, output, whole
+from benchmarks.common.arguments import Parser, existing, number, output, whole
 from benchmarks.common.named_errors import named_errors
 from companion.console.flight_source import FlightSource
 from companion.console.pictures import page_message
@@ -52,6 +52,13 @@ _DOWN = Pose(np.diag([1.0, -1.0, -1.0]), np.array([0.0, 0.0, _HEIGHT_M]))
 _WIDTH_PX = 640
 _PATIENCE_S = 20.0
 _FASTEST_HZ = 15.0
+_ROWS = (
+    ("the link's thread in the flight, CPU ms", "flight_link_ms"),
+    ("the console takes it, CPU ms", "console_receive_ms"),
+    ("the console makes JPEG and edges, CPU ms", "console_make_ms"),
+    ("from given out to there, p50, ms", "way_p50_ms"),
+    ("from given out to there, p95, ms", "way_p95_ms"),
+)
 
 
 def give(pictures: int, hz: float, width_px: int) -> dict[str, float]:
@@ -176,6 +183,9 @@ def main() -> None:
     parser.add_argument("--hz", type=number(0.5, 100.0), default=10.0, help="of the flight")
     parser.add_argument("--width", type=whole(64, 4096), default=_WIDTH_PX, help="of the page, px")
     parser.add_argument("--take", type=Path, help="be the console of this socket (used by itself)")
+    parser.add_argument(
+        "--against", type=existing, nargs="+", default=[], help="what it wrote for another version"
+    )
     parser.add_argument("--out", type=output, help="JSON file")
     options = parser.parse_args()
     if options.take is not None:
@@ -185,7 +195,10 @@ def main() -> None:
     for name, value in told.items():
         print(f"{name:22}{value:10.3f}")
     if options.out is not None:
-        options.out.write_text(json.dumps(told, indent=1))
+        runs = [json.loads(path.read_text()) for path in options.against] + [told]
+        columns = ["of one picture", *(f"before, {k + 1}" for k in range(len(runs) - 1)), "now"]
+        rows = [[label, *(f"{run[key]:.2f}" for run in runs)] for label, key in _ROWS]
+        options.out.write_text(json.dumps({"columns": columns, "rows": rows} | told, indent=1))
 
 
 if __name__ == "__main__":
