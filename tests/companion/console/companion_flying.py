@@ -56,8 +56,13 @@ class Flight:
     sent: int = 0
 
     def __post_init__(self) -> None:
-        self.vehicle = VehicleState(connected=True, mode="GUIDED", system_id=1, armed=self.armed)
         origin = self.cache.frame.origin
+        self.vehicle = VehicleState(
+            connected=True, mode="GUIDED", system_id=1, armed=self.armed,
+            latitude_deg=origin.latitude_deg, longitude_deg=origin.longitude_deg,
+            gps_latitude_deg=origin.latitude_deg, gps_longitude_deg=origin.longitude_deg,
+            gps_fix_type=3,
+        )  # fmt: skip
         corners = [(0.0, 0.0), (0.0, 60.0), (60.0, 60.0)]
         places = [self.cache.frame.position([e, n, 0.0]) for e, n in corners]
         self.mission = tuple(

@@ -218,7 +218,8 @@ def test_without_a_gpu_the_map_is_drawn_seldom_and_all_at_once(page, flight):
     drawn = page.evaluate(
         "[...window.consoleMap.moving].filter(([, f]) => f.length).map(([k]) => k)"
     )
-    assert {"vision", "ellipse", "footprint", "mission"} <= set(drawn)
+    assert {"vision", "autopilot", "gnss", "ellipse", "footprint", "mission"} <= set(drawn)
+    assert len(page.evaluate("window.consoleMap.about.outline")) > 2  # the coverage
 
 
 def test_the_mission_is_drawn_and_one_that_changed_is_drawn_anew(page, flight):
