@@ -5,7 +5,8 @@ import { MapView } from "./map.js";
 import { VideoView } from "./video.js";
 
 const $ = (id) => document.getElementById(id);
-const page = { about: null, state: null, connected: false, earlier: [] };
+const page = { about: null, state: null, connected: false, earlier: [], heardAt: 0 };
+const SILENT_MS = 3000; // states come twice a second
 
 export async function ask(path, body) {
   const options = body === undefined ? {} : {
@@ -58,6 +59,10 @@ function showState() {
       ? "the console does not answer: it ended with the flight; `companion console` shows the records"
       : "the companion is not running; records, doctor and settings are at hand";
     if (!state) return;
+  } else if (silentMs() > SILENT_MS) {
+    header.dataset.level = "off";
+    $("word").textContent = "silent";
+    $("reason").textContent = `nothing heard for ${Math.round(silentMs() / 1000)} s: all here is as old`;
   } else {
     header.dataset.level = health.level ?? "off";
     const word = state.estimate?.state ?? health.level ?? "-";
@@ -83,6 +88,12 @@ function showState() {
   ]);
   $("figures").title = state.shadow?.line ?? "";
 }
+
+// A flight or console that hangs says nothing, and what it said last looks as good as new.
+function silentMs() {
+  return page.connected && !page.about?.replay ? performance.now() - page.heardAt : 0;
+}
+setInterval(() => { if (silentMs() > SILENT_MS) showState(); }, 500);
 
 // What happens, not what is allowed: lost, nothing is sent, whatever the gate says.
 function mode(name, injecting) {
@@ -251,6 +262,7 @@ function connect() {
     if (typeof data !== "string") { video.show(data).finally(() => { shown += 1; wish(); }); return; }
     const message = JSON.parse(data);
     Object.assign(page, { state: message.state, hello: message.about, connected: message.connected });
+    page.heardAt = performance.now();
     showState();
     if (!message.state) return;
     window.consoleLinkS = message.state.machine?.console_link_s;

@@ -4,6 +4,7 @@ import shutil
 import socket
 import subprocess
 import sys
+import threading
 from types import SimpleNamespace
 
 import numpy as np
@@ -220,6 +221,30 @@ def test_without_a_gpu_the_map_is_drawn_seldom_and_all_at_once(page, flight):
     )
     assert {"vision", "autopilot", "gnss", "ellipse", "footprint", "mission"} <= set(drawn)
     assert len(page.evaluate("window.consoleMap.about.outline")) > 2  # the coverage
+
+
+def test_a_flight_that_hangs_is_called_silent_and_what_it_does_then_is_shown(page, flight):
+    """What was told last would else look as good as new."""
+    page, seen = page
+    assert page.inner_text("#word").lower() == "tracking"
+    shown, over = flight.flight.shown, threading.Event()
+    told = shown.state
+
+    def hung(*arguments):
+        over.wait(60)
+        return told(*arguments)
+
+    shown.state = hung  # the link's own thread stands still, and with it all that the page gets
+    try:
+        _until(page, lambda: page.inner_text("#word").lower() == "silent")
+        assert "nothing heard for" in page.inner_text("#reason")
+    finally:
+        shown.state = told
+        over.set()
+    before = page.evaluate("window.consoleFrames")
+    _until(page, lambda: page.inner_text("#word").lower() == "tracking")
+    _until(page, lambda: page.evaluate("window.consoleFrames") > before + 1)
+    assert seen.errors == []
 
 
 def test_the_mission_is_drawn_and_one_that_changed_is_drawn_anew(page, flight):
