@@ -27,7 +27,7 @@ def export_command(
 ) -> None:
     """Write a record in a format that other programs open."""
     if not mcap:
-        raise ConfigError("say which format: --mcap")
+        raise ConfigError("say which format: --mcap, the only one so far; the .tlog needs none")
     console = Console()
     with shown_steps(console) as say:
         say(f"reading {record}")

@@ -107,7 +107,10 @@ def load_record(folder: Path, kept_share: float = _MIN_IMAGES) -> FlightRecord:
     except (
         OSError, ValueError, KeyError, TypeError, ArithmeticError, RecursionError, csv.Error
     ) as error:  # fmt: skip
-        raise RecordError(f"{folder}: not a flight's record: {error}") from error
+        raise RecordError(
+            f"{folder}: not a flight's record: {error}; give the folder that "
+            "`companion run` recorded (record.folder), or a demo's companion/"
+        ) from error
     if not estimates:
         raise RecordError(f"{folder}: holds no estimate; nothing was localized in that flight")
     missing = sum(not image_path(folder, e).is_file() for e in estimates)

@@ -93,10 +93,10 @@ def _verdicts(report: Report) -> str:
             f"{_cell(v.needed)}<td class=mark>{mark}</td></tr>"
         )
     missed = sum(not v.ok for v in report.verdicts)
-    head = "targets reached" if not missed else f"{missed} of {len(rows)} targets missed"
+    head = "all criteria held" if not missed else f"{missed} of {len(rows)} criteria missed"
     return _section(
         f"Verdict: {head}",
-        "<table><tr><th>target<th>found<th>needed<th></tr>" + "".join(rows) + "</table>",
+        "<table><tr><th>criterion<th>found<th>needed<th></tr>" + "".join(rows) + "</table>",
     )
 
 

@@ -45,7 +45,10 @@ def require_extra() -> None:
     try:
         import_module("companion.export.mcap_file")
     except ImportError as error:
-        raise ConfigError(f"install pilot-companion[mcap] to write MCAP: {error}") from error
+        raise ConfigError(
+            "MCAP needs its packages: pip install 'pilot-companion[mcap]' "
+            f"(in a checkout: .venv/bin/pip install '.[mcap]'): {error}"
+        ) from error
 
 
 def record_folder(folder: Path) -> Path:
@@ -66,11 +69,11 @@ def export_mcap(
     the number of rows written now and then. `RecordError` for a folder that is no record,
     `ReportError` where the file cannot be written.
     """
+    folder = record_folder(folder)
+    tables = read_record(folder)
     require_extra()
     from companion.export.mcap_file import McapFile
 
-    folder = record_folder(folder)
-    tables = read_record(folder)
     path = out or folder / MCAP_NAME
     _require_free(path)
     partial = path.with_name(f".{path.name}.part")

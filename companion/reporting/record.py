@@ -154,7 +154,10 @@ def read_record(folder: Path) -> RecordTables:
         targets = _table(folder / "targets.csv", ("target_id", "visibility"))
         events = _table(folder / "events.csv", ("level", "text"))
     except (OSError, UnicodeDecodeError) as error:
-        raise RecordError(f"{folder}: not a flight's record: {error}") from error
+        raise RecordError(
+            f"{folder}: not a flight's record: {error}; give the folder that "
+            "`companion run` recorded (record.folder), or a demo's companion/"
+        ) from error
     notes = []
     manifest, health = _document(folder / MANIFEST_NAME), _document(folder / "health.json")
     if not manifest:

@@ -24,8 +24,9 @@ _ADVICE = {
         "distortion or a shifted map",
     ),
     "localizer R@": Advice(
-        "too many frames are outright wrong or missing",
-        "when it happens: the timeline's states, then the worst overlays",
+        "frames are wrong or missing; as many as completeness lacks are missing, not wrong",
+        "frames_report.csv: a frame without an error has no position, one with a large error is "
+        "wrong; then the timeline at that time, and the worst overlays",
     ),
     "completeness": Advice(
         "frames were refused, so there was no position for them",

@@ -408,9 +408,9 @@ def print_report(report: FlightReport, folder: Path) -> None:
 
 def _verdict(report: FlightReport) -> Table:
     passed = all(c.ok for c in report.criteria)
-    table = Table(title="[green]targets reached" if passed else "[red]targets missed")
-    for column in ("target", "found", "needed", ""):
-        table.add_column(column, justify="left" if column in ("target", "") else "right")
+    table = Table(title="[green]criteria held" if passed else "[red]criteria missed")
+    for column in ("criterion", "found", "needed", ""):
+        table.add_column(column, justify="left" if column in ("criterion", "") else "right")
     for c in report.criteria:
         value, needed = compared(c.value, c.limit, c.unit, at_least=c.at_least)
         mark = "[green]ok" if c.ok else "[red]missed"

@@ -10,10 +10,16 @@ from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass, field, replace
 from urllib.parse import urljoin, urlsplit
 
-import urllib3
-
 from localizer.errors import MapFetchError
 from localizer.map.fetch.terms import require_allowed
+
+try:
+    import urllib3
+except ImportError as missing:
+    raise MapFetchError(
+        "fetching a map needs urllib3: pip install 'pilot-companion[fetch]' "
+        "(in a checkout: .venv/bin/pip install '.[fetch]')"
+    ) from missing
 
 _AGENT = "pilot-companion (map fetch)"
 _TRIES = 5
