@@ -27,11 +27,10 @@ class StopAskedError(Exception):
 
 
 def compared(candidates: list[PlaceCandidate], judged: list[Judged]) -> list[PlaceCandidate]:
-    """The candidates that an answer is held against: the best of the search, or all where it took
-    those farther down to find it.
+    """The candidates that an answer is held against: the best of the search, or as many as it took
+    to find it.
     """
-    few = _ROUNDS[-1]
-    return candidates if any(j.rank >= few for j in judged) else candidates[:few]
+    return candidates[: max(_ROUNDS[-1], *(j.rank + 1 for j in judged))]
 
 
 @dataclass
@@ -39,7 +38,8 @@ class Confirmation:
     """The candidates of one query while they are judged. Used once.
 
     sight: the frame as the tracker sees it; small: at the size of the screening. places: of the
-    candidates screened so far, judged: of those registered, by rank.
+    candidates screened so far; judged: of those registered, by rank; surrounded, finished: ranks of
+    those that were registered from all sides, and to the end.
     """
 
     verifier: Verifier
@@ -52,15 +52,22 @@ class Confirmation:
     places: list[Aligned] = field(default_factory=list)
     judged: dict[int, Judged] = field(default_factory=dict)
     surrounded: set[int] = field(default_factory=set)
+    finished: set[int] = field(default_factory=set)
 
     def run(self) -> list[Judged]:
         """Those that were registered, the best of them to the end; best first. None if stopped."""
         try:
             self._first_pass()
-            final = self._final_passes()
+            self._finish()
+            order = self._order()
+            # Only now: the last pass may leave a place in doubt that was decisive before.
+            if order and order[0].credible and not is_decisive(order[0], self.config):
+                self._screen(min(len(self.candidates), _ROUNDS[-1]))
+                self._settle_alike(order[0])
+                self._finish()
         except StopAskedError:
             return []
-        return sorted(final, key=lambda j: (-int(j.credible), -j.result.quality))
+        return self._order()
 
     def _first_pass(self) -> None:
         """Ever more candidates, until one convinces."""
@@ -81,7 +88,6 @@ class Confirmation:
                 self._look_around()
             if self._is_any_credible():
                 break
-        self._settle_alike()
 
     def _screen(self, end: int) -> None:
         for candidate in self.candidates[len(self.places) : end]:
@@ -103,6 +109,8 @@ class Confirmation:
             metres, degrees = self._apart(rank, other)
             if other not in self.surrounded and max(metres, degrees) <= _SAME_START:
                 self.judged[rank] = self._judged(rank, done.prior, done.result)
+                if other in self.finished:
+                    self.finished.add(rank)
                 return
         self.judged[rank] = self._judged(
             rank, *self.verifier.from_place(self.sight, place, self.query)
@@ -120,15 +128,11 @@ class Confirmation:
             if result.quality > begun.result.quality:
                 self.judged[rank] = self._judged(rank, begun.prior, result)
 
-    def _settle_alike(self) -> None:
-        """Where one is credible: the others whose ground looks nearly as much like the frame, so
-        that it is known whether it stands out. They are registered where their rendering looks
-        nearly as much like it, too, and are not the place where it does not.
+    def _settle_alike(self, best: Judged) -> None:
+        """The others whose ground looks nearly as much like the frame, so that it is known whether
+        the best stands out: registered where their rendering looks nearly as much like it, too, and
+        not the place where it does not.
         """
-        credible = [j for j in self.judged.values() if j.credible]
-        if not credible:
-            return
-        best = max(credible, key=lambda j: j.result.quality)
         for rank, place in enumerate(self.places):
             if self.candidates[rank].score < NEARLY * best.candidate.score:
                 continue
@@ -138,22 +142,29 @@ class Confirmation:
                 none = failure(place.prior, RegistrationStatus.NOT_TRIED)
                 self.judged[rank] = self._judged(rank, place.prior, none)
 
-    def _final_passes(self) -> list[Judged]:
+    def _finish(self) -> None:
+        """The further passes of the best, each once."""
         order = sorted(self.judged.values(), key=lambda j: -j.result.quality)
-        final = []
-        for k, begun in enumerate(order):
-            j = begun
-            hopeless = k > 0 and j.result.quality < _HOPELESS * order[0].result.quality
-            hopeless = hopeless or k >= self.config.finalists
-            for _ in range(0 if hopeless else self.config.passes - 1):
-                self._go_on()
-                if not math.isfinite(j.result.score):
-                    break
-                prior = self.verifier.again(j.prior, j.result)
-                result = self.verifier.register(self.sight, prior, self.query)
-                j = self._judged(j.rank, prior, result)
-            final.append(j)
-        return final
+        for j in order[: self.config.finalists]:
+            hopeless = j.result.quality < _HOPELESS * order[0].result.quality
+            if j.rank in self.finished or hopeless:
+                continue
+            self.finished.add(j.rank)
+            self.judged[j.rank] = self._further(j)
+
+    def _further(self, begun: Judged) -> Judged:
+        j = begun
+        for _ in range(self.config.passes - 1):
+            self._go_on()
+            if not math.isfinite(j.result.score):
+                break
+            prior = self.verifier.again(j.prior, j.result)
+            result = self.verifier.register(self.sight, prior, self.query)
+            j = self._judged(j.rank, prior, result)
+        return j
+
+    def _order(self) -> list[Judged]:
+        return sorted(self.judged.values(), key=lambda j: (-int(j.credible), -j.result.quality))
 
     def _is_any_credible(self) -> bool:
         return any(j.credible for j in self.judged.values())

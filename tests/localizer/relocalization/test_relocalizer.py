@@ -140,6 +140,31 @@ def test_ground_that_looks_alike_costs_few_registrations(cache, query, truth, mo
     assert len(registered) <= 12
 
 
+def test_a_doubt_that_the_last_pass_leaves_is_settled(opened, query, truth, monkeypatch):
+    """Decisive at first, no other candidate was registered; no longer decisive at the end, they
+    have to be known not to be the place.
+    """
+    best = opened.relocalizer.search(query)[0]
+    alike = [
+        replace(best, world_from_camera=Pose(truth.rotation, np.array([x, 120.0, query.height_m])))
+        for x in (-120.0, -60.0, 0.0, 60.0, 120.0)
+    ]
+    register, calls = JNGO.register, []
+
+    def doubtful_later(*args, **options):
+        result = register(*args, **options)
+        calls.append(1)
+        votes = result.agreement
+        if len(calls) == 1 or votes is None or votes.share < 0.7:
+            return result
+        return replace(result, agreement=replace(votes, votes=round(0.7 * votes.parts)))
+
+    monkeypatch.setattr(JNGO, "register", doubtful_later)
+    answer = opened.relocalizer.confirm(query, [best, *alike])
+    assert answer is not None
+    assert answer.world_from_camera.distance_to(truth)[0] < 1.0
+
+
 def test_a_low_camera_among_high_houses_is_found_from_candidates_aside(opened, small_assets):
     """Their roofs lean outwards: flat ground fits best up to 12 m beside the place, from where
     a registration alone found two of eight back (the flight covered-10s was not found again).
