@@ -40,6 +40,9 @@ _DEPARTS_S = 1.0  # after a click: so long it may be one that moves
 _DEPARTED = 0.85  # correlation: what has just left looks as it did
 _FASTEST_MPS = 25.0
 _LOST_S = 4.0
+_LONG_S = 0.6  # unseen for so long, it is believed to be back once it was seen to go on for
+_BACK_S = (0.25, 1.0)  # so long, until its own motion has left a roof's edge behind
+_BACK_GAP_S = 0.5
 _PIXELS = 0.05  # of the picture's width: a delay's error beyond it is told as that much
 
 
@@ -95,6 +98,18 @@ class _Life:
     found_ns: int = 0
     """When it was last found in the image."""
     refusals: int = 0
+    back: _Back | None = None
+
+
+@dataclass(frozen=True)
+class _Back:
+    """Where a target that was long unseen may have come out. since_ns: when it was first seen there,
+    at position (3,); time_ns: when last.
+    """
+
+    since_ns: int
+    time_ns: int
+    position: Array
 
 
 class Population:
@@ -248,7 +263,10 @@ class Population:
             pass  # what is seen there is what hides it
         elif track.moves:
             sigma = float(np.sqrt(max(np.linalg.eigvalsh(P)[-1], 0.0)))
-            found = follower.find(gray, estimate, position, _NEAR_M + min(3.0 * sigma, _FAR_M))
+            reach_m = _NEAR_M + min(3.0 * sigma, _FAR_M)
+            found = follower.find(gray, estimate, position, reach_m)
+            if found is not None and since_s > _LONG_S and not self._is_back(life, found, time_ns):
+                found = None
         elif (near := follower.find(gray, estimate, position, _STILL_M)) is not None and (
             _off(near.position, position) < _STANDS_M
             or not life.moved_at_once
@@ -269,7 +287,7 @@ class Population:
         if found is not None:
             fix = track.see(estimate, found.pixel, pixel_sigma=_FOLLOWED_PX)
             life.found_ns = life.seen_ns = time_ns
-        elif track.moves and since_s > _LOST_S:
+        elif track.moves and since_s > _LOST_S and not self._may_be_back(life, time_ns):
             self._say(_INFO, f"PiLoT: target {clicked_number(name)} lost")
             self.end((name,))
             return
@@ -278,6 +296,27 @@ class Population:
         if fix is not None and self._is_due(life, time_ns):
             life.told_ns = time_ns
             self._report(life, fix, estimate)
+
+    @staticmethod
+    def _is_back(life: _Life, found: Found, time_ns: int) -> bool:
+        """Whether what was found goes on as the target did: a roof's edge does not."""
+        back, velocity = life.back, life.track.velocity
+        life.back = _Back(time_ns, time_ns, found.position)
+        if back is None or velocity is None:
+            return False
+        since_s, speed = (time_ns - back.since_ns) * 1e-9, float(np.hypot(*velocity[:2]))
+        gone = back.position + since_s * velocity
+        is_gap = time_ns - back.time_ns > _BACK_GAP_S * 1e9
+        if is_gap or _off(found.position[:2], gone[:2]) > _STANDS_M:
+            return False
+        life.back = replace(back, time_ns=time_ns)
+        return since_s >= np.clip(2.0 * _STANDS_M / max(speed, 1e-3), *_BACK_S)
+
+    @staticmethod
+    def _may_be_back(life: _Life, time_ns: int) -> bool:
+        """Whether it is seen to come out this moment."""
+        back = life.back
+        return back is not None and (time_ns - back.time_ns) * 1e-9 <= _BACK_GAP_S
 
     @staticmethod
     def _departed(

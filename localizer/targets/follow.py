@@ -37,6 +37,9 @@ _LONG_AGO_M = 3.0  # of reach
 _PREFERRED = 0.05  # by how much another look must be better
 _SURE = 0.8  # from which on its present look is learned
 _CLEAR = 1.15  # by how much the best place leads the second
+# By how much a look must be better at the end of the reach than where the target is expected: what
+# hid it for two seconds has edges that look like it, and they are metres from where it must be.
+_ASIDE = 0.15
 _RENEWED_NS = 2_000_000_000
 _OTHER, _NOISES = 10.0, 3.0  # grey levels, and medians of the chart: what differs by more has moved
 _SHARES = (0.03, 0.7)  # of a chart that may be the target
@@ -212,6 +215,12 @@ def _outline(differs: NDArray[np.uint8], half: int) -> NDArray[np.uint8] | None:
     return mask if mask[half - 1 : half + 2, half - 1 : half + 2].any() else None
 
 
+def _squared_share(reach: int) -> Grey:
+    """(2 reach + 1, 2 reach + 1): squared distance from the middle, as a share of the reach's."""
+    line = (np.arange(-reach, reach + 1, dtype=np.float32) / max(reach, 1)) ** 2
+    return np.asarray(line[:, None] + line[None], dtype=np.float32)
+
+
 def _match(
     chart: NDArray[np.float32],
     template: NDArray[np.float32],
@@ -221,6 +230,7 @@ def _match(
     """(correlation, offset in cells (2,), x then y) of the best place; 0 where a second rivals."""
     scores = cv2.matchTemplate(chart, template, cv2.TM_CCOEFF_NORMED, mask=mask)
     scores = np.nan_to_num(scores, nan=-1.0, posinf=-1.0, neginf=-1.0)
+    scores -= _ASIDE * _squared_share(reach)
     _, best, _, (x, y) = cv2.minMaxLoc(scores)
     offset = np.array([x - reach, y - reach], dtype=np.float64)
     for axis, line, k in ((0, scores[y], x), (1, scores[:, x], y)):

@@ -81,6 +81,11 @@ class TargetTrack:
         """Whether it was measured to move."""
         return self._moves
 
+    @property
+    def velocity(self) -> Array | None:
+        """(3,) m/s, world axes, of a target that moves; None where none was measured."""
+        return self._moving.velocity if self._moves else None
+
     def see(
         self,
         estimate: PoseEstimate,
