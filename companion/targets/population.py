@@ -103,8 +103,8 @@ class _Life:
 
 @dataclass(frozen=True)
 class _Back:
-    """Where a target that was long unseen may have come out. since_ns: when it was first seen there,
-    at position (3,); time_ns: when last.
+    """Where a target that was long unseen may have come out. since_ns: when it was first seen, at
+    position (3,); time_ns: when last.
     """
 
     since_ns: int
