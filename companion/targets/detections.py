@@ -24,6 +24,9 @@ _MAX_NAME = 64
 GROUND_STATION, CONSOLE = "ground station", "console"
 # What the targets that the operator clicked at are called: by where he did it, a number follows.
 CLICKED = (f"{GROUND_STATION} ", f"{CONSOLE} ")
+# And what the detector in the companion's own process calls things: another detector's "car 1" is
+# another car.
+DETECTED = "detector "
 _PAUSE_S = 0.001  # at most a thousand detections a second: a flood must not take the interpreter
 
 
@@ -87,6 +90,8 @@ def parse_detection(data: bytes) -> tuple[Detection, FrameName | None]:
         raise DetectionError(f"target_id must have 1 to {_MAX_NAME} printable characters")
     if target.startswith(CLICKED):
         raise DetectionError(f"target_id {target!r}: names that begin so are the operator's clicks")
+    if target.startswith(DETECTED):
+        raise DetectionError(f"target_id {target!r}: `targets.detector` gives names that begin so")
     return detection, name
 
 

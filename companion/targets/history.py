@@ -5,14 +5,19 @@ from __future__ import annotations
 import threading
 from bisect import bisect
 from collections import deque
+from collections.abc import Sequence
 from dataclasses import replace
 
-from localizer.geometry.pose import Pose, so3_exp, so3_log
+import numpy as np
+
+from localizer.geometry.pose import Array, Pose, so3_exp, so3_log
 from localizer.types import PoseEstimate
 
 _KEPT = 256
 _GAP_NS = 1_000_000_000  # between poses that a third one is taken from
 _NEAR_NS = 20_000_000  # a frame's own pose: no other is nearer
+# What a camera's motion changes by where nothing shows it: m/s², and rad/s² of a gimbal that holds.
+_LEAST_CHANGE = np.repeat([0.5, 0.05], 3)
 
 
 class PoseHistory:
@@ -38,8 +43,9 @@ class PoseHistory:
     def at(self, time_ns: int) -> PoseEstimate | None:
         """The estimate at a time, between two neighbours where it has no frame of its own.
 
-        Between two, the worse covariance and state of both are told. None outside of what is kept,
-        and in a gap of more than a second.
+        Between two, the worse covariance and state of both are told, and by how much the motion
+        may have changed between them. None outside of what is kept, and in a gap of more than a
+        second.
         """
         with self._lock:
             kept = list(self._estimates)
@@ -51,7 +57,38 @@ class PoseHistory:
             return near
         if k in (0, len(kept)) or times[k] - times[k - 1] > _GAP_NS:
             return None
-        return _between(kept[k - 1], kept[k], time_ns)
+        between = _between(kept[k - 1], kept[k], time_ns)
+        change = _change(kept[max(0, k - 2) : k + 2])
+        sigma = _swing_s2(kept[k - 1], kept[k], time_ns) * np.maximum(change, _LEAST_CHANGE)
+        return replace(between, covariance=between.covariance + np.diag(sigma**2))
+
+
+def _swing_s2(a: PoseEstimate, b: PoseEstimate, time_ns: int) -> float:
+    """By how much a straight line between two poses misses a motion that changes by 1 a second,
+    squared seconds: ``s (1 - s) T² / 2``.
+    """
+    gap_s = (b.exposure_time_ns - a.exposure_time_ns) * 1e-9
+    share = (time_ns - a.exposure_time_ns) * 1e-9 / gap_s
+    return 0.5 * share * (1.0 - share) * gap_s**2
+
+
+def _change(about: Sequence[PoseEstimate]) -> Array:
+    """(6,) m/s² and rad/s², world axes: by how much the motion changes from one of up to four
+    neighbours to the next, at most; 0 of two.
+    """
+    motions = [_motion(a, b) for a, b in zip(about[:-1], about[1:], strict=True)]
+    most = np.zeros(6)
+    for (v, at_s), (w, later_s) in zip(motions[:-1], motions[1:], strict=True):
+        most = np.maximum(most, np.abs(w - v) / (later_s - at_s))
+    return most
+
+
+def _motion(a: PoseEstimate, b: PoseEstimate) -> tuple[Array, float]:
+    """Mean velocity and turn rate (6,) from one pose to the next, and the middle's time, s."""
+    p, q = a.world_from_camera, b.world_from_camera
+    moved = np.concatenate([q.translation - p.translation, so3_log(q.rotation @ p.rotation.T)])
+    span_s = (b.exposure_time_ns - a.exposure_time_ns) * 1e-9
+    return moved / span_s, 0.5 * (a.exposure_time_ns + b.exposure_time_ns) * 1e-9
 
 
 def _between(a: PoseEstimate, b: PoseEstimate, time_ns: int) -> PoseEstimate:

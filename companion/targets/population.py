@@ -40,6 +40,8 @@ _DEPARTS_S = 1.0  # after a click: so long it may be one that moves
 _DEPARTED = 0.85  # correlation: what has just left looks as it did
 _FASTEST_MPS = 25.0
 _LOST_S = 4.0
+_SILENT_NS = 2_000_000_000  # what was told and is refused for so long is named,
+_SAID_NS = 10_000_000_000  # one of all targets in so long: a flood of texts hides the others
 _LONG_S = 0.6  # unseen for so long, it is believed to be back once it was seen to go on for
 _BACK_S = (0.25, 1.0)  # so long, until its own motion has left a roof's edge behind
 _BACK_GAP_S = 0.5
@@ -98,6 +100,8 @@ class _Life:
     found_ns: int = 0
     """When it was last found in the image."""
     refusals: int = 0
+    refused_ns: int = 0
+    """Since when nothing but refusals came; 0 after a fix."""
     back: _Back | None = None
 
 
@@ -145,6 +149,7 @@ class Population:
         self._pictures = RecentPictures[tuple[PoseEstimate, Gray]](
             _PICTURES, lambda picture: picture[1].nbytes
         )
+        self._silence_said_ns = -_SAID_NS
         self.missed = 0
         self.doubted = 0
         self.refused = 0
@@ -190,9 +195,9 @@ class Population:
             self._lives[name] = life
         life.seen_ns = time_ns
         if fix is None:
-            self._doubt(name, life)
+            self._doubt(name, life, time_ns)
             return
-        life.told_ns = time_ns
+        life.told_ns, life.refused_ns = time_ns, 0
         self._report(life, fix, estimate)
 
     def look(self, estimate: PoseEstimate, gray: Gray) -> None:
@@ -287,6 +292,7 @@ class Population:
         if found is not None:
             fix = track.see(estimate, found.pixel, pixel_sigma=_FOLLOWED_PX)
             life.found_ns = life.seen_ns = time_ns
+            life.refused_ns = 0 if fix is not None else life.refused_ns or time_ns
         elif track.moves and since_s > _LOST_S and not self._may_be_back(life, time_ns):
             self._say(_INFO, f"PiLoT: target {clicked_number(name)} lost")
             self.end((name,))
@@ -296,6 +302,9 @@ class Population:
         if fix is not None and self._is_due(life, time_ns):
             life.told_ns = time_ns
             self._report(life, fix, estimate)
+        if life.refused_ns and track.moves and time_ns - life.refused_ns > _LOST_S * 1e9:
+            self._say(_INFO, f"PiLoT: target {clicked_number(name)} lost: {track.refusal}")
+            self.end((name,))
 
     @staticmethod
     def _is_back(life: _Life, found: Found, time_ns: int) -> bool:
@@ -354,8 +363,8 @@ class Population:
         wanted = 0.9e9 / self._config.rate_hz
         return wanted if life.told_ns else min(wanted, _CONFIRMS_NS)
 
-    def _doubt(self, name: str, life: _Life) -> None:
-        """Count what is not told, and why."""
+    def _doubt(self, name: str, life: _Life, time_ns: int) -> None:
+        """Count what is not told, and why; the operator hears of one that he was told before."""
         if life.track.refusal == NO_MAP:
             self.missed += 1
         if life.track.refusal in (NO_MAP, UNCONFIRMED):
@@ -364,6 +373,11 @@ class Population:
         life.refusals += 1
         if life.refusals == 1:
             _log.warning("target %s is not told: %s", name, life.track.refusal)
+        life.refused_ns = life.refused_ns or time_ns
+        is_silent = life.told_ns > 0 and time_ns - life.refused_ns >= _SILENT_NS
+        if is_silent and time_ns - self._silence_said_ns >= _SAID_NS:
+            self._silence_said_ns = time_ns
+            self._say(_WARNING, f"PiLoT: {name} not told: {life.track.refusal}")
 
     def _drift(self, click: Click) -> tuple[float, float]:
         """One sigma, in pixels, of the picture's motion within the delay's error."""

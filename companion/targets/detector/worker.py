@@ -15,7 +15,7 @@ from collections.abc import Callable
 import numpy as np
 
 from companion.config import DetectorConfig
-from companion.targets.detections import Detection
+from companion.targets.detections import DETECTED, Detection
 from companion.targets.detector.boxes import Box
 from companion.targets.detector.names import Sight, ThingNames
 from companion.targets.detector.network import DetectorNetwork
@@ -148,7 +148,8 @@ class BoxDetector:
             if name is not None:
                 self.seen += 1
                 u, v = _middle(box)
-                self._on_detection(Detection(name, estimate.exposure_time_ns, u, v))
+                told = Detection(f"{DETECTED}{name}", estimate.exposure_time_ns, u, v)
+                self._on_detection(told)
 
     def _place(self, box: Box, estimate: PoseEstimate) -> np.ndarray | None:
         u, v = _middle(box)

@@ -35,6 +35,7 @@ def test_round_trip():
         b'{"target_id": "\\ud800", "time_ns": 1, "u": 1, "v": 2}',  # half a surrogate pair
         b'{"target_id": "a\\nb", "time_ns": 1, "u": 1, "v": 2}',
         b'{"target_id": "ground station 3", "time_ns": 1, "u": 1, "v": 2}',  # a click's name
+        b'{"target_id": "detector car 1", "time_ns": 1, "u": 1, "v": 2}',  # of another detector
     ],
 )
 def test_bad_datagrams_are_named(data):

@@ -188,7 +188,7 @@ def test_what_is_seen_twice_is_told_at_its_own_frames_time(tmp_path):
     flight = Flight(network.detect)
     flight.fly(4)
     assert flight.detector.looked == 4
-    assert {d.target_id for d in flight.told} == {"car 1"}
+    assert {d.target_id for d in flight.told} == {"detector car 1"}
     assert all(d.time_ns % (100 * MS) == 0 for d in flight.told)
     assert (flight.told[0].u, flight.told[0].v) == pytest.approx((320.0, 240.0))
     assert flight.said == []

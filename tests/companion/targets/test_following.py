@@ -217,7 +217,7 @@ class _Edge(_Returns):
         return Found(at, pixel, 0.9) if near else None
 
 
-def _flown(follower, monkeypatch, frames):
+def _flown(follower, monkeypatch, frames, at=(0.5, 0.3)):
     monkeypatch.setattr(population, "ImageFollower", follower)
     watcher = Operator(rate_hz=10.0)
     gray = np.zeros((480, 640), np.uint8)
@@ -232,7 +232,7 @@ def _flown(follower, monkeypatch, frames):
         watcher.now_ms = watcher.time_ms - 100
 
     fly(10)
-    watcher.clicks_at(0.5, 0.3)
+    watcher.clicks_at(*at)
     fly(frames)
     return watcher
 
@@ -253,6 +253,25 @@ def test_a_car_that_comes_out_where_it_must_is_found_at_once(monkeypatch):
     times = np.array([(f.exposure_time_ns - begun_ns) * 1e-9 for f in seen])
     assert times[times > _Returns.from_s].min() < _Returns.until_s + 0.6
     assert seen[-1].velocity is not None
+
+
+@pytest.mark.parametrize("refused_s", [6.0, 1.0])
+def test_a_car_that_is_found_and_refused_for_seconds_is_lost_with_a_word(monkeypatch, refused_s):
+    """It was neither told nor ended: the operator heard of it no more."""
+    see = population.TargetTrack.see
+
+    def refuses(track, estimate, pixel, **known):
+        if 1_900 <= estimate.exposure_time_ns // MS < 1_900 + 1_000 * refused_s:
+            track.refusal = "no map at its place"
+            return None
+        return see(track, estimate, pixel, **known)
+
+    monkeypatch.setattr(population.TargetTrack, "see", refuses)
+    flown = _flown(_Drives, monkeypatch, 75, (0.9, 0.95))
+    is_lost = refused_s > 4.0
+    lost = ["PiLoT: target 1 lost: no map at its place"]
+    assert [text for text in flown.texts if "lost" in text] == (lost if is_lost else [])
+    assert bool(flown.gone) == is_lost
 
 
 @pytest.mark.parametrize("follower", [_Slides, _Drives])

@@ -56,11 +56,11 @@ class Ground:
         return BundleHits(distances, np.tile([0.0, 0.0, 1.0], (len(directions), 1)))
 
 
-def errors(holed, velocity):
+def errors(holed, velocity, say=lambda *_: None):
     """(frame, error, own sigma, m) of every report of a target that a detector sees."""
     ground, told, found = Ground(), list[Target](), []
     population = Population(
-        TargetConfig(rate_hz=10), ground.cast, told.append, lambda _: None, lambda *_: None
+        TargetConfig(rate_hz=10), ground.cast, told.append, lambda _: None, say
     )
     noise = np.random.default_rng(0)
     for k in range(FRAMES):
@@ -101,6 +101,14 @@ def test_a_hole_in_the_first_frames_is_never_told_and_delays_the_right_place_lit
     assert max(off - 3.0 * sigma for _, off, sigma in told) < 0.5
     assert told[0][0] <= max(holed) + CONFIRMING + 2
     assert len(told) > FRAMES - 14
+
+
+@pytest.mark.parametrize("holed", [range(20, 60), range(20, 21), range(0)])
+def test_a_moving_target_that_is_refused_for_seconds_is_named_once(holed):
+    texts = []
+    errors(set(holed), (8.0, 3.0), lambda _, text: texts.append(text))
+    assert len(texts) == (1 if len(holed) > 20 else 0)
+    assert all(text.startswith("PiLoT: car not told: ") for text in texts)
 
 
 class Holed(Ground):
