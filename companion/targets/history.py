@@ -7,6 +7,7 @@ from bisect import bisect
 from collections import deque
 from collections.abc import Sequence
 from dataclasses import replace
+from itertools import pairwise
 
 import numpy as np
 
@@ -76,9 +77,9 @@ def _change(about: Sequence[PoseEstimate]) -> Array:
     """(6,) m/s² and rad/s², world axes: by how much the motion changes from one of up to four
     neighbours to the next, at most; 0 of two.
     """
-    motions = [_motion(a, b) for a, b in zip(about[:-1], about[1:], strict=True)]
+    motions = [_motion(a, b) for a, b in pairwise(about)]
     most = np.zeros(6)
-    for (v, at_s), (w, later_s) in zip(motions[:-1], motions[1:], strict=True):
+    for (v, at_s), (w, later_s) in pairwise(motions):
         most = np.maximum(most, np.abs(w - v) / (later_s - at_s))
     return most
 

@@ -59,9 +59,7 @@ class Ground:
 def errors(holed, velocity, say=lambda *_: None):
     """(frame, error, own sigma, m) of every report of a target that a detector sees."""
     ground, told, found = Ground(), list[Target](), []
-    population = Population(
-        TargetConfig(rate_hz=10), ground.cast, told.append, lambda _: None, say
-    )
+    population = Population(TargetConfig(rate_hz=10), ground.cast, told.append, lambda _: None, say)
     noise = np.random.default_rng(0)
     for k in range(FRAMES):
         estimate, ground.is_holed = estimate_at(k), k in holed
