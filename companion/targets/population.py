@@ -261,17 +261,11 @@ class Population:
         expected = track.expected(time_ns)
         if follower is None or expected is None:
             return
-        position, P = expected
+        position, _ = expected
         since_s = (time_ns - life.found_ns) * 1e-9
         found = None
-        if track.moves and track.is_hiding(estimate, position):
-            pass  # what is seen there is what hides it
-        elif track.moves:
-            sigma = float(np.sqrt(max(np.linalg.eigvalsh(P)[-1], 0.0)))
-            reach_m = _NEAR_M + min(3.0 * sigma, _FAR_M)
-            found = follower.find(gray, estimate, position, reach_m)
-            if found is not None and since_s > _LONG_S and not self._is_back(life, found, time_ns):
-                found = None
+        if track.moves:
+            found = self._found_moving(life, follower, estimate, gray)
         elif (near := follower.find(gray, estimate, position, _STILL_M)) is not None and (
             _off(near.position, position) < _STANDS_M
             or not life.moved_at_once
@@ -305,6 +299,22 @@ class Population:
         if life.refused_ns and track.moves and time_ns - life.refused_ns > _LOST_S * 1e9:
             self._say(_INFO, f"PiLoT: target {clicked_number(name)} lost: {track.refusal}")
             self.end((name,))
+
+    def _found_moving(
+        self, life: _Life, follower: ImageFollower, estimate: PoseEstimate, gray: Gray
+    ) -> Found | None:
+        """A moving target about where its motion leads; None where something hides it."""
+        time_ns = estimate.exposure_time_ns
+        expected = life.track.expected(time_ns)
+        if expected is None or life.track.is_hiding(estimate, expected[0]):
+            return None  # what is seen there is what hides it
+        sigma = float(np.sqrt(max(np.linalg.eigvalsh(expected[1])[-1], 0.0)))
+        reach_m = _NEAR_M + min(3.0 * sigma, _FAR_M)
+        found = follower.find(gray, estimate, expected[0], reach_m)
+        is_long = (time_ns - life.found_ns) * 1e-9 > _LONG_S
+        if found is not None and is_long and not self._is_back(life, found, time_ns):
+            return None
+        return found
 
     @staticmethod
     def _is_back(life: _Life, found: Found, time_ns: int) -> bool:
