@@ -310,8 +310,8 @@ class Population:
             return None  # what is seen there is what hides it
         sigma = float(np.sqrt(max(np.linalg.eigvalsh(expected[1])[-1], 0.0)))
         reach_m = _NEAR_M + min(3.0 * sigma, _FAR_M)
-        found = follower.find(gray, estimate, expected[0], reach_m)
         is_long = (time_ns - life.found_ns) * 1e-9 > _LONG_S
+        found = follower.find(gray, estimate, expected[0], reach_m, was_hidden=is_long)
         if found is not None and is_long and not self._is_back(life, found, time_ns):
             return None
         return found

@@ -83,9 +83,18 @@ class ImageFollower:
         self.ready = first is not None and float(first.std()) >= _FLAT
 
     def find(
-        self, gray: Gray, estimate: PoseEstimate, expected: Array, reach_m: float
+        self,
+        gray: Gray,
+        estimate: PoseEstimate,
+        expected: Array,
+        reach_m: float,
+        *,
+        was_hidden: bool = False,
     ) -> Found | None:
-        """The target within `reach_m` of where it is expected (3,); None where it is not seen."""
+        """The target within `reach_m` of where it is expected (3,); None where it is not seen.
+
+        was_hidden: it comes out of an occlusion, so nearer to there is likelier.
+        """
         reach = min(int(np.ceil(reach_m / self._cell)) + 1, _LARGEST_REACH)
         chart = self._chart(gray, estimate, expected, self._half + reach)
         if chart is None:
@@ -96,7 +105,7 @@ class ImageFollower:
                 turned, mask = self._turned(template, -angle), self._turned(self._mask, -angle)
                 if best[0] >= _SURE or turned is None:
                     break
-                one = _match(chart, turned, mask, reach)
+                one = _match(chart, turned, mask, reach, _ASIDE if was_hidden else 0.0)
                 if one[0] > best[0] + _PREFERRED:
                     best, turn = one, angle
         least = _SEEN if reach_m <= _EXPECTED_M else _FOUND
@@ -226,11 +235,15 @@ def _match(
     template: NDArray[np.float32],
     mask: Grey | None,
     reach: int,
+    aside: float = 0.0,
 ) -> tuple[float, Array]:
-    """(correlation, offset in cells (2,), x then y) of the best place; 0 where a second rivals."""
+    """(correlation, offset in cells (2,), x then y) of the best place; 0 where a second rivals.
+
+    aside: by how much a look at the end of the reach counts less.
+    """
     scores = cv2.matchTemplate(chart, template, cv2.TM_CCOEFF_NORMED, mask=mask)
     scores = np.nan_to_num(scores, nan=-1.0, posinf=-1.0, neginf=-1.0)
-    scores -= _ASIDE * _squared_share(reach)
+    scores -= aside * _squared_share(reach)
     _, best, _, (x, y) = cv2.minMaxLoc(scores)
     offset = np.array([x - reach, y - reach], dtype=np.float64)
     for axis, line, k in ((0, scores[y], x), (1, scores[:, x], y)):

@@ -176,7 +176,7 @@ class _Slides:
     def forget_shape(self):
         self.is_isolated = False
 
-    def find(self, _gray, estimate, expected, reach_m):
+    def find(self, _gray, estimate, expected, reach_m, was_hidden=False):
         since_s = (estimate.exposure_time_ns - self._begun_ns) * 1e-9
         at = self._place + np.array([0.0, self.speed * since_s, 0.0])
         pixel = projected(estimate, at)
@@ -193,7 +193,7 @@ class _Returns(_Drives):
 
     from_s, until_s = 1.2, 2.2
 
-    def find(self, gray, estimate, expected, reach_m):
+    def find(self, gray, estimate, expected, reach_m, was_hidden=False):
         since_s = (estimate.exposure_time_ns - self._begun_ns) * 1e-9
         if since_s < self.from_s:
             return super().find(gray, estimate, expected, reach_m)
