@@ -329,7 +329,8 @@ class Population:
         if is_gap or _off(found.position[:2], gone[:2]) > _STANDS_M:
             return False
         life.back = replace(back, time_ns=time_ns)
-        return since_s >= np.clip(2.0 * _STANDS_M / max(speed, 1e-3), *_BACK_S)
+        least_s = np.clip(2.0 * _STANDS_M / max(speed, 1e-3), *_BACK_S)
+        return since_s >= float(least_s)
 
     @staticmethod
     def _may_be_back(life: _Life, time_ns: int) -> bool:
