@@ -8,7 +8,7 @@ from companion.targets import population
 from localizer.geometry.camera import Camera
 from localizer.geometry.pose import Pose, so3_exp
 from localizer.targets.follow import Found
-from localizer.targets.track import projected
+from localizer.targets.track import TargetTrack, projected
 from localizer.types import Visibility
 from tests.companion.targets import scene
 from tests.companion.targets.scene import MS
@@ -258,7 +258,7 @@ def test_a_car_that_comes_out_where_it_must_is_found_at_once(monkeypatch):
 @pytest.mark.parametrize("refused_s", [6.0, 1.0])
 def test_a_car_that_is_found_and_refused_for_seconds_is_lost_with_a_word(monkeypatch, refused_s):
     """It was neither told nor ended: the operator heard of it no more."""
-    see = population.TargetTrack.see
+    see = TargetTrack.see
 
     def refuses(track, estimate, pixel, **known):
         if 1_900 <= estimate.exposure_time_ns // MS < 1_900 + 1_000 * refused_s:
@@ -266,7 +266,7 @@ def test_a_car_that_is_found_and_refused_for_seconds_is_lost_with_a_word(monkeyp
             return None
         return see(track, estimate, pixel, **known)
 
-    monkeypatch.setattr(population.TargetTrack, "see", refuses)
+    monkeypatch.setattr(TargetTrack, "see", refuses)
     flown = _flown(_Drives, monkeypatch, 75, (0.9, 0.95))
     is_lost = refused_s > 4.0
     lost = ["PiLoT: target 1 lost: no map at its place"]
