@@ -1,6 +1,7 @@
 """Streaming a large generated region: build throughput, and what the render thread waits for.
 
     python -m benchmarks.map_streaming [--km 10] [--seconds 40] [--budget-mb 384] [--keep DIR]
+        [--json streaming.json]
 
 First, regions of growing size are built: tiles a second, and that they stay as they are (regions
 that are in DIR already are not built again). Then an aircraft flies over the largest at 25 m/s, at
@@ -25,7 +26,8 @@ import numpy as np
 from rich.console import Console
 from rich.table import Table
 
-from benchmarks.common.arguments import Parser, number, whole
+from benchmarks.common.arguments import Parser, number, output, whole
+from benchmarks.common.figures import write_figures
 from benchmarks.common.named_errors import named_errors
 from localizer.geometry.camera import Camera
 from localizer.geometry.geo import Geodetic, LocalFrame
@@ -40,6 +42,11 @@ LEAF_M, TEXELS, CELLS = 80.0, 512, 64
 DOWN = np.array([[1.0, 0, 0], [0, -1, 0], [0, 0, -1]])
 SPEED_M_S, RATE_HZ, WARM_UP_S = 25.0, 10.0, 5.0
 LOOK_AHEAD_S = (1.0, 3.0)  # as the engine does
+FLIGHT_COLUMNS = (
+    "flight", "frames", "`select`, p50 / p99 / max ms", "its own work, max ms",
+    "`prefetch`, max ms", "at the wanted detail", "misses", "holes", "loaded / evicted",
+    "tiles in memory, MiB",
+)  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -163,7 +170,7 @@ def fly(
         str(frames),
         " / ".join(f"{t:.2f}" for t in (*np.percentile(times[0], (50, 99)), times[0].max())),
         f"{times[1].max():.2f}",
-        f"{times[2].max():.2f}",
+        f"{times[2].max():.2f}" if ahead else "",
         f"{100 * (end.complete - warm.complete) / frames:.1f} %",
         f"{end.misses - warm.misses} of {end.misses - warm.misses + end.hits - warm.hits}",
         str(end.stalls - warm.stalls),
@@ -182,6 +189,7 @@ def main() -> None:
         "--budget-mb", type=whole(16, 1 << 16), default=384, help="for tiles in memory, MiB"
     )
     parser.add_argument("--keep", type=Path, help="folder for the caches; else a temporary one")
+    parser.add_argument("--json", type=output, help="the flights' table, for the documentation")
     options = parser.parse_args()
     console = Console(width=160)
     with tempfile.TemporaryDirectory() as temporary:
@@ -198,19 +206,23 @@ def main() -> None:
         # As the companion does after its start: a full collection would stop every thread.
         gc.collect()
         gc.freeze()
-        table = Table(
-            "flight", "frames", "select p50 / p99 / max ms", "its own work, max",
-            "prefetch max", "at wanted detail", "misses", "holes", "loaded / evicted",
-            "tiles in memory, MiB",
-        )  # fmt: skip
         budget = options.budget_mb << 20
-        for height in (120.0, 400.0):
-            for ahead in (True, False):
-                row = fly(cache, height, options.km, options.seconds, budget, ahead=ahead)
-                table.add_row(*row)
+        rows = [
+            fly(cache, height, options.km, options.seconds, budget, ahead=ahead)
+            for height in (120.0, 400.0)
+            for ahead in (True, False)
+        ]
+        table = Table(*FLIGHT_COLUMNS)
+        for row in rows:
+            table.add_row(*row)
         console.print(table)
         peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
         console.print(f"peak resident memory of the process: {peak:.0f} MiB")
+        if options.json:
+            manifest = cache.manifest
+            made = {"km": options.km, "tiles": manifest.tiles, "bytes": manifest.bytes,
+                    "peak_resident_mib": round(peak)}  # fmt: skip
+            write_figures(options.json, FLIGHT_COLUMNS, rows, made)
 
 
 if __name__ == "__main__":

@@ -2,37 +2,50 @@
 
     python -m benchmarks.basin ablation FOLDER [--set generated|plain|quito|portugal|caliterra]
     python -m benchmarks.basin priors FOLDER [--set ...] [--anchors N]
+    python -m benchmarks.basin covariance FOLDER [--set ...]
     python -m benchmarks.basin axes FOLDER [--set ...] [--plot basin.png]
 
 FOLDER keeps generated worlds, imported maps and query images between runs. Every registration
 starts from a prior that is wrong by exact amounts: along a random direction and about a random axis
 (ablation), or along one axis alone (axes). Shares come with Wilson's 95 % interval, medians and
-differences to "ours" (same views, so paired) with bootstrap intervals over the views.
+differences to "ours" (same views, so paired) with bootstrap intervals over the views. `covariance`
+compares the errors of "ours" within 3 m and 3 degrees with their covariance (NEES; 6 is perfect).
+--json keeps the table, as the documentation has it, and every outcome.
 """
 
 from __future__ import annotations
 
 import argparse
-import json
+from collections.abc import Callable
 from dataclasses import asdict
 from functools import partial
 from pathlib import Path
 
 from benchmarks.common.arguments import Parser, existing, number, output, whole
+from benchmarks.common.figures import write_figures
 from benchmarks.common.named_errors import named_errors, needs_torch
 
 with needs_torch():
     from benchmarks.basin import axes as basin_axes
-    from benchmarks.basin.run import Outcome, Start, groups, random_start, run, summary
-    from benchmarks.basin.variants import DEFAULT_ANCHORS, FULL, our_rows, paper_rows, prior_rows
+    from benchmarks.basin.run import Outcome, groups, run, sized_starts, summary
+    from benchmarks.basin.tables import Cells, ablation_table, covariance_table
+    from benchmarks.basin.variants import (
+        DEFAULT_ANCHORS,
+        FULL,
+        Variant,
+        our_rows,
+        paper_rows,
+        prior_rows,
+    )
     from benchmarks.basin.views import View, load_views
 
 STARTS = (5.0, 10.0)  # metres and degrees: the paper's columns but the easiest
 
 
-def ablation_starts(index: int, sizes: tuple[float, ...]) -> list[Start]:
-    """A random direction and axis for each size in metres and degrees."""
-    return [random_start(size, size, index) for size in sizes]
+def photos_of(args: argparse.Namespace) -> int:
+    """How many different photos the set has; 0: its views are renders."""
+    views = load_views(args.set, args.folder, args.data, args.pairs)
+    return len(views) if views[0].condition == "photo" else 0
 
 
 def views_of(args: argparse.Namespace) -> list[View]:
@@ -43,16 +56,19 @@ def views_of(args: argparse.Namespace) -> list[View]:
     )
 
 
-def ablation(args: argparse.Namespace) -> list[Outcome]:
-    """Table 4, or the priors: one line a variant and start."""
-    views = views_of(args)
-    rows = prior_rows(args.anchors) if args.what == "priors" else paper_rows() + our_rows()
+def _registered(args: argparse.Namespace, rows: list[Variant]) -> list[Outcome]:
     if args.only:
         rows = [v for v in rows if any(text in v.name for text in args.only) or v.name == FULL]
-    outcomes = run(
-        views, rows, partial(ablation_starts, sizes=tuple(args.starts)), args.model, args.processes
-    )
-    print(f"{args.set}: {len(views)} views; R@1 = share within 1 m and 1 degree")
+    starts = partial(sized_starts, sizes=tuple(args.starts))
+    return run(views_of(args), rows, starts, args.model, args.processes)
+
+
+def ablation(args: argparse.Namespace) -> tuple[list[Outcome], Cells]:
+    """Table 4, or the priors: one line a variant and start."""
+    rows = prior_rows(args.anchors) if args.what == "priors" else paper_rows() + our_rows()
+    outcomes = _registered(args, rows)
+    views = len({o.view for o in outcomes})
+    print(f"{args.set}: {views} views; R@1 = share within 1 m and 1 degree")
     last = ""
     for variant, start, mine, full in sorted(
         groups(outcomes), key=lambda g: [v.name for v in rows].index(g[0])
@@ -67,10 +83,19 @@ def ablation(args: argparse.Namespace) -> list[Outcome]:
             f"median {s['median']:5.2f} m [{s['median_low']:.2f}, {s['median_high']:.2f}]  "
             f"NEES {nees}  {s['ms']:5.1f} ms"
         )
-    return outcomes
+    return outcomes, ablation_table(args.set, outcomes)
 
 
-def axes(args: argparse.Namespace) -> list[Outcome]:
+def covariance(args: argparse.Namespace) -> tuple[list[Outcome], Cells]:
+    """NEES of "ours", those on which it was fitted apart."""
+    outcomes = _registered(args, [Variant(FULL)])
+    columns, rows = covariance_table(args.set, outcomes, photos_of(args))
+    for row in (columns, *rows):
+        print(" | ".join(row))
+    return outcomes, (columns, rows)
+
+
+def axes(args: argparse.Namespace) -> tuple[list[Outcome], Cells]:
     """Table 6 and Fig. 10: share converged against the initial error of each axis."""
     variants = basin_axes.axis_variants()
     outcomes = run(views_of(args), variants, basin_axes.axis_starts, args.model, args.processes)
@@ -78,12 +103,17 @@ def axes(args: argparse.Namespace) -> list[Outcome]:
     basin_axes.report(outcomes)
     if args.plot:
         basin_axes.plot(outcomes, args.plot)
-    return outcomes
+    return outcomes, basin_axes.table(outcomes)
+
+
+_TABLES: dict[str, Callable[[argparse.Namespace], tuple[list[Outcome], Cells]]] = {
+    "ablation": ablation, "priors": ablation, "covariance": covariance, "axes": axes,
+}  # fmt: skip
 
 
 def main() -> None:
     parser = Parser(__doc__)
-    parser.add_argument("what", choices=("ablation", "priors", "axes"), help="table")
+    parser.add_argument("what", choices=tuple(_TABLES), help="table")
     parser.add_argument("folder", type=Path, help="of worlds, maps and query images")
     parser.add_argument(
         "--set", default="generated", help="generated, plain, or a folder of --data"
@@ -98,13 +128,14 @@ def main() -> None:
     parser.add_argument("--anchors", type=int, default=DEFAULT_ANCHORS, help="N of `priors`")
     parser.add_argument("--only", nargs="*", help="variants whose name contains one of these")
     parser.add_argument("--plot", type=output, help="PNG of the axes' curves")
-    parser.add_argument("--json", type=output, help="every outcome")
+    parser.add_argument("--json", type=output, help="the table and every outcome")
     args = parser.parse_args()
     if args.set not in ("generated", "plain") and not (args.data / args.set).is_dir():
         parser.error(f"--set: {args.set!r} is neither generated, plain nor a folder of {args.data}")
-    outcomes = (axes if args.what == "axes" else ablation)(args)
+    outcomes, (columns, rows) = _TABLES[args.what](args)
     if args.json:
-        args.json.write_text(json.dumps([asdict(o) for o in outcomes]))
+        made = {"set": args.set, "outcomes": [asdict(o) for o in outcomes]}
+        write_figures(args.json, columns, rows, made)
 
 
 if __name__ == "__main__":

@@ -8,6 +8,7 @@ import matplotlib.pyplot as plt
 import numpy as np
 
 from benchmarks.basin.run import Outcome, Start, groups, random_start, summary
+from benchmarks.basin.tables import Cells
 from benchmarks.basin.variants import FULL, Variant
 from localizer.registration import JNGOConfig
 
@@ -16,6 +17,7 @@ STEPS = (1.0, 2.0, 4.0, 6.0, 8.0, 11.0, 15.0)  # degrees or metres
 PAPER = {"yaw": 3.5, "pitch": 2.7, "roll": 3.2, "x": 5.6, "y": 8.1, "z": 7.4}  # Table 6
 MOTION = {"yaw": 6.7, "pitch": 3.0, "roll": 10.1, "x": 0.7, "y": 0.7, "z": 0.3}  # likewise
 _RESAMPLES = 400
+_JOINT = STEPS[-3:]
 
 Shares = dict[tuple[str, str], list[Outcome]]
 
@@ -77,9 +79,28 @@ def report(outcomes: list[Outcome]) -> None:
     for title, row in (("paper, Table 6", PAPER), ("paper, motion at 30 frames/s", MOTION)):
         print(f"{title:35s}" + "".join(f"{row[a]:19.1f}" for a in AXES))
     for name in names:
-        found = [limits(cells, name, a) for a in AXES]
-        texts = [f"{most(v)} [{most(low)}, {most(high)}]" for v, low, high in found]
+        texts = [limit_text(limits(cells, name, a)) for a in AXES]
         print(f"{name:35s}" + "".join(f"{t:>19s}" for t in texts))
+
+
+def table(outcomes: list[Outcome]) -> Cells:
+    """The limits beside Table 6, and the shares from the three largest errors of all axes."""
+    cells = {(v, s): mine for v, s, mine, _ in groups(outcomes)}
+    columns = ("", *AXES, f"from {' / '.join(f'{s:.0f}' for s in _JOINT)} m and ° in all, %")
+    rows = [
+        ("the paper, Table 6", *(f"{PAPER[a]} {_unit(a)}".replace(" °", "°") for a in AXES), "")
+    ]
+    for name in dict.fromkeys(o.variant for o in outcomes):
+        joint = [f"{x:.0f}" for x in shares(cells, name, "all")[-len(_JOINT) :]]
+        found = [limit_text(limits(cells, name, a)) for a in AXES]
+        rows.append((f"**{name}**" if name == FULL else name, *found, " / ".join(joint)))
+    return columns, rows
+
+
+def limit_text(found: tuple[float, float, float]) -> str:
+    """A limit with its interval."""
+    value, low, high = (most(v) for v in found)
+    return value if value == low == high else f"{value} [{low}, {high}]"
 
 
 def shares(cells: Shares, name: str, axis: str) -> list[float]:

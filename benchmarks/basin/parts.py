@@ -1,6 +1,7 @@
 """Covariance of registrations against a map that covers a part of the image only.
 
     python -m benchmarks.basin.parts FOLDER [--set generated|plain|quito|portugal|caliterra]
+        [--json parts.json]
 
 The reference view shows the map in a part and the sky elsewhere, as past a map's edge. For each
 part: the share of the registrations within 3 m and 3 degrees whose squared error, normalised by
@@ -13,16 +14,18 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
 import numpy as np
 
-from benchmarks.common.arguments import Parser, existing, number, whole
+from benchmarks.common.arguments import Parser, existing, number, output, whole
+from benchmarks.common.figures import write_figures
 from benchmarks.common.named_errors import named_errors, needs_torch
 
 with needs_torch():
     from benchmarks.basin.run import random_start, squared_error
+    from benchmarks.basin.tables import BOUND, Cells, row_name
     from benchmarks.basin.views import SIZE, View, load_views, photo_views
 from numpy.typing import NDArray
 
@@ -40,7 +43,6 @@ from localizer.types import RegistrationStatus, RenderedView
 
 PARTS = ("whole", "half", "quarter", "band", "discs")
 _SEEDS = dict(zip(PARTS, (0, 1, 2, 4, 5), strict=True))
-_BOUND = 12.59  # 95 % of the chi-square of 6 degrees of freedom
 _LEAST_DEPTH = 0.5  # share of a reference view that must show the map before a part is taken
 
 
@@ -74,9 +76,10 @@ def covered(view: RenderedView, kept: NDArray[np.bool_]) -> RenderedView:
 
 @dataclass(frozen=True)
 class Trial:
-    """One registration: of which part, how wrong, and whether the tracker's checks accept it."""
+    """One registration: of which part and view, how wrong, and whether the tracker accepts it."""
 
     part: str
+    view: int
     metres: float
     degrees: float
     nees: float
@@ -107,13 +110,14 @@ def trials(
                         query, view.camera, anchors, prior, motion=prior, seed=index
                     )
                     if found.status is RegistrationStatus.OK:
-                        yield _trial(part, found, view)
+                        yield _trial(part, index, found, view)
 
 
-def _trial(part: str, found: Registration, view: View) -> Trial:
+def _trial(part: str, index: int, found: Registration, view: View) -> Trial:
     pose = found.world_from_camera
     return Trial(
         part,
+        index,
         *pose.distance_to(view.truth),
         squared_error(pose, found.covariance, view.truth),
         is_acceptable(IntegrityConfig(), found, 0.0),
@@ -122,7 +126,7 @@ def _trial(part: str, found: Registration, view: View) -> Trial:
 
 def share(values: list[float]) -> str:
     """Share within the bound in per cent, with its interval and count."""
-    inside = sum(v < _BOUND for v in values)
+    inside = sum(v < BOUND for v in values)
     low, high = wilson(inside, len(values))
     return f"{100 * inside / max(len(values), 1):5.1f} [{low:4.1f}, {high:5.1f}] of {len(values)}"
 
@@ -138,15 +142,27 @@ def report(part: str, mine: list[Trial]) -> str:
     )
 
 
-def views_of(args: argparse.Namespace) -> list[View]:
-    """The set's views, the photos repeated."""
+def table(source: str, done: list[Trial], parts: list[str], photos: int) -> Cells:
+    """Share within the bound of those within 3 m and 3 degrees, and their number, by part."""
+    near = [t for t in done if t.metres < 3 and t.degrees < 3]
+    names = dict.fromkeys(row_name(source, t.view, photos) for t in near)
+    rows = []
+    for name in names:
+        mine = [t for t in near if row_name(source, t.view, photos) == name]
+        shares = [[t.nees for t in mine if t.part == part] for part in parts]
+        rows.append((name, *(" ".join(share(s).split()).replace("[ ", "[") for s in shares)))
+    return ("set", *parts), rows
+
+
+def views_of(args: argparse.Namespace) -> tuple[list[View], int]:
+    """The set's views, and how many different photos they repeat; 0: renders."""
     photos = args.data / args.set / "queries"
     views = load_views(args.set, args.folder, args.data, args.pairs)
-    if photos.is_dir():
-        size = (args.width, args.width * 3 // 4)
-        views = photo_views(views[0].map_cache, photos, size)
-        views = (views * -(-args.pairs // len(views)))[: args.pairs]
-    return views
+    if not photos.is_dir():
+        return views, 0
+    size = (args.width, args.width * 3 // 4)
+    taken = photo_views(views[0].map_cache, photos, size)
+    return (taken * -(-args.pairs // len(taken)))[: args.pairs], len(taken)
 
 
 def main() -> None:
@@ -161,12 +177,19 @@ def main() -> None:
     parser.add_argument("--start", type=number(0.01, 90), default=5.0, help="m and degrees")
     parser.add_argument("--width", type=whole(64, 4096), default=SIZE[0], help="of photos, px")
     parser.add_argument("--model", type=existing, help="ONNX features; none: the shipped ones")
+    parser.add_argument("--json", type=output, help="the table and every registration")
     args = parser.parse_args()
     if args.set not in ("generated", "plain") and not (args.data / args.set).is_dir():
         parser.error(f"--set: {args.set!r} is neither generated, plain nor a folder of {args.data}")
-    done = list(trials(views_of(args), list(args.parts), args.start, args.model))
-    for part in args.parts:
+    parts = list(args.parts)
+    views, photos = views_of(args)
+    done = list(trials(views, parts, args.start, args.model))
+    for part in parts:
         print(report(part, [t for t in done if t.part == part]))
+    if args.json:
+        name = args.set if args.width == SIZE[0] else f"{args.set} at {args.width} px"
+        made = {"set": args.set, "outcomes": [asdict(t) for t in done]}
+        write_figures(args.json, *table(name, done, parts, photos), made)
 
 
 if __name__ == "__main__":

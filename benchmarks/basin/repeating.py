@@ -1,6 +1,6 @@
 """Registrations between two equal modes: a flat ground whose features repeat every 12 to 24 m.
 
-    python -m benchmarks.basin.repeating [--pairs 60]
+    python -m benchmarks.basin.repeating [--pairs 60] [--json repeating.json]
 
 The prior lies between the true place and its copy one period away. What decides is the prediction
 (equation 10); without one, either place may be found, and the covariance has to know of the other.
@@ -8,13 +8,14 @@ The prior lies between the true place and its copy one period away. What decides
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
 from benchmarks.basin.variants import FULL, Variant, changed
-from benchmarks.common.arguments import Parser, whole
+from benchmarks.common.arguments import Parser, output, whole
+from benchmarks.common.figures import write_figures
 from benchmarks.common.named_errors import named_errors
 from benchmarks.features.report import wilson
 from localizer.geometry.camera import Camera
@@ -26,6 +27,9 @@ from localizer.types import FeatureLevel, FeaturePyramid, PosePrior, RenderedVie
 _CAMERA = Camera(160, 120, 150.0, 144.0, 76.0, 63.5)
 _STRIDES, _CHANNELS, _WAVES = (8, 4, 2), 16, 6
 _ANCHORS, _NOISE = 300, 0.1
+_COLUMNS = (
+    "", "n", "the predicted place found", "without a prediction, covariance knows of the other",
+)  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -122,16 +126,31 @@ def _covariance(metres: float, degrees: float) -> Array:
     return np.asarray(np.diag(np.repeat([metres, np.radians(degrees)], 3) ** 2))
 
 
+def table(outcomes: Sequence[tuple[str, bool, bool]]) -> list[tuple[str, ...]]:
+    """Cells of `_COLUMNS`: a row a variant, shares in per cent with Wilson's interval."""
+    rows = []
+    for name in dict.fromkeys(o[0] for o in outcomes):
+        mine = np.array([o[1:] for o in outcomes if o[0] == name])
+        shares = (_share(int(hits), len(mine)) for hits in mine.sum(0))
+        rows.append((f"**{name}**" if name == FULL else name, str(len(mine)), *shares))
+    return rows
+
+
+def _share(hits: int, count: int) -> str:
+    low, high = wilson(hits, count)
+    return f"{100 * hits / count:.0f} % [{low:.0f}, {high:.0f}]"
+
+
 def main() -> None:
     parser = Parser(__doc__)
     parser.add_argument("--pairs", type=whole(1, 100_000), default=60, help="of places")
-    outcomes = list(trials(parser.parse_args().pairs))
-    for name in (v.name for v in rows()):
-        mine = np.array([o[1:] for o in outcomes if o[0] == name])
-        for label, column in (("predicted mode", 0), ("covariance knows of the other", 1)):
-            hits = int(mine[:, column].sum())
-            low, high = wilson(hits, len(mine))
-            print(f"{name:34s} {label:30s} {100 * hits / len(mine):5.1f} [{low:.1f}, {high:.1f}] %")
+    parser.add_argument("--json", type=output, help="the table")
+    args = parser.parse_args()
+    cells = table(list(trials(args.pairs)))
+    for row in (_COLUMNS, *cells):
+        print(" | ".join(row))
+    if args.json:
+        write_figures(args.json, _COLUMNS, cells)
 
 
 if __name__ == "__main__":

@@ -90,6 +90,14 @@ def random_start(metres: float, degrees: float, seed: int) -> Start:
     return Start(f"{metres:.0f} m {degrees:.0f}°", tuple(shift), tuple(turn))
 
 
+def sized_starts(index: int, sizes: tuple[float, ...]) -> list[Start]:
+    """A random direction and axis for each size in metres and degrees.
+
+    Not in the package's `__main__`: a spawned process finds no function of that.
+    """
+    return [random_start(size, size, index) for size in sizes]
+
+
 def run_views(
     job: tuple[int, list[View]],
     variants: list[Variant],

@@ -1,6 +1,6 @@
 """Half an hour of the bridge against a vehicle on a line that does everything wrong.
 
-    python -m benchmarks.bridge.soak [--minutes 30] [--plot soak.png] [--trace]
+    python -m benchmarks.bridge.soak [--minutes 30] [--plot soak.png] [--json soak.json] [--trace]
 
 The embedded vehicle and the line are processes of their own. The line cuts the connection for five
 minutes, refuses, falls silent, stops reading, resets, flips bits, truncates, duplicates and swaps
@@ -26,8 +26,9 @@ from typing import Any
 import numpy as np
 
 from benchmarks.bridge.soak_line import HOME, Fault, world
-from benchmarks.bridge.soak_report import FIX_HZ, WARM_UP_S, Sample, judge, plot
+from benchmarks.bridge.soak_report import COLUMNS, FIX_HZ, WARM_UP_S, Sample, judge, plot, told
 from benchmarks.common.arguments import Parser, number, output, whole
+from benchmarks.common.figures import write_figures
 from benchmarks.common.named_errors import named_errors
 from mavlink_bridge import Bridge, BridgeConfig, CameraView, HealthLevel, TargetReport, VisionFix
 from mavlink_bridge.config import InjectionConfig, OriginConfig
@@ -138,14 +139,18 @@ def main() -> int:
     )
     parser.add_argument("--seed", type=whole(0, 1 << 31), default=1, help="of the damage")
     parser.add_argument("--plot", type=output, help="PNG of the curves over time")
+    parser.add_argument("--json", type=output, help="what was found beside what is wanted")
     parser.add_argument("--trace", action="store_true", help="where memory grew; slower")
     arguments = parser.parse_args()
     logging.basicConfig(level=logging.ERROR)
     samples, faults, counters = fly(arguments.minutes, arguments.seed, arguments.trace)
-    good = judge(samples, faults, counters)
+    found = judge(samples, faults, counters)
     if arguments.plot is not None:
         plot(samples, faults, counters["begun"], arguments.plot)
-    return 0 if good else 1
+    if arguments.json is not None:
+        made = {"minutes": arguments.minutes, "seed": arguments.seed, "counters": told(counters)}
+        write_figures(arguments.json, COLUMNS, [bound.row for bound in found], made)
+    return 0 if all(bound.good for bound in found) else 1
 
 
 if __name__ == "__main__":

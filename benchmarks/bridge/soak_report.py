@@ -37,55 +37,88 @@ def recovery_s(samples: list[Sample], fault: Fault, begun: float) -> float | Non
     return None
 
 
-def judge(samples: list[Sample], faults: list[Fault], counters: dict[str, Any]) -> bool:
-    """Print the table and whether every bound holds."""
-    begun = counters["begun"]
+@dataclass(frozen=True)
+class Bound:
+    """One thing that must hold: what, as it was found, as it is wanted."""
+
+    what: str
+    found: str
+    wanted: str
+    good: bool
+
+    @property
+    def row(self) -> tuple[str, str, str]:
+        """As `COLUMNS` has it; what is missed stands out."""
+        return self.what, self.found if self.good else f"**{self.found}**", self.wanted
+
+
+COLUMNS = ("figure", "found", "wanted")
+
+
+def bounds(samples: list[Sample], faults: list[Fault], counters: dict[str, Any]) -> list[Bound]:
+    """Every kind of fault with the seconds until injection was back, then what must not grow."""
+    found = [
+        _returns(kind, [f for f in faults if f.kind == kind], samples, counters["begun"])
+        for kind in dict.fromkeys(f.kind for f in faults)
+    ]
+    warm = [s for s in samples if s.time_s > min(WARM_UP_S, samples[-1].time_s / 4)]
+    growth = float(
+        np.mean([s.rss_mib for s in warm[-30:]]) - np.mean([s.rss_mib for s in warm[:30]])
+    )
+    threads = sorted({s.threads for s in warm})
+    descriptors, waiting = max(s.descriptors for s in warm), max(s.waiting for s in warm)
+    errors = [
+        counters[f"{link}_{what}"]
+        for what in ("handler_errors", "failures")
+        for link in ("fc", "ground")
+    ]
+    return [
+        *found,
+        Bound("growth of resident memory, MiB", f"{growth:+.1f}", f"<= {RSS_BOUND_MIB:.0f}",
+              growth <= RSS_BOUND_MIB),
+        Bound("threads", " to ".join(map(str, dict.fromkeys((threads[0], threads[-1])))),
+              "as many all the time", len(threads) == 1),
+        # A link that is between two transports has one descriptor less.
+        Bound("descriptors, at most", str(descriptors), f"<= {warm[0].descriptors + 1}",
+              descriptors <= warm[0].descriptors + 1),
+        Bound("messages and bytes waiting, at most", str(waiting), "<= 8192", waiting <= 8192),
+        Bound("errors and failures of handlers", str(sum(errors)), "0", not any(errors)),
+    ]  # fmt: skip
+
+
+def _returns(kind: str, alike: list[Fault], samples: list[Sample], begun: float) -> Bound:
+    seconds = [recovery_s(samples, fault, begun) for fault in alike]
+    # A reboot's length is the vehicle's own.
+    lasted = " and ".join(dict.fromkeys(f"{f.ended - f.begun:.0f} s" for f in alike))
+    told = ", ".join("never" if s is None else f"{s:.1f}" for s in seconds)
+    good = all(s is not None and s <= RECOVERY_BOUND_S for s in seconds)
+    what = f"{kind} for {lasted} ({len(alike)}): injecting again after, s"
+    return Bound(what, told, f"<= {RECOVERY_BOUND_S:.0f}", good)
+
+
+def judge(samples: list[Sample], faults: list[Fault], counters: dict[str, Any]) -> list[Bound]:
+    """What must hold, printed with the course of the run and its counters."""
     print("\n  minute   RSS MiB  threads  descriptors  waiting   injected")
     step = max(len(samples) // 15, 1)
     for s in samples[::step]:
         print(f"{s.time_s / 60:8.1f} {s.rss_mib:9.1f} {s.threads:8d} {s.descriptors:12d} "
               f"{s.waiting:8d} {s.injected:10d}")  # fmt: skip
-    print("\n  fault        at min   for s   injecting again after s")
-    slowest: float | None = 0.0  # None: one fault was never recovered from
-    for fault in faults:
-        recovery = recovery_s(samples, fault, begun)
-        slowest = None if slowest is None or recovery is None else max(slowest, recovery)
-        text = "never" if recovery is None else f"{recovery:.1f}"
-        minute, length = (fault.begun - begun) / 60, fault.ended - fault.begun
-        print(f"  {fault.kind:10} {minute:8.1f} {length:7.0f} {text:>14}")
-    warm = [s for s in samples if s.time_s > min(WARM_UP_S, samples[-1].time_s / 4)]
-    growth = float(
-        np.mean([s.rss_mib for s in warm[-30:]]) - np.mean([s.rss_mib for s in warm[:30]])
-    )
-    threads = {s.threads for s in warm}
-    checks = {
-        f"RSS grew by {growth:+.1f} MiB (bound {RSS_BOUND_MIB:.0f})": growth <= RSS_BOUND_MIB,
-        f"threads {min(threads)} to {max(threads)} (bound: equal)": len(threads) == 1,
-        # A link that is between two transports has one descriptor less.
-        f"descriptors at most {max(s.descriptors for s in warm)}, at first "
-        f"{warm[0].descriptors} (bound: + 1)": (
-            max(s.descriptors for s in warm) <= warm[0].descriptors + 1
-        ),
-        f"waiting at most {max(s.waiting for s in warm)} (bound 8192)": (
-            max(s.waiting for s in warm) <= 8192
-        ),
-        f"handler errors {counters['fc_handler_errors']} + {counters['ground_handler_errors']}, "
-        f"failures {counters['fc_failures']} + {counters['ground_failures']} (bound 0)": not any(
-            counters[f"{link}_{what}"]
-            for link in ("fc", "ground")
-            for what in ("handler_errors", "failures")
-        ),
-        f"slowest return {'never' if slowest is None else f'{slowest:.0f} s'} "
-        f"(bound {RECOVERY_BOUND_S:.0f})": slowest is not None and slowest <= RECOVERY_BOUND_S,
-    }
+    found = bounds(samples, faults, counters)
     print()
-    for text, good in checks.items():
-        print(f"  {'ok   ' if good else 'WRONG'} {text}")
+    for bound in found:
+        print(
+            f"  {'ok   ' if bound.good else 'WRONG'} {bound.what}: {bound.found} ({bound.wanted})"
+        )
+    print("  " + ", ".join(f"{key} {value}" for key, value in told(counters).items()))
+    return found
+
+
+def told(counters: dict[str, Any]) -> dict[str, int]:
+    """The counters that say how much went through, and how much of it was damage."""
     keys = ("fc_messages", "fc_bad_bytes", "fc_bad_checksums", "fc_lost", "fc_opened",
             "fc_timeouts", "ground_bad_bytes", "bridge_reboots", "bridge_lost", "bridge_injected",
             "ignored_messages", "tlog_dropped", "reset_counter")  # fmt: skip
-    print("  " + ", ".join(f"{key} {counters.get(key, 0)}" for key in keys))
-    return all(checks.values())
+    return {key: int(counters.get(key) or 0) for key in keys}
 
 
 def plot(samples: list[Sample], faults: list[Fault], begun: float, path: Path) -> None:

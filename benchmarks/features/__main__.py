@@ -2,6 +2,7 @@
 
     python -m benchmarks.features --pairs 200 --seed 0 --out seed0.csv
     python -m benchmarks.features --report seed0.csv seed1.csv quito.csv   (pooled, and each set)
+    python -m benchmarks.features --report *.csv --table light --json light.json
     python -m benchmarks.features --real ../shared/data/caliterra --pairs 320   (real photos)
     python -m benchmarks.features --real ../shared/data/quito --pairs 280       (real mesh)
     python -m benchmarks.features --real ../shared/data/textures/neon_sjer_pairs --pairs 80
@@ -21,15 +22,15 @@ import argparse
 import logging
 import time
 from collections.abc import Callable, Sequence
-from functools import partial
 from pathlib import Path
 
 import numpy as np
 
 from benchmarks.common.arguments import Parser, existing, output, whole
+from benchmarks.common.figures import write_figures
 from benchmarks.common.named_errors import named_errors, needs_torch
 from localizer.config import LocalizerConfig
-from localizer.features import FeatureExtractor, GradientExtractor, load_extractor
+from localizer.features import GradientExtractor, load_extractor
 from localizer.features.detail import DetailExtractor
 from localizer.types import PosePrior
 
@@ -45,6 +46,7 @@ with needs_torch():
     )
     from benchmarks.features.real import real_pairs
     from benchmarks.features.report import Outcome, read_outcomes, report, write_outcomes
+    from benchmarks.features.tables import TABLES
 
 _log = logging.getLogger(__name__)
 
@@ -97,12 +99,12 @@ def build_methods(
     return methods
 
 
-def speed(extractor_of: Callable[[int], FeatureExtractor]) -> dict[str, float]:
+def speed(model: Path | None) -> dict[str, float]:
     """Median milliseconds at 320 x 240 on one and two threads."""
     image = np.random.default_rng(0).integers(0, 256, (240, 320, 3), dtype=np.uint8)
     result = {}
     for threads in (1, 2):
-        extractor = extractor_of(threads)
+        extractor = load_extractor(model, threads=threads)
         times = []
         for _ in range(100):
             began = time.perf_counter()
@@ -144,6 +146,8 @@ def parser() -> Parser:
     kind.add_argument("--mesh", action="store_true", help="a mesh world instead of height fields")
     p.add_argument("--out", type=output, help="CSV of every outcome")
     p.add_argument("--report", type=existing, nargs="+", help="tables of earlier CSVs, no run")
+    p.add_argument("--table", choices=TABLES, default="sets", help="that --json keeps")
+    p.add_argument("--json", type=output, help="that table of --report, for the documentation")
     p.add_argument("--speed", action="store_true", help="time of extraction, no run")
     return p
 
@@ -167,20 +171,19 @@ def make_pairs(args: argparse.Namespace) -> tuple[str, list[TestPair]]:
     return "generated", made_pairs(args.pairs, which, args.cache)
 
 
-def _with_threads(model: Path | None, threads: int) -> FeatureExtractor:
-    return load_extractor(model, threads=threads)
-
-
 def main() -> None:
     args = parser().parse_args()
     if args.speed:
         for model in args.models:
             path = None if model == SHIPPED else model
-            times = speed(partial(_with_threads, path))
+            times = speed(path)
             print(model, {k: f"{v:.1f} ms" for k, v in times.items()})
         return
     if args.report:
-        print(report(read_outcomes(args.report)))
+        outcomes = read_outcomes(args.report)
+        print(report(outcomes))
+        if args.json:
+            write_figures(args.json, *TABLES[args.table](outcomes))
         return
     methods = build_methods(args.baselines, args.models, args.anchors)
     source, pairs = make_pairs(args)

@@ -21,7 +21,8 @@ With --flights (folders of `python -m sitl loop` or `demo`) it counts how many p
 the level that they had in flight: those that were injected, and those that were withheld or flown
 in shadow; and what the guardian said, by finding. With --replay their fixes and the vehicle's
 messages go through the guardian of now: what it would tell and withhold, and what the levels are
-made of; with --calibrated as if their deployments had said when they were calibrated.
+made of; with --calibrated as if their deployments had said when they were calibrated, with --lost 6
+as if no fix had come for 6 s after each 20 s: whatever is withheld then is a false alarm.
 """
 
 from __future__ import annotations
@@ -62,6 +63,7 @@ def parser() -> Parser:
     p.add_argument("--flights", type=existing, nargs="+", help="flown folders, no run")
     p.add_argument("--replay", type=existing, nargs="+", help="flown folders, once more")
     p.add_argument("--calibrated", action="store_true", help="with --replay: the cameras are")
+    p.add_argument("--lost", type=number(0, 60), default=0.0, help="with --replay: s, each 20")
     p.add_argument("--report", type=existing, nargs="+", help="earlier files, no run")
     return p
 
@@ -145,14 +147,16 @@ def count_flights(folders: list[Path], out: Path | None) -> None:
         out.write_text(json.dumps(found, indent=1, allow_nan=False))
 
 
-def replay_flights(folders: list[Path], out: Path | None, *, calibrated: bool) -> None:
+def replay_flights(
+    folders: list[Path], out: Path | None, *, calibrated: bool, lost_s: float
+) -> None:
     """Print what the guardian of now makes of flights; what cannot be replayed is named."""
     protection = ProtectionConfig().of_camera(calibrated=calibrated)
     config = GuardianConfig(protection=protection)
     flown, left_out = [], {}
     for folder in folders:
         try:
-            flown.append(replayed.replay(folder, config))
+            flown.append(replayed.replay(folder, config, lost_s))
         except RecordError as error:
             left_out[str(folder)] = str(error)
             print(f"left out: {error}")
@@ -168,7 +172,7 @@ def main() -> None:
         count_flights(args.flights, args.out)
         return
     if args.replay:
-        replay_flights(args.replay, args.out, calibrated=args.calibrated)
+        replay_flights(args.replay, args.out, calibrated=args.calibrated, lost_s=args.lost)
         return
     if args.report:
         found = report([o for path in args.report for o in read(path)])

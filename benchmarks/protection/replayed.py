@@ -10,17 +10,20 @@ import csv
 import json
 from collections import Counter
 from collections.abc import Iterator, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from companion.conversions import camera_on_body
 from companion.flight.injection import JumpPolicy
 from companion.guardian.config import GuardianConfig
 from companion.guardian.findings import RULES
 from companion.guardian.monitor import Limits, Monitor
 from companion.guardian.protection import budget
+from localizer.geometry.geo import NED_FROM_ENU
+from localizer.geometry.pose import euler_from_matrix, matrix_from_quaternion
 from localizer.types import TrackingState
 from mavlink_bridge.errors import RecordError
 from mavlink_bridge.link.tlog import read_tlog
@@ -34,6 +37,7 @@ from mavlink_bridge.messages import (
 from mavlink_bridge.vehicle.tracker import VehicleTracker
 
 _STEP_NS = 100_000_000
+_LOST_EVERY_S = 20.0
 _SOURCES = ("noise", "map", "calibration", "time")
 _COLUMNS = (
     "flight", "fixes", "withheld", "told", "HPL median, m", "noise, map, calibration, time, %",
@@ -53,6 +57,22 @@ class Replayed:
     told: dict[str, int]
     hpl_m: float
     shares: dict[str, float]
+
+
+@dataclass(frozen=True)
+class _Arrival:
+    """A fix, when it came, and how its camera looked: (3, 3) to NED; None where not recorded."""
+
+    came_ns: int
+    fix: VisionFix
+    ned_from_camera: np.ndarray | None
+
+    def with_heading(self, attitude: Attitude | None, gimbal: GimbalAttitude | None) -> VisionFix:
+        """As the companion had it."""
+        if self.ned_from_camera is None or attitude is None or gimbal is None:
+            return self.fix
+        ned_from_body = self.ned_from_camera @ camera_on_body(attitude, gimbal).T
+        return replace(self.fix, yaw_rad=euler_from_matrix(ned_from_body)[2])
 
 
 class _Recorded:
@@ -78,8 +98,11 @@ class _Recorded:
         return None  # the calibration watch does not run
 
 
-def replay(folder: Path, config: GuardianConfig | None = None) -> Replayed:
-    """A folder of `python -m sitl loop` or `demo`. RecordError says why it cannot be replayed."""
+def replay(folder: Path, config: GuardianConfig | None = None, lost_s: float = 0.0) -> Replayed:
+    """A folder of `python -m sitl loop` or `demo`. RecordError says why it cannot be replayed.
+
+    lost_s: so long after each `_LOST_EVERY_S` no fix came, and the next one announces itself.
+    """
     config = config or GuardianConfig()
     try:
         arrivals, since_utc_ns = _fixes(folder)
@@ -87,24 +110,27 @@ def replay(folder: Path, config: GuardianConfig | None = None) -> Replayed:
         raise RecordError(f"{folder}: not a flight's record: {error!r}") from error
     if not arrivals:
         raise RecordError(f"{folder}: no estimate in it has a protection level")
+    arrivals = _without(arrivals, lost_s)
     vehicle, monitor = _Recorded(), Monitor(config, Limits())
     told: Counter[str] = Counter()
     levels, parts = [], []
-    waiting, step_ns = iter([*arrivals, (np.inf, None)]), None
-    due_ns, fix = next(waiting)
+    waiting, step_ns = iter(arrivals), None
+    due = next(waiting, None)
     for utc_ns, message in read_tlog(folder / "flight.tlog"):
         now_ns = utc_ns + since_utc_ns
         step_ns = now_ns if step_ns is None else step_ns
-        while min(due_ns, step_ns) <= now_ns:
-            vehicle.now_ns = int(min(due_ns, step_ns))
-            if due_ns <= step_ns and fix is not None:
-                state = vehicle.state()
-                admitted = monitor.admit(fix, state)
+        while min(step_ns, step_ns if due is None else due.came_ns) <= now_ns:
+            if due is not None and due.came_ns <= step_ns:
+                vehicle.now_ns = due.came_ns
+                state, attitude = vehicle.state(), vehicle.attitude_at(due.fix.time_ns)
+                fix = due.with_heading(attitude, vehicle.gimbal_at(due.fix.time_ns))
+                admitted = monitor.admit(fix, state, attitude)
                 if admitted is not None and admitted.protection_m is not None:
                     levels.append(admitted.protection_m[0])
                     parts.append(_parts(fix, state, config))
-                due_ns, fix = next(waiting)
+                due = next(waiting, None)
             else:
+                vehicle.now_ns = step_ns
                 lines = monitor.step(vehicle.now_ns, vehicle)
                 told.update(r.name for r in RULES for one in lines if r.is_line(one.text))
                 step_ns += _STEP_NS
@@ -165,8 +191,21 @@ def _row(flight: Replayed) -> tuple[str, ...]:
     )  # fmt: skip
 
 
-def _fixes(folder: Path) -> tuple[list[tuple[float, VisionFix | None]], int]:
-    """When each fix came, and it; and CLOCK_MONOTONIC less UTC, ns."""
+def _without(arrivals: list[_Arrival], lost_s: float) -> list[_Arrival]:
+    """Those that come where one is lost again and again; the first after it announces a jump."""
+    kept: list[_Arrival] = []
+    began_ns = arrivals[0].fix.time_ns
+    for one in arrivals:
+        at_s = (one.fix.time_ns - began_ns) * 1e-9 % (_LOST_EVERY_S + lost_s)
+        if at_s < _LOST_EVERY_S:
+            gap_s = (one.fix.time_ns - kept[-1].fix.time_ns) * 1e-9 if kept else 0.0
+            is_found = 0.0 < lost_s <= gap_s
+            kept.append(replace(one, fix=replace(one.fix, reset=one.fix.reset or is_found)))
+    return kept
+
+
+def _fixes(folder: Path) -> tuple[list[_Arrival], int]:
+    """The fixes as they came; and CLOCK_MONOTONIC less UTC, ns."""
     records = sorted(p.parent for p in folder.glob("companion*/estimates.csv"))
     made = json.loads((records[0] / "record.json").read_text(encoding="utf-8")) if records else {}
     policy, fixes = JumpPolicy(), []
@@ -176,13 +215,23 @@ def _fixes(folder: Path) -> tuple[list[tuple[float, VisionFix | None]], int]:
             if row["accepted"] == "1" and row.get("hpl_m"):
                 time_ns = int(row["exposure_time_ns"])
                 came_ns = time_ns + round(float(row["latency_ms"]) * 1e6)
-                fixes.append((float(came_ns), _fix(row, time_ns, reset=policy.is_due)))
+                fix = _fix(row, time_ns, reset=policy.is_due)
+                fixes.append(_Arrival(came_ns, fix, _ned_from_camera(row)))
                 policy.carried()
-    fixes.sort(key=lambda one: one[0])
+    fixes.sort(key=lambda one: one.came_ns)
     return fixes, int(made.get("monotonic_ns", 0)) - int(made.get("utc_ns", 0))
 
 
-def _fix(row: dict[str, str], time_ns: int, *, reset: bool) -> VisionFix | None:
+def _ned_from_camera(row: dict[str, str]) -> np.ndarray | None:
+    """Records of before 2026-11 have no rotation in this file. About the map's origin's axes."""
+    if not row.get("qw"):
+        return None
+    w, x, y, z = (float(row[name]) for name in ("qw", "qx", "qy", "qz"))
+    rotation: np.ndarray = NED_FROM_ENU @ matrix_from_quaternion((w, x, y, z))
+    return rotation
+
+
+def _fix(row: dict[str, str], time_ns: int, *, reset: bool) -> VisionFix:
     sigmas = [float(row[f"sigma_{axis}_m"]) for axis in ("north", "east", "up")]
     covariance = np.diag(np.square(sigmas))
     return VisionFix(
@@ -191,6 +240,7 @@ def _fix(row: dict[str, str], time_ns: int, *, reset: bool) -> VisionFix | None:
         float(row["longitude_deg"]),
         float(row["height_m"]),
         position_covariance_ned=covariance,
+        attitude_sigma_rad=float(row.get("sigma_rotation_rad") or 0.02),
         reset=reset,
     )
 

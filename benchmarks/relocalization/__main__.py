@@ -3,7 +3,7 @@
     python -m benchmarks.relocalization --set generated --views 80 --heading known --out out.json
     python -m benchmarks.relocalization --set quito --views 48 --heading unknown
     python -m benchmarks.relocalization --set quito --on FOLDER/generated/2000001/survey.cache
-    python -m benchmarks.relocalization --report out.json more.json
+    python -m benchmarks.relocalization --report out.json more.json [--json table.json]
 
 Sets are those of `python -m benchmarks.basin`: generated worlds of seeds that no training uses, the
 query on another day under made weather; quito, a real mesh (map and query from the same mesh);
@@ -23,8 +23,17 @@ from pathlib import Path
 
 from benchmarks.basin.views import load_views
 from benchmarks.common.arguments import Parser, existing, output, whole
+from benchmarks.common.figures import write_figures
 from benchmarks.common.named_errors import named_errors
-from benchmarks.relocalization.run import Outcome, Search, run, table, with_threads
+from benchmarks.relocalization.run import (
+    COLUMNS,
+    Outcome,
+    Search,
+    cells,
+    run,
+    table,
+    with_threads,
+)
 from localizer.config import LocalizerConfig
 
 
@@ -44,6 +53,7 @@ def parser() -> Parser:
     p.add_argument("--data", type=Path, default=Path("../shared/data"), help="real sets")
     p.add_argument("--out", type=output, help="JSON of every outcome")
     p.add_argument("--report", type=existing, nargs="+", help="table of earlier files, no run")
+    p.add_argument("--json", type=output, help="the table")
     return p
 
 
@@ -52,6 +62,8 @@ def main() -> None:
     if args.report:
         rows = [Outcome(**row) for path in args.report for row in json.loads(path.read_text())]
         print(table(rows))
+        if args.json:
+            write_figures(args.json, COLUMNS, cells(rows))
         return
     config = with_threads(LocalizerConfig(), args.threads)
     views = load_views(args.set, args.cache, args.data, args.views)
@@ -65,6 +77,8 @@ def main() -> None:
             if args.out:  # after each one: an interrupted run keeps what it has
                 args.out.write_text(json.dumps([asdict(o) for o in outcomes], indent=1))
     print(table(outcomes))
+    if args.json:
+        write_figures(args.json, COLUMNS, cells(outcomes))
 
 
 if __name__ == "__main__":

@@ -4,9 +4,10 @@
 
 MAP is a tile cache. Its overview is laid side by side until it covers each area, so that the work
 is real and the places are not: nothing is found here, only timed. The query is coloured noise, as
-seen from 110 m above the ground: what is compared does not change the work. Processor seconds of a
-search on one thread, the map's transforms kept as far as the budget goes; beyond the largest area
-it is linear, since every block is compared with every trial: --on-paper draws that line.
+seen from 110 m above the ground: what is compared does not change the work. Processor and wall
+seconds of a search, on one thread or several, the map's transforms kept as far as the budget goes.
+Beyond the largest area it is linear, since every block is compared with every trial: --on-paper
+draws that line.
 """
 
 from __future__ import annotations
@@ -15,12 +16,14 @@ import json
 import resource
 import time
 from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict, dataclass, replace
 
 import numpy as np
 
 from benchmarks.common.arguments import Parser, existing, number, output, whole
 from benchmarks.common.named_errors import named_errors
+from benchmarks.relocalization.run import with_threads
 from localizer.config import LocalizerConfig
 from localizer.geometry.camera import Camera
 from localizer.geometry.pose import Pose, so3_exp
@@ -56,6 +59,7 @@ class Cost:
     peak_mib: float
     cell_m: float
     measured: bool = True
+    threads: int = 1
 
 
 def laid_out(level: OverviewLevel, area_km2: float) -> OverviewLevel:
@@ -71,7 +75,7 @@ def laid_out(level: OverviewLevel, area_km2: float) -> OverviewLevel:
 
 def costs(
     relocalizer: Relocalizer, query: PlaceQuery, areas: list[float], config: LocalizerConfig,
-    coarser: int = 0,
+    coarser: int = 0, pool: ThreadPoolExecutor | None = None,
 ) -> Iterator[Cost]:  # fmt: skip
     """One search on each area, after one that fills what is kept. coarser: of the overview's scales
     the finest are left out, as a coarser first stage would.
@@ -84,7 +88,7 @@ def costs(
         one = replace(query, heading_sigma_rad=1e-3)
         search(view, one, correlators, relocalizer.extractor, c)
         wall, cpu = time.perf_counter(), time.process_time()
-        search(view, query, correlators, relocalizer.extractor, c)
+        search(view, query, correlators, relocalizer.extractor, c, pool=pool)
         cpu, wall = time.process_time() - cpu, time.perf_counter() - wall
         blocks = len(correlators[0].blocks())
         yield Cost(
@@ -97,6 +101,7 @@ def costs(
             wall,
             resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024,
             levels[0].cell_m,
+            threads=c.threads,
         )
 
 
@@ -137,16 +142,17 @@ def main() -> None:
     p.add_argument("--on-paper", type=number(0.01, 1e5), default=100.0, help="km2, extrapolated")
     p.add_argument("--coarser", type=whole(0, 2), default=0, help="finest scales to leave out")
     p.add_argument("--spectra-mib", type=whole(0, 1 << 20), help="budget of kept transforms")
+    p.add_argument("--threads", type=whole(1, 64), default=1, help="of a search")
     p.add_argument("--out", type=output, help="JSON")
     args = p.parse_args()
-    config = LocalizerConfig()
+    config = with_threads(LocalizerConfig(), args.threads)
     if args.spectra_mib is not None:
         places = config.relocalization.model_copy(update={"spectra_mib": args.spectra_mib})
         config = config.model_copy(update={"relocalization": places})
     opened = open_relocalizer(TileCache.open(args.map), config)
     if opened is None:
         raise RuntimeError("an overview that nobody stopped was not made")
-    with opened as relocalizer:
+    with opened as relocalizer, ThreadPoolExecutor(args.threads) as workers:
         ground = float(np.nanmedian(relocalizer.overview.levels[0].ground))
         image = np.random.default_rng(0).integers(0, 255, (45, 60, 3)).astype(np.uint8)
         image = np.kron(image, np.ones((8, 8, 1), np.uint8))
@@ -155,8 +161,9 @@ def main() -> None:
         query = PlaceQuery(
             Frame(image, 0, _CAMERA, 0), pose.rotation, 0.01, sigma, ground + _HEIGHT_M, 2.0
         )
+        pool = workers if args.threads > 1 else None
         made = []
-        for cost in costs(relocalizer, query, args.areas, config, args.coarser):
+        for cost in costs(relocalizer, query, args.areas, config, args.coarser, pool):
             made.append(cost)
             print(line(cost), flush=True)
         if len(made) > 1 and args.on_paper > max(c.area_km2 for c in made):

@@ -30,6 +30,7 @@ import numpy as np
 from benchmarks.basin.views import SIZE, ground_height
 from benchmarks.common.arguments import Parser, existing, number, output, whole
 from benchmarks.common.deadline import deadline
+from benchmarks.common.figures import write_figures
 from benchmarks.common.named_errors import named_errors, needs_torch
 from benchmarks.common.shares import exact_interval
 from benchmarks.odometry.stretches import Plan, Stretch, make_stretch
@@ -64,6 +65,8 @@ from localizer.types import Frame, PosePrior, TrackingState
 # Of a set: the map that is searched, the world that is seen, how far from the middle it is flown.
 SETS = {
     "generated": ("generated/2000001/survey.cache", "generated/2000001/day.cache", 230.0),
+    "unseen": ("generated/2000002/survey.cache", "generated/2000002/day.cache", 230.0),
+    "unseen_2": ("generated/2000003/survey.cache", "generated/2000003/day.cache", 230.0),
     "quito": ("quito/map.cache", "quito/map.cache", 110.0),
     "roofs": ("roofs/map.cache", "roofs/map.cache", 120.0),
     "forest": ("forest/map.cache", "forest/map.cache", 120.0),
@@ -298,26 +301,35 @@ def shares(outcomes: Sequence[Outcome]) -> list[dict[str, object]]:
     return rows
 
 
-def table(rows: Sequence[dict[str, object]]) -> str:
-    """One line a row."""
+COLUMNS = (
+    "set", "heading", "light", "flights", "found in the first frame", "within five", "confirmed",
+    "flights with a false pose given out", "poses given, false", "search's wrong answers",
+)  # fmt: skip
+
+
+def cells(rows: Sequence[dict[str, object]]) -> list[tuple[str, ...]]:
+    """As they are printed, a line for each of `shares`."""
     names = ("found_in_first", "found_within_5", "confirmed", "trials_with_false")
-    lines = [
-        "| set | heading | light | trials | found in the first frame | within five | confirmed "
-        "| trials with a false pose given out | poses given, false | search's wrong answers |",
-        "|---|---|---|---|---|---|---|---|---|---|",
-    ]
+    made = []
     for row in rows:
-        cells = []
+        told = []
         for name in names:
             value = row[name]
             assert isinstance(value, dict)
-            cells.append(f"{value['hits']} [{value['low']:.1f}, {value['high']:.1f}]")
-        lines.append(
-            f"| {row['set']} | {row['heading']} | {row['light']} | {row['trials']} | "
-            + " | ".join(cells)
-            + f" | {row['given']}, {row['false_given']} | {row['wrong_answers']} |"
-        )
-    return "\n".join(lines)
+            told.append(f"{value['hits']} [{value['low']:.1f}, {value['high']:.1f}]")
+        made.append(
+            (
+                str(row["set"]), str(row["heading"]), str(row["light"]), str(row["trials"]), *told,
+                f"{row['given']}, {row['false_given']}", str(row["wrong_answers"]),
+            )
+        )  # fmt: skip
+    return made
+
+
+def table(rows: Sequence[dict[str, object]]) -> str:
+    """One line a row."""
+    lines = (COLUMNS, tuple("---" for _ in COLUMNS), *cells(rows))
+    return "\n".join("| " + " | ".join(line) + " |" for line in lines)
 
 
 def main() -> None:
@@ -356,7 +368,7 @@ def main() -> None:
     rows = shares(kept)
     print(table(rows))
     if args.json:
-        args.json.write_text(json.dumps(rows, indent=1))
+        write_figures(args.json, COLUMNS, cells(rows), {"shares": rows})
 
 
 if __name__ == "__main__":

@@ -119,22 +119,24 @@ def _aim(pose: Pose, height_m: float) -> Array:
     return place
 
 
-def table(outcomes: Sequence[Outcome]) -> str:
+COLUMNS = (
+    "set", "heading", "condition", "frames", "candidates hold it", "found and confirmed", "false",
+    "CPU s: search, confirm", "wall s",
+)  # fmt: skip
+
+
+def cells(outcomes: Sequence[Outcome]) -> list[tuple[str, ...]]:
     """One line per condition and for all, each with the exact interval."""
-    rows = [
-        "| set | heading | condition | frames | candidates hold it | found and confirmed | false "
-        "| CPU s: search, confirm | wall s |",
-        "|---|---|---|---|---|---|---|---|---|",
-    ]
+    rows = []
     for name, known in dict.fromkeys((o.set, o.heading_known) for o in outcomes):
         mine = [o for o in outcomes if (o.set, o.heading_known) == (name, known)]
         for condition in [*dict.fromkeys(o.condition for o in mine), "all"]:
             some = [o for o in mine if condition in (o.condition, "all")]
             rows.append(_row(name, known, condition, some))
-    return "\n".join(rows)
+    return rows
 
 
-def _row(name: str, known: bool, condition: str, some: Sequence[Outcome]) -> str:
+def _row(name: str, known: bool, condition: str, some: Sequence[Outcome]) -> tuple[str, ...]:
     n, hits = len(some), sum(o.found for o in some)
     low, high = exact_interval(hits, n)
     cpu, confirm, wall = (
@@ -142,10 +144,16 @@ def _row(name: str, known: bool, condition: str, some: Sequence[Outcome]) -> str
         for k in ("search_cpu_s", "verify_cpu_s", "wall_s")
     )
     return (
-        f"| {name} | {'15°' if known else 'unknown'} | {condition} | {n} "
-        f"| {sum(o.rank >= 0 for o in some)} | {hits} ({low:.0f} to {high:.0f} %) "
-        f"| {sum(o.false for o in some)} | {cpu:.2f}, {confirm:.2f} | {wall:.2f} |"
-    )
+        name, "15°" if known else "unknown", condition, str(n), str(sum(o.rank >= 0 for o in some)),
+        f"{hits} ({low:.0f} to {high:.0f} %)", str(sum(o.false for o in some)),
+        f"{cpu:.2f}, {confirm:.2f}", f"{wall:.2f}",
+    )  # fmt: skip
+
+
+def table(outcomes: Sequence[Outcome]) -> str:
+    """As Markdown has it."""
+    lines = (COLUMNS, tuple("---" for _ in COLUMNS), *cells(outcomes))
+    return "\n".join("| " + " | ".join(line) + " |" for line in lines)
 
 
 def with_threads(config: LocalizerConfig, threads: int) -> LocalizerConfig:

@@ -34,7 +34,7 @@ _PLACES = (
 )  # fmt: skip
 _COST = (
     "area", "cell, m", "heading", "overview, MiB", "transforms kept, MiB", "process, MiB",
-    "processor s",
+    "processor s", "s, threads",
 )  # fmt: skip
 _DRIFT = (
     "depth from", "light", "stretches", "drift median, p95, % of the way", "median, p95, m",
@@ -92,6 +92,7 @@ def _form(data: Any) -> Callable[[list[Any], str], Table]:
         ("columns", _figures), ("package", _package), ("recall_1", _sequence), ("verdict", _suite),
         ("acceptance", _integrity), ("search_cpu_s", _places), ("overview_mib", _cost),
         ("bins", _depths), ("rows", _throughput), ("end_percent_p95", _drift),
+        ("iteration_ms", _optimizer),
     ):  # fmt: skip
         if mark in marks:
             return made
@@ -113,6 +114,18 @@ def _depths(data: list[Any], _title: str) -> Table:
         for part in data for one in part["rows"]
     )  # fmt: skip
     return Table(_DEPTHS, rows)
+
+
+def _optimizer(data: list[Any], _title: str) -> Table:
+    """Milliseconds of one LM iteration by side of the feature map; the paper's own figures last."""
+    columns = ("per LM iteration, ms", *(f"{size} px" for size in data[0]["sizes"]))
+    rows = tuple(
+        (backend, *(f"{ms:.3g}" for ms in of_size))
+        for part in data
+        for times in (part["iteration_ms"], part["paper_ms"])
+        for backend, of_size in times.items()
+    )
+    return Table(columns, rows)
 
 
 def _throughput(data: list[Any], _title: str) -> Table:
@@ -257,7 +270,8 @@ def _cost(data: list[Any], _title: str) -> Table:
         (f"{one['area_km2']:.1f} km²{'' if one['measured'] else ', on paper'}",
          f"{one['cell_m']:g}", "15°" if one["heading_known"] else "unknown",
          f"{one['overview_mib']:.0f}",
-         f"{one['kept_mib']:.0f}", f"{one['peak_mib']:.0f}", f"{one['cpu_s']:.2f}")
+         f"{one['kept_mib']:.0f}", f"{one['peak_mib']:.0f}", f"{one['cpu_s']:.2f}",
+         f"{one['wall_s']:.2f}, {one.get('threads', 1)}")
         for part in data
         for one in part
     )  # fmt: skip

@@ -168,7 +168,7 @@ def _fix(target: Target) -> FollowedFix:
     fix = target.fix
     return FollowedFix(
         fix.exposure_time_ns, fix.position_world, fix.covariance, fix.velocity,
-        fix.velocity_covariance, fix.visibility is not Visibility.HIDDEN,
+        fix.velocity_covariance, fix.visibility is Visibility.SEEN,
     )  # fmt: skip
 
 

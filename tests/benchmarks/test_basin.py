@@ -2,11 +2,16 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from benchmarks.basin.axes import AXES, STEPS, axis_start, axis_starts, limit, limits
+from benchmarks.basin.axes import table as axes_table
+from benchmarks.basin.repeating import table
 from benchmarks.basin.run import Outcome, random_start, summary
+from benchmarks.basin.tables import ablation_table, covariance_table
 from localizer.geometry.pose import Pose, so3_exp
 
 TRUTH = Pose(so3_exp([2.0, 0.3, -0.4]), np.array([10.0, -20.0, 120.0]))
@@ -77,3 +82,53 @@ def test_a_summary_compares_the_same_views():
     assert low is not None
     assert high is not None
     assert low <= -50.0 <= high
+
+
+def test_what_the_covariance_was_fitted_on_has_its_own_row():
+    mine = [replace(outcome(k, 0.5), nees=4.0 + 20.0 * (k == 41)) for k in range(80)]
+    far = replace(outcome(79, 4.0), nees=900.0)  # not asked for: not within 3 m
+    _, rows = covariance_table("generated", [*mine, far], 0)
+    assert [row[:2] for row in rows] == [
+        ("generated, worlds of even number, fitted", "40"),
+        ("generated, worlds of odd number", "40"),
+    ]
+    assert rows[0][4] == "100.0 [91, 100]"
+    assert rows[1][4].startswith("97.5 [")
+    assert [row[0] for row in covariance_table("caliterra", mine, 25)[1]] == [
+        "caliterra, photos of even number, fitted",
+        "caliterra, photos of odd number",
+    ]
+
+
+def test_the_ablations_table_compares_with_ours_start_by_start():
+    rows = [outcome(k, 0.5, start) for k in range(4) for start in ("5 m 5°", "10 m 10°")]
+    other = [replace(o, variant="one", metres=2.0 * (o.view < 2)) for o in rows]
+    columns, cells = ablation_table("quito", rows + other)
+    assert columns[1] == "5 m, 5°, n 4: R@1, change, median"
+    assert cells[0] == ("quito: **ours**", "100.0 %, 0.50 m", "100.0 %, 0.50 m", "10")
+    assert cells[1][1].startswith("50.0 %, -50.0 (-")
+
+
+def test_shares_of_equal_modes_stand_row_by_row():
+    rows = table([("ours", True, True), ("ours", True, False), ("other", False, True)])
+    assert rows[0][:2] == ("**ours**", "2")
+    assert rows[0][2].startswith("100 % [")
+    assert rows[0][3].startswith("50 % [")
+    assert rows[1][2].startswith("0 % [")
+
+
+def test_the_axes_table_has_limits_beside_the_papers_and_shares_of_all_axes():
+    reach = dict(zip(STEPS, (1.0, 1.0, 1.0, 1.0, 0.75, 0.5, 0.25), strict=True))
+    made = [
+        outcome(k, 0.1 if k < share * 4 else 5.0, f"{axis} {size:.0f}")
+        for axis in ("all", *AXES)
+        for size, share in reach.items()
+        for k in range(4)
+    ]
+    columns, rows = axes_table(made)
+    assert columns[1:] == (*AXES, "from 8 / 11 / 15 m and ° in all, %")
+    assert rows[0][1] == "3.5°"
+    assert rows[0][4] == "5.6 m"
+    assert rows[1][0] == "**ours**"
+    assert rows[1][1].startswith("11.0 [")
+    assert rows[1][-1] == "75 / 50 / 25"

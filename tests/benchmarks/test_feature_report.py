@@ -13,6 +13,7 @@ from benchmarks.features.report import (
     wilson,
     write_outcomes,
 )
+from benchmarks.features.tables import TABLES
 from localizer.errors import SequenceError
 
 
@@ -70,3 +71,20 @@ def test_a_file_that_is_no_report_is_named(tmp_path: Path, text: str) -> None:
     path.write_text(text)
     with pytest.raises(SequenceError, match=r"seed0\.csv: "):
         read_outcomes([path])
+
+
+def test_the_tables_for_the_documentation_have_a_row_a_set_and_a_kind() -> None:
+    one = outcomes("gradient", [2.0] * 8, "made") + outcomes("gradient", [2.0] * 4, "quito")
+    two = outcomes("tiny", [0.5] * 8, "made") + outcomes("tiny", [0.5, 0.5, 2.0, 9.0], "quito")
+    _, sets = TABLES["sets"](one + two)
+    assert sets[0] == ("made", "8", "0 [0, 32], 100", "100 [68, 100], 100")
+    assert [row[:2] for row in sets] == [("made", "8"), ("quito", "4"), ("all", "12")]
+    columns, light = TABLES["light"](one + two)
+    assert columns == ("light and weather", "made", "quito")
+    assert light == [
+        ("day", "100, 100 (n 4)", "50, 50 (n 2)"),
+        ("night", "100, 100 (n 4)", "50, 100 (n 2)"),
+    ]
+    _, leads = TABLES["leads"](one + two)
+    assert [row[0] for row in leads] == ["all", "made", "quito", "night"]
+    assert leads[1][2] == "+100.0 [+100.0, +100.0]"

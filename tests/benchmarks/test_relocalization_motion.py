@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import asdict, replace
 
 import pytest
 
 from benchmarks.common.shares import exact_interval
+from benchmarks.relocalization.counted import cells, one
 from benchmarks.relocalization.motion import Outcome, share, shares, table
 
 FOUND = Outcome(
@@ -43,3 +44,16 @@ def test_shares_have_exact_intervals():
     assert high == pytest.approx(0.368, abs=1e-3)
     assert low == 0.0
     assert "0 [0.0, 97.5]" in table(shares([FOUND]))
+
+
+def test_all_relocalizations_are_counted_together_and_a_false_one_shows():
+    on_a_map = {"set": "quito", "heading_known": False, "found": True, "false": False}
+    elsewhere = on_a_map | {"set": "quito, not on this map", "found": False}
+    rows = [asdict(FOUND), asdict(NEVER), asdict(FALSE), on_a_map, elsewhere]
+    made = {line[:2]: line[2:] for line in cells([one(row) for row in rows])}
+    assert made["a flight without a place", "15°"] == ("2", "1", "1", "0, 0.00 [0.00, 84.19]")
+    assert made["a flight without a place of another place", "15°"][1:3] == ("0", "0")
+    assert made["one frame, the whole map", "unknown"][:3] == ("1", "1", "0")
+    assert made["one frame, the whole map of another place", "unknown"][:3] == ("1", "0", "1")
+    assert made["all", "any"][:3] == ("5", "2", "2")
+    assert made["all", "any"][3].startswith("1, 20.00 [0.51")

@@ -1,0 +1,97 @@
+"""The feature benchmark's tables as cells, for the documentation."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+
+from benchmarks.features.report import Outcome, difference, groups, wilson
+from localizer.synth.appearance.model import CONDITIONS
+
+Cells = tuple[tuple[str, ...], list[tuple[str, ...]]]  # columns and rows
+
+# What a row calls the kinds of pairs; photos are taken by day.
+_KINDS = {
+    **{name: name for name in CONDITIONS}, "photo": "day", "photo, coarser map": "coarser map",
+    "season": "another season", "outdated map": "outdated map", "photo, older map": "outdated map",
+    "combined": "any weather, season, outdated map together",
+}  # fmt: skip
+
+
+def by_set(outcomes: Sequence[Outcome]) -> Cells:
+    """A row a set, a column a method."""
+    named = {s: [o for o in outcomes if o.source == s] for s in _sources(outcomes)}
+    return _by_method("pairs", named | ({"all": list(outcomes)} if len(named) > 1 else {}))
+
+
+def by_condition(outcomes: Sequence[Outcome]) -> Cells:
+    """A row a kind of pair, a column a method, over all sets."""
+    named = {"all": list(outcomes)}
+    return _by_method("pairs", named | {k: _of(outcomes, k) for k in _kinds(outcomes)})
+
+
+def by_light(outcomes: Sequence[Outcome]) -> Cells:
+    """A row a kind of pair, a column a set: the last method alone."""
+    mine = [o for o in outcomes if o.method == _methods(outcomes)[-1]]
+    sets = _sources(mine)
+    rows = []
+    for kind in _kinds(mine):
+        found = [[o for o in _of(mine, kind) if o.source == s] for s in sets]
+        rows.append((kind, *(f"{_shares(some)} (n {len(some)})" if some else "" for some in found)))
+    return ("light and weather", *sets), rows
+
+
+def leads(outcomes: Sequence[Outcome]) -> Cells:
+    """Points by which the last method leads at 1 m and 1 degree: over all, by set, and at night."""
+    *others, last = _methods(outcomes)
+    split = {m: groups([o for o in outcomes if o.method == m]) for m in (*others, last)}
+    wanted = ["all", *(f"{s}: all" for s in _sources(outcomes)), "night"]
+    rows = []
+    for name in (w for w in wanted if w in split[last]):
+        found = (difference(split[last][name], split[m][name]) for m in others)
+        texts = (f"{gain:+.1f} [{low:+.1f}, {high:+.1f}]" for gain, low, high in found)
+        rows.append((name.removesuffix(": all"), str(len(split[last][name])), *texts))
+    return (f"lead of {last}, points", "n", *(f"over {m}" for m in others)), rows
+
+
+TABLES: dict[str, Callable[[Sequence[Outcome]], Cells]] = {
+    "sets": by_set, "conditions": by_condition, "light": by_light, "leads": leads,
+}  # fmt: skip
+
+
+def _by_method(title: str, named: dict[str, list[Outcome]]) -> Cells:
+    methods = _methods([o for some in named.values() for o in some])
+    rows = []
+    for name, some in named.items():
+        of = [[o for o in some if o.method == m] for m in methods]
+        rows.append((name, str(len(of[-1])), *(_with_interval(mine) for mine in of)))
+    return (title, "n", *methods), rows
+
+
+def _with_interval(mine: Sequence[Outcome]) -> str:
+    low, high = wilson(sum(o.within(1) for o in mine), len(mine))
+    one, three = _shares(mine).split(", ")
+    return f"{one} [{low:.0f}, {high:.0f}], {three}"
+
+
+def _shares(mine: Sequence[Outcome]) -> str:
+    """Per cent within 1 m and 1 degree, then within 3 m and 3 degrees."""
+    return ", ".join(f"{100 * sum(o.within(k) for o in mine) / len(mine):.0f}" for k in (1, 3))
+
+
+def _methods(outcomes: Sequence[Outcome]) -> list[str]:
+    return list(dict.fromkeys(o.method for o in outcomes))
+
+
+def _sources(outcomes: Sequence[Outcome]) -> list[str]:
+    return list(dict.fromkeys(o.source for o in outcomes))
+
+
+def _kinds(outcomes: Sequence[Outcome]) -> list[str]:
+    """Those that are there, in the table's order, unknown ones last."""
+    there = dict.fromkeys(_KINDS.get(o.condition, o.condition) for o in outcomes)
+    known = [k for k in dict.fromkeys(_KINDS.values()) if k in there]
+    return [*known, *(k for k in there if k not in known)]
+
+
+def _of(outcomes: Sequence[Outcome], kind: str) -> list[Outcome]:
+    return [o for o in outcomes if _KINDS.get(o.condition, o.condition) == kind]
