@@ -83,6 +83,11 @@ def known_state(state: VehicleState) -> VehicleState:
     return replace(state, **unknown) if unknown else state
 
 
+def known_attitude(attitude: Attitude | None) -> Attitude | None:
+    """The attitude; None where one of its numbers is none."""
+    return _known(attitude)
+
+
 def _known(told: _Told | None) -> _Told | None:
     if told is None or not _are_numbers(getattr(told, field.name) for field in fields(told)):
         return None

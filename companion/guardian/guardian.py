@@ -81,11 +81,11 @@ class Guardian:
         try:
             if self._hangs():
                 return None
-            state = self._bridge.state()
+            state, attitude = self._bridge.state(), self._bridge.attitude_at(fix.time_ns)
             with self._asked() as answers:
                 if not answers:
                     return None
-                admitted = self._monitor.admit(fix, state)
+                admitted = self._monitor.admit(fix, state, attitude)
         except Exception:
             self._fail("judging")
             return None

@@ -10,9 +10,10 @@ from dataclasses import dataclass
 import numpy as np
 
 from companion.guardian.config import GuardianConfig
+from companion.guardian.heading import Headings, Turn, turn_of
 from companion.guardian.place import LocalPlace
 from companion.guardian.step import Step
-from mavlink_bridge.messages import VehicleState, VisionFix
+from mavlink_bridge.messages import Attitude, VehicleState, VisionFix
 
 _SIGMAS = 4.0
 _DRIFT_MPS2 = 0.2  # what a velocity carried on may be wrong by, as an acceleration
@@ -24,6 +25,8 @@ _GAP_S = 1.0
 _RECKONED_MPS = 0.12
 _RECKONED_MPS2 = 0.04
 _RECKONS_S = 10.0  # afterwards an EKF without positions gives up: no evidence any more
+_HEADING_S = 60.0  # for which the gyros know the heading, as the yaw guard has it
+_TURNED_FIXES = 3  # in a row
 _CALM_FIXES = 5  # to which it led in a row: after a gap it is off by 10 m/s and more
 _KEPT = 600
 
@@ -88,17 +91,29 @@ class _Held:
         self.first = self.newest = first
         self.contradicted = False
         """It moved as the EKF's velocity does not."""
+        self.headings = Headings()
+        self.turned = False
+        """Its frame turned against that of the last ones that passed."""
+        self._turned_in_a_row = 0
 
     @property
     def seconds(self) -> float:
         return (self.newest.time_ns - self.first.time_ns) * 1e-9
+
+    def add_heading(self, turn: Turn | None, *, is_turned: bool) -> None:
+        """Of the newest. is_turned: against those that passed."""
+        self.headings.add(turn)
+        if turn is not None:
+            self._turned_in_a_row = self._turned_in_a_row + 1 if is_turned else 0
+        self.turned = self.turned or self._turned_in_a_row >= _TURNED_FIXES
 
 
 class JumpCheck:
     """A position that is farther from the last than any flight explains is held for a while.
 
     Meanwhile the last one that passed is carried on by the EKF's velocity, which the held ones do
-    not reach. A fix that comes to where it leads passes at once.
+    not reach. A fix that comes to where it leads passes at once. What moves otherwise, or whose
+    heading turned as neither gyros nor autopilot did, is not taken by waiting.
     """
 
     def __init__(self, config: GuardianConfig) -> None:
@@ -107,6 +122,7 @@ class JumpCheck:
         self._reckoning = DeadReckoning()
         self._passed: _Passed | None = None
         self._held: _Held | None = None
+        self._headings = Headings()  # of what passed
         self._led = 0  # fixes in a row, up to the last that passed, to which the EKF's velocity led
         self.distance_m = 0.0
         self.step: Step | None = None
@@ -120,34 +136,67 @@ class JumpCheck:
         """The vehicle's state, a few times a second whether fixes come or not."""
         self._reckoning.add(state)
 
-    def admit(self, fix: VisionFix, state: VehicleState, *, agrees: bool) -> bool:
-        """Whether the fix may pass. agrees: vision moves as the IMU does, or nobody knows."""
+    def admit(
+        self,
+        fix: VisionFix,
+        state: VehicleState,
+        attitude: Attitude | None = None,
+        *,
+        agrees: bool,
+    ) -> bool:
+        """Whether the fix may pass. attitude: the autopilot's at the fix's time; agrees: vision
+        moves as the IMU does, or nobody knows.
+        """
         self._reckoning.add(state)
         was_held = self._held
-        passes = self._passes(fix, state, agrees=agrees)
+        passes = self._passes(fix, state, attitude, agrees=agrees)
         self.leaps = self._held is not was_held
         return passes
 
-    def _passes(self, fix: VisionFix, state: VehicleState, *, agrees: bool) -> bool:
+    def _passes(
+        self, fix: VisionFix, state: VehicleState, attitude: Attitude | None, *, agrees: bool
+    ) -> bool:
         self.step = None
+        turn = turn_of(fix, attitude)
+        is_turned = turn is not None and self._is_turned(turn)
         step = None if self._passed is None else self._leap(self._passed, fix)
         jump_m = 0.0 if step is None else math.hypot(*step.offset_m) - step.allowed_m
-        if jump_m <= (self._config.jump_m if fix.reset else self._config.untold_jump_m):
+        if step is not None and is_turned:
+            jump_m += step.growth_m  # nor does time explain it
+        announced = fix.reset and not is_turned
+        if jump_m <= (self._config.jump_m if announced else self._config.untold_jump_m):
             self.step = step
             self._led = self._led + 1 if step is not None and step.is_led else 0
             self._pass(fix, state)
+            self._headings.add(turn)
             return True
         self.distance_m = jump_m
         held = self._hold(fix)
-        if agrees and not held.contradicted and held.seconds >= self._config.jump_hold_s:
+        held.add_heading(turn, is_turned=is_turned)
+        speaks_against = held.contradicted or (held.turned and is_turned)
+        if agrees and not speaks_against and held.seconds >= self._config.jump_hold_s:
             self._led = 0
             self._pass(fix, state)
+            self._headings = held.headings
             return True
         return False
 
     def _pass(self, fix: VisionFix, state: VehicleState) -> None:
         north, east, _ = state.local_velocity_ned or (0.0, 0.0, 0.0)
         self._passed, self._held = _Passed(fix, (north, east)), None
+
+    def _is_turned(self, turn: Turn) -> bool:
+        """Whether a fix's frame turned against that of the last ones that passed.
+
+        What gyros may have drifted grows: once a frame was seen to be turned, a fix is of the one
+        whose heading is nearer.
+        """
+        if self._passed is None or turn.time_ns - self._passed.fix.time_ns > _HEADING_S * 1e9:
+            return False
+        held = self._held
+        if held is not None and held.turned:
+            return held.headings.apart(turn) < self._headings.apart(turn)
+        return self._headings.contradict(turn)
 
     def _hold(self, fix: VisionFix) -> _Held:
         """The fixes held by now, with this one; one that does not follow them begins anew."""

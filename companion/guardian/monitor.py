@@ -7,12 +7,14 @@ from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 
+import numpy as np
+
 from companion.calibration_watch.sighting import Figure, Sighting
 from companion.calibration_watch.watch import CalibrationWatch
 from companion.guardian import findings as f
 from companion.guardian.config import GuardianConfig
 from companion.guardian.ekf import EkfWatch
-from companion.guardian.evidence import CheckedVehicle, Vehicle, known_state
+from companion.guardian.evidence import CheckedVehicle, Vehicle, known_attitude, known_state
 from companion.guardian.findings import Action, Latch, Reading
 from companion.guardian.inertial import InertialTrack
 from companion.guardian.jump import JumpCheck
@@ -22,10 +24,7 @@ from companion.guardian.place_checks import GnssCheck, HeightCheck
 from companion.guardian.protection import ProtectionLevel, protection_level
 from companion.guardian.step import StepDoubt
 from localizer.types import Image
-from mavlink_bridge.messages import (
-    VehicleState,
-    VisionFix,
-)
+from mavlink_bridge.messages import Attitude, VehicleState, VisionFix
 
 _AIRBORNE_M = 3.0
 _IDENTICAL_S = 1.5
@@ -150,12 +149,17 @@ class Monitor:
         """A registered picture, for what it says of the camera."""
         self._calibration.add(sighting)
 
-    def admit(self, fix: VisionFix, state: VehicleState) -> VisionFix | None:
-        """The fix, if it may be injected; with a reset where the last ones were wrong."""
+    def admit(
+        self, fix: VisionFix, state: VehicleState, attitude: Attitude | None = None
+    ) -> VisionFix | None:
+        """The fix, if it may be injected; with a reset where the last ones were wrong.
+
+        attitude: the autopilot's at the fix's time, None where it is not known.
+        """
         state = known_state(state)
         verdict = self._verdict
         agrees = verdict is None or not verdict.settled or verdict.share < _CALM_SHARE
-        admitted = self._jumps.admit(fix, state, agrees=agrees)
+        admitted = self._jumps.admit(fix, state, known_attitude(attitude), agrees=agrees)
         self._doubt_steps(fix, state, admitted=admitted)
         known_m = self._known_m(state)
         self._level = level = protection_level(fix, state, self._config.protection, known_m)
@@ -170,10 +174,11 @@ class Monitor:
         if self.action >= Action.WITHHOLD or not admitted:
             self._reset_due = self._reset_due or self._jump_held or self.action is Action.WITHDRAW
             return None
-        if self._reset_due:
-            self._reset_due = False
-            return replace(fix, reset=True)
-        return fix
+        resets, self._reset_due = self._reset_due or fix.reset, False
+        # The EKF must not believe what is known to be off to what noise alone would leave. The
+        # checks above keep the noise: what they look for is what it does not explain.
+        covariance = fix.position_covariance_ned + known_m**2 * np.eye(3)
+        return replace(fix, reset=resets, position_covariance_ned=covariance)
 
     def step(self, now_ns: int, vehicle: Vehicle) -> list[Line]:
         """Look at everything, a few times a second; the lines to be told."""

@@ -24,6 +24,16 @@ class GrowthModel(BaseModel):
     vertical: float = Field(ge=0, le=10, description="walk of the height, m per root m")
     tilt: float = Field(ge=0, le=1, description="walk of roll and pitch, rad per root m")
     heading: float = Field(ge=0, le=1, description="walk of the heading, rad per root m")
+    # Height, tilt and the map's shape mend a pose's other axes, and with them the place that hangs
+    # on these. What the registrations took for the place itself nobody mends: without this a night
+    # of quality 0.65 was 12.8 m off with a sigma of 1.8 m, inside its 95 % in 39 of 100 frames.
+    unmatched: float = Field(
+        0.0,
+        ge=0,
+        le=10,
+        description="walk of east and north that nothing mends, m per root m, times the share that "
+        "does not match (1 - quality)",
+    )
 
 
 class OdometryConfig(BaseModel):
@@ -77,7 +87,13 @@ class OdometryConfig(BaseModel):
     )
     with_map: GrowthModel = Field(
         GrowthModel(
-            registration=1.0, scale=0.001, horizontal=0.02, vertical=0.02, tilt=5e-4, heading=4e-4
+            registration=1.0,
+            scale=0.001,
+            horizontal=0.02,
+            vertical=0.02,
+            tilt=5e-4,
+            heading=4e-4,
+            unmatched=0.3,
         ),
         description="growth with depth from the map's geometry",
     )

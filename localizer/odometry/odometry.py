@@ -236,7 +236,8 @@ class VisualOdometry:
             frame, track.pose, track.covariance, track.way_m, surface, track.constraint
         )
         if made is not None:
-            self._keyframe, self._track = made, replace(track, best=0.0)
+            self._keyframe = replace(made, unmatched_m2=track.unmatched_m2)
+            self._track = replace(track, best=0.0)
 
     def _is_spent(self, keyframe: Keyframe, result: Registration, track: Track) -> bool:
         c = self.config
@@ -281,7 +282,8 @@ class VisualOdometry:
             scaled(growth_of(self.config, source), way)
             for source, way in keyframe.ways(pose).items()
         ]
-        covariance = track.covariance + np.sum(errors, axis=0)
+        unmatched = np.diag([track.unmatched_m2] * 2 + [0.0] * 4)
+        covariance = track.covariance + np.sum(errors, axis=0) + unmatched
         known = carried(begun.covariance, pose.translation - begun.pose.translation)
         added = np.linalg.eigvalsh((covariance - known)[:2, :2])[-1]
         return OdometryEstimate(

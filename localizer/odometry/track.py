@@ -47,7 +47,8 @@ class Beginning:
 class Track:
     """The last usable estimate. covariance: without the error of scale. constraint: what other
     sensors said, less their constant error. relative: (6, 6) what the covariance holds beside the
-    keyframe's own. best: quality of the keyframe's first registration.
+    keyframe's own. best: quality of the keyframe's first registration. unmatched_m2: variance of
+    east and north beside the covariance, which nothing mends.
     """
 
     pose: Pose
@@ -59,6 +60,7 @@ class Track:
     constraint: PoseConstraint | None
     relative: Array
     best: float = 0.0
+    unmatched_m2: float = 0.0
 
     def ahead(
         self, config: OdometryConfig, time_ns: int, constraint: PoseConstraint | None
@@ -127,9 +129,10 @@ def followed(
     pose, covariance = fused(pose, carried(keyframe.covariance, lever) + relative, corrected)
     dt = seconds(track.time_ns, time_ns)
     velocity = (pose.translation - track.pose.translation) / dt if dt > 0 else track.velocity
+    unmatched = (model.unmatched * (1.0 - result.quality)) ** 2 * hop
     return Track(
         pose, covariance, velocity, time_ns, keyframe.way_m + hop, aided_rotation(constraint),
-        corrected, relative, track.best or result.quality,
+        corrected, relative, track.best or result.quality, keyframe.unmatched_m2 + unmatched,
     )  # fmt: skip
 
 

@@ -16,6 +16,7 @@ from localizer.geometry.camera import Camera
 from localizer.geometry.pose import Array, Pose
 from localizer.relocalization.config import RelocalizationConfig
 from localizer.relocalization.correlate import (
+    BLOCKS_TOGETHER,
     SIZE,
     STEP,
     Block,
@@ -152,6 +153,7 @@ def search(
     correlator = next(c for c in correlators if c.level is level)
     correlator.begin()
     run = _Search(view, query, correlator, extractor, config, seen, heights)
+    run = replace(run, suited=tuple(run.suited_at(k) for k in range(len(heights))))
     groups = shared_extractions(heights, config.extraction_ratio)
     jobs = [(float(a), g) for g in groups for a in headings(query, config)]
     trials: list[Found] = []
@@ -196,6 +198,8 @@ class Found:
 
 @dataclass(frozen=True)
 class _Search:
+    """suited: for each height the blocks that it is right for anywhere, and where (`suits`)."""
+
     view: View
     query: PlaceQuery
     correlator: LevelCorrelator
@@ -203,6 +207,7 @@ class _Search:
     config: RelocalizationConfig
     seen: Footprint
     heights: Array
+    suited: tuple[dict[Block, NDArray[np.bool_]], ...] = ()
 
     def empty(self) -> Scores:
         rows, columns = self.correlator.level.shape
@@ -217,31 +222,44 @@ class _Search:
         wanted = []
         for scale in group:
             trial = self.trial(heading, float(self.heights[scale]))
-            blocks = [b for b in self.correlator.blocks() if self.meets(b, trial, scale)]
+            blocks = {b: where for b, where in self.suited[scale].items() if self.meets(b, trial)}
             if blocks:
-                wanted.append((scale, trial, blocks))
+                wanted.append((trial, blocks))
         if not wanted:
             return []
-        features, mask = self.patch(wanted[len(wanted) // 2][1])
-        found = []
-        for scale, trial, blocks in wanted:
-            patch = transform_patch(_resized(features, trial.cells), _resized(mask, trial.cells))
-            scores, power = [], 0.0
-            for block in blocks:
-                if should_stop():
-                    return None
-                raw = self.correlator.correlate(patch, block)
-                power += float(np.vdot(raw, raw)) / raw.size
-                scores.append((block, self.masked(raw, block, trial, scale)))
-            noise = max(math.sqrt(power / len(blocks)), 1e-6)
-            found.append(Found(trial, noise, scores))
-        return found
+        features, mask = self.patch(wanted[len(wanted) // 2][0])
+        patches = [
+            transform_patch(_resized(features, trial.cells), _resized(mask, trial.cells))
+            for trial, _ in wanted
+        ]
+        scores: list[list[tuple[Block, Float32]]] = [[] for _ in wanted]
+        power = [0.0] * len(wanted)
+        union = [b for b in self.correlator.blocks() if any(b in blocks for _, blocks in wanted)]
+        for first in range(0, len(union), BLOCKS_TOGETHER):
+            if should_stop():
+                return None
+            some = union[first : first + BLOCKS_TOGETHER]
+            pairs = [(n, b) for b in some for n, (_, blocks) in enumerate(wanted) if b in blocks]
+            for (n, block), raw in zip(
+                pairs, self.correlator.correlate_all(patches, pairs), strict=True
+            ):
+                trial, blocks = wanted[n]
+                power[n] += float(np.vdot(raw, raw)) / raw.size
+                scores[n].append((block, self.masked(raw, block, trial, blocks[block])))
+        return [
+            Found(trial, max(math.sqrt(power[n] / len(blocks)), 1e-6), scores[n])
+            for n, (trial, blocks) in enumerate(wanted)
+        ]
 
     def trial(self, heading: float, height: float) -> Trial:
         c, s = np.cos(heading), np.sin(heading)
         offset = np.array([[c, -s], [s, c]]) @ self.seen.centre * height
+        return Trial(heading, height, offset, self.cells(height))
+
+    def cells(self, height: float) -> int:
+        """Of a patch's side."""
         side = self.seen.side_m * height / self.correlator.level.cell_m
-        return Trial(heading, height, offset, int(np.clip(round(side), 8, SIZE - STEP)))
+        return int(np.clip(round(side), 8, SIZE - STEP))
 
     def patch(self, trial: Trial) -> tuple[Float32, Float32]:
         """Features (n, n, K), weighted, and where they count (n, n), of one rectification."""
@@ -261,21 +279,30 @@ class _Search:
         known = (mask > 0.05).astype(np.float32)
         return without_local_mean(weighted.astype(np.float32), known), known
 
-    def meets(self, block: Block, trial: Trial, scale: int) -> bool:
-        """Whether any origin of a block is a place of the region at about the trial's height."""
+    def meets(self, block: Block, trial: Trial) -> bool:
+        """Whether any origin of a block is a place of the region."""
         region = self.query.region
-        if region is not None:
-            low, high = region.bounds
-            first = self.camera_at(np.array([block.row + STEP, block.column]), trial)
-            last = self.camera_at(np.array([block.row, block.column + STEP]), trial)
-            if (first > high).any() or (last < low).any():
-                return False
-        return bool(self.suits(self.ground(block, trial), scale).any())
+        if region is None:
+            return True
+        low, high = region.bounds
+        first = self.camera_at(np.array([block.row + STEP, block.column]), trial)
+        last = self.camera_at(np.array([block.row, block.column + STEP]), trial)
+        return not ((first > high).any() or (last < low).any())
 
-    def ground(self, block: Block, trial: Trial) -> Float32:
-        """Heights of the ground under the middles of the patches, every `GROUND_CELLS`."""
+    def suited_at(self, scale: int) -> dict[Block, NDArray[np.bool_]]:
+        """The blocks of which any origin is at about the scale's height, the same at all headings;
+        where, every `GROUND_CELLS`.
+        """
+        cells = self.cells(float(self.heights[scale]))
+        where = {b: self.suits(self.ground(b, cells), scale) for b in self.correlator.blocks()}
+        return {b: suits for b, suits in where.items() if suits.any()}
+
+    def ground(self, block: Block, cells: int) -> Float32:
+        """Heights of the ground under the middles of patches of so many cells, every
+        `GROUND_CELLS`.
+        """
         ground = self.correlator.level.ground
-        at = np.arange(0, STEP, GROUND_CELLS) + (GROUND_CELLS + trial.cells) // 2
+        at = np.arange(0, STEP, GROUND_CELLS) + (GROUND_CELLS + cells) // 2
         rows, columns = at + block.row, at + block.column
         i, j = rows // GROUND_CELLS, columns // GROUND_CELLS
         inside = np.ix_(i.clip(0, ground.shape[0] - 1), j.clip(0, ground.shape[1] - 1))
@@ -292,10 +319,11 @@ class _Search:
         height = self.heights[scale]
         return np.asarray((low <= height) & (height <= high))
 
-    def masked(self, scores: Float32, block: Block, trial: Trial, scale: int) -> Float32:
-        suits = self.suits(self.ground(block, trial), scale)
+    def masked(
+        self, scores: Float32, block: Block, trial: Trial, suits: NDArray[np.bool_]
+    ) -> Float32:
         if not suits.all():
-            fine = np.kron(suits, np.ones((GROUND_CELLS, GROUND_CELLS), np.bool_))
+            fine = suits.repeat(GROUND_CELLS, axis=0).repeat(GROUND_CELLS, axis=1)
             scores = np.where(fine, scores, np.float32(-1.0))
         if self.query.region is not None:
             scores = np.where(self.inside(block, trial, self.query.region), scores, -1.0)

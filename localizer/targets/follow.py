@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from localizer.geometry.pose import Array
+from localizer.targets.foreground import Cover, Look, covered, is_distinct, is_ground
 from localizer.targets.track import projected
 from localizer.types import PoseEstimate
 
@@ -45,6 +46,9 @@ _OTHER, _NOISES = 10.0, 3.0  # grey levels, and medians of the chart: what diffe
 _SHARES = (0.03, 0.7)  # of a chart that may be the target
 _PART = 5  # cells: a smaller part of it is noise
 _ABOUT = 0.6  # of a chart's half side: parts of one thing reach so near to its middle
+_GROUNDS = 3  # pictures at least that show the ground without what passes over it
+_WHOLE = 0.9  # of a look that is seen before the ground, from which on it is learned
+_INSIDE = 20  # cells at least that are its own: of fewer, some of the ground look the same
 _FLAT = 4.0  # grey levels: a template of less contrast tells nothing
 
 
@@ -62,6 +66,9 @@ class ImageFollower:
 
     half_m: half the side of what is followed; None around a point. Use `ready` first: plain ground
     has no look that could be followed.
+
+    Above 200 lines: both ways to find it, by its look alone and before known ground, share what is
+    learned of the look.
     """
 
     def __init__(
@@ -79,6 +86,10 @@ class ImageFollower:
         first = self._chart(gray, estimate, position, half)
         self._first, self._late = first, first
         self._mask: Grey | None = None
+        self._outline: NDArray[np.uint8] | None = None
+        self._ground: Grey | None = None
+        self._isolated_look: Look | None = None  # as it was on that ground
+        self._learns_m = 0.5 * self._half_m  # from where it was clicked, once it is so far away
         self._renewed_ns = estimate.exposure_time_ns
         self.ready = first is not None and float(first.std()) >= _FLAT
 
@@ -122,6 +133,77 @@ class ImageFollower:
             self._renew(gray, estimate, position)
         return Found(position, pixel, best[0])
 
+    def find_before(
+        self,
+        gray: Gray,
+        estimate: PoseEstimate,
+        expected: Array,
+        reach_m: float,
+        pictures: Sequence[tuple[PoseEstimate, Gray]],
+        *,
+        was_hidden: bool = False,
+    ) -> tuple[bool, Found | None]:
+        """(whether these pictures can tell, the target): as `find`, of an isolated target, where it
+        covers the ground that `pictures` show without it. Neither road markings nor shadows under
+        it are taken for its look; where it looks as the ground does, or has stood in them all, they
+        cannot tell.
+        """
+        reach = min(int(np.ceil(reach_m / self._cell)) + 1, _LARGEST_REACH)
+        chart = self._chart(gray, estimate, expected, self._half + reach)
+        grounds = [self._chart(g, e, expected, self._half + reach) for e, g in pictures]
+        known = [ground for ground in grounds if ground is not None]
+        if self._outline is None or chart is None or len(known) < _GROUNDS:
+            return False, None
+        ground = np.median(known, axis=0).astype(np.float32)
+        ground += np.float32(np.median(chart - ground))  # the camera may expose otherwise by now
+        best, turn, can_tell = None, 0.0, False
+        for angle in _TURNS if reach_m <= _LONG_AGO_M else _FAR_TURNS:
+            for template in (self._first, self._late):
+                look = self._look(template, -angle)
+                if (best is not None and best.share >= _SURE) or look is None:
+                    break
+                can_tell = can_tell or is_distinct(ground, look)
+                one = covered(chart, ground, look, _ASIDE if was_hidden else 0.0)
+                if one is not None and _is_better(one, best):
+                    best, turn = one, angle
+        if best is None:
+            return can_tell, None
+        position = expected + self._on_ground(best.offset * self._cell)
+        pixel = projected(estimate, position)
+        if pixel is None:
+            return can_tell, None
+        self._course += turn
+        self._learn(gray, estimate, position, best.share)
+        return True, Found(position, pixel, best.share)
+
+    def _look(self, grey: Grey | None, angle: float) -> Look | None:
+        """An isolated target's look, turned by `angle`."""
+        if grey is None or self._outline is None:
+            return None
+        turned = self._turned(self._outline.astype(np.float32), angle)
+        grey = self._turned(grey, angle)
+        if turned is None or grey is None:
+            return None
+        return Look.of(grey, (turned > 0.5).astype(np.uint8))
+
+    def _learn(self, gray: Gray, estimate: PoseEstimate, position: Array, share: float) -> None:
+        """Its look as it is now: as it leaves the place where it was clicked, whose ground is about
+        its first look, and then from time to time.
+        """
+        gone_m = float(np.linalg.norm(position - self._origin))
+        is_due = estimate.exposure_time_ns - self._renewed_ns >= _RENEWED_NS
+        leaves = share >= _SURE and gone_m >= self._learns_m
+        if not leaves and not (share >= _WHOLE and is_due):
+            return
+        fresh = self._chart(gray, estimate, position, self._half)
+        if fresh is None:
+            return
+        self._late, self._renewed_ns = fresh, estimate.exposure_time_ns
+        if leaves:
+            self._first, self._usual = fresh, 0.0
+            is_off = gone_m >= 2.0 * self._half_m
+            self._learns_m = np.inf if is_off else gone_m + 0.5 * self._half_m
+
     def isolate(self, pictures: Sequence[tuple[PoseEstimate, Gray]]) -> bool:
         """Tell it from the ground by pictures of where it was first seen, without it; False if it
         cannot be told: it does not move, or the pictures do not show that.
@@ -136,7 +218,8 @@ class ImageFollower:
         known = [chart for chart in charts if chart is not None]
         if not known or self._first is None:
             return False
-        off = self._first - np.median(known, axis=0)
+        ground = np.median(known, axis=0).astype(np.float32)
+        off = self._first - ground
         off = np.abs(off - np.median(off))  # the camera may expose otherwise by now
         off = cv2.GaussianBlur(off.astype(np.float32), (0, 0), 1.0)
         least = max(_OTHER, _NOISES * float(np.median(off)))
@@ -145,11 +228,21 @@ class ImageFollower:
         if mask is None or not _SHARES[0] <= share <= _SHARES[1]:
             return False
         self._mask = cv2.dilate(mask, np.ones((3, 3))).astype(np.float32)
+        look = Look.of(self._first, mask)
+        if float(look.inside.sum()) >= _INSIDE:
+            self._outline, self._ground, self._isolated_look = mask, ground, look
         return True
+
+    def shows_ground(self, gray: Gray, estimate: PoseEstimate) -> bool:
+        """Whether the ground is seen where an isolated target was first, as it was without it."""
+        chart = self._chart(gray, estimate, self._origin, self._half, course=0.0)
+        if chart is None or self._isolated_look is None or self._ground is None:
+            return False
+        return is_ground(chart, self._ground, self._isolated_look)
 
     def forget_shape(self) -> None:
         """Undo `isolate`."""
-        self._mask = None
+        self._mask = self._outline = None
 
     @property
     def is_isolated(self) -> bool:
@@ -203,6 +296,10 @@ class ImageFollower:
         at = np.nan_to_num(pixels - 0.5, nan=-1e3).astype(np.float32)
         chart = cv2.remap(gray, at, None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
         return np.asarray(chart, dtype=np.float32)
+
+
+def _is_better(one: Cover, best: Cover | None) -> bool:
+    return best is None or one.evidence > (1.0 + _PREFERRED) * best.evidence
 
 
 def _outline(differs: NDArray[np.uint8], half: int) -> NDArray[np.uint8] | None:

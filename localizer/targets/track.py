@@ -111,7 +111,7 @@ class TargetTrack:
             self._begin_anew()
             return self._refuse("the map has a hole there")
         if any(drift):
-            self._aim = _aim(estimate, pixel, drift, surfaces[0], eye)
+            self._aim = _aim(estimate, pixel, sigma, drift, surfaces[0])
         if self._moves and time_ns - self._seen_ns > _GAP_S * 1e9:
             self._moving = TargetFilter()
         ray = SightedRay(eye, d, ray_spread(estimate, pixel, sigma, distance, drift))
@@ -263,18 +263,18 @@ class TargetTrack:
 def _aim(
     estimate: PoseEstimate,
     pixel: tuple[float, float],
+    pixel_sigma: float,
     drift: tuple[float, float],
     surface: TargetSurface,
-    eye: Array,
 ) -> Array:
-    """(3, 3) m²: by how much another place was meant than the one under the pixel. To follow that
-    place takes nothing away from it.
+    """(3, 3) m²: by how much another place was meant than the one that is followed: the hand's, the
+    delay's and the pose's error in the frame that was clicked at. To follow that place takes
+    nothing away from it.
     """
-    offset = surface.position - eye
-    spread = ray_spread(estimate, pixel, 0.0, float(np.linalg.norm(offset)), drift)
-    only = replace(spread, pose=np.zeros((2, 2)))
+    offset = surface.position - estimate.world_from_camera.translation
+    spread = ray_spread(estimate, pixel, pixel_sigma, float(np.linalg.norm(offset)), drift)
     normal = surface.normal if surface.normal is not None else np.array([0.0, 0.0, 1.0])
-    return surface_covariance(offset, normal, only, 0.0)
+    return surface_covariance(offset, normal, spread, 0.0)
 
 
 def projected(estimate: PoseEstimate, point: Array) -> tuple[float, float] | None:

@@ -5,7 +5,8 @@ Timing. A fix is sent when its age reaches `delay_ms`, the value that ArduPilot 
 once with its own exposure time, and the jitter is removed by the flight controller. PX4 maps the
 exposure time by TIMESYNC and needs no such value.
 Between fixes, and for fixes older than it can fuse, the newest fix is propagated to ``now -
-delay_ms`` with its covariance grown. Stamps never run back.
+delay_ms`` with its covariance grown; what is sent between them never makes a fix late. Stamps never
+run back.
 """
 
 from __future__ import annotations
@@ -52,12 +53,21 @@ class _Pace:
         if last_ns is not None and time_ns - last_ns < _STALE_NS:
             self._intervals_ns.append(time_ns - last_ns)
 
+    @property
+    def next_ns(self) -> int | None:
+        """When the next fix comes of age if it comes as usual; None while that is not known."""
+        usual = self._usual_ns()
+        return None if usual is None else self._taken_ns + round(usual)
+
     def overdue(self, now_ns: int) -> bool:
         """Whether the next fix should have come by now, judged by the usual interval."""
+        usual = self._usual_ns()
+        return usual is not None and now_ns - self._taken_ns > self._overdue_intervals * usual
+
+    def _usual_ns(self) -> float | None:
         if len(self._intervals_ns) < _INTERVALS_KNOWN:
-            return False
-        usual = statistics.median(self._intervals_ns)
-        return now_ns - self._taken_ns > self._overdue_intervals * usual
+            return None
+        return statistics.median(self._intervals_ns)
 
 
 class Injector:
@@ -68,6 +78,7 @@ class Injector:
         self._maker = MessageMaker(config, geoid_separation_m, utc)
         self._delay_ns = int(config.delay_ms * 1e6)
         self._period_ns = int(1e9 / config.rate_hz)
+        self._least_gap_ns = int(self._period_ns / 1.5)  # 30 Hz never passes 50 Hz
         self._propagator = FixPropagator(config.acceleration_sigma_mps2, config.sigma_floor_m)
         self.guard = YawGuard(config.yaw_guard)
         self._waiting: deque[VisionFix] = deque()
@@ -195,13 +206,19 @@ class Injector:
     # --- what to send ----------------------------------------------------------------------------
 
     def _earliest_ns(self) -> int:
-        """Not more than half as fast again as the wanted rate: 30 Hz never passes 50 Hz."""
-        return self._last_slot_ns + int(self._period_ns / 1.5)
+        return self._last_slot_ns + self._least_gap_ns
 
     def _fill_due_ns(self) -> int:
-        """A propagated message waits for a late fix for half a period, once."""
-        patience = 1.0 if self._last_was_fill else 1.5
-        return self._last_slot_ns + int(self._period_ns * patience)
+        """A propagated message goes so early that the next fix need not wait for it, or not at all:
+        a fix that comes later than the delay is fused where the EKF is by then, as far beside its
+        own place as the aircraft flew meanwhile. It waits for a late fix for half a period, once.
+        """
+        due = self._waiting[0].time_ns + self._delay_ns if self._waiting else self._pace.next_ns
+        if due is None or due <= self._last_slot_ns:
+            patience = 1.0 if self._last_was_fill else 1.5
+            return self._last_slot_ns + int(self._period_ns * patience)
+        between = min(self._last_slot_ns + self._period_ns, due - self._least_gap_ns)
+        return between if between >= self._earliest_ns() else due + self._period_ns // 2
 
     def _next(self, now_ns: int, context: InjectionContext) -> Injection | Withheld | None:
         if self._propagator.fix is None and not self.guard.blocked:
@@ -218,9 +235,9 @@ class Injector:
             if not too_old and fix.time_ns > self._last_stamp_ns:
                 return self._make(fix.time_ns, now_ns, context, fresh=True)
             fill_due = True
-        return (
-            self._make(now_ns - self._delay_ns, now_ns, context, fresh=False) if fill_due else None
-        )
+        if not fill_due:
+            return None
+        return self._make(now_ns - self._delay_ns, now_ns, context, fresh=False)
 
     def _make(
         self, time_ns: int, now_ns: int, context: InjectionContext, *, fresh: bool

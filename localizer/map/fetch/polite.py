@@ -17,8 +17,8 @@ try:
     import urllib3
 except ImportError as missing:
     raise MapFetchError(
-        "fetching a map needs urllib3: pip install 'pilot-companion[fetch]' "
-        "(in a checkout: .venv/bin/pip install '.[fetch]')"
+        "fetching a map needs urllib3: pip install '.[fetch]' in a checkout, with "
+        "the pip of the program's environment"
     ) from missing
 
 _AGENT = "pilot-companion (map fetch)"

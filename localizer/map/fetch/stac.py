@@ -26,7 +26,7 @@ def stac_files(source: Source, area: Area, client: PoliteClient) -> list[CloudFi
     try:
         import pystac
     except ImportError as error:
-        raise MapFetchError("STAC needs pystac: pip install 'pilot-companion[fetch]'") from error
+        raise MapFetchError("STAC needs pystac: pip install '.[fetch]' in a checkout") from error
 
     items = []
     try:

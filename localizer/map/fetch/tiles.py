@@ -117,7 +117,7 @@ def _capabilities(source: Source, client: PoliteClient) -> Any:
     try:
         from owslib.wmts import WebMapTileService
     except ImportError as error:
-        raise MapFetchError("WMTS needs OWSLib: pip install 'pilot-companion[fetch]'") from error
+        raise MapFetchError("WMTS needs OWSLib: pip install '.[fetch]' in a checkout") from error
 
     url = source.url
     if not url.lower().endswith(".xml") and "request=" not in url.lower():

@@ -207,7 +207,8 @@ def test_a_flights_record_becomes_a_trajectory(tmp_path):
         for k, accepted in enumerate("101"):
             pose = dict(zip(("qw", "qx", "qy", "qz"), q, strict=True))
             writer.writerow(pose | {"exposure_time_ns": 10**9 + k, "sequence": k, "east_m": k,
-                                    "latency_ms": 50, "accepted": accepted})  # fmt: skip
+                                    "latency_ms": 50, "focal_px": 500,
+                                    "accepted": accepted})  # fmt: skip
     _convert(record, tmp_path / "x.tum", "--from", "record", "--to", "tum")
     lines = np.loadtxt(tmp_path / "x.tum")
     assert lines[:, 1] == pytest.approx([0, 2])  # the rejected one is none

@@ -162,7 +162,7 @@ class Flight:
         )
 
     def _offer(self, fix: VisionFix) -> None:
-        admitted = self.monitor.admit(fix, self.state())
+        admitted = self.monitor.admit(fix, self.state(), self.attitude_at(fix.time_ns))
         if admitted is None:
             self.withheld.append(self.at_s)
         else:

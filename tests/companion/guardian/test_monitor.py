@@ -201,6 +201,10 @@ def test_positions_of_a_stream_that_begins_to_lag_are_within_their_level() -> No
     assert flight.told("position stepped 3 m, unexplained") <= 12.5
     assert flight.passed[-1].protection_m is not None
     assert flight.passed[-1].protection_m[0] < 6.0  # a bound, not a refusal
+    # The EKF was told 0.1 m of positions 3 m behind: it believed them, and turned its yaw away.
+    told = [np.sqrt(fix.position_covariance_ned[0, 0]) for fix in flight.passed]
+    assert max(told[:100]) == pytest.approx(0.1)
+    assert 2.5 < min(told[-100:]) <= max(told[-100:]) < 3.5
 
 
 def test_a_lag_that_ends_leaves_no_doubt() -> None:
@@ -208,6 +212,7 @@ def test_a_lag_that_ends_leaves_no_doubt() -> None:
     flight = Flight(monitor(), leg, late(12.0, 20.0), noise_m=0.1, claimed_m=0.1).fly(30.0)
     before = next(fix for fix in flight.passed if fix.time_ns >= second(11.5))
     assert flight.passed[-1].protection_m == pytest.approx(before.protection_m, abs=0.01)
+    assert flight.passed[-1].position_covariance_ned[0, 0] == pytest.approx(0.1**2)
     assert [line for _, line in flight.lines] == [
         "PiLoT: position stepped 3 m, unexplained",
         "PiLoT: over: step",

@@ -6,6 +6,7 @@ import socket
 import struct
 import threading
 import time
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -230,8 +231,9 @@ def test_a_row_that_a_loss_of_power_cut_short_is_left_out(record, tmp_path):
 
 @pytest.mark.parametrize(
     ("column", "value"),
-    [("latency_ms", "inf"), ("qw", "nan"), ("east_m", "x"), ("sequence", ""),
-     ("exposure_time_ns", 400 * "9"), ("exposure_time_ns", "-1")],
+    [("latency_ms", "inf"), ("focal_px", "-1"), ("focal_px", "nan"), ("qw", "nan"),
+     ("east_m", "x"), ("sequence", ""), ("exposure_time_ns", 400 * "9"),
+     ("exposure_time_ns", "-1")],
 )  # fmt: skip
 def test_a_row_that_is_no_estimate_is_named(record, tmp_path, column, value):
     folder = _copy_of(record, tmp_path)
@@ -242,6 +244,30 @@ def test_a_row_that_is_no_estimate_is_named(record, tmp_path, column, value):
         writer.writerows([*rows, rows[0] | {column: value}])
     with pytest.raises(RecordError, match="not a flight's record"):
         load_record(folder)
+
+
+def test_each_frame_is_replayed_with_the_focal_length_that_it_had(record, tmp_path, monkeypatch):
+    """All pictures of a zoomed flight had the model's."""
+    rows = _rows(record)
+    focal = float(rows[0]["focal_px"])
+    flown = [focal * (1.0 if k < 3 else 2.0) for k in range(len(rows))]
+    folder = _copy_of(record, tmp_path)
+    with (folder / "estimates.csv").open("w", newline="") as file:
+        writer = csv.DictWriter(file, rows[0].keys())
+        writer.writeheader()
+        writer.writerows(r | {"focal_px": f} for r, f in zip(rows, flown, strict=True))
+    seen = []
+
+    class Localizer:
+        tracker = SimpleNamespace(standing=SimpleNamespace(wants_prior=False))
+
+        def track(self, frame):
+            seen.append(frame.camera.fx)
+
+    monkeypatch.setattr("companion.offline.replay.build_localizer", lambda *_: Localizer())
+    loaded = load_record(folder)
+    replay(loaded, loaded.config.bridge.tlog)
+    assert seen == pytest.approx(flown, rel=1e-4)
 
 
 def test_damaged_images_are_no_agreement(record, tmp_path):

@@ -72,6 +72,16 @@ def watching(time_s):
     return Pose(np.column_stack([x, np.cross(z, x), z]), eye)
 
 
+def close_by(time_s):
+    """Half as high, a car's length off the crossing."""
+    eye = np.array([-14.0 + 2.0 * time_s, -24.0, 45.0])
+    z = np.array([-14.0, -16.0, 0.0]) - eye
+    z /= np.linalg.norm(z)
+    x = np.cross(z, [0.0, 1.0, 0.0])
+    x /= np.linalg.norm(x)
+    return Pose(np.column_stack([x, np.cross(z, x), z]), eye)
+
+
 def driving(time_s):
     """A bend beside the roof, then under its edge: 5 m/s."""
     way = 5.0 * time_s - 30.0
@@ -83,16 +93,17 @@ def driving(time_s):
 class Watcher(Operator):
     """An operator with pictures; poses err by a little, as a registration's do."""
 
-    def __init__(self, pictures, until_s):
-        super().__init__(flown=watching, rate_hz=10.0)
+    def __init__(self, pictures, until_s, flown=watching, sigma_m=0.05):
+        super().__init__(flown=flown, rate_hz=10.0)
+        self.at, self._sigmas = flown, np.repeat([sigma_m, 6e-3 * sigma_m], 3)
         self._pictures, self._until_s = pictures, until_s
         self._rng = np.random.default_rng(0)
 
     def fly(self, frames=1, state=None):
         for _ in range(frames):
             time_s = self.time_ms / 1e3
-            true = watching(time_s)
-            off = self._rng.normal(0, [0.05] * 3 + [3e-4] * 3)
+            true = self.at(time_s)
+            off = self._rng.normal(0, self._sigmas)
             told = Pose(so3_exp(off[3:]) @ true.rotation, true.translation + off[:3])
             seen = scene.estimate(told, self.time_ms * MS, sigma=0.05, camera=CAMERA)
             self.clicks.add_estimate(seen)
@@ -105,7 +116,7 @@ class Watcher(Operator):
 def _click(watcher, point, delay_s=0.25):
     """Where the operator saw it: the frame is `delay_s` old when the command comes."""
     seen_s = (watcher.now_ms + 40) / 1e3 - delay_s
-    seen = scene.estimate(watching(seen_s), 0, camera=CAMERA)
+    seen = scene.estimate(watcher.at(seen_s), 0, camera=CAMERA)
     pixel = projected(seen, np.array(point(seen_s)))
     assert pixel is not None
     u, v = pixel
@@ -145,6 +156,64 @@ def test_a_place_that_stands_is_never_told_to_move_though_a_car_passes_it():
         np.testing.assert_allclose(fix.position_world, place, atol=1.0)
 
 
+class _Crossing(Pictures):
+    """A car as grey as its road on a zebra crossing, as three flights lost it."""
+
+    def of(self, pose, time_s):
+        image = super().of(pose, time_s).astype(np.float32)
+        d = self._rays @ pose.rotation.T
+        ground = pose.translation + d * (-pose.translation[2] / d[..., 2])[..., None]
+        (x, y), course = self._car_at(time_s)
+        c, s = np.cos(course), np.sin(course)
+        off = ground[..., :2] - (x, y)
+        along = np.stack([c * off[..., 0] + s * off[..., 1], c * off[..., 1] - s * off[..., 0]], -1)
+        road = 0.15 * image + 75.0
+        striped = (np.abs(ground[..., 0] + 20.0) < 3.0) & (np.mod(ground[..., 1], 2.4) < 1.2)
+        image = np.where(striped, 215.0, road)
+        image[(np.abs(along) < (2.5, 1.2)).all(axis=-1)] = 85.0
+        for window in (0.9, -1.4):
+            image[(np.abs(along - (window, 0.0)) < (0.4, 1.0)).all(axis=-1)] = 45.0
+        blurred = cv2.GaussianBlur(image, (0, 0), 0.7)
+        return np.clip(blurred + np.roll(NOISE, round(time_s * 10) * 7, 1), 0, 255).astype(np.uint8)
+
+
+def test_a_car_that_is_clicked_at_on_a_zebra_crossing_is_followed():
+    watcher = Watcher(_Crossing(driving), 14.0, close_by, 0.02)
+    watcher.fly(22)
+    _click(watcher, lambda t: (*driving(t)[0], 0.0))
+    watcher.fly(35)
+    told = [(t.fix, t.estimate.exposure_time_ns * 1e-9) for t in watcher.of(1)]
+    late = [(f, s) for f, s in told if s > 3.0 and f.visibility is Visibility.SEEN]
+    assert len(late) > 8
+    for fix, s in late:
+        assert np.linalg.norm(fix.position_world[:2] - driving(s)[0]) < 1.0
+        assert fix.velocity is not None
+    assert watcher.gone == []
+
+
+def test_a_car_that_leaves_unseen_is_not_held_at_its_place_without_a_word():
+    def leaving(time_s):
+        return driving(time_s) if time_s < 2.25 else ((500.0, 500.0), 0.0)
+
+    watcher = Watcher(Pictures(leaving), 14.0)
+    watcher.fly(22)
+    _click(watcher, lambda t: (*driving(t)[0], 0.0))
+    watcher.fly(30)
+    assert watcher.texts[-1] == "PiLoT: target 1 lost: it left its place"
+    assert watcher.gone == ["ground station 1"]
+
+
+@pytest.mark.parametrize("place", [(9.5, -9.5, 8.0), (-9.9, 0.0, 8.0), (-14.0, -20.0, 0.0)])
+def test_a_place_that_stands_has_not_left(place):
+    """A roof's corner and edge move against the ground in charts of them, as a car would."""
+    watcher = Watcher(Pictures(driving), 14.0)
+    watcher.fly(8)
+    _click(watcher, lambda _: place)
+    watcher.fly(45)
+    assert watcher.gone == []
+    assert not [text for text in watcher.texts if "lost" in text or "changed" in text]
+
+
 def test_a_car_that_does_not_come_back_is_lost_with_a_word():
     def vanishing(time_s):
         return driving(time_s) if time_s < 4.0 else ((500.0, 500.0), 0.0)
@@ -182,6 +251,12 @@ class _Slides:
         pixel = projected(estimate, at)
         near = pixel is not None and np.linalg.norm(at - expected) <= reach_m
         return Found(at, pixel, 0.9) if near else None
+
+    def find_before(self, *_picture, **_how):
+        return False, None  # it looks as the ground does
+
+    def shows_ground(self, _gray, _estimate):
+        return False
 
 
 class _Drives(_Slides):

@@ -85,6 +85,23 @@ def test_scores_are_normalised_correlations():
     assert checked >= 6
 
 
+def test_patches_and_blocks_together_score_as_each_pair_alone():
+    """More patches than are multiplied at once, not each with each block, in any order."""
+    rng = np.random.default_rng(3)
+    correlator = LevelCorrelator(level(rng.integers(-60, 60, (3, 288, 288)).astype(np.int8)), 0)
+    patches = [
+        transform_patch(rng.normal(size=(n, n, 3)).astype(np.float32), np.ones((n, n), np.float32))
+        for n in (16, 20, 24, 17, 31)
+    ]
+    blocks = correlator.blocks()[:3]
+    pairs = [(4, blocks[2]), (0, blocks[0]), (3, blocks[0]), (4, blocks[1]), (1, blocks[2])]
+    together = correlator.correlate_all(patches, pairs)
+    assert len(together) == len(pairs)
+    for scores, (n, block) in zip(together, pairs, strict=True):
+        np.testing.assert_allclose(scores, correlator.correlate(patches[n], block), atol=1e-6)
+        assert np.abs(scores).max() > 0.01
+
+
 def test_a_cut_from_the_map_scores_one_where_it_was_cut_and_nowhere_else():
     rng = np.random.default_rng(1)
     features = rng.integers(-60, 60, (3, 320, 320)).astype(np.int8)

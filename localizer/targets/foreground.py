@@ -1,0 +1,142 @@
+"""What stands before ground that is known: where a look covers it, told by likelihood.
+
+A car's outline on a zebra crossing is the crossing's as much as its own, and correlation follows
+the stripes. With the ground known, each place of the look is asked: is the picture there the look,
+or the ground? What both share counts for neither.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from localizer.geometry.pose import Array
+
+Grey = NDArray[np.float32]  # of a chart
+
+_OPAQUE = 0.7  # of the look's difference from the ground that is seen, from which on it is there;
+_DOUBLED = 1.5  # more than all of it is something else
+_NOTHING = 0.2  # of it: the ground is seen, if it differs from how it was by no more than
+_AS_GROUND = 0.3  # of the squared difference of look and ground
+_END = 0.5  # the same of each end: what is half hidden is found aside
+_MATTERS = 0.15  # of all evidence: an end that could show less tells nothing
+_DIFFERS = 6.0  # grey levels, root mean square: a look that differs less cannot be told from ground
+_CLEAR = 1.3  # by how much the best place's evidence exceeds the second's
+_AHEAD = 3  # an end is a third of the length
+
+
+@dataclass(frozen=True)
+class Look:
+    """A target's own look in a chart. grey, inside, about: (2 half + 1) square; inside is 1 where
+    the grey levels are the target's own, about is 1 close by, where the ground is seen.
+    """
+
+    grey: Grey
+    inside: Grey
+    about: Grey
+
+    @classmethod
+    def of(cls, grey: Grey, outline: NDArray[np.uint8]) -> Look:
+        """From a mask that is 1 within the outline."""
+        inside = cv2.erode(outline, np.ones((3, 3)))
+        about = cv2.dilate(outline, np.ones((7, 7))) - cv2.dilate(outline, np.ones((3, 3)))
+        return cls(grey, inside.astype(np.float32), about.astype(np.float32))
+
+    def ends(self) -> tuple[Grey, Grey]:
+        """The parts of `inside` before and behind the middle third of its longer axis."""
+        rows, columns = np.nonzero(self.inside)
+        places = np.column_stack([columns, rows]).astype(np.float64)
+        off = places - places.mean(axis=0)
+        along = off @ np.linalg.eigh(off.T @ off)[1][:, -1]
+        reach = float(np.abs(along).max()) / _AHEAD
+        front, back = np.zeros_like(self.inside), np.zeros_like(self.inside)
+        front[rows[along > reach], columns[along > reach]] = 1.0
+        back[rows[along < -reach], columns[along < -reach]] = 1.0
+        return front, back
+
+
+@dataclass(frozen=True)
+class Cover:
+    """Where a look covers the ground. share: of the look that is seen, 1 is all of it; offset: (2,)
+    cells, x then y; evidence: log-likelihood ratio against the ground, times twice the noise's
+    variance.
+    """
+
+    share: float
+    offset: Array
+    evidence: float
+
+
+def is_distinct(ground: Grey, look: Look) -> bool:
+    """Whether the look in the middle of the ground (both square) differs enough to be told."""
+    side, size = len(look.grey), len(ground)
+    k = (size - side) // 2
+    off = (ground[k : k + side, k : k + side] - look.grey) ** 2
+    return float((off * look.inside).sum()) >= _DIFFERS**2 * float(look.inside.sum())
+
+
+def is_ground(chart: Grey, ground: Grey, look: Look) -> bool:
+    """Whether a chart (all of one size) shows the ground and nothing of the look, though the two
+    differ.
+    """
+    if not is_distinct(ground, look):
+        return False
+    level = np.float32(np.median(chart - ground))
+    share, _, whole = _evidence(chart, ground + level, look.grey, look.inside)
+    off = float((((chart - ground - level) ** 2) * look.inside).sum())
+    return float(share[0, 0]) <= _NOTHING and off <= _AS_GROUND * float(whole[0, 0])
+
+
+def covered(chart: Grey, ground: Grey, look: Look, aside: float = 0.0) -> Cover | None:
+    """Where the look covers the ground; None where it does not, is half hidden, or a second place
+    rivals. chart, ground: squares of the same size. aside: by how much evidence at the end of the
+    reach counts less.
+
+    Of Gaussian noise, the log-likelihood ratio of look against ground goes with ``sum (I - G)² -
+    (I - L)²``; a picture ``G + a (L - G)`` has ``(2 a - 1)`` of what the whole look would have,
+    ``sum (L - G)²``.
+    """
+    reach = (len(chart) - len(look.grey)) // 2
+    share, evidence, whole = _evidence(chart, ground, look.grey, look.inside)
+    least = _DIFFERS**2 * float(look.inside.sum())
+    allowed = (share >= _OPAQUE) & (share <= _DOUBLED) & (whole >= least)
+    if not allowed.any():
+        return None
+    line = (np.arange(-reach, reach + 1, dtype=np.float32) / max(reach, 1)) ** 2
+    told = np.where(allowed, evidence, 0.0) * (1.0 - aside * 0.5 * (line[:, None] + line))
+    # A plain car fits anywhere within itself: where it reaches beyond its outline, it is not.
+    beyond = cv2.matchTemplate((chart - ground) ** 2, look.about, cv2.TM_CCORR)
+    evidence = evidence - beyond
+    _, _, _, (x, y) = cv2.minMaxLoc(np.where(allowed, told - beyond, -np.inf).astype(np.float32))
+    near = max(3, (len(look.grey) - 1) // 3)
+    rivals = told.copy()
+    rivals[max(y - near, 0) : y + near + 1, max(x - near, 0) : x + near + 1] = 0.0
+    best = float(told[y, x])
+    if best < _CLEAR * float(rivals.max()):
+        return None
+    side = len(look.grey)
+    here, below = chart[y : y + side, x : x + side], ground[y : y + side, x : x + side]
+    for end in look.ends():
+        seen, _, differs = _evidence(here, below, look.grey, end)
+        if differs[0, 0] >= _MATTERS * whole[y, x] and seen[0, 0] < _END:
+            return None
+    offset = np.array([x - reach, y - reach], dtype=np.float64)
+    for axis, values, k in ((0, evidence[y], x), (1, evidence[:, x], y)):
+        if 0 < k < len(values) - 1:
+            a, b, c = (float(v) for v in values[k - 1 : k + 2])
+            bend = a - 2 * b + c
+            offset[axis] += 0.5 * (a - c) / bend if bend < 0 else 0.0
+    return Cover(float(share[y, x]), offset, best)
+
+
+def _evidence(chart: Grey, ground: Grey, look: Grey, inside: Grey) -> tuple[Grey, Grey, Grey]:
+    """(share seen, evidence, evidence that the whole look would have), each of every place."""
+    as_ground = cv2.matchTemplate((chart - ground) ** 2, inside, cv2.TM_CCORR)
+    as_look = cv2.matchTemplate(chart, look, cv2.TM_SQDIFF, mask=inside)
+    whole = cv2.matchTemplate(ground, look, cv2.TM_SQDIFF, mask=inside)
+    evidence = as_ground - as_look
+    share = 0.5 + 0.5 * evidence / np.maximum(whole, 1.0)
+    return share, evidence, np.asarray(whole, dtype=np.float32)
