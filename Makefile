@@ -7,7 +7,7 @@ BIN := $(VENV)/bin
 
 help:
 	@echo "make demo    fly without GNSS and write report/ (ARGS=\"--seed 1\": options of sitl demo)"
-	@echo "make test    lint, types, tests: a quarter of an hour"
+	@echo "make test    lint, types, tests: up to twenty minutes"
 	@echo "make setup   only make the environment: then .venv/bin/companion --help"
 	@echo "make clean   remove the environment and report/"
 

@@ -42,6 +42,7 @@ ESTIMATE_COLUMNS = (
     "latitude_deg", "longitude_deg", "height_m", "sigma_east_m", "sigma_north_m", "sigma_up_m",
     "sigma_rotation_rad", "quality", "state", "status", "accepted",
     "reference_ms", "extract_ms", "register_ms", "latency_ms", "hpl_m", "vpl_m",
+    "focal_px",
 )  # fmt: skip
 TARGET_COLUMNS = (
     "exposure_time_ns", "target_id", "east_m", "north_m", "up_m",
@@ -129,6 +130,7 @@ def _estimate_row(
         int(estimate.accepted), *(f"{x:.2f}" for x in stages),
         f"{estimate.stage_ms.get('latency', 0.0):.2f}",
         *(("", "") if levels is None else (f"{x:.3f}" for x in levels)),
+        f"{estimate.camera.fx:.3f}",
     )  # fmt: skip
 
 

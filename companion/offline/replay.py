@@ -24,6 +24,7 @@ from companion.flight.recorder import MANIFEST_NAME
 from companion.offline.autopilot import RecordedAutopilot
 from companion.sources.base import fitted_camera
 from companion.sources.folder_source import read_image
+from companion.sources.zoom import longer
 from companion.trajectory import snapshot_name
 from localizer.errors import OutsideMapError
 from localizer.geometry.camera import Camera
@@ -34,12 +35,16 @@ from localizer.tracking.pipeline import Localizer
 from localizer.types import Frame, PoseEstimate
 
 _log = logging.getLogger(__name__)
+_LONGEST_PX = 1e6
+_ALIKE = 1e-3  # a share of the focal length that is no other lens
 _MIN_IMAGES = 0.9  # share of the localized frames
 
 
 @dataclass(frozen=True)
 class RecordedEstimate:
-    """One row of ``estimates.csv``. known_ns: when it was published, CLOCK_MONOTONIC."""
+    """One row of ``estimates.csv``. known_ns: when it was published, CLOCK_MONOTONIC; focal_px: of
+    its frame, None in records from before it was written.
+    """
 
     exposure_time_ns: int
     sequence: int
@@ -47,6 +52,7 @@ class RecordedEstimate:
     world_from_camera: Pose
     accepted: bool
     is_tracking: bool = True
+    focal_px: float | None = None
 
 
 @dataclass(frozen=True)
@@ -156,7 +162,15 @@ def _estimate(row: dict[str, str]) -> RecordedEstimate:
         Pose(matrix_from_quaternion(q), t),
         row["accepted"] == "1",
         row.get("state", "tracking") == "tracking",
+        _focal(row.get("focal_px") or None, exposure_ns),
     )
+
+
+def _focal(text: str | None, exposure_ns: int) -> float | None:
+    focal = None if text is None else float(text)
+    if focal is not None and not 1.0 <= focal <= _LONGEST_PX:
+        raise ValueError(f"estimates.csv: {focal} px at {exposure_ns} is no focal length")
+    return focal
 
 
 def image_path(folder: Path, estimate: RecordedEstimate) -> Path:
@@ -213,6 +227,9 @@ def _localize(
 ) -> PoseEstimate | None:
     image = read_image(path)
     fitted = fitted_camera(image.shape[1], image.shape[0], camera, str(path))
+    if recorded.focal_px is not None:
+        factor = recorded.focal_px / fitted.fx
+        fitted = longer(fitted, factor) if abs(factor - 1.0) > _ALIKE else fitted
     frame = Frame(image, recorded.exposure_time_ns, fitted, recorded.sequence)
     try:
         return localizer.track(frame)

@@ -46,8 +46,8 @@ def require_extra() -> None:
         import_module("companion.export.mcap_file")
     except ImportError as error:
         raise ConfigError(
-            "MCAP needs its packages: pip install 'pilot-companion[mcap]' "
-            f"(in a checkout: .venv/bin/pip install '.[mcap]'): {error}"
+            "MCAP needs its packages: pip install '.[mcap]' in a checkout, with the pip of the "
+            f"program's environment: {error}"
         ) from error
 
 

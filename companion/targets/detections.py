@@ -12,11 +12,13 @@ import json
 import logging
 import socket
 import threading
+import time
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from math import isfinite
 
 from companion.errors import ConfigError, DetectionError
+from companion.targets.senders import Senders
 
 _log = logging.getLogger(__name__)
 _MAX_DATAGRAM = 2048
@@ -109,7 +111,9 @@ def parse_host_port(text: str) -> tuple[str, int]:
 
 
 class DetectionListener:
-    """Receives detections on a thread; bad datagrams are counted and ignored."""
+    """Receives detections on a thread; bad datagrams are counted and ignored. Two senders of one
+    name are two (`Senders`).
+    """
 
     def __init__(
         self, address: str, on_detection: Callable[[Detection, FrameName | None], None]
@@ -122,6 +126,7 @@ class DetectionListener:
             raise ConfigError(f"targets.detections {address}: cannot listen: {error}") from error
         self._socket.settimeout(0.3)
         self._on_detection = on_detection
+        self._senders = Senders()
         self._stop = threading.Event()
         self.received = 0
         self.rejected = self.failed = 0
@@ -137,12 +142,14 @@ class DetectionListener:
     def _run(self) -> None:
         while not self._stop.is_set():
             try:
-                data = self._socket.recv(_MAX_DATAGRAM)
+                data, sender = self._socket.recvfrom(_MAX_DATAGRAM)
             except TimeoutError:
                 continue
             self._stop.wait(_PAUSE_S)
             try:
                 detection, name = parse_detection(data)
+                whose = self._senders.name_of(detection.target_id, sender, time.monotonic_ns())
+                detection = replace(detection, target_id=whose)
             except DetectionError as error:
                 self.rejected += 1
                 if self.rejected == 1:

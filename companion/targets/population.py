@@ -39,12 +39,16 @@ _FAR_M = 15.0
 _DEPARTS_S = 1.0  # after a click: so long it may be one that moves
 _DEPARTED = 0.85  # correlation: what has just left looks as it did
 _FASTEST_MPS = 25.0
+_MISSED_S = 1.2  # a standing target that is not seen at its place for so long may have left it
+_CHANGED_NS = 3_000_000_000
+_GROUND_EVERY = 3  # so many of the kept pictures show the ground well enough
 _LOST_S = 4.0
 _SILENT_NS = 2_000_000_000  # what was told and is refused for so long is named,
 _SAID_NS = 10_000_000_000  # one of all targets in so long: a flood of texts hides the others
 _LONG_S = 0.6  # unseen for so long, it is believed to be back once it was seen to go on for
 _BACK_S = (0.25, 1.0)  # so long, until its own motion has left a roof's edge behind
 _BACK_GAP_S = 0.5
+_BENDS = 0.4  # of its way: a bend behind the roof leads it so far aside of its last course
 _PIXELS = 0.05  # of the picture's width: a delay's error beyond it is told as that much
 
 
@@ -103,6 +107,9 @@ class _Life:
     refused_ns: int = 0
     """Since when nothing but refusals came; 0 after a fix."""
     back: _Back | None = None
+    unseen_ns: int = 0
+    """Since when a standing one has not looked as it did, though nothing hides it; 0: it does."""
+    is_change_said: bool = False
 
 
 @dataclass(frozen=True)
@@ -261,27 +268,11 @@ class Population:
         expected = track.expected(time_ns)
         if follower is None or expected is None:
             return
-        position, _ = expected
         since_s = (time_ns - life.found_ns) * 1e-9
-        found = None
         if track.moves:
             found = self._found_moving(life, follower, estimate, gray)
-        elif (near := follower.find(gray, estimate, position, _STILL_M)) is not None and (
-            _off(near.position, position) < _STANDS_M
-            or not life.moved_at_once
-            or time_ns - life.begun_ns > _DEPARTS_S * 1e9
-        ):
-            # It stands, and geometry holds it better than its look, which slides with every change
-            # of view on what is not flat. What moved between pictures has left its place by now: if
-            # it is still here, a roof or a crown about it moved against the ground instead.
-            life.found_ns = time_ns
-            if life.moved_at_once and time_ns - life.begun_ns > _DEPARTS_S * 1e9:
-                life.moved_at_once = False
-                follower.forget_shape()
-        elif near is not None:
-            found = near
-        elif since_s <= _DEPARTS_S:
-            found = self._departed(life, follower, estimate, gray, position)
+        else:
+            found = self._found_leaving(life, follower, estimate, gray, expected[0])
         fix = None
         if found is not None:
             fix = track.see(estimate, found.pixel, pixel_sigma=_FOLLOWED_PX)
@@ -293,12 +284,59 @@ class Population:
             return
         elif track.moves:
             fix = track.coast(estimate)
+        elif since_s > _MISSED_S and self._is_gone(name, life, follower, estimate, gray):
+            return
         if fix is not None and self._is_due(life, time_ns):
             life.told_ns = time_ns
             self._report(life, fix, estimate)
         if life.refused_ns and track.moves and time_ns - life.refused_ns > _LOST_S * 1e9:
             self._say(_INFO, f"PiLoT: target {clicked_number(name)} lost: {track.refusal}")
             self.end((name,))
+
+    def _found_leaving(
+        self, life: _Life, follower: ImageFollower, estimate: PoseEstimate, gray: Gray,
+        position: Array,
+    ) -> Found | None:  # fmt: skip
+        """A target that was not measured to move yet, where it is beside its place (3,); None of
+        what is still there, or is not found.
+        """
+        time_ns = estimate.exposure_time_ns
+        if (left := self._left(life, follower, estimate, gray, position)) is not None:
+            return left
+        near = follower.find(gray, estimate, position, _STILL_M)
+        is_over = time_ns - life.begun_ns > _DEPARTS_S * 1e9
+        if near is None:
+            return self._departed(life, follower, estimate, gray, position)
+        if life.moved_at_once and not is_over and _off(near.position, position) >= _STANDS_M:
+            return near
+        # It stands, and geometry holds it better than its look, which slides with every change of
+        # view on what is not flat. What moved between pictures has left its place by now: if it is
+        # still here, a roof or a crown about it moved against the ground instead.
+        life.found_ns, life.unseen_ns = time_ns, 0
+        if life.moved_at_once and is_over:
+            life.moved_at_once = False
+            follower.forget_shape()
+        return None
+
+    def _is_gone(
+        self, name: str, life: _Life, follower: ImageFollower, estimate: PoseEstimate, gray: Gray
+    ) -> bool:
+        """Whether a target that was never measured to move ends, for the ground is seen again where
+        it was; of another that does not look as it did, the operator is told once.
+        """
+        number = clicked_number(name)
+        if life.moved_at_once and follower.shows_ground(gray, estimate):
+            self._say(_WARNING, f"PiLoT: target {number} lost: it left its place")
+            self.end((name,))
+            return True
+        held = life.track.hold(estimate)
+        is_in_view = held is not None and held.visibility is Visibility.HELD
+        life.unseen_ns = (life.unseen_ns or estimate.exposure_time_ns) if is_in_view else 0
+        missed_ns = estimate.exposure_time_ns - life.unseen_ns if life.unseen_ns else 0
+        if missed_ns > _CHANGED_NS and not life.is_change_said:
+            life.is_change_said = True
+            self._say(_INFO, f"PiLoT: target {number}: place held, its look has changed")
+        return False
 
     def _found_moving(
         self, life: _Life, follower: ImageFollower, estimate: PoseEstimate, gray: Gray
@@ -311,7 +349,11 @@ class Population:
         sigma = float(np.sqrt(max(np.linalg.eigvalsh(expected[1])[-1], 0.0)))
         reach_m = _NEAR_M + min(3.0 * sigma, _FAR_M)
         is_long = (time_ns - life.found_ns) * 1e-9 > _LONG_S
-        found = follower.find(gray, estimate, expected[0], reach_m, was_hidden=is_long)
+        can_tell, found = self._before_ground(
+            life, follower, (estimate, gray), expected[0], reach_m, was_hidden=is_long
+        )
+        if not can_tell:
+            found = follower.find(gray, estimate, expected[0], reach_m, was_hidden=is_long)
         if found is not None and is_long and not self._is_back(life, found, time_ns):
             return None
         return found
@@ -326,7 +368,8 @@ class Population:
         since_s, speed = (time_ns - back.since_ns) * 1e-9, float(np.hypot(*velocity[:2]))
         gone = back.position + since_s * velocity
         is_gap = time_ns - back.time_ns > _BACK_GAP_S * 1e9
-        if is_gap or _off(found.position[:2], gone[:2]) > _STANDS_M:
+        aside_m = _STANDS_M + _BENDS * speed * since_s
+        if is_gap or _off(found.position[:2], gone[:2]) > aside_m:
             return False
         life.back = replace(back, time_ns=time_ns)
         least_s = np.clip(2.0 * _STANDS_M / max(speed, 1e-3), *_BACK_S)
@@ -337,6 +380,35 @@ class Population:
         """Whether it is seen to come out this moment."""
         back = life.back
         return back is not None and (time_ns - back.time_ns) * 1e-9 <= _BACK_GAP_S
+
+    def _left(
+        self, life: _Life, follower: ImageFollower, estimate: PoseEstimate, gray: Gray,
+        position: Array,
+    ) -> Found | None:  # fmt: skip
+        """A target that moved when it was clicked, where it covers other ground than then; None of
+        what stands.
+        """
+        since_s = (estimate.exposure_time_ns - life.found_ns) * 1e-9
+        if not life.moved_at_once or since_s > _DEPARTS_S:
+            return None
+        reach_m = _NEAR_M + _FASTEST_MPS * since_s
+        _, found = self._before_ground(life, follower, (estimate, gray), position, reach_m)
+        return found if found is not None and _off(found.position, position) >= _STANDS_M else None
+
+    def _before_ground(
+        self, life: _Life, follower: ImageFollower, picture: tuple[PoseEstimate, Gray],
+        position: Array, reach_m: float, *, was_hidden: bool = False,
+    ) -> tuple[bool, Found | None]:  # fmt: skip
+        """Whether the pictures of a while ago can tell the target from the ground; where it is."""
+        if not follower.is_isolated:
+            return False, None
+        estimate, gray = picture
+        time_ns = estimate.exposure_time_ns
+        before = [p for p in self._pictures if time_ns - p[0].exposure_time_ns > _PASSED_NS]
+        ground = before[::_GROUND_EVERY]
+        return follower.find_before(
+            gray, estimate, position, reach_m, ground, was_hidden=was_hidden
+        )
 
     @staticmethod
     def _departed(

@@ -38,7 +38,9 @@ FLIGHT = LoopCase(
         "targets": {
             "operator_delay_ms": 1e3 * LATE_S,
             "operator_delay_sigma_ms": 1e3 * LATE_SIGMA_S,
-        }
+        },
+        # Every picture: what was seen of a car that is lost can be looked at again.
+        "record": {"snapshot_interval_s": 0.001},
     },
 )
 
@@ -56,6 +58,8 @@ class FollowRow:
     stall_s: float = 0.0
     late_s: float = 0.0
     """From the picture's exposure to the click."""
+    begin_ns: int = 0
+    """When the car was where it is clicked at, CLOCK_MONOTONIC."""
 
     @property
     def ok(self) -> bool:
@@ -107,7 +111,10 @@ def _flown(kind: VehicleKind, draw: int, options: FollowOptions) -> FollowRow:
     verdict = follow_verdict(fixes, pursuer.chase, pursuer.end_ns, texts)
     if pursuer.failure:
         verdict = replace(verdict, is_followed=False, why=(pursuer.failure, *verdict.why))
-    return FollowRow(kind, seed, draw, verdict, "", record.pace, record.stall_s, pursuer.late_s)
+    begin_ns = pursuer.chase.begins_ns()
+    return FollowRow(
+        kind, seed, draw, verdict, "", record.pace, record.stall_s, pursuer.late_s, begin_ns
+    )
 
 
 def read_fixes(targets: Path, number: int) -> list[FollowedFix]:

@@ -40,9 +40,10 @@ class FixModel(BaseModel):
     """How the fixes differ from the truth, when they come, and what is wrong with them.
 
     velocity_sigma_mps: None where no velocity is measured. rotation_deg turns the whole vision
-    frame (positions and yaw) about the origin, yaw_error_deg the yaw alone. frozen: the truth of
-    the moment it began, again and again under fresh time stamps, as from a picture that hangs; it
-    is registered to a fifth of `sigma_m`, since its errors are always the same.
+    frame (positions and yaw) about turns_about_m (north, east of home), yaw_error_deg the yaw
+    alone. frozen: the truth of the moment it began, again and again under fresh time stamps, as
+    from a picture that hangs; it is registered to a fifth of `sigma_m`, since its errors are always
+    the same.
     """
 
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
@@ -53,6 +54,7 @@ class FixModel(BaseModel):
     velocity_sigma_mps: float | None = Field(None, gt=0)
     attitude_sigma_deg: float = Field(1.15, ge=0)
     rotation_deg: float = 0.0
+    turns_about_m: tuple[float, float] = (0.0, 0.0)
     yaw_error_deg: float = 0.0
     offset_north_m: float = 0.0
     silent: bool = False
@@ -98,8 +100,9 @@ class Observer:
         angles = np.array(truth.roll_pitch_yaw) + attitude_sigma * draw[3:6]
         angles[2] += math.radians(model.yaw_error_deg) + turn
         velocity = truth.velocity_ned + (model.velocity_sigma_mps or 0.0) * draw[6:9]
+        about = np.array([*model.turns_about_m, 0.0])
         return Observation(
-            _three(matrix(quaternion(0.0, 0.0, turn)) @ position),
+            _three(about + matrix(quaternion(0.0, 0.0, turn)) @ (position - about)),
             _three(angles),
             _three(velocity),
         )

@@ -1,0 +1,76 @@
+"""Whose target it is: two detectors that give the same name mean two things."""
+
+from __future__ import annotations
+
+import logging
+from collections import OrderedDict
+from dataclasses import dataclass, field
+
+_log = logging.getLogger(__name__)
+_SILENT_NS = 10_000_000_000  # a sender unheard for so long is gone; its name is free
+_NAMES, _SENDERS = 256, 8  # remembered: of one name, so many senders
+_LONGEST = 58  # of a name, before what tells the sender
+
+Address = tuple[str, int]
+
+
+@dataclass
+class _Named:
+    """Who uses a name. numbers: each sender's, 1 is the name's first; heard_ns: when last."""
+
+    numbers: dict[Address, int] = field(default_factory=dict)
+    heard_ns: dict[Address, int] = field(default_factory=dict)
+    newest: Address | None = None
+    count: int = 1
+
+
+class Senders:
+    """Keeps the targets of several senders apart. Not thread-safe.
+
+    Another sender of a name takes it over, as a detector that was started again does, or one that
+    opens a socket for every datagram. If the one before it is heard once more, there are two of
+    them, and the later one's targets are called after its number: "car #2".
+    """
+
+    def __init__(self) -> None:
+        self._names: OrderedDict[str, _Named] = OrderedDict()
+
+    def name_of(self, target_id: str, sender: Address, now_ns: int) -> str:
+        """What a sender's target of that name is called. now_ns: CLOCK_MONOTONIC."""
+        named = self._names.setdefault(target_id, _Named())
+        self._names.move_to_end(target_id)
+        if len(self._names) > _NAMES:
+            self._names.popitem(last=False)
+        self._forget(named, now_ns)
+        newest = named.newest
+        if sender not in named.numbers:
+            named.numbers[sender] = named.numbers.get(newest, 1) if newest is not None else 1
+        elif newest is not None and newest != sender:
+            self._part(target_id, named, newest, named.numbers[sender])
+        named.heard_ns[sender], named.newest = now_ns, sender
+        number = named.numbers[sender]
+        return target_id if number == 1 else f"{target_id[:_LONGEST]} #{number}"
+
+    @staticmethod
+    def _part(target_id: str, named: _Named, other: Address, number: int) -> None:
+        """Another sender has spoken since this one did: it has a number of its own from now on."""
+        if named.numbers.get(other) != number:
+            return
+        named.count += 1
+        named.numbers[other] = named.count
+        if named.count == 2:
+            _log.warning(
+                "targets.detections: %s:%d and another name a target %r: its is %r from now on",
+                *other, target_id, f"{target_id[:_LONGEST]} #2",
+            )  # fmt: skip
+
+    @staticmethod
+    def _forget(named: _Named, now_ns: int) -> None:
+        """Those that are gone, and the oldest of too many."""
+        by_age = sorted(named.heard_ns, key=lambda a: -named.heard_ns[a])
+        for k, sender in enumerate(by_age):
+            if k >= _SENDERS or now_ns - named.heard_ns[sender] > _SILENT_NS:
+                del named.heard_ns[sender], named.numbers[sender]
+                named.newest = None if named.newest == sender else named.newest
+        if not named.numbers:
+            named.count = 1
