@@ -9,9 +9,11 @@ from pathlib import Path
 from typing import Annotated
 
 import typer
+from rich.console import Console
 
 from companion.cli.geographic import numbers
 from companion.errors import ConfigError
+from companion.terminal.steps import shown_work
 from companion.writing import writing
 from localizer.geometry.geo import Geodetic, LocalFrame
 from localizer.geometry.trajectory import StampedPose
@@ -82,9 +84,10 @@ def convert_command(
             raise ConfigError("--heights amsl needs --geoid-separation or --map")
         above = Heights(heights.value, separation or 0.0)
     place = Place(frame, above)
-    poses = _dated(READERS[of.value](source, place), times, needed=to is Target.TUM)
-    with writing(out):
-        WRITERS[to.value](out, poses, place)
+    with shown_work(Console(stderr=True), f"converting {source}"):
+        poses = _dated(READERS[of.value](source, place), times, needed=to is Target.TUM)
+        with writing(out):
+            WRITERS[to.value](out, poses, place)
     typer.echo(f"{out}: {len(poses)} poses")
 
 

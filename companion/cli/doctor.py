@@ -19,7 +19,7 @@ from rich.table import Table
 from rich.text import Text
 
 from companion.config import load_config
-from companion.terminal.steps import shown_steps
+from companion.terminal.steps import shown_steps, shown_work
 from companion.versions import made_by
 from mavlink_bridge.preflight.doctor import Diagnosis, Finding
 
@@ -46,7 +46,7 @@ def doctor_command(
     settings = load_config(config)
     vehicle, feed = vehicle and not beside_flight, not beside_flight
     console = Console()
-    with shown_steps(console) as say:
+    with shown_steps(Console(stderr=True)) as say:
         say(f"examining {config}")  # the imports take seconds, too
         from companion.preflight.doctor import examine_deployment
         from mavlink_bridge.preflight.doctor import repair
@@ -58,9 +58,10 @@ def doctor_command(
     if fix and diagnosis.fixable:
         names = ", ".join(f"{f.name} = {f.fix:.7g}" for f in diagnosis.fixable if f.fix is not None)
         if yes or typer.confirm(f"Write {names}?"):
-            reboot = repair(settings.bridge, diagnosis.fixable)
+            with shown_work(Console(stderr=True), "writing parameters"):
+                reboot = repair(settings.bridge, diagnosis.fixable)
             console.print("written" + ("; reboot the flight controller" if reboot else ""))
-            with shown_steps(console) as say:
+            with shown_steps(Console(stderr=True)) as say:
                 diagnosis = examine_deployment(settings, vehicle=vehicle, feed=feed, say=say)
             print_diagnosis(console, diagnosis, left_out)
     if page is not None:
@@ -108,9 +109,9 @@ def self_test_command(
     """Localize over a made map: compiles what a flight needs, and shows that it works here."""
     from companion.preflight.self_test import self_test
 
-    console = Console()
+    console, told = Console(), Console(stderr=True)
     with tempfile.TemporaryDirectory(prefix="companion-self-test-") as folder:
-        report = self_test(Path(folder), lambda line: console.print(f"{line} ..."))
+        report = self_test(Path(folder), lambda line: told.print(f"{line} ..."))
     console.print(
         f"[green]self-test passed[/]: tracked to {report.error_m:.4f} m, found to "
         f"{report.found_error_m:.4f} m, {report.frame_ms:.0f} ms of processor a frame, the first "

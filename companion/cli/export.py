@@ -29,7 +29,7 @@ def export_command(
     if not mcap:
         raise ConfigError("say which format: --mcap, the only one so far; the .tlog needs none")
     console = Console()
-    with shown_steps(console) as say:
+    with shown_steps(Console(stderr=True)) as say:
         say(f"reading {record}")
         from companion.reporting.mcap_export import export_mcap
 

@@ -38,7 +38,7 @@ def key_command(
         from mavlink_bridge.preflight.signing_setup import install_key
 
         console.print("the key goes over this connection in clear: use a cable", soft_wrap=True)
-        with shown_work(console, f"waiting for the flight controller at {install}"):
+        with shown_work(Console(stderr=True), f"waiting for the flight controller at {install}"):
             installed = install_key(install, file)
         if installed:
             console.print("installed: the autopilot's heartbeat is signed with it")

@@ -87,7 +87,7 @@ def show_record(record: Path, map_cache: Path | None, listen: str) -> None:
         config = validated(ConsoleConfig, {"listen": listen})
     except SettingsError as error:
         raise ConfigError(f"--console {listen}: {str(error).strip()}") from error
-    with shown_steps(Console()) as say, map_pictures(map_path) as pictures:
+    with shown_steps(Console(stderr=True)) as say, map_pictures(map_path) as pictures:
         say(f"reading {record} and its map")
         source = ReplaySource(tables, pictures)
         for note in pictures.notes:

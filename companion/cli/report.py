@@ -20,14 +20,20 @@ def report_command(
     out: Annotated[
         Path | None, typer.Option(help="file to write; none: report.html in the folder")
     ] = None,
+    overwrite: Annotated[
+        bool, typer.Option(help="replace a file that is there (the folder's own report always is)")
+    ] = False,
 ) -> None:
     """Write one self-contained HTML file and print its path."""
     if out is not None and out.suffix.lower() not in (".html", ".htm") and not out.is_dir():
         raise ReportError(f"{out}: give a name that ends in .html")
-    console = Console()
-    with shown_steps(console) as say:
+    if out is not None and out.is_file() and not overwrite:
+        raise ReportError(f"{out}: is there already; --overwrite replaces it")
+    with shown_steps(Console(stderr=True)) as say:
         say(f"reading {folder}")
-        from companion.reporting.report import write_page
+        from companion.reporting.report import NAME, write_page
 
+        is_new = not (out or folder / NAME).exists()
         path = write_page(folder, out, say)
-    console.print("report:", file_link(path), soft_wrap=True, highlight=False)
+    said = "report:" if is_new else "report, in place of the one before:"
+    Console().print(said, file_link(path), soft_wrap=True, highlight=False)

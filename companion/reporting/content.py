@@ -10,6 +10,8 @@ import numpy as np
 
 from localizer.types import Image
 
+NOTHING = "nothing"  # that went wrong: how the page's headline begins then
+
 
 @dataclass(frozen=True)
 class Verdict:
@@ -124,11 +126,14 @@ class Overlay:
 
 @dataclass(frozen=True)
 class Table:
-    """Rows of text under their headings. bad: numbers of the rows that miss their target."""
+    """Rows of text under their headings. bad: numbers of the rows that miss their target; note: how
+    the columns are to be read.
+    """
 
     headings: tuple[str, ...]
     rows: tuple[tuple[str, ...], ...]
     bad: frozenset[int] = frozenset()
+    note: str = ""
 
 
 @dataclass(frozen=True)

@@ -89,7 +89,7 @@ def demo_report(folder: Path, say: Say = silent) -> Report:
         f"Demo flight, seed {document.get('seed')}",
         f"{figures_of['vehicle']}, GNSS denied for {figures_of['denied_s']:.0f} s, "
         f"{figures_of['flown_m']:.0f} m flown; {record.health.get('text', '')}",
-        _broken(figures_of) + figures.first_fault(estimates, time_s, happened, large),
+        _broken(figures_of) + figures.first_fault(estimates, time_s, happened, large, 0.0),
         _verdicts(figures_of),
         sheet,
         _plots(record, time_s, errors, vehicle, start_ns),

@@ -7,12 +7,20 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 
 from companion.offline.tables import Columns
-from companion.reporting.content import Curve, Event, Mark, Plot, Span, Table, Track
+from companion.reporting.content import NOTHING, Curve, Event, Mark, Plot, Span, Table, Track
 
 STAGES = ("reference", "extract", "register", "latency")
 _GAP_S = 1.0  # without an estimate: the state before is not carried on over it
 _HARMLESS = ("PiLoT: injection forced", "PiLoT: GNSS lost", "PiLoT: ending")
+_WELL = f"{NOTHING}: tracking from the first fix to the end, and no warning"
 _NEAR_NS = 2_000_000
+LATENCY = "exposure to estimate"
+_NEWEST_FIX = "Place, sigma and elsewhere are those of each target's newest fix."
+_EVERY_FIX = (
+    "The errors are of every fix while GNSS was denied, the first ones too: a maximum far beyond "
+    "the sigma is an earlier fix, often one at the picture's edge, where the ray is flat and a "
+    "step of the surface moves its end by metres."
+)
 
 
 def seconds(time_ns: np.ndarray, start_ns: int) -> np.ndarray:
@@ -58,30 +66,34 @@ def events(columns: Columns, start_ns: int) -> tuple[Event, ...]:
     return tuple(Event(float(t), str(level), str(text)) for t, level, text in rows)
 
 
-def stage_table(estimates: Columns, abscissa: str = "") -> Table:
-    """Median, 95 % and largest of each stage."""
+def stage_table(estimates: Columns) -> Table:
+    """Median, 95 % and largest of each stage, over all of the record."""
     rows = []
     for name in STAGES:
         values = np.asarray(estimates[f"{name}_ms"])
         values = values[np.isfinite(values)]
         if len(values):
             spread = (*np.percentile(values, [50, 95]), values.max())
-            label = "exposure to estimate" if name == "latency" else name
+            label = LATENCY if name == "latency" else name
             rows.append((label, *(f"{v:.0f}" for v in spread)))
-    return Table(("stage" + abscissa, "median", "p95", "max"), tuple(rows))
+    note = "Over the whole record, from its first estimate to its last, also with GNSS."
+    return Table(("stage", "median", "p95", "max"), tuple(rows), note=note)
 
 
 def stage_plot(estimates: Columns, time_s: np.ndarray, limit_ms: float | None) -> Plot:
     """Latency by stage over time."""
-    curves = tuple(Curve(name, np.asarray(estimates[f"{name}_ms"])) for name in STAGES)
+    names = {"latency": LATENCY}
+    curves = tuple(Curve(names.get(s, s), np.asarray(estimates[f"{s}_ms"])) for s in STAGES)
     return Plot("latency by stage, ms", time_s, curves, limit_ms)
 
 
 def first_fault(
-    estimates: Columns, time_s: np.ndarray, happened: Sequence[Event], large_error: str = ""
-) -> str:
+    estimates: Columns, time_s: np.ndarray, happened: Sequence[Event], large_error: str = "",
+    since_s: float | None = None,
+) -> str:  # fmt: skip
     """What went wrong first once the place was known, in words. large_error: the first time that
-    the position was off, where the truth is known, with its time in front.
+    the position was off, where the truth is known, with its time in front. since_s: what came
+    before counts only where nothing came after, as what it is.
     """
     states = np.asarray(estimates.get("state", np.empty(0)))
     began = np.flatnonzero(states == "tracking")
@@ -89,6 +101,19 @@ def first_fault(
         last = next((e.text for e in reversed(happened) if e.level == "warning"), "")
         return "never localized" + (f"; the last warning: {last}" if last else "")
     begin_s = float(time_s[began[0]])
+    if since_s is not None and since_s > begin_s:
+        later = tuple(event for event in happened if event.time_s >= since_s)
+        after = _first_since(since_s, states, time_s, later, large_error)
+        before = _first_since(begin_s, states, time_s, happened, large_error)
+        return after or (f"{NOTHING} while GNSS was denied; before, {before}" if before else _WELL)
+    return _first_since(begin_s, states, time_s, happened, large_error) or _WELL
+
+
+def _first_since(
+    begin_s: float, states: np.ndarray, time_s: np.ndarray, happened: Sequence[Event],
+    large_error: str,
+) -> str:  # fmt: skip
+    """With its time; empty where nothing did."""
     found: list[tuple[float, str]] = []
     left = np.flatnonzero((states != "tracking") & (time_s > begin_s))
     if len(left):
@@ -104,7 +129,7 @@ def first_fault(
         when, _, text = large_error.partition(" ")
         found.append((float(when), text))
     if not found:
-        return "nothing: tracking from the first fix to the end, and no warning"
+        return ""
     t, text = min(found)
     return f"at {t:.1f} s: {text}"
 
@@ -150,7 +175,8 @@ def target_table(
         rows.append(tuple(cells))
     headings = ("target", "fixes", "latitude", "longitude", "height, m", "sigma, m", "elsewhere")
     more = ("median error, m", "p95, m", "max, m") if errors is not None else ()
-    return Table((*headings, *more), tuple(rows), frozenset(bad))
+    note = _NEWEST_FIX if errors is None else f"{_NEWEST_FIX} {_EVERY_FIX}"
+    return Table((*headings, *more), tuple(rows), frozenset(bad), note)
 
 
 def _last_place(targets: Columns, rows: np.ndarray | None) -> tuple[str, ...]:

@@ -14,7 +14,7 @@ import cv2
 import numpy as np
 
 from companion.errors import ReportError
-from companion.reporting.content import RIM, MapSheet, Plot, Report, Stanford, Table, Track
+from companion.reporting.content import NOTHING, RIM, MapSheet, Plot, Report, Stanford, Table, Track
 from companion.vendored import licence_of, vendored
 from companion.writing import writing
 from localizer.types import Image
@@ -60,9 +60,10 @@ def _embedded(data: Any) -> str:
 
 
 def _sections(report: Report) -> list[str]:
+    fine = " fine" if report.first.startswith(NOTHING) else ""
     return [
         f"<h1>{escape(report.title)}</h1><p class=sub>{escape(report.subtitle)}</p>",
-        f"<p class=first><b>What went wrong first:</b> {escape(report.first)}</p>",
+        f'<p class="first{fine}"><b>What went wrong first:</b> {escape(report.first)}</p>',
         "".join(f"<p class=note>{escape(note)}</p>" for note in report.notes),
         _verdicts(report),
         _section("Map", _map(report.sheet)) if report.sheet else "",
@@ -292,7 +293,8 @@ def _table(table: Table) -> str:
         f"<tr{' class=missed' if i in table.bad else ''}>" + "".join(_cell(cell) for cell in row)
         for i, row in enumerate(table.rows)
     )
-    return f"<div class=scroll><table><tr>{head}{rows}</table></div>"
+    note = f"<p class=sub>{escape(table.note)}</p>" if table.note else ""
+    return f"{note}<div class=scroll><table><tr>{head}{rows}</table></div>"
 
 
 def _settings(report: Report) -> str:

@@ -92,7 +92,9 @@ class Pace:
         if self.taken < _SLOW:
             said.append(f"{100 * self.taken:.0f} % of the pictures were localized in time")
         if self.latency_ms is not None and self.latency_ms > limit_ms:
-            said.append(f"latency p95 {self.latency_ms:.0f} ms ({limit_ms:.0f} at most)")
+            said.append(
+                f"exposure to estimate p95 {self.latency_ms:.0f} ms ({limit_ms:.0f} at most)"
+            )
         if not said:
             return None
         return (

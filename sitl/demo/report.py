@@ -23,6 +23,7 @@ from companion.offline.plots import (
     save_image,
 )
 from companion.offline.tables import Columns, poses, read_columns
+from companion.reporting.figures import LATENCY
 from companion.reporting.verdicts import advice, compared
 from companion.versions import made_by
 from localizer.evaluation.metrics import LocalizationMetrics
@@ -386,11 +387,14 @@ def print_report(report: FlightReport, folder: Path) -> None:
     console.print(table)
     stages = Table(title=f"{m.fps:.1f} localized frames/s, {report.frames_dropped} of "
                          f"{report.frames_sent} frames dropped")  # fmt: skip
-    stages.add_column("stage, ms")
+    stages.add_column("stage while GNSS was denied, ms")
     stages.add_column("p50", justify="right")
     stages.add_column("p95", justify="right")
     for name, spread in report.stages_ms.items():
-        stages.add_row(name, _figure(spread.median, 0), _figure(spread.p95, 0))
+        stages.add_row(
+            LATENCY if name == "latency" else name, _figure(spread.median, 0),
+            _figure(spread.p95, 0),
+        )  # fmt: skip
     for name, (p50, p95) in report.camera_ms.items():
         stages.add_row(f"world camera: {name}", f"{p50:.0f}", f"{p95:.0f}")
     console.print(stages)

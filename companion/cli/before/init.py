@@ -18,6 +18,7 @@ from localizer.errors import LocalizerError
 from mavlink_bridge.errors import BridgeError
 
 _DEFAULT_FOV_DEG = 65.0
+_NO_MAP = Path("maps/area")  # where the map is to lie, until there is one
 _Answer = TypeVar("_Answer", str, float)
 
 
@@ -61,8 +62,7 @@ def init_command(
     if out.exists() and not overwrite:
         raise ConfigError(f"{out}: is there already; --overwrite replaces it")
     notes: list[str] = []
-    asked = map_cache or Path(_asked("map: folder of the tile cache", "--map"))
-    settings: dict[str, Any] = {"map": str(asked.resolve()), "map_sha256": _pinned(asked)}
+    settings = _map_settings(map_cache or _asked_map(), notes)
     feed = source or _asked("video source", "--source", "udp://0.0.0.0:5600")
     wire = connection or _asked("autopilot", "--connection", "serial:/dev/ttyTHS1:921600")
     mounted = mount or _asked("camera mount (gimbal, fixed)", "--mount", "gimbal")
@@ -86,8 +86,11 @@ def init_command(
     write_deployment(deployment_text(config, notes), out, overwrite)
     for note in notes:
         Console().print(escape(note), style="yellow", soft_wrap=True, highlight=False)
-    Console().print(f"{escape(str(out))} is written; next: companion doctor {escape(str(out))}",
-                    soft_wrap=True)  # fmt: skip
+    first = "" if config.map_sha256 else "the map, then "
+    Console().print(
+        f"{escape(str(out))} is written; next: {first}companion doctor {escape(str(out))}",
+        soft_wrap=True,
+    )
 
 
 def _asked(what: str, option: str, default: _Answer | None = None) -> _Answer:
@@ -100,6 +103,33 @@ def _asked(what: str, option: str, default: _Answer | None = None) -> _Answer:
         typer.echo(err=True)
         raise ConfigError(f"{what}: nobody answers here; give {option}") from error
     return answer
+
+
+def _asked_map() -> Path | None:
+    """None where there is no map yet, and where there is nobody to ask."""
+    try:
+        answer = typer.prompt("map: folder of the tile cache (Enter: none yet)", default="",
+                              show_default=False)  # fmt: skip
+    except typer.Abort:
+        if sys.stdin.isatty():  # he does not want to go on
+            raise
+        typer.echo(err=True)
+        return None
+    return Path(answer) if answer else None
+
+
+def _map_settings(cache: Path | None, notes: list[str]) -> dict[str, Any]:
+    """Path and hash of the map; without one its place in the file, and a note of what is missing.
+    MapCacheError where something else is in its place.
+    """
+    place = cache or _NO_MAP
+    if cache is not None and cache.exists():
+        return {"map": str(place.resolve()), "map_sha256": _pinned(cache)}
+    notes.append(
+        f"NO MAP YET, nothing flies without one: {place} is not there; `companion map fetch` or "
+        f"`companion map build` --out {place}, then map_sha256 from `companion map verify {place}`"
+    )
+    return {"map": str(place.resolve())}
 
 
 def _pinned(map_cache: Path) -> str:

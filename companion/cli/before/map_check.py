@@ -68,5 +68,11 @@ def check_command(
         if bad
         else f"This map will do where it is: {area} from end to end at {_SPEED_M_S:.0f} m/s."
     )
-    Console().print(f"{verdict} Pictures: {escape(str(out))}", soft_wrap=True)
+    Console().print(verdict, soft_wrap=True, highlight=False)
+    if made.usable is None:
+        Console().print("No part of it is usable.", highlight=False)
+    elif bad or not made.usable.is_whole:
+        Console().print(f"Usable without a gap: {made.usable.line()}; keep what the camera sees "
+                        "inside it.", soft_wrap=True, highlight=False)  # fmt: skip
+    Console().print(f"Pictures: {escape(str(out))}", soft_wrap=True)
     raise typer.Exit(0 if made.ok else 1)

@@ -17,7 +17,7 @@ from rich.markup import escape
 from rich.table import Table
 
 from companion.errors import ConfigError
-from companion.terminal.steps import READING, shown_count
+from companion.terminal.steps import READING, shown_count, shown_work
 
 if TYPE_CHECKING:
     from localizer.map.fetch.area import Area
@@ -104,10 +104,12 @@ def fetch_command(
     console = Console()
     console.print(f"area: {area}", highlight=False, soft_wrap=True)
     work = out.with_name(f"{out.name}.fetch")
-    parts = [
-        _planned(choose(known, area, role, name), area, resolution, most_mb, work, role)
+    chosen = [
+        (role, choose(known, area, role, name))
         for role, name in (("imagery", imagery), ("heights", heights))
     ]
+    with shown_work(Console(stderr=True), "asking what the services have"):
+        parts = [_planned(one, area, resolution, most_mb, work, role) for role, one in chosen]
     if buildings is not None and parts[1].source.role != "terrain":
         raise ConfigError(
             f"--footprints: {parts[1].source.name} is a surface, which has its buildings; name a "
@@ -139,7 +141,8 @@ def raise_command(
     """Raise buildings on a terrain by their footprints: a surface for `map build`."""
     from localizer.map.footprints.raise_buildings import raise_buildings, read_footprints
 
-    done = raise_buildings(terrain, read_footprints(footprints, height_property), out)
+    with shown_work(Console(stderr=True), "raising buildings"):
+        done = raise_buildings(terrain, read_footprints(footprints, height_property), out)
     Console().print(f"{out}: {done.line()}", markup=False, highlight=False, soft_wrap=True)
 
 
@@ -157,13 +160,25 @@ def sources_command(
             table.add_row(name, escape(info.description or ""))
         console.print(table)
         return
-    table = Table(box=SIMPLE_HEAD)
-    for column in ("name", "country", "what", "m", "licence", "attribution"):
-        table.add_column(column, overflow="fold")
     for source in load_sources(tuple(sources or ())):
-        row = (source.name, source.country, source.title, f"{source.resolution_m:g}")
-        table.add_row(*map(escape, (*row, source.licence, source.attribution)))
-    console.print(table)
+        _print_source(console, source)
+
+
+def _print_source(console: Console, source: Source) -> None:
+    """Name first and whole, to be copied; what a terminal's width breaks goes on under itself."""
+    head = f"{source.name}  ({source.country}, {source.role}, {source.resolution_m:g} m)"
+    console.print(head, style="bold", markup=False, highlight=False, soft_wrap=True)
+    for what, text in (
+        ("what", source.title), ("licence", source.licence), ("attribution", source.attribution),
+    ):  # fmt: skip
+        if console.is_terminal:
+            line = Table.grid(padding=(0, 1))
+            line.add_column(width=16, no_wrap=True)
+            line.add_column(overflow="fold")
+            line.add_row(f"    {what}:", escape(text))
+            console.print(line)
+        else:
+            console.print(f"    {what}: {text}", markup=False, highlight=False, soft_wrap=True)
 
 
 def _area(rectangle: str | None, circle: str | None, mission: Path | None, margin: float) -> Area:
@@ -231,7 +246,7 @@ def _fetched(console: Console, part: _Part, area: Area) -> None:
     from localizer.map.fetch.fetch import fetch
 
     what = f"fetching {part.source.name}"
-    with _told_count(console, what) as progress:
+    with _told_count(what) as progress:
         known = fetch(part.source, part.plan, part.folder, part.out, part.client, progress)
     console.print(
         f"{part.source.name}: {part.client.bytes / _MB:.1f} MB in {part.client.requests} requests, "
@@ -241,9 +256,9 @@ def _fetched(console: Console, part: _Part, area: Area) -> None:
 
 
 @contextmanager
-def _told_count(console: Console, what: str) -> Iterator[Callable[[int, int], None]]:
+def _told_count(what: str) -> Iterator[Callable[[int, int], None]]:
     try:
-        with shown_count(console, what) as progress:
+        with shown_count(Console(stderr=True), what) as progress:
             yield progress
     except KeyboardInterrupt:
         Console(stderr=True).print("interrupted: the same command goes on with what has come")
@@ -255,7 +270,8 @@ def _raised(console: Console, part: _Part, footprints: Footprints) -> _Part:
     from localizer.map.footprints.raise_buildings import raise_buildings
 
     out = part.out.with_name("raised.tif")
-    done = raise_buildings(part.out, footprints, out)
+    with shown_work(Console(stderr=True), "raising buildings"):
+        done = raise_buildings(part.out, footprints, out)
     console.print(f"{footprints.path.name}: {done.line()}", markup=False, highlight=False,
                   soft_wrap=True)  # fmt: skip
     if not footprints.attribution:
@@ -285,11 +301,12 @@ def _built(
         workers=workers,
         apart=True,
     )
-    with shown_count(console, "importing tiles", begins=READING) as bar:
+    with shown_count(Console(stderr=True), "importing tiles", begins=READING) as bar:
         manifest = build_cache([parts[1].out, parts[0].out], out, options, progress=bar)
     for text in manifest.warnings:
         console.print(f"[yellow]warning:[/] {escape(text)}", soft_wrap=True)
-    found = verify(TileCache.open(out))
+    with shown_work(Console(stderr=True), "verifying the cache"):
+        found = verify(TileCache.open(out))
     for line in found.damaged:
         console.print(f"[red]{escape(line)}")
     if found.damaged:

@@ -15,7 +15,7 @@ from rich.markup import escape
 from rich.table import Table
 
 from companion.config import load_config
-from companion.terminal.steps import shown_count
+from companion.terminal.steps import shown_count, shown_work
 from companion.writing import made_folder
 
 
@@ -73,13 +73,14 @@ def plan_command(
     )  # fmt: skip
     with shown_count(Console(stderr=True), "places") as count:
         plan = make_plan(planned, cache, deployment, question, count)
-    sheet = pictures.sheet_of(plan, cache)
     camera = deployment.camera.model.camera().without_distortion()
-    shown = (
-        ("Track", pictures.track_picture(sheet, plan)),
-        ("Ground that is seen", pictures.heat_picture(sheet, plan, cache, camera,
-                                                      aim_of(deployment, pitch))),
-    )  # fmt: skip
+    with shown_work(Console(stderr=True), "drawing the pictures"):
+        sheet = pictures.sheet_of(plan, cache)
+        aim = aim_of(deployment, pitch)
+        shown = (
+            ("Track", pictures.track_picture(sheet, plan)),
+            ("Ground that is seen", pictures.heat_picture(sheet, plan, cache, camera, aim)),
+        )
     for name, (_, rgb) in zip(("track.png", "heat.png"), shown, strict=True):
         write_picture(out / name, rgb)
     page.write_page(plan, shown, out / "plan.html")

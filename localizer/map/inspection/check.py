@@ -13,6 +13,7 @@ from localizer.errors import MapCacheError
 from localizer.map.cache.cache import TileCache
 from localizer.map.inspection.alignment import Alignment, alignment_of
 from localizer.map.inspection.mosaic import Mosaic, mosaic_of
+from localizer.map.inspection.usable import Usable, usable_part
 from localizer.types import Image
 
 _LEAST_HOLE_M2 = 25.0
@@ -61,12 +62,13 @@ class Use:
 @dataclass(frozen=True)
 class MapCheck:
     """findings: each question's; pictures: name to RGB; size_m: east and north of the rectangle
-    about the map.
+    about the map; usable: the largest part of it without gaps, blanks and coarse texels.
     """
 
     findings: tuple[Finding, ...]
     pictures: dict[str, Image]
     size_m: tuple[float, float]
+    usable: Usable | None
 
     @property
     def ok(self) -> bool:
@@ -114,7 +116,9 @@ def check_map(cache: TileCache, use: Use) -> MapCheck:
         "alignment": _alignment_picture(mosaic),
     }
     rows, columns = gaps.shape
-    return MapCheck(findings, pictures, (columns * mosaic.gsd_m, rows * mosaic.gsd_m))
+    faulty = gaps | blank | (_texel_ratio(cache, mosaic, use) > _TOO_COARSE)
+    usable = usable_part(mosaic, faulty, use.height_m, cache.frame)
+    return MapCheck(findings, pictures, (columns * mosaic.gsd_m, rows * mosaic.gsd_m), usable)
 
 
 def seams_of(cache: TileCache, mosaic: Mosaic) -> list[Seam]:
@@ -279,8 +283,8 @@ def _painted(
     return picture
 
 
-def _texel_picture(cache: TileCache, mosaic: Mosaic, use: Use) -> Image:
-    """Texels over working pixels, from green (fine) to red (four and more)."""
+def _texel_ratio(cache: TileCache, mosaic: Mosaic, use: Use) -> NDArray[np.float32]:
+    """Texels over working pixels, (h, w)."""
     index = cache.index
     ratio = np.zeros(mosaic.height.shape, np.float32)
     for node in np.flatnonzero((index.child_count == 0) & (index.gsd > 0)):
@@ -289,6 +293,12 @@ def _texel_picture(cache: TileCache, mosaic: Mosaic, use: Use) -> Image:
         part = tuple(slice(max(int(a), 0), max(int(np.ceil(b)), 0)) for a, b in
                      ((top, bottom), (left, right)))  # fmt: skip
         ratio[part] = index.gsd[node] / use.pixel_m
+    return ratio
+
+
+def _texel_picture(cache: TileCache, mosaic: Mosaic, use: Use) -> Image:
+    """Texels over working pixels, from green (fine) to red (four and more)."""
+    ratio = _texel_ratio(cache, mosaic, use)
     level = np.clip(1 - ratio / _TOO_COARSE, 0, 1)
     colours = np.stack([255 * (1 - level), 200 * level, np.full_like(level, 40)], axis=2)
     mixed = 0.5 * mosaic.rgb + 0.5 * colours

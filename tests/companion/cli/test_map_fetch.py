@@ -14,6 +14,7 @@ from companion.cli.commands import app
 from localizer.geometry.geoid import geoid_separation
 from localizer.map.cache.cache import TileCache
 from localizer.map.cache.surface import MapSurface
+from localizer.map.fetch.catalogue import load_sources
 from tests.localizer.map.fetch.loopback import (
     LEFT,
     TOP,
@@ -197,3 +198,18 @@ def test_sources_are_listed_with_licence_and_whom_to_name(sources):
     assert "the photographers" in listed.output
     assert "copernicus-glo30" in listed.output
     assert "vertical_datum" in run("sources", "--keys").output
+
+
+def test_names_of_sources_are_whole_at_any_width(sources, monkeypatch):
+    """80 columns broke "ch-swisssurface3d" in the middle: it could not be copied."""
+    names = [s.name for s in load_sources((sources,))]
+    listed = run("sources", "--sources", sources).output  # no terminal: a line each, however long
+    assert all(f"{name}  (" in listed for name in names)
+    assert max(map(len, listed.splitlines())) > 120
+    monkeypatch.setenv("FORCE_COLOR", "1")  # which rich takes for a terminal
+    monkeypatch.setenv("COLUMNS", "80")
+    shown = CliRunner().invoke(app, ["map", "sources", "--sources", str(sources)]).output
+    lines = re.sub("\x1b\\[[0-9;]*m", "", shown).splitlines()
+    assert all(any(line.startswith(f"{name}  (") for line in lines) for name in names)
+    assert max(map(len, lines)) <= 80
+    assert any(line.startswith("    attribution: ") for line in lines)

@@ -8,19 +8,23 @@ import re
 import cv2
 import numpy as np
 import pytest
+from typer.testing import CliRunner
 
+from companion.cli.commands import app
 from companion.errors import RecordError
 from companion.flight.recorder import ESTIMATE_COLUMNS, EVENT_COLUMNS, TARGET_COLUMNS
 from companion.reporting.content import (
     INNER,
     MIDDLE,
     OUTER,
+    Event,
     MapSheet,
     Mark,
     Report,
     Stanford,
     Track,
 )
+from companion.reporting.figures import first_fault, target_table
 from companion.reporting.layout import render
 from companion.reporting.record import read_record, record_report, worst_frames
 from companion.reporting.report import report_of, write_page
@@ -94,6 +98,46 @@ def test_a_flight_without_fault_names_none(record):
     _rows(record / "events.csv", EVENT_COLUMNS, [])
     report = record_report(record)
     assert report.first.startswith("nothing: ")
+
+
+def test_what_came_before_gnss_was_denied_is_no_headline_of_the_denial() -> None:
+    """It stood in amber above a flight without a fault."""
+    time_s = np.arange(-5.0, 5.0)
+    estimates = {"state": np.full(10, "tracking"), "time": time_s}
+    early = (Event(-3.0, "warning", "PiLoT: video feed stalled"),)
+    told = first_fault(estimates, time_s, early, "", 0.0)
+    assert told == "nothing while GNSS was denied; before, at -3.0 s: PiLoT: video feed stalled"
+    late = (*early, Event(2.0, "warning", "PiLoT: withheld"))
+    assert first_fault(estimates, time_s, late, "", 0.0) == "at 2.0 s: PiLoT: withheld"
+    assert first_fault(estimates, time_s, (), "", 0.0).startswith("nothing: ")
+    assert '<p class="first fine">' in render(Report("a flight", "", told))
+    assert '<p class="first">' in render(Report("a flight", "", "at 2.0 s: PiLoT: withheld"))
+
+
+def test_a_latency_has_one_name_and_says_of_when_it_is(record):
+    stages = record_report(record).stages
+    assert stages.rows[-1][0] == "exposure to estimate"
+    assert "from its first estimate to its last" in stages.note
+
+
+def test_targets_say_what_their_sigma_is_of_and_what_an_error_far_beyond_it_is(record):
+    page = render(record_report(record))
+    assert "are those of each target&#x27;s newest fix" in page
+    table = target_table(read_record(record).targets, {"A": np.array([0.2, 0.9, 4.9])}, 3.0)
+    assert "far beyond the sigma is an earlier fix" in table.note
+
+
+def test_a_report_never_replaces_a_file_without_a_word(record, tmp_path):
+    out = tmp_path / "kept.html"
+    out.write_text("somebody's")
+    words = ["report", str(record), "--out", str(out)]
+    refused = CliRunner().invoke(app, words)
+    assert "is there already; --overwrite replaces it" in str(refused.exception)
+    assert out.read_text() == "somebody's"
+    done = CliRunner().invoke(app, [*words, "--overwrite"])
+    assert "in place of the one before" in done.stdout
+    assert out.read_text() != "somebody's"
+    assert " s drawing" not in done.stdout  # steps go to standard error
 
 
 def test_the_page_needs_nothing_else_and_runs_nothing_of_the_record(record):

@@ -15,6 +15,7 @@ from companion.errors import ConfigError
 from companion.preflight.map_pin import map_hash
 from companion.setup.difference import differing
 from companion.setup.reference import reference
+from localizer.errors import MapCacheError
 from localizer.map.building import build
 from localizer.map.building.options import BuildOptions
 from tests.companion.test_config import DEPLOYMENT, MINIMAL, MODEL
@@ -129,3 +130,25 @@ def test_a_calibration_of_another_size_is_told(cache, video, tmp_path):
     config = load_config(out)
     assert config.camera.model.fx == 550
     assert (config.bridge.camera.mount, config.bridge.camera.mount_pitch_deg) == ("fixed", -90.0)
+
+
+@pytest.mark.parametrize("given", [[], ["--map", "not/there"]])
+def test_without_a_map_a_file_is_written_that_says_what_is_missing(tmp_path, monkeypatch, given):
+    monkeypatch.chdir(tmp_path)
+    words = ["init", "d.yaml", *given, "--source", "a", "--no-listen", "--connection",
+             "udpin:127.0.0.1:14551", "--fov", "60", "--mount", "gimbal"]  # fmt: skip
+    done = CliRunner().invoke(app, words, input="")
+    assert done.exit_code == 0, done.output
+    assert "NO MAP YET" in done.output
+    assert "next: the map, then companion doctor" in done.output
+    place = given[1] if given else "maps/area"
+    assert f"--out {place}" in (tmp_path / "d.yaml").read_text()
+    config = load_config(tmp_path / "d.yaml")
+    assert (config.map, config.map_sha256) == (tmp_path / place, None)
+
+
+def test_something_else_in_the_maps_place_is_refused(tmp_path):
+    words = ["init", str(tmp_path / "d.yaml"), "--map", str(tmp_path), "--source", "a"]
+    done = CliRunner().invoke(app, words)
+    assert isinstance(done.exception, MapCacheError)
+    assert not (tmp_path / "d.yaml").exists()

@@ -83,8 +83,8 @@ GOOD_PACE = {"sent_hz": 10.0, "wanted_hz": 10, "taken": 1.0, "latency_ms": 150.0
     [
         ({"sent_hz": 6.1}, "the camera sent 6.1 of 10 pictures/s"),
         ({"taken": 0.5}, "50 % of the pictures were localized in time"),
-        ({"latency_ms": 612.0}, "latency p95 612 ms (220 at most)"),
-        ({"latency_ms": 260.0, "delay_ms": 300.0}, "latency p95 260 ms (250 at most)"),
+        ({"latency_ms": 612.0}, "exposure to estimate p95 612 ms (220 at most)"),
+        ({"latency_ms": 260.0, "delay_ms": 300.0}, "exposure to estimate p95 260 ms (250 at most)"),
     ],
 )
 def test_a_computer_that_is_too_slow_is_named_and_what_it_did_not_keep_up_with(changes, said):

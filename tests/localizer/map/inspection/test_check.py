@@ -16,6 +16,7 @@ from localizer.map.cache.cache import TileCache
 from localizer.map.inspection.alignment import alignment_of
 from localizer.map.inspection.check import Grade, Use, check_map, seams_of
 from localizer.map.inspection.mosaic import Mosaic, mosaic_of
+from localizer.map.inspection.usable import largest_rectangle, usable_part
 from tests.localizer.map.conftest import write_tileset
 
 FINE = Use(120.0, 0.004)
@@ -122,3 +123,31 @@ def test_the_command_says_it_in_words_pictures_and_its_exit_code(cache, tmp_path
     bad = CliRunner().invoke(app, low)
     assert bad.exit_code == 1
     assert "will not do: texel size" in bad.output
+    assert "No part of it is usable." in bad.output
+
+
+def test_of_a_map_with_bad_edges_the_usable_middle_is_named(cache):
+    """Until then a map that failed by its edges was only told to fail."""
+    mosaic = mosaic_of(cache, 200_000)
+    faulty = np.isnan(mosaic.height)
+    rows, columns = faulty.shape
+    assert usable_part(mosaic, faulty, 120.0, cache.frame).is_whole
+    faulty[: rows // 4] = True
+    faulty[:, : columns // 2] = True
+    faulty[-1, -1] = True  # a hole that does no harm
+    found = usable_part(mosaic, faulty, 120.0, cache.frame)
+    assert not found.is_whole
+    assert found.size_m == pytest.approx((200.0, 300.0), abs=16.0)
+    for north, east, inside in ((0.0, 100.0, True), (0.0, -20.0, False), (150.0, 100.0, False)):
+        at = cache.frame.position(np.array([east, north, 0.0]))
+        lies = found.south < at.latitude_deg < found.north
+        assert (lies and found.west < at.longitude_deg < found.east) is inside
+    assert usable_part(mosaic, np.ones_like(faulty), 120.0, cache.frame) is None
+
+
+def test_the_largest_rectangle_is_found_among_others():
+    good = np.zeros((6, 8), bool)
+    good[0:2, 0:3] = good[1:6, 4:7] = good[5] = True
+    assert largest_rectangle(good) == (1, 6, 4, 7)
+    assert largest_rectangle(~good | good) == (0, 6, 0, 8)
+    assert largest_rectangle(np.zeros((3, 3), bool)) is None

@@ -1,0 +1,88 @@
+"""The part of a map that may be flown over where its edges or other parts will not do."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from localizer.geometry.geo import LocalFrame
+from localizer.map.inspection.mosaic import Mosaic
+
+_CELL_OF_HEIGHT = 1 / 8  # a hole of a tenth of such a cell takes nothing from a view
+_MOST_CELLS = 400  # a side
+_LEAST_GOOD = 0.9  # of a cell
+_RIM = 2  # cells of both sides: a ragged edge is no news
+
+
+@dataclass(frozen=True)
+class Usable:
+    """The largest rectangle without faults. south, west, north, east: degrees, inside it; size_m:
+    east and north; is_whole: it is the rectangle about the map, but for a rim of a cell.
+    """
+
+    south: float
+    west: float
+    north: float
+    east: float
+    size_m: tuple[float, float]
+    is_whole: bool
+
+    def line(self) -> str:
+        """Where it is, in words."""
+        east_m, north_m = self.size_m
+        return (
+            f"latitude {self.south:.5f} to {self.north:.5f}, longitude {self.west:.5f} to "
+            f"{self.east:.5f} ({east_m:.0f} x {north_m:.0f} m)"
+        )
+
+
+def usable_part(
+    mosaic: Mosaic, faulty: NDArray[np.bool_], height_m: float, frame: LocalFrame
+) -> Usable | None:
+    """The largest rectangle of cells that are good to nine tenths; None where no cell is.
+
+    faulty: (h, w) of the mosaic, where there is nothing to match. height_m: of the flight, by which
+    the cells are as small as matters. frame: of the mosaic's metres.
+    """
+    rows, columns = faulty.shape
+    cell = max(round(height_m * _CELL_OF_HEIGHT / mosaic.gsd_m), 1)
+    cell = max(min(cell, min(rows, columns) // 8), -(-max(rows, columns) // _MOST_CELLS), 1)
+    h, w = max(rows // cell, 1), max(columns // cell, 1)
+    share = cv2.resize(faulty.astype(np.float32), (w, h), interpolation=cv2.INTER_AREA)
+    found = largest_rectangle(share <= 1 - _LEAST_GOOD)
+    if found is None:
+        return None
+    top, bottom = (r * rows / h for r in found[:2])
+    left, right = (c * columns / w for c in found[2:])
+    corners = [mosaic.place(r, c) for r in (top, bottom) for c in (left, right)]
+    places = [frame.position(np.array([*corner, 0.0])) for corner in corners]
+    north_west, north_east, south_west, south_east = places
+    return Usable(
+        max(south_west.latitude_deg, south_east.latitude_deg),
+        max(south_west.longitude_deg, north_west.longitude_deg),
+        min(north_west.latitude_deg, north_east.latitude_deg),
+        min(south_east.longitude_deg, north_east.longitude_deg),
+        ((right - left) * mosaic.gsd_m, (bottom - top) * mosaic.gsd_m),
+        found[1] - found[0] >= h - _RIM and found[3] - found[2] >= w - _RIM,
+    )
+
+
+def largest_rectangle(good: NDArray[np.bool_]) -> tuple[int, int, int, int] | None:
+    """First and last (exclusive) row, likewise column, of the largest all-true rectangle."""
+    best, found = 0, None
+    above = np.zeros(good.shape[1], np.int64)
+    for row, line in enumerate(good):
+        above = np.where(line, above + 1, 0)
+        waiting: list[tuple[int, int]] = []  # first column and height, rising
+        for column, height in enumerate([*above.tolist(), 0]):
+            first = column
+            while waiting and waiting[-1][1] >= height:
+                first, high = waiting.pop()
+                if high * (column - first) > best:
+                    best = high * (column - first)
+                    found = (row + 1 - high, row + 1, first, column)
+            waiting.append((first, height))
+    return found
