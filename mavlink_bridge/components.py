@@ -27,6 +27,8 @@ from mavlink_bridge.shared import Shared
 COMMANDS_IN = ("COMMAND_LONG", "COMMAND_INT")
 _QUEUE = 64
 _HEARTBEAT_NS = 1_000_000_000
+_HINT_NS = 1_000_000_000  # between two texts about hints: an operator's come one by one
+_MOST_REFUSED = 4  # systems that are named
 
 SYSTEM_STATUS = {
     HealthLevel.STARTING: mavlink.MAV_STATE_BOOT,
@@ -69,6 +71,7 @@ class Components:
         signing = self._config.ground_signing if ground else self._config.signing
         self._is_trusted = signing is not None or self._config.signing is None
         self._refused: set[int] = set()
+        self._hints_told: dict[int, int] = {}  # when, by severity
 
     def show(self, item: TargetReport | TargetEnd | CameraView) -> None:
         """Queue what the ground is to be told; the oldest go first when it is full."""
@@ -132,7 +135,7 @@ class Components:
             return
         localizer = self._config.localizer_component
         if (message.target_system, message.target_component) == (link.system_id, localizer):
-            self._localizer_command(link, message)
+            self._localizer_command(link, message, time_ns)
         elif self._config.camera.announce and message.target_system in (0, link.system_id):
             self._camera.command(message, time_ns, self._shared.uptime_ms(time_ns), link.send)
 
@@ -140,7 +143,9 @@ class Components:
         return self._is_trusted and message.get_srcSystem() in self._config.ground_systems
 
     def _refuse(self, link: Link, message: Any) -> None:
-        """Deny an order to one of our components, and tell of its sender once."""
+        """Deny an order to one of our components, and tell of its sender once; after the first few
+        of all others in one line.
+        """
         ours = (self._config.localizer_component, self._config.camera_component)
         if message.target_system not in (0, link.system_id) or message.target_component not in ours:
             return
@@ -150,20 +155,21 @@ class Components:
             message.command, denied, 0, 0, system, message.get_srcComponent()
         )
         link.send(ack, message.target_component)
-        if system not in self._refused:
+        if system not in self._refused and len(self._refused) < _MOST_REFUSED:
             self._refused.add(system)
             why = "not in ground_systems" if self._is_trusted else "link not signed"
-            text = f"PiLoT: system {system} refused: {why}"
+            more = len(self._refused) == _MOST_REFUSED
+            text = f"PiLoT: system {system}{' and more' if more else ''} refused: {why}"
             self._shared.say(mavlink.MAV_SEVERITY_WARNING, text)
 
-    def _localizer_command(self, link: Link, message: Any) -> None:
+    def _localizer_command(self, link: Link, message: Any, time_ns: int) -> None:
         """What gates injection and what hints at the place; others are refused in the protocol's
         way.
         """
         gate = self._shared.gate
         result = mavlink.MAV_RESULT_UNSUPPORTED
         if message.command == PLACE_HINT and self._shared.on_hint is not None:
-            result = self._hint(message, self._shared.on_hint)
+            result = self._hint(message, time_ns, self._shared.on_hint)
         elif gate is not None:
             result = gate.command(message.command, message.param1)
         ack = mavlink.MAVLink_command_ack_message(
@@ -171,14 +177,16 @@ class Components:
         )
         link.send(ack, self._config.localizer_component)
 
-    def _hint(self, message: Any, on_hint: Callable[[PlaceHint], bool]) -> int:
+    def _hint(self, message: Any, time_ns: int, on_hint: Callable[[PlaceHint], bool]) -> int:
         hint = place_hint(message)
         if hint is None:
             return int(mavlink.MAV_RESULT_DENIED)
-        if not on_hint(hint):
-            text = "PiLoT: hint refused: not on the map"
-            self._shared.say(mavlink.MAV_SEVERITY_WARNING, text)
-            return int(mavlink.MAV_RESULT_DENIED)
-        text = f"PiLoT: search {hint.radius_m:.0f} m about the place given"
-        self._shared.say(mavlink.MAV_SEVERITY_NOTICE, text)
-        return int(mavlink.MAV_RESULT_ACCEPTED)
+        taken = on_hint(hint)
+        severity, text = mavlink.MAV_SEVERITY_WARNING, "hint refused: not on the map"
+        if taken:
+            severity = mavlink.MAV_SEVERITY_NOTICE
+            text = f"search {hint.radius_m:.0f} m about the place given"
+        if time_ns - self._hints_told.get(severity, -_HINT_NS) >= _HINT_NS:
+            self._hints_told[severity] = time_ns
+            self._shared.say(severity, f"PiLoT: {text}")
+        return int(mavlink.MAV_RESULT_ACCEPTED if taken else mavlink.MAV_RESULT_DENIED)

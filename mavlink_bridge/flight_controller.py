@@ -151,7 +151,7 @@ class FlightControllerEnd:
             if self.time_sync.on_message(link, message, time_ns):
                 self._rebooted()
         elif kind == "GPS_GLOBAL_ORIGIN":
-            self.origin.on_message(message)
+            self.origin.on_message(message, time_ns)
         elif kind in MISSION_IN:
             self.requests.mission.on_message(link, message, time_ns)
         elif kind == "COMMAND_ACK":
@@ -159,7 +159,8 @@ class FlightControllerEnd:
         elif self._tracker.handle(message, time_ns):
             self._rebooted()
         elif kind == "STATUSTEXT":
-            self.sources.on_text(str(message.text))
+            if not getattr(message, "chunk_seq", 0):  # a longer text's middle begins anyhow
+                self.sources.on_text(str(message.text))
             sender = f"{message.get_srcSystem()}/{message.get_srcComponent()}"
             self._shared.on_vehicle_text(int(message.severity), str(message.text), sender)
         elif kind == "RC_CHANNELS" and self._shared.gate is not None:

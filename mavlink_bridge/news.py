@@ -7,6 +7,7 @@ from mavlink_bridge.messages import VehicleState
 from mavlink_bridge.texts import Teller
 
 _LOST_NS = 1_000_000_000  # beyond the freshness of a report, 1.5 s
+_PAID_BACK = 0.25  # of that time by each moment in which it is well: half of it is no GNSS
 _BACK_NS = 5_000_000_000
 _HELD_NS = 10_000_000_000
 
@@ -17,7 +18,8 @@ class VehicleNews:
     def __init__(self, teller: Teller) -> None:
         self._teller = teller
         self._gnss: bool | None = None  # None: never seen healthy
-        self._changed_ns: int | None = None
+        self._back_ns: int | None = None  # since when it is well again
+        self._bad_ns = self._looked_ns = 0  # for how long it was not, on balance
         self._armed = False
         self._held_ns: int | None = None
 
@@ -43,17 +45,17 @@ class VehicleNews:
             self._teller.tell("held", f"not sent: {reason}")
 
     def _follow_gnss(self, healthy: bool, now_ns: int, *, injecting: bool) -> None:
-        if self._gnss is None:
-            self._gnss = True if healthy else None
+        passed_ns, self._looked_ns = min(now_ns - self._looked_ns, _LOST_NS), now_ns
+        if not self._gnss:
+            self._back_ns = (self._back_ns or now_ns) if healthy else None
+            well = self._back_ns is not None and now_ns - self._back_ns >= _BACK_NS
+            if healthy and (well or self._gnss is None):
+                if self._gnss is not None:
+                    self._teller.inform("GNSS is back")
+                self._gnss, self._bad_ns = True, 0
             return
-        if healthy == self._gnss:
-            self._changed_ns = None
-            return
-        self._changed_ns = self._changed_ns or now_ns
-        if now_ns - self._changed_ns < (_BACK_NS if healthy else _LOST_NS):
-            return
-        self._gnss, self._changed_ns = healthy, None
-        if healthy:
-            self._teller.inform("GNSS is back")
-        else:
+        change_ns = round(-_PAID_BACK * passed_ns) if healthy else passed_ns
+        self._bad_ns = max(self._bad_ns + change_ns, 0)
+        if self._bad_ns > _LOST_NS:
+            self._gnss, self._back_ns = False, None
             self._teller.warn(f"GNSS lost, {'injecting' if injecting else 'nothing is injected'}")

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
-from itertools import count
+from itertools import chain, count
 
 from mavlink_bridge.camera.look_at import LookAt
 from mavlink_bridge.config import BridgeConfig, Mode
@@ -13,6 +13,15 @@ from mavlink_bridge.link.clock import SteadyUtc
 from mavlink_bridge.messages import HealthLevel, PlaceHint, TrackRequest
 from mavlink_bridge.vehicle.presence import VehicleWatch
 from mavlink_bridge.vehicle.tracker import VehicleTracker
+
+CLICKED = range(1, 1001)
+"""Numbers of clicked targets. What a detector sees has those behind, up to `FURTHER_CLICKS`."""
+FURTHER_CLICKS = 1_000_001
+
+
+def clicked_numbers() -> Iterator[int]:
+    """A number for each click, which is no detected target's."""
+    return chain(CLICKED, count(FURTHER_CLICKS))
 
 
 @dataclass(frozen=True)
@@ -35,7 +44,7 @@ class Shared:
     gate: InjectionGate | None
     look: LookAt
     on_vehicle_text: Callable[[int, str, str], None] = lambda _severity, _text, _sender: None
-    target_numbers: Iterator[int] = field(default_factory=lambda: count(1))
+    target_numbers: Iterator[int] = field(default_factory=clicked_numbers)
     """Of clicked targets, over all links; none is given twice."""
 
     def uptime_ms(self, now_ns: int) -> int:

@@ -3,23 +3,26 @@
 from __future__ import annotations
 
 import threading
+from itertools import cycle
 
 from companion.targets.detections import clicked_number
+from mavlink_bridge.shared import CLICKED, FURTHER_CLICKS
 
-_FIRST_DETECTED = 1001  # below are the clicks, which bring their numbers with them
+# Below and above are the clicks, which bring their numbers with them.
+_DETECTED = range(CLICKED.stop, FURTHER_CLICKS)
 _MOST = 256  # names; many times as many as are followed at a time
 
 
 class TargetNumbers:
     """A number for each target's name: a click's own, or the next one of what was detected.
 
-    No number is given twice. A name that 256 others came after is forgotten, since a detector
-    makes new ones as long as it flies.
+    No number is two targets' of now, and none is given again before a million others. A name that
+    256 others came after is forgotten, since a detector makes new ones as long as it flies.
     """
 
     def __init__(self) -> None:
         self._numbers: dict[str, int] = {}
-        self._next = _FIRST_DETECTED
+        self._free = cycle(_DETECTED)
         self._lock = threading.Lock()
 
     @property
@@ -34,7 +37,8 @@ class TargetNumbers:
         with self._lock:
             number = self._numbers.pop(name, None)
             if number is None:
-                number, self._next = self._next, self._next + 1
+                taken = self._numbers.values()
+                number = next(n for n in self._free if n not in taken)
                 if len(self._numbers) >= _MOST:
                     del self._numbers[next(iter(self._numbers))]
             self._numbers[name] = number  # at the end: the newest

@@ -111,8 +111,12 @@ class LookAt:
             return (LOOK_AT_PLACE, wanted.frame, x, y, wanted.altitude_m)
 
     def answered(self, result: int) -> None:
-        """The autopilot's answer to a look-at: what it refuses is told and not tried again."""
+        """The autopilot's answer to a look-at: what it refuses is told and not tried again. One
+        to nobody's question says nothing.
+        """
         with self._lock:
+            if self._asked_ns is None:
+                return
             self._asked_ns = None
             if result in (mavlink.MAV_RESULT_ACCEPTED, mavlink.MAV_RESULT_IN_PROGRESS):
                 return

@@ -130,7 +130,7 @@ def adsb_vehicle(report: TargetReport, geoid_separation_m: float) -> Any:
         speed = min(round(math.hypot(velocity[0], velocity[1]) * 100), 65535)
         climb = max(-32768, min(32767, round(-velocity[2] * 100)))
     return mavlink.MAVLink_adsb_vehicle_message(
-        _ICAO_BASE | (report.target_id & 0xFFFF),
+        _ICAO_BASE | (report.target_id & 0xFFFFF),
         round(report.latitude_deg * 1e7),
         round(report.longitude_deg * 1e7),
         mavlink.ADSB_ALTITUDE_TYPE_GEOMETRIC,

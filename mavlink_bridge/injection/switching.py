@@ -149,11 +149,14 @@ class SourceSwitch:
         self.current, self._was_chosen = source_set, True
         self._overruled = self._bad_since_ns is not None
 
-    def acknowledged(self, accepted: bool) -> None:
-        """COMMAND_ACK of the order."""
-        if self._ordered is not None and accepted:
+    def acknowledged(self, accepted: bool) -> bool:
+        """COMMAND_ACK; whether it answers an order."""
+        if self._ordered is None:
+            return False
+        if accepted:
             self.current, self._was_chosen = self._ordered, False
         self._ordered = None
+        return True
 
     def decide(
         self,
@@ -286,8 +289,7 @@ class SourceOrders:
 
     def acknowledged(self, accepted: bool) -> None:
         """COMMAND_ACK of an order."""
-        self._switch.acknowledged(accepted)
-        if not accepted:
+        if self._switch.acknowledged(accepted) and not accepted:
             self._teller.warn("source switch refused")
 
     def tick(

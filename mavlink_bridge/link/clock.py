@@ -15,6 +15,8 @@ _WINDOW_NS = 30_000_000_000
 _MAX_SAMPLES = 128
 _RUN_BACK_NS = 1_000_000_000
 _CONFIRMATIONS = 3  # stamps in a row, of a clock that ran back or ahead
+_ALONE_NS = 500_000_000  # while no stamp was in time: no forged burst beside a vehicle that speaks
+_CONTRADICTS_NS = 10_000_000_000  # of a TIMESYNC answer against stamps of now
 _SILENCE_NS = 3_000_000_000
 _MAX_ROUND_TRIP_NS = 500_000_000
 _STAMP_GRAIN_NS = 1_000_000  # boot times are whole milliseconds in most messages
@@ -83,6 +85,29 @@ class _Sync:
         return abs(apart) <= trips + _DRIFT * rate * abs(elapsed) + 2.0 * _STAMP_GRAIN_NS
 
 
+class _Run:
+    """Stamps in a row, each after the one before, of a time that is not the one that is known."""
+
+    def __init__(self) -> None:
+        self._count = self._last_ns = 0
+
+    def __bool__(self) -> bool:
+        return self._count > 0
+
+    def add(self, boot_ns: int) -> None:
+        """One more; a stamp before the last one begins anew."""
+        self._count = self._count + 1 if boot_ns >= self._last_ns else 1
+        self._last_ns = boot_ns
+
+    def clear(self) -> None:
+        """What is known goes on."""
+        self._count = self._last_ns = 0
+
+    def is_confirmed(self, alone_ns: int) -> bool:
+        """Whether the time is another from now on. alone_ns: for how long none was in time."""
+        return self._count >= _CONFIRMATIONS and alone_ns >= _ALONE_NS
+
+
 class BootClock:
     """Maps the flight controller's boot time to CLOCK_MONOTONIC; times in ns.
 
@@ -91,12 +116,16 @@ class BootClock:
     runs at another rate: a third answer tells which (a simulation at N times real speed runs at
     rate N). A boot time that runs back, or a clock that is behind after a silence, is a reboot. One
     stamp far ahead is a damaged one, no new time from which all others then run back.
+
+    As long as stamps come that are in time, others are a stranger's, however many: who could make
+    a vehicle seem to reboot would have its origin forgotten, and could forge another.
     """
 
     def __init__(self) -> None:
         self.reboots = 0
         self.steps = 0
         self.strays = 0
+        self.contradictions = 0  # TIMESYNC answers that the stamps of then contradicted
         self.rate = 1.0
         self.source = "none"
         self.round_trip_ns: int | None = None
@@ -106,23 +135,31 @@ class BootClock:
         self._doubted: _Sync | None = None
         self._anchor: tuple[int, int] | None = None
         self._newest_boot_ns = self._newest_at_ns = 0
-        self._behind: list[int] = []
-        self._ahead: list[int] = []
+        self._in_time_ns = 0  # when the last stamp came that was
+        self._behind, self._ahead = _Run(), _Run()
 
     @property
     def offset_ns(self) -> int | None:
         """``monotonic - boot`` at the last measurement, None before anything was heard."""
         return None if self._anchor is None else self._anchor[0] - self._anchor[1]
 
+    @property
+    def doubts(self) -> bool:
+        """Whether the stamp that came last is of another time than the one that is known: of a
+        stranger, or the first of a new time.
+        """
+        return bool(self._behind) or bool(self._ahead)
+
     def observe(self, boot_ns: int, received_ns: int) -> bool:
         """A stamped message arrived; True if it shows that the flight controller rebooted."""
-        rebooted = self._ran_back(boot_ns)
+        rebooted = self._ran_back(boot_ns, received_ns)
         if self._behind:
             return False  # an old frame that came late, or the first ones after a reboot
         if rebooted:
             self._restart()
         elif self._runs_ahead(boot_ns, received_ns):
             return False
+        self._in_time_ns = received_ns
         if boot_ns > self._newest_boot_ns:
             self._newest_boot_ns, self._newest_at_ns = boot_ns, received_ns
         # The smallest difference is the message that was under way the shortest.
@@ -137,7 +174,7 @@ class BootClock:
     def timesync(self, boot_ns: int, sent_ns: int, received_ns: int) -> bool:
         """A TIMESYNC answer: tc1 = boot_ns to our ts1 = sent_ns; True if it shows a reboot."""
         round_trip = received_ns - sent_ns
-        if not 0 <= round_trip <= _MAX_ROUND_TRIP_NS:
+        if not 0 <= round_trip <= _MAX_ROUND_TRIP_NS or self._contradicts(boot_ns, received_ns):
             return False
         self.answered_ns = received_ns
         sample = _Sync((sent_ns + received_ns) // 2, boot_ns, round_trip)
@@ -157,7 +194,17 @@ class BootClock:
         middle_ns, at_ns = self._anchor
         return min(middle_ns + round((boot_ns - at_ns) / self.rate), received_ns)
 
-    def _ran_back(self, boot_ns: int) -> bool:
+    def _contradicts(self, boot_ns: int, received_ns: int) -> bool:
+        """Whether the stamps of now say quite another time than a TIMESYNC answer does."""
+        since_ns = received_ns - self._in_time_ns
+        if not self._newest_boot_ns or since_ns > _ALONE_NS:
+            return False
+        expected_ns = self._newest_boot_ns + self.rate * (received_ns - self._newest_at_ns)
+        wrong = abs(boot_ns - expected_ns) > _CONTRADICTS_NS * max(self.rate, 1.0)
+        self.contradictions += wrong
+        return wrong
+
+    def _ran_back(self, boot_ns: int, received_ns: int) -> bool:
         """Whether boot time began anew: several stamps in a row, each after the one before.
 
         One alone may be an old frame that was duplicated or came late.
@@ -166,10 +213,8 @@ class BootClock:
             self.strays += bool(self._behind)
             self._behind.clear()
             return False
-        if self._behind and boot_ns < self._behind[-1]:
-            self._behind.clear()
-        self._behind.append(boot_ns)
-        if len(self._behind) < _CONFIRMATIONS:
+        self._behind.add(boot_ns)
+        if not self._behind.is_confirmed(received_ns - self._in_time_ns):
             return False
         self._behind.clear()
         return True
@@ -181,10 +226,8 @@ class BootClock:
             self.strays += bool(self._ahead)
             self._ahead.clear()
             return False
-        if self._ahead and boot_ns < self._ahead[-1]:
-            self._ahead.clear()
-        self._ahead.append(boot_ns)
-        if len(self._ahead) < _CONFIRMATIONS:
+        self._ahead.add(boot_ns)
+        if not self._ahead.is_confirmed(received_ns - self._in_time_ns):
             return True
         self._ahead.clear()
         return False

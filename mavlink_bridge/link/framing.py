@@ -19,7 +19,7 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 from pymavlink.generator.mavcrc import x25crc
 
 from mavlink_bridge.link import signing
-from mavlink_bridge.link.replay import ReplayWindow
+from mavlink_bridge.link.replay import NO_STAMP, ReplayWindow
 
 _V1, _V2 = 0xFE, 0xFD
 _SIGNED = 0x01
@@ -59,6 +59,8 @@ class VerifyingMavlink(mavlink.MAVLink):
         if digest != bytes(msgbuf[-6:]):
             return False
         stamp = int.from_bytes(msgbuf[-12:-6], "little")
+        if stamp >= NO_STAMP:
+            return False  # ours begin beyond it: they would run over, and nobody would hear us
         stream = (msgbuf[-13], srcSystem, srcComponent)
         newest = self.signing.stream_timestamps.get(stream)
         if newest is None:

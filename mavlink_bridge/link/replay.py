@@ -18,7 +18,7 @@ _log = logging.getLogger(__name__)
 
 _LEASE = 200_000  # 10 us ticks: 2 s
 _MAX_SIZE = 1 << 20
-_NO_STAMP = 1 << 47  # of 48 bits; the half of them last until 2059
+NO_STAMP = 1 << 47  # of 48 bits; the half of them last until 2059
 
 Stream = tuple[int, int, int]
 """Link id, system, component of a signed frame."""
@@ -110,6 +110,6 @@ def _stream(key: str) -> Stream:
 
 def _stamp(given: object) -> int:
     """A stamp that a frame can carry: our own would begin beyond it, and none could be packed."""
-    if not isinstance(given, int) or isinstance(given, bool) or not 0 <= given < _NO_STAMP:
+    if not isinstance(given, int) or isinstance(given, bool) or not 0 <= given < NO_STAMP:
         raise ValueError(f"{str(given)[:40]} is no stamp of a frame")
     return given

@@ -17,6 +17,7 @@ MAX_GAP_NS = 500_000_000
 _MAX_EXTRAPOLATION_NS = 100_000_000
 _GIMBAL_FALLBACK_NS = 1_000_000_000
 _GIMBAL_GONE_NS = 3_000_000_000
+_MOST_OTHERS = 8
 
 # Best first: a poorer source is only used while no better one speaks.
 GIMBAL_SOURCES = ("GIMBAL_DEVICE_ATTITUDE_STATUS", "MOUNT_ORIENTATION", "MOUNT_STATUS")
@@ -220,7 +221,7 @@ class GimbalBuffer:
 
     The first gimbal that is heard is followed as long as it speaks: the angles of two, mixed, are
     those of none. device: the (component, gimbal_device_id) to follow instead, 0 for any. others:
-    which were heard besides.
+    which were heard besides, eight at most.
     """
 
     def __init__(self, device: tuple[int, int] = (0, 0)) -> None:
@@ -240,12 +241,12 @@ class GimbalBuffer:
     def add(self, sample: GimbalSample) -> None:
         """Append, unless a better source, or the gimbal that is followed, spoke of late."""
         if not self._is_wanted(sample.device):
-            self.others.add(sample.device)
+            self._note(sample.device)
             return
         if self._samples:
             newest = self._samples[-1]
             if sample.source == newest.source and sample.device != newest.device:
-                self.others.add(sample.device)
+                self._note(sample.device)
                 if sample.time_ns - newest.time_ns < _GIMBAL_GONE_NS:
                     return
                 self._samples.clear()
@@ -260,6 +261,10 @@ class GimbalBuffer:
                 # Angles of two frames cannot be interpolated.
                 self._samples.clear()
         self._samples.append(sample)
+
+    def _note(self, device: tuple[int, int]) -> None:
+        if len(self.others) < _MOST_OTHERS:
+            self.others.add(device)
 
     def _is_wanted(self, device: tuple[int, int]) -> bool:
         pairs = zip(self._wanted, device, strict=True)

@@ -8,13 +8,14 @@ from typing import Any
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from mavlink_bridge.config import BridgeConfig
-from mavlink_bridge.link.clock import monotonic_ns
 from mavlink_bridge.link.link import Link
-from mavlink_bridge.messages import Origin
+from mavlink_bridge.messages import Origin, without_figures
 from mavlink_bridge.texts import Teller
 from mavlink_bridge.vehicle.commands import Commander
 from mavlink_bridge.vehicle.origin import OriginKeeper
 from mavlink_bridge.vehicle.tracker import VehicleTracker
+
+_AGAIN_NS = 10_000_000_000
 
 
 class OriginExchange:
@@ -34,22 +35,25 @@ class OriginExchange:
         self._commander = commander
         self._teller = teller
         self._counters = counters
+        self._told: dict[str, int] = {}
 
     @property
     def origin(self) -> Origin | None:
         """The EKF's origin; None while it is not known."""
         return self._keeper.origin
 
-    def on_message(self, message: Any) -> None:
-        """GPS_GLOBAL_ORIGIN (49) came."""
-        armed = self._tracker.snapshot(monotonic_ns()).armed
+    def on_message(self, message: Any, time_ns: int) -> None:
+        """GPS_GLOBAL_ORIGIN (49) came. The same news is told once in ten seconds."""
+        armed = self._tracker.snapshot(time_ns).armed
         news = self._keeper.on_origin(message, armed=armed)
         moved_m = self._keeper.moved_m
         if moved_m is not None:
             self._counters["origins_refused"] += 1
             self._teller.tell("origin", f"EKF origin off by {moved_m:.0f} m in flight: refused")
         self._tracker.set_origin(self._keeper.origin)
-        if news is not None:
+        key = without_figures(news or "")
+        if news is not None and time_ns - self._told.get(key, -_AGAIN_NS) >= _AGAIN_NS:
+            self._told[key] = time_ns
             self._teller.inform(news)
 
     def forget(self) -> None:

@@ -40,6 +40,7 @@ _HEIGHTS_MM = (-1_000_000, 50_000_000)  # AMSL: the Dead Sea's shore, and above 
 _ACCURACY_MM = 100_000_000  # beyond it, as of UINT32_MAX, a receiver says that it does not know
 _INVALID_SIGNAL = 1  # signal_quality of DISTANCE_SENSOR; 0: not said
 _SATURATED = 32_767  # of an int16: what the sensor could not say
+_GONE_NS = 3_000_000_000  # of an autopilot or a sensor: then another may take its place
 
 
 def is_autopilot(message: Any) -> bool:
@@ -87,7 +88,8 @@ class VehicleReadings:
     """The newest of everything and buffers of what is interpolated; the tracker's lock guards it.
 
     globals: the EKF's latitude, longitude, altitude AMSL. locals: its NED from the origin. gimbal:
-    component and device whose angles count, 0 for any.
+    component and device whose angles count, 0 for any. impostors: messages of the vehicle's ids
+    that name another make or firmware than it has.
 
     Above 200 lines: one short method for each of its messages.
     """
@@ -102,6 +104,8 @@ class VehicleReadings:
         self.locals = VectorBuffer()
         self.inertial = InertialBuffer()
         self.zooms = ZoomBuffer()
+        self.impostors = 0
+        self._ranger: int | None = None  # id of the sensor whose distances count
 
     def take(self, message: Any, time_ns: int) -> None:
         """One of MESSAGES_IN. Raises ValueError where no sensor says that, or no rotation."""
@@ -123,10 +127,15 @@ class VehicleReadings:
         ):
             buffer.clear()
         self.set_origin(None)
+        # It may have got another firmware, and is asked for it again.
+        self.state = replace(
+            self.state, version=None, profile=select_profile(self.state.autopilot, None).name
+        )
 
     def _heartbeat(self, m: Any, time_ns: int) -> None:
         if not is_autopilot(m):
             return
+        self._check_make(autopilot_name(m.autopilot), time_ns)
         self.heartbeat_ns = time_ns
         armed = self.arming.heard(bool(m.base_mode & mavlink.MAV_MODE_FLAG_SAFETY_ARMED), time_ns)
         autopilot = autopilot_name(m.autopilot)
@@ -145,8 +154,18 @@ class VehicleReadings:
 
     def _version(self, m: Any, _: int) -> None:
         version = decode_version(m.flight_sw_version)
+        if self.state.version not in (None, version):
+            self.impostors += 1
+            raise ValueError(f"{version}: no firmware changes while it runs")
         name = select_profile(self.state.autopilot, version).name
         self.state = replace(self.state, version=version, profile=name)
+
+    def _check_make(self, autopilot: str, time_ns: int) -> None:
+        """What is sent depends on the make: who is heard keeps it, whoever else says another."""
+        heard = self.heartbeat_ns is not None and time_ns - self.heartbeat_ns < _GONE_NS
+        if heard and autopilot != self.state.autopilot:
+            self.impostors += 1
+            raise ValueError(f"{autopilot}: an autopilot of another make")
 
     def _attitude_euler(self, m: Any, time_ns: int) -> None:
         _check_within(_ANGLE_RAD, m.roll, m.pitch, m.yaw)
@@ -283,11 +302,16 @@ class VehicleReadings:
 
     def _distance(self, m: Any, time_ns: int) -> None:
         """Of a sensor that looks down. What is out of its range, as it says itself, or marked as
-        invalid is no reading: the one before grows old.
+        invalid is no reading: the one before grows old. Of two sensors the first one that is heard
+        counts as long as it measures: their distances, mixed, would be jumps of the ground.
         """
         in_range = max(m.min_distance, 1) <= m.current_distance < m.max_distance
         invalid = getattr(m, "signal_quality", 0) == _INVALID_SIGNAL
         if m.orientation == mavlink.MAV_SENSOR_ROTATION_PITCH_270 and in_range and not invalid:
+            measured_ns = self.state.rangefinder_time_ns
+            if self._ranger not in (None, m.id) and time_ns - measured_ns < _GONE_NS:
+                return
+            self._ranger = m.id
             self.state = replace(
                 self.state,
                 rangefinder_m=m.current_distance * 1e-2,

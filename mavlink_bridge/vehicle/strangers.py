@@ -14,6 +14,7 @@ from mavlink_bridge.vehicle.tracker import VehicleTracker
 
 _TURNS = 6  # armed and disarmed again three times: nobody flies so
 _TURNS_IN_NS = 10_000_000_000
+_LIES = 3  # of TIMESYNC, which is asked once a second
 
 
 class StrangerWatch:
@@ -32,6 +33,7 @@ class StrangerWatch:
         self._counters = counters
         self._twins = TwinWatch()
         self._turns = (0, 0)  # arming's at a time
+        self._lies = (0, 0)  # of TIMESYNC likewise
 
     def on_message(self, link: Link, message: Any) -> None:
         """A message that is not the vehicle's; only its heartbeat says who it is from."""
@@ -62,9 +64,19 @@ class StrangerWatch:
             self._teller.tell("gimbals", f"another gimbal ignored: {component}, device {device}")
         self._check_arming(link, now_ns)
         clock = self._tracker.clock
-        if self._twins.two(now_ns, clock.strays + clock.reboots):
+        self._check_answers(clock.contradictions, now_ns)
+        ran_back = self._twins.two(now_ns, clock.strays + clock.reboots)
+        if ran_back or self._tracker.impostors:
             system = link.system_id
             self._teller.tell("twins", f"two autopilots speak as system {system}: change one's id")
+
+    def _check_answers(self, now: int, now_ns: int) -> None:
+        """Answers to TIMESYNC of quite another time than the vehicle's stamps are another's."""
+        lies, since_ns = self._lies
+        if now - lies >= _LIES:
+            self._teller.tell("answers", "TIMESYNC contradicts the stamps: do two answer?")
+        if now - lies >= _LIES or now_ns - since_ns > _TURNS_IN_NS:
+            self._lies = (now, now_ns)
 
     def _check_arming(self, link: Link, now_ns: int) -> None:
         """Forged heartbeats of the autopilot's ids: what is shut while armed stays shut then."""

@@ -40,6 +40,8 @@ class TimeSync:
     def on_message(self, link: Link, message: Any, time_ns: int) -> bool:
         """A question or an answer; True when the vehicle's clock tells of a reboot."""
         if message.tc1 == 0:
+            if link.congested:
+                return False  # as if lost: a flood of questions costs no position its place
             answer = mavlink.MAVLink_timesync_message(monotonic_ns(), message.ts1)
             link.send(answer, self._component)
             return False

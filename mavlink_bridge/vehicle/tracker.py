@@ -70,6 +70,12 @@ class VehicleTracker:
         with self._lock:
             return () if self._fixed else tuple(sorted(self._readings.gimbals.others))
 
+    @property
+    def impostors(self) -> int:
+        """Messages of the vehicle's ids that were of another make or firmware."""
+        with self._lock:
+            return self._readings.impostors
+
     def attitude_at(self, time_ns: int) -> Attitude | None:
         """The vehicle's attitude at a time."""
         with self._lock:
@@ -139,6 +145,8 @@ class VehicleTracker:
         if boot_ns is not None and message.get_srcComponent() == self._readings.state.component_id:
             rebooted = self.clock.observe(boot_ns, received_ns)
             stamp_ns = self.clock.to_monotonic(boot_ns, received_ns)
+            if self.clock.doubts:
+                stamp_ns = received_ns - 2 * _OLD_NS  # of which time it is, nobody knows
         if rebooted:
             self._forget()
         with self._lock:

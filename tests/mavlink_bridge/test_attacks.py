@@ -314,7 +314,7 @@ def test_a_place_that_cannot_be_written_is_told_and_the_link_goes_on(
 ) -> None:
     process = Process(tmp_path / "none" / "seen")
     with caplog.at_level(logging.WARNING):
-        assert process.takes(signed(10**15))
+        assert process.takes(signed(10**14))
         process.end()
     assert caplog.text.count("set signing.state_file") == 1
 

@@ -561,8 +561,9 @@ def test_answers_to_others_commands_are_not_ours(
     monkeypatch: pytest.MonkeyPatch, system: int, component: int, ours: bool
 ) -> None:
     """A ground station's refused order must not look like ours."""
-    flight = Flight(monkeypatch)
-    flight.run(5.0)
+    flight = Flight(monkeypatch, switch=SourceSwitchConfig(enabled=True))
+    while not any(getattr(m, "command", 0) == 42007 for _, m, _ in flight.link.sent):
+        flight.run(1.0)
     ack = mavlink.MAVLink_command_ack_message(42007, 4, 0, 0, system, component)
     flight.say(ack)
     assert flight.end.counters["commands_refused"] == (1 if ours else 0)
