@@ -44,6 +44,10 @@ _PACKAGE = (
     "package", "install, s", "start, s", "upgrade, s", "remove, s", "purge, s",
     "self-test: tracked, found to", "processor ms a frame",
 )  # fmt: skip
+_FOLLOWED = (
+    "flight", "followed", "seen, of reports", "back after a roof, s", "median / p95 / max, m",
+    "inside its 95 %", "velocity p95, m/s", "of something else",
+)  # fmt: skip
 _DEPTHS = ("height, m", "pixels", "median", "95 %", "99 %", "within 1 %", "hidden from the other")
 _THROUGHPUT = (
     "width", "cores", "frames offered", "frames", "frames/s", "latency p50 / p95, ms",
@@ -89,10 +93,10 @@ def _picked(table: Table, only: Sequence[str]) -> Table:
 def _form(data: Any) -> Callable[[list[Any], str], Table]:
     marks = data if isinstance(data, dict) else data[0]
     for mark, made in (
-        ("columns", _figures), ("package", _package), ("recall_1", _sequence), ("verdict", _suite),
-        ("acceptance", _integrity), ("search_cpu_s", _places), ("overview_mib", _cost),
-        ("bins", _depths), ("rows", _throughput), ("end_percent_p95", _drift),
-        ("iteration_ms", _optimizer),
+        ("columns", _figures), ("package", _package), ("recall_1", _sequence),
+        ("begin_ns", _followed), ("verdict", _suite), ("acceptance", _integrity),
+        ("search_cpu_s", _places), ("overview_mib", _cost), ("bins", _depths),
+        ("rows", _throughput), ("end_percent_p95", _drift), ("iteration_ms", _optimizer),
     ):  # fmt: skip
         if mark in marks:
             return made
@@ -211,6 +215,25 @@ def _suite(data: list[Any], _title: str) -> Table:
         measured = " / ".join(f"{m:.2f}" for m in one["measured"] or ())
         rows.append((one["scenario"], one["title"], one["vehicle"], measured, told))
     return Table(_SUITE, tuple(sorted(rows)))
+
+
+def _followed(data: list[Any], _title: str) -> Table:
+    return Table(_FOLLOWED, tuple(_pursuit(row) for part in data for row in part))
+
+
+def _pursuit(row: dict[str, Any]) -> tuple[str, ...]:
+    """A flight of `sitl follow`."""
+    name, verdict = f"{row['vehicle']}, world {row['seed']}, draw {row['draw']}", row["verdict"]
+    if verdict is None:
+        return (name, f"**not flown**: {row['error']}", *("-",) * (len(_FOLLOWED) - 2))
+    told = "yes" if verdict["is_followed"] else f"**no**: {'; '.join(verdict['why'])}"
+    return (
+        name, told, f"{verdict['seen']} of {verdict['reports']}",
+        ", ".join(f"{s:.1f}" for s in verdict["back_s"]),
+        " / ".join(f"{verdict[f'{k}_m']:.2f}" for k in ("p50", "p95", "max")),
+        f"{verdict['inside_percent']:.0f} %", f"{verdict['velocity_p95_mps']:.2f}",
+        str(verdict["foreign"]),
+    )  # fmt: skip
 
 
 def _integrity(data: list[Any], _title: str) -> Table:
