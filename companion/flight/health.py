@@ -37,6 +37,7 @@ _TOLD = (_NOT_USED, "withheld: ")
 _SILENT_VEHICLE = "no heartbeat from the flight controller"
 
 _NO_FRAME = "no frame is being localized"
+_SEARCH_HANGS = "the search hangs"
 _OF_FEED = {
     StreamState.FAILED: (HealthLevel.FAILED, "video feed failed"),
     StreamState.MISFIT: (HealthLevel.FAILED, "video size does not fit the calibration"),
@@ -167,7 +168,7 @@ class HealthMonitor:
         arrived, estimate = self._estimates[-1]
         if time.monotonic() - arrived > _STALE_S:
             if _is_lost(estimate):  # the error stands in health.json; this is what to act on
-                return HealthLevel.FAILED, "localization lost" + self._since(estimate)
+                return HealthLevel.FAILED, "localization lost" + self._since(estimate, engine)
             nothing = self._overload(engine) or _NO_FRAME
             return HealthLevel.DEGRADED, engine.last_error or nothing
         level, text = _OF_STATE[estimate.state]
@@ -183,7 +184,7 @@ class HealthMonitor:
         if withheld and not _is_lost(estimate):
             level, text = HealthLevel.FAILED, withheld
         if _is_lost(estimate):
-            text += self._since(estimate)
+            text += self._since(estimate, engine)
         # The map stands in by coarser levels, as far as they are in memory.
         text += ", map unreadable" if self._unreadable_nodes() else ""
         text += ", video scaled" if feed is StreamState.SCALED else ""
@@ -203,8 +204,9 @@ class HealthMonitor:
             return ""
         return f"overloaded, {done:.0f} of {offered:.0f} frames/s"
 
-    def _since(self, estimate: PoseEstimate) -> str:
-        """Since when there is no fix, and how far off the autopilot may be.
+    def _since(self, estimate: PoseEstimate, engine: EngineHealth) -> str:
+        """Since when there is no fix, how far off the autopilot may be, and that no search will
+        answer.
 
         Not whether the map is being searched: that begins and ends every few seconds, and each time
         the loss would be told again (`engine.searching` in health.json has it).
@@ -213,7 +215,8 @@ class HealthMonitor:
         if estimate.last_fix_ns is not None:
             text = f" {(time.monotonic_ns() - estimate.last_fix_ns) * 1e-9:.0f} s"
         sigma_m = self._position_sigma_m()
-        return text + (f", +-{2.0 * sigma_m:.0f} m" if sigma_m is not None else "")
+        text += f", +-{2.0 * sigma_m:.0f} m" if sigma_m is not None else ""
+        return text + (f", {_SEARCH_HANGS}" if engine.search_hangs else "")
 
     def _write(self, level: str, text: str) -> None:
         report: dict[str, Any] = {
@@ -273,7 +276,7 @@ def _stages(estimates: list[PoseEstimate]) -> dict[str, dict[str, float]]:
 def _waiting_for(engine: EngineHealth) -> str:
     """What is missing before the first estimate."""
     if engine.searching:
-        return "searching the map"
+        return _SEARCH_HANGS if engine.search_hangs else "searching the map"
     seen = engine.frames_in > 0
     return engine.last_error or f"waiting for {'a pose prior' if seen else 'video'}"
 

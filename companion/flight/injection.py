@@ -2,17 +2,23 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Callable
 
 from companion.conversions import Installation, vision_fix
+from companion.guardian.findings import UNJUDGED, Latch, Reading
 from localizer.types import PoseEstimate, ReferenceBundle, TrackingState
 from mavlink_bridge.bridge import Bridge
 from mavlink_bridge.injection.fix_queue import PendingJump
 from mavlink_bridge.messages import VisionFix
 
+_log = logging.getLogger(__name__)
+_ERROR, _NOTICE = 3, 5  # MAV_SEVERITY
+
 Judge = Callable[[PoseEstimate, VisionFix], VisionFix | None]
 """Has a word before injection: the fix, or one with another covariance; None withholds it. Called
-on the localization thread: it looks up what its own thread found and returns at once.
+on the localization thread: it looks up what its own thread found and returns at once. One that
+raises withholds the fix, and the operator is told.
 """
 
 
@@ -65,6 +71,7 @@ class FixInjection:
         self._installation = installation
         self._jump = JumpPolicy()
         self._judges: tuple[Judge, ...] = ()
+        self._unjudged = Latch(UNJUDGED)
 
     def add_judge(self, judge: Judge) -> None:
         """Have `judge` asked about every fix from now on, after those that are there already."""
@@ -83,8 +90,22 @@ class FixInjection:
             self._bridge.gimbal_at(time_ns),
             reset=self._jump.is_due,
         )
-        for judge in self._judges:
-            fix = judge(estimate, fix) if fix is not None else None
+        fix = self._judged(estimate, fix)
         if fix is not None:
             self._jump.carried()
             self._bridge.submit(fix)
+
+    def _judged(self, estimate: PoseEstimate, fix: VisionFix | None) -> VisionFix | None:
+        """The fix as all judges leave it."""
+        failed = False
+        try:
+            for judge in self._judges:
+                fix = judge(estimate, fix) if fix is not None else None
+        except Exception:  # a position that nobody judged would be believed unwarned
+            if not self._unjudged.raised:
+                _log.exception("a fix could not be judged")
+            failed, fix = True, None
+        text = self._unjudged.update(estimate.exposure_time_ns, Reading(failed))
+        if text is not None:
+            self._bridge.say(_ERROR if self._unjudged.raised else _NOTICE, text)
+        return fix

@@ -74,6 +74,7 @@ TIME_OFFSET = Rule(
     "time_offset", "pictures stamped {0:.0f} ms {1}", Action.NONE, 1.0, 10.0, 60.0, forbids=True
 )
 FAILED = Rule("guardian_failed", "guardian failed", Action.WITHHOLD, 0.0, 3.0, 10.0)
+UNJUDGED = Rule("judges", "fixes cannot be judged", Action.WITHHOLD, 0.0, 3.0, 10.0)
 STANDS = Rule("part_stands", "{1} stands {0:.0f} s", Action.NONE, 0.0, 3.0, 10.0)
 RULES = (
     VIDEO_FROZEN,

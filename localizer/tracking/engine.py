@@ -40,6 +40,8 @@ _TRIED_FRAMES = 5  # with what is known outside, before a search begins
 # for `_TRIED_FRAMES` seldom does, and takes half a processor from the search, which then answers
 # for where the vehicle was seconds ago.
 _TRIED_BESIDE = 3
+_SEARCH_HANGS_NS = 120_000_000_000  # a whole map takes seconds, tens of them beside other work
+_STOP_S = 10.0  # for a search to see that it is to end
 
 
 class DualThreadEngine:
@@ -49,7 +51,9 @@ class DualThreadEngine:
 
     subscribers: called on the localization thread with every estimate; they must not block.
     prior_provider: asked, with a time in ns, for a pose from outside when there is none or when
-    tracking is LOST. searcher: finds a place without a prior, on a thread of its own.
+    tracking is LOST. searcher: finds a place without a prior, on a thread of its own. One that does
+    not answer for two minutes hangs: that is told, all frames are tried again without it, and
+    nothing waits for it. clock: CLOCK_MONOTONIC, ns.
     """
 
     def __init__(
@@ -58,6 +62,7 @@ class DualThreadEngine:
         subscribers: tuple[Subscriber, ...],
         prior_provider: PriorProvider,
         searcher: Searcher | None = None,
+        clock: Callable[[], int] = time.monotonic_ns,
     ) -> None:
         self._localizer = localizer
         self._subscribers = subscribers
@@ -66,7 +71,8 @@ class DualThreadEngine:
         self._sought: Mailbox[Frame] = Mailbox()
         self._found: PosePrior | None = None
         self._unknown_frames = self._left_frames = 0
-        self._searching = False
+        self._clock = clock
+        self._search_begun_ns: int | None = None  # while one is under way
         self._ahead = Ahead(localizer.extract_query, self._may_extract_ahead)
         self._registers = False  # whether the last frame was registered: the next will be, too
         self._render_times: Mailbox[int] = Mailbox()
@@ -82,9 +88,11 @@ class DualThreadEngine:
             threading.Thread(target=self._run, args=(self._extract_once,), name="extract"),
             threading.Thread(target=self._run, args=(self._localize_once,), name="localize"),
         ]
+        self._search_thread: threading.Thread | None = None
         if searcher is not None:
-            search = threading.Thread(target=self._search, name="search")
-            self._threads.append(search)
+            # A daemon: one that hangs must not keep the process from ending.
+            self._search_thread = threading.Thread(target=self._search, name="search", daemon=True)
+            self._threads.append(self._search_thread)
 
     def start(self) -> None:
         """Start the threads."""
@@ -92,13 +100,13 @@ class DualThreadEngine:
             thread.start()
 
     def stop(self) -> None:
-        """Stop the threads and wait for them."""
+        """Stop the threads and wait for them; a search that hangs is left behind."""
         self._stop.set()
         self._ahead.close()
         self._render_times.close()
         self._sought.close()
         for thread in self._threads:
-            thread.join()
+            thread.join(_STOP_S if thread is self._search_thread else None)
 
     def submit(self, frame: Frame) -> None:
         """Offer a frame; an older one that was not yet taken is dropped. Never blocks."""
@@ -142,18 +150,25 @@ class DualThreadEngine:
         frame = self._sought.take(_IDLE_S)
         if frame is None or self._searcher is None or self._knows_place():
             return
-        self._searches(True)
+        self._searches(self._clock())
         try:
             found = self._searcher(frame, self._knows_place)
         finally:
-            self._searches(False)
+            self._searches(None)
         self._book.count(searches=1, found=int(found is not None))
         self._book.clear_error()
         self._found = found
 
-    def _searches(self, searching: bool) -> None:
-        self._searching = searching
-        self._book.set_searching(searching)
+    def _searches(self, begun_ns: int | None) -> None:
+        self._search_begun_ns = begun_ns
+        self._book.set_searching(begun_ns is not None)
+
+    def _search_hangs(self) -> bool:
+        """Whether no answer comes any more; told by who would wait for it."""
+        begun_ns = self._search_begun_ns
+        hangs = begun_ns is not None and self._clock() - begun_ns > _SEARCH_HANGS_NS
+        self._book.set_search_hangs(hangs)
+        return hangs
 
     def _knows_place(self) -> bool:
         """Whether a search has become idle: the place is known or on probation, or we end."""
@@ -245,7 +260,8 @@ class DualThreadEngine:
 
     def _is_left_to_search(self) -> bool:
         """Whether a frame is left out so that a search that runs has the processor."""
-        if not self._searching or self._found is not None or self._knows_place():
+        runs = self._search_begun_ns is not None and not self._search_hangs()
+        if not runs or self._found is not None or self._knows_place():
             self._left_frames = 0
             return False
         self._left_frames = (self._left_frames + 1) % _TRIED_BESIDE

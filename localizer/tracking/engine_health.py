@@ -15,7 +15,7 @@ _REPORT_EVERY_S = 5.0
 class EngineHealth:
     """Counters since the start, the text of the error that stands ("" when none does), and which
     renderer, feature network and optimizer serve. searches, found: of places without a prior;
-    searching: whether one is under way.
+    searching: whether one is under way; search_hangs: for so long that none will answer.
     """
 
     frames_in: int = 0
@@ -27,6 +27,7 @@ class EngineHealth:
     searches: int = 0
     found: int = 0
     searching: bool = False
+    search_hangs: bool = False
     last_error: str = ""
     renderer: str = ""
     features: str = ""
@@ -59,9 +60,17 @@ class HealthBook:
             self._health = replace(h, **{k: getattr(h, k) + n for k, n in increments.items()})
 
     def set_searching(self, searching: bool) -> None:
-        """Whether a search for a place is under way."""
+        """Whether a search for a place is under way; it begins or answers, so it does not hang."""
         with self._lock:
-            self._health = replace(self._health, searching=searching)
+            self._health = replace(self._health, searching=searching, search_hangs=False)
+
+    def set_search_hangs(self, hangs: bool) -> None:
+        """Whether the one under way does not answer any more."""
+        with self._lock:
+            news = hangs and not self._health.search_hangs
+            self._health = replace(self._health, search_hangs=hangs)
+        if news:
+            _log.error("the search for a place does not answer: the flight goes on without it")
 
     def report(self, text: str) -> None:
         """An error of this thread: it stands until the thread has done its work again."""

@@ -183,10 +183,10 @@ def test_a_loss_says_how_long_and_how_far_and_is_no_news_when_a_search_ends(tmp_
         state=TrackingState.LOST, stage_ms={}, last_fix_ns=time.monotonic_ns() - 23 * 10**9
     )
     texts = set()
-    for searching in (True, False):
+    for searching, hangs in ((True, False), (False, False), (True, True)):
         bridge = FakeBridge(True)
         monitor = HealthMonitor(
-            partial(EngineHealth, frames_in=9, searching=searching), bridge,
+            partial(EngineHealth, frames_in=9, searching=searching, search_hangs=hangs), bridge,
             lambda: StreamState.LIVE, lambda *_: None, tmp_path,
             Besides(position_sigma_m=lambda: 20.0),
         )  # fmt: skip
@@ -196,8 +196,9 @@ def test_a_loss_says_how_long_and_how_far_and_is_no_news_when_a_search_ends(tmp_
         level, text = bridge.told[-1]
         assert level is HealthLevel.FAILED
         assert text.startswith("localization lost 23 s, +-40 m")
+        assert text.endswith("the search hangs") is hangs
         texts.add(without_figures(text))
-    assert len(texts) == 1
+    assert len(texts) == 2  # a search that will not answer is
 
 
 def test_after_the_end_the_file_says_that_it_ended_and_how(tmp_path):

@@ -22,6 +22,10 @@ INSTALLATION = Installation(LocalFrame(Geodetic(47.3, 8.5, 450.0)), 47.5, np.zer
 class FakeBridge:
     def __init__(self):
         self.fixes = []
+        self.said = []
+
+    def say(self, _severity, text):
+        self.said.append(text)
 
     def attitude_at(self, _):
         return None
@@ -83,3 +87,24 @@ def test_a_jump_survives_the_fix_that_a_judge_withholds():
     assert [fix.reset for fix in bridge.fixes] == [True, False]
     widths = [fix.position_covariance_ned[0, 0] for fix in bridge.fixes]
     assert widths == pytest.approx([4e-4, 1e-4])
+
+
+def test_a_judge_that_raises_withholds_and_is_told_and_its_end_too():
+    bridge, broken = FakeBridge(), [False]
+
+    def judge(_, fix):
+        if broken[0]:
+            raise ZeroDivisionError
+        return fix
+
+    injection = FixInjection(bridge, INSTALLATION)
+    injection.add_judge(judge)
+    for tenth in range(300):
+        broken[0] = 100 <= tenth < 130 or (tenth > 200 and tenth % 2 == 0)
+        estimate = replace(_estimate(TRACKING), exposure_time_ns=10**9 + tenth * 10**8)
+        injection.add_estimate(estimate, None)
+    assert len(bridge.fixes) == 300 - 30 - 49
+    assert bridge.said == [
+        "PiLoT: withheld: fixes cannot be judged", "PiLoT: over: judges",
+        "PiLoT: withheld: fixes cannot be judged",
+    ]  # fmt: skip

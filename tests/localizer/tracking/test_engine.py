@@ -118,7 +118,9 @@ def _prior(time_ns: int) -> PosePrior:
 class Flight:
     """An engine, its estimates, and frames on demand."""
 
-    def __init__(self, localizer: Localizer, provider=_prior, searcher=None) -> None:
+    def __init__(
+        self, localizer: Localizer, provider=_prior, searcher=None, clock=time.monotonic_ns
+    ) -> None:
         self.estimates: list[Any] = []
         self.localizer, self.provider = localizer, provider
         self.engine = DualThreadEngine(
@@ -126,6 +128,7 @@ class Flight:
             (lambda e, _: self.estimates.append(e),),
             lambda time_ns: self.provider(time_ns),  # noqa: PLW0108 (a test replaces it)
             searcher,
+            clock,
         )
         self.sequence = 0
         self.engine.start()
@@ -494,3 +497,35 @@ def test_beside_a_search_fewer_frames_are_tried_until_it_answers(flight):
     answer.set()
     f.feed_until(lambda: not f.engine.health.searching)
     f.feed_until(lambda: f.estimates[-1].state is TrackingState.TRACKING)
+
+
+def test_a_search_that_never_answers_is_told_and_keeps_no_frame_and_no_end_waiting(
+    flight, monkeypatch, caplog
+):
+    optimizer, answer, now_ns = FakeOptimizer(), threading.Event(), [0]
+    monkeypatch.setattr("localizer.tracking.engine._STOP_S", 0.01)
+
+    def search(_frame, _is_idle):
+        answer.wait()
+
+    f = flight(_localizer(optimizer=optimizer), searcher=search, clock=lambda: now_ns[0])
+    f.feed_until(lambda: f.estimates and f.estimates[-1].state is TrackingState.TRACKING)
+    optimizer.offset = np.array([300.0, 0.0, 0.0])
+    f.feed_until(lambda: f.engine.health.searching)
+    now_ns[0] = 100 * 10**9  # a whole map on a slow computer
+    fed = f.sequence
+    f.feed_until(lambda: f.sequence == fed + 3)
+    assert not f.engine.health.search_hangs
+    now_ns[0] = 121 * 10**9
+    f.feed_until(lambda: f.engine.health.search_hangs)
+    tried, fed = len(f.estimates), f.sequence
+    f.feed_until(lambda: f.sequence == fed + 6)
+    assert len(f.estimates) - tried == 6
+    assert caplog.text.count("the search for a place does not answer") == 1
+    optimizer.offset = np.zeros(3)
+    f.feed_until(lambda: f.estimates[-1].state is TrackingState.TRACKING)
+    f.engine.stop()
+    assert not threads()
+    answer.set()
+    f.engine.stop()
+    assert not f.engine.health.search_hangs
