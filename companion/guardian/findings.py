@@ -106,7 +106,8 @@ class Reading:
 class Latch:
     """A rule over time: raised after alert_s of bad evidence, released after release_s of good.
 
-    Time without evidence counts for neither.
+    Time without evidence counts for neither, and nothing is told again in it: a receiver that is
+    gone is no metres from vision.
     """
 
     def __init__(self, rule: Rule) -> None:
@@ -126,7 +127,7 @@ class Latch:
                 self._since_ns = None
             elif self._since_ns is not None:
                 self._since_ns += silent_ns
-            return self._again(now_ns)
+            return None
         if reading.bad:
             self.figure, self.word = reading.figure, reading.word
         if reading.bad == self.raised:

@@ -242,6 +242,16 @@ def test_gnss_apart_from_vision_is_told_as_long_as_it_lasts(accuracy_m: float) -
     assert flight.withheld == []  # neither is said to be right
 
 
+def test_gnss_that_is_gone_is_not_told_as_apart_for_the_rest_of_the_flight() -> None:
+    flight = Flight(monitor(), gnss_north_m=lambda _: 20.0).fly(6.0)
+    told = len(flight.lines)
+    assert told == 1
+    flight.gnss_north_m = None
+    assert len(flight.fly(30.0).lines) == told
+    flight.gnss_north_m = lambda _: 20.0  # and as soon as it is there again, it is
+    assert len(flight.fly(32.0).lines) == told + 1
+
+
 def test_gnss_that_is_dragged_away_slowly_is_told_below_the_alert_limit() -> None:
     """0.6 m/s from 5 s on."""
     flight = Flight(monitor(), gnss_north_m=lambda at_s: 0.6 * max(at_s - 5.0, 0.0)).fly(40.0)
