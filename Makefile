@@ -17,7 +17,6 @@ demo: $(VENV)/.demo
 test: $(VENV)/.dev
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
-	$(BIN)/mypy
 	$(BIN)/python -m tests.parts $(ARGS)
 
 setup: $(VENV)/.demo

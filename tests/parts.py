@@ -4,6 +4,9 @@ Most tests run first, two at a time; then, likewise, those that fly a simulated 
 pictures: each is content with a core that nobody else uses. What streams pictures in real time or
 drives a browser runs after them, one at a time, with the machine to itself. Each part prints its
 own summary; a failure of one does not keep the next from running. `pytest` alone runs all as one.
+
+mypy runs beside the first part, in what its waiting tests leave of the processors, and is told after
+it: one process for more than a minute, for which the tests need not wait.
 """
 
 from __future__ import annotations
@@ -51,6 +54,9 @@ SHARED_FOLDER = "PILOT_TEST_SHARED"
 _WORKERS = ("--numprocesses=2", "--dist=loadfile")
 _ONE_CORE = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "NUMBA_NUM_THREADS"), "1")
 
+# Behind everything else: the tests get a processor as soon as they want one.
+_MYPY = ("nice", "-n", "19", sys.executable, "-m", "mypy")
+
 _PASSED, _NOTHING_RAN = 0, 5  # pytest's exit codes
 
 
@@ -73,22 +79,36 @@ def together(codes: Sequence[int]) -> int:
 
 
 def main(arguments: Sequence[str]) -> int:
-    """Run all parts with pytest's arguments; pytest's exit code."""
-    with tempfile.TemporaryDirectory(prefix="tests-") as shared:
+    """Run all parts with pytest's arguments; pytest's exit code, or mypy's if that alone failed."""
+    with tempfile.TemporaryDirectory(prefix="tests-") as shared, _beside(_MYPY) as types:
         common = {**os.environ, SHARED_FOLDER: str(Path(shared).resolve())}
         codes = {
             SIDE_BY_SIDE: _run(SIDE_BY_SIDE, [*_WORKERS, *arguments], common | _ONE_CORE),
+        }
+        types_code = _told(types)  # before what needs its processors for itself
+        codes |= {
             VEHICLES: _run(VEHICLES, [*_WORKERS, *arguments], common | _ONE_CORE),
             ALONE: _run(ALONE, arguments, common),
         }
     outcome = ", ".join(f"{part} part: {_word(code)}" for part, code in codes.items())
-    print(outcome, flush=True)
-    return together(list(codes.values()))
+    print(f"types: {_word(types_code)}, {outcome}", flush=True)
+    return together(list(codes.values())) or types_code
 
 
 def _run(part: str, arguments: Sequence[str], environment: Mapping[str, str]) -> int:
     command = [sys.executable, "-m", "pytest", f"--part={part}", *arguments]
     return subprocess.run(command, env=environment, check=False).returncode
+
+
+def _beside(command: Sequence[str]) -> subprocess.Popen[bytes]:
+    return subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT)
+
+
+def _told(process: subprocess.Popen[bytes]) -> int:
+    """Wait for its end and print what it said; its exit code."""
+    said, _ = process.communicate()
+    print(said.decode(errors="replace"), end="", flush=True)
+    return process.returncode
 
 
 def _word(code: int) -> str:

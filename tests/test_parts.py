@@ -54,8 +54,23 @@ def test_one_exit_code(codes, code):
     assert together(codes) == code
 
 
+class Mypy(SimpleNamespace):
+    """As it ended; `order` notes when it was waited for."""
+
+    def __enter__(self):
+        return self
+
+    def __exit__(self, *_):
+        pass
+
+    def communicate(self):
+        self.order.append("mypy")
+        return b"a.py:1: error: no type\n", None
+
+
 def test_the_parts_run_after_a_failure_of_the_first(monkeypatch, capsys):
     codes, commands = iter([1, 0, 0]), []
+    monkeypatch.setattr("subprocess.Popen", lambda *_, **__: Mypy(returncode=0, order=[]))
 
     def run(command, **_):
         commands.append(command)
@@ -71,3 +86,28 @@ def test_the_parts_run_after_a_failure_of_the_first(monkeypatch, capsys):
     assert all(command[-2:] == ["-k", "pose"] for command in commands)
     said = capsys.readouterr().out
     assert "side-by-side part: FAILED (1), vehicles part: passed, alone part: passed" in said
+
+
+@pytest.mark.parametrize(
+    ("tests", "types", "code"), [(0, 0, 0), (0, 1, 1), (0, 2, 2), (1, 0, 1), (3, 1, 3), (5, 0, 5)]
+)
+def test_types_are_checked_beside_the_first_part_and_told(monkeypatch, capsys, tests, types, code):
+    order = []
+
+    def run(command, **_):
+        order.append(command[3])
+        return SimpleNamespace(returncode=tests)
+
+    def start(command, **_):
+        order.append("started")
+        assert command[-2:] == ("-m", "mypy")
+        return Mypy(returncode=types, order=order)
+
+    monkeypatch.setattr("subprocess.run", run)
+    monkeypatch.setattr("subprocess.Popen", start)
+    assert main([]) == code
+    first, *others = [f"--part={part}" for part in PARTS]
+    assert order == ["started", first, "mypy", *others]
+    said = capsys.readouterr().out
+    assert "a.py:1: error: no type" in said
+    assert ("types: passed" in said) == (types == 0)
