@@ -30,9 +30,10 @@ $(VENV)/.demo: $(BIN)/python pyproject.toml
 	$(BIN)/python -m pip install --quiet --editable '.[console]'
 	touch $@
 
+# Most of what is installed is never imported: what is, Python compiles then.
 $(VENV)/.dev: $(BIN)/python pyproject.toml
 	@echo "installing what program, tests and training need into $(VENV), minutes the first time"
-	$(BIN)/python -m pip install --quiet --editable '.[dev,train]'
+	$(BIN)/python -m pip install --quiet --no-compile --editable '.[dev,train]'
 	touch $@ $(VENV)/.demo
 
 clean:

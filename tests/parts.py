@@ -5,8 +5,8 @@ pictures: each is content with a core that nobody else uses. What streams pictur
 drives a browser runs after them, one at a time, with the machine to itself. Each part prints its
 own summary; a failure of one does not keep the next from running. `pytest` alone runs all as one.
 
-mypy runs beside the first part, in what its waiting tests leave of the processors, and is told after
-it: one process for more than a minute, for which the tests need not wait.
+mypy runs beside the first part, in what its waiting tests leave of the processors, and is told
+after it: most of a minute for which no test waits.
 """
 
 from __future__ import annotations
@@ -39,9 +39,8 @@ FLIES = (
 RUNS_ALONE = (
     "tests/companion/console/test_browser.py",
     "tests/companion/flight/test_app.py",
-    "tests/companion/sources/test_live_stream.py",
+    "tests/companion/sources/test_live_timing.py",
     "tests/companion/sources/test_rtsp.py",
-    "tests/sitl/camera/test_process.py",
     "tests/sitl/demo/test_flight.py",
     "tests/sitl/suite/test_loop_flights.py",
     "tests/test_real_time.py",

@@ -20,7 +20,7 @@ from localizer.geometry.camera import Camera
 from localizer.types import Image
 from sitl.camera.stream import VideoSender
 from tests.companion.guardian.simulated import Flight, leg, second
-from tests.companion.sources.test_live_stream import (
+from tests.companion.sources.paced_sender import (
     CAMERA,
     Watch,
     counter_image,

@@ -12,191 +12,25 @@ import numpy as np
 import pytest
 
 from companion.errors import StreamOpenError, StreamSizeError
-from companion.sources import FrameSource, SourceSettings, StreamState, open_source
+from companion.sources import StreamState, open_source
 from companion.sources.base import fitted_camera
 from localizer.geometry.camera import Camera
-from localizer.types import Frame, Image
+from localizer.types import Image
 from sitl.camera.stream import LossyLink, VideoSender
-
-CAMERA = Camera.from_fov(320, 240, 70.0)
-_CELL = 16
-_BITS = 10
-
-
-def free_port() -> int:
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as s:
-        s.bind(("127.0.0.1", 0))
-        return int(s.getsockname()[1])
-
-
-def counter_image(number: int, camera: Camera = CAMERA) -> Image:
-    """Smooth background, and `number` as black and white cells along the top."""
-    v, u = np.mgrid[: camera.height, : camera.width]
-    image = np.stack([u * 255 // camera.width, v * 255 // camera.height, (u + v) // 4], axis=-1)
-    for bit in range(_BITS):
-        image[:_CELL, bit * _CELL : (bit + 1) * _CELL] = 255 * (number >> bit & 1)
-    return image.astype(np.uint8)
-
-
-def read_counter(image: Image) -> int:
-    h = _CELL // 2
-    bits = [image[h - 2 : h + 2, b * _CELL + h - 2 : b * _CELL + h + 2].mean() > 128
-            for b in range(_BITS)]  # fmt: skip
-    return sum(1 << b for b, bit in enumerate(bits) if bit)
-
-
-class PacedSender:
-    """Sends counter images at a fixed rate from a thread; remembers when each was exposed.
-
-    delay_s: what a camera's own processing takes between exposure and sending.
-    """
-
-    def __init__(
-        self,
-        url: str,
-        rate_hz: float = 20.0,
-        *,
-        camera: Camera = CAMERA,
-        misp: bool = True,
-        delay_s: float = 0.0,
-        first: int = 0,
-    ) -> None:
-        self.exposed: dict[int, int] = {}
-        self._url, self._rate, self._camera, self._misp = url, rate_hz, camera, misp
-        self._delay, self._next = delay_s, first
-        self._stop = threading.Event()
-        self._thread = threading.Thread(target=self._run, daemon=True)
-
-    def __enter__(self) -> PacedSender:
-        self._thread.start()
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self._stop.set()
-        self._thread.join(5.0)
-
-    def _run(self) -> None:
-        c = self._camera
-        sender = VideoSender(self._url, c.width, c.height, self._rate, misp=self._misp)
-        while not self._stop.is_set():
-            exposed = time.monotonic_ns()
-            self.exposed[self._next] = exposed
-            image = counter_image(self._next, c)
-            time.sleep(self._delay)
-            sender.send(image, exposed)
-            self._next = (self._next + 1) % (1 << _BITS)
-            self._stop.wait(max(0.0, 1 / self._rate - (time.monotonic_ns() - exposed) / 1e9))
-        sender.close()
-
-
-class Watch:
-    """Collects a source's frames and states from a thread, with the time each frame came out."""
-
-    def __init__(self, url: str, camera: Camera = CAMERA, **settings: object) -> None:
-        self.frames: list[tuple[Frame, int]] = []
-        self.told: list[tuple[StreamState, str]] = []
-        self.error: Exception | None = None
-        self.strangers: list[str] = []
-        self.source: FrameSource = open_source(
-            url,
-            camera,
-            SourceSettings.model_validate(settings),
-            self._on_state,
-            self.strangers.append,
-        )
-        self._thread = threading.Thread(target=self._run, daemon=True)
-
-    def __enter__(self) -> Watch:
-        self._thread.start()
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.source.close()
-        self._thread.join(60.0)
-        assert not self._thread.is_alive()
-
-    @property
-    def states(self) -> list[StreamState]:
-        return [state for state, _ in list(self.told)]
-
-    def text(self, state: StreamState) -> str:
-        """What was told first with a state."""
-        return next(text for s, text in list(self.told) if s is state)
-
-    def wait_for(self, count: int, timeout_s: float = 60.0) -> None:
-        self.wait_until(lambda: len(self.frames) >= count, timeout_s)
-
-    def wait_until(self, condition: object, timeout_s: float = 60.0) -> None:
-        deadline = time.monotonic() + timeout_s
-        while not condition():  # type: ignore[operator]
-            assert time.monotonic() < deadline, (len(self.frames), self.told)
-            time.sleep(0.02)
-
-    def _run(self) -> None:
-        try:
-            for frame in self.source.frames():
-                self.frames.append((frame, time.monotonic_ns()))
-        except Exception as error:
-            self.error = error
-
-    def _on_state(self, state: StreamState, text: str) -> None:
-        self.told.append((state, text))
+from tests.companion.sources.paced_sender import (
+    CAMERA,
+    CELL,
+    PacedSender,
+    Watch,
+    counter_image,
+    free_port,
+    read_counter,
+)
 
 
 @pytest.fixture
 def url() -> str:
     return f"udp://127.0.0.1:{free_port()}"
-
-
-def _compare(watch: Watch, sender: PacedSender, skip: int = 0) -> tuple[np.ndarray, np.ndarray]:
-    """(error of the exposure time, glass-to-glass latency) per frame, ms."""
-    rows = []
-    for frame, seen_ns in watch.frames[skip:]:
-        true_ns = sender.exposed[read_counter(frame.image)]
-        rows.append(((frame.exposure_time_ns - true_ns) / 1e6, (seen_ns - true_ns) / 1e6))
-    error, latency = np.array(rows).T
-    return error, latency
-
-
-def test_exposure_times_by_misp_stamps_are_exact_and_latency_is_low(
-    real_time: Any, url: str
-) -> None:
-    with real_time():
-        with Watch(url) as watch, PacedSender(url, rate_hz=10.0, delay_s=0.02) as sender:
-            watch.wait_for(25)
-        error, latency = _compare(watch, sender)
-        print(
-            f"\nglass to glass, ms: median {np.median(latency):.1f}"
-            f" p95 {np.percentile(latency, 95):.1f} (20 of them the sender's own);"
-            f" exposure error max {np.abs(error).max():.4f}"
-        )
-        assert np.abs(error).max() < 0.1
-        # One period is 100 ms: a receiver that held pictures back until the next one fails here.
-        assert np.median(latency) < 20 + 80
-    counters = watch.source.counters
-    assert counters.delivered == len(watch.frames)
-    assert counters.received - counters.delivered - counters.dropped in (0, 1)
-    sequences = [f.sequence for f, _ in watch.frames]
-    assert sequences == sorted(set(sequences))
-
-
-def test_exposure_times_by_presentation_times_need_the_fixed_latency_only(
-    real_time: Any, url: str
-) -> None:
-    delay = 0.03
-    with real_time():
-        with (
-            Watch(url, timing="pts", latency_ms=1000 * delay + 20, stamps_late_ms=-20) as watch,
-            PacedSender(url, misp=False, delay_s=delay) as sender,
-        ):
-            watch.wait_for(40)
-        # The smallest lag takes some frames to find: the first came in a burst after the probing.
-        error, _ = _compare(watch, sender, skip=25)
-        print(f"\nexposure error by pts, ms: {error.min():.2f} to {error.max():.2f}")
-        assert error.min() > -1.0
-        assert error.max() < 5.0
-    times = [f.exposure_time_ns for f, _ in watch.frames]
-    assert times == sorted(times)
 
 
 def test_a_stream_that_stops_is_reported_and_taken_up_again(url: str) -> None:
@@ -238,23 +72,6 @@ def test_pictures_of_a_second_sender_are_not_mixed_in(url: str) -> None:
         watch.wait_for(before + 3)
     assert max(read_counter(frame.image) for frame, _ in watch.frames) < 500
     assert watch.strangers == ["stranger's video ignored: 127.0.0.2"]
-
-
-def test_a_consumer_that_is_slow_gets_the_newest_frame_and_the_rest_are_counted(
-    real_time: Any, url: str
-) -> None:
-    with real_time():
-        with PacedSender(url, rate_hz=30.0):
-            source = open_source(url, CAMERA)
-            ages = []
-            for _, frame in zip(range(6), source.frames(), strict=False):
-                ages.append((time.monotonic_ns() - frame.exposure_time_ns) / 1e6)
-                time.sleep(0.25)
-            counters = source.counters
-            source.close()
-        assert np.median(ages[1:]) < 200  # a queue would make them grow by 200 ms a frame
-        assert counters.dropped > counters.received / 2
-    assert counters.delivered == 6
 
 
 def test_a_stream_of_another_shape_is_an_error_that_names_both(url: str) -> None:
@@ -429,9 +246,9 @@ class _HoledLink:
 def _rough_image(number: int) -> Image:
     """A counter image over grain that moves, so that a picture fills many packets."""
     image = counter_image(number)
-    rows = CAMERA.height - 2 * _CELL
+    rows = CAMERA.height - 2 * CELL
     grain = np.random.default_rng(number).integers(0, 120, (rows // 4, CAMERA.width // 4))
-    image[2 * _CELL :] = np.kron(grain, np.ones((4, 4)))[..., None].astype(np.uint8)
+    image[2 * CELL :] = np.kron(grain, np.ones((4, 4)))[..., None].astype(np.uint8)
     return image
 
 
