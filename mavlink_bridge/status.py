@@ -21,6 +21,7 @@ _TEXT_LENGTH = 50  # STATUSTEXT.text
 _NAME_LENGTH = 10  # NAMED_VALUE_FLOAT.name
 _MAX_CHUNKS = 4
 _AGAIN_NS = 10_000_000_000
+_SAME_NS = 1_000_000_000  # within it the same line is not said twice in a row
 _SEVERITY = {
     HealthLevel.STARTING: mavlink.MAV_SEVERITY_INFO,
     HealthLevel.OK: mavlink.MAV_SEVERITY_INFO,
@@ -48,6 +49,7 @@ class OperatorStatus:
         self._told_ns: dict[tuple[HealthLevel, str], int] = {}
         self._last_told = self._health
         self._texts: deque[tuple[int, str]] = deque(maxlen=_TEXTS)
+        self._newest = (-_SAME_NS, 0, "")  # line, and when it was said
         self._text_id = 0
 
     @property
@@ -75,10 +77,15 @@ class OperatorStatus:
             if news:
                 self._last_told, self._told_ns[key] = key, now_ns
         if news and tell:
-            self.say(_SEVERITY[level], f"PiLoT: {text or level.value}")
+            self.say(_SEVERITY[level], f"PiLoT: {text or level.value}", now_ns)
 
-    def say(self, severity: int, text: str) -> None:
-        """STATUSTEXT, and the log."""
+    def say(self, severity: int, text: str, now_ns: int | None = None) -> None:
+        """STATUSTEXT, and the log. A line that is said again within a second is left out: a flood
+        of orders that are refused would hide every other, and wear out the link and the record. One
+        after another line is no repetition: "on" after "off" tells how it stands.
+        """
+        if self._was_said(severity, text, monotonic_ns() if now_ns is None else now_ns):
+            return
         self._texts.append((severity, text))
         grave = severity <= mavlink.MAV_SEVERITY_WARNING
         _log.log(logging.WARNING if grave else logging.INFO, text)
@@ -87,6 +94,14 @@ class OperatorStatus:
             self._text_id = text_id = self._text_id % 0xFFFF + 1
         for message in status_texts(severity, text, text_id):
             self._send(severity, message)
+
+    def _was_said(self, severity: int, text: str, now_ns: int) -> bool:
+        with self._text_lock:
+            said_ns, *line = self._newest
+            if line == [severity, text] and now_ns - said_ns < _SAME_NS:
+                return True
+            self._newest = (now_ns, severity, text)
+            return False
 
     def texts(self) -> list[str]:
         """The last lines, oldest first."""

@@ -7,6 +7,7 @@ that are addressed to the autopilot.
 from __future__ import annotations
 
 import math
+from collections import deque
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from typing import Any
@@ -50,8 +51,24 @@ _OLD_REQUESTS = {
         mavlink.MAVLINK_MSG_ID_VIDEO_STREAM_INFORMATION
     ),
 }
+_MOST_CLICKS, _CLICKS_NS = 10, 5_000_000_000  # no hand is faster
 _MIN_INTERVAL_US = 20_000
 _PER_TICK = 4  # targets: more in one go would fill a slow port, and positions wait behind them
+
+
+class _Pace:
+    """Of clicks: more in a while would end targets before they are found."""
+
+    def __init__(self) -> None:
+        self._times_ns: deque[int] = deque(maxlen=_MOST_CLICKS)
+
+    def is_exceeded(self, time_ns: int) -> bool:
+        """Whether one more is too many; else it counts."""
+        times = self._times_ns
+        if len(times) == _MOST_CLICKS and time_ns - times[0] < _CLICKS_NS:
+            return True
+        times.append(time_ns)
+        return False
 
 
 class CameraComponent:
@@ -78,6 +95,7 @@ class CameraComponent:
         self._on_track = on_track
         self._numbers = numbers
         self._last_click: tuple[Any, int, TrackRequest] | None = None
+        self._pace = _Pace()
         self._period_ns = int(1e9 / config.targets.rate_hz)
         self._image_ns = self._geo_ns = self._period_ns
         self._targets: dict[int, TargetReport] = {}
@@ -196,6 +214,8 @@ class CameraComponent:
         else:
             if self._is_repeated(message, request):
                 return int(mavlink.MAV_RESULT_ACCEPTED)
+            if self._pace.is_exceeded(time_ns):
+                return int(mavlink.MAV_RESULT_TEMPORARILY_REJECTED)
             request = replace(request, number=next(self._numbers))
             self._last_click = (message.get_srcSystem(), message.command, request)
         self._on_track(request)

@@ -16,6 +16,7 @@ from mavlink_bridge.config import CameraConfig, RcGateConfig
 from mavlink_bridge.injection.rc_gate import InjectionGate
 from mavlink_bridge.link.framing import FrameReader
 from mavlink_bridge.shared import clicked_numbers
+from mavlink_bridge.status import OperatorStatus
 from tests.mavlink_bridge.simulated import HOME, METRE, MS, Flight
 
 KEY = bytes(range(1, 33))
@@ -369,3 +370,28 @@ def test_a_gate_that_chatters_ends_as_the_channel_stands(monkeypatch: pytest.Mon
         gate.channels([pulses] * 18)
         gate.command(mavlink.MAV_CMD_USER_1, (math.nan, math.inf, 0.5, -1.0)[turn % 4])
     assert gate.open
+
+
+def test_no_flood_of_clicks_ends_the_targets_that_are_followed(flight: Flight) -> None:
+    for turn in range(200):
+        x = 0.2 + 0.003 * turn
+        click = mavlink.MAVLink_command_long_message(1, 100, 2004, 0, x, x, 0, 0, 0, 0, 0)
+        flight.say(click, system=255, component=190)
+        flight.run(0.01)
+    assert len(flight.tracked) == 10
+    busy = mavlink.MAV_RESULT_TEMPORARILY_REJECTED
+    assert [m.result for _, m, _ in flight.link.sent if m.get_type() == "COMMAND_ACK"][-1] == busy
+    flight.run(5.0)
+    flight.say(click, system=255, component=190)
+    assert len(flight.tracked) == 11
+
+
+def test_a_line_repeated_at_once_is_told_once_and_on_after_off_is_told() -> None:
+    told: list[str] = []
+    status = OperatorStatus(lambda *_: None, lambda _, text: told.append(text))
+    for hundredth in range(250):
+        status.say(4, "look-at refused", hundredth * 10 * MS)
+    assert told == ["look-at refused"] * 3
+    for hundredth, text in enumerate(("on", "off", "on", "on")):
+        status.say(4, text, 10**10 + hundredth * 10 * MS)
+    assert told[3:] == ["on", "off", "on"]
