@@ -123,10 +123,11 @@ class _LoopFlight:
         with self._pilot.fast_forward():
             self._pilot.wait_ready()
         config = self._write_deployment(vehicle)
-        self._open_camera()
         self._companion = LoopCompanion(config, self._out, self._stack, supervised=case.supervised)
         if not case.cold:
-            self._companion.start()
+            self._companion.start()  # a processor for each while both load their programs
+        self._open_camera()
+        if not case.cold:
             self._companion.wait_up()
         pilot = self._pilot
         if not case.hover:
