@@ -36,10 +36,11 @@ from sitl.camera.realism import CameraRealism, Stamps
 from sitl.camera.stream import LossyLink, VideoSender
 from sitl.camera.true_motion import PoseTrack, TruthSample, camera_pose
 from sitl.camera.world_camera import CameraOptions, FrameLog, WorldCamera
+from sitl.camera.zoom import Zooming, ZoomLens
 from sitl.errors import WorldCameraError
 
 Command = Literal["pause", "resume", "stop"]
-Message = TruthSample | Command | PictureFault | None  # None ends the fault
+Message = TruthSample | Command | PictureFault | Zooming | None  # None ends the fault
 
 _START_S = 300.0  # numba compiles on the first run, a minute where there is room
 _STOP_S = 60.0
@@ -132,6 +133,10 @@ class WorldCameraProcess:
     def fault(self, fault: PictureFault | None) -> None:
         """From now on the pictures have this fault; None ends it."""
         self._send(fault)
+
+    def zoom(self, zooming: Zooming) -> None:
+        """From now on the lens does this."""
+        self._send(zooming)
 
     def stop(self) -> None:
         """Ends the process; `statistics` holds what it did. Harmless when it is not running."""
@@ -254,7 +259,7 @@ class _Studio:
             if c.detections
             else None
         )
-        self._lens = FaultyLens(c.seed)
+        self._lens, self._zoom = FaultyLens(c.seed), ZoomLens(c.camera)
         self._outbox: deque[_Waiting] = deque()
         self._track = PoseTrack()
         self._paused = self._stopped = False
@@ -306,6 +311,8 @@ class _Studio:
             self._track.add(message.time_ns, pose)
         elif message is None or isinstance(message, PictureFault):
             self._lens.set(message)
+        elif isinstance(message, Zooming):
+            self._zoom.set(message)
         elif message == "stop":
             self._stopped = True
         else:
@@ -325,7 +332,7 @@ class _Studio:
                 time_ns + self._lens.delay_ns,
                 time_ns,
                 self._lens.stamp(stamp_ns),
-                self._lens.picture(exposure.image),
+                self._lens.picture(self._zoom.picture(exposure.image, time_ns)),
             )
         )
         if self._detector is not None:

@@ -10,6 +10,7 @@ from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from companion.settings_file import SettingsError, read_settings, validated
 from sitl.camera.faults import PictureFault, PictureFaultKind
+from sitl.camera.zoom import MOST as ZOOM_MOST
 from sitl.demo.scenario import CameraSpec, Leg, Scenario, ScenarioError
 
 LOOP_SCENARIOS = Path(__file__).parents[2] / "scenarios" / "loop"
@@ -35,6 +36,13 @@ class Picture(_Model):
     def fault(self) -> PictureFault:
         """As the world camera takes it."""
         return PictureFault(self.kind, self.late_s)
+
+
+class Zoom(_Model):
+    """The lens goes to a multiple of its shortest focal length, in so many seconds."""
+
+    to: float = Field(ge=1.0, le=ZOOM_MOST)
+    over_s: float = Field(2.0, ge=0, le=60)
 
 
 class Drag(_Model):
@@ -64,13 +72,14 @@ class PlaceHint(_Model):
 class LoopEvent(_Model):
     """Something that happens at_s seconds after the recorded part began (and GNSS was denied).
 
-    picture: a fault of the video. kill: SIGKILL to the companion, which is started again
+    picture: a fault of the video. zoom: of the lens. kill: SIGKILL to the companion, started again
     restart_after_s later, or by its supervisor. hang: SIGSTOP to the flight process. start: of a
     companion that did not run until now (`cold`). vehicle: parameters that the ground station sets.
     """
 
     at_s: float = Field(ge=0)
     picture: Picture | None = None
+    zoom: Zoom | None = None
     drag: Drag | None = None
     load: Load | None = None
     hint: PlaceHint | None = None
@@ -132,7 +141,8 @@ class LoopCase(_Model):
     size_m: of the world. honest: that world as another visit shows it, with the demo's camera and
     the errors drawn for it. ci: flown in every test run on the embedded vehicle. deployment: keys
     that differ from the demo's deployment file; vehicle: parameters likewise (FS_EKF_ACTION 0: no
-    landing while the place is searched).
+    landing while the place is searched). zoom_points: the deployment's table of a lens that reports
+    its zoom (level, focal length over the model's); none: a lens that says nothing of it.
     """
 
     name: str
@@ -153,6 +163,7 @@ class LoopCase(_Model):
     deployment: dict[str, Any] = {}
     vehicle: dict[str, float] = {}
     wrong: Wrong = Wrong()
+    zoom_points: tuple[tuple[float, float], ...] = ()
     timeline: tuple[LoopEvent, ...] = ()
     expect: Expectation = Expectation()
 
@@ -179,7 +190,8 @@ class LoopCase(_Model):
     @property
     def is_normal(self) -> bool:
         """Whether nothing is wrong: whatever is told then is a false alarm."""
-        return self.wrong == Wrong() and not self.timeline and not self.cold
+        told = bool(self.zoom_points) and all(e.zoom is not None for e in self.timeline)
+        return self.wrong == Wrong() and (not self.timeline or told) and not self.cold
 
     @property
     def scenario(self) -> Scenario:

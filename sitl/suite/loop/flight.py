@@ -22,6 +22,7 @@ from sitl.camera.movers import Mover
 from sitl.camera.pose_sender import truth_feed
 from sitl.camera.process import WorldCameraProcess
 from sitl.camera.traffic import traffic
+from sitl.camera.zoom import ReportingCamera, Zooming
 from sitl.demo.assets import FlightAssets
 from sitl.demo.companion_process import Ports, free_udp_port, write_deployment
 from sitl.demo.flight import FilmedFlight, camera_config, home_of, vehicle_parameters
@@ -29,7 +30,7 @@ from sitl.demo.script import mission
 from sitl.ground.pilot import Pilot
 from sitl.ground.vehicle_record import VEHICLE
 from sitl.suite.flight import longest_stall, slowest_pace
-from sitl.suite.loop.case import LoopCase, LoopEvent, PlaceHint, Wrong
+from sitl.suite.loop.case import LoopCase, LoopEvent, PlaceHint, Wrong, Zoom
 from sitl.suite.loop.companion import LoopCompanion
 from sitl.suite.loop.disturbances import GnssDrag, OtherWork
 from sitl.suite.loop.judge import Back, LoopRecord, LoopSample, LoopText
@@ -108,6 +109,8 @@ class _LoopFlight:
         self._waiting = list(case.timeline)
         self._due: list[tuple[float, Callable[[], None]]] = []
         self._drag: GnssDrag | None = None
+        self._reporting: ReportingCamera | None = None
+        self._zooming = Zooming(1.0, 1.0, 0, 0)
         self._ticks: list[tuple[float, float]] = []
         self._tlog = out.resolve() / "flight.tlog"
         self._start_ns = 0
@@ -127,6 +130,9 @@ class _LoopFlight:
         if not case.cold:
             self._companion.start()  # a processor for each while both load their programs
         self._open_camera()
+        if case.zoom_points:
+            camera = ReportingCamera(vehicle.spare_endpoint)
+            self._reporting = self._stack.enter_context(camera)
         if not case.cold:
             self._companion.wait_up()
         pilot = self._pilot
@@ -215,6 +221,8 @@ class _LoopFlight:
         if case.wrong.terrain_off_m is not None:
             terrain = terrain_file(flown.world, self._out / "terrain.tif", case.wrong.terrain_off_m)
             settings["localizer"].setdefault("odometry", {})["terrain"] = str(terrain)
+        if case.zoom_points:
+            settings["camera"]["zoom"] = {"points": [list(point) for point in case.zoom_points]}
         settings["record"]["snapshot_interval_s"] = 5.0
         settings["bridge"]["tlog"] = str(self._tlog)
         path.write_text(yaml.safe_dump(_merged(settings, case.deployment), sort_keys=False))
@@ -256,6 +264,8 @@ class _LoopFlight:
         if event.picture is not None:
             self._camera.fault(event.picture.fault)
             self._later(event.picture.for_s, lambda: self._camera.fault(None))
+        if event.zoom is not None:
+            self._zoom_to(event.zoom)
         if event.drag is not None:
             self._drag = GnssDrag(event.drag, self._pilot.link, self._home, self._now_s)
             self._drag_on()
@@ -294,6 +304,16 @@ class _LoopFlight:
                 round(place.latitude_deg * 1e7), round(place.longitude_deg * 1e7), math.nan,
             )
         )  # fmt: skip
+
+    def _zoom_to(self, zoom: Zoom) -> None:
+        """The lens moves, and says so where it is one that does."""
+        now_ns = time.monotonic_ns()
+        before = self._zooming.at(now_ns)
+        end_ns = now_ns + round(zoom.over_s * 1e9)
+        self._zooming = Zooming(before, zoom.to, now_ns, end_ns)
+        self._camera.zoom(self._zooming)
+        if self._reporting is not None:
+            self._reporting.set(self._zooming)
 
     def _drag_on(self) -> None:
         if self._drag is not None and not self._drag.is_over(self._now_s):

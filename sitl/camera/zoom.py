@@ -1,0 +1,113 @@
+"""A lens that zooms in flight: what it does to the picture, and the level that it reports.
+
+Its focal length rises evenly with the level, which no table of a few points has exactly.
+"""
+
+from __future__ import annotations
+
+import threading
+import time
+from dataclasses import dataclass
+from types import TracebackType
+
+import cv2
+import numpy as np
+from pymavlink import mavutil
+from pymavlink.dialects.v20 import ardupilotmega as mavlink
+
+from localizer.geometry.camera import Camera
+from localizer.types import Image
+from sitl.ground.connection import silence
+from sitl.ground.vehicle_record import VEHICLE
+
+MOST = 2.0  # focal length at level 100 over that at level 0
+_CAMERA = mavlink.MAV_COMP_ID_CAMERA
+_PERIOD_S = 0.1
+
+
+@dataclass(frozen=True)
+class Zooming:
+    """A change of the focal length, as a multiple of the shortest; CLOCK_MONOTONIC, ns."""
+
+    before: float
+    after: float
+    begin_ns: int
+    end_ns: int
+
+    def at(self, time_ns: int) -> float:
+        """The multiple at a time."""
+        span = [self.begin_ns, max(self.end_ns, self.begin_ns + 1)]
+        return float(np.interp(time_ns, span, [self.before, self.after]))
+
+
+def level_of(factor: float) -> float:
+    """What CAMERA_SETTINGS says at a focal length, per cent of the range."""
+    return 100.0 * (factor - 1.0) / (MOST - 1.0)
+
+
+class ZoomLens:
+    """Makes the picture of a longer lens from that of the shortest: its middle, as large."""
+
+    def __init__(self, camera: Camera) -> None:
+        self._camera = camera
+        self._zooming: Zooming | None = None
+
+    def set(self, zooming: Zooming) -> None:
+        """What it does from now on."""
+        self._zooming = zooming
+
+    def picture(self, image: Image, time_ns: int) -> Image:
+        """(H, W, 3) uint8 of an exposure; about the principal point, distortion and all."""
+        factor = 1.0 if self._zooming is None else self._zooming.at(time_ns)
+        if factor == 1.0:
+            return image
+        # Pixel centres lie at (u + 0.5, v + 0.5), those of OpenCV at (u, v).
+        centre = np.array([self._camera.cx - 0.5, self._camera.cy - 0.5])
+        matrix = np.column_stack([np.eye(2) * factor, centre * (1.0 - factor)])
+        size = (image.shape[1], image.shape[0])
+        return np.asarray(cv2.warpAffine(image, matrix, size, flags=cv2.INTER_LINEAR), np.uint8)
+
+
+class ReportingCamera:
+    """A camera component of the vehicle that says its zoom level ten times a second."""
+
+    def __init__(self, endpoint: str) -> None:
+        self._link = mavutil.mavlink_connection(
+            endpoint, source_system=VEHICLE, source_component=_CAMERA, dialect="ardupilotmega"
+        )
+        silence(self._link)
+        self._zooming = Zooming(1.0, 1.0, 0, 0)
+        self._over = threading.Event()
+        self._thread = threading.Thread(target=self._run, name="camera component", daemon=True)
+
+    def set(self, zooming: Zooming) -> None:
+        """What it reports from now on."""
+        self._zooming = zooming
+
+    def __enter__(self) -> ReportingCamera:
+        self._thread.start()
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        self._over.set()
+        self._thread.join()
+        self._link.close()
+
+    def _run(self) -> None:
+        started_ns = time.monotonic_ns()
+        while not self._over.wait(_PERIOD_S):
+            now_ns = time.monotonic_ns()
+            boot_ms = (now_ns - started_ns) // 1_000_000
+            try:
+                self._link.mav.camera_settings_send(
+                    boot_ms, mavlink.CAMERA_MODE_VIDEO, level_of(self._zooming.at(now_ns)), 0.0
+                )
+                while self._link.recv_msg() is not None:  # nobody reads it, and it must not wait
+                    pass
+            except OSError:  # the vehicle has ended
+                return
