@@ -51,6 +51,12 @@ class LocalizerConfig(BaseModel):
     )
     feature_half: bool = Field(False, description="TensorRT computes features in float16")
     cache_mib: int = Field(384, ge=16, le=1 << 20, description="resident tiles, MiB")
+    focal_fit_s: float = Field(
+        0.0,
+        ge=0,
+        le=3600,
+        description="the focal length is fitted beside the pose so often",
+    )
     seed: int = Field(0, ge=0, lt=2**31, description="seed of anchors and hypotheses")
     registration: JNGOConfig = JNGOConfig()
     calibration: CalibrationSigmas = CalibrationSigmas()

@@ -135,6 +135,14 @@ class TrackingState(Enum):
 
 
 @dataclass(frozen=True)
+class FocalFit:
+    """The focal length that fits a picture best, as a multiple of its camera's, and its sigma."""
+
+    factor: float
+    sigma: float
+
+
+@dataclass(frozen=True)
 class PoseEstimate:
     """The localizer's answer for one frame.
 
@@ -145,7 +153,8 @@ class PoseEstimate:
     this one included; None before the first.
 
     state: INITIALIZING for a single photo, which confirms nothing, however good it is. BRIDGING
-    estimates are carried on by odometry, with a covariance that grows.
+    estimates are carried on by odometry, with a covariance that grows. focal: where it was fitted
+    (`LocalizerConfig.focal_fit_s`) and could be told.
     """
 
     world_from_camera: Pose
@@ -159,6 +168,7 @@ class PoseEstimate:
     camera: Camera
     stage_ms: dict[str, float] = field(default_factory=dict)
     last_fix_ns: int | None = None
+    focal: FocalFit | None = None
 
 
 def _up() -> Array:

@@ -64,6 +64,7 @@ from mavlink_bridge.config import BridgeConfig
 from mavlink_bridge.messages import TrackRequest
 
 _log = logging.getLogger(__name__)
+_FOCAL_FIT_S = 0.5  # where the table may be corrected: 5 ms of processor each
 _ZOOM_RATE_HZ = 5.0  # at which CAMERA_SETTINGS is asked for where a table waits for it
 _WARNING = 4  # MAV_SEVERITY_WARNING; lower is worse
 _BAD_FEED = (StreamState.STALLED, StreamState.FAILED, StreamState.SCALED, StreamState.MISFIT)
@@ -312,7 +313,10 @@ def _localizer(making: Making) -> Localizer:
         lambda _time_ns: autopilot().height_m,
         lambda time_ns: autopilot().clearance_m(time_ns),
     )
-    return build_localizer(making[MapStack], camera, config.localizer, sensors)
+    settings, zoom = config.localizer, config.camera.zoom
+    if zoom is not None and zoom.refine and not settings.focal_fit_s:
+        settings = settings.model_copy(update={"focal_fit_s": _FOCAL_FIT_S})
+    return build_localizer(making[MapStack], camera, settings, sensors)
 
 
 def _injection(making: Making) -> FixInjection:
@@ -442,6 +446,7 @@ def _engine(making: Making) -> DualThreadEngine:
         table, bridge.zoom_at, lambda text: bridge.say(_WARNING, f"PiLoT: {text}")
     )
     channels.frames.subscribe(zoomed.before(engine.submit))
+    channels.estimates.subscribe(lambda estimate, _: zoomed.learn(estimate))
     return engine
 
 

@@ -2,13 +2,15 @@
 
 CAMERA_SETTINGS (260) gives `zoomLevel`, a per cent of the range: no focal length. The table says
 what it means for this lens. Between its points the logarithm of the factor is linear, so that a
-longer level never gives a shorter focal length.
+longer level never gives a shorter focal length. What the registration finds beside the pose
+corrects it slowly, and never beyond a bound.
 """
 
 from __future__ import annotations
 
 import math
 import threading
+from collections import deque
 from collections.abc import Callable
 from dataclasses import replace
 from itertools import pairwise
@@ -18,11 +20,14 @@ import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, field_validator
 
 from localizer.geometry.camera import Camera
-from localizer.types import Frame
+from localizer.types import Frame, PoseEstimate
 
 Level = Annotated[float, Field(ge=0.0, le=100.0)]
 Factor = Annotated[float, Field(ge=0.2, le=50.0)]
 _ALIKE = 1e-3  # a share of the focal length that is no other lens: below what a calibration knows
+_ELSEWHERE = 0.05  # of the logarithm: so far off a table errs by something else
+_ALIKE_PICTURES = 9.0
+_REMEMBERED = 32  # pictures under way
 _AGAIN_NS = 10_000_000_000  # the same trouble is told so often
 
 
@@ -36,6 +41,13 @@ class ZoomTable(BaseModel):
     )
     hold_s: float = Field(
         2.0, ge=0.1, le=3600.0, description="a report that is no longer followed counts so long"
+    )
+
+    refine: float = Field(
+        0.0,
+        ge=0.0,
+        le=0.02,
+        description="registration may correct the table by this share of the focal length; 0: not",
     )
 
     @field_validator("points")
@@ -64,6 +76,33 @@ def longer(camera: Camera, factor: float) -> Camera:
     return replace(camera, fx=camera.fx * factor, fy=camera.fy * factor)
 
 
+class FocalCorrection:
+    """What pictures say of the table's error at this zoom: the logarithm of the true focal length
+    over the table's. It is held as unsure as the bound until pictures tell it, and again once the
+    lens has moved on: a table is wrong elsewhere by something else.
+    """
+
+    def __init__(self, bound: float) -> None:
+        self._bound = math.log1p(bound)
+        self._variance = self._first = (0.5 * self._bound) ** 2
+        self.value = 0.0
+
+    def moved(self, by: float) -> None:
+        """The lens is at another zoom: the logarithm of its factor changed by so much."""
+        other = min(abs(by) / _ELSEWHERE, 1.0)
+        self._variance = min(self._variance + other * self._first, self._first)
+
+    def learn(self, seen: float, sigma: float) -> None:
+        """A picture's logarithm. Neighbours err alike: each counts as little as if it were alone
+        among so many.
+        """
+        noise = _ALIKE_PICTURES * sigma**2
+        gain = self._variance / (self._variance + noise)
+        self._variance *= 1.0 - gain
+        value = self.value + gain * (seen - self.value)
+        self.value = min(max(value, -self._bound), self._bound)
+
+
 class ZoomedFrames:
     """Gives every frame the camera of its zoom; the feed's thread, `factor` from any.
 
@@ -80,6 +119,9 @@ class ZoomedFrames:
         self._table, self._level_at, self._tell = table, level_at, tell
         self._lock = threading.Lock()
         self._factor: float | None = None
+        self._correction = FocalCorrection(table.refine)
+        self._by_table: float | None = None  # the newest picture's factor
+        self._given: deque[tuple[int, float, float]] = deque(maxlen=_REMEMBERED)
         self._told_ns: int | None = None
         self.unknown = 0  # frames
 
@@ -94,9 +136,14 @@ class ZoomedFrames:
             return None
         self._told_ns = None
         with self._lock:
+            if self._by_table is not None:
+                self._correction.moved(math.log(factor / self._by_table))
+            self._by_table = by_table = factor
+            factor *= math.exp(self._correction.value)
             if self._factor is None or abs(factor / self._factor - 1.0) > _ALIKE:
                 self._factor = factor
             factor = self._factor
+            self._given.append((frame.exposure_time_ns, by_table, factor))
         return replace(frame, camera=longer(frame.camera, factor))
 
     def before(self, take: Callable[[Frame], object]) -> Callable[[Frame], None]:
@@ -108,6 +155,17 @@ class ZoomedFrames:
                 take(known)
 
         return hand_on
+
+    def learn(self, estimate: PoseEstimate) -> None:
+        """Take in what a registered picture says of its focal length; any thread, never blocks."""
+        fit = estimate.focal
+        if fit is None or not self._table.refine:
+            return
+        with self._lock:
+            for time_ns, by_table, factor in self._given:
+                same = by_table == self._by_table  # of a lens that moved on it says nothing
+                if time_ns == estimate.exposure_time_ns and same:
+                    self._correction.learn(math.log(fit.factor * factor / by_table), fit.sigma)
 
     @property
     def factor(self) -> float | None:

@@ -68,6 +68,7 @@ def _shifted_sums(
     # The window of every anchor lies in the image, or the image's edge would vote.
     whole = in_view(problem, x, uv) & (u >= _REACH) & (u < w - 1 - _REACH)
     whole &= (v >= _REACH) & (v < h - 1 - _REACH)
+    whole[whole] = sample_bilinear(problem.confidence, u[whole], v[whole]) > 0.0  # a picture there
     u, v = u[whole], v[whole]
     part_px = max(_PART_PX, (h * w * _ANCHORS_A_PART / problem.points.shape[1]) ** 0.5)
     across = int(w // part_px) + 1

@@ -51,7 +51,7 @@ from localizer.registration.selection import (
 )
 from localizer.registration.whole import WholeBackend
 from localizer.registration.zoom import FocalTest
-from localizer.types import Anchors, FeaturePyramid, PosePrior, RegistrationStatus
+from localizer.types import Anchors, FeaturePyramid, FocalFit, PosePrior, RegistrationStatus
 
 _log = logging.getLogger(__name__)
 
@@ -132,6 +132,12 @@ class JNGO:
         """What `register` found from the same, with its `focal_gain`; 2 to 3 ms."""
         gain = FocalTest(self.backend, self.config).gain(query, camera, anchors, found)
         return replace(found, focal_gain=gain)
+
+    def focal_fitted(
+        self, query: FeaturePyramid, camera: Camera, anchors: Anchors, found: Registration
+    ) -> FocalFit | None:
+        """The focal length that fits what `register` found from the same; see `FocalTest.fit`."""
+        return FocalTest(self.backend, self.config).fit(query, camera, anchors, found)
 
     def _refine(
         self,

@@ -14,6 +14,7 @@ from dataclasses import replace
 
 import cv2
 import numpy as np
+from numpy.typing import NDArray
 
 from localizer.config import LocalizerConfig
 from localizer.errors import (
@@ -58,6 +59,8 @@ _LEAD_NS = 200_000_000
 
 # A reference view with less of the map in it than this has nothing to register against.
 _MIN_MAP_SHARE = 0.1
+_BESIDE_PX = 6  # of a picture's edge, working px: features there have seen what lies beyond it
+_NEARLY_ALL, _WHOLLY = 0.9, 0.999  # an ordinary lens leaves its corners black
 
 _NO_PRIOR = "no pose prior yet: call set_prior before localizing"
 
@@ -82,6 +85,20 @@ class Undistorter:
         pinhole = target.resized(self._middle.width, self._middle.height)
         bent = not self._middle.is_like(pinhole)  # by its lens, or by its zoom
         self._maps = self._middle.undistortion_maps(pinhole) if bent else None
+        self.seen = self._seen()
+        """(height, width) of the target, what the source shows of it with room to all sides; None
+        where that is nearly all.
+        """
+
+    def _seen(self) -> NDArray[np.bool_] | None:
+        if self._maps is None:
+            return None
+        white = np.full((self._middle.height, self._middle.width), 255, np.uint8)
+        size = (self._target.width, self._target.height)
+        shown = cv2.resize(cv2.remap(white, *self._maps, cv2.INTER_LINEAR), size)
+        side = 2 * _BESIDE_PX + 1
+        inside = cv2.erode(shown, np.ones((side, side), np.uint8), borderValue=255) == 255
+        return inside if inside.mean() < _NEARLY_ALL else None
 
     def __call__(self, frame: Frame) -> Image:
         """The frame's image (height, width, 3) uint8 at the target's size."""
@@ -103,6 +120,21 @@ def _shrink(image: Image, camera: Camera) -> Image:
     resized = cv2.resize(image, (camera.width, camera.height), interpolation=cv2.INTER_AREA)
     shrunk: Image = resized.astype(np.uint8, copy=False)
     return shrunk
+
+
+def only_seen(pyramid: FeaturePyramid, seen: NDArray[np.bool_] | None) -> FeaturePyramid:
+    """The features without confidence where a longer lens shows nothing: black is no ground, and
+    anchors that meet it would vote against the pose.
+    """
+    if seen is None:
+        return pyramid
+    levels = []
+    for level in pyramid.levels:
+        size = (level.confidence.shape[1], level.confidence.shape[0])
+        share = cv2.resize(seen.astype(np.float32), size, interpolation=cv2.INTER_AREA)
+        confidence = np.where(share > _WHOLLY, level.confidence, 0).astype(np.float32)
+        levels.append(replace(level, confidence=confidence))
+    return replace(pyramid, levels=tuple(levels))
 
 
 def reference_anchors(
@@ -153,6 +185,7 @@ class Localizer:
         self._undistorter = Undistorter(camera, self.camera)
         self._reference: ReferenceBundle | None = None  # the last one of `track`
         self._asked_ns = 0  # what time the last reference was asked for
+        self._fitted_ns: int | None = None  # of the last picture whose focal length was fitted
         self._tracker = Tracker(config, self._sensors, self._bridging(config, optimizer, terrain))
 
     def _bridging(
@@ -343,7 +376,7 @@ class Localizer:
         image = undistorter(frame)
         if self._optimizer.on_gpu and isinstance(self._extractor, DeviceExtractor):
             return self._extractor.extract_on_device(image)
-        return self._extractor.extract(image)
+        return only_seen(self._extractor.extract(image), undistorter.seen)
 
     def localize(
         self, frame: Frame, query: FeaturePyramid, anchors: Anchors | None
@@ -382,7 +415,21 @@ class Localizer:
                 self.camera, sweep, moving,
             )  # fmt: skip
             estimate = replace(estimate, covariance=estimate.covariance + unknown)
+            if result is not None and self._is_focal_due(estimate):
+                focal = self._optimizer.focal_fitted(query, self.camera, seen_anchors, result)
+                estimate = replace(estimate, focal=focal)
         return replace(estimate, stage_ms=stage_ms)
+
+    def _is_focal_due(self, estimate: PoseEstimate) -> bool:
+        """Whether this picture is one whose focal length is to be fitted."""
+        every_ns = round(1e9 * self._config.focal_fit_s)
+        if not every_ns or not estimate.accepted or estimate.state is not TrackingState.TRACKING:
+            return False
+        now_ns, last_ns = estimate.exposure_time_ns, self._fitted_ns
+        if last_ns is not None and 0 <= now_ns - last_ns < every_ns:
+            return False
+        self._fitted_ns = now_ns
+        return True
 
 
 @contextmanager
