@@ -55,7 +55,7 @@ class LocalizerConfig(BaseModel):
         0.0,
         ge=0,
         le=3600,
-        description="the focal length is fitted beside the pose so often",
+        description="focal length is fitted beside the pose so often, s; 0: not",
     )
     seed: int = Field(0, ge=0, lt=2**31, description="seed of anchors and hypotheses")
     registration: JNGOConfig = JNGOConfig()
