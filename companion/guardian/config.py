@@ -94,6 +94,10 @@ class GuardianConfig(_Model):
     jump_hold_s: float = Field(
         default=5.0, ge=0.0, le=60.0, description="a jumped position must agree in motion so long"
     )
+    tilt_deg: float = Field(
+        default=0.9, ge=0.1, le=10.0,
+        description="gimbal's and autopilot's roll and pitch, mounting included, 1 sigma an axis",
+    )  # fmt: skip
     gnss_accuracy_cap_m: float = Field(
         default=3.0, gt=0.0, le=50.0, description="a receiver's own error is believed up to this"
     )

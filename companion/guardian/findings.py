@@ -58,6 +58,7 @@ MOTION = Rule("motion", "motion is not the IMU's ({0:.0f} m)", Action.WITHDRAW, 
 HEIGHT = Rule("height", "height {0:.0f} m off barometer", Action.WITHDRAW, 2.0, 5.0)
 JUMP = Rule("jump", "position jumped {0:.0f} m", Action.WITHDRAW, 0.0, 0.0)
 STEP = Rule("step", "position stepped {0:.0f} m, unexplained", Action.NONE, 0.0, 0.0, 60.0)
+TILT = Rule("tilt", "tilt {0:.0f} deg off the autopilot's", Action.NONE, 1.0, 3.0, 60.0)
 GNSS = Rule("gnss", "GNSS {0:.0f} m from vision: neither proven", Action.NONE, 2.0, 5.0, 10.0)
 EKF_REFUSES = Rule("ekf_refuses", "EKF refuses vision ({0:.1f})", Action.NONE, 2.0, 3.0, 10.0)
 EKF_JUMPED = Rule("ekf_jumped", "EKF jumped {0:.0f} m: unconfirmed", Action.NONE, 0.0, 0.0)
@@ -83,6 +84,7 @@ RULES = (
     HEIGHT,
     JUMP,
     STEP,
+    TILT,
     GNSS,
     EKF_REFUSES,
     EKF_JUMPED,

@@ -11,7 +11,7 @@ import numpy as np
 
 from companion.guardian.config import GuardianConfig
 from companion.guardian.heading import Headings, Turn, turn_of
-from companion.guardian.place import LocalPlace
+from companion.guardian.place_checks import LocalPlace
 from companion.guardian.step import Step
 from mavlink_bridge.messages import Attitude, VehicleState, VisionFix
 

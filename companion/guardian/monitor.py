@@ -23,6 +23,7 @@ from companion.guardian.picture import PictureVerdict, PictureWatch
 from companion.guardian.place_checks import GnssCheck, HeightCheck
 from companion.guardian.protection import ProtectionLevel, protection_level
 from companion.guardian.step import StepDoubt
+from companion.guardian.tilt import TiltCheck
 from localizer.types import Image
 from mavlink_bridge.messages import Attitude, VehicleState, VisionFix
 
@@ -78,6 +79,7 @@ class Monitor:
         self._gnss = GnssCheck(config)
         self._jumps = JumpCheck(config)
         self._steps = StepDoubt(config.untold_jump_m)
+        self._tilt = TiltCheck(config)
         self._ekf = EkfWatch()
         self._calibration = CalibrationWatch(config.calibration)
         alert_s = min(f.LIMIT.alert_s, limits.time_to_alert_s)
@@ -156,10 +158,11 @@ class Monitor:
 
         attitude: the autopilot's at the fix's time, None where it is not known.
         """
-        state = known_state(state)
+        state, attitude = known_state(state), known_attitude(attitude)
+        self._tilt.add(fix, attitude)
         verdict = self._verdict
         agrees = verdict is None or not verdict.settled or verdict.share < _CALM_SHARE
-        admitted = self._jumps.admit(fix, state, known_attitude(attitude), agrees=agrees)
+        admitted = self._jumps.admit(fix, state, attitude, agrees=agrees)
         self._doubt_steps(fix, state, admitted=admitted)
         known_m = self._known_m(state)
         self._level = level = protection_level(fix, state, self._config.protection, known_m)
@@ -251,6 +254,7 @@ class Monitor:
             f.HEIGHT.name: lambda: self._height_reading if fresh else none,
             f.JUMP.name: lambda: Reading(self._jump_held, self._jumps.distance_m),
             f.STEP.name: lambda: Reading(self._steps.metres > 0.0, self._steps.metres),
+            f.TILT.name: lambda: self._tilts(state) if fresh else none,
             f.GNSS.name: lambda: self._against_gnss(state, now_ns) if fresh else none,
             f.EKF_REFUSES.name: lambda: self._ekf.refuses(state) if fresh else Reading(False),
             f.EKF_JUMPED.name: lambda: self._ekf_jump(state, now_ns),
@@ -279,9 +283,8 @@ class Monitor:
         focal, late = self._latches[f.FOCAL.name].raised, self._latches[f.TIME_OFFSET.name].raised
         focal_m = self._calibration.known_m(speed, focal=focal, time=False)
         late_m = self._calibration.known_m(speed, focal=False, time=late)
-        return focal_m + max(
-            late_m, self._steps.possible_m
-        )  # late stamps are how a step is explained
+        # Late stamps are how a step is explained, and a tilt shifts as a step does.
+        return focal_m + max(late_m, self._steps.possible_m, self._tilt.metres(state))
 
     def _frozen(self, now_ns: int, state: VehicleState) -> Reading:
         if self._picture is None or now_ns - self._picture[0] > _PICTURE_FRESH_NS:
@@ -331,6 +334,9 @@ class Monitor:
         if self._newest is None or self._level is None or self._limits.gnss_is_ours:
             return Reading(None)
         return self._gnss.read(self._newest, state, self._level.horizontal_m, now_ns)
+
+    def _tilts(self, state: VehicleState) -> Reading:
+        return Reading(self._tilt.tilts, self._tilt.off_deg)
 
     def _ekf_jump(self, state: VehicleState, now_ns: int) -> Reading:
         verdict = self._verdict

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from companion.guardian.config import MotionConfig
 from companion.guardian.inertial import InertialTrack, Moved
-from companion.guardian.place import LocalPlace
+from companion.guardian.place_checks import LocalPlace
 from mavlink_bridge.messages import VisionFix
 
 Array = NDArray[np.float64]

@@ -9,9 +9,9 @@ import numpy as np
 
 from companion.guardian.config import GuardianConfig
 from companion.guardian.findings import Reading
-from companion.guardian.place import LocalPlace
 from mavlink_bridge.injection.shadow import gnss_healthy
 from mavlink_bridge.messages import VehicleState, VisionFix
+from mavlink_bridge.vehicle.origin import north_east
 
 _FORGET_S = 120.0  # the barometer's drift against vision: its zero follows with this time
 _MEDIAN_OF = 15
@@ -21,6 +21,24 @@ _SIGMAS = 4.0
 _GNSS_FLOOR_M = 1.0
 _GNSS_SIGMA_M = 2.5  # where the receiver does not say
 _GNSS_AGE_S = 0.2  # of a report when it comes, beyond what its four sigmas cover
+
+
+class LocalPlace:
+    """A flat frame about the first fix."""
+
+    def __init__(self) -> None:
+        self._anchor: tuple[float, float] | None = None
+
+    def ned(self, fix: VisionFix) -> tuple[float, float, float]:
+        """North, east of the first fix, and down of the ellipsoid; metres."""
+        north, east = self.north_east(fix.latitude_deg, fix.longitude_deg)
+        return north, east, -fix.height_m
+
+    def north_east(self, latitude_deg: float, longitude_deg: float) -> tuple[float, float]:
+        """North and east of the first fix, metres."""
+        if self._anchor is None:
+            self._anchor = (latitude_deg, longitude_deg)
+        return north_east(*self._anchor, latitude_deg, longitude_deg)
 
 
 class HeightCheck:

@@ -16,7 +16,7 @@ from mavlink_bridge.messages import (
     VehicleState,
     VisionFix,
 )
-from mavlink_bridge.vehicle.origin import offset
+from mavlink_bridge.vehicle.origin import north_east, offset
 
 Array = NDArray[np.float64]
 Path = Callable[[float], tuple[float, float]]
@@ -170,3 +170,14 @@ class Flight:
 
     def _tell(self, line: Line) -> None:
         self.lines.append((self.at_s, line.text))
+
+
+def outside(flight: Flight) -> list[float]:
+    """Seconds at which a position was let through farther off than its level."""
+    found = []
+    for fix in flight.passed:
+        true = offset(LATITUDE, LONGITUDE, *flight.path(fix.time_ns * 1e-9))
+        error = np.hypot(*north_east(*true, fix.latitude_deg, fix.longitude_deg))
+        if fix.protection_m is not None and error > fix.protection_m[0]:
+            found.append(fix.time_ns * 1e-9)
+    return found

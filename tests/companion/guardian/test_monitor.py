@@ -13,7 +13,7 @@ from companion.geometry import GIMBAL_FROM_CAMERA
 from companion.guardian.config import GuardianConfig
 from companion.guardian.monitor import Limits, Monitor
 from localizer.geometry.pose import matrix_from_quaternion, so3_exp
-from mavlink_bridge.vehicle.origin import north_east, offset
+from mavlink_bridge.vehicle.origin import offset
 from tests.companion.guardian.simulated import (
     HEIGHT,
     LATITUDE,
@@ -22,6 +22,7 @@ from tests.companion.guardian.simulated import (
     Path,
     hover,
     leg,
+    outside,
     second,
 )
 
@@ -178,17 +179,6 @@ def test_a_jump_within_the_alert_limit_passes_if_it_is_announced() -> None:
 def late(from_s: float, until_s: float = np.inf) -> Path:
     """What a stream that lags 0.3 s shows of `leg`, stamped as if it did not."""
     return lambda at_s: leg(at_s - 0.3 if from_s <= at_s < until_s else at_s)
-
-
-def outside(flight: Flight) -> list[float]:
-    """Seconds at which a position was let through farther off than its level."""
-    found = []
-    for fix in flight.passed:
-        true = offset(LATITUDE, LONGITUDE, *flight.path(fix.time_ns * 1e-9))
-        error = np.hypot(*north_east(*true, fix.latitude_deg, fix.longitude_deg))
-        if fix.protection_m is not None and error > fix.protection_m[0]:
-            found.append(fix.time_ns * 1e-9)
-    return found
 
 
 def test_positions_of_a_stream_that_begins_to_lag_are_within_their_level() -> None:

@@ -1,0 +1,60 @@
+"""Vision's roll and pitch against the autopilot's and the gimbal's.
+
+Low over ground that shows little, a tilt and a shift look alike: the position is wrong by the tilt
+times the height, its motion is nearly right, and the picture matches. Gravity knows the tilt.
+"""
+
+from __future__ import annotations
+
+import math
+
+from companion.guardian.config import GuardianConfig
+from mavlink_bridge.messages import Attitude, VehicleState, VisionFix
+
+_SIGMAS, _CALM_SIGMAS = 3.0, 2.0
+
+
+class TiltCheck:
+    """Takes every fix. What the gimbal is off by for good is not learned: a wrong tilt that came
+    slowly and with the first fix (at 1.5 degrees in 2 s, `begins-denied`) would be learned with it.
+    """
+
+    def __init__(self, config: GuardianConfig) -> None:
+        self._sigma_rad = math.radians(config.tilt_deg)
+        # What is larger is a jump, and held; a gimbal that was knocked costs no more.
+        self._most_m = config.untold_jump_m
+        self._off_rad = 0.0
+        self._share = 0.0  # of its sigma
+        self.tilts = False
+        """The newest fix is tilted as neither gimbal nor autopilot explain."""
+
+    @property
+    def off_deg(self) -> float:
+        """By how much the newest fix is tilted."""
+        return math.degrees(self._off_rad)
+
+    def metres(self, state: VehicleState) -> float:
+        """By how much its position may be wrong: the tilt times the height, as far as gimbal and
+        autopilot do not explain it.
+        """
+        believed = (self._share - _CALM_SIGMAS) / (_SIGMAS - _CALM_SIGMAS)
+        shift_m = max(state.altitude_relative_m or 0.0, 0.0) * self._off_rad
+        return min(shift_m * min(max(believed, 0.0), 1.0), self._most_m)
+
+    def add(self, fix: VisionFix, attitude: Attitude | None) -> None:
+        """Another fix, and the autopilot's attitude at its time; without one nothing is known."""
+        if attitude is None or fix.roll_rad is None or fix.pitch_rad is None:
+            self._off_rad, self._share, self.tilts = 0.0, 0.0, False
+            return
+        seen, known = (
+            _level(fix.roll_rad, fix.pitch_rad),
+            _level(attitude.roll_rad, attitude.pitch_rad),
+        )
+        self._off_rad = math.dist(seen, known)
+        self._share = self._off_rad / math.hypot(self._sigma_rad, fix.attitude_sigma_rad)
+        self.tilts = self._share > (_CALM_SIGMAS if self.tilts else _SIGMAS)
+
+
+def _level(roll_rad: float, pitch_rad: float) -> tuple[float, float]:
+    """Where the vertical lies in body axes, forward and right: no heading is in it."""
+    return -math.sin(pitch_rad), math.sin(roll_rad) * math.cos(pitch_rad)
