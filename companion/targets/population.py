@@ -41,6 +41,10 @@ _DEPARTED = 0.85  # correlation: what has just left looks as it did
 _FASTEST_MPS = 25.0
 _MISSED_S = 1.2  # a standing target that is not seen at its place for so long may have left it
 _CHANGED_NS = 3_000_000_000
+_LEAVES_IN, _LEAVES_OFF_M = 3, 1.0  # frames that show it go, and how far beside its way
+_LEAVES_LEAST_MPS = 1.0
+_LATE_S = 0.5  # so much earlier it may have been at its place than it was last found there
+_LEFT, _LEAVES_MPS = 0.5, 5.0  # the chance that it left then, and how fast, axis by axis
 _GROUND_EVERY = 3  # so many of the kept pictures show the ground well enough
 _LOST_S = 4.0
 _SILENT_NS = 2_000_000_000  # what was told and is refused for so long is named,
@@ -109,7 +113,11 @@ class _Life:
     back: _Back | None = None
     unseen_ns: int = 0
     """Since when a standing one has not looked as it did, though nothing hides it; 0: it does."""
-    is_change_said: bool = False
+    changed_ns: int = 0
+    """Since when it may have left, as the operator was told; 0: it has not."""
+    is_slide_said: bool = False
+    leaving: tuple[tuple[int, Array], ...] = ()
+    """When and where (3,) it seemed to have left its place, the newest few."""
 
 
 @dataclass(frozen=True)
@@ -223,6 +231,8 @@ class Population:
             if fix is None:
                 continue
             life.told_ns = time_ns
+            if life.changed_ns:
+                fix = self._doubted(life, fix, self._config.max_sigma_m)
             if fix.visibility is not Visibility.OUTSIDE:
                 life.seen_ns = time_ns
             elif time_ns - life.seen_ns > self._config.timeout_s * 1e9:
@@ -272,7 +282,7 @@ class Population:
         if track.moves:
             found = self._found_moving(life, follower, estimate, gray)
         else:
-            found = self._found_leaving(life, follower, estimate, gray, expected[0])
+            found = self._found_leaving(name, life, (estimate, gray), expected[0])
         fix = None
         if found is not None:
             fix = track.see(estimate, found.pixel, pixel_sigma=_FOLLOWED_PX)
@@ -294,25 +304,32 @@ class Population:
             self.end((name,))
 
     def _found_leaving(
-        self, life: _Life, follower: ImageFollower, estimate: PoseEstimate, gray: Gray,
-        position: Array,
-    ) -> Found | None:  # fmt: skip
+        self, name: str, life: _Life, picture: tuple[PoseEstimate, Gray], position: Array
+    ) -> Found | None:
         """A target that was not measured to move yet, where it is beside its place (3,); None of
         what is still there, or is not found.
         """
+        (estimate, gray), follower = picture, life.follower
+        if follower is None:
+            return None
         time_ns = estimate.exposure_time_ns
         if (left := self._left(life, follower, estimate, gray, position)) is not None:
-            return left
+            return left if self._drives(life, left, position, time_ns) else None
         near = follower.find(gray, estimate, position, _STILL_M)
         is_over = time_ns - life.begun_ns > _DEPARTS_S * 1e9
+        has_changed = follower.watch(gray, estimate, position)
         if near is None:
-            return self._departed(life, follower, estimate, gray, position)
+            left = self._departed(life, follower, estimate, gray, position)
+            drives = left is not None and self._drives(life, left, position, time_ns)
+            return left if drives else None
+        if has_changed:
+            return None
         if life.moved_at_once and not is_over and _off(near.position, position) >= _STANDS_M:
             return near
         # It stands, and geometry holds it better than its look, which slides with every change of
         # view on what is not flat. What moved between pictures has left its place by now: if it is
         # still here, a roof or a crown about it moved against the ground instead.
-        life.found_ns, life.unseen_ns = time_ns, 0
+        self._stands(name, life, time_ns)
         if life.moved_at_once and is_over:
             life.moved_at_once = False
             follower.forget_shape()
@@ -322,7 +339,8 @@ class Population:
         self, name: str, life: _Life, follower: ImageFollower, estimate: PoseEstimate, gray: Gray
     ) -> bool:
         """Whether a target that was never measured to move ends, for the ground is seen again where
-        it was; of another that does not look as it did, the operator is told once.
+        it was. Of another that does not look as it did, the operator is told: if that came at once,
+        it may have left.
         """
         number = clicked_number(name)
         if life.moved_at_once and follower.shows_ground(gray, estimate):
@@ -333,10 +351,54 @@ class Population:
         is_in_view = held is not None and held.visibility is Visibility.HELD
         life.unseen_ns = (life.unseen_ns or estimate.exposure_time_ns) if is_in_view else 0
         missed_ns = estimate.exposure_time_ns - life.unseen_ns if life.unseen_ns else 0
-        if missed_ns > _CHANGED_NS and not life.is_change_said:
-            life.is_change_said = True
+        if missed_ns <= _CHANGED_NS:
+            return False
+        if follower.is_changed and not life.changed_ns:
+            life.changed_ns = life.found_ns
+            self._say(_WARNING, f"PiLoT: target {number} may have left: look changed")
+        elif not life.is_slide_said and not life.changed_ns:
+            # The view of what is not flat changes by and by: its place is as good as before.
+            life.is_slide_said = True
             self._say(_INFO, f"PiLoT: target {number}: place held, its look has changed")
         return False
+
+    @staticmethod
+    def _drives(life: _Life, left: Found, place: Array, time_ns: int) -> bool:
+        """Whether what seems to have left its place (3,) does so at one speed, in one frame after
+        the other. Some look of a roof's corner or of a pitch's lines is elsewhere in single frames.
+        """
+        kept = [seen for seen in life.leaving if time_ns - seen[0] <= _DEPARTS_S * 1e9]
+        life.leaving = (*kept[1 - _LEAVES_IN :], (time_ns, left.position))
+        if len(life.leaving) < _LEAVES_IN:
+            return False
+        times = np.array([(t - time_ns) * 1e-9 for t, _ in life.leaving])
+        at = np.array([position for _, position in life.leaving])
+        velocity = (at[-1] - at[0]) / (times[-1] - times[0])
+        speed = float(np.linalg.norm(velocity))
+        if speed < _LEAVES_LEAST_MPS:
+            return False
+        ahead = np.outer(times, velocity) + at[-1]
+        since_s = float(np.clip((at[-1] - place) @ velocity / speed**2, 0.0, _DEPARTS_S + _LATE_S))
+        off_m = [_off(a, b) for a, b in zip(at, ahead, strict=True)]
+        return max(*off_m, _off(place, at[-1] - since_s * velocity)) <= _LEAVES_OFF_M
+
+    def _stands(self, name: str, life: _Life, time_ns: int) -> None:
+        """It is where it was, and looks as it did."""
+        life.found_ns, life.unseen_ns = time_ns, 0
+        if life.changed_ns:
+            life.changed_ns = 0
+            self._say(_INFO, f"PiLoT: target {clicked_number(name)} is at its place again")
+
+    @staticmethod
+    def _doubted(life: _Life, fix: TargetFix, most_m: float) -> TargetFix:
+        """A held place whose target may have left it: nothing of it is seen, and it may be as far
+        away as it has driven since.
+        """
+        gone_s = (fix.exposure_time_ns - life.changed_ns) * 1e-9
+        sigma_m = min(_LEAVES_MPS * gone_s, most_m)
+        level = np.diag([1.0, 1.0, 0.0]) * _LEFT * sigma_m**2
+        seen = Visibility.HIDDEN if fix.visibility is Visibility.HELD else fix.visibility
+        return replace(fix, visibility=seen, covariance=fix.covariance + level)
 
     def _found_moving(
         self, life: _Life, follower: ImageFollower, estimate: PoseEstimate, gray: Gray

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from localizer.geometry.pose import Array
 from localizer.targets.foreground import Cover, Look, covered, is_distinct, is_ground
+from localizer.targets.standing import StandingLook
 from localizer.targets.track import projected
 from localizer.types import PoseEstimate
 
@@ -91,6 +92,7 @@ class ImageFollower:
         self._isolated_look: Look | None = None  # as it was on that ground
         self._learns_m = 0.5 * self._half_m  # from where it was clicked, once it is so far away
         self._renewed_ns = estimate.exposure_time_ns
+        self._stands = StandingLook()
         self.ready = first is not None and float(first.std()) >= _FLAT
 
     def find(
@@ -232,6 +234,20 @@ class ImageFollower:
         if float(look.inside.sum()) >= _INSIDE:
             self._outline, self._ground, self._isolated_look = mask, ground, look
         return True
+
+    def watch(self, gray: Gray, estimate: PoseEstimate, position: Array) -> bool:
+        """`is_changed`, with the next frame of what stands at a place (3,)."""
+        chart = self._chart(gray, estimate, position, self._half, course=0.0)
+        if chart is not None:
+            self._stands.see(estimate.exposure_time_ns, chart)
+        return self._stands.is_changed
+
+    @property
+    def is_changed(self) -> bool:
+        """Whether what stands looks otherwise since a sudden change: it left, or something is
+        before it.
+        """
+        return self._stands.is_changed
 
     def shows_ground(self, gray: Gray, estimate: PoseEstimate) -> bool:
         """Whether the ground is seen where an isolated target was first, as it was without it."""
