@@ -300,7 +300,7 @@ class _Glimpse(_Slides):
     """What stands, of which something elsewhere once looks the same, before other ground."""
 
     speed = 0.0
-    times_s = (0.2,)
+    times_s: tuple[float, ...] = (0.2,)
 
     def find_before(self, _gray, estimate, *_picture, **_how):
         since_s = round((estimate.exposure_time_ns - self._begun_ns) * 1e-9, 1)
