@@ -245,7 +245,7 @@ class FlightControllerEnd:
         if now_ns >= self._next_check_ns:
             self._next_check_ns = now_ns + _IDLE_NS
             self._check(link, state, now_ns)
-            self._warnings.fixes(profile)
+            self._warnings.fixes(profile, now_ns)
         return sender.injector.next_due_ns(now_ns)
 
     def _check(self, link: Link, state: VehicleState, now_ns: int) -> None:

@@ -80,12 +80,19 @@ class Teller:
             self.inform(relief)
 
     def tell_settled(
-        self, topic: str, problem: str, relief: str, now_ns: int, *, prefix: str = ""
+        self,
+        topic: str,
+        problem: str,
+        relief: str,
+        now_ns: int,
+        *,
+        prefix: str = "",
+        wait_s: float = 1.5,
     ) -> None:
         """As `tell`, for what comes and goes: each problem once until the relief, and that only
-        once it has lasted.
+        once it has lasted, `wait_s` the first time.
         """
-        settling = self._settling.setdefault(topic, Settling())
+        settling = self._settling.setdefault(topic, Settling(wait_s))
         over = settling.is_over(now_ns, bad=bool(problem))
         told = self._since_relief.setdefault(topic, set())
         if problem and without_figures(problem) not in told:

@@ -10,6 +10,7 @@ from mavlink_bridge.vehicle.profile import FirmwareProfile
 
 _RELIEF_SHARE = 0.9  # of a limit, below which its warning ends
 _DELAY_SLACK_MS = 10.0
+_IN_TIME_S = 15.0  # until lateness is over; a computer at its limit is late and in time by turns
 
 
 class FixWarnings:
@@ -32,10 +33,12 @@ class FixWarnings:
             problem = f"{profile.name} does not take {self._config.message.upper()}"
         self._teller.tell("profile", problem)
 
-    def fixes(self, profile: FirmwareProfile) -> None:
+    def fixes(self, profile: FirmwareProfile, now_ns: int) -> None:
         """Fixes that are late, that nothing checks, or that cannot be stamped."""
         tell = self._teller.tell
-        tell("latency", self._latency(profile), "fixes are in time again")
+        late = self._latency(profile)
+        relief = "fixes are in time again"
+        self._teller.tell_settled("latency", late, relief, now_ns, wait_s=_IN_TIME_S)
         blind = "vision yaw is not checked: no attitude or no gimbal angles"
         tell("blind", blind if self._injector.guard.blind else "", "vision yaw is checked")
         unset = self._config.message == "gps_input" and not self._utc.is_set

@@ -244,6 +244,18 @@ def test_a_latency_text_never_names_a_figure_within_its_limit(
     assert told[1:] == ["PiLoT: fixes are 260 ms old, over the 250 ms of VISO_DELAY_MS"]
 
 
+def test_a_latency_that_comes_and_goes_is_told_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A computer at its limit is late and in time by turns: three texts a minute say no more."""
+    flight = Flight(monkeypatch, injection=InjectionConfig(rate_hz=10, delay_ms=100))
+    for latency_ms in (120, 80, 120, 80, 120, 80, 120):
+        flight.latency_ms = latency_ms
+        flight.run(8.0)
+    assert len([t for t in flight.texts if "ms old" in t]) == 1
+    flight.latency_ms = 80
+    flight.run(90.0)
+    assert flight.texts[-1] == "PiLoT: fixes are in time again"
+
+
 @pytest.mark.parametrize("gps_id", [0, 1])
 def test_a_latency_text_names_the_receivers_own_delay(
     monkeypatch: pytest.MonkeyPatch, gps_id: int
