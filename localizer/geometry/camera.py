@@ -214,6 +214,14 @@ class Camera:
         return xd, yd
 
 
+def followed(pinhole: Camera, camera: Camera) -> Camera:
+    """The pinhole, of its own size, that sees what a (distorted) camera sees now: `pinhole` itself
+    while the camera is the one that it was made for, at whatever size.
+    """
+    own = camera.without_distortion().resized(pinhole.width, pinhole.height)
+    return pinhole if own.is_like(pinhole) else own
+
+
 def _opencv_matrix(camera: Camera) -> Array:
     K = camera.K
     K[:2, 2] -= 0.5

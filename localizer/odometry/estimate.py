@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from enum import Enum
 
+from localizer.geometry.camera import Camera
 from localizer.geometry.pose import Array, Pose
 from localizer.geometry.shutter import Sweep
 from localizer.odometry.keyframe import DepthSource
@@ -28,12 +29,14 @@ class OdometryFrame:
     features: of the undistorted picture, in host memory, as for the map registration. time_ns: the
     exposure's. usability: `usability.examine`'s verdict on the picture, None if nobody looked.
     sweep: the camera's motion while its rows were read out; None: they were all at once.
+    camera: the pinhole of the features; None: the odometry's, of a lens that does not zoom.
     """
 
     features: FeaturePyramid
     time_ns: int
     usability: Usability | None = None
     sweep: Sweep | None = None
+    camera: Camera | None = None
 
 
 @dataclass(frozen=True)

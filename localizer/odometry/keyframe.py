@@ -38,9 +38,9 @@ class Keyframe:
 
     anchors: its features at world points, as the map registration's. covariance: (6, 6) of its
     pose, as `PosePrior`'s. source: of its depth. way_m: flown up to it. constraint: what other
-    sensors said of its pose. features, surface: what it was made of. behind: (3,) displacement from
-    the beginning up to it, by the source of depth over which it was measured. unmatched_m2: of the
-    place, up to it, by what did not match (`GrowthModel.unmatched`).
+    sensors said of its pose. features, camera, surface: what it was made of. behind: (3,)
+    displacement from the beginning up to it, by the source of depth over which it was measured.
+    unmatched_m2: of the place, up to it, by what did not match (`GrowthModel.unmatched`).
     """
 
     anchors: Anchors
@@ -50,6 +50,7 @@ class Keyframe:
     source: DepthSource
     way_m: float
     features: FeaturePyramid
+    camera: Camera
     surface: Array | None = None
     constraint: PoseConstraint | None = None
     behind: Mapping[DepthSource, Array] = field(default_factory=dict)

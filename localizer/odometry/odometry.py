@@ -42,10 +42,11 @@ class VisualOdometry:
     milliseconds more where a new keyframe begins. Both belong to one thread (the localization
     thread); nothing is rendered here, and no thread is started.
 
-    camera: the working pinhole of the features. optimizer: see `odometry_optimizer`. ground: a
-    terrain model for where the map has no geometry, of which the shape counts: it is raised or
-    lowered to the ground where the map was last seen; None: a plane at the height that a
-    rangefinder meets on the way, else at that of the ground where the map was last seen.
+    camera: the working pinhole of features whose frame names none. optimizer: see
+    `odometry_optimizer`. ground: a terrain model for where the map has no geometry, of which the
+    shape counts: it is raised or lowered to the ground where the map was last seen; None: a plane
+    at the height that a rangefinder meets on the way, else at that of the ground where the map was
+    last seen.
 
     Above 200 lines: one frame's way, from keyframe to estimate, over one state.
     """
@@ -144,10 +145,11 @@ class VisualOdometry:
             return self._failed(
                 OdometryStatus.UNUSABLE_IMAGE, frame.usability.fault.value, frame, prior, keyframe
             )
+        camera = frame.camera or self._camera
         result = self._optimizer.register(
             frame.features,
-            self._camera,
-            swept(keyframe.anchors, frame.sweep, prior.world_from_camera, self._camera),
+            camera,
+            swept(keyframe.anchors, frame.sweep, prior.world_from_camera, camera),
             prior,
             motion=prior,
             seed=self._seed + frame.time_ns % 1_000_003,
@@ -188,8 +190,9 @@ class VisualOdometry:
         surface: Array | None, constraint: PoseConstraint | None,
     ) -> Keyframe | None:  # fmt: skip
         ground, below = self._below(frame.time_ns)
+        camera = frame.camera or self._camera
         anchors, source = keyframe_anchors(
-            frame.features, self._camera, pose, surface, ground,
+            frame.features, camera, pose, surface, ground,
             self.config.anchors, self._seed, frame.sweep,
         )  # fmt: skip
         source = below if source is DepthSource.GROUND else source
@@ -197,7 +200,7 @@ class VisualOdometry:
         if len(anchors.points_world) < 2 * self._optimizer.config.min_anchors:
             return None
         return Keyframe(
-            anchors, pose, covariance, frame.time_ns, source, way_m, frame.features,
+            anchors, pose, covariance, frame.time_ns, source, way_m, frame.features, camera,
             surface if source is DepthSource.MAP else None, constraint, behind,
         )  # fmt: skip
 
@@ -217,9 +220,8 @@ class VisualOdometry:
             return track
         found = align(
             self._optimizer.backend,
-            self._camera,
-            View(keyframe.features, keyframe.world_from_camera),
-            View(frame.features, track.pose),
+            View(keyframe.features, keyframe.world_from_camera, keyframe.camera),
+            View(frame.features, track.pose, frame.camera or self._camera),
             keyframe.surface,
             keyframe.covariance,
             noise,

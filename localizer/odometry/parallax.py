@@ -43,10 +43,11 @@ _RADIAN_M = 100.0  # weighs turns against shifts where the axes of a covariance 
 
 @dataclass(frozen=True)
 class View:
-    """A picture's features and its pose, world_from_camera."""
+    """A picture's features, its pose, world_from_camera, and its pinhole."""
 
     features: FeaturePyramid
     pose: Pose
+    camera: Camera
 
 
 @dataclass(frozen=True)
@@ -59,8 +60,7 @@ class Alignment:
 
 
 def align(
-    backend: Backend, camera: Camera, first: View, second: View, points: Array, prior: Array,
-    noise: float,
+    backend: Backend, first: View, second: View, points: Array, prior: Array, noise: float
 ) -> Alignment | None:  # fmt: skip
     """Both pictures' poses on surface points (N, 3) of the map; None where it cannot be told.
 
@@ -68,7 +68,7 @@ def align(
     changes. prior: (6, 6) covariance of the first's pose. noise: sigma of a sample of the cost, as
     a share of it. It takes 29 scores of 1,500 points.
     """
-    cost = _Cost(backend, camera, first, second, points)
+    cost = _Cost(backend, first, second, points)
     axes = _axes(prior)
     plan, design, pairs = _plan(len(axes))
     samples = np.array([cost(step @ axes)[0] for step in plan])
@@ -117,10 +117,8 @@ def _moved(pose: Pose, step: Array) -> Pose:
 class _Cost:
     """How badly the second picture fits the first, draped over the shape from another pose."""
 
-    def __init__(
-        self, backend: Backend, camera: Camera, first: View, second: View, points: Array
-    ) -> None:
-        self._backend, self._camera = backend, camera
+    def __init__(self, backend: Backend, first: View, second: View, points: Array) -> None:
+        self._backend, self._cameras = backend, (first.camera, second.camera)
         self._first, self._second = first.pose, second.pose
         self._features = [_finest(view.features) for view in (first, second)]
         stride = max(1, -(-len(points) // _POINTS))
@@ -136,12 +134,12 @@ class _Cost:
         turn = first.rotation @ self._first.rotation.T
         arm = self._second.translation - self._first.translation
         second = Pose(turn @ self._second.rotation, first.translation + turn @ arm)
-        points, pixels = in_view(self._points, first, self._camera)
+        points, pixels = in_view(self._points, first, self._cameras[0])
         if not len(points):
             return np.inf, second
         anchors = anchors_at(points, pixels, self._features[0])
         origin = local_origin(anchors, second)
-        problem = level_problems(self._features[1], self._camera, anchors, origin)[0]
+        problem = level_problems(self._features[1], self._cameras[1], anchors, origin)[0]
         R, t = camera_from_local(second.rotation[None], second.translation[None], origin)
         if self._scale is None:  # the same for all, or they could not be compared
             self._scale = max(median_residual(problem, R[0], t[0]), _LEAST_SCALE)

@@ -13,7 +13,7 @@ from enum import Enum
 import numpy as np
 
 from localizer.errors import OdometryError
-from localizer.geometry.camera import Camera
+from localizer.geometry.camera import Camera, followed
 from localizer.geometry.pose import Array, Pose
 from localizer.geometry.shutter import Sweep
 from localizer.odometry import (
@@ -66,14 +66,15 @@ _TILT_RAD, _HEADING_RAD, _HEIGHT_M = float(np.radians(0.4)), float(np.radians(3.
 class Bridging:
     """The odometry beside the map's registration; one thread, the localization thread's.
 
-    sensors: other sensors' accounts of the camera, terrain: the ground's shape, see `Localizer`.
+    camera: the working pinhole, which follows a lens that zooms. sensors: other sensors' accounts
+    of the camera, terrain: the ground's shape, see `Localizer`.
     """
 
     def __init__(
         self, camera: Camera, optimizer: JNGO, config: OdometryConfig, threads: int,
         sensors: OtherSensors, terrain: Ground | None = None,
     ) -> None:  # fmt: skip
-        self._sensors = sensors
+        self._sensors, self._pinhole = sensors, camera
         registration = odometry_optimizer(optimizer, threads)
         self._odometry = VisualOdometry(camera, registration, config, terrain)
         self._longest_sigma_m = config.longest_sigma_m
@@ -88,7 +89,8 @@ class Bridging:
         sweep: Sweep | None = None,
     ) -> None:  # fmt: skip
         """The map has just said where this frame was: whatever was bridged before is over."""
-        frame = OdometryFrame(query, estimate.exposure_time_ns, sweep=sweep)
+        camera = followed(self._pinhole, estimate.camera)
+        frame = OdometryFrame(query, estimate.exposure_time_ns, sweep=sweep, camera=camera)
         self._odometry.begin(
             frame,
             estimate.world_from_camera,
@@ -105,7 +107,8 @@ class Bridging:
         """Carry the pose on to a frame. anchors: of the reference at the prediction, if any."""
         if not self._odometry.ready:
             return _NOTHING
-        seen = OdometryFrame(query, frame.exposure_time_ns, examine(frame.image), sweep)
+        camera = followed(self._pinhole, frame.camera)
+        seen = OdometryFrame(query, frame.exposure_time_ns, examine(frame.image), sweep, camera)
         surface = anchors.points_world if anchors is not None else None
         constraint = self._constraint(frame.exposure_time_ns)
         try:

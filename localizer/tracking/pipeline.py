@@ -24,7 +24,7 @@ from localizer.errors import (
     OutsideMapError,
 )
 from localizer.features.extractor import DeviceExtractor, FeatureExtractor
-from localizer.geometry.camera import Camera
+from localizer.geometry.camera import Camera, followed
 from localizer.geometry.geo import LocalFrame
 from localizer.odometry import Ground
 from localizer.registration.anchors import select_anchors, swept
@@ -123,7 +123,7 @@ def _shrink(image: Image, camera: Camera) -> Image:
 
 
 def only_seen(pyramid: FeaturePyramid, seen: NDArray[np.bool_] | None) -> FeaturePyramid:
-    """The features without confidence where a longer lens shows nothing: black is no ground, and
+    """The features without confidence where the lens shows nothing: black is no ground, and
     anchors that meet it would vote against the pose.
     """
     if seen is None:
@@ -181,7 +181,9 @@ class Localizer:
         self._optimizer = optimizer
         self._config = config
         self._sensors = sensors or OtherSensors()
-        self.camera = working_camera(camera, config.width)
+        self._pinhole = working_camera(camera, config.width)
+        self.camera = self._pinhole
+        """The working pinhole of the newest frame: another where its lens has zoomed."""
         self._undistorter = Undistorter(camera, self.camera)
         self._reference: ReferenceBundle | None = None  # the last one of `track`
         self._asked_ns = 0  # what time the last reference was asked for
@@ -195,7 +197,7 @@ class Localizer:
         if config.odometry is None or optimizer.on_gpu:
             return None
         return Bridging(
-            self.camera, optimizer, config.odometry, config.threads, self._sensors, terrain
+            self._pinhole, optimizer, config.odometry, config.threads, self._sensors, terrain
         )
 
     def __enter__(self) -> Localizer:
@@ -288,6 +290,7 @@ class Localizer:
         """
         stage_ms: dict[str, float] = {}
         features: FeaturePyramid | None = None
+        self.camera = followed(self._pinhole, frame.camera)
         for remaining in range(passes - 1, -1, -1):
             prior = self.predict(frame.exposure_time_ns)
             if prior is None:
@@ -329,7 +332,7 @@ class Localizer:
         interval_ns, self._asked_ns = time_ns - self._asked_ns, time_ns
         if last is None or not steady or shift_px == 0:
             return self.make_reference(prior, wait=wait)
-        if still_serves(last, pose, time_ns, shift_px):
+        if still_serves(last, pose, self.camera, time_ns, shift_px):
             return last
         later = self.predict(time_ns + _LEAD_NS)
         if later is not None:
@@ -370,9 +373,10 @@ class Localizer:
 
         They may be on the GPU, and are then valid until the next call.
         """
-        undistorter = self._undistorter
+        undistorter, camera = self._undistorter, followed(self._pinhole, frame.camera)
+        self.camera = camera
         if not frame.camera.is_like(undistorter.source):  # another size in flight, or a zoom
-            undistorter = self._undistorter = Undistorter(frame.camera, self.camera)
+            undistorter = self._undistorter = Undistorter(frame.camera, camera)
         image = undistorter(frame)
         if self._optimizer.on_gpu and isinstance(self._extractor, DeviceExtractor):
             return self._extractor.extract_on_device(image)
@@ -390,6 +394,7 @@ class Localizer:
         if ahead is None:
             raise OutsideMapError(_NO_PRIOR)
         stage_ms: dict[str, float] = {}
+        camera = followed(self._pinhole, frame.camera)
         result, sweep = None, self._tracker.sweep(frame, ahead)
         if anchors is not None:
             with stopwatch(stage_ms, "register"):
@@ -397,7 +402,7 @@ class Localizer:
                 seen_anchors = swept(anchors, sweep, about, frame.camera)
                 result = self._optimizer.register(
                     query,
-                    self.camera,
+                    camera,
                     seen_anchors,
                     ahead.prior,
                     motion=ahead.prior if seen.standing.trusts_prediction else None,
@@ -405,18 +410,18 @@ class Localizer:
                     seed=self._config.seed + frame.sequence,
                 )
                 if seen.standing.on_trial and not seen.standing.independent:
-                    result = self._optimizer.focal_tested(query, self.camera, seen_anchors, result)
+                    result = self._optimizer.focal_tested(query, camera, seen_anchors, result)
         estimate = self._tracker.judge(seen, ahead, frame, query, anchors, result)
         if anchors is not None and estimate.status is RegistrationStatus.OK:
             # Added to what is told and not to what is filtered: the next frame errs alike.
             moving = (ahead.velocity, ahead.rate)
             unknown = calibration_covariance(
                 self._config.calibration, anchors.points_world, estimate.world_from_camera,
-                self.camera, sweep, moving,
+                camera, sweep, moving,
             )  # fmt: skip
             estimate = replace(estimate, covariance=estimate.covariance + unknown)
             if result is not None and self._is_focal_due(estimate):
-                focal = self._optimizer.focal_fitted(query, self.camera, seen_anchors, result)
+                focal = self._optimizer.focal_fitted(query, camera, seen_anchors, result)
                 estimate = replace(estimate, focal=focal)
         return replace(estimate, stage_ms=stage_ms)
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from localizer.geometry.camera import Camera
 from localizer.geometry.pose import Pose
 from localizer.types import ReferenceBundle
 
@@ -13,16 +14,19 @@ _LEAD = 0.75  # of the limit
 _LONGEST_NS = 1_000_000_000  # finer tiles may have come, also for a camera that hovers
 
 
-def still_serves(bundle: ReferenceBundle, pose: Pose, time_ns: int, most_px: float) -> bool:
+def still_serves(
+    bundle: ReferenceBundle, pose: Pose, camera: Camera, time_ns: int, most_px: float
+) -> bool:
     """Whether a camera at `pose` sees the reference's anchors within `most_px` of where they are in
-    the reference, 95 of 100 of them.
+    the reference, 95 of 100 of them. camera: the pinhole of now, which may have zoomed since.
 
     Anchors are points of the map, so the registration does not care where they were seen from, as
     long as they look alike and the picture's border does not run dry.
     """
     if most_px <= 0 or not 0 <= time_ns - bundle.time_ns <= _LONGEST_NS:
         return False
-    return _apart_px(bundle, bundle.view.world_from_camera, pose) <= most_px
+    view = bundle.view
+    return _apart_px(bundle, (view.world_from_camera, view.camera), (pose, camera)) <= most_px
 
 
 def lead_share(
@@ -35,18 +39,21 @@ def lead_share(
     it would serve one frame only without that, it is rendered where that frame is: a few
     millimetres better. frame: share of the way that lies between two frames.
     """
-    apart = _apart_px(bundle, pose, later)
+    camera = bundle.view.camera
+    apart = _apart_px(bundle, (pose, camera), (later, camera))
     if apart * frame > most_px:
         return 0.0
     return min(_LEAD * most_px / max(apart, 1e-9), 1.0)
 
 
-def _apart_px(bundle: ReferenceBundle, one: Pose, other: Pose) -> float:
-    """How far apart cameras at both poses see the anchors, 95 of 100 of them; inf for too few."""
+def _apart_px(
+    bundle: ReferenceBundle, one: tuple[Pose, Camera], other: tuple[Pose, Camera]
+) -> float:
+    """How far apart two cameras see the anchors, 95 of 100 of them; inf for too few."""
     points = bundle.anchors.points_world
     if len(points) < _LEAST_PROBES:
         return np.inf
-    some, camera = points[:: max(1, len(points) // _PROBES)], bundle.view.camera
-    seen = [camera.project(pose.inverse.apply(some))[0] for pose in (one, other)]
+    some = points[:: max(1, len(points) // _PROBES)]
+    seen = [camera.project(pose.inverse.apply(some))[0] for pose, camera in (one, other)]
     away = np.linalg.norm(seen[0] - seen[1], axis=1)  # NaN behind the camera
     return float(np.quantile(np.nan_to_num(away, nan=np.inf), 0.95, method="lower"))

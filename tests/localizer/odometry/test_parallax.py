@@ -35,10 +35,11 @@ def aligned(flight: Flight, step: Array, covariance: Array) -> Alignment | None:
     moved = Pose(turn @ first.rotation, first.translation + step[:3])
     arm = turn @ (second.translation - first.translation)
     after = Pose(turn @ second.rotation, moved.translation + arm)
-    return align(
-        NumbaBackend(1), CAMERA, View(flight.frame(FIRST).features, moved),
-        View(flight.frame(SECOND).features, after), flight.surface(FIRST), covariance, NOISE,
-    )  # fmt: skip
+    views = (
+        View(flight.frame(FIRST).features, moved, CAMERA),
+        View(flight.frame(SECOND).features, after, CAMERA),
+    )
+    return align(NumbaBackend(1), *views, flight.surface(FIRST), covariance, NOISE)
 
 
 def off(pose: Pose, truth: Pose) -> Array:
@@ -82,5 +83,5 @@ def test_a_keyframe_that_is_right_stays_there(mountains: Flight) -> None:
 def test_nothing_is_told_where_nothing_is_seen(mountains: Flight) -> None:
     covariance, _ = prior(mountains, 0.2, 0.1)
     elsewhere = mountains.surface(FIRST) + np.array([5000.0, 0.0, 0.0])
-    view = View(mountains.frame(FIRST).features, mountains.pose(FIRST))
-    assert align(NumbaBackend(1), CAMERA, view, view, elsewhere, covariance, NOISE) is None
+    view = View(mountains.frame(FIRST).features, mountains.pose(FIRST), CAMERA)
+    assert align(NumbaBackend(1), view, view, elsewhere, covariance, NOISE) is None
