@@ -10,13 +10,29 @@ class CompanionError(Exception):
 class StreamError(CompanionError):
     """Base of everything that can be wrong with a camera feed."""
 
+    def retold(self, text: str) -> StreamError:
+        """The same error in other words."""
+        return type(self)(text)
+
 
 class StreamOpenError(StreamError):
     """A source that does not exist, cannot be opened, or is of an unknown kind."""
 
 
 class StreamSizeError(StreamError):
-    """A stream whose frames are of another size than the camera model says."""
+    """A stream whose frames are of another size than the camera model says. size: theirs."""
+
+    def __init__(self, text: str, size: tuple[int, int] | None = None) -> None:
+        super().__init__(text)
+        self.size = size
+
+    def retold(self, text: str) -> StreamSizeError:
+        """The same error in other words."""
+        return StreamSizeError(text, self.size)
+
+
+class StreamDepthError(StreamError):
+    """A stream of 16-bit grey of which it is not said which counts are black and white."""
 
 
 class StreamDecodeError(StreamError):

@@ -9,14 +9,13 @@ counter-clockwise from north (docs/reference/angles.md).
 import sys
 from pathlib import Path
 
-import cv2
-
 from localizer import Camera, Frame, Geodetic, PosePrior, PoseRow, open_localizer, pose_of_row
+from localizer.pictures import read_rgb
 
 photo, cache, camera_file, *numbers = sys.argv[1:] if len(sys.argv) == 10 else sys.exit(__doc__)
 latitude, longitude, height, roll, pitch, yaw = map(float, numbers)
 camera = Camera.from_json(Path(camera_file))
-image = cv2.cvtColor(cv2.imread(photo), cv2.COLOR_BGR2RGB)
+image = read_rgb(Path(photo))
 with open_localizer(cache, camera) as localizer:
     about = PoseRow(photo, Geodetic(latitude, longitude, height), roll, pitch, yaw)
     localizer.set_prior(PosePrior.around(pose_of_row(about, localizer.frame)))

@@ -21,12 +21,12 @@ _HEAD = """# API of `localizer`
 Made from the docstrings by `python -m localizer.api_page docs/reference/api.md`; do not edit.
 Everything here is imported as `from localizer import NAME` and stays; what is not here may change.
 Frames, heights and time are those of [architecture.md](../explanation/architecture.md), angles
-those of [angles.md](angles.md); [examples/](../../examples) shows it at work. One photo
-([localize_photo.py](../../examples/localize_photo.py)):
+those of [angles.md](angles.md); [examples/](../../examples) shows it at work. One photo,
+`read_rgb` being `localizer.pictures`' ([localize_photo.py](../../examples/localize_photo.py)):
 
 ```python
 camera = Camera.from_json("camera.json")
-image = cv2.cvtColor(cv2.imread(photo), cv2.COLOR_BGR2RGB)
+image = read_rgb(Path(photo))
 with open_localizer(cache, camera) as localizer:
     about = PoseRow(photo, Geodetic(latitude, longitude, height), roll, pitch, yaw)
     localizer.set_prior(PosePrior.around(pose_of_row(about, localizer.frame)))

@@ -59,6 +59,10 @@ class SequenceError(LocalizerError):
     """An evaluation sequence that lacks a part or contradicts itself."""
 
 
+class GreyRangeError(LocalizerError):
+    """Grey counts of a sensor of which it is not said what is black and what is white."""
+
+
 class DeviceArrayError(LocalizerError):
     """An array in GPU memory that the kernels cannot read in place."""
 

@@ -2,24 +2,79 @@
 
 from __future__ import annotations
 
+from functools import lru_cache
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
+from numpy.typing import NDArray
 
-from localizer.errors import SequenceError
+from localizer.errors import GreyRangeError, SequenceError
 from localizer.types import Image
+
+GreyRange = tuple[int, int]  # counts of a 16-bit grey picture that become black and white
+_COUNTS = 1 << 16
 
 
 def read_rgb(path: Path) -> Image:
-    """RGB image (H, W, 3) of a file, turned as its EXIF data say; `SequenceError` if it is none."""
+    """RGB image (H, W, 3) of a file, turned as its EXIF data say; `SequenceError` if it is none, or
+    of 16-bit grey: there is nobody to ask for the range.
+    """
     try:
-        bgr = cv2.imdecode(np.frombuffer(path.read_bytes(), np.uint8), cv2.IMREAD_COLOR)
+        rgb = decode_rgb(path.read_bytes())
+    except GreyRangeError as error:
+        raise SequenceError(f"{path}: {error}; write it with 8 bits") from error
     except (OSError, cv2.error) as error:
         raise SequenceError(f"{path}: cannot be read: {error}") from error
-    if bgr is None:
+    if rgb is None:
         raise SequenceError(f"{path}: not an image, or damaged")
-    return np.asarray(cv2.cvtColor(bgr, cv2.COLOR_BGR2RGB), np.uint8)
+    return rgb
+
+
+def decode_rgb(
+    data: bytes, *, turned: bool = True, grey_range: GreyRange | None = None
+) -> Image | None:
+    """RGB image (H, W, 3) of a file's content, grey ones with three equal channels; None if it is
+    no image. turned: as its EXIF data say. `GreyRangeError` for 16-bit grey without a range.
+    """
+    flags = cv2.IMREAD_ANYCOLOR | cv2.IMREAD_ANYDEPTH
+    if not turned:
+        flags |= cv2.IMREAD_IGNORE_ORIENTATION
+    found: NDArray[Any] | None = cv2.imdecode(np.frombuffer(data, np.uint8), flags)
+    if found is None:
+        return None
+    if found.ndim == 2:
+        grey = found if found.dtype == np.uint8 else grey_levels(found, grey_range)
+        return np.asarray(cv2.cvtColor(grey, cv2.COLOR_GRAY2RGB), np.uint8)
+    if found.dtype == np.uint16:  # colour of 16 bits fills them
+        found = (found >> 8).astype(np.uint8)
+    if found.dtype != np.uint8:
+        return None
+    return np.asarray(cv2.cvtColor(found, cv2.COLOR_BGR2RGB), np.uint8)
+
+
+def grey_levels(counts: NDArray[Any], grey_range: GreyRange | None) -> Image:
+    """(H, W) uint8 of a sensor's counts (H, W), linear between the two of `grey_range`.
+
+    A thermal camera fills a few thousand of the 65536: by their upper bits alone its picture would
+    have some ten levels of grey. So `GreyRangeError` where the range is not said.
+    """
+    if counts.dtype != np.uint16:
+        raise GreyRangeError(f"grey of {counts.dtype} counts; 8 or 16 bits without sign are read")
+    if grey_range is None:
+        raise GreyRangeError(
+            f"16-bit grey, here {counts.min()} to {counts.max()}, without a range: which counts "
+            "are black and white is not said"
+        )
+    return np.asarray(_table(grey_range)[counts], np.uint8)
+
+
+@lru_cache(maxsize=4)
+def _table(grey_range: GreyRange) -> Image:
+    low, high = grey_range
+    share = (np.arange(_COUNTS, dtype=np.float32) - low) / np.float32(high - low)
+    return np.asarray(np.clip(share, 0.0, 1.0) * 255.0 + 0.5, np.uint8)
 
 
 def write_rgb(path: Path, rgb: Image, jpeg_quality: int = 95) -> None:

@@ -13,6 +13,7 @@ from enum import Enum
 import numpy as np
 from numpy.typing import NDArray
 
+from localizer.errors import GreyRangeError
 from localizer.geometry.camera import Camera
 from localizer.geometry.pose import Array, Pose
 
@@ -22,12 +23,24 @@ Image = NDArray[np.uint8]
 
 @dataclass(frozen=True)
 class Frame:
-    """One video frame. image: (height, width, 3) uint8 RGB, as the (distorted) camera saw it."""
+    """One video frame. image: (height, width, 3) uint8 RGB, as the (distorted) camera saw it; a
+    grey one (height, width) gets three equal channels, counts of 16 bits are a `GreyRangeError`.
+    """
 
     image: Image
     exposure_time_ns: int
     camera: Camera
     sequence: int
+
+    def __post_init__(self) -> None:
+        if self.image.dtype != np.uint8:
+            raise GreyRangeError(
+                f"frame {self.sequence}: a picture of {self.image.dtype}; give 8 bits a channel, a "
+                "thermal sensor's counts stretched between what shall be black and white"
+            )
+        if self.image.ndim == 2:
+            rgb = np.repeat(self.image[..., None], 3, axis=2)
+            object.__setattr__(self, "image", rgb)
 
 
 @dataclass(frozen=True)

@@ -6,13 +6,14 @@ import threading
 from dataclasses import dataclass
 from pathlib import Path
 
-from companion.errors import StreamError
+from companion.errors import StreamError, StreamSizeError
 from companion.sources import SourceSettings, open_source
 from companion.sources.folder_source import list_images, read_image
 from localizer.geometry.camera import Camera
 
 _FIRST_PICTURE_S = 10.0
 _GUESS = Camera.from_fov(1280, 720, 65.0)  # any: a picture says its size, this only names one
+_ANY_GREY = (0, 65535)  # of a size, levels do not matter
 
 
 @dataclass(frozen=True)
@@ -26,15 +27,19 @@ class Seen:
 def first_picture(source: str) -> Seen:
     """The size of the stream's pictures; StreamError where none comes in time."""
     if "://" not in source and Path(source).is_dir():  # pictures are taken at their own size there
-        height, width = read_image(list_images(Path(source))[0]).shape[:2]
+        height, width = read_image(list_images(Path(source))[0], _ANY_GREY).shape[:2]
         return Seen(width, height)
-    feed = open_source(source, _GUESS, SourceSettings())
+    feed = open_source(source, _GUESS, SourceSettings(grey_range=_ANY_GREY))
     timer = threading.Timer(_FIRST_PICTURE_S, feed.close)
     timer.start()
     try:
         for frame in feed.frames():
             height, width = frame.image.shape[:2]
             return Seen(width, height)
+    except StreamSizeError as error:  # of another shape than the guess, as most thermal ones are
+        if error.size is None:
+            raise
+        return Seen(*error.size)
     finally:
         timer.cancel()
         feed.close()

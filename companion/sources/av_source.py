@@ -12,13 +12,21 @@ from fractions import Fraction
 from pathlib import Path
 
 import av
+import cv2
 import numpy as np
 from av.sidedata.sidedata import Type as SideDataType
 from av.video.frame import PictureType
 
-from companion.errors import StreamDecodeError, StreamError, StreamOpenError, StreamSizeError
+from companion.errors import (
+    StreamDecodeError,
+    StreamDepthError,
+    StreamError,
+    StreamOpenError,
+    StreamSizeError,
+)
 from companion.redaction import redacted
 from companion.sources.base import (
+    GREY_RANGE_ADVICE,
     PacketTap,
     SourceCounters,
     SourceSettings,
@@ -37,6 +45,7 @@ from companion.sources.misp import MispTime, parse_message
 from companion.sources.references import Damage, References
 from companion.sources.timing import ExposureClock, Stamps
 from localizer.geometry.camera import Camera
+from localizer.pictures import GreyRange, grey_levels
 from localizer.tracking.mailbox import Mailbox
 from localizer.types import Frame, Image
 
@@ -151,7 +160,7 @@ class VideoFileSource:
         self._closed = threading.Event()
         self._counters = SourceCounters()
         self._state = StreamState.IDLE
-        self._to_rgb = av.video.reformatter.VideoReformatter()
+        self._rgb = _ToRgb(self._settings.grey_range)
 
     @property
     def counters(self) -> SourceCounters:
@@ -189,7 +198,7 @@ class VideoFileSource:
         start = time.monotonic_ns()
         first: int | None = None
         for picture in self._readable(decoder):
-            camera = fitted_camera(picture.width, picture.height, self._camera, str(self._path))
+            camera = self._rgb.camera(picture, self._camera, str(self._path))
             self._tell_scaling(camera)
             pts = self._pts_ns(picture, decoder)
             first = pts if first is None else first
@@ -199,7 +208,7 @@ class VideoFileSource:
             if self._closed.is_set():
                 return
             n = self._counters.delivered
-            frame = Frame(_rgb(picture, self._to_rgb), start + offset, camera, n)
+            frame = Frame(self._rgb(picture), start + offset, camera, n)
             self._counters = replace(self._counters, received=n + 1, delivered=n + 1)
             _tell(self._tap, picture, frame.exposure_time_ns)
             yield frame
@@ -275,7 +284,7 @@ class LiveVideoSource:
         self._counters = SourceCounters()
         self._state = StreamState.IDLE
         self._last_picture_ns = 0
-        self._to_rgb = av.video.reformatter.VideoReformatter()
+        self._rgb = _ToRgb(self._settings.grey_range)
 
     @property
     def counters(self) -> SourceCounters:
@@ -300,7 +309,7 @@ class LiveVideoSource:
         while (item := self._newest.take()) is not None:
             picture, camera, exposure_ns, sequence = item
             # Converted here and not in the reader: pictures that are dropped cost no conversion.
-            image = _rgb(picture, self._to_rgb)
+            image = self._rgb(picture)
             self._count(delivered=1)
             yield Frame(image, exposure_ns, camera, sequence)
 
@@ -347,7 +356,7 @@ class LiveVideoSource:
                 connections += 1
             except StreamError as error:
                 self._report(StreamState.FAILED, str(error))
-                self._newest.close(type(error)(redacted(str(error))))
+                self._newest.close(error.retold(redacted(str(error))))
                 return
             except (av.error.ExitError, SilentSenderError):  # the open time-out
                 reason = f"nothing came within {_OPEN_TIMEOUT_S:g} s; is the camera sending there?"
@@ -417,10 +426,10 @@ class LiveVideoSource:
             self._report_change(StreamState.SCALED, text)
 
     def _fitted(self, picture: av.VideoFrame) -> Camera | None:
-        """The picture's camera. None for another shape, which in flight must not end the feed."""
+        """The picture's camera. None for another kind, which in flight must not end the feed."""
         try:
-            return fitted_camera(picture.width, picture.height, self._camera, self._location)
-        except StreamSizeError as error:
+            return self._rgb.camera(picture, self._camera, self._location)
+        except (StreamSizeError, StreamDepthError) as error:
             if not self._counters.received:
                 raise
             self._count(misfits=1)
@@ -478,8 +487,38 @@ def live_input(
     return _Input(str(device), size, format="v4l2", device=True)
 
 
-def _rgb(picture: av.VideoFrame, reformatter: av.video.reformatter.VideoReformatter) -> Image:
-    return np.ascontiguousarray(reformatter.reformat(picture, format="rgb24").to_ndarray())
+class _ToRgb:
+    """Decoded pictures as RGB (H, W, 3) uint8."""
+
+    def __init__(self, grey_range: GreyRange | None) -> None:
+        self._grey_range = grey_range
+        self._reformatter = av.video.reformatter.VideoReformatter()
+
+    def __call__(self, picture: av.VideoFrame) -> Image:
+        if _is_counts(picture):
+            counts = self._reformatter.reformat(picture, format="gray16le").to_ndarray()
+            return np.asarray(
+                cv2.cvtColor(grey_levels(counts, self._grey_range), cv2.COLOR_GRAY2RGB), np.uint8
+            )
+        return np.ascontiguousarray(
+            self._reformatter.reformat(picture, format="rgb24").to_ndarray()
+        )
+
+    def camera(self, picture: av.VideoFrame, camera: Camera, where: str) -> Camera:
+        """As of `fitted_camera`; `StreamDepthError` for 16-bit grey without a range."""
+        if self._grey_range is None and _is_counts(picture):
+            raise StreamDepthError(
+                f"{where}: {picture.format.name}, 16-bit grey without a range; {GREY_RANGE_ADVICE}"
+            )
+        return fitted_camera(picture.width, picture.height, camera, where)
+
+
+def _is_counts(picture: av.VideoFrame) -> bool:
+    """Whether the pictures are a sensor's 16-bit counts. Grey of 9 to 14 bits is a codec's (H.264,
+    H.265), whose white is known.
+    """
+    parts = picture.format.components
+    return len(parts) == 1 and bool(parts[0].is_luma) and parts[0].bits == 16
 
 
 def _pts_ns(picture: av.VideoFrame) -> int | None:

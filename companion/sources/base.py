@@ -6,7 +6,7 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from enum import Enum
 from fractions import Fraction
-from typing import Protocol
+from typing import Annotated, Protocol
 
 import av
 from pydantic import BaseModel, ConfigDict, Field, field_validator
@@ -16,7 +16,14 @@ from companion.sources.datagrams import parse_sender
 from companion.sources.timing import Timing
 from localizer.errors import CameraError
 from localizer.geometry.camera import Camera
+from localizer.pictures import GreyRange
 from localizer.types import Frame
+
+# What is said of 16-bit grey pictures without a range.
+GREY_RANGE_ADVICE = (
+    "set camera.settings.grey_range: [black, white] where a deployment reads them, or let the "
+    "camera or a converter write 8 bits"
+)
 
 # Relative difference of width / height that rounding to even sizes makes; 1080 padded to 1088
 # lines (0.7 %) lies outside.
@@ -60,6 +67,9 @@ class SourceCounters:
     misfits: int = 0
     reconnects: int = 0
     foreign: int = 0
+
+
+Count = Annotated[int, Field(ge=0, le=65535)]  # of a 16-bit sensor
 
 
 class SourceSettings(BaseModel):
@@ -107,10 +117,22 @@ class SourceSettings(BaseModel):
         description="UDP: whose video is taken, ADDRESS or ADDRESS:PORT; null: the first one's",
     )
 
+    grey_range: tuple[Count, Count] | None = Field(
+        default=None,
+        description="16-bit grey pictures: the counts that are black and white; null: refused",
+    )
+
     @property
     def late_ns(self) -> int:
         """`stamps_late_ms` in ns."""
         return round(1e6 * self.stamps_late_ms)
+
+    @field_validator("grey_range")
+    @classmethod
+    def _is_a_range(cls, value: GreyRange | None) -> GreyRange | None:
+        if value is not None and value[0] >= value[1]:
+            raise ValueError(f"black at {value[0]} must lie below white at {value[1]}")
+        return value
 
     @field_validator("sender")
     @classmethod
@@ -196,12 +218,14 @@ def fitted_camera(width: int, height: int, camera: Camera, where: str) -> Camera
         raise StreamSizeError(
             f"{where} delivers {width}x{height} but the camera model is "
             f"{camera.width}x{camera.height}: set the stream to the calibrated size, or give the "
-            f"camera model of {width}x{height} (intrinsics do not carry over to a cropped size)"
+            f"camera model of {width}x{height} (intrinsics do not carry over to a cropped size)",
+            (width, height),
         )
     try:
         return camera.resized(width, height)
     except CameraError as error:
-        raise StreamSizeError(f"{where} delivers {width}x{height}: {error}") from error
+        text = f"{where} delivers {width}x{height}: {error}"
+        raise StreamSizeError(text, (width, height)) from error
 
 
 def scaling_text(width: int, height: int, camera: Camera, where: str) -> str:

@@ -9,10 +9,10 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import cv2
-import numpy as np
 
 from companion.errors import StreamDecodeError, StreamOpenError
 from companion.sources.base import (
+    GREY_RANGE_ADVICE,
     SourceCounters,
     SourceSettings,
     StateCallback,
@@ -20,7 +20,9 @@ from companion.sources.base import (
     fitted_camera,
     scaling_text,
 )
+from localizer.errors import GreyRangeError
 from localizer.geometry.camera import Camera
+from localizer.pictures import GreyRange, decode_rgb
 from localizer.plain_files import plain_bytes, plain_text
 from localizer.types import Frame, Image
 
@@ -41,17 +43,20 @@ def list_images(folder: Path) -> list[Path]:
     return sorted(images, key=_natural_key)
 
 
-def read_image(path: Path) -> Image:
-    """RGB image (H, W, 3) uint8 in the sensor's own orientation (EXIF rotation is not applied)."""
-    flags = cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION
+def read_image(path: Path, grey_range: GreyRange | None = None) -> Image:
+    """RGB image (H, W, 3) uint8 in the sensor's own orientation (EXIF rotation is not applied).
+
+    grey_range: `SourceSettings.grey_range`; 16-bit grey without it is a `StreamDecodeError`.
+    """
     try:
-        # imdecode, because imread prints a warning for what becomes a named error here.
-        bgr = cv2.imdecode(np.frombuffer(plain_bytes(path), np.uint8), flags)
+        rgb = decode_rgb(plain_bytes(path), turned=False, grey_range=grey_range)
+    except GreyRangeError as error:
+        raise StreamDecodeError(f"{path}: {error}; {GREY_RANGE_ADVICE}") from error
     except (OSError, cv2.error) as error:
         raise StreamDecodeError(f"{path}: cannot be read: {error}") from error
-    if bgr is None:
+    if rgb is None:
         raise StreamDecodeError(f"{path}: not an image, or damaged; remove or replace it")
-    return np.asarray(cv2.cvtColor(bgr, cv2.COLOR_BGR2RGB))
+    return rgb
 
 
 def read_timestamps(path: Path) -> dict[str, int]:
@@ -131,7 +136,7 @@ class FolderSource:
 
     def _load(self, path: Path, time_ns: int, sequence: int) -> Frame:
         try:
-            image = read_image(path)
+            image = read_image(path, self._settings.grey_range)
             height, width = image.shape[:2]
             camera = fitted_camera(width, height, self._camera, str(path))
         except Exception as error:
