@@ -46,21 +46,24 @@ class FixWarnings:
         tell("utc", problem if unset else "")
 
     def _latency(self, profile: FirmwareProfile) -> str:
-        latency, delay = self._injector.latency_ms, self._config.delay_ms
-        if latency is None or not self._injector.latency_is_known:
+        latency, least = self._injector.latency_ms, self._injector.least_latency_ms
+        if latency is None or least is None or not self._injector.latency_is_known:
             return ""
+        delay = self._config.delay_ms
+        # Where the firmware goes by the least lag, its positions lag by what that is late.
+        lag = least if profile.least_lag else latency
         name = profile.delay_parameter
         if self._config.message == "gps_input":
             name = profile.gps_delay_parameter.format(n=self._config.gps_id + 1)
         told = self._teller.told("latency")
-        late = f"fixes are {latency:.0f} ms old: raise delay_ms ({delay:.0f}) and {name}"
+        late = f"fixes are {lag:.0f} ms old: raise delay_ms ({delay:.0f}) and {name}"
         over = f"fixes are {latency:.0f} ms old, over the {profile.max_delay_ms:.0f} ms of {name}"
         over_is_told = told == without_figures(over)
         if latency > profile.max_delay_ms * (_RELIEF_SHARE if over_is_told else 1.0):
             return over
         limit = delay + _DELAY_SLACK_MS
-        if latency > limit:
+        if lag > limit:
             return late
-        if told and latency > _RELIEF_SHARE * limit:  # not yet over, but nothing new to say
+        if told and lag > _RELIEF_SHARE * limit:  # not yet over, but nothing new to say
             return over if over_is_told else late
         return ""

@@ -118,6 +118,11 @@ class Injector:
         return statistics.median(self._latencies_ms) if self._latencies_ms else None
 
     @property
+    def least_latency_ms(self) -> float | None:
+        """The youngest of the last 50 fixes when it came; None before the first."""
+        return min(self._latencies_ms, default=None)
+
+    @property
     def latency_is_known(self) -> bool:
         """Whether enough fixes came to judge by."""
         return len(self._latencies_ms) == _LATENCIES

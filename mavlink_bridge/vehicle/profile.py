@@ -25,6 +25,8 @@ class FirmwareProfile:
     covariance: how it turns the message's diagonal into an error (see `covariance_entry`).
     max_delay_ms: age beyond which a measurement cannot be fused any more.
     messages: the injections it accepts. odometry_frame: MAV_FRAME it accepts for position.
+    least_lag: the delay parameter stands for the least lag of its last messages; it maps the others
+    by their stamps (ArduPilot's AP_HAL JitterCorrection, over 100 messages).
     """
 
     name: str
@@ -35,6 +37,7 @@ class FirmwareProfile:
     odometry_frame: int
     delay_parameter: str
     gps_delay_parameter: str  # {n}: the receiver, gps_id + 1
+    least_lag: bool = False
     known: bool = True
 
 
@@ -53,6 +56,7 @@ ARDUPILOT = FirmwareProfile(
     odometry_frame=mavlink.MAV_FRAME_LOCAL_FRD,
     delay_parameter="VISO_DELAY_MS",
     gps_delay_parameter="GPS{n}_DELAY_MS",
+    least_lag=True,
 )
 # Pull request 32084 (merged February 2026) replaced the cube root.
 ARDUPILOT_SQRT = FirmwareProfile(
@@ -64,6 +68,7 @@ ARDUPILOT_SQRT = FirmwareProfile(
     odometry_frame=mavlink.MAV_FRAME_LOCAL_FRD,
     delay_parameter="VISO_DELAY_MS",
     gps_delay_parameter="GPS{n}_DELAY_MS",
+    least_lag=True,
 )
 PX4 = FirmwareProfile(
     name="PX4 1.15+",

@@ -50,7 +50,8 @@ class FixModel(BaseModel):
 
     rate_hz: float = Field(10.0, gt=0, le=50)
     sigma_m: float = Field(0.5, ge=0, description="1 sigma of each position axis")
-    latency_ms: float = Field(100.0, ge=0, le=2000, description="exposure to hand-over")
+    latency_ms: float = Field(100.0, ge=0, le=2000, description="exposure to hand-over, at least")
+    latency_spread_ms: float = Field(0.0, ge=0, le=2000, description="up to so much more, drawn")
     velocity_sigma_mps: float | None = Field(None, gt=0)
     attitude_sigma_deg: float = Field(1.15, ge=0)
     rotation_deg: float = 0.0
@@ -89,6 +90,13 @@ class Observer:
 
     def __init__(self, seed: int) -> None:
         self._rng = np.random.default_rng(seed)
+        self._lags = np.random.default_rng([seed, 1])
+
+    def latency_s(self, model: FixModel) -> float:
+        """From an exposure to the hand-over of its fix, seconds."""
+        spread = model.latency_spread_ms
+        drawn = self._lags.uniform(0.0, spread) if spread else 0.0
+        return (model.latency_ms + drawn) * 1e-3
 
     def observe(self, truth: Truth, origin: Location, model: FixModel) -> Observation:
         """What a localizer with the errors of `model` makes of the truth, about `origin`."""
@@ -157,7 +165,7 @@ class BridgeFeed:
             with self._lock:
                 model = self._model
             exposure += 1.0 / model.rate_hz
-            due = exposure + model.latency_ms * 1e-3
+            due = exposure + self._observer.latency_s(model)
             if self._stop.wait(max(0.0, due - time.monotonic())):
                 return
             truth = self.pilot.record.truth_at(int(exposure * 1e9))
@@ -262,7 +270,7 @@ class TruthFeed:
         if origin is None or model.silent:
             return
         seen = self._observer.observe(truth, origin, model)
-        due_s = truth.boot_s + model.latency_ms * 1e-3
+        due_s = truth.boot_s + self._observer.latency_s(model)
         self._queue.append(_Due(due_s, truth.boot_s, seen, self._resets % 256))
 
     def _send(self, due: _Due) -> None:

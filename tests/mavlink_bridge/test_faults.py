@@ -256,6 +256,19 @@ def test_a_latency_that_comes_and_goes_is_told_once(monkeypatch: pytest.MonkeyPa
     assert flight.texts[-1] == "PiLoT: fixes are in time again"
 
 
+@pytest.mark.parametrize(("delay_ms", "texts"), [(100, 0), (45, 1)])
+def test_what_counts_is_the_least_lag(
+    monkeypatch: pytest.MonkeyPatch, delay_ms: float, texts: int
+) -> None:
+    """ArduPilot takes the least lag for VISO_DELAY_MS: later fixes beside it cost no position."""
+    flight = Flight(monkeypatch, injection=InjectionConfig(rate_hz=10, delay_ms=delay_ms))
+    flight.run(5.0)
+    for latency_ms in itertools.islice(itertools.cycle((70, 125, 140, 150)), 100):
+        flight.latency_ms = latency_ms
+        flight.run(0.1)
+    assert len([t for t in flight.texts if "ms old" in t]) == texts
+
+
 @pytest.mark.parametrize("gps_id", [0, 1])
 def test_a_latency_text_names_the_receivers_own_delay(
     monkeypatch: pytest.MonkeyPatch, gps_id: int
