@@ -73,19 +73,19 @@ def alignment_loss(
     """Eq. 3: Barron's loss of the reprojection error after each LM iteration on one level.
 
     reference: anchor features (B, N, C) and confidences (B, N); query: maps (B, C, h, w) and
-    (B, h, w); start: (B, 4, 4) initial query_from_reference. Returns the loss and the pixel error
-    (image pixels, mean over visible anchors) after the last iteration.
+    (B, h, w); start: (B, 4, 4) initial query_from_reference. Returns the loss and each pair's pixel
+    error (B,) (image pixels, mean over visible anchors) after the last iteration.
     """
     pose = start
     total = reference[0].new_zeros(())
-    errors = total
+    errors = total.expand(len(start))
     for k in range(iterations):
         pose = lm_step(pose, batch.points, reference, query, batch.K_query / stride)
         pixels, _ = project(pose, batch.points, batch.K_query)
         squared = ((pixels - batch.query_pixels) ** 2).sum(-1).clamp(max=1e5)
         weight = 1.0 if k == iterations - 1 else 0.5
         total = total + weight * _mean(barron(squared, stride / 2), batch.visible, cap=20.0)
-        errors = _mean(squared.detach().sqrt(), batch.visible)
+        errors = _per_pair(squared.detach().sqrt(), batch.visible)
     return total, errors
 
 
@@ -244,7 +244,11 @@ def window_similarity(reference: Tensor, query: Tensor, truth: Tensor) -> Tensor
 
 def _mean(values: Tensor, mask: Tensor, cap: float | None = None) -> Tensor:
     """Mean over masked anchors of each pair, capped per pair, then over pairs."""
-    per_pair = (values * mask).sum(1) / mask.sum(1).clamp(min=1.0)
+    per_pair = _per_pair(values, mask)
     if cap is not None:
         per_pair = per_pair.clamp(max=cap)
     return per_pair.mean()
+
+
+def _per_pair(values: Tensor, mask: Tensor) -> Tensor:
+    return (values * mask).sum(1) / mask.sum(1).clamp(min=1.0)

@@ -22,7 +22,7 @@ def plot(log: Path) -> Path:
         raise SequenceError(f"{log}: not a run's CSV: {error}") from error
     if not rows or "step" not in rows[0]:
         raise SequenceError(f"{log}: not a run's CSV: holds no row with a step")
-    names = [k for k in rows[0] if k not in ("step", "seconds")]
+    names = [k for k in rows[0] if k not in ("step", "seconds", "core_seconds")]
     figure, axes = plt.subplots(-(-len(names) // 4), 4, figsize=(14, 2.4 * -(-len(names) // 4)))
     for axis, name in zip(axes.flat, names, strict=False):
         axis.plot([r["step"] for r in rows], [r[name] for r in rows], lw=1)

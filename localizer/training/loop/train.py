@@ -15,13 +15,15 @@ from torch import Tensor, nn
 from localizer.errors import ModelError
 from localizer.training.checkpoint import fill, read_checkpoint, write_checkpoint
 from localizer.training.config import OptimizerSection, TrainConfig
-from localizer.training.data.streams import open_stream
+from localizer.training.data.batches import ShardStream
+from localizer.training.data.streams import hard_pairs, open_stream
 from localizer.training.distributed import Workers
 from localizer.training.loop.distill import Teacher, distillation_loss
 from localizer.training.losses import Batch, alignment_loss, contrast_loss, sample, se3_exp
 from localizer.training.models.networks import build
 
 _log = logging.getLogger(__name__)
+_LOST = 3.0  # of its begin: a pair that ended this far off counts as no worse than another
 
 
 class Trainer:
@@ -57,8 +59,9 @@ class Trainer:
         self.teacher = None
         if config.distill is not None:
             self.teacher = Teacher(config.distill.teacher, self.model.strides, self.device)
+        self.hard = hard_pairs(config.data)
         self.step = 0
-        self.seconds = 0.0
+        self.seconds = self.core_seconds = 0.0  # by the clock, and of the processor
         self._resume()
 
     @property
@@ -75,28 +78,32 @@ class Trainer:
         if steps is not None:
             last = min(last, self.step + steps)
         self.config.output.mkdir(parents=True, exist_ok=True)  # its error now, not after hours
-        stream = open_stream(self.config, self.workers, generating)
+        stream = open_stream(self.config, self.workers, generating, self.hard)
         rows: list[dict[str, float]] = []
         began = time.monotonic() - self.seconds
+        core_began = time.process_time() - self.core_seconds
         try:
             while self.step < last:
-                rows.append(self._train_step(stream.batch(self.step)))
+                row, errors = self._train_step(stream.batch(self.step))
+                rows.append(row)
+                if self.hard is not None and isinstance(stream, ShardStream):
+                    self.hard.note(self.step, stream.drawn(self.step), errors)
                 self.step += 1
                 self.seconds = time.monotonic() - began
-                if self.step % self.config.checkpoint_steps == 0 or self.step == last:
-                    self._save()
+                self.core_seconds = time.process_time() - core_began
+                self._save(at_the_end=self.step == last)
                 if self.step % 25 == 0 or self.step == last:
                     self._log(rows)
                     rows = []
         finally:
             stream.close()
 
-    def _train_step(self, batch: Batch) -> dict[str, float]:
+    def _train_step(self, batch: Batch) -> tuple[dict[str, float], list[float]]:
         o = self.config.optimizer
         batch = Batch(*(t.to(self.device) for t in vars(batch).values()))
         for group in self.optimizer.param_groups:
             group["lr"] = learning_rate(self.step, o)
-        loss, parts = self._loss(batch)
+        loss, parts, errors = self._loss(batch)
         self.optimizer.zero_grad()
         loss.backward()
         parameters = [*self.model.parameters(), self.log_scale]
@@ -107,9 +114,10 @@ class Trainer:
             self._update_average()
         else:
             _log.warning("step %d skipped: gradient is not finite", self.step)
-        return parts | {"loss": float(loss.detach()), "gradient": float(norm)}
+        return parts | {"loss": float(loss.detach()), "gradient": float(norm)}, errors.tolist()
 
-    def _loss(self, batch: Batch) -> tuple[Tensor, dict[str, float]]:
+    def _loss(self, batch: Batch) -> tuple[Tensor, dict[str, float], Tensor]:
+        """The loss, its parts, and how far off each pair ends, as a share of its begin."""
         o = self.config.optimizer
         pairs = batch.points.shape[0]
         with torch.autocast(self.device.type, torch.bfloat16, enabled=o.mixed_precision):
@@ -118,6 +126,7 @@ class Trainer:
         ramp = alignment_ramp(self.step, o)
         generator = torch.Generator().manual_seed(self.config.seed * 1_000_003 + self.step)
         total, parts = batch.points.new_zeros(()), {}
+        left = batch.points.new_zeros(pairs)
         strides = self.model.strides
         for k, ((features, confidence), stride) in enumerate(zip(levels, strides, strict=True)):
             at = batch.reference_pixels / stride
@@ -144,8 +153,9 @@ class Trainer:
                 parts[f"distill_{k}"] = float(lesson.detach())
             parts[f"contrast_{k}"] = float(contrast.detach())
             parts[f"alignment_{k}"] = float(alignment.detach())
-            parts[f"error_px_{k}"] = float(error)
-        return total, parts
+            parts[f"error_px_{k}"] = float(error.mean())
+            left += (error / max(o.start_error_px[k], 1e-3)).clamp(max=_LOST) / len(strides)
+        return total, parts, left
 
     def _update_average(self) -> None:
         decay = min(self.config.optimizer.ema_decay, (1 + self.step) / (10 + self.step))
@@ -158,21 +168,28 @@ class Trainer:
                 else:
                     mean.copy_(value)
 
-    def _save(self) -> None:
-        if self.workers.rank > 0:
+    def _save(self, *, at_the_end: bool) -> None:
+        kept = self.config.kept_steps is not None and self.step % self.config.kept_steps == 0
+        due = at_the_end or self.step % self.config.checkpoint_steps == 0
+        if self.workers.rank > 0 or not (kept or due):
             return
-        write_checkpoint(
-            self.checkpoint,
-            {
-                "model": self.model.state_dict(),
-                "average": self.average.state_dict(),
-                "log_scale": self.log_scale.detach(),
-                "optimizer": self.optimizer.state_dict(),
-                "step": self.step,
-                "seconds": self.seconds,
-                "config": self.config.model_dump(mode="json"),
-            },
-        )
+        if kept:
+            name = f"{self.config.name}-{self.step:06d}.pt"
+            write_checkpoint(self.checkpoint.with_name(name), self._state())
+        write_checkpoint(self.checkpoint, self._state())
+
+    def _state(self) -> dict[str, object]:
+        return {
+            "model": self.model.state_dict(),
+            "average": self.average.state_dict(),
+            "log_scale": self.log_scale.detach(),
+            "optimizer": self.optimizer.state_dict(),
+            "hard": None if self.hard is None else self.hard.state(),
+            "step": self.step,
+            "seconds": self.seconds,
+            "core_seconds": self.core_seconds,
+            "config": self.config.model_dump(mode="json"),
+        }
 
     def _resume(self) -> None:
         if not self.checkpoint.exists():
@@ -185,6 +202,9 @@ class Trainer:
                 self.log_scale.copy_(state["log_scale"])
             self.optimizer.load_state_dict(state["optimizer"])
             self.step, self.seconds = int(state["step"]), float(state["seconds"])
+            self.core_seconds = float(state.get("core_seconds", self.seconds))
+            if self.hard is not None and state.get("hard"):
+                self.hard.restore(state["hard"])
         except (KeyError, RuntimeError, TypeError, ValueError, AttributeError) as error:
             raise ModelError(
                 f"{self.checkpoint}: no state to continue from ({type(error).__name__}: {error}); "
@@ -196,7 +216,8 @@ class Trainer:
         if self.workers.rank > 0:
             return
         means: dict[str, float] = {k: float(np.mean([r[k] for r in rows])) for k in rows[0]}
-        row = {"step": float(self.step), "seconds": round(self.seconds, 1)} | means
+        spent = {"seconds": round(self.seconds, 1), "core_seconds": round(self.core_seconds, 1)}
+        row = {"step": float(self.step)} | spent | means
         path = self.config.output / f"{self.config.name}.csv"
         new = not path.exists()
         path.parent.mkdir(parents=True, exist_ok=True)
