@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 import logging
 import time
 from concurrent.futures import Future
@@ -19,6 +18,7 @@ from localizer.training.data.batches import ShardStream
 from localizer.training.data.streams import hard_pairs, open_stream
 from localizer.training.distributed import Workers
 from localizer.training.loop.distill import Teacher, distillation_loss
+from localizer.training.loop.log import append
 from localizer.training.losses import Batch, alignment_loss, contrast_loss, sample, se3_exp
 from localizer.training.models.networks import build
 
@@ -218,14 +218,7 @@ class Trainer:
         means: dict[str, float] = {k: float(np.mean([r[k] for r in rows])) for k in rows[0]}
         spent = {"seconds": round(self.seconds, 1), "core_seconds": round(self.core_seconds, 1)}
         row = {"step": float(self.step)} | spent | means
-        path = self.config.output / f"{self.config.name}.csv"
-        new = not path.exists()
-        path.parent.mkdir(parents=True, exist_ok=True)
-        with path.open("a", newline="") as file:
-            writer = csv.DictWriter(file, row.keys())
-            if new:
-                writer.writeheader()
-            writer.writerow({k: f"{v:.5g}" for k, v in row.items()})
+        append(self.config.output / f"{self.config.name}.csv", row)
         shown = " ".join(f"{k} {v:.3g}" for k, v in row.items())
         _log.info("%s", shown)
 
