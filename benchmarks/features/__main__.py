@@ -6,6 +6,7 @@
     python -m benchmarks.features --real ../shared/data/caliterra --pairs 320   (real photos)
     python -m benchmarks.features --real ../shared/data/quito --pairs 280       (real mesh)
     python -m benchmarks.features --real ../shared/data/textures/neon_sjer_pairs --pairs 80
+    python -m benchmarks.features --widths 320 640 --baselines --models shipped NEW.onnx
     python -m benchmarks.features --speed
 
 Every pair shows a place that no training run has seen, its query under its own light, weather and
@@ -13,7 +14,8 @@ season (feature_real.py says what the real sets are). The reference is rendered 
 the query's true pose. The direct methods go through the same `JNGO`, gradient and network with the
 fixed detail level and the number of anchors as in flight; the matchers go through PnP-RANSAC on the
 rendered depth. Generated pairs and real maps are kept below --cache. A checkpoint is chosen on
-`--split validation`; `test` is for the final report.
+`--split validation`; `test` is for the final report. `--widths` makes the pictures as wide as the
+widest and shrinks the very same pairs for the others.
 """
 
 from __future__ import annotations
@@ -39,10 +41,12 @@ with needs_torch():
     from benchmarks.features.pairs import (
         DEGREES,
         METRES,
+        SIZE,
         MadePlaces,
         TestPair,
         made_pairs,
         mesh_pairs,
+        narrowed,
     )
     from benchmarks.features.real import real_pairs
     from benchmarks.features.report import Outcome, read_outcomes, report, write_outcomes
@@ -141,6 +145,9 @@ def parser() -> Parser:
     p.add_argument(
         "--models", nargs="*", type=_model, default=[SHIPPED], help="ONNX files, or `shipped`"
     )
+    p.add_argument(
+        "--widths", type=whole(64, 4096), nargs="+", default=[SIZE[0]], help="of the pictures"
+    )
     kind = p.add_mutually_exclusive_group()
     kind.add_argument("--real", type=existing, help="folder of a real set, instead of made places")
     kind.add_argument("--mesh", action="store_true", help="a mesh world instead of height fields")
@@ -157,17 +164,25 @@ def _model(text: str) -> Path:
 
 
 def make_pairs(args: argparse.Namespace) -> tuple[str, list[TestPair]]:
-    """The set's name, and its pairs."""
+    """The set's name, and its pairs, as wide as the widest that is asked for."""
+    size = (max(args.widths), max(args.widths) * SIZE[1] // SIZE[0])
     if args.mesh:
-        return "mesh world", mesh_pairs(args.pairs, args.seed, shared_detail=args.shared_detail)
+        return "mesh world", mesh_pairs(
+            args.pairs, args.seed, shared_detail=args.shared_detail, size=size
+        )
     if args.real is not None:
         return args.real.resolve().name, real_pairs(
-            args.real, args.pairs, args.seed, args.cache, shared_detail=args.shared_detail
+            args.real,
+            args.pairs,
+            args.seed,
+            args.cache,
+            shared_detail=args.shared_detail,
+            size=size,
         )
     textures = args.textures if args.textures.is_dir() else None
     if textures is None:
         _log.warning("%s is absent: places without real textures", args.textures)
-    which = MadePlaces(args.split, args.seed, args.shared_detail, textures)
+    which = MadePlaces(args.split, args.seed, args.shared_detail, textures, size)
     return "generated", made_pairs(args.pairs, which, args.cache)
 
 
@@ -187,7 +202,10 @@ def main() -> None:
         return
     methods = build_methods(args.baselines, args.models, args.anchors)
     source, pairs = make_pairs(args)
-    outcomes = evaluate(methods, pairs, source, args.seed)
+    outcomes = []
+    for width in args.widths:
+        name = source if len(args.widths) == 1 else f"{source}, {width} wide"
+        outcomes += evaluate(methods, [narrowed(p, width) for p in pairs], name, args.seed)
     if args.out:
         write_outcomes(outcomes, args.out)
     print(report(outcomes))

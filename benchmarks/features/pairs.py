@@ -7,9 +7,10 @@ stands for. `shared_detail` is the easier condition of earlier reports.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
+import cv2
 import numpy as np
 
 from localizer.geometry.pose import Pose
@@ -44,27 +45,30 @@ class TestPair:
 @dataclass(frozen=True)
 class MadePlaces:
     """Which generated pairs: split (test or validation), seed (0, 1, 2, ... other places), whether
-    map and query share their fine texture, and the folder of the real textures, if any.
+    map and query share their fine texture, and the folder of the real textures, if any; size: of
+    the pictures. Wider ones look from further away, so that a pixel is as much ground.
     """
 
     split: str
     seed: int
     shared_detail: bool
     textures: Path | None
+    size: tuple[int, int] = SIZE
 
     @property
     def name(self) -> str:
         """Folder of these pairs in the cache."""
         kind = "easy" if self.shared_detail else "made"
-        return f"{kind}-{self.split}-{self.seed}" + ("" if self.textures else "-untextured")
+        wide = "" if self.size == SIZE else f"-{self.size[0]}"
+        return f"{kind}-{self.split}-{self.seed}{wide}" + ("" if self.textures else "-untextured")
 
     @property
     def scenes(self) -> SceneConfig:
         """Size and variety: each place is seen once under every condition."""
         return SceneConfig(
             cells=768,
-            width=SIZE[0],
-            height=SIZE[1],
+            width=self.size[0],
+            height=self.size[1],
             photo_share=0.4,
             references=len(MADE_CONDITIONS),
             queries_per_light=1,
@@ -92,10 +96,25 @@ def made_pairs(count: int, which: MadePlaces, cache: Path, workers: int = 2) -> 
     return pairs[:count]
 
 
-def mesh_pairs(count: int, seed: int, *, shared_detail: bool) -> list[TestPair]:
+def narrowed(pair: TestPair, width: int) -> TestPair:
+    """The same pair in pictures of `width` pixels."""
+    camera = pair.view.camera
+    if width == camera.width:
+        return pair
+    size = (width, round(camera.height * width / camera.width))
+    rgb, query = (cv2.resize(i, size, interpolation=cv2.INTER_AREA) for i in (
+        pair.view.rgb, pair.query))  # fmt: skip
+    depth = cv2.resize(pair.view.depth, size, interpolation=cv2.INTER_NEAREST_EXACT)
+    view = RenderedView(rgb, depth, pair.view.world_from_camera, camera.resized(*size))
+    return replace(pair, view=view, query=query)
+
+
+def mesh_pairs(
+    count: int, seed: int, *, shared_detail: bool, size: tuple[int, int] = SIZE
+) -> list[TestPair]:
     """Pairs of a generated mesh world that no training run has seen."""
     rng = np.random.default_rng((seed, 2))
-    scenes = MadePlaces("test", seed, shared_detail, None).scenes
+    scenes = MadePlaces("test", seed, shared_detail, None, size).scenes
     made = world_pairs(900_000 + seed, scenes, count=count)
     return [_degraded(pair, rng, k) for k, pair in enumerate(made)]
 

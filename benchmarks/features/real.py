@@ -42,18 +42,24 @@ _MADE = tuple(c for c in CONDITIONS if c != "day")
 
 
 def real_pairs(
-    folder: Path, count: int, seed: int, cache: Path, *, shared_detail: bool
+    folder: Path,
+    count: int,
+    seed: int,
+    cache: Path,
+    *,
+    shared_detail: bool,
+    size: tuple[int, int] = SIZE,
 ) -> list[TestPair]:
     """Pairs of the real set in `folder`, conditions in turn; its map is built in `cache` once."""
     if (folder / "offsets.csv").exists():
-        return _season_pairs(folder, count, seed)
+        return _season_pairs(folder, count, seed, size)
     photos = folder / "queries"
     origin = _origin(folder / "georef.json") if photos.exists() else None
     with TileStreamer(TileCache.open(_map(folder, cache, origin))) as streamer:
         renderer = NumbaRenderer(streamer)
         if photos.exists():
-            return _photo_pairs(renderer, photos, count, seed)
-        return _rendered_pairs(renderer, count, seed, shared_detail=shared_detail)
+            return _photo_pairs(renderer, photos, count, seed, size)
+        return _rendered_pairs(renderer, count, seed, size, shared_detail=shared_detail)
 
 
 def _map(folder: Path, cache: Path, origin: Geodetic | None) -> Path:
@@ -74,8 +80,10 @@ def _map(folder: Path, cache: Path, origin: Geodetic | None) -> Path:
     return built
 
 
-def _photo_pairs(renderer: NumbaRenderer, photos: Path, count: int, seed: int) -> list[TestPair]:
-    camera = Camera.from_json(photos / "camera.json").resized(*SIZE)
+def _photo_pairs(
+    renderer: NumbaRenderer, photos: Path, count: int, seed: int, size: tuple[int, int]
+) -> list[TestPair]:
+    camera = Camera.from_json(photos / "camera.json").resized(*size)
     poses = json.loads((photos / "poses.json").read_text())
     names = sorted(p.name for p in (photos / "images").iterdir())
     kinds = (PHOTO, COARSE_MAP, OLDER_MAP, *_MADE)
@@ -85,7 +93,7 @@ def _photo_pairs(renderer: NumbaRenderer, photos: Path, count: int, seed: int) -
         condition, photo = kinds[k % len(kinds)], k // len(kinds) % len(names)
         truth = Pose.from_matrix(poses[names[photo]]["T_enu_from_cam"])
         image = read_photo(photos / "images" / names[photo])
-        query = cv2.resize(image, SIZE, interpolation=cv2.INTER_AREA)
+        query = cv2.resize(image, size, interpolation=cv2.INTER_AREA)
         if condition in _MADE:
             depth = renderer.render(truth, camera, wait=True).depth
             query = apply_appearance(
@@ -107,14 +115,14 @@ def _surveyed(view: RenderedView, rng: np.random.Generator, *, repainted: bool) 
 
 
 def _rendered_pairs(
-    renderer: NumbaRenderer, count: int, seed: int, *, shared_detail: bool
+    renderer: NumbaRenderer, count: int, seed: int, size: tuple[int, int], *, shared_detail: bool
 ) -> list[TestPair]:
     """Views of the map itself, 80 to 200 m up, under every condition in turn."""
     kinds = (*CONDITIONS, SEASON)
     rng = np.random.default_rng((seed, 1))
     pairs: list[TestPair] = []
     while len(pairs) < count:
-        camera = Camera.from_fov(*SIZE, rng.uniform(40, 75))
+        camera = Camera.from_fov(*size, rng.uniform(40, 75))
         truth = _view(rng)
         start = moved(rng, truth, np.inf, (METRES, DEGREES))
         view, seen = (renderer.render(pose, camera, wait=True) for pose in (start, truth))
@@ -159,7 +167,7 @@ def _view(rng: np.random.Generator) -> Pose:
     return look_at(target, rng.uniform(80, 200) / np.sin(pitch), pitch, rng)
 
 
-def _season_pairs(folder: Path, count: int, seed: int) -> list[TestPair]:
+def _season_pairs(folder: Path, count: int, seed: int, size: tuple[int, int]) -> list[TestPair]:
     """A plot at one date as the map and at the other as the flight, 25 to 40 m above it."""
     plots = sorted(p for p in folder.iterdir() if p.is_dir())[3::4]
     pairs: list[TestPair] = []
@@ -168,7 +176,7 @@ def _season_pairs(folder: Path, count: int, seed: int) -> list[TestPair]:
         plot, dry_map = plots[k // 2 % len(plots)], bool(k % 2)
         dates = [read_photo(p) for p in _dates(plot)]
         surveyed, flown = dates[:: -1 if dry_map else 1]
-        view, query, truth = _plot_pair(surveyed, flown, rng)
+        view, query, truth = _plot_pair(surveyed, flown, rng, size)
         seen = np.full(query.shape[:2], truth.translation[2], np.float32)
         query = apply_appearance(query, seen, tamed(sample_appearance(rng, "day"), seen), rng)
         condition = "dry map, green flight" if dry_map else "green map, dry flight"
@@ -187,11 +195,11 @@ def _dates(plot: Path) -> list[Path]:
 
 
 def _plot_pair(
-    surveyed: Image, flown: Image, rng: np.random.Generator
+    surveyed: Image, flown: Image, rng: np.random.Generator, size: tuple[int, int]
 ) -> tuple[RenderedView, Image, Pose]:
     """Two views of flat ground: all of the query and four fifths of the map's view lie on it."""
     while True:
-        camera = Camera.from_fov(*SIZE, rng.uniform(35, 50))
+        camera = Camera.from_fov(*size, rng.uniform(35, 50))
         pitch = np.radians(rng.uniform(65, 90))
         at = rng.uniform(-12, 12, 2)
         truth = look_at(np.array([*at, 0.0]), rng.uniform(25, 40) / np.sin(pitch), pitch, rng)

@@ -81,11 +81,13 @@ def wilson(hits: int, count: int) -> tuple[float, float]:
     return 100 * max(middle - half, 0.0), 100 * min(middle + half, 1.0)
 
 
-def difference(a: Sequence[Outcome], b: Sequence[Outcome]) -> tuple[float, float, float]:
-    """Points by which `a` beats `b` within 1 m / 1 deg, with a 95 % interval: a bootstrap over
-    places, because the pairs of a place are alike. Both must be of the same pairs in order.
+def difference(
+    a: Sequence[Outcome], b: Sequence[Outcome], limit: float = 1
+) -> tuple[float, float, float]:
+    """Points by which `a` beats `b` within `limit` m and deg, with a 95 % interval: a bootstrap
+    over places, because the pairs of a place are alike. Both must be of the same pairs in order.
     """
-    gain = np.array([x.within(1) - float(y.within(1)) for x, y in zip(a, b, strict=True)])
+    gain = np.array([x.within(limit) - float(y.within(limit)) for x, y in zip(a, b, strict=True)])
     names = [(x.source, x.seed, x.place) for x in a]
     index = {name: k for k, name in enumerate(dict.fromkeys(names))}
     group = np.array([index[name] for name in names])

@@ -53,8 +53,30 @@ def leads(outcomes: Sequence[Outcome]) -> Cells:
     return (f"lead of {last}, points", "n", *(f"over {m}" for m in others)), rows
 
 
+def against(outcomes: Sequence[Outcome]) -> Cells:
+    """The last method against the first, on the same pairs: a row a set, and its hard kinds."""
+    first, *_, last = _methods(outcomes)
+    rows = []
+    for source in _sources(outcomes):
+        mine = [o for o in outcomes if o.source == source]
+        named = {source: mine} | {
+            f"{source}: {kind}": some
+            for kind in ("dusk", "combined")
+            if len(some := [o for o in mine if o.condition == kind]) < len(mine) and some
+        }
+        for name, some in named.items():
+            old, new = ([o for o in some if o.method == m] for m in (first, last))
+            leads = (difference(new, old, limit) for limit in (1, 3))
+            texts = (f"{gain:+.1f} [{low:+.1f}, {high:+.1f}]" for gain, low, high in leads)
+            places = len({(o.seed, o.place) for o in new})
+            rows.append((name, str(len(new)), str(places), _shares(old), _shares(new), *texts))
+    columns = ("pairs", "n", "places", first, last, "points, 1 m and 1°", "points, 3 m and 3°")
+    return columns, rows
+
+
 TABLES: dict[str, Callable[[Sequence[Outcome]], Cells]] = {
     "sets": by_set, "conditions": by_condition, "light": by_light, "leads": leads,
+    "against": against,
 }  # fmt: skip
 
 
