@@ -119,7 +119,7 @@ class FlightControllerEnd:
         result["reset_counter"] = injector.reset_counter
         yaw = injector.yaw_difference_rad
         result["yaw_difference_deg"] = None if yaw is None else math.degrees(yaw)
-        result["fix_latency_ms"] = injector.latency_ms
+        result["fix_latency_ms"] = injector.latency.median_ms
         trip = clock.round_trip_ns
         result["clock_round_trip_ms"] = None if trip is None else trip * 1e-6
         result["clock_rate"] = clock.rate

@@ -1,12 +1,15 @@
-"""Fixes between threads, and that a jump survives the fix that told of it."""
+"""Fixes between threads, how old they come, and that a jump survives the fix that told of it."""
 
 from __future__ import annotations
 
+import statistics
 import threading
 from collections import deque
 from dataclasses import replace
 
 from mavlink_bridge.messages import VisionFix
+
+_AGES = 50
 
 
 class PendingJump:
@@ -67,3 +70,29 @@ class FixQueue:
                 fixes[0] = replace(fixes[0], reset=True)
                 self._jump.told()
         return fixes
+
+
+class Latency:
+    """Ages of the last 50 fixes, from exposure to when they came, milliseconds."""
+
+    def __init__(self) -> None:
+        self._ages_ms: deque[float] = deque(maxlen=_AGES)
+
+    def take(self, age_ms: float) -> None:
+        """Of one fix."""
+        self._ages_ms.append(age_ms)
+
+    @property
+    def is_known(self) -> bool:
+        """Whether enough fixes came to judge by."""
+        return len(self._ages_ms) == _AGES
+
+    @property
+    def median_ms(self) -> float | None:
+        """None before the first fix."""
+        return statistics.median(self._ages_ms) if self._ages_ms else None
+
+    @property
+    def least_ms(self) -> float | None:
+        """Of the youngest; None before the first fix."""
+        return min(self._ages_ms, default=None)

@@ -46,8 +46,9 @@ class FixWarnings:
         tell("utc", problem if unset else "")
 
     def _latency(self, profile: FirmwareProfile) -> str:
-        latency, least = self._injector.latency_ms, self._injector.least_latency_ms
-        if latency is None or least is None or not self._injector.latency_is_known:
+        known = self._injector.latency
+        latency, least = known.median_ms, known.least_ms
+        if latency is None or least is None or not known.is_known:
             return ""
         delay = self._config.delay_ms
         # Where the firmware goes by the least lag, its positions lag by what that is late.

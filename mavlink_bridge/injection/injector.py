@@ -17,7 +17,7 @@ from collections import Counter, deque
 
 from mavlink_bridge.config import InjectionConfig
 from mavlink_bridge.injection.encode import Estimate
-from mavlink_bridge.injection.fix_queue import PendingJump
+from mavlink_bridge.injection.fix_queue import Latency, PendingJump
 from mavlink_bridge.injection.message_maker import (
     Injection,
     InjectionContext,
@@ -33,7 +33,6 @@ from mavlink_bridge.messages import VisionFix
 NO_FIX_YET = "no fix yet"
 NO_FRESH_FIX = "no fresh fix"
 _QUEUE = 32
-_LATENCIES = 50
 _FUTURE_SLACK_NS = 20_000_000
 _INTERVALS, _INTERVALS_KNOWN = 10, 3
 _STALE_NS = 3_000_000_000
@@ -82,7 +81,7 @@ class Injector:
         self._propagator = FixPropagator(config.acceleration_sigma_mps2, config.sigma_floor_m)
         self.guard = YawGuard(config.yaw_guard)
         self._waiting: deque[VisionFix] = deque()
-        self._latencies_ms: deque[float] = deque(maxlen=_LATENCIES)
+        self.latency = Latency()
         self._fresh: VisionFix | None = None
         self._jump = PendingJump()
         self._reset_counter = 0
@@ -112,21 +111,6 @@ class Injector:
         """The yaw difference for which the guard blocks injection; None while it does not."""
         return self.yaw_difference_rad if self.guard.blocked else None
 
-    @property
-    def latency_ms(self) -> float | None:
-        """Median age of the last 50 fixes when they came; None before the first."""
-        return statistics.median(self._latencies_ms) if self._latencies_ms else None
-
-    @property
-    def least_latency_ms(self) -> float | None:
-        """The youngest of the last 50 fixes when it came; None before the first."""
-        return min(self._latencies_ms, default=None)
-
-    @property
-    def latency_is_known(self) -> bool:
-        """Whether enough fixes came to judge by."""
-        return len(self._latencies_ms) == _LATENCIES
-
     def submit(self, fix: VisionFix, now_ns: int) -> None:
         """Queue a fix; one that is late by seconds, from the future or out of order is dropped."""
         unusable = self._unusable(fix, now_ns)
@@ -135,7 +119,7 @@ class Injector:
             self._jump.note(fix)
             return
         self._newest_ns = fix.time_ns
-        self._latencies_ms.append((now_ns - fix.time_ns) * 1e-6)
+        self.latency.take((now_ns - fix.time_ns) * 1e-6)
         self.counters["fixes"] += 1
         self._waiting.append(fix)
         if len(self._waiting) > _QUEUE:
