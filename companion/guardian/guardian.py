@@ -85,12 +85,13 @@ class Guardian:
             with self._asked() as answers:
                 if not answers:
                     return None
-                admitted = self._monitor.admit(fix, state, attitude)
+                blind = self._is_blind
+                admitted = self._monitor.admit(fix, state, attitude, withheld=blind)
         except Exception:
             self._fail("judging")
             return None
         self._works("judging")
-        return None if self._is_blind else admitted
+        return admitted
 
     def submit(self, fix: VisionFix) -> None:
         """Judge a fix and hand it to the bridge, if it may be injected."""

@@ -152,11 +152,17 @@ class Monitor:
         self._calibration.add(sighting)
 
     def admit(
-        self, fix: VisionFix, state: VehicleState, attitude: Attitude | None = None
+        self,
+        fix: VisionFix,
+        state: VehicleState,
+        attitude: Attitude | None = None,
+        *,
+        withheld: bool = False,
     ) -> VisionFix | None:
         """The fix, if it may be injected; with a reset where the last ones were wrong.
 
-        attitude: the autopilot's at the fix's time, None where it is not known.
+        attitude: the autopilot's at the fix's time, None where it is not known; withheld: another
+        has a reason against it, and a reset stays due.
         """
         state, attitude = known_state(state), known_attitude(attitude)
         self._tilt.add(fix, attitude)
@@ -176,6 +182,8 @@ class Monitor:
         self._newest = fix
         if self.action >= Action.WITHHOLD or not admitted:
             self._reset_due = self._reset_due or self._jump_held or self.action is Action.WITHDRAW
+            return None
+        if withheld:
             return None
         resets, self._reset_due = self._reset_due or fix.reset, False
         # The EKF must not believe what is known to be off to what noise alone would leave. The

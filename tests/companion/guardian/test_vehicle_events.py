@@ -195,6 +195,25 @@ def test_a_guardian_that_sees_nothing_for_a_second_withholds_until_it_does(
     assert guardian.judge(FIX) is not None
 
 
+def test_a_reset_that_falls_into_a_blind_time_is_announced_after_it(
+    faulty: tuple[Guardian, Any],
+) -> None:
+    """A jumped place proved itself while nobody watched: the EKF would have fought it, untold."""
+    guardian, bridge = faulty
+    guardian.judge(FIX)
+    jumped = [replace(FIX, time_ns=second(1.0 + k), latitude_deg=47.01) for k in range(1, 9)]
+    assert [guardian.judge(fix) for fix in jumped[:3]] == [None, None, None]
+    bridge.fails_at = {"inertial_since"}
+    for _ in range(10):
+        guardian.turn()
+    assert [guardian.judge(fix) for fix in jumped[3:7]] == [None, None, None, None]
+    bridge.fails_at = set()
+    guardian.turn()
+    passed = guardian.judge(jumped[7])
+    assert passed is not None
+    assert passed.reset
+
+
 def test_a_failure_is_told_again_as_long_as_it_lasts_and_not_more_often(
     faulty: tuple[Guardian, Any],
 ) -> None:
