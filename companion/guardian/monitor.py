@@ -262,7 +262,7 @@ class Monitor:
             f.HEIGHT.name: lambda: self._height_reading if fresh else none,
             f.JUMP.name: lambda: Reading(self._jump_held, self._jumps.distance_m),
             f.STEP.name: lambda: Reading(self._steps.metres > 0.0, self._steps.metres),
-            f.TILT.name: lambda: self._tilts(state) if fresh else none,
+            f.TILT.name: lambda: self._tilts() if fresh else none,
             f.GNSS.name: lambda: self._against_gnss(state, now_ns) if fresh else none,
             f.EKF_REFUSES.name: lambda: self._ekf.refuses(state) if fresh else Reading(False),
             f.EKF_JUMPED.name: lambda: self._ekf_jump(state, now_ns),
@@ -343,8 +343,8 @@ class Monitor:
             return Reading(None)
         return self._gnss.read(self._newest, state, self._level.horizontal_m, now_ns)
 
-    def _tilts(self, state: VehicleState) -> Reading:
-        return Reading(self._tilt.tilts, self._tilt.off_deg)
+    def _tilts(self) -> Reading:
+        return Reading(self._tilt.tilts if self._tilt.is_known else None, self._tilt.off_deg)
 
     def _ekf_jump(self, state: VehicleState, now_ns: int) -> Reading:
         verdict = self._verdict

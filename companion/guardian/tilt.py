@@ -12,6 +12,7 @@ from companion.guardian.config import GuardianConfig
 from mavlink_bridge.messages import Attitude, VehicleState, VisionFix
 
 _SIGMAS, _CALM_SIGMAS = 3.0, 2.0
+_HOLDS_NS = 1_000_000_000  # without an attitude: a link loses some
 
 
 class TiltCheck:
@@ -25,8 +26,13 @@ class TiltCheck:
         self._most_m = config.untold_jump_m
         self._off_rad = 0.0
         self._share = 0.0  # of its sigma
+        self._judged_ns: int | None = None
         self.tilts = False
         """The newest fix is tilted as neither gimbal nor autopilot explain."""
+        self.is_known = False
+        """Whether there was an attitude of late. What the last one said holds until the next: a
+        position is no better because nobody looks.
+        """
 
     @property
     def off_deg(self) -> float:
@@ -38,14 +44,17 @@ class TiltCheck:
         autopilot do not explain it.
         """
         believed = (self._share - _CALM_SIGMAS) / (_SIGMAS - _CALM_SIGMAS)
-        shift_m = max(state.altitude_relative_m or 0.0, 0.0) * self._off_rad
+        height_m = state.altitude_relative_m
+        shift_m = self._most_m if height_m is None else max(height_m, 0.0) * self._off_rad
         return min(shift_m * min(max(believed, 0.0), 1.0), self._most_m)
 
     def add(self, fix: VisionFix, attitude: Attitude | None) -> None:
-        """Another fix, and the autopilot's attitude at its time; without one nothing is known."""
+        """Another fix, and the autopilot's attitude at its time, None where it is unknown."""
         if attitude is None or fix.roll_rad is None or fix.pitch_rad is None:
-            self._off_rad, self._share, self.tilts = 0.0, 0.0, False
+            since = self._judged_ns
+            self.is_known = since is not None and abs(fix.time_ns - since) <= _HOLDS_NS
             return
+        self._judged_ns, self.is_known = fix.time_ns, True
         seen, known = (
             _level(fix.roll_rad, fix.pitch_rad),
             _level(attitude.roll_rad, attitude.pitch_rad),

@@ -107,6 +107,60 @@ def test_a_gimbal_that_is_off_and_wanders_is_left_alone(seed: int) -> None:
         assert not check.tilts
 
 
+@dataclass
+class Unheard(Tilted):
+    """Some attitudes are missing. heard: whether there is one at a time, seconds."""
+
+    heard: Callable[[float], bool] = lambda at_s: True
+
+    def attitude_at(self, time_ns: int) -> Attitude | None:
+        """None where it is missing."""
+        return super().attitude_at(time_ns) if self.heard(time_ns * 1e-9) else None
+
+
+def unheard(heard: Callable[[float], bool], vision_deg: Angle = never) -> Unheard:
+    """As `low`."""
+    flight = low(vision_deg)
+    return Unheard(
+        flight.monitor, leg, flight.seen, noise_m=0.05, claimed_m=0.2, vision_deg=vision_deg,
+        heard=heard,
+    )  # fmt: skip
+
+
+def test_a_tilt_is_not_over_because_the_attitude_is_gone() -> None:
+    """The attitude ends at 10 s, and what it said of the position was forgotten with it."""
+    flight = unheard(lambda at_s: at_s < 10.0, valley).fly(13.0)
+    assert flight.told("deg off the autopilot's") <= 9.0
+    assert flight.told("over: tilt") == np.inf
+    assert outside(flight) == []
+
+
+def test_a_tilt_is_told_and_bounded_by_every_other_attitude() -> None:
+    """A link that loses some must not hide it."""
+    flight = unheard(lambda at_s: round(10.0 * at_s) % 2 == 0, valley).fly(12.5)
+    assert flight.told("deg off the autopilot's") <= 9.0
+    assert outside(flight) == []
+
+
+def test_attitudes_that_are_missing_are_no_tilt() -> None:
+    """Whether some or all, of a flight that is right."""
+    for heard in (lambda at_s: round(10.0 * at_s) % 3 == 0, lambda at_s: at_s > 4.0):
+        flight = unheard(heard).fly(8.0)
+        assert flight.told("autopilot's") == np.inf
+        assert flight.withheld == []
+
+
+def test_a_tilt_at_an_unknown_height_is_widened() -> None:
+    """A vehicle without a home says no height, and its position was taken to be right."""
+    check = TiltCheck(GuardianConfig())
+    for fix in fixes(1, 0.0, 0.0, 1):
+        check.add(replace(fix, pitch_rad=0.1), LEVEL)
+    assert check.metres(VehicleState()) == GuardianConfig().untold_jump_m
+    for fix in fixes(1, 0.5, 0.3, 1):
+        check.add(fix, LEVEL)
+    assert check.metres(VehicleState()) == 0.0
+
+
 def test_without_an_attitude_nothing_is_said() -> None:
     """No attitude of the camera: no evidence."""
     check = TiltCheck(GuardianConfig())
