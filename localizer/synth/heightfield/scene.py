@@ -101,12 +101,27 @@ def light_scene(
     sx, sy, sz = light.sun
     cosine = np.clip((-gx * sx - gy * sy + sz) / np.sqrt(gx**2 + gy**2 + 1), 0, 1)
     if light.direct > 0.0:
-        sunny = _cast_shadows(height, cell, sx, sy, sz, float(np.ptp(height)))
+        sunny = cast_shadows(height, cell, sx, sy, sz, float(np.ptp(height)))
         cosine = cosine * cv2.GaussianBlur(sunny, (0, 0), 0.6)
-    # Concave places see less sky.
-    openness = np.clip(1.0 + (height - cv2.GaussianBlur(height, (0, 0), 4.0)) * 0.06, 0.55, 1.15)
-    shade = light.ambient * openness + light.direct * cosine
+    shade = light.ambient * openness(height) + light.direct * cosine
     texture = scene.albedo * shade[..., None].astype(np.float32)
+    return textured(scene, texture, light, sky, texel_cells)
+
+
+def openness(height: Float32) -> Float32:
+    """(n, n): how much sky is seen; concave places see less."""
+    return np.clip(1.0 + (height - cv2.GaussianBlur(height, (0, 0), 4.0)) * 0.06, 0.55, 1.15)
+
+
+def textured(
+    scene: Scene,
+    texture: Float32,
+    light: Light,
+    sky: tuple[float, float, float],
+    texel_cells: float = 1.0,
+) -> LitScene:
+    """The scene with what its surfaces show, (n, n, 3), ready for the ray marcher."""
+    height, cell = scene.height, scene.cell_m
     block_max = cv2.dilate(height, np.ones((3, 3), np.uint8))
     n = height.shape[0]
     block_max = block_max.reshape(n // BLOCK, BLOCK, n // BLOCK, BLOCK).max((1, 3))
@@ -176,7 +191,7 @@ def _draw_prism(
 
 
 @njit(cache=True, fastmath=True, nogil=True)
-def _cast_shadows(
+def cast_shadows(
     height: Float32, cell: float, sx: float, sy: float, sz: float, relief: float
 ) -> Float32:
     """(n, n) float32: 1 where the sun is seen, 0 in cast shadow."""
