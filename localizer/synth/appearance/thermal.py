@@ -109,13 +109,15 @@ class ThermalDay:
         inertia = _COVERS[:, 2].copy()
         inertia[Cover.SOIL] *= 1.0 + self.wet  # water in it stores heat
         exchange = self.exchange()[:, None]
-        return np.fft.irfft(1.0 / (exchange + inertia[:, None] * np.sqrt(1j * omega)), STEPS)
+        out: Array = np.fft.irfft(1.0 / (exchange + inertia[:, None] * np.sqrt(1j * omega)), STEPS)
+        return out
 
     def heating(self) -> Array:
         """Of each cover: share of the absorbed sun that heats, the rest evaporates water."""
         share = _COVERS[:, 3].copy()
         share[Cover.SOIL] = 0.5 * self.wet
-        return 1.0 - share
+        left: Array = 1.0 - share
+        return left
 
     def emissivity(self) -> Array:
         """Of each cover."""
@@ -167,8 +169,7 @@ def level_surfaces(day: ThermalDay, absorbed: float = 0.8) -> Array:
 
 def half_hours(day: ThermalDay) -> Array:
     """(STEPS,): the hours before the flight, of `ThermalDay.answers`, the newest first."""
-    hours: Array = (day.hour - 24.0 / STEPS * np.arange(STEPS)) % 24.0
-    return hours
+    return np.asarray((day.hour - 24.0 / STEPS * np.arange(STEPS)) % 24.0, np.float64)
 
 
 def day_apparent(day: ThermalDay, by_sun: Array, open_sky: Array | float = 1.0) -> Array:
@@ -178,7 +179,7 @@ def day_apparent(day: ThermalDay, by_sun: Array, open_sky: Array | float = 1.0) 
     # The sky's whole band is warmer than its window that is seen: 75 W/m2 are lost to a clear one.
     lost = 5.5 * 0.35 * day.sky_below_air_k * day.emissivity() * answers.sum(axis=1)
     shape = (-1, *(1,) * (np.ndim(by_sun) - 1))
-    warmth = by_sun + air.reshape(shape) - lost.reshape(shape) * open_sky
+    warmth: Array = by_sun + air.reshape(shape) - lost.reshape(shape) * open_sky
     seen_sky = float(day.air_k(np.array(day.hour))) - day.sky_below_air_k
     emissivity = day.emissivity().reshape(shape)
     out: Array = emissivity * warmth + (1 - emissivity) * seen_sky
@@ -240,7 +241,7 @@ def film_thermal(
     kelvin = kelvin + np.float32(sensor.noise_k) * rng.standard_normal(kelvin.shape, np.float32)
     kelvin = kelvin + np.float32(sensor.columns_k) * rng.standard_normal(width, np.float32)
     x, y = np.linspace(-1, 1, width)[None], np.linspace(-1, 1, height)[:, None]
-    kelvin = kelvin + np.float32(sensor.shading_k) * (x**2 + y**2).astype(np.float32)
+    kelvin += np.float32(sensor.shading_k) * (x**2 + y**2).astype(np.float32)
     grey = _gain_controlled(kelvin, sensor)
     coded = cv2.imencode(".jpg", grey, [cv2.IMWRITE_JPEG_QUALITY, sensor.jpeg_quality])[1]
     grey = np.asarray(cv2.imdecode(coded, cv2.IMREAD_GRAYSCALE), np.uint8)

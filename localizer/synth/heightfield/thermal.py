@@ -60,7 +60,8 @@ def thermal_scene(
     span = SPAN_K[day.condition]
 
     def grey(kelvin: Float32) -> Float32:
-        return np.clip(0.5 + (kelvin - middle) / np.float32(span), 0.04, 1.0).astype(np.float32)
+        share = 0.5 + (kelvin - middle) / np.float32(span)
+        return np.asarray(np.clip(share, 0.04, 1.0), np.float32)
 
     base, sunny = grey(walls[:, 0]), grey(walls[:, 1])
     facades = np.repeat(base[:, None], 4, axis=1)
@@ -125,7 +126,7 @@ def _warmed(
         cosine = np.clip((-gx * sx - gy * sy + sz) / length, 0, 1)
         lit = cast_shadows(height, cell, sx, sy, sz, float(np.ptp(height)))
         warmed += by_cover[cover] * (cosine * cv2.GaussianBlur(lit, (0, 0), 1.0)).astype(np.float32)
-    return absorbs * (warmed + scattered.astype(np.float32)[cover] * open_sky)
+    return np.asarray(absorbs * (warmed + scattered[cover] * open_sky), np.float32)
 
 
 def _texture(cover: NDArray[np.int8], scene: Scene, rng: np.random.Generator) -> Float32:

@@ -8,7 +8,7 @@ weather and sensor are put on the query afterwards (`localizer.synth.appearance.
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
@@ -36,6 +36,7 @@ from localizer.training.places.objects import new_buildings, parked_cars
 from localizer.training.places.photos import PhotoLibrary
 from localizer.training.places.place import Place
 from localizer.training.places.seasons import season_shift
+from localizer.training.places.styles import LAMPS, STYLES, SUNNY, styled_ground, styled_light
 from localizer.types import Float32, Image
 
 SEASON, OUTDATED, COMBINED = "season", "outdated map", "combined"
@@ -72,7 +73,8 @@ class SceneConfig:
     there are lights; else drawn. motion: metres and
     degrees between the two views, exactly, instead of the training's mixture. shared_detail: the
     query repeats the map's fine texture and the map is nearly as sharp as the query; no flight is
-    like that, it is kept as the easier condition of earlier reports.
+    like that, it is kept as the easier condition of earlier reports. styles: share of the drawn
+    days that have one of `STYLES`; 0 draws nothing, so that places stay as they were.
     """
 
     cells: int = 1024
@@ -86,17 +88,19 @@ class SceneConfig:
     conditions: tuple[str, ...] = ()
     motion: tuple[float, float] | None = None
     shared_detail: bool = False
+    styles: float = 0.0
 
 
 @dataclass(frozen=True)
 class Visit:
     """The day of a flight: weather or light (of `CONDITIONS`), buildings gone and new, vegetation
-    of another season (None: drawn).
+    of another season (None: drawn), and one of `STYLES` or None.
     """
 
     weather: str
     outdated: bool
     season: bool | None
+    style: str | None = None
 
 
 def scene_pairs(seed: int, config: SceneConfig, library: PhotoLibrary | None) -> Iterator[Pair]:
@@ -111,7 +115,7 @@ def scene_pairs(seed: int, config: SceneConfig, library: PhotoLibrary | None) ->
             if config.conditions:
                 visit = visit_of(rng, config.conditions[k // config.queries_per_light])
             else:
-                visit = draw_visit(rng)
+                visit = draw_visit(rng, config.styles)
             fixed = None if config.light_variety else survey.light
             lived, season = lived_scene(rng, place, visit, fixed, config.shared_detail)
         pair = draw_views(rng, survey, lived, config)
@@ -139,9 +143,14 @@ def draw_place(
     return generated_place(rng, n, cell), "generated"
 
 
-def draw_visit(rng: np.random.Generator) -> Visit:
-    """The day of a training flight."""
-    return Visit(draw_condition(rng), bool(rng.random() < 0.4), None)
+def draw_visit(rng: np.random.Generator, styles: float = 0.0) -> Visit:
+    """The day of a training flight. styles: as of `SceneConfig`."""
+    visit = Visit(draw_condition(rng), bool(rng.random() < 0.4), None)
+    if styles > 0.0 and rng.random() < styles:
+        style = str(rng.choice(STYLES))
+        weather = "night" if style == LAMPS else "day" if style in SUNNY else visit.weather
+        return replace(visit, weather=weather, style=style)
+    return visit
 
 
 def warp_check(pair: Pair) -> tuple[Float32, NDArray[np.bool_]]:
@@ -202,6 +211,9 @@ def lived_scene(
     if not shared_detail:
         albedo = regrown(land.albedo, place.lasting, land.cell_m, rng)
         land = Land(land.height, wetted(albedo, place.lasting, rng), land.cell_m)
+    if visit.style is not None:
+        ground = styled_ground(land.albedo, place, visit.style, rng)
+        land = Land(land.height, ground, land.cell_m)
     if outdated:
         prisms = without(prisms, rng, rng.uniform(0.03, 0.25))
         prisms += new_buildings(rng, place, int(rng.integers(3, 40)))
@@ -216,6 +228,12 @@ def lived_scene(
         return thermal_scene(compose(land, prisms), prisms, place.lasting, day, rng), season
     elevation = rng.uniform(8, 22) if condition == "dusk" else rng.uniform(22, 75)
     sun = _sun(rng, elevation, direct)
+    if visit.style is not None and light is None:
+        styled = styled_light(sun, place, visit.style, rng)
+        sky = (0.03, 0.03, 0.05) if visit.style == LAMPS else _sky(rng, condition)
+        return light_scene(
+            compose(land, prisms), styled.light, sky, sunlit=styled.sunlit, glow=styled.glow
+        ), season
     return light_scene(compose(land, prisms), light or sun, _sky(rng, condition)), season
 
 
@@ -242,11 +260,13 @@ def draw_condition(rng: np.random.Generator) -> str:
 
 
 def visit_of(rng: np.random.Generator, condition: str) -> Visit:
-    """The visit of a test condition: a weather alone, `SEASON` or `OUTDATED` on a day, or any
-    weather together with both (`COMBINED`).
+    """The visit of a test condition: a weather or one of `STYLES` alone, `SEASON` or `OUTDATED` on
+    a day, or any weather together with both (`COMBINED`).
     """
     if condition == COMBINED:
         return Visit(str(rng.choice(CONDITIONS)), True, True)
+    if condition in STYLES:
+        return Visit("night" if condition == LAMPS else "day", False, False, condition)
     if condition in (SEASON, OUTDATED):
         return Visit("day", condition == OUTDATED, condition == SEASON)
     return Visit(condition, False, False)
