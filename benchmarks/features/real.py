@@ -169,12 +169,12 @@ def _view(rng: np.random.Generator) -> Pose:
 
 def _season_pairs(folder: Path, count: int, seed: int, size: tuple[int, int]) -> list[TestPair]:
     """A plot at one date as the map and at the other as the flight, 25 to 40 m above it."""
-    plots = sorted(p for p in folder.iterdir() if p.is_dir())[3::4]
+    plots = unseen_plots(folder)
     pairs: list[TestPair] = []
     for k in range(count):
         rng = np.random.default_rng((seed, 3, k))
         plot, dry_map = plots[k // 2 % len(plots)], bool(k % 2)
-        dates = [read_photo(p) for p in _dates(plot)]
+        dates = [read_photo(p) for p in plot_dates(plot)]
         surveyed, flown = dates[:: -1 if dry_map else 1]
         view, query, truth = _plot_pair(surveyed, flown, rng, size)
         seen = np.full(query.shape[:2], truth.translation[2], np.float32)
@@ -184,7 +184,12 @@ def _season_pairs(folder: Path, count: int, seed: int, size: tuple[int, int]) ->
     return pairs
 
 
-def _dates(plot: Path) -> list[Path]:
+def unseen_plots(folder: Path) -> list[Path]:
+    """The plots that no training run has seen."""
+    return sorted(p for p in folder.iterdir() if p.is_dir())[3::4]
+
+
+def plot_dates(plot: Path) -> list[Path]:
     """The green date, then the dry one."""
 
     def green(path: Path) -> float:
@@ -204,15 +209,15 @@ def _plot_pair(
         at = rng.uniform(-12, 12, 2)
         truth = look_at(np.array([*at, 0.0]), rng.uniform(25, 40) / np.sin(pitch), pitch, rng)
         start = moved(rng, truth, np.inf, (METRES, DEGREES))
-        query, depth = _plane_view(flown, truth, camera)
+        query, depth = plane_view(flown, truth, camera)
         if not (depth > 0).all():
             continue
-        reference, depth = _plane_view(surveyed, start, camera)
+        reference, depth = plane_view(surveyed, start, camera)
         if (depth > 0).mean() >= 0.8:
             return RenderedView(reference, depth, start, camera), query, truth
 
 
-def _plane_view(ortho: Image, pose: Pose, camera: Camera) -> tuple[Image, Float32]:
+def plane_view(ortho: Image, pose: Pose, camera: Camera) -> tuple[Image, Float32]:
     """View of a square orthophoto lying at z = 0 around the origin; black, depth 0 beside it."""
     v, u = np.mgrid[0 : camera.height, 0 : camera.width] + 0.5
     rays = camera.rays(np.stack([u, v], -1))

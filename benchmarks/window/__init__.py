@@ -1,0 +1,1 @@
+"""What a sliding window of frames would be worth over single frames."""
