@@ -10,6 +10,7 @@ import numpy as np
 
 from benchmarks.features.pairs import DEGREES, METRES, SIZE, UNSEEN_GROUPS, MadePlaces
 from benchmarks.features.real import plane_view, plot_dates, unseen_plots
+from localizer.errors import SequenceError
 from localizer.geometry.camera import Camera
 from localizer.geometry.pose import Array, Pose, so3_exp
 from localizer.synth.appearance.model import apply_appearance, sample_appearance
@@ -31,6 +32,7 @@ INTERVAL_S = 0.5
 NEON = "neon"
 _FIRST_SEED = {"test": 5_500_000, "validation": 4_500_000}
 _SPEED, _PLOT_SPEED = 12.0, 1.5  # m/s; a plot has 40 m
+_TRIES = 1000  # of a path that stays on its plot
 _DRIFT_MPS, _SHAKE_DEG = 0.2, 0.2  # of a beginning from frame to frame
 
 See = Callable[[Pose], tuple[Image, Float32]]
@@ -92,7 +94,7 @@ def plot_sequence(place: int, frames: int, textures: Path) -> Iterator[SequenceF
     dates = [read_photo(p) for p in plot_dates(plot)]
     surveyed, flown = dates[:: -1 if dry_map else 1]
     rng = np.random.default_rng((place, 4))
-    while True:
+    for _ in range(_TRIES):
         camera = Camera.from_fov(*SIZE, rng.uniform(35, 50))
         pitch = np.radians(rng.uniform(70, 90))
         at = np.array([*rng.uniform(-10, 10, 2), 0.0])
@@ -100,6 +102,8 @@ def plot_sequence(place: int, frames: int, textures: Path) -> Iterator[SequenceF
         truths = _path(rng, first, frames, _PLOT_SPEED)
         if all((plane_view(flown, t, camera)[1] > 0).mean() > 0.97 for t in truths):
             break
+    else:
+        raise SequenceError(f"{plot}: {frames} frames do not fit on it: ask for fewer")
     scene = _Scene(
         lambda pose: plane_view(surveyed, pose, camera),
         lambda pose: plane_view(flown, pose, camera),
