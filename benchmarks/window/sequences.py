@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -34,18 +34,21 @@ _FIRST_SEED = {"test": 5_500_000, "validation": 4_500_000}
 _SPEED, _PLOT_SPEED = 12.0, 1.5  # m/s; a plot has 40 m
 _TRIES = 1000  # of a path that stays on its plot
 _DRIFT_MPS, _SHAKE_DEG = 0.2, 0.2  # of a beginning from frame to frame
+ALIKE, OWN, TRUE = "alike", "own", "true"
+BEGINNINGS = (ALIKE, OWN, TRUE)
 
 See = Callable[[Pose], tuple[Image, Float32]]
 
 
 @dataclass(frozen=True)
 class SequenceFrame:
-    """One frame: the view of the map from where a tracker believes to be, and the query's image.
+    """One frame: the map's views from where a tracker may believe to be, and the query's image.
 
-    A window's beginnings err alike, by 5 m and 5 degrees, with a drift and the gimbal's shake.
+    views: by beginning. ALIKE err by the same 5 m and 5 degrees in all frames, with a drift and the
+    gimbal's shake; every OWN errs by as much in a direction of its own; TRUE does not err.
     """
 
-    view: RenderedView
+    views: Mapping[str, RenderedView]
     query: Image
     truth: Pose
 
@@ -132,14 +135,25 @@ def _flown(scene: _Scene, rng: np.random.Generator) -> Iterator[SequenceFrame]:
     look = sample_appearance(rng, scene.weather)
     shift, turn = _of_length(rng, METRES), _of_length(rng, np.radians(DEGREES))
     wrong = rng.normal(0.0, _DRIFT_MPS, 3)
+    own = rng.spawn(1)[0]
     for k, truth in enumerate(scene.truths):
-        shaken = so3_exp(turn + np.radians(rng.normal(0.0, _SHAKE_DEG, 3)))
-        drifted = truth.translation + shift + wrong * INTERVAL_S * k
-        believed = Pose(shaken @ truth.rotation, drifted)
+        shake = np.radians(rng.normal(0.0, _SHAKE_DEG, 3))
+        begins = {
+            ALIKE: _beside(truth, shift + wrong * INTERVAL_S * k, turn + shake),
+            OWN: _beside(truth, _of_length(own, METRES), _of_length(own, np.radians(DEGREES))),
+            TRUE: truth,
+        }
         image, depth = scene.lived(truth)
         query = apply_appearance(image, depth, tamed(look, depth), rng)
-        rgb, seen = scene.survey(believed)
-        yield SequenceFrame(RenderedView(rgb, seen, believed, scene.camera), query, truth)
+        views = {
+            name: RenderedView(*scene.survey(pose), pose, scene.camera)
+            for name, pose in begins.items()
+        }
+        yield SequenceFrame(views, query, truth)
+
+
+def _beside(truth: Pose, shift: Array, turn: Array) -> Pose:
+    return Pose(so3_exp(turn) @ truth.rotation, truth.translation + shift)
 
 
 def _of_length(rng: np.random.Generator, length: float) -> Array:

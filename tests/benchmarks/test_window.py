@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from benchmarks.window.motions import MOTIONS, Step
-from benchmarks.window.report import rows
+from benchmarks.window.report import Error, rows
 from benchmarks.window.votes import Vote, Window, elected
 from localizer.geometry.pose import Pose, so3_exp
 
@@ -72,8 +72,14 @@ def test_a_turn_that_is_not_known_is_a_place_that_is_not_known():
 
 
 def test_the_table_counts_from_the_fifth_frame():
-    far, near = [(9.0, 9.0)] * 4, [(0.5, 0.5)] * 4
+    far, near = [Error(np.full(3, 5.0), 9.0)] * 4, [Error(np.full(3, 0.2), 0.5)] * 4
     places = [{("", "single", 1): far + near, ("odometry", "vote", 5): far + far}] * 2
-    single, window = rows("dusk", places)
-    assert single[5:7] == ("100", "")
-    assert window[5:7] == ("0", "-100 (-100, -100)")
+    single, window = rows("dusk", "alike", places)
+    assert single[6:8] == ("100", "")
+    assert window[6:8] == ("0", "-100 (-100, -100)")
+
+
+@pytest.mark.parametrize(("sign", "shared"), [(1.0, "100 %"), (-1.0, "0 %")])
+def test_what_the_frames_share_stands_apart(sign, shared):
+    frames = [Error(side * np.array([0.0, 3.0, 0.0]), 0.5) for side in (1.0, sign)] * 4
+    assert rows("dusk", "alike", [{("", "single", 1): frames}])[0][-1] == shared
