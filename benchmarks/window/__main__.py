@@ -100,7 +100,7 @@ def windowed(flown: Flown, motion: str, frames: int, *, robust: bool) -> list[Po
     return [window.add(vote, step) for vote, step in pairs]
 
 
-def errors(flown: Flown, windows: list[int]) -> Errors:
+def errors(flown: Flown, windows: list[int], motions: Sequence[str]) -> Errors:
     """Errors of single frames and of every window, by (motion, kind, frames)."""
 
     def against(poses: list[Pose]) -> list[Error]:
@@ -110,7 +110,7 @@ def errors(flown: Flown, windows: list[int]) -> Errors:
         ]
 
     found: Errors = {("", "single", 1): against([v.pose for v in flown.votes])}
-    for motion in MOTIONS:
+    for motion in motions:
         for kind in ("mean", "vote"):
             for frames in windows:
                 poses = windowed(flown, motion, frames, robust=kind == "vote")
@@ -126,6 +126,8 @@ def main() -> None:
     p.add_argument("--first", type=whole(0, 1000), default=0, help="place")
     p.add_argument("--frames", type=whole(5, 200), default=12, help="of each place")
     p.add_argument("--windows", type=whole(1, 200), nargs="+", default=[5, 10], help="frames")
+    p.add_argument("--motions", nargs="+", choices=tuple(MOTIONS), default=list(MOTIONS),
+                   help="that tie the frames")  # fmt: skip
     p.add_argument("--beginnings", nargs="+", choices=BEGINNINGS, default=[ALIKE],
                    help="of the registrations")  # fmt: skip
     p.add_argument("--split", choices=("test", "validation"), default="test", help="of places")
@@ -143,7 +145,7 @@ def main() -> None:
             else:
                 frames = made_sequence(name, k, args.frames, args.split, args.textures)
             for begins, flight in registrar.flown(k, frames, args.beginnings).items():
-                places[begins].append(errors(flight, args.windows))
+                places[begins].append(errors(flight, args.windows, args.motions))
             if args.json:
                 write_figures(args.json, COLUMNS, [*table, *_rows(name, places)])
         table += _rows(name, places)
