@@ -74,6 +74,7 @@ def solve(evidence: Evidence, fixed: NDArray[np.bool_] | None = None) -> Solutio
             if np.abs(step[: u.COUNT] / u.USEFUL).max() < _CONVERGED:
                 break
         noise = _noise(evidence, guess, noise)
+    noise = _as_told(evidence, guess, noise)
     H, _ = _normal(evidence, guess, noise, still)
     shared = np.eye(len(H), u.COUNT)
     gain: Array = cho_solve(cho_factor(H, lower=True), shared).T
@@ -105,6 +106,15 @@ def _noise(evidence: Evidence, guess: Guess, before: _Noise) -> _Noise:
         left = evidence.places(guess)[placed]
         place = Wander.of(left, evidence.times_s[placed], _LEAST["places"])
     return replace(before, pixel_sigma=sigma, weight=weight, attitude=attitude, place=place)
+
+
+def _as_told(evidence: Evidence, guess: Guess, noise: _Noise) -> _Noise:
+    """Of the covariance that is told: places stray further than they do from picture to picture."""
+    placed = evidence.placed
+    if not placed.any():
+        return noise
+    left = evidence.places(guess)[placed]
+    return replace(noise, place=noise.place.over_long_steps(left, evidence.times_s[placed]))
 
 
 def _normal(

@@ -19,6 +19,7 @@ from companion.calibrate import unknowns as u
 from localizer.geometry.pose import Array
 
 _MEMORIES_S = np.array([0.1, 0.3, 1.0, 2.0, 4.0, 8.0, 15.0, 30.0, 60.0])
+_LONG_STEP_S, _LEAST_STEPS = 8.0, 8  # beyond an EKF's own memory; fewer steps say nothing
 _AS_LIKELY = 1.0  # of minus twice the logarithm of the likelihood
 _COMPASS_S = 60.0
 _USUAL_S, _UNUSUAL = 8.0, 1.0  # of a gimbal's memory: the middle, and one sigma of its logarithm
@@ -58,19 +59,47 @@ class Wander:
             e = left[:, axis]
             found = []
             for memory_s in _MEMORIES_S:
-                kept = np.exp(-gaps / memory_s)
-                free = np.maximum(1.0 - kept**2, 1e-6)
-                white = np.concatenate([e[:1], (e[1:] - kept * e[:-1]) / np.sqrt(free)])
-                ones = np.concatenate([[1.0], (1.0 - kept) / np.sqrt(free)])
-                told = float(ones @ ones)
-                squares = float(white @ white) - float(ones @ white) ** 2 / told
+                squares, likely = _restricted(e, gaps, memory_s)
                 variance = max(squares / free_of_mean, least**2)
-                cost = squares / variance + free_of_mean * np.log(variance)
-                found.append((cost + float(np.log(free).sum()) + np.log(told), np.sqrt(variance)))
+                cost = squares / variance + free_of_mean * np.log(variance) + likely
+                found.append((cost, np.sqrt(variance)))
             costs = np.array([cost for cost, _ in found])
             longest = int(np.flatnonzero(costs < costs.min() + _AS_LIKELY)[-1])
             sigmas[axis], memories[axis] = found[longest][1], _MEMORIES_S[longest]
         return cls(sigmas, memories)
+
+    def over_long_steps(self, left: Array, times_s: Array) -> Wander:
+        """The same memories, with no smaller sigmas than steps of `_LONG_STEP_S` say. From picture
+        to picture an EKF smooths its receiver's errors, and the poses that were solved for follow
+        it: those steps are too small for how far it strays in a minute. left: (K, 3).
+        """
+        spacing_s = max(float(np.median(np.diff(times_s))), 1e-3)
+        stride = max(1, round(_LONG_STEP_S / spacing_s))
+        begins = [k for k in range(stride) if len(times_s[k::stride]) >= _LEAST_STEPS]
+        if not begins:
+            return self
+        sigma = self.sigma.copy()
+        for axis, memory_s in enumerate(self.memory_s):
+            squares = told = 0.0
+            for k in begins:
+                some = times_s[k::stride]
+                squares += _restricted(left[k::stride, axis], np.diff(some), memory_s)[0]
+                told += len(some) - 1
+            sigma[axis] = max(sigma[axis], np.sqrt(squares / told))
+        return Wander(sigma, self.memory_s)
+
+
+def _restricted(errors: Array, gaps_s: Array, memory_s: float) -> tuple[float, float]:
+    """Squares of errors (K,) that last for memory_s, less their mean, in units of their variance;
+    and what else minus twice the logarithm of the restricted likelihood has in it.
+    """
+    kept = np.exp(-gaps_s / memory_s)
+    free = np.maximum(1.0 - kept**2, 1e-6)
+    white = np.concatenate([errors[:1], (errors[1:] - kept * errors[:-1]) / np.sqrt(free)])
+    ones = np.concatenate([[1.0], (1.0 - kept) / np.sqrt(free)])
+    told = float(ones @ ones)
+    squares = float(white @ white) - float(ones @ white) ** 2 / told
+    return squares, float(np.log(free).sum()) + float(np.log(told))
 
 
 @dataclass(frozen=True)

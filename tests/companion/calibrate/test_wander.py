@@ -90,3 +90,39 @@ def test_derivatives_of_the_likelihood_are_those_of_its_value():
         step = np.eye(6)[k] * 1e-5
         difference = (likelihood(at + step)[0] - likelihood(at - step)[0]) / 2e-5
         assert slope == pytest.approx(difference, rel=1e-4, abs=1e-4)
+
+
+def strays(rng: np.random.Generator, sigma_m: float, memory_s: float, smooth_s: float) -> Array:
+    """(K, 3): a receiver's errors as an EKF passes them on."""
+    kept, passed = np.exp(-np.diff(TIMES_S) / memory_s), np.exp(-0.9 / smooth_s)
+    raw = sigma_m * rng.normal(size=(len(TIMES_S), 3))
+    for k in range(1, len(raw)):
+        raw[k] = kept[k - 1] * raw[k - 1] + np.sqrt(1.0 - kept[k - 1] ** 2) * raw[k]
+    made = raw.copy()
+    for k in range(1, len(raw)):
+        made[k] = passed * made[k - 1] + (1.0 - passed) * raw[k]
+    return made
+
+
+def test_an_ekf_that_smooths_does_not_make_its_receiver_better():
+    rng = np.random.default_rng(1)
+    short, told = [], []
+    for _ in range(20):
+        left = strays(rng, 0.25, 60.0, smooth_s=4.0)
+        wander = Wander.of(left, TIMES_S, 0.08)
+        short.append(wander.sigma)
+        told.append(wander.over_long_steps(left, TIMES_S).sigma)
+    assert np.median(short) < 0.6 * 0.25
+    assert 0.65 * 0.25 < np.median(told) < 1.2 * 0.25
+
+
+def test_errors_that_nothing_smooths_are_said_as_before():
+    rng = np.random.default_rng(2)
+    ratios = []
+    for memory_s in (2.0, 8.0):
+        left = strays(rng, 0.25, memory_s, smooth_s=1e-3)
+        wander = Wander.of(left, TIMES_S, 0.08)
+        ratios.append(wander.over_long_steps(left, TIMES_S).sigma / wander.sigma)
+    assert np.max(ratios) < 1.15
+    few = TIMES_S[:20]
+    assert wander.over_long_steps(left[:20], few).sigma == pytest.approx(wander.sigma)
