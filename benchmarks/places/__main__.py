@@ -15,7 +15,6 @@ done. Nothing of ours is tuned on these places.
 from __future__ import annotations
 
 import argparse
-import json
 from dataclasses import replace
 from pathlib import Path
 
@@ -26,7 +25,7 @@ with needs_torch():
     from benchmarks.places.flights import CONDITIONS, FULL, HEIGHTS
     from benchmarks.places.rivals import RIVALS, unavailable
     from benchmarks.places.run import Plan, chosen_cells, run
-    from benchmarks.places.table import draw, markdown, read_results, rows
+    from benchmarks.places.table import draw, markdown, read_results, write_json
     from benchmarks.places.worlds import PLACES
 
 
@@ -44,7 +43,7 @@ def main() -> None:
     parser.add_argument("--minutes", type=number(0.1, 1e5), default=1e5,
                         help="after which no new sequence is begun")  # fmt: skip
     parser.add_argument("--out", type=output, help="Markdown of the table")
-    parser.add_argument("--json", type=output, help="the table's figures")
+    parser.add_argument("--json", type=Path, help="folder of the tables' figures")
     parser.add_argument("--plot", type=output, help="PNG of the errors")
     args = parser.parse_args()
     wanted = chosen_cells(args.places or (), args.conditions or (), args.heights or ())
@@ -72,7 +71,7 @@ def _table(plan: Plan, args: argparse.Namespace) -> None:
     if args.out:
         args.out.write_text(text)
     if args.json:
-        args.json.write_text(json.dumps(rows(plan, results), indent=1) + "\n")
+        write_json(plan, results, args.json)
     if args.plot:
         draw(plan, results, args.plot)
 

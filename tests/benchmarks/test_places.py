@@ -12,7 +12,7 @@ pytest.importorskip("torch")
 from benchmarks.places.flights import CONDITIONS, FULL, HEIGHTS, cells, first_frame
 from benchmarks.places.rivals import RIVALS, Answer, Rendered, Setting, unavailable
 from benchmarks.places.run import Plan, chosen_cells
-from benchmarks.places.table import interval, markdown, measures, read_results, rows
+from benchmarks.places.table import interval, markdown, measures, read_results, recall_3, write_json
 from benchmarks.places.worlds import PLACES, visits
 from localizer.config import LocalizerConfig
 from localizer.errors import SequenceError
@@ -89,18 +89,23 @@ def test_only_sequences_that_every_method_has_done_are_counted(tmp_path):
     assert (orb.recall_1, orb.recall_3, orb.recall_5) == (25.0, 50.0, 75.0)
     assert orb.completeness == 75.0
     assert orb.fps == pytest.approx(10.0)
-    ours = next(r for r in rows(plan, results) if (r["group"], r["method"]) == ("all", "ours"))
-    assert ours["recall_1"] == 100.0
+    write_json(plan, results, tmp_path)
+    rows = json.loads((tmp_path / "six-places.json").read_text())["rows"]
+    assert next(r for r in rows if r[0] == "Render2ORB")[5] == "1 of 3"
+    assert next(r for r in rows if r[0] == "ours")[3].startswith("100.0 / 100.0 / 100.0")
+    recall = json.loads((tmp_path / "six-places-recall.json").read_text())
+    assert recall["columns"] == ["", "Render2ORB", "ours"]
+    assert next(r for r in recall["rows"] if r[0] == first.condition)[1] == "50 [50, 50]"
     assert f"| {first.condition} | 1 |" in text
 
 
-def test_an_interval_is_over_sequences_and_not_over_their_frames(tmp_path):
+def test_an_interval_is_over_places_and_not_over_their_frames(tmp_path):
     plan = _plan(tmp_path, 6)
     for k, cell in enumerate(plan.cells):
         for method in METHODS:
             _done(plan, cell, method, [0.1 if k % 2 else 4.0] * 50)
     mine = [r for r in read_results(plan) if r.method == "ours"]
-    between = interval(mine, lambda m: m.recall_1)
+    between = interval(mine, recall_3)
     assert between is not None
     low, high = between
     assert high - low > 40  # 300 frames by themselves would have 11
