@@ -34,6 +34,7 @@ from typing import Any
 
 from benchmarks.basin.views import load_views
 from benchmarks.common.arguments import Parser, existing, number, output, whole
+from benchmarks.common.figures import write_figures
 from benchmarks.common.named_errors import named_errors
 from benchmarks.protection import flights, replayed
 from benchmarks.protection.draws import LENSES
@@ -144,7 +145,7 @@ def count_flights(folders: list[Path], out: Path | None) -> None:
     found = flights.report(flown) | {"left_out": left_out}
     print(flights.table(found))
     if out is not None:
-        out.write_text(json.dumps(found, indent=1, allow_nan=False))
+        write_figures(out, flights.COLUMNS, flights.rows(found), found)
 
 
 def replay_flights(

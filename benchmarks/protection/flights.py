@@ -146,26 +146,36 @@ def share(flights: Sequence[FlownPositions], *, injected: bool) -> Share | None:
     )  # fmt: skip
 
 
+COLUMNS = ("positions", "flights", "within HPL", "within VPL", "HPL, VPL median m", "worst / HPL")
+
+
+def rows(found: dict[str, Any]) -> list[list[str]]:
+    """Of `COLUMNS`, a kind of flight each."""
+    return [
+        [
+            name,
+            f"{s['flights']}, {s['flights_whole']} whole",
+            f"{s['within_hpl']} of {s['positions']} "
+            f"[{100 * s['low']:.2f}, {100 * s['high']:.2f}] %",
+            f"{s['within_vpl']}",
+            f"{s['hpl_median_m']:.2f}, {s['vpl_median_m']:.2f}",
+            f"{s['worst_share']:.2f}",
+        ]
+        for name, s in found["shares"].items()
+    ]
+
+
 def table(found: dict[str, Any]) -> str:
     """For docs/explanation/integrity.md."""
-    rows = [
-        "| positions | flights | within HPL | within VPL | HPL, VPL median m | worst / HPL |",
-        "|---|---|---|---|---|---|",
+    lines = [
+        f"| {' | '.join(cells)} |" for cells in (COLUMNS, ["---"] * len(COLUMNS), *rows(found))
     ]
-    for name, s in found["shares"].items():
-        inside = f"{s['within_hpl']} of {s['positions']}"
-        bounds = f"[{100 * s['low']:.2f}, {100 * s['high']:.2f}] %"
-        rows.append(
-            f"| {name} | {s['flights']}, {s['flights_whole']} whole | {inside} {bounds} | "
-            f"{s['within_vpl']} | {s['hpl_median_m']:.2f}, {s['vpl_median_m']:.2f} | "
-            f"{s['worst_share']:.2f} |"
-        )
-    rows += [
+    lines += [
         f"\nguardian, {name}: {g['with a finding']} of {g['flights']} with a finding, "
         f"{g['withheld']} withheld"
         for name, g in found["guardian"].items()
     ]
-    return "\n".join(rows)
+    return "\n".join(lines)
 
 
 def _case(folder: Path) -> LoopCase | None:
