@@ -6,10 +6,11 @@
 Each place is surveyed once and seen at other visits (what was built, felled and grown since,
 another fine texture, a survey's own errors), through a rolling shutter, with a calibration and time
 stamps that err. Every method is given the same pictures, the same prior of the first frame and one
-core. FOLDER keeps worlds, sequences and one JSON for each sequence and method; a killed run goes
-on. A short run takes consecutive frames from a drawn place of the whole sequence, all cells in an
-order that makes a part of the table a fair part. `table` counts the sequences that all methods have
-done. Nothing of ours is tuned on these places.
+core; one more row of ours hears the autopilot's turns beside them. FOLDER keeps worlds, sequences
+and one JSON for each sequence and method; a killed run goes on. A short run takes consecutive
+frames from a drawn place of the whole sequence, all cells in an order that makes a part of the
+table a fair part. `table` counts the sequences that all methods have done. Nothing of ours is tuned
+on these places.
 """
 
 from __future__ import annotations

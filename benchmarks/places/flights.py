@@ -16,6 +16,7 @@ import numpy as np
 
 from benchmarks.places.worlds import LIVE, OUTDATED, PLACES, Place, PlaceFolder
 from localizer.evaluation.sequences import Sequence, load_sequence
+from localizer.geometry.pose import Pose
 from localizer.map.cache.cache import TileCache
 from localizer.map.cache.stream import TileStreamer
 from localizer.render.numba_raster import NumbaRenderer
@@ -99,6 +100,11 @@ def first_frame(cell: Cell, frames: int) -> int:
     return int(rng.integers(max(FULL - frames, 0) + 1))
 
 
+def true_path(cell: Cell, home: PlaceFolder) -> list[tuple[int, Pose]]:
+    """(time in ns, world_from_camera) of the whole sequence every 20 ms, less the vibration."""
+    return list(camera_path(cell.scenario, float(home.world.ground_height(0.0, 0.0))))
+
+
 def sequence_of(cell: Cell, home: PlaceFolder, folder: Path, frames: int) -> Sequence:
     """The cell's consecutive frames, rendered where they are not there yet."""
     out = folder / "sequences" / f"{cell.name}-{frames}"
@@ -111,7 +117,7 @@ def _record(cell: Cell, home: PlaceFolder, out: Path, frames: int) -> None:
     """Written beside it first: a killed run leaves no half of a sequence."""
     scenario, seed = cell.scenario, cell.seed
     frame = TileCache.open(home.map_cache).frame
-    path = list(camera_path(scenario, float(home.world.ground_height(0.0, 0.0))))
+    path = true_path(cell, home)
     track = PoseTrack(path, keep=None)
     errors = draw_errors(scenario, seed)
     appearance = sample_appearance(np.random.default_rng([seed, 11]), cell.weather)

@@ -12,12 +12,14 @@ from pathlib import Path
 
 import cv2
 
-from benchmarks.places.flights import Cell, cells, sequence_of
+from benchmarks.places.flights import Cell, cells, sequence_of, true_path
 from benchmarks.places.rivals import PASSES, RIVALS, Setting, stack_of
+from benchmarks.places.turns import ToldTurns
 from benchmarks.places.worlds import open_place
 from localizer.config import LocalizerConfig
 from localizer.evaluation.sequences import Perturbation
 from localizer.evaluation.sequences import Sequence as Recorded
+from localizer.tracking.motion import OtherSensors
 
 PRIOR = Perturbation(10.0, 10.0)  # of the first frame, in metres and degrees, as the paper's
 
@@ -89,12 +91,13 @@ def run_cell(plan: Plan, cell: Cell) -> None:
     cv2.setNumThreads(1)
     home = open_place(cell.place, plan.folder, cell.seen)
     sequence = sequence_of(cell, home, plan.folder, plan.frames)
+    sensors = OtherSensors(ToldTurns(true_path(cell, home), cell.seed).rotation)
     for method in plan.missing(cell):
         config = LocalizerConfig(width=plan.width, threads=1, renderer="numba", device="cpu")
         document = {
             "place": cell.place.name, "condition": cell.condition, "height": cell.height,
             "weather": cell.weather, "method": method, "width": plan.width, "seed": cell.seed,
-            **localized(method, home.map_cache, sequence, config, cell.seed),
+            **localized(method, home.map_cache, sequence, config, cell.seed, sensors),
         }  # fmt: skip
         path = plan.result(cell, method)
         path.parent.mkdir(parents=True, exist_ok=True)
@@ -104,15 +107,16 @@ def run_cell(plan: Plan, cell: Cell) -> None:
 
 
 def localized(
-    method: str, map_cache: Path, sequence: Recorded, config: LocalizerConfig, seed: int
-) -> dict[str, object]:
+    method: str, map_cache: Path, sequence: Recorded, config: LocalizerConfig, seed: int,
+    sensors: OtherSensors,
+) -> dict[str, object]:  # fmt: skip
     """One method over one sequence: errors per frame (None: no answer) and processor time."""
     stack = stack_of(map_cache, config)
     metres: list[float | None] = []
     degrees: list[float | None] = []
     cpu_ms: list[float] = []
     try:
-        tracking = RIVALS[method].open(stack, Setting(sequence.camera, config))
+        tracking = RIVALS[method].open(stack, Setting(sequence.camera, config, sensors))
         for index in range(len(sequence.images)):
             frame = sequence.frame(index)
             truth = sequence.truth[index]

@@ -13,11 +13,12 @@ from benchmarks.places.flights import CONDITIONS, FULL, HEIGHTS, cells, first_fr
 from benchmarks.places.rivals import RIVALS, Answer, Rendered, Setting, unavailable
 from benchmarks.places.run import Plan, chosen_cells
 from benchmarks.places.table import interval, markdown, measures, read_results, recall_3, write_json
+from benchmarks.places.turns import ToldTurns
 from benchmarks.places.worlds import PLACES, visits
 from localizer.config import LocalizerConfig
 from localizer.errors import SequenceError
 from localizer.geometry.camera import Camera
-from localizer.geometry.pose import Pose
+from localizer.geometry.pose import Pose, so3_exp, so3_log
 from localizer.types import Frame, PosePrior, RenderedView
 
 METHODS = ("orb", "ours")
@@ -178,3 +179,21 @@ def test_a_rival_that_found_nothing_has_no_pose_and_stays_where_it_was():
     poses = [rival.track(Frame(image, 10**9 + k * 10**8, camera, k), 1) for k in range(10)]
     assert poses == [None] * 10
     assert stack.renderer.asked[-1].translation == pytest.approx(NADIR.translation)
+
+
+def test_told_turns_err_by_a_constant_that_no_turn_has_and_by_little_else():
+    step_ns = 20_000_000
+    true = [(k * step_ns, Pose(so3_exp([0.0, 0.0, 0.01 * k]), np.zeros(3))) for k in range(100)]
+    constant, turned = [], []
+    for seed in range(8):
+        told = ToldTurns(true, seed)
+        begin, end = told.rotation(40 * step_ns), told.rotation(45 * step_ns)
+        assert begin is not None
+        assert end is not None
+        constant.append(so3_log(begin @ true[40][1].rotation.T))
+        turned.append(so3_log(end @ begin.T) - [0.0, 0.0, 0.05])
+    off, error = np.degrees(np.std(constant)), np.degrees(np.std(turned))
+    assert 0.2 < off < 1.5
+    assert error < 0.15
+    assert told.rotation(-step_ns) is None
+    assert told.rotation(100 * step_ns) is None
