@@ -201,6 +201,15 @@ def _opened(url: str, client: PoliteClient, failed: list[MapFetchError]) -> Any:
         raise MapFetchError(f"{shown(url)}: no GeoTIFF that can be read: {error}") from error
 
 
+def check_depth(name: str, dtype: str) -> None:
+    """`MapFetchError` for more than 8 bits: which of them are black and white is not said."""
+    if dtype != "uint8":
+        raise MapFetchError(
+            f"{name} has pixels of {dtype}, no picture of 8 bits; ask for another layer or "
+            "`format`, or scale it with `gdal_translate -ot Byte -scale`"
+        )
+
+
 def _window(
     source: Source, window: Grid, urls: Sequence[str], client: PoliteClient
 ) -> bytes | None:
@@ -218,6 +227,8 @@ def _window(
                 _opened(url, client, failed) as data,
                 _warped(data, window, how, source) as vrt,
             ):
+                if not source.has_heights:
+                    check_depth(shown(url), data.dtypes[0])
                 count = min(bands, data.count)
                 read = vrt.read(list(range(1, count + 1))).astype(dtype)
                 has = vrt.dataset_mask() > 0

@@ -18,7 +18,7 @@ from rasterio.windows import Window
 
 from localizer.errors import MapFetchError
 from localizer.map.fetch.catalogue import Source
-from localizer.map.fetch.cloud import NODATA
+from localizer.map.fetch.cloud import NODATA, check_depth
 from localizer.map.fetch.raster import Piece, Plan
 from localizer.map.importers.raster_file import offline
 
@@ -62,14 +62,20 @@ def assemble(source: Source, plan: Plan, folder: Path, out: Path) -> float:
 
 
 def check_piece(source: Source, piece: Piece, data: bytes) -> None:
-    """`MapFetchError` for what is no image, or not of the size that was asked for."""
+    """`MapFetchError` for what is no whole image, of more than 8 bits, or not of the size that was
+    asked for.
+    """
     try:
         if data[:4] in _TIFF:
             with offline(), MemoryFile(data) as memory, memory.open(driver="GTiff") as image:
                 size, bands, dtype = (image.width, image.height), image.count, image.dtypes[0]
+                image.read()  # what ends too early is kept for ever else, and fails each mosaic
         else:
             with _picture(data) as picture:
-                size, bands, dtype = picture.size, len(picture.getbands()), "uint8"
+                picture.load()
+                deep = picture.mode[0] in "IF"
+                size, bands = picture.size, len(picture.getbands())
+                dtype = "uint16" if deep else "uint8"
     except (RasterioError, OSError, ValueError, SyntaxError) as error:
         raise MapFetchError(f"{source.name}: piece {piece.name} is no image: {error}") from error
     if not piece.placed and size != (piece.width, piece.height):
@@ -77,7 +83,9 @@ def check_piece(source: Source, piece: Piece, data: bytes) -> None:
             f"{source.name}: piece {piece.name} is {size[0]} x {size[1]} pixels, asked for "
             f"{piece.width} x {piece.height}"
         )
-    if source.has_heights and (bands != 1 or dtype == "uint8"):
+    if not source.has_heights:
+        check_depth(f"{source.name}: piece {piece.name}", dtype)
+    elif bands != 1 or dtype == "uint8":
         raise MapFetchError(
             f"{source.name}: sends {bands} bands of {dtype}, no heights; set `format` to a GeoTIFF "
             "of numbers"

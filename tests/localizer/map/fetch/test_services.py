@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import io
 from pathlib import Path
 
 import numpy as np
 import pytest
 import rasterio
+from PIL import Image
 from pyproj import Transformer
 
 pytest.importorskip("owslib")
@@ -15,7 +17,9 @@ from localizer.errors import MapFetchError
 from localizer.map.fetch.area import Area
 from localizer.map.fetch.catalogue import Source
 from localizer.map.fetch.fetch import estimate, fetch, make_plan
+from localizer.map.fetch.mosaic import check_piece
 from localizer.map.fetch.polite import Manners, PoliteClient
+from localizer.map.fetch.raster import Piece
 from tests.localizer.map.fetch.loopback import (
     CRS,
     MAPSERV,
@@ -245,3 +249,31 @@ def test_a_server_that_fails_in_the_middle_of_a_file_is_told_and_not_taken_for_a
     with pytest.raises(MapFetchError, match="status 404"):
         fetch(wanted, plan, tmp_path / "pieces", tmp_path / "out.tif", client)
     assert not (tmp_path / "out.tif").exists()
+
+
+def test_a_picture_that_ends_too_early_is_told_and_not_kept(server):
+    """Its head was whole, so it was kept; the mosaic then failed, and so did every further run."""
+    noise = np.random.default_rng(1).integers(0, 255, (64, 64, 3), np.uint8)
+    kept = io.BytesIO()
+    Image.fromarray(noise).save(kept, "JPEG")
+    wanted = source("xyz", f"{server.url}/tiles/{{z}}/{{x}}/{{y}}.png")
+    piece = Piece("0-0", 0, 0, 64, 64, lambda _: None)
+    check_piece(wanted, piece, kept.getvalue())
+    with pytest.raises(MapFetchError, match="no image"):
+        check_piece(wanted, piece, kept.getvalue()[:-1000])
+
+
+@pytest.mark.parametrize("kind", ["wms", "cog"])
+def test_a_picture_of_more_than_8_bits_is_refused(server, tmp_path, kind):
+    """Its counts were cut to their lowest 8 bits: a map of noise, and nobody was told."""
+    path = server.folder / f"deep-{kind}.tif"
+    with rasterio.open(server.folder / "ortho.tif") as data:
+        profile = data.profile | {"dtype": "uint16"}
+        with rasterio.open(path, "w", **profile) as deep:
+            deep.write(data.read().astype(np.uint16) * 200)
+    wanted = source(kind, f"{server.url}/{path.name}", layer="deep")
+    piece = Piece("0-0", 0, 0, profile["width"], profile["height"], lambda _: None)
+    with pytest.raises(MapFetchError, match="uint16"):
+        fetched(wanted, tmp_path) if kind == "cog" else check_piece(
+            wanted, piece, path.read_bytes()
+        )
