@@ -109,7 +109,7 @@ def test_what_cannot_be_counted_is_named_and_the_rest_is_written(
     arguments = ["protection", "--flights", *map(str, (flight, shifted, empty)), "--out", str(out)]
     monkeypatch.setattr("sys.argv", arguments)
     main()
-    found = json.loads(out.read_text())
+    found = json.loads(out.read_text())["more"]
     assert found["shares"]["normal, injected"]["positions"] == 4
     assert set(found["left_out"]) == {shifted.name, "empty"}
     assert "| normal, injected | 1, 1 whole | 4 of 4" in capsys.readouterr().out
