@@ -20,12 +20,12 @@ from companion.config import CompanionConfig, RecordConfig
 from companion.errors import DiskFaultError, ReportError
 from companion.ground.target_files import write_target_files
 from companion.redaction import redacted
-from companion.sources.timing import system_minus_monotonic
 from companion.trajectory import TrajectoryFiles, snapshot_name, stamped
 from companion.versions import versions
 from localizer.geometry.geo import LocalFrame
 from localizer.geometry.pose import quaternion_from_matrix
 from localizer.types import Frame, PoseEstimate, TargetFix
+from mavlink_bridge.link.clock import process_utc
 from mavlink_bridge.link.tlog import is_disk_fault
 
 _log = logging.getLogger(__name__)
@@ -90,7 +90,7 @@ def write_manifest(folder: Path, config: CompanionConfig) -> None:
     monotonic_ns = time.monotonic_ns()
     document = {
         "monotonic_ns": monotonic_ns,
-        "utc_ns": monotonic_ns + system_minus_monotonic(),
+        "utc_ns": process_utc().utc_ns(monotonic_ns),
         "versions": versions(),
         "config": _without_credentials(config.model_dump(mode="json")),
     }
@@ -355,7 +355,7 @@ def _live_mcap(config: CompanionConfig, record: RecordConfig) -> RecordStream | 
 
         record.folder.mkdir(parents=True, exist_ok=True)
         camera = config.camera.model.camera()
-        return McapFile(record.folder / MCAP_NAME, system_minus_monotonic(), camera)
+        return McapFile(record.folder / MCAP_NAME, process_utc().utc_ns(0), camera)
     except ImportError as error:
         _log.warning("no record.mcap: install pilot-companion[mcap] (%s)", error)
     except OSError as error:

@@ -10,6 +10,7 @@ from __future__ import annotations
 import time
 from collections import deque
 from dataclasses import dataclass
+from functools import cache
 
 _WINDOW_NS = 30_000_000_000
 _MAX_SAMPLES = 128
@@ -32,11 +33,6 @@ _NOT_BEFORE_UNIX_S = 1_672_531_200  # 2023-01-01: a clock that says less was nev
 def monotonic_ns() -> int:
     """CLOCK_MONOTONIC, nanoseconds."""
     return time.monotonic_ns()
-
-
-def utc_us() -> int:
-    """Wall clock, microseconds since 1970; only for records that people read."""
-    return time.time_ns() // 1000
 
 
 class SteadyUtc:
@@ -67,6 +63,21 @@ class SteadyUtc:
             return 0, 0
         gps_ms = self.utc_ns(time_ns) // 1_000_000 - (GPS_EPOCH_UNIX_S - GPS_LEAP_SECONDS) * 1000
         return gps_ms // _WEEK_MS, gps_ms % _WEEK_MS
+
+
+@cache
+def process_utc() -> SteadyUtc:
+    """What all records of this process are dated by: one offset holds from the first to the last.
+
+    A computer without a battery begins in the past and its clock steps once it meets the network; a
+    .tlog dated by that clock would tell a message's time apart from its picture's by the step.
+    """
+    return SteadyUtc()
+
+
+def utc_us() -> int:
+    """UTC by `process_utc`, microseconds since 1970; for records."""
+    return process_utc().utc_ns(monotonic_ns()) // 1000
 
 
 @dataclass(frozen=True)

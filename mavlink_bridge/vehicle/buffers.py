@@ -11,6 +11,7 @@ from typing import Protocol, TypeVar
 
 from mavlink_bridge import quaternion as quat
 from mavlink_bridge.messages import Attitude, InertialSample
+from mavlink_bridge.vehicle.origin import wrap_degrees
 
 _LENGTH = 512
 MAX_GAP_NS = 500_000_000
@@ -102,7 +103,19 @@ class VectorBuffer:
         before, after, t = _around(samples, time_ns)
         if after.time_ns - before.time_ns > MAX_GAP_NS:
             return None
-        return tuple(a + t * (b - a) for a, b in zip(before.values, after.values, strict=True))
+        return self._between(before.values, after.values, t)
+
+    def _between(self, a: tuple[float, ...], b: tuple[float, ...], t: float) -> tuple[float, ...]:
+        return tuple(x + t * (y - x) for x, y in zip(a, b, strict=True))
+
+
+class PlaceBuffer(VectorBuffer):
+    """Latitude, longitude (degrees) and altitude: across the date line the short way."""
+
+    def _between(self, a: tuple[float, ...], b: tuple[float, ...], t: float) -> tuple[float, ...]:
+        near = a[1] + wrap_degrees(b[1] - a[1])
+        latitude, longitude, altitude = super()._between(a, (b[0], near, b[2]), t)
+        return latitude, wrap_degrees(longitude), altitude
 
 
 class ZoomBuffer:

@@ -34,7 +34,8 @@ def _longitude_scale(latitude_deg: float) -> float:
     return max(math.cos(math.radians(latitude_deg)), 0.01)
 
 
-def _wrap_degrees(angle: float) -> float:
+def wrap_degrees(angle: float) -> float:
+    """The same longitude from -180 up to 180."""
     return (angle + 180.0) % 360.0 - 180.0
 
 
@@ -50,7 +51,7 @@ def north_east(
     ArduPilot: `Location::get_distance_NE` (longitude scaled at the mean latitude).
     PX4: azimuthal equidistant projection on a sphere (`MapProjection::project`).
     """
-    d_lon = _wrap_degrees(longitude_deg - origin_lon)
+    d_lon = wrap_degrees(longitude_deg - origin_lon)
     if projection == "ardupilot":
         scale = _longitude_scale((origin_lat + latitude_deg) / 2.0)
         north = (latitude_deg - origin_lat) * METRES_PER_DEGREE
@@ -72,7 +73,7 @@ def offset(
     """(latitude, longitude) degrees of a point; inverse of `north_east` in ArduPilot's scaling."""
     latitude = origin_lat + north_m / METRES_PER_DEGREE
     scale = _longitude_scale((origin_lat + latitude) / 2.0)
-    return latitude, _wrap_degrees(origin_lon + east_m / (METRES_PER_DEGREE * scale))
+    return latitude, wrap_degrees(origin_lon + east_m / (METRES_PER_DEGREE * scale))
 
 
 def ned_from_origin(

@@ -17,6 +17,7 @@ from mavlink_bridge.vehicle.buffers import (
     GimbalBuffer,
     GimbalSample,
     InertialBuffer,
+    PlaceBuffer,
     VectorBuffer,
     ZoomBuffer,
     attitude,
@@ -100,7 +101,7 @@ class VehicleReadings:
         self.arming = Arming()
         self.attitudes = AttitudeBuffer()
         self.gimbals = GimbalBuffer(gimbal)
-        self.globals = VectorBuffer()
+        self.globals = PlaceBuffer()
         self.locals = VectorBuffer()
         self.inertial = InertialBuffer()
         self.zooms = ZoomBuffer()

@@ -1,6 +1,7 @@
 import csv
 import errno
 import itertools
+import json
 import logging
 import os
 import sys
@@ -13,15 +14,17 @@ from typing import Any
 import numpy as np
 import pytest
 
-from companion.config import RecordConfig
+from companion.config import CameraModel, CompanionConfig, FeedConfig, RecordConfig
 from companion.convert.formats import READERS, WRITERS, Place
 from companion.errors import DiskFaultError, ReportError
 from companion.flight.recorder import (
     ESTIMATE_COLUMNS,
+    MANIFEST_NAME,
     Recorder,
     RecordKeeper,
     fresh_folder,
     remove_empty,
+    write_manifest,
 )
 from companion.offline.tables import poses, read_columns
 from localizer.geometry.camera import Camera
@@ -35,6 +38,7 @@ from localizer.types import (
     TrackingState,
     Visibility,
 )
+from mavlink_bridge.link.clock import utc_us
 
 FRAME = LocalFrame(Geodetic(47.3, 8.5, 450.0))
 CAMERA = Camera.from_fov(64, 48, 60)
@@ -295,3 +299,16 @@ def test_latest_is_the_newest_record_and_never_somebodys_folder(tmp_path):
     keeper.folder = tmp_path / "other" / "flight"
     keeper.link()
     assert not (tmp_path / "other" / "latest").is_symlink()
+
+
+def test_pictures_and_messages_are_dated_by_one_clock_though_the_wall_clock_steps(
+    tmp_path, monkeypatch
+):
+    """Without a battery a computer's clock steps once it meets the network."""
+    before = utc_us()
+    monkeypatch.setattr("time.time_ns", lambda: 0)
+    model = CameraModel(width=64, height=48, fx=50, fy=50, cx=32, cy=24)
+    camera = FeedConfig(source="udp://0.0.0.0:5600", model=model)
+    write_manifest(tmp_path, CompanionConfig(map=tmp_path, camera=camera))
+    manifest = json.loads((tmp_path / MANIFEST_NAME).read_text())
+    assert before * 1000 <= manifest["utc_ns"] < before * 1000 + 60e9

@@ -7,7 +7,7 @@ from collections.abc import Iterator
 
 import pytest
 
-from mavlink_bridge.link.clock import BootClock, SteadyUtc
+from mavlink_bridge.link.clock import BootClock, SteadyUtc, utc_us
 
 MS = 1_000_000
 SECOND = 1_000 * MS
@@ -165,3 +165,9 @@ def test_a_clock_that_was_never_set_gives_no_gps_time() -> None:
     assert not utc.is_set
     assert utc.gps_week_ms(5 * SECOND) == (0, 0)
     assert SteadyUtc().is_set
+
+
+def test_a_step_of_the_wall_clock_is_not_in_the_records(monkeypatch: pytest.MonkeyPatch) -> None:
+    before = utc_us()
+    monkeypatch.setattr("mavlink_bridge.link.clock.time.time_ns", lambda: 0)
+    assert before <= utc_us() < before + 60_000_000

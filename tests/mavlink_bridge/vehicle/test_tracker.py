@@ -222,6 +222,21 @@ def test_position_that_is_not_on_earth_is_no_position(place: tuple[int, int]) ->
     assert it.global_at(10 * SECOND) is None
 
 
+@pytest.mark.parametrize(("before", "after"), [(1_799_999_900, -1_799_999_700), (-300, 100)])
+def test_between_two_places_the_way_over_the_date_line_is_the_short_one(
+    before: int, after: int
+) -> None:
+    it = tracker()
+    for ms, lon in ((1, before), (201, after)):
+        m = mavlink.MAVLink_global_position_int_message(ms, -168_000_000, lon, 500000, 0, 0, 0, 0, 0)
+        it.handle(sent(m), 10 * SECOND + ms * MS)
+    found = it.global_at(10 * SECOND + 101 * MS)
+    assert found is not None
+    north, east = north_east(-16.8, before * 1e-7, found[0], found[1])
+    assert (north, east) == pytest.approx((0.0, 200e-7 * 111_319 * 0.957), abs=0.1)
+    assert -180.0 <= found[1] <= 180.0
+
+
 def test_heartbeat_age_and_connection() -> None:
     it = tracker()
     assert it.snapshot(2 * SECOND).connected
