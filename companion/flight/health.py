@@ -177,6 +177,8 @@ class HealthMonitor:
         trouble = self._bridge.trouble
         if level is HealthLevel.OK and trouble:
             level, text = HealthLevel.DEGRADED, _NOT_USED + trouble
+        if level is HealthLevel.OK and engine.search_hangs:
+            level, text = HealthLevel.DEGRADED, f"tracking, but {_SEARCH_HANGS}"
         overload = self._overload(engine)
         if overload and level is HealthLevel.OK:
             level, text = HealthLevel.DEGRADED, overload

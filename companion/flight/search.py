@@ -161,7 +161,8 @@ class PlaceSearch:
         self._hint: Hint | None = None
         self._open: OpenRelocalizer | None = None
         self._stop = threading.Event()
-        self._thread = threading.Thread(target=self._prepare, name="overview")
+        # A daemon: one that hangs must not keep the process from ending.
+        self._thread = threading.Thread(target=self._prepare, name="overview", daemon=True)
 
     def start(self) -> None:
         """Begin to make the search ready."""

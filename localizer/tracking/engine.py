@@ -22,7 +22,7 @@ from localizer.tracking.ahead import Ahead, Prepared
 from localizer.tracking.engine_health import EngineHealth, HealthBook
 from localizer.tracking.mailbox import Mailbox
 from localizer.tracking.pipeline import Localizer, stopwatch
-from localizer.types import Frame, PoseEstimate, PosePrior, ReferenceBundle
+from localizer.types import Frame, PoseEstimate, PosePrior, ReferenceBundle, TrackingState
 
 _log = logging.getLogger(__name__)
 _IDLE_S = 0.2
@@ -241,6 +241,8 @@ class DualThreadEngine:
         tracker = self._localizer.tracker
         known = tracker.motion is not None
         if known and not tracker.standing.wants_prior:
+            if tracker.standing.state is TrackingState.TRACKING:
+                self._found = None  # of a loss that is over: at the next one it is another place
             return True
         found, self._found = self._found, None
         prior = found or self._prior_provider(time_ns)

@@ -201,6 +201,19 @@ def test_a_loss_says_how_long_and_how_far_and_is_no_news_when_a_search_ends(tmp_
     assert len(texts) == 2  # a search that will not answer is
 
 
+def test_while_tracking_it_is_told_that_a_loss_could_not_be_searched(tmp_path):
+    bridge = FakeBridge(True)
+    monitor = HealthMonitor(
+        partial(EngineHealth, search_hangs=True), bridge, lambda: StreamState.LIVE,
+        lambda *_: None, tmp_path,
+    )  # fmt: skip
+    tracking = SimpleNamespace(state=TrackingState.TRACKING, stage_ms={}, last_fix_ns=None)
+    monitor.add_estimate(tracking)
+    monitor.start()
+    monitor.stop()
+    assert bridge.told[-1] == (HealthLevel.DEGRADED, "tracking, but the search hangs")
+
+
 def test_after_the_end_the_file_says_that_it_ended_and_how(tmp_path):
     bridge = FakeBridge(True)
     monitor = HealthMonitor(

@@ -479,6 +479,33 @@ def test_while_lost_a_search_finds_the_place_and_the_way_flown_confirms_it(fligh
     assert f.engine.health.searches >= f.engine.health.found > 0
 
 
+def test_a_place_found_for_a_loss_that_is_over_is_not_tried_at_the_next_one(flight, monkeypatch):
+    optimizer, answer, offered = FakeOptimizer(), threading.Event(), []
+    offer = Localizer.offer
+    monkeypatch.setattr(
+        Localizer, "offer", lambda self, prior: (offered.append(prior.time_ns), offer(self, prior))
+    )
+
+    def search(frame, _is_idle):
+        answer.wait(60.0)
+        stale = frame.exposure_time_ns if f.engine.health.found == 0 else None
+        return None if stale is None else PosePrior(NADIR, np.eye(6), -stale, independent=False)
+
+    f = flight(_localizer(optimizer=optimizer), searcher=search)
+    f.feed_until(lambda: f.estimates and f.estimates[-1].state is TrackingState.TRACKING)
+    optimizer.offset = np.array([300.0, 0.0, 0.0])
+    f.feed_until(lambda: f.engine.health.searching)
+    optimizer.offset = np.zeros(3)  # it is where the prior says, after all
+    f.feed_until(lambda: f.estimates[-1].state is TrackingState.TRACKING)
+    answer.set()
+    f.feed_until(lambda: f.engine.health.found == 1)
+    fed = f.sequence
+    f.feed_until(lambda: f.sequence > fed + 3)
+    optimizer.offset = np.array([300.0, 0.0, 0.0])
+    f.feed_until(lambda: f.engine.health.searches > 1)
+    assert not any(time_ns < 0 for time_ns in offered)
+
+
 def test_beside_a_search_fewer_frames_are_tried_until_it_answers(flight):
     optimizer, answer = FakeOptimizer(), threading.Event()
 
