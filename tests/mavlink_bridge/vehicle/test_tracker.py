@@ -228,7 +228,9 @@ def test_between_two_places_the_way_over_the_date_line_is_the_short_one(
 ) -> None:
     it = tracker()
     for ms, lon in ((1, before), (201, after)):
-        m = mavlink.MAVLink_global_position_int_message(ms, -168_000_000, lon, 500000, 0, 0, 0, 0, 0)
+        m = mavlink.MAVLink_global_position_int_message(
+            ms, -168_000_000, lon, 500000, 0, 0, 0, 0, 0
+        )
         it.handle(sent(m), 10 * SECOND + ms * MS)
     found = it.global_at(10 * SECOND + 101 * MS)
     assert found is not None
