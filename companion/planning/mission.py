@@ -7,7 +7,7 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import Enum
 from pathlib import Path
 from typing import Any
@@ -27,7 +27,7 @@ _PLACES = (
     mavlink.MAV_CMD_NAV_LOITER_TIME,
     mavlink.MAV_CMD_NAV_LOITER_TURNS,
 )
-_ENDS = (mavlink.MAV_CMD_NAV_RETURN_TO_LAUNCH, mavlink.MAV_CMD_NAV_LAND)
+_UNSET = (0.0, 0.0)  # coordinates that stand for where the vehicle is
 
 
 class HeightAbove(Enum):
@@ -64,7 +64,7 @@ class Waypoint:
 @dataclass(frozen=True)
 class PlannedMission:
     """home: (latitude, longitude) degrees, if the file has it. speed_m_s: the last that is said.
-    returns: it ends with a return or a landing. ignored: numbers of commands that are not flown.
+    returns: it ends with a return to home. ignored: numbers of commands that are not flown.
     """
 
     home: tuple[float, float] | None
@@ -83,6 +83,10 @@ class _Item:
     latitude_deg: float
     longitude_deg: float
     altitude_m: float
+
+    @property
+    def place(self) -> tuple[float, float]:
+        return self.latitude_deg, self.longitude_deg
 
 
 def read_mission(path: Path) -> PlannedMission:
@@ -165,8 +169,13 @@ def _mission(
             above_home = _FRAMES.get(item.frame) is HeightAbove.HOME
             takeoff = item.altitude_m if above_home else None
         elif item.command in _PLACES:
-            waypoints.append(_waypoint(path, item, pitch, len(waypoints) + 1))
-        elif item.command in _ENDS:
+            before = waypoints[-1] if waypoints else _begun(home, takeoff)
+            waypoints.append(_waypoint(path, _filled(item, before), pitch, len(waypoints) + 1))
+        elif item.command == mavlink.MAV_CMD_NAV_LAND:
+            if waypoints and item.place != _UNSET:  # it is flown to, and then down
+                there = _level(item, waypoints[-1])
+                waypoints.append(_waypoint(path, there, pitch, len(waypoints) + 1))
+        elif item.command == mavlink.MAV_CMD_NAV_RETURN_TO_LAUNCH:
             returns = True
         elif item.command == mavlink.MAV_CMD_DO_CHANGE_SPEED:
             speed = item.parameters[1]
@@ -182,6 +191,29 @@ def _mission(
     if not waypoints:
         raise MissionFileError(f"{path}: holds no waypoint")
     return PlannedMission(home, tuple(waypoints), takeoff, speed, returns, tuple(ignored))
+
+
+def _begun(home: tuple[float, float] | None, takeoff_m: float | None) -> Waypoint | None:
+    """Where the vehicle is before the first place; None where the file does not say."""
+    return None if home is None else Waypoint(*home, takeoff_m or 0.0, None)
+
+
+def _filled(item: _Item, before: Waypoint | None) -> _Item:
+    """With what is not set, coordinates or an altitude of zero, as it is where the vehicle is, as
+    ArduPilot has it (ModeAuto::loc_from_cmd).
+    """
+    if before is None:
+        return item
+    if item.place == _UNSET:
+        latitude, longitude = before.latitude_deg, before.longitude_deg
+        item = replace(item, latitude_deg=latitude, longitude_deg=longitude)
+    return item if item.altitude_m else _level(item, before)
+
+
+def _level(item: _Item, before: Waypoint) -> _Item:
+    """At the height of the waypoint before it."""
+    frame = next(f for f, above in _FRAMES.items() if above is before.above)
+    return replace(item, altitude_m=before.height_m, frame=frame)
 
 
 def _waypoint(path: Path, item: _Item, pitch: float | None, number: int) -> Waypoint:

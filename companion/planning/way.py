@@ -25,6 +25,7 @@ from localizer.map.cache.surface import MapSurface
 LEAST_LEG_M = 1.0  # shorter ones are climbs on the spot
 # A ray that falls just between two tiles may miss both: some beside it do not.
 _DOWN = np.array([[x, y, -1.0] for x, y in ((0, 0), (1e-3, 4e-4), (-4e-4, 1e-3), (-1e-3, -6e-4))])
+_EARTH_M = 6.371e6
 _FARTHEST_KM = 500.0  # from the map: beyond it a digit is wrong
 
 
@@ -142,10 +143,17 @@ def _leg(
     heading = float(np.degrees(np.arctan2(east, north)) % 360.0)
     shares = (np.arange(count) + 0.5) / count
     samples = tuple(
-        Sample(start + s * (end - start), begun_m + float(s) * length, heading, pitch_deg)
-        for s in shares
+        Sample(_on_the_way(start, end, s), begun_m + s * length, heading, pitch_deg)
+        for s in map(float, shares)
     )
     return Leg(name, length, length / count, samples)
+
+
+def _on_the_way(start: Array, end: Array, share: float) -> Array:
+    """A place (3,) on a leg, as high above the Earth as between its ends: a chord lies below."""
+    east, north, _ = end - start
+    bulge = 0.5 * share * (1.0 - share) * (east * east + north * north) / _EARTH_M
+    return np.asarray(start + share * (end - start) + (0.0, 0.0, bulge))
 
 
 def _home(mission: PlannedMission, cache: TileCache) -> tuple[float, float]:
@@ -188,7 +196,11 @@ def _position(
             f"{cache.path} ({_extent(cache, below)}), so nobody knows how high its ground is: plan "
             "it over the map, or with altitudes above mean sea level"
         )
-    return np.array([east, north, surface + waypoint.height_m])
+    # Above the ellipsoid, not above the map's plane: that falls away by 8 m in 10 km.
+    height = cache.frame.position([*below, surface]).height_m + waypoint.height_m
+    return np.asarray(
+        cache.frame.enu_from_geodetic(waypoint.latitude_deg, waypoint.longitude_deg, height)
+    )
 
 
 def _extent(cache: TileCache, below: tuple[float, float]) -> str:

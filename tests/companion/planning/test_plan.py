@@ -89,6 +89,39 @@ def test_samples_stand_for_equal_parts_of_the_whole_way(tmp_path, cache):
     assert ways == pytest.approx(np.arange(10, 200, 20), abs=0.2)
 
 
+def test_a_landing_elsewhere_is_flown_to_and_no_return_is_made_up(tmp_path, cache):
+    land = item(21, 0, 0, 0, 0, *place(cache, 100, 50), 0)
+    path = plan_file(tmp_path / "a.plan", cache, waypoint(cache, 100, 0, 40), land)
+    mission = read_mission(path)
+    legs = legs_of(mission, cache, Ground(cache), GIMBAL, 1000.0)
+    assert [leg.name for leg in legs] == ["home to 1", "1 to 2"]
+    assert legs[1].samples[0].position == pytest.approx(
+        [100, 25, float(height(0, 0)) + 40], abs=0.5
+    )
+
+
+@pytest.mark.parametrize("altitude", [0, 60])
+def test_zero_zero_is_where_the_vehicle_is_and_no_place_off_africa(tmp_path, cache, altitude):
+    """Autopilots take unset coordinates, and an altitude of zero, for those of now."""
+    path = plan_file(
+        tmp_path / "a.plan", cache, item(17, 0, 0, 0, 0, 0, 0, 40), waypoint(cache, 100, 0, 40),
+        item(19, 5, 0, 0, 0, 0, 0, altitude), waypoint(cache, 100, 50, 0),
+    )  # fmt: skip
+    legs = legs_of(read_mission(path), cache, Ground(cache), GIMBAL, 1000.0)
+    assert [leg.name for leg in legs] == ["1 to 2", "3 to 4"]
+    assert legs[1].length_m == pytest.approx(50, abs=0.5)
+    above = legs[1].samples[0].position[2] - float(height(0, 0))
+    assert above == pytest.approx(altitude or 40, abs=0.5)
+
+
+def test_altitudes_above_home_follow_the_earths_curve(tmp_path, cache):
+    path = plan_file(tmp_path / "a.plan", cache, waypoint(cache, 0, 30_000, 100))
+    leg = legs_of(read_mission(path), cache, Ground(cache), GIMBAL, 100.0)[0]
+    ways = [leg.samples[k].position for k in (150, -1)]
+    above = [cache.frame.position(p).height_m - cache.frame.origin.height_m for p in ways]
+    assert above == pytest.approx([float(height(0, 0)) + 100] * 2, abs=1.0)
+
+
 def test_gimbal_and_fixed_cameras_look_where_they_are_aimed(tmp_path, cache):
     path = plan_file(tmp_path / "a.plan", cache, item(205, -40, 0, 0, 0, 0, 0, 0),
                      waypoint(cache, 100, 0, 40))  # fmt: skip
