@@ -215,6 +215,7 @@ def _sighting(
         estimate.exposure_time_ns, (where.latitude_deg, where.longitude_deg, where.height_m),
         sigmas.get(estimate.exposure_time_ns, 0.5),
         ned_from_world(cache.frame, where) @ pose.rotation, hit,
+        record.config.camera.model.camera().horizontal_fov_deg,
     )  # fmt: skip
 
 

@@ -16,7 +16,7 @@ class Sighting:
 
     place: latitude, longitude (degrees) and height above the ellipsoid (m) of the vehicle;
     sigma_m: horizontal, 1 sigma. ned_from_camera: (3, 3), OpenCV axes. depth_m: of the ground along
-    the optical axis, as the map is seen from there.
+    the optical axis, as the map is seen from there. horizontal_fov_deg: of this picture's zoom.
     """
 
     time_ns: int
@@ -24,6 +24,7 @@ class Sighting:
     sigma_m: float
     ned_from_camera: Array
     depth_m: float
+    horizontal_fov_deg: float
 
 
 @dataclass(frozen=True)

@@ -121,7 +121,8 @@ class CalibrationWatch:
 
     def add(self, sighting: Sighting) -> None:
         """A registered picture that was accepted against the map."""
-        self._waiting.append(sighting)
+        if self._limits.enabled:
+            self._waiting.append(sighting)
 
     def distrust(self, since_ns: int) -> None:
         """Pictures from a time on are not of their time (frozen, repeated): they are left out, and

@@ -1,4 +1,4 @@
-"""A few estimates a second as evidence of the calibration."""
+"""A few estimates a second as evidence of the calibration, and of how far the ground is."""
 
 from __future__ import annotations
 
@@ -48,6 +48,7 @@ class Sightings:
             float(np.sqrt(np.linalg.eigvalsh(P[:2, :2])[-1])),
             ned_from_world(frame, frame.position(pose.translation)) @ pose.rotation,
             depth_m,
+            estimate.camera.horizontal_fov_deg,
         )
 
 

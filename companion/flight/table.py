@@ -351,9 +351,8 @@ def _guardian(making: Making) -> Guardian:
     guardian = Guardian(watched, limits, making[Bridge])
     making[FixInjection].add_judge(lambda _, fix: guardian.judge(fix))
     making.channels.frames.subscribe(lambda f: guardian.see(f.exposure_time_ns, f.image))
-    if config.guardian.calibration.enabled:
-        sightings = Sightings(making[Bridge], making[Installation], guardian.sight)
-        making.channels.estimates.subscribe(sightings.add_estimate)
+    sightings = Sightings(making[Bridge], making[Installation], guardian.sight)
+    making.channels.estimates.subscribe(sightings.add_estimate)
     return guardian
 
 

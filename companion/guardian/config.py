@@ -57,7 +57,7 @@ class ProtectionConfig(_Model):
     map_height_m: float = Field(default=0.4, ge=0.0, le=100.0, description="the map's height")
     calibration_share: float = Field(
         default=0.003, ge=0.0, le=0.5,
-        description="the camera's, of the height above take-off, where nothing says how well it is "
+        description="the camera's, of the height above ground, where nothing says how well it is "
         "known: `camera.calibrated` null or long ago",
     )  # fmt: skip
     calibrated_share: float = Field(

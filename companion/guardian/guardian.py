@@ -71,7 +71,7 @@ class Guardian:
         self._picture = (time_ns, image)
 
     def sight(self, sighting: Sighting) -> None:
-        """Offer a registered picture as evidence of the calibration."""
+        """Offer a registered picture, as evidence of the calibration and of the ground."""
         with self._asked() as answers:
             if answers:
                 self._monitor.sight(sighting)

@@ -9,6 +9,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from companion.calibration_watch.ground import GroundView
 from companion.calibration_watch.sighting import Figure, Sighting
 from companion.calibration_watch.watch import CalibrationWatch
 from companion.guardian import findings as f
@@ -82,6 +83,7 @@ class Monitor:
         self._tilt = TiltCheck(config)
         self._ekf = EkfWatch()
         self._calibration = CalibrationWatch(config.calibration)
+        self._ground = GroundView(limits.horizontal_fov_deg)
         alert_s = min(f.LIMIT.alert_s, limits.time_to_alert_s)
         changed = {
             f.GNSS.name: replace(f.GNSS, repeat_s=config.gnss_repeat_s),
@@ -148,8 +150,9 @@ class Monitor:
         self._picture = (time_ns, self._pictures.add(time_ns, image))
 
     def sight(self, sighting: Sighting) -> None:
-        """A registered picture, for what it says of the camera."""
+        """A registered picture, for what it says of the camera and of the ground."""
         self._calibration.add(sighting)
+        self._ground.add(sighting)
 
     def admit(
         self,
@@ -171,7 +174,9 @@ class Monitor:
         admitted = self._jumps.admit(fix, state, attitude, agrees=agrees)
         self._doubt_steps(fix, state, admitted=admitted)
         known_m = self._known_m(state)
-        self._level = level = protection_level(fix, state, self._config.protection, known_m)
+        self._level = level = protection_level(
+            fix, state, self._config.protection, known_m, self._ground.height_m(state)
+        )
         fix = replace(fix, protection_m=(level.horizontal_m, level.vertical_m))
         self._jump_held = not admitted
         # The jump has a line of its own; how the place moves after it is judged anew. An announced
@@ -253,7 +258,8 @@ class Monitor:
         newest = self._newest
         fresh = newest is not None and now_ns - newest.time_ns < _FRESH_NS
         height = state.altitude_relative_m
-        flies = state.armed and (height is None or height >= _AIRBORNE_M)
+        # Below take-off it flies, too: it began on a hill.
+        flies = state.armed and (height is None or abs(height) >= _AIRBORNE_M)
         none = Reading(None)
         checks: dict[str, Callable[[], Reading]] = {
             f.VIDEO_FROZEN.name: lambda: self._frozen(now_ns, state) if flies else Reading(False),
@@ -292,7 +298,8 @@ class Monitor:
         focal_m = self._calibration.known_m(speed, focal=focal, time=False)
         late_m = self._calibration.known_m(speed, focal=False, time=late)
         # Late stamps are how a step is explained, and a tilt shifts as a step does.
-        return focal_m + max(late_m, self._steps.possible_m, self._tilt.metres(state))
+        tilt_m = self._tilt.metres(self._ground.height_m(state))
+        return focal_m + max(late_m, self._steps.possible_m, tilt_m)
 
     def _frozen(self, now_ns: int, state: VehicleState) -> Reading:
         if self._picture is None or now_ns - self._picture[0] > _PICTURE_FRESH_NS:
@@ -301,7 +308,8 @@ class Monitor:
         if verdict.contrast < _SHOWS_GRAY:
             return Reading(False)  # fog, a covered lens: the localizer says that it sees nothing
         identical = verdict.identical_s >= _IDENTICAL_S
-        still = verdict.still_s >= self._still_s(state) or self._should_have_moved(state, verdict)
+        still = verdict.still_s >= self._still_s(now_ns, state)
+        still = still or self._should_have_moved(state, verdict)
         return Reading(identical or still, verdict.still_s)
 
     @staticmethod
@@ -315,11 +323,9 @@ class Monitor:
         speed = math.hypot(*state.local_velocity_ned[:2])
         return speed >= _MOVED_SPEED_MPS and speed * verdict.still_s >= _MOVED_M
 
-    def _still_s(self, state: VehicleState) -> float:
+    def _still_s(self, now_ns: int, state: VehicleState) -> float:
         """How long a hover may look still: the limit in the picture is metres on the ground."""
-        height = 100.0 if state.altitude_relative_m is None else state.altitude_relative_m
-        half = math.tan(math.radians(self._limits.horizontal_fov_deg) / 2.0)
-        ground_m = self._config.picture.still_share * 2.0 * max(height, 0.0) * half
+        ground_m = self._config.picture.still_share * self._ground.width_m(state, now_ns)
         return max(self._config.picture.still_s, _STILL_FIRST_S + _STILL_PER_M * ground_m)
 
     def _repeats(self, now_ns: int) -> Reading:

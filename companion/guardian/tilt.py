@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 
 from companion.guardian.config import GuardianConfig
-from mavlink_bridge.messages import Attitude, VehicleState, VisionFix
+from mavlink_bridge.messages import Attitude, VisionFix
 
 _SIGMAS, _CALM_SIGMAS = 3.0, 2.0
 _HOLDS_NS = 1_000_000_000  # without an attitude: a link loses some
@@ -39,13 +39,12 @@ class TiltCheck:
         """By how much the newest fix is tilted."""
         return math.degrees(self._off_rad)
 
-    def metres(self, state: VehicleState) -> float:
-        """By how much its position may be wrong: the tilt times the height, as far as gimbal and
-        autopilot do not explain it.
+    def metres(self, height_m: float | None) -> float:
+        """By how much its position may be wrong: the tilt times the height above the ground, as far
+        as gimbal and autopilot do not explain it.
         """
         believed = (self._share - _CALM_SIGMAS) / (_SIGMAS - _CALM_SIGMAS)
-        height_m = state.altitude_relative_m
-        shift_m = self._most_m if height_m is None else max(height_m, 0.0) * self._off_rad
+        shift_m = self._most_m if height_m is None else height_m * self._off_rad
         return min(shift_m * min(max(believed, 0.0), 1.0), self._most_m)
 
     def add(self, fix: VisionFix, attitude: Attitude | None) -> None:

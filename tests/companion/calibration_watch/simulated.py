@@ -224,4 +224,5 @@ class Flown:
             0.1,
             turned,
             depth * (1.0 + focal),
+            60.0,
         )

@@ -323,7 +323,7 @@ def looking(flight: Flight, yaw_off_deg: float) -> Sighting:
     assert gimbal is not None
     reported = matrix_from_quaternion(gimbal.quaternion) @ GIMBAL_FROM_CAMERA
     turned = so3_exp(np.array([0.0, 0.0, np.radians(yaw_off_deg)])) @ reported
-    return Sighting(now_ns, (LATITUDE, LONGITUDE, HEIGHT), 0.1, turned, 85.0)
+    return Sighting(now_ns, (LATITUDE, LONGITUDE, HEIGHT), 0.1, turned, 85.0, 60.0)
 
 
 @pytest.mark.parametrize(("off_deg", "told"), [(4.0, True), (-12.0, True), (1.5, False)])

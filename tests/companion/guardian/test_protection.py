@@ -45,7 +45,7 @@ def level_m(sigma_m: float, *, calibrated: bool) -> float:
         1, 47.0, 8.0, 500.0, position_covariance_ned=np.eye(3) * sigma_m**2, reset=False
     )
     config = ProtectionConfig().of_camera(calibrated=calibrated)
-    return protection_level(fix, AT_120_M, config).horizontal_m
+    return protection_level(fix, AT_120_M, config, 0.0, 120.0).horizontal_m
 
 
 def test_a_calibrated_camera_has_the_narrower_level_and_one_that_states_more_a_wider() -> None:

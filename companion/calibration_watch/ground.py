@@ -1,0 +1,54 @@
+"""How far the ground is, and how much of it the camera sees: what its errors are multiplied with.
+
+The height above take-off is neither: an aircraft that left a hill flies over a valley below zero,
+and a lens that zooms sees another piece of the same ground. The registered pictures know both.
+"""
+
+from __future__ import annotations
+
+import math
+
+from companion.calibration_watch.sighting import Sighting
+from mavlink_bridge.messages import VehicleState
+
+UNKNOWN_HEIGHT_M = 120.0  # most may fly no higher
+_BELOW_M = -5.0  # of a barometer on the ground
+_WIDTH_HEIGHT_M = 100.0  # where nothing is known: an assumption too high finds a still picture late
+_HOLDS_NS = 2_000_000_000  # a view, for a lens and a height that change
+
+
+class GroundView:
+    """Takes the registered pictures. horizontal_fov_deg: the camera's, where none says another."""
+
+    def __init__(self, horizontal_fov_deg: float) -> None:
+        self._fov_deg = horizontal_fov_deg
+        self._newest: Sighting | None = None
+
+    def add(self, sighting: Sighting) -> None:
+        """A registered picture that was accepted against the map."""
+        self._newest = sighting
+
+    def height_m(self, state: VehicleState) -> float | None:
+        """Above the ground, at the least favourable of what is known; None where nothing is.
+
+        The ground that was seen last may be higher than that below, and it was seen before.
+        """
+        relative_m = state.altitude_relative_m
+        known = [] if relative_m is None or relative_m < _BELOW_M else [max(relative_m, 0.0)]
+        if self._newest is not None:
+            down = float(self._newest.ned_from_camera[2, 2])
+            known.append(max(self._newest.depth_m * down, 0.0))
+        return max(known, default=None)
+
+    def width_m(self, state: VehicleState, now_ns: int) -> float:
+        """Of the ground from one side of the picture to the other."""
+        newest = self._newest
+        if newest is not None and now_ns - newest.time_ns < _HOLDS_NS:
+            return newest.depth_m * _spread(newest.horizontal_fov_deg)
+        height_m = self.height_m(state)
+        return (_WIDTH_HEIGHT_M if height_m is None else height_m) * _spread(self._fov_deg)
+
+
+def _spread(fov_deg: float) -> float:
+    """Width of what is seen, per distance."""
+    return 2.0 * math.tan(math.radians(fov_deg) / 2.0)
