@@ -12,7 +12,9 @@ within one, only the pixels' own noise averages out; the pose's error counts in 
 from __future__ import annotations
 
 from collections import deque
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import TypeVar
 
 import numpy as np
 
@@ -20,6 +22,7 @@ from localizer.geometry.pose import Array
 from localizer.targets.locate import RaySpread
 from localizer.types import TargetSurface
 
+_Item = TypeVar("_Item")
 _SAME_VIEW = float(np.cos(np.radians(2.0)))
 _MOST_VIEWS = 32
 _AVERAGED = 5  # pixels of one viewpoint: a detector's aim is off alike in all of them
@@ -172,8 +175,8 @@ class StaticTarget:
                 self._views[k] = known.with_(view)
                 return
         self._views.append(view)
-        if len(self._views) > _MOST_VIEWS:  # the first one stays: it was placed by
-            self._views = [self._views[0], *self._views[2::2], self._views[-1]]
+        if len(self._views) > _MOST_VIEWS:
+            self._views = thinned(self._views)
 
     def _meet(self, surfaces: tuple[TargetSurface, ...]) -> None:
         """Each surface on which a hypothesis lies is its plane from now on, or begins another.
@@ -218,6 +221,11 @@ class StaticTarget:
             if h.log_weight >= least and not same and len(kept) < _MOST_PLACES:
                 kept.append(h)
         self._hypotheses = kept
+
+
+def thinned(views: Sequence[_Item]) -> list[_Item]:
+    """Every second, each once, the newest and the first among them: it was placed by that one."""
+    return [views[0], *views[:0:-2][::-1]]
 
 
 @dataclass(frozen=True)

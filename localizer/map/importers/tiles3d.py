@@ -288,6 +288,8 @@ def _centre(root: dict[str, Any], where: str) -> Array:
     volume = _object(root.get("boundingVolume"), f"{where}: the root's boundingVolume")
     if "region" in volume:
         west, south, east, north, low, _ = _numbers(volume["region"], 6, where)
+        if east < west:  # across the 180th meridian (3D Tiles 1.1, 3.5.2)
+            east += 2 * np.pi
         lat, lon = np.degrees(0.5 * (south + north)), np.degrees(0.5 * (west + east))
         return ecef_from_geodetic(lat, lon, low)
     key = "box" if "box" in volume else "sphere"

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 from localizer.errors import GeoreferenceError, MapCacheError, MapSourceError
+from localizer.geometry.geo import geodetic_from_ecef
 from localizer.geometry.pose import Pose
 from localizer.map.building.build import build_cache
 from localizer.map.building.options import BuildOptions
@@ -237,6 +238,17 @@ def test_the_geoid_separation_is_computed_and_compared(tmp_path, make):
         build_cache(source, tmp_path / "c", BuildOptions(geoid_separation_m=20, workers=1))
     with pytest.raises(GeoreferenceError, match="does not occur"):
         build_cache(source, tmp_path / "c", BuildOptions(geoid_separation_m=900, workers=1))
+
+
+@pytest.mark.parametrize(("west", "east"), [(177.99, 178.01), (179.99, -179.99)])
+def test_a_map_across_the_date_line_has_its_origin_there(tmp_path, make, west, east):
+    region = [*np.radians([west, -16.81, east, -16.79]).tolist(), 50.0, 90.0]
+    source = single_tile(
+        make, tmp_path / "s", flat_patch(make)[1], boundingVolume={"region": region}, transform=None
+    )
+    latitude, longitude, height = geodetic_from_ecef(read_tileset(source).centre)
+    assert (latitude, height) == pytest.approx((-16.8, 50.0), abs=1e-6)
+    assert (longitude - west) % 360.0 == pytest.approx((east - west) % 360.0 / 2, abs=1e-6)
 
 
 def test_a_tileset_that_is_not_on_earth_is_an_error(tmp_path, make, build):
