@@ -24,6 +24,7 @@ from rasterio.warp import transform_bounds
 from localizer.errors import MapFetchError
 from localizer.map.fetch.area import Area, utm_zone
 from localizer.map.fetch.catalogue import Source
+from localizer.map.fetch.heights import UNITS, metres_of
 from localizer.map.fetch.polite import PoliteClient, shown
 from localizer.map.fetch.raster import Grid, Piece, Plan, cut, grid_over
 from localizer.map.importers.raster_file import offline
@@ -230,7 +231,11 @@ def _window(
                 if not source.has_heights:
                     check_depth(shown(url), data.dtypes[0])
                 count = min(bands, data.count)
-                read = vrt.read(list(range(1, count + 1))).astype(dtype)
+                read = vrt.read(list(range(1, count + 1)))
+                if source.has_heights:
+                    name = url.rpartition("/")[2].partition("?")[0]
+                    read = metres_of(source, name, data, window.crs).metres(read)
+                read = read.astype(dtype)
                 has = vrt.dataset_mask() > 0
         except RasterioError as error:
             raise MapFetchError(f"{shown(url)}: cannot be read: {error}") from error
@@ -273,6 +278,8 @@ def as_geotiff(bands: np.ndarray, known: np.ndarray, window: Grid) -> bytes:
     with rasterio.Env(GDAL_TIFF_INTERNAL_MASK=True), MemoryFile() as memory:
         with memory.open(**profile) as file:
             file.write(values)
-            if not heights:
+            if heights:
+                file.units = UNITS
+            else:
                 file.write_mask(known)
         return bytes(memory.read())

@@ -19,6 +19,7 @@ from rasterio.windows import Window
 from localizer.errors import MapFetchError
 from localizer.map.fetch.catalogue import Source
 from localizer.map.fetch.cloud import NODATA, check_depth
+from localizer.map.fetch.heights import UNITS, metres_of
 from localizer.map.fetch.raster import Piece, Plan
 from localizer.map.importers.raster_file import offline
 
@@ -47,7 +48,9 @@ def assemble(source: Source, plan: Plan, folder: Path, out: Path) -> float:
             rasterio.Env(GDAL_TIFF_INTERNAL_MASK=True),
             rasterio.open(partial, "w", **profile) as file,
         ):
-            if not heights:
+            if heights:
+                file.units = UNITS
+            else:
                 file.write_mask(np.zeros((grid.height, grid.width), bool))
             for piece in plan.pieces:
                 path = folder / piece.name
@@ -147,6 +150,9 @@ def _values(source: Source, plan: Plan, piece: Piece, image: Any) -> tuple[np.nd
         if source.nodata is not None:
             known &= values[0] != source.nodata
         values = values[:wanted]
+    if source.has_heights:
+        band = metres_of(source, piece.name, image, plan.grid.crs)
+        values = band.metres(values.astype(np.float64))
     if len(values) < wanted:
         values = np.repeat(values[:1], wanted, axis=0)
     return values, known & np.isfinite(values.astype(np.float64)).all(axis=0)

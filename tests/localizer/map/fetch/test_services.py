@@ -277,3 +277,45 @@ def test_a_picture_of_more_than_8_bits_is_refused(server, tmp_path, kind):
         fetched(wanted, tmp_path) if kind == "cog" else check_piece(
             wanted, piece, path.read_bytes()
         )
+
+
+def _other_numbers(server, name, values, **says):
+    """The surface as a service may give it: in feet, in decimetres, above something else."""
+    with rasterio.open(server.folder / "surface.tif") as data:
+        profile = data.profile | {
+            "dtype": "int16",
+            "nodata": None,
+            "crs": says.get("crs", data.crs),
+        }
+        metres = data.read(1).astype(np.float64)
+    with rasterio.open(server.folder / name, "w", **profile) as file:
+        file.write(np.rint(values(metres)).astype(np.int16), 1)
+        file.scales, file.offsets = (says.get("scale", 1.0),), (says.get("offset", 0.0),)
+        if "unit" in says:
+            file.units = (says["unit"],)
+    return source("cog", f"{server.url}/{name}", role="surface")
+
+
+@pytest.mark.parametrize(
+    ("values", "says"),
+    [
+        (lambda z: z / 0.3048, {"unit": "ft"}),
+        (lambda z: (z - 400.0) / 0.1, {"scale": 0.1, "offset": 400.0}),
+    ],
+)
+def test_heights_are_metres_whatever_unit_scale_and_offset_a_file_has(
+    server, tmp_path, values, says
+):
+    """They were taken as they stand: a map 500 m too low, and nobody was told."""
+    path = fetched(_other_numbers(server, "counted.tif", values, **says), tmp_path)
+    compare(path, height_m, 0.3)
+    with rasterio.open(path) as data:
+        assert data.units == ("m",)
+
+
+def test_heights_above_another_datum_than_the_source_says_are_refused(server, tmp_path):
+    wanted = _other_numbers(server, "high.tif", lambda z: z, crs=f"{CRS}+5773")
+    compare(fetched(wanted, tmp_path), height_m, 0.7)
+    wanted = wanted.model_copy(update={"vertical_datum": "ellipsoidal"})
+    with pytest.raises(MapFetchError, match=r"are amsl by its CRS .*EGM96.*says ellipsoidal"):
+        fetched(wanted, tmp_path / "again")
