@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import stat
 from dataclasses import dataclass
 from datetime import datetime, timezone
 from pathlib import Path
@@ -14,10 +15,11 @@ from companion.calibrate import unknowns as u
 from companion.calibrate.evidence import changed_camera
 from companion.calibrate.flight import Calibrated
 from companion.calibrate.lens import Lens
-from companion.config import CompanionConfig
+from companion.config import CompanionConfig, load_config, parse_config
 from companion.errors import ConfigError
 from companion.settings_file import read_settings, validated
 from localizer.geometry.pose import Array, euler_from_matrix, so3_exp
+from mavlink_bridge.whole_file import replace_whole
 
 _LEAST = {"focal_percent": 0.05, "principal_percent": 0.05, "distortion": 0.001, "stamp_ms": 2.0}
 _JITTER_MS = 2.0  # of stamps, from picture to picture, which the mean does not show
@@ -138,22 +140,41 @@ def _apply(document: dict[str, Any], wanted: tuple[Change, ...]) -> None:
         at[change.key[-1]] = change.after
 
 
+def require_flown_with(path: Path, wanted: tuple[Change, ...]) -> None:
+    """`ConfigError` where a deployment file is another than the flight's: differences from one
+    mounting, written over another's, would be neither's. What was written already may stand there.
+    """
+    document = load_config(path).model_dump()
+    for change in wanted:
+        told = document
+        for name in change.key:
+            told = told[name]
+        now = list(told) if isinstance(told, tuple) else told
+        if now not in (change.before, change.after):
+            raise ConfigError(
+                f"{path}: {'.'.join(change.key)} is {now}, the record was flown with "
+                f"{change.before}: give the file that it was flown with"
+            )
+
+
 def write_changed(path: Path, wanted: tuple[Change, ...], heading: str) -> Path:
-    """Replace the deployment file; the old one stays beside it under the name that is returned."""
+    """Replace the deployment file, if the result is one; the old one stays beside it under the name
+    that is returned. Both may be read by whom the old one might.
+    """
     document = read_settings(path, ConfigError)
     _apply(document, wanted)
     today = datetime.now(timezone.utc).date().isoformat()
     _apply(document, (Change(("camera", "calibrated"), None, today),))
+    parse_config(document, f"{path}, as it would be written (nothing was changed)")
     number, kept = 1, path.with_name(f"{path.name}.before-calibration")
     while kept.exists():
         number += 1
         kept = path.with_name(f"{path.name}.before-calibration-{number}")
     text = yaml.safe_dump(document, sort_keys=False, default_flow_style=None, width=100)
-    fresh = path.with_name(f".{path.name}.new")
     try:
-        kept.write_bytes(path.read_bytes())
-        fresh.write_text(f"# {heading}\n# Before it: {kept.name}\n\n{text}", encoding="utf-8")
-        fresh.replace(path)
+        mode = stat.S_IMODE(path.stat().st_mode)
+        replace_whole(kept, path.read_bytes().decode("utf-8"), mode)
+        replace_whole(path, f"# {heading}\n# Before it: {kept.name}\n\n{text}", mode)
     except OSError as error:
         raise ConfigError(f"{path}: cannot be written: {error.strerror}") from error
     return kept

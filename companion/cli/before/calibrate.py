@@ -37,7 +37,12 @@ def flight_command(
 ) -> None:
     """Camera, boresight, lever arm, times and map shift from a shadow flight with pictures."""
     from companion.calibrate.flight import calibrate
-    from companion.calibrate.proposal import blind_spots, changes, write_changed
+    from companion.calibrate.proposal import (
+        blind_spots,
+        changes,
+        require_flown_with,
+        write_changed,
+    )
     from companion.offline.replay import load_record
 
     if write and config is None:
@@ -69,6 +74,7 @@ def flight_command(
     if report is not None:
         report.write_text(json.dumps(_figures(found, wanted, blind), indent=1), encoding="utf-8")
     if write and config is not None:
+        require_flown_with(config, wanted)
         kept = write_changed(config, wanted, f"calibrated by `companion calibrate flight {record}`")
         console.print(f"{config} is changed; before it: {kept}", style="green", soft_wrap=True)
 

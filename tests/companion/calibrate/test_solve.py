@@ -13,10 +13,18 @@ from companion.calibrate import unknowns as u
 from companion.calibrate.evidence import Evidence, Sighted, changed_camera
 from companion.calibrate.flight import Calibrated
 from companion.calibrate.pictures import Parts
-from companion.calibrate.proposal import blind_spots, changed, changes, write_changed
+from companion.calibrate.proposal import (
+    Change,
+    blind_spots,
+    changed,
+    changes,
+    require_flown_with,
+    write_changed,
+)
 from companion.calibrate.said import OFFSETS_S, Said
 from companion.calibrate.solve import solve
 from companion.config import load_config
+from companion.errors import ConfigError
 from companion.geometry import GIMBAL_FROM_CAMERA
 from localizer.geometry.camera import Camera
 from localizer.geometry.geo import NED_FROM_ENU
@@ -133,3 +141,34 @@ def test_the_deployment_is_changed_and_the_old_one_kept(rich: Calibrated, tmp_pa
     assert after.model_copy(update={"camera": dated}) == changed(load_config(kept), wanted)
     assert write_changed(path, wanted, "again") != kept
     json.dumps({".".join(c.key): [c.before, c.after] for c in wanted})
+
+
+def test_a_deployment_that_nobody_else_may_read_stays_so(tmp_path: Path):
+    """Feeds and keys have their passwords in it."""
+    path = deployment(tmp_path)
+    path.chmod(0o600)
+    kept = write_changed(path, (), "calibrated")
+    assert [p.stat().st_mode & 0o777 for p in (path, kept)] == [0o600, 0o600]
+
+
+def test_what_makes_no_deployment_is_not_written(tmp_path: Path):
+    """A flight that tells little may say a lens that the next start would refuse."""
+    path = deployment(tmp_path)
+    before = path.read_text()
+    wanted = (Change(("camera", "model", "cx"), 320.0, 6000.0),)
+    with pytest.raises(ConfigError, match=r"nothing was changed.*(\n.*)*cx 6000 is far"):
+        write_changed(path, wanted, "calibrated")
+    assert path.read_text() == before
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["deployment.yaml"]
+
+
+def test_another_flights_deployment_is_not_written_over(rich: Calibrated, tmp_path: Path):
+    path = deployment(tmp_path)
+    wanted = changes(load_config(path), rich)
+    require_flown_with(path, wanted)
+    write_changed(path, wanted, "calibrated")
+    require_flown_with(path, wanted)  # the same flight again
+    remounted = (Change(("bridge", "camera", "mount_pitch_deg"), None, -8.0),)
+    write_changed(path, remounted, "mounted anew")
+    with pytest.raises(ConfigError, match=r"mount_pitch_deg is -8.0, .* flown with 0.0"):
+        require_flown_with(path, wanted)
