@@ -12,7 +12,7 @@ import hashlib
 import logging
 import math
 import os
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -48,6 +48,9 @@ _LOCAL_CELLS = 8.0
 _SAMPLE_SQUARES = 24  # that the principal components are computed from
 _GROUND_PERCENTILE = 30  # of the heights in a sample: lower than roofs and trees
 _LEAST_SHARE = 0.9  # of a square's cell that the map must cover to be compared
+
+_SEARCHED_BYTES = 16  # of the finest level's cell: its scores, their trials, and copies
+_MOST_OF_MEMORY = 0.5  # of what is free
 
 Progress = Callable[[int, int], None]
 
@@ -151,6 +154,7 @@ def open_overview(
     folder = cache.path / "overview" / key
     levels = []
     squares = [_squares(cache, gsd) for gsd in GSD_M]
+    _require_memory(squares)
     total, done = sum(len(s.corners) for s in squares), 0
     for plan in squares:
         path = folder / f"{plan.gsd_m:g}.safetensors"
@@ -195,6 +199,29 @@ class _Squares:
         return np.array(
             [self.west + (corner[1] + half) * cell, self.north - (corner[0] + half) * cell]
         )
+
+
+def _require_memory(squares: Sequence[_Squares]) -> None:
+    """A flight that the system ends for want of memory has lost more than its search."""
+    cells = [s.rows * s.columns for s in squares]
+    wanted, free = CHANNELS * sum(cells) + _SEARCHED_BYTES * cells[0], available_bytes()
+    if free is not None and wanted > _MOST_OF_MEMORY * free:
+        raise MapCacheError(
+            f"a search of {cells[0] * (GSD_M[0] * STRIDE) ** 2 / 1e6:.0f} km² takes "
+            f"{wanted / 2**20:.0f} MiB, more than half of the {free / 2**20:.0f} MiB that are "
+            "free: build a smaller map, or one in parts"
+        )
+
+
+def available_bytes() -> int | None:
+    """Memory that may be had without swapping; None where the system does not say."""
+    try:
+        for line in Path("/proc/meminfo").read_text(encoding="ascii").splitlines():
+            if line.startswith("MemAvailable:"):
+                return int(line.split()[1]) * 1024
+    except (OSError, ValueError, IndexError):
+        pass
+    return None
 
 
 def _squares(cache: TileCache, gsd_m: float) -> _Squares:

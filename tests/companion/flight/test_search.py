@@ -184,6 +184,16 @@ def test_a_place_that_is_found_at_once_is_given_at_once(slowly, cache):
     assert len(slow.queries) == 1
 
 
+def test_far_from_the_origin_the_height_is_counted_from_the_maps_plane(slowly, cache):
+    """At 30 km that lies 70 m above the ellipsoid: no height that was tried was the right one."""
+    falling = Falling()
+    search, slow = slowly(falling)
+    search.hint(0.0, 30_000.0, 30.0)
+    search.search(falling.frame(), lambda: False)
+    place = cache.frame.position(np.array([0.0, 30_000.0, slow.queries[0].height_m]))
+    assert place.height_m - cache.frame.origin.height_m == pytest.approx(75.0, abs=0.5)
+
+
 def test_a_place_of_long_ago_says_nothing(slowly):
     falling = Falling()
     search, slow = slowly(falling)

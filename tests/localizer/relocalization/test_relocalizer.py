@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from localizer.config import LocalizerConfig
+from localizer.errors import MapCacheError
 from localizer.geometry.camera import Camera
 from localizer.geometry.pose import Pose, so3_exp
 from localizer.map.cache.cache import TileCache
@@ -265,6 +266,15 @@ def test_the_overview_is_kept_and_a_damaged_one_is_made_again(cache, opened, cap
         assert not caplog.records
         renderer.close()
     assert stamps[files[0]] == files[0].stat().st_mtime_ns  # the whole ones were left alone
+
+
+def test_a_map_whose_search_does_not_fit_into_memory_is_named(cache, opened, monkeypatch):
+    monkeypatch.setattr("localizer.relocalization.overview.available_bytes", lambda: 1 << 20)
+    with pytest.raises(MapCacheError, match=r"search of .* km² takes \d+ MiB, more than half of"):
+        open_relocalizer(cache, CONFIG)
+    monkeypatch.setattr("localizer.relocalization.overview.available_bytes", lambda: None)
+    with open_relocalizer(cache, CONFIG) as found:
+        assert found.overview.key == opened.relocalizer.overview.key
 
 
 def test_another_map_or_model_has_an_overview_of_its_own(cache):
