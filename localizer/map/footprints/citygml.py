@@ -8,6 +8,8 @@ from pathlib import Path
 from xml.etree import ElementTree
 
 import numpy as np
+from pyproj import CRS
+from pyproj.exceptions import CRSError
 
 from localizer.errors import MapSourceError
 from localizer.geometry.pose import Array
@@ -18,8 +20,14 @@ from localizer.map.footprints.footprint import (
     ring_of,
     sane_height,
 )
+from localizer.map.importers.height_crs import UNITS, horizontal_unit_m
 from localizer.plain_files import plain_bytes
 
+# As CityGML spells them besides: UCUM, EPSG's numbers, English plurals.
+_UNITS = {
+    "mtr": 1.0, "meters": 1.0, "9001": 1.0, "ft_i": UNITS["ft"], "9002": UNITS["ft"],
+    "ft_us": UNITS["us-ft"], "9003": UNITS["us-ft"],
+}  # fmt: skip
 _BUILDINGS = ("Building", "BuildingPart")
 _GROUNDS = ("GroundSurface", "lod0FootPrint")
 _LEVEL_M = 0.3  # by which a ground surface's corners may differ in height
@@ -38,15 +46,18 @@ def read_citygml(path: Path) -> Footprints:
         raise MapSourceError(f"{path}: no CityGML: {error}") from error
     found: list[Footprint] = []
     left_out = 0
-    for element in root.iter():
-        if _name(element) not in _BUILDINGS:
-            continue
-        made = _footprint(element)
+    buildings = [element for element in root.iter() if _name(element) in _BUILDINGS]
+    crs = _crs(path, root) if buildings else ""
+    try:
+        unit_m = horizontal_unit_m(CRS(crs)) if crs else 1.0
+    except CRSError as error:
+        raise MapSourceError(f"{path}: {error}") from error
+    for element in buildings:
+        made = _footprint(element, path, unit_m)
         if made is not None:
             found.append(made)
         elif not any(_name(part) == "BuildingPart" for part in element.iter()):
             left_out += 1
-    crs = _crs(path, root) if found else ""
     return Footprints(path, crs, tuple(found), either_order=True, left_out=left_out).require()
 
 
@@ -72,17 +83,29 @@ def _own(element: ElementTree.Element) -> Iterator[ElementTree.Element]:
             yield from _own(child)
 
 
-def _footprint(building: ElementTree.Element) -> Footprint | None:
+def _measured(element: ElementTree.Element, path: Path) -> float | None:
+    """Metres of a measuredHeight, whose unit is a name, or the end of an address of one."""
+    uom = element.attrib.get("uom", "m")
+    name = re.split(r"[:#/]", uom)[-1].strip("[]").lower()
+    unit_m = UNITS.get(name, _UNITS.get(name))
+    if unit_m is None:
+        raise MapSourceError(f"{path}: a measuredHeight has the unit {uom!r}: m or ft is expected")
+    told = sane_height(element.text or "")
+    return None if told is None else told * unit_m
+
+
+def _footprint(building: ElementTree.Element, path: Path, unit_m: float) -> Footprint | None:
+    """unit_m: of the file's coordinates, heights too."""
     told: float | None = None
     for element in _own(building):
         if _name(element) == "measuredHeight":
-            told = sane_height(element.text or "")
+            told = _measured(element, path)
     grounds = [e for e in _own(building) if _name(e) in _GROUNDS]
     everything = list(_polygons(building))
     height = told
     if height is None and everything:
         heights = np.concatenate([p[0][:, 2] for p in everything])
-        height = sane_height(float(np.ptp(heights)))
+        height = sane_height(unit_m * float(np.ptp(heights)))
     if height is None or not everything:
         return None
     ground = [p for e in grounds for p in _polygons(e)]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from pathlib import Path
 
 import numpy as np
@@ -92,6 +93,36 @@ def test_roofs_are_as_high_as_said_and_walls_stand_upright(tmp_path, terrain, ki
     with rasterio.open(out) as file_:
         assert file_.res == (0.5, 0.5)
         assert file_.crs == CRS
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "metres"),
+    [
+        ("EPSG::25832", "EPSG::2263", 12.5 * 1200 / 3937),
+        ("<bldg:lod1Solid>", "<bldg:measuredHeight uom='m'>20</bldg:measuredHeight>\\g<0>", 20.0),
+        ("<bldg:lod1Solid>", "<bldg:measuredHeight uom='urn:ogc:def:uom:UCUM::[ft_i]'>20"
+         "</bldg:measuredHeight>\\g<0>", 6.096),
+    ],
+)  # fmt: skip
+def test_a_model_of_a_town_that_counts_in_feet_is_no_three_times_higher(tmp_path, old, new, metres):
+    file = citygml(tmp_path / "a.gml", HOUSE, 12.5)
+    file.write_text(re.sub(old, new, file.read_text()))
+    assert read_footprints(file).buildings[0].height_m == pytest.approx(metres)
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "why"),
+    [
+        ("<bldg:lod1Solid>", "<bldg:measuredHeight uom='fathom'>20</bldg:measuredHeight>\\g<0>",
+         "has the unit 'fathom'"),
+        ("EPSG::25832", "EPSG::999999", "999999"),
+    ],
+)  # fmt: skip
+def test_a_unit_or_crs_that_nobody_knows_is_named(tmp_path, old, new, why):
+    file = citygml(tmp_path / "a.gml", HOUSE, 12.5)
+    file.write_text(re.sub(old, new, file.read_text()))
+    with pytest.raises(MapSourceError, match=why):
+        read_footprints(file)
 
 
 def test_a_court_stays_open_and_a_tower_on_a_house_is_not_lifted_by_it(tmp_path, terrain):
