@@ -16,6 +16,7 @@ from typing import Any
 
 import numpy as np
 
+from companion.flight.search import NOT_READY
 from companion.guardian.guardian import Guardian
 from companion.sources import StreamState
 from companion.writing import NewestFile
@@ -56,7 +57,7 @@ _OF_STATE = {
 class Besides:
     """What else may say how well it goes: is the record complete, the autopilot's own idea of its
     position's sigma in metres, the guardian, nodes of the map that cannot be read, the map's shift,
-    counts of targets.
+    counts of targets, why a lost place cannot be searched.
     """
 
     is_recorded: Callable[[], bool] = lambda: True
@@ -65,6 +66,7 @@ class Besides:
     unreadable_nodes: Callable[[], int] = lambda: 0
     map_shift: Callable[[], dict[str, float | bool] | None] = lambda: None
     targets: Callable[[], dict[str, int]] = dict
+    search_lacks: Callable[[], str] = lambda: ""
 
 
 class HealthMonitor:
@@ -88,6 +90,7 @@ class HealthMonitor:
         self._guardian = besides.guardian
         self._unreadable_nodes = besides.unreadable_nodes
         self._map_shift, self._targets = besides.map_shift, besides.targets
+        self._search_lacks = besides.search_lacks
         self._ended = ""
         self.newest: dict[str, Any] = {"level": "starting", "text": "starting"}
         """The newest report, as health.json has it."""
@@ -164,7 +167,7 @@ class HealthMonitor:
             return HealthLevel.DEGRADED, _SILENT_VEHICLE
         engine = self._engine_health()
         if not self._estimates:
-            return HealthLevel.STARTING, _waiting_for(engine)
+            return HealthLevel.STARTING, _waiting_for(engine, self._lacks(engine))
         arrived, estimate = self._estimates[-1]
         if time.monotonic() - arrived > _STALE_S:
             if _is_lost(estimate):  # the error stands in health.json; this is what to act on
@@ -177,8 +180,8 @@ class HealthMonitor:
         trouble = self._bridge.trouble
         if level is HealthLevel.OK and trouble:
             level, text = HealthLevel.DEGRADED, _NOT_USED + trouble
-        if level is HealthLevel.OK and engine.search_hangs:
-            level, text = HealthLevel.DEGRADED, f"tracking, but {_SEARCH_HANGS}"
+        if level is HealthLevel.OK and (lacks := self._lacks(engine)) not in ("", NOT_READY):
+            level, text = HealthLevel.DEGRADED, f"tracking, but {lacks}"
         overload = self._overload(engine)
         if overload and level is HealthLevel.OK:
             level, text = HealthLevel.DEGRADED, overload
@@ -218,7 +221,12 @@ class HealthMonitor:
             text = f" {(time.monotonic_ns() - estimate.last_fix_ns) * 1e-9:.0f} s"
         sigma_m = self._position_sigma_m()
         text += f", +-{2.0 * sigma_m:.0f} m" if sigma_m is not None else ""
-        return text + (f", {_SEARCH_HANGS}" if engine.search_hangs else "")
+        lacks = self._lacks(engine)
+        return text + (f", {lacks}" if lacks else "")
+
+    def _lacks(self, engine: EngineHealth) -> str:
+        """Why a lost place cannot be searched now; empty where it can."""
+        return _SEARCH_HANGS if engine.search_hangs else self._search_lacks()
 
     def _write(self, level: str, text: str) -> None:
         report: dict[str, Any] = {
@@ -275,10 +283,10 @@ def _stages(estimates: list[PoseEstimate]) -> dict[str, dict[str, float]]:
     }
 
 
-def _waiting_for(engine: EngineHealth) -> str:
-    """What is missing before the first estimate."""
-    if engine.searching:
-        return _SEARCH_HANGS if engine.search_hangs else "searching the map"
+def _waiting_for(engine: EngineHealth, lacks: str) -> str:
+    """What is missing before the first estimate. lacks: for a search of the map."""
+    if engine.searching or (lacks and engine.searches):
+        return lacks or "searching the map"
     seen = engine.frames_in > 0
     return engine.last_error or f"waiting for {'a pose prior' if seen else 'video'}"
 

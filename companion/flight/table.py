@@ -175,7 +175,7 @@ def _klv(making: Making) -> KlvRelay:
 def _health(making: Making) -> HealthMonitor:
     engine, keeper = making.later(DualThreadEngine), making[RecordKeeper]
     streamer = making[MapStack].streamer
-    autopilot = making.later(AutopilotPose)
+    autopilot, search = making.later(AutopilotPose), making.later(PlaceSearch)
     source = making[FrameSource]  # type: ignore[type-abstract]  # whichever of its kinds
     besides = Besides(
         lambda: keeper.is_complete,
@@ -184,6 +184,7 @@ def _health(making: Making) -> HealthMonitor:
         lambda: streamer.counters().unreadable,
         making[MapShift].report,
         _target_counts(making),
+        lambda: search().lacks,
     )
     health = HealthMonitor(
         lambda: engine().health,
@@ -483,7 +484,7 @@ PARTS: tuple[Part[Any], ...] = (
     Part(
         "health", HealthMonitor, _health,
         depends=(MapStack, Bridge, MapShift, RecordKeeper, FrameSource, Guardian, FrameTimes),
-        later=(DualThreadEngine, AutopilotPose, TargetReporter, BoxDetector),
+        later=(DualThreadEngine, AutopilotPose, TargetReporter, BoxDetector, PlaceSearch),
         start=HealthMonitor.start, stop=HealthMonitor.stop,
     ),
     Part(

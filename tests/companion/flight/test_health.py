@@ -201,17 +201,29 @@ def test_a_loss_says_how_long_and_how_far_and_is_no_news_when_a_search_ends(tmp_
     assert len(texts) == 2  # a search that will not answer is
 
 
-def test_while_tracking_it_is_told_that_a_loss_could_not_be_searched(tmp_path):
-    bridge = FakeBridge(True)
-    monitor = HealthMonitor(
-        partial(EngineHealth, search_hangs=True), bridge, lambda: StreamState.LIVE,
-        lambda *_: None, tmp_path,
-    )  # fmt: skip
-    tracking = SimpleNamespace(state=TrackingState.TRACKING, stage_ms={}, last_fix_ns=None)
-    monitor.add_estimate(tracking)
-    monitor.start()
-    monitor.stop()
-    assert bridge.told[-1] == (HealthLevel.DEGRADED, "tracking, but the search hangs")
+@pytest.mark.parametrize(
+    ("hangs", "lacks", "tracking", "lost"),
+    [
+        (True, "", "tracking, but the search hangs", "localization lost, the search hangs"),
+        (False, "no search", "tracking, but no search", "localization lost, no search"),
+        # At a map's first start, for minutes: no news for who is not lost.
+        (False, "search not ready", "localization tracking", "localization lost, search not ready"),
+        (False, "", "localization tracking", "localization lost"),
+    ],
+)
+def test_that_a_loss_cannot_be_searched_is_told_before_it_comes(
+    tmp_path, hangs, lacks, tracking, lost
+):
+    for state, text in ((TrackingState.TRACKING, tracking), (TrackingState.LOST, lost)):
+        bridge = FakeBridge(True)
+        monitor = HealthMonitor(
+            partial(EngineHealth, search_hangs=hangs), bridge, lambda: StreamState.LIVE,
+            lambda *_: None, tmp_path, Besides(search_lacks=lambda: lacks),
+        )  # fmt: skip
+        monitor.add_estimate(SimpleNamespace(state=state, stage_ms={}, last_fix_ns=None))
+        monitor.start()
+        monitor.stop()
+        assert bridge.told[-1][1] == text
 
 
 def test_after_the_end_the_file_says_that_it_ended_and_how(tmp_path):

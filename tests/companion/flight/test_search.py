@@ -5,6 +5,7 @@ import pytest
 
 from companion.flight.search import PlaceSearch, place_on_map
 from localizer.config import LocalizerConfig
+from localizer.errors import MapCacheError
 from localizer.geometry.camera import Camera
 from localizer.geometry.pose import Pose
 from localizer.map.cache.cache import TileCache
@@ -182,6 +183,20 @@ def test_a_place_that_is_found_at_once_is_given_at_once(slowly, cache):
     search.hint(0.0, 10.0, 30.0)
     assert search.search(falling.frame(), lambda: False) is not None
     assert len(slow.queries) == 1
+
+
+def test_a_search_that_is_not_ready_or_cannot_be_says_so(cache, monkeypatch):
+    def fail(*_, **__):
+        raise MapCacheError("too large a map")
+
+    monkeypatch.setattr("companion.flight.search.open_relocalizer", fail)
+    events = []
+    search = PlaceSearch(cache, LocalizerConfig(), Lost(), lambda *e: events.append(e))
+    assert search.lacks == "search not ready"
+    search.start()
+    search.stop()
+    assert search.lacks == "no search"
+    assert events == [("warning", "no search for a lost place: too large a map")]
 
 
 def test_far_from_the_origin_the_height_is_counted_from_the_maps_plane(slowly, cache):
