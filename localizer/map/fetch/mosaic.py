@@ -24,6 +24,7 @@ from localizer.map.fetch.raster import Piece, Plan
 from localizer.map.importers.raster_file import offline
 
 _TIFF = (b"II*\0", b"MM\0*", b"II+\0", b"MM\0+")
+_LARGER, _MOST_BANDS = 4, 16  # than asked for, of what says its own place; of any
 _LOWEST_M, _HIGHEST_M = -1000.0, 9500.0
 
 
@@ -71,27 +72,36 @@ def check_piece(source: Source, piece: Piece, data: bytes) -> None:
     try:
         if data[:4] in _TIFF:
             with offline(), MemoryFile(data) as memory, memory.open(driver="GTiff") as image:
-                size, bands, dtype = (image.width, image.height), image.count, image.dtypes[0]
+                bands, dtype = image.count, image.dtypes[0]
+                _require_size(source, piece, (image.width, image.height), bands)
                 image.read()  # what ends too early is kept for ever else, and fails each mosaic
         else:
             with _picture(data) as picture:
+                bands = len(picture.getbands())
+                _require_size(source, piece, picture.size, bands)
                 picture.load()
-                deep = picture.mode[0] in "IF"
-                size, bands = picture.size, len(picture.getbands())
-                dtype = "uint16" if deep else "uint8"
-    except (RasterioError, OSError, ValueError, SyntaxError) as error:
+                dtype = "uint16" if picture.mode[0] in "IF" else "uint8"
+    except (
+        RasterioError, OSError, ValueError, SyntaxError, Image.DecompressionBombError
+    ) as error:  # fmt: skip
         raise MapFetchError(f"{source.name}: piece {piece.name} is no image: {error}") from error
-    if not piece.placed and size != (piece.width, piece.height):
-        raise MapFetchError(
-            f"{source.name}: piece {piece.name} is {size[0]} x {size[1]} pixels, asked for "
-            f"{piece.width} x {piece.height}"
-        )
     if not source.has_heights:
         check_depth(f"{source.name}: piece {piece.name}", dtype)
     elif bands != 1 or dtype == "uint8":
         raise MapFetchError(
             f"{source.name}: sends {bands} bands of {dtype}, no heights; set `format` to a GeoTIFF "
             "of numbers"
+        )
+
+
+def _require_size(source: Source, piece: Piece, size: tuple[int, int], bands: int) -> None:
+    """Before it is unpacked: of a few bytes some formats make gigabytes."""
+    wanted = piece.width, piece.height
+    large = piece.placed and max(size) > _LARGER * max(wanted)
+    if large or bands > _MOST_BANDS or (size != wanted and not piece.placed):
+        raise MapFetchError(
+            f"{source.name}: piece {piece.name} is {size[0]} x {size[1]} pixels of {bands} bands, "
+            f"asked for {wanted[0]} x {wanted[1]}"
         )
 
 

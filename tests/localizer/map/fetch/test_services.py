@@ -279,6 +279,25 @@ def test_a_picture_of_more_than_8_bits_is_refused(server, tmp_path, kind):
         )
 
 
+@pytest.mark.parametrize("kind", ["wms", "wcs"])
+def test_a_picture_is_not_unpacked_before_its_size_is_known_to_be_right(server, tmp_path, kind):
+    """Of some kilobytes a server could make the 30 GB that no computer has."""
+    path = tmp_path / "bomb.tif"
+    with rasterio.open(
+        path, "w", driver="GTiff", width=100_000, height=100_000, count=1, dtype="float32",
+        crs=CRS, transform=rasterio.transform.from_origin(0, 9, 1, 1), tiled=True, SPARSE_OK=True,
+    ):  # fmt: skip
+        pass
+    wanted = source(kind, server.url, layer="x", role="surface" if kind == "wcs" else "imagery")
+    piece = Piece("0-0", 0, 0, 1024, 1024, lambda _: None, placed=kind == "wcs")
+    with pytest.raises(MapFetchError, match="is 100000 x 100000 pixels"):
+        check_piece(wanted, piece, path.read_bytes())
+    kept = io.BytesIO()
+    Image.new("1", (20_000, 20_000)).save(kept, "PNG")
+    with pytest.raises(MapFetchError, match=r"20000 x 20000 pixels|exceeds limit"):
+        check_piece(wanted, piece, kept.getvalue())
+
+
 def _other_numbers(server, name, values, **says):
     """The surface as a service may give it: in feet, in decimetres, above something else."""
     with rasterio.open(server.folder / "surface.tif") as data:
