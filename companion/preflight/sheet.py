@@ -11,7 +11,8 @@ from pathlib import Path
 from typing import Any
 
 from companion.config import CompanionConfig
-from companion.errors import ReportError
+from companion.errors import ConfigError, ReportError
+from companion.preflight.map_pin import map_hash
 from companion.versions import versions
 from companion.writing import writing
 from localizer.errors import LocalizerError
@@ -57,7 +58,7 @@ def make_sheet(
         _calibration(config, now.date()),
         *_map(config, now.date()),
         _shadow(config, now),
-        _forecast(plan),
+        _forecast(plan, config.map),
         Row("mode", f"{config.bridge.mode}, {config.bridge.injection.message}"),
         Row("software", str(versions().get("pilot-companion", "not installed"))),
     )
@@ -131,7 +132,8 @@ def _shadow(config: CompanionConfig, now: datetime) -> Row:
     return Row("shadow score", "none: fly in shadow mode first", False)
 
 
-def _forecast(plan: Path | None) -> Row:
+def _forecast(plan: Path | None, flown: Path) -> Row:
+    """flown: the deployment's map, which must be the one that the forecast was made over."""
     if plan is None:
         return Row("forecast", "none: `companion plan MISSION`, then --plan plan/plan.json", False)
     data = _read(plan)
@@ -140,10 +142,24 @@ def _forecast(plan: Path | None) -> Row:
         raise ReportError(f"--plan {plan}: not a plan.json of `companion plan`")
     bad = [str(leg.get("name")) for leg in legs if not leg.get("holds")]
     conditions = ", ".join(map(str, data.get("conditions", ())))
-    if not bad:
-        return Row("forecast", f"vision should hold on all {len(legs)} legs ({conditions})", True)
-    text = f"vision will not do on {len(bad)} of {len(legs)} legs ({conditions}): {', '.join(bad)}"
+    mission = Path(str(data.get("mission", "a mission without a name"))).name
+    if data.get("map_sha256") != _hash(flown):
+        return Row("forecast", f"{mission}: made over another map than {flown}", False)
+    if data["holds"] and not bad:
+        text = f"{mission}: vision should hold on all {len(legs)} legs ({conditions})"
+        return Row("forecast", text, True)
+    text = (
+        f"{mission}: vision will not do on {len(bad)} of {len(legs)} legs ({conditions}): "
+        f"{', '.join(bad)}"
+    )
     return Row("forecast", text, False)
+
+
+def _hash(cache: Path) -> str:
+    try:
+        return map_hash(cache)
+    except ConfigError:
+        return "no map"
 
 
 def _read(path: Path) -> dict[str, Any]:

@@ -53,6 +53,7 @@ def plan_command(
     from companion.planning.judge import Limits
     from companion.planning.mission import read_mission
     from companion.planning.plan import Question, aim_of, make_plan
+    from companion.preflight.map_pin import map_hash
     from localizer.forecast.visit import FORECAST_CONDITIONS
     from localizer.map.cache.cache import TileCache
     from localizer.map.inspection.inspect import write_picture
@@ -84,7 +85,8 @@ def plan_command(
     for name, (_, rgb) in zip(("track.png", "heat.png"), shown, strict=True):
         write_picture(out / name, rgb)
     page.write_page(plan, shown, out / "plan.html")
-    (out / "plan.json").write_text(json.dumps(page.as_data(plan), indent=1), encoding="utf-8")
+    document = page.as_data(plan) | {"map_sha256": map_hash(cache.path)}
+    (out / "plan.json").write_text(json.dumps(document, indent=1), encoding="utf-8")
     _print("legs", page.LEG_HEADINGS, [page.leg_row(v) for v in plan.verdicts])
     _print("to be bridged", page.STRETCH_HEADINGS, map(page.stretch_row, plan.stretches))
     _print("what would do instead", page.INSTEAD_HEADINGS, page.instead_rows(plan))

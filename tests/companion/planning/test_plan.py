@@ -15,6 +15,7 @@ from companion.planning.instead import changes
 from companion.planning.judge import Judged, LegVerdict, Limits, Reason, judge, stretches
 from companion.planning.mission import HeightAbove, read_mission
 from companion.planning.way import Aim, Ground, camera_pose, legs_of
+from companion.preflight.map_pin import map_hash
 from localizer.forecast.forecast import ViewForecast
 from localizer.forecast.risk import Figures
 from localizer.forecast.rivals import Rival
@@ -251,6 +252,7 @@ def test_a_mission_over_the_edge_is_told_with_pictures_and_exit_code_1(tmp_path,
     done = run(over, "--config", config, "--out", out, "--spacing", 80)
     assert done.exit_code == 1, done.output
     made = json.loads((out / "plan.json").read_text())
+    assert made["map_sha256"] == map_hash(cache.path)
     assert made["legs"][1]["samples"][-1]["reason"] == "no map in view"
     assert made["stretches"][-1]["end_m"] == pytest.approx(420, abs=1)
     page = (out / "plan.html").read_text()

@@ -12,7 +12,9 @@ import yaml
 
 from companion.config import CompanionConfig, load_config
 from companion.errors import ReportError
+from companion.preflight.map_pin import map_hash
 from companion.preflight.sheet import Sheet, as_html, as_text, make_sheet, write_sheet
+from localizer.map.cache.cache import MANIFEST_NAME
 from mavlink_bridge.preflight.doctor import Diagnosis, Finding
 
 NOW = datetime(2026, 11, 22, 12, 0, tzinfo=timezone.utc)
@@ -42,17 +44,34 @@ def test_each_line_is_of_its_source(deployment, tmp_path):
     path, config = deployment
     plan = tmp_path / "plan.json"
     legs = [{"name": "1-2", "holds": True}, {"name": "2-3", "holds": False}]
-    plan.write_text(json.dumps({"holds": False, "legs": legs, "conditions": ["dusk"]}))
+    config.map.mkdir()
+    (config.map / MANIFEST_NAME).write_text("{}")
+    told = {"holds": False, "legs": legs, "conditions": ["dusk"], "mission": "there/a.plan"}
+    plan.write_text(json.dumps(told | {"map_sha256": map_hash(config.map)}))
     record = config.record.folder.with_name("day-2")
     record.mkdir(parents=True)
     (record / "health.json").write_text(json.dumps({"shadow": "go: 0.4 m for 120 s"}))
     now = datetime.now(timezone.utc)
     found = rows(make_sheet(path, config, Diagnosis((GOOD, WRONG)), plan, now))
     assert found["parameters and parts"] == ("1 of 2 checks good; wrong: VISO_TYPE", False)
-    assert found["forecast"][0] == "vision will not do on 1 of 2 legs (dusk): 2-3"
+    assert found["forecast"][0] == "a.plan: vision will not do on 1 of 2 legs (dusk): 2-3"
     assert found["shadow score"] == ("go: 0.4 m for 120 s (day-2, today)", True)
     assert found["map"][1] is False
     assert "2026-11-02" in found["calibration"][0]
+
+
+@pytest.mark.parametrize("made_over", ["0" * 64, None])
+def test_a_forecast_over_another_map_says_nothing_of_this_flight(deployment, tmp_path, made_over):
+    path, config = deployment
+    config.map.mkdir()
+    (config.map / MANIFEST_NAME).write_text("{}")
+    plan = tmp_path / "plan.json"
+    told = {"holds": True, "legs": [{"name": "1-2", "holds": True}], "mission": "a.plan"}
+    for sha, good in ((map_hash(config.map), True), (made_over, False)):
+        plan.write_text(json.dumps(told | ({} if sha is None else {"map_sha256": sha})))
+        text, marked = rows(make_sheet(path, config, Diagnosis((GOOD,)), plan, NOW))["forecast"]
+        assert marked is good
+        assert ("made over another map" in text) is not good
 
 
 def test_what_is_old_or_lacks_is_marked(deployment):
