@@ -40,7 +40,7 @@ _TRIED_FRAMES = 5  # with what is known outside, before a search begins
 # for `_TRIED_FRAMES` seldom does, and takes half a processor from the search, which then answers
 # for where the vehicle was seconds ago.
 _TRIED_BESIDE = 3
-_SEARCH_HANGS_NS = 120_000_000_000  # a whole map takes seconds, tens of them beside other work
+_SEARCH_HANGS_NS = 120_000_000_000  # without asking whether it is wanted, as it does all the time
 _STOP_S = 10.0  # for a search to see that it is to end
 
 
@@ -51,9 +51,9 @@ class DualThreadEngine:
 
     subscribers: called on the localization thread with every estimate; they must not block.
     prior_provider: asked, with a time in ns, for a pose from outside when there is none or when
-    tracking is LOST. searcher: finds a place without a prior, on a thread of its own. One that does
-    not answer for two minutes hangs: that is told, all frames are tried again without it, and
-    nothing waits for it. clock: CLOCK_MONOTONIC, ns.
+    tracking is LOST. searcher: finds a place without a prior, on a thread of its own. One that
+    neither asks nor answers for two minutes hangs: that is told, all frames are tried again without
+    it, and nothing waits for it. clock: CLOCK_MONOTONIC, ns.
     """
 
     def __init__(
@@ -72,7 +72,7 @@ class DualThreadEngine:
         self._found: PosePrior | None = None
         self._unknown_frames = self._left_frames = 0
         self._clock = clock
-        self._search_begun_ns: int | None = None  # while one is under way
+        self._search_alive_ns: int | None = None  # while one is under way: when it last said so
         self._ahead = Ahead(localizer.extract_query, self._may_extract_ahead)
         self._registers = False  # whether the last frame was registered: the next will be, too
         self._render_times: Mailbox[int] = Mailbox()
@@ -152,21 +152,26 @@ class DualThreadEngine:
             return
         self._searches(self._clock())
         try:
-            found = self._searcher(frame, self._knows_place)
+            found = self._searcher(frame, self._needs_no_search)
         finally:
             self._searches(None)
         self._book.count(searches=1, found=int(found is not None))
         self._book.clear_error()
         self._found = found
 
+    def _needs_no_search(self) -> bool:
+        """Asked by a search all the time, which so tells that it goes on, however large the map."""
+        self._search_alive_ns = self._clock()
+        return self._knows_place()
+
     def _searches(self, begun_ns: int | None) -> None:
-        self._search_begun_ns = begun_ns
+        self._search_alive_ns = begun_ns
         self._book.set_searching(begun_ns is not None)
 
     def _search_hangs(self) -> bool:
         """Whether no answer comes any more; told by who would wait for it."""
-        begun_ns = self._search_begun_ns
-        hangs = begun_ns is not None and self._clock() - begun_ns > _SEARCH_HANGS_NS
+        alive_ns = self._search_alive_ns
+        hangs = alive_ns is not None and self._clock() - alive_ns > _SEARCH_HANGS_NS
         self._book.set_search_hangs(hangs)
         return hangs
 
@@ -262,7 +267,7 @@ class DualThreadEngine:
 
     def _is_left_to_search(self) -> bool:
         """Whether a frame is left out so that a search that runs has the processor."""
-        runs = self._search_begun_ns is not None and not self._search_hangs()
+        runs = self._search_alive_ns is not None and not self._search_hangs()
         if not runs or self._found is not None or self._knows_place():
             self._left_frames = 0
             return False

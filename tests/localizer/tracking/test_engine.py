@@ -526,6 +526,30 @@ def test_beside_a_search_fewer_frames_are_tried_until_it_answers(flight):
     f.feed_until(lambda: f.estimates[-1].state is TrackingState.TRACKING)
 
 
+def test_a_search_that_goes_on_for_long_does_not_hang(flight):
+    """Of a hundred square kilometres it takes minutes."""
+    now_ns, polled, answer = [0], threading.Event(), threading.Event()
+
+    def search(_frame, is_idle):
+        while not answer.is_set() and not is_idle():
+            polled.set()
+            answer.wait(1e-3)
+
+    optimizer = FakeOptimizer()
+    f = flight(_localizer(optimizer=optimizer), searcher=search, clock=lambda: now_ns[0])
+    f.feed_until(lambda: f.estimates and f.estimates[-1].state is TrackingState.TRACKING)
+    optimizer.offset = np.array([300.0, 0.0, 0.0])
+    f.feed_until(lambda: f.engine.health.searching)
+    for _ in range(4):
+        now_ns[0] += 100 * 10**9
+        polled.clear()
+        assert polled.wait(60.0)
+        fed = f.sequence
+        f.feed_until(lambda fed=fed: f.sequence == fed + 2)
+        assert not f.engine.health.search_hangs
+    answer.set()
+
+
 def test_a_search_that_never_answers_is_told_and_keeps_no_frame_and_no_end_waiting(
     flight, monkeypatch, caplog
 ):
