@@ -26,6 +26,7 @@ from localizer.map.cache.select import DetailLimits, Selection, TileSelector
 from localizer.map.cache.tile import TileMesh
 
 _log = logging.getLogger(__name__)
+_CLOSE_S = 10.0  # for a tile to be read to its end
 
 
 @dataclass(frozen=True)
@@ -159,11 +160,11 @@ class TileStreamer:
             return self._waiting and not (self._nodes.evicted or self._to_load())
 
     def close(self) -> None:
-        """Stop the loader thread and drop all tiles."""
+        """Stop the loader thread and drop all tiles; a disk that stands still is left behind."""
         with self._lock:
             self._closed = True
             self._lock.notify_all()
-        self._thread.join()
+        self._thread.join(_CLOSE_S)
         with self._lock:
             self._arrived.clear()
             self._nodes.clear()

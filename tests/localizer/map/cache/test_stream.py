@@ -232,6 +232,26 @@ def test_a_map_that_comes_back_is_read_again_and_nothing_ends_the_loader(cache, 
         assert running.counters().unreadable < lost
 
 
+def test_a_disk_that_stands_still_keeps_no_end_waiting(cache, monkeypatch):
+    monkeypatch.setattr("localizer.map.cache.stream._CLOSE_S", 0.01)
+    asked, still = threading.Event(), threading.Event()
+
+    def stands(*_):
+        asked.set()
+        still.wait(120.0)
+        raise MapCacheError("at last")
+
+    monkeypatch.setattr(TileCache, "load_tile", stands)
+    streamer = TileStreamer(cache)
+    streamer.select(above(0, 0, 100), CAMERA)
+    assert asked.wait(60.0)
+    ending = threading.Thread(target=streamer.close, daemon=True)
+    ending.start()
+    ending.join(60.0)
+    assert not ending.is_alive()
+    still.set()
+
+
 def test_a_closed_streamer_says_so(cache):
     streamer = TileStreamer(cache)
     streamer.close()
