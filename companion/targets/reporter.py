@@ -21,6 +21,7 @@ _log = logging.getLogger(__name__)
 _KEPT = 64  # detections that wait
 _ESTIMATES = 256  # as many as `FrameTimes` knows frames: a slow detector is seconds behind
 _PICTURES = 16
+_WARNING = 4  # MAV_SEVERITY
 _MATCH_NS = 5_000_000  # detection and estimate must be of the same frame
 
 
@@ -45,6 +46,7 @@ class TargetReporter:
         say: Callable[[int, str], None] = _say_nothing,
     ) -> None:
         self._population = Population(config, cast, on_target, on_gone, say)
+        self._on_gone, self._say = on_gone, say
         self._forgotten: tuple[str, ...] = ()
         self._clicks: list[Click] = []
         self._estimates: deque[PoseEstimate] = deque(maxlen=_ESTIMATES)
@@ -130,7 +132,10 @@ class TargetReporter:
             for estimate, frame in pictures:
                 self._guarded(self._population.look, estimate, _gray(frame))
             for click in clicks:
-                self._guarded(self._population.begin, click)
+                if not self._guarded(self._population.begin, click):
+                    self._say(_WARNING, f"PiLoT: target {click.number} refused: map unreadable?")
+                    self._guarded(self._population.end, (click.name,))
+                    self._on_gone(click.name)
             for name in forgotten:
                 self._guarded(self._population.end, (name,))
             for detection, estimate in pairs:
@@ -140,13 +145,16 @@ class TargetReporter:
                 self._held = newest
                 self._guarded(self._population.hold, newest)
 
-    def _guarded(self, work: Callable[..., None], *arguments: Any) -> None:
+    def _guarded(self, work: Callable[..., None], *arguments: Any) -> bool:
+        """Whether it went well."""
         try:
             work(*arguments)
         except Exception:  # a target must not end the flight
             self.failed += 1
             if self.failed == 1:
                 _log.exception("a target could not be located")
+            return False
+        return True
 
     def _has_work(self) -> bool:
         newest = self._estimates[-1] if self._estimates else None

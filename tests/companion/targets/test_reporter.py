@@ -5,7 +5,9 @@ import numpy as np
 
 from companion.config import TargetConfig
 from companion.targets.detections import Detection
+from companion.targets.population import Click
 from companion.targets.reporter import TargetReporter
+from localizer.errors import MapCacheError
 from localizer.geometry.camera import Camera
 from localizer.geometry.pose import Pose
 from localizer.map.cache.pick import BundleHits
@@ -148,3 +150,23 @@ def test_a_flood_of_names_is_bounded_and_room_comes_back(caplog):
         assert sleep_until(lambda: len(s.targets) == 34, 30.0)
         assert s.targets[-1].fix.target_id == "late"
     assert sum("more than 32 targets" in r.message for r in caplog.records) == 1
+
+
+def test_a_click_that_no_map_answers_is_refused_and_not_left_alive():
+    def unreadable(_origin, _directions):
+        raise MapCacheError("tile 7: cannot be read")
+
+    said, gone, ended = [], [], threading.Event()
+    reporter = TargetReporter(
+        TargetConfig(), unreadable, lambda _: None, lambda name: (gone.append(name), ended.set()),
+        lambda *text: said.append(text),
+    )  # fmt: skip
+    reporter.start()
+    try:
+        reporter.begin(Click(3, _estimate(50 * MS), (320.0, 240.0)))
+        assert ended.wait(60.0)
+    finally:
+        reporter.stop()
+    assert gone == ["ground station 3"]
+    assert said == [(4, "PiLoT: target 3 refused: map unreadable?")]
+    assert reporter.failed == 1
