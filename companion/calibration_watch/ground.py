@@ -15,6 +15,7 @@ UNKNOWN_HEIGHT_M = 120.0  # most may fly no higher
 _BELOW_M = -5.0  # of a barometer on the ground
 _WIDTH_HEIGHT_M = 100.0  # where nothing is known: an assumption too high finds a still picture late
 _HOLDS_NS = 2_000_000_000  # a view, for a lens and a height that change
+_LONG_AGO_NS = 10_000_000_000  # the ground below may be another since
 
 
 class GroundView:
@@ -28,16 +29,15 @@ class GroundView:
         """A registered picture that was accepted against the map."""
         self._newest = sighting
 
-    def height_m(self, state: VehicleState) -> float | None:
+    def height_m(self, state: VehicleState, now_ns: int) -> float | None:
         """Above the ground, at the least favourable of what is known; None where nothing is.
 
-        The ground that was seen last may be higher than that below, and it was seen before.
+        now_ns: of what it is asked for; ground that was seen long before says nothing of it.
         """
-        relative_m = state.altitude_relative_m
+        relative_m, newest = state.altitude_relative_m, self._newest
         known = [] if relative_m is None or relative_m < _BELOW_M else [max(relative_m, 0.0)]
-        if self._newest is not None:
-            down = float(self._newest.ned_from_camera[2, 2])
-            known.append(max(self._newest.depth_m * down, 0.0))
+        if newest is not None and now_ns - newest.time_ns < _LONG_AGO_NS:
+            known.append(max(newest.depth_m * float(newest.ned_from_camera[2, 2]), 0.0))
         return max(known, default=None)
 
     def width_m(self, state: VehicleState, now_ns: int) -> float:
@@ -45,7 +45,7 @@ class GroundView:
         newest = self._newest
         if newest is not None and now_ns - newest.time_ns < _HOLDS_NS:
             return newest.depth_m * _spread(newest.horizontal_fov_deg)
-        height_m = self.height_m(state)
+        height_m = self.height_m(state, now_ns)
         return (_WIDTH_HEIGHT_M if height_m is None else height_m) * _spread(self._fov_deg)
 
 

@@ -173,9 +173,10 @@ class Monitor:
         agrees = verdict is None or not verdict.settled or verdict.share < _CALM_SHARE
         admitted = self._jumps.admit(fix, state, attitude, agrees=agrees)
         self._doubt_steps(fix, state, admitted=admitted)
-        known_m = self._known_m(state)
+        height_m = self._ground.height_m(state, fix.time_ns)
+        known_m = self._known_m(state, height_m)
         self._level = level = protection_level(
-            fix, state, self._config.protection, known_m, self._ground.height_m(state)
+            fix, state, self._config.protection, known_m, height_m
         )
         fix = replace(fix, protection_m=(level.horizontal_m, level.vertical_m))
         self._jump_held = not admitted
@@ -291,15 +292,14 @@ class Monitor:
             f.TIME_OFFSET.name: lambda: _beyond(late, limits.time_s, 1e3, when),
         }
 
-    def _known_m(self, state: VehicleState) -> float:
-        """By how much a fix is wrong for what was found of the calibration, metres."""
+    def _known_m(self, state: VehicleState, height_m: float | None) -> float:
+        """By how much a fix is wrong for what was found of calibration and tilt, metres."""
         speed = math.hypot(*(state.local_velocity_ned or (0.0, 0.0, 0.0))[:2])
         focal, late = self._latches[f.FOCAL.name].raised, self._latches[f.TIME_OFFSET.name].raised
         focal_m = self._calibration.known_m(speed, focal=focal, time=False)
         late_m = self._calibration.known_m(speed, focal=False, time=late)
         # Late stamps are how a step is explained, and a tilt shifts as a step does.
-        tilt_m = self._tilt.metres(self._ground.height_m(state))
-        return focal_m + max(late_m, self._steps.possible_m, tilt_m)
+        return focal_m + max(late_m, self._steps.possible_m, self._tilt.metres(height_m))
 
     def _frozen(self, now_ns: int, state: VehicleState) -> Reading:
         if self._picture is None or now_ns - self._picture[0] > _PICTURE_FRESH_NS:

@@ -33,7 +33,9 @@ def level(relative_m: float | None, seen_m: float | None, **known: object) -> Pr
     if seen_m is not None:
         ground.add(sighting(1.0, seen_m))
     fix = VisionFix(1, LATITUDE, LONGITUDE, HEIGHT, position_covariance_ned=0.01 * np.eye(3))
-    return protection_level(fix, state, ProtectionConfig(), 0.0, ground.height_m(state))
+    return protection_level(
+        fix, state, ProtectionConfig(), 0.0, ground.height_m(state, second(2.0))
+    )
 
 
 @pytest.mark.parametrize("relative_m", [None, -60.0, 10.0])
@@ -49,6 +51,13 @@ def test_the_ground_that_is_seen_counts_wherever_take_off_was(relative_m: float 
 def test_a_height_that_nobody_knows_is_taken_for_a_high_one(relative_m: float | None) -> None:
     assert level(relative_m, None).horizontal_m >= level(100.0, None).horizontal_m
     assert level(-1.0, None) == level(0.0, None)  # a barometer's wander before take-off
+
+
+def test_ground_that_was_seen_long_ago_says_nothing_of_what_is_below() -> None:
+    ground, below = GroundView(FOV_DEG), VehicleState(altitude_relative_m=-40.0)
+    ground.add(sighting(1.0, 30.0))
+    assert ground.height_m(below, second(9.0)) == 30.0
+    assert ground.height_m(below, second(12.0)) is None
 
 
 def test_a_speed_that_nobody_knows_is_not_zero() -> None:
