@@ -32,8 +32,10 @@ class CalibrationSigmas(BaseModel):
     readout_ms: float = Field(1.0, ge=0, le=100, description="of a rolling shutter's readout")
     stamp_ms: float = Field(4.0, ge=0, le=1000, description="of the frames' time stamps")
     map_m: float = Field(0.07, ge=0, le=20, description="of the map's surface, per axis")
+    # Ground that changed since the survey errs alike over more than a survey's own bumps: three
+    # flights over other visits were likeliest with 20 m (docs/results/covariance.md).
     map_length_m: float = Field(
-        5.0, ge=0.01, le=1000, description="over which it is displaced alike"
+        20.0, ge=0.01, le=1000, description="over which it is displaced alike"
     )
 
     @classmethod
