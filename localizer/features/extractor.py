@@ -220,6 +220,13 @@ class OnnxExtractor:
                     )
 
 
+def model_key(extractor: FeatureExtractor) -> str:
+    """What tells its features from any other's: two models may bear one name."""
+    if isinstance(extractor, OnnxExtractor):
+        return f"{extractor.name} {extractor.info.sha256}"
+    return extractor.name
+
+
 def load_extractor(
     model: Path | None = None,
     *,

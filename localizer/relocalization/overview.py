@@ -24,7 +24,7 @@ import safetensors.numpy
 from numpy.typing import NDArray
 
 from localizer.errors import MapCacheError
-from localizer.features.extractor import FeatureExtractor
+from localizer.features.extractor import FeatureExtractor, model_key
 from localizer.geometry.pose import Array
 from localizer.map.cache.cache import TileCache
 from localizer.relocalization.topview import render_top_view
@@ -130,10 +130,10 @@ def comparable_level(extractor: FeatureExtractor, rgb: Image) -> FeatureLevel:
     raise MapCacheError(f"{extractor.name}: no features of stride {STRIDE} to compare places with")
 
 
-def overview_key(cache: TileCache, model_key: str) -> str:
-    """Of map, model and format."""
+def overview_key(cache: TileCache, model: str) -> str:
+    """Of map, model (`model_key`) and format."""
     settings = (_FORMAT, GSD_M, STRIDE, CHANNELS, GROUND_CELLS, _QUANTUM)
-    text = f"{cache.manifest.index_sha256} {model_key} {settings}"
+    text = f"{cache.manifest.index_sha256} {model} {settings}"
     return hashlib.sha256(text.encode()).hexdigest()[:16]
 
 
@@ -150,7 +150,7 @@ def open_overview(
     A file that is damaged is named in the log and made again. A folder that cannot be written costs
     the time of computing it at every start, and the log says so.
     """
-    key = overview_key(cache, extractor.name)
+    key = overview_key(cache, model_key(extractor))
     folder = cache.path / "overview" / key
     levels = []
     squares = [_squares(cache, gsd) for gsd in GSD_M]

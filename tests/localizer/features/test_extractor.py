@@ -11,6 +11,7 @@ import pytest
 
 from localizer.errors import ModelError
 from localizer.features import GradientExtractor, OnnxExtractor, extractor, load_extractor
+from localizer.features.extractor import model_key
 from localizer.types import FeaturePyramid
 
 
@@ -101,6 +102,19 @@ def copied_model(folder: Path) -> Path:
     model.write_bytes(extractor.SHIPPED_MODEL.read_bytes())
     model.with_suffix(".json").write_text(extractor.SHIPPED_MODEL.with_suffix(".json").read_text())
     return model
+
+
+def test_two_models_of_one_name_are_told_apart(tmp_path: Path) -> None:
+    """What is kept of a map's features is of one of them: the other would find no place by it."""
+    model = tmp_path / "again.onnx"
+    model.write_bytes(extractor.SHIPPED_MODEL.read_bytes() + b"\x32\x01x")  # protobuf: a remark
+    description = json.loads(extractor.SHIPPED_MODEL.with_suffix(".json").read_text())
+    description["sha256"] = hashlib.sha256(model.read_bytes()).hexdigest()
+    model.with_suffix(".json").write_text(json.dumps(description))
+    shipped, trained = load_extractor(), load_extractor(model)
+    assert shipped.name == trained.name
+    assert model_key(shipped) != model_key(trained)
+    assert model_key(shipped) == model_key(load_extractor())
 
 
 def test_a_changed_byte_is_found(tmp_path: Path) -> None:
