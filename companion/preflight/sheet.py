@@ -128,7 +128,10 @@ def _shadow(config: CompanionConfig, now: datetime) -> Row:
             when = datetime.fromtimestamp(path.stat().st_mtime, timezone.utc)
             text = f"{shadow} ({path.parent.name}, {_age(when.date(), now.date())})"
             recent = (now - when).days <= _OLD_SHADOW_DAYS
-            return Row("shadow score", text, shadow.startswith("go") and recent)
+            flown = _read(path.with_name("record.json")).get("config")
+            other = isinstance(flown, dict) and flown.get("map") != str(config.map)
+            text += ", over another map" if other else ""
+            return Row("shadow score", text, shadow.startswith("go") and recent and not other)
     return Row("shadow score", "none: fly in shadow mode first", False)
 
 

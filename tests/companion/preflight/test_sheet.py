@@ -74,6 +74,19 @@ def test_a_forecast_over_another_map_says_nothing_of_this_flight(deployment, tmp
         assert ("made over another map" in text) is not good
 
 
+def test_a_score_over_another_map_is_marked(deployment):
+    path, config = deployment
+    record = config.record.folder
+    record.mkdir(parents=True)
+    (record / "health.json").write_text(json.dumps({"shadow": "go: 0.4 m for 120 s"}))
+    for flown, good in ((str(config.map), True), ("/maps/valley", False)):
+        (record / "record.json").write_text(json.dumps({"config": {"map": flown}}))
+        sheet = make_sheet(path, config, Diagnosis((GOOD,)), None, datetime.now(timezone.utc))
+        text, marked = rows(sheet)["shadow score"]
+        assert marked is good
+        assert text.endswith("over another map") is not good
+
+
 def test_what_is_old_or_lacks_is_marked(deployment):
     path, config = deployment
     recent = rows(make_sheet(path, config, Diagnosis((GOOD,)), None, NOW))
