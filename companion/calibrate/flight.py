@@ -18,7 +18,12 @@ from companion.config import CompanionConfig, FeedConfig
 from companion.errors import RecordError, StreamDecodeError
 from companion.geometry import Mount
 from companion.offline.autopilot import RecordedAutopilot
-from companion.offline.replay import FlightRecord, RecordedEstimate, image_path
+from companion.offline.replay import (
+    FlightRecord,
+    RecordedEstimate,
+    image_path,
+    require_flown_map,
+)
 from companion.sources.base import fitted_camera
 from companion.sources.folder_source import read_image
 from localizer.features.detail import DetailExtractor
@@ -100,6 +105,7 @@ def calibrate(
     config = record.config
     stack = MapStack(map_cache, config.localizer)
     try:
+        require_flown_map(record, stack.cache)
         mount = mount_of(config)
         pictures, bias_m = _chosen(record, tlog, stack, mount, frames)
         camera = config.camera.model.camera()

@@ -26,9 +26,11 @@ from companion.sources.base import fitted_camera
 from companion.sources.folder_source import read_image
 from companion.sources.zoom import longer
 from companion.trajectory import snapshot_name
-from localizer.errors import OutsideMapError
+from localizer.errors import GeoreferenceError, OutsideMapError
 from localizer.geometry.camera import Camera
+from localizer.geometry.geo import Geodetic
 from localizer.geometry.pose import Array, Pose, matrix_from_quaternion
+from localizer.map.cache.cache import TileCache
 from localizer.plain_files import plain_text
 from localizer.tracking.opening import MapStack, build_localizer
 from localizer.tracking.pipeline import Localizer
@@ -37,13 +39,15 @@ from localizer.types import Frame, PoseEstimate
 _log = logging.getLogger(__name__)
 _LONGEST_PX = 1e6
 _ALIKE = 1e-3  # a share of the focal length that is no other lens
+_SAME_FRAME_M = 1.0
 _MIN_IMAGES = 0.9  # share of the localized frames
 
 
 @dataclass(frozen=True)
 class RecordedEstimate:
     """One row of ``estimates.csv``. known_ns: when it was published, CLOCK_MONOTONIC; focal_px: of
-    its frame, None in records from before it was written.
+    its frame, None in records from before it was written; place: of the same pose, by the flown
+    map's frame, None where it is not written.
     """
 
     exposure_time_ns: int
@@ -53,6 +57,7 @@ class RecordedEstimate:
     accepted: bool
     is_tracking: bool = True
     focal_px: float | None = None
+    place: Geodetic | None = None
 
 
 @dataclass(frozen=True)
@@ -111,7 +116,8 @@ def load_record(folder: Path, kept_share: float = _MIN_IMAGES) -> FlightRecord:
         estimates = _estimates(folder / "estimates.csv")
     # RecursionError: endless nesting.
     except (
-        OSError, ValueError, KeyError, TypeError, ArithmeticError, RecursionError, csv.Error
+        OSError, ValueError, KeyError, TypeError, ArithmeticError, RecursionError, csv.Error,
+        GeoreferenceError,
     ) as error:  # fmt: skip
         raise RecordError(
             f"{folder}: not a flight's record: {error}; give the folder that "
@@ -132,7 +138,9 @@ def read_estimates(path: Path) -> tuple[RecordedEstimate, ...]:
     """The rows of a record's ``estimates.csv``. `RecordError` says why it is none."""
     try:
         return _estimates(path)
-    except (OSError, ValueError, KeyError, TypeError, ArithmeticError, csv.Error) as error:
+    except (
+        OSError, ValueError, KeyError, TypeError, ArithmeticError, csv.Error, GeoreferenceError
+    ) as error:  # fmt: skip
         raise RecordError(f"{path}: not a record's estimates: {error}") from error
 
 
@@ -163,7 +171,14 @@ def _estimate(row: dict[str, str]) -> RecordedEstimate:
         row["accepted"] == "1",
         row.get("state", "tracking") == "tracking",
         _focal(row.get("focal_px") or None, exposure_ns),
+        _place(row),
     )
+
+
+def _place(row: dict[str, str]) -> Geodetic | None:
+    told = [row.get(k) for k in ("latitude_deg", "longitude_deg", "height_m")]
+    numbers = [float(text) for text in told if text]
+    return Geodetic(*numbers) if len(numbers) == len(told) else None
 
 
 def _focal(text: str | None, exposure_ns: int) -> float | None:
@@ -178,6 +193,24 @@ def image_path(folder: Path, estimate: RecordedEstimate) -> Path:
     return folder / "snapshots" / snapshot_name(estimate.exposure_time_ns)
 
 
+def require_flown_map(record: FlightRecord, cache: TileCache) -> None:
+    """`RecordError` for a map about another origin than the flight's: a record has its poses in
+    metres about that, and every one of them would lie elsewhere, by the same way.
+    """
+    for estimate in record.estimates:
+        if estimate.place is None:
+            continue
+        p = estimate.place
+        here = cache.frame.enu_from_geodetic(p.latitude_deg, p.longitude_deg, p.height_m)
+        away_m = float(np.linalg.norm(here - estimate.world_from_camera.translation))
+        if away_m > _SAME_FRAME_M:
+            raise RecordError(
+                f"{record.folder}: flown over a map about another origin than {cache.path}, "
+                f"{away_m:.0f} m away: was it built again since? give the flight's own as --map"
+            )
+        return
+
+
 def replay(
     record: FlightRecord, tlog: Path, progress: Callable[[], None] = lambda: None
 ) -> list[ReplayedFrame]:
@@ -190,6 +223,7 @@ def replay(
     try:
         camera = config.camera.model.camera()
         cache = stack.cache
+        require_flown_map(record, cache)
         arm = np.array(config.camera.lever_arm_m)
         installation = Installation(cache.frame, cache.manifest.geoid_separation_m, arm)
         pose = AutopilotPose(autopilot, installation, config.prior)

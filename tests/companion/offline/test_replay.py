@@ -6,6 +6,7 @@ import socket
 import struct
 import threading
 import time
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -18,7 +19,7 @@ from companion.config import parse_config
 from companion.errors import RecordError
 from companion.flight.app import Companion
 from companion.geometry import GIMBAL_FROM_CAMERA
-from companion.offline.replay import load_record, replay, summarize
+from companion.offline.replay import load_record, replay, require_flown_map, summarize
 from localizer.geometry.camera import Camera
 from localizer.geometry.geo import NED_FROM_ENU
 from localizer.geometry.pose import quaternion_from_matrix
@@ -175,10 +176,25 @@ def test_the_command_tells_a_record_that_agrees_from_one_that_does_not(record, t
     with (moved / "estimates.csv").open("w", newline="") as file:
         writer = csv.DictWriter(file, rows[0].keys())
         writer.writeheader()
-        writer.writerows(r | {"east_m": str(float(r["east_m"]) + 2.0)} for r in rows)
+        writer.writerows(
+            r | {"east_m": str(float(r["east_m"]) + 2.0), "latitude_deg": ""} for r in rows
+        )
     result = CliRunner().invoke(app, ["replay", str(moved)])
     assert result.exit_code == 1
     assert "differs" in result.output
+
+
+def test_a_map_that_was_built_again_about_another_origin_is_refused(record):
+    """All places of the record lay beside it by the same way, and nobody was told."""
+    loaded = load_record(record)
+    flown = TileCache.open(loaded.config.map)
+    require_flown_map(loaded, flown)
+    origin = replace(
+        flown.manifest.origin, longitude_deg=flown.manifest.origin.longitude_deg + 1e-4
+    )
+    again = TileCache(flown.path, flown.manifest.model_copy(update={"origin": origin}), flown.index)
+    with pytest.raises(RecordError, match=r"another origin .* 8 m away: was it built again"):
+        require_flown_map(loaded, again)
 
 
 def test_what_a_record_lacks_is_named(record, tmp_path):
