@@ -59,12 +59,15 @@ class Told:
 def read_told(folder: Path, recorded_m: float) -> Told:
     """A flight's folder. recorded_m: the length with which its bounds were told."""
     config = load_config(folder / "companion.yaml")
-    truth, told = read_columns(folder / "frames.csv"), _told(folder / "companion")
+    try:
+        truth, told = read_columns(folder / "frames.csv"), _told(folder / "companion")
+        stamps, true_poses = truth["exposure_time_ns"], poses(truth)
+    except KeyError as error:
+        raise RecordError(f"{folder}: a table of the record has no {error}, or no rows") from error
     sigmas = config.localizer.calibration
     unit = CalibrationSigmas.none().model_copy(update={"map_m": sigmas.map_m, "map_length_m": 1.0})
     seen, width = config.camera.model.camera().without_distortion(), config.localizer.width
     camera = seen.resized(width, round(seen.height * width / seen.width))
-    stamps, true_poses = truth["exposure_time_ns"], poses(truth)
     ground_m = float(min(truth["up_m"][:30]))
     errors, covariances, shares = [], [], []
     for time_ns, pose, covariance in told:

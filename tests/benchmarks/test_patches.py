@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 import yaml
 
-from benchmarks.protection.patches import Told, main, table
+from benchmarks.protection.patches import Told, main, read_told, table
+from companion.errors import RecordError
 
 
 def told(length_m: float, seed: int = 0) -> Told:
@@ -67,3 +68,12 @@ def test_a_flight_is_read_from_its_folder(tmp_path: Path, monkeypatch: pytest.Mo
     rows = json.loads(out.read_text())["rows"]
     assert rows[0][:4] == ["flight", "10", "5", "0.0 %"]
     assert float(rows[0][5]) == 0.1 < float(rows[1][5]) < 0.3
+
+
+@pytest.mark.parametrize("name", ["frames.csv", "companion/estimates.csv"])
+def test_a_flight_without_rows_is_refused_by_name(name: str, tmp_path: Path) -> None:
+    flight = flown(tmp_path / "flight")
+    file = flight / name
+    file.write_text(file.read_text().splitlines(keepends=True)[0])
+    with pytest.raises(RecordError, match=r"flight: .* has no '\w+', or no rows"):
+        read_told(flight, 5.0)
