@@ -14,6 +14,7 @@ from typing import Any
 
 import numpy as np
 import rasterio
+from numpy.typing import NDArray
 from pyproj import CRS
 from rasterio.enums import Resampling
 from rasterio.errors import RasterioError
@@ -34,6 +35,11 @@ _HEIGHT_BYTES, _PICTURE_BYTES = 3.0, 0.8
 _BLOCK = 1 << 18
 _KEPT_BLOCKS = 64  # 16 MiB a file that is open
 _MOST_FILES = 500
+_NOT_THERE = 404
+
+
+class NoFileError(MapFetchError):
+    """A file that a server does not have."""
 
 
 class RangeFile(io.RawIOBase):
@@ -99,7 +105,10 @@ class RangeFile(io.RawIOBase):
     def _asked(self, number: int) -> bytes:
         begin = number * _BLOCK
         asked = {"Range": f"bytes={begin}-{begin + _BLOCK - 1}"}
-        answer = self._client.get(self._url, asked)
+        # Only at its begin: one that goes away in between is a fault of the server.
+        answer = self._client.get(self._url, asked, () if self._size else (_NOT_THERE,))
+        if answer.status == _NOT_THERE:
+            raise NoFileError(f"{shown(self._url)}: status {_NOT_THERE}: there is no such file")
         if answer.status != 206:
             raise MapFetchError(
                 f"{shown(self._url)}: the server gives whole files only (no HTTP ranges): download "
@@ -115,10 +124,13 @@ class RangeFile(io.RawIOBase):
 
 @dataclass(frozen=True)
 class CloudFile:
-    """One file. bounds: west, south, east, north in degrees, of which it has something."""
+    """One file. bounds: west, south, east, north in degrees, of which it has something. may_lack:
+    whether there may be no such file, since its address is made and not found in a catalogue.
+    """
 
     url: str
     bounds: tuple[float, float, float, float]
+    may_lack: bool = False
 
 
 def plan_files(
@@ -137,7 +149,7 @@ def plan_files(
         window = grid.window(column, row, width, height)
         meeting = [f for f in there if _meets(window, f)]
         if meeting:
-            get = partial(_window, source, window, tuple(f.url for f in meeting))
+            get = partial(_window, source, window, tuple(meeting))
             pieces.append(Piece(f"{column}-{row}", column, row, width, height, get))
     size = _HEIGHT_BYTES if source.has_heights else _PICTURE_BYTES
     expected = size * grid.width * grid.height
@@ -145,7 +157,9 @@ def plan_files(
 
 
 def degree_files(source: Source, area: Area) -> list[CloudFile]:
-    """Of a model that is cut by whole degrees (Copernicus GLO-30), else the one file."""
+    """Of a model that is cut by whole degrees (Copernicus GLO-30), else the one file. A degree that
+    is all sea has no file.
+    """
     if "{lat}" not in source.url:
         return [CloudFile(source.url, source.bounds)]
     found = []
@@ -154,7 +168,7 @@ def degree_files(source: Source, area: Area) -> list[CloudFile]:
             latitude = f"{'N' if south >= 0 else 'S'}{abs(south):02d}"
             longitude = f"{'E' if west >= 0 else 'W'}{abs(west):03d}"
             url = source.url.replace("{lat}", latitude).replace("{lon}", longitude)
-            found.append(CloudFile(url, (west, south, west + 1, south + 1)))
+            found.append(CloudFile(url, (west, south, west + 1, south + 1), may_lack=True))
     return found
 
 
@@ -162,10 +176,7 @@ def _grid_of(
     files: Sequence[CloudFile], area: Area, resolution_m: float, client: PoliteClient
 ) -> Grid:
     """In the first file's CRS where that is in metres, on its pixels where they are as wished."""
-    with _opened(files[0].url, client, []) as data:
-        if data.crs is None:
-            raise MapFetchError(f"{shown(files[0].url)}: has no CRS")
-        crs, transform = CRS(data.crs), data.transform
+    crs, transform = _lie_of_first(files, client)
     flat = crs.sub_crs_list[0] if crs.is_compound else crs
     if flat.is_geographic:
         utm = utm_zone(area)
@@ -175,6 +186,23 @@ def _grid_of(
     factor = max(round(resolution_m / unit / own[0]), 1)
     pixel = factor * own[0], factor * own[1]
     return grid_over(area.bounds_in(flat), pixel, flat, (transform.c, transform.f))
+
+
+def _lie_of_first(files: Sequence[CloudFile], client: PoliteClient) -> tuple[CRS, Any]:
+    """CRS and transform of the first file that is there."""
+    for file in files:
+        try:
+            with _opened(file.url, client, []) as data:
+                if data.crs is None:
+                    raise MapFetchError(f"{shown(file.url)}: has no CRS")
+                return CRS(data.crs), data.transform
+        except NoFileError:
+            if not file.may_lack:
+                raise
+    raise NoFileError(
+        f"{shown(files[0].url)}: there is no such file, nor of any other degree of the area: is it "
+        "all sea? are latitude and longitude swapped?"
+    )
 
 
 def _meets(window: Grid, file: CloudFile) -> bool:
@@ -212,42 +240,55 @@ def check_depth(name: str, dtype: str) -> None:
 
 
 def _window(
-    source: Source, window: Grid, urls: Sequence[str], client: PoliteClient
+    source: Source, window: Grid, files: Sequence[CloudFile], client: PoliteClient
 ) -> bytes | None:
     """The first file that knows a pixel gives it."""
     bands = 1 if source.has_heights else 3
     dtype = np.float32 if source.has_heights else np.uint8
     whole = np.zeros((bands, window.height, window.width), dtype)
     known = np.zeros((window.height, window.width), bool)
-    how = Resampling.bilinear if source.has_heights else Resampling.average
-    for url in urls:
-        failed: list[MapFetchError] = []
+    for file in files:
         try:
-            with (
-                offline(),
-                _opened(url, client, failed) as data,
-                _warped(data, window, how, source) as vrt,
-            ):
-                if not source.has_heights:
-                    check_depth(shown(url), data.dtypes[0])
-                count = min(bands, data.count)
-                read = vrt.read(list(range(1, count + 1)))
-                if source.has_heights:
-                    name = url.rpartition("/")[2].partition("?")[0]
-                    read = metres_of(source, name, data, window.crs).metres(read)
-                read = read.astype(dtype)
-                has = vrt.dataset_mask() > 0
-        except RasterioError as error:
-            raise MapFetchError(f"{shown(url)}: cannot be read: {error}") from error
-        finally:
-            if failed:
-                raise failed[0]
+            read, has = _of_file(source, window, file.url, client)
+        except NoFileError:
+            if not file.may_lack:
+                raise
+            continue
         fresh = has & ~known
-        whole[:, fresh] = read[:, fresh] if count == bands else read[:1, fresh]
+        whole[:, fresh] = read[:, fresh] if len(read) == bands else read[:1, fresh]
         known |= has
         if known.all():
             break
     return None if not known.any() else as_geotiff(whole, known, window)
+
+
+def _of_file(
+    source: Source, window: Grid, url: str, client: PoliteClient
+) -> tuple[NDArray[Any], NDArray[np.bool_]]:
+    """A window's bands (n, height, width) of one file, and where it knows them."""
+    bands = 1 if source.has_heights else 3
+    how = Resampling.bilinear if source.has_heights else Resampling.average
+    failed: list[MapFetchError] = []
+    try:
+        with (
+            offline(),
+            _opened(url, client, failed) as data,
+            _warped(data, window, how, source) as vrt,
+        ):
+            if not source.has_heights:
+                check_depth(shown(url), data.dtypes[0])
+            read = vrt.read(list(range(1, min(bands, data.count) + 1)))
+            if source.has_heights:
+                name = url.rpartition("/")[2].partition("?")[0]
+                read = metres_of(source, name, data, window.crs).metres(read)
+            return read.astype(np.float32 if source.has_heights else np.uint8), (
+                vrt.dataset_mask() > 0
+            )
+    except RasterioError as error:
+        raise MapFetchError(f"{shown(url)}: cannot be read: {error}") from error
+    finally:
+        if failed:
+            raise failed[0]
 
 
 def _warped(data: Any, window: Grid, how: Resampling, source: Source) -> WarpedVRT:

@@ -16,6 +16,7 @@ pytest.importorskip("pystac")
 from localizer.errors import MapFetchError
 from localizer.map.fetch.area import Area
 from localizer.map.fetch.catalogue import Source
+from localizer.map.fetch.cloud import CloudFile, plan_files
 from localizer.map.fetch.fetch import estimate, fetch, make_plan
 from localizer.map.fetch.mosaic import check_piece
 from localizer.map.fetch.polite import Manners, PoliteClient
@@ -249,6 +250,34 @@ def test_a_server_that_fails_in_the_middle_of_a_file_is_told_and_not_taken_for_a
     with pytest.raises(MapFetchError, match="status 404"):
         fetch(wanted, plan, tmp_path / "pieces", tmp_path / "out.tif", client)
     assert not (tmp_path / "out.tif").exists()
+
+
+def _with_sea_beside(server, wanted: Source, lacks: int) -> list[CloudFile]:
+    """The world's file, and one that is not there: GLO-30 has none of a degree that is all sea."""
+    files = [CloudFile(f"{server.url}/{name}", wanted.bounds, may_lack=True)
+             for name in ("surface.tif", "surface.tif")]  # fmt: skip
+    files[lacks] = CloudFile(f"{server.url}/sea.tif", wanted.bounds, may_lack=True)
+    return files
+
+
+@pytest.mark.parametrize("lacks", [0, 1])
+def test_a_degree_of_the_worlds_model_that_is_sea_does_not_cost_the_coast(server, tmp_path, lacks):
+    """Its 404 ended the fetch of every coast whose area reached a degree further."""
+    wanted = source("cog", f"{server.url}/surface.tif", role="surface")
+    client = PoliteClient(Manners(50.0))
+    plan = plan_files(wanted, AREA, 1.0, _with_sea_beside(server, wanted, lacks), client)
+    fetch(wanted, plan, tmp_path / "pieces", tmp_path / "out.tif", client)
+    compare(tmp_path / "out.tif", **HEIGHTS)
+
+
+def test_where_every_degree_is_sea_it_is_told_by_name_and_a_named_file_must_be_there(server):
+    wanted = source("cog", f"{server.url}/sea.tif", role="surface")
+    client = PoliteClient(Manners(50.0))
+    sea = CloudFile(wanted.url, wanted.bounds, may_lack=True)
+    with pytest.raises(MapFetchError, match=r"sea\.tif.*no such file.*all sea"):
+        plan_files(wanted, AREA, 1.0, [sea, sea], client)
+    with pytest.raises(MapFetchError, match=r"sea\.tif: status 404"):
+        make_plan(wanted, AREA, 1.0, client)
 
 
 def test_a_picture_that_ends_too_early_is_told_and_not_kept(server):
