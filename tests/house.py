@@ -49,6 +49,8 @@ _OUTSIDE_MODULES = {"numba.core.runtime"}
 
 _IMPORT = re.compile(r"^[ \t]*(?:from ([\w.]+) import (\([^)]*\)|[^\n]*)|import ([\w.]+))", re.M)
 _REACHES = re.compile(r"([\w\])]+)\._(?!_)\w|import[^\n]* _(?!_)\w|setattr\(.*\b_(?!_)[A-Za-z]")
+_WAITS = re.compile(r"thread\w*\.join\((?:None)?\)", re.IGNORECASE)
+_FLIES = ("companion/", "mavlink_bridge/", "localizer/tracking/", "localizer/map/cache/")
 _CLASS = re.compile(r"^class .*\n(?:(?:[ \t)].*)?\n)*", re.M)  # up to the next line at column 0
 
 
@@ -172,6 +174,18 @@ def _imported(path: str, text: str, files: Mapping[str, str]) -> Iterator[str]:
             inner = f"{module}.{name}"
             is_module = f"{inner.replace('.', '/')}.py" in files
             yield inner if is_module else module
+
+
+def endless_waits(files: Mapping[str, str]) -> list[str]:
+    """Where what flies waits for a thread without a limit: one that hangs would keep the record and
+    the link to the autopilot from being closed.
+    """
+    return [
+        f"{path}: {match.group()} has no limit; use companion.ending.joined"
+        for path, text in files.items()
+        if path.startswith(_FLIES)
+        for match in _WAITS.finditer(text)
+    ]
 
 
 def private_reaches(files: Mapping[str, str]) -> list[str]:

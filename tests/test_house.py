@@ -8,6 +8,7 @@ import pytest
 
 from tests.house import (
     crowded_folders,
+    endless_waits,
     folder_circles,
     large_classes,
     long_signatures,
@@ -23,6 +24,7 @@ RULES = (
     wrong_imports,
     folder_circles,
     private_reaches,
+    endless_waits,
 )
 
 
@@ -61,6 +63,8 @@ WIDE = "class A:\n    '''{}'''\n" + "".join(f"    def f{n}(self): ...\n" for n i
         (wrong_imports, {"localizer/a.py": "from mavlink_bridge import bridge\n"}, 1),
         (wrong_imports, {"mavlink_bridge/a.py": "def f():\n    import companion.flight\n"}, 1),
         (wrong_imports, {"companion/a.py": "from mavlink_bridge import bridge\n"}, 0),
+        (endless_waits, {"companion/a.py": "self._thread.join()\n"}, 1),
+        (endless_waits, {"companion/a.py": "self._thread.join(2.0)\n", "sitl/a.py": LONG}, 0),
         (private_reaches, {"sitl/a.py": "from sitl.b import _c\n"}, 1),
         (private_reaches, {"sitl/a.py": "def f(b):\n    return b._c\n"}, 1),
         (private_reaches, {"tests/a.py": "monkeypatch.setattr(Link, '_serve', None)\n"}, 1),

@@ -7,6 +7,7 @@ import threading
 import time
 from collections.abc import Callable
 
+from companion.ending import joined
 from companion.sources import FrameSource
 from localizer.types import Frame
 
@@ -26,7 +27,7 @@ class Feed:
         self.error: Exception | None = None
         self.failures = 0
         self._taken_ns: int | None = None
-        self._thread = threading.Thread(target=self._run, name="feed")
+        self._thread = threading.Thread(target=self._run, name="feed", daemon=True)
 
     def start(self) -> None:
         """Start the thread."""
@@ -35,7 +36,7 @@ class Feed:
     def stop(self) -> None:
         """Close the source and wait for the thread."""
         self._source.close()
-        self._thread.join()
+        joined(self._thread)
 
     @property
     def turn_ns(self) -> int:

@@ -16,6 +16,7 @@ from typing import Any
 
 import numpy as np
 
+from companion.ending import joined
 from companion.flight.search import NOT_READY
 from companion.guardian.guardian import Guardian
 from companion.sources import StreamState
@@ -101,7 +102,7 @@ class HealthMonitor:
         self.turn_ns = time.monotonic_ns()
         """When its thread began its newest turn, CLOCK_MONOTONIC."""
         self._stop = threading.Event()
-        self._thread = threading.Thread(target=self._run, name="health")
+        self._thread = threading.Thread(target=self._run, name="health", daemon=True)
 
     def start(self) -> None:
         """Start watching."""
@@ -112,7 +113,7 @@ class HealthMonitor:
     def stop(self) -> None:
         """Stop, after one last report."""
         self._stop.set()
-        self._thread.join()
+        joined(self._thread)
         if self._file is not None:
             self._file.stop()
 

@@ -22,6 +22,7 @@ import numpy as np
 
 from companion.config import PriorConfig
 from companion.conversions import Installation
+from companion.ending import joined
 from companion.flight.priors import AutopilotPose, drift_sigma_m
 from localizer.geometry.geo import NED_FROM_ENU
 from localizer.geometry.pose import Pose
@@ -124,17 +125,18 @@ class FixMemory:
         self._newest: PoseEstimate | None = None
         self._failed = False
         self._stop = threading.Event()
-        self._thread = threading.Thread(target=self._run, name="last-fix")
+        self._thread = threading.Thread(target=self._run, name="last-fix", daemon=True)
 
     def start(self) -> None:
         """Start keeping."""
         self._thread.start()
 
     def stop(self) -> None:
-        """Stop keeping; a flight that ended in order leaves nothing to go on from."""
+        """Stop keeping; a flight that ended in order leaves nothing to go on from. A disk that
+        stands still is left behind.
+        """
         self._stop.set()
-        self._thread.join()
-        if self._path is not None:
+        if joined(self._thread) and self._path is not None:
             try:
                 self._path.unlink(missing_ok=True)
             except OSError as error:  # its age and the boot still tell the next process

@@ -258,16 +258,19 @@ class Recorder:
             if not self._put("snapshot", lambda: (frame,)):
                 self._written(frame)
 
-    def close(self) -> None:
-        """Write what is queued and close the files; a disk that stands still is left behind."""
+    def close(self) -> bool:
+        """Write what is queued and close the files. False: the disk stands still, and is left
+        behind.
+        """
         with contextlib.suppress(queue.Full):
             self._rows.put(None, timeout=_CLOSE_S)
         self._thread.join(_CLOSE_S)
         if self._thread.is_alive():
             _log.warning("the record is incomplete, its disk does not answer")
-            return
+            return False
         for file in self._files:
             self._guarded(file.close)
+        return True
 
     def _open(self, path: Path, columns: tuple[str, ...]) -> Any:
         file = path.open("w", newline="", encoding="utf-8")
@@ -411,9 +414,8 @@ class RecordKeeper:
 
     def close(self) -> None:
         """Write what is queued, close the files, and put the targets on maps."""
-        if self.recorder is not None:
-            self.recorder.close()
-        if self.folder is not None:
+        answers = self.recorder is None or self.recorder.close()
+        if self.folder is not None and answers:
             try:
                 write_target_files(self.folder)
             except OSError as error:

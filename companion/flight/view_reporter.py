@@ -7,6 +7,7 @@ import threading
 from collections.abc import Callable
 
 from companion.conversions import camera_view
+from companion.ending import joined
 from localizer.geometry.geo import LocalFrame
 from localizer.targets.locate import RayCaster
 from localizer.types import PoseEstimate
@@ -35,7 +36,7 @@ class ViewReporter:
         self._newest: PoseEstimate | None = None
         self._came = threading.Event()
         self._stop = threading.Event()
-        self._thread = threading.Thread(target=self._run, name="view")
+        self._thread = threading.Thread(target=self._run, name="view", daemon=True)
 
     def start(self) -> None:
         """Start the thread."""
@@ -45,7 +46,7 @@ class ViewReporter:
         """Stop the thread."""
         self._stop.set()
         self._came.set()
-        self._thread.join()
+        joined(self._thread)
 
     def add_estimate(self, estimate: PoseEstimate) -> None:
         """Offer an estimate; only accepted ones are told. Never blocks."""

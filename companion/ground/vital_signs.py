@@ -10,6 +10,7 @@ from collections.abc import Callable, Mapping
 
 import numpy as np
 
+from companion.ending import joined
 from localizer.types import PoseEstimate, TrackingState
 
 _log = logging.getLogger(__name__)
@@ -35,7 +36,7 @@ class VitalSigns:
         self._state: TrackingState | None = None
         self._stop = threading.Event()
         self._failures = 0
-        self._thread = threading.Thread(target=self._run, name="vital signs")
+        self._thread = threading.Thread(target=self._run, name="vital signs", daemon=True)
 
     def start(self) -> None:
         """Start the thread."""
@@ -44,7 +45,7 @@ class VitalSigns:
     def stop(self) -> None:
         """Stop the thread."""
         self._stop.set()
-        self._thread.join()
+        joined(self._thread)
 
     def add_estimate(self, estimate: PoseEstimate) -> None:
         """Note an estimate. Never blocks."""

@@ -17,6 +17,7 @@ from fractions import Fraction
 import av
 
 from companion.config import KlvConfig
+from companion.ending import joined
 from companion.errors import StreamError
 from companion.klv.local_set import encode
 from companion.klv.metadata import Scene, picture_fields
@@ -67,7 +68,7 @@ class KlvRelay:
         self._condition = threading.Condition()
         self._stopping = False
         self.sent = self.described = self.dropped = self.failed = 0
-        self._thread = threading.Thread(target=self._run, name="klv")
+        self._thread = threading.Thread(target=self._run, name="klv", daemon=True)
 
     def start(self) -> None:
         """Start the thread."""
@@ -78,7 +79,7 @@ class KlvRelay:
         with self._condition:
             self._stopping = True
             self._condition.notify()
-        self._thread.join()
+        joined(self._thread)
 
     def begin(self, stream: av.VideoStream) -> None:
         """A new connection: its packets go into a stream of their own."""

@@ -10,6 +10,7 @@ import os
 import threading
 from collections.abc import Callable, Mapping
 
+from companion.ending import joined
 from companion.supervision.processes import ENDING
 from mavlink_bridge.link.clock import monotonic_ns
 
@@ -30,7 +31,7 @@ class Pulse:
         os.set_blocking(descriptor, False)
         self._begun_ns = 0
         self._stop = threading.Event()
-        self._thread = threading.Thread(target=self._run, name="pulse")
+        self._thread = threading.Thread(target=self._run, name="pulse", daemon=True)
 
     def start(self) -> None:
         """Start telling."""
@@ -42,9 +43,10 @@ class Pulse:
         time that a recording takes; after an error another process should fly soon.
         """
         self._stop.set()
-        self._thread.join()
+        ended = joined(self._thread)
         self._say(f"{ENDING if in_order else 'failing'} 0\n".encode())
-        os.close(self._descriptor)
+        if ended:  # else its next line would go into whatever file has the number then
+            os.close(self._descriptor)
 
     def _run(self) -> None:
         while not self._stop.wait(_PERIOD_S):

@@ -17,6 +17,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 from math import isfinite
 
+from companion.ending import joined
 from companion.errors import ConfigError, DetectionError
 from companion.targets.senders import Senders
 
@@ -130,13 +131,13 @@ class DetectionListener:
         self._stop = threading.Event()
         self.received = 0
         self.rejected = self.failed = 0
-        self._thread = threading.Thread(target=self._run, name="detections")
+        self._thread = threading.Thread(target=self._run, name="detections", daemon=True)
         self._thread.start()
 
     def close(self) -> None:
         """Stop listening."""
         self._stop.set()
-        self._thread.join()
+        joined(self._thread)
         self._socket.close()
 
     def _run(self) -> None:

@@ -11,6 +11,7 @@ from typing import Any
 import cv2
 
 from companion.config import TargetConfig
+from companion.ending import joined
 from companion.targets.detections import Detection
 from companion.targets.pictures import RecentPictures
 from companion.targets.population import Click, Population, Target
@@ -56,7 +57,7 @@ class TargetReporter:
         self._condition = threading.Condition()
         self._stopping = False
         self.failed = self.unmatched = 0
-        self._thread = threading.Thread(target=self._run, name="targets")
+        self._thread = threading.Thread(target=self._run, name="targets", daemon=True)
 
     @property
     def missed(self) -> int:
@@ -82,7 +83,7 @@ class TargetReporter:
         with self._condition:
             self._stopping = True
             self._condition.notify()
-        self._thread.join()
+        joined(self._thread)
 
     def add_estimate(self, estimate: PoseEstimate) -> None:
         """Offer an estimate; only accepted ones are used. Never blocks."""

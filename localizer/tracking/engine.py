@@ -42,6 +42,7 @@ _TRIED_FRAMES = 5  # with what is known outside, before a search begins
 _TRIED_BESIDE = 3
 _SEARCH_HANGS_NS = 120_000_000_000  # without asking whether it is wanted, as it does all the time
 _STOP_S = 10.0  # for a search to see that it is to end
+_FIX_STOP_S = 20.0  # for a frame that is at work to be done, on a slow computer
 
 
 class DualThreadEngine:
@@ -84,15 +85,12 @@ class DualThreadEngine:
         self._stop = threading.Event()
         self._turns: dict[str, int] = {}
         self._threads = [
-            threading.Thread(target=self._run, args=(self._render_once,), name="render"),
-            threading.Thread(target=self._run, args=(self._extract_once,), name="extract"),
-            threading.Thread(target=self._run, args=(self._localize_once,), name="localize"),
+            self._thread("render", self._render_once),
+            self._thread("extract", self._extract_once),
+            self._thread("localize", self._localize_once),
         ]
-        self._search_thread: threading.Thread | None = None
         if searcher is not None:
-            # A daemon: one that hangs must not keep the process from ending.
-            self._search_thread = threading.Thread(target=self._search, name="search", daemon=True)
-            self._threads.append(self._search_thread)
+            self._threads.append(self._thread("search", self._search_once))
 
     def start(self) -> None:
         """Start the threads."""
@@ -100,13 +98,15 @@ class DualThreadEngine:
             thread.start()
 
     def stop(self) -> None:
-        """Stop the threads and wait for them; a search that hangs is left behind."""
+        """Stop the threads and wait for them; one that hangs is left behind."""
         self._stop.set()
         self._ahead.close()
         self._render_times.close()
         self._sought.close()
         for thread in self._threads:
-            thread.join(_STOP_S if thread is self._search_thread else None)
+            thread.join(_STOP_S if thread.name == "search" else _FIX_STOP_S)
+            if thread.is_alive():
+                _log.warning("the %s thread does not end, it is left behind", thread.name)
 
     def submit(self, frame: Frame) -> None:
         """Offer a frame; an older one that was not yet taken is dropped. Never blocks."""
@@ -127,6 +127,13 @@ class DualThreadEngine:
         """When each thread that makes fixes began its newest turn, CLOCK_MONOTONIC ns, by name."""
         return {n: self._turns[n] for n in _FIX_THREADS if n in self._turns}
 
+    def _thread(self, name: str, once: Callable[[], None]) -> threading.Thread:
+        # A daemon: one that hangs must not keep the process from ending. All, the search too, are
+        # of the process's own priority: a thread of a lower one that is put aside while it holds
+        # the interpreter holds up all that fly (2 s at nice 15, 0.2 s without, on a busy
+        # processor); and the ports of a killed process are free once its last thread had its turn.
+        return threading.Thread(target=self._run, args=(once,), name=name, daemon=True)
+
     def _run(self, once: Callable[[], None]) -> None:
         name = threading.current_thread().name
         while not self._stop.is_set():
@@ -138,12 +145,6 @@ class DualThreadEngine:
             except Exception as error:  # the flight goes on: degrade, report, try the next frame
                 _log.exception("unexpected error on the %s thread", threading.current_thread().name)
                 self._book.report(f"unexpected {type(error).__name__}: {error}")
-
-    def _search(self) -> None:
-        # Of the process's own priority: a thread of a lower one that is put aside while it holds
-        # the interpreter holds up all that fly (2 s at nice 15, 0.2 s without, on a busy
-        # processor); and the ports of a killed process are free once its last thread had its turn.
-        self._run(self._search_once)
 
     def _search_once(self) -> None:
         """Search for the newest frame's place, as long as nobody knows it."""

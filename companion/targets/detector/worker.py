@@ -15,6 +15,7 @@ from collections.abc import Callable
 import numpy as np
 
 from companion.config import DetectorConfig
+from companion.ending import joined
 from companion.targets.detections import DETECTED, Detection
 from companion.targets.detector.boxes import Box
 from companion.targets.detector.names import Sight, ThingNames
@@ -58,7 +59,7 @@ class BoxDetector:
         self._in_a_row = 0
         self.looked = self.seen = self.failed = 0
         self.is_working = False
-        self._thread = threading.Thread(target=self._run, name="detector")
+        self._thread = threading.Thread(target=self._run, name="detector", daemon=True)
 
     def start(self) -> None:
         """Start the thread, which loads the model."""
@@ -69,7 +70,7 @@ class BoxDetector:
         self._stopping.set()
         with self._condition:
             self._condition.notify()
-        self._thread.join()
+        joined(self._thread)
 
     def add_frame(self, frame: Frame) -> None:
         """Offer a picture. Never blocks."""

@@ -1,0 +1,142 @@
+"""What hangs is named and left behind, and what comes after it ends as it should."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import threading
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from companion.config import PriorConfig, RecordConfig, TargetConfig
+from companion.conversions import Installation
+from companion.ending import joined
+from companion.flight.last_fix import FixMemory
+from companion.flight.recorder import RecordKeeper
+from companion.supervision.pulse import Pulse
+from companion.targets.population import Click
+from companion.targets.reporter import TargetReporter
+from localizer.geometry.camera import Camera
+from localizer.geometry.geo import Geodetic, LocalFrame
+from localizer.geometry.pose import Pose
+from localizer.types import PoseEstimate, RegistrationStatus, TrackingState
+
+FRAME = LocalFrame(Geodetic(47.0, 8.0, 500.0))
+DOWN = np.diag([1.0, -1.0, -1.0])
+
+
+class Hang:
+    """Whoever calls it waits until the test is over."""
+
+    def __init__(self) -> None:
+        self.reached, self.over = threading.Event(), threading.Event()
+
+    def __call__(self, *_: Any) -> Any:
+        self.reached.set()
+        self.over.wait(120.0)
+        raise OSError("at last")
+
+
+@pytest.fixture
+def hang(monkeypatch: pytest.MonkeyPatch) -> Iterator[Hang]:
+    monkeypatch.setattr("companion.ending._PATIENCE_S", 0.01)
+    hanging = Hang()
+    yield hanging
+    hanging.over.set()
+
+
+def ends(stop: Callable[[], Any]) -> bool:
+    """Whether it comes back while the other hangs."""
+    ending = threading.Thread(target=stop, daemon=True)
+    ending.start()
+    ending.join(60.0)
+    return not ending.is_alive()
+
+
+def tracked() -> PoseEstimate:
+    return PoseEstimate(
+        Pose(DOWN, np.array([5.0, 6.0, 80.0])), np.eye(6) * 0.04, 1.0, TrackingState.TRACKING,
+        RegistrationStatus.OK, True, 5, 0, Camera.from_fov(640, 480, 60),
+    )  # fmt: skip
+
+
+def test_a_thread_that_hangs_is_named_and_one_that_ends_is_not(
+    hang: Hang, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    hanging = threading.Thread(target=lambda: hang.over.wait(120.0), name="stuck", daemon=True)
+    hanging.start()
+    assert not joined(hanging)
+    assert "the thread stuck does not end" in caplog.text
+    caplog.clear()
+    hang.over.set()
+    monkeypatch.setattr("companion.ending._PATIENCE_S", 60.0)
+    assert joined(hanging)
+    assert not caplog.text
+
+
+def test_a_map_on_a_dead_disk_keeps_the_targets_end_waiting_no_longer(hang: Hang) -> None:
+    """Record and link to the autopilot are closed after the targets: they never were."""
+    reporter = TargetReporter(TargetConfig(), hang, lambda _: None)
+    reporter.start()
+    reporter.add_estimate(tracked())
+    reporter.begin(Click(1, tracked(), (320.0, 240.0)))
+    assert hang.reached.wait(60.0)
+    assert ends(reporter.stop)
+
+
+def test_a_last_fix_on_a_dead_disk_is_left_there(
+    hang: Hang, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("companion.flight.last_fix._WRITE_S", 0.001)
+    autopilot: Any = SimpleNamespace(rotation=lambda _: DOWN, velocity=np.zeros(3))
+    path = tmp_path / "last-fix.json"
+    path.write_text("{}")
+    installation = Installation(FRAME, 47.0, np.zeros(3))
+    memory = FixMemory(path, PriorConfig(), autopilot, installation, hang)
+    bundle: Any = None
+    memory.start()
+    memory.add_estimate(tracked(), bundle)
+    assert hang.reached.wait(60.0)
+    assert ends(memory.stop)
+    assert path.exists()  # the same disk would be waited for once more
+
+
+def test_a_pulse_that_hangs_never_writes_into_another_file(hang: Hang, tmp_path: Path) -> None:
+    """Its pipe was closed under it: the next file that was opened got the pipe's number."""
+
+    def beats() -> dict[str, int]:
+        with contextlib.suppress(OSError):
+            hang()
+        return {}
+
+    reading, writing = os.pipe()
+    pulse = Pulse(beats, writing)
+    pulse.start()
+    assert hang.reached.wait(60.0)
+    assert ends(lambda: pulse.stop(in_order=True))
+    assert os.read(reading, 100).startswith(b"ending")
+    os.fstat(writing)
+    os.close(reading)
+
+
+def test_a_record_whose_disk_stands_still_gets_no_maps_of_its_targets(
+    hang: Hang, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("companion.flight.recorder._CLOSE_S", 0.01)
+    asked: list[Path] = []
+    monkeypatch.setattr("companion.flight.recorder.write_target_files", asked.append)
+    monkeypatch.setattr("companion.flight.recorder.write_manifest", lambda *_: None)
+    keeper = RecordKeeper(FRAME, lambda _: None)
+    config: Any = None
+    keeper.open(config, RecordConfig(folder=tmp_path / "flight"), lambda _: None)
+    assert keeper.recorder is not None
+    disk: Any = type("Disk", (), {"position_world": property(hang)})()
+    keeper.recorder.target(disk)
+    assert hang.reached.wait(60.0)
+    assert ends(keeper.close)
+    assert not asked
