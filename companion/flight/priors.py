@@ -159,9 +159,8 @@ class AutopilotPose:
 
     @property
     def height_m(self) -> float | None:
-        """The vehicle's height in the map's frame (world z, m) by its barometer; None: unknown.
-
-        Above the plane through the map's origin: the Earth's curve costs 0.2 m at 1.6 km.
+        """The vehicle's height above that of the map's origin, m, by its barometer; None: unknown.
+        Its world z is less by what the Earth falls away on the way there.
         """
         altitude_m = self._autopilot.state().altitude_amsl_m
         if altitude_m is None or not math.isfinite(altitude_m):

@@ -36,6 +36,13 @@ from localizer.tracking.motion import OtherSensors
 from localizer.types import Anchors, FeaturePyramid, Frame, PoseEstimate, PosePrior
 
 
+def fallen_m(place: Array) -> float:
+    """By how much the ground of a place (3,) lies below the plane through the world's origin, since
+    the Earth is round: 7.8 m at 10 km, where 50 m further on are another 0.08 m.
+    """
+    return float(place[:2] @ place[:2]) / (2.0 * _EARTH_M)
+
+
 class Carry(Enum):
     """What the odometry makes of a frame that the map rejected."""
 
@@ -58,6 +65,7 @@ class Carried:
 _NOTHING = Carried(Carry.NONE)
 
 
+_EARTH_M = 6.371e6
 # Sigmas of what the autopilot knows absolutely; its turns and rises since a keyframe are known
 # better (`OdometryConfig`), and constant errors are taken out by the odometry.
 _TILT_RAD, _HEADING_RAD, _HEIGHT_M = float(np.radians(0.4)), float(np.radians(3.0)), 0.5
@@ -97,7 +105,7 @@ class Bridging:
             estimate.covariance,
             velocity=velocity,
             surface=anchors.points_world,
-            constraint=self._constraint(estimate.exposure_time_ns),
+            constraint=self._constraint(estimate.exposure_time_ns, estimate.world_from_camera),
         )
 
     def carry(
@@ -110,7 +118,7 @@ class Bridging:
         camera = followed(self._pinhole, frame.camera)
         seen = OdometryFrame(query, frame.exposure_time_ns, examine(frame.image), sweep, camera)
         surface = anchors.points_world if anchors is not None else None
-        constraint = self._constraint(frame.exposure_time_ns)
+        constraint = self._constraint(frame.exposure_time_ns, prediction.world_from_camera)
         try:
             estimate = self._odometry.step(
                 seen,
@@ -134,11 +142,13 @@ class Bridging:
             Carry.CARRIED, estimate.world_from_camera, estimate.covariance, estimate.quality
         )
 
-    def _constraint(self, time_ns: int) -> PoseConstraint | None:
+    def _constraint(self, time_ns: int, about: Pose) -> PoseConstraint | None:
+        """about: where the camera is, to some metres."""
         rotation, height_m = self._sensors.rotation_at(time_ns), self._sensors.height_at(time_ns)
         known = []
         if rotation is not None:
             known.append(attitude_constraint(rotation, _TILT_RAD, _HEADING_RAD))
         if height_m is not None:
-            known.append(height_constraint(height_m, _HEIGHT_M))
+            world_z = height_m - fallen_m(about.translation)
+            known.append(height_constraint(world_z, _HEIGHT_M))
         return combine(*known) if known else None

@@ -184,9 +184,9 @@ class OtherSensors:
     """What other sensors (autopilot and gimbal) say of the camera; None where they do not know.
 
     rotation_at: (3, 3) world_from_camera at a time in ns. displacement_between: the way (3,)
-    between two times in world axes (m) with its sigma (m). height_at: the camera's world z (m),
-    which may have a constant error. clearance_at: the height above what lies below (m), by a
-    rangefinder.
+    between two times in world axes (m) with its sigma (m). height_at: the camera's height above
+    the ellipsoid, less that of the world's origin (m), which may have a constant error.
+    clearance_at: the height above what lies below (m), by a rangefinder.
     """
 
     rotation_at: RotationAt = lambda _time_ns: None

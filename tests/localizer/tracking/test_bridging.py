@@ -4,15 +4,23 @@ from __future__ import annotations
 
 from pathlib import Path
 from types import SimpleNamespace
+from typing import Any, ClassVar
 
 import numpy as np
 import pytest
 
 from localizer.config import LocalizerConfig
+from localizer.errors import OdometryError
 from localizer.evaluation.sequences import Sequence, load_sequence
+from localizer.geometry.camera import Camera
+from localizer.geometry.geo import Geodetic, LocalFrame
 from localizer.geometry.pose import Pose
 from localizer.map.cache.cache import TileCache
 from localizer.odometry.keyframe import DepthSource
+from localizer.registration.jngo import JNGO
+from localizer.registration.priors import PoseConstraint
+from localizer.tracking.bridging import Bridging
+from localizer.tracking.motion import OtherSensors
 from localizer.tracking.opening import open_localizer
 from localizer.tracking.pipeline import Localizer
 from localizer.types import Frame, PoseEstimate, PosePrior, TrackingState
@@ -59,6 +67,47 @@ def test_the_maps_edge_is_bridged_and_the_map_found_again(
             estimate = localizer.track(sequence.frame(k))
         assert estimate.state is TrackingState.TRACKING
         assert error_m(estimate, sequence.truth[EDGE + 2]) < 0.5
+
+
+class _HeardOdometry:
+    """What the odometry is told of the camera's height."""
+
+    told: ClassVar[list[float]] = []
+
+    def __init__(self, *_: Any) -> None:
+        self.ready = True
+
+    def begin(self, *_: Any, constraint: PoseConstraint, **__: Any) -> None:
+        self.told.append(float(constraint.world_from_camera.translation[2]))
+
+    def step(self, *_: Any, constraint: PoseConstraint, **__: Any) -> Any:
+        self.told.append(float(constraint.world_from_camera.translation[2]))
+        raise OdometryError("heard")
+
+
+def test_a_height_far_from_the_origin_is_told_in_the_worlds_axes(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """An aircraft that keeps its height 10 km from the map's origin was told to climb against the
+    plane: 0.8 m in half a kilometre.
+    """
+    monkeypatch.setattr("localizer.tracking.bridging.VisualOdometry", _HeardOdometry)
+    _HeardOdometry.told.clear()
+    frame_of_map = LocalFrame(Geodetic(47.0, 8.0, 500.0))
+    places = [frame_of_map.enu_from_geodetic(47.0, lon, 600.0) for lon in (8.13, 8.137)]
+    camera = Camera.from_fov(64, 48, 60)
+    sensors = OtherSensors(height_at=lambda _: 100.0)
+    bridging = Bridging(camera, JNGO(threads=1), LocalizerConfig().odometry, 1, sensors)
+    begun: Any = SimpleNamespace(
+        camera=camera, exposure_time_ns=0, covariance=np.eye(6),
+        world_from_camera=Pose(np.eye(3), places[0]),
+    )  # fmt: skip
+    nothing: Any = SimpleNamespace(points_world=None)
+    bridging.begin(begun, nothing, nothing, np.zeros(3))
+    prior = PosePrior(Pose(np.eye(3), places[1]), np.eye(6), 1)
+    image = np.zeros((48, 64, 3), np.uint8)
+    bridging.carry(Frame(image, 1, camera, 1), nothing, prior, None)
+    assert _HeardOdometry.told == pytest.approx([place[2] for place in places], abs=0.05)
 
 
 def test_a_covered_lens_ends_the_bridge(small_assets: FlightAssets, sequence: Sequence) -> None:
