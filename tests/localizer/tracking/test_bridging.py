@@ -84,6 +84,9 @@ class _HeardOdometry:
         self.told.append(float(constraint.world_from_camera.translation[2]))
         raise OdometryError("heard")
 
+    def forget(self) -> None:
+        pass
+
 
 def test_a_height_far_from_the_origin_is_told_in_the_worlds_axes(
     monkeypatch: pytest.MonkeyPatch,
