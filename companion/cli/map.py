@@ -152,6 +152,7 @@ def info(
     """Coverage, heights, texel size, levels and sizes."""
     outlines = [file for file in (geojson, kml) if file is not None]
     _require_place(*outlines)
+    from localizer.geometry.antimeridian import geo_box
     from localizer.geometry.geoid import geoid_separation
     from localizer.map.cache.cache import TileCache
     from localizer.map.inspection.footprint import as_geojson, as_kml
@@ -159,20 +160,20 @@ def info(
 
     opened = TileCache.open(cache)
     m = opened.manifest
-    south_north, west_east = zip(*m.extent, strict=True)
+    box = geo_box(m.extent)
     egm96 = geoid_separation(m.origin.latitude_deg, m.origin.longitude_deg)
-    box = opened.index.box_max[0] - opened.index.box_min[0]
+    size = opened.index.box_max[0] - opened.index.box_min[0]
     facts = {
         "source": m.source,
         "attribution": m.attribution or "not given",
         "imagery of": str(m.build.get("imagery_date", "not known")),
         "origin": f"{m.origin.latitude_deg:.7f}, {m.origin.longitude_deg:.7f}, "
         f"{m.origin.height_m:.2f} m (ellipsoidal)",
-        "latitude": f"{min(south_north):.6f} to {max(south_north):.6f}",
-        "longitude": f"{min(west_east):.6f} to {max(west_east):.6f}",
+        "latitude": f"{box.south:.6f} to {box.north:.6f}",
+        "longitude": f"{box.west:.6f} to {box.east:.6f}",
         "heights of the source": m.vertical_datum,
         "geoid separation": f"{m.geoid_separation_m:.2f} m (EGM96 there: {egm96:.2f} m)",
-        "extent": f"{box[0]:.0f} x {box[1]:.0f} m, {m.height_range_m[0]:.1f} to "
+        "extent": f"{size[0]:.0f} x {size[1]:.0f} m, {m.height_range_m[0]:.1f} to "
         f"{m.height_range_m[1]:.1f} m (ellipsoidal)",
         "texel size": f"{m.gsd_m:.3f} m",
         "tiles": f"{m.tiles} in {m.levels} levels, {m.bytes / 1e6:.1f} MB",

@@ -11,6 +11,7 @@ from typing import Any
 
 import cv2
 
+from localizer.geometry.antimeridian import beside
 from localizer.map.cache.cache import TileCache
 from localizer.map.cache.stream import TileStreamer
 from localizer.relocalization.topview import render_top_view
@@ -65,18 +66,19 @@ class TopTiles:
         self._renderer: NumbaRenderer | None = None
 
     def about(self) -> dict[str, Any]:
-        """What the page needs to place the map."""
+        """What the page needs to place the map. Across the 180th meridian longitudes go on beyond
+        it: a page's box from 179 to -179 degrees would be the rest of the Earth.
+        """
         manifest, frame = self._cache.manifest, self._cache.frame
         low, high = self._cache.index.box_min[0], self._cache.index.box_max[0]
-        ground = frame.origin.height_m
+        ground, here = frame.origin.height_m, frame.origin.longitude_deg
         corners = [frame.position([e, n, 0.0]) for e, n in ((low[0], low[1]), (high[0], high[1]))]
         return {
             "bounds": [
-                [corners[0].longitude_deg, corners[0].latitude_deg],
-                [corners[1].longitude_deg, corners[1].latitude_deg],
+                [beside(corner.longitude_deg, here), corner.latitude_deg] for corner in corners
             ],
             "origin": [frame.origin.latitude_deg, frame.origin.longitude_deg, ground],
-            "outline": [[lon, lat] for lat, lon in manifest.extent],
+            "outline": [[beside(lon, here), lat] for lat, lon in manifest.extent],
             "gsd_m": manifest.gsd_m,
             "attribution": manifest.attribution,
             "geoid_separation_m": manifest.geoid_separation_m,

@@ -18,6 +18,7 @@ from companion.geometry import (
     world_from_camera,
 )
 from companion.planning.mission import HeightAbove, PlannedMission, Waypoint
+from localizer.geometry.antimeridian import geo_box
 from localizer.geometry.pose import Array, Pose, matrix_from_euler
 from localizer.map.cache.cache import TileCache
 from localizer.map.cache.surface import MapSurface
@@ -210,11 +211,7 @@ def _extent(cache: TileCache, below: tuple[float, float]) -> str:
     )  # of the rectangle, (n, 2)
     nearest = np.clip(below, corners.min(axis=0), corners.max(axis=0))
     away_m = float(np.hypot(*(np.asarray(below) - nearest)))
-    latitudes, longitudes = zip(*cache.manifest.extent, strict=True)
-    return (
-        f"latitude {min(latitudes):.5f} to {max(latitudes):.5f}, longitude {min(longitudes):.5f} "
-        f"to {max(longitudes):.5f}; it is {away_m:.0f} m away"
-    )
+    return f"{geo_box(cache.manifest.extent).line()}; it is {away_m:.0f} m away"
 
 
 def length_m(legs: Sequence[Leg]) -> float:

@@ -16,6 +16,7 @@ from companion.preflight.map_pin import map_hash
 from companion.versions import versions
 from companion.writing import writing
 from localizer.errors import LocalizerError
+from localizer.geometry.antimeridian import geo_box
 from localizer.map.cache.cache import TileCache
 from mavlink_bridge.preflight.doctor import Diagnosis, Finding
 
@@ -97,11 +98,11 @@ def _map(config: CompanionConfig, today: date) -> tuple[Row, ...]:
         m = TileCache.open(config.map).manifest
     except LocalizerError as error:
         return (Row("map", str(error), False),)
-    latitudes, longitudes = zip(*m.extent, strict=True)
+    box = geo_box(m.extent)
     pinned = "pinned by sha256" if config.map_sha256 else "not pinned: any map is flown"
     where = (
-        f"{min(latitudes):.5f} to {max(latitudes):.5f}, {min(longitudes):.5f} to "
-        f"{max(longitudes):.5f}; {m.gsd_m:.2f} m a texel; {pinned}"
+        f"{box.south:.5f} to {box.north:.5f}, {box.west:.5f} to "
+        f"{box.east:.5f}; {m.gsd_m:.2f} m a texel; {pinned}"
     )
     stated = str(m.build.get("imagery_date") or "")
     try:

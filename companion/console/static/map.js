@@ -165,9 +165,14 @@ export class MapView {
   resize() { this.map.resize(); }
 }
 
+// Tiles are counted from the 180th meridian on: a map across it has some at either end.
+function onEarth([[west, south], [east, north]]) {
+  return west < -180 || east > 180 ? [-180, south, 180, north] : [west, south, east, north];
+}
+
 function style(about) {
   const sources = {
-    top: { type: "raster", tiles: [`${location.origin}/tiles/{z}/{x}/{y}.jpg`], tileSize: 256, minzoom: 8, maxzoom: 21, bounds: about.bounds.flat() },
+    top: { type: "raster", tiles: [`${location.origin}/tiles/{z}/{x}/{y}.jpg`], tileSize: 256, minzoom: 8, maxzoom: 21, bounds: onEarth(about.bounds) },
     coverage: { type: "geojson", data: about.outline.length > 2 ? { type: "Polygon", coordinates: [[...about.outline, about.outline[0]]] } : EMPTY },
     moving: { type: "geojson", data: EMPTY },
   };

@@ -3,16 +3,24 @@
 from __future__ import annotations
 
 import json
+from typing import Any
 from xml.sax.saxutils import escape
 
+from localizer.geometry.antimeridian import Corner, cut
 from localizer.map.cache.cache import Manifest
 
 
 def as_geojson(manifest: Manifest, name: str) -> str:
-    """One feature: the outline as a polygon, counter-clockwise, longitude first."""
+    """One feature: the outline as a polygon, counter-clockwise, longitude first; as two where it
+    crosses the 180th meridian.
+    """
+    rings = _rings(manifest)
+    geometry: dict[str, Any] = {"type": "Polygon", "coordinates": rings}
+    if len(rings) > 1:
+        geometry = {"type": "MultiPolygon", "coordinates": [[ring] for ring in rings]}
     feature = {
         "type": "Feature",
-        "geometry": {"type": "Polygon", "coordinates": [_ring(manifest)]},
+        "geometry": geometry,
         "properties": {
             "name": name,
             "attribution": manifest.attribution,
@@ -26,23 +34,30 @@ def as_geojson(manifest: Manifest, name: str) -> str:
 
 
 def as_kml(manifest: Manifest, name: str) -> str:
-    """One placemark: the outline as a polygon on the ground."""
-    ring = " ".join(f"{lon:.8f},{lat:.8f}" for lon, lat in _ring(manifest))
+    """One placemark: the outline as a polygon on the ground, or as two, as in GeoJSON."""
+    polygons = "".join(
+        "<Polygon><outerBoundaryIs><LinearRing><coordinates>"
+        + " ".join(f"{lon:.8f},{lat:.8f}" for lon, lat in ring)
+        + "</coordinates></LinearRing></outerBoundaryIs></Polygon>"
+        for ring in _rings(manifest)
+    )
     return (
         '<?xml version="1.0" encoding="UTF-8"?>\n'
         '<kml xmlns="http://www.opengis.net/kml/2.2"><Document><Placemark>'
         f"<name>{escape(name)}</name><description>{escape(manifest.attribution)}</description>"
-        "<Polygon><outerBoundaryIs><LinearRing><coordinates>"
-        f"{ring}</coordinates></LinearRing></outerBoundaryIs></Polygon>"
+        f"<MultiGeometry>{polygons}</MultiGeometry>"
         "</Placemark></Document></kml>\n"
     )
 
 
-def _ring(manifest: Manifest) -> list[tuple[float, float]]:
+def _rings(manifest: Manifest) -> list[list[Corner]]:
     """(longitude, latitude) corners, counter-clockwise, the first again at the end."""
-    corners = [(lon, lat) for lat, lon in manifest.extent]
+    return [_closed(ring) for ring in cut([(lon, lat) for lat, lon in manifest.extent])]
+
+
+def _closed(corners: list[Corner]) -> list[Corner]:
     following = [*corners[1:], corners[0]]
     area = sum(x * b - a * y for (x, y), (a, b) in zip(corners, following, strict=True))
     if area < 0:
-        corners.reverse()
+        corners = corners[::-1]
     return [*corners, corners[0]]

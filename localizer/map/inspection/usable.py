@@ -8,6 +8,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from localizer.geometry.antimeridian import beside, wrapped
 from localizer.geometry.geo import LocalFrame
 from localizer.map.inspection.mosaic import Mosaic
 
@@ -59,12 +60,14 @@ def usable_part(
     left, right = (c * columns / w for c in found[2:])
     corners = [mosaic.place(r, c) for r in (top, bottom) for c in (left, right)]
     places = [frame.position(np.array([*corner, 0.0])) for corner in corners]
-    north_west, north_east, south_west, south_east = places
+    north_west, north_east, south_west, south_east = (p.latitude_deg for p in places)
+    about = frame.origin.longitude_deg
+    beyond = [beside(p.longitude_deg, about) for p in places]  # in the same order
     return Usable(
-        max(south_west.latitude_deg, south_east.latitude_deg),
-        max(south_west.longitude_deg, north_west.longitude_deg),
-        min(north_west.latitude_deg, north_east.latitude_deg),
-        min(south_east.longitude_deg, north_east.longitude_deg),
+        max(south_west, south_east),
+        wrapped(max(beyond[0], beyond[2])),
+        min(north_west, north_east),
+        wrapped(min(beyond[1], beyond[3])),
         ((right - left) * mosaic.gsd_m, (bottom - top) * mosaic.gsd_m),
         found[1] - found[0] >= h - _RIM and found[3] - found[2] >= w - _RIM,
     )

@@ -1,0 +1,72 @@
+"""Outlines across the 180th meridian, where longitude jumps from 180 to -180 degrees.
+
+The smallest and largest of such longitudes are the rest of the Earth, and a polygon of them runs
+around it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+
+Corner = tuple[float, float]
+
+
+@dataclass(frozen=True)
+class GeoBox:
+    """Degrees. Across the 180th meridian east is less than west (as RFC 7946, 5.2, has it)."""
+
+    south: float
+    west: float
+    north: float
+    east: float
+
+    def line(self) -> str:
+        """Where it is, in words."""
+        return (
+            f"latitude {self.south:.5f} to {self.north:.5f}, longitude {self.west:.5f} to "
+            f"{self.east:.5f}"
+        )
+
+
+def wrapped(longitude_deg: float) -> float:
+    """The same longitude from -180 up to 180; 180 itself stays."""
+    return longitude_deg if abs(longitude_deg) <= 180.0 else beside(longitude_deg, 0.0)
+
+
+def beside(longitude_deg: float, reference_deg: float) -> float:
+    """The same longitude less than half the Earth from another; it may be beyond 180."""
+    return longitude_deg + 360.0 * round((reference_deg - longitude_deg) / 360.0)
+
+
+def geo_box(places: Iterable[tuple[float, float]]) -> GeoBox:
+    """About places (latitude, longitude) less than half the Earth apart."""
+    latitudes, longitudes = zip(*places, strict=True)
+    near = [beside(longitude, longitudes[0]) for longitude in longitudes]
+    return GeoBox(min(latitudes), wrapped(min(near)), max(latitudes), wrapped(max(near)))
+
+
+def cut(ring: Sequence[Corner]) -> list[list[Corner]]:
+    """A convex outline (longitude, latitude; not closed) as one, or across the 180th meridian as
+    two that end there (RFC 7946, 3.1.9). What does not cross it comes back as it was.
+    """
+    near = [(beside(lon, ring[0][0]), lat) for lon, lat in ring]
+    parts = []
+    for turn in (-360.0, 0.0, 360.0):
+        part = [(lon + turn, lat) for lon, lat in near]
+        part = _clipped(_clipped(part, -180.0, 1.0), 180.0, -1.0)
+        if len({lon for lon, _ in part}) > 1:
+            parts.append(part)
+    return parts
+
+
+def _clipped(ring: Sequence[Corner], limit: float, sign: float) -> list[Corner]:
+    """What lies beyond a meridian in the direction of `sign` (Sutherland and Hodgman)."""
+    kept: list[Corner] = []
+    for (x, y), (a, b) in zip(ring, [*ring[1:], *ring[:1]], strict=True):
+        here, there = sign * (x - limit) >= 0.0, sign * (a - limit) >= 0.0
+        if here:
+            kept.append((x, y))
+        if here != there:
+            kept.append((limit, y + (limit - x) / (a - x) * (b - y)))
+    return kept
