@@ -32,6 +32,15 @@ class JNGOConfig(BaseModel):
     translation_sigma_m: float = Field(
         default=1.0, ge=0, le=100, description="largest sigma of the perturbation"
     )
+    preselected: int = Field(
+        default=2048,
+        ge=0,
+        le=65536,
+        description="poses drawn of a wide prior and compared before half of the swarm; 0: none",
+    )
+    preselected_from_m: float = Field(
+        default=2.0, ge=0, le=1e4, description="position sigma from which a prior is wide"
+    )
     spread_sigmas: float = Field(
         default=2.2, ge=0.01, le=100, description="grid half-width in prior sigmas"
     )

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 from scipy.spatial.transform import Rotation
+from scipy.stats import qmc
 
 from localizer.geometry.pose import Array
 from localizer.types import PosePrior
@@ -47,6 +48,19 @@ def generate_hypotheses(
     return rotations, prior.world_from_camera.translation + shifts
 
 
+def draw_hypotheses(prior: PosePrior, count: int, seed: int = 0) -> tuple[Array, Array]:
+    """Rotations (count, 3, 3) and centres (count, 3) of poses world_from_camera, normal with the
+    prior's whole covariance: a scrambled Sobol sequence, which leaves no gaps and no clusters.
+    """
+    root = _limited_square_root(prior.covariance, np.inf)
+    balanced = 1 << max(count - 1, 0).bit_length()  # the sequence covers evenly in powers of two
+    normal = qmc.MultivariateNormalQMC(np.zeros(6), rng=seed).random(balanced)[:count]
+    offsets = normal @ root.T
+    pose = prior.world_from_camera
+    rotations: Array = Rotation.from_rotvec(offsets[:, 3:]).as_matrix() @ pose.rotation
+    return rotations, pose.translation + offsets[:, :3]
+
+
 def _grid(half: Array, step: float, count: int) -> Array:
     """At most `count` points (M, 2), nearest first, of a grid over +-half per axis."""
     most = max(1, int(np.sqrt(count)))
@@ -64,7 +78,7 @@ def _grid(half: Array, step: float, count: int) -> Array:
 
 
 def _limited_square_root(covariance: Array, limit: float) -> Array:
-    """A (3, 3) square root of a covariance whose axes' deviations are cut to `limit`."""
+    """A (n, n) square root of a covariance whose axes' deviations are cut to `limit`."""
     values, vectors = np.linalg.eigh(covariance)
     root: Array = vectors * np.minimum(np.sqrt(np.maximum(values, 0.0)), limit)
     return root

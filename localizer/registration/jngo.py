@@ -40,6 +40,7 @@ from localizer.registration.covariance import (
 from localizer.registration.cpu.kernel import NumbaBackend
 from localizer.registration.cpu.reference import ReferenceBackend, count_in_view, retractions
 from localizer.registration.devices import trial
+from localizer.registration.hypotheses import draw_hypotheses
 from localizer.registration.priors import PoseConstraint
 from localizer.registration.result import Found, Registration, failure, registration
 from localizer.registration.selection import (
@@ -57,6 +58,9 @@ _log = logging.getLogger(__name__)
 
 _COVARIANCE_ANCHORS = 1000  # enough for a covariance, cheap enough for every frame
 _VOTING_ANCHORS = 1000  # likewise
+_PRESELECTING_ANCHORS = 125  # likewise, of the coarsest level
+_ALIKE = 4  # times as many of the best draws as are wanted, because some repeat others
+_APART_PX = 0.5  # rms distance on the coarsest level from which two draws are two
 _LEAST_SCALE = 0.02  # of the sharpening loss, where features fit perfectly
 
 
@@ -150,7 +154,7 @@ class JNGO:
         seed: int,
     ) -> _Swarm:
         c = self.config
-        R, t = camera_from_local(*c.swarm(prior, seed), origin)
+        R, t = _beginning(self.backend, c, problems[0], origin, prior, seed)
         keep = (*c.keep[: len(problems) - 1], c.hypotheses)
         evaluations = 0
         for level, iterations, survivors, anchors in zip(
@@ -281,6 +285,34 @@ class _Winner:
     rotation: Array
     translation: Array
     evaluations: int
+
+
+def _beginning(
+    backend: Backend,
+    c: JNGOConfig,
+    problem: LevelProblem,
+    origin: Array,
+    prior: PosePrior,
+    seed: int,
+) -> tuple[Array, Array]:
+    """The swarm, camera_from_local. About a wide prior the best of many draws, by the coarsest
+    level's cost where they are, take the place of its farther half (registration.md, section 6).
+    """
+    R, t = camera_from_local(*c.swarm(prior, seed), origin)
+    widest = float(np.linalg.eigvalsh(prior.covariance[:3, :3])[-1]) ** 0.5
+    if c.preselected == 0 or widest < c.preselected_from_m:
+        return R, t
+    drawn = camera_from_local(*draw_hypotheses(prior, c.preselected, seed), origin)
+    few = thinned(problem, _PRESELECTING_ANCHORS)
+    scores = backend.refine(few, *drawn, 0, c.settings).scores
+    half = c.hypotheses // 2
+    best = np.argsort(scores, kind="stable")[: _ALIKE * half]
+    chosen = best[distinct(few, drawn[0][best], drawn[1][best], scores[best], _APART_PX)][:half]
+    kept = c.hypotheses - len(chosen)
+    return (
+        np.concatenate([R[:kept], drawn[0][chosen]]),
+        np.concatenate([t[:kept], drawn[1][chosen]]),
+    )
 
 
 def _totals(

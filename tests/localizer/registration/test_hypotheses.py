@@ -5,7 +5,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from localizer.geometry.pose import Pose, so3_exp
-from localizer.registration.hypotheses import generate_hypotheses
+from localizer.registration.hypotheses import draw_hypotheses, generate_hypotheses
 from localizer.types import PosePrior
 
 
@@ -87,3 +87,17 @@ def test_seeds():
     a, b, c = (generate_hypotheses(wide(), 50, seed=s)[1] for s in (1, 1, 2))
     np.testing.assert_array_equal(a, b)
     assert not np.array_equal(a, c)
+
+
+def test_draws_have_the_priors_whole_covariance():
+    root = np.random.default_rng(0).normal(size=(6, 6)) * np.repeat([2.0, 0.02], 3)[:, None]
+    prior = prior_with(root @ root.T)
+    rotations, centres = draw_hypotheses(prior, 3000, seed=5)
+    pose = prior.world_from_camera
+    turns = Rotation.from_matrix(rotations @ pose.rotation.T).as_rotvec()
+    spread = np.cov(np.hstack([centres - pose.translation, turns]).T)
+    scale = np.sqrt(np.outer(*[np.diag(prior.covariance)] * 2))
+    np.testing.assert_allclose(spread / scale, prior.covariance / scale, atol=0.02)
+    again = draw_hypotheses(prior, 3000, seed=5)
+    np.testing.assert_array_equal(rotations, again[0])
+    np.testing.assert_array_equal(centres, again[1])

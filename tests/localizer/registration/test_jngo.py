@@ -66,6 +66,40 @@ def test_swarm_reaches_what_one_hypothesis_does_not(scene_factory, prior):
     assert reached["single"] <= 8
 
 
+def test_draws_reach_a_place_that_the_swarm_does_not(scene_factory, prior):
+    """Metres beside at 110 m above ground, which the swarm's grid of angles does not stand for."""
+    reached = {0: 0, 2048: 0}
+    for seed in range(8):
+        scene = scene_factory(500 + seed, 40.0, 4.0)
+        for draws in reached:
+            result = JNGO(JNGOConfig(preselected=draws)).register(
+                scene.query, scene.camera, scene.anchors, prior(scene.reference, 16.0, 2.0)
+            )
+            reached[draws] += result.world_from_camera.distance_to(scene.true)[0] < 1.0
+    assert reached[2048] == 8
+    assert reached[0] <= 5
+
+
+@pytest.mark.parametrize("count", [1, 2, 5, 144])
+def test_a_narrow_prior_draws_nothing_and_a_wide_one_any_number(scene, prior, count):
+    drawing = JNGO(JNGOConfig(hypotheses=count, preselected=count))
+    plain = JNGO(JNGOConfig(hypotheses=count, preselected=0))
+    arguments = (scene.query, scene.camera, scene.anchors)
+    poses = [o.register(*arguments, prior(scene.reference, 1.9, 1.5)) for o in (drawing, plain)]
+    np.testing.assert_array_equal(*(p.world_from_camera.matrix for p in poses))
+    found = drawing.register(*arguments, prior(scene.reference, 2.1, 1.5))
+    assert found.status is RegistrationStatus.OK
+
+
+def test_draws_that_all_look_elsewhere_leave_the_swarm(scene_factory, prior):
+    """No draw of a prior of kilometres sees the anchors; the swarm about its middle does."""
+    scene = scene_factory(11, 2.0, 1.5)
+    result = JNGO().register(
+        scene.query, scene.camera, scene.anchors, prior(scene.reference, 1e5, 5.0)
+    )
+    assert result.world_from_camera.distance_to(scene.true)[0] < 0.5
+
+
 def test_more_anchors_sharpen_the_winner(jngo, place, camera, scene_factory, prior):
     errors_by_count: dict[int, list[Any]] = {150: [], 1500: []}
     for seed in range(10):
