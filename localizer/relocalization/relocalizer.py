@@ -196,7 +196,9 @@ def open_relocalizer(
             cache, renderer, extractor, progress=progress, should_stop=should_stop
         )
         if overview is not None:
-            optimizer = JNGO(config.registration, "numba", c.threads)
+            # Its places are laid over the map's picture first, so that the swarm reaches them.
+            registration = config.registration.model_copy(update={"preselected": 0})
+            optimizer = JNGO(registration, "numba", c.threads)
             relocalizer = Relocalizer(renderer, extractor, optimizer, overview, config)
             return OpenRelocalizer(relocalizer, streamer, renderer)
     except BaseException:
