@@ -299,7 +299,7 @@ def _beginning(
     level's cost where they are, take the place of its farther half (registration.md, section 6).
     """
     R, t = camera_from_local(*c.swarm(prior, seed), origin)
-    widest = float(np.linalg.eigvalsh(prior.covariance[:3, :3])[-1]) ** 0.5
+    widest = max(float(np.linalg.eigvalsh(prior.covariance[:3, :3])[-1]), 0.0) ** 0.5
     if c.preselected == 0 or widest < c.preselected_from_m:
         return R, t
     drawn = camera_from_local(*draw_hypotheses(prior, c.preselected, seed), origin)
