@@ -22,7 +22,6 @@ from companion.offline.replay import (
     FlightRecord,
     RecordedEstimate,
     image_path,
-    require_flown_map,
 )
 from companion.sources.base import fitted_camera
 from companion.sources.folder_source import read_image
@@ -105,7 +104,7 @@ def calibrate(
     config = record.config
     stack = MapStack(map_cache, config.localizer)
     try:
-        require_flown_map(record, stack.cache)
+        record.flown.require_frame(stack.cache)
         mount = mount_of(config)
         pictures, bias_m = _chosen(record, tlog, stack, mount, frames)
         camera = config.camera.model.camera()

@@ -9,6 +9,7 @@ from typing import Annotated
 import numpy as np
 import typer
 from rich.console import Console
+from rich.markup import escape
 from rich.table import Table
 
 from companion.cli.console import require_extra, serve
@@ -38,6 +39,7 @@ def replay_command(
         show_record(record, map_cache, page)
         return
     from companion.offline.replay import load_record, replay, summarize
+    from localizer.map.cache.cache import TileCache
 
     loaded = load_record(record)
     log = tlog or loaded.config.bridge.tlog
@@ -54,6 +56,8 @@ def replay_command(
     table.add_row("position differs, m", *_spread(summary.translation_m, 2))
     table.add_row("rotation differs, °", *_spread(summary.rotation_deg, 3))
     console = Console()
+    if doubt := loaded.flown.doubt(TileCache.open(loaded.config.map)):
+        console.print(f"[yellow]warning:[/] {escape(doubt)}", highlight=False, soft_wrap=True)
     console.print(table)
     console.print(
         f"{summary.frames} frames: {summary.accepted_recorded} accepted in flight, "
@@ -87,7 +91,10 @@ def show_record(record: Path, map_cache: Path | None, listen: str) -> None:
         config = validated(ConsoleConfig, {"listen": listen})
     except SettingsError as error:
         raise ConfigError(f"--console {listen}: {str(error).strip()}") from error
-    with shown_steps(Console(stderr=True)) as say, map_pictures(map_path) as pictures:
+    with (
+        shown_steps(Console(stderr=True)) as say,
+        map_pictures(map_path, flown=tables.flown) as pictures,
+    ):
         say(f"reading {record} and its map")
         source = ReplaySource(tables, pictures)
         for note in pictures.notes:

@@ -22,6 +22,7 @@ from companion.errors import RecordError, StreamDecodeError
 from companion.flight.priors import AutopilotPose
 from companion.flight.recorder import MANIFEST_NAME
 from companion.offline.autopilot import RecordedAutopilot
+from companion.offline.flown_map import FlownMap
 from companion.sources.base import fitted_camera
 from companion.sources.folder_source import read_image
 from companion.sources.zoom import longer
@@ -30,7 +31,6 @@ from localizer.errors import GeoreferenceError, OutsideMapError
 from localizer.geometry.camera import Camera
 from localizer.geometry.geo import Geodetic
 from localizer.geometry.pose import Array, Pose, matrix_from_quaternion
-from localizer.map.cache.cache import TileCache
 from localizer.plain_files import plain_text
 from localizer.tracking.opening import MapStack, build_localizer
 from localizer.tracking.pipeline import Localizer
@@ -39,7 +39,6 @@ from localizer.types import Frame, PoseEstimate
 _log = logging.getLogger(__name__)
 _LONGEST_PX = 1e6
 _ALIKE = 1e-3  # a share of the focal length that is no other lens
-_SAME_FRAME_M = 1.0
 _MIN_IMAGES = 0.9  # share of the localized frames
 
 
@@ -63,7 +62,7 @@ class RecordedEstimate:
 @dataclass(frozen=True)
 class FlightRecord:
     """A record's folder, read. start_ns: of the record, CLOCK_MONOTONIC; utc_minus_monotonic_ns: of
-    the machine, then.
+    the machine, then; map_sha256: of the flown map's manifest, None in older records.
     """
 
     folder: Path
@@ -71,6 +70,16 @@ class FlightRecord:
     start_ns: int
     utc_minus_monotonic_ns: int
     estimates: tuple[RecordedEstimate, ...]
+    map_sha256: str | None = None
+
+    @property
+    def flown(self) -> FlownMap:
+        """What it knows of the map that it was flown over."""
+        for estimate in self.estimates:
+            if estimate.place is not None:
+                point = estimate.world_from_camera.translation
+                return FlownMap(self.folder, self.map_sha256, estimate.place, point)
+        return FlownMap(self.folder, self.map_sha256)
 
 
 @dataclass(frozen=True)
@@ -131,7 +140,9 @@ def load_record(folder: Path, kept_share: float = _MIN_IMAGES) -> FlightRecord:
             f"{folder}: {missing} of {len(estimates)} localized frames have no image in snapshots: "
             "fly with record.snapshot_interval_s 0.001 to keep every frame"
         )
-    return FlightRecord(folder, config, start_ns, offset_ns, estimates)
+    told = manifest.get("map_sha256")
+    sha256 = told if isinstance(told, str) else None
+    return FlightRecord(folder, config, start_ns, offset_ns, estimates, sha256)
 
 
 def read_estimates(path: Path) -> tuple[RecordedEstimate, ...]:
@@ -193,24 +204,6 @@ def image_path(folder: Path, estimate: RecordedEstimate) -> Path:
     return folder / "snapshots" / snapshot_name(estimate.exposure_time_ns)
 
 
-def require_flown_map(record: FlightRecord, cache: TileCache) -> None:
-    """`RecordError` for a map about another origin than the flight's: a record has its poses in
-    metres about that, and every one of them would lie elsewhere, by the same way.
-    """
-    for estimate in record.estimates:
-        if estimate.place is None:
-            continue
-        p = estimate.place
-        here = cache.frame.enu_from_geodetic(p.latitude_deg, p.longitude_deg, p.height_m)
-        away_m = float(np.linalg.norm(here - estimate.world_from_camera.translation))
-        if away_m > _SAME_FRAME_M:
-            raise RecordError(
-                f"{record.folder}: flown over a map about another origin than {cache.path}, "
-                f"{away_m:.0f} m away: was it built again since? give the flight's own as --map"
-            )
-        return
-
-
 def replay(
     record: FlightRecord, tlog: Path, progress: Callable[[], None] = lambda: None
 ) -> list[ReplayedFrame]:
@@ -223,7 +216,7 @@ def replay(
     try:
         camera = config.camera.model.camera()
         cache = stack.cache
-        require_flown_map(record, cache)
+        record.flown.require_frame(cache)
         arm = np.array(config.camera.lever_arm_m)
         installation = Installation(cache.frame, cache.manifest.geoid_separation_m, arm)
         pose = AutopilotPose(autopilot, installation, config.prior)

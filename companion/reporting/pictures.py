@@ -9,7 +9,8 @@ from pathlib import Path
 
 import numpy as np
 
-from companion.errors import StreamDecodeError
+from companion.errors import RecordError, StreamDecodeError
+from companion.offline.flown_map import FlownMap
 from companion.reporting.content import MapSheet, Mark, Overlay, Track
 from companion.sources.folder_source import read_image
 from companion.terminal.steps import Say
@@ -96,18 +97,25 @@ class MapPictures:
 
 
 @contextmanager
-def map_pictures(path: Path | None, say: Say = silent) -> Iterator[MapPictures]:
-    """Pictures of the map in that folder; without one, the report says so and goes on."""
+def map_pictures(
+    path: Path | None, say: Say = silent, flown: FlownMap | None = None
+) -> Iterator[MapPictures]:
+    """Pictures of the map in that folder; without one, the report says so and goes on. flown: what
+    the record knows of it: over a map about another origin everything would be drawn elsewhere.
+    """
     if path is None:
         yield MapPictures(None, None, ["the map is not named: no pictures of it"])
         return
     try:
         cache = TileCache.open(path)
-    except (LocalizerError, OSError) as error:
+        if flown is not None:
+            flown.require_frame(cache)
+    except (LocalizerError, RecordError, OSError) as error:
         yield MapPictures(None, None, [f"no pictures of the map: {error}"])
         return
+    doubt = "" if flown is None else flown.doubt(cache)
     streamer = TileStreamer(cache)
     try:
-        yield MapPictures(cache, NumbaRenderer(streamer), say=say)
+        yield MapPictures(cache, NumbaRenderer(streamer), [doubt] if doubt else [], say)
     finally:
         streamer.close()

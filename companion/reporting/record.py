@@ -14,6 +14,7 @@ from pydantic import ValidationError
 from companion.config import CameraModel
 from companion.errors import RecordError
 from companion.flight.recorder import MANIFEST_NAME
+from companion.offline.flown_map import FlownMap
 from companion.offline.tables import Columns, poses, read_columns
 from companion.reporting import figures
 from companion.reporting.autopilot import AutopilotTracks, read_autopilot
@@ -30,8 +31,9 @@ from companion.reporting.content import (
 )
 from companion.reporting.pictures import ShownFrame, map_pictures, silent
 from companion.terminal.steps import Say
-from localizer.errors import CameraError
+from localizer.errors import CameraError, GeoreferenceError
 from localizer.geometry.camera import Camera
+from localizer.geometry.geo import Geodetic
 from localizer.plain_files import plain_text
 
 _OVERLAYS = 8
@@ -51,6 +53,7 @@ _NEEDED = {
     ),
     "events.csv": ("time_ns", "level", "text"),
 }  # fmt: skip
+_PLACE, _POINT = ("latitude_deg", "longitude_deg", "height_m"), ("east_m", "north_m", "up_m")
 _LATEST_MS = 250.0  # the oldest measurement that ArduPilot fuses
 VISION = "#ff8c1a"
 AUTOPILOT = "#1fd1ff"
@@ -100,6 +103,20 @@ class RecordTables:
         """Of the map that was flown on; None where the record does not say."""
         named = self._setting("map")
         return Path(named) if isinstance(named, str) else None
+
+    @property
+    def flown(self) -> FlownMap:
+        """What the record knows of that map."""
+        told = self.manifest.get("map_sha256")
+        sha256 = told if isinstance(told, str) else None
+        columns = [self.estimates.get(name) for name in (*_PLACE, *_POINT)]
+        numbers = [np.nan if c is None or not len(c) else float(c[0]) for c in columns]
+        if not np.isfinite(numbers).all():
+            return FlownMap(self.folder, sha256)
+        try:
+            return FlownMap(self.folder, sha256, Geodetic(*numbers[:3]), np.array(numbers[3:]))
+        except GeoreferenceError:
+            return FlownMap(self.folder, sha256)
 
     @property
     def camera(self) -> Camera | None:
@@ -181,7 +198,7 @@ def record_report(folder: Path, say: Say = silent) -> Report:
             versions=tables.versions,
         )  # fmt: skip
     time_s = figures.seconds(estimates["exposure_time_ns"], start_ns)
-    with map_pictures(tables.map_path, say) as pictures:
+    with map_pictures(tables.map_path, say, tables.flown) as pictures:
         autopilot = read_autopilot(tables, pictures)
         tracks = _tracks(estimates, autopilot)
         sheet = pictures.sheet(tracks, figures.target_marks(tables.targets))

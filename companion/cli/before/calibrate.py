@@ -44,6 +44,7 @@ def flight_command(
         write_changed,
     )
     from companion.offline.replay import load_record
+    from localizer.map.cache.cache import TileCache
 
     if write and config is None:
         raise ConfigError("--write needs --config: which deployment file is to be changed?")
@@ -63,7 +64,8 @@ def flight_command(
     console.print("What this flight cannot tell:" if blind else "This flight tells all of it.")
     for line in blind:
         console.print(f"  {escape(line)}", soft_wrap=True, highlight=False)
-    for note in found.notes:
+    doubt = loaded.flown.doubt(TileCache.open(loaded.config.map))
+    for note in (*found.notes, *filter(None, (doubt,))):
         console.print(escape(note), style="yellow", soft_wrap=True)
     console.print(
         f"{found.frames} pictures, {found.parts} of their parts: {found.before_px:.2f} px from the "

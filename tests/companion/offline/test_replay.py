@@ -19,7 +19,9 @@ from companion.config import parse_config
 from companion.errors import RecordError
 from companion.flight.app import Companion
 from companion.geometry import GIMBAL_FROM_CAMERA
-from companion.offline.replay import load_record, replay, require_flown_map, summarize
+from companion.offline.replay import load_record, replay, summarize
+from companion.reporting.pictures import map_pictures
+from companion.reporting.record import read_record
 from localizer.geometry.camera import Camera
 from localizer.geometry.geo import NED_FROM_ENU
 from localizer.geometry.pose import quaternion_from_matrix
@@ -188,13 +190,41 @@ def test_a_map_that_was_built_again_about_another_origin_is_refused(record):
     """All places of the record lay beside it by the same way, and nobody was told."""
     loaded = load_record(record)
     flown = TileCache.open(loaded.config.map)
-    require_flown_map(loaded, flown)
+    loaded.flown.require_frame(flown)
+    assert not loaded.flown.doubt(flown)
     origin = replace(
         flown.manifest.origin, longitude_deg=flown.manifest.origin.longitude_deg + 1e-4
     )
     again = TileCache(flown.path, flown.manifest.model_copy(update={"origin": origin}), flown.index)
     with pytest.raises(RecordError, match=r"another origin .* 8 m away: was it built again"):
-        require_flown_map(loaded, again)
+        loaded.flown.require_frame(again)
+
+
+def test_a_map_that_was_built_again_about_the_same_origin_is_doubted(record, tmp_path):
+    """The replay said `differs`, and of what was left to guess; reports drew over it in silence."""
+    loaded = load_record(record)
+    again = tmp_path / "again"
+    again.mkdir()
+    flown = TileCache.open(loaded.config.map)
+    for name in ("manifest.json", "index.safetensors"):
+        (again / name).write_bytes((loaded.config.map / name).read_bytes())
+    (again / "manifest.json").write_text(
+        flown.manifest.model_copy(update={"gsd_m": 9.0}).model_dump_json()
+    )
+    built = TileCache.open(again)
+    loaded.flown.require_frame(built)
+    assert "not the map that was flown over: was it built again" in loaded.flown.doubt(built)
+    assert not replace(loaded, map_sha256=None).flown.doubt(built)  # an older record
+    tables = read_record(record)
+    with map_pictures(again, flown=tables.flown) as pictures:
+        assert any("built again" in note for note in pictures.notes)
+    with map_pictures(loaded.config.map, flown=tables.flown) as pictures:
+        assert pictures.notes == []
+    assert tables.flown.point is not None
+    moved = replace(tables.flown, point=tables.flown.point + 5.0)
+    with map_pictures(loaded.config.map, flown=moved) as pictures:
+        assert pictures.cache is None
+        assert any("another origin" in note for note in pictures.notes)
 
 
 def test_what_a_record_lacks_is_named(record, tmp_path):

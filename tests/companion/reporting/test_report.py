@@ -28,6 +28,7 @@ from companion.reporting.figures import first_fault, target_table
 from companion.reporting.layout import render
 from companion.reporting.record import read_record, record_report, worst_frames
 from companion.reporting.report import report_of, write_page
+from localizer.map.cache.cache import TileCache
 
 MODEL = {"width": 64, "height": 48, "fx": 60, "fy": 60, "cx": 32, "cy": 24}
 START_NS = 1_000_000_000
@@ -56,6 +57,11 @@ def record(small_assets, tmp_path):
     rows = [_estimate(i) for i in range(20)]
     rows += [_estimate(i, "lost", 0, quality=0.1) for i in range(20, 25)]
     rows[7]["quality"] = 0.3
+    origin = TileCache.open(small_assets.map_cache).manifest.origin
+    rows[0] |= {
+        "latitude_deg": origin.latitude_deg, "longitude_deg": origin.longitude_deg,
+        "height_m": origin.height_m,
+    }  # fmt: skip
     _rows(folder / "estimates.csv", ESTIMATE_COLUMNS, rows)
     targets = [
         {"exposure_time_ns": START_NS, "target_id": n, "sigma_horizontal_m": 1} for n in "AB"

@@ -1,0 +1,57 @@
+"""Whether a map is the one that a record was flown over: it may have been built again since."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from companion.errors import ConfigError, RecordError
+from companion.preflight.map_pin import map_hash
+from localizer.geometry.geo import Geodetic
+from localizer.geometry.pose import Array
+from localizer.map.cache.cache import TileCache
+
+_SAME_FRAME_M = 1.0
+
+
+@dataclass(frozen=True)
+class FlownMap:
+    """What a record's folder knows of its map. sha256: of the map's manifest, None in a record from
+    before it was written. place, point: of one pose, in WGS84 and in metres about the map's origin;
+    None where no estimate says both.
+    """
+
+    folder: Path
+    sha256: str | None = None
+    place: Geodetic | None = None
+    point: Array | None = None
+
+    def require_frame(self, cache: TileCache) -> None:
+        """`RecordError` for a map about another origin than the flight's: a record has its poses in
+        metres about that, and every one of them would lie elsewhere, by the same way.
+        """
+        if self.place is None or self.point is None:
+            return
+        p = self.place
+        here = cache.frame.enu_from_geodetic(p.latitude_deg, p.longitude_deg, p.height_m)
+        away_m = float(np.linalg.norm(here - self.point))
+        if away_m > _SAME_FRAME_M:
+            raise RecordError(
+                f"{self.folder}: flown over a map about another origin than {cache.path}, "
+                f"{away_m:.0f} m away: was it built again since? give the flight's own as --map"
+            )
+
+    def doubt(self, cache: TileCache) -> str:
+        """Of a map about the same origin that is another all the same; empty for the flown one."""
+        try:
+            same = self.sha256 in (None, map_hash(cache.path))
+        except ConfigError as error:
+            return str(error)
+        if same:
+            return ""
+        return (
+            f"{cache.path} is not the map that was flown over: was it built again since? what "
+            "differs from the flight may be the map's"
+        )
