@@ -32,7 +32,9 @@ class StreamSizeError(StreamError):
 
 
 class StreamDepthError(StreamError):
-    """A stream of 16-bit grey of which it is not said which counts are black and white."""
+    """A stream of 16-bit grey of which it is not said which counts are black and white, or of
+    pixels that cannot be converted.
+    """
 
 
 class StreamDecodeError(StreamError):

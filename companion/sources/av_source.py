@@ -53,6 +53,11 @@ _log = logging.getLogger(__name__)
 
 _RETRY_FIRST_S = 0.25
 _OPEN_TIMEOUT_S = 3.0  # a joining receiver has to see one key frame with its headers
+_UNCONVERTED = (
+    ", a kind of pixels that cannot be converted; have the camera or a converter send 8 bits a "
+    "channel"
+)
+_ABORTING = {f"yaf{bits}{end}" for bits in (16, 32) for end in ("le", "be")}  # the process, too
 _LOW_DELAY = 0x80000  # AV_CODEC_FLAG_LOW_DELAY: hand a picture out at once, not in display order
 
 
@@ -208,7 +213,7 @@ class VideoFileSource:
             if self._closed.is_set():
                 return
             n = self._counters.delivered
-            frame = Frame(self._rgb(picture), start + offset, camera, n)
+            frame = Frame(self._rgb(picture, str(self._path)), start + offset, camera, n)
             self._counters = replace(self._counters, received=n + 1, delivered=n + 1)
             _tell(self._tap, picture, frame.exposure_time_ns)
             yield frame
@@ -260,6 +265,8 @@ class VideoFileSource:
 class LiveVideoSource:
     """A live stream, decoded by a reader thread; the newest picture wins. One that stops is told,
     and connected to again, waiting longer after each failure.
+
+    Above 200 lines: what the reader's thread finds and what the taker's does are one state to tell.
     """
 
     def __init__(
@@ -309,7 +316,13 @@ class LiveVideoSource:
         while (item := self._newest.take()) is not None:
             picture, camera, exposure_ns, sequence = item
             # Converted here and not in the reader: pictures that are dropped cost no conversion.
-            image = self._rgb(picture)
+            try:
+                image = self._rgb(picture, self._location)
+            except StreamDepthError:  # another kind, which in flight must not end the feed
+                if not self._counters.delivered:
+                    raise
+                self._count(misfits=1)  # the reader refuses and reports the next of its kind
+                continue
             self._count(delivered=1)
             yield Frame(image, exposure_ns, camera, sequence)
 
@@ -493,19 +506,30 @@ class _ToRgb:
     def __init__(self, grey_range: GreyRange | None) -> None:
         self._grey_range = grey_range
         self._reformatter = av.video.reformatter.VideoReformatter()
+        self._unknown = set(_ABORTING)  # kinds of pixels
 
-    def __call__(self, picture: av.VideoFrame) -> Image:
-        if _is_counts(picture):
-            counts = self._reformatter.reformat(picture, format="gray16le").to_ndarray()
-            return np.asarray(
-                cv2.cvtColor(grey_levels(counts, self._grey_range), cv2.COLOR_GRAY2RGB), np.uint8
+    def __call__(self, picture: av.VideoFrame, where: str) -> Image:
+        """`StreamDepthError` for pixels that FFmpeg cannot convert."""
+        try:
+            if _is_counts(picture):
+                counts = self._reformatter.reformat(picture, format="gray16le").to_ndarray()
+                return np.asarray(
+                    cv2.cvtColor(grey_levels(counts, self._grey_range), cv2.COLOR_GRAY2RGB),
+                    np.uint8,
+                )
+            return np.ascontiguousarray(
+                self._reformatter.reformat(picture, format="rgb24").to_ndarray()
             )
-        return np.ascontiguousarray(
-            self._reformatter.reformat(picture, format="rgb24").to_ndarray()
-        )
+        except (av.error.FFmpegError, OSError, ValueError) as error:
+            self._unknown.add(picture.format.name)
+            raise StreamDepthError(f"{where}: {picture.format.name}{_UNCONVERTED}") from error
 
     def camera(self, picture: av.VideoFrame, camera: Camera, where: str) -> Camera:
-        """As of `fitted_camera`; `StreamDepthError` for 16-bit grey without a range."""
+        """As of `fitted_camera`; `StreamDepthError` for 16-bit grey without a range, and for what
+        could not be converted before.
+        """
+        if picture.format.name in self._unknown:
+            raise StreamDepthError(f"{where}: {picture.format.name}{_UNCONVERTED}")
         if self._grey_range is None and _is_counts(picture):
             raise StreamDepthError(
                 f"{where}: {picture.format.name}, 16-bit grey without a range; {GREY_RANGE_ADVICE}"

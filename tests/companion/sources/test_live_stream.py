@@ -5,17 +5,19 @@ from __future__ import annotations
 import socket
 import threading
 import time
+from collections.abc import Iterator
 from functools import partial
-from typing import Any
+from typing import Any, ClassVar
 
+import av
 import numpy as np
 import pytest
 
-from companion.errors import StreamOpenError, StreamSizeError
+from companion.errors import StreamDepthError, StreamOpenError, StreamSizeError
 from companion.sources import StreamState, open_source
 from companion.sources.base import fitted_camera
 from localizer.geometry.camera import Camera
-from localizer.types import Image
+from localizer.types import Frame, Image
 from sitl.camera.stream import LossyLink, VideoSender
 from tests.companion.sources.paced_sender import (
     CAMERA,
@@ -215,6 +217,63 @@ def test_an_unexpected_error_in_the_reader_is_a_stall_and_tried_again(
         with PacedSender(url):
             watch.wait_for(3)
     assert watch.error is None
+
+
+class _Decoder:
+    """Pictures of these kinds of pixels, in turn, each once the one before was taken."""
+
+    kinds: ClassVar[list[str]] = []
+    taken: ClassVar[list[threading.Event]] = []
+    late = 0
+
+    def __init__(self, *_: Any) -> None:
+        pass
+
+    def pictures(self) -> Iterator[tuple[av.VideoFrame, int]]:
+        for kind, taken in zip(self.kinds, self.taken, strict=True):
+            yield av.VideoFrame(CAMERA.width, CAMERA.height, kind), time.monotonic_ns()
+            taken.wait(30.0)
+
+    def close(self) -> None:
+        pass
+
+
+def test_pixels_that_cannot_be_converted_do_not_end_the_feed_in_flight(
+    url: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """FFmpeg's error left `frames` and ended the flight; one kind ends even the process."""
+    monkeypatch.setattr("companion.sources.av_source.Decoder", _Decoder)
+    _Decoder.kinds = ["yuv420p", "y210be", "y210be", "yaf32le", "yuv420p"]
+    _Decoder.taken = [threading.Event() for _ in _Decoder.kinds]
+    source = open_source(url, CAMERA)
+    frames = source.frames()
+    first = next(frames)
+    assert first.image.shape == (CAMERA.height, CAMERA.width, 3)
+    _Decoder.taken[0].set()
+    found: list[Frame] = []
+    feed = threading.Thread(target=lambda: found.append(next(frames)), daemon=True)
+    feed.start()
+    while not source.counters.misfits:
+        assert feed.is_alive()
+        feed.join(0.01)
+    for taken in _Decoder.taken:
+        taken.set()
+    feed.join(60.0)
+    assert [frame.sequence for frame in found] > [first.sequence]
+    source.close()
+
+
+def test_pixels_that_cannot_be_converted_are_named_at_the_start(
+    url: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("companion.sources.av_source.Decoder", _Decoder)
+    for kind in ("y210be", "yaf32le"):
+        _Decoder.kinds, _Decoder.taken = [kind], [threading.Event()]
+        source = open_source(url, CAMERA)
+        with pytest.raises(StreamDepthError, match=f"{kind}, a kind of pixels"):
+            next(source.frames())
+        _Decoder.taken[0].set()
+        source.close()
 
 
 @pytest.mark.parametrize("size", [(4, 3), (1, 1), (8, 6)])
