@@ -97,8 +97,7 @@ class FlightProcess:
             with contextlib.suppress(OSError):
                 self._process.stdin.close()
         if self.wait(_DISMISS_S) is None:
-            self._process.kill()
-            self._process.wait()
+            self.kill()
         self.close()
 
 

@@ -8,10 +8,12 @@ aircraft may fly without GNSS: cold starts wait longer and longer, and each is t
 
 from __future__ import annotations
 
+import glob
 import json
 import logging
 import math
 import signal
+import threading
 import time
 from collections import deque
 from collections.abc import Callable, Sequence
@@ -26,6 +28,7 @@ _WATCH_S = 0.25  # between looks at what else is due; a death wakes at once
 _LOOKED_AWAY_S = 1.5  # after which it was the supervisor that stood still, or the computer
 _PAUSE_S = 0.25  # between looks whether to go on waiting
 _MOST_DEATHS = 64  # that are remembered: more within the window wait no longer
+_WORDS_S = 3.0  # for a death to be told, or marked
 _PART = 10  # characters of a part's name, so that the line is one STATUSTEXT
 _USAGE = 2  # exit code of a named error
 
@@ -238,8 +241,8 @@ class Supervisor:
             process.release()
             self._fly(process, self._policy.released_s)
         text = f"companion {how}, {what}"
-        self._guarded(lambda: self._tell(2, f"PiLoT: {text}"))
-        self._guarded(lambda: self._mark(dead, text))
+        _do_in_time("tell", lambda: self._tell(2, f"PiLoT: {text}"))
+        _do_in_time("mark", lambda: self._mark(dead, text))
         if self._manager is not None:
             self._manager.status(text)
         if process is None:
@@ -279,13 +282,23 @@ class Supervisor:
             if self._manager is not None:
                 self._manager.alive()
 
-    @staticmethod
-    def _guarded(do: Callable[[], None]) -> None:
-        """What cannot be told must not keep the aircraft waiting."""
+
+def _do_in_time(name: str, do: Callable[[], None]) -> None:
+    """What cannot be told must not keep the aircraft waiting: neither an error nor a disk or a port
+    that stands still, which may be what the flight process died of.
+    """
+
+    def guarded() -> None:
         try:
             do()
         except Exception:
             _log.exception("the death could not be told")
+
+    thread = threading.Thread(target=guarded, name=name, daemon=True)
+    thread.start()
+    thread.join(_WORDS_S)
+    if thread.is_alive():
+        _log.error("the death could not be told: to %s it takes too long", name)
 
 
 def described(code: int) -> str:
@@ -303,7 +316,7 @@ def mark_dead(folder: Path, pid: int, text: str) -> None:
 
     Where no record has one of this process, there is nothing to say it in.
     """
-    for path in folder.parent.glob(f"{folder.name}*/health.json"):
+    for path in folder.parent.glob(f"{glob.escape(folder.name)}*/health.json"):
         report = _report(path)
         if report.get("pid") == pid:
             _mark(path, report, text)

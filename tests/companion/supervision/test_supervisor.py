@@ -8,6 +8,7 @@ import os
 import signal
 import socket
 import sys
+import threading
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
@@ -88,11 +89,20 @@ class Stage:
         self.waited_s = 0.0
         self.stops_after_s = float("inf")
         self.manager = Noted()
-        self.supervisor = Supervisor(
+        self._policy = RestartPolicy(**policy)  # type: ignore[arg-type]
+        self.supervisor = self.made()
+
+    def made(
+        self,
+        tell: Callable[[int, str], None] | None = None,
+        mark: Callable[[int, str], None] | None = None,
+    ) -> Supervisor:
+        """A supervisor of these processes."""
+        return Supervisor(
             self._spawn,
-            lambda severity, text: self.told.append((severity, text)),
-            lambda _, text: self.marked.append(text),
-            RestartPolicy(**policy),  # type: ignore[arg-type]
+            tell or (lambda severity, text: self.told.append((severity, text))),
+            mark or (lambda _, text: self.marked.append(text)),
+            self._policy,
             self.manager,
             self._clock,
             self._wait,
@@ -132,6 +142,32 @@ def test_a_death_is_told_marked_and_the_standby_flies_on() -> None:
     assert not third.released
     assert stage.told == [(2, "PiLoT: companion died (SIGKILL), restarting")]
     assert stage.marked == ["companion died (SIGKILL), restarting"]
+
+
+@pytest.mark.parametrize("what", ["tell", "mark"])
+@pytest.mark.parametrize("standby_after_s", [5.0, 60.0])
+def test_a_disk_or_a_port_that_stands_still_keeps_no_flight_waiting(
+    what: str, standby_after_s: float, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The supervisor waited for the dead record's disk before it started the next process."""
+    monkeypatch.setattr("companion.supervision.supervisor._WORDS_S", 0.01)
+    stage = Stage(
+        [Scripted(30, -9), Scripted(9, 0), Scripted(9, 0)], standby_after_s=standby_after_s
+    )
+    still, ended = threading.Event(), threading.Event()
+
+    def stands(*_: object) -> None:
+        still.wait(120.0)
+
+    supervisor = stage.made(**{what: stands})
+    flying = threading.Thread(target=lambda: (supervisor.run(), ended.set()), daemon=True)
+    flying.start()
+    try:
+        assert ended.wait(60.0)
+    finally:
+        still.set()
+    assert len(stage.spawned) >= 2
+    assert stage.spawned[1].looks < 0  # it was watched
 
 
 def test_a_death_before_there_is_a_standby_starts_a_cold_one() -> None:
@@ -365,20 +401,21 @@ def test_codes_in_words(code: int, said: str) -> None:
     assert described(code) == said
 
 
-def test_the_health_of_the_process_says_dead(tmp_path: Path) -> None:
+@pytest.mark.parametrize("flight", ["flight", "[21] field *"])
+def test_the_health_of_the_process_says_dead(tmp_path: Path, flight: str) -> None:
     """Of several flights the record of the process that died; without a record nothing."""
-    for name, pid in (("flight", 11), ("flight-2", 12)):
+    for name, pid in ((flight, 11), (f"{flight}-2", 12)):
         (tmp_path / name).mkdir()
         (tmp_path / name / "health.json").write_text(f'{{"level": "ok", "pid": {pid}}}')
-    (tmp_path / "flight-3").mkdir()  # of the standby, which does not report yet
-    (tmp_path / "flight-4").mkdir()
-    (tmp_path / "flight-4" / "health.json").write_text("{")
+    (tmp_path / f"{flight}-3").mkdir()  # of the standby, which does not report yet
+    (tmp_path / f"{flight}-4").mkdir()
+    (tmp_path / f"{flight}-4" / "health.json").write_text("{")
     before_ns = time.monotonic_ns()
-    mark_dead(tmp_path / "flight", 12, "companion died (SIGKILL), restarting")
-    report = json.loads((tmp_path / "flight-2" / "health.json").read_text())
+    mark_dead(tmp_path / flight, 12, "companion died (SIGKILL), restarting")
+    report = json.loads((tmp_path / f"{flight}-2" / "health.json").read_text())
     assert (report["level"], report["text"]) == ("failed", "companion died (SIGKILL), restarting")
     assert report["time_ns"] >= before_ns
-    assert json.loads((tmp_path / "flight" / "health.json").read_text())["level"] == "ok"
+    assert json.loads((tmp_path / flight / "health.json").read_text())["level"] == "ok"
     mark_dead(tmp_path / "nowhere" / "flight", 12, "dead")
     assert not (tmp_path / "nowhere").exists()
 
