@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import signal
 import sys
+from itertools import count
 from pathlib import Path
 from typing import Annotated
 
@@ -36,6 +37,7 @@ def run_command(
     ] = False,
     standby: Annotated[bool, typer.Option(hidden=True)] = False,
     pulse: Annotated[int | None, typer.Option(hidden=True, min=3)] = None,
+    again: Annotated[bool, typer.Option("--again", hidden=True)] = False,
     verbose: Annotated[bool, typer.Option("--verbose", "-v", help="log more")] = False,
 ) -> None:
     """Localize the camera feed and inject positions until interrupted."""
@@ -58,7 +60,7 @@ def run_command(
     settings = settings.model_copy(update={"localizer": localizer})
     from companion.flight.standby import ready
 
-    companion = ready(settings, standby=standby, pulse=pulse)
+    companion = ready(settings, standby=standby, pulse=pulse, again=again)
     if companion is None:
         return
 
@@ -92,8 +94,14 @@ def _supervise(settings: CompanionConfig, arguments: list[str]) -> int:
     def tell(severity: int, text: str) -> None:
         say_without_bridge(settings.bridge, severity, text)
 
+    begun = count()
+
+    def spawn(standby: bool) -> FlightProcess:
+        again = ["--again"] if next(begun) else []
+        return FlightProcess([*command, *again], standby=standby)
+
     supervisor = Supervisor(
-        lambda standby: FlightProcess(command, standby=standby),
+        spawn,
         tell,
         lambda pid, text: mark_dead(record.folder, pid, text) if record is not None else None,
         manager=ServiceManager.of(os.environ),

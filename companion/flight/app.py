@@ -21,6 +21,7 @@ from companion.flight.recorder import RecordKeeper
 from companion.flight.table import PARTS
 from companion.guardian.guardian import Guardian
 from companion.redaction import redacted
+from companion.supervision.again import without_lost_disks
 from companion.supervision.pulse import Pulse
 from localizer.tracking.engine import DualThreadEngine
 from localizer.tracking.opening import MapStack
@@ -35,7 +36,8 @@ _SWITCH_S = 0.0002
 class Companion:
     """One deployment. `run` blocks until `stop` is called or the feed ends.
 
-    pulse: descriptor of the supervisor's pipe, see `Pulse`; None without a supervisor.
+    pulse: descriptor of the supervisor's pipe, see `Pulse`; None without a supervisor. again:
+    whether another process of this flight died before: it goes on without what is gone.
     """
 
     def __init__(
@@ -43,8 +45,10 @@ class Companion:
         config: CompanionConfig,
         parts: Sequence[Part[Any]] = PARTS,
         pulse: int | None = None,
+        *,
+        again: bool = False,
     ) -> None:
-        self._config = config
+        self._config, self._again = config, again
         self._parts = Assembly(config, parts)
         self._pulse = pulse
         self._up = ExitStack()
@@ -72,6 +76,9 @@ class Companion:
         """
         sys.setswitchinterval(_SWITCH_S)
         self._parts.channels.events.subscribe(_log_event)
+        lost = ""
+        if self._again:
+            self._parts.config, lost = without_lost_disks(self._config)
         with self._up as up:
             try:
                 self._parts.make(up)
@@ -93,7 +100,7 @@ class Companion:
                 pulse.start()
                 # First of all: what comes down takes no turns.
                 up.push(lambda error, *_: pulse.stop(in_order=self._is_in_order(error)))
-            self._tell_what_runs()
+            self._tell_what_runs(lost)
             feed = self._parts[Feed]
             # In slices: signals are handled between them.
             while not (self._is_stopping or feed.ended.wait(0.2)):
@@ -136,13 +143,16 @@ class Companion:
         ends = self._is_stopping or self._parts[Feed].ended.is_set()
         return {} if health is None or ends else {"health": health.turn_ns}
 
-    def _tell_what_runs(self) -> None:
+    def _tell_what_runs(self, lost: str) -> None:
         events = self._parts.channels.events
         events.send("info", f"map {self._config.map}, feed {redacted(self._config.camera.source)}")
         events.send("info", f"renderer {self._parts[MapStack].renderer.name}")
         keeper = self._parts.get(RecordKeeper)
         if keeper is not None and keeper.folder is not None:
             events.send("info", f"record {keeper.folder}")
+        if keeper is not None and lost:
+            events.send("warning", f"left out, since it was gone at the restart: {lost}")
+            keeper.failed("disk gone")
 
 
 def _log_event(level: str, text: str) -> None:

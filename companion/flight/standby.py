@@ -13,12 +13,14 @@ from localizer.errors import LocalizerError
 _log = logging.getLogger(__name__)
 
 
-def ready(config: CompanionConfig, *, standby: bool, pulse: int | None) -> Companion | None:
+def ready(
+    config: CompanionConfig, *, standby: bool, pulse: int | None, again: bool = False
+) -> Companion | None:
     """The flight process: at once, or once a standby is released; None of one that never is.
 
-    pulse: see `Companion`.
+    pulse, again: see `Companion`; a standby flies after another died, and so always again.
     """
-    companion = Companion(config, pulse=pulse)
+    companion = Companion(config, pulse=pulse, again=again or standby)
     return _stand_by(companion) if standby else companion
 
 

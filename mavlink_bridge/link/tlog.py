@@ -28,7 +28,12 @@ _CLOSE_S = 5.0
 _FRAME_START = {0xFE: (8, 1), 0xFD: (12, 1)}  # bytes beside the payload, place of its length
 _SIGNATURE_BYTES = 13
 
-_DISK_FAULTS = (errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.EIO)
+_DISK_FAULTS = (
+    errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.EIO,
+    # The file system is damaged or was taken down; the stick, or what serves it, is gone.
+    errno.EUCLEAN, errno.ESHUTDOWN, errno.ENODEV, errno.ENXIO, errno.ENOMEDIUM, errno.EREMOTEIO,
+    errno.ENOTCONN, errno.ESTALE, errno.ETIMEDOUT,
+)  # fmt: skip
 
 
 def is_disk_fault(error: OSError) -> bool:

@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 
 from companion.config import parse_config
-from companion.errors import ConfigError, StreamOpenError
+from companion.errors import ConfigError, ReportError, StreamOpenError
 from companion.flight.app import Companion
 from companion.flight.feed import Feed
 from companion.flight.parts import Part
@@ -67,6 +67,24 @@ def test_a_restart_on_a_full_disk_goes_on_without_a_record(
     with pytest.raises(StreamOpenError):
         Companion(config).run()
     assert any("record is incomplete: [Errno 28]" in r.getMessage() for r in caplog.records)
+
+
+def test_a_restart_whose_stick_is_gone_goes_on_without_a_record(small_assets, tmp_path):
+    """A first start names the setting; in the air it was right when the flight began."""
+    (tmp_path / "stick").touch()
+    config = parse_config(
+        {
+            "map": str(small_assets.map_cache),
+            "camera": {"source": str(tmp_path / "no.mp4"), "model": MODEL},
+            "bridge": {"connection": "tcp:127.0.0.1:9"},
+            "record": {"folder": str(tmp_path / "stick" / "record")},
+        },
+        "test",
+    )
+    with pytest.raises(ReportError, match=r"record\.folder .*cannot be written"):
+        Companion(config).run()
+    with pytest.raises(StreamOpenError):
+        Companion(config, again=True).run()
 
 
 class _InterruptedWait:

@@ -1,0 +1,84 @@
+"""What a restart in the air leaves out: disks that went, or stand still, since the flight began.
+
+At a first start a folder that cannot be written to is a wrong setting, and ends it. At a restart it
+was right when the flight began: a stick that shook loose must not keep the aircraft on the ground's
+rules while it flies without GNSS.
+"""
+
+from __future__ import annotations
+
+import os
+import tempfile
+import threading
+import time
+from collections.abc import Callable, Iterable
+from pathlib import Path
+
+from companion.config import CompanionConfig
+from mavlink_bridge.link.tlog import is_disk_fault
+
+_PATIENCE_S = 3.0  # for all disks together: no position comes meanwhile
+_STILL = "does not answer"
+
+
+def without_lost_disks(
+    config: CompanionConfig, probe: Callable[[Path], str] | None = None
+) -> tuple[CompanionConfig, str]:
+    """The deployment without the files that have no disk any more, and what is left out, empty for
+    nothing. What a full or failing disk costs is each part's own to tell (`DiskFaultError`).
+
+    probe: why a folder cannot be written to; empty if it can.
+    """
+    bridge, prior, record = config.bridge, config.prior, config.record
+    beside = None if record is None else record.folder.parent
+    gate = bridge.state_file or (None if beside is None else beside / "injection-gate.json")
+    place = prior.state_file or (None if beside is None else beside / "last-fix.json")
+    files = [path for path in (bridge.tlog, gate, place) if path is not None]
+    lost = _lost({*(p.parent for p in files), *filter(None, (beside,))}, probe or written_to)
+    if not lost:
+        return config, ""
+
+    def kept(path: Path | None) -> Path | None:
+        """Of what is read, too: without a disk that answers there is nothing to read."""
+        return path if path is None or lost.get(path.parent) != _STILL else None
+
+    tlog = bridge.tlog if bridge.tlog is None or bridge.tlog.parent not in lost else None
+    changed = config.model_copy(
+        update={
+            "record": None if beside in lost else record,
+            "bridge": bridge.model_copy(update={"tlog": tlog, "state_file": kept(gate)}),
+            "prior": prior.model_copy(update={"state_file": kept(place)}),
+        }
+    )
+    return changed, ", ".join(f"{folder}: {why}" for folder, why in sorted(lost.items()))
+
+
+def _lost(folders: Iterable[Path], probe: Callable[[Path], str]) -> dict[Path, str]:
+    found: dict[Path, str] = {}
+
+    def look(folder: Path) -> None:
+        found[folder] = probe(folder)
+
+    threads = {
+        folder: threading.Thread(target=look, args=(folder,), name="probe", daemon=True)
+        for folder in folders
+    }
+    for thread in threads.values():
+        thread.start()
+    end_s = time.monotonic() + _PATIENCE_S
+    for thread in threads.values():
+        thread.join(max(end_s - time.monotonic(), 0.0))
+    told = {folder: found.get(folder, _STILL) for folder in threads}
+    return {folder: why for folder, why in told.items() if why}
+
+
+def written_to(folder: Path) -> str:
+    """Why nothing can be written in a folder; empty if something can, and of a full disk."""
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        descriptor, name = tempfile.mkstemp(prefix=".again-", dir=folder)
+        os.close(descriptor)
+        os.unlink(name)
+    except OSError as error:
+        return "" if is_disk_fault(error) else (error.strerror or str(error))
+    return ""
