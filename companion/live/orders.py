@@ -16,6 +16,7 @@ _NOTICE = 5  # MAV_SEVERITY_NOTICE
 _MOST = 10  # orders in as many seconds
 _SPAN_S = 5.0
 _LARGEST_RADIUS_M = 10_000.0
+_OLDEST_S, _AHEAD_S = 10.0, 1.0  # of a picture that is pointed into
 
 
 class OrderError(CompanionError):
@@ -71,16 +72,26 @@ class Orders:
         raise OrderError("no such order")
 
     def _track(self, kind: str, order: dict[str, Any], at: tuple[float, ...], text: str) -> str:
-        now_ns = time.monotonic_ns()
-        time_ns = order.get("exposure_ns", now_ns)
-        if not isinstance(time_ns, int) or not 0 <= now_ns - time_ns < 10_000_000_000:
-            time_ns = now_ns
+        time_ns = time.monotonic_ns() if kind == "stop" else _pointed_into(order)
         self._helm.track(TrackRequest(kind, time_ns, at, asked_by=CONSOLE))
         return self._told(text)
 
     def _told(self, text: str) -> str:
         self._helm.say(_NOTICE, f"PiLoT: console: {text}")
         return text
+
+
+def _pointed_into(order: dict[str, Any]) -> int:
+    """When the picture was taken that the operator saw; now where the order does not say. One of
+    long ago, or of another flight, shows something else at that place than the picture of now.
+    """
+    now_ns = time.monotonic_ns()
+    if order.get("exposure_ns") is None:
+        return now_ns
+    age_s = (now_ns - _number(order, "exposure_ns", 0.0, 2.0**63)) * 1e-9
+    if not -_AHEAD_S <= age_s < _OLDEST_S:
+        raise OrderError("the picture that was clicked is not of now: click into a newer one")
+    return min(int(order["exposure_ns"]), now_ns)
 
 
 def _share(order: dict[str, Any], key: str) -> float:

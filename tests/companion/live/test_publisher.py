@@ -7,6 +7,7 @@ import os
 import socket
 import stat
 import threading
+import time
 from typing import Any
 
 import numpy as np
@@ -313,6 +314,38 @@ def test_an_order_that_makes_no_sense_is_refused(order):
     with pytest.raises(OrderError):
         Orders(True, ship.helm).take(order)
     assert (ship.said, ship.tracked, ship.hints) == ([], [], [])
+
+
+@pytest.mark.parametrize("away_s", [-30.0, -10.1, 5.0, 1e9, float("nan"), "then", True])
+@pytest.mark.parametrize(
+    "order",
+    [
+        {"do": "target", "x": 0.5, "y": 0.5},
+        {"do": "box", "left": 0.1, "top": 0.1, "right": 0.4, "bottom": 0.2},
+    ],
+)
+def test_a_click_into_a_picture_that_is_not_of_now_is_refused(order, away_s):
+    """On a page that had stood still it was taken for one into the present picture, and what lay
+    there by then became the target.
+    """
+    ship, now_ns = Ship(), time.monotonic_ns()
+    told = away_s if isinstance(away_s, str | bool) else now_ns + away_s * 1e9
+    with pytest.raises(OrderError, match=r"click into a newer one|exposure_ns"):
+        Orders(True, ship.helm).take({**order, "exposure_ns": told})
+    assert ship.tracked == []
+    Orders(True, ship.helm).take({"do": "stop", "exposure_ns": told})  # targets end all the same
+    assert len(ship.tracked) == 1
+
+
+@pytest.mark.parametrize("away_s", [-9.0, -0.2, 0.004, None])
+def test_a_click_bears_the_time_of_its_picture(away_s):
+    ship, now_ns = Ship(), time.monotonic_ns()
+    told = None if away_s is None else now_ns + round(away_s * 1e9)
+    Orders(True, ship.helm).take({"do": "target", "x": 0.5, "y": 0.5, "exposure_ns": told})
+    (request,) = ship.tracked
+    assert now_ns - 9.1e9 < request.time_ns <= time.monotonic_ns()
+    if away_s is not None and away_s < 0:
+        assert request.time_ns == told
 
 
 @pytest.mark.parametrize(
