@@ -11,6 +11,7 @@ from localizer.geometry.geo import LocalFrame
 from localizer.geometry.pose import Array
 from localizer.map.cache.cache import TileCache
 from mavlink_bridge.config import OriginConfig
+from mavlink_bridge.messages import VehicleState
 from mavlink_bridge.preflight.doctor import Finding
 from mavlink_bridge.vehicle.mission import Waypoint
 
@@ -18,6 +19,9 @@ _STEP_M = 25.0
 _NAME = "mission"
 _ORIGIN_KM = 50.0  # a take-off far from the map is odd, another country is a typing error
 _ORIGIN_HEIGHT_M = 300.0
+_STAND_KM = 0.3  # a take-off beside the map's edge
+_BELOW_M = 1000.0  # the Earth falls away by so much within 110 km
+_FIX_3D = 3
 _NEEDED = "inside the map"
 
 
@@ -80,12 +84,49 @@ def check_origin(origin: OriginConfig, cache: TileCache) -> Finding:
     """
     m = cache.manifest
     ground = origin.altitude_amsl_m + m.geoid_separation_m
-    place = cache.frame.enu_from_geodetic(origin.latitude_deg, origin.longitude_deg, ground)
-    low, high = cache.index.box_min[0, :2], cache.index.box_max[0, :2]
-    away_km = float(np.linalg.norm(np.maximum(low - place[:2], place[:2] - high).clip(0.0))) / 1000
+    away_km = _away_km(cache, origin.latitude_deg, origin.longitude_deg)
     bottom, top = m.height_range_m
     off_m = max(bottom - ground, ground - top, 0.0)
     good = away_km <= _ORIGIN_KM and off_m <= _ORIGIN_HEIGHT_M
     found = f"{away_km:.1f} km beside and {off_m:.0f} m above or below the map"
     needed = f"<= {_ORIGIN_KM:.0f} km and {_ORIGIN_HEIGHT_M:.0f} m"
-    return Finding("bridge.origin", found, needed, "the take-off ground, altitude AMSL", good, True)
+    why = "the take-off ground, altitude AMSL"
+    if away_km > _ORIGIN_KM and _is_swapped(cache, origin.latitude_deg, origin.longitude_deg):
+        why = "latitude and longitude are swapped: the other way round they are on the map"
+    return Finding("bridge.origin", found, needed, why, good, True)
+
+
+def check_stand(cache: TileCache, state: VehicleState) -> list[Finding]:
+    """Where the vehicle stands by its GNSS, beside the map: a map of another place has heights and
+    a geoid of its own, and everything else about it is in order. Empty where it stands on the map,
+    or does not know.
+    """
+    latitude_deg, longitude_deg = state.gps_latitude_deg, state.gps_longitude_deg
+    if latitude_deg is None or longitude_deg is None or state.gps_fix_type < _FIX_3D:
+        return []
+    away_km = _away_km(cache, latitude_deg, longitude_deg)
+    if away_km <= _STAND_KM:
+        return []
+    far = away_km > _ORIGIN_KM
+    why = "no position by vision here" + (": the map of another place?" if far else "")
+    if far and _is_swapped(cache, latitude_deg, longitude_deg):
+        why = "the map lies where latitude and longitude are swapped: build it again"
+    needed = f"<= {_STAND_KM:g} km"
+    return [Finding("vehicle's place", f"{away_km:.1f} km beside the map", needed, why, False, far)]
+
+
+def _away_km(cache: TileCache, latitude_deg: float, longitude_deg: float) -> float:
+    """From a place to the rectangle about the map, 0 inside; through the Earth."""
+    height_m = cache.manifest.origin.height_m
+    place = np.asarray(cache.frame.enu_from_geodetic(latitude_deg, longitude_deg, height_m))
+    low, high = cache.index.box_min[0, :2], cache.index.box_max[0, :2]
+    beside = np.maximum(low - place[:2], place[:2] - high).clip(0.0)
+    # On the other side of the Earth a place is near in the plane, and far below it.
+    below = max(-float(place[2]) - _BELOW_M, 0.0)
+    return float(np.hypot(np.linalg.norm(beside), below)) / 1000
+
+
+def _is_swapped(cache: TileCache, latitude_deg: float, longitude_deg: float) -> bool:
+    if abs(longitude_deg) > 90.0:
+        return False
+    return _away_km(cache, longitude_deg, latitude_deg) <= _ORIGIN_KM

@@ -9,12 +9,13 @@ from pathlib import Path
 
 from companion.config import CompanionConfig
 from companion.errors import CompanionError, DetectorError
-from companion.preflight.coverage import check_mission, check_origin
+from companion.preflight.coverage import check_mission, check_origin, check_stand
 from companion.preflight.heights import check_heights
 from companion.preflight.map_pin import require_pinned
+from companion.preflight.meanings import check_meanings, check_ports
 from companion.preflight.places import check_places
 from companion.redaction import redacted
-from companion.sources import SourceSettings, open_source
+from companion.sources import SourceSettings, StreamState, open_source
 from companion.targets.detector.network import DetectorNetwork
 from localizer.errors import LocalizerError
 from localizer.features.extractor import load_extractor
@@ -54,7 +55,8 @@ def examine_deployment(
         camera = aside.submit(_check_camera, config) if feed else None
         diagnosis = examine(config.bridge, say) if vehicle else None
         findings += [*([] if camera is None else [camera.result()]), _check_power()]
-    findings += check_places(config)
+    findings += [*check_places(config), *check_meanings(config)]
+    findings += check_ports(config) if feed else []  # beside a flight they are its own
     findings += _check_detector(config)
     if cache is not None and config.bridge.origin is not None:
         findings.append(check_origin(config.bridge.origin, cache))
@@ -62,6 +64,7 @@ def examine_deployment(
         found = diagnosis.findings
         findings += found
         if cache is not None and diagnosis.state is not None:
+            findings += check_stand(cache, diagnosis.state)
             findings += check_heights(cache, diagnosis.state)
         if cache is not None and found[0].ok:
             say("reading the mission")
@@ -138,8 +141,14 @@ def _check_camera(config: CompanionConfig) -> Finding:
     """
     feed = config.camera
     settings = SourceSettings.model_validate(feed.settings.model_dump() | {"realtime": True})
+    told: list[str] = []
+
+    def on_state(state: StreamState, text: str) -> None:
+        if state is StreamState.STALLED:
+            told.append(text)
+
     try:
-        source = open_source(feed.source, feed.model.camera(), settings)
+        source = open_source(feed.source, feed.model.camera(), settings, on_state)
     except (CompanionError, LocalizerError) as error:
         return _failed("camera", "no feed", "pictures", str(error))
     times: list[int] = []
@@ -160,6 +169,7 @@ def _check_camera(config: CompanionConfig) -> Finding:
     if len(times) < 2:
         where = redacted(feed.source)
         why = f"nothing arrived from {where} in {_FEED_S:.0f} s: is the stream running?"
+        why += f" ({told[0].removeprefix(f'{where}: ')})" if told else ""
         return _failed("camera", "silent", "pictures", why)
     rate = (len(times) - 1) / max((times[-1] - times[0]) * 1e-9, 1e-9)
     found = f"{seen.width}x{seen.height}, {rate:.1f} Hz"

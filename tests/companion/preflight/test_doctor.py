@@ -11,6 +11,7 @@ from rich.console import Console
 from companion.cli.doctor import print_diagnosis
 from companion.config import CameraModel, parse_config
 from companion.preflight.doctor import examine_deployment
+from companion.sources import StreamState
 from companion.terminal.steps import shown_steps
 from localizer.types import Frame
 from mavlink_bridge.preflight.doctor import Diagnosis, Finding
@@ -104,6 +105,24 @@ def test_a_feed_that_delivers_is_left_after_three_seconds_of_pictures(map_cache,
     finding = _findings(map_cache, feed)["camera"]
     assert (finding.ok, finding.found) == (True, "160x120, 20.0 Hz")
     assert len(taken) == 62
+
+
+def test_a_feed_whose_port_another_has_is_not_called_a_camera_that_is_off(map_cache, monkeypatch):
+    class Taken:
+        def __init__(self, *given):
+            self.tell = given[3]
+
+        def frames(self):
+            self.tell(StreamState.STALLED, "udp://127.0.0.1:5600: cannot connect: Address in use")
+            return iter(())
+
+        def close(self):
+            pass
+
+    monkeypatch.setattr("companion.preflight.doctor.open_source", Taken)
+    finding = _findings(map_cache, "udp://127.0.0.1:5600")["camera"]
+    assert (finding.ok, finding.found) == (False, "silent")
+    assert "is the stream running? (cannot connect: Address in use)" in finding.why
 
 
 def test_what_is_being_done_is_told_before_it_takes_time(map_cache, feed):
