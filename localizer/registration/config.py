@@ -36,7 +36,7 @@ class JNGOConfig(BaseModel):
         default=2048,
         ge=0,
         le=65536,
-        description="poses drawn of a wide prior and compared before half of the swarm; 0: none",
+        description="poses drawn of a wide prior at 320 x 240, more in larger pictures; 0: none",
     )
     preselected_from_m: float = Field(
         default=2.0, ge=0, le=1e4, description="position sigma from which a prior is wide"

@@ -59,6 +59,7 @@ _log = logging.getLogger(__name__)
 _COVARIANCE_ANCHORS = 1000  # enough for a covariance, cheap enough for every frame
 _VOTING_ANCHORS = 1000  # likewise
 _PRESELECTING_ANCHORS = 125  # likewise, of the coarsest level
+_CELLS = 1200  # of that level of a picture of 320 x 240
 _ALIKE = 4  # times as many of the best draws as are wanted, because some repeat others
 _APART_PX = 0.5  # rms distance on the coarsest level from which two draws are two
 _LEAST_SCALE = 0.02  # of the sharpening loss, where features fit perfectly
@@ -302,7 +303,9 @@ def _beginning(
     widest = max(float(np.linalg.eigvalsh(prior.covariance[:3, :3])[-1]), 0.0) ** 0.5
     if c.preselected == 0 or widest < c.preselected_from_m:
         return R, t
-    drawn = camera_from_local(*draw_hypotheses(prior, c.preselected, seed), origin)
+    # A cell of a larger picture is a smaller turn, so that as many draws would leave gaps.
+    count = round(c.preselected * problem.confidence.size / _CELLS)
+    drawn = camera_from_local(*draw_hypotheses(prior, max(count, 1), seed), origin)
     few = thinned(problem, _PRESELECTING_ANCHORS)
     scores = backend.refine(few, *drawn, 0, c.settings).scores
     half = c.hypotheses // 2
