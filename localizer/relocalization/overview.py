@@ -8,6 +8,7 @@ format, so that another model or a rebuilt map makes a file of its own.
 
 from __future__ import annotations
 
+import contextlib
 import hashlib
 import logging
 import math
@@ -27,6 +28,7 @@ from localizer.errors import MapCacheError
 from localizer.features.extractor import FeatureExtractor, model_key
 from localizer.geometry.pose import Array
 from localizer.map.cache.cache import TileCache
+from localizer.relocalization.kept_overviews import drop_old, mark_used
 from localizer.relocalization.topview import render_top_view
 from localizer.render.base import MapRenderer
 from localizer.types import FeatureLevel, Float32, Image
@@ -152,7 +154,8 @@ def open_overview(
     """
     key = overview_key(cache, model_key(extractor))
     folder = cache.path / "overview" / key
-    levels = []
+    mark_used(folder)
+    levels, is_new = [], False
     squares = [_squares(cache, gsd) for gsd in GSD_M]
     _require_memory(squares)
     total, done = sum(len(s.corners) for s in squares), 0
@@ -170,9 +173,12 @@ def open_overview(
             if level is None:
                 return None
             _write(path, level)
+            is_new = True
         done += len(plan.corners)
         progress(done, total)
         levels.append(level)
+    if is_new:
+        drop_old(folder)
     return MapOverview(tuple(levels), key)
 
 
@@ -375,4 +381,5 @@ def _write(path: Path, level: OverviewLevel) -> None:
         logger.warning(
             "%s: the overview cannot be kept (%s): it is computed at every start", path, error
         )
-        new.unlink(missing_ok=True)
+        with contextlib.suppress(OSError):  # of a file system that is only read
+            new.unlink()

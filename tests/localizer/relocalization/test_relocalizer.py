@@ -1,8 +1,12 @@
 """A frame of another day, found on a small world of 400 m: and what is not there is not found."""
 
+import errno
 import logging
+import os
 import shutil
+import time
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -14,6 +18,7 @@ from localizer.geometry.pose import Pose, so3_exp
 from localizer.map.cache.cache import TileCache
 from localizer.map.cache.stream import TileStreamer
 from localizer.registration.jngo import JNGO
+from localizer.relocalization.kept_overviews import drop_old, mark_used
 from localizer.relocalization.overview import open_overview, overview_key
 from localizer.relocalization.patch import turned
 from localizer.relocalization.relocalizer import open_relocalizer
@@ -266,6 +271,50 @@ def test_the_overview_is_kept_and_a_damaged_one_is_made_again(cache, opened, cap
         assert not caplog.records
         renderer.close()
     assert stamps[files[0]] == files[0].stat().st_mtime_ns  # the whole ones were left alone
+
+
+def test_overviews_of_models_that_are_no_longer_used_are_removed(tmp_path):
+    """Each model that was tried left 5 MB a km² in the map's folder for good."""
+    now, mine = time.time(), tmp_path / "0123456789abcdef"
+    for k, name in enumerate(["a" * 16, "b" * 16, "c" * 16, mine.name, "d" * 16, "notes"]):
+        (tmp_path / name).mkdir()
+        (tmp_path / name / "1.safetensors").touch()
+        os.utime(tmp_path / name, (now - 100 + k, now - 100 + k))
+    for name, age_s in (("1.new", 2e5), ("2.new", 5.0)):
+        (mine / name).touch()
+        os.utime(mine / name, (now - age_s, now - age_s))
+    mark_used(tmp_path / ("a" * 16))  # by another deployment, just now
+    drop_old(mine)
+    left = sorted(path.name for path in tmp_path.iterdir())
+    assert left == sorted([mine.name, "a" * 16, "d" * 16, "notes"])
+    assert sorted(path.name for path in mine.iterdir()) == ["1.safetensors", "2.new"]
+    drop_old(tmp_path / "nowhere" / ("f" * 16))  # a map that is only read has none
+    mark_used(tmp_path / "nowhere")
+
+
+def test_a_map_that_is_only_read_is_searched_all_the_same(cache, opened, monkeypatch, caplog):
+    """Its partial overview cannot be finished there; the error of removing a file that was never
+    made cost the search.
+    """
+    folder = cache.path / "overview" / opened.relocalizer.overview.key
+    kept = (folder / "2.safetensors").read_bytes()
+    (folder / "2.safetensors").unlink()
+
+    def read_only(*_, **__):
+        raise OSError(errno.EROFS, "Read-only file system")
+
+    with TileStreamer(cache) as streamer, caplog.at_level(logging.WARNING):
+        renderer = NumbaRenderer(streamer, 1)
+        with monkeypatch.context() as patched:
+            patched.setattr(Path, "unlink", read_only)
+            patched.setattr(os, "fsync", read_only)
+            found = open_overview(cache, renderer, opened.relocalizer.extractor)
+        renderer.close()
+    for left in folder.glob("*.new"):
+        left.unlink()
+    (folder / "2.safetensors").write_bytes(kept)
+    assert found is not None
+    assert "computed at every start" in caplog.text
 
 
 def test_a_map_whose_search_does_not_fit_into_memory_is_named(cache, opened, monkeypatch):

@@ -1,0 +1,45 @@
+"""Overviews of models that are no longer used: a map's folder keeps the few newest."""
+
+from __future__ import annotations
+
+import logging
+import os
+import re
+import shutil
+import time
+from pathlib import Path
+
+logger = logging.getLogger(__name__)
+
+_KEPT = 3  # the deployment's, and those of models that are compared with it
+_KEY = re.compile(r"[0-9a-f]{16}")
+_UNFINISHED_S = 86_400.0  # of a process that was cut off; one that writes takes seconds
+
+
+def mark_used(folder: Path) -> None:
+    """Note that an overview's folder is in use, by its time."""
+    try:
+        os.utime(folder)
+    except OSError:  # a map that is only read keeps what it has
+        return
+
+
+def drop_old(folder: Path) -> None:
+    """Remove overviews beside this folder, the longest unused first, and what a cut off process
+    left in it. What is no overview, or cannot be removed, stays.
+    """
+    try:
+        for left in folder.glob("*.new"):
+            if time.time() - left.stat().st_mtime > _UNFINISHED_S:
+                left.unlink()
+        others = [
+            (path.stat().st_mtime, path)
+            for path in folder.parent.iterdir()
+            if path != folder and _KEY.fullmatch(path.name) and path.is_dir()
+            and not path.is_symlink()
+        ]  # fmt: skip
+        for _, path in sorted(others, reverse=True)[_KEPT - 1 :]:
+            logger.info("%s: an overview of a model that is no longer used: removed", path)
+            shutil.rmtree(path)
+    except OSError as error:
+        logger.info("%s: old overviews stay: %s", folder.parent, error)
