@@ -27,6 +27,7 @@ from companion.flight.priors import AutopilotPose, drift_sigma_m
 from localizer.geometry.geo import NED_FROM_ENU
 from localizer.geometry.pose import Pose
 from localizer.types import PoseEstimate, PosePrior, ReferenceBundle, TrackingState
+from mavlink_bridge.messages import Origin, VehicleState
 from mavlink_bridge.whole_file import read_whole, replace_whole
 
 _log = logging.getLogger(__name__)
@@ -34,6 +35,8 @@ _WRITE_S = 0.5
 _FASTEST_MPS = 40.0  # a way beyond it is a jump of the EKF
 _LEAST_SIGMA_M = 0.5
 _FARTHEST_M = 1e6
+_CLOCK_NS = 500_000_000  # by which the first measurement of the autopilot's clock may be off
+_SAME_DEG, _SAME_M = 1e-6, 0.1  # of an origin that is read again
 _BOOT = Path("/proc/sys/kernel/random/boot_id")
 LocalAt = Callable[[int], tuple[float, ...] | None]
 
@@ -41,7 +44,8 @@ LocalAt = Callable[[int], tuple[float, ...] | None]
 @dataclass(frozen=True)
 class LastFix:
     """time_ns: CLOCK_MONOTONIC of `boot`. The camera's WGS84 place; sigma_m: worst axis. local_ned:
-    the EKF's position at that time, m.
+    the EKF's position at that time, m; autopilot_ns, origin: since the autopilot's boot, and where
+    (latitude, longitude, altitude AMSL) that position is counted from, None where not known.
     """
 
     boot: str
@@ -51,6 +55,27 @@ class LastFix:
     height_m: float
     sigma_m: float
     local_ned: tuple[float, float, float]
+    autopilot_ns: int | None = None
+    origin: tuple[float, float, float] | None = None
+
+    def counts_alike(self, state: VehicleState, time_ns: int) -> bool:
+        """Whether the EKF still counts its position from where it did: not after a reboot of the
+        autopilot, whose clock began anew, nor about another origin.
+        """
+        offset_ns, origin = state.clock_offset_ns, _place(state.origin)
+        since = None if offset_ns is None else time_ns - offset_ns + _CLOCK_NS
+        if since is not None and since < (self.autopilot_ns or 0):
+            return False
+        if self.origin is None or origin is None:
+            return True
+        pairs = zip(self.origin, origin, (_SAME_DEG, _SAME_DEG, _SAME_M), strict=True)
+        return all(abs(a - b) <= most for a, b, most in pairs)
+
+
+def _place(origin: Origin | None) -> tuple[float, float, float] | None:
+    if origin is None:
+        return None
+    return origin.latitude_deg, origin.longitude_deg, origin.altitude_amsl_m
 
 
 def boot_id() -> str:
@@ -73,10 +98,14 @@ def read_last_fix(path: Path, boot: str) -> LastFix | None:
             return None
         row = json.loads(read_whole(path))
         north, east, down = (float(v) for v in row["local_ned"])
+        since, origin = row.get("autopilot_ns"), row.get("origin")
+        counted = None if origin is None else tuple(float(v) for v in origin)
+        if counted is not None and len(counted) != 3:
+            raise ValueError(f"{counted} is no origin")
         found = LastFix(
             str(row["boot"]), int(row["time_ns"]), float(row["latitude_deg"]),
             float(row["longitude_deg"]), float(row["height_m"]), float(row["sigma_m"]),
-            (north, east, down),
+            (north, east, down), None if since is None else int(since), counted,
         )  # fmt: skip
     except FileNotFoundError:
         return None
@@ -104,8 +133,9 @@ def _is_place(fix: LastFix) -> bool:
 class FixMemory:
     """Keeps the newest confirmed place while flying, and knows that of the process before.
 
-    trusted: whether nobody withholds fixes now. Thread-safe: estimates come on the localization
-    thread, which only leaves them here; the file is written on a thread of its own.
+    trusted: whether nobody withholds fixes now; state: what the vehicle says about itself.
+    Thread-safe: estimates come on the localization thread, which only leaves them here; the file is
+    written on a thread of its own.
     """
 
     def __init__(
@@ -116,10 +146,11 @@ class FixMemory:
         installation: Installation,
         local_at: LocalAt,
         trusted: Callable[[], bool] = lambda: True,
+        state: Callable[[], VehicleState] = VehicleState,
     ) -> None:
         self._path, self._config = path, config
         self._autopilot, self._installation = autopilot, installation
-        self._local_at, self._trusted = local_at, trusted
+        self._local_at, self._trusted, self._state = local_at, trusted, state
         self._boot = boot_id()
         self._before = None if path is None else read_last_fix(path, self._boot)
         self._newest: PoseEstimate | None = None
@@ -159,6 +190,9 @@ class FixMemory:
         local, rotation = self._local_at(time_ns), self._autopilot.rotation(time_ns)
         if local is None or rotation is None:
             return None
+        if not last.counts_alike(self._state(), time_ns):
+            self._before = None
+            return None
         way = np.array(local[:3]) - np.array(last.local_ned)
         if float(np.linalg.norm(way)) > _FASTEST_MPS * age_s + 1.0:
             self._before = None
@@ -193,9 +227,12 @@ class FixMemory:
         if local is None:
             return
         place = self._installation.frame.position(estimate.world_from_camera.translation)
+        state, time_ns = self._state(), estimate.exposure_time_ns
+        offset_ns = state.clock_offset_ns
         row = LastFix(
-            self._boot, estimate.exposure_time_ns, place.latitude_deg, place.longitude_deg,
+            self._boot, time_ns, place.latitude_deg, place.longitude_deg,
             place.height_m, float(np.sqrt(np.linalg.eigvalsh(estimate.covariance[:3, :3])[-1])),
-            (local[0], local[1], local[2]),
+            (local[0], local[1], local[2]), None if offset_ns is None else time_ns - offset_ns,
+            _place(state.origin),
         )  # fmt: skip
         replace_whole(path, json.dumps(asdict(row)))

@@ -299,6 +299,7 @@ def _last_fix(making: Making) -> FixMemory:
         making[Installation],
         lambda time_ns: local_about(bridge, time_ns),
         lambda: guardian is None or not guardian.reason,
+        bridge.state,
     )
     making.channels.estimates.subscribe(memory.add_estimate)
     return memory

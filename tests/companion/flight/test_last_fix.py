@@ -20,7 +20,7 @@ from localizer.geometry.camera import Camera
 from localizer.geometry.geo import Geodetic, LocalFrame
 from localizer.geometry.pose import Pose
 from localizer.types import PoseEstimate, RegistrationStatus, TrackingState
-from mavlink_bridge.messages import VehicleState
+from mavlink_bridge.messages import Origin, VehicleState
 
 FRAME = LocalFrame(Geodetic(47.0, 8.0, 500.0))
 INSTALLATION = Installation(FRAME, 47.0, np.zeros(3))
@@ -82,6 +82,53 @@ def test_a_picture_that_is_newer_than_the_ekf_report_can_be_placed(
         assert north == pytest.approx(3.0 + 5.0 * ahead_s, abs=0.01)
 
 
+ORIGIN = Origin(47.0, 8.0, 453.0)
+MINUTE = 60 * SECOND
+
+
+@pytest.mark.parametrize(
+    ("offset_ns", "origin", "usable"),
+    [
+        (100 * SECOND - MINUTE, ORIGIN, True),  # the autopilot a minute old at the last fix
+        (100 * SECOND - MINUTE + SECOND // 2, None, True),  # its clock is not measured so well
+        (103 * SECOND - SECOND // 10, None, False),  # it booted between the two processes
+        (None, Origin(47.001, 8.0, 453.0), False),
+        (None, Origin(47.0, 8.0, 500.0), False),
+        (None, None, True),
+    ],
+)
+def test_an_ekf_that_counts_from_elsewhere_shows_no_way(
+    tmp_path: Path, offset_ns: int | None, origin: Origin | None, usable: bool
+) -> None:
+    """An autopilot that rebooted while this process was away is where it began, by itself: the
+    place was off by the way between, up to 40 m/s times the gap, and not on trial.
+    """
+    fix = replace(BEGUN, autopilot_ns=MINUTE, origin=(47.0, 8.0, 453.0))
+    state = VehicleState(clock_offset_ns=offset_ns, origin=origin)
+    path = kept(tmp_path, fix)
+    again = FixMemory(
+        path, PriorConfig(), AUTOPILOT, INSTALLATION, lambda _: (13.0, 24.0, -85.0),
+        state=lambda: state,
+    )  # fmt: skip
+    assert (again.prior(103 * SECOND) is not None) is usable
+    assert memory(kept(tmp_path)).prior(103 * SECOND) is not None  # a file of an older version
+
+
+def test_where_the_ekf_counts_from_is_kept(tmp_path: Path) -> None:
+    path = tmp_path / "last-fix.json"
+    state = VehicleState(clock_offset_ns=40 * SECOND, origin=ORIGIN)
+    kept_on = FixMemory(
+        path, PriorConfig(), AUTOPILOT, INSTALLATION, lambda _: (1.0, 2.0, 3.0),
+        state=lambda: state,
+    )  # fmt: skip
+    kept_on.start()
+    kept_on.add_estimate(tracked(104 * SECOND), None)  # type: ignore[arg-type]
+    while (found := read_last_fix(path, boot_id())) is None:
+        pass
+    kept_on.stop()
+    assert (found.autopilot_ns, found.origin) == (64 * SECOND, (47.0, 8.0, 453.0))
+
+
 @pytest.mark.parametrize(
     ("at_s", "local"),
     [
@@ -107,6 +154,8 @@ def test_what_may_not_be_trusted_is_not_used(
         json.dumps({**asdict(BEGUN), "local_ned": [1.0]}),
         json.dumps({**asdict(BEGUN), "time_ns": -(10**400)}),
         json.dumps({**asdict(BEGUN), "latitude_deg": 1e300}),
+        json.dumps({**asdict(BEGUN), "origin": [1.0]}),
+        json.dumps({**asdict(BEGUN), "autopilot_ns": "x"}),
         json.dumps({**asdict(BEGUN), "sigma_m": 1e300}),
     ],
 )  # fmt: skip
