@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import io
 import json
+import os
 import tarfile
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO
 
 from localizer.plain_files import plain_text
 
@@ -56,28 +56,38 @@ class Records:
 
 
 def archive(record: RecordFolder) -> Iterator[bytes]:
-    """The record as a .tar, piece by piece. Only plain files of the folder itself go in."""
-    buffer = io.BytesIO()
-    with tarfile.open(fileobj=buffer, mode="w", format=tarfile.PAX_FORMAT) as tar:
-        for path in _plain_files(record.path):
-            name = f"{record.name}/{path.relative_to(record.path)}"
-            try:
-                data = path.read_bytes()
-            except OSError:
-                continue  # it went meanwhile; a flight may be writing
-            info = tarfile.TarInfo(name)
-            info.size = len(data)
-            tar.addfile(info, io.BytesIO(data))
-            if buffer.tell() > _CHUNK:
-                yield _emptied(buffer)
-    yield buffer.getvalue()
+    """The record as a .tar, piece by piece. Only plain files of the folder itself go in. Of a file
+    that is read no more than a piece is in memory: a .tlog may have two GiB, and the flight needs
+    its own.
+    """
+    for path in _plain_files(record.path):
+        try:
+            file = path.open("rb")
+        except OSError:
+            continue  # it went meanwhile; a flight may be writing
+        with file:
+            info = tarfile.TarInfo(f"{record.name}/{path.relative_to(record.path)}")
+            info.size = os.fstat(file.fileno()).st_size
+            yield info.tobuf(tarfile.PAX_FORMAT)
+            yield from _content(file, info.size)
+    yield bytes(2 * tarfile.BLOCKSIZE)
 
 
-def _emptied(buffer: io.BytesIO) -> bytes:
-    data = buffer.getvalue()
-    buffer.seek(0)
-    buffer.truncate()
-    return data
+def _content(file: BinaryIO, size: int) -> Iterator[bytes]:
+    """So many bytes of a file, then zeros up to a whole block; zeros, too, for what it lost since
+    its size was told. What was added since is left out.
+    """
+    left = size
+    while left > 0:
+        try:
+            data = file.read(min(left, _CHUNK))
+        except OSError:
+            data = b""
+        data = data or bytes(min(left, _CHUNK))
+        left -= len(data)
+        yield data
+    if size % tarfile.BLOCKSIZE:
+        yield bytes(-size % tarfile.BLOCKSIZE)
 
 
 def _plain_files(folder: Path) -> Iterator[Path]:
