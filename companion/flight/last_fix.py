@@ -27,6 +27,7 @@ from companion.flight.priors import AutopilotPose, drift_sigma_m
 from localizer.geometry.geo import NED_FROM_ENU
 from localizer.geometry.pose import Pose
 from localizer.types import PoseEstimate, PosePrior, ReferenceBundle, TrackingState
+from mavlink_bridge.link.clock import boot_id
 from mavlink_bridge.messages import Origin, VehicleState
 from mavlink_bridge.whole_file import read_whole, replace_whole
 
@@ -37,7 +38,6 @@ _LEAST_SIGMA_M = 0.5
 _FARTHEST_M = 1e6
 _CLOCK_NS = 500_000_000  # by which the first measurement of the autopilot's clock may be off
 _SAME_DEG, _SAME_M = 1e-6, 0.1  # of an origin that is read again
-_BOOT = Path("/proc/sys/kernel/random/boot_id")
 LocalAt = Callable[[int], tuple[float, ...] | None]
 
 
@@ -76,14 +76,6 @@ def _place(origin: Origin | None) -> tuple[float, float, float] | None:
     if origin is None:
         return None
     return origin.latitude_deg, origin.longitude_deg, origin.altitude_amsl_m
-
-
-def boot_id() -> str:
-    """Of this computer's present run: CLOCK_MONOTONIC begins anew with each."""
-    try:
-        return _BOOT.read_text(encoding="ascii").strip()
-    except OSError:
-        return ""
 
 
 def read_last_fix(path: Path, boot: str) -> LastFix | None:

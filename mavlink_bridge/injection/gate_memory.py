@@ -14,7 +14,9 @@ import threading
 import time
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
+from mavlink_bridge.link.clock import boot_id
 from mavlink_bridge.whole_file import read_whole, replace_whole
 
 _log = logging.getLogger(__name__)
@@ -26,13 +28,20 @@ _STOP_S = 2.0
 class GateMemory:
     """Reads once; writes in a thread of its own, so that a disk that stands still stalls nobody.
 
-    wall_s: UTC seconds. The wall clock, since a computer that lost its power in the air starts
-    CLOCK_MONOTONIC anew.
+    wall_s: UTC seconds; boot, clock_s: of CLOCK_MONOTONIC. Within one run of the computer that
+    clock counts, which nobody sets; the wall clock where it lost its power in the air.
     """
 
-    def __init__(self, path: Path, wall_s: Callable[[], float] = time.time) -> None:
+    def __init__(
+        self,
+        path: Path,
+        wall_s: Callable[[], float] = time.time,
+        clock_s: Callable[[], float] = time.monotonic,
+        boot: str | None = None,
+    ) -> None:
         self._path = path
-        self._wall_s = wall_s
+        self._wall_s, self._clock_s = wall_s, clock_s
+        self._boot = boot_id() if boot is None else boot
         self._wake = threading.Event()
         self._stopping = self._in_use = False
         self._channel: bool | None = None
@@ -51,7 +60,7 @@ class GateMemory:
                 _log.warning("%s is not this user's alone (mode 0600): ignored", self._path)
                 return None
             content = json.loads(read_whole(self._path))
-            age_s = self._wall_s() - float(content["utc_s"])
+            age_s = self._age_s(content)
             opened, channel = content["open"] is True, content["by_channel"] is True
         except FileNotFoundError:
             return None
@@ -59,6 +68,12 @@ class GateMemory:
             _log.warning("%s cannot be used: %s", self._path, error)
             return None
         return (channel, age_s) if opened and 0.0 <= age_s <= _OLDEST_S else None
+
+    def _age_s(self, content: dict[str, Any]) -> float:
+        utc_s = float(content["utc_s"])
+        if self._boot and content.get("boot") == self._boot:
+            return self._clock_s() - float(content["clock_s"])
+        return self._wall_s() - utc_s
 
     def opened(self, *, by_channel: bool) -> None:
         """The gate is open from now on."""
@@ -101,5 +116,6 @@ class GateMemory:
 
     def _write(self, by_channel: bool) -> None:
         """Whole or not at all."""
-        text = json.dumps({"open": True, "by_channel": by_channel, "utc_s": self._wall_s()})
+        told = {"open": True, "by_channel": by_channel, "utc_s": self._wall_s()}
+        text = json.dumps(told | {"boot": self._boot, "clock_s": self._clock_s()})
         replace_whole(self._path, text, durable=True)

@@ -11,7 +11,9 @@ import time
 from collections import deque
 from dataclasses import dataclass
 from functools import cache
+from pathlib import Path
 
+_BOOT = Path("/proc/sys/kernel/random/boot_id")
 _WINDOW_NS = 30_000_000_000
 _MAX_SAMPLES = 128
 _RUN_BACK_NS = 1_000_000_000
@@ -33,6 +35,14 @@ _NOT_BEFORE_UNIX_S = 1_672_531_200  # 2023-01-01: a clock that says less was nev
 def monotonic_ns() -> int:
     """CLOCK_MONOTONIC, nanoseconds."""
     return time.monotonic_ns()
+
+
+def boot_id() -> str:
+    """Of this computer's present run: CLOCK_MONOTONIC begins anew with each. Empty: not known."""
+    try:
+        return _BOOT.read_text(encoding="ascii").strip()
+    except OSError:
+        return ""
 
 
 class SteadyUtc:

@@ -14,12 +14,13 @@ import pytest
 
 from companion.config import PriorConfig
 from companion.conversions import Installation
-from companion.flight.last_fix import FixMemory, LastFix, boot_id, read_last_fix
+from companion.flight.last_fix import FixMemory, LastFix, read_last_fix
 from companion.flight.priors import local_about
 from localizer.geometry.camera import Camera
 from localizer.geometry.geo import Geodetic, LocalFrame
 from localizer.geometry.pose import Pose
 from localizer.types import PoseEstimate, RegistrationStatus, TrackingState
+from mavlink_bridge.link.clock import boot_id
 from mavlink_bridge.messages import Origin, VehicleState
 
 FRAME = LocalFrame(Geodetic(47.0, 8.0, 500.0))

@@ -55,8 +55,13 @@ def killed(path: Path, by: str) -> None:
 
 def restarted(path: Path, later_s: float = 4.0) -> tuple[InjectionGate, list[str]]:
     told: list[str] = []
-    utc_s = json.loads(path.read_text())["utc_s"] if path.exists() else 0.0
-    gate = InjectionGate(RcGateConfig(), told.append, GateMemory(path, lambda: utc_s + later_s))
+    kept = json.loads(path.read_text()) if path.exists() else {}
+    memory = GateMemory(
+        path,
+        lambda: kept.get("utc_s", 0.0) + later_s,
+        lambda: kept.get("clock_s", 0.0) + later_s,
+    )
+    gate = InjectionGate(RcGateConfig(), told.append, memory)
     gate.recall()
     gate.announce()
     return gate, told
@@ -75,6 +80,37 @@ def test_a_killed_process_leaves_the_gate_open(tmp_path: Path, by: str) -> None:
     assert gate.open is (by == "command")
     gate.stop()
     assert not path.exists()  # an orderly end is not a restart in the air
+
+
+@pytest.mark.parametrize("step_s", [-3600.0, 3600.0, 1e9])
+def test_a_wall_clock_that_is_set_meanwhile_closes_no_gate(tmp_path: Path, step_s: float) -> None:
+    """A computer without a battery meets the network after take-off; killed afterwards, it came
+    back with its gate closed and the vehicle without a position.
+    """
+    path, wall, clock = tmp_path / "gate.json", [1e9], [500.0]
+    memory = GateMemory(path, lambda: wall[0], lambda: clock[0], "this run")
+    memory.opened(by_channel=True)
+    while not path.exists():
+        pass
+    left = path.read_text()
+    memory.stop()
+
+    def recalled(boot: str, later_s: float) -> tuple[bool, float] | None:
+        path.write_text(left)
+        path.chmod(0o600)
+        again = GateMemory(path, lambda: wall[0], lambda: clock[0] + later_s, boot)
+        try:
+            return again.recall()
+        finally:
+            again.stop()
+
+    wall[0] += step_s
+    assert recalled("this run", 4.0) == (True, 4.0)
+    assert recalled("this run", 601.0) is None
+    assert recalled("another run", 4.0) is None  # nobody knows how long it was off
+    assert recalled("", 4.0) is None
+    wall[0] -= step_s - 30.0
+    assert recalled("another run", -490.0) == (True, 30.0)
 
 
 @pytest.mark.parametrize("later_s", [601.0, -5.0])
