@@ -105,10 +105,10 @@ def build_methods(
     for model in models:
         extractor = DetailExtractor(load_extractor(None if model == SHIPPED else model))
         name = "tiny" if model == SHIPPED else str(model)
-        methods[name] = Direct(extractor, anchors)
         if alone:
             swarm = JNGOConfig(preselected=0)
             methods[f"{name}, swarm alone"] = Direct(extractor, anchors, swarm)
+        methods[name] = Direct(extractor, anchors)
     return methods
 
 
