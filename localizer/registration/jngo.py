@@ -155,7 +155,7 @@ class JNGO:
         seed: int,
     ) -> _Swarm:
         c = self.config
-        R, t = _beginning(self.backend, c, problems[0], origin, prior, seed)
+        R, t, drawn = _beginning(self.backend, c, problems[0], origin, prior, seed)
         keep = (*c.keep[: len(problems) - 1], c.hypotheses)
         evaluations = 0
         for level, iterations, survivors, anchors in zip(
@@ -167,10 +167,11 @@ class JNGO:
             R, t, totals = found.rotations, found.translations, found.scores
             if level is problems[-1]:
                 totals = _totals(c.motion_weight, R, t, totals, origin, motion)
-            order = distinct(problem, R, t, totals, c.distinct_px)[:survivors]
-            R, t = R[order], t[order]
+                drawn = np.zeros(len(R), bool)
+            order = _survivors(problem, R, t, totals, drawn, c.distinct_px, survivors)
+            R, t, drawn = R[order], t[order], drawn[order]
             scores, overlaps = found.scores[order], found.overlaps[order]
-            if not np.isfinite(scores[0]):
+            if not np.isfinite(scores).any():
                 break
         return _Swarm(problem, c.settings, R, t, scores, overlaps, evaluations)
 
@@ -295,27 +296,46 @@ def _beginning(
     origin: Array,
     prior: PosePrior,
     seed: int,
-) -> tuple[Array, Array]:
-    """The swarm, camera_from_local. About a wide prior the best of many draws, by the coarsest
-    level's cost where they are, take the place of its farther half (registration.md, section 6).
+) -> tuple[Array, Array, NDArray[np.bool_]]:
+    """The swarm, camera_from_local, and after it the best of many draws of a wide prior, by the
+    coarsest level's cost where they are; which are drawn (registration.md, section 6).
     """
     R, t = camera_from_local(*c.swarm(prior, seed), origin)
     widest = max(float(np.linalg.eigvalsh(prior.covariance[:3, :3])[-1]), 0.0) ** 0.5
-    if c.preselected == 0 or widest < c.preselected_from_m:
-        return R, t
     # A cell of a larger picture is a smaller turn, so that as many draws would leave gaps.
     count = round(c.preselected * problem.confidence.size / _CELLS)
-    drawn = camera_from_local(*draw_hypotheses(prior, max(count, 1), seed), origin)
+    if count == 0 or widest < c.preselected_from_m:
+        return R, t, np.zeros(len(R), bool)
+    Rd, td = camera_from_local(*draw_hypotheses(prior, count, seed), origin)
     few = thinned(problem, _PRESELECTING_ANCHORS)
-    scores = backend.refine(few, *drawn, 0, c.settings).scores
-    half = c.hypotheses // 2
-    best = np.argsort(scores, kind="stable")[: _ALIKE * half]
-    chosen = best[distinct(few, drawn[0][best], drawn[1][best], scores[best], _APART_PX)][:half]
-    kept = c.hypotheses - len(chosen)
-    return (
-        np.concatenate([R[:kept], drawn[0][chosen]]),
-        np.concatenate([t[:kept], drawn[1][chosen]]),
-    )
+    scores = backend.refine(few, Rd, td, 0, c.settings).scores
+    wanted = c.hypotheses // 2
+    best = np.argsort(scores, kind="stable")[: _ALIKE * wanted]
+    chosen = best[distinct(few, Rd[best], td[best], scores[best], _APART_PX)][:wanted]
+    drawn = np.arange(len(R) + len(chosen)) >= len(R)
+    return np.concatenate([R, Rd[chosen]]), np.concatenate([t, td[chosen]]), drawn
+
+
+def _survivors(
+    problem: LevelProblem,
+    R: Array,
+    t: Array,
+    totals: Array,
+    drawn: NDArray[np.bool_],
+    distance_px: float,
+    count: int,
+) -> NDArray[np.int64]:
+    """Indices of the best distinct ones: `count` of the swarm, half as many of the draws.
+
+    Draws were chosen by their cost, so on a dark coarse level they would crowd out what is right.
+    """
+    order = np.flatnonzero(~drawn)
+    order = order[distinct(problem, R[order], t[order], totals[order], distance_px)][:count]
+    others = np.flatnonzero(drawn)
+    if len(others) == 0:
+        return order
+    best = distinct(problem, R[others], t[others], totals[others], distance_px)
+    return np.concatenate([order, others[best][: count // 2]])
 
 
 def _totals(
