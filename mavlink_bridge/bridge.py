@@ -16,7 +16,7 @@ from mavlink_bridge.errors import BridgeStateError
 from mavlink_bridge.flight_controller import FC_WANTED, FlightControllerEnd, message_id
 from mavlink_bridge.ground import GroundEnd
 from mavlink_bridge.injection.closed_loop import LoopVerdict
-from mavlink_bridge.injection.gate_memory import GateMemory
+from mavlink_bridge.injection.gate_memory import GateMemory, RestartMemory
 from mavlink_bridge.injection.rc_gate import InjectionGate
 from mavlink_bridge.injection.shadow import ShadowScore, gnss_healthy
 from mavlink_bridge.link.clock import SteadyUtc, monotonic_ns
@@ -143,6 +143,7 @@ class Bridge:
             self._recorder.start()
         if self._shared.gate is not None:
             self._shared.gate.recall()  # before a link finds the vehicle and has it announced
+        self._fc.recall()
         for link in self._links:
             link.start()
 
@@ -155,6 +156,7 @@ class Bridge:
             self._shared.gate.stop()
         for link in self._links:
             link.stop()
+        self._fc.end()
         if self._cot is not None:
             self._cot.close()
         if self._recorder is not None:
@@ -386,7 +388,8 @@ class _LinkMaker:
 def _gate(config: BridgeConfig, teller: Teller) -> InjectionGate | None:
     if config.mode != "rc":
         return None
-    memory = GateMemory(config.state_file) if config.state_file is not None else None
+    file = config.state_file
+    memory = None if file is None else GateMemory(RestartMemory(file))
     return InjectionGate(config.rc, teller.notice, memory)
 
 

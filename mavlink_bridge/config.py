@@ -287,7 +287,8 @@ class BridgeConfig(_Model):
     tlog: Path | None = None
     state_file: Path | None = Field(
         default=None,
-        description="where mode rc remembers an open gate over a restart, for 10 minutes",
+        description="where mode rc remembers an open gate over a restart, for 10 minutes; beside "
+        "it every mode a no go of the shadow score",
     )
     link_timeout_s: float = Field(default=5.0, ge=1.0, le=60.0)
 

@@ -10,9 +10,10 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from mavlink_bridge.camera.look_at import LOOKS
 from mavlink_bridge.components import COMMANDS_IN, Components
-from mavlink_bridge.config import Mode
+from mavlink_bridge.config import BridgeConfig, Mode
 from mavlink_bridge.injection.fix_sender import FixSender
 from mavlink_bridge.injection.fix_warnings import FixWarnings
+from mavlink_bridge.injection.gate_memory import NoGoMemory, RestartMemory
 from mavlink_bridge.injection.interlock import ShadowInterlock
 from mavlink_bridge.injection.outcome import InjectionOutcome
 from mavlink_bridge.injection.shadow import ShadowScore
@@ -53,6 +54,12 @@ FC_WANTED = frozenset(
 )
 
 
+def _no_go_memory(config: BridgeConfig) -> NoGoMemory | None:
+    if config.state_file is None:
+        return None
+    return NoGoMemory(RestartMemory(config.state_file.with_name("shadow-no-go.json")))
+
+
 class FlightControllerEnd:
     """Runs in the flight-controller link's thread; only `sender.fixes` is filled from outside.
 
@@ -74,7 +81,11 @@ class FlightControllerEnd:
         self.sender = FixSender(shared, self.origin, self.outcome, teller, self.counters)
         self.sources = SourceOrders(config.switch, commander, teller, self.counters)
         self._interlock = ShadowInterlock(
-            config.injection.force, self.shadow_score, lambda: self.outcome.compared_ns, teller
+            config.injection.force,
+            self.shadow_score,
+            lambda: self.outcome.compared_ns,
+            teller,
+            _no_go_memory(config),
         )
         self.news = VehicleNews(teller)
         self._warnings = FixWarnings(shared, self.sender.injector, teller)
@@ -86,6 +97,14 @@ class FlightControllerEnd:
     def shadow_score(self, now_ns: int) -> ShadowScore:
         """How vision compared with GNSS over the last two minutes."""
         return self.outcome.shadow.score(now_ns, self.sender.injector.refused_yaw_rad)
+
+    def recall(self) -> None:
+        """Before the link begins: what a process that was killed knew."""
+        self._interlock.recall()
+
+    def end(self) -> None:
+        """After the link has ended, in order."""
+        self._interlock.end()
 
     def forbid(self, why: str) -> None:
         """Until it is called with an empty text, nothing begins."""

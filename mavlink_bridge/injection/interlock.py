@@ -10,6 +10,7 @@ from __future__ import annotations
 from collections.abc import Callable
 
 from mavlink_bridge.config import Mode
+from mavlink_bridge.injection.gate_memory import NoGoMemory
 from mavlink_bridge.injection.shadow import MINIMUM_SAMPLES, ShadowScore, gnss_healthy
 from mavlink_bridge.messages import VehicleState
 from mavlink_bridge.texts import Teller
@@ -24,7 +25,7 @@ class ShadowInterlock:
     """Judges with each step of the injection; one thread.
 
     force: `bridge.injection.force`. score: the shadow's verdict now. compared_ns: when a fix was
-    last compared with GNSS, 0 never.
+    last compared with GNSS, 0 never. memory: of what spoke against the map, over a restart.
     """
 
     def __init__(
@@ -33,8 +34,9 @@ class ShadowInterlock:
         score: Callable[[int], ShadowScore],
         compared_ns: Callable[[], int],
         teller: Teller,
+        memory: NoGoMemory | None = None,
     ) -> None:
-        self._force = force
+        self._force, self._memory = force, memory
         self._score = score
         self._compared_ns = compared_ns
         self._teller = teller
@@ -45,6 +47,18 @@ class ShadowInterlock:
         self._against = ""
         self._reason = "not compared with GNSS yet"
         self._open = False
+
+    def recall(self) -> None:
+        """What spoke against the map in a process that was killed speaks against it still."""
+        against = "" if self._memory is None else self._memory.recall()
+        if against:
+            self._against = self._reason = against
+            self._teller.warn("no go, as before the restart")
+
+    def end(self) -> None:
+        """An orderly end: nothing is remembered."""
+        if self._memory is not None:
+            self._memory.stop()
 
     def mode(self, wanted: Mode, state: VehicleState, now_ns: int, *, by_pilot: bool) -> Mode:
         """What may be done of what is wanted. by_pilot: the gate of mode ``rc`` is a person's word:
@@ -113,4 +127,6 @@ class ShadowInterlock:
             # It stays when its samples have aged: what was wrong with GNSS is wrong without. A rate
             # that was too low says nothing of the map: the injection looks at it itself.
             self._against = score.against[0] if score.against else ""
+        if self._memory is not None:
+            self._memory.note(self._against)
         self._reason = self._against or (score.reasons[0] if score.reasons else "")

@@ -17,7 +17,7 @@ import pytest
 
 from mavlink_bridge.bridge import Bridge
 from mavlink_bridge.config import BridgeConfig, RcGateConfig
-from mavlink_bridge.injection.gate_memory import GateMemory
+from mavlink_bridge.injection.gate_memory import GateMemory, NoGoMemory, RestartMemory
 from mavlink_bridge.injection.rc_gate import InjectionGate
 from mavlink_bridge.link.link import sleep_until
 
@@ -25,10 +25,10 @@ _CHILD = """
 import sys, time
 from pathlib import Path
 from mavlink_bridge.config import RcGateConfig
-from mavlink_bridge.injection.gate_memory import GateMemory
+from mavlink_bridge.injection.gate_memory import GateMemory, RestartMemory
 from mavlink_bridge.injection.rc_gate import InjectionGate
 path = Path(sys.argv[1])
-gate = InjectionGate(RcGateConfig(), lambda _: None, GateMemory(path))
+gate = InjectionGate(RcGateConfig(), lambda _: None, GateMemory(RestartMemory(path)))
 if sys.argv[2] == "command":
     gate.command(31010, 1.0)
 else:
@@ -56,12 +56,12 @@ def killed(path: Path, by: str) -> None:
 def restarted(path: Path, later_s: float = 4.0) -> tuple[InjectionGate, list[str]]:
     told: list[str] = []
     kept = json.loads(path.read_text()) if path.exists() else {}
-    memory = GateMemory(
+    memory = RestartMemory(
         path,
         lambda: kept.get("utc_s", 0.0) + later_s,
         lambda: kept.get("clock_s", 0.0) + later_s,
     )
-    gate = InjectionGate(RcGateConfig(), told.append, memory)
+    gate = InjectionGate(RcGateConfig(), told.append, GateMemory(memory))
     gate.recall()
     gate.announce()
     return gate, told
@@ -88,7 +88,7 @@ def test_a_wall_clock_that_is_set_meanwhile_closes_no_gate(tmp_path: Path, step_
     back with its gate closed and the vehicle without a position.
     """
     path, wall, clock = tmp_path / "gate.json", [1e9], [500.0]
-    memory = GateMemory(path, lambda: wall[0], lambda: clock[0], "this run")
+    memory = GateMemory(RestartMemory(path, lambda: wall[0], lambda: clock[0], "this run"))
     memory.opened(by_channel=True)
     while not path.exists():
         pass
@@ -98,7 +98,7 @@ def test_a_wall_clock_that_is_set_meanwhile_closes_no_gate(tmp_path: Path, step_
     def recalled(boot: str, later_s: float) -> tuple[bool, float] | None:
         path.write_text(left)
         path.chmod(0o600)
-        again = GateMemory(path, lambda: wall[0], lambda: clock[0] + later_s, boot)
+        again = GateMemory(RestartMemory(path, lambda: wall[0], lambda: clock[0] + later_s, boot))
         try:
             return again.recall()
         finally:
@@ -134,11 +134,22 @@ def test_a_damaged_file_or_another_users_is_ignored(tmp_path: Path, text: str) -
     path = tmp_path / "gate.json"
     path.write_text(text)
     path.chmod(0o600)
-    memory = GateMemory(path)
+    memory = GateMemory(RestartMemory(path))
     assert memory.recall() is None
     path.write_text(json.dumps({"open": True, "by_channel": False, "utc_s": 1000.0}))
     path.chmod(0o666)
     assert memory.recall() is None
+    memory.stop()
+
+
+@pytest.mark.parametrize("against", ["", 5, None, "\x1b[2J", ["x"]])
+def test_a_no_go_of_nonsense_is_none(tmp_path: Path, against: object) -> None:
+    path = tmp_path / "no-go.json"
+    stamps = {"utc_s": time.time(), "boot": "", "clock_s": 0.0}
+    path.write_text(json.dumps({"against": against} | stamps))
+    path.chmod(0o600)
+    memory = NoGoMemory(RestartMemory(path))
+    assert memory.recall() == ""
     memory.stop()
 
 
@@ -156,7 +167,7 @@ def test_an_orderly_end_in_the_middle_of_a_write_leaves_no_open_gate(
                 memory.stop()
 
     monkeypatch.setattr(os, "fsync", ordered_to_end)
-    memory = GateMemory(path)
+    memory = GateMemory(RestartMemory(path))
     memory.opened(by_channel=False)
     assert ends.wait(20.0)
     memory.stop()

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
+from pathlib import Path
 from typing import Any
 
 import pytest
@@ -54,6 +55,38 @@ def test_a_map_20_m_off_is_neither_injected_nor_switched_to(
     assert flight.vision() == []
     assert orders(flight) == []
     assert told(flight, "GNSS lost")[0] == "GNSS lost, nothing is injected"
+
+
+def test_a_map_20_m_off_is_as_wrong_after_a_restart_under_denial(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    """The process that had seen it was killed, the next one had nothing to compare with: after two
+    seconds it injected.
+    """
+    gate, file = tmp_path / "gate.json", tmp_path / "shadow-no-go.json"
+    killed = on_gnss(monkeypatch, state_file=gate)
+    killed.north_m = 20.0
+    killed.run(15.0)
+    assert killed.vision() == []
+    while not file.exists():  # written by its own thread
+        pass
+    again = on_gnss(monkeypatch, state_file=gate)
+    again.north_m, again.gnss_north_m = 20.0, None
+    again.end.recall()
+    again.run(30.0)
+    assert again.vision() == []
+    assert told(again, "no go") == [
+        "no go, as before the restart", "not sent: no go: median error 20.0 m",
+    ]  # fmt: skip
+    # It is mended: GNSS comes back and agrees.
+    again.gnss_north_m = again.north_m = 0.0
+    again.run(150.0)
+    assert again.vision()
+    while file.exists():
+        pass
+    for flight in (killed, again):
+        flight.end.end()
+    assert not file.exists()
 
 
 def test_a_right_map_is_injected_after_the_go_and_switched_to_when_gnss_is_lost(
