@@ -34,7 +34,9 @@ class _Frozen(BaseModel):
 
 
 class _PlacesSection(_Frozen):
-    """What every place and visit is made of. workers: processes that make them."""
+    """What every place and visit is made of. styles: share of the days that look like one of
+    `places.styles`; workers: processes that make them.
+    """
 
     first_seed: int = Field(ge=1000, lt=2**31)
     scenes: int = Field(gt=0, lt=2**31)
@@ -42,6 +44,7 @@ class _PlacesSection(_Frozen):
     photo_groups: tuple[str, ...]
     photo_share: float = Field(ge=0.0, le=1.0)
     light_variety: bool
+    styles: _Share = 0.0
     appearance: bool
     workers: int = Field(gt=0, le=_MOST_WORKERS)
 

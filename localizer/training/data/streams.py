@@ -63,7 +63,9 @@ def schedule(data: DataSection) -> Schedule:
 
 def scene_config(data: DataSection | LiveSection) -> SceneConfig:
     """What the generator needs of a run's configuration."""
-    scenes = SceneConfig(photo_share=data.photo_share, light_variety=data.light_variety)
+    scenes = SceneConfig(
+        photo_share=data.photo_share, light_variety=data.light_variety, styles=data.styles
+    )
     width, height = data.image
     scenes = replace(scenes, width=width, height=height)
     return scenes if isinstance(data, DataSection) else replace(scenes, cells=data.cells)

@@ -1,12 +1,15 @@
 """Seasons' styles: each changes what it should, and places drawn without them stay as they were."""
 
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
 
 from localizer.synth.appearance.thermal import THERMAL_CONDITIONS
+from localizer.training.config import load_config
 from localizer.training.data.pairs import SceneConfig, draw_visit, scene_pairs, visit_of
+from localizer.training.data.streams import scene_config
 from localizer.training.places.land import generated_place
 from localizer.training.places.styles import LAMPS, STYLES, styled_ground, styled_light
 
@@ -83,3 +86,10 @@ def test_styles_are_drawn_where_they_are_asked_for() -> None:
     assert {v.style for v in drawn} == {*STYLES, None}
     assert {v.weather for v in drawn if v.style == LAMPS} == {"night"}
     assert visit_of(rng, "mown").style == "mown"
+
+
+@pytest.mark.parametrize("name", ["train_tiny", "train_s0"])  # pairs on disk, and live ones
+def test_a_run_says_how_many_of_its_days_have_a_style(name: str) -> None:
+    data = load_config(Path(__file__).parents[3] / "configs" / f"{name}.yaml").data
+    assert scene_config(data).styles == 0.0
+    assert scene_config(data.model_copy(update={"styles": 0.3})).styles == 0.3
