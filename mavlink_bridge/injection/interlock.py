@@ -68,10 +68,19 @@ class ShadowInterlock:
         if wanted != "inject":
             if by_pilot:
                 self._open = False  # its next opening is told again
+            self._remember()
             return wanted
         if not self._open and state.connected:
             self._open = self._may_begin(now_ns, by_pilot=by_pilot)
+        self._remember()
         return "inject" if self._open else "shadow"
+
+    def _remember(self) -> None:
+        """Not while it injects: a beginning is not taken back, by a restart no more than by a
+        receiver that is led astray meanwhile.
+        """
+        if self._memory is not None:
+            self._memory.note("" if self._open else self._against)
 
     @property
     def reason(self) -> str:
@@ -127,6 +136,4 @@ class ShadowInterlock:
             # It stays when its samples have aged: what was wrong with GNSS is wrong without. A rate
             # that was too low says nothing of the map: the injection looks at it itself.
             self._against = score.against[0] if score.against else ""
-        if self._memory is not None:
-            self._memory.note(self._against)
         self._reason = self._against or (score.reasons[0] if score.reasons else "")

@@ -4,12 +4,14 @@ from __future__ import annotations
 
 from collections import Counter
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from mavlink_bridge.config import InjectionConfig, RcGateConfig, SourceSwitchConfig
+from mavlink_bridge.injection.gate_memory import NoGoMemory
 from mavlink_bridge.injection.interlock import ShadowInterlock
 from mavlink_bridge.injection.rc_gate import InjectionGate
 from mavlink_bridge.injection.shadow import ShadowScore
@@ -87,6 +89,32 @@ def test_a_map_20_m_off_is_as_wrong_after_a_restart_under_denial(
     for flight in (killed, again):
         flight.end.end()
     assert not file.exists()
+
+
+@pytest.mark.parametrize(("begins", "kept"), [(True, []), (False, ["20 m off"])])
+def test_only_who_never_began_is_kept_from_beginning_by_a_restart(
+    begins: bool, kept: list[str]
+) -> None:
+    """A receiver that is led astray while vision is flown on speaks against it, too: without the
+    restart it is flown on.
+    """
+    told: list[str] = []
+    file: Any = SimpleNamespace(
+        keep=lambda what: told.append(what["against"]), drop=lambda: told.append(""),
+        recall=lambda: None,
+    )  # fmt: skip
+    scores = [ShadowScore(begins, 100, () if begins else ("3.0 Hz, needs 4",))]
+    interlock = ShadowInterlock(
+        False, lambda _: scores[-1], lambda: SECOND, Teller(lambda *_: None), NoGoMemory(file)
+    )
+    interlock.recall()
+    for second, against in ((1, ()), (2, ("20 m off",)), (4, ("20 m off",))):
+        if against:
+            scores.append(ShadowScore(False, 100, against, against=against))
+        state = VehicleState(connected=True, gps_fix_type=3, gps_time_ns=second * SECOND)
+        mode = interlock.mode("inject", state, second * SECOND, by_pilot=False)
+        assert mode == ("inject" if begins else "shadow")
+    assert told == kept
 
 
 def test_a_right_map_is_injected_after_the_go_and_switched_to_when_gnss_is_lost(
