@@ -24,7 +24,7 @@ from typing import Any
 import numpy as np
 
 from benchmarks.common.arguments import Parser, existing, output
-from benchmarks.common.figures import write_figures
+from benchmarks.common.figures import show_figures
 from benchmarks.common.named_errors import named_errors
 from companion.flight.priors import drift_sigma_m
 
@@ -168,10 +168,7 @@ def main() -> None:
     if not found:
         p.error(f"{args.flights}: no flight with a loss that the companion told")
     rows = table(found)
-    for row in (COLUMNS, *rows):
-        print("| " + " | ".join(row) + " |")
-    if args.json:
-        write_figures(args.json, COLUMNS, rows)
+    show_figures(args.json, COLUMNS, rows)
 
 
 if __name__ == "__main__":

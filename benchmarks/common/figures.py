@@ -1,4 +1,4 @@
-"""A benchmark's table as JSON, so that the documentation's tables are made and not copied."""
+"""A benchmark's table, printed, and as JSON: the documentation's tables are made, not copied."""
 
 from __future__ import annotations
 
@@ -8,6 +8,22 @@ from pathlib import Path
 from typing import Any
 
 from companion.versions import made_by
+
+
+def markdown(columns: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
+    """Cells as a table of Markdown."""
+    head, *lines = ("| " + " | ".join(line) + " |" for line in (columns, *rows))
+    return "\n".join([head, "|" + "---|" * len(columns), *lines])
+
+
+def show_figures(
+    path: Path | None, columns: Sequence[str], rows: Sequence[Sequence[str]],
+    more: dict[str, Any] | None = None,
+) -> None:  # fmt: skip
+    """Print the table, and write it where `path` is given, as `write_figures` does."""
+    print(markdown(columns, rows))
+    if path is not None:
+        write_figures(path, columns, rows, more)
 
 
 def write_figures(

@@ -17,7 +17,7 @@ from pathlib import Path
 import numpy as np
 
 from benchmarks.common.arguments import Parser, existing, number, output
-from benchmarks.common.figures import write_figures
+from benchmarks.common.figures import show_figures
 from benchmarks.common.named_errors import named_errors
 from companion.config import load_config
 from companion.errors import RecordError
@@ -141,10 +141,7 @@ def main() -> None:
     parser.add_argument("--json", type=output, help="the table")
     args = parser.parse_args()
     rows = table([read_told(f, args.recorded) for f in args.flights], args.lengths)
-    for row in (COLUMNS, ["---"] * len(COLUMNS), *rows):
-        print("| " + " | ".join(row) + " |")
-    if args.json:
-        write_figures(args.json, COLUMNS, rows)
+    show_figures(args.json, COLUMNS, rows)
 
 
 if __name__ == "__main__":

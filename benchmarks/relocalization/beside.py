@@ -27,7 +27,7 @@ import numpy as np
 from benchmarks.basin.views import View, load_views
 from benchmarks.common.arguments import Parser, existing, number, output, whole
 from benchmarks.common.deadline import deadline
-from benchmarks.common.figures import write_figures
+from benchmarks.common.figures import show_figures
 from benchmarks.common.named_errors import named_errors
 from benchmarks.relocalization.run import RIGHT_DEG, RIGHT_M, Search, with_threads
 from localizer.config import LocalizerConfig
@@ -222,10 +222,7 @@ def main() -> None:
     if not kept:
         raise RuntimeError("no view was tracked: nothing was measured")
     rows = table(shares(kept))
-    for row in (COLUMNS, *rows):
-        print("| " + " | ".join(row) + " |")
-    if args.json:
-        write_figures(args.json, COLUMNS, rows, shares(kept))
+    show_figures(args.json, COLUMNS, rows, shares(kept))
 
 
 if __name__ == "__main__":

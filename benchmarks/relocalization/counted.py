@@ -18,7 +18,7 @@ from pathlib import Path
 from typing import Any
 
 from benchmarks.common.arguments import Parser, existing, output
-from benchmarks.common.figures import write_figures
+from benchmarks.common.figures import show_figures
 from benchmarks.common.named_errors import named_errors
 from benchmarks.common.shares import exact_interval
 
@@ -81,10 +81,7 @@ def main() -> None:
     if not found:
         raise RuntimeError("no relocalization in these files")
     made = cells(found)
-    for row in (COLUMNS, *made):
-        print("| " + " | ".join(row) + " |")
-    if args.json:
-        write_figures(args.json, COLUMNS, made)
+    show_figures(args.json, COLUMNS, made)
 
 
 def _rows(path: Path) -> list[dict[str, Any]]:

@@ -30,7 +30,7 @@ import numpy as np
 from benchmarks.basin.views import SIZE, ground_height
 from benchmarks.common.arguments import Parser, existing, number, output, whole
 from benchmarks.common.deadline import deadline
-from benchmarks.common.figures import write_figures
+from benchmarks.common.figures import markdown, write_figures
 from benchmarks.common.named_errors import named_errors, needs_torch
 from benchmarks.common.shares import exact_interval
 from benchmarks.odometry.stretches import Plan, Stretch, make_stretch
@@ -328,8 +328,7 @@ def cells(rows: Sequence[dict[str, object]]) -> list[tuple[str, ...]]:
 
 def table(rows: Sequence[dict[str, object]]) -> str:
     """One line a row."""
-    lines = (COLUMNS, tuple("---" for _ in COLUMNS), *cells(rows))
-    return "\n".join("| " + " | ".join(line) + " |" for line in lines)
+    return markdown(COLUMNS, cells(rows))
 
 
 def main() -> None:

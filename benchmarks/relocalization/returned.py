@@ -19,7 +19,7 @@ from pathlib import Path
 import numpy as np
 
 from benchmarks.common.arguments import Parser, existing, number, output
-from benchmarks.common.figures import write_figures
+from benchmarks.common.figures import show_figures
 from benchmarks.common.named_errors import named_errors
 from companion.config import load_config
 from companion.offline.replay import read_estimates
@@ -106,10 +106,7 @@ def main() -> None:
         (r.flight, f"{r.gap_s:.1f}", "never" if r.found_s is None else f"{r.found_s:.1f}")
         for r in found
     ]
-    for row in (COLUMNS, *rows):
-        print("| " + " | ".join(row) + " |")
-    if args.json:
-        write_figures(args.json, COLUMNS, rows, {"returns": [asdict(r) for r in found]})
+    show_figures(args.json, COLUMNS, rows, {"returns": [asdict(r) for r in found]})
 
 
 if __name__ == "__main__":

@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from benchmarks.basin.views import View
+from benchmarks.common.figures import markdown
 from benchmarks.common.shares import exact_interval
 from localizer.config import LocalizerConfig
 from localizer.evaluation.places import KnownOfPlace
@@ -152,8 +153,7 @@ def _row(name: str, known: bool, condition: str, some: Sequence[Outcome]) -> tup
 
 def table(outcomes: Sequence[Outcome]) -> str:
     """As Markdown has it."""
-    lines = (COLUMNS, tuple("---" for _ in COLUMNS), *cells(outcomes))
-    return "\n".join("| " + " | ".join(line) + " |" for line in lines)
+    return markdown(COLUMNS, cells(outcomes))
 
 
 def with_threads(config: LocalizerConfig, threads: int) -> LocalizerConfig:

@@ -14,6 +14,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
+from benchmarks.common.figures import markdown
 from companion.errors import ReportError
 
 DATA = Path("docs/results/data")
@@ -30,8 +31,7 @@ class Table:
     @property
     def markdown(self) -> str:
         """As Markdown has it."""
-        head, *rows = ("| " + " | ".join(line) + " |" for line in (self.columns, *self.rows))
-        return "\n".join([head, "|" + "---|" * len(self.columns), *rows])
+        return markdown(self.columns, self.rows)
 
 
 @dataclass(frozen=True)
