@@ -42,7 +42,9 @@ def without_lost_disks(
         """Of what is read, too: without a disk that answers there is nothing to read."""
         return path if path is None or lost.get(path.parent) != _STILL else None
 
-    tlog = bridge.tlog if bridge.tlog is None or bridge.tlog.parent not in lost else None
+    tlog = kept(bridge.tlog)
+    if tlog is not None and tlog.parent in lost and not os.access(tlog, os.W_OK):
+        tlog = None  # one that is there is appended to, though its folder takes no other
     changed = config.model_copy(
         update={
             "record": None if beside in lost else record,

@@ -53,6 +53,15 @@ def test_one_disk_of_two(tmp_path: Path) -> None:
     assert told == f"{stick}: Not a directory" or str(stick) in told
 
 
+def test_a_log_that_is_there_is_appended_to(tmp_path: Path) -> None:
+    (tmp_path / "a.tlog").touch()
+    config = deployment(tmp_path, tlog=str(tmp_path / "a.tlog"))
+    left, told = without_lost_disks(config, lambda _: "Permission denied")
+    assert left.bridge.tlog == tmp_path / "a.tlog"
+    assert left.record is None
+    assert told == f"{tmp_path}: Permission denied"
+
+
 def test_a_disk_that_stands_still_is_not_even_read(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
