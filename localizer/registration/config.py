@@ -41,6 +41,9 @@ class JNGOConfig(BaseModel):
     preselected_from_m: float = Field(
         default=2.0, ge=0, le=1e4, description="position sigma from which a prior is wide"
     )
+    preselected_to_m: float = Field(
+        default=50.0, ge=0, le=1e4, description="and up to which; one view shows no more of a map"
+    )
     spread_sigmas: float = Field(
         default=2.2, ge=0.01, le=100, description="grid half-width in prior sigmas"
     )

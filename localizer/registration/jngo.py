@@ -301,10 +301,11 @@ def _beginning(
     coarsest level's cost where they are; which are drawn (registration.md, section 6).
     """
     R, t = camera_from_local(*c.swarm(prior, seed), origin)
-    widest = max(float(np.linalg.eigvalsh(prior.covariance[:3, :3])[-1]), 0.0) ** 0.5
+    variance = float(np.linalg.eigvalsh(prior.covariance[:3, :3])[-1])
+    wide = c.preselected_from_m**2 <= variance <= c.preselected_to_m**2
     # A cell of a larger picture is a smaller turn, so that as many draws would leave gaps.
     count = round(c.preselected * problem.confidence.size / _CELLS)
-    if count == 0 or widest < c.preselected_from_m:
+    if count == 0 or not wide:
         return R, t, np.zeros(len(R), bool)
     Rd, td = camera_from_local(*draw_hypotheses(prior, count, seed), origin)
     few = thinned(problem, _PRESELECTING_ANCHORS)

@@ -91,12 +91,19 @@ def test_a_narrow_prior_draws_nothing_and_a_wide_one_any_number(scene, prior, co
     assert found.status is RegistrationStatus.OK
 
 
-def test_draws_that_all_look_elsewhere_leave_the_swarm(scene_factory, prior):
+def test_a_prior_wider_than_a_view_draws_nothing(scene, prior):
+    """A whole map is for the search: one view's match with what lies 100 m away is chance."""
+    arguments = (scene.query, scene.camera, scene.anchors, prior(scene.reference, 51.0, 5.0))
+    drawing, plain = JNGO(), JNGO(JNGOConfig(preselected=0))
+    poses = [o.register(*arguments).world_from_camera.matrix for o in (drawing, plain)]
+    np.testing.assert_array_equal(*poses)
+
+
+def test_draws_that_all_look_elsewhere_leave_the_swarm(scene, prior):
     """No draw of a prior of kilometres sees the anchors; the swarm about its middle does."""
-    scene = scene_factory(11, 2.0, 1.5)
-    result = JNGO().register(
-        scene.query, scene.camera, scene.anchors, prior(scene.reference, 1e5, 5.0)
-    )
+    anywhere = JNGO(JNGOConfig(preselected_to_m=1e4))
+    about = prior(scene.reference, 9e3, 5.0)
+    result = anywhere.register(scene.query, scene.camera, scene.anchors, about)
     assert result.world_from_camera.distance_to(scene.true)[0] < 0.5
 
 
