@@ -49,8 +49,15 @@ RUNS_ALONE = (
 # Where the parts find what is dear to build (tests/conftest.py); a folder that lives as long.
 SHARED_FOLDER = "PILOT_TEST_SHARED"
 
-# A file's tests share its fixtures, so one worker runs them; a core for each of two workers.
-_WORKERS = ("--numprocesses=2", "--dist=loadfile")
+# A file's tests share its fixtures, so one worker runs them; a core for each of two workers. A
+# worker that a test crashes is not replaced, because xdist would run that test again, for ever.
+WORKERS = ("--numprocesses=2", "--dist=loadfile", "--max-worker-restart=0")
+
+# A test that hangs ends its process, and every thread's stack is printed.
+PATIENCE_S = 900
+_PATIENT = (f"faulthandler_timeout={PATIENCE_S}", "faulthandler_exit_on_timeout=true")
+HANGS_END = tuple(f"--override-ini={setting}" for setting in _PATIENT)
+
 _ONE_CORE = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "NUMBA_NUM_THREADS"), "1")
 
 # Behind everything else: the tests get a processor as soon as they want one.
@@ -82,11 +89,11 @@ def main(arguments: Sequence[str]) -> int:
     with tempfile.TemporaryDirectory(prefix="tests-") as shared, _beside(_MYPY) as types:
         common = {**os.environ, SHARED_FOLDER: str(Path(shared).resolve())}
         codes = {
-            SIDE_BY_SIDE: _run(SIDE_BY_SIDE, [*_WORKERS, *arguments], common | _ONE_CORE),
+            SIDE_BY_SIDE: _run(SIDE_BY_SIDE, [*WORKERS, *arguments], common | _ONE_CORE),
         }
         types_code = _told(types)  # before what needs its processors for itself
         codes |= {
-            VEHICLES: _run(VEHICLES, [*_WORKERS, *arguments], common | _ONE_CORE),
+            VEHICLES: _run(VEHICLES, [*WORKERS, *arguments], common | _ONE_CORE),
             ALONE: _run(ALONE, arguments, common),
         }
     outcome = ", ".join(f"{part} part: {_word(code)}" for part, code in codes.items())
@@ -95,7 +102,7 @@ def main(arguments: Sequence[str]) -> int:
 
 
 def _run(part: str, arguments: Sequence[str], environment: Mapping[str, str]) -> int:
-    command = [sys.executable, "-m", "pytest", f"--part={part}", *arguments]
+    command = [sys.executable, "-m", "pytest", f"--part={part}", *HANGS_END, *arguments]
     return subprocess.run(command, env=environment, check=False).returncode
 
 

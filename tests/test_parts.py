@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import re
+import subprocess
+import sys
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -11,10 +13,13 @@ import pytest
 from tests.parts import (
     ALONE,
     FLIES,
+    HANGS_END,
     PARTS,
+    PATIENCE_S,
     RUNS_ALONE,
     SIDE_BY_SIDE,
     VEHICLES,
+    WORKERS,
     main,
     part_of,
     together,
@@ -86,6 +91,27 @@ def test_the_parts_run_after_a_failure_of_the_first(monkeypatch, capsys):
     assert all(command[-2:] == ["-k", "pose"] for command in commands)
     said = capsys.readouterr().out
     assert "side-by-side part: FAILED (1), vehicles part: passed, alone part: passed" in said
+
+
+@pytest.mark.parametrize(
+    ("ends_badly", "said"),
+    [
+        ("ctypes.string_at(0)", "Segmentation fault"),
+        ("time.sleep(600)", "Timeout"),
+    ],
+)
+def test_a_test_that_crashes_or_hangs_is_named_and_the_run_ends(tmp_path, ends_badly, said):
+    suite = f"import ctypes, time\ndef test_before(): pass\ndef test_bad(): {ends_badly}\n"
+    (tmp_path / "test_bad.py").write_text(suite)
+    (tmp_path / "test_good.py").write_text("def test_good(): pass\n")
+    soon = [option.replace(f"={PATIENCE_S}", "=1") for option in HANGS_END]
+    command = [sys.executable, "-m", "pytest", *WORKERS, *soon, "--rootdir=.", "."]
+    ended = subprocess.run(
+        command, cwd=tmp_path, capture_output=True, text=True, timeout=120, check=False
+    )
+    assert ended.returncode == 1
+    assert "crashed while running 'test_bad.py::test_bad'" in ended.stdout
+    assert said in ended.stderr
 
 
 @pytest.mark.parametrize(

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import mmap
+from pathlib import Path
+
 import numpy as np
 import pytest
 
@@ -44,12 +47,33 @@ def test_a_missing_barrier_shows_in_the_order_of_threads(run):
         ("divergent_barrier", "threads wait for each other"),
         ("missing_lanes", "threads wait for each other"),
         ("beyond_the_end", "access outside an allocation"),
+        ("far_beyond", "access outside an allocation"),
+        ("far_before", "access outside an allocation"),
     ],
 )
 def test_undefined_behaviour_is_an_error(emulator, run, kernel, text):
     with pytest.raises(CudaError, match="LAUNCH_FAILED"):
         run(kernel)
     assert text in emulator.problem()
+
+
+def test_nothing_of_the_process_lies_where_a_wrong_index_may_write(emulator):
+    device, reach = emulator.device, 1 << 22  # bytes; "far_beyond" goes a quarter of it
+    page = mmap.PAGESIZE
+    address = device.allocate(page)
+    assert address % page == 0
+    for start, end, rights in _mappings():
+        near = start < address + page + reach and end > address - reach
+        assert not near or rights == "---p" or (start, end) == (address, address + page)
+    device.free(address)
+    assert all(rights == "---p" for start, end, rights in _mappings() if start <= address < end)
+
+
+def _mappings() -> list[tuple[int, int, str]]:
+    """This process's memory: first address, end and rights of each mapping."""
+    lines = [line.split() for line in Path("/proc/self/maps").read_text().splitlines()]
+    spans = [(line[0].split("-"), line[1]) for line in lines]
+    return [(int(start, 16), int(end, 16), rights) for (start, end), rights in spans]
 
 
 def test_shared_memory_starts_as_rubbish(run):

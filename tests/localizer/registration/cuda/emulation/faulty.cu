@@ -33,7 +33,12 @@ void missing_lanes(const Arguments a) {
     if (threadIdx.x % 32 < 16) a.values[threadIdx.x] = __shfl_xor_sync(0xffffffffu, 1, 1);
 }
 
-void beyond_the_end(const Arguments a) { a.values[4096 * (int)(1 + threadIdx.x)] = 1; }
+void beyond_the_end(const Arguments a) { a.values[a.count + (int)threadIdx.x] = 1; }
+
+// A whole array's length off, as with a wrong stride.
+void far_beyond(const Arguments a) { a.values[4096 * (int)(1 + threadIdx.x)] = 1; }
+
+void far_before(const Arguments a) { a.values[-4096 * (int)(1 + threadIdx.x)] = 1; }
 
 // Shared memory is not zero at the start.
 void uninitialised(const Arguments a) {

@@ -31,6 +31,8 @@
     KERNEL(divergent_barrier, Arguments) \
     KERNEL(missing_lanes, Arguments)    \
     KERNEL(beyond_the_end, Arguments)   \
+    KERNEL(far_beyond, Arguments)       \
+    KERNEL(far_before, Arguments)       \
     KERNEL(uninitialised, Arguments)
 #else
 #define KERNELS                                         \

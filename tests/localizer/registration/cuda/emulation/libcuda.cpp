@@ -1,5 +1,5 @@
 // A stand-in for the NVIDIA driver, for tests: the part of its interface that the product calls, over
-// host memory. Allocations lie between guard pages; a new allocation holds NaN, a freed one faults.
+// host memory. Allocations lie between guards; a new allocation holds NaN, a freed one faults.
 // An image is "emulated:PATH" of a library with the emulated kernels; streams run at once. It shows
 // no device until stand_in_enable(1), so that code under test elsewhere in the process sees none.
 #include <dlfcn.h>
@@ -21,7 +21,11 @@ enum Result { success = 0, invalid_value = 1, no_device = 100, invalid_image = 2
               launch_failed = 719, capture_unsupported = 900 };
 using Kernel = int (*)(void**, unsigned, unsigned, unsigned, char*, size_t);
 struct Function { Kernel kernel; size_t bytes; };  // bytes: of its one parameter
-struct Block { char* base; size_t pages; size_t size; };
+struct Block { char* base; size_t bytes; size_t size; };
+
+// Addresses without memory on both sides of an allocation: a kernel whose index is wrong by less
+// writes there, which is noticed, and not into the memory of the process that runs the tests.
+constexpr size_t guard = size_t{4} << 20;
 
 std::recursive_mutex lock;
 bool enabled = false;
@@ -89,13 +93,13 @@ API cuStreamCreate(void** stream, unsigned) { *stream = new int(0); return succe
 API cuMemAlloc(uintptr_t* address, size_t size) {
     std::lock_guard<std::recursive_mutex> hold(lock);
     const size_t page = sysconf(_SC_PAGESIZE), aligned = (size + 15) / 16 * 16;
-    const size_t pages = (aligned + page - 1) / page + 2;
-    char* base = (char*)mmap(nullptr, pages * page, PROT_NONE, MAP_PRIVATE | MAP_ANONYMOUS, -1, 0);
+    const size_t held = (aligned + page - 1) / page * page, bytes = held + 2 * guard;
+    char* base = (char*)mmap(nullptr, bytes, PROT_NONE, MAP_PRIVATE | MAP_ANONYMOUS, -1, 0);
     if (base == MAP_FAILED) return 2;
-    mprotect(base + page, (pages - 2) * page, PROT_READ | PROT_WRITE);
-    std::memset(base + page, 0xff, (pages - 2) * page);
-    *address = (uintptr_t)base + (pages - 1) * page - aligned;
-    blocks[*address] = {base, pages, size};
+    mprotect(base + guard, held, PROT_READ | PROT_WRITE);
+    std::memset(base + guard, 0xff, held);
+    *address = (uintptr_t)base + guard + held - aligned;
+    blocks[*address] = {base, bytes, size};
     ++allocations;
     return success;
 }
@@ -103,7 +107,9 @@ API cuMemFree(uintptr_t address) {
     std::lock_guard<std::recursive_mutex> hold(lock);
     auto found = blocks.find(address);
     if (found == blocks.end()) return invalid_value;
-    mprotect(found->second.base, found->second.pages * sysconf(_SC_PAGESIZE), PROT_NONE);
+    // The addresses stay taken, so that a late access faults; the memory goes back.
+    const Block& block = found->second;
+    mmap(block.base, block.bytes, PROT_NONE, MAP_PRIVATE | MAP_ANONYMOUS | MAP_FIXED, -1, 0);
     blocks.erase(found);
     return success;
 }
