@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 from localizer.errors import MapCacheError
 from localizer.geometry.pose import Array
 from localizer.map.cache.cache import INDEX_NAME, MANIFEST_NAME, Manifest, TileIndex, encode_tile
+from localizer.map.cache.hold import replacing
 from localizer.map.cache.tile import build_mips, texel_coverage
 from localizer.map.source import SourceMesh
 from localizer.types import Image
@@ -111,6 +112,8 @@ def staging(out: Path, parameters: dict[str, Any], *, overwrite: bool) -> Iterat
         )
     if out.exists() and not (out / MANIFEST_NAME).is_file() and not _is_empty(out):
         raise MapCacheError(f"{out} is no tile cache and is not overwritten; choose another folder")
+    with replacing(out):
+        pass  # known before the work; whoever opens it meanwhile is found by `publish`
     folder = out.with_name(out.name + ".building")
     try:
         folder.mkdir(parents=True, exist_ok=True)
@@ -132,18 +135,19 @@ def staging(out: Path, parameters: dict[str, Any], *, overwrite: bool) -> Iterat
 
 
 def publish(staged: Staging, out: Path, index: TileIndex, manifest: Manifest) -> Manifest:
-    """Write index and manifest and rename the folder to `out`; nothing is half done after it."""
+    """Write index and manifest and rename the folder to `out`; nothing is half done after it.
+    MapCacheError while someone reads what is there: the next try publishes what is staged.
+    """
     folder = staged.folder
     digest = index.save(folder / INDEX_NAME)
     final = manifest.model_copy(update={"index_sha256": digest})
     _write(folder / MANIFEST_NAME, final.model_dump_json(indent=1).encode())
-    for name in ("records", "parts"):
-        shutil.rmtree(folder / name, ignore_errors=True)
-    for name in ("build.json", "lock"):
-        (folder / name).unlink(missing_ok=True)
-    with TemporaryDirectory(prefix=f"{out.name}.old-", dir=out.parent) as old:
+    # Renamed now and deleted after that, so that nobody who opens the cache finds it locked.
+    with TemporaryDirectory(prefix=f"{out.name}.old-", dir=out.parent) as old, replacing(out):
+        for name in ("records", "parts", "build.json", "lock"):
+            (folder / name).rename(Path(old) / name)
         if out.exists():
-            out.rename(Path(old) / out.name)
+            out.rename(Path(old) / "replaced")
         folder.rename(out)
     return final
 

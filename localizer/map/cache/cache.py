@@ -138,7 +138,7 @@ class TileCache:
     def open(cls, path: Path) -> TileCache:
         """Open a cache folder; raises `MapCacheError` when it is missing, corrupt or too new."""
         path = Path(path)
-        manifest = _read_manifest(path)
+        manifest = read_manifest(path)
         try:
             data = plain_bytes(path / INDEX_NAME, None)
         except OSError as error:
@@ -265,7 +265,8 @@ def _decode_image(data: NDArray[np.uint8]) -> Image:
     return decoded
 
 
-def _read_manifest(path: Path) -> Manifest:
+def read_manifest(path: Path) -> Manifest:
+    """What the cache folder `path` says about itself; `MapCacheError` as `TileCache.open`."""
     where = path / MANIFEST_NAME
     if not where.is_file():
         raise MapCacheError(

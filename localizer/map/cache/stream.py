@@ -19,8 +19,9 @@ from numpy.typing import NDArray
 from localizer.errors import MapCacheError
 from localizer.geometry.camera import Camera
 from localizer.geometry.pose import Pose
-from localizer.map.cache.cache import TileCache
+from localizer.map.cache.cache import TileCache, read_manifest
 from localizer.map.cache.failed_nodes import FailedNodes
+from localizer.map.cache.hold import Hold
 from localizer.map.cache.resident_nodes import ResidentNodes
 from localizer.map.cache.select import DetailLimits, Selection, TileSelector
 from localizer.map.cache.tile import TileMesh
@@ -62,7 +63,8 @@ class TileStreamer:
         bytes_per_select: int = 64 << 20,
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
-        """Start the loader thread.
+        """Start the loader thread, and hold the cache: until `close` no build replaces it.
+        MapCacheError where one has since it was opened.
 
         byte_budget: of decoded tiles. max_error_px, max_texel_px: see `DetailLimits`.
         bytes_per_select: how much new data one selection may bring in, so that a renderer that has
@@ -84,6 +86,7 @@ class TileStreamer:
         self._bytes_per_select = bytes_per_select
         self._protected: set[int] = set()  # in the current view
         self._closed = self._waiting = False
+        self._hold = _held(cache)
         self._thread = threading.Thread(target=self._run, name="tile-loader", daemon=True)
         self._thread.start()
 
@@ -168,6 +171,7 @@ class TileStreamer:
         with self._lock:
             self._arrived.clear()
             self._nodes.clear()
+        self._hold.close()
 
     def __enter__(self) -> TileStreamer:
         return self
@@ -247,6 +251,17 @@ class TileStreamer:
             self._arrived_bytes -= size
             taken += size
             self._nodes.add(node, meshes, keep=self._protected, beside=self._arrived_bytes)
+
+
+def _held(cache: TileCache) -> Hold:
+    hold = Hold(cache.path)
+    try:
+        if read_manifest(cache.path).index_sha256 != cache.manifest.index_sha256:
+            raise MapCacheError(f"{cache.path}: was built again since it was opened")
+    except BaseException:
+        hold.close()
+        raise
+    return hold
 
 
 def _load(cache: TileCache, node: int) -> list[TileMesh] | MapCacheError:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import json
 import os
 import shutil
@@ -9,6 +10,8 @@ import signal
 import subprocess
 import sys
 import time
+from contextlib import ExitStack
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -19,6 +22,7 @@ from localizer.geometry.pose import Pose
 from localizer.map.building.build import build_cache
 from localizer.map.building.options import BuildOptions
 from localizer.map.cache.cache import TileCache, decode_tile, encode_tile
+from localizer.map.cache.stream import TileStreamer
 from localizer.map.cache.tile import TileMesh, build_mips, texel_coverage
 
 
@@ -314,6 +318,66 @@ def test_overwrite_replaces_the_cache(source, tmp_path):
     assert not (out / "mark").exists()
     assert TileCache.open(out).manifest.tiles == 21
     assert [p.name for p in tmp_path.iterdir() if p.name.startswith("c")] == ["c"]
+
+
+def test_a_cache_that_a_flight_has_open_is_not_replaced(source, tmp_path):
+    """Its tiles are read for as long as it flies: another map's are not those of its index."""
+    out = tmp_path / "c"
+    build_cache(source, out, BuildOptions(workers=1))
+    again = BuildOptions(workers=1, overwrite=True)
+    with TileStreamer(TileCache.open(out)) as flight, TileStreamer(TileCache.open(out)):
+        with pytest.raises(MapCacheError, match=r"flight.*another folder"):
+            build_cache(source, out, again)
+        assert not (tmp_path / "c.building").exists()  # known before the work and not after it
+        assert flight.cache.load_tile(20).faces.size
+    assert build_cache(source, out, again).tiles == 21
+
+
+def test_a_cache_that_is_opened_while_its_successor_is_built_stays(source, tmp_path):
+    """The build is kept: the same command puts it there after the flight."""
+    out, built = tmp_path / "c", []
+    build_cache(source, out, BuildOptions(workers=1))
+    again = BuildOptions(workers=1, overwrite=True)
+    with ExitStack() as flight:
+
+        def opened(done, total):
+            built.append(done)
+            if done == total:
+                flight.enter_context(TileStreamer(TileCache.open(out)))
+
+        with pytest.raises(MapCacheError, match="same command"):
+            build_cache(source, out, again, progress=opened)
+        TileCache.open(out).load_tile(20)
+    built.clear()
+    build_cache(source, out, again, progress=lambda done, _: built.append(done))
+    assert set(built) == {21}  # none was imported again
+
+
+def test_a_cache_that_was_replaced_before_it_was_held_is_not_read(source, tmp_path):
+    out = tmp_path / "c"
+    build_cache(source, out, BuildOptions(workers=1))
+    opened = TileCache.open(out)
+    origin = replace(opened.manifest.origin, height_m=opened.manifest.origin.height_m + 1.0)
+    build_cache(source, out, BuildOptions(workers=1, overwrite=True, origin=origin))
+    with pytest.raises(MapCacheError, match="built again"):
+        TileStreamer(opened)
+    with TileStreamer(TileCache.open(out)):
+        pass
+
+
+@pytest.mark.parametrize("number", [errno.ENOLCK, errno.EOPNOTSUPP, errno.EBADF])
+def test_where_locks_are_not_known_maps_are_read_and_built(source, tmp_path, monkeypatch, number):
+    """False alarm: a network's file system may know no locks, or none on folders."""
+
+    def refuses(*_):
+        raise OSError(number, "no locks")
+
+    out = tmp_path / "c"
+    build_cache(source, out, BuildOptions(workers=1))
+    monkeypatch.setattr("localizer.map.cache.hold.flock", refuses)
+    with TileStreamer(TileCache.open(out)):
+        build_cache(source, out, BuildOptions(workers=1, overwrite=True))
+    TileCache.open(out)
 
 
 def test_overwrite_spares_what_is_no_cache(source, tmp_path):

@@ -1,0 +1,70 @@
+"""Who streams a cache holds its folder, so that no build puts another map in its place meanwhile.
+
+A lock of the kernel on the folder: it ends with the process, however that ends, and a cache that
+may only be read can be held. Where a file system knows no such locks, nobody is kept from anything.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator
+from contextlib import contextmanager
+from fcntl import LOCK_EX, LOCK_NB, LOCK_SH, flock
+from pathlib import Path
+
+from localizer.errors import MapCacheError
+
+
+class Hold:
+    """Nobody replaces the cache at `path` until `close`; any number of readers hold it."""
+
+    def __init__(self, path: Path) -> None:
+        self._folder: int | None = _opened(path)
+        try:
+            _lock(self._folder, LOCK_SH)
+        except BlockingIOError as error:
+            self.close()
+            raise MapCacheError(f"{path}: is just being replaced; open it again") from error
+
+    def close(self) -> None:
+        """Let it go."""
+        if self._folder is not None:
+            os.close(self._folder)
+            self._folder = None
+
+
+@contextmanager
+def replacing(path: Path) -> Iterator[None]:
+    """The cache at `path`, if there is one, is nobody's: MapCacheError while someone holds it."""
+    if not path.exists():
+        yield
+        return
+    folder = _opened(path)
+    try:
+        try:
+            _lock(folder, LOCK_EX)
+        except BlockingIOError as error:
+            raise MapCacheError(
+                f"{path}: is not replaced while a flight, its console or another program reads it; "
+                "end that and give the same command again, or choose another folder"
+            ) from error
+        yield
+    finally:
+        os.close(folder)
+
+
+def _opened(path: Path) -> int:
+    try:
+        return os.open(path, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
+    except OSError as error:
+        raise MapCacheError(f"{path}: cannot be read: {error.strerror}") from error
+
+
+def _lock(folder: int, kind: int) -> None:
+    """BlockingIOError where another one keeps it from us; other errors mean no locks here."""
+    try:
+        flock(folder, kind | LOCK_NB)
+    except BlockingIOError:
+        raise
+    except OSError:
+        return
