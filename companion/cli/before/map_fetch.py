@@ -224,7 +224,7 @@ def _planned(
 
 
 def _print_estimate(console: Console, parts: list[_Part]) -> float:
-    """A line a source; returns the megabytes of all."""
+    """A line a source, and what it lacks; returns the megabytes of all."""
     from localizer.map.fetch.fetch import estimate
 
     total = 0.0
@@ -239,6 +239,12 @@ def _print_estimate(console: Console, parts: list[_Part]) -> float:
             highlight=False, soft_wrap=True,
         )  # fmt: skip
         console.print(f"  licence: {part.source.licence}", highlight=False, soft_wrap=True)
+        for name in part.plan.lacking:
+            console.print(
+                f"[yellow]warning:[/] {part.source.name} has no {escape(name)}: sea, or land that "
+                "it lacks; the map has a hole there",
+                highlight=False, soft_wrap=True,
+            )  # fmt: skip
     return total
 
 

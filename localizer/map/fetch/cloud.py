@@ -138,11 +138,18 @@ def plan_files(
     client: PoliteClient,
 ) -> Plan:  # fmt: skip
     """Windows of the files that meet an area. The grid is the files' own where they share it."""
-    there = [f for f in files if area.meets(f.bounds)]
-    if not there:
+    wanted = [f for f in files if area.meets(f.bounds)]
+    if not wanted:
         raise MapFetchError(f"{source.name}: has no file at {area}")
-    if len(there) > _MOST_FILES:
-        raise MapFetchError(f"{source.name}: {len(there)} files: a smaller area")
+    if len(wanted) > _MOST_FILES:
+        raise MapFetchError(f"{source.name}: {len(wanted)} files: a smaller area")
+    there = [f for f in wanted if not f.may_lack or _exists(f, client)]
+    if not there:
+        raise NoFileError(
+            f"{shown(wanted[0].url)}: there is no such file, nor of any other degree of the area: "
+            "is it all sea? are latitude and longitude swapped?"
+        )
+    lacking = tuple(_name(f.url) for f in wanted if f not in there)
     grid = _grid_of(there, area, resolution_m, client)
     pieces = []
     for column, row, width, height in cut(grid, source.piece_px):
@@ -153,12 +160,13 @@ def plan_files(
             pieces.append(Piece(f"{column}-{row}", column, row, width, height, get))
     size = _HEIGHT_BYTES if source.has_heights else _PICTURE_BYTES
     expected = size * grid.width * grid.height
-    return Plan(grid, tuple(pieces), size, len(there) + math.ceil(expected / _BLOCK))
+    requests = len(there) + math.ceil(expected / _BLOCK)
+    return Plan(grid, tuple(pieces), size, requests, lacking)
 
 
 def degree_files(source: Source, area: Area) -> list[CloudFile]:
     """Of a model that is cut by whole degrees (Copernicus GLO-30), else the one file. A degree that
-    is all sea has no file.
+    is all sea has no file, nor has some land whose heights are not public: nothing says which.
     """
     if "{lat}" not in source.url:
         return [CloudFile(source.url, source.bounds)]
@@ -176,7 +184,7 @@ def _grid_of(
     files: Sequence[CloudFile], area: Area, resolution_m: float, client: PoliteClient
 ) -> Grid:
     """In the first file's CRS where that is in metres, on its pixels where they are as wished."""
-    crs, transform = _lie_of_first(files, client)
+    crs, transform = _lie_of(files[0], client)
     flat = crs.sub_crs_list[0] if crs.is_compound else crs
     if flat.is_geographic:
         utm = utm_zone(area)
@@ -188,21 +196,21 @@ def _grid_of(
     return grid_over(area.bounds_in(flat), pixel, flat, (transform.c, transform.f))
 
 
-def _lie_of_first(files: Sequence[CloudFile], client: PoliteClient) -> tuple[CRS, Any]:
-    """CRS and transform of the first file that is there."""
-    for file in files:
-        try:
-            with _opened(file.url, client, []) as data:
-                if data.crs is None:
-                    raise MapFetchError(f"{shown(file.url)}: has no CRS")
-                return CRS(data.crs), data.transform
-        except NoFileError:
-            if not file.may_lack:
-                raise
-    raise NoFileError(
-        f"{shown(files[0].url)}: there is no such file, nor of any other degree of the area: is it "
-        "all sea? are latitude and longitude swapped?"
-    )
+def _lie_of(file: CloudFile, client: PoliteClient) -> tuple[CRS, Any]:
+    """A file's CRS and transform."""
+    with _opened(file.url, client, []) as data:
+        if data.crs is None:
+            raise MapFetchError(f"{shown(file.url)}: has no CRS")
+        return CRS(data.crs), data.transform
+
+
+def _exists(file: CloudFile, client: PoliteClient) -> bool:
+    return client.get(file.url, {"Range": "bytes=0-0"}, (_NOT_THERE,)).status != _NOT_THERE
+
+
+def _name(url: str) -> str:
+    """A file's own name; what follows it may be a key."""
+    return url.rpartition("/")[2].partition("?")[0]
 
 
 def _meets(window: Grid, file: CloudFile) -> bool:
@@ -248,12 +256,7 @@ def _window(
     whole = np.zeros((bands, window.height, window.width), dtype)
     known = np.zeros((window.height, window.width), bool)
     for file in files:
-        try:
-            read, has = _of_file(source, window, file.url, client)
-        except NoFileError:
-            if not file.may_lack:
-                raise
-            continue
+        read, has = _of_file(source, window, file.url, client)
         fresh = has & ~known
         whole[:, fresh] = read[:, fresh] if len(read) == bands else read[:1, fresh]
         known |= has
@@ -279,8 +282,7 @@ def _of_file(
                 check_depth(shown(url), data.dtypes[0])
             read = vrt.read(list(range(1, min(bands, data.count) + 1)))
             if source.has_heights:
-                name = url.rpartition("/")[2].partition("?")[0]
-                read = metres_of(source, name, data, window.crs).metres(read)
+                read = metres_of(source, _name(url), data, window.crs).metres(read)
             return read.astype(np.float32 if source.has_heights else np.uint8), (
                 vrt.dataset_mask() > 0
             )

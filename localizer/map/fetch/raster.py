@@ -69,13 +69,15 @@ class Piece:
 @dataclass(frozen=True)
 class Plan:
     """All that is needed of one source. bytes_per_pixel: of what is sent, a guess; requests: of all
-    pieces, a guess where a piece takes several.
+    pieces, a guess where a piece takes several. lacking: names of files that the server does not
+    have: nothing is known where they would be.
     """
 
     grid: Grid
     pieces: tuple[Piece, ...]
     bytes_per_pixel: float
     requests: int
+    lacking: tuple[str, ...] = ()
 
     @property
     def bytes(self) -> float:

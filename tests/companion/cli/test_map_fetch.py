@@ -15,6 +15,7 @@ from localizer.geometry.geoid import geoid_separation
 from localizer.map.cache.cache import TileCache
 from localizer.map.cache.surface import MapSurface
 from localizer.map.fetch.catalogue import load_sources
+from localizer.map.fetch.cloud import CloudFile
 from tests.localizer.map.fetch.loopback import (
     LEFT,
     TOP,
@@ -153,6 +154,24 @@ def test_the_estimate_asks_for_nothing_large_and_a_bound_stops_before(server, so
     assert stopped.exit_code != 0
     assert "--most-mb" in str(stopped.exception)
     assert not (tmp_path / "a.fetch").exists()
+
+
+def test_files_that_a_source_lacks_are_named_before_anything_is_fetched(
+    server, sources, tmp_path, monkeypatch
+):
+    """They may be land: a hole in the map that nobody was told of."""
+
+    def degrees(source, _area):
+        names = "surface.tif", "Copernicus_N40_E046.tif"
+        return [CloudFile(f"{server.url}/{name}", source.bounds, may_lack=True) for name in names]
+
+    common = ("fetch", "--rectangle", BOX, "--sources", sources, "--imagery", "photos",
+              "--heights", "surface", "--out", tmp_path / "a", "--estimate")  # fmt: skip
+    assert "warning" not in run(*common).output
+    monkeypatch.setattr("localizer.map.fetch.fetch.degree_files", degrees)
+    told = run(*common)
+    assert told.exit_code == 0, told.output
+    assert re.search(r"warning: surface has no Copernicus_N40_E046\.tif: .*hole", told.output)
 
 
 @pytest.mark.parametrize("how", ["circle", "mission"])

@@ -268,6 +268,39 @@ def test_a_degree_of_the_worlds_model_that_is_sea_does_not_cost_the_coast(server
     plan = plan_files(wanted, AREA, 1.0, _with_sea_beside(server, wanted, lacks), client)
     fetch(wanted, plan, tmp_path / "pieces", tmp_path / "out.tif", client)
     compare(tmp_path / "out.tif", **HEIGHTS)
+    assert plan.lacking == ("sea.tif",)
+
+
+def test_a_degree_without_a_file_is_unknown_and_named_and_never_a_height_of_zero(server, tmp_path):
+    """GLO-30 Public lacks some land, too, and a 404 does not say which of both it is."""
+    wanted = source("cog", f"{server.url}/surface.tif", role="surface")
+    client = PoliteClient(Manners(50.0))
+    west, south, east, north = wanted.bounds
+    middle = 0.5 * (west + east)
+    files = [
+        CloudFile(f"{server.url}/surface.tif", (west, south, middle, north), may_lack=True),
+        CloudFile(f"{server.url}/N47_E008.tif?key=secret", (middle, south, east, north), True),
+    ]
+    area = Area(west, AREA.south, east, AREA.north)
+    plan = plan_files(wanted.model_copy(update={"piece_px": 64}), area, 1.0, files, client)
+    assert plan.lacking == ("N47_E008.tif",)
+    known = fetch(wanted, plan, tmp_path / "pieces", tmp_path / "out.tif", client)
+    assert 0.5 < known < 0.9
+    with rasterio.open(tmp_path / "out.tif") as file:
+        heights, mask = file.read(1), file.dataset_mask() > 0
+    assert not mask[:, -64:].any()
+    assert (heights[~mask] == file.nodata).all()
+    assert make_plan(wanted, AREA, 1.0, client).lacking == ()
+
+
+def test_a_degree_that_was_there_and_is_gone_is_told_and_no_sea(server, tmp_path):
+    wanted = source("cog", f"{server.url}/surface.tif", role="surface")
+    client = PoliteClient(Manners(50.0), sleep=lambda _: None)
+    file = CloudFile(wanted.url, wanted.bounds, may_lack=True)
+    plan = plan_files(wanted, AREA, 1.0, [file], client)
+    server.broken = [(404, {})]
+    with pytest.raises(MapFetchError, match=r"surface\.tif: status 404"):
+        fetch(wanted, plan, tmp_path / "pieces", tmp_path / "out.tif", client)
 
 
 def test_where_every_degree_is_sea_it_is_told_by_name_and_a_named_file_must_be_there(server):
