@@ -25,7 +25,7 @@ from companion.offline.autopilot import RecordedAutopilot
 from companion.offline.flown_map import FlownMap
 from companion.sources.base import fitted_camera
 from companion.sources.folder_source import read_image
-from companion.sources.zoom import longer
+from companion.sources.zoom import ZoomTable, longer
 from companion.trajectory import snapshot_name
 from localizer.errors import GeoreferenceError, OutsideMapError
 from localizer.geometry.camera import Camera
@@ -221,7 +221,7 @@ def replay(
         installation = Installation(cache.frame, cache.manifest.geoid_separation_m, arm)
         pose = AutopilotPose(autopilot, installation, config.prior)
         localizer = build_localizer(stack, camera, config.localizer, pose.sensors)
-        frames = []
+        frames, unzoomed = [], 0
         for recorded in record.estimates:
             progress()
             if not (path := image_path(record.folder, recorded)).is_file():
@@ -231,14 +231,24 @@ def replay(
                 prior = pose.prior(recorded.exposure_time_ns)
                 if prior is not None:
                     localizer.offer(prior)
+            factor = _told_factor(config.camera.zoom, autopilot, recorded)
+            if factor is None:  # a fix of it would be metres off and look as good as any
+                unzoomed += 1
+                frames.append(ReplayedFrame(recorded, None))
+                continue
             try:
-                again = _localize(localizer, camera, recorded, path)
+                again = _localize(localizer, longer(camera, factor), recorded, path)
             except StreamDecodeError as error:  # power may have gone while it was written
                 _log.warning("left out: %s", error)
                 continue
             if again is not None and again.accepted:
                 pose.belief.note_fix(again.exposure_time_ns)
             frames.append(ReplayedFrame(recorded, again))
+        if unzoomed:
+            _log.warning(
+                "%d of %d pictures are not localized again: neither estimates.csv nor %s tells "
+                "the zoom that they were taken with", unzoomed, len(record.estimates), tlog,
+            )  # fmt: skip
         if len(frames) < _MIN_IMAGES * len(record.estimates):
             raise RecordError(
                 f"{record.folder}: only {len(frames)} of {len(record.estimates)} images in "
@@ -247,6 +257,18 @@ def replay(
         return frames
     finally:
         stack.close()
+
+
+def _told_factor(
+    zoom: ZoomTable | None, autopilot: RecordedAutopilot, recorded: RecordedEstimate
+) -> float | None:
+    """Multiple of the model's focal length that the log tells of a frame whose row does not, as in
+    older records; 1 where none is needed, None where nobody tells.
+    """
+    if zoom is None or recorded.focal_px is not None:
+        return 1.0
+    level = autopilot.zoom_at(recorded.exposure_time_ns, zoom.hold_s)
+    return None if level is None else zoom.factor(level)
 
 
 def _localize(

@@ -19,9 +19,11 @@ from companion.config import parse_config
 from companion.errors import RecordError
 from companion.flight.app import Companion
 from companion.geometry import GIMBAL_FROM_CAMERA
+from companion.offline.autopilot import RecordedAutopilot
 from companion.offline.replay import load_record, replay, summarize
 from companion.reporting.pictures import map_pictures
 from companion.reporting.record import read_record
+from companion.sources.zoom import ZoomTable
 from localizer.geometry.camera import Camera
 from localizer.geometry.geo import NED_FROM_ENU
 from localizer.geometry.pose import quaternion_from_matrix
@@ -314,6 +316,43 @@ def test_each_frame_is_replayed_with_the_focal_length_that_it_had(record, tmp_pa
     loaded = load_record(folder)
     replay(loaded, loaded.config.bridge.tlog)
     assert seen == pytest.approx(flown, rel=1e-4)
+
+
+def test_an_older_record_of_a_camera_that_zooms_is_replayed_by_its_log_or_told(
+    record, monkeypatch, caplog
+):
+    """All its pictures had the model's focal length: metres off, and as good as any to look at."""
+    loaded, seen = load_record(record), []
+    old = tuple(replace(e, focal_px=None) for e in loaded.estimates)
+    zooms_ns, unknown_ns = old[2].exposure_time_ns, old[-1].exposure_time_ns
+    model = loaded.config.camera.model
+
+    class Localizer:
+        tracker = SimpleNamespace(standing=SimpleNamespace(wants_prior=False))
+
+        def track(self, frame):
+            seen.append(frame.camera.fx / model.fx)
+
+    def zoom_at(_, time_ns, hold_s):
+        assert hold_s == 5.0
+        return None if time_ns == unknown_ns else 50.0 if time_ns >= zooms_ns else 0.0
+
+    def replayed(zoom):
+        seen.clear()
+        caplog.clear()
+        camera = loaded.config.camera.model_copy(update={"zoom": zoom})
+        config = loaded.config.model_copy(update={"camera": camera})
+        frames = replay(replace(loaded, config=config, estimates=old), config.bridge.tlog)
+        return [f.recorded for f in frames]
+
+    monkeypatch.setattr("companion.offline.replay.build_localizer", lambda *_: Localizer())
+    monkeypatch.setattr(RecordedAutopilot, "zoom_at", zoom_at)
+    assert replayed(ZoomTable(points=((0, 1), (100, 4)), hold_s=5.0)) == list(old)
+    assert seen == pytest.approx([1.0] * 2 + [2.0] * (len(old) - 3), rel=1e-3)
+    assert f"1 of {len(old)} pictures are not localized again" in caplog.text
+    assert replayed(None) == list(old)  # false alarm: a camera that does not zoom
+    assert seen == pytest.approx([1.0] * len(old))
+    assert not caplog.records
 
 
 def test_damaged_images_are_no_agreement(record, tmp_path):
