@@ -12,7 +12,8 @@ from typing import Annotated
 import typer
 
 from companion.cli.interrupts import end_at_once
-from companion.config import CompanionConfig, load_config
+from companion.config import CompanionConfig
+from companion.supervision.kept_settings import keep, settings_of
 from companion.terminal.console_log import console_log
 from companion.terminal.console_process import running_console
 from localizer.registration.devices import DeviceChoice
@@ -38,6 +39,7 @@ def run_command(
     standby: Annotated[bool, typer.Option(hidden=True)] = False,
     pulse: Annotated[int | None, typer.Option(hidden=True, min=3)] = None,
     again: Annotated[bool, typer.Option("--again", hidden=True)] = False,
+    kept: Annotated[int | None, typer.Option(hidden=True, min=3)] = None,
     verbose: Annotated[bool, typer.Option("--verbose", "-v", help="log more")] = False,
 ) -> None:
     """Localize the camera feed and inject positions until interrupted."""
@@ -46,7 +48,7 @@ def run_command(
         signal.signal(number, end_at_once)
     if pulse is not None:
         os.setpgrp()  # see `FlightProcess`
-    settings = load_config(config)
+    settings, lost = settings_of(config, kept)
     os.umask(_UMASK)
     if supervised:
         arguments = [str(config), *(["--verbose"] if verbose else [])]
@@ -60,7 +62,7 @@ def run_command(
     settings = settings.model_copy(update={"localizer": localizer})
     from companion.flight.standby import ready
 
-    companion = ready(settings, standby=standby, pulse=pulse, again=again)
+    companion = ready(settings, standby=standby, pulse=pulse, again=again, lost_settings=lost)
     if companion is None:
         return
 
@@ -94,11 +96,13 @@ def _supervise(settings: CompanionConfig, arguments: list[str]) -> int:
     def tell(severity: int, text: str) -> None:
         say_without_bridge(settings.bridge, severity, text)
 
-    begun = count()
+    begun, kept = count(), keep(settings)
 
     def spawn(standby: bool) -> FlightProcess:
-        again = ["--again"] if next(begun) else []
-        return FlightProcess([*command, *again], standby=standby)
+        if not next(begun):
+            return FlightProcess(command, standby=standby)
+        again = [*command, f"--kept={kept}", "--again"]
+        return FlightProcess(again, standby=standby, hands_on=(kept,))
 
     supervisor = Supervisor(
         spawn,

@@ -31,6 +31,7 @@ _log = logging.getLogger(__name__)
 # How long a thread may keep the interpreter from another that woke up. Python's 5 ms, several times
 # between an estimate and the autopilot, would be 7 ms in the median (benchmarks.bridge).
 _SWITCH_S = 0.0002
+_WARNING = 4  # MAV_SEVERITY
 
 
 class Companion:
@@ -38,6 +39,7 @@ class Companion:
 
     pulse: descriptor of the supervisor's pipe, see `Pulse`; None without a supervisor. again:
     whether another process of this flight died before: it goes on without what is gone.
+    lost_settings: why `config` is not from the deployment's file, which is gone; else empty.
     """
 
     def __init__(
@@ -47,8 +49,10 @@ class Companion:
         pulse: int | None = None,
         *,
         again: bool = False,
+        lost_settings: str = "",
     ) -> None:
         self._config, self._again = config, again
+        self._lost_settings = lost_settings
         self._parts = Assembly(config, parts)
         self._pulse = pulse
         self._up = ExitStack()
@@ -153,6 +157,10 @@ class Companion:
         if keeper is not None and lost:
             events.send("warning", f"left out, since it was gone at the restart: {lost}")
             keeper.failed("disk gone")
+        bridge = self._parts.get(Bridge)
+        if bridge is not None and self._lost_settings:
+            bridge.say(_WARNING, "PiLoT: deployment file lost, flown as before")
+            events.send("warning", f"flown as before the restart, since {self._lost_settings}")
 
 
 def _log_event(level: str, text: str) -> None:

@@ -14,13 +14,19 @@ _log = logging.getLogger(__name__)
 
 
 def ready(
-    config: CompanionConfig, *, standby: bool, pulse: int | None, again: bool = False
+    config: CompanionConfig,
+    *,
+    standby: bool,
+    pulse: int | None,
+    again: bool = False,
+    lost_settings: str = "",
 ) -> Companion | None:
     """The flight process: at once, or once a standby is released; None of one that never is.
 
-    pulse, again: see `Companion`; a standby flies after another died, and so always again.
+    pulse, again, lost_settings: see `Companion`; a standby flies after another died, and so always
+    again.
     """
-    companion = Companion(config, pulse=pulse, again=again or standby)
+    companion = Companion(config, pulse=pulse, again=again or standby, lost_settings=lost_settings)
     return _stand_by(companion) if standby else companion
 
 

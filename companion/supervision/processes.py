@@ -24,12 +24,15 @@ class Beat:
 
 class FlightProcess:
     """A command that flies. standby: with ``--standby`` it prepares, and waits for a line.
+    hands_on: descriptors that it may read, under the same numbers.
 
     It takes a process group of its own: the terminal's interrupt comes through the supervisor
     alone. Not a session: Linux schedules each as one, whatever priority the supervisor was given.
     """
 
-    def __init__(self, command: Sequence[str], *, standby: bool) -> None:
+    def __init__(
+        self, command: Sequence[str], *, standby: bool, hands_on: Sequence[int] = ()
+    ) -> None:
         self._beats, end = os.pipe()
         os.set_blocking(self._beats, False)
         self._unread = b""
@@ -37,7 +40,7 @@ class FlightProcess:
             self._process = subprocess.Popen(
                 [*command, f"--pulse={end}", *(["--standby"] if standby else [])],
                 stdin=subprocess.PIPE if standby else subprocess.DEVNULL,
-                pass_fds=(end,),
+                pass_fds=(end, *hands_on),
             )
         except BaseException:
             os.close(self._beats)

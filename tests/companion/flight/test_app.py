@@ -124,6 +124,26 @@ def test_the_order_to_stop_takes_no_lock(small_assets):
     assert orders == [True]
 
 
+@pytest.mark.parametrize("lost", ["", "companion.yaml: cannot be read: Input/output error"])
+def test_a_restart_without_its_deployment_file_tells_the_operator(small_assets, caplog, lost):
+    config = parse_config(
+        {"map": str(small_assets.map_cache), "camera": {"source": "s", "model": MODEL}}, "test"
+    )
+    feed, bridge, said = _StubFeed(), object.__new__(Bridge), []
+    bridge.say = lambda severity, text: said.append((severity, text))  # type: ignore[method-assign]
+    parts = [
+        *(p for p in PARTS if p.name == "map"),
+        Part("feed", Feed, lambda _: feed), Part("bridge", Bridge, lambda _: bridge),
+    ]  # fmt: skip
+    companion = Companion(config, parts, again=True, lost_settings=lost)
+    feed.ended.interrupt = companion.stop
+    with caplog.at_level(logging.WARNING):
+        companion.run()
+    told = [r.getMessage() for r in caplog.records if "companion.yaml" in r.getMessage()]
+    assert len(told) == len(said) == bool(lost)
+    assert all(severity == 4 and len(text) <= 50 for severity, text in said)
+
+
 def test_what_happens_is_logged_and_recorded_once_and_every_thread_ends(
     small_assets, tmp_path, caplog
 ):

@@ -1,0 +1,35 @@
+"""The deployment as the supervisor read it: a restart in the air has it where its file is gone."""
+
+from __future__ import annotations
+
+import json
+import os
+from pathlib import Path
+
+from companion.config import CompanionConfig, load_config, parse_config
+from companion.errors import ConfigError
+
+
+def keep(config: CompanionConfig) -> int:
+    """A descriptor for the processes that are to know the deployment: of memory, which goes with no
+    disk.
+    """
+    descriptor = os.memfd_create("deployment")
+    with open(descriptor, "wb", closefd=False) as file:
+        file.write(config.model_dump_json().encode())
+    return descriptor
+
+
+def settings_of(path: Path, kept: int | None) -> tuple[CompanionConfig, str]:
+    """The deployment in a file; of one that cannot be read any more, what was kept of it, and why.
+
+    kept: the descriptor that `keep` gave, None at a first start, which a wrong file ends.
+    """
+    try:
+        return load_config(path), ""
+    except ConfigError as error:
+        if kept is None:
+            raise
+        # Several processes have this descriptor, and one position in it.
+        data = os.pread(kept, os.fstat(kept).st_size, 0)
+        return parse_config(json.loads(data), "the supervisor's deployment"), str(error)

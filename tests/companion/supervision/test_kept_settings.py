@@ -1,0 +1,139 @@
+"""A deployment whose file goes away in flight: a restart flies with what was read before."""
+
+from __future__ import annotations
+
+import os
+import signal
+import sys
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import pytest
+import yaml
+from typer.testing import CliRunner
+
+from companion.cli.commands import app
+from companion.config import CompanionConfig, load_config
+from companion.errors import ConfigError
+from companion.supervision.kept_settings import keep, settings_of
+from companion.supervision.processes import FlightProcess
+
+MODEL = {"width": 640, "height": 480, "fx": 500, "fy": 500, "cx": 320, "cy": 240}
+SHIPPED = Path(__file__).parents[3] / "configs" / "deployment.yaml"
+
+
+@pytest.fixture
+def deployment(tmp_path: Path) -> Path:
+    path = tmp_path / "companion.yaml"
+    path.write_text(
+        yaml.safe_dump({"map": "area", "camera": {"model": MODEL, "source": "udp://x:1"}})
+    )
+    return path
+
+
+@pytest.fixture
+def kept() -> Iterator[Callable[[CompanionConfig], int]]:
+    descriptors: list[int] = []
+
+    def made(config: CompanionConfig) -> int:
+        descriptors.append(keep(config))
+        return descriptors[-1]
+
+    yield made
+    for descriptor in descriptors:
+        os.close(descriptor)
+
+
+def _gone(path: Path) -> None:
+    path.unlink()
+
+
+def _no_file_any_more(path: Path) -> None:
+    path.unlink()
+    path.mkdir()
+
+
+def _half_written(path: Path) -> None:
+    path.write_text(path.read_text()[:40])
+
+
+def _another_programs(path: Path) -> None:
+    path.write_bytes(b"\x00\xff" * 9)
+
+
+@pytest.mark.parametrize("lose", [_gone, _no_file_any_more, _half_written, _another_programs])
+def test_a_lost_file_costs_nothing_in_the_air_and_ends_a_first_start(
+    deployment: Path, kept: Callable[[CompanionConfig], int], lose: Callable[[Path], None]
+) -> None:
+    """Each restart ended with it, and none ever flew again."""
+    flown = load_config(deployment)
+    descriptor = kept(flown)
+    lose(deployment)
+    for _ in range(2):  # of many restarts each reads it from its begin
+        again, why = settings_of(deployment, descriptor)
+        assert again == flown
+        assert str(deployment) in why
+    with pytest.raises(ConfigError):
+        settings_of(deployment, None)
+
+
+def test_a_file_that_is_there_counts(
+    deployment: Path, kept: Callable[[CompanionConfig], int]
+) -> None:
+    descriptor = kept(load_config(deployment))
+    deployment.write_text(deployment.read_text().replace("area", "other"))
+    again, why = settings_of(deployment, descriptor)
+    assert (again.map, why) == (deployment.parent / "other", "")
+
+
+def test_every_setting_comes_back(kept: Callable[[CompanionConfig], int], tmp_path: Path) -> None:
+    flown = load_config(SHIPPED)
+    assert settings_of(tmp_path / "gone.yaml", kept(flown))[0] == flown
+
+
+_READS = 'import os, sys; sys.exit(os.pread(int(sys.argv[1]), 9, 0) != b\'{"map":"/\')'
+
+
+def test_restarted_processes_can_read_it(
+    deployment: Path, kept: Callable[[CompanionConfig], int]
+) -> None:
+    descriptor = kept(load_config(deployment))
+    command = [sys.executable, "-S", "-c", _READS, str(descriptor)]
+    for _ in range(2):
+        process = FlightProcess(command, standby=False, hands_on=(descriptor,))
+        assert process.wait(60.0) == 0
+        process.close()
+
+
+def test_restarts_are_given_it_and_the_first_start_is_not(
+    deployment: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    begun: list[tuple[list[str], tuple[int, ...]]] = []
+
+    class Dies:
+        pid = 1
+
+        def __init__(
+            self, command: list[str], *, standby: bool, hands_on: tuple[int, ...] = ()
+        ) -> None:
+            begun.append((command[5:], hands_on))
+            self.code = 0 if len(begun) == 3 else -signal.SIGKILL
+
+        def wait(self, _: float) -> int:
+            return self.code
+
+        def close(self) -> None:
+            pass
+
+    monkeypatch.setattr("companion.supervision.processes.FlightProcess", Dies)
+    monkeypatch.setattr("mavlink_bridge.vehicle.last_words.say_without_bridge", lambda *_: None)
+    before = {n: signal.getsignal(n) for n in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)}
+    try:
+        done = CliRunner().invoke(app, ["run", str(deployment), "--supervised"])
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+    assert done.exit_code == 0, done.output
+    assert begun[0] == ([], ())
+    (kept,) = begun[1][1]
+    assert begun[1:] == [([f"--kept={kept}", "--again"], (kept,))] * 2
