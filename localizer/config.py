@@ -13,18 +13,8 @@ from localizer.registration.config import JNGOConfig
 from localizer.registration.devices import DeviceChoice
 from localizer.relocalization.config import RelocalizationConfig
 from localizer.render.select import RendererName
+from localizer.tracking.horizon import AttitudePrior
 from localizer.tracking.motion import MotionConfig
-
-
-class AttitudePrior(BaseModel):
-    """How well the autopilot's attitude and the gimbal's angles tell the camera's rotation."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
-
-    tilt_sigma_deg: float = Field(
-        0.7, ge=0.01, le=90, description="roll and pitch, which gravity shows"
-    )
-    heading_sigma_deg: float = Field(4.0, ge=0.01, le=180, description="yaw, by the compass")
 
 
 class LocalizerConfig(BaseModel):
@@ -60,11 +50,10 @@ class LocalizerConfig(BaseModel):
     seed: int = Field(0, ge=0, lt=2**31, description="seed of anchors and hypotheses")
     registration: JNGOConfig = JNGOConfig()
     calibration: CalibrationSigmas = CalibrationSigmas()
-    # Off: at a degree, which is honest, it hardly moves a pose that is sure of a wrong tilt (4
-    # degrees at 30 m, replayed: p95 1.8 m with it, 1.9 without, and fewer inside their bound), and
-    # over 17 flights nothing was gained. Weighed more it pulls right poses by the gimbal's error.
-    # The guardian widens instead (`guardian.tilt_deg`).
-    attitude: AttitudePrior | None = None
+    attitude: AttitudePrior | None = Field(
+        AttitudePrior(),
+        description="roll and pitch of autopilot and gimbal as a constraint; none: not used",
+    )
     motion: MotionConfig = MotionConfig()
     integrity: IntegrityConfig = IntegrityConfig()
     odometry: OdometryConfig | None = Field(

@@ -9,6 +9,7 @@
     python -m benchmarks.features --widths 320 640 --baselines --models shipped NEW.onnx
     python -m benchmarks.features --thermal --pairs 120 (a thermal camera over a map of colours)
     python -m benchmarks.features --swarm-alone --baselines     (what draws of the prior add)
+    python -m benchmarks.features --tilts 0.5 --baselines       (what roll and pitch add)
     python -m benchmarks.features --speed
 
 Every pair shows a place that no training run has seen, its query under its own light, weather and
@@ -30,7 +31,7 @@ from pathlib import Path
 
 import numpy as np
 
-from benchmarks.common.arguments import Parser, existing, output, whole
+from benchmarks.common.arguments import Parser, existing, number, output, whole
 from benchmarks.common.figures import write_figures
 from benchmarks.common.named_errors import named_errors, needs_torch
 from localizer.config import LocalizerConfig
@@ -40,7 +41,14 @@ from localizer.registration import JNGOConfig
 from localizer.types import PosePrior
 
 with needs_torch():
-    from benchmarks.features.methods import Direct, IntensityExtractor, Method, load_xfeat, sift_pnp
+    from benchmarks.features.methods import (
+        Direct,
+        IntensityExtractor,
+        Levelled,
+        Method,
+        load_xfeat,
+        sift_pnp,
+    )
     from benchmarks.features.pairs import (
         DEGREES,
         METRES,
@@ -61,7 +69,7 @@ SHIPPED = Path("shipped")  # stands for the shipped network
 
 
 def evaluate(
-    methods: dict[str, Method], pairs: Sequence[TestPair], source: str, seed: int
+    methods: dict[str, Method | Levelled], pairs: Sequence[TestPair], source: str, seed: int
 ) -> list[Outcome]:
     """Every method on every pair of the set `source`."""
     axes = np.diag([METRES**2 / 3] * 3 + [np.radians(DEGREES) ** 2 / 3] * 3)
@@ -69,8 +77,9 @@ def evaluate(
     for name, method in methods.items():
         for k, pair in enumerate(pairs):
             prior = PosePrior(pair.view.world_from_camera, axes, 0)
+            run = method.hearing(pair.truth, seed + k) if isinstance(method, Levelled) else method
             began = time.perf_counter()
-            pose = method(pair.view, pair.query, prior, seed + k)
+            pose = run(pair.view, pair.query, prior, seed + k)
             seconds = time.perf_counter() - began
             metres, degrees = pose.distance_to(pair.truth)
             outcomes.append(
@@ -90,12 +99,17 @@ BASELINES: dict[str, tuple[str, Callable[[int], Method]]] = {
 
 
 def build_methods(
-    baselines: Sequence[str], models: Sequence[Path], anchors: int, *, alone: bool = False
-) -> dict[str, Method]:
+    baselines: Sequence[str],
+    models: Sequence[Path],
+    anchors: int,
+    *,
+    alone: bool = False,
+    tilts_deg: Sequence[float] = (),
+) -> dict[str, Method | Levelled]:
     """The baselines, as far as installed, then the networks; alone: these without the draws of the
-    prior, too.
+    prior, too; tilts_deg: and with roll and pitch heard, so exactly.
     """
-    methods: dict[str, Method] = {}
+    methods: dict[str, Method | Levelled] = {}
     for key in baselines:
         name, build = BASELINES[key]
         try:
@@ -108,7 +122,9 @@ def build_methods(
         if alone:
             swarm = JNGOConfig(preselected=0)
             methods[f"{name}, swarm alone"] = Direct(extractor, anchors, swarm)
-        methods[name] = Direct(extractor, anchors)
+        direct = methods[name] = Direct(extractor, anchors)
+        for tilt_deg in tilts_deg:
+            methods[f"{name}, tilt to {tilt_deg:g} deg"] = Levelled(direct, tilt_deg)
     return methods
 
 
@@ -157,6 +173,10 @@ def parser() -> Parser:
     p.add_argument(
         "--swarm-alone", action="store_true", help="models without draws of the prior, too"
     )
+    p.add_argument(
+        "--tilts", type=number(0.01, 90), nargs="*", default=[],
+        help="models with an autopilot's roll and pitch, too, that are off by so many degrees",
+    )  # fmt: skip
     p.add_argument(
         "--widths", type=whole(64, 4096), nargs="+", default=[SIZE[0]], help="of the pictures"
     )
@@ -215,7 +235,9 @@ def main() -> None:
         if args.json:
             write_figures(args.json, *TABLES[args.table](outcomes))
         return
-    methods = build_methods(args.baselines, args.models, args.anchors, alone=args.swarm_alone)
+    methods = build_methods(
+        args.baselines, args.models, args.anchors, alone=args.swarm_alone, tilts_deg=args.tilts
+    )
     source, pairs = make_pairs(args)
     outcomes = []
     for width in args.widths:

@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import dataclass
+from functools import partial
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from localizer.features import FeatureExtractor
-from localizer.geometry.pose import Pose
-from localizer.registration import JNGO, JNGOConfig
+from localizer.geometry.pose import Pose, so3_exp
+from localizer.registration import JNGO, JNGOConfig, PoseConstraint, attitude_constraint
 from localizer.tracking.pipeline import reference_anchors
 from localizer.types import FeatureLevel, FeaturePyramid, Image, PosePrior, RenderedView
 
@@ -46,12 +48,33 @@ class Direct:
     ) -> None:
         self._extractor, self._optimizer, self._anchors = extractor, JNGO(config), anchors
 
-    def __call__(self, view: RenderedView, query: Image, prior: PosePrior, seed: int) -> Pose:
+    def __call__(
+        self, view: RenderedView, query: Image, prior: PosePrior, seed: int,
+        constraint: PoseConstraint | None = None,
+    ) -> Pose:  # fmt: skip
         anchors = reference_anchors(view, self._extractor, self._anchors, seed)
         found = self._optimizer.register(
-            self._extractor.extract(query), view.camera, anchors, prior, seed=seed
-        )
+            self._extractor.extract(query), view.camera, anchors, prior, constraint=constraint,
+            seed=seed,
+        )  # fmt: skip
         return found.world_from_camera
+
+
+@dataclass(frozen=True)
+class Levelled:
+    """`Direct` that hears an autopilot's roll and pitch: off by `tilt_deg` an axis, one sigma. No
+    heading: where vision feeds the autopilot's, hearing it would be hearing oneself.
+    """
+
+    direct: Direct
+    tilt_deg: float
+
+    def hearing(self, truth: Pose, seed: int) -> Method:
+        """The method for one pair, whose true pose is `truth`."""
+        sigma = np.radians(self.tilt_deg)
+        off = np.random.default_rng([seed, 71]).normal(0.0, sigma, 3) * (1.0, 1.0, 0.0)
+        told = attitude_constraint(so3_exp(off) @ truth.rotation, float(sigma), np.pi)
+        return partial(self.direct, constraint=told)
 
 
 def sift_pnp(view: RenderedView, query: Image, prior: PosePrior, seed: int) -> Pose:

@@ -121,7 +121,10 @@ class DualThreadEngine:
     @property
     def health(self) -> EngineHealth:
         """A snapshot of the counters."""
-        return self._book.read(self._ahead.dropped, self._localizer.optimizer_name)
+        localizer = self._localizer
+        return self._book.read(
+            self._ahead.dropped, localizer.optimizer_name, localizer.levelling.horizon
+        )
 
     def turns(self) -> dict[str, int]:
         """When each thread that makes fixes began its newest turn, CLOCK_MONOTONIC ns, by name."""

@@ -7,6 +7,8 @@ import threading
 import time
 from dataclasses import dataclass, replace
 
+from localizer.tracking.horizon import Horizon
+
 _log = logging.getLogger(__name__)
 _REPORT_EVERY_S = 5.0
 
@@ -16,6 +18,8 @@ class EngineHealth:
     """Counters since the start, the text of the error that stands ("" when none does), and which
     renderer, feature network and optimizer serve. searches, found: of places without a prior;
     searching: whether one is under way; search_hangs: for so long that none will answer.
+    horizon_off_deg: what autopilot and gimbal are off by in pitch and roll, and the sigma of their
+    attitude once that is taken out; None where it is not used.
     """
 
     frames_in: int = 0
@@ -32,6 +36,7 @@ class EngineHealth:
     renderer: str = ""
     features: str = ""
     optimizer: str = ""
+    horizon_off_deg: tuple[float, float, float] | None = None
 
 
 class HealthBook:
@@ -43,13 +48,16 @@ class HealthBook:
         self._reported_s = -_REPORT_EVERY_S
         self._lock = threading.Lock()
 
-    def read(self, frames_dropped: int, optimizer: str) -> EngineHealth:
+    def read(
+        self, frames_dropped: int, optimizer: str, horizon: Horizon | None = None
+    ) -> EngineHealth:
         """A snapshot, with what only the engine knows."""
         with self._lock:
             return replace(
                 self._health,
                 frames_dropped=frames_dropped,
                 optimizer=optimizer,
+                horizon_off_deg=None if horizon is None else horizon.told_deg,
                 last_error=next(iter(self._errors.values()), ""),
             )
 

@@ -26,14 +26,16 @@ from localizer.errors import (
 from localizer.features.extractor import DeviceExtractor, FeatureExtractor
 from localizer.geometry.camera import Camera, followed
 from localizer.geometry.geo import LocalFrame
+from localizer.geometry.pose import Array
 from localizer.odometry import Ground
 from localizer.registration.anchors import select_anchors, swept
 from localizer.registration.calibration import calibration_covariance
 from localizer.registration.jngo import JNGO
-from localizer.registration.priors import PoseConstraint, attitude_constraint
+from localizer.registration.result import Registration
 from localizer.render.base import MapRenderer
 from localizer.render.holes import fill_holes
 from localizer.tracking.bridging import Bridging
+from localizer.tracking.horizon import Levelling, Sight
 from localizer.tracking.motion import OtherSensors
 from localizer.tracking.reference import lead_share, still_serves
 from localizer.tracking.tracker import Tracker, TrackerState
@@ -153,8 +155,9 @@ class Localizer:
     the halves share what it holds; motion, judgement and bridging are `Tracker`'s.
 
     sensors: other sensors' accounts (autopilot and gimbal). Their turns replace the constant
-    angular rate of the motion model, their attitude enters the registration as a weak prior
-    (`AttitudePrior`), and with the displacement it confirms or refutes a place that was searched.
+    angular rate of the motion model, their roll and pitch constrain the registration while it
+    tracks (`tracking.horizon`), and with the displacement they confirm or refute a place that was
+    searched.
     map_frame: the map's. terrain: the ground's shape where the map has none. on_close: releases
     what was opened for this localizer alone. is_loading: whether tiles that were asked for are
     still on their way.
@@ -188,6 +191,8 @@ class Localizer:
         self._reference: ReferenceBundle | None = None  # the last one of `track`
         self._asked_ns = 0  # what time the last reference was asked for
         self._fitted_ns: int | None = None  # of the last picture whose focal length was fitted
+        self.levelling = Levelling(config.attitude, self._sensors.rotation_at)
+        """What the other sensors' roll and pitch are off by."""
         self._tracker = Tracker(config, self._sensors, self._bridging(config, optimizer, terrain))
 
     def _bridging(
@@ -313,13 +318,6 @@ class Localizer:
         """The motion model's prediction at `time_ns`; None before the first prior."""
         return self._tracker.predict(time_ns)
 
-    def _attitude(self, time_ns: int) -> PoseConstraint | None:
-        sigma, rotation = self._config.attitude, self._sensors.rotation_at(time_ns)
-        if sigma is None or rotation is None:
-            return None
-        tilt, heading = np.radians([sigma.tilt_sigma_deg, sigma.heading_sigma_deg])
-        return attitude_constraint(rotation, float(tilt), float(heading))
-
     def reference_for(
         self, prior: PosePrior, last: ReferenceBundle | None, *, wait: bool = False
     ) -> ReferenceBundle:
@@ -400,13 +398,17 @@ class Localizer:
             with stopwatch(stage_ms, "register"):
                 about = ahead.prior.world_from_camera
                 seen_anchors = swept(anchors, sweep, about, frame.camera)
+                # Not on trial: there the reported attitude is what confirms or refutes a place.
+                tracks = seen.standing.state is TrackingState.TRACKING
+                tracks = tracks and not seen.standing.on_trial
+                level = self.levelling.constraint(ahead.prior) if tracks else None
                 result = self._optimizer.register(
                     query,
                     camera,
                     seen_anchors,
                     ahead.prior,
                     motion=ahead.prior if seen.standing.trusts_prediction else None,
-                    constraint=self._attitude(frame.exposure_time_ns),
+                    constraint=level,
                     seed=self._config.seed + frame.sequence,
                 )
                 if seen.standing.on_trial and not seen.standing.independent:
@@ -420,10 +422,37 @@ class Localizer:
                 camera, sweep, moving,
             )  # fmt: skip
             estimate = replace(estimate, covariance=estimate.covariance + unknown)
+            if result is not None and estimate.accepted:
+                free = None if level is not None else result
+                self._learn_level(frame, query, seen_anchors, estimate, unknown, free)
             if result is not None and self._is_focal_due(estimate):
                 focal = self._optimizer.focal_fitted(query, camera, seen_anchors, result)
                 estimate = replace(estimate, focal=focal)
         return replace(estimate, stage_ms=stage_ms)
+
+    def _learn_level(
+        self, frame: Frame, query: FeaturePyramid, anchors: Anchors, estimate: PoseEstimate,
+        unknown: Array, free: Registration | None,
+    ) -> None:  # fmt: skip
+        """Measure the other sensors' horizon, over new ground, by a registration of no constraint.
+
+        unknown: (6, 6) covariance of what map and camera err by; free: the frame's own registration
+        if that had none, else another one is made (10 ms, every few seconds).
+        """
+        pose, time_ns = estimate.world_from_camera, frame.exposure_time_ns
+        distance_m = _distance_m(anchors, pose.translation)
+        tracks = estimate.state is TrackingState.TRACKING
+        if not tracks or not self.levelling.is_due(pose.translation, distance_m):
+            return
+        if free is None:
+            prior = PosePrior(pose, estimate.covariance, time_ns)
+            camera = followed(self._pinhole, frame.camera)
+            free = self._optimizer.register(
+                query, camera, anchors, prior, seed=self._config.seed + frame.sequence
+            )
+        if free.status is RegistrationStatus.OK:
+            covariance = free.covariance + unknown
+            self.levelling.learn(Sight(free.world_from_camera, covariance, distance_m, time_ns))
 
     def _is_focal_due(self, estimate: PoseEstimate) -> bool:
         """Whether this picture is one whose focal length is to be fitted."""
@@ -435,6 +464,11 @@ class Localizer:
             return False
         self._fitted_ns = now_ns
         return True
+
+
+def _distance_m(anchors: Anchors, place: Array) -> float:
+    """Of what is seen."""
+    return max(float(np.linalg.norm(anchors.points_world.mean(axis=0) - place)), 1.0)
 
 
 @contextmanager
