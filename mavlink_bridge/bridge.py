@@ -270,9 +270,16 @@ class Bridge:
         """The EKF's (latitude, longitude, altitude AMSL) at a time; None while it does not follow a
         healthy GNSS, or where that is not known.
         """
-        if not self._fc.sources.on_gnss or not gnss_healthy(self.state(), monotonic_ns()):
+        if not self.on_gnss or not gnss_healthy(self.state(), monotonic_ns()):
             return None
         return self._tracker.global_at(time_ns)
+
+    @property
+    def on_gnss(self) -> bool | None:
+        """Whether GNSS makes the EKF's position, healthy or not: by its source set, and not where
+        the receiver is fed by us; None where the set is not known.
+        """
+        return self._fc.on_gnss(monotonic_ns())
 
     def inertial_since(self, time_ns: int) -> tuple[InertialSample, ...]:
         """What the vehicle's IMU read after a CLOCK_MONOTONIC time, oldest first."""

@@ -98,6 +98,17 @@ class FlightControllerEnd:
         """How vision compared with GNSS over the last two minutes."""
         return self.outcome.shadow.score(now_ns, self.sender.injector.refused_yaw_rad)
 
+    def on_gnss(self, now_ns: int) -> bool | None:
+        """Whether GNSS makes the EKF's position; None where its source set is not known. A receiver
+        that tells what it is told by us (GPS_INPUT) is none.
+        """
+        current = self.sources.current
+        if self._shared.config.injection.message == "gps_input" and (
+            current is None or self.sender.fed(now_ns)
+        ):
+            return False
+        return None if current is None else self.sources.on_gnss
+
     def recall(self) -> None:
         """Before the link begins: what a process that was killed knew."""
         self._interlock.recall()
@@ -270,8 +281,7 @@ class FlightControllerEnd:
     def _check(self, link: Link, state: VehicleState, now_ns: int) -> None:
         """What came of it, ten times a second: score, verdict, source switch."""
         sender = self.sender
-        on_gnss = None if self.sources.current is None else self.sources.on_gnss
-        self.outcome.compare(state, now_ns, on_gnss=on_gnss)
+        self.outcome.compare(state, now_ns, on_gnss=self.on_gnss(now_ns))
         self._strangers.check(link, now_ns)
         if self.outcome.judge(state, now_ns):
             sender.injector.announce_jump()

@@ -21,6 +21,7 @@ _NEWS_AFTER_NS = 1_000_000_000  # a gap in the fixes that is told
 _NOT_SENT = "not sent: "
 _FULL = "the link takes no more"
 _GOOD_NS = 1_000_000_000
+_FED_NS = 10_000_000_000  # ArduPilot's receiver times out after 4 s, and the EKF reckons on
 
 
 class FixSender:
@@ -82,6 +83,10 @@ class FixSender:
         or refused by the port.
         """
         return self._sent_ns is not None and now_ns - self._sent_ns < _GOOD_NS
+
+    def fed(self, now_ns: int) -> bool:
+        """Whether what the EKF says may still be made of our positions."""
+        return self._sent_ns is not None and now_ns - self._sent_ns < _FED_NS
 
     @property
     def refusal(self) -> str:

@@ -385,6 +385,41 @@ def test_the_pilots_gate_is_obeyed_and_told_without_a_go(monkeypatch: pytest.Mon
     assert told(flight, "go from") == ["injecting without a go from shadow"]
 
 
+def test_what_gps_input_told_the_receiver_is_no_word_for_vision(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """The pilot had injected a map 20 m off: receiver and EKF repeated it, which was a go, and his
+    next injection and a switch to vision began without a word.
+    """
+    gate = InjectionGate(RcGateConfig(), lambda _: None)
+    injection = InjectionConfig(rate_hz=10, delay_ms=100, message="gps_input")
+    flight = Flight(monkeypatch, gate, mode="rc", injection=injection, switch=SWITCH)
+    flight.gnss_north_m, flight.north_m, flight.origin = 0.0, 20.0, (47.397742, 8.545594, 488.0)
+    flight.run(10.0)
+    gate.command(31010, 1.0)
+    flight.run(1.0)
+    flight.gnss_north_m = flight.ekf_north_m = 20.0
+    flight.run(150.0)
+    score = flight.end.shadow_score(flight.now_ns)
+    assert not score.go, score.line()
+    assert flight.end.on_gnss(flight.now_ns) is False
+    gate.command(31010, 0.0)
+    flight.run(1.0)
+    gate.command(31010, 1.0)
+    flight.run(1.0)
+    assert told(flight, "go from") == 2 * ["injecting without a go from shadow"]
+
+
+def test_gps_input_in_shadow_is_compared_with_the_receiver_that_is_there(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    injection = InjectionConfig(rate_hz=10, delay_ms=100, message="gps_input", gps_id=1)
+    flight = on_gnss(monkeypatch, mode="shadow", injection=injection)
+    flight.run(20.0)
+    assert flight.end.shadow_score(flight.now_ns).go
+    assert flight.end.on_gnss(flight.now_ns)
+
+
 class Compared:
     """An interlock whose score and comparisons are said."""
 
