@@ -280,7 +280,9 @@ def _vital_signs(making: Making) -> VitalSigns:
 
 def _autopilot(making: Making) -> AutopilotPose:
     bridge = making[Bridge]
-    autopilot = AutopilotPose(bridge, making[Installation], making.config.prior)
+    autopilot = AutopilotPose(
+        bridge, making[Installation], making.config.prior, lambda: bridge.on_gnss
+    )
     making.channels.estimates.subscribe(
         lambda estimate, _: autopilot.add_estimate(estimate, reaches_ekf=bridge.reaches_ekf)
     )
