@@ -109,5 +109,8 @@ class FixSender:
             self._counters["shadowed"] += 1
             return
         self._counters["injected"] += 1
+        if self._sent_ns is None and injection.estimate.reset_counter:
+            # A process that died had counted as far: the autopilot sees a jump with the next one.
+            self.injector.announce_jump()
         self._sent_ns = now_ns
         self._outcome.sent(injection.estimate, now_ns)
