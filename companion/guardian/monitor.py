@@ -15,7 +15,13 @@ from companion.calibration_watch.watch import CalibrationWatch
 from companion.guardian import findings as f
 from companion.guardian.config import GuardianConfig
 from companion.guardian.ekf import EkfWatch
-from companion.guardian.evidence import CheckedVehicle, Vehicle, known_attitude, known_state
+from companion.guardian.evidence import (
+    CheckedVehicle,
+    Vehicle,
+    known_attitude,
+    known_state,
+    moving_now,
+)
 from companion.guardian.findings import Action, Latch, Reading
 from companion.guardian.inertial import InertialTrack
 from companion.guardian.jump import JumpCheck
@@ -175,8 +181,9 @@ class Monitor:
         self._doubt_steps(fix, state, admitted=admitted)
         height_m = self._ground.height_m(state, fix.time_ns)
         known_m = self._known_m(state, height_m)
+        moving = moving_now(state, fix.time_ns)
         self._level = level = protection_level(
-            fix, state, self._config.protection, known_m, height_m
+            fix, moving, self._config.protection, known_m, height_m
         )
         fix = replace(fix, protection_m=(level.horizontal_m, level.vertical_m))
         self._jump_held = not admitted
@@ -208,7 +215,7 @@ class Monitor:
         self._leave_out_old_pictures()
         self._calibration.step(now_ns, vehicle, self._track)
         lines = []
-        readings = self._readings(now_ns, state)
+        readings = self._readings(now_ns, moving_now(state, now_ns))
         for name, latch in self._latches.items():
             text = latch.update(now_ns, readings[name])
             if text is not None:

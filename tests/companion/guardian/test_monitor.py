@@ -13,6 +13,7 @@ from companion.geometry import GIMBAL_FROM_CAMERA
 from companion.guardian.config import GuardianConfig
 from companion.guardian.monitor import Limits, Monitor
 from localizer.geometry.pose import matrix_from_quaternion, so3_exp
+from mavlink_bridge.messages import VehicleState, VisionFix
 from mavlink_bridge.vehicle.origin import offset
 from tests.companion.guardian.simulated import (
     HEIGHT,
@@ -370,3 +371,41 @@ def test_a_frozen_picture_is_no_evidence_of_its_stamps() -> None:
     texts = [line for _, line in flight.lines]
     assert flight.told("withheld: video") < 16.0
     assert not [line for line in texts if "stamped" in line or "focal" in line or "off in" in line]
+
+
+class WithoutPosition(Flight):
+    """Its EKF lost its position at 10 m/s, 30 s before, and says none any more: what it said last
+    stands. The pilot has stopped it since.
+    """
+
+    said_s = -30.0
+
+    def state(self) -> VehicleState:
+        return replace(
+            super().state(), local_velocity_ned=(10.0, 0.0, 0.0), local_time_ns=second(self.said_s)
+        )
+
+
+def calm(at_s: float) -> tuple[float, float]:
+    """A hover without wind: 0.02 m, which a picture shows, take 1.3 s."""
+    return hover(0.1 * at_s)
+
+
+def test_a_speed_of_before_the_ekf_lost_its_position_makes_no_picture_frozen() -> None:
+    """The place was found again, and withheld as `video frozen 0 s` every other second."""
+    flight = Filmed(WithoutPosition(monitor(), calm, noise_m=0.03), calm).fly(20.0)
+    assert flight.lines == []
+    assert flight.withheld == []
+
+
+def test_a_speed_of_before_the_ekf_lost_its_position_makes_no_level_small() -> None:
+    """It hovered when it lost it, and may fly at any speed since."""
+    fix = VisionFix(second(2.0), LATITUDE, LONGITUDE, HEIGHT)
+    hovered = replace(Flight(monitor()).state(), local_velocity_ned=(0.0, 0.0, 0.0))
+    levels = [
+        passed.protection_m[0]
+        for said_ns in (fix.time_ns, second(-30.0))
+        if (passed := monitor().admit(fix, replace(hovered, local_time_ns=said_ns))) is not None
+        and passed.protection_m is not None
+    ]
+    assert levels[1] > levels[0]
