@@ -283,6 +283,48 @@ def test_a_barometer_that_drifts_is_no_finding() -> None:
     assert Flight(monitor(), height_m=lambda at_s: 0.025 * at_s).fly(60.0).lines == []
 
 
+@dataclass
+class InAir(Flight):
+    """Climbs at 5 m/s by 100 m; the barometer's altitude is of the standard atmosphere, which is
+    15 degrees at sea level. celsius: the air's.
+    """
+
+    celsius: float = 15.0
+
+    def state(self) -> VehicleState:
+        climbed_m = self.height_m(self.at_s)
+        standard = climbed_m * 288.15 / (self.celsius + 273.15)
+        return replace(super().state(), pressure_altitude_m=500.0 + standard)
+
+
+def climb(at_s: float) -> float:
+    return min(5.0 * max(at_s - 10.0, 0.0), 100.0)
+
+
+@pytest.mark.parametrize("celsius", [-25.0, 0.0, 45.0])
+def test_a_climb_through_cold_or_hot_air_is_no_finding(celsius: float) -> None:
+    """At -25 degrees 100 m are 116 by the barometer: withheld at 60 m, and for the whole flight,
+    because its zero stands while it is off.
+    """
+    flight = InAir(monitor(), height_m=climb, celsius=celsius).fly(60.0)
+    assert flight.lines == []
+    assert flight.withheld == []
+
+
+@pytest.mark.parametrize("celsius", [-25.0, 45.0])
+def test_a_climb_that_vision_makes_half_is_withheld_in_any_air(celsius: float) -> None:
+    """It saw 50 m of 100: another place's ground."""
+
+    class Halved(InAir):
+        def state(self) -> VehicleState:
+            standard = climb(self.at_s) * 288.15 / (self.celsius + 273.15)
+            return replace(super().state(), pressure_altitude_m=500.0 + standard)
+
+    flight = Halved(monitor(), height_m=lambda at_s: 0.5 * climb(at_s), celsius=celsius).fly(60.0)
+    assert flight.told("off barometer") < 21.0
+    assert max(flight.withheld) > 59.0
+
+
 def test_beyond_the_alert_limit_nothing_is_injected() -> None:
     """A sigma of 3 m is honest, and too much for the risk."""
     flight = Flight(monitor(), noise_m=0.2, claimed_m=3.0).fly(10.0)
