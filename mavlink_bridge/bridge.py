@@ -147,6 +147,12 @@ class Bridge:
         for link in self._links:
             link.start()
 
+    def leave(self) -> None:
+        """What follows is no end in order: what is remembered over a restart stays so."""
+        if self._shared.gate is not None:
+            self._shared.gate.stop(in_order=False)
+        self._fc.end(in_order=False)
+
     def stop(self) -> None:
         """Close the links; the bridge cannot be started again. Harmless when called again."""
         if self._stopped:

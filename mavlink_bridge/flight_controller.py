@@ -113,9 +113,9 @@ class FlightControllerEnd:
         """Before the link begins: what a process that was killed knew."""
         self._interlock.recall()
 
-    def end(self) -> None:
-        """After the link has ended, in order."""
-        self._interlock.end()
+    def end(self, *, in_order: bool = True) -> None:
+        """After the link has ended; before, where that is not in order."""
+        self._interlock.end(in_order=in_order)
 
     def forbid(self, why: str) -> None:
         """Until it is called with an empty text, nothing begins."""

@@ -463,6 +463,7 @@ PARTS: tuple[Part[Any], ...] = (
     Part(
         "bridge", Bridge, _bridge, depends=(MapStack,), later=(PlaceSearch,),
         start=Bridge.start, stop=Bridge.stop, close=Bridge.stop,  # one not started has files open
+        leave=Bridge.leave,
     ),
     Part("injection", FixInjection, _injection, depends=(Bridge, Installation)),
     Part("map shift", MapShift, _map_shift, depends=(Bridge, FixInjection)),
@@ -508,7 +509,7 @@ PARTS: tuple[Part[Any], ...] = (
     Part(
         "last fix", FixMemory, _last_fix,
         depends=(Bridge, Installation, Guardian, AutopilotPose),
-        start=FixMemory.start, stop=FixMemory.stop,
+        start=FixMemory.start, stop=FixMemory.stop, leave=FixMemory.leave,
     ),
     Part(
         "priors", PriorSources,

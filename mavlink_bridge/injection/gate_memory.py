@@ -82,13 +82,19 @@ class RestartMemory:
         self._told = None
         self._wake.set()
 
-    def stop(self) -> None:
-        """End the thread. An orderly end is the pilot's: nothing is remembered of it.
+    def stop(self, *, in_order: bool = True) -> None:
+        """End the thread. An orderly end is the pilot's: nothing is remembered of it. After another
+        one the next process takes over, as after a kill; who says so first is believed.
 
         A standby that never flew leaves the file alone: it is of the process that flies.
         """
-        self._told, self._stopping = None, True
-        self._wake.set()
+        if not self._stopping:
+            if in_order:
+                self._told = None
+            else:
+                self._in_use = False
+            self._stopping = True
+            self._wake.set()
         self._thread.join(_STOP_S)
 
     def _age_s(self, content: dict[str, Any]) -> float:
@@ -146,9 +152,9 @@ class GateMemory:
         """The gate is closed from now on."""
         self._memory.drop()
 
-    def stop(self) -> None:
-        """An orderly end: nothing is remembered of it."""
-        self._memory.stop()
+    def stop(self, *, in_order: bool = True) -> None:
+        """The end; see `RestartMemory.stop`."""
+        self._memory.stop(in_order=in_order)
 
 
 class NoGoMemory:
@@ -176,6 +182,6 @@ class NoGoMemory:
         else:
             self._memory.drop()
 
-    def stop(self) -> None:
-        """An orderly end: nothing is remembered of it."""
-        self._memory.stop()
+    def stop(self, *, in_order: bool = True) -> None:
+        """The end; see `RestartMemory.stop`."""
+        self._memory.stop(in_order=in_order)

@@ -196,6 +196,34 @@ def test_the_bridge_restores_the_gate_that_a_killed_one_left_open(
     assert not path.exists()
 
 
+def test_a_bridge_that_does_not_end_in_order_leaves_the_gate_to_the_next(tmp_path: Path) -> None:
+    """Its process takes over from a killed one, and fails on the way up."""
+    path = tmp_path / "gate.json"
+    _left_open(path)
+    bridge = _bridge(path, "udpout:127.0.0.1:9", [])
+    bridge.start()
+    bridge.leave()
+    bridge.stop()
+    assert json.loads(path.read_text())["open"] is True
+    again = _bridge(path, "udpout:127.0.0.1:9", [])
+    again.start()
+    again.stop()
+    assert not path.exists()
+
+
+def test_what_is_not_remembered_is_not_kept_by_such_an_end(tmp_path: Path) -> None:
+    path = tmp_path / "gate.json"
+    gate, _ = restarted(path)
+    gate.command(31010, 1.0)
+    while not path.exists():
+        pass
+    gate.command(31010, 0.0)
+    while path.exists():
+        pass
+    gate.stop(in_order=False)
+    assert not path.exists()
+
+
 def test_a_standby_that_never_flew_leaves_the_file_alone(tmp_path: Path) -> None:
     path = tmp_path / "gate.json"
     _left_open(path)
