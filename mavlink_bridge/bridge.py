@@ -134,6 +134,12 @@ class Bridge:
 
     # --- life -----------------------------------------------------------------------------------
 
+    def flies_over(self, map_id: str) -> None:
+        """Before `start`, which map the fixes are of: what spoke against another one in a process
+        before is not remembered of it.
+        """
+        self._fc.flies_over(map_id)
+
     def start(self) -> None:
         """Open the links and keep them open."""
         if self._started:

@@ -54,10 +54,9 @@ FC_WANTED = frozenset(
 )
 
 
-def _no_go_memory(config: BridgeConfig) -> NoGoMemory | None:
-    if config.state_file is None:
-        return None
-    return NoGoMemory(RestartMemory(config.state_file.with_name("shadow-no-go.json")))
+def _no_go_memory(config: BridgeConfig) -> RestartMemory | None:
+    file = config.state_file
+    return None if file is None else RestartMemory(file.with_name("shadow-no-go.json"))
 
 
 class FlightControllerEnd:
@@ -80,12 +79,13 @@ class FlightControllerEnd:
         self.outcome = InjectionOutcome(shared, self.origin, teller, self.counters)
         self.sender = FixSender(shared, self.origin, self.outcome, teller, self.counters)
         self.sources = SourceOrders(config.switch, commander, teller, self.counters)
+        self._no_go = no_go = _no_go_memory(config)
         self._interlock = ShadowInterlock(
             config.injection.force,
             self.shadow_score,
             lambda: self.outcome.compared_ns,
             teller,
-            _no_go_memory(config),
+            None if no_go is None else NoGoMemory(no_go),
         )
         self.news = VehicleNews(teller)
         self._warnings = FixWarnings(shared, self.sender.injector, teller)
@@ -108,6 +108,11 @@ class FlightControllerEnd:
         ):
             return False
         return None if current is None else self.sources.on_gnss
+
+    def flies_over(self, map_id: str) -> None:
+        """Before `recall`: which map the fixes are of."""
+        if self._no_go is not None:
+            self._no_go.about = map_id
 
     def recall(self) -> None:
         """Before the link begins: what a process that was killed knew."""

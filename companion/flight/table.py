@@ -40,7 +40,7 @@ from companion.live.protocol import socket_path
 from companion.live.publisher import Publisher
 from companion.live.shown import Instruments, Shown
 from companion.preflight.coverage import check_origin
-from companion.preflight.map_pin import require_pinned
+from companion.preflight.map_pin import readable_map_hash, require_pinned
 from companion.sources import FrameSource, PacketTap, PacketTaps, StreamState, open_source
 from companion.sources.timing import system_minus_monotonic
 from companion.sources.zoom import ZoomedFrames
@@ -90,7 +90,7 @@ def _installation(making: Making) -> Installation:
 
 def _bridge(making: Making) -> Bridge:
     search = making.later(PlaceSearch)
-    return Bridge(
+    bridge = Bridge(
         _bridge_config(making.config),
         making[MapStack].cache.manifest.geoid_separation_m,
         on_track=making.channels.clicks.send,
@@ -98,6 +98,8 @@ def _bridge(making: Making) -> Bridge:
         on_text=making.channels.texts.send,
         on_vehicle_text=making.channels.vehicle_texts.send,
     )
+    bridge.flies_over(readable_map_hash(making.config.map) or "")
+    return bridge
 
 
 def _record(making: Making) -> RecordKeeper:

@@ -91,6 +91,27 @@ def test_a_map_20_m_off_is_as_wrong_after_a_restart_under_denial(
     assert not file.exists()
 
 
+def test_another_map_after_a_restart_is_not_blamed_for_the_one_before(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    gate, file = tmp_path / "gate.json", tmp_path / "shadow-no-go.json"
+    killed = on_gnss(monkeypatch, state_file=gate)
+    killed.end.flies_over("map a")
+    killed.north_m = 20.0
+    killed.run(15.0)
+    while not file.exists():
+        pass
+    again = on_gnss(monkeypatch, state_file=gate)
+    again.end.flies_over("map b")
+    again.gnss_north_m = None
+    again.end.recall()
+    again.run(10.0)
+    assert again.vision()
+    assert told(again, "no go") == []
+    for flight in (killed, again):
+        flight.end.end()
+
+
 @pytest.mark.parametrize(("begins", "kept"), [(True, []), (False, ["20 m off"])])
 def test_only_who_never_began_is_kept_from_beginning_by_a_restart(
     begins: bool, kept: list[str]
