@@ -6,6 +6,7 @@ above it and subscribes to the channels that it reads.
 
 from __future__ import annotations
 
+import hashlib
 import logging
 from collections.abc import Callable
 from dataclasses import replace
@@ -31,6 +32,7 @@ from companion.flight.search import PlaceSearch, place_on_map
 from companion.flight.sightings import Sightings
 from companion.flight.view_reporter import ViewReporter
 from companion.ground.vital_signs import VitalSigns
+from companion.guardian.findings import ForbidMemory
 from companion.guardian.guardian import Guardian
 from companion.guardian.monitor import Limits
 from companion.klv.metadata import Scene
@@ -61,6 +63,7 @@ from localizer.tracking.pipeline import Localizer
 from localizer.types import Frame, PoseEstimate, ReferenceBundle
 from mavlink_bridge.bridge import Bridge
 from mavlink_bridge.config import BridgeConfig
+from mavlink_bridge.injection.gate_memory import RestartMemory
 from mavlink_bridge.messages import TrackRequest
 
 _log = logging.getLogger(__name__)
@@ -354,7 +357,7 @@ def _guardian(making: Making) -> Guardian:
     calibrated = config.camera.is_calibrated(datetime.now(timezone.utc).date())
     protection = config.guardian.protection.of_camera(calibrated=calibrated)
     watched = config.guardian.model_copy(update={"protection": protection})
-    guardian = Guardian(watched, limits, making[Bridge])
+    guardian = Guardian(watched, limits, making[Bridge], _forbid_memory(config))
     making[FixInjection].add_judge(lambda _, fix: guardian.judge(fix))
     making.channels.frames.subscribe(lambda f: guardian.see(f.exposure_time_ns, f.image))
     sightings = Sightings(making[Bridge], making[Installation], guardian.sight)
@@ -471,7 +474,8 @@ PARTS: tuple[Part[Any], ...] = (
     Part("map shift", MapShift, _map_shift, depends=(Bridge, FixInjection)),
     Part(
         "guardian", Guardian, _guardian, depends=(Bridge, Installation, FixInjection),
-        start=Guardian.start, stop=Guardian.stop, wanted=lambda config: config.guardian.enabled,
+        start=Guardian.start, stop=Guardian.stop, close=Guardian.close, leave=Guardian.leave,
+        wanted=lambda config: config.guardian.enabled,
     ),
     Part(
         "record", RecordKeeper, _record, depends=(MapStack, Bridge, Guardian),
@@ -586,7 +590,21 @@ def _bridge_config(config: CompanionConfig) -> BridgeConfig:
         }
         | ({"zoom_rate_hz": asked} if config.camera.zoom is not None else {})
     )
-    state_file = config.bridge.state_file
-    if state_file is None and config.record is not None:
-        state_file = config.record.folder.parent / "injection-gate.json"
-    return config.bridge.model_copy(update={"camera": announced, "state_file": state_file})
+    return config.bridge.model_copy(update={"camera": announced, "state_file": _state_file(config)})
+
+
+def _state_file(config: CompanionConfig) -> Path | None:
+    if config.bridge.state_file is not None or config.record is None:
+        return config.bridge.state_file
+    return config.record.folder.parent / "injection-gate.json"
+
+
+def _forbid_memory(config: CompanionConfig) -> ForbidMemory | None:
+    """Of this map and this camera: what was found of another says nothing."""
+    file = _state_file(config)
+    if file is None:
+        return None
+    described = (config.camera.model_dump_json(), config.bridge.camera.model_dump_json())
+    about = "\n".join((readable_map_hash(config.map) or "", *described))
+    digest = hashlib.sha256(about.encode()).hexdigest()
+    return ForbidMemory(RestartMemory(file.with_name("guardian-forbids.json"), about=digest))

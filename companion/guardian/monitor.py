@@ -22,7 +22,7 @@ from companion.guardian.evidence import (
     known_state,
     moving_now,
 )
-from companion.guardian.findings import Action, Latch, Reading
+from companion.guardian.findings import Action, Found, Latch, Reading
 from companion.guardian.inertial import InertialTrack
 from companion.guardian.jump import JumpCheck
 from companion.guardian.motion import MotionCheck, MotionVerdict
@@ -135,6 +135,16 @@ class Monitor:
             if latch.raised and latch.rule.forbids:
                 return latch.line().removeprefix(f.PREFIX)
         return ""
+
+    def forbidding(self) -> Found:
+        """The findings that stand and forbid."""
+        standing = (latch for latch in self._latches.values() if latch.raised)
+        return {one.rule.name: (one.figure, one.word) for one in standing if one.rule.forbids}
+
+    def restore(self, found: Found) -> None:
+        """What stood in a process before this one stands until evidence speaks against it."""
+        for name, (figure, word) in found.items():
+            self._latches[name].restore(figure, word)
 
     @property
     def level(self) -> ProtectionLevel | None:

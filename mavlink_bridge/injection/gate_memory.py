@@ -33,7 +33,8 @@ class RestartMemory:
 
     about: what it holds of, empty where that is always the same; what was kept of another counts
     for nothing. wall_s: UTC seconds; boot, clock_s: of CLOCK_MONOTONIC. Within one run of the
-    computer that clock counts, which nobody sets; the wall clock where it lost its power in the air.
+    computer that clock counts, which nobody sets; else, where it lost its power in the air, the
+    wall clock.
     """
 
     def __init__(

@@ -191,8 +191,8 @@ def test_an_end_that_is_none_in_order_leaves_what_is_remembered(small_assets, fa
     assert memory.log == log
 
 
-def test_the_gate_and_the_last_fix_are_what_is_left():
-    assert {p.name for p in PARTS if p.leave is not None} == {"bridge", "last fix"}
+def test_the_gate_the_last_fix_and_what_forbids_are_what_is_left():
+    assert {p.name for p in PARTS if p.leave is not None} == {"bridge", "guardian", "last fix"}
 
 
 def test_what_happens_is_logged_and_recorded_once_and_every_thread_ends(
