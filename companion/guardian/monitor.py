@@ -378,8 +378,7 @@ class Monitor:
             and verdict.still_s < _MOVES_S
             and self.action is Action.NONE
         )
-        reading = self._ekf.jumped(state, now_ns, agrees=agrees)
-        return reading if state.armed else Reading(False)
+        return self._ekf.jumped(state, now_ns, agrees=agrees)
 
     def _beyond_limit(self) -> Reading:
         if self._level is None:
