@@ -45,7 +45,9 @@ class LocalPlace:
 
 
 class HeightCheck:
-    """Vision's height against the barometer's, both since they were first seen together."""
+    """Vision's height against the barometer's, both since they were first seen together in this
+    flight: weather and temperature change between two.
+    """
 
     def __init__(self, config: GuardianConfig) -> None:
         self._limit_m = config.height_m
@@ -56,6 +58,10 @@ class HeightCheck:
 
     def add(self, fix: VisionFix, state: VehicleState) -> Reading:
         """One fix, and the state at about its time."""
+        if not state.armed:
+            self._zero = None
+            self._differences.clear()
+            return Reading(False)
         altitude = state.pressure_altitude_m
         if altitude is None or abs(fix.time_ns - state.pressure_time_ns) > _BARO_FRESH_NS:
             return Reading(None)

@@ -283,6 +283,39 @@ def test_a_barometer_that_drifts_is_no_finding() -> None:
     assert Flight(monitor(), height_m=lambda at_s: 0.025 * at_s).fly(60.0).lines == []
 
 
+class Twice(Flight):
+    """Two flights of one process, on the ground from 20 to 40 s; meanwhile the weather changed."""
+
+    weather_m = 17.0
+
+    def state(self) -> VehicleState:
+        on_ground, later = 20.0 <= self.at_s < 40.0, self.at_s >= 30.0
+        return replace(
+            super().state(),
+            armed=not on_ground,
+            pressure_altitude_m=500.0 + (self.weather_m if later else 0.0),
+        )
+
+
+def test_the_weather_between_two_flights_is_no_finding() -> None:
+    """2 hPa in some hours are 17 m: the second flight was withheld from its first position on, and
+    to its end, because the zero of the first stood while it was off.
+    """
+    flight = Twice(monitor()).fly(60.0)
+    assert flight.lines == []
+    assert flight.withheld == []
+
+
+def test_a_height_that_was_off_in_one_flight_is_watched_anew_in_the_next() -> None:
+    def height(at_s: float) -> float:
+        return 30.0 if 10.0 <= at_s < 20.0 or at_s >= 50.0 else 0.0
+
+    flight = Twice(monitor(), height_m=height).fly(60.0)
+    told = [at_s for at_s, text in flight.lines if "off barometer" in text]
+    assert told == pytest.approx([12.8, 52.8], abs=1.0)
+    assert not [at_s for at_s in flight.withheld if 27.0 < at_s < 50.0]
+
+
 @dataclass
 class InAir(Flight):
     """Climbs at 5 m/s by 100 m; the barometer's altitude is of the standard atmosphere, which is
