@@ -164,12 +164,16 @@ class Guardian:
         """Look at everything once; ten times a second by its thread."""
         self.turn_ns = monotonic_ns()
         self._works("taking turns")
+        picture, self._picture = self._picture, None
+        looks = picture is not None  # a turn without one is no word that pictures can be looked at
         try:
-            self._step()
+            self._step(picture)
         except Exception:
-            self._fail("watching")
+            self._fail("looking" if looks else "watching")
         else:
             self._works("watching")
+            if looks:
+                self._works("looking")
         self._tell_failure(self.turn_ns)
         self._tell_what_stands(self.turn_ns)
 
@@ -191,7 +195,7 @@ class Guardian:
     @property
     def _is_blind(self) -> bool:
         with self._failures:
-            return self._fails.get("watching", 0) >= _BLIND_TURNS
+            return sum(self._fails.get(one, 0) for one in ("watching", "looking")) >= _BLIND_TURNS
 
     def _fail(self, what: str) -> None:
         """A guardian that died in silence would be believed: told with its next turn."""
@@ -204,8 +208,7 @@ class Guardian:
         with self._failures:
             self._fails.pop(what, None)
 
-    def _step(self) -> None:
-        picture, self._picture = self._picture, None
+    def _step(self, picture: tuple[int, Image] | None) -> None:
         with self._lock:
             if picture is not None:
                 self._monitor.see(*picture)

@@ -225,6 +225,50 @@ def test_a_guardian_that_sees_nothing_for_a_second_withholds_until_it_does(
     assert guardian.judge(FIX) is not None
 
 
+def test_a_guardian_that_fails_at_each_picture_of_a_slow_video_withholds(
+    faulty: tuple[Guardian, Any], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """At 5 pictures a second every other turn had none, and was well: fixes passed under the text
+    that they were withheld, and no picture was ever looked at.
+    """
+    guardian, bridge = faulty
+
+    def fails(*_: object) -> None:
+        raise ValueError("no picture")
+
+    with monkeypatch.context() as broken:
+        broken.setattr(Monitor, "see", fails)
+        for turn in range(20):
+            if turn % 2:
+                guardian.see(second(10.0 + turn), PICTURE)
+            guardian.turn()
+        assert guardian.judge(FIX) is None
+        assert bridge.said == [(3, "PiLoT: withheld: guardian failed")]
+    guardian.turn()
+    assert guardian.judge(FIX) is None  # without a picture it saw nothing
+    guardian.see(second(40.0), PICTURE)
+    guardian.turn()
+    assert guardian.judge(FIX) is not None
+
+
+def test_a_picture_that_fails_now_and_then_withholds_nothing(
+    faulty: tuple[Guardian, Any], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    guardian, _ = faulty
+    see = Monitor.see
+
+    def fails(watched: Monitor, time_ns: int, image: Any) -> None:
+        if time_ns % second(4.0) == 0:
+            raise ValueError("no picture")
+        see(watched, time_ns, image)
+
+    monkeypatch.setattr(Monitor, "see", fails)
+    for turn in range(60):
+        guardian.see(second(10.0 + turn), np.roll(PICTURE, 7 * turn, axis=1))
+        guardian.turn()
+        assert guardian.judge(replace(FIX, time_ns=second(1.0) + turn)) is not None
+
+
 def test_a_reset_that_falls_into_a_blind_time_is_announced_after_it(
     faulty: tuple[Guardian, Any],
 ) -> None:
