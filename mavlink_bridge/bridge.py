@@ -134,6 +134,12 @@ class Bridge:
 
     # --- life -----------------------------------------------------------------------------------
 
+    def flies_over(self, map_id: str) -> None:
+        """Before `start`, which map the fixes are of: what spoke against another one in a process
+        before is not remembered of it.
+        """
+        self._fc.flies_over(map_id)
+
     def start(self) -> None:
         """Open the links and keep them open."""
         if self._started:
@@ -146,6 +152,12 @@ class Bridge:
         self._fc.recall()
         for link in self._links:
             link.start()
+
+    def leave(self) -> None:
+        """What follows is no end in order: what is remembered over a restart stays so."""
+        if self._shared.gate is not None:
+            self._shared.gate.stop(in_order=False)
+        self._fc.end(in_order=False)
 
     def stop(self) -> None:
         """Close the links; the bridge cannot be started again. Harmless when called again."""
@@ -270,9 +282,16 @@ class Bridge:
         """The EKF's (latitude, longitude, altitude AMSL) at a time; None while it does not follow a
         healthy GNSS, or where that is not known.
         """
-        if not self._fc.sources.on_gnss or not gnss_healthy(self.state(), monotonic_ns()):
+        if not self.on_gnss or not gnss_healthy(self.state(), monotonic_ns()):
             return None
         return self._tracker.global_at(time_ns)
+
+    @property
+    def on_gnss(self) -> bool | None:
+        """Whether GNSS makes the EKF's position, healthy or not: by its source set, and not where
+        the receiver is fed by us; None where the set is not known.
+        """
+        return self._fc.on_gnss(monotonic_ns())
 
     def inertial_since(self, time_ns: int) -> tuple[InertialSample, ...]:
         """What the vehicle's IMU read after a CLOCK_MONOTONIC time, oldest first."""

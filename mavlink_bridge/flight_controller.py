@@ -54,10 +54,9 @@ FC_WANTED = frozenset(
 )
 
 
-def _no_go_memory(config: BridgeConfig) -> NoGoMemory | None:
-    if config.state_file is None:
-        return None
-    return NoGoMemory(RestartMemory(config.state_file.with_name("shadow-no-go.json")))
+def _no_go_memory(config: BridgeConfig) -> RestartMemory | None:
+    file = config.state_file
+    return None if file is None else RestartMemory(file.with_name("shadow-no-go.json"))
 
 
 class FlightControllerEnd:
@@ -80,12 +79,13 @@ class FlightControllerEnd:
         self.outcome = InjectionOutcome(shared, self.origin, teller, self.counters)
         self.sender = FixSender(shared, self.origin, self.outcome, teller, self.counters)
         self.sources = SourceOrders(config.switch, commander, teller, self.counters)
+        self._no_go = no_go = _no_go_memory(config)
         self._interlock = ShadowInterlock(
             config.injection.force,
             self.shadow_score,
             lambda: self.outcome.compared_ns,
             teller,
-            _no_go_memory(config),
+            None if no_go is None else NoGoMemory(no_go),
         )
         self.news = VehicleNews(teller)
         self._warnings = FixWarnings(shared, self.sender.injector, teller)
@@ -98,13 +98,29 @@ class FlightControllerEnd:
         """How vision compared with GNSS over the last two minutes."""
         return self.outcome.shadow.score(now_ns, self.sender.injector.refused_yaw_rad)
 
+    def on_gnss(self, now_ns: int) -> bool | None:
+        """Whether GNSS makes the EKF's position; None where its source set is not known. A receiver
+        that tells what it is told by us (GPS_INPUT) is none.
+        """
+        current = self.sources.current
+        if self._shared.config.injection.message == "gps_input" and (
+            current is None or self.sender.fed(now_ns)
+        ):
+            return False
+        return None if current is None else self.sources.on_gnss
+
+    def flies_over(self, map_id: str) -> None:
+        """Before `recall`: which map the fixes are of."""
+        if self._no_go is not None:
+            self._no_go.about = map_id
+
     def recall(self) -> None:
         """Before the link begins: what a process that was killed knew."""
         self._interlock.recall()
 
-    def end(self) -> None:
-        """After the link has ended, in order."""
-        self._interlock.end()
+    def end(self, *, in_order: bool = True) -> None:
+        """After the link has ended; before, where that is not in order."""
+        self._interlock.end(in_order=in_order)
 
     def forbid(self, why: str) -> None:
         """Until it is called with an empty text, nothing begins."""
@@ -270,8 +286,7 @@ class FlightControllerEnd:
     def _check(self, link: Link, state: VehicleState, now_ns: int) -> None:
         """What came of it, ten times a second: score, verdict, source switch."""
         sender = self.sender
-        on_gnss = None if self.sources.current is None else self.sources.on_gnss
-        self.outcome.compare(state, now_ns, on_gnss=on_gnss)
+        self.outcome.compare(state, now_ns, on_gnss=self.on_gnss(now_ns))
         self._strangers.check(link, now_ns)
         if self.outcome.judge(state, now_ns):
             sender.injector.announce_jump()

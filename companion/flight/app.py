@@ -95,26 +95,37 @@ class Companion:
                 up.close()
                 self.discard_record()
                 raise
-            self._parts.start(up)
-            guardian = self._parts.get(Guardian)
-            if guardian is not None:
-                guardian.watch(self._untold_turns)
-            if self._pulse is not None:
-                pulse = Pulse(self._turns, self._pulse)
-                pulse.start()
-                # First of all: what comes down takes no turns.
-                up.push(lambda error, *_: pulse.stop(in_order=self._is_in_order(error)))
-            self._tell_what_runs(lost)
-            feed = self._parts[Feed]
-            # In slices: signals are handled between them.
-            while not (self._is_stopping or feed.ended.wait(0.2)):
-                pass
-            health = self._parts.get(HealthMonitor)
-            if health is not None:
-                error = "" if feed.error is None else f": {feed.error}"
-                health.end("stopped" if self._is_stopping else f"the feed ended{error}")
+            try:
+                feed = self._fly(up, lost)
+            except BaseException:
+                self._parts.leave()
+                raise
+            if feed.error is not None and not self._is_stopping:
+                self._parts.leave()
         if feed.error is not None:
             raise feed.error
+
+    def _fly(self, up: ExitStack, lost: str) -> Feed:
+        """From the start of the parts to the end of the feed, or to the order to stop."""
+        self._parts.start(up)
+        guardian = self._parts.get(Guardian)
+        if guardian is not None:
+            guardian.watch(self._untold_turns)
+        if self._pulse is not None:
+            pulse = Pulse(self._turns, self._pulse)
+            pulse.start()
+            # First of all: what comes down takes no turns.
+            up.push(lambda error, *_: pulse.stop(in_order=self._is_in_order(error)))
+        self._tell_what_runs(lost)
+        feed = self._parts[Feed]
+        # In slices: signals are handled between them.
+        while not (self._is_stopping or feed.ended.wait(0.2)):
+            pass
+        health = self._parts.get(HealthMonitor)
+        if health is not None:
+            error = "" if feed.error is None else f": {feed.error}"
+            health.end("stopped" if self._is_stopping else f"the feed ended{error}")
+        return feed
 
     def stop(self) -> bool:
         """End `run` in order, soon. False on the way up, which goes on.

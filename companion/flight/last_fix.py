@@ -146,7 +146,7 @@ class FixMemory:
         self._boot = boot_id()
         self._before = None if path is None else read_last_fix(path, self._boot)
         self._newest: PoseEstimate | None = None
-        self._failed = False
+        self._failed = self._leaves = False
         self._stop = threading.Event()
         self._thread = threading.Thread(target=self._run, name="last-fix", daemon=True)
 
@@ -154,12 +154,16 @@ class FixMemory:
         """Start keeping."""
         self._thread.start()
 
+    def leave(self) -> None:
+        """What follows is no end in order: the next process goes on from what is kept."""
+        self._leaves = True
+
     def stop(self) -> None:
         """Stop keeping; a flight that ended in order leaves nothing to go on from. A disk that
         stands still is left behind.
         """
         self._stop.set()
-        if joined(self._thread) and self._path is not None:
+        if joined(self._thread) and self._path is not None and not self._leaves:
             try:
                 self._path.unlink(missing_ok=True)
             except OSError as error:  # its age and the boot still tell the next process

@@ -38,6 +38,8 @@ class Part(Generic[T]):
     """Undoes `start`; waits for the part's threads."""
     close: Callable[[T], None] | None = None
     """Undoes `make`, where that opened something."""
+    leave: Callable[[T], None] | None = None
+    """Called before an end that is none in order: another process takes over what it remembers."""
     wanted: Callable[[CompanionConfig], bool] = _always
     """Whether this deployment has the part at all."""
     ahead: bool = False
@@ -115,6 +117,12 @@ class Assembly:
             self._made[part.kind] = made
             if part.close is not None:
                 up.callback(part.close, made)
+
+    def leave(self) -> None:
+        """What follows is no end in order."""
+        for part in self._parts:
+            if part.leave is not None and part.kind in self._made:
+                part.leave(self._made[part.kind])
 
     def forget(self) -> None:
         """What was made is closed: it is made anew."""

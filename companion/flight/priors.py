@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import threading
 import time
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Protocol
 
@@ -19,6 +20,7 @@ from localizer.tracking.motion import OtherSensors
 from localizer.types import PoseEstimate, PosePrior
 from mavlink_bridge.injection.shadow import gnss_healthy
 from mavlink_bridge.messages import Attitude, GimbalAttitude, VehicleState
+from mavlink_bridge.vehicle.origin import north_east
 
 _CONST_POSITION = 128  # EKF_CONST_POS_MODE of EKF_STATUS_REPORT (193): it only knows that it is
 _ATTITUDE = 1
@@ -35,6 +37,7 @@ _AHEAD_S = 0.3  # by which a velocity carries a position on
 _RANGE_AGE_S = 0.5  # a rangefinder's reading on the way: 5 m at 10 m/s
 _LEAST_UPRIGHT = math.cos(math.radians(25.0))  # else a beam meets the ground far to one side
 _UNTOLD_SIGMA_M = 25.0  # of a position of which nobody says where it comes from
+_BESIDE_M, _REPORT_S = 3.0, 0.5  # of the receiver: an EKF farther off follows something else
 
 
 class Autopilot(Protocol):
@@ -105,9 +108,9 @@ class PositionBelief:
         with self._lock:
             self._fix_ns = time_ns
 
-    def at(self, state: VehicleState, now_ns: int) -> Belief:
-        """What the position of this state is worth now."""
-        healthy = gnss_healthy(state, now_ns) and not state.ekf_flags & _GLITCH
+    def at(self, state: VehicleState, now_ns: int, *, on_gnss: bool = True) -> Belief:
+        """What the position of this state is worth now. on_gnss: GNSS, if healthy, makes it."""
+        healthy = on_gnss and gnss_healthy(state, now_ns) and not state.ekf_flags & _GLITCH
         with self._lock:
             if healthy:
                 self._gnss_ns = now_ns
@@ -125,13 +128,33 @@ class PositionBelief:
         )
 
 
+def _is_beside_receiver(state: VehicleState) -> bool:
+    """Whether the EKF's position is where the receiver's is."""
+    ekf = (state.latitude_deg, state.longitude_deg)
+    receiver = (state.gps_latitude_deg, state.gps_longitude_deg)
+    if ekf[0] is None or ekf[1] is None or receiver[0] is None or receiver[1] is None:
+        return False
+    apart_m = math.hypot(*north_east(ekf[0], ekf[1], receiver[0], receiver[1]))
+    speed_mps = math.hypot(*(state.local_velocity_ned or (0.0, 0.0, 0.0))[:2])
+    return apart_m <= _BESIDE_M + _REPORT_S * speed_mps
+
+
 class AutopilotPose:
-    """The camera's pose as the autopilot's position, attitude and gimbal tell it."""
+    """The camera's pose as the autopilot's position, attitude and gimbal tell it.
+
+    on_gnss: whether GNSS, if healthy, makes the autopilot's position, None where nobody knows: then
+    it does where the receiver says the same place. One that was led by our own fixes is none to
+    begin from, whatever a receiver says beside it that is not followed.
+    """
 
     def __init__(
-        self, autopilot: Autopilot, installation: Installation, config: PriorConfig
+        self,
+        autopilot: Autopilot,
+        installation: Installation,
+        config: PriorConfig,
+        on_gnss: Callable[[], bool | None] = lambda: True,
     ) -> None:
-        self._autopilot = autopilot
+        self._autopilot, self._on_gnss = autopilot, on_gnss
         self._installation = installation
         self._config = config
         self.belief = PositionBelief(config)
@@ -148,7 +171,7 @@ class AutopilotPose:
     @property
     def sigma_m(self) -> float | None:
         """Horizontal sigma of the autopilot's position now; None where it is not known."""
-        return self.belief.at(self._autopilot.state(), time.monotonic_ns()).sigma_m
+        return self._believed(self._autopilot.state(), time.monotonic_ns()).sigma_m
 
     @property
     def sensors(self) -> OtherSensors:
@@ -195,7 +218,7 @@ class AutopilotPose:
     def prior(self, time_ns: int) -> PosePrior | None:
         """The camera's pose at a CLOCK_MONOTONIC time; None while the autopilot does not know."""
         state = self._autopilot.state()
-        belief = self.belief.at(state, time_ns)
+        belief = self._believed(state, time_ns)
         if belief.sigma_m is None:
             return None
         prior = vehicle_prior(
@@ -226,7 +249,7 @@ class AutopilotPose:
         if begin is None or end is None:
             return None
         way = NED_FROM_ENU.T @ (np.array(end[:3]) - np.array(begin[:3]))
-        belief = self.belief.at(state, end_ns)
+        belief = self._believed(state, end_ns)
         if belief.sigma_m is None:
             return None
         # The position's sigma now against that at the begin is what the velocity may be off.
@@ -234,6 +257,11 @@ class AutopilotPose:
         since_s = max(elapsed_s, math.sqrt(belief.sigma_m / _DRIFT_ACCELERATION_M_S2))
         speed_error = _DRIFT_SPEED_M_S + 2.0 * _DRIFT_ACCELERATION_M_S2 * since_s
         return way, 0.5 + speed_error * elapsed_s
+
+    def _believed(self, state: VehicleState, now_ns: int) -> Belief:
+        known = self._on_gnss()
+        on_gnss = _is_beside_receiver(state) if known is None else known
+        return self.belief.at(state, now_ns, on_gnss=on_gnss)
 
 
 class PriorSources:

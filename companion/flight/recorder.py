@@ -17,9 +17,9 @@ import cv2
 import numpy as np
 
 from companion.config import CompanionConfig, RecordConfig
-from companion.errors import ConfigError, DiskFaultError, ReportError
+from companion.errors import DiskFaultError, ReportError
 from companion.ground.target_files import write_target_files
-from companion.preflight.map_pin import map_hash
+from companion.preflight.map_pin import readable_map_hash
 from companion.redaction import redacted
 from companion.trajectory import TrajectoryFiles, snapshot_name, stamped
 from companion.versions import versions
@@ -93,20 +93,13 @@ def write_manifest(folder: Path, config: CompanionConfig) -> None:
         "monotonic_ns": monotonic_ns,
         "utc_ns": process_utc().utc_ns(monotonic_ns),
         "versions": versions(),
-        "map_sha256": _map_hash(config.map),
+        "map_sha256": readable_map_hash(config.map),
         "config": _without_credentials(config.model_dump(mode="json")),
     }
     try:
         (folder / MANIFEST_NAME).write_text(json.dumps(document, indent=1), encoding="utf-8")
     except OSError as error:
         raise _unwritable(folder, error) from error
-
-
-def _map_hash(cache: Path) -> str | None:
-    try:
-        return map_hash(cache)
-    except ConfigError:  # it was open a moment ago; the record is worth more than its name
-        return None
 
 
 def _without_credentials(value: Any) -> Any:

@@ -6,6 +6,7 @@ above it and subscribes to the channels that it reads.
 
 from __future__ import annotations
 
+import hashlib
 import logging
 from collections.abc import Callable
 from dataclasses import replace
@@ -31,6 +32,7 @@ from companion.flight.search import PlaceSearch, place_on_map
 from companion.flight.sightings import Sightings
 from companion.flight.view_reporter import ViewReporter
 from companion.ground.vital_signs import VitalSigns
+from companion.guardian.findings import ForbidMemory
 from companion.guardian.guardian import Guardian
 from companion.guardian.monitor import Limits
 from companion.klv.metadata import Scene
@@ -40,7 +42,7 @@ from companion.live.protocol import socket_path
 from companion.live.publisher import Publisher
 from companion.live.shown import Instruments, Shown
 from companion.preflight.coverage import check_origin
-from companion.preflight.map_pin import require_pinned
+from companion.preflight.map_pin import readable_map_hash, require_pinned
 from companion.sources import FrameSource, PacketTap, PacketTaps, StreamState, open_source
 from companion.sources.timing import system_minus_monotonic
 from companion.sources.zoom import ZoomedFrames
@@ -61,6 +63,7 @@ from localizer.tracking.pipeline import Localizer
 from localizer.types import Frame, PoseEstimate, ReferenceBundle
 from mavlink_bridge.bridge import Bridge
 from mavlink_bridge.config import BridgeConfig
+from mavlink_bridge.injection.gate_memory import RestartMemory
 from mavlink_bridge.messages import TrackRequest
 
 _log = logging.getLogger(__name__)
@@ -90,7 +93,7 @@ def _installation(making: Making) -> Installation:
 
 def _bridge(making: Making) -> Bridge:
     search = making.later(PlaceSearch)
-    return Bridge(
+    bridge = Bridge(
         _bridge_config(making.config),
         making[MapStack].cache.manifest.geoid_separation_m,
         on_track=making.channels.clicks.send,
@@ -98,6 +101,8 @@ def _bridge(making: Making) -> Bridge:
         on_text=making.channels.texts.send,
         on_vehicle_text=making.channels.vehicle_texts.send,
     )
+    bridge.flies_over(readable_map_hash(making.config.map) or "")
+    return bridge
 
 
 def _record(making: Making) -> RecordKeeper:
@@ -280,7 +285,9 @@ def _vital_signs(making: Making) -> VitalSigns:
 
 def _autopilot(making: Making) -> AutopilotPose:
     bridge = making[Bridge]
-    autopilot = AutopilotPose(bridge, making[Installation], making.config.prior)
+    autopilot = AutopilotPose(
+        bridge, making[Installation], making.config.prior, lambda: bridge.on_gnss
+    )
     making.channels.estimates.subscribe(
         lambda estimate, _: autopilot.add_estimate(estimate, reaches_ekf=bridge.reaches_ekf)
     )
@@ -350,7 +357,7 @@ def _guardian(making: Making) -> Guardian:
     calibrated = config.camera.is_calibrated(datetime.now(timezone.utc).date())
     protection = config.guardian.protection.of_camera(calibrated=calibrated)
     watched = config.guardian.model_copy(update={"protection": protection})
-    guardian = Guardian(watched, limits, making[Bridge])
+    guardian = Guardian(watched, limits, making[Bridge], _forbid_memory(config))
     making[FixInjection].add_judge(lambda _, fix: guardian.judge(fix))
     making.channels.frames.subscribe(lambda f: guardian.see(f.exposure_time_ns, f.image))
     sightings = Sightings(making[Bridge], making[Installation], guardian.sight)
@@ -461,12 +468,14 @@ PARTS: tuple[Part[Any], ...] = (
     Part(
         "bridge", Bridge, _bridge, depends=(MapStack,), later=(PlaceSearch,),
         start=Bridge.start, stop=Bridge.stop, close=Bridge.stop,  # one not started has files open
+        leave=Bridge.leave,
     ),
     Part("injection", FixInjection, _injection, depends=(Bridge, Installation)),
     Part("map shift", MapShift, _map_shift, depends=(Bridge, FixInjection)),
     Part(
         "guardian", Guardian, _guardian, depends=(Bridge, Installation, FixInjection),
-        start=Guardian.start, stop=Guardian.stop, wanted=lambda config: config.guardian.enabled,
+        start=Guardian.start, stop=Guardian.stop, close=Guardian.close, leave=Guardian.leave,
+        wanted=lambda config: config.guardian.enabled,
     ),
     Part(
         "record", RecordKeeper, _record, depends=(MapStack, Bridge, Guardian),
@@ -506,7 +515,7 @@ PARTS: tuple[Part[Any], ...] = (
     Part(
         "last fix", FixMemory, _last_fix,
         depends=(Bridge, Installation, Guardian, AutopilotPose),
-        start=FixMemory.start, stop=FixMemory.stop,
+        start=FixMemory.start, stop=FixMemory.stop, leave=FixMemory.leave,
     ),
     Part(
         "priors", PriorSources,
@@ -581,7 +590,21 @@ def _bridge_config(config: CompanionConfig) -> BridgeConfig:
         }
         | ({"zoom_rate_hz": asked} if config.camera.zoom is not None else {})
     )
-    state_file = config.bridge.state_file
-    if state_file is None and config.record is not None:
-        state_file = config.record.folder.parent / "injection-gate.json"
-    return config.bridge.model_copy(update={"camera": announced, "state_file": state_file})
+    return config.bridge.model_copy(update={"camera": announced, "state_file": _state_file(config)})
+
+
+def _state_file(config: CompanionConfig) -> Path | None:
+    if config.bridge.state_file is not None or config.record is None:
+        return config.bridge.state_file
+    return config.record.folder.parent / "injection-gate.json"
+
+
+def _forbid_memory(config: CompanionConfig) -> ForbidMemory | None:
+    """Of this map and this camera: what was found of another says nothing."""
+    file = _state_file(config)
+    if file is None:
+        return None
+    described = (config.camera.model_dump_json(), config.bridge.camera.model_dump_json())
+    about = "\n".join((readable_map_hash(config.map) or "", *described))
+    digest = hashlib.sha256(about.encode()).hexdigest()
+    return ForbidMemory(RestartMemory(file.with_name("guardian-forbids.json"), about=digest))

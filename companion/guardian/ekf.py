@@ -33,9 +33,12 @@ class EkfWatch:
         """Whether the EKF's position leapt, until the IMU has agreed with vision for a while.
 
         agrees: there is evidence that vision moves as the IMU does; no evidence is no agreement.
+        On the ground an EKF begins with a jump: from its origin onto the first position.
         """
         leap_m = self._leap(state)
-        if leap_m > 0.0:
+        if not state.armed:
+            self._unconfirmed_m = 0.0
+        elif leap_m > 0.0:
             self._unconfirmed_m, self._agreed_since_ns = leap_m, None
         if not agrees:
             self._agreed_since_ns = None

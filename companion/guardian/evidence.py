@@ -19,6 +19,7 @@ from mavlink_bridge.messages import (
 
 _LARGEST = 1e6  # of metres, degrees, m/s, m/s^2, rad, and rad/s: far beyond all of them
 _UNIT = 1e-3  # by which a quaternion's square may be off
+_OLD_NS = 2_000_000_000  # of a velocity, which comes ten times a second
 
 _Told = TypeVar("_Told", Attitude, GimbalAttitude, InertialSample)
 
@@ -81,6 +82,14 @@ def known_state(state: VehicleState) -> VehicleState:
         field.name: None for field in fields(state) if not _is_number(getattr(state, field.name))
     }
     return replace(state, **unknown) if unknown else state
+
+
+def moving_now(state: VehicleState, time_ns: int) -> VehicleState:
+    """The state at a time, without a velocity of long before: an EKF that has lost its position
+    says none any more (ArduPilot ends LOCAL_POSITION_NED), and its last one would stand.
+    """
+    old = time_ns - state.local_time_ns > _OLD_NS
+    return replace(state, local_velocity_ned=None) if old else state
 
 
 def known_attitude(attitude: Attitude | None) -> Attitude | None:

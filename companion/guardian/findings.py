@@ -1,12 +1,22 @@
-"""What the guardian may find: limits in time, texts, actions, and latches that do not flap."""
+"""What the guardian may find: limits in time, texts, actions, and latches that do not flap.
+
+What forbids injection is kept over a restart: a turn or a climb showed it, and may in minutes
+again, and who takes over from a killed process under denial would begin after two seconds.
+"""
 
 from __future__ import annotations
 
 import enum
 import re
+from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import Any
+
+from mavlink_bridge.injection.gate_memory import RestartMemory
 
 PREFIX = "PiLoT: "
+_LARGEST = 1e4  # per cent, degrees, milliseconds; of what is kept
+_LONGEST = 10  # characters of a word that is
 
 
 class Action(enum.IntEnum):
@@ -143,6 +153,10 @@ class Latch:
         self._since_ns, self.raised, self._told_ns = None, not self.raised, now_ns
         return self.line() if self.raised else f"{PREFIX}over: {self.rule.name.replace('_', ' ')}"
 
+    def restore(self, figure: float, word: str) -> None:
+        """It stood in a process before this one: evidence releases it, as any other."""
+        self.raised, self.figure, self.word = True, figure, word
+
     def line(self) -> str:
         """The operator's line, with the newest figure."""
         return self.rule.line(self.figure, self.word)
@@ -153,3 +167,50 @@ class Latch:
             return None
         self._told_ns = now_ns
         return self.line()
+
+
+Found = Mapping[str, tuple[float, str]]
+"""Findings by the names of their rules: figure and word."""
+
+_FORBID = frozenset(rule.name for rule in RULES if rule.forbids)
+
+
+class ForbidMemory:
+    """Of the findings that stand and forbid; see `RestartMemory`."""
+
+    def __init__(self, memory: RestartMemory) -> None:
+        self._memory = memory
+        self._kept: frozenset[str] = frozenset()
+
+    def recall(self) -> Found:
+        """What stood in the process before; empty for nothing."""
+        kept = self._memory.recall()
+        told = None if kept is None else kept[0].get("forbids")
+        rows = told.items() if isinstance(told, dict) else ()
+        found = {name: row for name, told in rows if (row := _row(told)) and name in _FORBID}
+        self.note(found)
+        return found
+
+    def note(self, found: Found) -> None:
+        """What stands now."""
+        if found.keys() == self._kept:
+            return
+        self._kept = frozenset(found)
+        if found:
+            self._memory.keep({"forbids": dict(found)})
+        else:
+            self._memory.drop()
+
+    def stop(self, *, in_order: bool = True) -> None:
+        """The end; see `RestartMemory.stop`."""
+        self._memory.stop(in_order=in_order)
+
+
+def _row(told: Any) -> tuple[float, str] | None:
+    if not isinstance(told, list) or len(told) != 2:
+        return None
+    figure, word = told
+    if not isinstance(figure, float) or not abs(figure) <= _LARGEST:
+        return None
+    known = isinstance(word, str) and len(word) <= _LONGEST and word.isprintable()
+    return (figure, word) if known else None

@@ -10,7 +10,7 @@ from contextlib import contextmanager
 
 from companion.calibration_watch.sighting import Sighting
 from companion.guardian.config import GuardianConfig
-from companion.guardian.findings import FAILED, PREFIX, STANDS, Latch, Reading
+from companion.guardian.findings import FAILED, PREFIX, STANDS, ForbidMemory, Latch, Reading
 from companion.guardian.monitor import Limits, Monitor
 from companion.guardian.protection import ProtectionLevel
 from localizer.types import Image
@@ -38,8 +38,14 @@ class Guardian:
     all until it turns again. Then those who ask tell it: its own thread cannot.
     """
 
-    def __init__(self, config: GuardianConfig, limits: Limits, bridge: Bridge) -> None:
-        self._monitor = Monitor(config, limits)
+    def __init__(
+        self,
+        config: GuardianConfig,
+        limits: Limits,
+        bridge: Bridge,
+        memory: ForbidMemory | None = None,
+    ) -> None:
+        self._monitor, self._memory = Monitor(config, limits), memory
         self._bridge = bridge
         self._lock = threading.Lock()
         self._picture: tuple[int, Image] | None = None
@@ -53,7 +59,10 @@ class Guardian:
         self._thread = threading.Thread(target=self._run, name="guardian", daemon=True)
 
     def start(self) -> None:
-        """Start watching."""
+        """Start watching, with what forbade in a process that was killed."""
+        if self._memory is not None:
+            self._monitor.restore(self._memory.recall())
+            self._bridge.forbid(self._monitor.forbids)
         self.turn_ns = monotonic_ns()
         self._thread.start()
 
@@ -61,6 +70,16 @@ class Guardian:
         """Stop watching. A thread that hangs is left behind."""
         self._stop.set()
         self._thread.join(2.0 * _LOCK_S)
+
+    def close(self) -> None:
+        """An orderly end: nothing is remembered."""
+        if self._memory is not None:
+            self._memory.stop()
+
+    def leave(self) -> None:
+        """What follows is no end in order: what is remembered stays so."""
+        if self._memory is not None:
+            self._memory.stop(in_order=False)
 
     def watch(self, turns: Callable[[], Mapping[str, int]]) -> None:
         """Tell of parts that stand. turns: when each began its newest turn, CLOCK_MONOTONIC ns."""
@@ -145,12 +164,16 @@ class Guardian:
         """Look at everything once; ten times a second by its thread."""
         self.turn_ns = monotonic_ns()
         self._works("taking turns")
+        picture, self._picture = self._picture, None
+        looks = picture is not None  # a turn without one is no word that pictures can be looked at
         try:
-            self._step()
+            self._step(picture)
         except Exception:
-            self._fail("watching")
+            self._fail("looking" if looks else "watching")
         else:
             self._works("watching")
+            if looks:
+                self._works("looking")
         self._tell_failure(self.turn_ns)
         self._tell_what_stands(self.turn_ns)
 
@@ -172,7 +195,7 @@ class Guardian:
     @property
     def _is_blind(self) -> bool:
         with self._failures:
-            return self._fails.get("watching", 0) >= _BLIND_TURNS
+            return sum(self._fails.get(one, 0) for one in ("watching", "looking")) >= _BLIND_TURNS
 
     def _fail(self, what: str) -> None:
         """A guardian that died in silence would be believed: told with its next turn."""
@@ -185,15 +208,18 @@ class Guardian:
         with self._failures:
             self._fails.pop(what, None)
 
-    def _step(self) -> None:
-        picture, self._picture = self._picture, None
+    def _step(self, picture: tuple[int, Image] | None) -> None:
         with self._lock:
             if picture is not None:
                 self._monitor.see(*picture)
             lines = self._monitor.step(monotonic_ns(), self._bridge)
             doubt, forbids = self._monitor.doubt, self._monitor.forbids
+            found = self._monitor.forbidding()
         self._bridge.doubt(doubt)
         self._bridge.forbid(forbids)
+        if self._memory is not None:
+            # What flies is not taken back, by a restart no more than by the finding.
+            self._memory.note({} if self._bridge.injecting else found)
         for line in lines:
             severity = _ERROR if line.withholds else _WARNING
             self._bridge.say(severity if line.bad else _NOTICE, line.text)

@@ -15,8 +15,14 @@ from companion.calibration_watch.watch import CalibrationWatch
 from companion.guardian import findings as f
 from companion.guardian.config import GuardianConfig
 from companion.guardian.ekf import EkfWatch
-from companion.guardian.evidence import CheckedVehicle, Vehicle, known_attitude, known_state
-from companion.guardian.findings import Action, Latch, Reading
+from companion.guardian.evidence import (
+    CheckedVehicle,
+    Vehicle,
+    known_attitude,
+    known_state,
+    moving_now,
+)
+from companion.guardian.findings import Action, Found, Latch, Reading
 from companion.guardian.inertial import InertialTrack
 from companion.guardian.jump import JumpCheck
 from companion.guardian.motion import MotionCheck, MotionVerdict
@@ -130,6 +136,16 @@ class Monitor:
                 return latch.line().removeprefix(f.PREFIX)
         return ""
 
+    def forbidding(self) -> Found:
+        """The findings that stand and forbid."""
+        standing = (latch for latch in self._latches.values() if latch.raised)
+        return {one.rule.name: (one.figure, one.word) for one in standing if one.rule.forbids}
+
+    def restore(self, found: Found) -> None:
+        """What stood in a process before this one stands until evidence speaks against it."""
+        for name, (figure, word) in found.items():
+            self._latches[name].restore(figure, word)
+
     @property
     def level(self) -> ProtectionLevel | None:
         """The newest fix's protection level."""
@@ -175,8 +191,9 @@ class Monitor:
         self._doubt_steps(fix, state, admitted=admitted)
         height_m = self._ground.height_m(state, fix.time_ns)
         known_m = self._known_m(state, height_m)
+        moving = moving_now(state, fix.time_ns)
         self._level = level = protection_level(
-            fix, state, self._config.protection, known_m, height_m
+            fix, moving, self._config.protection, known_m, height_m
         )
         fix = replace(fix, protection_m=(level.horizontal_m, level.vertical_m))
         self._jump_held = not admitted
@@ -208,7 +225,7 @@ class Monitor:
         self._leave_out_old_pictures()
         self._calibration.step(now_ns, vehicle, self._track)
         lines = []
-        readings = self._readings(now_ns, state)
+        readings = self._readings(now_ns, moving_now(state, now_ns))
         for name, latch in self._latches.items():
             text = latch.update(now_ns, readings[name])
             if text is not None:
@@ -361,8 +378,7 @@ class Monitor:
             and verdict.still_s < _MOVES_S
             and self.action is Action.NONE
         )
-        reading = self._ekf.jumped(state, now_ns, agrees=agrees)
-        return reading if state.armed else Reading(False)
+        return self._ekf.jumped(state, now_ns, agrees=agrees)
 
     def _beyond_limit(self) -> Reading:
         if self._level is None:

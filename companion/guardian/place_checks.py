@@ -14,6 +14,9 @@ from mavlink_bridge.messages import VehicleState, VisionFix
 from mavlink_bridge.vehicle.origin import north_east
 
 _FORGET_S = 120.0  # the barometer's drift against vision: its zero follows with this time
+# The barometer's metres are those of the standard atmosphere: 16 % too many at -25 degrees, 9 % too
+# few at 45, of what the aircraft climbed.
+_ATMOSPHERE = 0.16
 _MEDIAN_OF = 15
 _BARO_FRESH_NS = 1_000_000_000
 _FIX_FRESH_NS = 500_000_000
@@ -42,16 +45,23 @@ class LocalPlace:
 
 
 class HeightCheck:
-    """Vision's height against the barometer's, both since they were first seen together."""
+    """Vision's height against the barometer's, both since they were first seen together in this
+    flight: weather and temperature change between two.
+    """
 
     def __init__(self, config: GuardianConfig) -> None:
         self._limit_m = config.height_m
         self._zero: float | None = None
+        self._altitude_m = 0.0  # that the zero is of
         self._last_ns = 0
         self._differences: deque[float] = deque(maxlen=_MEDIAN_OF)
 
     def add(self, fix: VisionFix, state: VehicleState) -> Reading:
         """One fix, and the state at about its time."""
+        if not state.armed:
+            self._zero = None
+            self._differences.clear()
+            return Reading(False)
         altitude = state.pressure_altitude_m
         if altitude is None or abs(fix.time_ns - state.pressure_time_ns) > _BARO_FRESH_NS:
             return Reading(None)
@@ -60,15 +70,17 @@ class HeightCheck:
         median = float(np.median(self._differences))
         if self._zero is None:
             if len(self._differences) == _MEDIAN_OF:
-                self._zero, self._last_ns = median, fix.time_ns
+                self._zero, self._altitude_m, self._last_ns = median, altitude, fix.time_ns
             return Reading(None)
         dt = min(max((fix.time_ns - self._last_ns) * 1e-9, 0.0), 1.0)
         self._last_ns = fix.time_ns
         apart = median - self._zero
         sigma = math.sqrt(float(fix.position_covariance_ned[2, 2]))
-        bad = abs(apart) > self._limit_m + _SIGMAS * sigma
+        climbed_m = altitude - self._altitude_m
+        bad = abs(apart) > self._limit_m + _SIGMAS * sigma + _ATMOSPHERE * abs(climbed_m)
         if not bad:
             self._zero += apart * dt / _FORGET_S
+            self._altitude_m += climbed_m * dt / _FORGET_S
         return Reading(bad, abs(apart))
 
 

@@ -23,6 +23,14 @@ def map_hash(cache: Path) -> str:
         raise ConfigError(f"{path}: cannot be read: {error}") from error
 
 
+def readable_map_hash(cache: Path) -> str | None:
+    """The same in flight; None where the manifest, which was open a moment ago, is not readable."""
+    try:
+        return map_hash(cache)
+    except ConfigError:
+        return None
+
+
 def require_pinned(cache: Path, wanted: str | None) -> None:
     """Raises `ConfigError` when the map is another than the pinned one; None pins nothing."""
     if wanted is None:

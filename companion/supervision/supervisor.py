@@ -125,6 +125,7 @@ class Supervisor:
         self._deaths: deque[float] = deque(maxlen=_MOST_DEATHS)
         self._since_s = self._no_standby_until_s = 0.0
         self._heard_s = self._looked_s = self._patience_s = 0.0
+        self._awake_s = -math.inf  # since when, after both or the computer stood still
         self._shown_s: float | None = None
         self._is_new = True
         self._stopping = False
@@ -184,13 +185,16 @@ class Supervisor:
         now_s, beats = self._clock(), self._flying.beats()
         looked_away = now_s - self._looked_s > _LOOKED_AWAY_S
         self._looked_s = now_s
+        if looked_away:
+            self._awake_s = now_s
         hangs = ""
         if beats:
             last = beats[-1]
             is_ending = last.part == ENDING
             self._heard_s = now_s
             self._patience_s = self._policy.ending_s if is_ending else self._policy.silent_s
-            hangs = last.part[:_PART] if last.age_s > self._policy.part_s else ""
+            without_turn_s = min(last.age_s, now_s - self._awake_s)
+            hangs = last.part[:_PART] if without_turn_s > self._policy.part_s else ""
             self._tell_ready(now_s, last)
         elif looked_away:
             self._heard_s = now_s

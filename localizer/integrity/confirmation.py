@@ -79,13 +79,22 @@ def weigh(
     if probation.independent_prior:
         return Verdict.CONFIRMED
     turned = so3_log(pose.rotation @ probation.world_from_camera.rotation.T)
-    has_moved = np.linalg.norm(moved) >= config.confirm_distance_m
+    noise_m = _noise_m(moved, probation.covariance + covariance)
+    has_moved = np.linalg.norm(moved) >= max(config.confirm_distance_m, noise_m)
     has_moved = has_moved or np.linalg.norm(turned) >= _TURN_RAD
     has_stayed = (time_ns - probation.time_ns) * 1e-9 >= config.confirm_still_s
     # A hovering camera sees the same ground again: without the autopilot's attitude beside it,
     # that the map goes on matching says nothing new.
     has_stayed = has_stayed and witness.rotation is not None
     return Verdict.CONFIRMED if has_moved or has_stayed else Verdict.PENDING
+
+
+def _noise_m(moved: Array, covariance: Array) -> float:
+    """What noise may make of a way (3,), m: estimates slide along what looks alike, and the same
+    view is seen again. covariance: (6, 6), of the way.
+    """
+    along = moved / max(float(np.linalg.norm(moved)), 1e-9)
+    return _SIGMAS * float(np.sqrt(along @ covariance[:3, :3] @ along))
 
 
 def _attitude_agrees(pose: Pose, rotation: Array, config: IntegrityConfig) -> bool:

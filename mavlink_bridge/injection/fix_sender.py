@@ -21,6 +21,7 @@ _NEWS_AFTER_NS = 1_000_000_000  # a gap in the fixes that is told
 _NOT_SENT = "not sent: "
 _FULL = "the link takes no more"
 _GOOD_NS = 1_000_000_000
+_FED_NS = 10_000_000_000  # ArduPilot's receiver times out after 4 s, and the EKF reckons on
 
 
 class FixSender:
@@ -83,6 +84,10 @@ class FixSender:
         """
         return self._sent_ns is not None and now_ns - self._sent_ns < _GOOD_NS
 
+    def fed(self, now_ns: int) -> bool:
+        """Whether what the EKF says may still be made of our positions."""
+        return self._sent_ns is not None and now_ns - self._sent_ns < _FED_NS
+
     @property
     def refusal(self) -> str:
         """Why positions that are due are not made, once it has lasted and was told; else empty."""
@@ -104,5 +109,8 @@ class FixSender:
             self._counters["shadowed"] += 1
             return
         self._counters["injected"] += 1
+        if self._sent_ns is None and injection.estimate.reset_counter:
+            # A process that died had counted as far: the autopilot sees a jump with the next one.
+            self.injector.announce_jump()
         self._sent_ns = now_ns
         self._outcome.sent(injection.estimate, now_ns)

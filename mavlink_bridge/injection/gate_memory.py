@@ -31,8 +31,10 @@ class RestartMemory:
     """What holds now, for a process that takes over from one that was killed. Reads once; writes in
     a thread of its own, so that a disk that stands still stalls nobody.
 
-    wall_s: UTC seconds; boot, clock_s: of CLOCK_MONOTONIC. Within one run of the computer that
-    clock counts, which nobody sets; the wall clock where it lost its power in the air.
+    about: what it holds of, empty where that is always the same; what was kept of another counts
+    for nothing. wall_s: UTC seconds; boot, clock_s: of CLOCK_MONOTONIC. Within one run of the
+    computer that clock counts, which nobody sets; else, where it lost its power in the air, the
+    wall clock.
     """
 
     def __init__(
@@ -41,8 +43,9 @@ class RestartMemory:
         wall_s: Callable[[], float] = time.time,
         clock_s: Callable[[], float] = time.monotonic,
         boot: str | None = None,
+        about: str = "",
     ) -> None:
-        self._path = path
+        self._path, self.about = path, about
         self._wall_s, self._clock_s = wall_s, clock_s
         self._boot = boot_id() if boot is None else boot
         self._wake = threading.Event()
@@ -64,6 +67,9 @@ class RestartMemory:
                 return None
             content = json.loads(read_whole(self._path))
             age_s = self._age_s(content)
+            if self.about and content.get("about", self.about) != self.about:
+                _log.warning("%s is of something else than what flies now: ignored", self._path)
+                return None
         except FileNotFoundError:
             return None
         except (OSError, ValueError, KeyError, TypeError, OverflowError, RecursionError) as error:
@@ -82,13 +88,19 @@ class RestartMemory:
         self._told = None
         self._wake.set()
 
-    def stop(self) -> None:
-        """End the thread. An orderly end is the pilot's: nothing is remembered of it.
+    def stop(self, *, in_order: bool = True) -> None:
+        """End the thread. An orderly end is the pilot's: nothing is remembered of it. After another
+        one the next process takes over, as after a kill; who says so first is believed.
 
         A standby that never flew leaves the file alone: it is of the process that flies.
         """
-        self._told, self._stopping = None, True
-        self._wake.set()
+        if not self._stopping:
+            if in_order:
+                self._told = None
+            else:
+                self._in_use = False
+            self._stopping = True
+            self._wake.set()
         self._thread.join(_STOP_S)
 
     def _age_s(self, content: dict[str, Any]) -> float:
@@ -120,7 +132,8 @@ class RestartMemory:
     def _write(self, told: dict[str, Any]) -> None:
         """Whole or not at all."""
         stamps = {"utc_s": self._wall_s(), "boot": self._boot, "clock_s": self._clock_s()}
-        replace_whole(self._path, json.dumps(told | stamps), durable=True)
+        about = {"about": self.about} if self.about else {}
+        replace_whole(self._path, json.dumps(told | about | stamps), durable=True)
 
 
 class GateMemory:
@@ -146,9 +159,9 @@ class GateMemory:
         """The gate is closed from now on."""
         self._memory.drop()
 
-    def stop(self) -> None:
-        """An orderly end: nothing is remembered of it."""
-        self._memory.stop()
+    def stop(self, *, in_order: bool = True) -> None:
+        """The end; see `RestartMemory.stop`."""
+        self._memory.stop(in_order=in_order)
 
 
 class NoGoMemory:
@@ -176,6 +189,6 @@ class NoGoMemory:
         else:
             self._memory.drop()
 
-    def stop(self) -> None:
-        """An orderly end: nothing is remembered of it."""
-        self._memory.stop()
+    def stop(self, *, in_order: bool = True) -> None:
+        """The end; see `RestartMemory.stop`."""
+        self._memory.stop(in_order=in_order)

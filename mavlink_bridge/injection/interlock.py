@@ -55,10 +55,10 @@ class ShadowInterlock:
             self._against = self._reason = against
             self._teller.warn("no go, as before the restart")
 
-    def end(self) -> None:
-        """An orderly end: nothing is remembered."""
+    def end(self, *, in_order: bool = True) -> None:
+        """The end; of an orderly one nothing is remembered."""
         if self._memory is not None:
-            self._memory.stop()
+            self._memory.stop(in_order=in_order)
 
     def mode(self, wanted: Mode, state: VehicleState, now_ns: int, *, by_pilot: bool) -> Mode:
         """What may be done of what is wanted. by_pilot: the gate of mode ``rc`` is a person's word:

@@ -65,10 +65,10 @@ class InjectionGate:
         """Tell how it stood at the start: once the links have somebody who hears it."""
         self._changed(self._at_start)
 
-    def stop(self) -> None:
-        """An orderly end: nothing is remembered."""
+    def stop(self, *, in_order: bool = True) -> None:
+        """The end; of an orderly one nothing is remembered."""
         if self._memory is not None:
-            self._memory.stop()
+            self._memory.stop(in_order=in_order)
 
     @property
     def open(self) -> bool:

@@ -12,11 +12,13 @@ from mavlink_bridge.config import BridgeConfig
 _CHECK_EVERY_NS = 2_000_000_000
 _SILENT_NS = 3_000_000_000
 _OPTIONAL_ATTEMPTS = 2
+_OPTIONAL_EVERY = 30  # looks, a minute: an autopilot that boots hears no question
 
 
 @dataclass(frozen=True)
 class Stream:
-    """A message to be streamed. optional: a firmware may not know it; then asking ends soon.
+    """A message to be streamed. optional: a firmware may not know it; then it is asked seldom until
+    it comes.
 
     unless: not asked for while that message comes.
     """
@@ -96,7 +98,8 @@ class StreamKeeper:
         if stream.unless and (self._flows(stream.unless, now_ns) or not self._tried(stream.unless)):
             return False
         self._attempts[stream.name] = attempts + 1
-        return not stream.optional or attempts < _OPTIONAL_ATTEMPTS
+        known = not stream.optional or stream.name in self._seen_ns
+        return known or attempts < _OPTIONAL_ATTEMPTS or attempts % _OPTIONAL_EVERY == 0
 
     def _tried(self, name: str) -> bool:
         return self._attempts.get(name, 0) > _OPTIONAL_ATTEMPTS

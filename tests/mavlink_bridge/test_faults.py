@@ -430,6 +430,32 @@ def test_every_field_of_every_message_at_its_extremes_raises_nothing(flight: Fli
     assert flight.attitude_error() < 0.005
 
 
+@pytest.mark.parametrize("jumps", [1, 2, 3])
+def test_the_jump_at_a_restart_is_a_change_to_an_autopilot_that_flies_on(
+    monkeypatch: pytest.MonkeyPatch, jumps: int
+) -> None:
+    """Each process begins with a jump and counted from 0: ArduPilot had seen a 1 last, and fought
+    the place that was found after the gap.
+    """
+    killed = Flight(monkeypatch)
+    for _ in range(jumps):
+        killed.reset_next = True
+        killed.run(8.0)
+    again = Flight(monkeypatch)
+    again.armed = again.reset_next = True
+    again.north_m = again.ekf_north_m = 8.0
+    again.run(15.0)
+    seen = [m.reset_counter for _, m in (*killed.vision()[-1:], *again.vision())]
+    changes = [k for k, (a, b) in enumerate(itertools.pairwise(seen)) if a != b]
+    assert changes
+    assert changes[-1] <= 1  # with the second message at latest, and then no more
+    assert again.end.counters["jumps_repeated"] == 0
+
+
+def test_a_start_without_a_jump_announces_none(flight: Flight) -> None:
+    assert {m.reset_counter for _, m in flight.vision()} == {0}
+
+
 @pytest.mark.parametrize("taken_at", [1, 2, 4, None])
 def test_a_jump_that_the_ekf_missed_is_announced_again(
     flight: Flight, taken_at: int | None

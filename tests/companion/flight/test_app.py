@@ -1,5 +1,6 @@
 """The whole process, wired: an embedded vehicle, a feed of grey pictures, a record."""
 
+import contextlib
 import csv
 import errno
 import itertools
@@ -142,6 +143,56 @@ def test_a_restart_without_its_deployment_file_tells_the_operator(small_assets, 
     told = [r.getMessage() for r in caplog.records if "companion.yaml" in r.getMessage()]
     assert len(told) == len(said) == bool(lost)
     assert all(severity == 4 and len(text) <= 50 for severity, text in said)
+
+
+class _Memory:
+    """A part that is told how the flight ends."""
+
+    def __init__(self):
+        self.log = []
+
+
+@pytest.mark.parametrize(
+    ("fails", "log"),
+    [
+        ("", ["stop"]),
+        ("feed", ["leave", "stop"]),
+        ("start", ["leave", "stop"]),
+    ],
+)
+def test_an_end_that_is_none_in_order_leaves_what_is_remembered(small_assets, fails, log):
+    """Each failing start in the air dropped the gate that the killed process had left open, and so
+    did an error of the feed: the process after it injected nothing.
+    """
+    config = parse_config(
+        {"map": str(small_assets.map_cache), "camera": {"source": "s", "model": MODEL}}, "test"
+    )
+
+    def fail(_):
+        if fails == "start":
+            raise OSError("no more threads")
+
+    memory, feed = _Memory(), _StubFeed()
+    feed.ended = threading.Event()
+    feed.ended.set()
+    feed.error = StreamOpenError("gone") if fails == "feed" else None
+    part = Part(
+        "memory", _Memory, lambda _: memory, start=lambda _: None,
+        stop=lambda made: made.log.append("stop"), leave=lambda made: made.log.append("leave"),
+    )  # fmt: skip
+    parts = [p for p in PARTS if p.name == "map"]
+    parts += [part, Part("feed", Feed, lambda _: feed, start=fail)]
+    with (
+        pytest.raises(OSError, match="no more")
+        if fails == "start"
+        else contextlib.suppress(StreamOpenError)
+    ):
+        Companion(config, parts).run()
+    assert memory.log == log
+
+
+def test_the_gate_the_last_fix_and_what_forbids_are_what_is_left():
+    assert {p.name for p in PARTS if p.leave is not None} == {"bridge", "guardian", "last fix"}
 
 
 def test_what_happens_is_logged_and_recorded_once_and_every_thread_ends(

@@ -130,6 +130,20 @@ def test_where_the_ekf_counts_from_is_kept(tmp_path: Path) -> None:
     assert (found.autopilot_ns, found.origin) == (64 * SECOND, (47.0, 8.0, 453.0))
 
 
+def test_a_flight_that_does_not_end_in_order_leaves_its_place(tmp_path: Path) -> None:
+    """A restart that fails on the way up had removed it: the next one searched the map."""
+    path = kept(tmp_path)
+    failing = memory(path)
+    failing.start()
+    failing.leave()
+    failing.stop()
+    assert memory(path).prior(103 * SECOND) is not None
+    ending = memory(path)
+    ending.start()
+    ending.stop()
+    assert not path.exists()
+
+
 @pytest.mark.parametrize(
     ("at_s", "local"),
     [

@@ -14,10 +14,12 @@ from companion.config import PriorConfig
 from companion.conversions import Installation
 from companion.flight.priors import AutopilotPose, PositionBelief, drift_sigma_m
 from localizer.geometry.geo import Geodetic, LocalFrame
-from mavlink_bridge.messages import Attitude, VehicleState
+from mavlink_bridge.messages import Attitude, GimbalAttitude, VehicleState
 
 SECOND = 10**9
+METRE = 1.0 / 111319.0  # of latitude, degrees
 FLYING = VehicleState(connected=True, ekf_flags=8 | 16)
+INSTALLATION = Installation(LocalFrame(Geodetic(47.0, 8.0, 500.0)), 48.0, np.zeros(3))
 
 
 def with_gnss(at_s: float, accuracy_m: float = 1.0) -> VehicleState:
@@ -86,6 +88,57 @@ def test_a_glitching_gnss_is_not_healthy() -> None:
     assert not beliefs.at(state, 10 * SECOND).independent
 
 
+class Placed:
+    """An autopilot that has dead reckoned for a minute, 40 m from a receiver that is well."""
+
+    apart_m = 40.0
+
+    def state(self) -> VehicleState:
+        return replace(
+            with_gnss(100),
+            latitude_deg=47.0 + self.apart_m * METRE, longitude_deg=8.0, altitude_amsl_m=520.0,
+            gps_latitude_deg=47.0, gps_longitude_deg=8.0, position_time_ns=100 * SECOND,
+        )  # fmt: skip
+
+    def attitude_at(self, time_ns: int) -> Attitude:
+        return Attitude(time_ns, 0.0, 0.0, 0.0, (1.0, 0.0, 0.0, 0.0))
+
+    def gimbal_at(self, time_ns: int) -> GimbalAttitude:
+        return GimbalAttitude(time_ns, 0.0, 0.0, 0.0, (1.0, 0.0, 0.0, 0.0), "test")
+
+    def local_at(self, time_ns: int) -> None:
+        return None
+
+
+@pytest.mark.parametrize("on_gnss", [False, None])
+def test_an_ekf_that_follows_our_fixes_is_no_evidence_whatever_a_receiver_says_beside_it(
+    on_gnss: bool | None,
+) -> None:
+    """Its source set was vision's; the receiver that had been left for it went on to report a fix.
+    Where it had dead reckoned to, the tracking began without a trial, and was searched within 15 m.
+    """
+    pose = AutopilotPose(Placed(), INSTALLATION, PriorConfig(), lambda: on_gnss)
+    fix: Any = SimpleNamespace(accepted=True, exposure_time_ns=40 * SECOND)
+    pose.add_estimate(fix, reaches_ekf=True)
+    prior = pose.prior(100 * SECOND)
+    assert prior is not None
+    assert not prior.independent
+    assert prior.covariance[0, 0] > 150.0**2
+
+
+@pytest.mark.parametrize(("on_gnss", "apart_m"), [(True, 40.0), (None, 2.0)])
+def test_an_ekf_on_gnss_begins_the_tracking_and_after_a_restart_where_they_agree(
+    on_gnss: bool | None, apart_m: float
+) -> None:
+    """Who begins in the air does not know the source set, and the receiver knows the place."""
+    placed = Placed()
+    placed.apart_m = apart_m
+    prior = AutopilotPose(placed, INSTALLATION, PriorConfig(), lambda: on_gnss).prior(100 * SECOND)
+    assert prior is not None
+    assert prior.independent
+    assert prior.covariance[0, 0] == pytest.approx(25.0)
+
+
 class Ranging:
     """An autopilot with a rangefinder, leaning by so much."""
 
@@ -106,8 +159,7 @@ class Ranging:
 
 
 def autopilot_pose(lean_deg: float = 0.0) -> AutopilotPose:
-    installation = Installation(LocalFrame(Geodetic(47.0, 8.0, 500.0)), 48.0, np.zeros(3))
-    return AutopilotPose(Ranging(lean_deg), installation, PriorConfig())
+    return AutopilotPose(Ranging(lean_deg), INSTALLATION, PriorConfig())
 
 
 def clearance(lean_deg: float, at_s: float) -> float | None:

@@ -13,6 +13,7 @@ from companion.geometry import GIMBAL_FROM_CAMERA
 from companion.guardian.config import GuardianConfig
 from companion.guardian.monitor import Limits, Monitor
 from localizer.geometry.pose import matrix_from_quaternion, so3_exp
+from mavlink_bridge.messages import VehicleState, VisionFix
 from mavlink_bridge.vehicle.origin import offset
 from tests.companion.guardian.simulated import (
     HEIGHT,
@@ -282,6 +283,81 @@ def test_a_barometer_that_drifts_is_no_finding() -> None:
     assert Flight(monitor(), height_m=lambda at_s: 0.025 * at_s).fly(60.0).lines == []
 
 
+class Twice(Flight):
+    """Two flights of one process, on the ground from 20 to 40 s; meanwhile the weather changed."""
+
+    weather_m = 17.0
+
+    def state(self) -> VehicleState:
+        on_ground, later = 20.0 <= self.at_s < 40.0, self.at_s >= 30.0
+        return replace(
+            super().state(),
+            armed=not on_ground,
+            pressure_altitude_m=500.0 + (self.weather_m if later else 0.0),
+        )
+
+
+def test_the_weather_between_two_flights_is_no_finding() -> None:
+    """2 hPa in some hours are 17 m: the second flight was withheld from its first position on, and
+    to its end, because the zero of the first stood while it was off.
+    """
+    flight = Twice(monitor()).fly(60.0)
+    assert flight.lines == []
+    assert flight.withheld == []
+
+
+def test_a_height_that_was_off_in_one_flight_is_watched_anew_in_the_next() -> None:
+    def height(at_s: float) -> float:
+        return 30.0 if 10.0 <= at_s < 20.0 or at_s >= 50.0 else 0.0
+
+    flight = Twice(monitor(), height_m=height).fly(60.0)
+    told = [at_s for at_s, text in flight.lines if "off barometer" in text]
+    assert told == pytest.approx([12.8, 52.8], abs=1.0)
+    assert not [at_s for at_s in flight.withheld if 27.0 < at_s < 50.0]
+
+
+@dataclass
+class InAir(Flight):
+    """Climbs at 5 m/s by 100 m; the barometer's altitude is of the standard atmosphere, which is
+    15 degrees at sea level. celsius: the air's.
+    """
+
+    celsius: float = 15.0
+
+    def state(self) -> VehicleState:
+        climbed_m = self.height_m(self.at_s)
+        standard = climbed_m * 288.15 / (self.celsius + 273.15)
+        return replace(super().state(), pressure_altitude_m=500.0 + standard)
+
+
+def climb(at_s: float) -> float:
+    return min(5.0 * max(at_s - 10.0, 0.0), 100.0)
+
+
+@pytest.mark.parametrize("celsius", [-25.0, 0.0, 45.0])
+def test_a_climb_through_cold_or_hot_air_is_no_finding(celsius: float) -> None:
+    """At -25 degrees 100 m are 116 by the barometer: withheld at 60 m, and for the whole flight,
+    because its zero stands while it is off.
+    """
+    flight = InAir(monitor(), height_m=climb, celsius=celsius).fly(60.0)
+    assert flight.lines == []
+    assert flight.withheld == []
+
+
+@pytest.mark.parametrize("celsius", [-25.0, 45.0])
+def test_a_climb_that_vision_makes_half_is_withheld_in_any_air(celsius: float) -> None:
+    """It saw 50 m of 100: another place's ground."""
+
+    class Halved(InAir):
+        def state(self) -> VehicleState:
+            standard = climb(self.at_s) * 288.15 / (self.celsius + 273.15)
+            return replace(super().state(), pressure_altitude_m=500.0 + standard)
+
+    flight = Halved(monitor(), height_m=lambda at_s: 0.5 * climb(at_s), celsius=celsius).fly(60.0)
+    assert flight.told("off barometer") < 21.0
+    assert max(flight.withheld) > 59.0
+
+
 def test_beyond_the_alert_limit_nothing_is_injected() -> None:
     """A sigma of 3 m is honest, and too much for the risk."""
     flight = Flight(monitor(), noise_m=0.2, claimed_m=3.0).fly(10.0)
@@ -370,3 +446,41 @@ def test_a_frozen_picture_is_no_evidence_of_its_stamps() -> None:
     texts = [line for _, line in flight.lines]
     assert flight.told("withheld: video") < 16.0
     assert not [line for line in texts if "stamped" in line or "focal" in line or "off in" in line]
+
+
+class WithoutPosition(Flight):
+    """Its EKF lost its position at 10 m/s, 30 s before, and says none any more: what it said last
+    stands. The pilot has stopped it since.
+    """
+
+    said_s = -30.0
+
+    def state(self) -> VehicleState:
+        return replace(
+            super().state(), local_velocity_ned=(10.0, 0.0, 0.0), local_time_ns=second(self.said_s)
+        )
+
+
+def calm(at_s: float) -> tuple[float, float]:
+    """A hover without wind: 0.02 m, which a picture shows, take 1.3 s."""
+    return hover(0.1 * at_s)
+
+
+def test_a_speed_of_before_the_ekf_lost_its_position_makes_no_picture_frozen() -> None:
+    """The place was found again, and withheld as `video frozen 0 s` every other second."""
+    flight = Filmed(WithoutPosition(monitor(), calm, noise_m=0.03), calm).fly(20.0)
+    assert flight.lines == []
+    assert flight.withheld == []
+
+
+def test_a_speed_of_before_the_ekf_lost_its_position_makes_no_level_small() -> None:
+    """It hovered when it lost it, and may fly at any speed since."""
+    fix = VisionFix(second(2.0), LATITUDE, LONGITUDE, HEIGHT)
+    hovered = replace(Flight(monitor()).state(), local_velocity_ned=(0.0, 0.0, 0.0))
+    levels = [
+        passed.protection_m[0]
+        for said_ns in (fix.time_ns, second(-30.0))
+        if (passed := monitor().admit(fix, replace(hovered, local_time_ns=said_ns))) is not None
+        and passed.protection_m is not None
+    ]
+    assert levels[1] > levels[0]

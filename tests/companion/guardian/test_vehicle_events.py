@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import threading
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -76,6 +76,36 @@ def test_a_reset_of_the_ekf_is_unconfirmed_until_the_imu_has_agreed_for_a_while(
 def test_while_it_is_unconfirmed_nobody_says_that_the_ekf_follows() -> None:
     flight = flown(leg, 14.0, leap_m=lambda at_s: 15.0 if at_s >= 12.0 else 0.0)
     assert flight.monitor.doubt == "EKF jumped 15 m: unconfirmed"
+
+
+@dataclass
+class Waiting(Answering):
+    """On the ground until 20 s, then off to 10 m/s."""
+
+    def state(self) -> VehicleState:
+        return replace(super().state(), armed=self.at_s >= 20.0)
+
+
+def departs(at_s: float) -> tuple[float, float]:
+    return leg(at_s - 20.0) if at_s >= 20.0 else leg(0.0)
+
+
+def test_an_ekf_that_begins_on_the_ground_is_no_jump_when_it_is_armed() -> None:
+    """From its origin onto the first position 300 m away: told at the moment of arming, and "the
+    EKF follows" was not said for the first ten seconds of flight.
+    """
+    flight = Waiting(monitor(), departs, noise_m=0.05)
+    flight.leap_m = lambda at_s: 300.0 if at_s >= 8.0 else 0.0
+    flight.fly(30.0)
+    assert flight.lines == []
+    assert flight.monitor.doubt == ""
+
+
+def test_an_ekf_that_jumps_right_after_arming_is_told() -> None:
+    flight = Waiting(monitor(), departs, noise_m=0.05)
+    flight.leap_m = lambda at_s: 300.0 if at_s >= 20.5 else 0.0
+    flight.fly(22.0)
+    assert [text for _, text in flight.lines] == ["PiLoT: EKF jumped 300 m: unconfirmed"]
 
 
 def test_hard_flight_is_no_jump() -> None:
@@ -193,6 +223,50 @@ def test_a_guardian_that_sees_nothing_for_a_second_withholds_until_it_does(
     bridge.fails_at = set()
     guardian.turn()
     assert guardian.judge(FIX) is not None
+
+
+def test_a_guardian_that_fails_at_each_picture_of_a_slow_video_withholds(
+    faulty: tuple[Guardian, Any], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """At 5 pictures a second every other turn had none, and was well: fixes passed under the text
+    that they were withheld, and no picture was ever looked at.
+    """
+    guardian, bridge = faulty
+
+    def fails(*_: object) -> None:
+        raise ValueError("no picture")
+
+    with monkeypatch.context() as broken:
+        broken.setattr(Monitor, "see", fails)
+        for turn in range(20):
+            if turn % 2:
+                guardian.see(second(10.0 + turn), PICTURE)
+            guardian.turn()
+        assert guardian.judge(FIX) is None
+        assert bridge.said == [(3, "PiLoT: withheld: guardian failed")]
+    guardian.turn()
+    assert guardian.judge(FIX) is None  # without a picture it saw nothing
+    guardian.see(second(40.0), PICTURE)
+    guardian.turn()
+    assert guardian.judge(FIX) is not None
+
+
+def test_a_picture_that_fails_now_and_then_withholds_nothing(
+    faulty: tuple[Guardian, Any], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    guardian, _ = faulty
+    see = Monitor.see
+
+    def fails(watched: Monitor, time_ns: int, image: Any) -> None:
+        if time_ns % second(4.0) == 0:
+            raise ValueError("no picture")
+        see(watched, time_ns, image)
+
+    monkeypatch.setattr(Monitor, "see", fails)
+    for turn in range(60):
+        guardian.see(second(10.0 + turn), np.roll(PICTURE, 7 * turn, axis=1))
+        guardian.turn()
+        assert guardian.judge(replace(FIX, time_ns=second(1.0) + turn)) is not None
 
 
 def test_a_reset_that_falls_into_a_blind_time_is_announced_after_it(

@@ -359,6 +359,25 @@ def test_a_computer_that_slept_hangs_nothing() -> None:
     assert stage.told == []
 
 
+@pytest.mark.parametrize("hangs", [False, True])
+def test_a_part_that_slept_with_the_computer_has_its_time_after_it(hangs: bool) -> None:
+    """Of a process that woke up the pulse had its turn before the others: it was ended for it."""
+
+    class Slept(Scripted):
+        def wait(self, timeout_s: float) -> int | None:
+            if self.looks == 40:
+                stage.sleep(60.0)
+            return super().wait(timeout_s)
+
+    def says(looks: int) -> Beat:
+        slept = looks < 40 and (hangs or looks >= 38)
+        return Beat("feed", 60.0 + 0.5 * (40 - looks) if slept else 0.0)
+
+    stage = Stage([Slept(60, 0, says=says), Scripted(9, 0)], standby_after_s=1e3)
+    assert stage.supervisor.run() == 0
+    assert stage.marked == (["companion hangs (feed), restarting"] if hangs else [])
+
+
 _HANGING = """
 import os, signal, sys
 pulse = next(int(one.partition("=")[2]) for one in sys.argv if one.startswith("--pulse="))

@@ -142,6 +142,34 @@ def test_a_damaged_file_or_another_users_is_ignored(tmp_path: Path, text: str) -
     memory.stop()
 
 
+@pytest.mark.parametrize(
+    ("flown", "kept"), [("map a", "20 m off"), ("map b", ""), ("", "20 m off")]
+)
+def test_a_no_go_is_of_the_map_that_was_seen(tmp_path: Path, flown: str, kept: str) -> None:
+    """The map was exchanged for the right one, and ten minutes long nothing was injected."""
+    path = tmp_path / "no-go.json"
+    killed = NoGoMemory(RestartMemory(path, about="map a"))
+    killed.note("20 m off")
+    while not path.exists():
+        pass
+    left = path.read_text()
+    killed.stop()
+    path.write_text(left)
+    path.chmod(0o600)
+    again = NoGoMemory(RestartMemory(path, about=flown))
+    assert again.recall() == kept
+    again.stop()
+
+
+def test_a_no_go_of_an_older_version_is_of_any_map(tmp_path: Path) -> None:
+    path = tmp_path / "no-go.json"
+    path.write_text(json.dumps({"against": "20 m off", "utc_s": time.time()}))
+    path.chmod(0o600)
+    memory = NoGoMemory(RestartMemory(path, about="map a"))
+    assert memory.recall() == "20 m off"
+    memory.stop()
+
+
 @pytest.mark.parametrize("against", ["", 5, None, "\x1b[2J", ["x"]])
 def test_a_no_go_of_nonsense_is_none(tmp_path: Path, against: object) -> None:
     path = tmp_path / "no-go.json"
@@ -193,6 +221,34 @@ def test_the_bridge_restores_the_gate_that_a_killed_one_left_open(
         # Told once somebody may hear it: after the first word about the flight controller.
         assert sleep_until(lambda: any("injection on (restored" in text for text in told), 30.0)
     assert "flight controller" in told[0]
+    assert not path.exists()
+
+
+def test_a_bridge_that_does_not_end_in_order_leaves_the_gate_to_the_next(tmp_path: Path) -> None:
+    """Its process takes over from a killed one, and fails on the way up."""
+    path = tmp_path / "gate.json"
+    _left_open(path)
+    bridge = _bridge(path, "udpout:127.0.0.1:9", [])
+    bridge.start()
+    bridge.leave()
+    bridge.stop()
+    assert json.loads(path.read_text())["open"] is True
+    again = _bridge(path, "udpout:127.0.0.1:9", [])
+    again.start()
+    again.stop()
+    assert not path.exists()
+
+
+def test_what_is_not_remembered_is_not_kept_by_such_an_end(tmp_path: Path) -> None:
+    path = tmp_path / "gate.json"
+    gate, _ = restarted(path)
+    gate.command(31010, 1.0)
+    while not path.exists():
+        pass
+    gate.command(31010, 0.0)
+    while path.exists():
+        pass
+    gate.stop(in_order=False)
     assert not path.exists()
 
 

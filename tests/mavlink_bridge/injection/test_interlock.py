@@ -91,6 +91,27 @@ def test_a_map_20_m_off_is_as_wrong_after_a_restart_under_denial(
     assert not file.exists()
 
 
+def test_another_map_after_a_restart_is_not_blamed_for_the_one_before(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    gate, file = tmp_path / "gate.json", tmp_path / "shadow-no-go.json"
+    killed = on_gnss(monkeypatch, state_file=gate)
+    killed.end.flies_over("map a")
+    killed.north_m = 20.0
+    killed.run(15.0)
+    while not file.exists():
+        pass
+    again = on_gnss(monkeypatch, state_file=gate)
+    again.end.flies_over("map b")
+    again.gnss_north_m = None
+    again.end.recall()
+    again.run(10.0)
+    assert again.vision()
+    assert told(again, "no go") == []
+    for flight in (killed, again):
+        flight.end.end()
+
+
 @pytest.mark.parametrize(("begins", "kept"), [(True, []), (False, ["20 m off"])])
 def test_only_who_never_began_is_kept_from_beginning_by_a_restart(
     begins: bool, kept: list[str]
@@ -383,6 +404,41 @@ def test_the_pilots_gate_is_obeyed_and_told_without_a_go(monkeypatch: pytest.Mon
     flight.run(5.0)
     assert flight.vision()
     assert told(flight, "go from") == ["injecting without a go from shadow"]
+
+
+def test_what_gps_input_told_the_receiver_is_no_word_for_vision(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """The pilot had injected a map 20 m off: receiver and EKF repeated it, which was a go, and his
+    next injection and a switch to vision began without a word.
+    """
+    gate = InjectionGate(RcGateConfig(), lambda _: None)
+    injection = InjectionConfig(rate_hz=10, delay_ms=100, message="gps_input")
+    flight = Flight(monkeypatch, gate, mode="rc", injection=injection, switch=SWITCH)
+    flight.gnss_north_m, flight.north_m, flight.origin = 0.0, 20.0, (47.397742, 8.545594, 488.0)
+    flight.run(10.0)
+    gate.command(31010, 1.0)
+    flight.run(1.0)
+    flight.gnss_north_m = flight.ekf_north_m = 20.0
+    flight.run(150.0)
+    score = flight.end.shadow_score(flight.now_ns)
+    assert not score.go, score.line()
+    assert flight.end.on_gnss(flight.now_ns) is False
+    gate.command(31010, 0.0)
+    flight.run(1.0)
+    gate.command(31010, 1.0)
+    flight.run(1.0)
+    assert told(flight, "go from") == 2 * ["injecting without a go from shadow"]
+
+
+def test_gps_input_in_shadow_is_compared_with_the_receiver_that_is_there(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    injection = InjectionConfig(rate_hz=10, delay_ms=100, message="gps_input", gps_id=1)
+    flight = on_gnss(monkeypatch, mode="shadow", injection=injection)
+    flight.run(20.0)
+    assert flight.end.shadow_score(flight.now_ns).go
+    assert flight.end.on_gnss(flight.now_ns)
 
 
 class Compared:

@@ -503,6 +503,26 @@ def test_old_gimbal_message_is_asked_for_only_when_the_new_one_stays_silent() ->
         assert old not in names(flowing, config, t + 0.1)
 
 
+def test_evidence_that_an_autopilot_did_not_hear_of_is_asked_for_again() -> None:
+    """IMU and barometer were asked for twice in the first seconds, while it still booted, and the
+    guardian flew without either, untold. One that does not know them is asked once a minute.
+    """
+    keeper, config = StreamKeeper(), BridgeConfig()
+    asked = ["RAW_IMU" in names(keeper, config, 10.0 + 2.5 * i) for i in range(90)]
+    assert asked[:4] == [True, True, False, False]
+    assert 2 < sum(asked) <= 5
+
+
+def test_evidence_that_stops_is_asked_for_again() -> None:
+    keeper, config = StreamKeeper(), BridgeConfig()
+    for t in (10, 13):  # answered with the second question
+        assert "RAW_IMU" in names(keeper, config, t)
+    for t in range(14, 20):
+        keeper.seen("RAW_IMU", t * SECOND)
+        assert "RAW_IMU" not in names(keeper, config, t + 0.5)
+    assert all("RAW_IMU" in names(keeper, config, t) for t in (25, 28, 31, 34))
+
+
 def test_rc_channels_and_estimator_by_configuration() -> None:
     wanted = {s.name for s in wanted_streams(BridgeConfig(mode="rc"), "px4")}
     assert {"RC_CHANNELS", "ESTIMATOR_STATUS"} <= wanted
