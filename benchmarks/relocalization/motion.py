@@ -39,7 +39,7 @@ from benchmarks.relocalization.run import RIGHT_DEG, RIGHT_M, with_threads
 with needs_torch():
     from localizer.training.data.batches import tamed
     from localizer.training.data.pairs import soften
-from localizer.config import AttitudePrior, LocalizerConfig
+from localizer.config import LocalizerConfig
 from localizer.errors import OutsideMapError
 from localizer.evaluation.places import KnownOfPlace
 from localizer.features.detail import DetailExtractor
@@ -58,6 +58,7 @@ from localizer.synth.appearance.model import (
     apply_appearance,
     sample_appearance,
 )
+from localizer.tracking.horizon import AttitudePrior
 from localizer.tracking.motion import OtherSensors
 from localizer.tracking.pipeline import Localizer
 from localizer.types import Frame, PosePrior, TrackingState
