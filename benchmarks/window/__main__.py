@@ -2,6 +2,7 @@
 
     python -m benchmarks.window --sets dusk combined day --places 12 --json window.json
     python -m benchmarks.window --sets neon --places 16 --beginnings alike own true
+    python -m benchmarks.window --sets dusk combined neon --tilt 0.5
 
 Each place is flown over for some seconds at two frames a second. Every frame is registered with the
 shipped network from where a tracker would believe to be: 5 m and 5 degrees off, alike in all frames
@@ -20,11 +21,12 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from itertools import product
 from pathlib import Path
 
 import numpy as np
 
-from benchmarks.common.arguments import Parser, existing, output, whole
+from benchmarks.common.arguments import Parser, existing, number, output, whole
 from benchmarks.common.figures import write_figures
 from benchmarks.common.named_errors import named_errors, needs_torch
 from benchmarks.window.motions import MOTIONS
@@ -33,8 +35,8 @@ from benchmarks.window.votes import Vote, Window
 from localizer.config import LocalizerConfig
 from localizer.features import load_extractor
 from localizer.features.detail import DetailExtractor
-from localizer.geometry.pose import Pose
-from localizer.registration import JNGO
+from localizer.geometry.pose import Array, Pose, so3_exp
+from localizer.registration import JNGO, attitude_constraint
 from localizer.types import FeaturePyramid, PosePrior, RegistrationStatus, RenderedView
 
 with needs_torch():
@@ -53,19 +55,25 @@ with needs_torch():
 _TRUST = (0.1, 3.0, 0.9)  # of a vote: its quality times this, within these
 
 
+PLAIN, LEVEL = "", ", level"
+
+
 @dataclass(frozen=True)
 class Flown:
-    """One place's frames: where they were, and what the registration of each says."""
+    """One place's frames: where they were, and what the registrations of each say: `PLAIN`, or
+    with roll and pitch heard, `LEVEL`.
+    """
 
     place: int
     truths: list[Pose]
-    votes: list[Vote]
+    votes: dict[str, list[Vote]]
 
 
 class Registrar:
-    """Registers frames as the product does."""
+    """Registers frames as the product does. tilt_deg: None hears no roll and pitch."""
 
-    def __init__(self) -> None:
+    def __init__(self, tilt_deg: float | None = None) -> None:
+        self._tilt = None if tilt_deg is None else float(np.radians(tilt_deg))
         self._extractor = DetailExtractor(load_extractor(None))
         self._optimizer, self._anchors = JNGO(), LocalizerConfig().anchors
         self._spread = np.diag([METRES**2 / 3] * 3 + [np.radians(DEGREES) ** 2 / 3] * 3)
@@ -74,29 +82,40 @@ class Registrar:
         self, place: int, frames: Iterator[SequenceFrame], beginnings: Sequence[str]
     ) -> dict[str, Flown]:
         """Every frame of a sequence, by beginning."""
-        flights = {begins: Flown(place, [], []) for begins in beginnings}
+        kinds = (PLAIN,) if self._tilt is None else (PLAIN, LEVEL)
+        off = np.random.default_rng((place, 72)).normal(0.0, self._tilt or 0.0, 3) * (1, 1, 0)
+        flights = {b: Flown(place, [], {kind: [] for kind in kinds}) for b in beginnings}
         for k, frame in enumerate(frames):
             query = self._extractor.extract(frame.query)
             for begins, flight in flights.items():
                 flight.truths.append(frame.truth)
-                flight.votes.append(self._vote(query, frame.views[begins], k))
+                for kind, votes in flight.votes.items():
+                    heard = so3_exp(off) @ frame.truth.rotation if kind == LEVEL else None
+                    votes.append(self._vote(query, frame.views[begins], heard, k))
         return flights
 
-    def _vote(self, query: FeaturePyramid, view: RenderedView, seed: int) -> Vote:
+    def _vote(
+        self, query: FeaturePyramid, view: RenderedView, heard: Array | None, seed: int
+    ) -> Vote:
         prior = PosePrior(view.world_from_camera, self._spread, 0)
         anchors = reference_anchors(view, self._extractor, self._anchors, seed)
-        found = self._optimizer.register(query, view.camera, anchors, prior, seed=seed)
+        level = None
+        if heard is not None and self._tilt is not None:
+            level = attitude_constraint(heard, self._tilt, np.pi)
+        found = self._optimizer.register(
+            query, view.camera, anchors, prior, constraint=level, seed=seed
+        )
         if found.status is not RegistrationStatus.OK:
             return Vote(found.world_from_camera, 4 * self._spread, _TRUST[0])
         trust = float(np.clip(found.quality * _TRUST[1], _TRUST[0], _TRUST[2]))
         return Vote(found.world_from_camera, found.covariance, trust)
 
 
-def windowed(flown: Flown, motion: str, frames: int, *, robust: bool) -> list[Pose]:
+def windowed(flown: Flown, kind: str, motion: str, frames: int, *, robust: bool) -> list[Pose]:
     """The window's pose of every frame."""
     steps = MOTIONS[motion](flown.truths, INTERVAL_S, np.random.default_rng(flown.place))
     window = Window(frames, robust=robust)
-    pairs = zip(flown.votes, [None, *steps], strict=True)
+    pairs = zip(flown.votes[kind], [None, *steps], strict=True)
     return [window.add(vote, step) for vote, step in pairs]
 
 
@@ -109,12 +128,13 @@ def errors(flown: Flown, windows: list[int], motions: Sequence[str]) -> Errors:
             for p, t in zip(poses, flown.truths, strict=True)
         ]
 
-    found: Errors = {("", "single", 1): against([v.pose for v in flown.votes])}
-    for motion in motions:
-        for kind in ("mean", "vote"):
-            for frames in windows:
-                poses = windowed(flown, motion, frames, robust=kind == "vote")
-                found[motion, kind, frames] = against(poses)
+    found: Errors = {
+        ("", f"single{kind}", 1): against([v.pose for v in votes])
+        for kind, votes in flown.votes.items()
+    }
+    for motion, kind, elects, frames in product(motions, flown.votes, ("mean", "vote"), windows):
+        poses = windowed(flown, kind, motion, frames, robust=elects == "vote")
+        found[motion, f"{elects}{kind}", frames] = against(poses)
     return found
 
 
@@ -130,12 +150,13 @@ def main() -> None:
                    help="that tie the frames")  # fmt: skip
     p.add_argument("--beginnings", nargs="+", choices=BEGINNINGS, default=[ALIKE],
                    help="of the registrations")  # fmt: skip
+    p.add_argument("--tilt", type=number(0.01, 90), help="error of roll and pitch, degrees")
     p.add_argument("--split", choices=("test", "validation"), default="test", help="of places")
     p.add_argument("--textures", type=existing, default=Path("../shared/data/textures"),
                    help="real textures")  # fmt: skip
     p.add_argument("--json", type=output, help="the table, for the documentation")
     args = p.parse_args()
-    registrar = Registrar()
+    registrar = Registrar(args.tilt)
     table: list[tuple[str, ...]] = []
     for name in args.sets:
         places: dict[str, list[Errors]] = {begins: [] for begins in args.beginnings}
