@@ -228,7 +228,7 @@ class RecordConfig(_Model):
 
     folder: Path = Field(description="estimates, targets, events, health and snapshots")
     snapshot_interval_s: float | None = Field(
-        10.0, ge=0.001, le=86400, description="a video frame is kept this often; none: never"
+        10.0, ge=0.001, le=86400, description="a video frame is kept this often; null: never"
     )
     mcap: bool = Field(
         False, description="write record.mcap in flight, too (extra `mcap`), for Foxglove and Rerun"

@@ -61,6 +61,8 @@ def _reason(model: type[BaseModel], error: dict[str, Any]) -> str:
         return f"no such setting{_meant(model, error['loc'])}"
     if error["type"] == "missing":
         return "is missing and has no default"
+    if error["type"] == "model_type":
+        return "must be a section of settings; null where one can be left out"
     # Pydantic's "Input should be a valid integer, unable to parse string as an integer".
     text = str(error["msg"]).removeprefix("Value error, ").split(", unable to parse", 1)[0]
     text = text.replace("Input should", "must").replace("a valid ", "a ")

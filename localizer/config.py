@@ -23,7 +23,7 @@ class LocalizerConfig(BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
 
     width: int = Field(320, ge=64, le=2048, description="width of query and reference, pixels")
-    model: Path | None = Field(None, description="ONNX feature network; none: the shipped one")
+    model: Path | None = Field(None, description="ONNX feature network; null: the shipped one")
     anchors: int = Field(4000, ge=50, le=8000, description="geo-anchors per reference view")
     reference_shift_px: float = Field(
         2.0,
@@ -52,11 +52,11 @@ class LocalizerConfig(BaseModel):
     calibration: CalibrationSigmas = CalibrationSigmas()
     attitude: AttitudePrior | None = Field(
         AttitudePrior(),
-        description="roll and pitch of autopilot and gimbal as a constraint; none: not used",
+        description="roll and pitch of autopilot and gimbal as a constraint; null: not used",
     )
     motion: MotionConfig = MotionConfig()
     integrity: IntegrityConfig = IntegrityConfig()
     odometry: OdometryConfig | None = Field(
-        OdometryConfig(), description="carries on where the map does not match; none: it does not"
+        OdometryConfig(), description="carries on where the map does not match; null: it does not"
     )
     relocalization: RelocalizationConfig = RelocalizationConfig()

@@ -237,7 +237,7 @@ def _date(cache: TileCache) -> Finding:
     if date:
         words = "what was built or felled since costs accuracy"
         return Finding("imagery of", str(date), Grade.GOOD, words)
-    words = "the source does not say; what was built or felled since costs accuracy"
+    words = "give `map build` --imagery-date; what was built or felled since costs accuracy"
     return Finding("imagery of", "not known", Grade.ADVICE, words)
 
 
