@@ -108,6 +108,7 @@ class HealthMonitor:
         """Start watching."""
         if self._file is not None:
             self._file.start()
+        self.turn_ns = time.monotonic_ns()  # since it was made, kernels were compiled for a minute
         self._thread.start()
 
     def stop(self) -> None:

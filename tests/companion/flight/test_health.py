@@ -317,3 +317,16 @@ def test_an_overloaded_computer_is_told_as_that(tmp_path, monkeypatch):
     assert told[-1] == (HealthLevel.DEGRADED, "overloaded, 1 of 10 frames/s")
     fly(8, 5)
     assert told[-1] == (HealthLevel.OK, "localization tracking")
+
+
+def test_its_first_turn_is_its_start_not_its_making():
+    """Kernels are compiled for a minute between the two: it was told to stand before it began."""
+    state, connected = StreamState.LIVE, True
+    monitor = HealthMonitor(
+        EngineHealth, FakeBridge(connected), lambda: state, lambda *_: None, None
+    )
+    made_ns = monitor.turn_ns = monitor.turn_ns - 36_000_000_000
+    monitor.start()
+    begun_ns = monitor.turn_ns
+    monitor.stop()
+    assert begun_ns - made_ns >= 36_000_000_000
