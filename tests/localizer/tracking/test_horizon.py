@@ -140,6 +140,19 @@ def test_the_same_ground_is_measured_once():
     assert not is_new_ground(horizon, np.array([15.0, 0.0, 20.0]), 20.0)
 
 
+def test_ground_that_tells_nothing_is_looked_at_once_too():
+    """From 15 m every frame was registered a second time, for nothing."""
+    place = np.array([60.0, 0.0, 15.0])
+    unsure = Sight(Pose(camera(0.0), place), np.eye(6) * np.radians(0.5) ** 2, 15.0, STEP_NS)
+    horizon = measured(unknown(CONFIG), CONFIG, camera(0.0), unsure)
+    assert horizon.off_deg == (0.0, 0.0)
+    assert not is_new_ground(horizon, place, 15.0)
+    failed = Levelling(CONFIG, lambda _: camera(0.0))
+    assert failed.is_due(place, 15.0)
+    failed.pass_by(place, STEP_NS)
+    assert not failed.is_due(place, 15.0)
+
+
 def test_on_its_side_or_unreported_there_is_none():
     side = so3_exp([0, np.radians(90), 0]) @ camera(0.0, 0.0)
     assert constraint(unknown(CONFIG), side, predicted(side)) is None
