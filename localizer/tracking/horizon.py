@@ -176,7 +176,7 @@ def measured(horizon: Horizon, config: AttitudePrior, reported: Array, sight: Si
     least = float(np.radians(config.tilt_sigma_deg)) ** 2
     return replace(
         here, mean=horizon.mean + gain @ off, covariance=P - gain @ S @ gain.T, count=count,
-        spread=float(np.clip(spread, least, _MOST_SPREAD_RAD**2)), refused=0,
+        spread=max(min(spread, _MOST_SPREAD_RAD**2), least), refused=0,
     )  # fmt: skip
 
 

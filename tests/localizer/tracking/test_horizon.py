@@ -89,6 +89,14 @@ def test_a_gimbal_that_wanders_more_is_believed_less():
     assert np.degrees(wild.sigma_rad) > 0.9
 
 
+def test_one_that_is_said_to_be_bad_stays_so():
+    """8 degrees were 3 from the first sight on."""
+    config = AttitudePrior(tilt_sigma_deg=8.0)
+    sight = Sight(Pose(camera(0.0), np.zeros(3)), np.eye(6) * 1e-6, 110.0, STEP_NS)
+    horizon = measured(unknown(config), config, camera(0.0), sight)
+    assert np.degrees(horizon.sigma_rad) >= 8.0
+
+
 def test_a_frame_is_constrained_in_tilt_alone_at_the_corrected_rotation():
     horizon = flown(unknown(CONFIG), (1.2, -0.8), 30)
     reported = camera(200.0)
