@@ -16,7 +16,8 @@ def keep(config: CompanionConfig) -> int:
     """
     descriptor = os.memfd_create("deployment")
     with open(descriptor, "wb", closefd=False) as file:
-        file.write(config.model_dump_json().encode())
+        # Escaped: a folder's name may be no UTF-8.
+        file.write(json.dumps(config.model_dump(mode="json")).encode())
     return descriptor
 
 
