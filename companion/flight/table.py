@@ -7,6 +7,7 @@ above it and subscribes to the channels that it reads.
 from __future__ import annotations
 
 import hashlib
+import json
 import logging
 from collections.abc import Callable
 from dataclasses import replace
@@ -604,7 +605,7 @@ def _forbid_memory(config: CompanionConfig) -> ForbidMemory | None:
     file = _state_file(config)
     if file is None:
         return None
-    described = (config.camera.model_dump_json(), config.bridge.camera.model_dump_json())
-    about = "\n".join((readable_map_hash(config.map) or "", *described))
+    cameras = [one.model_dump(mode="json") for one in (config.camera, config.bridge.camera)]
+    about = json.dumps([readable_map_hash(config.map), *cameras])  # escaped: paths may be no UTF-8
     digest = hashlib.sha256(about.encode()).hexdigest()
     return ForbidMemory(RestartMemory(file.with_name("guardian-forbids.json"), about=digest))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+from fcntl import F_DUPFD_CLOEXEC, fcntl
 from pathlib import Path
 
 from companion.config import CompanionConfig, load_config, parse_config
@@ -14,10 +15,11 @@ def keep(config: CompanionConfig) -> int:
     """A descriptor for the processes that are to know the deployment: of memory, which goes with no
     disk.
     """
-    descriptor = os.memfd_create("deployment")
-    with open(descriptor, "wb", closefd=False) as file:
-        file.write(config.model_dump_json().encode())
-    return descriptor
+    with open(os.memfd_create("deployment"), "wb") as file:
+        # Escaped: a folder's name may be no UTF-8.
+        file.write(json.dumps(config.model_dump(mode="json")).encode())
+        # Beyond the standard streams, whose places are free where a program was begun without.
+        return fcntl(file, F_DUPFD_CLOEXEC, 3)
 
 
 def settings_of(path: Path, kept: int | None) -> tuple[CompanionConfig, str]:

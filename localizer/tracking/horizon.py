@@ -142,27 +142,32 @@ def is_new_ground(horizon: Horizon, place: Array, distance_m: float) -> bool:
     return horizon.place is None or bool(np.hypot(*(place[:2] - horizon.place)) >= apart_m)
 
 
+def passed(horizon: Horizon, place: Array, time_ns: int) -> Horizon:
+    """The horizon at `place` (3,), from where nothing was learned: less sure, by the time."""
+    apart_s = abs(time_ns - horizon.time_ns) * 1e-9 if horizon.place is not None else 0.0
+    walked = np.eye(2) * _WALK_RAD**2 * min(apart_s, 60.0)
+    covariance = horizon.covariance + walked
+    return replace(horizon, covariance=covariance, place=place[:2].copy(), time_ns=time_ns)
+
+
 def measured(horizon: Horizon, config: AttitudePrior, reported: Array, sight: Sight) -> Horizon:
     """The horizon after another sight. reported: (3, 3) as in `constraint`."""
     axes = horizontal_axes(reported)
     if axes is None:
         return horizon
-    seen, time_ns = sight.pose, sight.time_ns
+    seen = sight.pose
+    here = passed(horizon, seen.translation, sight.time_ns)
     R = axes.T @ sight.covariance[3:, 3:] @ axes * max(1.0, _HONEST_M / sight.distance_m) ** 2
     if np.linalg.eigvalsh(R)[-1] > _LARGEST_SIGMA_RAD**2:
-        return horizon
-    passed_s = (
-        min(abs(time_ns - horizon.time_ns) * 1e-9, 60.0) if horizon.place is not None else 0.0
-    )
-    P = horizon.covariance + np.eye(2) * _WALK_RAD**2 * passed_s
+        return here
+    P = here.covariance
     off = axes.T @ so3_log(seen.rotation @ reported.T) - horizon.mean
     S = P + R + np.eye(2) * horizon.spread
     sigmas = _sigmas(off, S)
-    here = replace(horizon, place=seen.translation[:2].copy(), time_ns=time_ns)
     if sigmas > _TAKEN:
         if horizon.refused + 1 < _REFUSED_IN_ROW:
             return replace(here, refused=horizon.refused + 1)
-        return replace(unknown(config), place=here.place, time_ns=time_ns)
+        return replace(unknown(config), place=here.place, time_ns=here.time_ns)
     S = S * max(1.0, sigmas / _CAUTIOUS) ** 2
     gain = P @ np.linalg.inv(S)
     count = min(horizon.count + 1.0, _MOST_SPREAD_COUNT)
@@ -171,7 +176,7 @@ def measured(horizon: Horizon, config: AttitudePrior, reported: Array, sight: Si
     least = float(np.radians(config.tilt_sigma_deg)) ** 2
     return replace(
         here, mean=horizon.mean + gain @ off, covariance=P - gain @ S @ gain.T, count=count,
-        spread=float(np.clip(spread, least, _MOST_SPREAD_RAD**2)), refused=0,
+        spread=max(min(spread, _MOST_SPREAD_RAD**2), least), refused=0,
     )  # fmt: skip
 
 
@@ -197,6 +202,11 @@ class Levelling:
     def is_due(self, place: Array, distance_m: float) -> bool:
         """Whether a sight from `place` (3,) is wanted."""
         return self.horizon is not None and is_new_ground(self.horizon, place, distance_m)
+
+    def pass_by(self, place: Array, time_ns: int) -> None:
+        """What is seen from `place` (3,) tells nothing: the next sight is wanted from another."""
+        if self.horizon is not None:
+            self.horizon = passed(self.horizon, place, time_ns)
 
     def learn(self, sight: Sight) -> None:
         """Take a sight."""

@@ -453,6 +453,8 @@ class Localizer:
         if free.status is RegistrationStatus.OK:
             covariance = free.covariance + unknown
             self.levelling.learn(Sight(free.world_from_camera, covariance, distance_m, time_ns))
+        else:
+            self.levelling.pass_by(pose.translation, time_ns)
 
     def _is_focal_due(self, estimate: PoseEstimate) -> bool:
         """Whether this picture is one whose focal length is to be fitted."""

@@ -91,7 +91,34 @@ def test_every_setting_comes_back(kept: Callable[[CompanionConfig], int], tmp_pa
     assert settings_of(tmp_path / "gone.yaml", kept(flown))[0] == flown
 
 
-_READS = 'import os, sys; sys.exit(os.pread(int(sys.argv[1]), 9, 0) != b\'{"map":"/\')'
+def test_a_folder_whose_name_is_no_utf8_is_kept(
+    deployment: Path, kept: Callable[[CompanionConfig], int]
+) -> None:
+    """No supervised flight began there."""
+    folder = Path(os.fsdecode(os.fsencode(deployment.parent) + b"/fl\xfcge"))
+    folder.mkdir()
+    moved = deployment.rename(folder / deployment.name)
+    flown = load_config(moved)
+    descriptor = kept(flown)
+    moved.unlink()
+    assert settings_of(moved, descriptor)[0] == flown
+
+
+def test_it_takes_no_standard_streams_place(
+    deployment: Path, kept: Callable[[CompanionConfig], int]
+) -> None:
+    """Begun with its input closed, every restart was told ``--kept=0``: wrong usage, its end."""
+    config = load_config(deployment)
+    saved = os.dup(0)
+    os.close(0)
+    try:
+        assert kept(config) >= 3
+    finally:
+        os.dup2(saved, 0)
+        os.close(saved)
+
+
+_READS = 'import os, sys; sys.exit(os.pread(int(sys.argv[1]), 10, 0) != b\'{"map": "/\')'
 
 
 def test_restarted_processes_can_read_it(

@@ -89,6 +89,14 @@ def test_a_gimbal_that_wanders_more_is_believed_less():
     assert np.degrees(wild.sigma_rad) > 0.9
 
 
+def test_one_that_is_said_to_be_bad_stays_so():
+    """8 degrees were 3 from the first sight on."""
+    config = AttitudePrior(tilt_sigma_deg=8.0)
+    sight = Sight(Pose(camera(0.0), np.zeros(3)), np.eye(6) * 1e-6, 110.0, STEP_NS)
+    horizon = measured(unknown(config), config, camera(0.0), sight)
+    assert np.degrees(horizon.sigma_rad) >= 8.0
+
+
 def test_a_frame_is_constrained_in_tilt_alone_at_the_corrected_rotation():
     horizon = flown(unknown(CONFIG), (1.2, -0.8), 30)
     reported = camera(200.0)
@@ -138,6 +146,19 @@ def test_the_same_ground_is_measured_once():
     assert not is_new_ground(horizon, np.array([40.0, 0.0, 100.0]), 100.0)
     assert is_new_ground(horizon, np.array([60.0, 0.0, 100.0]), 100.0)
     assert not is_new_ground(horizon, np.array([15.0, 0.0, 20.0]), 20.0)
+
+
+def test_ground_that_tells_nothing_is_looked_at_once_too():
+    """From 15 m every frame was registered a second time, for nothing."""
+    place = np.array([60.0, 0.0, 15.0])
+    unsure = Sight(Pose(camera(0.0), place), np.eye(6) * np.radians(0.5) ** 2, 15.0, STEP_NS)
+    horizon = measured(unknown(CONFIG), CONFIG, camera(0.0), unsure)
+    assert horizon.off_deg == (0.0, 0.0)
+    assert not is_new_ground(horizon, place, 15.0)
+    failed = Levelling(CONFIG, lambda _: camera(0.0))
+    assert failed.is_due(place, 15.0)
+    failed.pass_by(place, STEP_NS)
+    assert not failed.is_due(place, 15.0)
 
 
 def test_on_its_side_or_unreported_there_is_none():

@@ -6,6 +6,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -15,12 +16,14 @@ from localizer.geometry.camera import Camera
 from localizer.geometry.pose import Array, Pose, so3_exp
 from localizer.map.cache.cache import TileCache
 from localizer.map.cache.stream import TileStreamer
+from localizer.registration.jngo import JNGO
+from localizer.registration.result import Registration, failure
 from localizer.render.numba_raster import NumbaRenderer
 from localizer.synth.appearance.model import Appearance
 from localizer.tracking.horizon import Horizon, horizontal_axes
 from localizer.tracking.motion import OtherSensors
 from localizer.tracking.opening import open_localizer
-from localizer.types import Frame, PosePrior
+from localizer.types import Frame, PosePrior, RegistrationStatus
 from sitl.camera.true_motion import PoseTrack
 from sitl.camera.world_camera import CameraOptions, WorldCamera
 from sitl.demo.assets import FlightAssets
@@ -38,8 +41,12 @@ def _pose(time_ns: int, height_m: float) -> Pose:
 
 @pytest.fixture(scope="module")
 def filmed(small_assets: FlightAssets) -> list[tuple[Frame, Pose]]:
-    height_m = ABOVE_M + float(small_assets.world.ground_height(0.0, 0.0))
-    end_ns = (COUNT + 2) * PERIOD_NS
+    return _filmed(small_assets, ABOVE_M, COUNT)
+
+
+def _filmed(small_assets: FlightAssets, above_m: float, count: int) -> list[tuple[Frame, Pose]]:
+    height_m = above_m + float(small_assets.world.ground_height(0.0, 0.0))
+    end_ns = (count + 2) * PERIOD_NS
     track = PoseTrack([(t, _pose(t, height_m)) for t in range(0, end_ns, 20_000_000)])
     live = TileCache.open(small_assets.live_cache)
     streamer = TileStreamer(live)
@@ -48,7 +55,7 @@ def filmed(small_assets: FlightAssets) -> list[tuple[Frame, Pose]]:
     seen = []
     try:
         camera = WorldCamera(NumbaRenderer(streamer), CAMERA, Appearance(), options)
-        for k in range(1, COUNT + 1):
+        for k in range(1, count + 1):
             exposed = camera.expose(k * PERIOD_NS, track)
             assert exposed is not None
             frame = Frame(exposed.image, exposed.time_ns, CAMERA, k)
@@ -88,7 +95,7 @@ def fly(
                 errors.append(estimate.world_from_camera.distance_to(true)[0])
         horizon = localizer.levelling.horizon
     assert horizon is not None
-    assert len(errors) > COUNT - 4
+    assert len(errors) > len(filmed) - 4
     return errors, horizon
 
 
@@ -111,3 +118,22 @@ def test_nor_does_one_that_sinks_slowly(small_assets, filmed):
     """8 degrees, 0.5 in each frame, so that every one is nearly where the last one was."""
     errors, _ = fly(small_assets, filmed, lambda k: float(np.clip(0.5 * (k - KNOCKED), 0.0, 8.0)))
     assert max(errors) < 0.6
+
+
+@pytest.mark.parametrize("fails", [False, True])
+def test_from_low_down_frames_are_not_registered_twice(small_assets, monkeypatch, fails):
+    """Once on 20 m of ground, whatever comes of it; every frame was, since nothing was learned."""
+    free: list[int] = []
+    register = JNGO.register
+
+    def counted(self: JNGO, *args: Any, **options: Any) -> Registration:
+        if options.get("motion") is not None:
+            return register(self, *args, **options)
+        free.append(options["seed"])
+        if fails and len(free) > 5:
+            return failure(args[3], RegistrationStatus.NO_TEXTURE)
+        return register(self, *args, **options)
+
+    monkeypatch.setattr(JNGO, "register", counted)
+    fly(small_assets, _filmed(small_assets, 15.0, 16), lambda _: 0.0)
+    assert 0 < len(free) <= 10  # 96 m, and the first frames
