@@ -15,7 +15,7 @@ from typing import Any
 from xml.etree import ElementTree
 
 from benchmarks.common.shares import exact_interval
-from benchmarks.site.kept import Table
+from benchmarks.site.kept import PrintedTable
 from companion.errors import ReportError
 from sitl.demo.scenario import ScenarioError
 from sitl.suite.loop.report import markdown, read_rows
@@ -60,7 +60,7 @@ _TESTS = ("tests", "passed", "failed", "skipped", "seconds")
 
 def tables_of(
     paths: Sequence[Path], title: str, only: Sequence[str] = ()
-) -> tuple[Table, Table | None]:
+) -> tuple[PrintedTable, PrintedTable | None]:
     """The table of one result, and what was needed beside what was found where the report says.
 
     paths: several files of one form; title: of a row that has no name of its own, behind the names
@@ -85,12 +85,12 @@ def tables_of(
     return _picked(table, only), None
 
 
-def _picked(table: Table, only: Sequence[str]) -> Table:
+def _picked(table: PrintedTable, only: Sequence[str]) -> PrintedTable:
     rows = tuple(row for row in table.rows if not only or row[0] in only)
-    return Table(table.columns, rows)
+    return PrintedTable(table.columns, rows)
 
 
-def _form(data: Any) -> Callable[[list[Any], str], Table]:
+def _form(data: Any) -> Callable[[list[Any], str], PrintedTable]:
     marks = data if isinstance(data, dict) else data[0]
     for mark, made in (
         ("columns", _figures), ("package", _package), ("recall_1", _sequence),
@@ -103,12 +103,12 @@ def _form(data: Any) -> Callable[[list[Any], str], Table]:
     raise KeyError("none of the marks of a form")
 
 
-def _figures(data: list[Any], _title: str) -> Table:
+def _figures(data: list[Any], _title: str) -> PrintedTable:
     rows = (tuple(map(str, row)) for one in data for row in one["rows"])
-    return Table(tuple(data[0]["columns"]), tuple(rows))
+    return PrintedTable(tuple(data[0]["columns"]), tuple(rows))
 
 
-def _depths(data: list[Any], _title: str) -> Table:
+def _depths(data: list[Any], _title: str) -> PrintedTable:
     rows = tuple(
         (
             f"{one['height_m']:.0f}", str(one["pixels"]),
@@ -117,10 +117,10 @@ def _depths(data: list[Any], _title: str) -> Table:
         )
         for part in data for one in part["rows"]
     )  # fmt: skip
-    return Table(_DEPTHS, rows)
+    return PrintedTable(_DEPTHS, rows)
 
 
-def _optimizer(data: list[Any], _title: str) -> Table:
+def _optimizer(data: list[Any], _title: str) -> PrintedTable:
     """Milliseconds of one LM iteration by side of the feature map; the paper's own figures last."""
     columns = ("per LM iteration, ms", *(f"{size} px" for size in data[0]["sizes"]))
     rows = tuple(
@@ -129,10 +129,10 @@ def _optimizer(data: list[Any], _title: str) -> Table:
         for times in (part["iteration_ms"], part["paper_ms"])
         for backend, of_size in times.items()
     )
-    return Table(columns, rows)
+    return PrintedTable(columns, rows)
 
 
-def _throughput(data: list[Any], _title: str) -> Table:
+def _throughput(data: list[Any], _title: str) -> PrintedTable:
     """Without the stages, which are of another shape."""
     rows = tuple(
         (
@@ -144,24 +144,26 @@ def _throughput(data: list[Any], _title: str) -> Table:
         )
         for part in data for one in part["rows"] if "stage_ms" not in one
     )  # fmt: skip
-    return Table(_THROUGHPUT, rows)
+    return PrintedTable(_THROUGHPUT, rows)
 
 
-def _loop(paths: Sequence[Path], title: str, only: Sequence[str]) -> Table:
+def _loop(paths: Sequence[Path], title: str, only: Sequence[str]) -> PrintedTable:
     rows = [row for path in paths for row in read_rows(path) if not only or row.name in only]
     table = _of_markdown(markdown(rows))
     if not title:
         return table
-    return Table(table.columns, tuple((f"{row[0]} ({title})", *row[1:]) for row in table.rows))
+    return PrintedTable(
+        table.columns, tuple((f"{row[0]} ({title})", *row[1:]) for row in table.rows)
+    )
 
 
-def _of_markdown(text: str) -> Table:
+def _of_markdown(text: str) -> PrintedTable:
     lines = [line for line in text.splitlines() if line.startswith("|")]
     cells = [tuple(cell.strip() for cell in line.strip("|").split("|")) for line in lines]
-    return Table(cells[0], tuple(cells[2:]))
+    return PrintedTable(cells[0], tuple(cells[2:]))
 
 
-def _flight(report: dict[str, Any], title: str) -> tuple[Table, Table]:
+def _flight(report: dict[str, Any], title: str) -> tuple[PrintedTable, PrintedTable]:
     localizer, latency = report["localizer"], report["stages_ms"]["latency"]
     ekf = report.get("ekf_in_map_m") or report["ekf_horizontal_m"]
     row = (
@@ -176,10 +178,10 @@ def _flight(report: dict[str, Any], title: str) -> tuple[Table, Table]:
         f"{localizer['fps']:.1f}",
         f"{latency['median']:.0f} / {latency['p95']:.0f}",
     )
-    return Table(_FLIGHT, (row,)), _criteria(report["criteria"])
+    return PrintedTable(_FLIGHT, (row,)), _criteria(report["criteria"])
 
 
-def _criteria(criteria: Sequence[dict[str, Any]]) -> Table:
+def _criteria(criteria: Sequence[dict[str, Any]]) -> PrintedTable:
     rows = []
     for one in criteria:
         enough = one["value"] >= one["limit"] if one["at_least"] else one["value"] <= one["limit"]
@@ -189,10 +191,10 @@ def _criteria(criteria: Sequence[dict[str, Any]]) -> Table:
         digits = 2 if enough or round(one["value"], 2) != round(one["limit"], 2) else 3
         found, needed = (_number(one[key], one["unit"], digits) for key in ("value", "limit"))
         rows.append((one["name"], found, f"{sign} {needed}", held))
-    return Table(("figure", "found", "needed", "held"), tuple(rows))
+    return PrintedTable(("figure", "found", "needed", "held"), tuple(rows))
 
 
-def _sequence(data: list[Any], title: str) -> Table:
+def _sequence(data: list[Any], title: str) -> PrintedTable:
     one = data[0]
     row = (
         title,
@@ -203,10 +205,10 @@ def _sequence(data: list[Any], title: str) -> Table:
         f"{one['completeness']:.1f}",
         f"{one['fps']:.1f}",
     )
-    return Table(_SEQUENCE, (row,))
+    return PrintedTable(_SEQUENCE, (row,))
 
 
-def _suite(data: list[Any], _title: str) -> Table:
+def _suite(data: list[Any], _title: str) -> PrintedTable:
     rows = []
     for one in (row for part in data for row in part):
         broken = "; ".join(f["what"] for f in one["findings"] or () if not f["ok"])
@@ -214,11 +216,11 @@ def _suite(data: list[Any], _title: str) -> Table:
         told = " ".join(filter(None, (verdict, broken, one["error"].split("\n")[0])))
         measured = " / ".join(f"{m:.2f}" for m in one["measured"] or ())
         rows.append((one["scenario"], one["title"], one["vehicle"], measured, told))
-    return Table(_SUITE, tuple(sorted(rows)))
+    return PrintedTable(_SUITE, tuple(sorted(rows)))
 
 
-def _followed(data: list[Any], _title: str) -> Table:
-    return Table(_FOLLOWED, tuple(_pursuit(row) for part in data for row in part))
+def _followed(data: list[Any], _title: str) -> PrintedTable:
+    return PrintedTable(_FOLLOWED, tuple(_pursuit(row) for part in data for row in part))
 
 
 def _pursuit(row: dict[str, Any]) -> tuple[str, ...]:
@@ -236,7 +238,7 @@ def _pursuit(row: dict[str, Any]) -> tuple[str, ...]:
     )  # fmt: skip
 
 
-def _integrity(data: list[Any], _title: str) -> Table:
+def _integrity(data: list[Any], _title: str) -> PrintedTable:
     rows = (
         (one["set"], one["acceptance"], *(_rate(one[k]) for k in ("false", "false_far", "lost")))
         for part in data
@@ -244,7 +246,7 @@ def _integrity(data: list[Any], _title: str) -> Table:
         if one["acceptance"].endswith("ours on trial")
         or (one["set"].startswith("all") and one["acceptance"] in _ACCEPTANCES)
     )
-    return Table(_INTEGRITY, tuple(rows))
+    return PrintedTable(_INTEGRITY, tuple(rows))
 
 
 def _rate(rate: dict[str, float]) -> str:
@@ -253,7 +255,7 @@ def _rate(rate: dict[str, float]) -> str:
     return f"{rate['hits']} of {rate['count']}, {share:.2f} {interval}"
 
 
-def _places(data: list[Any], _title: str) -> Table:
+def _places(data: list[Any], _title: str) -> PrintedTable:
     outcomes = [one for part in data for one in part]
     rows = []
     for name, known in dict.fromkeys((o["set"], o["heading_known"]) for o in outcomes):
@@ -263,7 +265,7 @@ def _places(data: list[Any], _title: str) -> Table:
         mine = [o for o in outcomes if o["heading_known"] is known]
         if len({o["set"] for o in mine}) > 1:
             rows.append(_place("together", known, mine))
-    return Table(_PLACES, tuple(rows))
+    return PrintedTable(_PLACES, tuple(rows))
 
 
 def _place(name: str, known: bool, mine: Sequence[dict[str, Any]]) -> tuple[str, ...]:
@@ -288,7 +290,7 @@ def _share(some: Sequence[dict[str, Any]]) -> str:
     return f"{hits} of {len(some)} [{low:.0f}, {high:.0f}]"
 
 
-def _cost(data: list[Any], _title: str) -> Table:
+def _cost(data: list[Any], _title: str) -> PrintedTable:
     rows = (
         (f"{one['area_km2']:.1f} km²{'' if one['measured'] else ', on paper'}",
          f"{one['cell_m']:g}", "15°" if one["heading_known"] else "unknown",
@@ -298,10 +300,10 @@ def _cost(data: list[Any], _title: str) -> Table:
         for part in data
         for one in part
     )  # fmt: skip
-    return Table(_COST, tuple(rows))
+    return PrintedTable(_COST, tuple(rows))
 
 
-def _drift(data: list[Any], _title: str) -> Table:
+def _drift(data: list[Any], _title: str) -> PrintedTable:
     rows = tuple(
         (
             one["depth"], one["condition"], str(one["stretches"]),
@@ -312,10 +314,10 @@ def _drift(data: list[Any], _title: str) -> Table:
         )
         for part in data for one in part
     )  # fmt: skip
-    return Table(_DRIFT, rows)
+    return PrintedTable(_DRIFT, rows)
 
 
-def _package(data: list[Any], _title: str) -> Table:
+def _package(data: list[Any], _title: str) -> PrintedTable:
     rows = []
     for one in data:
         tested, seconds = one["self_test"], one["seconds"]
@@ -332,10 +334,10 @@ def _package(data: list[Any], _title: str) -> Table:
                 f"{tested['frame_ms']:.0f}" if tested else "-",
             )
         )
-    return Table(_PACKAGE, tuple(rows))
+    return PrintedTable(_PACKAGE, tuple(rows))
 
 
-def _exposure(paths: Sequence[Path]) -> Table:
+def _exposure(paths: Sequence[Path]) -> PrintedTable:
     """Of `systemd-analyze security`."""
     rows = []
     for path in paths:
@@ -343,10 +345,10 @@ def _exposure(paths: Sequence[Path]) -> Table:
         if found is None:
             raise ValueError("no overall exposure level")
         rows.append((found[1], f"{found[2]} {found[3]}", "below 3"))
-    return Table(_EXPOSURE, tuple(rows))
+    return PrintedTable(_EXPOSURE, tuple(rows))
 
 
-def _tests(paths: Sequence[Path], title: str) -> Table:
+def _tests(paths: Sequence[Path], title: str) -> PrintedTable:
     """Of `pytest --junitxml`."""
     count = dict.fromkeys(("tests", "failures", "errors", "skipped", "time"), 0.0)
     for path in paths:
@@ -356,7 +358,7 @@ def _tests(paths: Sequence[Path], title: str) -> Table:
     failed = count["failures"] + count["errors"]
     passed = count["tests"] - failed - count["skipped"]
     cells = (f"{n:.0f}" for n in (passed, failed, count["skipped"], count["time"]))
-    return Table(_TESTS, ((title, *cells),))
+    return PrintedTable(_TESTS, ((title, *cells),))
 
 
 def _short(percent: float) -> str:

@@ -22,7 +22,7 @@ _MARK = re.compile(r"<!-- (kept|criteria) ([\w\- ]+) -->\n.*?<!-- end -->", re.S
 
 
 @dataclass(frozen=True)
-class Table:
+class PrintedTable:
     """Cells as they are printed."""
 
     columns: tuple[str, ...]
@@ -43,8 +43,8 @@ class Kept:
     date: str
     machine: str
     source: str
-    table: Table
-    criteria: Table | None = None
+    table: PrintedTable
+    criteria: PrintedTable | None = None
 
 
 def load(path: Path) -> Kept:
@@ -105,7 +105,7 @@ def _origins(parts: Sequence[Kept]) -> list[str]:
     return lines
 
 
-def _together(tables: Sequence[Table], parts: Sequence[Kept]) -> str:
+def _together(tables: Sequence[PrintedTable], parts: Sequence[Kept]) -> str:
     columns = tables[0].columns
     if any(table.columns != columns for table in tables):
         raise ReportError(f"tables of one mark differ in their columns: {columns}")
@@ -115,8 +115,8 @@ def _together(tables: Sequence[Table], parts: Sequence[Kept]) -> str:
         for table, part in zip(tables, parts, strict=True)
         for row in table.rows
     )
-    return Table((*columns, "commit") if several else columns, rows).markdown
+    return PrintedTable((*columns, "commit") if several else columns, rows).markdown
 
 
-def _table(data: dict[str, Any]) -> Table:
-    return Table(tuple(data["columns"]), tuple(tuple(row) for row in data["rows"]))
+def _table(data: dict[str, Any]) -> PrintedTable:
+    return PrintedTable(tuple(data["columns"]), tuple(tuple(row) for row in data["rows"]))

@@ -49,7 +49,7 @@ _FRAMES = {
 
 
 @dataclass(frozen=True)
-class Waypoint:
+class PlannedWaypoint:
     """A place to fly to. height_m: above what `above` says; pitch_deg: of the gimbal on the way
     there, if said.
     """
@@ -68,7 +68,7 @@ class PlannedMission:
     """
 
     home: tuple[float, float] | None
-    waypoints: tuple[Waypoint, ...]
+    waypoints: tuple[PlannedWaypoint, ...]
     takeoff_height_m: float | None
     speed_m_s: float | None
     returns: bool
@@ -76,7 +76,7 @@ class PlannedMission:
 
 
 @dataclass(frozen=True)
-class _Item:
+class _MissionItem:
     command: int
     frame: int
     parameters: tuple[float, float, float, float]
@@ -115,7 +115,7 @@ def read_mission(path: Path) -> PlannedMission:
         ) from error
 
 
-def _plan(document: dict[str, Any]) -> tuple[tuple[float, float], list[_Item]]:
+def _plan(document: dict[str, Any]) -> tuple[tuple[float, float], list[_MissionItem]]:
     mission = document["mission"]
     home = mission["plannedHomePosition"]
     items = [_plan_item(item) for entry in mission["items"] for item in _simple(entry)]
@@ -130,15 +130,15 @@ def _simple(entry: dict[str, Any]) -> Iterator[dict[str, Any]]:
         yield from entry["TransectStyleComplexItem"]["Items"]
 
 
-def _plan_item(entry: dict[str, Any]) -> _Item:
+def _plan_item(entry: dict[str, Any]) -> _MissionItem:
     numbers = [0.0 if p is None else float(p) for p in entry["params"]]
     p1, p2, p3, p4, latitude, longitude, altitude = numbers
-    return _Item(
+    return _MissionItem(
         int(entry["command"]), int(entry["frame"]), (p1, p2, p3, p4), latitude, longitude, altitude
     )
 
 
-def _waypoints(text: str) -> tuple[tuple[float, float] | None, list[_Item]]:
+def _waypoints(text: str) -> tuple[tuple[float, float] | None, list[_MissionItem]]:
     """Rows of index, current, frame, command, four parameters, latitude, longitude, altitude,
     autocontinue; row 0 is home.
     """
@@ -152,16 +152,18 @@ def _waypoints(text: str) -> tuple[tuple[float, float] | None, list[_Item]]:
         cells = line.split()
         p1, p2, p3, p4, latitude, longitude, altitude = (float(c) for c in cells[4:11])
         items.append(
-            _Item(int(cells[3]), int(cells[2]), (p1, p2, p3, p4), latitude, longitude, altitude)
+            _MissionItem(
+                int(cells[3]), int(cells[2]), (p1, p2, p3, p4), latitude, longitude, altitude
+            )
         )
     home = (items[0].latitude_deg, items[0].longitude_deg) if items else None
     return (None if home == (0.0, 0.0) else home), items[1:]
 
 
 def _mission(
-    path: Path, home: tuple[float, float] | None, items: Sequence[_Item]
+    path: Path, home: tuple[float, float] | None, items: Sequence[_MissionItem]
 ) -> PlannedMission:
-    waypoints: list[Waypoint] = []
+    waypoints: list[PlannedWaypoint] = []
     takeoff = speed = pitch = None
     returns, ignored = False, []
     for item in items:
@@ -193,12 +195,12 @@ def _mission(
     return PlannedMission(home, tuple(waypoints), takeoff, speed, returns, tuple(ignored))
 
 
-def _begun(home: tuple[float, float] | None, takeoff_m: float | None) -> Waypoint | None:
+def _begun(home: tuple[float, float] | None, takeoff_m: float | None) -> PlannedWaypoint | None:
     """Where the vehicle is before the first place; None where the file does not say."""
-    return None if home is None else Waypoint(*home, takeoff_m or 0.0, None)
+    return None if home is None else PlannedWaypoint(*home, takeoff_m or 0.0, None)
 
 
-def _filled(item: _Item, before: Waypoint | None) -> _Item:
+def _filled(item: _MissionItem, before: PlannedWaypoint | None) -> _MissionItem:
     """With what is not set, coordinates or an altitude of zero, as it is where the vehicle is, as
     ArduPilot has it (ModeAuto::loc_from_cmd).
     """
@@ -210,13 +212,13 @@ def _filled(item: _Item, before: Waypoint | None) -> _Item:
     return item if item.altitude_m else _level(item, before)
 
 
-def _level(item: _Item, before: Waypoint) -> _Item:
+def _level(item: _MissionItem, before: PlannedWaypoint) -> _MissionItem:
     """At the height of the waypoint before it."""
     frame = next(f for f, above in _FRAMES.items() if above is before.above)
     return replace(item, altitude_m=before.height_m, frame=frame)
 
 
-def _waypoint(path: Path, item: _Item, pitch: float | None, number: int) -> Waypoint:
+def _waypoint(path: Path, item: _MissionItem, pitch: float | None, number: int) -> PlannedWaypoint:
     place = (item.latitude_deg, item.longitude_deg, item.altitude_m)
     if not (_is_on_earth(*place[:2]) and math.isfinite(item.altitude_m)):
         raise ValueError(f"waypoint {number} is no place: {place}")
@@ -227,7 +229,7 @@ def _waypoint(path: Path, item: _Item, pitch: float | None, number: int) -> Wayp
             f"{path}: waypoint {number} in frame {item.frame}; known are {sorted(_FRAMES)} "
             "(MAV_FRAME): save the mission with global coordinates"
         )
-    return Waypoint(*place, pitch, _FRAMES[item.frame])
+    return PlannedWaypoint(*place, pitch, _FRAMES[item.frame])
 
 
 def _is_on_earth(latitude_deg: float, longitude_deg: float) -> bool:

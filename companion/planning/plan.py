@@ -8,10 +8,10 @@ from pathlib import Path
 from companion.config import CompanionConfig
 from companion.geometry import Mount
 from companion.planning.instead import Instead, instead
-from companion.planning.judge import LegVerdict, Limits, Stretch, stretches
+from companion.planning.judge import LegVerdict, MissionLimits, VisionGap, stretches
 from companion.planning.mission import PlannedMission
 from companion.planning.survey import Progress, surveyor
-from companion.planning.way import Aim, Ground, legs_of, length_m
+from companion.planning.way import Aim, MapHeights, legs_of, length_m
 from localizer.map.cache.cache import TileCache
 from localizer.odometry.config import OdometryConfig
 
@@ -29,7 +29,7 @@ class Question:
 
     mission_file: Path
     conditions: tuple[str, ...] = ("day",)
-    limits: Limits = field(default_factory=Limits)
+    limits: MissionLimits = field(default_factory=MissionLimits)
     spacing_m: float = 25.0
     speed_m_s: float = DEFAULT_SPEED_M_S
     pitch_deg: float = DEFAULT_PITCH_DEG
@@ -37,14 +37,14 @@ class Question:
 
 
 @dataclass(frozen=True)
-class Plan:
+class MissionForecast:
     """The answer. notes: what the forecast does not know of this mission, as sentences."""
 
     question: Question
     length_m: float
     speed_m_s: float
     verdicts: tuple[LegVerdict, ...]
-    stretches: tuple[Stretch, ...]
+    stretches: tuple[VisionGap, ...]
     instead: tuple[Instead, ...]
     notes: tuple[str, ...]
 
@@ -72,10 +72,10 @@ def make_plan(
     deployment: CompanionConfig,
     question: Question,
     progress: Progress | None = None,
-) -> Plan:
+) -> MissionForecast:
     """Forecast every leg, say what must be bridged, and look for what would do instead."""
     aim = aim_of(deployment, question.pitch_deg)
-    ground = Ground(cache)
+    ground = MapHeights(cache)
     legs = legs_of(mission, cache, ground, aim, question.spacing_m)
     thinned = length_m(legs) / _MOST_SAMPLES
     if thinned > question.spacing_m:
@@ -91,7 +91,7 @@ def make_plan(
     speed_m_s = speed or question.speed_m_s
     bridged = stretches(verdicts, speed_m_s, odometry)
     notes = _notes(mission, deployment, aim, max(thinned, question.spacing_m))
-    return Plan(question, length_m(legs), speed_m_s, verdicts, bridged, options, notes)
+    return MissionForecast(question, length_m(legs), speed_m_s, verdicts, bridged, options, notes)
 
 
 def _notes(

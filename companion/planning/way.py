@@ -17,7 +17,7 @@ from companion.geometry import (
     ned_from_world,
     world_from_camera,
 )
-from companion.planning.mission import HeightAbove, PlannedMission, Waypoint
+from companion.planning.mission import HeightAbove, PlannedMission, PlannedWaypoint
 from localizer.geometry.antimeridian import geo_box
 from localizer.geometry.pose import Array, Pose, matrix_from_euler
 from localizer.map.cache.cache import TileCache
@@ -42,7 +42,7 @@ class Aim:
 
 
 @dataclass(frozen=True)
-class Sample:
+class PathSample:
     """A place on the way. position: (3,) of the vehicle, world metres; way_m: flown until there;
     turn_deg: of the camera to the right of the way (an alternative's).
     """
@@ -55,7 +55,7 @@ class Sample:
 
 
 @dataclass(frozen=True)
-class Leg:
+class FlightLeg:
     """A straight way between two places. name: as the ground station numbers them, "home" too;
     step_m: of the way that each sample stands for.
     """
@@ -63,10 +63,10 @@ class Leg:
     name: str
     length_m: float
     step_m: float
-    samples: tuple[Sample, ...]
+    samples: tuple[PathSample, ...]
 
 
-class Ground:
+class MapHeights:
     """Heights of the map's surface."""
 
     def __init__(self, cache: TileCache) -> None:
@@ -81,8 +81,8 @@ class Ground:
 
 
 def legs_of(
-    mission: PlannedMission, cache: TileCache, ground: Ground, aim: Aim, spacing_m: float
-) -> tuple[Leg, ...]:
+    mission: PlannedMission, cache: TileCache, ground: MapHeights, aim: Aim, spacing_m: float
+) -> tuple[FlightLeg, ...]:
     """The legs between home, the waypoints and, if it returns, home; a sample every so many metres.
 
     MissionFileError where the mission does not say how high it flies over the map.
@@ -116,7 +116,7 @@ def legs_of(
     return tuple(legs)
 
 
-def camera_pose(sample: Sample, cache: TileCache, aim: Aim) -> Pose:
+def camera_pose(sample: PathSample, cache: TileCache, aim: Aim) -> Pose:
     """The camera's pose (world) of a level vehicle that flies along its way."""
     to_ned = ned_from_world(cache.frame, cache.frame.position(sample.position))
     body = matrix_from_euler(0.0, 0.0, float(np.radians(sample.heading_deg)))
@@ -132,7 +132,7 @@ def camera_pose(sample: Sample, cache: TileCache, aim: Aim) -> Pose:
 
 def _leg(
     name: str, ends: tuple[Array, Array], pitch_deg: float, way: tuple[float, float]
-) -> Leg | None:
+) -> FlightLeg | None:
     """None for a climb on the spot. way: flown before it, and the samples' spacing, m."""
     start, end = ends
     east, north = (end - start)[:2]
@@ -144,10 +144,10 @@ def _leg(
     heading = float(np.degrees(np.arctan2(east, north)) % 360.0)
     shares = (np.arange(count) + 0.5) / count
     samples = tuple(
-        Sample(_on_the_way(start, end, s), begun_m + s * length, heading, pitch_deg)
+        PathSample(_on_the_way(start, end, s), begun_m + s * length, heading, pitch_deg)
         for s in map(float, shares)
     )
-    return Leg(name, length, length / count, samples)
+    return FlightLeg(name, length, length / count, samples)
 
 
 def _on_the_way(start: Array, end: Array, share: float) -> Array:
@@ -178,7 +178,7 @@ def _enu(latitude_deg: float, longitude_deg: float, cache: TileCache) -> tuple[f
 
 
 def _position(
-    waypoint: Waypoint, cache: TileCache, ground: Ground, home: tuple[float, float]
+    waypoint: PlannedWaypoint, cache: TileCache, ground: MapHeights, home: tuple[float, float]
 ) -> Array:
     """World position (3,) of a waypoint."""
     if waypoint.above is HeightAbove.SEA:
@@ -214,6 +214,6 @@ def _extent(cache: TileCache, below: tuple[float, float]) -> str:
     return f"{geo_box(cache.manifest.extent).line()}; it is {away_m:.0f} m away"
 
 
-def length_m(legs: Sequence[Leg]) -> float:
+def length_m(legs: Sequence[FlightLeg]) -> float:
     """Of all legs."""
     return sum(leg.length_m for leg in legs)

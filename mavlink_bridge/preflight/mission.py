@@ -13,7 +13,7 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 from mavlink_bridge.config import BridgeConfig
 from mavlink_bridge.errors import MissionError
 from mavlink_bridge.preflight.client import VehicleClient
-from mavlink_bridge.vehicle.mission import Waypoint, place_of
+from mavlink_bridge.vehicle.mission import MissionWaypoint, place_of
 
 _RETRIES = 5
 _ANSWER_S = 1.0
@@ -25,7 +25,7 @@ _WANTED = (
 )
 
 
-class MissionClient(VehicleClient):
+class MissionDownloader(VehicleClient):
     """Downloads the mission. A context manager."""
 
     def __init__(self, config: BridgeConfig) -> None:
@@ -34,7 +34,7 @@ class MissionClient(VehicleClient):
         self._items: dict[int, Any] = {}
         self._refusal: int | None = None
 
-    def download(self) -> list[Waypoint]:
+    def download(self) -> list[MissionWaypoint]:
         """The places of the mission in order; MissionError when it is not handed over."""
         self._count, self._refusal = None, None
         self._items.clear()
@@ -82,7 +82,7 @@ class MissionClient(VehicleClient):
             self._refusal = message.type
 
 
-def download_mission(config: BridgeConfig) -> list[Waypoint]:
+def download_mission(config: BridgeConfig) -> list[MissionWaypoint]:
     """The places of the mission that the flight controller at `config.connection` holds."""
-    with MissionClient(config) as client:
+    with MissionDownloader(config) as client:
         return client.download()
