@@ -367,7 +367,7 @@ def test_beyond_the_alert_limit_nothing_is_injected() -> None:
     assert relaxed.held == []
 
 
-@pytest.mark.parametrize("alert_s", [0.3, 3.0])
+@pytest.mark.parametrize("raise_s", [0.3, 3.0])
 def test_the_alert_limit_is_told_within_the_time_to_alert(raise_s: float) -> None:
     """What passes says how wrong it may be; what may be more wrong than the limit does not pass."""
     flight = Flight(monitor(time_to_alert_s=raise_s), claimed_m=0.3, noise_m=0.1).fly(5.0)

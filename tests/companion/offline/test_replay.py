@@ -30,7 +30,7 @@ from localizer.geometry.pose import quaternion_from_matrix
 from localizer.geometry.posefile import read_poses, world_from_camera
 from localizer.map.cache.cache import TileCache
 from localizer.tracking.engine import DualThreadEngine
-from mavlink_bridge.errors import TlogError as TlogError
+from mavlink_bridge.errors import TlogError
 from mavlink_bridge.link.tlog import read_tlog
 from sitl.demo.kinematic import record_scenario
 from sitl.demo.scenario import CameraSpec, Scenario, ScenarioLeg

@@ -46,7 +46,7 @@ def test_a_pulse_is_read_and_a_supervisor_that_does_not_read_is_not_waited_for()
     os.close(reading)
 
 
-@pytest.mark.parametrize("in_order", [True, False])
+@pytest.mark.parametrize("clean_shutdown", [True, False])
 def test_the_last_word_says_whether_the_end_is_in_order(clean_shutdown: bool) -> None:
     reading, writing = os.pipe()
     pulse = Pulse(lambda: {}, writing)
