@@ -52,7 +52,13 @@ class LocalizerConfig(BaseModel):
     calibration: CalibrationSigmas = CalibrationSigmas()
     attitude: AttitudePrior | None = Field(
         AttitudePrior(),
-        description="roll and pitch of autopilot and gimbal as a constraint; null: not used",
+        description="roll and pitch of autopilot and gimbal, fused with each fix; null: not used",
+    )
+    height_sigma_m: float | None = Field(
+        3.0,
+        ge=0.1,
+        le=1000,
+        description="of the autopilot's height (barometer) against the map's; null: not used",
     )
     motion: MotionConfig = MotionConfig()
     integrity: IntegrityConfig = IntegrityConfig()

@@ -1,10 +1,10 @@
 """How wrong the map's heights are, learned from the images that register to it.
 
-A terrain or flat map lacks buildings and trees. Their parallax pulls a registered pose: the optimizer
-explains it by a tilt, a shift and a lower camera. How large these heights are shows in the same
-images: in the pattern in which the patches are displaced, and in how far the registered tilt and
-height are from what gravity and the barometer say. Each registration over new ground gives the
-likelihood of a few candidate values; their product over a flight is the posterior.
+A terrain or flat map lacks buildings and trees. Their parallax pulls a registered pose: the
+optimizer explains it by a tilt, a shift and a lower camera. How large these heights are shows in
+the same images: in the pattern in which the patches are displaced, and in how far the registered
+tilt and height are from what gravity and the barometer say. Each registration over new ground gives
+the likelihood of a few candidate values; their product over a flight is the posterior.
 """
 
 from __future__ import annotations
@@ -55,7 +55,8 @@ def height_likelihood(
     for k, sigma_m in enumerate(CANDIDATES_M):
         variance = _NOISE_PX[:, None] ** 2 + sigma_m**2 * np.maximum(values, 0.0)
         result[k] = max(_marginal(y, rows, known, wanted, 1.0 / v) for v in variance)
-    return result - result.max()
+    relative: Array = result - result.max()
+    return relative
 
 
 def _marginal(y: Array, rows: Array, known: Array, wanted: Array, weight: Array) -> float:

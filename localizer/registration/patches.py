@@ -70,8 +70,9 @@ def patch_covariance(patches: PatchDisplacements, height_sigma_m: float) -> Arra
     if height_sigma_m > 0:
         pull = np.einsum("kai,ka->ki", patches.motion, patches.rise)
         meat = meat + height_sigma_m**2 * pull.T @ height_correlation(patches.ground) @ pull
-    covariance: Array = inverse @ meat @ inverse
-    return 0.5 * (covariance + covariance.T)
+    covariance = inverse @ meat @ inverse
+    symmetric: Array = 0.5 * (covariance + covariance.T)
+    return symmetric
 
 
 def height_correlation(ground: Array) -> Array:

@@ -123,7 +123,7 @@ class DualThreadEngine:
         """A snapshot of the counters."""
         localizer = self._localizer
         return self._book.read(
-            self._ahead.dropped, localizer.optimizer_name, localizer.attitude_bias.bias
+            self._ahead.dropped, localizer.optimizer_name, localizer.attitude_bias
         )
 
     def last_ticks_ns(self) -> dict[str, int]:
