@@ -1,11 +1,9 @@
-"""The figures of the results pages, from the kept results: ``python -m benchmarks.site.figures``.
-
-Writes docs/img/missed.png, errors.png and speed.png.
-"""
+"""The figures of the results pages, drawn from the kept results."""
 
 from __future__ import annotations
 
 import re
+from collections.abc import Iterator
 from pathlib import Path
 
 from matplotlib.axes import Axes
@@ -13,7 +11,6 @@ from matplotlib.figure import Figure
 
 from benchmarks.site.kept import DATA, Kept, load
 
-_ROOT = Path(__file__).parents[2]
 _CRITERIA = {
     "localizer median": "localizer median", "EKF horizontal p95": "EKF p95",
     "fixed targets p95": "targets p95", "fixes in their bound": "inside 95 % bound",
@@ -29,16 +26,16 @@ _TESTS = {
 }
 
 
-def main() -> None:
-    """Draw all three."""
-    results = {path.stem: load(path) for path in sorted((_ROOT / DATA).glob("*.json"))}
+def draw_all(root: Path) -> Iterator[Path]:
+    """Write missed.png, errors.png and speed.png into docs/img of the repository at `root`."""
+    results = {path.stem: load(path) for path in sorted((root / DATA).glob("*.json"))}
     figures = (("missed", 3.2, _missed), ("errors", 2.8, _errors), ("speed", 3.6, _speed))
     for name, height, draw in figures:
         figure = Figure(figsize=(8, height), layout="constrained")
         draw(figure.subplots(), results)
-        path = _ROOT / "docs" / "img" / f"{name}.png"
+        path = root / "docs" / "img" / f"{name}.png"
         figure.savefig(path, dpi=110)
-        print(path.relative_to(_ROOT))
+        yield path
 
 
 def _missed(axes: Axes, results: dict[str, Kept]) -> None:
@@ -93,7 +90,3 @@ def _demos(results: dict[str, Kept]) -> dict[str, Kept]:
 
 def _number(cell: str) -> float:
     return float(re.findall(r"\d+\.\d+", cell)[0])
-
-
-if __name__ == "__main__":
-    main()

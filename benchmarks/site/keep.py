@@ -5,7 +5,7 @@
 
 Takes the JSON of a demo flight, `companion eval`, `sitl suite`, `sitl loop`, `sitl follow` and the
 benchmarks; `--also` adds further files of the same form. Then `python -m benchmarks.site` writes
-the tables, and `python -m benchmarks.site.figures` the figures.
+the tables, and `python -m benchmarks.site --figures` the figures.
 """
 
 from __future__ import annotations
