@@ -65,7 +65,8 @@ def test_a_landing_pattern_is_flown_over_its_approach_to_its_landing(tmp_path, k
 
 def test_a_landing_pattern_of_an_older_file(tmp_path):
     old = PATTERN | {"complexItemType": "fwLandingPattern", "loiterAltitudeRelative": False}
-    old["loiterCoordinate"] = [*old.pop("landingApproachCoordinate")[:2], 480]
+    del old["landingApproachCoordinate"]
+    old["loiterCoordinate"] = [47.2009, 8.2009, 480]
     mission = plan(tmp_path, waypoint(47.201, 80), old, vehicleType=1)
     approach, landing = mission.path[-2:]
     assert (approach.height_m, approach.above) == (480, HeightAbove.SEA)
