@@ -48,7 +48,7 @@ def test_results_of_one_form_stand_together_and_others_are_refused(tmp_path):
     made = with_tables("<!-- kept x y -->\n<!-- end -->", tmp_path)
     assert made.count("| 1 | 2 |") == 2
     assert "[x](data/x.json), [y](data/y.json)" in made
-    other = Kept("make x", "abc1234", "2026-11-22", "2 cores", "", Table(("c",), (("1",),)))
+    other = Kept("make x", "abc1234", "2026-11-22", "2 cores", "", PrintedTable(("c",), (("1",),)))
     save(other, tmp_path / "y.json")
     with pytest.raises(ReportError, match="differ in their columns"):
         with_tables("<!-- kept x y -->\n<!-- end -->", tmp_path)
