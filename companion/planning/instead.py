@@ -89,10 +89,10 @@ def changes(worst: JudgedSample, fixed: bool) -> list[LegAlternative]:
         if _LOWEST_M <= height <= _HIGHEST_M:
             rise = height - above
             words = f"{abs(rise):.0f} m {'higher' if rise > 0 else 'lower'}"
-            options.append(LegAlternative(rise, sample.pitch_deg, 0.0, words))
+            options.append(LegAlternative(rise, sample.pitch_deg, sample.turn_deg, words))
     if not fixed:
         options += [
-            LegAlternative(0.0, pitch, 0.0, f"gimbal at {pitch:.0f}°")
+            LegAlternative(0.0, pitch, sample.turn_deg, f"gimbal at {pitch:.0f}°")
             for pitch in _PITCHES_DEG
             if abs(pitch - sample.pitch_deg) >= _LEAST_CHANGE_DEG
         ]

@@ -55,10 +55,13 @@ class JudgedSample:
 
 @dataclass(frozen=True)
 class LegVerdict:
-    """A leg's samples, judged. holds: of all of them; share: of the samples that hold."""
+    """A leg's samples, judged. holds: of all of them; share: of the samples that hold; times: that
+    the leg is flown.
+    """
 
     leg: FlightLeg
     judged: tuple[JudgedSample, ...]
+    times: int = 1
 
     @property
     def holds(self) -> bool:
@@ -125,26 +128,30 @@ def _reason(forecast: ViewForecast, limits: MissionLimits) -> Reason:
 def stretches(
     verdicts: Sequence[LegVerdict], speed_m_s: float, odometry: OdometryConfig
 ) -> tuple[VisionGap, ...]:
-    """What must be bridged, in the order of the way; neighbouring samples are one stretch."""
-    found: list[tuple[float, float, bool]] = []
+    """What must be bridged, in the order of the way; neighbouring samples are one stretch.
+    speed_m_s: where the leg has none.
+    """
+    found: list[tuple[float, float, float, bool]] = []
     for verdict in verdicts:
         half = verdict.leg.step_m / 2
+        seconds = verdict.leg.step_m / (verdict.leg.speed_m_s or speed_m_s)
         for judged in (j for j in verdict.judged if not j.holds):
             begin, end = judged.sample.way_m - half, judged.sample.way_m + half
             off_map = judged.reason in (Reason.NO_MAP, Reason.EDGE)
             if found and begin - found[-1][1] < 1e-6 + 0.01 * half:
-                found[-1] = (found[-1][0], end, found[-1][2] or off_map)
+                start, _, before, beside = found[-1]
+                found[-1] = (start, end, before + seconds, beside or off_map)
             else:
-                found.append((begin, end, off_map))
-    return tuple(_stretch(*one, speed_m_s, odometry) for one in found)
+                found.append((begin, end, seconds, off_map))
+    return tuple(_stretch(*one, odometry) for one in found)
 
 
 def _stretch(
-    begin_m: float, end_m: float, off_map: bool, speed_m_s: float, odometry: OdometryConfig
+    begin_m: float, end_m: float, seconds: float, off_map: bool, odometry: OdometryConfig
 ) -> VisionGap:
     """off_map: the map has no geometry there, at one place at least."""
     ground = odometry.with_plane if odometry.terrain is None else odometry.with_ground
     growth, length = ground if off_map else odometry.with_map, end_m - begin_m
     drift = math.hypot(growth.horizontal * math.sqrt(length), growth.scale * length)
     can_bridge = drift <= odometry.longest_sigma_m
-    return VisionGap(begin_m, end_m, length / speed_m_s, drift, can_bridge)
+    return VisionGap(begin_m, end_m, seconds, drift, can_bridge)

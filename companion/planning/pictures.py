@@ -67,14 +67,15 @@ def track_picture(sheet: MapSquare, plan: MissionForecast) -> Image:
     """The way in green (holds), amber (doubtful) and red (will not do), its waypoints numbered."""
     picture = sheet.rgb.copy()
     for verdict in plan.verdicts:
-        half = _half_step(verdict, sheet.gsd_m)
         pixels = sheet.pixels(_places(verdict.judged))
         for judged, pixel in zip(verdict.judged, pixels, strict=True):
+            half = _half_step(verdict, judged, sheet.gsd_m)
             a, b = np.int32(np.stack([pixel - half, pixel + half]) * 16).tolist()
             cv2.line(picture, a, b, (20, 20, 20), _LINE_PX + 4, cv2.LINE_AA, 4)
             cv2.line(picture, a, b, colour_of(judged), _LINE_PX, cv2.LINE_AA, 4)
     for verdict in plan.verdicts:
-        start = sheet.pixels(_places(verdict.judged))[0] - _half_step(verdict, sheet.gsd_m)
+        start = sheet.pixels(_places(verdict.judged))[0]
+        start = start - _half_step(verdict, verdict.judged[0], sheet.gsd_m)
         _label(picture, start, verdict.leg.name.split(" to ")[0])
     return _with_legend(picture, ("holds", "doubtful", "will not do"))
 
@@ -121,9 +122,9 @@ def _places(judged: Sequence[JudgedSample]) -> Array:
     return np.array([j.sample.position[:2] for j in judged])
 
 
-def _half_step(verdict: LegVerdict, gsd_m: float) -> Array:
+def _half_step(verdict: LegVerdict, judged: JudgedSample, gsd_m: float) -> Array:
     """Half of the way (2,) that a sample of the leg stands for, pixels."""
-    heading = np.radians(verdict.judged[0].sample.heading_deg)
+    heading = np.radians(judged.sample.heading_deg)
     along = np.array([np.sin(heading), -np.cos(heading)])
     half: Array = 0.5 * verdict.leg.step_m / gsd_m * along
     return half

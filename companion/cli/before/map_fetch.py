@@ -194,10 +194,14 @@ def _area(rectangle: str | None, circle: str | None, mission: Path | None, margi
         return around(np.array([[latitude, longitude]]), radius)
     assert mission is not None
     planned = read_mission(mission)
-    places = [(w.latitude_deg, w.longitude_deg) for w in planned.waypoints]
-    places += [] if planned.home is None else [planned.home]
-    if not places:
-        raise ConfigError(f"{mission}: flies to no place")
+    places = [(p.latitude_deg, p.longitude_deg) for p in planned.path]
+    for unknown in planned.not_judged:
+        if unknown.flies:
+            Console(stderr=True).print(
+                f"[yellow]warning:[/] not on a known way: {escape(unknown.text)}; a larger "
+                "--margin may be needed",
+                soft_wrap=True,
+            )
     return around(np.array(places), margin)
 
 

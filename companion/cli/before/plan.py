@@ -48,7 +48,7 @@ def plan_command(
         bool, typer.Option(help="look for what would do instead on legs that will not do")
     ] = True,
 ) -> None:
-    """Forecast a mission over its map: exit code 1 if vision will not do on some leg."""
+    """Forecast a mission over its map: exit code 1 if vision will not do, or not all was judged."""
     from companion.planning import page, pictures
     from companion.planning.judge import MissionLimits
     from companion.planning.mission import read_mission

@@ -143,6 +143,64 @@ def test_gimbal_and_fixed_cameras_look_where_they_are_aimed(tmp_path, cache):
     assert -pose.rotation[:, 1] == pytest.approx([1, 0, 0], abs=1e-3)  # image up is ahead
 
 
+def test_the_camera_keeps_its_region_of_interest_in_view(tmp_path, cache):
+    """Pitch and yaw follow from it at every place; a camera without a gimbal turns the vehicle."""
+    region = item(195, 0, 0, 0, 0, *place(cache, 50, 150), 0)
+    path = plan_file(tmp_path / "a.plan", cache, region, waypoint(cache, 100, 0, 40))
+    fixed = Aim(Mount.from_degrees(pitch_deg=-30.0), -75.0, True)
+    for aim in (GIMBAL, fixed):
+        legs = legs_of(read_mission(path), cache, MapHeights(cache), aim, 10.0)
+        for sample in legs[0].samples:
+            forward = camera_pose(sample, cache, aim).rotation[:, 2]
+            there = np.array([50, 150, float(height(0, 0))]) - sample.position
+            assert math.atan2(*forward[:2]) == pytest.approx(math.atan2(*there[:2]), abs=0.01)
+            if aim is GIMBAL:
+                assert forward == pytest.approx(there / np.linalg.norm(there), abs=0.01)
+
+
+def test_a_yaw_is_from_the_heading_or_from_north(tmp_path, cache):
+    def turn(flags):
+        turned = item(1000, -60, 30, None, None, flags, 0, 0)
+        path = plan_file(tmp_path / "a.plan", cache, turned, waypoint(cache, 100, 0, 40))
+        sample = legs_of(read_mission(path), cache, MapHeights(cache), GIMBAL, 500.0)[0].samples[0]
+        assert sample.pitch_deg == -60
+        return sample.turn_deg
+
+    assert (turn(12), turn(16)) == pytest.approx((30, -60), abs=0.1)
+
+
+def test_a_spline_is_flown_as_a_curve_through_its_places(tmp_path, cache):
+    """From a straight leg east into a corner: it leaves to the east, and arrives to the north."""
+    path = plan_file(
+        tmp_path / "a.plan", cache, waypoint(cache, -100, 0, 40), waypoint(cache, 0, 0, 40),
+        item(82, 0, 0, 0, None, *place(cache, 80, 80), 40), waypoint(cache, 80, 160, 40),
+        home=(-150, 0),
+    )  # fmt: skip
+    legs = legs_of(read_mission(path), cache, MapHeights(cache), GIMBAL, 4.0)
+    curve = next(leg for leg in legs if leg.name == "2 to 3")
+    headings = [s.heading_deg for s in curve.samples]
+    assert headings[0] == pytest.approx(90, abs=6)
+    assert headings[-1] == pytest.approx(0, abs=6)
+    assert curve.length_m > 1.03 * math.hypot(80, 80)
+    # Hermite's polynomial with the legs before and after as its tangents, half way.
+    middle = np.array([40 + 100 / 8, 40 - 80 / 8])
+    nearest = min(np.linalg.norm(s.position[:2] - middle) for s in curve.samples)
+    assert nearest < 2.5
+
+
+def test_rounds_are_flown_often_and_judged_once(tmp_path, cache):
+    jump = item(177, 1, 3, 0, 0, 0, 0, 0)
+    places = [waypoint(cache, *p, 40) for p in ((60, 0), (60, 60))]
+    path = plan_file(tmp_path / "a.plan", cache, *places, jump, item(20, *[0] * 7))
+    legs = legs_of(read_mission(path), cache, MapHeights(cache), GIMBAL, 30.0)
+    assert [leg.name for leg in legs[:4]] == ["home to 1", "1 to 2", "2 to 1", "1 to 2"]
+    assert len(legs) == 1 + 4 + 3 + 1
+    assert [leg.first for leg in legs] == [0, 1, 2, 1, 2, 1, 2, 1, 8]
+    ways = [s.way_m for leg in legs for s in leg.samples]
+    assert ways == pytest.approx(sorted(ways))
+    assert max(ways) < sum(leg.length_m for leg in legs)
+
+
 def test_missions_that_cannot_be_placed_are_named(tmp_path, cache):
     ground = MapHeights(cache)
     far = plan_file(tmp_path / "far.plan", cache, waypoint(cache, 0, 0, 50), home=(0, 9e5))
@@ -250,6 +308,31 @@ def test_a_fixed_camera_is_offered_no_gimbal_angle(leg):
 
 def run(*arguments):
     return CliRunner().invoke(app, ["plan", *map(str, arguments)])
+
+
+def test_no_verdict_is_given_for_what_was_not_judged(tmp_path, cache):
+    config = tmp_path / "deployment.yaml"
+    config.write_text(DEPLOYMENT.format(map=cache.path))
+    scan = {"type": "ComplexItem", "complexItemType": "StructureScan", "polygon": []}
+    path = plan_file(
+        tmp_path / "a.plan", cache, item(178, 1, 18, -1, 0, 0, 0, 0), waypoint(cache, 60, 0, 60),
+        waypoint(cache, 60, 60, 60), item(177, 2, 1, 0, 0, 0, 0, 0), scan,
+        waypoint(cache, 0, 60, 60),
+    )  # fmt: skip
+    out = tmp_path / "report"
+    done = run(path, "--config", config, "--out", out, "--no-alternatives", "--spacing", 60)
+    assert done.exit_code == 1, done.output
+    words = " ".join(done.output.split())
+    assert "Not judged: StructureScan (item 5)" in words
+    assert "all 3 legs" not in words
+    assert "StructureScan (item 5)" in (out / "plan.html").read_text()
+    made = json.loads((out / "plan.json").read_text())
+    assert not made["holds"]
+    assert made["speed_m_s"] == 18
+    assert [(leg["name"], leg["times"]) for leg in made["legs"]] == [
+        ("home to 1", 1), ("1 to 2", 2), ("2 to 1", 1),
+    ]  # fmt: skip
+    assert made["length_m"] == pytest.approx(60 * 4, abs=1)
 
 
 def test_a_mission_over_the_edge_is_told_with_pictures_and_exit_code_1(tmp_path, cache):
