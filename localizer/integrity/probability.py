@@ -21,7 +21,8 @@ from localizer.registration.result import Registration
 from localizer.types import RegistrationStatus
 
 MODEL = Path(__file__).with_name("probability.json")
-FEATURES = ("log_quality", "inliers", "peak", "scatter_px", "log_lead")
+FEATURES = ("log_quality", "inlier_excess", "peak", "log_lead")
+_CHANCE = 0.1  # of the patches that match where they lie, at wrong places
 _LEAST_QUALITY, _LEAST_LEAD = 0.02, 0.003  # below, a logarithm says no more
 
 
@@ -51,29 +52,26 @@ def place_model(path: Path = MODEL) -> PlaceModel:
 
 
 def place_features(result: Registration) -> Array | None:
-    """(5,) evidence of a registration, in the order of `FEATURES`; None where it has no patches.
+    """(4,) evidence of a registration, in the order of `FEATURES`; None where it has no patches.
 
-    quality of the fit; share of the patches that match where they lie; the whole image's match over
-    its matches beside; scatter of the patches, level px; lead over the best other mode of the
-    swarm.
+    Quality of the fit; how many patches match where they lie, beyond chance, in their sigmas; the
+    whole image's match there over its matches beside, likewise; lead over the best other mode of
+    the swarm.
     """
     votes = result.agreement
-    if result.status is not RegistrationStatus.OK or votes is None or votes.displacements is None:
-        return None
-    if len(votes.displacements.shift) == 0:
+    if result.status is not RegistrationStatus.OK or votes is None or votes.patches == 0:
         return None
     return np.array(
         [
             np.log(max(result.quality, _LEAST_QUALITY)),
-            votes.share,
+            np.sqrt(votes.patches) * (votes.share - _CHANCE),
             votes.peak,
-            votes.displacements.scatter_px,
             np.log(np.clip(result.lead, _LEAST_LEAD, 1.0)),
         ]
     )
 
 
 def log_odds(result: Registration) -> float:
-    """Natural log odds that the registration shows the right place; -inf where it has no evidence."""
+    """Natural log odds that a registration shows the right place; -inf without evidence."""
     features = place_features(result)
     return -np.inf if features is None else place_model().log_odds(features)
