@@ -33,7 +33,7 @@ class LocalizerConfig(BaseModel):
     )
     renderer: RendererName = Field("auto", description="auto: a GPU where there is one, else numba")
     device: DeviceChoice = Field(
-        "auto", description="of the optimizer; auto, cuda: a GPU that works, else the CPU"
+        "cpu", description="of the optimizer; auto, cuda: a GPU that works, else the CPU"
     )
     threads: int = Field(2, ge=1, le=256, description="CPU threads of rendering and optimization")
     feature_threads: int = Field(

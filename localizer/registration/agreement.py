@@ -100,7 +100,7 @@ def _peaks(sums: Float32) -> Array:
     the peak and its neighbours.
     """
     n = sums.shape[1]
-    best = sums.reshape(len(sums), -1).argmax(axis=1)
+    best = sums.reshape(len(sums), n * n).argmax(axis=1)
     row, column = best // n, best % n
     k = np.arange(len(sums))
 

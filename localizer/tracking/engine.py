@@ -202,7 +202,7 @@ class DualThreadEngine:
 
     def _may_extract_ahead(self) -> bool:
         """Whether a frame's features will be asked for, and may be computed beside another's."""
-        return self._registers and self._localizer.keeps_features
+        return self._registers
 
     def _localize_once(self) -> None:
         prepared = self._ahead.take(_IDLE_S)

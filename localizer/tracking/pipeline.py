@@ -23,7 +23,7 @@ from localizer.errors import (
     MapLoadingError,
     OutsideMapError,
 )
-from localizer.features.extractor import DeviceExtractor, FeatureExtractor
+from localizer.features.extractor import FeatureExtractor
 from localizer.geometry.camera import Camera, followed
 from localizer.geometry.geo import LocalFrame
 from localizer.odometry import TerrainModel
@@ -202,8 +202,7 @@ class Localizer:
     def _dead_reckoning(
         self, config: LocalizerConfig, optimizer: JNGO, terrain: TerrainModel | None
     ) -> DeadReckoning | None:
-        # A GPU's features are valid until the next frame only: there is no keyframe to keep.
-        if config.odometry is None or optimizer.on_gpu:
+        if config.odometry is None:
             return None
         return DeadReckoning(
             self._pinhole, optimizer, config.odometry, config.threads, self._sensors, terrain
@@ -255,11 +254,6 @@ class Localizer:
     def can_carry(self) -> bool:
         """Whether `localize` has an answer where there is no reference (None for its anchors)."""
         return self._tracker.can_carry
-
-    @property
-    def keeps_features(self) -> bool:
-        """Whether `extract_query`'s features outlast its next call: a GPU's do not."""
-        return not self._optimizer.on_gpu
 
     @property
     def reference_age_s(self) -> float:
@@ -381,18 +375,12 @@ class Localizer:
         self._renderer.prefetch([prior.world_from_camera for prior in ahead], self.camera)
 
     def extract_query(self, frame: Frame) -> FeaturePyramid:
-        """Features of the frame (does not need the reference, so it may run beside it).
-
-        They may be on the GPU, and are then valid until the next call.
-        """
+        """Features of the frame (does not need the reference, so it may run beside it)."""
         undistorter, camera = self._undistorter, followed(self._pinhole, frame.camera)
         self.camera = camera
         if not frame.camera.is_like(undistorter.source):  # another size in flight, or a zoom
             undistorter = self._undistorter = Undistorter(frame.camera, camera)
-        image = undistorter(frame)
-        if self._optimizer.on_gpu and isinstance(self._extractor, DeviceExtractor):
-            return self._extractor.extract_on_device(image)
-        return only_seen(self._extractor.extract(image), undistorter.seen)
+        return only_seen(self._extractor.extract(undistorter(frame)), undistorter.seen)
 
     def localize(
         self, frame: Frame, query: FeaturePyramid, anchors: Anchors | None
