@@ -13,8 +13,8 @@ from localizer.geometry.pose import Array
 from localizer.map.cache.cache import TileCache
 from localizer.map.cache.stream import TileStreamer
 from localizer.map.kind import UNKNOWN_HEIGHT_SIGMA_M, Heights, MapKind
-from localizer.relocalization.topview import TopView, render_top_view
 from localizer.render.numba_raster import NumbaRenderer
+from localizer.render.topview import TopView, render_top_view
 from localizer.types import Float32
 
 _EARTH_M = 6.371e6
