@@ -14,7 +14,9 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from localizer.geometry.pose import Array, Pose
+from localizer.map.kind import MapKind
 from localizer.registration.patches import (
+    COMMON,
     LEAST_PATCHES,
     PatchDisplacements,
     height_correlation,
@@ -86,6 +88,15 @@ class MapHeightError:
             return cls(-CANDIDATES_M / _SURE_M)
         off = np.log2(np.maximum(CANDIDATES_M, 0.15) / expected_m)
         return cls(-0.5 * off**2)
+
+    @classmethod
+    def of_kind(cls, kind: MapKind | None) -> MapHeightError:
+        """Before the first image over a map of a kind, None where that is not known."""
+        if kind is None:
+            return cls()
+        if kind.has_buildings:
+            return cls.prior(0.0)
+        return cls.prior(kind.unknown_height_sigma_m / np.hypot(1.0, COMMON))
 
     @property
     def sigma_m(self) -> float:

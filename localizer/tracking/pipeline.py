@@ -26,6 +26,7 @@ from localizer.errors import (
 from localizer.features.extractor import FeatureExtractor
 from localizer.geometry.camera import Camera, followed
 from localizer.geometry.geo import LocalFrame
+from localizer.map.kind import MapKind
 from localizer.odometry import TerrainModel
 from localizer.registration.anchors import select_anchors, swept
 from localizer.registration.calibration import calibration_covariance
@@ -157,10 +158,9 @@ class Localizer:
     angular rate of the motion model; their roll and pitch, and their height, are fused with each
     registration (`tracking.sensor_fusion`); with the displacement they confirm or refute a place
     that was searched.
-    map_frame: the map's. height_error_m: root mean square of the heights that the map does not
-    have, None: not known. terrain: the ground's shape where the map has none. on_close: releases
-    what was opened for this localizer alone. is_loading: whether tiles that were asked for are
-    still on their way.
+    map_frame, map_kind: the map's. terrain: the ground's shape where the map has none. on_close:
+    releases what was opened for this localizer alone. is_loading: whether tiles that were asked for
+    are still on their way.
     """
 
     def __init__(
@@ -173,13 +173,15 @@ class Localizer:
         sensors: AuxiliarySensors | None = None,
         *,
         map_frame: LocalFrame | None = None,
-        height_error_m: float | None = None,
+        map_kind: MapKind | None = None,
         terrain: TerrainModel | None = None,
         on_close: Callable[[], None] = lambda: None,
         is_loading: Callable[[], bool] = lambda: False,
     ) -> None:
         self._is_loading = is_loading
         self._map_frame, self._on_close = map_frame, on_close
+        self.map_kind = map_kind
+        """What the map can show; None where the localizer was made without it."""
         self._renderer = renderer
         self._extractor = extractor
         self._optimizer = optimizer
@@ -192,9 +194,7 @@ class Localizer:
         self._reference: ReferenceBundle | None = None  # the last one of `track`
         self._asked_ns = 0  # what time the last reference was asked for
         self._fitted_ns: int | None = None  # of the last picture whose focal length was fitted
-        self._fusion = SensorFusion(
-            config.attitude, config.height_sigma_m, self._sensors, height_error_m
-        )
+        self._fusion = SensorFusion(config.attitude, config.height_sigma_m, self._sensors, map_kind)
         self._tracker = Tracker(
             config, self._sensors, self._dead_reckoning(config, optimizer, terrain)
         )

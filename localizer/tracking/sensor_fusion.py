@@ -17,6 +17,7 @@ import numpy as np
 
 from localizer.geometry.pose import Array, Pose
 from localizer.integrity.height_error import MapHeightError, height_likelihood
+from localizer.map.kind import MapKind
 from localizer.registration.patches import patch_covariance
 from localizer.registration.priors import PoseConstraint, combine, fused, height_constraint
 from localizer.registration.result import Registration
@@ -47,7 +48,7 @@ class SensorFusion:
     """Belongs to the localization thread.
 
     attitude, height_sigma_m: how well roll and pitch, and the height, are known; None: not used.
-    expected_height_error_m: by the map's kind, None where that is not known.
+    map_kind: None where it is not known.
     """
 
     def __init__(
@@ -55,11 +56,11 @@ class SensorFusion:
         attitude: AttitudePrior | None,
         height_sigma_m: float | None,
         sensors: AuxiliarySensors,
-        expected_height_error_m: float | None = None,
+        map_kind: MapKind | None = None,
     ) -> None:
         self._sensors, self._height_sigma_m = sensors, height_sigma_m
         self.attitude_bias = AttitudeBiasEstimator(attitude, sensors.rotation_at)
-        self.height_error = MapHeightError.prior(expected_height_error_m)
+        self.height_error = MapHeightError.of_kind(map_kind)
 
     def fuse(self, result: Registration, time_ns: int) -> FusedRegistration:
         """The registration of a frame exposed at `time_ns`, with attitude and height."""
