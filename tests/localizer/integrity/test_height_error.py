@@ -50,7 +50,7 @@ def town(spread_m: float, seed: int, noise_px: float = 0.3) -> tuple[PatchDispla
     rise = -motion[:, :, 2]
     seen = rise * heights[:, None] + rng.normal(0.0, noise_px, (len(ground), 2))
     rows = motion.reshape(-1, 6)
-    off, *_ = np.linalg.lstsq(rows, seen.reshape(-1), rcond=None)
+    off: Array = np.linalg.lstsq(rows, seen.reshape(-1), rcond=None)[0]
     return PatchDisplacements(seen - motion @ off, motion, rise, ground), off
 
 
@@ -80,11 +80,13 @@ def test_the_height_of_what_the_map_lacks_is_learned(spread_m, low, high):
 
 def test_errors_over_a_town_are_within_what_is_claimed():
     """Without the heights in the budget the pose is ten times better known than it is."""
-    honest, naive = [], []
+    honest: list[float] = []
+    naive: list[float] = []
     for seed in range(40):
         seen, off = town(5.0, seed)
         for values, sigma_m in ((honest, 5.0), (naive, 0.0)):
             covariance = patch_covariance(seen, sigma_m)
+            assert covariance is not None
             values.append(off[:3] @ np.linalg.solve(covariance[:3, :3], off[:3]) / 3)
     assert np.mean(np.array(honest) < 2.6) > 0.9
     assert np.median(naive) > 5 * np.median(honest)
