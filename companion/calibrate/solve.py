@@ -116,9 +116,7 @@ def _as_told(evidence: Evidence, guess: Guess, noise: _Noise) -> _Noise:
     return replace(noise, place=noise.place.over_long_steps(left, evidence.times_s[placed]))
 
 
-def _normal(
-    evidence: Evidence, guess: Guess, noise: _Noise, prior: Array
-) -> tuple[Array, Array]:
+def _normal(evidence: Evidence, guess: Guess, noise: _Noise, prior: Array) -> tuple[Array, Array]:
     """Normal equations over (shared, frame 0, frame 1, ...): (M, M) and (M,). prior: (COUNT,)
     information of the weak priors; of what is fixed, certainty.
     """
