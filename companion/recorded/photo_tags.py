@@ -101,6 +101,7 @@ class PhotoTags:
             # All three exactly zero: the firmware has no measurement (DJI Mini 2, P1).
             if len(values) == 3 and any(values):
                 roll, pitch, yaw = convert(values[0], values[1], values[2])
+                roll = -roll if self.maker == "sensefly" else roll  # positive to the left there
                 return RecordedView.of_angles(roll, pitch, yaw, _TILT_DEG, _HEADING_DEG)
         return None
 
