@@ -25,7 +25,7 @@ from localizer.render.base import MapRenderer
 _LEAST_FRAMES = 4
 _TURNS = 2  # with the camera as given, and with the one that was found
 _MOST_FRAMES = 40  # more of them tell little that these do not
-_RELIEF_SHARE = 0.01  # of the height above ground: flatter ground shows no focal length
+_RELIEF_SHARE = 0.004  # of the height above ground: flatter ground shows no focal length
 _UP_SIGMA_M = 10.0  # of the map's surface against the height that is recorded
 _OUTLIER_SHARE, _OUTLIER_SIGMAS = 0.1, 3.0  # of the height above ground; of the median deviation
 _ROBUST_ROUNDS = 10

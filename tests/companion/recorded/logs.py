@@ -20,7 +20,8 @@ Motion = Callable[[float], tuple[float, float, float, float, float, float]]
 
 def swaying(t: float) -> tuple[float, float, float, float, float, float]:
     """Ahead to the north, turning and rolling as a small aircraft does."""
-    return 8.0 * t, 6.0 * math.sin(0.3 * t), 80.0, 0.15 * math.sin(0.9 * t), 0.0, 0.3 * math.sin(0.5 * t)  # fmt: skip
+    roll, yaw = 0.15 * math.sin(0.9 * t), 0.3 * math.sin(0.5 * t)
+    return 8.0 * t, 6.0 * math.sin(0.3 * t), 80.0, roll, 0.0, yaw
 
 
 def place(north_m: float, east_m: float) -> tuple[float, float]:
@@ -29,7 +30,9 @@ def place(north_m: float, east_m: float) -> tuple[float, float]:
     return ORIGIN[0] + north_m * _METRE_DEG, ORIGIN[1] + east_m * _METRE_DEG / shrink
 
 
-def write_tlog(path: Path, motion: Motion, seconds: float, gimbal_pitch_deg: float | None = None) -> Path:  # fmt: skip
+def write_tlog(
+    path: Path, motion: Motion, seconds: float, gimbal_pitch_deg: float | None = None
+) -> Path:
     """Attitude at 10 Hz, position at 5 Hz; gimbal_pitch_deg: MOUNT_STATUS beside them."""
     codec, frames = mavlink.MAVLink(None, srcSystem=1, srcComponent=1), []
 
@@ -70,7 +73,9 @@ _WEEK_S = 604_800.0
 _GPS_EPOCH_S, _LEAP_S = 315_964_800.0, 18.0
 
 
-def write_dataflash(path: Path, motion: Motion, seconds: float, gimbal_pitch_deg: float | None = None) -> Path:  # fmt: skip
+def write_dataflash(
+    path: Path, motion: Motion, seconds: float, gimbal_pitch_deg: float | None = None
+) -> Path:
     """The same flight as a .bin, with three camera triggers."""
     body = b"".join(_format(name) for name in _ROWS)
     gps_s = UTC_S - _GPS_EPOCH_S + _LEAP_S

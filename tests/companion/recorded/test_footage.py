@@ -20,7 +20,8 @@ def _survey(folder, count=4, **more):
     folder.mkdir(exist_ok=True)
     for k in range(count):
         xmp = dji(GpsLatitude=47.3 + 1e-4 * k, GpsLongitude=8.5, RelativeAltitude="+60.0",
-                  GimbalRollDegree="0.0", GimbalPitchDegree="-89.9", GimbalYawDegree="12.0", **more)  # fmt: skip
+                  GimbalRollDegree="0.0", GimbalPitchDegree="-89.9", GimbalYawDegree="12.0",
+                  **more)  # fmt: skip
         exif = {_FOCAL_35: 24, _TAKEN: f"2024:05:01 10:00:{2 * k:02d}"}
         write_photo(folder / f"DJI_{k:04d}.JPG", xmp, exif=exif)
     return folder
@@ -111,7 +112,8 @@ def test_several_files_of_places_are_asked_about(tmp_path):
 def test_a_video_with_subtitles(tmp_path):
     video = write_video(tmp_path / "DJI_0001.MP4", rates=(10, 4))
     cues = "".join(
-        f"{s + 1}\n00:00:0{s},000 --> 00:00:0{s},500\n[focal_len: 24] [latitude: {47.3 + 1e-4 * s}] "
+        f"{s + 1}\n00:00:0{s},000 --> 00:00:0{s},500\n[focal_len: 24] "
+        f"[latitude: {47.3 + 1e-4 * s}] "
         "[longitude: 8.5] [rel_alt: 60.0 abs_alt: 500]\n\n"
         for s in range(5)
     )
@@ -128,7 +130,8 @@ def test_a_video_with_subtitles(tmp_path):
 def test_a_video_with_metadata_in_it(tmp_path):
     fields = {tag.SENSOR_LATITUDE: 47.3, tag.SENSOR_LONGITUDE: 8.5, tag.SENSOR_ALTITUDE: 560.0,
               tag.HORIZONTAL_FOV: 60.0, tag.PLATFORM_HEADING: 90.0, tag.PLATFORM_PITCH: 0.0,
-              tag.PLATFORM_ROLL: 0.0, tag.RELATIVE_AZIMUTH: 0.0, tag.RELATIVE_ELEVATION: -60.0}  # fmt: skip
+              tag.PLATFORM_ROLL: 0.0, tag.RELATIVE_AZIMUTH: 0.0, tag.RELATIVE_ELEVATION: -60.0,
+    }  # fmt: skip
     packets = [(0.1 * k, tag.encode(round(1e6 * (UTC_S + 0.1 * k)), fields)) for k in range(40)]
     packets[7] = (packets[7][0], packets[7][1][:-1] + b"\x00")
     video = write_video(tmp_path / "a.ts", klv=packets)
