@@ -8,9 +8,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from companion.calibrate import unknowns as u
-from companion.calibrate.evidence import Evidence, Sighted, changed_camera
+from companion.calibrate.autopilot_window import OFFSETS_S, AutopilotWindow
+from companion.calibrate.evidence import CalibrationFrame, CalibrationProblem, changed_camera
 from companion.calibrate.pictures import Parts, PictureReader
-from companion.calibrate.said import OFFSETS_S, Said
 from companion.calibrate.solve import Solution, solve
 from companion.errors import StreamDecodeError, StreamSizeError
 from companion.geometry import GIMBAL_FROM_CAMERA
@@ -90,17 +90,17 @@ def estimate(
     for turn in range(_TURNS):
         believed = changed_camera(guess.camera, shared)
         reader = PictureReader(tools.renderer, tools.extractor, believed, tools.width)
-        sighted: dict[int, Sighted] = {}
+        sighted: dict[int, CalibrationFrame] = {}
         for number, (k, pose) in enumerate(poses.items(), 1):
             progress(turn * len(used) + number, _TURNS * len(used))
             parts = _parts(frames[k], pose, believed, reader, loader)
             if parts is not None:
                 said = _said(priors[k], pose)
-                sighted[k] = Sighted(10_000_000_000 * (k + 1), pose, parts, said)
+                sighted[k] = CalibrationFrame(10_000_000_000 * (k + 1), pose, parts, said)
         if len(sighted) < _LEAST_FRAMES:
             return None
         fixed = _fixed(list(sighted.values()))
-        evidence = Evidence(list(sighted.values()), guess.camera, np.eye(3), np.zeros(3))
+        evidence = CalibrationProblem(list(sighted.values()), guess.camera, np.eye(3), np.zeros(3))
         solution = solve(evidence, fixed, _sigmas(guess))
         shared = solution.guess.shared
         camera = changed_camera(guess.camera, shared)
@@ -167,7 +167,7 @@ def _parts(
     return reader.read(replace(frame, camera=camera), pose, None)
 
 
-def _said(prior: FramePrior, pose: Pose) -> Said:
+def _said(prior: FramePrior, pose: Pose) -> AutopilotWindow:
     """The telemetry, the same at all offsets: no time offset is looked for. An unknown heading is
     the registration's.
     """
@@ -179,13 +179,13 @@ def _said(prior: FramePrior, pose: Pose) -> Said:
     known = prior.pose is not None and prior.height_known
     place = prior.pose.translation if known and prior.pose is not None else np.full(3, np.nan)
     count = len(OFFSETS_S)
-    return Said(
+    return AutopilotWindow(
         np.repeat(housing[None], count, 0), np.repeat(housing[None], count, 0),
         np.repeat(place[None], count, 0),
     )  # fmt: skip
 
 
-def _fixed(sighted: Sequence[Sighted]) -> np.ndarray:
+def _fixed(sighted: Sequence[CalibrationFrame]) -> np.ndarray:
     """Which numbers keep their value: all but focal length, mounting and map offset; over flat
     ground the focal length, too, because it cannot be told from the height.
     """
@@ -195,7 +195,7 @@ def _fixed(sighted: Sequence[Sighted]) -> np.ndarray:
     return fixed
 
 
-def _relief(one: Sighted) -> float:
+def _relief(one: CalibrationFrame) -> float:
     """How far the ground in an image strays from a plane, as a share of the height above it."""
     points = one.parts.points
     design = np.column_stack([points[:, :2] - points[:, :2].mean(axis=0), np.ones(len(points))])

@@ -10,21 +10,21 @@ from typing import Any
 
 import numpy as np
 
-from companion.guardian.config import ProtectionConfig
+from companion.integrity_monitor.config import ProtectionConfig
 from companion.reporting.content import (
     INNER,
     NOTHING,
     OUTER,
+    CriterionResult,
     Curve,
+    MapMark,
     MapSheet,
-    Mark,
+    MapTrack,
     Overlay,
     Plot,
     Report,
+    ReportTable,
     Stanford,
-    Table,
-    Track,
-    Verdict,
 )
 from companion.reporting.layout import write_report
 from companion.reporting.pictures import MapPictures, ShownFrame, map_pictures, silent
@@ -95,29 +95,29 @@ def _first_fault(trial: Trial) -> str:
     return f"{trial.best[k].name}: {trial.reasons[k]}; {len(trial.reasons)} such frames in all"
 
 
-def _verdicts(trial: Trial, errors: Array) -> tuple[Verdict, ...]:
+def _verdicts(trial: Trial, errors: Array) -> tuple[CriterionResult, ...]:
     count = len(trial.best)
     share = 100.0 * sum(one.accepted for one in trial.best) / count
-    rows = [Verdict("frames localized", f"{share:.0f} %", ">= 80 %", share >= 80.0,
+    rows = [CriterionResult("frames localized", f"{share:.0f} %", ">= 80 %", share >= 80.0,
                     "no position for the others", "the table of failed frames")]  # fmt: skip
     known = errors[np.isfinite(errors)]
     if len(known):
         own = float(np.median([p.sigma_m for p in trial.priors if p.pose is not None]))
         limit, value = float(np.hypot(2.0 * own, 3.0)), float(np.median(known))
-        rows.append(Verdict(
+        rows.append(CriterionResult(
             "distance from GNSS, median", f"{value:.1f} m", f"<= {limit:.1f} m", value <= limit,
             "positions are wrong, or the recorded ones are", "the overlays: do edges run on?",
         ))  # fmt: skip
         levels = trial.levels_m()
         both = np.isfinite(errors) & np.isfinite(levels)
         inside = 100.0 * float((errors[both] <= levels[both] + 2.0 * own).mean())
-        rows.append(Verdict(
+        rows.append(CriterionResult(
             "within the protection level and GNSS's own error", f"{inside:.0f} %", ">= 95 %",
             inside >= 95.0, "vision is less sure than it says", "the Stanford plot",
         ))  # fmt: skip
     searched, right, wrong = trial.search_outcome()
     if searched:
-        rows.append(Verdict(
+        rows.append(CriterionResult(
             "found without a position", f"{right} of {searched}, {wrong} at a wrong place",
             "none at a wrong place", wrong == 0, "two places look alike",
             "restrict the search by a region",
@@ -131,21 +131,21 @@ def _sheet(trial: Trial, pictures: MapPictures) -> MapSheet | None:
     return None if sheet is None else replace(sheet, key=key)
 
 
-def _marks(trial: Trial) -> list[Mark]:
+def _marks(trial: Trial) -> list[MapMark]:
     """Where vision has each frame, and where GNSS has those that failed."""
     levels = trial.levels_m()
     marks = []
     for k, (one, prior) in enumerate(zip(trial.best, trial.priors, strict=True)):
         if one.accepted and one.pose is not None:
             east, north = map(float, one.pose.translation[:2])
-            marks.append(Mark("", east, north, "target", float(levels[k])))
+            marks.append(MapMark("", east, north, "target", float(levels[k])))
         elif prior.pose is not None:
             east, north = map(float, prior.pose.translation[:2])
-            marks.append(Mark(one.name, east, north))
+            marks.append(MapMark(one.name, east, north))
     return marks
 
 
-def _tracks(trial: Trial) -> list[Track]:
+def _tracks(trial: Trial) -> list[MapTrack]:
     nowhere = np.full(2, np.nan)
     gnss = [nowhere if p.pose is None else p.pose.translation[:2] for p in trial.priors]
     vision = [
@@ -153,15 +153,15 @@ def _tracks(trial: Trial) -> list[Track]:
         for one in trial.best
     ]
     return [
-        Track("GNSS, with the estimated offset", _GNSS, OUTER, np.array(gnss)),
-        Track("vision", VISION, INNER, np.array(vision)),
+        MapTrack("GNSS, with the estimated offset", _GNSS, OUTER, np.array(gnss)),
+        MapTrack("vision", VISION, INNER, np.array(vision)),
     ]
 
 
-def _estimates(trial: Trial) -> Table:
+def _estimates(trial: Trial) -> ReportTable:
     found = trial.estimated
     if found is None:
-        return Table(("quantity", "value"), (("too few frames agree to estimate", "-"),))
+        return ReportTable(("quantity", "value"), (("too few frames agree to estimate", "-"),))
     up, right = found.mount_deg[1], found.mount_deg[2]
     rows = [
         ("camera looks further up (ahead)", f"{up:+.1f}", f"{found.mount_sigma_deg[1]:.1f}", "deg"),
@@ -189,14 +189,14 @@ def _estimates(trial: Trial) -> Table:
     note = f"By {found.frames} frames, against what was recorded or given."
     if found.focal_percent is None:
         note += " The map is too flat to tell the focal length from the height."
-    return Table(("quantity", "differs by", "1 sigma", "unit"), tuple(rows), bad, note)
+    return ReportTable(("quantity", "differs by", "1 sigma", "unit"), tuple(rows), bad, note)
 
 
-def _failures(trial: Trial) -> tuple[tuple[str, Table], ...]:
+def _failures(trial: Trial) -> tuple[tuple[str, ReportTable], ...]:
     if not trial.reasons:
         return ()
     rows = tuple((trial.best[k].name, text) for k, text in sorted(trial.reasons.items()))
-    return (("Frames that failed", Table(("frame", "likely reason"), rows)),)
+    return (("Frames that failed", ReportTable(("frame", "likely reason"), rows)),)
 
 
 def _overlays(trial: Trial, pictures: MapPictures) -> tuple[Overlay, ...]:

@@ -7,8 +7,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from companion.guardian.config import ProtectionConfig
-from companion.guardian.protection import budget
+from companion.integrity_monitor.config import ProtectionConfig
+from companion.integrity_monitor.protection import budget
 from companion.recorded.flight import RecordedFlight
 from companion.trial.estimate import Estimated
 from companion.trial.localize import Localized, horizontal_m
