@@ -6,24 +6,21 @@ roll, pitch (0 horizontal, -90 down), yaw from north clockwise, Rz(yaw) Ry(pitch
 
 from __future__ import annotations
 
-import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
 import numpy as np
-from PIL import ExifTags, Image
 
 from companion.convert.angles import Angles, gimbal_of_pose, pose_of_gimbal
+from companion.errors import FootageError
+from companion.recorded.photo_tags import read_photo_tags, read_xmp
 from localizer.errors import GeoreferenceError, PoseFileError
 from localizer.geometry.geo import Geodetic, LocalFrame
 from localizer.geometry.trajectory import StampedPose
-from localizer.plain_files import plain_text
 
 _PHOTO_SUFFIXES = frozenset({".jpg", ".jpeg"})
-_XMP_HEADER = b"http://ns.adobe.com/xap/1.0/\x00"
-_LARGEST_BYTES = 1 << 20  # of a photo's head, in which its tags stand
 _ANGLES = ("GimbalRollDegree", "GimbalPitchDegree", "GimbalYawDegree")
 _SIDECAR = """<x:xmpmeta xmlns:x="adobe:ns:meta/">
  <rdf:RDF xmlns:rdf="http://www.w3.org/1999/02/22-rdf-syntax-ns#">
@@ -110,22 +107,14 @@ def _read_photo(path: Path, frame: LocalFrame, lift_m: float) -> StampedPose:
 
 def _xmp_tags(path: Path) -> dict[str, str]:
     """DJI's tags by name: as attributes or as elements, both occur."""
-    sidecar = path.with_suffix(".xmp")
     try:
-        if sidecar.is_file():
-            text = plain_text(sidecar)
-        else:
-            with path.open("rb") as file:
-                head = file.read(_LARGEST_BYTES)
-            begin = head.find(_XMP_HEADER)
-            end = head.find(b"</x:xmpmeta>", begin)
-            if begin < 0 or end < 0:
-                raise PoseFileError(f"{path}: has no XMP tags, and there is no {sidecar.name}")
-            text = head[begin:end].decode("utf-8", errors="replace")
-    except (OSError, UnicodeDecodeError) as error:
-        raise PoseFileError(f"{path}: cannot be read: {error}") from error
-    tags = dict(re.findall(r'drone-dji:(\w+)\s*=\s*"([^"]*)"', text))
-    return tags | dict(re.findall(r"<drone-dji:(\w+)>([^<]*)</", text))
+        tags = read_xmp(path)
+    except FootageError as error:
+        raise PoseFileError(str(error)) from error
+    if not tags:
+        sidecar = path.with_suffix(".xmp").name
+        raise PoseFileError(f"{path}: has no XMP tags, and there is no {sidecar}")
+    return tags
 
 
 def _xmp_position(tags: dict[str, str]) -> tuple[float, float, float] | None:
@@ -141,22 +130,9 @@ def _xmp_position(tags: dict[str, str]) -> tuple[float, float, float] | None:
 
 def _exif_position(path: Path) -> tuple[float, float, float]:
     try:
-        with Image.open(path) as image:
-            gps = image.getexif().get_ifd(ExifTags.IFD.GPSInfo)
-    except OSError as error:
-        raise PoseFileError(f"{path}: cannot be read: {error}") from error
-    try:
-        lat = _degrees(gps[ExifTags.GPS.GPSLatitude], gps[ExifTags.GPS.GPSLatitudeRef] == "S")
-        lon = _degrees(gps[ExifTags.GPS.GPSLongitude], gps[ExifTags.GPS.GPSLongitudeRef] == "W")
-        height = float(gps[ExifTags.GPS.GPSAltitude])
-    except (KeyError, TypeError, ZeroDivisionError) as error:
-        raise PoseFileError(f"{path}: has no GPS position in EXIF or XMP: {error}") from error
-    # 1 and b"\\x01" both occur; Pillow gives the byte as it stands.
-    below = gps.get(ExifTags.GPS.GPSAltitudeRef, 0) in (1, b"\x01")
-    return lat, lon, -height if below else height
-
-
-def _degrees(parts: Sequence[float], negative: bool) -> float:
-    degrees, minutes, seconds = (float(part) for part in parts)
-    value = degrees + minutes / 60 + seconds / 3600
-    return -value if negative else value
+        position = read_photo_tags(path).telemetry().position
+    except FootageError as error:
+        raise PoseFileError(str(error)) from error
+    if position is None or not position.heights:
+        raise PoseFileError(f"{path}: has no GPS position in EXIF or XMP")
+    return position.latitude_deg, position.longitude_deg, position.heights[-1].value_m

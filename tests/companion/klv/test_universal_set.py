@@ -91,8 +91,8 @@ def test_a_real_flights_universal_sets(real_data, clip, count):
     # The ground in the image's middle lies where range and angles put it: 1 % of the range.
     fields = decode(packets[0][1])
     down = track.samples[0].view.ned_from_camera[2, 2]
-    height = fields[tag.SENSOR_ALTITUDE] - 0.5 * 60.0  # the ground there is at 0 to 60 m
-    assert fields[tag.SLANT_RANGE] * down == pytest.approx(height, rel=0.05)
+    height = float(fields[tag.SENSOR_ALTITUDE]) - 0.5 * 60.0  # the ground there is at 0 to 60 m
+    assert float(fields[tag.SLANT_RANGE]) * down == pytest.approx(height, rel=0.05)
 
 
 @pytest.mark.real

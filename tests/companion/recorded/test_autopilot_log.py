@@ -70,7 +70,7 @@ def _ground(rng):
 def _seen(ground, motion, t, camera):
     """The image of a camera fixed to the body of that motion, over flat ground."""
     north, east, height, roll, pitch, yaw = motion(t)
-    cr, sr, cp, sp, cy, sy = *_cs(roll), *_cs(pitch), *_cs(yaw)
+    (cr, sr), (cp, sp), (cy, sy) = (_cs(angle) for angle in (roll, pitch, yaw))
     Rz = np.array([[cy, -sy, 0], [sy, cy, 0], [0, 0, 1]])
     Ry = np.array([[cp, 0, sp], [0, 1, 0], [-sp, 0, cp]])
     Rx = np.array([[1, 0, 0], [0, cr, -sr], [0, sr, cr]])
