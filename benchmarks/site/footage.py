@@ -23,11 +23,11 @@ from localizer.geometry.pose import Pose, so3_exp
 from localizer.geometry.posefile import PoseRow, read_poses, world_from_camera
 from localizer.map.cache.cache import TileCache
 from localizer.map.cache.stream import TileStreamer
-from localizer.relocalization.topview import render_top_view
 from localizer.render.numba_raster import NumbaRenderer
+from localizer.render.topview import render_top_view
 from sitl.demo.assets import FlightAssets, prepare
 from sitl.demo.kinematic import record_scenario
-from sitl.demo.scenario import CameraSpec, ScenarioLeg, Scenario
+from sitl.demo.scenario import CameraSpec, Scenario, ScenarioLeg
 
 _SEED, _SIZE_M = 5, 400.0
 _SIDE_M, _ORTHO_M, _DSM_M = 360.0, 0.4, 1.2

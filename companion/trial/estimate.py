@@ -62,11 +62,14 @@ class Estimated:
 
 @dataclass(frozen=True)
 class Tools:
-    """What reads images over the map. width: of the working image, pixels."""
+    """What reads images over the map. width: of the working image, pixels; has_buildings: whether
+    the map's heights hold them.
+    """
 
     renderer: MapRenderer
     extractor: FeatureExtractor
     width: int
+    has_buildings: bool = True
 
 
 def estimate(
@@ -99,7 +102,7 @@ def estimate(
                 sighted[k] = CalibrationFrame(10_000_000_000 * (k + 1), pose, parts, said)
         if len(sighted) < _LEAST_FRAMES:
             return None
-        fixed = _fixed(list(sighted.values()))
+        fixed = _fixed(list(sighted.values()), tools.has_buildings)
         evidence = CalibrationProblem(list(sighted.values()), guess.camera, np.eye(3), np.zeros(3))
         solution = solve(evidence, fixed, _sigmas(guess))
         shared = solution.guess.shared
@@ -185,13 +188,15 @@ def _said(prior: FramePrior, pose: Pose) -> AutopilotWindow:
     )  # fmt: skip
 
 
-def _fixed(sighted: Sequence[CalibrationFrame]) -> np.ndarray:
+def _fixed(sighted: Sequence[CalibrationFrame], has_buildings: bool) -> np.ndarray:
     """Which numbers keep their value: all but focal length, mounting and map offset; over flat
-    ground the focal length, too, because it cannot be told from the height.
+    ground the focal length, too, because it cannot be told from the height; nor over a map without
+    the buildings that the images show, which are nearer than it says.
     """
     fixed = np.ones(u.COUNT, bool)
     fixed[u.MOUNT], fixed[u.SHIFT] = False, False
-    fixed[u.FOCAL] = float(np.median([_relief(s) for s in sighted])) < _RELIEF_SHARE
+    is_flat = float(np.median([_relief(s) for s in sighted])) < _RELIEF_SHARE
+    fixed[u.FOCAL] = is_flat or not has_buildings
     return fixed
 
 

@@ -188,7 +188,7 @@ def _estimates(trial: Trial) -> ReportTable:
     )  # fmt: skip
     note = f"By {found.frames} frames, against what was recorded or given."
     if found.focal_percent is None:
-        note += " The map is too flat to tell the focal length from the height."
+        note += " Over this map the focal length cannot be told from the height."
     return ReportTable(("quantity", "differs by", "1 sigma", "unit"), tuple(rows), bad, note)
 
 

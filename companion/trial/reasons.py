@@ -14,6 +14,7 @@ from companion.sources.folder_source import read_image
 from companion.trial.estimate import Estimated
 from companion.trial.localize import Localized, horizontal_m
 from companion.trial.priors import FramePrior
+from localizer.map.kind import HEIGHTS_HOLD, MapKind
 from localizer.types import Image
 
 _WIDTH_PX = 640
@@ -62,6 +63,7 @@ def reasons(
     priors: Sequence[FramePrior],
     localized: Sequence[Localized],
     estimated: Estimated | None,
+    kind: MapKind | None = None,
 ) -> dict[int, str]:
     """The likely reason for each frame that was not accepted, by its number."""
     failed = [k for k, one in enumerate(localized) if not one.accepted]
@@ -74,8 +76,7 @@ def reasons(
         k: _image_reason(states[k], usual)
         or _place_reason(priors[k], localized[k])
         or _setup_reason(estimated)
-        or "image and map agree too little: a map of another season, date or sensor, or without "
-        "the buildings that the image shows"
+        or _map_reason(kind)
         for k in failed
     }  # fmt: skip
 
@@ -109,6 +110,12 @@ def _place_reason(prior: FramePrior, one: Localized) -> str:
                 f"{prior.sigma_m:.0f} m: position, height or angles are wrong"
             )
     return ""
+
+
+def _map_reason(kind: MapKind | None) -> str:
+    if kind is not None and not kind.has_buildings:
+        return f"map of another kind than the image: {HEIGHTS_HOLD[kind.heights]}"
+    return "image and map agree too little: a map of another season, date or sensor"
 
 
 def _setup_reason(estimated: Estimated | None) -> str:

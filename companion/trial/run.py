@@ -19,6 +19,8 @@ from localizer.config import LocalizerConfig
 from localizer.features.detail import DetailExtractor
 from localizer.features.extractor import load_extractor
 from localizer.map.cache.cache import TileCache
+from localizer.map.inspection.kind import map_kind
+from localizer.map.kind import MapKind
 from localizer.relocalization.relocalizer import Relocalizer, open_relocalizer
 from localizer.tracking.opening import MapStack, build_localizer
 
@@ -50,15 +52,14 @@ def run_trial(
     with ExitStack() as opened:
         stack = MapStack(map_cache, config)
         opened.callback(stack.close)
-        known = priors_of(flight, stack.cache)
+        known, kind = priors_of(flight, stack.cache), map_kind(stack.cache)
         search = _Search(stack.cache, config, opened)
         first_loader = FrameLocalizer(
             build_localizer(stack, flight.camera.camera, config), search, flight.camera.camera
         )
         first = _all(flight, known.priors, first_loader, stage, "localizing")
-        tools = Tools(
-            stack.renderer, DetailExtractor(load_extractor(None, threads=2)), options.width
-        )
+        extractor = DetailExtractor(load_extractor(None, threads=2))
+        tools = Tools(stack.renderer, extractor, options.width, kind.has_buildings)
         with stage("estimating camera and map offset") as count:
             found = estimate(
                 flight.frames, known.priors, first, flight.camera, tools, first_loader, count
@@ -72,8 +73,14 @@ def run_trial(
             begun = tuple(map(_begun, priors, first))
             second = _all(flight, begun, loader, stage, "localizing again")
         searched = _searched(flight, priors, loader, options.searches, stage)
-    why = reasons(flight.frames, priors, second, found)
-    return Trial(flight, priors, first, second, searched, found, why, (*flight.notes, *known.notes))
+    why = reasons(flight.frames, priors, second, found, kind)
+    notes = (*flight.notes, *known.notes, *_map_notes(kind, flight))
+    return Trial(flight, priors, first, second, searched, found, why, notes)
+
+
+def _map_notes(kind: MapKind, flight: RecordedFlight) -> tuple[str, ...]:
+    advice = kind.advice(flight.camera.camera.horizontal_fov_deg / 2)
+    return (f"map: {kind.line()}", *([advice] if advice else []))
 
 
 class _Search:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -89,10 +91,11 @@ def _try(flight: RecordedFlight, map_cache: Path, report: Path, width: int, sear
 
     TileCache.open(map_cache)  # what is missing is said before anything is computed
     console = Console(stderr=True)
-    trial = run_trial(
-        flight, map_cache, TrialOptions(width, searches),
-        lambda what: shown_count(console, what, begins=COMPILES),
-    )  # fmt: skip
+
+    def stage(what: str) -> AbstractContextManager[Callable[..., None]]:
+        return shown_count(console, what, begins=COMPILES if what == "localizing" else "begun")
+
+    trial = run_trial(flight, map_cache, TrialOptions(width, searches), stage)
     judgement = judge(trial)
     _tell_notes(trial.notes)
     with shown_steps(console) as say:
