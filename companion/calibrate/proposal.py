@@ -104,6 +104,8 @@ def lens_changes(config: CompanionConfig | None, lens: Lens) -> tuple[Change, ..
         **{name: round(getattr(c, name), 2) for name in ("fx", "fy", "cx", "cy")},
         "distortion": [round(k, 5) for k in c.distortion],
     }  # fmt: skip
+    if model is not None and model.distortion_model != c.distortion_model:
+        values["distortion_model"] = c.distortion_model
     made = [
         Change(("camera", "model", name), None if model is None else getattr(model, name), value)
         for name, value in values.items()
