@@ -19,6 +19,7 @@ from companion.config import CompanionConfig, load_config, parse_config
 from companion.errors import ConfigError
 from companion.settings_file import read_settings, validated
 from localizer.geometry.pose import Array, euler_from_matrix, so3_exp
+from localizer.plain_files import plain_text
 from mavlink_bridge.whole_file import replace_whole
 
 _LEAST = {"focal_percent": 0.05, "principal_percent": 0.05, "distortion": 0.001, "stamp_ms": 2.0}
@@ -175,7 +176,7 @@ def write_changed(path: Path, wanted: tuple[Change, ...], heading: str) -> Path:
     text = yaml.safe_dump(document, sort_keys=False, default_flow_style=None, width=100)
     try:
         mode = stat.S_IMODE(path.stat().st_mode)
-        replace_whole(kept, path.read_bytes().decode("utf-8"), mode)
+        replace_whole(kept, plain_text(path), mode)
         replace_whole(path, f"# {heading}\n# Before it: {kept.name}\n\n{text}", mode)
     except OSError as error:
         raise ConfigError(f"{path}: cannot be written: {error.strerror}") from error

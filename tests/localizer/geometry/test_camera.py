@@ -138,7 +138,8 @@ def test_what_a_polynomial_folds_back_into_the_picture_is_not_seen(camera):
     np.testing.assert_array_equal(inside, [False, True])
     wide = Camera(640, 480, 130.0, 130.0, 320.0, 240.0)
     maps = folding.undistortion_maps(wide)
-    shown = cv2.remap(np.full((480, 640), 255, np.uint8), *maps, cv2.INTER_LINEAR)
+    white = np.full((480, 640), 255, np.uint8)
+    shown = cv2.remap(white, maps[0], maps[1], cv2.INTER_LINEAR)
     columns = np.flatnonzero(shown[240])
     reach = (folding.rays([[0.0, 240.0], [640.0, 240.0]]) * 130)[:, 0] + 320
     assert columns[0] + 0.5 == pytest.approx(reach[0], abs=20)
