@@ -3,11 +3,19 @@ PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 
-.PHONY: help demo test setup clean
+# The versions that are installed, and that pip builds with: the lock, made by `make lock`.
+# `make newest` takes the newest ones that pyproject.toml allows.
+LOCK := constraints.txt
+INSTALL = PIP_CONSTRAINT=$(LOCK) PIP_BUILD_CONSTRAINT=$(LOCK) $(BIN)/python -m pip install --quiet
+EXTRAS := cluster console dev docs fetch mcap pyrender
+
+.PHONY: help demo test newest setup lock clean
 
 help:
 	@echo "make demo    fly without GNSS and write report/ (ARGS=\"--seed 1\": options of sitl demo)"
 	@echo "make test    lint, types, tests: up to twenty minutes"
+	@echo "make newest  make test with the newest versions of all packages, in $(VENV)-newest"
+	@echo "make lock    write the newest versions into constraints.txt and constraints-gpu.txt"
 	@echo "make setup   only make the environment: then .venv/bin/companion --help"
 	@echo "make clean   remove the environment and report/"
 
@@ -19,22 +27,38 @@ test: $(VENV)/.dev
 	$(BIN)/ruff format --check .
 	$(BIN)/python -m tests.parts $(ARGS)
 
+newest:
+	rm -rf $(VENV)-newest
+	$(MAKE) test VENV=$(VENV)-newest LOCK=/dev/null
+
 setup: $(VENV)/.demo
 	@echo "ready: $(BIN)/companion --help"
 
 $(BIN)/python:
 	$(PYTHON) -m venv $(VENV)
 
-$(VENV)/.demo: $(BIN)/python pyproject.toml
+$(VENV)/.demo: $(BIN)/python pyproject.toml $(LOCK)
 	@echo "installing what the program needs into $(VENV), minutes the first time"
-	$(BIN)/python -m pip install --quiet --editable '.[console]'
+	$(INSTALL) --editable '.[console]'
 	touch $@
 
 # Most of what is installed is never imported: what is, Python compiles then.
-$(VENV)/.dev: $(BIN)/python pyproject.toml
+$(VENV)/.dev: $(BIN)/python pyproject.toml $(LOCK)
 	@echo "installing what program, tests and training need into $(VENV), minutes the first time"
-	$(BIN)/python -m pip install --quiet --no-compile --editable '.[dev,train]'
+	$(INSTALL) --no-compile --editable '.[dev,train]'
 	touch $@ $(VENV)/.demo
 
+# uv resolves for every Python and processor at once. torch asks for CUDA 13, a Jetson has CUDA 12:
+# two files.
+lock:
+	$(PYTHON) -m venv $(VENV)-lock
+	$(VENV)-lock/bin/python -m pip install --quiet --upgrade uv
+	$(call locked,constraints.txt,train)
+	$(call locked,constraints-gpu.txt,gpu)
+
+locked = ( echo "\# Made by 'make lock': all extras but $(if $(filter gpu,$(2)),train,gpu)." && \
+	$(VENV)-lock/bin/uv pip compile pyproject.toml --quiet --universal --python-version 3.10 --upgrade \
+	$(EXTRAS:%=--extra %) --extra $(2) --no-annotate --no-header ) > $(VENV)-lock/$(1) && mv $(VENV)-lock/$(1) $(1)
+
 clean:
-	rm -rf $(VENV) report
+	rm -rf $(VENV) $(VENV)-newest $(VENV)-lock report

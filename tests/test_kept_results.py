@@ -34,20 +34,22 @@ def test_a_marked_table_is_made_anew_and_what_stands_around_it_stays(tmp_path):
     save(KEPT, tmp_path / "x.json")
     page = "before\n<!-- kept x -->\n| old |\n<!-- end -->\nafter\n"
     made = with_tables(page, tmp_path)
-    assert made.startswith("before\n<!-- kept x -->\n| a | b |\n|---|---|\n| 1 | 2 |\n\n*`make x`;")
-    assert "was not kept, at commit abc1234, 2026-11-22; 2 cores" in made
+    assert made.startswith("before\n<!-- kept x -->\n| a | b |\n|---|---|\n| 1 | 2 |\n\n*Command, ")
+    assert "[x](data/x.json)" in made
     assert made.endswith("<!-- end -->\nafter\n")
     assert with_tables(made, tmp_path) == made
 
 
-def test_results_of_several_commits_say_which(tmp_path):
+def test_results_of_one_form_stand_together_and_others_are_refused(tmp_path):
     save(KEPT, tmp_path / "x.json")
-    other = Kept("make x", "def5678", "2026-11-23", "2 cores", "r.json", KEPT.table)
-    save(other, tmp_path / "y.json")
+    save(KEPT, tmp_path / "y.json")
     made = with_tables("<!-- kept x y -->\n<!-- end -->", tmp_path)
-    assert "| a | b | commit |" in made
-    assert "| 1 | 2 | def5678 |" in made
-    assert "from its `r.json` of commit def5678" in made
+    assert made.count("| 1 | 2 |") == 2
+    assert "[x](data/x.json), [y](data/y.json)" in made
+    other = Kept("make x", "abc1234", "2026-11-22", "2 cores", "", Table(("c",), (("1",),)))
+    save(other, tmp_path / "y.json")
+    with pytest.raises(ReportError, match="differ in their columns"):
+        with_tables("<!-- kept x y -->\n<!-- end -->", tmp_path)
 
 
 def test_a_pursuit_s_table_says_why_a_car_was_not_followed(tmp_path):
@@ -98,7 +100,7 @@ def test_every_kept_result_stands_on_a_page():
     pages = "".join(p.read_text(encoding="utf-8") for p in (ROOT / "docs").rglob("*.md"))
     for path in (ROOT / DATA).glob("*.json"):
         assert load(path).command
-        assert f" {path.stem} " in pages, path
+        assert f"data/{path.name}" in pages, path
 
 
 def test_reports_name_commit_and_processor():
@@ -119,22 +121,3 @@ def test_rates_of_several_runs_stand_together_without_their_stages(tmp_path):
     table, _ = tables_of(paths, "")
     assert len(table.rows) == 2
     assert table.rows[0][3:6] == ("279 of 280", "37.8", "48 / 76")
-
-
-def test_depths_are_kept_by_height(tmp_path):
-    row = {"height_m": 100.0, "pixels": 9, "median": 8e-8, "p95": 2e-4, "p99": 5.7e-3,
-           "within_1_percent": 99.384, "hidden_percent": 2.85}  # fmt: skip
-    path = tmp_path / "d.json"
-    path.write_text(json.dumps({"bins": [0.1], "rows": [row]}))
-    table, _ = tables_of([path], "")
-    assert table.rows[0] == ("100", "9", "8.0e-08", "2.0e-04", "5.7e-03", "99.38 %", "2.9 %")
-
-
-def test_the_units_exposure_is_read_from_what_systemd_says(tmp_path):
-    path = tmp_path / "security.txt"
-    path.write_text("→ Overall exposure level for companion.service: 1.8 OK 🙂\n")
-    table, _ = tables_of([path], "")
-    assert table.rows == (("companion.service", "1.8 OK", "below 3"),)
-    path.write_text("Failed to load unit\n")
-    with pytest.raises(ReportError, match=r"security\.txt.*no overall exposure"):
-        tables_of([path], "")

@@ -1,8 +1,10 @@
 """What operators install: the wheel in an environment of its own, and the service's unit."""
 
 import configparser
+import email
 import json
 import os
+import re
 import shlex
 import shutil
 import subprocess
@@ -11,6 +13,8 @@ import zipfile
 from pathlib import Path
 
 import pytest
+from packaging.requirements import Requirement
+from packaging.utils import canonicalize_name
 
 ROOT = Path(__file__).parents[1]
 UNIT = ROOT / "configs" / "companion.service"
@@ -75,9 +79,10 @@ def test_the_wheel_has_what_the_program_reads(built):
 
 
 def test_the_command_runs_outside_the_checkout(environment, tmp_path):
-    where = _run(environment, "-c", "import companion; print(companion.__file__)", cwd=tmp_path)
+    program = [environment, "-I"]  # no PYTHONPATH: it may lead to the checkout
+    where = _run(*program, "-c", "import companion; print(companion.__file__)", cwd=tmp_path)
     assert str(environment.parents[1]) in where
-    assert _run(environment, "-m", "companion", "--version", cwd=tmp_path).startswith("companion 0")
+    assert _run(*program, "-m", "companion", "--version", cwd=tmp_path).startswith("companion 0")
 
 
 @pytest.mark.long  # compiles every kernel anew: minutes
@@ -121,6 +126,47 @@ def test_versions_and_labels_agree():
     for name in ("permissions", "authors", "company", "tags"):
         json.loads(words[name])
     assert "links" not in words  # the project has no public home: who publishes an image adds his
+
+
+def _pins(lock, python, machine):
+    """What a lock pins for a Python and a processor: versions by name."""
+    where = {
+        "python_version": python, "python_full_version": f"{python}.9", "sys_platform": "linux",
+        "platform_machine": machine, "platform_system": "Linux", "os_name": "posix", "extra": "",
+    }  # fmt: skip
+    pins: dict[str, set[str]] = {}
+    for line in (ROOT / lock).read_text(encoding="utf-8").splitlines():
+        if line.startswith("#"):
+            continue
+        pin = Requirement(line)  # a name, a version, a marker: no address, no hash
+        assert pin.url is None
+        (version,) = pin.specifier
+        assert version.operator == "=="
+        if pin.marker is None or pin.marker.evaluate(where):
+            pins.setdefault(canonicalize_name(pin.name), set()).add(version.version)
+    assert all(len(versions) == 1 for versions in pins.values())
+    return {name: next(iter(versions)) for name, versions in pins.items()}, where
+
+
+@pytest.mark.parametrize("machine", ["x86_64", "aarch64"])
+@pytest.mark.parametrize("python", ["3.10", "3.11", "3.12", "3.13"])
+def test_the_locks_pin_what_the_project_needs(built, python, machine):
+    (wheel,) = built.glob("*.whl")
+    with zipfile.ZipFile(wheel) as packed:
+        (name,) = (n for n in packed.namelist() if n.endswith(".dist-info/METADATA"))
+        said = email.message_from_bytes(packed.read(name))
+    locks = {
+        lock: _pins(lock, python, machine) for lock in ("constraints.txt", "constraints-gpu.txt")
+    }
+    for line in said.get_all("Requires-Dist", []):
+        need = Requirement(line)
+        extra = re.search(r'extra == "(\w+)"', line)
+        for lock, (pins, where) in locks.items():
+            if extra and extra[1] == ("train" if "gpu" in lock else "gpu"):
+                continue  # torch asks for CUDA 13, a Jetson has CUDA 12
+            here = where | {"extra": extra[1] if extra else ""}
+            if need.marker is None or need.marker.evaluate(here):
+                assert need.specifier.contains(pins[canonicalize_name(need.name)]), lock
 
 
 @pytest.mark.skipif(shutil.which("systemd-analyze") is None, reason="no systemd-analyze")

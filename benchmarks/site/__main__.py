@@ -2,6 +2,7 @@
 
     python -m benchmarks.site            # command line, configuration, API; tables of results
     python -m benchmarks.site --check    # ends with 1 and names what is not of today
+    python -m benchmarks.site --figures  # of the results pages
     python -m benchmarks.site --pictures report    # the README's, of `make demo`'s report folder
 
 The site itself: `mkdocs build --strict` (extra `docs`), then site/index.html.
@@ -14,6 +15,7 @@ from pathlib import Path
 
 from benchmarks.common.arguments import Parser, existing
 from benchmarks.common.named_errors import named_errors
+from benchmarks.site.figures import draw_all
 from benchmarks.site.kept import DATA, with_tables
 from benchmarks.site.pages import command_page, configuration_page
 from benchmarks.site.pictures import keep
@@ -50,7 +52,11 @@ def main() -> None:
     parser = Parser(__doc__)
     parser.add_argument("--check", action="store_true", help="write nothing")
     parser.add_argument("--pictures", type=existing, metavar="REPORT", help="of a demo flight")
+    parser.add_argument("--figures", action="store_true", help="draw those of the results")
     options = parser.parse_args()
+    if options.figures:
+        print(*draw_all(_ROOT), sep="\n")
+        return
     if options.pictures is not None:
         print(*keep(options.pictures, _ROOT / "docs" / "img"), sep="\n")
         return

@@ -7,12 +7,10 @@ from __future__ import annotations
 
 import json
 import math
-import re
 import statistics
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
-from xml.etree import ElementTree
 
 from benchmarks.common.shares import exact_interval
 from benchmarks.site.kept import Table
@@ -32,30 +30,14 @@ _ACCEPTANCES = ("no added test", "parts agree", "parts agree, stands out: ours")
 _PLACES = (
     "set", "heading", "by day", "dusk", "night", "all", "false", "processor s: search, confirm",
 )  # fmt: skip
-_COST = (
-    "area", "cell, m", "heading", "overview, MiB", "transforms kept, MiB", "process, MiB",
-    "processor s", "s, threads",
-)  # fmt: skip
-_DRIFT = (
-    "depth from", "light", "stretches", "drift median, p95, % of the way", "median, p95, m",
-    "inside its 95 %, % of frames", "at the end", "carried to the end",
-)  # fmt: skip
-_PACKAGE = (
-    "package", "install, s", "start, s", "upgrade, s", "remove, s", "purge, s",
-    "self-test: tracked, found to", "processor ms a frame",
-)  # fmt: skip
 _FOLLOWED = (
     "flight", "followed", "seen, of reports", "back after a roof, s", "median / p95 / max, m",
     "inside its 95 %", "velocity p95, m/s", "of something else",
 )  # fmt: skip
-_DEPTHS = ("height, m", "pixels", "median", "95 %", "99 %", "within 1 %", "hidden from the other")
 _THROUGHPUT = (
     "width", "cores", "frames offered", "frames", "frames/s", "latency p50 / p95, ms",
     "CPU ms a frame", "share of the cores", "median / p95 error, m",
 )  # fmt: skip
-_EXPOSURE = ("unit", "overall exposure", "wanted")
-_EXPOSED = re.compile(r"Overall exposure level for (\S+): ([\d.]+) (\w+)")
-_TESTS = ("tests", "passed", "failed", "skipped", "seconds")
 
 
 def tables_of(
@@ -69,18 +51,13 @@ def tables_of(
     if not paths:
         raise ReportError("no report to keep")
     try:
-        if paths[0].suffix == ".xml":
-            return _tests(paths, title), None
-        if paths[0].suffix == ".txt":
-            return _exposure(paths), None
         data = [json.loads(path.read_text(encoding="utf-8")) for path in paths]
         if isinstance(data[0], dict) and "report" in data[0]:
             return _flight(data[0]["report"], title)
         if isinstance(data[0], dict) and "flights" in data[0]:
             return _loop(paths, title, only), None
         table = _form(data[0])(data, title)
-    except (OSError, ValueError, KeyError, IndexError, TypeError, ElementTree.ParseError,
-            ScenarioError) as error:  # fmt: skip
+    except (OSError, ValueError, KeyError, IndexError, TypeError, ScenarioError) as error:
         raise ReportError(f"{paths[0]}: not a report of a form that is known: {error!r}") from error
     return _picked(table, only), None
 
@@ -93,10 +70,9 @@ def _picked(table: Table, only: Sequence[str]) -> Table:
 def _form(data: Any) -> Callable[[list[Any], str], Table]:
     marks = data if isinstance(data, dict) else data[0]
     for mark, made in (
-        ("columns", _figures), ("package", _package), ("recall_1", _sequence),
-        ("begin_ns", _followed), ("verdict", _suite), ("acceptance", _integrity),
-        ("search_cpu_s", _places), ("overview_mib", _cost), ("bins", _depths),
-        ("rows", _throughput), ("end_percent_p95", _drift), ("iteration_ms", _optimizer),
+        ("columns", _figures), ("recall_1", _sequence), ("begin_ns", _followed),
+        ("verdict", _suite), ("acceptance", _integrity), ("search_cpu_s", _places),
+        ("rows", _throughput),
     ):  # fmt: skip
         if mark in marks:
             return made
@@ -106,30 +82,6 @@ def _form(data: Any) -> Callable[[list[Any], str], Table]:
 def _figures(data: list[Any], _title: str) -> Table:
     rows = (tuple(map(str, row)) for one in data for row in one["rows"])
     return Table(tuple(data[0]["columns"]), tuple(rows))
-
-
-def _depths(data: list[Any], _title: str) -> Table:
-    rows = tuple(
-        (
-            f"{one['height_m']:.0f}", str(one["pixels"]),
-            *(f"{one[key]:.1e}" for key in ("median", "p95", "p99")),
-            f"{one['within_1_percent']:.2f} %", f"{one['hidden_percent']:.1f} %",
-        )
-        for part in data for one in part["rows"]
-    )  # fmt: skip
-    return Table(_DEPTHS, rows)
-
-
-def _optimizer(data: list[Any], _title: str) -> Table:
-    """Milliseconds of one LM iteration by side of the feature map; the paper's own figures last."""
-    columns = ("per LM iteration, ms", *(f"{size} px" for size in data[0]["sizes"]))
-    rows = tuple(
-        (backend, *(f"{ms:.3g}" for ms in of_size))
-        for part in data
-        for times in (part["iteration_ms"], part["paper_ms"])
-        for backend, of_size in times.items()
-    )
-    return Table(columns, rows)
 
 
 def _throughput(data: list[Any], _title: str) -> Table:
@@ -286,77 +238,6 @@ def _share(some: Sequence[dict[str, Any]]) -> str:
     hits = sum(o["found"] for o in some)
     low, high = exact_interval(hits, len(some))
     return f"{hits} of {len(some)} [{low:.0f}, {high:.0f}]"
-
-
-def _cost(data: list[Any], _title: str) -> Table:
-    rows = (
-        (f"{one['area_km2']:.1f} km²{'' if one['measured'] else ', on paper'}",
-         f"{one['cell_m']:g}", "15°" if one["heading_known"] else "unknown",
-         f"{one['overview_mib']:.0f}",
-         f"{one['kept_mib']:.0f}", f"{one['peak_mib']:.0f}", f"{one['cpu_s']:.2f}",
-         f"{one['wall_s']:.2f}, {one.get('threads', 1)}")
-        for part in data
-        for one in part
-    )  # fmt: skip
-    return Table(_COST, tuple(rows))
-
-
-def _drift(data: list[Any], _title: str) -> Table:
-    rows = tuple(
-        (
-            one["depth"], one["condition"], str(one["stretches"]),
-            f"{one['end_percent_p50']:.2f}, {one['end_percent_p95']:.2f}",
-            f"{one['end_m_p50']:.1f}, {one['end_m_p95']:.1f}",
-            f"{one['inside_95_percent']:.1f}", one["inside_95_at_end"].replace("/", " of "),
-            f"{one['carried_to_the_end']} of {one['stretches']}",
-        )
-        for part in data for one in part
-    )  # fmt: skip
-    return Table(_DRIFT, rows)
-
-
-def _package(data: list[Any], _title: str) -> Table:
-    rows = []
-    for one in data:
-        tested, seconds = one["self_test"], one["seconds"]
-        upgrade = str(seconds["upgrade"])
-        rows.append(
-            (
-                one["package"],
-                *(str(seconds[step]) for step in ("install", "start")),
-                upgrade,
-                *(str(seconds[step]) for step in ("remove", "purge")),
-                f"{tested['error_m']:.4f} m, {tested['found_error_m']:.4f} m"
-                if tested
-                else "left out",
-                f"{tested['frame_ms']:.0f}" if tested else "-",
-            )
-        )
-    return Table(_PACKAGE, tuple(rows))
-
-
-def _exposure(paths: Sequence[Path]) -> Table:
-    """Of `systemd-analyze security`."""
-    rows = []
-    for path in paths:
-        found = _EXPOSED.search(path.read_text(encoding="utf-8"))
-        if found is None:
-            raise ValueError("no overall exposure level")
-        rows.append((found[1], f"{found[2]} {found[3]}", "below 3"))
-    return Table(_EXPOSURE, tuple(rows))
-
-
-def _tests(paths: Sequence[Path], title: str) -> Table:
-    """Of `pytest --junitxml`."""
-    count = dict.fromkeys(("tests", "failures", "errors", "skipped", "time"), 0.0)
-    for path in paths:
-        for suite in ElementTree.parse(path).getroot().iter("testsuite"):
-            for key in count:
-                count[key] += float(suite.get(key, 0.0))
-    failed = count["failures"] + count["errors"]
-    passed = count["tests"] - failed - count["skipped"]
-    cells = (f"{n:.0f}" for n in (passed, failed, count["skipped"], count["time"]))
-    return Table(_TESTS, ((title, *cells),))
 
 
 def _short(percent: float) -> str:

@@ -3,10 +3,9 @@
     python -m benchmarks.site.keep report/report.json NAME --title "seed 0, embedded" \\
         --command 'make demo ARGS="--seed 0"' [--machine "2 cores, nothing else running"]
 
-Takes the JSON of a demo flight, of `companion eval`, of `sitl suite` and `sitl loop`, of the
-benchmarks and of configs/package's checks, `pytest --junitxml`'s XML, and what `systemd-analyze
-security` says, as .txt; `--also` adds further files of the same form. Then `python -m
-benchmarks.site` writes the tables.
+Takes the JSON of a demo flight, `companion eval`, `sitl suite`, `sitl loop`, `sitl follow` and the
+benchmarks; `--also` adds further files of the same form. Then `python -m benchmarks.site` writes
+the tables, and `python -m benchmarks.site --figures` the figures.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
 """Results that are kept: one JSON each under docs/results/data, and the tables that they become.
 
-A kept result says what made it: the command, the commit, the day and the machine. `source` names
-the JSON that the command wrote; where it wrote none, the figures are those that it printed.
+A kept result names its command, commit, date and machine. `source` names the JSON that the command
+wrote. If `source` is empty, the figures were copied from the command's output.
 """
 
 from __future__ import annotations
@@ -9,7 +9,6 @@ from __future__ import annotations
 import json
 import re
 import textwrap
-from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -18,7 +17,7 @@ from benchmarks.common.figures import markdown
 from companion.errors import ReportError
 
 DATA = Path("docs/results/data")
-_MARK = re.compile(r"<!-- (kept|criteria) ([\w\- ]+) -->\n.*?<!-- end -->", re.S)
+_MARK = re.compile(r"<!-- kept ([\w\- ]+) -->\n.*?<!-- end -->", re.S)
 
 
 @dataclass(frozen=True)
@@ -27,11 +26,6 @@ class Table:
 
     columns: tuple[str, ...]
     rows: tuple[tuple[str, ...], ...]
-
-    @property
-    def markdown(self) -> str:
-        """As Markdown has it."""
-        return markdown(self.columns, self.rows)
 
 
 @dataclass(frozen=True)
@@ -69,53 +63,27 @@ def save(kept: Kept, path: Path) -> None:
 
 
 def with_tables(text: str, folder: Path) -> str:
-    """A page with its marked tables made anew.
+    """A page of docs/results with its marked tables written anew.
 
-    ``<!-- kept A B -->`` up to ``<!-- end -->`` is the table of results A and B, which have the
-    same columns; ``<!-- criteria A -->`` what was needed beside what was found.
+    ``<!-- kept A B -->`` up to ``<!-- end -->`` becomes the table of results A and B, which have
+    the same columns, with links to their JSON below it.
     """
 
     def made(mark: re.Match[str]) -> str:
-        kind, names = mark.group(1), mark.group(2).split()
-        parts = [load(folder / f"{name}.json") for name in names]
-        tables = [part.criteria if kind == "criteria" else part.table for part in parts]
-        body = _together([table for table in tables if table is not None], parts)
-        origins = "\n\n".join(_origins(parts))
-        return f"<!-- {kind} {' '.join(names)} -->\n{body}\n\n{origins}\n<!-- end -->"
+        names = mark.group(1).split()
+        tables = [load(folder / f"{name}.json").table for name in names]
+        columns = tables[0].columns
+        if any(table.columns != columns for table in tables):
+            raise ReportError(f"tables of one mark differ in their columns: {columns}")
+        rows = tuple(row for table in tables for row in table.rows)
+        links = ", ".join(f"[{name}](data/{name}.json)" for name in names)
+        line = f"*Command, commit, date and machine: {links}.*"
+        origin = "\n".join(textwrap.wrap(line, 120, break_on_hyphens=False))
+        return (
+            f"{mark.group(0).splitlines()[0]}\n{markdown(columns, rows)}\n\n{origin}\n<!-- end -->"
+        )
 
     return _MARK.sub(made, text)
-
-
-def _origins(parts: Sequence[Kept]) -> list[str]:
-    """The lines below a table: what made it, once for the parts that say the same."""
-    alike: dict[tuple[str, str, bool], list[Kept]] = {}
-    for part in parts:
-        alike.setdefault((part.command, part.machine, bool(part.source)), []).append(part)
-    lines = []
-    for (command, machine, written), some in alike.items():
-        sources = ", ".join(dict.fromkeys(f"`{part.source}`" for part in some))
-        of = f"from its {sources} of" if written else "a print of it, whose JSON was not kept, at"
-        commits = ", ".join(dict.fromkeys(part.commit for part in some))
-        days = ", ".join(dict.fromkeys(part.date for part in some))
-        word = "commits" if "," in commits else "commit"
-        line = f"*`{command}`; {of} {word} {commits}, {days}; {machine}.*"
-        lines.append(
-            "\n".join(textwrap.wrap(line, 120, break_long_words=False, break_on_hyphens=False))
-        )
-    return lines
-
-
-def _together(tables: Sequence[Table], parts: Sequence[Kept]) -> str:
-    columns = tables[0].columns
-    if any(table.columns != columns for table in tables):
-        raise ReportError(f"tables of one mark differ in their columns: {columns}")
-    several = len({part.commit for part in parts}) > 1
-    rows = tuple(
-        (*row, part.commit) if several else row
-        for table, part in zip(tables, parts, strict=True)
-        for row in table.rows
-    )
-    return Table((*columns, "commit") if several else columns, rows).markdown
 
 
 def _table(data: dict[str, Any]) -> Table:

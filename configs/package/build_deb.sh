@@ -1,8 +1,9 @@
 #!/bin/sh
 # Build the Debian package: build_deb.sh ARCHITECTURE [PYTHON [OUT]]
 #   ARCHITECTURE  amd64 or arm64; PYTHON  the target's, default 3.11; OUT  default dist
-# The package carries the wheels of everything it needs, so that its installation asks no network;
-# on the target they are installed into an environment of their own, /opt/companion/venv.
+# The package carries the wheels of everything it needs, in the versions of constraints.txt, so that
+# its installation asks no network; on the target they are installed into an environment of their
+# own, /opt/companion/venv. The target's Python with pip chooses the wheels: what is needed differs.
 set -eu
 arch=$1 python=${2:-3.11} out=${3:-dist}
 here=$(cd "$(dirname "$0")" && pwd)
@@ -12,6 +13,7 @@ case $arch in
     arm64) machine=aarch64 ;;
     *) echo "build_deb.sh: architecture $arch: amd64 and arm64 are known" >&2; exit 2 ;;
 esac
+command -v "python$python" > /dev/null || { echo "build_deb.sh: needs python$python with pip" >&2; exit 2; }
 command -v dpkg-deb > /dev/null || { echo "build_deb.sh: needs dpkg-deb (package dpkg)" >&2; exit 2; }
 work=$(mktemp -d) && trap 'rm -rf "$work"' EXIT
 root=$work/root
@@ -21,12 +23,12 @@ mkdir -p "$wheels" "$root/DEBIAN" "$root/lib/systemd/system" "$root/lib/udev/rul
 
 # Of a copy: setuptools leaves its build folder in the source otherwise.
 (cd "$source" && git archive HEAD) | (mkdir "$work/source" && cd "$work/source" && tar x)
-python3 -m pip wheel --quiet --no-deps --wheel-dir "$wheels" "$work/source"
+"python$python" -m pip wheel --quiet --no-deps --wheel-dir "$wheels" "$work/source"
 version=$(basename "$wheels"/pilot_companion-*.whl | cut -d- -f2)
 platforms=$(for tag in manylinux2014 manylinux_2_17 manylinux_2_27 manylinux_2_28; do
     printf -- '--platform %s_%s ' "$tag" "$machine"; done)
 # shellcheck disable=SC2086  # the list is words
-python3 -m pip download --quiet --only-binary=:all: $platforms --implementation cp \
+"python$python" -m pip download --quiet --constraint "$source/constraints.txt" --only-binary=:all: $platforms --implementation cp \
     --python-version "$python" --dest "$wheels" \
     "pilot-companion[console] @ file://$(ls "$wheels"/pilot_companion-*.whl)" pip
 

@@ -33,7 +33,7 @@ class CalibrationSigmas(BaseModel):
     stamp_ms: float = Field(4.0, ge=0, le=1000, description="of the frames' time stamps")
     map_m: float = Field(0.07, ge=0, le=20, description="of the map's surface, per axis")
     # Ground that changed since the survey errs alike over more than a survey's own bumps: three
-    # flights over other visits were likeliest with 20 m (docs/results/covariance.md).
+    # flights over other visits were likeliest with 20 m (docs/results/errors.md).
     map_length_m: float = Field(
         20.0, ge=0.01, le=1000, description="over which it is displaced alike"
     )

@@ -25,10 +25,24 @@ def test_the_same_key_in_two_mappings_is_no_repetition() -> None:
     assert load_yaml("a: {x: 1}\nb: {x: 2}\n") == {"a": {"x": 1}, "b": {"x": 2}}
 
 
-def test_a_merged_key_may_be_overridden() -> None:
-    text = "base: &b {x: 1, y: 2}\nin: {own: &o {<<: *b, x: 3}}\nother: {<<: *o, y: 4}\n"
-    assert load_yaml(text)["in"]["own"] == {"x": 3, "y": 2}
-    assert load_yaml(text)["other"] == {"x": 3, "y": 4}
+@pytest.mark.parametrize(
+    ("text", "where"),
+    [
+        ("base: &b {x: 1}\nown: {<<: *b, y: 3}\n", "line 2, column 7"),
+        ("base: &b {x: 1}\nown:\n  <<: [*b, *b]\n", "line 3, column 3"),
+        ("base: &b {x: 1}\nown: {!!merge any: *b}\n", "line 2, column 7"),
+        ("base: &b {x: 1}\nown: {? !!merge [x] : *b}\n", "line 2, column 9"),
+    ],
+)
+def test_a_merge_key_is_refused_with_its_place(text: str, where: str) -> None:
+    with pytest.raises(yaml.YAMLError, match="the merge key << is not read") as error:
+        load_yaml(text)
+    assert where in str(error.value)
+
+
+def test_an_alias_and_a_quoted_merge_key_are_read() -> None:
+    assert load_yaml("base: &b {x: 1}\nown: *b\n")["own"] == {"x": 1}
+    assert load_yaml("'<<': 1\n") == {"<<": 1}
 
 
 @pytest.mark.parametrize("text", ["!!python/object/apply:os.system ['true']", "? [a]\n: 1\n"])
