@@ -95,7 +95,9 @@ Arm = Annotated[float, Field(ge=-20.0, le=20.0)]  # metres; larger ones were giv
 class FeedConfig(_Model):
     """Where the video comes from. How the camera is mounted stands under ``bridge.camera``."""
 
-    source: str = Field(description="udp://, rtsp://, /dev/videoN, a video file or a folder")
+    source: str = Field(
+        description="udp:// (MPEG-TS, RTP, H.264), .sdp file, rtsp://, /dev/videoN, video or folder"
+    )
     model: CameraModel
     calibrated: date | None = Field(
         None, description="when `companion calibrate` last changed model or mounting; null: never"
@@ -123,7 +125,8 @@ class FeedConfig(_Model):
 
     @model_validator(mode="after")
     def _sender_is_of_udp(self) -> FeedConfig:
-        if self.settings.sender is not None and not self.source.startswith("udp://"):
+        udp = self.source.startswith(("udp://", "rtp://")) or self.source.endswith(".sdp")
+        if self.settings.sender is not None and not udp:
             raise ValueError(
                 "settings.sender chooses among the senders of a udp:// feed; this source has none: "
                 "remove it"
