@@ -9,10 +9,15 @@ LOCK := constraints.txt
 INSTALL = PIP_CONSTRAINT=$(LOCK) PIP_BUILD_CONSTRAINT=$(LOCK) $(BIN)/python -m pip install --quiet
 EXTRAS := cluster console dev docs fetch mcap pyrender
 
-.PHONY: help demo test newest setup lock clean
+CHECKED := tests/test_house.py tests/test_docs_commands.py tests/companion/test_config.py \
+	tests/localizer/geometry tests/localizer/integrity tests/localizer/tracking tests/companion/integrity_monitor \
+	tests/mavlink_bridge/injection tests/mavlink_bridge/vehicle
+
+.PHONY: help demo check test newest setup lock clean
 
 help:
 	@echo "make demo    fly without GNSS and write report/ (ARGS=\"--seed 1\": options of sitl demo)"
+	@echo "make check   lint and the fast tests of the core: two minutes"
 	@echo "make test    lint, types, tests: up to twenty minutes"
 	@echo "make newest  make test with the newest versions of all packages, in $(VENV)-newest"
 	@echo "make lock    write the newest versions into constraints.txt and constraints-gpu.txt"
@@ -21,6 +26,12 @@ help:
 
 demo: $(VENV)/.demo
 	$(BIN)/python -m sitl demo $(ARGS)
+
+# The fast tests of what a change is most likely to break.
+check: $(VENV)/.dev
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+	$(BIN)/python -m pytest --part=side-by-side --numprocesses=2 --dist=loadfile $(CHECKED) $(ARGS)
 
 test: $(VENV)/.dev
 	$(BIN)/ruff check .

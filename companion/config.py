@@ -10,8 +10,9 @@ from typing import Annotated, Any, Literal
 from pydantic import BaseModel, ConfigDict, Field, field_validator, model_validator
 
 from companion.errors import ConfigError
-from companion.guardian.config import GuardianConfig
+from companion.integrity_monitor.config import IntegrityMonitorConfig
 from companion.live.config import ConsoleConfig
+from companion.renamed_keys import with_current_keys
 from companion.settings_file import SettingsError, read_settings, validated
 from companion.sources.base import SourceSettings
 from companion.sources.zoom import ZoomTable
@@ -257,7 +258,7 @@ class CompanionConfig(_Model):
     bridge: BridgeConfig = BridgeConfig()
     targets: TargetConfig = TargetConfig()
     prior: PriorConfig = PriorConfig()
-    guardian: GuardianConfig = GuardianConfig()
+    integrity_monitor: IntegrityMonitorConfig = IntegrityMonitorConfig()
     record: RecordConfig | None = None
     klv: KlvConfig | None = Field(
         None, description="the camera's video on to a ground station, with metadata; null: not sent"
@@ -279,7 +280,7 @@ def load_config(path: Path) -> CompanionConfig:
 def parse_config(data: dict[str, Any], where: str) -> CompanionConfig:
     """Check a configuration given as plain data; `where` names it in errors."""
     try:
-        config = validated(CompanionConfig, data)
+        config = validated(CompanionConfig, with_current_keys(data, where))
         config.camera.model.camera()
     except SettingsError as error:
         count = len(str(error).splitlines())

@@ -10,7 +10,7 @@ import pytest
 
 from benchmarks.site.__main__ import outdated
 from benchmarks.site.kept import DATA, load
-from companion.guardian.findings import RULES
+from companion.integrity_monitor.alert_rules import RULES
 
 ROOT = Path(__file__).parents[1]
 PAGES = sorted(
@@ -72,7 +72,7 @@ def test_what_the_safety_page_names_exists_and_each_finding_is_on_it():
 def test_every_leaf_of_the_hazard_analysis_has_its_test_and_each_test_exists():
     page = (ROOT / "docs/safety.md").read_text(encoding="utf-8")
     rows = [line.split("|") for line in page.splitlines() if line.startswith("| ")]
-    leaves = [r for r in rows if len(r) == 8 and not r[1].strip().startswith(("**", "leaf"))]
+    leaves = [r for r in rows if len(r) == 8 and not r[1].strip().startswith(("**", "hazard"))]
     known = {p.stem for p in (ROOT / "tests").rglob("test_*.py")}
     known |= {p.stem for p in (ROOT / "sitl/scenarios").rglob("*.yaml")}
     known |= {"benchmarks." + p.name for p in (ROOT / "benchmarks").iterdir()}

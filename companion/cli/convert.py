@@ -20,7 +20,7 @@ from localizer.geometry.geo import Geodetic, LocalFrame
 from localizer.geometry.trajectory import StampedPose
 
 
-class Source(str, Enum):
+class InputFormat(str, Enum):
     """What is read."""
 
     POSES = "poses"
@@ -31,7 +31,7 @@ class Source(str, Enum):
     RECORD = "record"
 
 
-class Target(str, Enum):
+class OutputFormat(str, Enum):
     """What is written."""
 
     POSES = "poses"
@@ -53,8 +53,8 @@ def convert_command(
         Path, typer.Argument(help="a file; a folder for photos and for the record of a flight")
     ],
     out: Annotated[Path, typer.Argument(help="file to write; a folder of sidecars for photos")],
-    of: Annotated[Source, typer.Option("--from", help="format of the source")],
-    to: Annotated[Target, typer.Option("--to", help="format of the result")],
+    of: Annotated[InputFormat, typer.Option("--from", help="format of the source")],
+    to: Annotated[OutputFormat, typer.Option("--to", help="format of the result")],
     map_cache: Annotated[
         Path | None, typer.Option("--map", help="tile cache whose ENU frame is meant")
     ] = None,
@@ -73,7 +73,7 @@ def convert_command(
     ] = None,
 ) -> None:
     """Convert camera poses: pose lines, TUM, COLMAP, photos' tags, autopilot angles, records."""
-    from companion.convert.formats import READERS, WRITERS, Place
+    from companion.convert.formats import READERS, WRITERS, MapReference
     from companion.convert.photos import Heights
 
     frame, separation = _frame(map_cache, origin)
@@ -85,9 +85,9 @@ def convert_command(
             raise ConfigError("--heights amsl needs --geoid-separation or --map")
         above = Heights(heights.value, separation or 0.0)
     notes: list[str] = []
-    place = Place(frame, above, notes.append)
+    place = MapReference(frame, above, notes.append)
     with shown_work(Console(stderr=True), f"converting {source}"):
-        poses = _dated(READERS[of.value](source, place), times, needed=to is Target.TUM)
+        poses = _dated(READERS[of.value](source, place), times, needed=to is OutputFormat.TUM)
         with writing(out):
             WRITERS[to.value](out, poses, place)
     for note in notes:

@@ -7,8 +7,6 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
-from enum import Enum
 from pathlib import Path
 from typing import Any
 
@@ -16,96 +14,38 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from companion.errors import MissionFileError
 from localizer.plain_files import plain_text
+from mavlink_bridge.errors import MissionError
+from mavlink_bridge.mission.items import HeightAbove, MissionItem, MissionVehicle, UnreadItem
+from mavlink_bridge.mission.path import MissionPlace, PlannedMission, fly
+
+__all__ = ["HeightAbove", "MissionPlace", "PlannedMission", "read_mission"]
 
 # ArduPilot counts its commands in a signed 16-bit number (AP_Mission, MIS_TOTAL).
 _MOST_ITEMS = 32_767
 _MOST_BYTES = 16 << 20  # so many items take 8 MB
-_PLACES = (
-    mavlink.MAV_CMD_NAV_WAYPOINT,
-    mavlink.MAV_CMD_NAV_SPLINE_WAYPOINT,
-    mavlink.MAV_CMD_NAV_LOITER_UNLIM,
-    mavlink.MAV_CMD_NAV_LOITER_TIME,
-    mavlink.MAV_CMD_NAV_LOITER_TURNS,
-)
-_UNSET = (0.0, 0.0)  # coordinates that stand for where the vehicle is
-
-
-class HeightAbove(Enum):
-    """What an item's altitude is above."""
-
-    HOME = "home"
-    SEA = "mean sea level"
-    TERRAIN = "terrain"
-
-
-_FRAMES = {
-    mavlink.MAV_FRAME_GLOBAL: HeightAbove.SEA,
-    mavlink.MAV_FRAME_GLOBAL_INT: HeightAbove.SEA,
-    mavlink.MAV_FRAME_GLOBAL_RELATIVE_ALT: HeightAbove.HOME,
-    mavlink.MAV_FRAME_GLOBAL_RELATIVE_ALT_INT: HeightAbove.HOME,
-    mavlink.MAV_FRAME_GLOBAL_TERRAIN_ALT: HeightAbove.TERRAIN,
-    mavlink.MAV_FRAME_GLOBAL_TERRAIN_ALT_INT: HeightAbove.TERRAIN,
+_LANDING_PATTERNS = {
+    "fwLandingPattern": mavlink.MAV_CMD_NAV_LAND,
+    "vtolLandingPattern": mavlink.MAV_CMD_NAV_VTOL_LAND,
 }
-
-
-@dataclass(frozen=True)
-class Waypoint:
-    """A place to fly to. height_m: above what `above` says; pitch_deg: of the gimbal on the way
-    there, if said.
-    """
-
-    latitude_deg: float
-    longitude_deg: float
-    height_m: float
-    pitch_deg: float | None
-    above: HeightAbove = HeightAbove.HOME
-
-
-@dataclass(frozen=True)
-class PlannedMission:
-    """home: (latitude, longitude) degrees, if the file has it. speed_m_s: the last that is said.
-    returns: it ends with a return to home. ignored: numbers of commands that are not flown.
-    """
-
-    home: tuple[float, float] | None
-    waypoints: tuple[Waypoint, ...]
-    takeoff_height_m: float | None
-    speed_m_s: float | None
-    returns: bool
-    ignored: tuple[int, ...]
-
-
-@dataclass(frozen=True)
-class _Item:
-    command: int
-    frame: int
-    parameters: tuple[float, float, float, float]
-    latitude_deg: float
-    longitude_deg: float
-    altitude_m: float
-
-    @property
-    def place(self) -> tuple[float, float]:
-        return self.latitude_deg, self.longitude_deg
+_Items = list[MissionItem | UnreadItem]
 
 
 def read_mission(path: Path) -> PlannedMission:
     """Read either format; MissionFileError says what is wrong with a file."""
     try:
         text = plain_text(path, _MOST_BYTES)
-        home: tuple[float, float] | None
-        if path.suffix == ".plan":
-            home, items = _plan(json.loads(text))
-        else:
-            home, items = _waypoints(text)
+        read = _plan if text.lstrip()[:1] in ("{", "[") else _waypoints
+        home, items, vehicle, speed = read(text)
         if len(items) > _MOST_ITEMS:
             raise MissionFileError(
                 f"{path}: holds {len(items):,} items; an autopilot counts {_MOST_ITEMS:,} at the "
                 "most: split the mission"
             )
-        return _mission(path, home, items)
+        mission = fly(items, home, vehicle, speed)
     except OSError as error:
         raise MissionFileError(f"{path}: cannot be read: {error.strerror}") from error
+    except MissionError as error:
+        raise MissionFileError(f"{path}: {error}") from error
     # What a damaged or a foreign file raises while it is taken apart.
     except (
         ValueError, KeyError, TypeError, IndexError, AttributeError, OverflowError, RecursionError
@@ -113,122 +53,116 @@ def read_mission(path: Path) -> PlannedMission:
         raise MissionFileError(
             f"{path}: no .plan of QGroundControl and no QGC WPL 110 file ({error})"
         ) from error
+    if not mission.waypoints:
+        unknown = ", ".join(n.text for n in mission.not_judged)
+        but = f", and this cannot be followed before the flight: {unknown}" if unknown else ""
+        raise MissionFileError(f"{path}: holds no waypoint{but}")
+    return mission
 
 
-def _plan(document: dict[str, Any]) -> tuple[tuple[float, float], list[_Item]]:
-    mission = document["mission"]
-    home = mission["plannedHomePosition"]
-    items = [_plan_item(item) for entry in mission["items"] for item in _simple(entry)]
-    return (float(home[0]), float(home[1])), items
+_Read = tuple[tuple[float, float] | None, _Items, MissionVehicle, float | None]
 
 
-def _simple(entry: dict[str, Any]) -> Iterator[dict[str, Any]]:
-    """A simple item, or those that a complex one (a survey) was turned into when it was saved."""
+def _plan(text: str) -> _Read:
+    mission = json.loads(text)["mission"]
+    home = _home(mission["plannedHomePosition"])
+    autopilot, kind = (_whole(mission.get(key)) for key in ("firmwareType", "vehicleType"))
+    vehicle = MissionVehicle(autopilot, kind)
+    entries = [found for entry in mission["items"] for found in _expanded(entry)]
+    numbers = _numbers([_whole(entry.get("doJumpId")) for entry in entries])
+    items = [_plan_item(*one) for one in zip(entries, numbers, strict=True)]
+    speed = mission.get("hoverSpeed" if vehicle.is_multirotor else "cruiseSpeed")
+    return home, items, vehicle, float(speed) if speed and speed > 0 else None
+
+
+def _expanded(entry: dict[str, Any]) -> Iterator[dict[str, Any]]:
+    """A simple item; those that a survey or a corridor was turned into when it was saved; those
+    that QGroundControl makes of a landing pattern; else the entry itself, which is not read.
+    """
     if entry["type"] == "SimpleItem":
         yield entry
+        return
+    kind = str(entry.get("complexItemType"))
+    inner = entry.get("TransectStyleComplexItem", entry)
+    if kind in _LANDING_PATTERNS:
+        yield from _landing_pattern(entry, kind)
+    elif isinstance(inner.get("Items"), list) and inner["Items"]:
+        yield from inner["Items"]
     else:
-        yield from entry["TransectStyleComplexItem"]["Items"]
+        yield {"complexItemType": kind}
 
 
-def _plan_item(entry: dict[str, Any]) -> _Item:
-    numbers = [0.0 if p is None else float(p) for p in entry["params"]]
-    p1, p2, p3, p4, latitude, longitude, altitude = numbers
-    return _Item(
-        int(entry["command"]), int(entry["frame"]), (p1, p2, p3, p4), latitude, longitude, altitude
+def _landing_pattern(entry: dict[str, Any], kind: str) -> Iterator[dict[str, Any]]:
+    """Approach and landing (QGroundControl's LandingComplexItem). Older files name the approach
+    after the loiter, and say for each place what its altitude is above.
+    """
+    name = "landingApproachCoordinate"
+    approach = entry[name if name in entry else "loiterCoordinate"]
+    landing = entry["landCoordinate"]
+    relative = entry.get("altitudesAreRelative", True)
+    above_home, above_sea = mavlink.MAV_FRAME_GLOBAL_RELATIVE_ALT, mavlink.MAV_FRAME_GLOBAL
+    frames = [
+        above_home if entry.get(key, relative) else above_sea
+        for key in ("loiterAltitudeRelative", "landAltitudeRelative")
+    ]
+    loiters = entry.get("useLoiterToAlt", True)
+    radius = float(entry.get("loiterRadius", 0.0)) if loiters else 0.0
+    command = mavlink.MAV_CMD_NAV_LOITER_TO_ALT if loiters else mavlink.MAV_CMD_NAV_WAYPOINT
+    yield {"command": mavlink.MAV_CMD_DO_LAND_START, "frame": 2, "params": [0] * 7}
+    if entry.get("useDoChangeSpeed"):
+        speed = entry.get("finalApproachSpeed")
+        yield {
+            "command": mavlink.MAV_CMD_DO_CHANGE_SPEED, "frame": 2,
+            "params": [0, speed, -1, 0, 0, 0, 0],
+        }  # fmt: skip
+    yield {"command": command, "frame": frames[0], "params": [0, radius, 0, 0, *approach]}
+    yield {"command": _LANDING_PATTERNS[kind], "frame": frames[1], "params": [0] * 4 + landing}
+
+
+def _plan_item(entry: dict[str, Any], number: int) -> MissionItem | UnreadItem:
+    if "command" not in entry:
+        return UnreadItem(number, str(entry["complexItemType"]))
+    given = [*entry["params"], *entry.get("coordinate", ())]  # apart in the format's first version
+    p1, p2, p3, p4, x, y, z = (math.nan if p is None else float(p) for p in given)
+    return MissionItem(
+        number, int(entry["command"]), int(entry["frame"]), (p1, p2, p3, p4, x, y, z)
     )
 
 
-def _waypoints(text: str) -> tuple[tuple[float, float] | None, list[_Item]]:
+def _waypoints(text: str) -> _Read:
     """Rows of index, current, frame, command, four parameters, latitude, longitude, altitude,
     autocontinue; row 0 is home.
     """
     first, *lines = text.splitlines()
     if first.split() != ["QGC", "WPL", "110"]:
         raise ValueError(f"it begins with {first[:20]!r}")
-    items = []
-    for line in lines:
-        if not line.strip():
-            continue
-        cells = line.split()
-        p1, p2, p3, p4, latitude, longitude, altitude = (float(c) for c in cells[4:11])
-        items.append(
-            _Item(int(cells[3]), int(cells[2]), (p1, p2, p3, p4), latitude, longitude, altitude)
-        )
-    home = (items[0].latitude_deg, items[0].longitude_deg) if items else None
-    return (None if home == (0.0, 0.0) else home), items[1:]
+    rows = [line.split() for line in lines if line.strip()]
+    numbers = _numbers([int(cells[0]) for cells in rows[1:]])
+    items: _Items = []
+    for number, cells in zip([0, *numbers], rows, strict=False):
+        p1, p2, p3, p4, x, y, z = (float(c) for c in cells[4:11])
+        items.append(MissionItem(number, int(cells[3]), int(cells[2]), (p1, p2, p3, p4, x, y, z)))
+    home = _home([float(c) for c in rows[0][8:10]]) if rows else None
+    return home, items[1:], MissionVehicle(), None
 
 
-def _mission(
-    path: Path, home: tuple[float, float] | None, items: Sequence[_Item]
-) -> PlannedMission:
-    waypoints: list[Waypoint] = []
-    takeoff = speed = pitch = None
-    returns, ignored = False, []
-    for item in items:
-        if item.command == mavlink.MAV_CMD_NAV_TAKEOFF:
-            above_home = _FRAMES.get(item.frame) is HeightAbove.HOME
-            takeoff = item.altitude_m if above_home else None
-        elif item.command in _PLACES:
-            before = waypoints[-1] if waypoints else _begun(home, takeoff)
-            waypoints.append(_waypoint(path, _filled(item, before), pitch, len(waypoints) + 1))
-        elif item.command == mavlink.MAV_CMD_NAV_LAND:
-            if waypoints and item.place != _UNSET:  # it is flown to, and then down
-                there = _level(item, waypoints[-1])
-                waypoints.append(_waypoint(path, there, pitch, len(waypoints) + 1))
-        elif item.command == mavlink.MAV_CMD_NAV_RETURN_TO_LAUNCH:
-            returns = True
-        elif item.command == mavlink.MAV_CMD_DO_CHANGE_SPEED:
-            speed = item.parameters[1]
-        elif item.command in (
-            mavlink.MAV_CMD_DO_GIMBAL_MANAGER_PITCHYAW,
-            mavlink.MAV_CMD_DO_MOUNT_CONTROL,
-        ):
-            pitch = item.parameters[0]
-        else:
-            ignored.append(item.command)
-    if home is not None and not _is_on_earth(*home):
-        raise ValueError(f"home is no place: {home}")
-    if not waypoints:
-        raise MissionFileError(f"{path}: holds no waypoint")
-    return PlannedMission(home, tuple(waypoints), takeoff, speed, returns, tuple(ignored))
+def _numbers(stated: Sequence[int | None]) -> Sequence[int]:
+    """As a jump names them: as stated, or counted from 1 where that does not tell them apart."""
+    known = [number for number in stated if number is not None]
+    if len(set(known)) == len(stated):
+        return known
+    return range(1, len(stated) + 1)
 
 
-def _begun(home: tuple[float, float] | None, takeoff_m: float | None) -> Waypoint | None:
-    """Where the vehicle is before the first place; None where the file does not say."""
-    return None if home is None else Waypoint(*home, takeoff_m or 0.0, None)
+def _home(place: Sequence[Any]) -> tuple[float, float] | None:
+    """Degrees; None where it was never set: 0, 0 or nothing."""
+    latitude, longitude = (math.nan if p is None else float(p) for p in place[:2])
+    if (latitude, longitude) == (0, 0) or (math.isnan(latitude) and math.isnan(longitude)):
+        return None
+    if not (abs(latitude) <= 90.0 and abs(longitude) <= 360.0):
+        raise ValueError(f"home is no place: {(latitude, longitude)}")
+    return latitude, longitude
 
 
-def _filled(item: _Item, before: Waypoint | None) -> _Item:
-    """With what is not set, coordinates or an altitude of zero, as it is where the vehicle is, as
-    ArduPilot has it (ModeAuto::loc_from_cmd).
-    """
-    if before is None:
-        return item
-    if item.place == _UNSET:
-        latitude, longitude = before.latitude_deg, before.longitude_deg
-        item = replace(item, latitude_deg=latitude, longitude_deg=longitude)
-    return item if item.altitude_m else _level(item, before)
-
-
-def _level(item: _Item, before: Waypoint) -> _Item:
-    """At the height of the waypoint before it."""
-    frame = next(f for f, above in _FRAMES.items() if above is before.above)
-    return replace(item, altitude_m=before.height_m, frame=frame)
-
-
-def _waypoint(path: Path, item: _Item, pitch: float | None, number: int) -> Waypoint:
-    place = (item.latitude_deg, item.longitude_deg, item.altitude_m)
-    if not (_is_on_earth(*place[:2]) and math.isfinite(item.altitude_m)):
-        raise ValueError(f"waypoint {number} is no place: {place}")
-    if pitch is not None and not math.isfinite(pitch):
-        raise ValueError(f"the gimbal's pitch before waypoint {number} is no angle: {pitch}")
-    if item.frame not in _FRAMES:
-        raise MissionFileError(
-            f"{path}: waypoint {number} in frame {item.frame}; known are {sorted(_FRAMES)} "
-            "(MAV_FRAME): save the mission with global coordinates"
-        )
-    return Waypoint(*place, pitch, _FRAMES[item.frame])
-
-
-def _is_on_earth(latitude_deg: float, longitude_deg: float) -> bool:
-    return abs(latitude_deg) <= 90.0 and abs(longitude_deg) <= 360.0  # NaN is not either
+def _whole(value: Any) -> int | None:
+    return int(value) if isinstance(value, int | float) and math.isfinite(value) else None

@@ -8,8 +8,8 @@ from html import escape
 from pathlib import Path
 from typing import Any
 
-from companion.planning.judge import LegVerdict, Stretch
-from companion.planning.plan import Plan
+from companion.planning.judge import LegVerdict, VisionGap
+from companion.planning.plan import MissionForecast
 from companion.reporting.layout import data_uri
 from companion.writing import writing
 from localizer.types import Image
@@ -30,20 +30,23 @@ STRETCH_HEADINGS = ("from m", "to m", "length m", "seconds", "drift m", "odometr
 INSTEAD_HEADINGS = ("leg", "fly", "lost or wrong", "sigma m", "holds then")
 
 
-def verdict_words(plan: Plan) -> str:
+def verdict_words(plan: MissionForecast) -> str:
     """The answer in a sentence."""
     bad = [v for v in plan.verdicts if not v.holds]
-    limits = plan.question.limits
-    if not bad:
-        return (
-            f"Vision should hold on all {len(plan.verdicts)} legs "
-            f"({plan.length_m / 1000:.1f} km), sigma below {limits.sigma_m:g} m."
+    count, limit = len(plan.verdicts), plan.question.limits.sigma_m
+    if bad:
+        lost = sum(s.length_m for s in plan.stretches)
+        said = (
+            f"Vision will not do on {len(bad)} of {count} legs: {lost:.0f} of "
+            f"{plan.length_m:.0f} m have to be bridged or flown otherwise"
         )
-    lost = sum(s.length_m for s in plan.stretches)
-    return (
-        f"Vision will not do on {len(bad)} of {len(plan.verdicts)} legs: {lost:.0f} of "
-        f"{plan.length_m:.0f} m have to be bridged or flown otherwise."
-    )
+    else:
+        which = f"the {count} legs that could be judged" if plan.not_judged else f"all {count} legs"
+        said = (
+            f"Vision should hold on {which} ({plan.length_m / 1000:.1f} km), sigma below "
+            f"{limit:g} m"
+        )
+    return said + (f". Not judged: {'; '.join(plan.not_judged)}." if plan.not_judged else ".")
 
 
 def leg_row(verdict: LegVerdict) -> tuple[str, ...]:
@@ -51,7 +54,7 @@ def leg_row(verdict: LegVerdict) -> tuple[str, ...]:
     worst = verdict.worst
     forecast = worst.forecast
     return (
-        verdict.leg.name,
+        verdict.leg.name + (f" (x {verdict.times})" if verdict.times > 1 else ""),
         f"{verdict.leg.length_m:.0f}",
         f"{100 * verdict.share:.0f} %",
         "none" if math.isnan(verdict.sigma_m) else f"{verdict.sigma_m:.2f}",
@@ -63,7 +66,7 @@ def leg_row(verdict: LegVerdict) -> tuple[str, ...]:
     )
 
 
-def stretch_row(stretch: Stretch) -> tuple[str, ...]:
+def stretch_row(stretch: VisionGap) -> tuple[str, ...]:
     """A stretch as cells."""
     return (
         f"{stretch.begin_m:.0f}",
@@ -75,7 +78,7 @@ def stretch_row(stretch: Stretch) -> tuple[str, ...]:
     )
 
 
-def instead_rows(plan: Plan) -> list[tuple[str, ...]]:
+def instead_rows(plan: MissionForecast) -> list[tuple[str, ...]]:
     """What would do instead, as cells."""
     return [
         (
@@ -89,7 +92,7 @@ def instead_rows(plan: Plan) -> list[tuple[str, ...]]:
     ]
 
 
-def as_data(plan: Plan) -> dict[str, Any]:
+def as_data(plan: MissionForecast) -> dict[str, Any]:
     """For other programs: what was asked, and every leg, sample and stretch."""
     q = plan.question
     return {
@@ -98,12 +101,14 @@ def as_data(plan: Plan) -> dict[str, Any]:
         "sigma_limit_m": q.limits.sigma_m,
         "risk_limit": q.limits.risk,
         "holds": plan.holds,
+        "not_judged": list(plan.not_judged),
         "length_m": plan.length_m,
         "speed_m_s": plan.speed_m_s,
         "legs": [
             {
                 "name": v.leg.name,
                 "length_m": v.leg.length_m,
+                "times": v.times,
                 "holds": v.holds,
                 "samples": [
                     {
@@ -134,7 +139,7 @@ def as_data(plan: Plan) -> dict[str, Any]:
     }
 
 
-def write_page(plan: Plan, pictures: Sequence[tuple[str, Image]], path: Path) -> None:
+def write_page(plan: MissionForecast, pictures: Sequence[tuple[str, Image]], path: Path) -> None:
     """Write the page. ReportError where it cannot be written."""
     q = plan.question
     shown = "".join(
@@ -144,7 +149,7 @@ def write_page(plan: Plan, pictures: Sequence[tuple[str, Image]], path: Path) ->
     bad = {k for k, v in enumerate(plan.verdicts) if not v.holds}
     body = (
         f"<h1>Forecast of {escape(q.mission_file.name)}</h1>"
-        f"<p class='verdict {'no' if bad else 'ok'}'>{escape(verdict_words(plan))}</p>"
+        f"<p class='verdict {'ok' if plan.holds else 'no'}'>{escape(verdict_words(plan))}</p>"
         f"<p>Under {escape(', '.join(q.conditions))}; sigma to {q.limits.sigma_m:g} m, at most "
         f"{100 * q.limits.risk:.0f} % of the pictures lost or more than 1 m wrong.</p>"
         + "<h2>Legs</h2>"

@@ -2,16 +2,18 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 from companion.config import CompanionConfig
 from companion.geometry import Mount
 from companion.planning.instead import Instead, instead
-from companion.planning.judge import LegVerdict, Limits, Stretch, stretches
+from companion.planning.judge import LegVerdict, MissionLimits, VisionGap, stretches
 from companion.planning.mission import PlannedMission
 from companion.planning.survey import Progress, surveyor
-from companion.planning.way import Aim, Ground, legs_of, length_m
+from companion.planning.way import Aim, FlightLeg, MapHeights, legs_of, length_m
 from localizer.map.cache.cache import TileCache
 from localizer.odometry.config import OdometryConfig
 
@@ -29,7 +31,7 @@ class Question:
 
     mission_file: Path
     conditions: tuple[str, ...] = ("day",)
-    limits: Limits = field(default_factory=Limits)
+    limits: MissionLimits = field(default_factory=MissionLimits)
     spacing_m: float = 25.0
     speed_m_s: float = DEFAULT_SPEED_M_S
     pitch_deg: float = DEFAULT_PITCH_DEG
@@ -37,21 +39,25 @@ class Question:
 
 
 @dataclass(frozen=True)
-class Plan:
-    """The answer. notes: what the forecast does not know of this mission, as sentences."""
+class MissionForecast:
+    """The answer. length_m: of all that is flown; verdicts: of each leg once, however often it is
+    flown; not_judged: what of the mission is not in it, by its MAVLink names; notes: what the
+    forecast does not know of this mission, as sentences.
+    """
 
     question: Question
     length_m: float
     speed_m_s: float
     verdicts: tuple[LegVerdict, ...]
-    stretches: tuple[Stretch, ...]
+    stretches: tuple[VisionGap, ...]
     instead: tuple[Instead, ...]
     notes: tuple[str, ...]
+    not_judged: tuple[str, ...] = ()
 
     @property
     def holds(self) -> bool:
-        """Whether vision will do on every leg."""
-        return all(v.holds for v in self.verdicts)
+        """Whether the whole mission was judged, and vision will do on every leg."""
+        return not self.not_judged and all(v.holds for v in self.verdicts)
 
 
 def aim_of(deployment: CompanionConfig, pitch_deg: float) -> Aim:
@@ -72,41 +78,69 @@ def make_plan(
     deployment: CompanionConfig,
     question: Question,
     progress: Progress | None = None,
-) -> Plan:
+) -> MissionForecast:
     """Forecast every leg, say what must be bridged, and look for what would do instead."""
     aim = aim_of(deployment, question.pitch_deg)
-    ground = Ground(cache)
+    ground = MapHeights(cache)
     legs = legs_of(mission, cache, ground, aim, question.spacing_m)
-    thinned = length_m(legs) / _MOST_SAMPLES
+    thinned = length_m(_once(legs)) / _MOST_SAMPLES
     if thinned > question.spacing_m:
         legs = legs_of(mission, cache, ground, aim, thinned)
-    samples = [s for leg in legs for s in leg.samples]
+    samples = [s for leg in _once(legs) for s in leg.samples]
 
     with surveyor(cache, deployment, aim, question.conditions, question.limits) as found:
         judged = iter(found.judged(samples, progress))
-        verdicts = tuple(LegVerdict(leg, tuple(next(judged) for _ in leg.samples)) for leg in legs)
+        times = Counter(leg.first for leg in legs)
+        verdicts = tuple(
+            LegVerdict(leg, tuple(next(judged) for _ in leg.samples), times[leg.first])
+            for leg in _once(legs)
+        )
         options = instead(found, verdicts, aim.fixed, progress) if question.seek else ()
     odometry = deployment.localizer.odometry or OdometryConfig()
-    speed = mission.speed_m_s if (mission.speed_m_s or 0) > 0 else None
-    speed_m_s = speed or question.speed_m_s
-    bridged = stretches(verdicts, speed_m_s, odometry)
+    speed_m_s = mission.speed_m_s or question.speed_m_s
+    bridged = stretches(_as_flown(legs, verdicts), speed_m_s, odometry)
     notes = _notes(mission, deployment, aim, max(thinned, question.spacing_m))
-    return Plan(question, length_m(legs), speed_m_s, verdicts, bridged, options, notes)
+    unknown = tuple(n.text for n in mission.not_judged if not (aim.fixed and n.gimbal_only))
+    length = length_m(legs)
+    return MissionForecast(question, length, speed_m_s, verdicts, bridged, options, notes, unknown)
+
+
+def _once(legs: Sequence[FlightLeg]) -> list[FlightLeg]:
+    """The legs without those that were flown alike before."""
+    return [leg for number, leg in enumerate(legs) if leg.first == number]
+
+
+def _as_flown(legs: Sequence[FlightLeg], verdicts: Sequence[LegVerdict]) -> list[LegVerdict]:
+    """A verdict for each leg, in the order in which they are flown."""
+    of = {verdict.leg.first: verdict for verdict in verdicts}
+    return [
+        LegVerdict(
+            leg,
+            tuple(
+                replace(judged, sample=sample)
+                for judged, sample in zip(of[leg.first].judged, leg.samples, strict=True)
+            ),
+        )
+        for leg in legs
+    ]
 
 
 def _notes(
     mission: PlannedMission, deployment: CompanionConfig, aim: Aim, spacing_m: float
 ) -> tuple[str, ...]:
-    notes = [f"A place every {spacing_m:.0f} m; legs are flown straight, turns are left out."]
+    notes = [
+        f"A place every {spacing_m:.0f} m; legs are flown straight, turns and circles are left out."
+    ]
     if aim.fixed:
         notes.append("The camera is screwed on and the vehicle flown level: it leans in flight.")
-    elif all(w.pitch_deg is None for w in mission.waypoints):
+    elif all(w.gimbal.pitch_deg is None and w.gimbal.roi is None for w in mission.path):
         notes.append(f"The mission moves no gimbal: taken at {aim.pitch_deg:.0f}°.")
     if mission.home is None:
-        notes.append("The mission has no home: heights are taken above its first waypoint.")
-    if mission.ignored:
-        numbers = ", ".join(str(n) for n in sorted(set(mission.ignored)))
-        notes.append(f"Commands that are not flown here: {numbers}.")
+        notes.append("The mission has no home: heights are taken above its first place.")
+    notes += mission.notes
+    if mission.no_effect:
+        names = ", ".join(sorted(mission.no_effect))
+        notes.append(f"Commands that change neither way nor view: {names}.")
     if deployment.localizer.odometry is None:
         notes.append("Odometry is off in this deployment: nothing bridges a stretch.")
     return tuple(notes)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 
@@ -17,16 +18,17 @@ from companion.geometry import (
     ned_from_world,
     world_from_camera,
 )
-from companion.planning.mission import HeightAbove, PlannedMission, Waypoint
+from companion.planning.course import Course, spline, straight
+from companion.planning.mission import HeightAbove, MissionPlace, PlannedMission
 from localizer.geometry.antimeridian import geo_box
 from localizer.geometry.pose import Array, Pose, matrix_from_euler
 from localizer.map.cache.cache import TileCache
 from localizer.map.cache.surface import MapSurface
+from mavlink_bridge.mission.gimbal import GimbalTarget, RegionOfInterest
 
 LEAST_LEG_M = 1.0  # shorter ones are climbs on the spot
 # A ray that falls just between two tiles may miss both: some beside it do not.
 _DOWN = np.array([[x, y, -1.0] for x, y in ((0, 0), (1e-3, 4e-4), (-4e-4, 1e-3), (-1e-3, -6e-4))])
-_EARTH_M = 6.371e6
 _FARTHEST_KM = 500.0  # from the map: beyond it a digit is wrong
 
 
@@ -42,9 +44,9 @@ class Aim:
 
 
 @dataclass(frozen=True)
-class Sample:
+class PathSample:
     """A place on the way. position: (3,) of the vehicle, world metres; way_m: flown until there;
-    turn_deg: of the camera to the right of the way (an alternative's).
+    turn_deg: of the camera to the right of the way.
     """
 
     position: Array
@@ -55,68 +57,90 @@ class Sample:
 
 
 @dataclass(frozen=True)
-class Leg:
-    """A straight way between two places. name: as the ground station numbers them, "home" too;
-    step_m: of the way that each sample stands for.
+class FlightLeg:
+    """The way between two places. name: of their numbers, "home" and "take-off" too; step_m:
+    of the way that each sample stands for; speed_m_s: None where the mission does not say; first:
+    index of the first leg that is flown alike, its own where there is none before it.
     """
 
     name: str
     length_m: float
     step_m: float
-    samples: tuple[Sample, ...]
+    samples: tuple[PathSample, ...]
+    speed_m_s: float | None = None
+    first: int = 0
 
 
-class Ground:
+class MapHeights:
     """Heights of the map's surface."""
 
     def __init__(self, cache: TileCache) -> None:
         self._surface = MapSurface(cache)
         self._top_m = float(cache.index.box_max[0, 2]) + 1.0
+        self._known: dict[tuple[float, float], float | None] = {}
 
     def height_m(self, east_m: float, north_m: float) -> float | None:
         """World z (m) of the highest surface there; None beside the map and in its holes."""
+        place = east_m, north_m
+        if place not in self._known:
+            self._known[place] = self._measured(east_m, north_m)
+        return self._known[place]
+
+    def _measured(self, east_m: float, north_m: float) -> float | None:
         eye = np.array([east_m, north_m, self._top_m])
         hits = self._surface.cast(eye, _DOWN).distances
         return self._top_m - float(np.nanmin(hits)) if np.isfinite(hits).any() else None
 
 
 def legs_of(
-    mission: PlannedMission, cache: TileCache, ground: Ground, aim: Aim, spacing_m: float
-) -> tuple[Leg, ...]:
-    """The legs between home, the waypoints and, if it returns, home; a sample every so many metres.
+    mission: PlannedMission, cache: TileCache, ground: MapHeights, aim: Aim, spacing_m: float
+) -> tuple[FlightLeg, ...]:
+    """The legs in the order in which they are flown, those to places whose way is not known left
+    out; a sample every so many metres.
 
     MissionFileError where the mission does not say how high it flies over the map.
     """
-    home = _home(mission, cache)
-    places = [(f"{k}", w) for k, w in enumerate(mission.waypoints, 1)]
-    if mission.home is not None:
-        latitude, longitude = mission.home
-        at_home = replace(mission.waypoints[0], latitude_deg=latitude, longitude_deg=longitude)
-        if mission.waypoints[0].above is HeightAbove.HOME:
-            at_home = replace(
-                at_home, height_m=mission.takeoff_height_m or mission.waypoints[0].height_m
-            )
-        places.insert(0, ("home", at_home))
-        if mission.returns:
-            last = mission.waypoints[-1]
-            back = replace(last, latitude_deg=latitude, longitude_deg=longitude)
-            places.append(("home", back))
-    points = [_position(w, cache, ground, home) for _, w in places]
-    legs, way_m = [], 0.0
-    for (start, end), (a, b) in zip(
-        itertools.pairwise(places), itertools.pairwise(points), strict=True
-    ):
-        pitch = aim.pitch_deg if end[1].pitch_deg is None else end[1].pitch_deg
-        leg = _leg(f"{start[0]} to {end[0]}", (a, b), pitch, (way_m, spacing_m))
-        if leg is not None:
-            legs.append(leg)
-            way_m += leg.length_m
+    site = _Site(cache, ground, _launch(mission, cache))
+    path = [replace(p, after_gap=False) for p in mission.path]
+    positions = [site.position(p) for p in path]
+    legs: list[FlightLeg] = []
+    firsts: dict[tuple[Any, ...], FlightLeg] = {}
+    way_m, leaves = 0.0, np.zeros(3)
+    for k, (start, end) in enumerate(itertools.pairwise(path)):
+        if mission.path[k + 1].after_gap:
+            leaves = np.zeros(3)
+            continue
+        beyond = path[k + 2] if k + 2 < len(path) else None
+        here, there = positions[k], positions[k + 1]
+        course = straight(here, there)
+        if end.curved:
+            after, curved = (None, False) if beyond is None else (positions[k + 2], beyond.curved)
+            course = spline(here, there, leaves, after, curved_on=curved)
+        arrived, leaves = leaves, course.leaves
+        if course.length_m < LEAST_LEG_M:  # a climb on the spot
+            leaves = np.zeros(3)
+            continue
+        alike = (start.name, start.latitude_deg, start.longitude_deg, start.height_m, end)
+        key = (*alike, *arrived, beyond) if end.curved else alike
+        if key not in firsts:
+            name = f"{start.name} to {end.name}"
+            firsts[key] = replace(_leg(name, end, course, site, aim, spacing_m), first=len(legs))
+        legs.append(_later(firsts[key], way_m))
+        way_m += course.length_m
     if not legs:
         raise MissionFileError("the mission goes nowhere: its places lie on one another")
     return tuple(legs)
 
 
-def camera_pose(sample: Sample, cache: TileCache, aim: Aim) -> Pose:
+def _later(leg: FlightLeg, begun_m: float) -> FlightLeg:
+    """The leg, flown after so much of the way."""
+    samples = tuple(
+        replace(s, way_m=begun_m + (k + 0.5) * leg.step_m) for k, s in enumerate(leg.samples)
+    )
+    return replace(leg, samples=samples)
+
+
+def camera_pose(sample: PathSample, cache: TileCache, aim: Aim) -> Pose:
     """The camera's pose (world) of a level vehicle that flies along its way."""
     to_ned = ned_from_world(cache.frame, cache.frame.position(sample.position))
     body = matrix_from_euler(0.0, 0.0, float(np.radians(sample.heading_deg)))
@@ -130,36 +154,55 @@ def camera_pose(sample: Sample, cache: TileCache, aim: Aim) -> Pose:
     return world_from_camera(sample.position, body, attitude, aim.mount.lever_arm_m, to_ned)
 
 
+@dataclass(frozen=True)
+class _Site:
+    """What turns places into positions. launch: (east, north) where heights above home begin."""
+
+    cache: TileCache
+    ground: MapHeights
+    launch: tuple[float, float]
+
+    def position(self, place: MissionPlace | RegionOfInterest) -> Array:
+        """World position (3,)."""
+        return _position(place, self.cache, self.ground, self.launch)
+
+
 def _leg(
-    name: str, ends: tuple[Array, Array], pitch_deg: float, way: tuple[float, float]
-) -> Leg | None:
-    """None for a climb on the spot. way: flown before it, and the samples' spacing, m."""
-    start, end = ends
-    east, north = (end - start)[:2]
-    length = float(np.hypot(east, north))
-    if length < LEAST_LEG_M:
-        return None
-    begun_m, spacing_m = way
-    count = max(round(length / spacing_m), 1)
-    heading = float(np.degrees(np.arctan2(east, north)) % 360.0)
-    shares = (np.arange(count) + 0.5) / count
-    samples = tuple(
-        Sample(_on_the_way(start, end, s), begun_m + s * length, heading, pitch_deg)
-        for s in map(float, shares)
-    )
-    return Leg(name, length, length / count, samples)
+    name: str, end: MissionPlace, course: Course, site: _Site, aim: Aim, spacing_m: float
+) -> FlightLeg:
+    """Its samples, as if it were flown first."""
+    count = max(round(course.length_m / spacing_m), 1)
+    step_m = course.length_m / count
+    looked_at = None if end.gimbal.roi is None else site.position(end.gimbal.roi)
+    samples = []
+    for share in map(float, (np.arange(count) + 0.5) / count):
+        position, heading = course.at(share)
+        pitch, turn = _look(end.gimbal, aim, position, heading, looked_at)
+        samples.append(PathSample(position, share * course.length_m, heading, pitch, turn))
+    return FlightLeg(name, course.length_m, step_m, tuple(samples), end.speed_m_s)
 
 
-def _on_the_way(start: Array, end: Array, share: float) -> Array:
-    """A place (3,) on a leg, as high above the Earth as between its ends: a chord lies below."""
-    east, north, _ = end - start
-    bulge = 0.5 * share * (1.0 - share) * (east * east + north * north) / _EARTH_M
-    return np.asarray(start + share * (end - start) + (0.0, 0.0, bulge))
+def _look(
+    gimbal: GimbalTarget, aim: Aim, position: Array, heading_deg: float, looked_at: Array | None
+) -> tuple[float, float]:
+    """Pitch, and turn to the right of the way, degrees. A vehicle without a gimbal turns to a
+    region of interest itself, as ArduCopter does.
+    """
+    pitch = aim.pitch_deg if gimbal.pitch_deg is None else gimbal.pitch_deg
+    if looked_at is not None:
+        east, north, up = looked_at - position
+        pitch = float(np.degrees(np.arctan2(up, np.hypot(east, north))))
+        turn = float(np.degrees(np.arctan2(east, north))) - heading_deg
+    elif aim.fixed:
+        turn = 0.0
+    else:
+        turn = gimbal.yaw_deg - (heading_deg if gimbal.from_north else 0.0)
+    return pitch, (turn + 180.0) % 360.0 - 180.0
 
 
-def _home(mission: PlannedMission, cache: TileCache) -> tuple[float, float]:
-    """(east, north) of home, or of the first waypoint where the file has no home."""
-    first = mission.waypoints[0]
+def _launch(mission: PlannedMission, cache: TileCache) -> tuple[float, float]:
+    """(east, north) of home, or of the first place where the mission has no home."""
+    first = mission.path[0]
     latitude, longitude = mission.home or (first.latitude_deg, first.longitude_deg)
     east, north = _enu(latitude, longitude, cache)
     if np.hypot(east, north) > 1000.0 * _FARTHEST_KM:
@@ -178,9 +221,12 @@ def _enu(latitude_deg: float, longitude_deg: float, cache: TileCache) -> tuple[f
 
 
 def _position(
-    waypoint: Waypoint, cache: TileCache, ground: Ground, home: tuple[float, float]
+    waypoint: MissionPlace | RegionOfInterest,
+    cache: TileCache,
+    ground: MapHeights,
+    home: tuple[float, float],
 ) -> Array:
-    """World position (3,) of a waypoint."""
+    """World position (3,) of a place."""
     if waypoint.above is HeightAbove.SEA:
         height = waypoint.height_m + cache.manifest.geoid_separation_m
         return np.asarray(
@@ -214,6 +260,6 @@ def _extent(cache: TileCache, below: tuple[float, float]) -> str:
     return f"{geo_box(cache.manifest.extent).line()}; it is {away_m:.0f} m away"
 
 
-def length_m(legs: Sequence[Leg]) -> float:
+def length_m(legs: Sequence[FlightLeg]) -> float:
     """Of all legs."""
     return sum(leg.length_m for leg in legs)

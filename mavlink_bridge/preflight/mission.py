@@ -6,14 +6,17 @@ https://mavlink.io/en/services/mission.html
 from __future__ import annotations
 
 import time
+from collections.abc import Sequence
 from typing import Any
 
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from mavlink_bridge.config import BridgeConfig
 from mavlink_bridge.errors import MissionError
+from mavlink_bridge.mission.items import FRAMES
+from mavlink_bridge.mission.path import fly
 from mavlink_bridge.preflight.client import VehicleClient
-from mavlink_bridge.vehicle.mission import Waypoint, place_of
+from mavlink_bridge.vehicle.mission import MissionWaypoint, item_of, place_of
 
 _RETRIES = 5
 _ANSWER_S = 1.0
@@ -25,7 +28,7 @@ _WANTED = (
 )
 
 
-class MissionClient(VehicleClient):
+class MissionDownloader(VehicleClient):
     """Downloads the mission. A context manager."""
 
     def __init__(self, config: BridgeConfig) -> None:
@@ -34,8 +37,10 @@ class MissionClient(VehicleClient):
         self._items: dict[int, Any] = {}
         self._refusal: int | None = None
 
-    def download(self) -> list[Waypoint]:
-        """The places of the mission in order; MissionError when it is not handed over."""
+    def download(self) -> list[MissionWaypoint]:
+        """Home and the places of the mission in the order in which they are flown to; MissionError
+        when it is not handed over.
+        """
         self._count, self._refusal = None, None
         self._items.clear()
         self._repeat(
@@ -57,8 +62,7 @@ class MissionClient(VehicleClient):
                 f"item {number}",
             )
         self.ask(mavlink.MAVLink_mission_ack_message(self.system, self.component, 0))
-        items = [self._items[number] for number in range(count)]
-        return [place for item in items if (place := place_of(item)) is not None]
+        return _as_flown([self._items[number] for number in range(count)])
 
     def _repeat(self, question: Any, answered: Any, what: str) -> None:
         for _ in range(_RETRIES):
@@ -82,7 +86,21 @@ class MissionClient(VehicleClient):
             self._refusal = message.type
 
 
-def download_mission(config: BridgeConfig) -> list[Waypoint]:
+def _as_flown(messages: Sequence[Any]) -> list[MissionWaypoint]:
+    """Of MISSION_ITEM_INT messages, the first of which is home. Places in metres are left out."""
+    home = place_of(messages[0]) if messages else None
+    items = [item_of(m) for m in messages[1:] if not _is_local(m)]
+    place = None if home is None else (home.latitude_deg, home.longitude_deg)
+    flown = fly(items, place).path
+    places = [MissionWaypoint(p.item, p.latitude_deg, p.longitude_deg) for p in flown if p.item > 0]
+    return places if home is None else [home, *places]
+
+
+def _is_local(message: Any) -> bool:
+    return message.command <= mavlink.MAV_CMD_NAV_LAST and message.frame not in FRAMES
+
+
+def download_mission(config: BridgeConfig) -> list[MissionWaypoint]:
     """The places of the mission that the flight controller at `config.connection` holds."""
-    with MissionClient(config) as client:
+    with MissionDownloader(config) as client:
         return client.download()

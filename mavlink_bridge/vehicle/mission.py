@@ -13,6 +13,7 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 from mavlink_bridge.errors import MissionError
 from mavlink_bridge.link.link import Link
 from mavlink_bridge.messages import VehicleState
+from mavlink_bridge.mission.items import FLOWN_TO, FRAMES, WITH_PLACE, MissionItem
 
 MISSION_IN = ("MISSION_COUNT", "MISSION_ITEM_INT", "MISSION_ACK")
 _POLE = 900_000_000  # 1e-7 degrees
@@ -22,20 +23,10 @@ _MOST = 2000  # items; beyond that it is not read in flight
 _COUNT_EVERY_NS = 10_000_000_000
 _ANSWER_NS = 1_000_000_000
 _TRIES = 5
-_GLOBAL_FRAMES = frozenset(
-    (
-        mavlink.MAV_FRAME_GLOBAL,
-        mavlink.MAV_FRAME_GLOBAL_RELATIVE_ALT,
-        mavlink.MAV_FRAME_GLOBAL_INT,
-        mavlink.MAV_FRAME_GLOBAL_RELATIVE_ALT_INT,
-        mavlink.MAV_FRAME_GLOBAL_TERRAIN_ALT,
-        mavlink.MAV_FRAME_GLOBAL_TERRAIN_ALT_INT,
-    )
-)
 
 
 @dataclass(frozen=True)
-class Waypoint:
+class MissionWaypoint:
     """A place that the mission flies to. number: of the item; 0 is home in ArduPilot."""
 
     number: int
@@ -43,19 +34,30 @@ class Waypoint:
     longitude_deg: float
 
 
-def place_of(item: Any) -> Waypoint | None:
+def place_of(item: Any) -> MissionWaypoint | None:
     """Where a MISSION_ITEM_INT is flown to; None for other commands, and where 0, 0 or the unset
     value mean the place where the vehicle is. MissionError for what is no place on Earth.
     """
-    flown = item.seq == 0 or item.command <= mavlink.MAV_CMD_NAV_LAST
-    if not flown or item.frame not in _GLOBAL_FRAMES or (item.x, item.y) in _HERE:
+    flown = item.seq == 0 or item.command in FLOWN_TO
+    if not flown or item.frame not in FRAMES or (item.x, item.y) in _HERE:
         return None
     if abs(item.x) > _POLE or abs(item.y) > 2 * _POLE:
         raise MissionError(
             f"item {item.seq} of the mission lies at {item.x * 1e-7:g}, {item.y * 1e-7:g} degrees, "
             "which is no place on Earth; load the mission into the vehicle again"
         )
-    return Waypoint(item.seq, item.x * 1e-7, item.y * 1e-7)
+    return MissionWaypoint(item.seq, item.x * 1e-7, item.y * 1e-7)
+
+
+def item_of(message: Any) -> MissionItem:
+    """A MISSION_ITEM_INT as an item: a command with a place has it in 1e-7 degrees."""
+    x, y = float(message.x), float(message.y)
+    if (message.x, message.y) in _HERE:
+        x = y = 0.0
+    elif message.command in WITH_PLACE:
+        x, y = x * 1e-7, y * 1e-7
+    parameters = (message.param1, message.param2, message.param3, message.param4, x, y, message.z)
+    return MissionItem(message.seq, message.command, message.frame, parameters)
 
 
 class MissionWatch:
@@ -70,11 +72,11 @@ class MissionWatch:
     def __init__(self, component: int) -> None:
         self._component = component
         self.wanted = False
-        self.waypoints: tuple[Waypoint, ...] = ()
+        self.waypoints: tuple[MissionWaypoint, ...] = ()
         self._known: int | None = None  # items
         self._flown_as: tuple[bool, int] | None = None
         self._reading: int | None = None  # items
-        self._places: list[Waypoint] = []
+        self._places: list[MissionWaypoint] = []
         self._item: int | None = None  # asked for; None: the number of items is
         self._tries = 0
         self._due_ns = 0

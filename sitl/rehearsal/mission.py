@@ -16,7 +16,7 @@ def read_mission(path: Path) -> PlannedMission:
         planned = saved.read_mission(path)
     except MissionFileError as error:
         raise ScenarioError(str(error)) from error
-    strange = {w.above.value for w in planned.waypoints} - {HeightAbove.HOME.value}
+    strange = {w.above.value for w in planned.path} - {HeightAbove.HOME.value}
     if strange:
         raise ScenarioError(
             f"{path}: waypoints above {', '.join(sorted(strange))}; a rehearsal flies heights "

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
-from companion.planning.mission import PlannedMission
+from companion.planning.mission import MissionPlace, PlannedMission
 from companion.preflight.coverage import covered
 from companion.settings_file import SettingsError, validated
 from localizer.geometry.geo import Geodetic, LocalFrame
@@ -16,12 +17,13 @@ from localizer.map.cache.surface import MapSurface
 from localizer.synth.plan.terrain import River, Terrain
 from localizer.synth.world import WorldInfo
 from sitl.demo.assets import FlightAssets
-from sitl.demo.scenario import Leg, Scenario, ScenarioError
+from sitl.demo.scenario import Scenario, ScenarioError, ScenarioLeg
 from sitl.rehearsal.mission import read_mission
 
 _PITCH_DEG = -75.0  # where the mission does not say
 _SIDE = 0.5  # of the map's shorter half extent: how far the flight without a mission goes
 _HEIGHT_M = 100.0
+_LOWEST_M = 5.0  # of a leg
 
 
 @dataclass(frozen=True)
@@ -50,9 +52,13 @@ def rehearse(cache: Path, live: Path | None, mission: Path | None, scenario: Sce
         flown = scenario.model_copy(update=_triangle(opened))
     else:
         flown = _as_planned(planned, world.frame, scenario)
-        if planned.ignored:
-            numbers = ", ".join(map(str, sorted(set(planned.ignored))))
-            notes.append(f"mission commands that are not rehearsed: {numbers}")
+        unknown = [n.text for n in planned.not_judged] + sorted(planned.no_effect)
+        if any(p.gimbal.roi is not None for p in planned.path):
+            unknown.append("the camera's region of interest")
+        if any(p.curved for p in planned.path):
+            unknown.append("the curves of its splines, flown straight")
+        if unknown:
+            notes.append(f"of the mission is not rehearsed: {', '.join(unknown)}")
     _require_covered(opened, world.frame, flown)
     return Rehearsal(FlightAssets(world, cache, live or cache), flown, tuple(notes))
 
@@ -69,7 +75,7 @@ def _require_covered(cache: TileCache, home: LocalFrame, scenario: Scenario) -> 
 def _home(cache: TileCache, planned: PlannedMission | None) -> Geodetic:
     """On the map's surface: the mission's home, its first waypoint, or the map's middle."""
     if planned is not None:
-        first = planned.waypoints[0]
+        first = planned.path[0]
         latitude, longitude = planned.home or (first.latitude_deg, first.longitude_deg)
         east, north, _ = cache.frame.enu_from_geodetic(latitude, longitude, 0.0)
     else:
@@ -120,30 +126,35 @@ def _triangle(cache: TileCache) -> dict[str, object]:
     side = round(_SIDE * float((high - low)[:2].min()) / 2)
     corners = ((0, side), (side, side), (0, 0))
     legs = tuple(
-        Leg(east_m=e, north_m=n, height_m=_HEIGHT_M, gimbal_pitch_deg=-80.0) for e, n in corners
+        ScenarioLeg(east_m=e, north_m=n, height_m=_HEIGHT_M, gimbal_pitch_deg=-80.0)
+        for e, n in corners
     )
     return {"legs": legs, "takeoff_height_m": _HEIGHT_M, "deny_after_s": 5.0, "speed_m_s": 8.0}
 
 
+def _glides(place: MissionPlace, legs: Sequence[dict[str, float]]) -> bool:
+    """An aeroplane's way down to its landing: the rehearsal's vehicle flies there level."""
+    return bool(legs) and 0.0 <= place.height_m < _LOWEST_M
+
+
 def _as_planned(planned: PlannedMission, home: LocalFrame, scenario: Scenario) -> Scenario:
-    legs = []
-    for waypoint in planned.waypoints:
+    legs: list[dict[str, float]] = []
+    places = planned.path if planned.launch is None else planned.path[1:]
+    for waypoint in places:
         east, north, _ = home.enu_from_geodetic(
             waypoint.latitude_deg, waypoint.longitude_deg, home.origin.height_m
         )
         pitch = _PITCH_DEG if waypoint.pitch_deg is None else waypoint.pitch_deg
         legs.append(
             {
-                "east_m": float(east),
-                "north_m": float(north),
-                "height_m": waypoint.height_m,
+                "east_m": round(float(east), 6),
+                "north_m": round(float(north), 6),
+                "height_m": legs[-1]["height_m"] if _glides(waypoint, legs) else waypoint.height_m,
                 "gimbal_pitch_deg": min(max(pitch, -90.0), 0.0),
             }
         )
-    if planned.returns:
-        legs.append({**legs[-1], "east_m": 0.0, "north_m": 0.0})
     changed: dict[str, object] = {"legs": legs}
-    changed["takeoff_height_m"] = planned.takeoff_height_m or planned.waypoints[0].height_m
+    changed["takeoff_height_m"] = planned.takeoff_height_m or places[0].height_m
     if planned.speed_m_s is not None and planned.speed_m_s > 0:
         changed["speed_m_s"] = planned.speed_m_s
     try:

@@ -57,7 +57,7 @@ def test_a_plan_of_qgroundcontrol_is_flown_as_it_was_drawn(tmp_path, small_asset
     assert [leg.gimbal_pitch_deg for leg in flown.legs] == [-65, -65, -65]
     assert (flown.legs[0].east_m, flown.legs[0].north_m) == pytest.approx((0, 60), abs=0.3)
     assert (flown.legs[2].east_m, flown.legs[2].north_m) == (0, 0)  # the return
-    assert done.notes == ("mission commands that are not rehearsed: 206",)
+    assert done.notes == ("of the mission is not rehearsed: MAV_CMD_DO_SET_CAM_TRIGG_DIST",)
     place = home_of(done.assets)
     true = home_of(small_assets)
     assert (place.latitude_deg, place.longitude_deg) == pytest.approx(home, abs=1e-8)

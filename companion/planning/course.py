@@ -1,0 +1,74 @@
+"""The line that is flown between two places: straight, or a spline as ArduPilot flies it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from localizer.geometry.pose import Array
+
+_EARTH_M = 6.371e6
+_PIECES = 64  # of a spline
+# The vectors at both ends are shortened to so many times the distance between them
+# (SplineCurve::set_origin_and_destination).
+_LONGEST = 4.0
+
+
+@dataclass(frozen=True)
+class Course:
+    """points: (N, 3) of the line, world metres; leaves: (3,) direction and strength with which it
+    ends, zero where it stops.
+    """
+
+    points: Array
+    leaves: Array
+
+    @property
+    def length_m(self) -> float:
+        """Over the ground."""
+        return float(self._steps().sum())
+
+    def at(self, share: float) -> tuple[Array, float]:
+        """Position (3,) and heading (degrees) after a share of the length."""
+        steps = self._steps()
+        done = np.concatenate([[0.0], np.cumsum(steps)])
+        way = share * done[-1]
+        k = int(np.clip(np.searchsorted(done, way, side="right") - 1, 0, len(steps) - 1))
+        start, end = self.points[k], self.points[k + 1]
+        east, north, _ = end - start
+        part = (way - done[k]) / max(steps[k], 1e-9)
+        # As high above the Earth as between the ends: a chord lies below.
+        bulge = 0.5 * part * (1.0 - part) * (east * east + north * north) / _EARTH_M
+        position = start + part * (end - start) + (0.0, 0.0, bulge)
+        return position, float(np.degrees(np.arctan2(east, north)) % 360.0)
+
+    def _steps(self) -> Array:
+        return np.asarray(np.hypot(*np.diff(self.points, axis=0)[:, :2].T))
+
+
+def straight(start: Array, end: Array) -> Course:
+    """From one place (3,) to another."""
+    return Course(np.stack([start, end]), end - start)
+
+
+def spline(
+    start: Array, end: Array, arrives: Array, after: Array | None, *, curved_on: bool
+) -> Course:
+    """From one place (3,) to another. arrives: (3,) how the course before it leaves; after: the
+    place after the end, None where it stops there; curved_on: whether that is flown to by a spline.
+    """
+    leaves = np.zeros(3)
+    if after is not None:
+        leaves = after - start if curved_on else after - end
+    longest = _LONGEST * float(np.linalg.norm(end - start))
+    strength = float(np.linalg.norm(arrives) + np.linalg.norm(leaves))
+    scale = min(longest / strength, 1.0) if strength > 0 else 1.0
+    t = np.linspace(0.0, 1.0, _PIECES + 1)[:, None]
+    points = (
+        (2 * t**3 - 3 * t**2 + 1) * start
+        + (t**3 - 2 * t**2 + t) * scale * arrives
+        + (3 * t**2 - 2 * t**3) * end
+        + (t**3 - t**2) * scale * leaves
+    )
+    return Course(points, leaves)

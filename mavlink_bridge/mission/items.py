@@ -1,0 +1,130 @@
+"""Items of a mission as MAVLink carries them: https://mavlink.io/en/services/mission.html"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from enum import Enum
+
+from pymavlink.dialects.v20 import ardupilotmega as mavlink
+
+
+class HeightAbove(Enum):
+    """What an item's altitude is above."""
+
+    HOME = "home"
+    SEA = "mean sea level"
+    TERRAIN = "terrain"
+
+
+FRAMES = {
+    mavlink.MAV_FRAME_GLOBAL: HeightAbove.SEA,
+    mavlink.MAV_FRAME_GLOBAL_INT: HeightAbove.SEA,
+    mavlink.MAV_FRAME_MISSION: HeightAbove.SEA,  # as ArduPilot reads it (AP_Mission)
+    mavlink.MAV_FRAME_GLOBAL_RELATIVE_ALT: HeightAbove.HOME,
+    mavlink.MAV_FRAME_GLOBAL_RELATIVE_ALT_INT: HeightAbove.HOME,
+    mavlink.MAV_FRAME_GLOBAL_TERRAIN_ALT: HeightAbove.TERRAIN,
+    mavlink.MAV_FRAME_GLOBAL_TERRAIN_ALT_INT: HeightAbove.TERRAIN,
+}
+TAKEOFFS = (mavlink.MAV_CMD_NAV_TAKEOFF, mavlink.MAV_CMD_NAV_VTOL_TAKEOFF)
+LOITERS: Mapping[int, int] = {  # each with the index of its radius
+    mavlink.MAV_CMD_NAV_LOITER_UNLIM: 2,
+    mavlink.MAV_CMD_NAV_LOITER_TURNS: 2,
+    mavlink.MAV_CMD_NAV_LOITER_TIME: 2,
+    mavlink.MAV_CMD_NAV_LOITER_TO_ALT: 1,
+}
+PLACES = (mavlink.MAV_CMD_NAV_WAYPOINT, mavlink.MAV_CMD_NAV_SPLINE_WAYPOINT, *LOITERS)
+LANDINGS = (mavlink.MAV_CMD_NAV_LAND, mavlink.MAV_CMD_NAV_VTOL_LAND)
+DESCENTS = (*LANDINGS, mavlink.MAV_CMD_NAV_PAYLOAD_PLACE)
+FLOWN_TO = frozenset((*PLACES, *DESCENTS))  # ArduPilot takes off where it stands
+ROI_COMMANDS = (
+    mavlink.MAV_CMD_DO_SET_ROI_LOCATION,
+    mavlink.MAV_CMD_DO_SET_ROI,
+    mavlink.MAV_CMD_DO_SET_ROI_NONE,
+)
+WITH_PLACE = FLOWN_TO | {*TAKEOFFS, *ROI_COMMANDS}  # their x and y are degrees
+_ARDUPILOT, _PX4 = 3, 12  # MAV_AUTOPILOT
+# MAV_TYPE by number: the names of some change from release to release of the dialect.
+_MULTIROTORS = frozenset((2, 3, 4, 13, 14, 15, 29, 35, 43))  # helicopters among them
+_WINGED = frozenset((1, *range(19, 26)))  # an aeroplane, VTOLs
+
+
+@dataclass(frozen=True)
+class MissionVehicle:
+    """What a mission is for, as far as its file says. autopilot: MAV_AUTOPILOT; kind: MAV_TYPE."""
+
+    autopilot: int | None = None
+    kind: int | None = None
+
+    @property
+    def is_px4(self) -> bool:
+        """PX4 reads some items otherwise than ArduPilot."""
+        return self.autopilot == _PX4
+
+    @property
+    def is_ardupilot(self) -> bool:
+        """ArduPilot, of any kind."""
+        return self.autopilot == _ARDUPILOT
+
+    @property
+    def is_multirotor(self) -> bool:
+        """It hovers, and has no wings."""
+        return self.kind in _MULTIROTORS
+
+    @property
+    def has_wings(self) -> bool:
+        """An aeroplane, or a VTOL."""
+        return self.kind in _WINGED
+
+
+UNKNOWN_VEHICLE = MissionVehicle()
+
+
+@dataclass(frozen=True)
+class MissionItem:
+    """One item. number: as DO_JUMP names it, home is 0; command: MAV_CMD; frame: MAV_FRAME;
+    parameters: param1 to param7, NaN where they are not set; latitude and longitude in degrees.
+    """
+
+    number: int
+    command: int
+    frame: int
+    parameters: tuple[float, float, float, float, float, float, float]
+
+    @property
+    def place(self) -> tuple[float, float] | None:
+        """(latitude, longitude), degrees; None where 0, 0 or NaN stand for the present position."""
+        latitude, longitude = self.parameters[4:6]
+        unset = (math.isnan(latitude) and math.isnan(longitude)) or (latitude, longitude) == (0, 0)
+        return None if unset else (latitude, longitude)
+
+    @property
+    def altitude_m(self) -> float | None:
+        """None where 0 or NaN stand for the present altitude (ArduCopter's loc_from_cmd)."""
+        altitude = self.parameters[6]
+        return None if math.isnan(altitude) or altitude == 0 else altitude
+
+    @property
+    def named(self) -> str:
+        """Its MAVLink name and number."""
+        return f"{command_name(self.command)} (item {self.number})"
+
+
+@dataclass(frozen=True)
+class UnreadItem:
+    """What a ground station expands into items only when it uploads them. name: the file's."""
+
+    number: int
+    name: str
+
+    @property
+    def named(self) -> str:
+        """Its name and number."""
+        return f"{self.name} (item {self.number})"
+
+
+def command_name(command: int) -> str:
+    """As MAVLink calls a command."""
+    entry = mavlink.enums["MAV_CMD"].get(command)
+    return f"MAV_CMD {command}" if entry is None else str(entry.name)

@@ -1,0 +1,358 @@
+"""The way that a mission's items are flown, as ArduPilot's AP_Mission and its modes read them.
+
+One reading for every use: the forecast (`plan`), `map fetch --mission`, the rehearsal, the doctor.
+What cannot be followed without flying it is named (`NotJudged`), never left out silently.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+
+from pymavlink.dialects.v20 import ardupilotmega as mavlink
+
+from mavlink_bridge.errors import MissionError
+from mavlink_bridge.mission.effects import FLY_TOO, GIMBAL_ONLY, NO_EFFECT, VIEW
+from mavlink_bridge.mission.gimbal import (
+    GIMBAL_COMMANDS,
+    GimbalTarget,
+    gimbal_after,
+)
+from mavlink_bridge.mission.items import (
+    DESCENTS,
+    FRAMES,
+    LANDINGS,
+    LOITERS,
+    PLACES,
+    ROI_COMMANDS,
+    TAKEOFFS,
+    UNKNOWN_VEHICLE,
+    HeightAbove,
+    MissionItem,
+    MissionVehicle,
+    UnreadItem,
+    command_name,
+)
+from mavlink_bridge.mission.jumps import JUMPS, Jumps
+
+_MOST_STEPS = 200_000  # of a mission of jumps in jumps
+
+_ENDS = (*LANDINGS, mavlink.MAV_CMD_NAV_RETURN_TO_LAUNCH)
+
+
+@dataclass(frozen=True)
+class MissionPlace:
+    """A place that is flown to. name: the waypoint's number among the waypoints, "home" or
+    "take-off"; item: its number in the mission; gimbal, speed_m_s: on the way there (None: not
+    said); after_gap: how the vehicle gets there is not known; curved: by a spline.
+    """
+
+    name: str
+    item: int
+    latitude_deg: float
+    longitude_deg: float
+    height_m: float
+    above: HeightAbove = HeightAbove.HOME
+    gimbal: GimbalTarget = field(default_factory=GimbalTarget)
+    speed_m_s: float | None = None
+    after_gap: bool = False
+    curved: bool = False
+
+    @property
+    def pitch_deg(self) -> float | None:
+        """Of the gimbal, if said."""
+        return self.gimbal.pitch_deg
+
+    @property
+    def is_waypoint(self) -> bool:
+        """Whether an item of the mission names it."""
+        return self.name.isdecimal()
+
+
+@dataclass(frozen=True)
+class NotJudged:
+    """What cannot be followed before the flight. text: its MAVLink name, number and reason;
+    gimbal_only: it matters to a camera on a
+    gimbal only; flies: it moves the vehicle.
+    """
+
+    text: str
+    gimbal_only: bool = False
+    flies: bool = False
+
+
+@dataclass(frozen=True)
+class PlannedMission:
+    """A mission as it is flown.
+
+    home: (latitude, longitude) degrees, if known; path: the places in the order in which they are
+    flown to, from home or the take-off on, returns to home among them; takeoff_height_m: above
+    home, if said; speed_m_s: the last that is said; no_effect: names of commands that change
+    neither the way nor the view; notes: what else one should know, as sentences.
+    """
+
+    home: tuple[float, float] | None
+    path: tuple[MissionPlace, ...]
+    takeoff_height_m: float | None
+    speed_m_s: float | None
+    not_judged: tuple[NotJudged, ...] = ()
+    no_effect: tuple[str, ...] = ()
+    notes: tuple[str, ...] = ()
+
+    @property
+    def waypoints(self) -> tuple[MissionPlace, ...]:
+        """The places without home and take-off."""
+        return tuple(place for place in self.path if place.is_waypoint)
+
+    @property
+    def launch(self) -> MissionPlace | None:
+        """Where it begins, over home or the take-off; None where nothing says it."""
+        return self.path[0] if self.path and self.path[0].item == 0 else None
+
+    @property
+    def returns(self) -> bool:
+        """Whether it ends with a return to home."""
+        return bool(self.waypoints) and self.path[-1].name == "home"
+
+
+def fly(
+    items: Sequence[MissionItem | UnreadItem],
+    home: tuple[float, float] | None,
+    vehicle: MissionVehicle = UNKNOWN_VEHICLE,
+    speed_m_s: float | None = None,
+) -> PlannedMission:
+    """Follow a mission's items, home not among them. speed_m_s: where it does not say.
+
+    MissionError for a place that is none on Earth, or in a frame without global coordinates.
+    """
+    flight = _Flight(items, home, vehicle, speed_m_s)
+    flight.run()
+    return flight.result()
+
+
+class _Flight:
+    """The state of a mission that is followed item by item."""
+
+    def __init__(
+        self,
+        items: Sequence[MissionItem | UnreadItem],
+        home: tuple[float, float] | None,
+        vehicle: MissionVehicle,
+        speed_m_s: float | None,
+    ) -> None:
+        self._items, self._home, self._vehicle = items, home, vehicle
+        self._usual_speed_m_s = self._speed_m_s = speed_m_s
+        self._at = home
+        self._level: tuple[float, HeightAbove] | None = None
+        self._launch: MissionPlace | None = None
+        self._takeoff_m: float | None = None
+        self._gimbal = GimbalTarget()
+        self._path: list[MissionPlace] = []
+        self._names: dict[int, str] = {}
+        self._gap = False
+        self._not_judged: dict[NotJudged, None] = {}
+        self._no_effect: dict[str, None] = {}
+        self._notes: dict[str, None] = {}
+        self._jumps = Jumps(items)
+
+    def run(self) -> None:
+        """From the first item to the end."""
+        index = commands = 0
+        while index < len(self._items):
+            item = self._items[index]
+            if isinstance(item, MissionItem) and item.command in JUMPS:
+                following = self._jumps.following(item, index, commands)
+                if following is None:
+                    return
+                index = following
+                continue
+            index, commands = index + 1, commands + 1
+            if commands > _MOST_STEPS:
+                self._leave_out(f"what follows {_MOST_STEPS:,} commands")
+                return
+            self._take(item)
+            ends = isinstance(item, MissionItem) and item.command in _ENDS
+            if ends and not _takes_off_next(self._items[index:]):
+                return
+
+    def result(self) -> PlannedMission:
+        """What was followed."""
+        path = list(self._path)
+        start = self._start()
+        if start is not None:
+            path.insert(0, start)
+        return PlannedMission(
+            self._home,
+            tuple(path),
+            self._takeoff_m,
+            self._speed_m_s,
+            tuple(self._not_judged),
+            tuple(self._no_effect),
+            (*self._notes, *self._jumps.notes),
+        )
+
+    def _start(self) -> MissionPlace | None:
+        """Over home, or over the take-off where home is not set."""
+        if self._launch is not None:
+            return self._launch
+        if self._home is None or not self._path:
+            return None
+        first = self._path[0]
+        return MissionPlace("home", 0, *self._home, first.height_m, first.above)
+
+    def _take(self, item: MissionItem | UnreadItem) -> None:
+        if isinstance(item, UnreadItem):
+            self._leave_out(item.named, "the ground station works it out at the upload", gap=True)
+            return
+        command = item.command
+        if command in TAKEOFFS:
+            self._take_off(item)
+        elif command in PLACES:
+            self._fly_to(item, item.altitude_m)
+            self._note_place(item)
+        elif command in DESCENTS:
+            self._descend(item)
+        elif command == mavlink.MAV_CMD_NAV_RETURN_TO_LAUNCH:
+            self._return(item)
+        elif command == mavlink.MAV_CMD_DO_CHANGE_SPEED:
+            self._speed_m_s = _speed_after(item, self._speed_m_s, self._usual_speed_m_s)
+        elif command in GIMBAL_COMMANDS:
+            self._gimbal, why = gimbal_after(item, self._gimbal, self._vehicle)
+            if why:
+                turned = command not in ROI_COMMANDS  # a region turns a vehicle without gimbal
+                self._leave_out(item.named, why, gimbal_only=turned)
+        elif command in NO_EFFECT or _is_off(item):
+            self._no_effect[command_name(command)] = None
+        else:
+            flies = command <= mavlink.MAV_CMD_NAV_LAST or command in FLY_TOO
+            gimbal_only = command in GIMBAL_ONLY
+            self._leave_out(item.named, gap=flies and command not in VIEW, gimbal_only=gimbal_only)
+
+    def _leave_out(
+        self, named: str, why: str = "", *, gap: bool = False, gimbal_only: bool = False
+    ) -> None:
+        text = f"{named}: {why}" if why else named
+        self._not_judged[NotJudged(text, gimbal_only, gap)] = None
+        self._gap |= gap
+
+    def _take_off(self, item: MissionItem) -> None:
+        """Straight up; ArduPilot leaves a take-off's coordinates aside, PX4 flies there."""
+        altitude = item.altitude_m
+        if altitude is not None:
+            self._level = (altitude, _above(item))
+        if self._path:
+            if self._vehicle.is_px4 and item.place is not None:
+                self._add("take-off", item, item.place)
+            return
+        place = self._home or item.place
+        if altitude is not None and _above(item) is HeightAbove.HOME:
+            self._takeoff_m = altitude
+        if place is None:
+            return
+        self._at = _checked(item, "the take-off", place)
+        if self._level is not None:
+            name = "home" if self._home is not None else "take-off"
+            self._launch = MissionPlace(name, 0, *place, *self._level)
+        if self._vehicle.is_px4 and item.place is not None and item.place != place:
+            self._add("take-off", item, item.place)
+
+    def _fly_to(self, item: MissionItem, altitude_m: float | None) -> None:
+        name = self._names.setdefault(item.number, str(len(self._names) + 1))
+        place = item.place or self._at
+        if altitude_m is not None:
+            self._level = (altitude_m, _above(item))
+        if place is None:  # on the spot, and nobody knows where that is
+            return
+        self._add(name, item, place)
+
+    def _add(self, name: str, item: MissionItem, place: tuple[float, float]) -> None:
+        what = f"waypoint {name}" if name.isdecimal() else name
+        self._at = _checked(item, what, place)
+        height, above = self._level or (0.0, HeightAbove.HOME)
+        if not math.isfinite(height):
+            raise MissionError(f"{what} is no place: its altitude is {height}")
+        gap, self._gap = self._gap, False
+        curved = item.command == mavlink.MAV_CMD_NAV_SPLINE_WAYPOINT
+        there = MissionPlace(name, item.number, *place, height, above, self._gimbal)
+        self._path.append(replace(there, speed_m_s=self._speed_m_s, after_gap=gap, curved=curved))
+
+    def _note_place(self, item: MissionItem) -> None:
+        _above(item)  # a local frame's coordinates are no latitude and longitude
+        radius = abs(item.parameters[LOITERS[item.command]]) if item.command in LOITERS else 0.0
+        circles = not self._vehicle.is_multirotor
+        if item.command == mavlink.MAV_CMD_NAV_LOITER_TO_ALT:
+            if radius > 0 and circles:  # once or twice round: a turn
+                self._notes[f"{item.named}: its circle of {radius:.0f} m is left out."] = None
+        elif radius > 0 and (circles or item.command == mavlink.MAV_CMD_NAV_LOITER_TURNS):
+            self._leave_out(item.named, f"its circle of {radius:.0f} m")
+        if item.command == mavlink.MAV_CMD_NAV_LOITER_UNLIM:
+            self._notes[f"{item.named} holds until the pilot goes on."] = None
+
+    def _descend(self, item: MissionItem) -> None:
+        """To its coordinates at the height of before, then down; an aeroplane glides there."""
+        if item.place is None:
+            return
+        _above(item)
+        glides = item.command == mavlink.MAV_CMD_NAV_LAND and self._vehicle.has_wings
+        altitude = item.parameters[6]
+        before = self._level
+        self._fly_to(item, altitude if glides and math.isfinite(altitude) else None)
+        self._level = before
+
+    def _return(self, item: MissionItem) -> None:
+        if self._home is None:
+            self._leave_out(item.named, "the mission has no home")
+            return
+        self._add("home", item, self._home)
+
+
+def _takes_off_next(items: Sequence[MissionItem | UnreadItem]) -> bool:
+    """Only a take-off goes on after a landing (AP_Mission::is_takeoff_next)."""
+    for item in items:
+        if not isinstance(item, MissionItem):
+            return False
+        if item.command in TAKEOFFS:
+            return True
+        if item.command not in NO_EFFECT and item.command <= mavlink.MAV_CMD_NAV_LAST:
+            return False
+    return False
+
+
+def _is_off(item: MissionItem) -> bool:
+    """A command whose parameter says that nothing is to be done."""
+    mode = item.parameters[0]
+    if item.command == mavlink.MAV_CMD_NAV_GUIDED_ENABLE:
+        return not mode > 0.5
+    if item.command == mavlink.MAV_CMD_DO_MOUNT_CONFIGURE:
+        return bool(mode == mavlink.MAV_MOUNT_MODE_MAVLINK_TARGETING)
+    return False
+
+
+def _speed_after(item: MissionItem, before: float | None, usual: float | None) -> float | None:
+    """Over the ground or through the air; -1 leaves it, -2 is the vehicle's usual one."""
+    kind, speed = item.parameters[:2]
+    if kind not in (mavlink.SPEED_TYPE_AIRSPEED, mavlink.SPEED_TYPE_GROUNDSPEED):
+        return before
+    if speed == -2:
+        return usual
+    return speed if math.isfinite(speed) and speed > 0 else before
+
+
+def _above(item: MissionItem) -> HeightAbove:
+    if item.frame not in FRAMES:
+        raise MissionError(
+            f"{item.named} is in frame {item.frame}; known are {sorted(FRAMES)} (MAV_FRAME): save "
+            "the mission with global coordinates"
+        )
+    return FRAMES[item.frame]
+
+
+def _checked(item: MissionItem, what: str, place: tuple[float, float]) -> tuple[float, float]:
+    latitude, longitude = place
+    if not (abs(latitude) <= 90.0 and abs(longitude) <= 360.0):  # NaN is not either
+        raise MissionError(
+            f"{what} is no place: item {item.number} lies at {latitude:g}, {longitude:g} degrees; "
+            "load the mission into the vehicle again, or save it again"
+        )
+    return place
