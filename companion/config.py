@@ -19,7 +19,7 @@ from companion.sources.zoom import ZoomTable
 from companion.targets.detections import CLICKED, parse_host_port
 from localizer.config import LocalizerConfig
 from localizer.errors import CameraError
-from localizer.geometry.camera import MAX_READOUT_MS, Camera
+from localizer.geometry.camera import MAX_READOUT_MS, Camera, lens_fault
 from localizer.geometry.lens import LensModel, whole_coefficients
 from mavlink_bridge.config import BridgeConfig
 
@@ -73,7 +73,7 @@ class CameraModel(_Model):
                     "point in pixels"
                 )
         try:
-            fault = self.camera().lens_fault()
+            fault = lens_fault(self.camera())
         except CameraError as error:
             raise ValueError(str(error)) from error
         if fault:

@@ -76,7 +76,7 @@ class Camera:
         """
         try:
             camera = cls(**camera_numbers(data))
-            if fault := camera.lens_fault():
+            if fault := lens_fault(camera):
                 raise CameraError(fault)
         except (TypeError, ValueError, OverflowError, CameraError) as error:
             raise CameraError(f"{where}: {error}") from error
@@ -103,11 +103,6 @@ class Camera:
     def is_distorted(self) -> bool:
         """Whether a straight line may look bent."""
         return self.distortion_model != "opencv" or any(k != 0.0 for k in self.distortion)
-
-    def lens_fault(self) -> str:
-        """Why no lens is so, "" where one may be (`lens.fault`)."""
-        size = self.width, self.height
-        return lens.fault(size, self.rays, self.project) if self.is_distorted else ""
 
     def is_like(self, other: Camera) -> bool:
         """Whether pictures of both can be taken for one another: focal lengths to 0.1 %, principal
@@ -225,6 +220,12 @@ class Camera:
         edges += [np.stack(np.broadcast_arrays(side, v), -1) for side in (0.0, self.width)]
         x, y, _ = self.rays(np.concatenate(edges)).T
         return float(np.fmax.reduce(np.hypot(x, y), initial=0.0)) * (1.0 + _ALIKE)
+
+
+def lens_fault(camera: Camera) -> str:
+    """Why no lens is so, "" where one may be (`lens.fault`)."""
+    size = camera.width, camera.height
+    return lens.fault(size, camera.rays, camera.project) if camera.is_distorted else ""
 
 
 def followed(pinhole: Camera, camera: Camera) -> Camera:
