@@ -34,6 +34,7 @@ from companion.recorded.video import VIDEO_SUFFIXES, extract_frames, video_facts
 from companion.sources.base import fitted_camera
 from companion.sources.folder_source import list_images
 from localizer.geometry.camera import Camera
+from localizer.plain_files import files_of
 
 Progress = Callable[[int, int], None]
 _VIDEO_FOCAL_PERCENT = 5.0  # a video's crop of the sensor is not told
@@ -87,9 +88,9 @@ def _list(suffixes: frozenset[str]) -> str:
 def _read_folder(path: Path, options: FootageOptions, progress: Progress) -> RecordedFlight:
     inner = path / "images"
     for folder in (path, inner):
-        files = sorted(folder.iterdir()) if folder.is_dir() else []
-        photos = [f for f in files if f.suffix.lower() in PHOTO_SUFFIXES and not _hidden(f)]
-        videos = [f for f in files if f.suffix.lower() in VIDEO_SUFFIXES and not _hidden(f)]
+        if not folder.is_dir():
+            continue
+        photos, videos = files_of(folder, PHOTO_SUFFIXES), files_of(folder, VIDEO_SUFFIXES)
         if photos and videos:
             raise FootageError(
                 f"{folder}: holds {len(photos)} photos and {len(videos)} videos; give one of the "
@@ -102,13 +103,9 @@ def _read_folder(path: Path, options: FootageOptions, progress: Progress) -> Rec
         if photos:
             ordered = [f for f in list_images(folder) if f in photos]
             return _read_photos(path, ordered, options, progress)
-    if any(f.suffix.lower() in RAW_SUFFIXES for f in path.iterdir()):
+    if files_of(path, RAW_SUFFIXES):
         raise FootageError(f"{path}: holds raw photos only, which are not read; give JPEGs")
     raise FootageError(f"{path}: holds no photo and no video")
-
-
-def _hidden(file: Path) -> bool:
-    return file.name.startswith(".")  # AppleDouble files beside the real ones
 
 
 def _read_photos(
@@ -196,10 +193,10 @@ def _places_file(folder: Path, tags: Sequence[PhotoTags], options: FootageOption
         return options.places
     names = {t.path.name for t in tags} | {t.path.stem for t in tags}
     candidates = [
-        f for f in sorted(folder.iterdir())
-        if f.suffix.lower() in PLACES_SUFFIXES and not _hidden(f) and is_places_file(f)
-        and names & read_places(f).keys()
-    ]  # fmt: skip
+        f
+        for f in files_of(folder, PLACES_SUFFIXES)
+        if is_places_file(f) and names & read_places(f).keys()
+    ]
     if len(candidates) > 1:
         told = ", ".join(f.name for f in candidates)
         raise FootageError(f"{folder}: several files hold places of the photos: {told}; choose one "
@@ -238,7 +235,7 @@ def _with_places(
 def _log_file(folder: Path, options: FootageOptions) -> Path | None:
     if options.log is not None:
         return options.log
-    logs = [f for f in sorted(folder.iterdir()) if f.suffix.lower() in LOG_SUFFIXES]
+    logs = files_of(folder, LOG_SUFFIXES)
     if len(logs) > 1:
         raise FootageError(f"{folder}: holds {len(logs)} logs; choose one by --log")
     return logs[0] if logs else None
@@ -342,10 +339,7 @@ def _read_video(path: Path, options: FootageOptions, progress: Progress) -> Reco
 
 def _beside(path: Path, suffixes: frozenset[str]) -> Path | None:
     """A file of the same name with another ending, in any letter case."""
-    for file in sorted(path.parent.iterdir()):
-        if file.stem == path.stem and file.suffix.lower() in suffixes:
-            return file
-    return None
+    return next((f for f in files_of(path.parent, suffixes) if f.stem == path.stem), None)
 
 
 def _subtitles(path: Path) -> Subtitles | None:

@@ -123,7 +123,7 @@ class PhotoTags:
         latitude = self.number("GpsLatitude", "Latitude")
         longitude = self.number("GpsLongitude", "GpsLongtitude", "Longitude")
         if latitude is None or longitude is None:
-            latitude, longitude = self._exif_place()
+            latitude, longitude = self._exif_place
         if latitude is None or longitude is None or (latitude == 0.0 and longitude == 0.0):
             return None
         if abs(latitude) > 90.0 or abs(longitude) > 360.0:
@@ -136,6 +136,16 @@ class PhotoTags:
         sigma = max(_RTK_M, *told) if told else self.number("GPSXYAccuracy") or _GNSS_M
         return RecordedPosition(latitude, longitude, sigma, tuple(self._heights()))
 
+    @property
+    def exif_position(self) -> tuple[float, float, float] | None:
+        """Latitude, longitude and altitude of EXIF; None where one of them is missing."""
+        latitude, longitude = self._exif_place
+        height = self._exif_altitude
+        if latitude is None or longitude is None or height is None:
+            return None
+        return latitude, longitude, height
+
+    @property
     def _exif_place(self) -> tuple[float | None, float | None]:
         gps, tag = self.gps, ExifTags.GPS
         latitude = _degrees(gps.get(tag.GPSLatitude), gps.get(tag.GPSLatitudeRef) == "S")
@@ -160,12 +170,15 @@ class PhotoTags:
         return heights
 
     def _exif_height(self) -> list[Height]:
+        value = self._exif_altitude
+        return [] if value is None else [Height(value, Datum.AMSL, _GNSS_HEIGHT_M)]
+
+    @property
+    def _exif_altitude(self) -> float | None:
         value = _number(self.gps.get(ExifTags.GPS.GPSAltitude))
-        if value is None:
-            return []
-        # 1 and b"\x01" both occur; Pillow gives the byte as it stands.
-        below = self.gps.get(ExifTags.GPS.GPSAltitudeRef, 0) in (1, b"\x01")
-        return [Height(-value if below else value, Datum.AMSL, _GNSS_HEIGHT_M)]
+        # 1 and b"\x01" both occur; Pillow gives the byte as it stands. EXIF 3 has 3 below the sea.
+        below = self.gps.get(ExifTags.GPS.GPSAltitudeRef, 0) in (1, 3, b"\x01", b"\x03")
+        return -value if below and value is not None else value
 
 
 Convert = Callable[[float, float, float], tuple[float, float, float]]
@@ -215,9 +228,9 @@ def read_photo_tags(path: Path) -> PhotoTags:
 
 def read_xmp(path: Path) -> dict[str, str]:
     """XMP tags by name, attributes and elements alike; empty where there are none."""
-    sidecar = path.with_suffix(".xmp")
+    sidecar = next((p for p in map(path.with_suffix, (".xmp", ".XMP")) if p.is_file()), None)
     try:
-        if sidecar.is_file():
+        if sidecar is not None:
             text = plain_text(sidecar)
         else:
             with path.open("rb") as file:
@@ -227,7 +240,7 @@ def read_xmp(path: Path) -> dict[str, str]:
             text = head[begin:end].decode("utf-8", "replace") if 0 <= begin < end else ""
     except (OSError, UnicodeDecodeError) as error:
         raise FootageError(f"{path}: cannot be read: {error}") from error
-    tags = dict(re.findall(rf'\s{_TAG}\s*=\s*"([^"]*)"', text))
+    tags = dict(re.findall(rf"""\s{_TAG}\s*=\s*["']([^"']*)["']""", text))
     tags |= dict(re.findall(rf"<{_TAG}>\s*([^<]*?)\s*</", text))
     # A structure of Skydio and Parrot: <a:CameraOrientationNED><a:Pitch>..</a:Pitch>...
     for name, body in re.findall(r"<[\w-]+:(\w+NED)[^>]*>(.*?)</[\w-]+:\1>", text, re.DOTALL):
