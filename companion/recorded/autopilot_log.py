@@ -187,8 +187,8 @@ def _read_dataflash(path: Path) -> _Raw:
     raw = _Raw([], [], [], [])
     kinds = ["POS", "ATT", "MNT", "CAM", "TRIG"]
     while (m := reader.recv_match(type=kinds)) is not None:
-        # pymavlink dates messages by the log's own GPS messages: UTC, or seconds since boot.
-        time_ns, kind = round(m._timestamp * 1e9), m.get_type()
+        # The clock's base is UTC by the log's own GPS messages, or 0: seconds since boot.
+        time_ns, kind = round(1e9 * reader.clock.timebase) + int(m.TimeUS) * 1000, m.get_type()
         if kind == "POS":
             raw.positions.append((time_ns, m.Lat, m.Lng, m.Alt, getattr(m, "RelHomeAlt", None)))
         elif kind == "ATT":

@@ -10,6 +10,7 @@ import av
 import cv2
 
 from companion.errors import FootageError
+from companion.sources.base import video_stream
 from localizer.pictures import write_rgb
 from localizer.types import Image
 
@@ -44,7 +45,7 @@ def video_facts(path: Path) -> VideoFacts:
     """Size, duration and orientation. `FootageError` where it is no video."""
     try:
         with av.open(str(path)) as container:
-            stream = _stream(container, path)
+            stream = video_stream(container, str(path))
             duration = container.duration / av.time_base if container.duration else 0.0
             frame = next(container.decode(stream), None)
             if frame is None:
@@ -79,20 +80,12 @@ def extract_frames(
     return frames
 
 
-def _stream(container: av.container.InputContainer, path: Path) -> av.VideoStream:
-    """The video, not the cover picture that some cameras put before it."""
-    streams = sorted(container.streams.video, key=lambda s: -(s.width or 0) * (s.height or 0))
-    if not streams:
-        raise FootageError(f"{path}: has no video stream")
-    return streams[0]
-
-
 def _pictures(path: Path) -> Iterator[tuple[int, av.VideoFrame]]:
     first: int | None = None
     count = 0
     try:
         with av.open(str(path)) as container:
-            stream = _stream(container, path)
+            stream = video_stream(container, str(path))
             stream.thread_type = "AUTO"
             rate = float(stream.average_rate or 30.0)
             for packet in container.demux(stream):
