@@ -18,7 +18,7 @@ from localizer.tracking.motion import MotionConfig
 
 
 class LocalizerConfig(BaseModel):
-    """What the dual-thread engine needs to know."""
+    """Settings of the localizer and the dual-thread engine."""
 
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
 
