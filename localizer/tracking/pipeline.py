@@ -272,7 +272,7 @@ class Localizer:
             self.propose(prior)
 
     def propose(self, prior: PosePrior) -> None:
-        """Start a tentative track at a pose; it is used once it is confirmed (`localizer.integrity`).
+        """Start a tentative track; its pose is used once confirmed (`localizer.integrity`).
 
         The state does not change: a tentative track does not end LOST.
         """
