@@ -27,6 +27,7 @@ from localizer.features.extractor import DeviceExtractor, FeatureExtractor
 from localizer.geometry.camera import Camera, followed
 from localizer.geometry.geo import LocalFrame
 from localizer.geometry.pose import Array
+from localizer.map.kind import MapKind
 from localizer.odometry import TerrainModel
 from localizer.registration.anchors import select_anchors, swept
 from localizer.registration.calibration import calibration_covariance
@@ -157,8 +158,8 @@ class Localizer:
     sensors: attitude and motion of autopilot and gimbal. Their turns replace the constant angular
     rate of the motion model. Their roll and pitch constrain the registration while tracking
     (`tracking.attitude_bias`). With the displacement they confirm or refute a tentative track.
-    map_frame: the map's frame. terrain: ground heights outside the map. on_close: releases what
-    was opened for this localizer. is_loading: whether requested tiles are still being loaded.
+    map_frame, map_kind: the map's. terrain: ground heights outside the map. on_close: releases
+    what was opened for this localizer. is_loading: whether requested tiles are still loading.
     """
 
     def __init__(
@@ -171,12 +172,15 @@ class Localizer:
         sensors: AuxiliarySensors | None = None,
         *,
         map_frame: LocalFrame | None = None,
+        map_kind: MapKind | None = None,
         terrain: TerrainModel | None = None,
         on_close: Callable[[], None] = lambda: None,
         is_loading: Callable[[], bool] = lambda: False,
     ) -> None:
         self._is_loading = is_loading
         self._map_frame, self._on_close = map_frame, on_close
+        self.map_kind = map_kind
+        """What the map can show; None where the localizer was made without it."""
         self._renderer = renderer
         self._extractor = extractor
         self._optimizer = optimizer
