@@ -32,7 +32,8 @@ from mavlink_bridge.config import InjectionEnableConfig
 from mavlink_bridge.injection.restart_memory import InjectionEnableMemory, RestartMemory
 from mavlink_bridge.injection.injection_enable import InjectionEnable
 path = Path(sys.argv[1])
-gate = InjectionEnable(InjectionEnableConfig(), lambda _: None, InjectionEnableMemory(RestartMemory(path)))
+memory = InjectionEnableMemory(RestartMemory(path))
+gate = InjectionEnable(InjectionEnableConfig(), lambda _: None, memory)
 if sys.argv[2] == "command":
     gate.command(31010, 1.0)
 else:
