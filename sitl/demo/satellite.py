@@ -176,7 +176,8 @@ def _processed(mosaic: Image, spec: SatelliteMap) -> Image:
     tones = cv2.cvtColor(soft, cv2.COLOR_RGB2YCrCb)
     tones[..., 0] = cv2.createCLAHE(_CONTRAST, _CONTRAST_GRID).apply(tones[..., 0])
     tinted = cv2.cvtColor(tones, cv2.COLOR_YCrCb2RGB).astype(np.float32) * _TINT - 4.0
-    return np.clip(tinted, 0, 255).astype(np.uint8)
+    processed: Image = np.clip(tinted, 0, 255).astype(np.uint8)
+    return processed
 
 
 def _write(
