@@ -82,26 +82,26 @@ class SourceSettings(BaseModel):
         default=0.0,
         ge=0,
         le=1000,
-        description="fixed glass-to-glass latency, taken off where the stream has no exact times",
+        description="constant glass-to-glass latency, for streams without exact times",
     )
     time_offset_ms: float = Field(
         default=0.0,
         ge=-1000,
         le=1000,
-        description="by which every picture's time is late, found by `calibrate flight`: taken off",
+        description="constant time offset of the frames, from `calibrate flight`; subtracted",
     )
     timing: Timing = Field(
         default="auto",
-        description="auto: MISP time stamps where the stream has them; pts: never use them",
+        description="auto: MISP timestamps if the stream has them; pts: never",
     )
     stall_timeout_s: float = Field(
         default=1.0,
         ge=0.1,
         le=60,
-        description="a live stream without a picture for so long is stalled",
+        description="time without a frame after which a live stream is stalled",
     )
     retry_max_s: float = Field(
-        default=4.0, ge=0.1, le=600, description="longest wait between two attempts to connect"
+        default=4.0, ge=0.1, le=600, description="longest wait between connection attempts"
     )
     rate_hz: float = Field(
         default=10.0,
@@ -111,16 +111,16 @@ class SourceSettings(BaseModel):
     )
     realtime: bool = Field(
         default=False,
-        description="play files and folders at their own pace instead of as fast as possible",
+        description="play files and folders in real time",
     )
     sender: str | None = Field(
         default=None,
-        description="UDP: whose video is taken, ADDRESS or ADDRESS:PORT; null: the first one's",
+        description="UDP: accepted sender, ADDRESS or ADDRESS:PORT; null: the first",
     )
 
     grey_range: tuple[Count, Count] | None = Field(
         default=None,
-        description="16-bit grey pictures: the counts that are black and white; null: refused",
+        description="16-bit grey: counts of black and white; null: refused",
     )
 
     @property
