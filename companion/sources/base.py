@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from enum import Enum
@@ -9,6 +10,7 @@ from fractions import Fraction
 from typing import Annotated, Protocol
 
 import av
+from av.format import Flags
 from av.stream import Disposition
 from pydantic import BaseModel, ConfigDict, Field, field_validator
 
@@ -19,6 +21,8 @@ from localizer.errors import CameraError
 from localizer.geometry.camera import Camera
 from localizer.pictures import GreyRange
 from localizer.types import Frame
+
+_log = logging.getLogger(__name__)
 
 # What is said of 16-bit grey pictures without a range.
 GREY_RANGE_ADVICE = (
@@ -185,12 +189,23 @@ class PacketTaps:
 
 def video_stream(container: av.container.InputContainer, where: str) -> av.VideoStream:
     """The video among a container's streams, not a cover picture, wherever they stand; of several
-    FFmpeg's choice: the largest. `StreamOpenError` where there is none.
+    FFmpeg's choice, which is logged. `StreamOpenError` where there is none.
     """
     best = container.streams.best("video")
     if not isinstance(best, av.VideoStream) or best.disposition & Disposition.attached_pic:
         raise StreamOpenError(f"{where}: has no video stream; give a video")
+    films = [s for s in container.streams.video if not s.disposition & Disposition.attached_pic]
+    if len(films) > 1:
+        _log.warning(
+            "%s: holds %d video streams; number %d of %dx%d is read",
+            where, len(films), best.index, best.width, best.height,
+        )  # fmt: skip
     return best
+
+
+def has_times(container: av.container.InputContainer) -> bool:
+    """Whether its format says when pictures were taken, unlike raw H.264."""
+    return not container.format.flags & Flags.no_timestamps.value
 
 
 class FrameSource(Protocol):

@@ -166,7 +166,7 @@ class Camera:
             & (pixels[..., 1] <= self.height)
         )
         if self.is_distorted:
-            inside &= np.hypot(x, y) <= self._reach
+            inside &= x * x + y * y <= self._reach**2
         return pixels, inside
 
     def rays(self, pixels: ArrayLike) -> Array:
