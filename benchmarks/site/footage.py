@@ -93,7 +93,8 @@ def write_photos(sequence: Path, frame: LocalFrame, assets: FlightAssets, out: P
     """JPEGs with DJI's tags, spread over the flight."""
     rows, camera = read_poses(sequence / "poses.txt"), Camera.from_json(sequence / "camera.json")
     chosen = np.linspace(0, len(rows) - 1, _PHOTOS).round().astype(int)
-    ground = float(assets.world.ground_height(0.0, 0.0))
+    home = np.array([0.0, 0.0, float(assets.world.ground_height(0.0, 0.0))])
+    takeoff_m = assets.world.frame.position(home).height_m
     for number, k in enumerate(chosen, 1):
         image = Image.open(sequence / "images" / rows[k].name)
         focal = camera.fx * np.hypot(36.0, 24.0) / np.hypot(camera.width, camera.height)
@@ -102,19 +103,19 @@ def write_photos(sequence: Path, frame: LocalFrame, assets: FlightAssets, out: P
         inner = exif.get_ifd(ExifTags.IFD.Exif)
         inner[ExifTags.Base.FocalLengthIn35mmFilm] = round(float(focal))
         inner[ExifTags.Base.DateTimeOriginal] = f"2026:05:01 10:{k // 60:02d}:{k % 60:02d}"
-        xmp = _XMP.format(tags=_tags(rows[k], frame, ground)).encode()
+        xmp = _XMP.format(tags=_tags(rows[k], frame, takeoff_m)).encode()
         file = out / f"DJI_{number:04d}.JPG"
         image.convert("RGB").save(file, "JPEG", quality=80, exif=exif, xmp=xmp)
 
 
-def _tags(row: PoseRow, frame: LocalFrame, ground_m: float) -> str:
+def _tags(row: PoseRow, frame: LocalFrame, takeoff_m: float) -> str:
     pose = world_from_camera(row, frame)
     told = frame.position(pose.translation + _GNSS_OFF_M)
     back = so3_exp([-np.radians(_GIMBAL_OFF_DEG), 0.0, 0.0])
     gimbal = gimbal_of_pose(Pose(pose.rotation @ back, pose.translation), frame)
     tags = {
         "GpsLatitude": f"{told.latitude_deg:.8f}", "GpsLongitude": f"{told.longitude_deg:.8f}",
-        "RelativeAltitude": f"{pose.translation[2] - ground_m:+.2f}",
+        "RelativeAltitude": f"{told.height_m - takeoff_m:+.2f}",
         "GimbalRollDegree": f"{gimbal.roll_deg:+.2f}",
         "GimbalPitchDegree": f"{gimbal.pitch_deg:+.2f}",
         "GimbalYawDegree": f"{gimbal.yaw_deg:+.2f}",

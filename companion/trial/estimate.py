@@ -26,6 +26,7 @@ _LEAST_FRAMES = 4
 _TURNS = 2  # with the camera as given, and with the one that was found
 _MOST_FRAMES = 40  # more of them tell little that these do not
 _RELIEF_SHARE = 0.004  # of the height above ground: flatter ground shows no focal length
+_SIGNIFICANT = 3.0  # sigmas: the given focal length is kept unless it differs by so much
 _UP_SIGMA_M = 10.0  # of the map's surface against the height that is recorded
 _OUTLIER_SHARE, _OUTLIER_SIGMAS = 0.1, 3.0  # of the height above ground; of the median deviation
 _ROBUST_ROUNDS = 10
@@ -36,10 +37,10 @@ _LEAST_TILT_DEG = 0.5
 class Estimated:
     """What the footage says about its camera and the map.
 
-    focal_percent, focal_sigma_percent: against the camera as given; None where the ground is too
-    flat to tell. mount_deg: (3,) about the boresight, up, right; shift_m: (3,) map less GNSS, east,
-    north, up; has_shift: whether positions were recorded to tell it. poses: by frame, of those that
-    were used.
+    focal_percent, focal_sigma_percent: against the camera as given, which is kept within three
+    sigmas; None where this map cannot tell it. mount_deg: (3,) about the boresight, up, right;
+    shift_m: (3,) map less GNSS, east, north, up; has_shift: whether positions were recorded to tell
+    it. poses: by frame, of those that were used.
     """
 
     camera: Camera
@@ -89,6 +90,7 @@ def estimate(
         return None
     poses = {k: pose for k in used if (pose := localized[k].pose) is not None}
     shared, solution, camera = np.zeros(u.COUNT), None, guess.camera
+    focal: tuple[float, float] | None = None
     fixed = np.ones(u.COUNT, bool)
     for turn in range(_TURNS):
         believed = changed_camera(guess.camera, shared)
@@ -105,13 +107,17 @@ def estimate(
         fixed = _fixed(list(sighted.values()), tools.has_buildings)
         evidence = CalibrationProblem(list(sighted.values()), guess.camera, np.eye(3), np.zeros(3))
         solution = solve(evidence, fixed, _sigmas(guess))
+        focal = _focal(solution, fixed)
+        if focal is not None and abs(focal[0]) < _SIGNIFICANT * focal[1]:
+            fixed[u.FOCAL] = True
+            solution = solve(evidence, fixed, _sigmas(guess))
         shared = solution.guess.shared
         camera = changed_camera(guess.camera, shared)
         found = zip(sighted, solution.guess.rotations, solution.guess.places, strict=True)
         poses = {k: Pose(R, t) for k, R, t in found}
     if solution is None:
         return None
-    return _estimated(camera, solution, fixed, priors, poses)
+    return _estimated(camera, solution, focal, priors, poses)
 
 
 def consistent(priors: Sequence[FramePrior], localized: Sequence[Localized]) -> list[int]:
@@ -216,10 +222,21 @@ def _sigmas(guess: CameraGuess) -> Array:
     return sigmas
 
 
+def _focal(solution: Solution, fixed: np.ndarray) -> tuple[float, float] | None:
+    """The focal length's difference and its sigma, per cent; None where it was not looked for."""
+    if fixed[u.FOCAL]:
+        return None
+    difference = float(np.expm1(solution.guess.shared[u.FOCAL]))
+    return 100.0 * difference, 100.0 * float(np.sqrt(solution.covariance[u.FOCAL, u.FOCAL]))
+
+
 def _estimated(
-    camera: Camera, solution: Solution, fixed: np.ndarray, priors: Sequence[FramePrior],
+    camera: Camera,
+    solution: Solution,
+    focal: tuple[float, float] | None,
+    priors: Sequence[FramePrior],
     poses: dict[int, Pose],
-) -> Estimated:  # fmt: skip
+) -> Estimated:
     shared, sigma = solution.guess.shared, np.sqrt(np.diag(solution.covariance))
     has_shift = any(priors[k].pose is not None and priors[k].height_known for k in poses)
     shift, shift_sigma = shared[u.SHIFT].copy(), sigma[u.SHIFT].copy()
@@ -228,11 +245,11 @@ def _estimated(
     housing = so3_exp(shared[u.MOUNT])
     mount = GIMBAL_FROM_CAMERA.T @ housing @ GIMBAL_FROM_CAMERA
     left = max(float(np.degrees(solution.attitude.sigma[:3].max())), _LEAST_TILT_DEG)
+    percent, percent_sigma = (None, 0.0) if focal is None else focal
     return Estimated(
-        camera, Correction(np.asarray(mount), shift, left),
-        None if fixed[u.FOCAL] else 100.0 * float(np.expm1(shared[u.FOCAL])),
-        100.0 * float(sigma[u.FOCAL]), np.degrees(shared[u.MOUNT]), np.degrees(sigma[u.MOUNT]),
-        shift, shift_sigma, has_shift, poses, solution.pixel_sigma,
+        camera, Correction(np.asarray(mount), shift, left), percent, percent_sigma,
+        np.degrees(shared[u.MOUNT]), np.degrees(sigma[u.MOUNT]), shift, shift_sigma, has_shift,
+        poses, solution.pixel_sigma,
     )  # fmt: skip
 
 

@@ -100,6 +100,15 @@ def _place_reason(prior: FramePrior, one: Localized) -> str:
         return "no position was recorded"
     if prior.pose is not None and not prior.over_map:
         return "no map: it was taken beside the map"
+    if one.searched:
+        unknown = [
+            name
+            for name, known in (
+                ("heading", prior.heading_sigma_deg is not None), ("height", prior.height_known)
+            )
+            if not known
+        ]  # fmt: skip
+        return f"not found about its position: its {' and '.join(unknown)} is not recorded"
     if "does not meet the map" in one.problem:
         return "no map in view: the camera's direction or height is wrong, or the map ends there"
     if one.pose is not None and prior.pose is not None and prior.is_complete:

@@ -1,6 +1,7 @@
 """Folders, photos and videos as people bring them."""
 
 from fractions import Fraction
+from pathlib import Path
 
 import av
 import numpy as np
@@ -155,3 +156,12 @@ def test_a_video_without_telemetry_or_with_anothers_is_named(tmp_path):
     (tmp_path / "b.mp4").write_bytes(video.read_bytes()[:200])
     with pytest.raises(FootageError, match="not a video, or damaged"):
         read_footage(tmp_path / "b.mp4", FootageOptions(tmp_path / "w", fov_deg=70.0))
+
+
+def test_the_sample_of_the_tutorial_is_complete(tmp_path):
+    sample = Path(__file__).parents[3] / "examples" / "footage"
+    flight = read_footage(sample / "photos", FootageOptions(tmp_path / "w"))
+    assert (len(flight.frames), flight.located, flight.notes) == (8, 8, ())
+    assert all(f.telemetry.view is not None for f in flight.frames)
+    assert (sample / "dsm.tif").is_file()
+    assert (sample / "ortho.tif").is_file()

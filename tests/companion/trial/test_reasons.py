@@ -1,5 +1,6 @@
 """Priors over a map, and why frames fail."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -13,6 +14,7 @@ from companion.recorded.flight import (
     RecordedFlight,
     RecordedFrame,
     RecordedPosition,
+    RecordedView,
     Telemetry,
 )
 from companion.trial.localize import Localized
@@ -113,3 +115,15 @@ def test_the_wanted_map_reaches_past_the_footage(cache):
     south = flight.frames[0].telemetry.position.latitude_deg
     assert (south - wanted.south) * 111_320.0 == pytest.approx(150.0, rel=1e-6)
     assert wanted.gsd_m == pytest.approx(100.0 / (CAMERA.camera.fx / 2), rel=1e-6)
+
+
+def test_the_wanted_map_of_an_oblique_view_lies_where_it_looks(cache):
+    above = Height(100.0, Datum.TAKEOFF, 3.0)
+    (frame,) = _flight(cache.frame, [(0.0, 0.0)], (above,)).frames
+    east = RecordedView.of_angles(0.0, -30.0, 90.0, 1.0, 1.0)
+    oblique = frame.with_telemetry(replace(frame.telemetry, view=east))
+    wanted = wanted_map(RecordedFlight("a", "video", (oblique,), CAMERA))
+    at = frame.telemetry.position
+    metres = 111_320.0 * np.cos(np.radians(at.latitude_deg))
+    assert (wanted.east - at.longitude_deg) * metres == pytest.approx(100 * 3**0.5 + 150, rel=1e-3)
+    assert (at.longitude_deg - wanted.west) * metres == pytest.approx(150.0, rel=1e-3)
