@@ -70,6 +70,8 @@ def read_autopilot_log(path: Path, fixed_pitch_deg: float = -90.0) -> LogTrack:
 
     `FootageError` where the log lacks positions or attitudes, or is none.
     """
+    if path.suffix.lower() == ".ulg":
+        raise FootageError(f"{path}: PX4's logs are not read; give the .tlog of the ground station")
     try:
         raw = _read_tlog(path) if path.suffix.lower() == ".tlog" else _read_dataflash(path)
     except (OSError, BridgeError, ValueError, TypeError, AttributeError, IndexError) as error:

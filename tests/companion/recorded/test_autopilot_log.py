@@ -59,6 +59,8 @@ def test_half_a_log_and_no_log_are_named(tmp_path):
         (tmp_path / name).write_bytes(content)
         with pytest.raises(FootageError, match=name):
             read_autopilot_log(tmp_path / name)
+    with pytest.raises(FootageError, match="PX4's logs are not read"):
+        read_autopilot_log(tmp_path / "d.ulg")
 
 
 def _ground(rng):
