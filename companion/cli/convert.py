@@ -10,6 +10,7 @@ from typing import Annotated
 
 import typer
 from rich.console import Console
+from rich.markup import escape
 
 from companion.cli.geographic import numbers
 from companion.errors import ConfigError
@@ -55,20 +56,20 @@ def convert_command(
     of: Annotated[InputFormat, typer.Option("--from", help="format of the source")],
     to: Annotated[OutputFormat, typer.Option("--to", help="format of the result")],
     map_cache: Annotated[
-        Path | None, typer.Option("--map", help="tile cache whose ENU frame is meant")
+        Path | None, typer.Option("--map", help="tile cache with the ENU frame")
     ] = None,
     origin: Annotated[
         str | None, typer.Option(help="LAT,LON,HEIGHT of the ENU frame, instead of --map")
     ] = None,
     heights: Annotated[
-        HeightDatum | None, typer.Option(help="what the heights in photos' tags are above")
+        HeightDatum | None, typer.Option(help="datum of the heights in photo tags")
     ] = None,
     geoid_separation: Annotated[
-        float | None, typer.Option(help="geoid above the ellipsoid, m; else the map's")
+        float | None, typer.Option(help="geoid above the ellipsoid, m; default: the map's")
     ] = None,
     times: Annotated[
         Path | None,
-        typer.Option(help="timestamps.txt ('name nanoseconds'): of poses that have no time"),
+        typer.Option(help="timestamps.txt ('name nanoseconds') for poses without a time"),
     ] = None,
 ) -> None:
     """Convert camera poses: pose lines, TUM, COLMAP, photos' tags, autopilot angles, records."""
@@ -83,11 +84,14 @@ def convert_command(
         if heights is HeightDatum.AMSL and separation is None:
             raise ConfigError("--heights amsl needs --geoid-separation or --map")
         above = Heights(heights.value, separation or 0.0)
-    place = MapReference(frame, above)
+    notes: list[str] = []
+    place = MapReference(frame, above, notes.append)
     with shown_work(Console(stderr=True), f"converting {source}"):
         poses = _dated(READERS[of.value](source, place), times, needed=to is OutputFormat.TUM)
         with writing(out):
             WRITERS[to.value](out, poses, place)
+    for note in notes:
+        Console(stderr=True).print(escape(note), style="yellow", soft_wrap=True, highlight=False)
     typer.echo(f"{out}: {len(poses)} poses")
 
 

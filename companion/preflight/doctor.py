@@ -15,7 +15,7 @@ from companion.preflight.map_pin import require_pinned
 from companion.preflight.meanings import check_meanings, check_ports
 from companion.preflight.places import check_places
 from companion.redaction import redacted
-from companion.sources import SourceSettings, StreamState, open_source
+from companion.sources import StreamState, open_source
 from companion.targets.detector.network import DetectorNetwork
 from localizer.errors import LocalizerError
 from localizer.features.extractor import load_extractor
@@ -152,7 +152,7 @@ def _check_camera(config: CompanionConfig) -> DoctorFinding:
     delivers is read for less time than one that must be called silent.
     """
     feed = config.camera
-    settings = SourceSettings.model_validate(feed.settings.model_dump() | {"realtime": True})
+    settings = feed.settings.model_copy(update={"realtime": True})
     told: list[str] = []
 
     def on_state(state: StreamState, text: str) -> None:
@@ -180,8 +180,8 @@ def _check_camera(config: CompanionConfig) -> DoctorFinding:
         source.close()
     if len(times) < 2:
         where = redacted(feed.source)
-        why = f"nothing arrived from {where} in {_FEED_S:.0f} s: is the stream running?"
-        why += f" ({told[0].removeprefix(f'{where}: ')})" if told else ""
+        why = f"no pictures from {where} in {_FEED_S:.0f} s: "
+        why += told[-1].removeprefix(f"{where}: ") if told else "is the stream running?"
         return _failed("camera", "silent", "pictures", why)
     rate = (len(times) - 1) / max((times[-1] - times[0]) * 1e-9, 1e-9)
     found = f"{seen.width}x{seen.height}, {rate:.1f} Hz"

@@ -33,7 +33,7 @@ class IntegrityConfig(BaseModel):
         0.01,
         ge=0,
         le=1,
-        description="share by which another focal length may fit a place on trial better",
+        description="largest gain of another focal length for a tentative registration",
     )
     ambiguity_sigma_m: float = Field(
         6.0,
@@ -52,20 +52,21 @@ class IntegrityConfig(BaseModel):
     )
     lost_after: int = Field(10, ge=1, le=1000, description="rejections in a row until LOST")
     confirm_distance_m: float = Field(
-        5.0, ge=0.1, le=1000, description="way over which a place found without GNSS must hold"
+        5.0,
+        ge=0.1,
+        le=1000,
+        description="distance over which a position found without GNSS must hold",
     )
     confirm_still_s: float = Field(
-        3.0, ge=0.1, le=60, description="the same for a vehicle that does not move"
+        3.0, ge=0.1, le=60, description="time for a vehicle that does not move"
     )
     confirm_tilt_deg: float = Field(
-        6.0, ge=0.1, le=90, description="roll and pitch of a found place against the autopilot's"
+        6.0, ge=0.1, le=90, description="largest roll and pitch difference to the autopilot"
     )
     confirm_heading_deg: float = Field(
-        30.0, ge=0.1, le=180, description="heading of a found place against the autopilot's"
+        30.0, ge=0.1, le=180, description="largest heading difference to the autopilot"
     )
-    reference_age_s: float = Field(
-        2.0, ge=0.1, le=60, description="a reference view older than this is not registered to"
-    )
+    reference_age_s: float = Field(2.0, ge=0.1, le=60, description="oldest usable reference view")
 
 
 def is_acceptable(
