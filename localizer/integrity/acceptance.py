@@ -27,7 +27,7 @@ class IntegrityConfig(BaseModel):
         2.0,
         ge=-20,
         le=50,
-        description="natural log odds that a registration shows the right place, to be used",
+        description="natural log odds that a registration shows the right place",
     )
     max_focal_gain: float = Field(
         0.01,
@@ -39,7 +39,7 @@ class IntegrityConfig(BaseModel):
         6.0,
         ge=0.1,
         le=1e4,
-        description="sigma of a prior's place from which on it holds several places",
+        description="prior sigma above which more evidence is required",
     )
     chi2_threshold: float = Field(
         40.0, ge=1, le=1e4, description="squared Mahalanobis distance, 6 dof"

@@ -9,7 +9,7 @@ the likelihood of a few candidate values; their product over a flight is the pos
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -75,9 +75,12 @@ def _marginal(y: Array, rows: Array, known: Array, wanted: Array, weight: Array)
 
 @dataclass(frozen=True)
 class MapHeightError:
-    """Posterior of the spread of the heights that a map does not have. log_weight: (K,)."""
+    """Posterior of the spread of the heights that a map does not have. log_prior: (K,) by the map's
+    kind; evidence: (K,) log likelihood of the images so far, older ground counting less.
+    """
 
-    log_weight: Array = field(default_factory=lambda: np.zeros(len(CANDIDATES_M)))
+    log_prior: Array = field(default_factory=lambda: np.zeros(len(CANDIDATES_M)))
+    evidence: Array = field(default_factory=lambda: np.zeros(len(CANDIDATES_M)))
 
     @classmethod
     def prior(cls, expected_m: float | None) -> MapHeightError:
@@ -101,9 +104,10 @@ class MapHeightError:
     @property
     def sigma_m(self) -> float:
         """The spread to reckon with: root mean square over the posterior."""
-        weight = np.exp(self.log_weight - self.log_weight.max())
+        total = self.log_prior + self.evidence
+        weight = np.exp(total - total.max())
         return float(np.sqrt((weight * CANDIDATES_M**2).sum() / weight.sum()))
 
     def after(self, likelihood: Array) -> MapHeightError:
         """With another image over new ground; likelihood: (K,) of `height_likelihood`."""
-        return MapHeightError(_KEPT * self.log_weight + _TEMPERED * likelihood)
+        return replace(self, evidence=_KEPT * self.evidence + _TEMPERED * likelihood)

@@ -61,12 +61,17 @@ def place_features(result: Registration) -> Array | None:
     votes = result.agreement
     if result.status is not RegistrationStatus.OK or votes is None or votes.patches == 0:
         return None
+    return evidence(result.quality, votes.patches, votes.share, votes.peak, result.lead)
+
+
+def evidence(quality: float, patches: int, share: float, peak: float, lead: float) -> Array:
+    """(4,) the features of these numbers of a `Registration` and its `PatchAgreement`."""
     return np.array(
         [
-            np.log(max(result.quality, _LEAST_QUALITY)),
-            np.sqrt(votes.patches) * (votes.share - _CHANCE),
-            votes.peak,
-            np.log(np.clip(result.lead, _LEAST_LEAD, 1.0)),
+            np.log(max(quality, _LEAST_QUALITY)),
+            np.sqrt(patches) * (share - _CHANCE),
+            peak,
+            np.log(np.clip(lead, _LEAST_LEAD, 1.0)),
         ]
     )
 

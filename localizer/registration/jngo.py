@@ -108,11 +108,11 @@ class JNGO:
             return failure(prior, status)
         if self._whole is not None:
             try:
-                found = self._whole.register(
+                on_device = self._whole.register(
                     self.config, query, camera, anchors, prior,
                     motion=motion, constraint=constraint, seed=seed,
                 )  # fmt: skip
-                return self._with_agreement(found, query, camera, anchors)
+                return self._with_agreement(on_device, query, camera, anchors)
             except BackendError as error:
                 _log.error("registration continues on the CPU: %s", error)
                 self.backend, self._whole = NumbaBackend(self._threads), None

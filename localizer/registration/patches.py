@@ -20,9 +20,6 @@ import numpy as np
 from localizer.geometry.pose import Array
 
 LEAST_PATCHES = 8  # six numbers are fitted
-# Neighbouring patches are not wholly independent. Of 1, 1.5 and 2 times the measured scatter, 1.5
-# gave the honest errors on caliterra, fengyuan, NEON and generated maps alike (`benchmarks.real`).
-SCATTER_FACTOR = 1.5
 _RAYLEIGH = 1.1774  # median length of a vector of two independent errors, in their sigmas
 _LEAST_PX = 0.05  # of the scatter: a perfect fit is no perfect knowledge
 BLOCK_M = 20.0  # over which an unknown height is the same: a building, a row of trees
@@ -70,7 +67,7 @@ def patch_covariance(patches: PatchDisplacements, height_sigma_m: float) -> Arra
     if np.linalg.eigvalsh(scaled)[0] < _SINGULAR:
         return None
     inverse = np.linalg.inv(scaled) * np.outer(scale, scale)
-    noise_px = SCATTER_FACTOR * max(patches.scatter_px, _LEAST_PX)
+    noise_px = max(patches.scatter_px, _LEAST_PX)
     meat = noise_px**2 * normal
     if height_sigma_m > 0:
         pull = np.einsum("kai,ka->ki", patches.motion, patches.rise)

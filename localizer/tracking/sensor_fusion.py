@@ -30,7 +30,7 @@ from localizer.tracking.dead_reckoning import fallen_m
 from localizer.tracking.motion import AuxiliarySensors
 from localizer.types import RegistrationStatus
 
-CONTRADICTS = 4.0
+CONTRADICTS = 2.5
 """Sigmas between the registered pose and a sensor from which one of them is wrong."""
 
 
@@ -61,6 +61,7 @@ class SensorFusion:
         self._sensors, self._height_sigma_m = sensors, height_sigma_m
         self.attitude_bias = AttitudeBiasEstimator(attitude, sensors.rotation_at)
         self.height_error = MapHeightError.of_kind(map_kind)
+        self._is_surface = map_kind is not None and map_kind.has_buildings
 
     def fuse(self, result: Registration, time_ns: int) -> FusedRegistration:
         """The registration of a frame exposed at `time_ns`, with attitude and height."""
@@ -103,7 +104,9 @@ class SensorFusion:
             return
         votes = result.agreement
         if votes is not None and votes.displacements is not None:
-            known = self._constraints(result.world_from_camera, time_ns)
+            # A gimbal that sinks looks like missing buildings. Over a surface model it would make
+            # the pose less sure and pull it along, so there the image alone is heard.
+            known = [] if self._is_surface else self._constraints(place, time_ns)
             likelihood = height_likelihood(
                 votes.displacements, result.world_from_camera, combine(*known) if known else None
             )

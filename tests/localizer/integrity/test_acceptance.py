@@ -46,7 +46,7 @@ def test_a_contradicted_prediction_rejects() -> None:
 
 def test_a_wide_prior_asks_for_more_evidence() -> None:
     doubtful = _registration(
-        quality=0.3, lead=0.05, agreement=PatchAgreement(patches=60, votes=24, peak=4.5)
+        quality=0.4, lead=0.2, agreement=PatchAgreement(patches=60, votes=30, peak=5.0)
     )
     assert is_acceptable(CONFIG, doubtful, 1.0, prior_sigma_m=3.0)
     assert not is_acceptable(CONFIG, doubtful, 1.0, prior_sigma_m=200.0)
