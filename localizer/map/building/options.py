@@ -19,9 +19,10 @@ class BuildOptions:
     above the geoid), else the source's own, else EGM96's. vertical_datum: what the source's heights
     are; "amsl" ones are lifted by the separation; needed unless the source's format or CRS says it.
 
-    georeference, up_axis: of a mesh, see `read_georeference` and `mesh_tree`. height_unit, nodata:
-    of a DSM, see `read_rasters`. origin: of the world frame, else the source's centre. attribution:
-    whose data it is; imagery_date: of its pictures, as 2024, 2024-06 or 2024-06-30.
+    georeference: of a mesh, see `read_georeference`. up_axis: of a mesh or a tileset's content,
+    whatever it says, see `mesh_tree` and `read_tileset`. height_unit, nodata: of a DSM, see
+    `read_rasters`. origin: of the world frame, else the source's centre. attribution: whose data it
+    is; imagery_date: of its pictures, as 2024, 2024-06 or 2024-06-30.
 
     skip_bad_tiles: leave out tiles that cannot be imported (their parents are shown there) instead
     of failing. overwrite: replace a cache of another source or of other options. rules: what a

@@ -28,7 +28,7 @@ _IMPORTABLE = (
 
 @dataclass(frozen=True)
 class SourceOptions:
-    """How a source is to be read, beyond what it says. up_axis: of a mesh; height_unit, nodata: of
+    """How a source is to be read, beyond what it says. up_axis: of meshes; height_unit, nodata: of
     a DSM, see `read_rasters`.
     """
 
@@ -68,7 +68,7 @@ def read_source(
     if sources[0].suffix.lower() in MESHES:
         return _read_mesh(sources[0], georeference, options)
     if sources[0].is_dir() or sources[0].suffix.lower() == ".json":
-        return with_levels(read_tileset(sources[0], rules))
+        return with_levels(read_tileset(sources[0], rules, options.up_axis))
     raise MapSourceError(f"{sources[0]}: not a source that can be imported: {_IMPORTABLE}")
 
 
@@ -113,5 +113,6 @@ def mesh_tree(path: Path, georeference: Georeference, options: SourceOptions) ->
         "",
         files,
         options=f"{georeference} {axis}",
+        up_axis=axis,
         warnings=tuple(warnings),
     )

@@ -1,11 +1,12 @@
 """The files that a mesh or a tile's content refers to: its source has changed when they have.
 
-They are found by the names in headers alone and never raise: what is wrong with them is told by the
-importer that reads them.
+`file_of` finds a file by its name as programs write it. What files refer to is found by the names
+in headers alone, and never raises: what is wrong is told by the importer that reads them.
 """
 
 from __future__ import annotations
 
+import gzip
 import json
 import mmap
 import re
@@ -16,12 +17,50 @@ from typing import Any
 from urllib.parse import unquote, urlsplit
 
 _LONGEST_JSON = 1 << 30
+_LONGEST_PACKED = 64 << 20  # of a compressed header
 _B3DM_HEADER = 28
 _LIBRARY = re.compile(rb"^[ \t]*mtllib[ \t]+([^\r\n]+)", re.MULTILINE)
 _PICTURE = re.compile(rb"^[ \t]*(?:map_\w+|bump|disp|decal|norm|refl)[ \t]+([^\r\n]+)",
                       re.MULTILINE | re.IGNORECASE)  # fmt: skip
 
 _COLOURS = re.compile(rb"^[ \t]*map_Kd[ \t]+([^\r\n]+)", re.MULTILINE | re.IGNORECASE)
+
+
+def file_of(folder: Path, name: str) -> Path:
+    """The file that a name means, beside `folder`: as it stands; else with backslashes for slashes
+    and in other letter case, as Windows has it; else, for an absolute name of another machine, the
+    file of that name here. What is not found is returned as it stands.
+    """
+    plain = folder / name
+    if "\0" in name or _exists(plain):
+        return plain
+    parts = [part for part in name.replace("\\", "/").split("/") if part not in ("", ".")]
+    ways = [parts]
+    if name[:1] in "/\\" or name[1:2] == ":":
+        ways = [parts[-1:]]
+    for way in ways:
+        path = folder
+        for part in way:
+            path = _entry(path, part)
+        if way and _exists(path):
+            return path
+    return plain
+
+
+def _entry(folder: Path, name: str) -> Path:
+    """An entry of a folder, in any letter case if there is none of that very name."""
+    path = folder / name
+    if name == ".." or _exists(path) or not folder.is_dir():
+        return path
+    alike = [entry for entry in folder.iterdir() if entry.name.casefold() == name.casefold()]
+    return min(alike, default=path)
+
+
+def _exists(path: Path) -> bool:
+    try:
+        return path.exists()
+    except OSError:  # a name that is too long
+        return False
 
 
 def files_beside(path: Path) -> tuple[Path, ...]:
@@ -73,7 +112,7 @@ def _named(folder: Path, text: bytes) -> Iterator[Path]:
     """
     line = text.decode("utf-8", "replace").strip()
     for name in {line, line.split()[-1]} if line else ():
-        yield folder / name.replace("\\", "/")
+        yield file_of(folder, name)
 
 
 def _of_gltf(path: Path) -> Iterator[Path]:
@@ -86,21 +125,24 @@ def _of_gltf(path: Path) -> Iterator[Path]:
             if isinstance(uri, str) and not uri.startswith("data:"):
                 name = unquote(urlsplit(uri).path)
                 if name and "\0" not in name:
-                    yield path.parent / name
+                    yield file_of(path.parent, name)
 
 
 def _gltf_json(path: Path) -> dict[str, Any]:
     """The JSON of a glTF, or that in the header of a GLB or a b3dm."""
-    with path.open("rb") as file:
+    with path.open("rb") as plain:
+        packed = plain.read(2) == b"\x1f\x8b"
+    longest = _LONGEST_PACKED if packed else _LONGEST_JSON
+    with gzip.open(path) if packed else path.open("rb") as file:
         start = file.read(_B3DM_HEADER)
         begin = 0
         if start[:4] == b"b3dm":
             begin = _B3DM_HEADER + sum(struct.unpack_from("<4I", start, 12))
             file.seek(begin)
             start = file.read(20)
-        length = _LONGEST_JSON
+        length = longest
         if start[:4] == b"glTF":
-            length = min(struct.unpack_from("<I", start, 12)[0], _LONGEST_JSON)
+            length = min(struct.unpack_from("<I", start, 12)[0], longest)
             begin += 20
         file.seek(begin)
         document = json.loads(file.read(length))

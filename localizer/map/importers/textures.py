@@ -52,6 +52,15 @@ def decode_image(data: bytes, rules: ImportRules) -> tuple[Image, bytes | None]:
     return rgb, data if kind == "JPEG" else None
 
 
+def decode_alpha(data: bytes) -> NDArray[np.uint8] | None:
+    """(h, w) of a picture that `decode_image` has read; None where all of it is opaque."""
+    with PillowImage.open(io.BytesIO(data)) as picture:
+        if not picture.has_transparency_data:
+            return None
+        alpha = np.asarray(picture.convert("RGBA").getchannel("A"), np.uint8)
+    return None if alpha.min() == 255 else alpha
+
+
 def palette_mesh(positions: Array, faces: NDArray[np.int32], colours: Image) -> SourceMesh:
     """A mesh of flat-coloured faces. colours: (F, 3) uint8; they become blocks of a texture."""
     unique, which = np.unique(colours.reshape(-1, 3), axis=0, return_inverse=True)
