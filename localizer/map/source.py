@@ -78,7 +78,7 @@ class SourceTree:
     tells; files: everything it is made of, so that a change of the source can be seen; options:
     what else decided the tree; vertical_crs: the source's own statement of `vertical_datum`, empty
     where that only follows from the format; warnings: doubts that did not stop the import; up_axis:
-    of its meshes as they were read, None where they have several or none.
+    by which its meshes were read, None where it has none.
     """
 
     root: SourceNode

@@ -22,14 +22,17 @@ def require_upright(
     """Warnings where most of the finest tiles' surface does not face up; `MapSourceError` unless
     that is trusted. up_axis: by which the source was read, None where it has none.
     """
+    if up_axis is None:  # heights, which can only face up
+        return []
     fault = facing_fault(np.sum([tile.area for tile in leaves], axis=0))
     if fault is None:
         return []
-    remedy = ""
-    if up_axis is not None:
-        other = "z" if up_axis == "y" else "y"
-        remedy = f": its meshes were read with {up_axis} up; try --up-axis {other}"
-    return [rules.doubt("upright", f"{source}: its ground {fault}{remedy}")]
+    other = "z" if up_axis == "y" else "y"
+    text = (
+        f"{source}: its ground {fault}: its meshes were read with {up_axis} up; try --up-axis "
+        f"{other}"
+    )
+    return [rules.doubt("upright", text)]
 
 
 def require_in_volumes(

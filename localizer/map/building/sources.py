@@ -13,9 +13,9 @@ from localizer.map.building.levels import with_levels
 from localizer.map.building.quadtree import bounds, quadtree
 from localizer.map.importers.folder import MESHES, RASTERS, FoundSource, source_in
 from localizer.map.importers.georeference import Georeference, UpAxis, read_georeference
-from localizer.map.importers.mesh import MeshFile
+from localizer.map.importers.mesh import MeshFile, obj_materials
 from localizer.map.importers.raster import read_rasters
-from localizer.map.importers.referenced_files import colour_pictures, files_beside
+from localizer.map.importers.referenced_files import files_beside
 from localizer.map.importers.rules import DEFAULT_RULES, ImportRules, require_plain_file
 from localizer.map.importers.tiles3d import read_tileset
 from localizer.map.source import SourceTree
@@ -95,8 +95,8 @@ def mesh_tree(path: Path, georeference: Georeference, options: SourceOptions) ->
     middle = [*(0.5 * (low + high))[:2], low[2]] if georeference.origin is None else [0.0, 0.0, 0.0]
     centre = georeference.ecef(np.array([middle]))[0]
     files = (path, *files_beside(path))
-    missing = colour_pictures(path)[1] if path.suffix.lower() == ".obj" else ()
-    warnings = [f"{path.name}: its texture {name!r} is not there" for name in missing]
+    doubts = obj_materials(path)[1] if path.suffix.lower() == ".obj" else ()
+    warnings = [f"{path.name}: {text}" for text in doubts]
     text = georeference.far_outside(np.array([low, high]))
     if text is not None:
         warnings.append(options.rules.doubt("area", f"{path}: {text}"))

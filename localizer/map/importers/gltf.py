@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import DracoPy
@@ -34,6 +34,7 @@ from localizer.map.importers.textures import (
     merged_by_picture,
     palette_mesh,
     picture_size,
+    placed,
     srgb,
     tinted,
 )
@@ -138,8 +139,7 @@ class _Document:
             for part in self._primitive(primitive):
                 self._vertices += len(part.positions)
                 self._rules.require("vertices", self._vertices, "the glTF")
-                positions = part.positions @ T[:3, :3].T + T[:3, 3]
-                parts.append(replace(part, positions=positions))
+                parts.append(placed(part, T))
         return merged_by_picture(parts)
 
     def corners(self) -> Array:

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -10,12 +11,19 @@ from numpy.typing import NDArray
 
 from localizer.geometry.pose import Array
 from localizer.map.importers.gltf_data import vector
+from localizer.map.importers.referenced_files import file_of
 from localizer.types import Float32
 
 _BLACK = 1 / 255  # linear light; a base so dark shows nothing of its own
 _LEAST_TEXELS = 4.0  # side of a triangle's part that is not cut further
 _MOST_CUTS = 10  # halvings of a triangle
 _MOST_FACES = 40_000  # more are not made of one mesh, beyond four times its own
+# MTL: statements of a picture, the better ones last; options, with how many values they have.
+_PICTURES = {"map_ke": 1, "map_ka": 2, "map_kd": 3}
+_OPTIONS = {
+    "-o": 3, "-s": 3, "-t": 3, "-mm": 2, "-blendu": 1, "-blendv": 1, "-boost": 1, "-texres": 1,
+    "-clamp": 1, "-bm": 1, "-imfchan": 1, "-type": 1, "-cc": 1,
+}  # fmt: skip
 _CENTRE = np.array([[4, 1, 1], [1, 4, 1], [1, 1, 4], [2, 2, 2]]) / 6.0  # barycentric samples
 
 
@@ -129,3 +137,96 @@ def _halved(
         np.concatenate([uvs, *uv_middles]).astype(np.float32),
         made.astype(np.int32),
     )
+
+
+@dataclass(frozen=True)
+class MtlMaterial:
+    """A material of an OBJ's library. colour: (3,) from 0 to 1; picture, mask: its files, the mask
+    of opacity; missing: names of pictures that are not there; scale, offset: of its texture
+    coordinates; clamped: the picture does not go on beyond its edges.
+    """
+
+    name: str
+    colour: tuple[float, float, float] = (0.8, 0.8, 0.8)
+    picture: Path | None = None
+    mask: Path | None = None
+    missing: tuple[str, ...] = ()
+    scale: tuple[float, float] = (1.0, 1.0)
+    offset: tuple[float, float] = (0.0, 0.0)
+    clamped: bool = False
+
+
+def read_mtl(library: Path, obj_folder: Path) -> list[MtlMaterial]:
+    """The materials of a library, in its order. A picture of the ambient or emissive colour stands
+    for that of the diffuse one where that has none.
+    """
+    made: list[MtlMaterial] = []
+    rank = 0
+    for line in library.read_bytes().decode("utf-8-sig", "replace").splitlines():
+        key, _, rest = line.strip().partition(" ")
+        key, rest = key.strip().lower(), rest.strip()
+        if key == "newmtl":
+            made.append(MtlMaterial(rest))
+            rank = 0
+        elif not made or not rest:
+            continue
+        elif key == "kd" and (colour := _floats(rest.split()[:3])) and len(colour) == 3:
+            made[-1] = replace(made[-1], colour=(colour[0], colour[1], colour[2]))
+        elif key in _PICTURES and _PICTURES[key] > rank:
+            made[-1], rank = _with_picture(made[-1], rest, library, obj_folder), _PICTURES[key]
+        elif key == "map_d":
+            made[-1] = replace(made[-1], mask=_picture(rest, library, obj_folder)[0])
+    return made
+
+
+def _with_picture(material: MtlMaterial, text: str, library: Path, obj_folder: Path) -> MtlMaterial:
+    options, _ = _options(text)
+    picture, name = _picture(text, library, obj_folder)
+    return replace(
+        material,
+        picture=picture,
+        missing=(name,) if picture is None else (),
+        scale=_pair(options.get("-s", []), 1.0),
+        offset=_pair(options.get("-o", []), 0.0),
+        clamped=options.get("-clamp") == ["on"],
+    )
+
+
+def _picture(text: str, library: Path, obj_folder: Path) -> tuple[Path | None, str]:
+    """The file of a texture statement, and its name: the whole text, or what follows its options,
+    or its last word.
+    """
+    _, name = _options(text)
+    for candidate in (text, name, text.rsplit(maxsplit=1)[-1]):
+        plain = candidate.strip("\"'")
+        for folder in (library.parent, obj_folder):
+            if (path := file_of(folder, plain)).is_file():
+                return path, plain
+    return None, name
+
+
+def _options(text: str) -> tuple[dict[str, list[str]], str]:
+    """Options of a texture statement, and what follows them."""
+    words, found = text.split(), dict[str, list[str]]()
+    while words and words[0].lower() in _OPTIONS:
+        name, most = words[0].lower(), _OPTIONS[words[0].lower()]
+        count = 1
+        if most > 1:  # as many as are numbers
+            count = next((k for k in range(most) if not _floats(words[1 + k : 2 + k])), most)
+        found[name] = words[1 : 1 + count]
+        words = words[1 + count :]
+    return found, " ".join(words)
+
+
+def _pair(words: list[str], default: float) -> tuple[float, float]:
+    """The first two numbers of an option, which may leave the later ones out."""
+    u, v, *_ = [*_floats(words), default, default]
+    return u, v
+
+
+def _floats(words: list[str]) -> list[float]:
+    """Of words; empty where one of them is no number."""
+    try:
+        return [float(word) for word in words]
+    except ValueError:
+        return []

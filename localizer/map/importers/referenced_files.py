@@ -19,11 +19,9 @@ from urllib.parse import unquote, urlsplit
 _LONGEST_JSON = 1 << 30
 _LONGEST_PACKED = 64 << 20  # of a compressed header
 _B3DM_HEADER = 28
-_LIBRARY = re.compile(rb"^[ \t]*mtllib[ \t]+([^\r\n]+)", re.MULTILINE)
+_LIBRARY = re.compile(rb"^(?:\xef\xbb\xbf)?[ \t]*mtllib[ \t]+([^\r\n]+)", re.MULTILINE)
 _PICTURE = re.compile(rb"^[ \t]*(?:map_\w+|bump|disp|decal|norm|refl)[ \t]+([^\r\n]+)",
                       re.MULTILINE | re.IGNORECASE)  # fmt: skip
-
-_COLOURS = re.compile(rb"^[ \t]*map_Kd[ \t]+([^\r\n]+)", re.MULTILINE | re.IGNORECASE)
 
 
 def file_of(folder: Path, name: str) -> Path:
@@ -74,24 +72,6 @@ def files_beside(path: Path) -> tuple[Path, ...]:
     return tuple(sorted(found))
 
 
-def colour_pictures(path: Path) -> tuple[dict[str, Path], tuple[str, ...]]:
-    """The colour textures that an OBJ's materials name: those that are there, by their name, and
-    the names of those that are not.
-    """
-    found: dict[str, Path] = {}
-    missing = []
-    for library in files_beside(path):
-        if library.suffix.lower() == ".mtl" and library.is_file():
-            for match in _COLOURS.finditer(library.read_bytes()):
-                name = match[1].decode("utf-8", "replace").strip()
-                file = next((p for p in _named(path.parent, match[1]) if p.is_file()), None)
-                if file is None:
-                    missing.append(name)
-                else:
-                    found[name] = file
-    return found, tuple(dict.fromkeys(missing))
-
-
 def _of_obj(path: Path) -> Iterator[Path]:
     """Its material libraries, and their pictures."""
     if path.stat().st_size == 0:  # which cannot be mapped
@@ -99,7 +79,7 @@ def _of_obj(path: Path) -> Iterator[Path]:
     with path.open("rb") as file, mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as text:
         libraries = [match[1] for match in _LIBRARY.finditer(text)]
     for names in libraries:
-        for library in _named(path.parent, names):
+        for library in {*_named(path.parent, names), *_each(path.parent, names)}:
             yield library
             if library.is_file():
                 for match in _PICTURE.finditer(library.read_bytes()):
@@ -112,6 +92,12 @@ def _named(folder: Path, text: bytes) -> Iterator[Path]:
     """
     line = text.decode("utf-8", "replace").strip()
     for name in {line, line.split()[-1]} if line else ():
+        yield file_of(folder, name)
+
+
+def _each(folder: Path, text: bytes) -> Iterator[Path]:
+    """The files of the line's words: a line may name several libraries."""
+    for name in text.decode("utf-8", "replace").split():
         yield file_of(folder, name)
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import struct
 import zlib
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 from urllib.parse import unquote, urlsplit
@@ -19,6 +19,7 @@ from localizer.map.importers.georeference import UpAxis
 from localizer.map.importers.gltf import gltf_bounds, gltf_weight, read_gltf
 from localizer.map.importers.referenced_files import file_of, files_beside
 from localizer.map.importers.rules import DEFAULT_RULES, ImportRules, require_plain_file
+from localizer.map.importers.textures import placed
 from localizer.map.source import SourceMesh, SourceNode, SourceTree
 
 _MAX_USES = 64  # of one tileset: each of a few that name each other multiplies their tiles
@@ -67,7 +68,7 @@ class ContentFile:
         data, rtc = self._gltf()
         meshes, gltf_rtc = read_gltf(data, self._beside, self.rules)
         T = self._ecef_from_gltf(rtc + gltf_rtc)
-        return [replace(m, positions=m.positions @ T[:3, :3].T + T[:3, 3]) for m in meshes]
+        return [placed(m, T) for m in meshes]
 
     def corners(self) -> Array:
         """(N, 3) ECEF corners of boxes that hold the content, by the file's headers."""
@@ -133,7 +134,7 @@ def _read_tileset(path: Path, rules: ImportRules, up_axis: UpAxis | None) -> Sou
         tuple(reader.files),
         "ellipsoidal",  # by the specification
         options="" if up_axis is None else f"up {up_axis}",
-        up_axis=reader.up_axes.pop() if len(reader.up_axes) == 1 else None,
+        up_axis="/".join(sorted(reader.up_axes)),
         warnings=tuple(dict.fromkeys(reader.warnings)),
     )
 
